@@ -1,0 +1,86 @@
+"""Models of pose graph optimisation: graphs, the problem, its convex models, starts and certificates.
+
+Nothing here iterates; methods are in `solvers`.
+"""
+
+from pgo_models.certificate import Certificate, Verdict, certify, prove_bound
+from pgo_models.cholesky import CholeskyBackend, default_backend
+from pgo_models.datasets import known_datasets, load
+from pgo_models.errors import (
+    DatasetError,
+    FileFormatError,
+    GraphError,
+    MissingExtraError,
+    NotPositiveDefiniteError,
+    PGOError,
+    SettingError,
+)
+from pgo_models.g2o import read_g2o, write_g2o
+from pgo_models.grid_world import grid_world
+from pgo_models.initialization import chordal_start, gps_imu_start, odometry_start, spanning_tree_start
+from pgo_models.matrices import connection_laplacian, joint_matrix, marginalized_matrix, residual_matrix
+from pgo_models.multipliers import certificate_matrix, multipliers
+from pgo_models.partition import Partition, PartitionMethod, partition
+from pgo_models.polish import polish
+from pgo_models.pose_graph import PoseGraph
+from pgo_models.poses import Poses, absolute_trajectory_error, relative_pose_error
+from pgo_models.problem import PGOProblem
+from pgo_models.rotation_qp import RotationQP, rotation_qp
+from pgo_models.rotations import exp_map, log_map, project_to_rotations, random_rotations
+from pgo_models.scenes import NoiseModel, circle, grid, random_geometric, sphere
+from pgo_models.trajectories import read_kitti, read_tum, write_kitti, write_tum
+
+__all__ = [
+    "Certificate",
+    "CholeskyBackend",
+    "DatasetError",
+    "FileFormatError",
+    "GraphError",
+    "MissingExtraError",
+    "NoiseModel",
+    "NotPositiveDefiniteError",
+    "PGOError",
+    "PGOProblem",
+    "Partition",
+    "PartitionMethod",
+    "PoseGraph",
+    "Poses",
+    "RotationQP",
+    "SettingError",
+    "Verdict",
+    "absolute_trajectory_error",
+    "certificate_matrix",
+    "certify",
+    "chordal_start",
+    "circle",
+    "connection_laplacian",
+    "default_backend",
+    "exp_map",
+    "gps_imu_start",
+    "grid",
+    "grid_world",
+    "joint_matrix",
+    "known_datasets",
+    "load",
+    "log_map",
+    "marginalized_matrix",
+    "multipliers",
+    "odometry_start",
+    "partition",
+    "polish",
+    "project_to_rotations",
+    "prove_bound",
+    "random_geometric",
+    "random_rotations",
+    "read_g2o",
+    "read_kitti",
+    "read_tum",
+    "relative_pose_error",
+    "residual_matrix",
+    "rotation_qp",
+    "spanning_tree_start",
+    "sphere",
+    "write_g2o",
+    "write_kitti",
+    "write_tum",
+]

@@ -1,0 +1,282 @@
+"""g2o files, one for all robots or a folder with one for each, as a PoseGraph and back.
+
+Information matrices become the precisions of SE-Sync (Rosen et al. 2019):
+d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I_tt^-1), kappa = I_theta.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from pgo_models.errors import FileFormatError, GraphError
+from pgo_models.files import replace_when_done
+from pgo_models.g2o_lines import G2OLines, IntArray, information_of, poses_of, read_lines
+from pgo_models.pose_graph import PoseGraph
+from pgo_models.poses import Poses
+from pgo_models.rotations import Array, log_map, quaternions_from_rotations
+
+_LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
+_LETTER_SHIFT = 56  # a GTSAM symbol is a letter in the top byte and an index below it
+
+
+def read_g2o(path: Path | str) -> PoseGraph:
+    """Pose graph of a g2o file, or of a folder with one g2o file for each robot.
+
+    Read are EDGE_SE3:QUAT, EDGE_SE2, VERTEX_SE3:QUAT, VERTEX_SE2 and FIX lines. Poses are numbered by ascending id.
+    Quaternions are normalised, repeated edges all count. `initial` is set when every pose has a VERTEX line; edges to
+    poses without one are accepted, and leave it out.
+
+    Robots. When every id is a GTSAM symbol (a letter in the top byte), the rank of its letter is the robot. Otherwise a
+    pose of a folder belongs to the file with its VERTEX line, the first of them in the order 0, 1, .., 9, 10, or else
+    to the first file that names it. An edge that stands in two files of a folder is one measurement, and the VERTEX
+    line that counts is that of the pose's own robot.
+
+    Returns
+    -------
+    PoseGraph with translations in the file's unit, taken as metres, and `information` as in the file.
+
+    Raises
+    ------
+    FileFormatError
+        See `read_lines`; also for a folder without g2o files, no edges, and a FIX line of an unknown pose.
+    """
+    path = Path(path)
+    files = [read_lines(file) for file in _files_of(path)]
+    for file in files[1:]:
+        if file.d != files[0].d:
+            raise FileFormatError(file.path, None, f"{file.d}D, but {files[0].path} is {files[0].d}D; part the folder")
+    d = files[0].d
+    edges = _join_edges(files)
+    edge_ids = np.concatenate([file.edge_ids[kept] for file, kept in zip(files, edges, strict=True)])
+    rows = np.concatenate([file.edges[kept] for file, kept in zip(files, edges, strict=True)])
+    if not len(rows):
+        raise FileFormatError(path, None, "no edges; a pose graph needs at least one EDGE_SE2 or EDGE_SE3:QUAT line")
+    ids = np.unique(np.concatenate([edge_ids.ravel(), *(file.vertex_ids for file in files)]))
+    robot = _robots(ids, files)
+    R_ij, t_ij = poses_of(d, rows)
+    information = information_of(d, rows)
+    kappa, tau = precisions(information)
+    both = np.searchsorted(ids, edge_ids)
+    return PoseGraph(
+        num_poses=len(ids),
+        i=both[:, 0],
+        j=both[:, 1],
+        R_ij=R_ij,
+        t_ij=t_ij,
+        kappa=kappa,
+        tau=tau,
+        information=information,
+        ids=ids,
+        robot=robot,
+        initial=_initial(ids, robot, files),
+        fixed=_fixed(ids, files),
+        name=path.resolve().stem if path.is_file() else path.resolve().name,
+    )
+
+
+def read_g2o_poses(path: Path | str, graph: PoseGraph) -> Poses:
+    """Poses of the VERTEX lines of a g2o file, in the order of `graph`; the file needs no edges.
+
+    Raises
+    ------
+    FileFormatError
+        See `read_lines`; also when the file has another dimension, or a pose of the graph is not in it.
+    """
+    file = read_lines(path)
+    if file.d != graph.d:
+        raise FileFormatError(path, None, f"{file.d}D, but {graph.name} is {graph.d}D; give poses of this graph")
+    absent = ~np.isin(graph.pose_ids, file.vertex_ids)
+    if absent.any():
+        first = graph.pose_ids[np.argmax(absent)]
+        raise FileFormatError(path, None, f"no VERTEX line for pose {first} ({absent.sum()} missing); add it")
+    order = np.argsort(file.vertex_ids)
+    at = order[np.searchsorted(file.vertex_ids[order], graph.pose_ids)]
+    return Poses(*poses_of(file.d, file.vertices[at]))
+
+
+def write_g2o(graph: PoseGraph, path: Path | str, poses: Poses | None = None) -> None:
+    """Write VERTEX lines (of `poses`, else of `graph.initial`, else none), FIX lines and EDGE lines to one file.
+
+    Numbers are written so that reading gives the same floats. Without `graph.information` the matrices are
+    tau I, 2 kappa I in space and diag(tau, tau, kappa) in the plane, which read back as the same kappa and tau.
+
+    Raises
+    ------
+    GraphError
+        When `poses` do not have the size of the graph.
+    PGOError
+        When the file cannot be written; what stood there stays.
+    """
+    every = np.ones(graph.num_edges, dtype=bool)
+    _write(graph, Path(path), _poses_to_write(graph, poses), np.ones(graph.num_poses, dtype=bool), every)
+
+
+def write_g2o_folder(graph: PoseGraph, folder: Path | str, poses: Poses | None = None) -> None:
+    """Write one file 0.g2o, 1.g2o, .. for each robot: its poses, and all edges that touch one of them.
+
+    Edges between two robots stand in both files. Reading the folder gives the graph back, up to the order of its edges;
+    when there are no VERTEX lines, the owners come back only if the ids are symbols (see `symbol_ids`).
+
+    Raises
+    ------
+    GraphError, PGOError
+        As `write_g2o`.
+    """
+    chosen = _poses_to_write(graph, poses)
+    for robot in range(graph.num_robots):
+        mine = graph.robots == robot
+        _write(graph, Path(folder) / f"{robot}.g2o", chosen, mine, mine[graph.i] | mine[graph.j])
+
+
+def precisions(information: Array) -> tuple[Array, Array]:
+    """(kappa, tau), each (m,), of information matrices (m, 3, 3) in the plane or (m, 6, 6) in space.
+
+    d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I_tt^-1), kappa = I_theta.
+    The blocks themselves are inverted, not the marginal information. Per radian^2 and per metre^2.
+
+    Examples
+    --------
+    >>> precisions(np.diag([4.0, 4.0, 4.0, 6.0, 6.0, 6.0])[None])
+    (array([3.]), array([4.]))
+    """
+    if information.shape[-1] == 3:
+        return information[:, 2, 2].copy(), 2.0 / _trace_of_inverse(information[:, :2, :2])
+    tau = 3.0 / _trace_of_inverse(information[:, :3, :3])
+    return 1.5 / _trace_of_inverse(information[:, 3:, 3:]), tau
+
+
+def isotropic_information(kappa: Array, tau: Array, d: int) -> Array:
+    """Diagonal information matrices, (m, 3, 3) or (m, 6, 6), whose `precisions` are kappa and tau."""
+    diagonal = [tau, tau, kappa] if d == 2 else [tau, tau, tau, 2 * kappa, 2 * kappa, 2 * kappa]
+    return np.asarray(np.stack(diagonal, axis=1)[:, :, None] * np.eye(len(diagonal)))
+
+
+def symbol_ids(robots: IntArray) -> IntArray:
+    """GTSAM symbols a0, a1, .., b0, .. for poses owned by `robots`, (n,): up to 26 robots a to z, up to 52 A to z.
+
+    Raises
+    ------
+    GraphError
+        For more than 52 robots: there are no more letters.
+    """
+    count = int(robots.max()) + 1
+    if count > len(_LETTERS):
+        raise GraphError(f"{count} robots, but symbols have {len(_LETTERS)} letters; number the poses instead")
+    letters = _LETTERS[26:] if count <= 26 else _LETTERS
+    ids = np.zeros(len(robots), dtype=np.int64)
+    for robot in range(count):
+        mine = robots == robot
+        ids[mine] = (ord(letters[robot]) << _LETTER_SHIFT) + np.arange(mine.sum())
+    return ids
+
+
+def _trace_of_inverse(A: Array) -> Array:
+    return np.asarray(np.trace(np.linalg.inv(A), axis1=1, axis2=2))
+
+
+def _files_of(path: Path) -> list[Path]:
+    if not path.is_dir():
+        return [path]
+    found = [file for file in path.iterdir() if file.suffix == ".g2o" and file.is_file()]
+    if not found:
+        raise FileFormatError(path, None, "a folder without g2o files; give a file, or a folder with a file a robot")
+    return sorted(found, key=lambda file: [(len(part), part) for part in re.findall(r"\d+|\D+", file.name)])
+
+
+def _join_edges(files: list[G2OLines]) -> list[np.ndarray]:
+    """Rows of every file to keep: the k-th copy of an edge counts in the first file that has k copies of it."""
+    if len(files) == 1:
+        return [np.arange(len(files[0].edges))]
+    seen: set[tuple[bytes, int]] = set()
+    kept = []
+    for file in files:
+        copies: dict[bytes, int] = {}
+        new = []
+        for row, (ids, numbers) in enumerate(zip(file.edge_ids, file.edges + 0.0, strict=True)):  # -0.0 is 0.0
+            edge = ids.tobytes() + numbers.tobytes()
+            copies[edge] = copies.get(edge, 0) + 1
+            if (edge, copies[edge]) not in seen:
+                seen.add((edge, copies[edge]))
+                new.append(row)
+        kept.append(np.array(new, dtype=np.int64))
+    return kept
+
+
+def _robots(ids: IntArray, files: list[G2OLines]) -> IntArray | None:
+    letters = ids >> _LETTER_SHIFT
+    if np.isin(letters, [ord(letter) for letter in _LETTERS]).all():
+        return np.asarray(np.unique(letters, return_inverse=True)[1], dtype=np.int64)
+    if len(files) == 1:
+        return None
+    owner = np.full(len(ids), -1, dtype=np.int64)
+    for mentioned in ([file.vertex_ids for file in files], [file.edge_ids.ravel() for file in files]):
+        for robot, named in enumerate(mentioned):
+            at = np.searchsorted(ids, named)
+            owner[at[owner[at] < 0]] = robot
+    return np.asarray(np.unique(owner, return_inverse=True)[1], dtype=np.int64)
+
+
+def _initial(ids: IntArray, robot: IntArray | None, files: list[G2OLines]) -> Poses | None:
+    numbers = np.zeros((len(ids), files[0].vertices.shape[1]))
+    known = np.zeros(len(ids), dtype=bool)
+    own = np.zeros(len(ids), dtype=bool)
+    for file in files:
+        if not len(file.vertex_ids):
+            continue
+        at = np.searchsorted(ids, file.vertex_ids)
+        # The robot of a file is the one most of its VERTEX lines belong to.
+        mine = np.ones(len(at), dtype=bool) if robot is None else robot[at] == np.bincount(robot[at]).argmax()
+        better = ~known[at] | (mine & ~own[at])
+        numbers[at[better]] = file.vertices[better]
+        known[at] = True
+        own[at[better]] = mine[better]
+    return Poses(*poses_of(files[0].d, numbers)) if known.all() else None
+
+
+def _fixed(ids: IntArray, files: list[G2OLines]) -> IntArray:
+    for file in files:
+        unknown = ~np.isin(file.fixed, ids)
+        if unknown.any():
+            at = int(np.argmax(unknown))
+            raise FileFormatError(
+                file.path,
+                int(file.fixed_lines[at]),
+                f"FIX names pose {file.fixed[at]}, which has no other line; remove it",
+            )
+    return np.unique(np.searchsorted(ids, np.concatenate([file.fixed for file in files])))
+
+
+def _poses_to_write(graph: PoseGraph, poses: Poses | None) -> Poses | None:
+    chosen = graph.initial if poses is None else poses
+    if chosen is not None and chosen.t.shape != (graph.num_poses, graph.d):
+        raise GraphError(f"poses are {chosen}; {graph.name} needs {graph.num_poses} of them in {graph.d}D")
+    return chosen
+
+
+def _write(graph: PoseGraph, path: Path, poses: Poses | None, mine: np.ndarray, edges: np.ndarray) -> None:
+    vertex, edge = ("VERTEX_SE2", "EDGE_SE2") if graph.d == 2 else ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
+    ids = graph.pose_ids
+    information = graph.information
+    if information is None:
+        information = isotropic_information(graph.kappa, graph.tau, graph.d)
+    k = information.shape[-1]
+    upper = information[:, *np.triu_indices(k)]
+    with replace_when_done(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
+        if poses is not None:
+            file.writelines(_lines(vertex, ids[mine, None], _numbers(poses[mine].R, poses[mine].t)))
+        file.writelines(f"FIX {ids[pose]}\n" for pose in graph.fixed if mine[pose])
+        measured = np.concatenate([_numbers(graph.R_ij[edges], graph.t_ij[edges]), upper[edges]], axis=1)
+        file.writelines(_lines(edge, np.stack([ids[graph.i], ids[graph.j]], axis=1)[edges], measured))
+
+
+def _numbers(R: Array, t: Array) -> Array:
+    return np.concatenate([t, log_map(R) if R.shape[-1] == 2 else quaternions_from_rotations(R)], axis=1)
+
+
+def _lines(tag: str, ids: IntArray, numbers: Array) -> Iterator[str]:
+    for names, row in zip(ids.tolist(), numbers.tolist(), strict=True):
+        yield f"{tag} {' '.join(map(str, names))} {' '.join(map(repr, row))}\n"

@@ -1,0 +1,180 @@
+"""SO(d), d = 2 or 3, vectorised over poses: projection, exponential, logarithm, random draws, stacking.
+
+The projection is step (b) of the paper's Algorithm 1 (`algo1: SOC`), with det = +1 enforced.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_POLAR_TOLERANCE = 1e-8  # the iteration is quadratic: a last change below this leaves an error below 1e-15
+_POLAR_ITERATIONS = 10
+_POLAR_MIN_DETERMINANT = 1e-2  # of the matrix scaled to Frobenius norm sqrt(3); below, the SVD is used
+
+
+def project_to_rotations(A: Array) -> Array:
+    """Nearest rotations: argmin over omega in SO(d) of ||omega - A_i||_F for every A_i.
+
+    With the SVD A = U D V^T the answer is U diag(1, .., 1, det(U V^T)) V^T. Well conditioned 3 x 3 matrices of
+    positive determinant take Newton's polar iteration X <- (X + cof(X) / det X) / 2 instead, which has the same limit.
+
+    Parameters
+    ----------
+    A : (n, d, d)
+
+    Returns
+    -------
+    (n, d, d) rotations. Where the nearest one is not unique, one of the nearest.
+
+    References
+    ----------
+    Ebrahimi & Deghat, Algorithm 1, steps 4 and 5; Higham, Functions of Matrices, section 8.3.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> project_to_rotations(np.array([[[0.0, -2.0], [2.0, 0.0]]]))[0].round(3).tolist()
+    [[0.0, -1.0], [1.0, 0.0]]
+    """
+    if A.shape[-1] == 2:
+        return _project_2d(A)
+    norm = np.sqrt(np.einsum("nab,nab->n", A, A) / 3.0)
+    X = A / np.where(norm > 0, norm, 1.0)[:, None, None]
+    cofactors = _cofactors(X)
+    determinant = np.einsum("nb,nb->n", X[:, 0], cofactors[:, 0])
+    good = determinant > _POLAR_MIN_DETERMINANT
+    if good.all():
+        omega, settled = _polar(X, cofactors, determinant)
+        bad = ~settled
+    else:
+        omega = np.empty_like(X)
+        polar, settled = _polar(X[good], cofactors[good], determinant[good])
+        omega[good] = polar
+        bad = ~good
+        bad[np.flatnonzero(good)[~settled]] = True
+    if bad.any():
+        omega[bad] = project_by_svd(A[bad])
+    return omega
+
+
+def project_by_svd(A: Array) -> Array:
+    """Nearest rotations of (n, d, d) matrices through the SVD, whatever their determinant."""
+    U, _, Vt = np.linalg.svd(A)
+    U[..., :, -1] *= np.where(np.linalg.det(U @ Vt) < 0, -1.0, 1.0)[..., None]
+    return np.asarray(U @ Vt)
+
+
+def _project_2d(A: Array) -> Array:
+    cosine = A[..., 0, 0] + A[..., 1, 1]
+    sine = A[..., 1, 0] - A[..., 0, 1]
+    norm = np.hypot(cosine, sine)
+    degenerate = norm == 0.0
+    norm = np.where(degenerate, 1.0, norm)
+    return _from_cosine_sine(np.where(degenerate, 1.0, cosine / norm), sine / norm)
+
+
+def _from_cosine_sine(cosine: Array, sine: Array) -> Array:
+    return np.stack([np.stack([cosine, -sine], -1), np.stack([sine, cosine], -1)], -2)
+
+
+def _polar(X: Array, cofactors: Array, determinant: Array) -> tuple[Array, BoolArray]:
+    """Newton's polar iteration on matrices of positive determinant; second, which of them have settled."""
+    change = np.full(len(X), np.inf)
+    for _ in range(_POLAR_ITERATIONS):
+        following = 0.5 * (X + cofactors / determinant[:, None, None])
+        change = np.abs(following - X).max(axis=(1, 2), initial=0.0)
+        X = following
+        if change.max(initial=0.0) < _POLAR_TOLERANCE:
+            break
+        cofactors = _cofactors(X)
+        determinant = np.einsum("nb,nb->n", X[:, 0], cofactors[:, 0])
+    return X, change < _POLAR_TOLERANCE
+
+
+def _cofactors(X: Array) -> Array:
+    """Cofactor matrices of (n, 3, 3): the rows are cross products of the other two rows."""
+    C = np.empty_like(X)
+    for row in range(3):
+        u, v = X[:, (row + 1) % 3], X[:, (row + 2) % 3]
+        C[:, row, 0] = u[:, 1] * v[:, 2] - u[:, 2] * v[:, 1]
+        C[:, row, 1] = u[:, 2] * v[:, 0] - u[:, 0] * v[:, 2]
+        C[:, row, 2] = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    return C
+
+
+def tangent_dimension(d: int) -> int:
+    """Dimension d (d - 1) / 2 of SO(d): 1 in the plane, 3 in space."""
+    return d * (d - 1) // 2
+
+
+def hat(w: Array) -> Array:
+    """Skew matrices of (n, 1) or (n, 3) tangent vectors: hat(w) v = w x v in space, the turn by w in the plane."""
+    if w.shape[-1] == 1:
+        zero = np.zeros_like(w[..., 0])
+        return np.stack([np.stack([zero, -w[..., 0]], -1), np.stack([w[..., 0], zero], -1)], -2)
+    W = np.zeros((*w.shape, 3))
+    W[..., 2, 1], W[..., 0, 2], W[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
+    W[..., 1, 2], W[..., 2, 0], W[..., 0, 1] = -w[..., 0], -w[..., 1], -w[..., 2]
+    return W
+
+
+def vee(W: Array) -> Array:
+    """Tangent vectors (n, 1) or (n, 3) of the skew part of (n, d, d) matrices; vee(hat(w)) = w."""
+    if W.shape[-1] == 2:
+        return 0.5 * (W[..., 1, 0] - W[..., 0, 1])[..., None]
+    return 0.5 * np.stack([W[..., 2, 1] - W[..., 1, 2], W[..., 0, 2] - W[..., 2, 0], W[..., 1, 0] - W[..., 0, 1]], -1)
+
+
+def exp_map(w: Array) -> Array:
+    """Rotations Exp(hat(w)) of tangent vectors w, (n, 1) or (n, 3), in radians."""
+    if w.shape[-1] == 1:
+        return _from_cosine_sine(np.cos(w[..., 0]), np.sin(w[..., 0]))
+    return np.asarray(Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix()).reshape((*w.shape, 3))
+
+
+def log_map(R: Array) -> Array:
+    """Tangent vectors w, (n, 1) or (n, 3), in radians, with Exp(hat(w)) = R and ||w|| <= pi."""
+    if R.shape[-1] == 2:
+        return np.arctan2(R[..., 1, 0] - R[..., 0, 1], R[..., 0, 0] + R[..., 1, 1])[..., None]
+    return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()).reshape(R.shape[:-1])
+
+
+def random_rotations(count: int, d: int, rng: np.random.Generator) -> Array:
+    """Rotations (count, d, d) drawn uniformly (by the Haar measure) from SO(d)."""
+    if d == 2:
+        return exp_map(rng.uniform(-np.pi, np.pi, (count, 1)))
+    quaternions = rng.standard_normal((count, 4))
+    return np.asarray(Rotation.from_quat(quaternions).as_matrix()).reshape(count, 3, 3)
+
+
+def rotations_from_quaternions(quaternions: Array) -> Array:
+    """Rotations of (n, 4) quaternions (x, y, z, w), normalised first; none may be zero."""
+    return np.asarray(Rotation.from_quat(quaternions).as_matrix()).reshape(-1, 3, 3)
+
+
+def quaternions_from_rotations(R: Array) -> Array:
+    """Unit quaternions (n, 4), ordered (x, y, z, w) with w >= 0, of (n, 3, 3) rotations."""
+    return np.asarray(Rotation.from_matrix(R).as_quat(canonical=True)).reshape(-1, 4)
+
+
+def orthogonality_error(R: Array) -> Array:
+    """max(||R_i^T R_i - I||_F, 1 - det R_i) of every (n, d, d) matrix; nan or inf stay what they are."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        error = np.linalg.norm(np.swapaxes(R, -1, -2) @ R - np.eye(R.shape[-1]), axis=(-2, -1))
+        return np.asarray(np.maximum(error, 1.0 - np.linalg.det(R)))
+
+
+def stack_transposes(R: Array) -> Array:
+    """The (d n, d) matrix whose rows d i .. d i + d - 1 are R_i^T."""
+    return np.swapaxes(R, -1, -2).reshape(-1, R.shape[-1])
+
+
+def unstack_transposes(Y: Array) -> Array:
+    """The (n, d, d) matrices R of `stack_transposes`."""
+    d = Y.shape[-1]
+    return np.swapaxes(Y.reshape(-1, d, d), -1, -2)

@@ -1,0 +1,104 @@
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pgo_models.errors import FileFormatError, PGOError
+from pgo_models.files import finite_number, read_table, read_text, replace_when_done
+
+
+def test_text_is_read_without_the_byte_order_mark(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"\xef\xbb\xbfone\n")
+    assert read_text(tmp_path / "a") == "one\n"
+
+
+@pytest.mark.parametrize("data", [b"one\ntwo\0three\n", b"one\n\xff\xfe\n", b"one\n\xff\0\n"])
+def test_binary_files_are_refused_at_their_line(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "a").write_bytes(data)
+    with pytest.raises(FileFormatError, match=r"a:2: bytes that are no text"):
+        read_text(tmp_path / "a")
+
+
+def test_missing_file_and_folder_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="nothing: no such file"):
+        read_text(tmp_path / "nothing")
+    with pytest.raises(FileFormatError, match="cannot be read: Is a directory"):
+        read_text(tmp_path)
+
+
+@pytest.mark.parametrize("word", ["1", "-1.5e-3", "+.5", "0"])
+def test_finite_numbers(word: str) -> None:
+    assert finite_number("f", 1, word) == float(word)
+
+
+@pytest.mark.parametrize(
+    "word", ["one", "1_000", "\u0661", "1,5", "0x10", "nan", "inf", "-Infinity", "1e999", "-1e101"]
+)
+def test_other_words_are_refused_with_file_line_and_value(word: str) -> None:
+    with pytest.raises(FileFormatError) as caught:
+        finite_number("f", 7, word)
+    assert str(caught.value).startswith("f:7: ")
+    assert word in str(caught.value)
+
+
+def test_table_skips_comments_and_keeps_lines(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("# x y\n1 2\n\n  3\t4\r\n")
+    rows, lines = read_table(tmp_path / "a", 2)
+    np.testing.assert_array_equal(rows, [[1, 2], [3, 4]])
+    assert lines == [2, 4]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("1 2\n3\n", "a:2: 1 numbers where 2 belong"), ("1 2 3\n", "a:1: 3 numbers"), ("#\n", "a: no rows")],
+)
+def test_bad_tables_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "a").write_text(text)
+    with pytest.raises(FileFormatError, match=message):
+        read_table(tmp_path / "a", 2)
+
+
+def test_replaces_only_when_done(tmp_path: Path) -> None:
+    target = tmp_path / "a"
+    target.write_text("old")
+    with replace_when_done(target) as temporary:
+        temporary.write_text("new")
+        assert target.read_text() == "old"
+        assert temporary.parent == tmp_path
+    assert target.read_text() == "new"
+    assert os.listdir(tmp_path) == ["a"]
+
+
+def test_error_in_the_block_leaves_the_old_file_alone(tmp_path: Path) -> None:
+    target = tmp_path / "a"
+    target.write_text("old")
+
+    def fail() -> None:
+        with replace_when_done(target) as temporary:
+            temporary.write_text("half")
+            raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError, match="stop"):
+        fail()
+    assert target.read_text() == "old"
+    assert os.listdir(tmp_path) == ["a"]
+
+
+def write_one(target: Path) -> None:
+    with replace_when_done(target) as temporary:
+        temporary.write_text("1")
+
+
+def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
+    with pytest.raises(PGOError, match=r"cannot write .*missing/a: No such file"):
+        write_one(tmp_path / "missing" / "a")
+    with pytest.raises(PGOError, match="not a regular file"):
+        write_one(tmp_path)
+
+
+def test_a_link_stays_a_link(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "a")
+    write_one(tmp_path / "link")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "a").read_text() == "1"
