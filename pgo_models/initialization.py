@@ -1,0 +1,119 @@
+"""Starts: noisy truth (GPS / IMU), odometry, breadth-first spanning tree, and the chordal relaxation."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import breadth_first_order
+
+from pgo_models.errors import GraphError
+from pgo_models.pose_graph import IntArray, PoseGraph
+from pgo_models.poses import Poses
+from pgo_models.problem import PGOProblem
+from pgo_models.rotations import BoolArray, exp_map, project_to_rotations, tangent_dimension, unstack_transposes
+
+
+def gps_imu_start(truth: Poses, translation_std: float, rotation_std: float, rng: np.random.Generator) -> Poses:
+    """Truth under noise: t_i + N(0, translation_std^2 I) and R_i Exp(N(0, rotation_std^2 I)) (paper: section `sec3`).
+
+    Parameters
+    ----------
+    truth : Poses
+    translation_std, rotation_std : float
+        Standard deviations, metres and radians.
+    rng : np.random.Generator
+    """
+    n, d = truth.num_poses, truth.d
+    t = truth.t + rng.normal(0.0, translation_std, (n, d))
+    return Poses(truth.R @ exp_map(rng.normal(0.0, rotation_std, (n, tangent_dimension(d)))), t)
+
+
+def odometry_start(graph: PoseGraph) -> Poses:
+    """Compose the measurements i -> i + 1 from pose 0 on; the first of repeated ones counts.
+
+    Raises
+    ------
+    GraphError
+        When a link i -> i + 1 is missing: `spanning_tree_start` needs none.
+    """
+    n = graph.num_poses
+    forward = np.flatnonzero(graph.j == graph.i + 1)
+    edge = np.full(n - 1, -1)
+    edge[graph.i[forward][::-1]] = forward[::-1]
+    if n > 1 and edge.min() < 0:
+        missing = int(np.argmin(edge))
+        raise GraphError(
+            f"no odometry from pose {graph.pose_ids[missing]} to {graph.pose_ids[missing + 1]}; "
+            "use spanning_tree_start() or chordal_start()"
+        )
+    return _compose(graph, np.arange(n), np.arange(-1, n - 1), edge, np.ones(n - 1, dtype=bool))
+
+
+def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
+    """Compose measurements along a breadth-first spanning tree from pose `root`, the paper's start for SLAM graphs.
+
+    Raises
+    ------
+    GraphError
+        When the graph is not connected.
+    """
+    graph.check_connected()
+    n = graph.num_poses
+    # The stored number of an adjacency entry is 1 + the first edge between the two poses.
+    pair = np.minimum(graph.i, graph.j) * n + np.maximum(graph.i, graph.j)
+    first = np.unique(pair, return_index=True)[1]
+    rows, columns, number = graph.i[first], graph.j[first], first + 1.0
+    adjacency = csr_array(
+        coo_array(
+            (np.concatenate([number, number]), (np.concatenate([rows, columns]), np.concatenate([columns, rows]))),
+            shape=(n, n),
+        )
+    )
+    order, parent = breadth_first_order(adjacency, root, directed=False)
+    child = order[1:]
+    edge = np.asarray(adjacency[child, parent[child]]).astype(np.int64).ravel() - 1
+    return _compose(graph, order, parent, edge, graph.j[edge] == child)
+
+
+def chordal_start(problem: PGOProblem) -> Poses:
+    """Minimise tr(X^T M X) without the constraints, pose 0 fixed at the identity, and project the rotations.
+
+    Joint in rotations and translations; after the projection the translations are the best ones for
+    the rotations. One factorisation with the pattern of M.
+    """
+    n, d = problem.num_poses, problem.d
+    fixed = np.concatenate([[0], n + np.arange(d)])
+    X_fixed = np.zeros((problem.side, d))
+    X_fixed[fixed[1:]] = np.eye(d)
+    right_hand_side = -(problem.M @ X_fixed)
+    right_hand_side[fixed] = X_fixed[fixed]
+    is_fixed = np.zeros(problem.side, dtype=bool)
+    is_fixed[fixed] = True
+    data = problem.M.data.copy()
+    data[is_fixed[problem.M.indices]] = 0.0
+    for column in fixed:
+        data[problem.M.indptr[column] : problem.M.indptr[column + 1]] = 0.0
+    data[problem.diagonal_positions[fixed]] = 1.0
+    X = problem.analysis.factorize(problem.with_pattern_of_M(data)).solve(right_hand_side)
+    return problem.with_best_translations(project_to_rotations(unstack_transposes(X[n:])))
+
+
+def _compose(graph: PoseGraph, order: IntArray, parent: IntArray, edge: IntArray, forward: BoolArray) -> Poses:
+    """Poses of a tree: order[k] hangs on its parent by edge[k-1], which ends at it if forward[k-1].
+
+    Pointer jumping: every pose holds its transform from an ancestor, which doubles its distance until it is the root.
+    """
+    n, d = graph.num_poses, graph.d
+    root, child = order[0], order[1:]
+    R, t = np.broadcast_to(np.eye(d), (n, d, d)).copy(), np.zeros((n, d))
+    R_step, t_step = graph.R_ij[edge], graph.t_ij[edge]
+    back = ~forward
+    R_step[back] = np.swapaxes(R_step[back], 1, 2)
+    t_step[back] = -np.einsum("nab,nb->na", R_step[back], t_step[back])
+    R[child], t[child] = R_step, t_step
+    ancestor = np.where(parent >= 0, parent, root)
+    while (ancestor != root).any():
+        t = t[ancestor] + np.einsum("nab,nb->na", R[ancestor], t)
+        R = project_to_rotations(R[ancestor] @ R)
+        ancestor = ancestor[ancestor]
+    return Poses(R, t)

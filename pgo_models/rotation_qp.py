@@ -1,0 +1,95 @@
+"""The R-subproblem, step (a) of the paper's Algorithm 1, as a cvxpy quadratic program for Clarabel.
+
+    minimise over X   sum_rows w ||A X||^2 + 1/2 ||sqrt(D) (X - V)||_F^2
+
+joint in rotations and translations, for a whole graph or for one robot's share of it. V, the shift omega - B, is the
+only Parameter (DPP), so that the problem is compiled once and solved again for every shift.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cvxpy as cp
+import numpy as np
+from scipy.sparse import csr_array, diags_array
+
+from pgo_models.errors import PGOError, SettingError
+from pgo_models.rotations import Array
+
+CLARABEL_TOLERANCE = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class RotationQP:
+    """A compiled R-subproblem.
+
+    Attributes
+    ----------
+    problem : cp.Problem
+    X : cp.Variable, (N, d)
+        Rows t_i, then the rows of every R_i^T, of the poses concerned.
+    shift : cp.Parameter, (N_D, d)
+        sqrt(D) V on the rows whose penalty is not zero.
+    penalty : (N,)
+        The diagonal of D.
+    """
+
+    problem: cp.Problem
+    X: cp.Variable
+    shift: cp.Parameter
+    penalty: Array
+
+    def solve(self, V: Array) -> Array:
+        """X, (N, d), for the shift V, (N, d); rows of V without a penalty do not matter.
+
+        Raises
+        ------
+        PGOError
+            When Clarabel does not end with a solution; the message has its status.
+        """
+        held = self.penalty > 0
+        self.shift.value = np.sqrt(self.penalty[held])[:, None] * V[held]
+        try:
+            self.problem.solve(
+                solver=cp.CLARABEL,
+                tol_gap_abs=CLARABEL_TOLERANCE,
+                tol_gap_rel=CLARABEL_TOLERANCE,
+                tol_feas=CLARABEL_TOLERANCE,
+                max_threads=1,
+            )
+        except cp.SolverError as error:
+            raise PGOError(f"Clarabel could not solve the R-subproblem: {error}") from error
+        if self.problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or self.X.value is None:
+            raise PGOError(f"Clarabel ended with status {self.problem.status} on the R-subproblem; check its scaling")
+        return np.asarray(self.X.value)
+
+
+def rotation_qp(A: csr_array, w: Array, penalty: Array, d: int) -> RotationQP:
+    """Pose the R-subproblem.
+
+    Parameters
+    ----------
+    A : (rows, N), sparse
+        Residuals A X, as from `pgo_models.residual_matrix`.
+    w : (rows,)
+        Their weights.
+    penalty : (N,)
+        Diagonal of D: rho on the rows of penalised rotations (and translations), else 0.
+    d : int
+        Columns of X: the dimension of space.
+
+    Raises
+    ------
+    SettingError
+        When a penalty is negative or all are zero.
+    """
+    if not ((penalty >= 0).all() and (penalty > 0).any()):
+        raise SettingError("penalties must not be negative, and one must be positive")
+    X = cp.Variable((A.shape[1], d), name="X")
+    held = np.flatnonzero(penalty > 0)
+    select = diags_array(np.sqrt(penalty)).tocsr()[held]
+    shift = cp.Parameter((len(held), d), name="shift")
+    weighted = diags_array(np.sqrt(w)).tocsr() @ A
+    objective = cp.sum_squares(weighted @ X) + 0.5 * cp.sum_squares(select @ X - shift)
+    return RotationQP(cp.Problem(cp.Minimize(objective)), X, shift, penalty)
