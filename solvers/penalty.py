@@ -1,0 +1,123 @@
+"""Rules for the ADMM penalty rho: from the multipliers, fixed, or balanced by residuals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pgo_models.errors import SettingError
+from pgo_models.multipliers import multipliers
+from pgo_models.poses import Poses
+from pgo_models.problem import PGOProblem
+from pgo_models.rotations import Array
+
+
+@dataclass(frozen=True)
+class MultiplierPenalty:
+    """rho_i = factor max(||Lambda_i||_2, q m_i), one for every pose.
+
+    m_i is the mean diagonal of M over the rotation rows of pose i and q a quantile of ||Lambda_i||_2 / m_i over all
+    poses. The multipliers measure how far from convex the constraint makes each pose. They are taken at the start, and
+    once more where the recursion stalls; B then restarts at its stationary value there, -2 Lambda_i R_i^T / rho_i.
+
+    Attributes
+    ----------
+    factor : float
+    quantile : float
+    stall_window, stall_ratio : int, float
+        Stalled: the residual of the last `stall_window` iterations has not fallen below `stall_ratio` of what it was.
+    max_refreshes : int
+    """
+
+    factor: float = 8.0
+    quantile: float = 0.8
+    stall_window: int = 6
+    stall_ratio: float = 0.5
+    max_refreshes: int = 1
+
+    def __post_init__(self) -> None:
+        if not self.factor > 0:
+            raise SettingError(f"factor must be positive, got {self.factor}")
+        if not 0 <= self.quantile <= 1:
+            raise SettingError(f"quantile must be in [0, 1], got {self.quantile}")
+        if self.stall_window < 1 or not 0 < self.stall_ratio < 1:
+            raise SettingError(
+                "stall_window must be at least 1 and stall_ratio in (0, 1), "
+                f"got {self.stall_window} and {self.stall_ratio}"
+            )
+
+    def initial(self, problem: PGOProblem, poses: Poses) -> Array:
+        """rho, (n,), at poses."""
+        norms = np.abs(np.linalg.eigvalsh(multipliers(problem, poses))).max(axis=1)
+        scale = rotation_scale(problem)
+        # Where every multiplier is zero (measurements without noise) any penalty works.
+        floor = float(np.quantile(norms / scale, self.quantile)) or 1.0
+        return np.asarray(self.factor * np.maximum(norms, floor * scale))
+
+
+@dataclass(frozen=True)
+class FixedPenalty:
+    """rho_i = rho for all poses and iterations."""
+
+    rho: float
+
+    def __post_init__(self) -> None:
+        if not self.rho > 0:
+            raise SettingError(f"rho must be positive, got {self.rho}")
+
+    def initial(self, problem: PGOProblem, poses: Poses) -> Array:
+        """rho, (n,)."""
+        return np.full(problem.num_poses, self.rho)
+
+
+@dataclass(frozen=True)
+class BalancedPenalty:
+    """rho that keeps primal and dual residual within a factor of each other (Boyd et al. 2011, section 3.4.1).
+
+    It starts at `scale` times m_i, the mean diagonal of M over the rotation rows of the pose. When one residual exceeds
+    `imbalance` times the other, rho is due to move towards it; it moves, and the matrices are factored again, once the
+    balance asks for a change by `refactor_ratio` or more (the rule of OSQP, Stellato et al. 2020, section 5.2). B is
+    rescaled with it. A rise of the merit puts rho up again (the safeguard of `solvers.soc`).
+    """
+
+    scale: float = 0.3
+    imbalance: float = 10.0
+    refactor_ratio: float = 5.0
+
+    def __post_init__(self) -> None:
+        if not self.scale > 0:
+            raise SettingError(f"scale must be positive, got {self.scale}")
+        if not (self.imbalance > 1 and self.refactor_ratio > 1):
+            raise SettingError(
+                f"imbalance and refactor_ratio must be above 1, got {self.imbalance} and {self.refactor_ratio}"
+            )
+
+    def initial(self, problem: PGOProblem, poses: Poses) -> Array:
+        """rho, (n,)."""
+        return self.scale * rotation_scale(problem)
+
+    def factor(self, primal_residual: float, dual_residual: float) -> float:
+        """Factor by which rho moves now; 1 for not at all."""
+        if primal_residual > self.imbalance * dual_residual:
+            wanted = np.sqrt(primal_residual / max(dual_residual, np.finfo(float).tiny))
+        elif dual_residual > self.imbalance * primal_residual:
+            wanted = 1.0 / np.sqrt(dual_residual / max(primal_residual, np.finfo(float).tiny))
+        else:
+            return 1.0
+        moved = float(np.clip(wanted, 1.0 / self.refactor_ratio, self.refactor_ratio))
+        return moved if max(wanted, 1.0 / wanted) >= self.refactor_ratio else 1.0
+
+
+PenaltyRule = MultiplierPenalty | FixedPenalty | BalancedPenalty
+
+
+def rotation_scale(problem: PGOProblem) -> Array:
+    """m_i, (n,): the mean diagonal of M over the rotation rows of every pose."""
+    diagonal = problem.M.data[problem.diagonal_positions[problem.num_poses :]]
+    return np.asarray(diagonal.reshape(problem.num_poses, problem.d).mean(axis=1))
+
+
+def translation_scale(problem: PGOProblem) -> Array:
+    """Diagonal of M over the translation row of every pose, (n,)."""
+    return np.asarray(problem.M.data[problem.diagonal_positions[: problem.num_poses]])

@@ -1,0 +1,132 @@
+"""What happened in a run: Status, one Record per iterate, History, and Run."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from pgo_models.poses import Poses
+from pgo_models.rotations import Array
+
+S = TypeVar("S")
+
+
+class Status(enum.Enum):
+    """Why a run ended."""
+
+    CONVERGED = "residuals are within tolerance"
+    MAX_ITERATIONS = "iteration limit reached; raise max_iterations or loosen the tolerance"
+    TIME_LIMIT = "time limit reached; raise it or loosen the tolerance"
+    STALLED = "no further decrease is possible in double precision"
+    STOPPED = "stopped by the callback"
+    INTERRUPTED = "interrupted; the best iterate so far is returned"
+    NOT_FINITE = "the iterate contains nan or inf; raise the penalty"
+
+    @property
+    def is_success(self) -> bool:
+        """Whether the run did what it was asked for."""
+        return self in (Status.CONVERGED, Status.STALLED)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Figures of one iterate.
+
+    Attributes
+    ----------
+    objective : float
+        F of the feasible poses that the iterate stands for.
+    primal_residual : float
+        Distance from feasibility, relative; 0 for methods whose iterates are feasible.
+    dual_residual : float
+        Distance from stationarity, relative; each solver's docstring says which.
+    """
+
+    objective: float
+    primal_residual: float
+    dual_residual: float
+
+
+@dataclass(frozen=True)
+class Record:
+    """One row of a history: iterate k, seconds spent in steps up to it, and its figures."""
+
+    k: int
+    seconds: float
+    measurement: Measurement
+
+
+@dataclass(frozen=True)
+class History:
+    """Records of all measured iterates, in order."""
+
+    records: tuple[Record, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    @property
+    def k(self) -> Array:
+        """Iterate numbers."""
+        return np.array([record.k for record in self.records], dtype=float)
+
+    @property
+    def seconds(self) -> Array:
+        """Seconds in steps, measuring and printing left out."""
+        return np.array([record.seconds for record in self.records])
+
+    @property
+    def objective(self) -> Array:
+        """F of every iterate."""
+        return np.array([record.measurement.objective for record in self.records])
+
+    @property
+    def primal_residual(self) -> Array:
+        """Primal residual of every iterate."""
+        return np.array([record.measurement.primal_residual for record in self.records])
+
+    @property
+    def dual_residual(self) -> Array:
+        """Dual residual of every iterate."""
+        return np.array([record.measurement.dual_residual for record in self.records])
+
+
+@dataclass(frozen=True, eq=False)
+class Run(Generic[S]):
+    """A finished run of one solver.
+
+    Attributes
+    ----------
+    name : str
+        Of the solver.
+    poses : Poses
+        Of the last iterate, or of the best one (lowest F) when the run did not succeed.
+    objective : float
+        F of `poses`.
+    state : S
+        The iterate `poses` belong to.
+    status : Status
+    iterations : int
+        Finished steps.
+    history : History
+    seconds : float
+        Wall time of the whole run.
+    """
+
+    name: str
+    poses: Poses
+    objective: float
+    state: S
+    status: Status
+    iterations: int
+    history: History
+    seconds: float
+
+    def __repr__(self) -> str:
+        return (
+            f"Run({self.name}: {self.status.name} after {self.iterations} iterations, F = {self.objective:.10g}, "
+            f"{self.seconds:.3g} s)"
+        )

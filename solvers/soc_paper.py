@@ -1,0 +1,205 @@
+"""SOC as the paper has it: rotations only, every robot with its neighbours frozen (Algorithm 1, `algo1: SOC`).
+
+All robots' subproblems (a) are solved together: they are the diagonal blocks of L, one a robot, so that with the
+neighbours of the last iterate on the right-hand side
+
+    (L_blocks + rho/2) Y = rho/2 (omega - B) - L_between Y_last,     L = L_blocks + L_between.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csc_array, csr_array, vstack
+
+from pgo_models.cholesky import SymbolicCholesky, analyze
+from pgo_models.errors import SettingError
+from pgo_models.matrices import assemble, residual_matrix, rotation_columns
+from pgo_models.partition import Partition, PartitionMethod, partition
+from pgo_models.poses import Poses
+from pgo_models.problem import PGOProblem
+from pgo_models.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
+from solvers.penalty import BalancedPenalty, MultiplierPenalty, PenaltyRule
+from solvers.result import Measurement
+from solvers.rotation_step import RotationStep, RStep, Subproblem, prepare
+
+_PATIENCE = 20  # steps without a new smallest merit, after which rho goes up
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """L split by robots: what a robot knows of its own rotations, and what ties them to frozen neighbours.
+
+    Attributes
+    ----------
+    A, w, own : sparse (rows, dn), (rows,), sparse (dn, dn)
+        own = A^T diag(w) A: edges within a robot, and kappa I for both ends of an edge between robots.
+    between : sparse (dn, dn)
+        L - own.
+    analysis : SymbolicCholesky
+    """
+
+    A: csr_array
+    w: Array
+    own: csc_array
+    between: csr_array
+    analysis: SymbolicCholesky
+
+
+@dataclass(frozen=True, eq=False)
+class PaperState:
+    """Iterate k of the paper's recursion; names as in Algorithm 1.
+
+    Attributes
+    ----------
+    k : int
+    R, omega, B : (n, d, d)
+    rho : float
+        One penalty for all poses, as in the paper.
+    blocks, r_step
+        The split matrix, and the prepared back end for the present rho.
+    dual_residual : float
+        rho ||omega - omega_last||_F over the root of n d.
+    smallest_merit, steps_since_smallest, may_fall
+        Safeguard of the adaptive rho: the smallest ||R - omega|| and ||omega - omega_last|| together since rho changed,
+        how long ago, and whether rho may still be lowered.
+    """
+
+    k: int
+    R: Array
+    omega: Array
+    B: Array
+    rho: float
+    blocks: Blocks
+    r_step: RotationStep
+    dual_residual: float = np.inf
+    smallest_merit: float = np.inf
+    steps_since_smallest: int = 0
+    may_fall: bool = True
+
+
+def init_paper(
+    problem: PGOProblem, start: Poses, robots: Partition | None, rule: PenaltyRule, back_end: RStep
+) -> PaperState:
+    """State 0: R = omega = start, B = 0."""
+    if isinstance(rule, MultiplierPenalty):
+        raise SettingError("the paper has one rho for all poses; give a FixedPenalty or a BalancedPenalty")
+    if robots is None:
+        robots = partition(problem.graph, method=PartitionMethod.SINGLETONS)
+    blocks = _split(problem, robots)
+    rho = float(rule.initial(problem, start).mean())
+    return PaperState(
+        k=0,
+        R=start.R,
+        omega=start.R,
+        B=np.zeros_like(start.R),
+        rho=rho,
+        blocks=blocks,
+        r_step=_prepare(problem, blocks, rho, back_end),
+    )
+
+
+def step_paper(problem: PGOProblem, state: PaperState, rule: PenaltyRule, back_end: RStep) -> PaperState:
+    """Steps (a), (b), (c), then the adaptive rho with B rescaled."""
+    neighbours = state.blocks.between @ stack_transposes(state.R)
+    shift = stack_transposes(state.omega - state.B) - (2.0 / state.rho) * neighbours
+    R = unstack_transposes(state.r_step.solve(shift))  # (a)
+    if not np.isfinite(R).all():
+        return replace(state, k=state.k + 1, R=R, dual_residual=np.nan)
+    omega = project_to_rotations(R + state.B)  # (b)
+    B = state.B + R - omega  # (c)
+    root = np.sqrt(R.shape[0] * R.shape[1])
+    primal, change = float(np.linalg.norm(omega - R)) / root, float(np.linalg.norm(omega - state.omega)) / root
+    merit = float(np.hypot(primal, change))
+    smaller = merit < state.smallest_merit
+    following = replace(
+        state,
+        k=state.k + 1,
+        R=R,
+        omega=omega,
+        B=B,
+        dual_residual=state.rho * change,
+        smallest_merit=merit if smaller else state.smallest_merit,
+        steps_since_smallest=0 if smaller else state.steps_since_smallest + 1,
+    )
+    return _with_adapted_rho(problem, following, rule, primal, change, back_end)
+
+
+def _with_adapted_rho(
+    problem: PGOProblem, state: PaperState, rule: PenaltyRule, primal: float, change: float, back_end: RStep
+) -> PaperState:
+    """State with the rho for the next step, B rescaled: balanced, and up again for good when the merit stays up."""
+    if not isinstance(rule, BalancedPenalty):
+        return state
+    factor, may_fall = rule.factor(primal, change), state.may_fall
+    if state.steps_since_smallest >= _PATIENCE:
+        factor, may_fall = rule.refactor_ratio, False
+    if factor == 1.0 or (factor < 1.0 and not may_fall):
+        return state
+    rho = factor * state.rho
+    return replace(
+        state,
+        rho=rho,
+        B=state.B / factor,
+        r_step=_prepare(problem, state.blocks, rho, back_end),
+        smallest_merit=np.inf,
+        steps_since_smallest=0,
+        may_fall=may_fall,
+    )
+
+
+def measure_paper(problem: PGOProblem, state: PaperState) -> Measurement:
+    """F at omega with the best translations, and the paper's KKT residual p_res per pose.
+
+    p_res = sqrt(||omega^T omega - I||^2 + ||omega - R||^2) over the root of n. The paper stops when its tolerance is at
+    most this value; the inequality belongs the other way round.
+    """
+    if np.isnan(state.dual_residual):
+        return Measurement(np.nan, np.nan, np.nan)
+    omega, d = state.omega, state.omega.shape[1]
+    orthogonality = np.linalg.norm(np.swapaxes(omega, 1, 2) @ omega - np.eye(d))
+    p_res = float(np.hypot(orthogonality, np.linalg.norm(omega - state.R))) / np.sqrt(len(omega))
+    X = np.concatenate([problem.recover_translations(omega), stack_transposes(omega)])
+    return Measurement(problem.objective_stacked(X), p_res, state.dual_residual)
+
+
+def _prepare(problem: PGOProblem, blocks: Blocks, rho: float, back_end: RStep) -> RotationStep:
+    penalty = np.full(blocks.own.shape[0], rho)
+    return prepare(
+        Subproblem(
+            A=blocks.A,
+            w=blocks.w,
+            M=blocks.own,
+            d=problem.d,
+            num_translations=0,
+            penalty=penalty,
+            analysis=blocks.analysis,
+            backend=problem.backend,
+        ),
+        back_end,
+    )
+
+
+def _split(problem: PGOProblem, robots: Partition) -> Blocks:
+    graph, n, d = problem.graph, problem.num_poses, problem.d
+    cut = robots.cut_edges(graph)
+    A, w = residual_matrix(graph)
+    rotation_rows = (graph.num_edges + d * np.flatnonzero(~cut)[:, None] + np.arange(d)).ravel()
+    inner = A[:, n:].tocsr()[rotation_rows]
+    ends = np.concatenate([graph.i[cut], graph.j[cut]])
+    columns = rotation_columns(ends, 0, d).ravel()
+    alone = csr_array((np.ones(len(columns)), columns, np.arange(len(columns) + 1)), shape=(len(columns), n * d))
+    A_own = vstack([inner, alone], format="csr")
+    w_own = np.concatenate([w[rotation_rows], np.repeat(np.tile(graph.kappa[cut], 2), d)])
+    every = np.arange(n)
+    full_blocks = rotation_columns(every, 0, d)
+    zero = (
+        np.repeat(full_blocks[:, :, None], d, axis=2),
+        np.repeat(full_blocks[:, None, :], d, axis=1),
+        np.zeros((n, d, d)),
+    )
+    product = (A_own.T @ (A_own * w_own[:, None])).tocoo()
+    own = assemble([(product.row, product.col, product.data), zero], n * d)
+    between = (problem.L - own).tocsr()
+    return Blocks(A_own, w_own, own, between, analyze(own, problem.backend))

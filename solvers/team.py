@@ -1,0 +1,176 @@
+"""Robots in this process: who holds which copies, the local subproblems, and the average over copies.
+
+Robot a holds its own poses and copies of the neighbours' separator poses; an edge between two robots is given half to
+each. One robot holds the graph.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csc_array, csr_array
+
+from pgo_models.cholesky import SymbolicCholesky, analyze
+from pgo_models.matrices import joint_matrix, residual_matrix
+from pgo_models.partition import Partition
+from pgo_models.pose_graph import IntArray, PoseGraph
+from pgo_models.problem import PGOProblem
+from pgo_models.rotations import Array
+from solvers.rotation_step import RotationStep, RStep, Subproblem, prepare
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """One robot's share: its local poses, residuals and matrix, and which of its rows it agrees on with omega.
+
+    Attributes
+    ----------
+    poses : (n_a,)
+        Poses it holds, ascending: its own and its neighbours' separators.
+    held : (rows_a,)
+        Rows of its X with a penalty: separator translations, and all rotations.
+    held_global : (rows_a,)
+        The same rows in the X of the whole graph.
+    A, w, M, analysis
+        As in `solvers.rotation_step.Subproblem`.
+    """
+
+    poses: IntArray
+    held: IntArray
+    held_global: IntArray
+    A: csr_array
+    w: Array
+    M: csc_array
+    analysis: SymbolicCholesky
+
+
+@dataclass(frozen=True, eq=False)
+class Team:
+    """All robots, in this process and in order; deterministic.
+
+    A team vector, (rows, d), stacks the held rows of all robots.
+
+    Attributes
+    ----------
+    robots : tuple of Robot
+    row : (rows,)
+        Row of the whole graph's X for every row of a team vector.
+    copies : (N,)
+        How many robots hold a row of X; 0 for translations that only their robot knows.
+    slices : tuple of slice
+        Rows of every robot in a team vector.
+    steps : tuple of RotationStep
+        Prepared back ends, empty before `with_penalty`.
+    penalty : (rows,)
+        Share of rho of every row.
+    """
+
+    problem: PGOProblem
+    back_end: RStep
+    robots: tuple[Robot, ...]
+    row: IntArray
+    copies: IntArray
+    slices: tuple[slice, ...]
+    steps: tuple[RotationStep, ...] = ()
+    penalty: Array | None = None
+
+    def with_penalty(self, rho: Array, rho_t: Array) -> Team:
+        """Return the team ready to solve with penalties rho (rotations) and rho_t (separator translations), (n,).
+
+        The penalty of a pose is shared equally among its copies.
+        """
+        d = self.problem.d
+        whole = np.concatenate([rho_t, np.repeat(rho, d)])
+        share = whole[self.row] / self.copies[self.row]
+        steps = []
+        for robot, rows in zip(self.robots, self.slices, strict=True):
+            penalty = np.zeros(robot.M.shape[0])
+            penalty[robot.held] = share[rows]
+            subproblem = Subproblem(
+                A=robot.A,
+                w=robot.w,
+                M=robot.M,
+                d=d,
+                num_translations=len(robot.poses),
+                penalty=penalty,
+                analysis=robot.analysis,
+                backend=self.problem.backend,
+            )
+            steps.append(prepare(subproblem, self.back_end))
+        return replace(self, steps=tuple(steps), penalty=share)
+
+    def solve_all(self, shift: Array) -> Array:
+        """Step (a) of every robot: the held rows of X(shift), (rows, d)."""
+        solution = np.empty_like(shift)
+        for robot, rows, step in zip(self.robots, self.slices, self.steps, strict=True):
+            V = np.zeros((robot.M.shape[0], shift.shape[1]))
+            V[robot.held] = shift[rows]
+            solution[rows] = step.solve(V)[robot.held]
+        return solution
+
+    def average(self, vector: Array) -> Array:
+        """Mean over the copies of every row of X, (N, d); rows without copies are zero."""
+        if len(self.robots) == 1:
+            mean = np.zeros((len(self.copies), vector.shape[1]))
+            mean[self.row] = vector
+            return mean
+        total = np.stack(
+            [np.bincount(self.row, weights=column, minlength=len(self.copies)) for column in vector.T], axis=1
+        )
+        return np.asarray(total / np.maximum(self.copies, 1)[:, None])
+
+    def gradients(self, X: Array) -> Array:
+        """2 M_a X of every robot on its held rows, (rows, d), at copies that agree with X, (N, d)."""
+        gradient = np.empty((len(self.row), X.shape[1]))
+        for robot, rows in zip(self.robots, self.slices, strict=True):
+            local = X[_global_rows(robot.poses, self.problem)]
+            gradient[rows] = 2.0 * (robot.A.T @ (robot.w[:, None] * (robot.A @ local)))[robot.held]
+        return gradient
+
+
+def build_team(problem: PGOProblem, partition: Partition | None, back_end: RStep) -> Team:
+    """Split a problem among robots; None is one robot that holds it all."""
+    if partition is None or partition.num_robots == 1:
+        robots: tuple[Robot, ...] = (_whole(problem),)
+    else:
+        separator = np.zeros(problem.num_poses, dtype=bool)
+        separator[partition.separators(problem.graph)] = True
+        robots = tuple(_share(problem, partition.robot, a, separator) for a in range(partition.num_robots))
+    row = np.concatenate([robot.held_global for robot in robots])
+    ends = np.cumsum([len(robot.held) for robot in robots])
+    slices = tuple(slice(end - len(robot.held), end) for robot, end in zip(robots, ends, strict=True))
+    return Team(problem, back_end, robots, row, np.bincount(row, minlength=problem.side), slices)
+
+
+def _whole(problem: PGOProblem) -> Robot:
+    A, w = problem.residual_matrix
+    held = np.arange(problem.num_poses, problem.side)
+    return Robot(np.arange(problem.num_poses), held, held, A, w, problem.M, problem.analysis)
+
+
+def _share(problem: PGOProblem, owner: IntArray, a: int, separator: Array) -> Robot:
+    graph = problem.graph
+    mine_i, mine_j = owner[graph.i] == a, owner[graph.j] == a
+    edges = np.flatnonzero(mine_i | mine_j)
+    share = np.where(mine_i[edges] & mine_j[edges], 1.0, 0.5)
+    poses = np.unique(np.concatenate([np.flatnonzero(owner == a), graph.i[edges], graph.j[edges]]))
+    local = PoseGraph(
+        num_poses=len(poses),
+        i=np.searchsorted(poses, graph.i[edges]),
+        j=np.searchsorted(poses, graph.j[edges]),
+        R_ij=graph.R_ij[edges],
+        t_ij=graph.t_ij[edges],
+        kappa=share * graph.kappa[edges],
+        tau=share * graph.tau[edges],
+    )
+    M = joint_matrix(local)
+    A, w = residual_matrix(local)
+    held = np.concatenate([np.flatnonzero(separator[poses]), np.arange(len(poses), M.shape[0])])
+    return Robot(poses, held, _global_rows(poses, problem)[held], A, w, M, analyze(M, problem.backend))
+
+
+def _global_rows(poses: IntArray, problem: PGOProblem) -> IntArray:
+    """Rows of the whole X that the X of some poses holds."""
+    n, d = problem.num_poses, problem.d
+    return np.concatenate([poses, (n + d * poses[:, None] + np.arange(d)).ravel()])
