@@ -3,6 +3,11 @@
 Nothing here iterates; methods are in `solvers`.
 """
 
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
 from pgo_models.certificate import Certificate, Verdict, certify, prove_bound
 from pgo_models.cholesky import CholeskyBackend, default_backend
 from pgo_models.datasets import known_datasets, load
@@ -21,14 +26,20 @@ from pgo_models.initialization import chordal_start, gps_imu_start, odometry_sta
 from pgo_models.matrices import connection_laplacian, joint_matrix, marginalized_matrix, residual_matrix
 from pgo_models.multipliers import certificate_matrix, multipliers
 from pgo_models.partition import Partition, PartitionMethod, partition
+from pgo_models.plots import compare_poses, draw_graph
 from pgo_models.polish import polish
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses, absolute_trajectory_error, relative_pose_error
 from pgo_models.problem import PGOProblem
-from pgo_models.rotation_qp import RotationQP, rotation_qp
 from pgo_models.rotations import exp_map, log_map, project_to_rotations, random_rotations
 from pgo_models.scenes import NoiseModel, circle, grid, random_geometric, sphere
 from pgo_models.trajectories import read_kitti, read_tum, write_kitti, write_tum
+
+if TYPE_CHECKING:
+    from pgo_models.rotation_qp import RotationQP, rotation_qp
+
+# cvxpy takes half of the time of an import: its models are loaded when one of their names is first used.
+_CVXPY_MODELS = {"RotationQP": "pgo_models.rotation_qp", "rotation_qp": "pgo_models.rotation_qp"}
 
 __all__ = [
     "Certificate",
@@ -53,8 +64,10 @@ __all__ = [
     "certify",
     "chordal_start",
     "circle",
+    "compare_poses",
     "connection_laplacian",
     "default_backend",
+    "draw_graph",
     "exp_map",
     "gps_imu_start",
     "grid",
@@ -84,3 +97,10 @@ __all__ = [
     "write_kitti",
     "write_tum",
 ]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _CVXPY_MODELS:
+        raise AttributeError(f"module 'pgo_models' has no attribute {name!r}")
+    value: object = getattr(importlib.import_module(_CVXPY_MODELS[name]), name)
+    return value

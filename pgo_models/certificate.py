@@ -133,8 +133,8 @@ def certify(problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP) -> Cert
     """Judge anybody's poses: a proven lower bound on the global optimum, and how far F is above it.
 
     The bound is found at a stationary point. Poses that are not stationary are polished first (damped Newton,
-    `polish`); where that point does not give the gap, the one that the chordal start polishes to is tried, and the better bound is
-    taken. `source` says what was done; the gap is always that of the poses given.
+    `polish`); where that point does not give the gap, the one that the chordal start polishes to is tried, and the
+    better bound is taken. `source` says what was done; the gap is always that of the poses given.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pgo_models.errors import FileFormatError, GraphError
+from pgo_models.errors import FileFormatError, GraphError, PGOError
 from pgo_models.files import replace_when_done
 from pgo_models.g2o_lines import G2OLines, IntArray, information_of, poses_of, read_lines
 from pgo_models.pose_graph import PoseGraph
@@ -124,12 +124,21 @@ def write_g2o_folder(graph: PoseGraph, folder: Path | str, poses: Poses | None =
     Raises
     ------
     GraphError, PGOError
-        As `write_g2o`.
+        As `write_g2o`; also when the folder, which is made if it is not there, holds other g2o files: reading it would
+        join them to this graph.
     """
-    chosen = _poses_to_write(graph, poses)
-    for robot in range(graph.num_robots):
+    chosen, folder = _poses_to_write(graph, poses), Path(folder)
+    names = [f"{robot}.g2o" for robot in range(graph.num_robots)]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise PGOError(f"cannot write {folder}: {error.strerror}; choose a place that can be written") from error
+    strangers = sorted({file.name for file in folder.glob("*.g2o")} - set(names))
+    if strangers:
+        raise PGOError(f"cannot write {folder}: it holds another graph's {strangers[0]}; choose an empty folder")
+    for robot, name in enumerate(names):
         mine = graph.robots == robot
-        _write(graph, Path(folder) / f"{robot}.g2o", chosen, mine, mine[graph.i] | mine[graph.j])
+        _write(graph, folder / name, chosen, mine, mine[graph.i] | mine[graph.j])
 
 
 def precisions(information: Array) -> tuple[Array, Array]:

@@ -32,9 +32,9 @@ def grid_world(
     """Pose graph of robots that walk on one lattice of 1 m cells and see each other and places they were at.
 
     A robot starts in a cell and with a heading of its own, and every step turns it by 0 or 90 degrees and moves it
-    one cell along its x axis; walls keep it in a box with about two poses a cell. Edges are, in this order, odometry between
-    consecutive poses, and loop closures: two poses in one cell or in cells side by side, of one robot or of two, are
-    measured with the given probability. Poses are numbered robot by robot.
+    one cell along its x axis; walls keep it in a box with about two poses a cell. Edges are, in this order, odometry
+    between consecutive poses, and loop closures: two poses in one cell or in cells side by side, of one robot or of
+    two, are measured with the given probability. Poses are numbered robot by robot.
 
     Connected by construction: odometry connects a robot's own poses, and where closures leave groups of robots apart,
     the smallest group gets an edge to the rest between the two poses that come closest, until there is one group.

@@ -116,6 +116,6 @@ def _metis(graph: PoseGraph, num_robots: int) -> IntArray:
         xadj=adjacency.indptr.tolist(),
         adjncy=adjacency.indices.tolist(),
         eweights=adjacency.data.tolist(),
-        options=pymetis.Options(contiguous=True, seed=0),
+        options=pymetis.Options(contig=True, seed=0),
     )
     return np.asarray(np.unique(np.asarray(part), return_inverse=True)[1], dtype=np.int64)

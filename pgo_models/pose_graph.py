@@ -164,8 +164,11 @@ class PoseGraph:
 
     def unit_weights(self) -> PoseGraph:
         """Return the same measurements with kappa = tau = 1, the weights of the paper's equation (`min overall`)."""
-        one = np.ones(self.num_edges)
-        return replace(self, kappa=one, tau=one.copy(), information=None)
+        return self.with_weights(np.ones(self.num_edges), np.ones(self.num_edges))
+
+    def with_weights(self, kappa: Array, tau: Array) -> PoseGraph:
+        """Return the same measurements with other precisions, (m,); information matrices as read do not go along."""
+        return replace(self, kappa=kappa, tau=tau, information=None)
 
     def with_robots(self, robot: IntArray) -> PoseGraph:
         """Return the same graph with `robot`, (n,), as owners of the poses."""
@@ -196,6 +199,7 @@ class PoseGraph:
             "information": (m, k, k),
             "ids": (self.num_poses,),
             "robot": (self.num_poses,),
+            "fixed": (len(self.fixed),),
         }
         for name, shape in expected.items():
             value = getattr(self, name)
@@ -216,6 +220,8 @@ class PoseGraph:
         loops = self.i == self.j
         if loops.any():
             raise GraphError(f"{self.edge_label(int(np.argmax(loops)))} leads from a pose to itself; remove it")
+        if ((self.fixed < 0) | (self.fixed >= self.num_poses)).any():
+            raise GraphError(f"fixed names a pose outside 0 .. {self.num_poses - 1}")
         for name in ("R_ij", "t_ij", "kappa", "tau"):
             value = getattr(self, name).reshape(self.num_edges, -1)
             finite = np.isfinite(value).all(axis=1)

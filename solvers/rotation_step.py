@@ -8,7 +8,7 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array, diags_array
@@ -16,9 +16,11 @@ from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
 from pgo_models.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, factorize
 from pgo_models.matrices import entry_positions
-from pgo_models.rotation_qp import RotationQP, rotation_qp
 from pgo_models.rotations import Array
 from solvers.fista import fista
+
+if TYPE_CHECKING:
+    from pgo_models.rotation_qp import RotationQP
 
 
 class RStep(enum.Enum):
@@ -89,6 +91,8 @@ def prepare(subproblem: Subproblem, back_end: RStep) -> RotationStep:
         return _Factorized(subproblem.analysis.factorize(subproblem.K), 0.5 * subproblem.penalty[:, None])
     if back_end is RStep.FISTA:
         return _Fista(subproblem)
+    from pgo_models.rotation_qp import rotation_qp  # cvxpy takes half of the import time, and only this needs it
+
     qp = rotation_qp(subproblem.A, subproblem.w, subproblem.penalty, subproblem.d)
     return _Clarabel(qp, subproblem.num_translations if subproblem.needs_ground else 0)
 

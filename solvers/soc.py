@@ -63,7 +63,7 @@ class SOCState:
         Robots with their prepared subproblems.
     memory : AndersonMemory
     primal_residual, dual_residual : float
-        ||x - z||_rho and ||z - z_before||_rho, both over ||z||_rho.
+        ||x - z||_rho and ||z - z_before||_rho, both over ||omega||_rho.
     merits : tuple of float
         Fixed-point residual ||x - z_before||_rho of the steps since rho last changed.
     best : (rows, d)
@@ -184,7 +184,7 @@ class SOC:
         if not np.isfinite(s).all():
             return replace(state, k=state.k + 1, x=x, primal_residual=np.nan, dual_residual=np.nan)
         omega, following = _agree(team, s, problem)  # (b), and (c): B = s - z = B + x - z
-        size = float(np.linalg.norm(weight * following))
+        size = _size(team)
         return replace(
             state,
             k=state.k + 1,
@@ -292,6 +292,13 @@ def _agree(team: Team, s: Array, problem: PGOProblem) -> tuple[Array, Array]:
     omega = project_to_rotations(unstack_transposes(mean[problem.num_poses :]))
     mean[problem.num_poses :] = stack_transposes(omega)
     return omega, mean[team.row]
+
+
+def _size(team: Team) -> float:
+    """||omega||_rho over all copies: the translations, which depend on the origin of the world, are left out."""
+    assert team.penalty is not None
+    rotations = team.row >= team.problem.num_poses
+    return float(np.sqrt(team.penalty[rotations].sum()))
 
 
 def _norm_weight(team: Team) -> Array:

@@ -1,0 +1,267 @@
+"""The command `pgo`: solve, certify, info, generate.
+
+Exit codes: 0 done; 1 bad input, one line on stderr; 2 not converged, the result written all the same; 3 not certified.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pgo_models.certificate import DEFAULT_GAP, certify
+from pgo_models.datasets import known_datasets, load
+from pgo_models.errors import FileFormatError, PGOError, SettingError
+from pgo_models.files import replace_when_done
+from pgo_models.g2o import read_g2o_poses, symbol_ids, write_g2o, write_g2o_folder
+from pgo_models.initialization import chordal_start, spanning_tree_start
+from pgo_models.pose_graph import PoseGraph
+from pgo_models.poses import Poses, absolute_trajectory_error
+from pgo_models.problem import PGOProblem
+from pgo_models.trajectories import read_kitti, read_tum, write_tum
+from solvers.choices import BackEnd, Method, Scene, Split, Start, chosen_pipeline, chosen_scene, chosen_start
+from solvers.pipeline import solve
+from solvers.solution import versions
+
+DONE, BAD_INPUT, NOT_CONVERGED, NOT_CERTIFIED, INTERRUPTED = 0, 1, 2, 3, 130
+
+app = typer.Typer(
+    name="pgo",
+    help="Pose graph optimisation by splitting, with a certified distance to the global optimum.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+GraphArgument = Annotated[
+    str,
+    typer.Argument(help="A g2o file, a folder with one file a robot, or the name of a data set (pgo info lists them)."),
+]
+GapOption = Annotated[float, typer.Option(help="Relative gap to certify.")]
+UnitWeightsOption = Annotated[
+    bool, typer.Option("--unit-weights", help="Set kappa = tau = 1, the weights of the paper's equation.")
+]
+
+
+@app.command("solve")
+def solve_command(
+    graph: GraphArgument,
+    out: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Write the result: .g2o, .tum, .kitti, .json, .png, .svg or .pdf; may be given several times.",
+        ),
+    ] = None,
+    method: Annotated[
+        Method | None,
+        typer.Option(
+            help="First stage: joint SOC (one robot), consensus SOC (several), SOC as in the paper, or none before "
+            "Newton. Joint unless there are robots."
+        ),
+    ] = None,
+    robots: Annotated[
+        int | None, typer.Option(min=1, help="Number of robots that share the poses (paper: one a pose unless given).")
+    ] = None,
+    split: Annotated[
+        Split | None, typer.Option(help="How poses go to robots: as the file names them if it does, else contiguous.")
+    ] = None,
+    start: Annotated[
+        Start | None, typer.Option(help="Start: chordal relaxation (tree for the paper's method) unless given.")
+    ] = None,
+    r_step: Annotated[BackEnd, typer.Option("--r-step", help="Back end of SOC's R-subproblem.")] = BackEnd.FACTORIZED,
+    gap: GapOption = DEFAULT_GAP,
+    max_iterations: Annotated[int | None, typer.Option(min=0, help="Most SOC iterations.")] = None,
+    tolerance: Annotated[float | None, typer.Option(help="Residual at which Newton takes over from SOC.")] = None,
+    time_limit: Annotated[float, typer.Option(help="Seconds for the iterations.")] = math.inf,
+    unit_weights: UnitWeightsOption = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print a line an iteration.")] = False,
+) -> None:
+    """Solve a pose graph: poses, their cost F, a proven lower bound on the global optimum, and the gap."""
+    problem = PGOProblem(_load(graph, unit_weights))
+    pipeline = chosen_pipeline(problem, method, robots, split, r_step, gap, max_iterations, tolerance)
+    solution = solve(
+        problem,
+        pipeline,
+        chosen_start(problem, start),
+        time_limit=time_limit,
+        verbose=verbose,
+        progress=sys.stderr.isatty(),
+    )
+    typer.echo(str(solution))
+    truth = problem.graph.truth
+    if truth is not None:
+        typer.echo(f"\nerror to the truth (ATE): {absolute_trajectory_error(solution.poses, truth):.4g} m")
+    for path in out or []:
+        solution.save(path)
+        typer.echo(f"written: {path}")
+    if not solution.status.is_success:
+        raise typer.Exit(NOT_CONVERGED)
+    raise typer.Exit(DONE if solution.is_certified else NOT_CERTIFIED)
+
+
+@app.command("certify")
+def certify_command(
+    graph: GraphArgument,
+    estimate: Annotated[
+        Path | None,
+        typer.Option(
+            "--estimate", "-e", help="Poses to judge: .g2o, .tum or .kitti; the graph's own VERTEX lines unless given."
+        ),
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the certificate as .json.")] = None,
+    gap: GapOption = DEFAULT_GAP,
+    unit_weights: UnitWeightsOption = False,
+) -> None:
+    """Judge anybody's poses: how far their cost can be above the global optimum."""
+    problem = PGOProblem(_load(graph, unit_weights))
+    certificate = certify(problem, _estimate(problem.graph, estimate), gap)
+    typer.echo(str(certificate))
+    if out is not None:
+        if out.suffix.lower() != ".json":
+            raise SettingError(f"cannot write {out}: a certificate is written as .json")
+        record = {
+            "objective": certificate.objective,
+            "lower_bound": certificate.lower_bound,
+            "gap": certificate.gap,
+            "wanted_gap": certificate.wanted_gap,
+            "eta": None if math.isnan(certificate.eta) else certificate.eta,
+            "stationarity": certificate.stationarity if math.isfinite(certificate.stationarity) else None,
+            "source": certificate.source.name,
+            "best_known_objective": certificate.poses_objective,
+            "verdict": certificate.verdict.name,
+            "versions": versions(problem.backend),
+        }
+        with replace_when_done(out) as temporary:
+            temporary.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        typer.echo(f"written: {out}")
+    raise typer.Exit(DONE if certificate.is_certified else NOT_CERTIFIED)
+
+
+@app.command("info")
+def info_command(
+    graph: Annotated[
+        str | None, typer.Argument(help="A g2o file, folder or data set; without it, versions and data sets.")
+    ] = None,
+) -> None:
+    """Show what a pose graph is made of, or what this installation has."""
+    table = Table(show_header=False, box=None)
+    if graph is None:
+        for name, version in versions(None).items():
+            table.add_row(name, version)
+        table.add_row("data sets", ", ".join(known_datasets()))
+    else:
+        for label, text in _describe(load(graph)):
+            table.add_row(label, text)
+    Console().print(table)
+
+
+@app.command("generate")
+def generate_command(
+    scene: Annotated[Scene, typer.Argument(help="Which scene; the first three are the paper's.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="A .g2o file, or a name without suffix: a folder with one file a robot.")
+    ],
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random generator.")] = 0,
+    poses: Annotated[int, typer.Option(min=2, help="Poses: in all (random), or of every robot (grid-world).")] = 100,
+    robots: Annotated[int, typer.Option(min=1, help="Robots (grid-world).")] = 4,
+    dimension: Annotated[
+        int, typer.Option("--dimension", "-d", min=2, max=3, help="Of space (random, grid-world).")
+    ] = 3,
+    translation_noise: Annotated[
+        float | None, typer.Option(help="Standard deviation, metres (random, grid-world).")
+    ] = None,
+    rotation_noise: Annotated[
+        float | None, typer.Option(help="Standard deviation, degrees (random, grid-world).")
+    ] = None,
+) -> None:
+    """Generate a scene with known truth, written beside it as NAME.truth.tum."""
+    made = chosen_scene(scene, np.random.default_rng(seed), poses, robots, dimension, translation_noise, rotation_noise)
+    if out.suffix == "":
+        write_g2o_folder(replace(made, ids=symbol_ids(made.robots)), out)
+    elif out.suffix.lower() == ".g2o":
+        write_g2o(made, out)
+    else:
+        raise SettingError(f"cannot write {out}: give a name that ends in .g2o, or a folder's name without a suffix")
+    assert made.truth is not None
+    truth = out.with_name(f"{out.stem}.truth.tum")
+    write_tum(made.truth, truth)
+    typer.echo(f"{made!r}\nwritten: {out}, {truth}")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run `pgo` and leave with its exit code; every error of ours is one line on stderr."""
+    # Every error of the command line itself derives from the base of typer's BadParameter.
+    usage_error: type[Exception] = typer.BadParameter.__mro__[1]
+    try:
+        code = app(args=arguments, standalone_mode=False)
+    except PGOError as error:
+        print(f"pgo: {error}", file=sys.stderr)
+        code = BAD_INPUT
+    except usage_error as error:
+        message = error.format_message() if isinstance(error, typer.BadParameter) else str(error)
+        print(f"pgo: {message.rstrip('.')}; see pgo --help", file=sys.stderr)
+        code = BAD_INPUT
+    except (KeyboardInterrupt, typer.Abort):
+        print("pgo: interrupted before there was a result", file=sys.stderr)
+        code = INTERRUPTED
+    raise SystemExit(code or DONE)
+
+
+def _load(graph: str, unit_weights: bool) -> PoseGraph:
+    loaded = load(graph)
+    return loaded.unit_weights() if unit_weights else loaded
+
+
+def _estimate(graph: PoseGraph, path: Path | None) -> Poses:
+    if path is None:
+        if graph.initial is None:
+            raise SettingError(f"{graph.name} has no VERTEX line for every pose; give --estimate FILE")
+        return graph.initial
+    suffix = path.suffix.lower()
+    if suffix == ".g2o":
+        return read_g2o_poses(path, graph)
+    if suffix in (".tum", ".txt"):
+        found = read_tum(path, graph.d)
+    elif suffix == ".kitti":
+        found = read_kitti(path, graph.d)
+    else:
+        raise SettingError(f"cannot read {path}: no format has suffix {suffix!r}; use .g2o, .tum or .kitti")
+    if found.num_poses != graph.num_poses:
+        raise FileFormatError(path, None, f"{found.num_poses} poses, {graph.name} has {graph.num_poses}; give one each")
+    return found
+
+
+def _describe(graph: PoseGraph) -> list[tuple[str, str]]:
+    components = graph.components()
+    degree = np.bincount(np.concatenate([graph.i, graph.j]), minlength=graph.num_poses)
+    rows = [
+        ("graph", f"{graph.name}, {graph.d}D"),
+        ("poses", str(graph.num_poses)),
+        ("edges", str(graph.num_edges)),
+        ("robots", str(graph.num_robots)),
+        ("components", f"{len(components)} (sizes {', '.join(str(len(part)) for part in components[:5])})"),
+        ("degree", f"{degree.min()} to {degree.max()}, mean {degree.mean():.2f}"),
+        ("kappa", f"{graph.kappa.min():.4g} to {graph.kappa.max():.4g} per rad^2"),
+        ("tau", f"{graph.tau.min():.4g} to {graph.tau.max():.4g} per m^2"),
+        ("estimate", "with the graph" if graph.initial is not None else "none"),
+        ("truth", "with the graph" if graph.truth is not None else "none"),
+    ]
+    if len(components) == 1:
+        problem = PGOProblem(graph)
+        if graph.initial is not None:
+            rows.append(("F, estimate", f"{problem.objective(graph.initial):.8g}"))
+        rows.append(("F, tree", f"{problem.objective(spanning_tree_start(graph)):.8g}"))
+        rows.append(("F, chordal", f"{problem.objective(chordal_start(problem)):.8g}"))
+    rows.append(("Cholesky", versions(None)["cholesky"]))
+    return rows

@@ -1,0 +1,228 @@
+"""Solution: poses, cost, certificate and what each stage did; prints well, and saves itself."""
+
+from __future__ import annotations
+
+import html
+import json
+import platform
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from pgo_models.certificate import Certificate, Verdict
+from pgo_models.cholesky import CholeskyBackend, default_backend
+from pgo_models.errors import SettingError
+from pgo_models.files import replace_when_done
+from pgo_models.g2o import write_g2o, write_g2o_folder
+from pgo_models.initialization import spanning_tree_start
+from pgo_models.plots import compare_poses, is_picture, save_figure
+from pgo_models.poses import Poses
+from pgo_models.problem import PGOProblem
+from pgo_models.trajectories import write_kitti, write_tum
+from solvers.result import History, Run, Status
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+S = TypeVar("S")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What one stage of a solve did."""
+
+    name: str
+    status: Status
+    iterations: int
+    objective: float
+    seconds: float
+    history: History
+
+    @classmethod
+    def of(cls, run: Run[S]) -> Stage:
+        """Stage of a finished run."""
+        return cls(run.name, run.status, run.iterations, run.objective, run.seconds, run.history)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The answer to a pose graph.
+
+    Attributes
+    ----------
+    problem : PGOProblem
+    poses : Poses
+        Aligned with the estimate that came with the graph, if one did, else with pose 0 at the identity.
+    objective : float
+        F of the poses.
+    certificate : Certificate
+        Lower bound on the global optimum, gap and verdict.
+    status : Status
+        How the last stage ended.
+    stages : tuple of Stage
+        The start and the iterative stages, in order.
+    seconds : float
+        Wall time of it all.
+    """
+
+    problem: PGOProblem
+    poses: Poses
+    objective: float
+    certificate: Certificate
+    status: Status
+    stages: tuple[Stage, ...]
+    seconds: float
+
+    @property
+    def lower_bound(self) -> float:
+        """Proven lower bound on F over all poses."""
+        return self.certificate.lower_bound
+
+    @property
+    def gap(self) -> float:
+        """(objective - lower_bound) / max(1, objective)."""
+        return self.certificate.gap
+
+    @property
+    def is_certified(self) -> bool:
+        """Whether the gap is within the one asked for."""
+        return self.certificate.is_certified
+
+    def __repr__(self) -> str:
+        return (
+            f"Solution({self.problem.graph.name!r}, F={self.objective:.10g}, gap={self.gap:.3g}, {self._verdict.name})"
+        )
+
+    def __str__(self) -> str:
+        rows = [f"{label:<12} {text}" for label, text in self._summary()]
+        rows += ["", f"{'stage':<14} {'iterations':>10} {'F':>16} {'seconds':>9}  ended"]
+        for stage in self.stages:
+            rows.append(
+                f"{stage.name:<14} {stage.iterations:>10} {stage.objective:>16.10g} {stage.seconds:>9.3f}  "
+                f"{stage.status.name}"
+            )
+        return "\n".join(rows)
+
+    def _repr_html_(self) -> str:
+        rows = "".join(f"<tr><th>{label}</th><td>{html.escape(text)}</td></tr>" for label, text in self._summary())
+        stages = "".join(
+            f"<tr><td>{html.escape(s.name)}</td><td>{s.iterations}</td><td>{s.objective:.10g}</td>"
+            f"<td>{s.seconds:.3f}</td><td>{html.escape(s.status.name)}</td></tr>"
+            for s in self.stages
+        )
+        heads = "".join(f"<th>{head}</th>" for head in ("stage", "iterations", "F", "seconds", "ended"))
+        return f"<table>{rows}</table><table><tr>{heads}</tr>{stages}</table>"
+
+    def save(self, path: Path | str) -> None:
+        """Write the solution in the format that the suffix of `path` names.
+
+        `.g2o`: the graph with the solved poses (a folder, when the name has no suffix: one file a robot); `.tum` or
+        `.txt`: a TUM trajectory; `.kitti`: a KITTI trajectory; `.json`: everything but the measurements; `.png`, `.svg`
+        or `.pdf`: the picture of `plot`. The file is written whole or not at all.
+
+        Raises
+        ------
+        SettingError
+            On another suffix.
+        PGOError
+            When the file cannot be written.
+        """
+        path = Path(path)
+        suffix = path.suffix.lower()
+        if suffix == ".g2o":
+            write_g2o(self.problem.graph, path, self.poses)
+        elif suffix == "":
+            write_g2o_folder(self.problem.graph, path, self.poses)
+        elif suffix in (".tum", ".txt"):
+            write_tum(self.poses, path)
+        elif suffix == ".kitti":
+            write_kitti(self.poses, path)
+        elif suffix == ".json":
+            with replace_when_done(path) as temporary:
+                temporary.write_text(json.dumps(self.as_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        elif is_picture(path):
+            save_figure(self.plot(), path)
+        else:
+            raise SettingError(
+                f"cannot write {path}: no format has suffix {suffix!r}; "
+                "use .g2o, .tum, .kitti, .json, .png, .svg or .pdf"
+            )
+
+    def plot(self) -> Figure:
+        """Figure of the graph as it came (its own estimate, else a spanning tree) and as solved.
+
+        Raises
+        ------
+        MissingExtraError
+            Without matplotlib.
+        """
+        graph = self.problem.graph
+        before, name = graph.initial, "estimate that came with the graph"
+        if before is None:
+            before, name = spanning_tree_start(graph), "spanning tree"
+        solved = f"{self._verdict.name.lower().replace('_', ' ')}: F = {self.objective:.6g}, gap {self.gap:.1e}"
+        return compare_poses(
+            graph, [(f"{name}: F = {self.problem.objective(before):.4g}", before), (solved, self.poses)]
+        )
+
+    def as_json(self) -> dict[str, object]:
+        """Return what `.json` files hold: figures, stages, versions, and the poses by id."""
+        graph, certificate = self.problem.graph, self.certificate
+        return {
+            "graph": {"name": graph.name, "d": graph.d, "poses": graph.num_poses, "edges": graph.num_edges},
+            "objective": self.objective,
+            "lower_bound": certificate.lower_bound,
+            "gap": certificate.gap,
+            "wanted_gap": certificate.wanted_gap,
+            "eta": certificate.eta if certificate.verdict is not Verdict.TRIVIAL else None,
+            "stationarity": certificate.stationarity,
+            "verdict": certificate.verdict.name,
+            "status": self.status.name,
+            "seconds": self.seconds,
+            "stages": [
+                {
+                    "name": stage.name,
+                    "status": stage.status.name,
+                    "iterations": stage.iterations,
+                    "objective": stage.objective,
+                    "seconds": stage.seconds,
+                }
+                for stage in self.stages
+            ],
+            "versions": versions(self.problem.backend),
+            "ids": graph.pose_ids.tolist(),
+            "R": self.poses.R.tolist(),
+            "t": self.poses.t.tolist(),
+        }
+
+    @property
+    def _verdict(self) -> Verdict:
+        return self.certificate.verdict
+
+    def _summary(self) -> list[tuple[str, str]]:
+        graph, certificate = self.problem.graph, self.certificate
+        return [
+            ("graph", f"{graph.name}: {graph.num_poses} poses, {graph.num_edges} edges, {graph.d}D"),
+            ("status", f"{self.status.name}: {self.status.value}"),
+            ("F", f"{self.objective:.10g}"),
+            ("lower bound", f"{certificate.lower_bound:.10g}"),
+            ("gap", f"{certificate.gap:.3g}"),
+            ("verdict", f"{certificate.verdict.name}: {certificate.verdict.value}"),
+            ("seconds", f"{self.seconds:.3g}"),
+        ]
+
+
+def versions(backend: CholeskyBackend | None) -> dict[str, str]:
+    """Versions of what computed a result, for records."""
+    names = ("pgo-splitting", "numpy", "scipy", "cvxpy", "clarabel")
+    found = {name: metadata.version(name) for name in names if _is_installed(name)}
+    return {"python": platform.python_version(), **found, "cholesky": (backend or default_backend()).value}
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        metadata.distribution(name)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
