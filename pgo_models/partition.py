@@ -113,8 +113,7 @@ def _metis(graph: PoseGraph, num_robots: int) -> IntArray:
     adjacency.sort_indices()
     _, part = pymetis.part_graph(
         num_robots,
-        xadj=adjacency.indptr.tolist(),
-        adjncy=adjacency.indices.tolist(),
+        adjacency=pymetis.CSRAdjacency(adjacency.indptr.tolist(), adjacency.indices.tolist()),
         eweights=adjacency.data.tolist(),
         options=pymetis.Options(contig=True, seed=0),
     )

@@ -29,7 +29,7 @@ from pgo_models.problem import PGOProblem
 from pgo_models.trajectories import read_kitti, read_tum, write_tum
 from solvers.choices import BackEnd, Method, Scene, Split, Start, chosen_pipeline, chosen_scene, chosen_start
 from solvers.pipeline import solve
-from solvers.solution import versions
+from solvers.solution import finite_or_none, versions
 
 DONE, BAD_INPUT, NOT_CONVERGED, NOT_CERTIFIED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -135,8 +135,8 @@ def certify_command(
             "lower_bound": certificate.lower_bound,
             "gap": certificate.gap,
             "wanted_gap": certificate.wanted_gap,
-            "eta": None if math.isnan(certificate.eta) else certificate.eta,
-            "stationarity": certificate.stationarity if math.isfinite(certificate.stationarity) else None,
+            "eta": finite_or_none(certificate.eta),
+            "stationarity": finite_or_none(certificate.stationarity),
             "source": certificate.source.name,
             "best_known_objective": certificate.poses_objective,
             "verdict": certificate.verdict.name,

@@ -83,7 +83,7 @@ def solve(
     Raises
     ------
     PGOError
-        When the graph is not connected, or the start does not fit it.
+        When the graph is not connected, the start does not fit it, or the time limit is not positive.
 
     Examples
     --------
@@ -94,6 +94,8 @@ def solve(
     ('CONVERGED', True)
     """
     began = time.perf_counter()
+    if not time_limit > 0:
+        raise SettingError(f"time_limit is {time_limit}; give positive seconds")
     if isinstance(problem, PoseGraph):
         problem = PGOProblem(problem)
     pipeline = pipeline if pipeline is not None else Pipeline()

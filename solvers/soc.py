@@ -22,7 +22,7 @@ from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
 from solvers.acceleration import Anderson, AndersonMemory, extrapolate, over_relax
-from solvers.penalty import BalancedPenalty, MultiplierPenalty, PenaltyRule, translation_scale
+from solvers.penalty import BalancedPenalty, MultiplierPenalty, PenaltyRule, rotation_scale, translation_scale
 from solvers.result import Measurement, Status
 from solvers.rotation_step import RStep
 from solvers.soc_paper import PaperState, init_paper, measure_paper, step_paper
@@ -113,9 +113,12 @@ class SOC:
         Back end of step (a).
     translation_penalty : float
         Penalty of separator translations in CONSENSUS, times their diagonal in M.
+    separator_penalty : float
+        Least penalty of separator rotations in CONSENSUS under a MultiplierPenalty, times their mean diagonal in M: on
+        graphs with little noise the multipliers alone would hold the copies too loosely together.
     tolerance : float
-        On the primal and the dual residual, both relative. For PAPER on the paper's KKT residual: the root mean square
-        over poses of ||omega_i^T omega_i - I||^2 + ||omega_i - R_i||^2.
+        On the primal and the dual residual, both relative. For PAPER the primal one is the paper's KKT residual, the
+        root mean square over poses of ||omega_i^T omega_i - I||^2 + ||omega_i - R_i||^2, the dual one its stationarity.
     max_iterations : int
 
     Raises
@@ -130,7 +133,8 @@ class SOC:
     alpha: float = 1.0
     acceleration: Anderson | None = field(default_factory=Anderson)
     r_step: RStep = RStep.FACTORIZED
-    translation_penalty: float = 0.1
+    translation_penalty: float = 0.05
+    separator_penalty: float = 0.3
     tolerance: float = 1e-5
     max_iterations: int = 500
 
@@ -139,6 +143,8 @@ class SOC:
             raise SettingError(f"alpha must be in (0, 2), got {self.alpha}")
         if not self.translation_penalty > 0:
             raise SettingError(f"translation_penalty must be positive, got {self.translation_penalty}")
+        if not self.separator_penalty >= 0:
+            raise SettingError(f"separator_penalty must not be negative, got {self.separator_penalty}")
         if not self.tolerance > 0:
             raise SettingError(f"tolerance must be positive, got {self.tolerance}")
         if self.max_iterations < 0:
@@ -162,10 +168,11 @@ class SOC:
             rule = self.penalty if self.penalty is not None else BalancedPenalty()
             return init_paper(problem, poses, self.robots, rule, self.r_step)
         poses = start if start is not None else chordal_start(problem)
-        rho = self._rule.initial(problem, poses)
+        rho = self._initial_rho(problem, poses)
         team = build_team(problem, self.robots, self.r_step).with_penalty(rho, self._rho_t(problem))
-        z = problem.stacked(poses)[team.row]
-        return SOCState(k=0, x=z, omega=poses.R, z=z, s=z, rho=rho, team=team)
+        X = problem.stacked(poses)
+        z = X[team.row]
+        return SOCState(k=0, x=z, omega=poses.R, z=z, s=z + _balanced(team, X, np.zeros_like(X)), rho=rho, team=team)
 
     def step(self, problem: PGOProblem, state: SOCState | PaperState) -> SOCState | PaperState:
         """One iteration: (a), (b), (c)."""
@@ -215,14 +222,19 @@ class SOC:
 
     def converged(self, state: SOCState | PaperState, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals are within tolerance."""
-        if isinstance(state, PaperState):
-            return Status.CONVERGED if measurement.primal_residual <= self.tolerance and state.k > 0 else None
         worst = max(measurement.primal_residual, measurement.dual_residual)
         return Status.CONVERGED if worst <= self.tolerance else None
 
     @property
     def _rule(self) -> PenaltyRule:
         return self.penalty if self.penalty is not None else MultiplierPenalty()
+
+    def _initial_rho(self, problem: PGOProblem, poses: Poses) -> Array:
+        rho = self._rule.initial(problem, poses)
+        if self.robots is not None and isinstance(self._rule, MultiplierPenalty):
+            shared = self.robots.separators(problem.graph)
+            rho[shared] = np.maximum(rho[shared], self.separator_penalty * rotation_scale(problem)[shared])
+        return rho
 
     def _rho_t(self, problem: PGOProblem) -> Array:
         return self.translation_penalty * translation_scale(problem)
@@ -239,7 +251,7 @@ class SOC:
             window = rule.stall_window
             stalled = len(merits) >= window and merits[-1] > rule.stall_ratio * merits[-window]
             if stalled and state.refreshes < rule.max_refreshes:
-                return self._refreshed(problem, state, rule)
+                return self._refreshed(problem, state)
         if isinstance(rule, BalancedPenalty) and state.k > 0:
             factor = rule.factor(state.primal_residual, state.dual_residual)
             if factor != 1.0 and (factor > 1.0 or state.raises == 0):
@@ -256,27 +268,20 @@ class SOC:
         s = state.z + (before / team.penalty)[:, None] * state.B
         return replace(state, s=s, rho=rho, team=team, memory=AndersonMemory(), merits=(), best=None)
 
-    def _refreshed(self, problem: PGOProblem, state: SOCState, rule: MultiplierPenalty) -> SOCState:
-        """State with rho and B from the multipliers at omega.
-
-        At a stationary point 2 M_a x + rho_a B_a = 0 for every robot. The part of the copies' mean that is not the
-        multiplier of the constraint is taken out, so that the projection gives omega back.
-        """
+    def _refreshed(self, problem: PGOProblem, state: SOCState) -> SOCState:
+        """State with rho and B from the multipliers at omega, where the mean B_i is -2 Lambda_i R_i^T / rho_i."""
         poses = problem.with_best_translations(state.omega)
-        rho = rule.initial(problem, poses)
+        rho = self._initial_rho(problem, poses)
         team = state.team.with_penalty(rho, self._rho_t(problem))
-        assert team.penalty is not None
         X = problem.stacked(poses)
-        B = -team.gradients(X) / team.penalty[:, None]
         normal = np.zeros_like(X)
         transposes = np.swapaxes(multipliers(problem, poses) @ np.swapaxes(poses.R, 1, 2), 1, 2)
         normal[problem.num_poses :] = stack_transposes(-2.0 * transposes / rho[:, None, None])
-        B += (normal - team.average(B))[team.row]
         z = X[team.row]
         return replace(
             state,
             z=z,
-            s=z + B,
+            s=z + _balanced(team, X, normal),
             rho=rho,
             team=team,
             memory=AndersonMemory(),
@@ -284,6 +289,16 @@ class SOC:
             best=None,
             refreshes=state.refreshes + 1,
         )
+
+
+def _balanced(team: Team, X: Array, mean: Array) -> Array:
+    """B, (rows, d), whose mean over the copies is `mean`, (N, d), and which holds every robot's forces in balance at X.
+
+    At a stationary point 2 M_a x + rho_a B_a = 0 for every robot a. One robot alone has B = mean.
+    """
+    assert team.penalty is not None
+    B = -team.gradients(X) / team.penalty[:, None]
+    return B + (mean - team.average(B))[team.row]
 
 
 def _agree(team: Team, s: Array, problem: PGOProblem) -> tuple[Array, Array]:

@@ -59,8 +59,10 @@ class PaperState:
         One penalty for all poses, as in the paper.
     blocks, r_step
         The split matrix, and the prepared back end for the present rho.
+    scale : float
+        Mean diagonal of L, the unit in which the stationarity residual is measured.
     dual_residual : float
-        rho ||omega - omega_last||_F over the root of n d.
+        Stationarity, rho ||omega - omega_last||_F / scale over the root of n d.
     smallest_merit, steps_since_smallest, may_fall
         Safeguard of the adaptive rho: the smallest ||R - omega|| and ||omega - omega_last|| together since rho changed,
         how long ago, and whether rho may still be lowered.
@@ -73,6 +75,7 @@ class PaperState:
     rho: float
     blocks: Blocks
     r_step: RotationStep
+    scale: float
     dual_residual: float = np.inf
     smallest_merit: float = np.inf
     steps_since_smallest: int = 0
@@ -97,6 +100,7 @@ def init_paper(
         rho=rho,
         blocks=blocks,
         r_step=_prepare(problem, blocks, rho, back_end),
+        scale=float(problem.L.diagonal().mean()),
     )
 
 
@@ -119,7 +123,7 @@ def step_paper(problem: PGOProblem, state: PaperState, rule: PenaltyRule, back_e
         R=R,
         omega=omega,
         B=B,
-        dual_residual=state.rho * change,
+        dual_residual=state.rho * change / state.scale,
         smallest_merit=merit if smaller else state.smallest_merit,
         steps_since_smallest=0 if smaller else state.steps_since_smallest + 1,
     )

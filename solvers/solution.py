@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import math
 import platform
 from dataclasses import dataclass
 from importlib import metadata
@@ -175,8 +176,8 @@ class Solution:
             "lower_bound": certificate.lower_bound,
             "gap": certificate.gap,
             "wanted_gap": certificate.wanted_gap,
-            "eta": certificate.eta if certificate.verdict is not Verdict.TRIVIAL else None,
-            "stationarity": certificate.stationarity,
+            "eta": finite_or_none(certificate.eta),
+            "stationarity": finite_or_none(certificate.stationarity),
             "verdict": certificate.verdict.name,
             "status": self.status.name,
             "seconds": self.seconds,
@@ -218,6 +219,11 @@ def versions(backend: CholeskyBackend | None) -> dict[str, str]:
     names = ("pgo-splitting", "numpy", "scipy", "cvxpy", "clarabel")
     found = {name: metadata.version(name) for name in names if _is_installed(name)}
     return {"python": platform.python_version(), **found, "cholesky": (backend or default_backend()).value}
+
+
+def finite_or_none(value: float) -> float | None:
+    """Value for JSON, which knows neither nan (no eta was proved) nor inf (stationarity was not measured)."""
+    return value if math.isfinite(value) else None
 
 
 def _is_installed(name: str) -> bool:

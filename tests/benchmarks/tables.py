@@ -1,0 +1,126 @@
+"""Prints the README's tables: the whole job beside SE-Sync, SOC's iterations, and SOC as in the paper.
+
+    PGO_DATA=folder python tests/benchmarks/tables.py [solve] [iterations] [paper]
+
+Every graph of the first table runs in a process of its own, one thread: a first job, then five more; imports are apart.
+"""
+
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ[variable] = "1"
+
+from rich.console import Console
+from rich.table import Table
+from unit import seconds_of_unit
+
+import pgo_models as pgo
+import solvers
+
+REFERENCE = json.loads((Path(__file__).parents[2] / "data" / "reference.json").read_text())
+OPTIMUM = {name: value for name, value in REFERENCE["certified_optimum"].items() if name != "source"}
+SE_SYNC = REFERENCE["peers"]["se_sync_units"]
+ITERATIONS = REFERENCE["peers"]["prototype_iterations_to_1e-6"]
+PAPER = REFERENCE["paper_tables"]
+REPEATS = 5
+MAX_ITERATIONS = 400
+
+
+def one_job(name: str) -> None:
+    """Read, solve and certify a graph 1 + REPEATS times; print the figures as JSON."""
+    path = Path(os.environ["PGO_DATA"]) / f"{name}.g2o"
+    pgo.default_backend()
+    if pgo.default_backend() is pgo.CholeskyBackend.CHOLMOD:
+        import cvxopt.cholmod  # noqa: F401 - import time is apart
+    seconds = []
+    for _ in range(1 + REPEATS):
+        begin = time.perf_counter()
+        solution = solvers.solve(pgo.read_g2o(path))
+        seconds.append(time.perf_counter() - begin)
+    figures = {
+        "first": seconds[0],
+        "median": statistics.median(seconds[1:]),
+        "memory": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "objective": solution.objective,
+        "gap": solution.gap,
+        "verdict": solution.certificate.verdict.name,
+        "soc": solution.stages[1].iterations,
+        "newton": solution.stages[2].iterations,
+    }
+    print(json.dumps(figures))
+
+
+def solve_table() -> Table:
+    """Whole job, file to certificate."""
+    table = Table("graph", "F", "off by", "gap", "SOC", "Newton", "first (s)", "median (s)", "u", "SE-Sync (u)", "MB")
+    for name in OPTIMUM:
+        unit = seconds_of_unit()
+        child = subprocess.run(
+            [sys.executable, __file__, "--job", name], capture_output=True, text=True, check=True, env=os.environ
+        )
+        row = json.loads(child.stdout)
+        peer = SE_SYNC.get(name)
+        table.add_row(
+            name,
+            f"{row['objective']:.7f}",
+            f"{abs(row['objective'] - OPTIMUM[name]) / OPTIMUM[name]:.0e}",
+            f"{row['gap']:.1e} {'' if row['verdict'] == 'CERTIFIED' else row['verdict']}",
+            str(row["soc"]),
+            str(row["newton"]),
+            f"{row['first']:.3f}",
+            f"{row['median']:.3f}",
+            f"{row['median'] / unit:.2f}",
+            "-" if peer is None else f"{peer:.2f}",
+            f"{row['memory']:.0f}",
+        )
+    return table
+
+
+def iterations_table() -> Table:
+    """Iterations of JOINT SOC from the chordal start, default settings, to three relative gaps."""
+    table = Table("graph", "start", "1e-3", "1e-6", "1e-8", "prototype, 1e-6")
+    for name in ITERATIONS:
+        problem = pgo.PGOProblem(pgo.load(name))
+        run = solvers.run(solvers.SOC(tolerance=1e-9, max_iterations=MAX_ITERATIONS), problem)
+        gaps = (run.history.objective - OPTIMUM[name]) / max(1.0, OPTIMUM[name])
+        cells = [next((str(k) for k, gap in enumerate(gaps) if gap <= level), "-") for level in (1e-3, 1e-6, 1e-8)]
+        table.add_row(name, f"{gaps[0]:.1e}", *cells, str(ITERATIONS[name]))
+    return table
+
+
+def paper_table() -> Table:
+    """SOC as in the paper, one pose a robot, from the spanning tree, in the paper's iterations; then Gauss-Newton."""
+    table = Table("graph", "iterations", "F, SOC", "F, then Gauss-Newton", "F, the paper's SOC", "its iterations", "F*")
+    for name in ("parking-garage", "cubicle", "torus3D"):
+        problem, published = pgo.PGOProblem(pgo.load(name)), PAPER[name]
+        soc = solvers.SOC(coupling=solvers.Coupling.PAPER, max_iterations=published["iterations_soc"])
+        first = solvers.run(soc, problem)
+        second = solvers.run(solvers.gauss_newton(), problem, first.poses)
+        table.add_row(
+            name,
+            str(first.iterations),
+            f"{first.objective:.6g}",
+            f"{second.objective:.8g}",
+            f"{published['F_soc']:g}",
+            str(published["iterations_soc"]),
+            f"{OPTIMUM[name]:.8g}",
+        )
+    return table
+
+
+TABLES = {"solve": solve_table, "iterations": iterations_table, "paper": paper_table}
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--job"]:
+        one_job(sys.argv[2])
+    else:
+        for chosen in sys.argv[1:] or TABLES:
+            print(TABLES[chosen].__doc__)
+            Console(width=130).print(TABLES[chosen]())

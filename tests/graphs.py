@@ -1,0 +1,84 @@
+"""Small problems, hostile poses and published optima that several test files share."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from hypothesis import strategies as st
+
+from pgo_models.pose_graph import PoseGraph
+from pgo_models.poses import Poses
+from pgo_models.problem import PGOProblem
+from pgo_models.rotations import Array, random_rotations
+from pgo_models.scenes import MILD_NOISE, NoiseModel, observe, random_geometric
+
+EPS = float(np.finfo(float).eps)
+SEEDS = st.integers(0, 2**32 - 1)
+SIZES = st.integers(2, 12)
+DIMENSIONS = st.sampled_from([2, 3])
+LOUD_NOISE = NoiseModel(translation_std=0.3, rotation_std=0.3)
+
+REFERENCE = json.loads((Path(__file__).parent.parent / "data" / "reference.json").read_text())
+OPTIMUM: dict[str, float] = {k: v for k, v in REFERENCE["certified_optimum"].items() if k != "source"}
+
+
+def optimum_tolerance(name: str) -> float:
+    """1e-7 of the published optimum, or half a unit of the last of its seven decimals."""
+    return max(1e-7 * OPTIMUM[name], 0.5e-7)
+
+
+def varied_graph(seed: int, n: int, d: int, noise: NoiseModel = MILD_NOISE, weights: float = 1.0) -> PoseGraph:
+    """Random geometric graph, some edges reversed, some repeated, with log-normal factors on kappa and tau."""
+    rng = np.random.default_rng(seed)
+    graph = random_geometric(n, rng, d=d, mean_degree=rng.uniform(1.0, 6.0), noise=noise)
+    edges = np.concatenate([np.arange(graph.num_edges), rng.integers(0, graph.num_edges, graph.num_edges // 4)])
+    back = rng.random(len(edges)) < 0.5
+    i, j, R_ij, t_ij = graph.i[edges], graph.j[edges], graph.R_ij[edges], graph.t_ij[edges]
+    i[back], j[back] = j[back], i[back]
+    R_ij[back] = np.swapaxes(R_ij[back], 1, 2)
+    t_ij[back] = -np.einsum("mab,mb->ma", R_ij[back], t_ij[back])
+    return replace(
+        graph,
+        i=i,
+        j=j,
+        R_ij=R_ij,
+        t_ij=t_ij,
+        kappa=graph.kappa[edges] * np.exp(weights * rng.standard_normal(len(edges))),
+        tau=graph.tau[edges] * np.exp(weights * rng.standard_normal(len(edges))),
+    )
+
+
+def varied_problem(seed: int, n: int, d: int, noise: NoiseModel = MILD_NOISE) -> PGOProblem:
+    """Problem of `varied_graph`."""
+    return PGOProblem(varied_graph(seed, n, d, noise))
+
+
+def exact_graph(seed: int, n: int, d: int) -> PoseGraph:
+    """Connected graph of edges in both directions whose measurements are the true relative poses."""
+    pattern = varied_graph(seed, n, d)
+    assert pattern.truth is not None
+    silence = NoiseModel(1e-300, 1e-300)
+    rng = np.random.default_rng(seed)
+    graph = observe("exact", pattern.truth, pattern.i, pattern.j, silence, 1.0, 1.0, rng)
+    return replace(graph, kappa=pattern.kappa, tau=pattern.tau)
+
+
+def random_poses(n: int, d: int, seed: int, spread: float = 1.0) -> Poses:
+    """Uniform rotations, and normal translations with standard deviation `spread`."""
+    rng = np.random.default_rng([seed, 1])
+    return Poses(random_rotations(n, d, rng), spread * rng.standard_normal((n, d)))
+
+
+def rounding_of_objective(problem: PGOProblem, X: Array) -> float:
+    """What tr(X^T M X) can lose to rounding."""
+    return 16 * EPS * float(abs(problem.M).sum(axis=0).max()) * float(np.sum(X**2))
+
+
+def median_slope(
+    error: Callable[[Array, Array, float], float], moves: list[tuple[Array, Array]], exponents: tuple[float, float]
+) -> float:
+    """Median over moves (w, v) of the order in h of error(w, v, h), for h from 10^first to 10^last."""
+    h = np.logspace(*exponents, 5)
+    return float(np.median([np.polyfit(np.log(h), np.log([error(w, v, x) for x in h]), 1)[0] for w, v in moves]))

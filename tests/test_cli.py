@@ -1,0 +1,244 @@
+import inspect
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pgo_models as pgo
+import solvers
+from solvers import cli
+
+PGO = [sys.executable, "-c", "from solvers.cli import main; main()"]
+
+
+@pytest.fixture
+def pgo_command(capsys):
+    """Runs `pgo` in this process: exit code, standard output, standard error."""
+
+    def call(*arguments):
+        with pytest.raises(SystemExit) as end:
+            cli.main([str(argument) for argument in arguments])
+        streams = capsys.readouterr()
+        return end.value.code, streams.out, streams.err
+
+    return call
+
+
+def test_solve_prints_cost_bound_and_gap_and_ends_with_0(pgo_command):
+    code, out, err = pgo_command("solve", "sphere")
+    assert (code, err) == (0, "")
+    cost = float(re.search(r"^F +(\S+)", out, re.M)[1])
+    bound = float(re.search(r"^lower bound +(\S+)", out, re.M)[1])
+    assert 0 <= cost - bound <= 1e-6 * cost
+    assert "CERTIFIED" in out
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--method", "joint"),
+        ("--method", "newton"),
+        ("--method", "consensus", "--robots", "3"),
+        ("--robots", "3", "--split", "metis"),
+        ("--method", "paper", "--robots", "3"),
+        ("--method", "paper", "--split", "singletons"),
+        ("--r-step", "fista"),
+        ("--r-step", "clarabel"),
+        ("--start", "tree"),
+        ("--start", "file"),
+        ("--max-iterations", "3"),
+        ("--tolerance", "1e-4", "--verbose"),
+    ],
+)
+def test_every_way_to_solve_ends_at_the_same_optimum(options, pgo_command):
+    code, out, _ = pgo_command("solve", "circle", *options)
+    assert code == 0
+    costs = [float(re.search(r"^F +(\S+)", text, re.M)[1]) for text in (out, pgo_command("solve", "circle")[1])]
+    np.testing.assert_allclose(costs[0], costs[1], rtol=1e-8, atol=0)
+
+
+def test_unit_weights_give_the_papers_equation(pgo_command):
+    code, out, _ = pgo_command("solve", "circle", "--unit-weights")
+    assert code == 0
+    cost = float(re.search(r"^F +(\S+)", out, re.M)[1])
+    expected = solvers.solve(pgo.load("circle").unit_weights()).objective
+    np.testing.assert_allclose(cost, expected, rtol=1e-9, atol=0)
+
+
+def test_results_are_written_in_every_format(pgo_command, tmp_path):
+    paths = [tmp_path / f"result.{suffix}" for suffix in ("g2o", "tum", "kitti", "json")]
+    code, out, _ = pgo_command("solve", "robots", *(part for path in paths for part in ("--out", path)))
+    assert code == 0
+    assert sorted(tmp_path.iterdir()) == sorted(paths)
+    assert all(f"written: {path}" in out for path in paths)
+    assert json.loads((tmp_path / "result.json").read_text())["verdict"] == "CERTIFIED"
+    for suffix in ("g2o", "tum", "kitti"):
+        code, out, _ = pgo_command("certify", "robots", "--estimate", tmp_path / f"result.{suffix}")
+        assert code == 0
+        assert "at the poses given" in out
+
+
+def test_certify_judges_poses_that_are_not_optimal_with_3(pgo_command, tmp_path):
+    code, out, err = pgo_command("certify", "grid", "--out", tmp_path / "certificate.json")
+    assert (code, err) == (3, "")
+    assert "NOT_CERTIFIED" in out
+    assert "after polishing" in out
+    record = json.loads((tmp_path / "certificate.json").read_text())
+    assert record["lower_bound"] <= record["best_known_objective"] < record["objective"]
+
+
+def test_not_converged_ends_with_2_and_writes_the_result(pgo_command, tmp_path):
+    code, out, _ = pgo_command("solve", "grid", "--time-limit", "1e-9", "--out", tmp_path / "so_far.json")
+    assert code == 2
+    assert "TIME_LIMIT" in out
+    assert (tmp_path / "so_far.json").exists()
+
+
+def test_not_certified_ends_with_3(pgo_command, tmp_path):
+    pgo_command("generate", "random", "--poses", 12, "--rotation-noise", 140, "--seed", 5, "--out", tmp_path / "x.g2o")
+    code, out, _ = pgo_command("solve", tmp_path / "x.g2o")
+    assert code == 3
+    assert "not shown to be optimal" in out
+
+
+@pytest.mark.parametrize("scene", ["circle", "grid", "sphere", "random", "grid-world"])
+def test_generated_scenes_have_their_truth_and_solve(scene, pgo_command, tmp_path):
+    code, _, _ = pgo_command("generate", scene, "--poses", 15, "--robots", 2, "--out", tmp_path / "scene.g2o")
+    assert code == 0
+    code, out, _ = pgo_command("solve", tmp_path / "scene.g2o")
+    assert code == 0
+    assert "error to the truth (ATE)" in out
+
+
+def test_a_generated_folder_holds_one_file_a_robot(pgo_command, tmp_path):
+    pgo_command("generate", "grid-world", "--poses", 15, "--robots", 3, "--dimension", 2, "--out", tmp_path / "world")
+    graph = pgo.load(tmp_path / "world")
+    assert (graph.num_robots, graph.num_poses, graph.d) == (3, 45, 2)
+    assert graph.truth is not None
+    assert pgo_command("solve", tmp_path / "world", "--method", "consensus")[0] == 0
+
+
+def test_info_describes_graphs_and_the_installation(pgo_command):
+    code, out, _ = pgo_command("info", "robots")
+    assert code == 0
+    assert re.search(r"poses +160", out)
+    assert re.search(r"robots +4", out)
+    code, out, _ = pgo_command("info")
+    assert code == 0
+    assert re.search(r"cholesky +(CHOLMOD|SuperLU)", out)
+    assert "circle" in out
+
+
+BAD_FILES = {
+    "truncated": "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 0 1 0 0\n",
+    "word": "EDGE_SE2 0 1 1 zero 0 1 0 0 1 0 1\n",
+    "nan": "EDGE_SE2 0 1 nan 0 0 1 0 0 1 0 1\n",
+    "zero quaternion": "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 0 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n",
+    "indefinite": "EDGE_SE2 0 1 1 0 0 -1 0 0 1 0 1\n",
+    "itself": "EDGE_SE2 0 0 1 0 0 1 0 0 1 0 1\n",
+    "mixed": "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nVERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n",
+    "empty": "",
+    "binary": "EDGE\0\1\2",
+    "two components": "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 2 3 1 0 0 1 0 0 1 0 1\n",
+}
+
+
+@pytest.mark.parametrize("fault", BAD_FILES)
+@pytest.mark.parametrize("command", ["solve", "certify", "info"])
+def test_bad_files_end_with_1_and_one_line_without_a_traceback(command, fault, pgo_command, tmp_path):
+    if (command, fault) == ("info", "two components"):
+        return  # info names the components instead: the next test
+    path = tmp_path / "bad.g2o"
+    path.write_text(BAD_FILES[fault])
+    code, out, err = pgo_command(command, path)
+    assert (code, out) == (1, "")
+    assert err.startswith("pgo: ")
+    assert err.count("\n") == 1
+    assert "Traceback" not in err
+
+
+def test_info_names_the_components(pgo_command, tmp_path):
+    (tmp_path / "two.g2o").write_text(BAD_FILES["two components"])
+    code, out, _ = pgo_command("info", tmp_path / "two.g2o")
+    assert code == 0
+    assert "2 (sizes 2, 2)" in out
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("solve", "no-such-graph"),
+        ("solve", "no/such/file.g2o"),
+        ("solve", "sphere", "--robots", "0"),
+        ("solve", "sphere", "--robots", "51"),
+        ("solve", "sphere", "--method", "joint", "--robots", "2"),
+        ("solve", "sphere", "--gap", "-1"),
+        ("solve", "sphere", "--time-limit", "-1"),
+        ("solve", "sphere", "--tolerance", "0"),
+        ("solve", "sphere", "--bogus"),
+        ("solve", "sphere", "--method", "magic"),
+        ("solve",),
+        ("solve", "sphere", "--out", "result.xyz"),
+        ("certify", "sphere", "--estimate", "no-such.tum"),
+        ("certify", "sphere", "--estimate", "no-such.xyz"),
+        ("generate", "circle", "--rotation-noise", "3", "--out", "x.g2o"),
+        ("generate", "random", "--rotation-noise", "-3", "--out", "x.g2o"),
+        ("generate", "circle", "--out", "x.xyz"),
+        ("generate", "circle"),
+        ("fly",),
+    ],
+)
+def test_bad_options_end_with_1_and_one_line(arguments, pgo_command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, _, err = pgo_command(*arguments)
+    assert code == 1
+    assert err.startswith("pgo: ")
+    assert err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_start_the_graph_does_not_offer_is_refused(pgo_command, tmp_path):
+    path = tmp_path / "gap.g2o"
+    path.write_text("EDGE_SE2 0 2 1 0 0 1 0 0 1 0 1\nEDGE_SE2 2 1 1 0 0 1 0 0 1 0 1\n")
+    assert "no odometry from pose 0 to 1" in pgo_command("solve", path, "--start", "odometry")[2]
+    assert "no VERTEX line" in pgo_command("solve", path, "--start", "file")[2]
+    assert "no VERTEX line" in pgo_command("certify", path)[2]
+
+
+def test_help_explains_every_option(pgo_command):
+    for command in cli.app.registered_commands:
+        code, out, _ = pgo_command(command.name, "--help")
+        assert code == 0
+        for parameter in inspect.signature(command.callback, eval_str=True).parameters.values():
+            (option,) = parameter.annotation.__metadata__
+            assert option.help, (command.name, parameter.name)
+            assert all(name in out for name in option.param_decls or ())
+
+
+def test_ctrl_c_returns_the_best_iterate_so_far(tmp_path):
+    path = tmp_path / "so_far.json"
+    env = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parent.parent)}
+    arguments = ["solve", "sphere", "--method", "paper", "--tolerance", "1e-300", "--max-iterations", "100000000"]
+    process = subprocess.Popen(
+        [*PGO, *arguments, "--verbose", "--out", str(path)],
+        env=env,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    for _ in range(12):
+        process.stdout.readline()  # the run is under way
+    time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 2, err
+    assert "INTERRUPTED" in out
+    assert "Traceback" not in err
+    assert json.loads(path.read_text())["status"] == "INTERRUPTED"

@@ -1,0 +1,107 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from graphs import OPTIMUM
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pgo_models as pgo
+import solvers
+from pgo_models.certificate import Verdict
+from pgo_models.scenes import NoiseModel, observe
+from solvers.pipeline import HANDOVER_TOLERANCE
+
+
+@pytest.mark.parametrize("name", OPTIMUM)
+def test_every_benchmark_file_is_solved_to_the_published_optimum_and_certified(name, benchmark_data):
+    solution = solvers.solve(pgo.read_g2o(benchmark_data / f"{name}.g2o"))
+    assert solution.status is solvers.Status.CONVERGED
+    assert solution.certificate.verdict is Verdict.CERTIFIED
+    assert 0 <= solution.gap <= 1e-6
+    # The published figures are rounded to seven decimals: parking-garage's to 4e-8 of itself.
+    np.testing.assert_allclose(solution.objective, OPTIMUM[name], rtol=1e-8, atol=0.51e-7)
+
+
+@pytest.mark.parametrize("name", ["example_4robots", "example_16robots"])
+def test_folders_of_robots_are_solved_as_they_are(name, benchmark_data):
+    graph = pgo.read_g2o(benchmark_data / name)
+    robots = pgo.partition(graph)
+    assert robots.num_robots == int("".join(filter(str.isdigit, name)))
+    solution = solvers.solve(graph, solvers.Pipeline(soc=solvers.SOC(robots=robots, tolerance=HANDOVER_TOLERANCE)))
+    assert solution.is_certified
+
+
+@settings(deadline=None, max_examples=15)
+@given(seed=st.integers(0, 10**6), d=st.sampled_from([2, 3]), rotation_std=st.floats(0.01, 2.0))
+def test_the_bound_holds_and_the_solution_is_no_worse_than_the_start_at_any_noise(seed, d, rotation_std):
+    rng = np.random.default_rng(seed)
+    graph = pgo.random_geometric(20, rng, d=d, noise=NoiseModel(0.3, rotation_std))
+    problem = pgo.PGOProblem(graph)
+    start = pgo.chordal_start(problem)
+    solution = solvers.solve(problem)
+    from_truth = problem.objective(pgo.polish(problem, graph.truth))
+    assert solution.objective <= problem.objective(start) * (1 + 1e-12)
+    assert solution.lower_bound <= min(solution.objective, from_truth) * (1 + 1e-12)
+    assert solution.is_certified == (solution.gap <= solution.certificate.wanted_gap)
+
+
+def test_the_result_is_aligned_with_the_estimate_that_came_with_the_graph():
+    graph = pgo.circle(np.random.default_rng(0))
+    solution = solvers.solve(graph)
+    again = solution.poses.aligned_to(graph.initial)
+    np.testing.assert_allclose(solution.poses.t, again.t, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(solution.poses.R, again.R, rtol=0, atol=1e-10)
+
+
+def test_without_an_estimate_pose_0_is_the_identity():
+    graph = pgo.circle(np.random.default_rng(0))
+    solution = solvers.solve(replace(graph, initial=None))
+    np.testing.assert_allclose(solution.poses.R[0], np.eye(3), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(solution.poses.t[0], 0, rtol=0, atol=1e-12)
+
+
+def test_newton_alone_and_the_papers_coupling_find_the_same_optimum():
+    problem = pgo.PGOProblem(pgo.grid(np.random.default_rng(0)))
+    expected = solvers.solve(problem).objective
+    alone = solvers.solve(problem, solvers.Pipeline(soc=None))
+    paper = solvers.solve(problem, solvers.Pipeline(soc=solvers.SOC(coupling=solvers.Coupling.PAPER)))
+    np.testing.assert_allclose([alone.objective, paper.objective], expected, rtol=1e-10, atol=0)
+    assert [stage.name for stage in alone.stages] == ["chordal start", "Newton"]
+    assert [stage.name for stage in paper.stages] == ["spanning tree", "SOC", "Newton"]
+
+
+def test_a_bad_start_is_rescued_by_the_second_try():
+    # A ring whose rotations wind around once more than they should is a local minimum of its own.
+    n, rng = 20, np.random.default_rng(0)
+    angle = 2 * np.pi * np.arange(n) / n
+    truth = pgo.Poses(np.broadcast_to(np.eye(2), (n, 2, 2)), np.column_stack([np.cos(angle), np.sin(angle)]))
+    i, j = np.arange(n), (np.arange(n) + 1) % n
+    problem = pgo.PGOProblem(observe("ring", truth, i, j, NoiseModel(0.01, 0.01), 100.0, 1.0, rng))
+    wound = pgo.Poses(pgo.exp_map(angle[:, None]), truth.t)
+    stuck = solvers.solve(problem, solvers.Pipeline(soc=None, second_try=False), wound)
+    rescued = solvers.solve(problem, solvers.Pipeline(soc=None), wound)
+    assert not stuck.is_certified
+    assert rescued.is_certified
+    assert rescued.objective < 0.1 * stuck.objective
+    assert stuck.lower_bound <= rescued.objective
+
+
+def test_a_time_limit_ends_the_run_with_its_status_and_a_valid_bound():
+    problem = pgo.PGOProblem(pgo.random_geometric(300, np.random.default_rng(0), noise=NoiseModel(0.3, 0.3)))
+    optimum = solvers.solve(problem).objective
+    solution = solvers.solve(problem, time_limit=1e-9)
+    assert solution.status is solvers.Status.TIME_LIMIT
+    assert solution.lower_bound <= optimum * (1 + 1e-12)
+
+
+def test_a_disconnected_graph_is_refused_with_its_components_named():
+    R, t = np.broadcast_to(np.eye(2), (2, 2, 2)), np.ones((2, 2))
+    graph = pgo.PoseGraph(4, np.array([0, 2]), np.array([1, 3]), R, t, np.ones(2), np.ones(2))
+    with pytest.raises(pgo.GraphError, match="2 components"):
+        solvers.solve(graph)
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(pgo.SettingError, match="gap must be positive"):
+        solvers.Pipeline(gap=0.0)

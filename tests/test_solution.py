@@ -1,0 +1,77 @@
+import json
+
+import numpy as np
+import pytest
+
+import pgo_models as pgo
+import solvers
+
+
+@pytest.fixture(scope="module")
+def solution():
+    return solvers.solve(pgo.circle(np.random.default_rng(0)))
+
+
+def test_it_prints_cost_bound_gap_and_verdict(solution):
+    text = str(solution)
+    for part in ("circle: 25 poses, 300 edges, 3D", f"{solution.objective:.10g}", f"{solution.lower_bound:.10g}"):
+        assert part in text
+    assert "CERTIFIED: globally optimal within the gap asked for" in text
+    assert repr(solution).startswith("Solution('circle', F=")
+
+
+def test_its_html_is_well_formed_and_escapes_names(solution):
+    from dataclasses import replace
+    from xml.etree import ElementTree
+
+    named = replace(solution, problem=pgo.PGOProblem(replace(solution.problem.graph, name="<b>&")))
+    tree = ElementTree.fromstring(f"<div>{named._repr_html_()}</div>")
+    assert any("<b>&" in (cell.text or "") for cell in tree.iter("td"))
+
+
+def test_a_solved_graph_reads_back_with_the_same_cost(solution, tmp_path):
+    solution.save(tmp_path / "solved.g2o")
+    graph = pgo.read_g2o(tmp_path / "solved.g2o")
+    np.testing.assert_allclose(pgo.PGOProblem(graph).objective(graph.initial), solution.objective, rtol=1e-12, atol=0)
+
+
+def test_trajectories_read_back(solution, tmp_path):
+    for suffix, read in ((".tum", pgo.read_tum), (".kitti", pgo.read_kitti)):
+        solution.save(tmp_path / f"poses{suffix}")
+        poses = read(tmp_path / f"poses{suffix}")
+        np.testing.assert_allclose(poses.t, solution.poses.t, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(poses.R, solution.poses.R, rtol=0, atol=1e-12)
+
+
+def test_json_holds_the_figures_and_the_poses(solution, tmp_path):
+    solution.save(tmp_path / "solution.json")
+    record = json.loads((tmp_path / "solution.json").read_text())
+    assert record["objective"] == solution.objective
+    assert record["lower_bound"] == solution.lower_bound
+    assert record["verdict"] == "CERTIFIED"
+    assert record["stages"][-1]["name"] == "Newton"
+    np.testing.assert_array_equal(record["R"], solution.poses.R)
+    assert record["ids"] == list(range(25))
+
+
+def test_an_unknown_suffix_is_refused_and_nothing_is_written(solution, tmp_path):
+    with pytest.raises(pgo.SettingError, match=r"no format has suffix '\.xyz'"):
+        solution.save(tmp_path / "solution.xyz")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unwritable_place_is_one_error(solution, tmp_path):
+    with pytest.raises(pgo.PGOError, match="cannot write"):
+        solution.save(tmp_path / "no" / "folder" / "solution.json")
+
+
+def test_the_uncertified_solution_of_an_impossible_graph_saves_too(tmp_path):
+    from pgo_models.scenes import NoiseModel
+
+    graph = pgo.random_geometric(12, np.random.default_rng(5), noise=NoiseModel(1.0, 2.5))
+    solution = solvers.solve(graph)
+    assert not solution.is_certified
+    solution.save(tmp_path / "solution.json")
+    record = json.loads((tmp_path / "solution.json").read_text())
+    assert record["verdict"] in ("NOT_CERTIFIED", "TRIVIAL")
+    assert record["lower_bound"] <= record["objective"]
