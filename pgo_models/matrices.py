@@ -5,6 +5,8 @@ Unknowns are stacked in X, (N, d) with N = (d+1) n: first the n rows t_i, then t
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.sparse import csc_array, csr_array
 
@@ -116,6 +118,19 @@ def marginalized_matrix(graph: PoseGraph) -> Array:
 def rotation_columns(pose: IntArray, first: int, d: int) -> IntArray:
     """Columns (m, d) that the rows of R_i^T have in X when rotations begin at `first`."""
     return np.asarray(first + d * pose[:, None] + np.arange(d))
+
+
+def inner(A: Array, B: Array) -> float:
+    """Frobenius inner product sum_ab A_ab B_ab of two arrays of one shape.
+
+    einsum, not BLAS: a sum of this size is over before a pool of threads has woken up to share it.
+    """
+    return float(np.einsum("r,r->", A.ravel(), B.ravel()))
+
+
+def norm(A: Array) -> float:
+    """Frobenius norm, by `inner`."""
+    return math.sqrt(inner(A, A))
 
 
 def assemble(blocks: list[tuple[IntArray, IntArray, Array]], side: int) -> csc_array:

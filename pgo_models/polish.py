@@ -14,6 +14,7 @@ from scipy.sparse import csc_array
 from pgo_models.cholesky import CholeskyFactor, SymbolicCholesky, analyze
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.hessian import TangentLayout, riemannian_hessian
+from pgo_models.matrices import inner
 from pgo_models.multipliers import multipliers
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
@@ -163,14 +164,14 @@ def _direction(problem: PGOProblem, layout: TangentLayout, state: PolishState) -
     assert state.factor is not None
     gradient = layout.join(*problem.riemannian_gradient(state.poses))
     direction = -state.factor.solve(gradient)
-    return gradient, direction, float(-0.5 * (gradient @ direction)) / max(1.0, state.objective)
+    return gradient, direction, -0.5 * inner(gradient, direction) / max(1.0, state.objective)
 
 
 def _backtrack(
     problem: PGOProblem, layout: TangentLayout, state: PolishState, gradient: Array, direction: Array
 ) -> PolishState | None:
     """First of the moves direction, direction/2, .. that lowers F enough; None when none does."""
-    slope = float(gradient @ direction)
+    slope = inner(gradient, direction)
     w, v = layout.split(direction)
     length = 1.0
     for _ in range(_HALVINGS):

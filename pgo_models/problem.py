@@ -132,7 +132,7 @@ class PGOProblem:
         """F = tr(X^T M X) as a weighted sum of squared residuals, which does not cancel; X need not be feasible."""
         residuals = self.residuals(X)
         _, w = self.residual_matrix
-        return float(w @ np.einsum("rc,rc->r", residuals, residuals))
+        return float(np.einsum("r,rc,rc->", w, residuals, residuals))
 
     def objective(self, poses: Poses) -> float:
         """F at poses (paper: `min overall`, weighted)."""

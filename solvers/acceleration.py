@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pgo_models.errors import SettingError
+from pgo_models.matrices import inner, norm
 from pgo_models.rotations import Array
 
 
@@ -65,10 +66,10 @@ def extrapolate(
     residual, image : (rows, d)
         `residual` may carry weights; `image` not.
     """
-    norm = float(np.linalg.norm(residual))
-    if norm > settings.restart_ratio * memory.smallest:
+    size = norm(residual)
+    if size > settings.restart_ratio * memory.smallest:
         memory = AndersonMemory()
-    smallest = min(memory.smallest, norm)
+    smallest = min(memory.smallest, size)
     if memory.residual is None or memory.image is None:
         return image, AndersonMemory(residual=residual, image=image, smallest=smallest)
     keep = settings.memory - 1
@@ -77,11 +78,11 @@ def extrapolate(
     newest = residual - memory.residual
     gram = np.empty((len(older) + 1, len(older) + 1))
     gram[:-1, :-1] = memory.gram[len(memory.gram) - len(older) :, len(memory.gram) - len(older) :]
-    gram[-1, :] = [np.vdot(newest, other) for other in (*older, newest)]
+    gram[-1, :] = [inner(newest, other) for other in (*older, newest)]
     gram[:, -1] = gram[-1]
     residuals = (*older, newest)
     images = (*older_images, image - memory.image)
-    right_hand_side = np.array([np.vdot(other, residual) for other in residuals])
+    right_hand_side = np.array([inner(other, residual) for other in residuals])
     damped = gram + settings.regularization * np.trace(gram) * np.eye(len(gram))
     gamma = np.linalg.lstsq(damped, right_hand_side, rcond=None)[0]
     following = image.copy()

@@ -16,6 +16,7 @@ import numpy as np
 
 from pgo_models.errors import SettingError
 from pgo_models.initialization import chordal_start, spanning_tree_start
+from pgo_models.matrices import norm
 from pgo_models.multipliers import multipliers
 from pgo_models.partition import Partition
 from pgo_models.poses import Poses
@@ -185,7 +186,7 @@ class SOC:
         x = team.solve_all(z - B)  # (a)
         relaxed = over_relax(x, z, self.alpha)
         s, memory = relaxed + B, state.memory
-        merit = float(np.linalg.norm(weight * (relaxed - z)))
+        merit = norm(weight * (relaxed - z))
         if self.acceleration is not None and np.isfinite(merit):
             s, memory = extrapolate(self.acceleration, memory, weight * (relaxed - z), s)
         if not np.isfinite(s).all():
@@ -200,8 +201,8 @@ class SOC:
             z=following,
             s=s,
             memory=memory,
-            primal_residual=float(np.linalg.norm(weight * (x - following))) / size,
-            dual_residual=float(np.linalg.norm(weight * (following - z))) / size,
+            primal_residual=norm(weight * (x - following)) / size,
+            dual_residual=norm(weight * (following - z)) / size,
             merits=(*state.merits, merit),
             best=state.s if merit <= min(state.merits, default=np.inf) else state.best,
         )

@@ -15,7 +15,7 @@ from scipy.sparse import csc_array, csr_array, vstack
 
 from pgo_models.cholesky import SymbolicCholesky, analyze
 from pgo_models.errors import SettingError
-from pgo_models.matrices import assemble, residual_matrix, rotation_columns
+from pgo_models.matrices import assemble, norm, residual_matrix, rotation_columns
 from pgo_models.partition import Partition, PartitionMethod, partition
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
@@ -114,7 +114,7 @@ def step_paper(problem: PGOProblem, state: PaperState, rule: PenaltyRule, back_e
     omega = project_to_rotations(R + state.B)  # (b)
     B = state.B + R - omega  # (c)
     root = np.sqrt(R.shape[0] * R.shape[1])
-    primal, change = float(np.linalg.norm(omega - R)) / root, float(np.linalg.norm(omega - state.omega)) / root
+    primal, change = norm(omega - R) / root, norm(omega - state.omega) / root
     merit = float(np.hypot(primal, change))
     smaller = merit < state.smallest_merit
     following = replace(
@@ -162,8 +162,8 @@ def measure_paper(problem: PGOProblem, state: PaperState) -> Measurement:
     if np.isnan(state.dual_residual):
         return Measurement(np.nan, np.nan, np.nan)
     omega, d = state.omega, state.omega.shape[1]
-    orthogonality = np.linalg.norm(np.swapaxes(omega, 1, 2) @ omega - np.eye(d))
-    p_res = float(np.hypot(orthogonality, np.linalg.norm(omega - state.R))) / np.sqrt(len(omega))
+    orthogonality = norm(np.swapaxes(omega, 1, 2) @ omega - np.eye(d))
+    p_res = float(np.hypot(orthogonality, norm(omega - state.R))) / np.sqrt(len(omega))
     X = np.concatenate([problem.recover_translations(omega), stack_transposes(omega)])
     return Measurement(problem.objective_stacked(X), p_res, state.dual_residual)
 
