@@ -160,12 +160,24 @@ class _SuperLU(SymbolicCholesky):
 
 
 class _CholmodFactor(CholeskyFactor):
-    def __init__(self, numeric: _Capsule) -> None:
-        self._numeric = numeric
+    """CVXOPT factors in place, symbolic part included: a factor out of use hands it back for the next one."""
+
+    def __init__(self, numeric: _Capsule, analysis: _Cholmod) -> None:
+        self._numeric: _Capsule | None = numeric
+        self._analysis = analysis
+
+    def __del__(self) -> None:
+        self.hand_back()
+
+    def hand_back(self) -> None:
+        if self._numeric is not None:
+            self._analysis.spare, self._numeric = self._numeric, None
 
     def solve(self, right_hand_side: Array) -> Array:
         cvxopt, cholmod = _import_cvxopt()
         solution = cvxopt.matrix(np.asfortranarray(right_hand_side, dtype=float))
+        if self._numeric is None:
+            raise ValueError("this factor was overwritten by a later one")
         cholmod.solve(self._numeric, solution)
         return np.array(solution).reshape(right_hand_side.shape)
 
@@ -182,7 +194,7 @@ class _Cholmod(SymbolicCholesky):
         self._matrix = cvxopt.spmatrix(
             1.0, cvxopt.matrix(rows), cvxopt.matrix(columns[self._lower].astype(np.int64)), pattern.shape
         )
-        self._symbolic: _Capsule | None = self._analyze()  # taken by the first factor
+        self.spare: _Capsule | None = self._analyze()
 
     def _analyze(self) -> _Capsule:
         _, cholmod = _import_cvxopt()
@@ -194,21 +206,19 @@ class _Cholmod(SymbolicCholesky):
         cvxopt, cholmod = _import_cvxopt()
         self._matrix.V = cvxopt.matrix(matrix.data[self._lower])
         if isinstance(overwrite, _CholmodFactor):
-            numeric = overwrite._numeric
-        elif self._symbolic is not None:
-            numeric, self._symbolic = self._symbolic, None
-        else:
-            numeric = self._analyze()
+            overwrite.hand_back()
+        numeric = self.spare if self.spare is not None else self._analyze()
+        self.spare = None
         saved = cholmod.options.get("supernodal", 2)
         cholmod.options["supernodal"] = 2  # L L^T, which exists for positive definite matrices only
         try:
             cholmod.numeric(self._matrix, numeric)
         except ArithmeticError as error:
-            self._symbolic = numeric  # a failed factorisation leaves the analysis intact
+            self.spare = numeric  # a failed factorisation leaves the symbolic part intact
             raise NotPositiveDefiniteError("the matrix has a pivot that is not positive") from error
         finally:
             cholmod.options["supernodal"] = saved
-        return _CholmodFactor(numeric)
+        return _CholmodFactor(numeric, self)
 
 
 def _import_cvxopt() -> tuple[ModuleType, ModuleType]:

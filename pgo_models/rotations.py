@@ -96,6 +96,12 @@ def _polar(X: Array, cofactors: Array, determinant: Array) -> tuple[Array, BoolA
     return X, change < _POLAR_TOLERANCE
 
 
+def _determinants(X: Array) -> Array:
+    if X.shape[-1] == 2:
+        return np.asarray(X[..., 0, 0] * X[..., 1, 1] - X[..., 0, 1] * X[..., 1, 0])
+    return np.asarray(np.einsum("nb,nb->n", X[:, 0], np.cross(X[:, 1], X[:, 2])))
+
+
 def _cofactors(X: Array) -> Array:
     """Cofactor matrices of (n, 3, 3): the rows are cross products of the other two rows."""
     C = np.empty_like(X)
@@ -166,7 +172,7 @@ def orthogonality_error(R: Array) -> Array:
     """max(||R_i^T R_i - I||_F, 1 - det R_i) of every (n, d, d) matrix; nan or inf stay what they are."""
     with np.errstate(invalid="ignore", over="ignore"):
         error = np.linalg.norm(np.swapaxes(R, -1, -2) @ R - np.eye(R.shape[-1]), axis=(-2, -1))
-        return np.asarray(np.maximum(error, 1.0 - np.linalg.det(R)))
+        return np.asarray(np.maximum(error, 1.0 - _determinants(R)))
 
 
 def stack_transposes(R: Array) -> Array:
