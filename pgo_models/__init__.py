@@ -36,20 +36,60 @@ from pgo_models.scenes import NoiseModel, circle, grid, random_geometric, sphere
 from pgo_models.trajectories import read_kitti, read_tum, write_kitti, write_tum
 
 if TYPE_CHECKING:
+    from pgo_models.bregman_examples import (
+        basis_pursuit,
+        shared_rotation_step,
+        total_variation_denoising,
+        total_variation_scale_space,
+    )
+    from pgo_models.bregman_models import BregmanPoint, BregmanProblem
+    from pgo_models.orthogonal import KKTResiduals, OrthogonalPoint, OrthogonalProblem, kkt_residuals
+    from pgo_models.orthogonal_examples import (
+        one_norm_components,
+        procrustes,
+        rotation_averaging,
+        smallest_eigenvectors,
+        sparse_components,
+        sparse_low_rank,
+    )
     from pgo_models.rotation_qp import RotationQP, rotation_qp
 
 # cvxpy takes half of the time of an import: its models are loaded when one of their names is first used.
-_CVXPY_MODELS = {"RotationQP": "pgo_models.rotation_qp", "rotation_qp": "pgo_models.rotation_qp"}
+_CVXPY_MODELS = {
+    "basis_pursuit": "pgo_models.bregman_examples",
+    "shared_rotation_step": "pgo_models.bregman_examples",
+    "total_variation_denoising": "pgo_models.bregman_examples",
+    "total_variation_scale_space": "pgo_models.bregman_examples",
+    "BregmanPoint": "pgo_models.bregman_models",
+    "BregmanProblem": "pgo_models.bregman_models",
+    "KKTResiduals": "pgo_models.orthogonal",
+    "OrthogonalPoint": "pgo_models.orthogonal",
+    "OrthogonalProblem": "pgo_models.orthogonal",
+    "kkt_residuals": "pgo_models.orthogonal",
+    "one_norm_components": "pgo_models.orthogonal_examples",
+    "procrustes": "pgo_models.orthogonal_examples",
+    "rotation_averaging": "pgo_models.orthogonal_examples",
+    "smallest_eigenvectors": "pgo_models.orthogonal_examples",
+    "sparse_components": "pgo_models.orthogonal_examples",
+    "sparse_low_rank": "pgo_models.orthogonal_examples",
+    "RotationQP": "pgo_models.rotation_qp",
+    "rotation_qp": "pgo_models.rotation_qp",
+}
 
 __all__ = [
+    "BregmanPoint",
+    "BregmanProblem",
     "Certificate",
     "CholeskyBackend",
     "DatasetError",
     "FileFormatError",
     "GraphError",
+    "KKTResiduals",
     "MissingExtraError",
     "NoiseModel",
     "NotPositiveDefiniteError",
+    "OrthogonalPoint",
+    "OrthogonalProblem",
     "PGOError",
     "PGOProblem",
     "Partition",
@@ -60,6 +100,7 @@ __all__ = [
     "SettingError",
     "Verdict",
     "absolute_trajectory_error",
+    "basis_pursuit",
     "certificate_matrix",
     "certify",
     "chordal_start",
@@ -73,14 +114,17 @@ __all__ = [
     "grid",
     "grid_world",
     "joint_matrix",
+    "kkt_residuals",
     "known_datasets",
     "load",
     "log_map",
     "marginalized_matrix",
     "multipliers",
     "odometry_start",
+    "one_norm_components",
     "partition",
     "polish",
+    "procrustes",
     "project_to_rotations",
     "prove_bound",
     "random_geometric",
@@ -90,9 +134,16 @@ __all__ = [
     "read_tum",
     "relative_pose_error",
     "residual_matrix",
+    "rotation_averaging",
     "rotation_qp",
+    "shared_rotation_step",
+    "smallest_eigenvectors",
     "spanning_tree_start",
+    "sparse_components",
+    "sparse_low_rank",
     "sphere",
+    "total_variation_denoising",
+    "total_variation_scale_space",
     "write_g2o",
     "write_kitti",
     "write_tum",

@@ -1,25 +1,53 @@
 """Methods on the problems of `pgo_models`: every one is settings with init, step, measure and converged."""
 
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
 from solvers.acceleration import Anderson
-from solvers.loop import Solver, iterate, run
+from solvers.loop import Method, Solver, iterate, run, run_method
 from solvers.newton import Newton, gauss_newton
 from solvers.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty
 from solvers.pipeline import Pipeline, solve
-from solvers.result import History, Measurement, Record, Run, Status
+from solvers.result import History, Measurement, Outcome, Record, Run, Status
 from solvers.rotation_step import RStep
 from solvers.soc import SOC, Coupling
 from solvers.solution import Solution, Stage
 
+if TYPE_CHECKING:
+    from solvers.bregman import AlternatingBregman, Bregman, MethodOfMultipliers, TwoLineBregman, feasibility_bound
+    from solvers.orthogonal_soc import OrthogonalSOC, OrthogonalSolution, solve_orthogonal
+
+# These import cvxpy, which takes half of the time of an import: loaded when one of their names is first used.
+_CVXPY_METHODS = {
+    "AlternatingBregman": "solvers.bregman",
+    "Bregman": "solvers.bregman",
+    "MethodOfMultipliers": "solvers.bregman",
+    "TwoLineBregman": "solvers.bregman",
+    "feasibility_bound": "solvers.bregman",
+    "OrthogonalSOC": "solvers.orthogonal_soc",
+    "OrthogonalSolution": "solvers.orthogonal_soc",
+    "solve_orthogonal": "solvers.orthogonal_soc",
+}
+
 __all__ = [
     "SOC",
+    "AlternatingBregman",
     "Anderson",
     "BalancedPenalty",
+    "Bregman",
     "Coupling",
     "FixedPenalty",
     "History",
     "Measurement",
+    "Method",
+    "MethodOfMultipliers",
     "MultiplierPenalty",
     "Newton",
+    "OrthogonalSOC",
+    "OrthogonalSolution",
+    "Outcome",
     "Pipeline",
     "RStep",
     "Record",
@@ -28,8 +56,19 @@ __all__ = [
     "Solver",
     "Stage",
     "Status",
+    "TwoLineBregman",
+    "feasibility_bound",
     "gauss_newton",
     "iterate",
     "run",
+    "run_method",
     "solve",
+    "solve_orthogonal",
 ]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _CVXPY_METHODS:
+        raise AttributeError(f"module 'solvers' has no attribute {name!r}")
+    value: object = getattr(importlib.import_module(_CVXPY_METHODS[name]), name)
+    return value

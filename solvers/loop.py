@@ -10,41 +10,50 @@ from typing import Protocol, TypeVar
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
-from solvers.result import History, Measurement, Record, Run, Status
+from solvers.result import History, Measurement, Outcome, Record, Run, Status
 from solvers.table import Table
 
+P = TypeVar("P", contravariant=True)
+X = TypeVar("X", contravariant=True)
 S = TypeVar("S")
 
 
-class Solver(Protocol[S]):
-    """What an iterative method provides: settings, and these functions of them."""
+class Method(Protocol[P, X, S]):
+    """What the loop needs of an iterative method: settings, and these functions of them.
+
+    P is the kind of problem, X what a run can be started from, S the method's state.
+    """
 
     @property
     def max_iterations(self) -> int:
         """Most steps of a run."""
 
-    def init(self, problem: PGOProblem, start: Poses | None) -> S:
+    def init(self, problem: P, start: X | None) -> S:
         """State 0, at `start` or at the method's own start."""
 
-    def step(self, problem: PGOProblem, state: S) -> S:
+    def step(self, problem: P, state: S) -> S:
         """Return the next state; `state` stays as it is."""
 
-    def measure(self, problem: PGOProblem, state: S) -> Measurement:
+    def measure(self, problem: P, state: S) -> Measurement:
         """Figures of a state."""
-
-    def poses(self, problem: PGOProblem, state: S) -> Poses:
-        """Feasible poses of a state, those whose F `measure` reports."""
 
     def converged(self, state: S, measurement: Measurement) -> Status | None:
         """CONVERGED or STALLED when the run is done, else None."""
 
 
-def iterate(solver: Solver[S], problem: PGOProblem, start: Poses | None = None) -> Iterator[S]:
+class Solver(Method[PGOProblem, Poses, S], Protocol[S]):
+    """A method for pose graphs: every state stands for feasible poses."""
+
+    def poses(self, problem: PGOProblem, state: S) -> Poses:
+        """Feasible poses of a state, those whose F `measure` reports."""
+
+
+def iterate(method: Method[P, X, S], problem: P, start: X | None = None) -> Iterator[S]:
     """Yield state 0, state 1, .. without end; take what you need with itertools.islice."""
-    state = solver.init(problem, start)
+    state = method.init(problem, start)
     while True:
         yield state
-        state = solver.step(problem, state)
+        state = method.step(problem, state)
 
 
 def run(
@@ -57,7 +66,7 @@ def run(
     verbose: bool = False,
     progress: bool = False,
 ) -> Run[S]:
-    """Run a solver to its end.
+    """Run a solver on a pose graph to its end: `run_method`, and the poses.
 
     Parameters
     ----------
@@ -82,30 +91,64 @@ def run(
     SettingError
         When time_limit is not positive.
     """
+    began = time.perf_counter()
+    outcome = run_method(
+        solver, problem, start, callback=callback, time_limit=time_limit, verbose=verbose, progress=progress
+    )
+    poses = solver.poses(problem, outcome.state)
+    return Run(
+        name=outcome.name,
+        objective=problem.objective(poses),
+        state=outcome.state,
+        status=outcome.status,
+        iterations=outcome.iterations,
+        history=outcome.history,
+        seconds=time.perf_counter() - began,
+        poses=poses,
+    )
+
+
+def run_method(
+    method: Method[P, X, S],
+    problem: P,
+    start: X | None = None,
+    *,
+    callback: Callable[[S, Record], bool | None] | None = None,
+    time_limit: float = math.inf,
+    verbose: bool = False,
+    progress: bool = False,
+) -> Outcome[S]:
+    """Run a method on a problem of its kind to its end; parameters and errors as for `run`.
+
+    Returns
+    -------
+    Outcome
+        Its state is the last iterate after success, else the best one: least infeasibility, then least objective.
+    """
     if not time_limit > 0:
         raise SettingError(f"time_limit is {time_limit}; give positive seconds")
-    name = type(solver).__name__
+    name = type(method).__name__
     began = time.perf_counter()
-    state = solver.init(problem, start)
+    state = method.init(problem, start)
     in_steps = time.perf_counter() - began
-    best: tuple[float, S] | None = None
+    best: tuple[Measurement, S] | None = None
     records: list[Record] = []
     k = 0
-    with Table(name, solver.max_iterations, verbose, progress) as table:
+    with Table(name, method.max_iterations, verbose, progress) as table:
         try:
             while True:
-                measurement = solver.measure(problem, state)
+                measurement = method.measure(problem, state)
                 record = Record(k, in_steps, measurement)
                 records.append(record)
-                if math.isfinite(measurement.objective) and (best is None or measurement.objective < best[0]):
-                    best = (measurement.objective, state)
+                if math.isfinite(measurement.objective) and (best is None or _is_better(measurement, best[0])):
+                    best = (measurement, state)
                 elapsed = time.perf_counter() - began
                 table.row(record, elapsed)
-                status = _ending(solver, state, record, elapsed > time_limit, callback)
+                status = _ending(method, state, record, elapsed > time_limit, callback)
                 if status is not None:
                     break
                 before = time.perf_counter()
-                state = solver.step(problem, state)
+                state = method.step(problem, state)
                 in_steps += time.perf_counter() - before
                 k += 1
         except KeyboardInterrupt:
@@ -116,13 +159,12 @@ def run(
                 raise
             status = Status.NOT_FINITE
         table.end(status, k)
+    objective = records[-1].measurement.objective if records else math.nan
     if best is not None and not status.is_success:
-        state = best[1]
-    poses = solver.poses(problem, state)
-    return Run(
+        objective, state = best[0].objective, best[1]
+    return Outcome(
         name=name,
-        poses=poses,
-        objective=problem.objective(poses),
+        objective=objective,
         state=state,
         status=status,
         iterations=k,
@@ -131,8 +173,12 @@ def run(
     )
 
 
+def _is_better(one: Measurement, other: Measurement) -> bool:
+    return (one.infeasibility, one.objective) < (other.infeasibility, other.objective)
+
+
 def _ending(
-    solver: Solver[S],
+    method: Method[P, X, S],
     state: S,
     record: Record,
     out_of_time: bool,
@@ -143,9 +189,9 @@ def _ending(
         return Status.STOPPED
     if math.isnan(record.measurement.objective) or math.isinf(record.measurement.objective):
         return Status.NOT_FINITE
-    status = solver.converged(state, record.measurement)
+    status = method.converged(state, record.measurement)
     if status is not None:
         return status
     if out_of_time:
         return Status.TIME_LIMIT
-    return Status.MAX_ITERATIONS if record.k >= solver.max_iterations else None
+    return Status.MAX_ITERATIONS if record.k >= method.max_iterations else None

@@ -1,4 +1,4 @@
-"""What happened in a run: Status, one Record per iterate, History, and Run."""
+"""What happened in a run: Status, one Record per iterate, History, Outcome and Run."""
 
 from __future__ import annotations
 
@@ -43,11 +43,15 @@ class Measurement:
         Distance from feasibility, relative; 0 for methods whose iterates are feasible.
     dual_residual : float
         Distance from stationarity, relative; each solver's docstring says which.
+    infeasibility : float
+        Distance of the point whose objective this is from the constraints; 0 where that point is feasible, as poses
+        are. The best iterate of a run has the least infeasibility, and among those the least objective.
     """
 
     objective: float
     primal_residual: float
     dual_residual: float
+    infeasibility: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -94,20 +98,18 @@ class History:
         return np.array([record.measurement.dual_residual for record in self.records])
 
 
-@dataclass(frozen=True, eq=False)
-class Run(Generic[S]):
-    """A finished run of one solver.
+@dataclass(frozen=True, eq=False, repr=False)
+class Outcome(Generic[S]):
+    """A finished run of one method, on a problem of any kind.
 
     Attributes
     ----------
     name : str
-        Of the solver.
-    poses : Poses
-        Of the last iterate, or of the best one (lowest F) when the run did not succeed.
+        Of the method.
     objective : float
-        F of `poses`.
+        Of `state`.
     state : S
-        The iterate `poses` belong to.
+        The last iterate, or the best one when the run did not succeed.
     status : Status
     iterations : int
         Finished steps.
@@ -117,7 +119,6 @@ class Run(Generic[S]):
     """
 
     name: str
-    poses: Poses
     objective: float
     state: S
     status: Status
@@ -127,6 +128,19 @@ class Run(Generic[S]):
 
     def __repr__(self) -> str:
         return (
-            f"Run({self.name}: {self.status.name} after {self.iterations} iterations, F = {self.objective:.10g}, "
-            f"{self.seconds:.3g} s)"
+            f"{type(self).__name__}({self.name}: {self.status.name} after {self.iterations} iterations, "
+            f"F = {self.objective:.10g}, {self.seconds:.3g} s)"
         )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Run(Outcome[S]):
+    """A finished run of one solver on a pose graph.
+
+    Attributes
+    ----------
+    poses : Poses
+        Of the last iterate, or of the best one (lowest F) when the run did not succeed; `objective` is F of them.
+    """
+
+    poses: Poses
