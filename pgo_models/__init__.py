@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from pgo_models.certificate import Certificate, Verdict, certify, prove_bound
 from pgo_models.cholesky import CholeskyBackend, default_backend
+from pgo_models.chordal import CliqueTree, clique_tree
 from pgo_models.datasets import known_datasets, load
 from pgo_models.errors import (
     DatasetError,
@@ -26,12 +27,14 @@ from pgo_models.initialization import chordal_start, gps_imu_start, odometry_sta
 from pgo_models.matrices import connection_laplacian, joint_matrix, marginalized_matrix, residual_matrix
 from pgo_models.multipliers import certificate_matrix, multipliers
 from pgo_models.partition import Partition, PartitionMethod, partition
-from pgo_models.plots import compare_poses, draw_graph
+from pgo_models.plots import compare_poses, draw_graph, plot_decay, plot_tightness
 from pgo_models.polish import polish
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses, absolute_trajectory_error, relative_pose_error
 from pgo_models.problem import PGOProblem
+from pgo_models.relaxation_plan import RelaxationForm, RelaxationPlan, SDPSolver, plan_relaxation
 from pgo_models.rotations import exp_map, log_map, project_to_rotations, random_rotations
+from pgo_models.rounding import RankReport, round_gram
 from pgo_models.scenes import NoiseModel, circle, grid, random_geometric, sphere
 from pgo_models.trajectories import read_kitti, read_tum, write_kitti, write_tum
 
@@ -43,6 +46,8 @@ if TYPE_CHECKING:
         total_variation_scale_space,
     )
     from pgo_models.bregman_models import BregmanPoint, BregmanProblem
+    from pgo_models.clique_relaxation import CliqueRelaxation, clique_relaxation
+    from pgo_models.graph_qp import Change, GraphQP, Neighbours, PoseVariables, Unknowns, graph_qp, robot_qp
     from pgo_models.orthogonal import KKTResiduals, OrthogonalPoint, OrthogonalProblem, kkt_residuals
     from pgo_models.orthogonal_examples import (
         one_norm_components,
@@ -52,10 +57,28 @@ if TYPE_CHECKING:
         sparse_components,
         sparse_low_rank,
     )
+    from pgo_models.relaxations import DualRelaxation, PrimalRelaxation, dual_relaxation, primal_relaxation
     from pgo_models.rotation_qp import RotationQP, rotation_qp
+    from pgo_models.semidefinite import RelaxationSolution, RelaxationStatus, solve_relaxation
 
 # cvxpy takes half of the time of an import: its models are loaded when one of their names is first used.
 _CVXPY_MODELS = {
+    "Change": "pgo_models.graph_qp",
+    "GraphQP": "pgo_models.graph_qp",
+    "Neighbours": "pgo_models.graph_qp",
+    "PoseVariables": "pgo_models.graph_qp",
+    "Unknowns": "pgo_models.graph_qp",
+    "graph_qp": "pgo_models.graph_qp",
+    "robot_qp": "pgo_models.graph_qp",
+    "CliqueRelaxation": "pgo_models.clique_relaxation",
+    "clique_relaxation": "pgo_models.clique_relaxation",
+    "DualRelaxation": "pgo_models.relaxations",
+    "PrimalRelaxation": "pgo_models.relaxations",
+    "dual_relaxation": "pgo_models.relaxations",
+    "primal_relaxation": "pgo_models.relaxations",
+    "RelaxationSolution": "pgo_models.semidefinite",
+    "RelaxationStatus": "pgo_models.semidefinite",
+    "solve_relaxation": "pgo_models.semidefinite",
     "basis_pursuit": "pgo_models.bregman_examples",
     "shared_rotation_step": "pgo_models.bregman_examples",
     "total_variation_denoising": "pgo_models.bregman_examples",
@@ -80,12 +103,18 @@ __all__ = [
     "BregmanPoint",
     "BregmanProblem",
     "Certificate",
+    "Change",
     "CholeskyBackend",
+    "CliqueRelaxation",
+    "CliqueTree",
     "DatasetError",
+    "DualRelaxation",
     "FileFormatError",
     "GraphError",
+    "GraphQP",
     "KKTResiduals",
     "MissingExtraError",
+    "Neighbours",
     "NoiseModel",
     "NotPositiveDefiniteError",
     "OrthogonalPoint",
@@ -95,9 +124,18 @@ __all__ = [
     "Partition",
     "PartitionMethod",
     "PoseGraph",
+    "PoseVariables",
     "Poses",
+    "PrimalRelaxation",
+    "RankReport",
+    "RelaxationForm",
+    "RelaxationPlan",
+    "RelaxationSolution",
+    "RelaxationStatus",
     "RotationQP",
+    "SDPSolver",
     "SettingError",
+    "Unknowns",
     "Verdict",
     "absolute_trajectory_error",
     "basis_pursuit",
@@ -105,12 +143,16 @@ __all__ = [
     "certify",
     "chordal_start",
     "circle",
+    "clique_relaxation",
+    "clique_tree",
     "compare_poses",
     "connection_laplacian",
     "default_backend",
     "draw_graph",
+    "dual_relaxation",
     "exp_map",
     "gps_imu_start",
+    "graph_qp",
     "grid",
     "grid_world",
     "joint_matrix",
@@ -123,7 +165,11 @@ __all__ = [
     "odometry_start",
     "one_norm_components",
     "partition",
+    "plan_relaxation",
+    "plot_decay",
+    "plot_tightness",
     "polish",
+    "primal_relaxation",
     "procrustes",
     "project_to_rotations",
     "prove_bound",
@@ -134,10 +180,13 @@ __all__ = [
     "read_tum",
     "relative_pose_error",
     "residual_matrix",
+    "robot_qp",
     "rotation_averaging",
     "rotation_qp",
+    "round_gram",
     "shared_rotation_step",
     "smallest_eigenvectors",
+    "solve_relaxation",
     "spanning_tree_start",
     "sparse_components",
     "sparse_low_rank",

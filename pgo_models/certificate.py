@@ -189,7 +189,7 @@ def certify_stationary(problem: PGOProblem, poses: Poses, gap: float, stationari
     # With the best translations, the trace of the multipliers is F to rounding.
     Lambda = multipliers(problem, problem.with_best_translations(poses.R))
     objective = problem.objective(poses)
-    eta, lower_bound = _smallest_provable(problem, Lambda, gap, objective)
+    eta, lower_bound = smallest_provable(problem, Lambda, gap, objective)
     unjudged = Certificate(
         objective=objective,
         lower_bound=lower_bound,
@@ -222,7 +222,7 @@ def _bound_is_tight(certificate: Certificate) -> bool:
     return (best - certificate.lower_bound) / max(1.0, best) <= certificate.wanted_gap
 
 
-def _smallest_provable(problem: PGOProblem, Lambda: Array, gap: float, objective: float) -> tuple[float, float]:
+def smallest_provable(problem: PGOProblem, Lambda: Array, gap: float, objective: float) -> tuple[float, float]:
     """Smallest eta found, from what the wanted gap allows upwards, and its bound; (nan, 0) when only F >= 0 is left."""
     count = problem.num_poses * problem.d
     floor = _ROUNDING_FLOOR * float(problem.M.data[problem.diagonal_positions].max())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ from pgo_models.errors import GraphError, MissingExtraError
 from pgo_models.files import replace_when_done
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
+from pgo_models.rotations import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -78,6 +80,67 @@ def compare_poses(graph: PoseGraph, panels: list[tuple[str, Poses]]) -> Figure:
         axes = figure.add_subplot(1, len(panels), place, projection="3d" if graph.d == 3 else None)
         draw_graph(graph, poses, axes)
         axes.set_title(title, fontsize=10)
+    return figure
+
+
+def plot_tightness(curves: list[tuple[str, Array, Array]]) -> Figure:
+    """Figure of how many graphs are certified at which rotation noise.
+
+    Parameters
+    ----------
+    curves : list of (label, rotation_std, fraction)
+        Noise in radians, (levels,), and the certified share there, (levels,), in [0, 1].
+
+    Raises
+    ------
+    MissingExtraError
+        Without matplotlib.
+    """
+    figure = _single_panel()
+    (axes,) = figure.axes
+    for (label, rotation_std, fraction), colour, marker in zip(
+        curves, cycle(_ROBOT_COLOURS), cycle("osD^v"), strict=False
+    ):
+        axes.plot(np.rad2deg(rotation_std), 100.0 * fraction, color=colour, marker=marker, label=label)
+    axes.set_xlabel("rotation noise, standard deviation (degrees)")
+    axes.set_ylabel("graphs certified (%)")
+    axes.set_ylim(-5, 105)
+    axes.legend()
+    return figure
+
+
+def plot_decay(curves: list[tuple[str, Array]], quantity: str) -> Figure:
+    """Figure of positive quantities over the iterations, on a logarithmic axis.
+
+    Parameters
+    ----------
+    curves : list of (label, values)
+        Values from iterate 0 on.
+    quantity : str
+        What they are, with the unit, for the axis.
+
+    Raises
+    ------
+    MissingExtraError
+        Without matplotlib.
+    """
+    figure = _single_panel()
+    (axes,) = figure.axes
+    for (label, values), colour, marker in zip(curves, cycle(_ROBOT_COLOURS), cycle("osD^v"), strict=False):
+        axes.semilogy(np.arange(len(values)), values, color=colour, marker=marker, markersize=4, label=label)
+    axes.set_xlabel("iteration")
+    axes.set_ylabel(quantity)
+    figure.legend(loc="outside upper center")
+    return figure
+
+
+def _single_panel() -> Figure:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtraError("matplotlib", "plot") from error
+    figure = Figure(figsize=(1.4 * _PANEL_INCHES, _PANEL_INCHES), layout="constrained")
+    figure.add_subplot()
     return figure
 
 

@@ -8,24 +8,31 @@ from typing import TYPE_CHECKING
 from solvers.acceleration import Anderson
 from solvers.loop import Method, Solver, iterate, run, run_method
 from solvers.newton import Newton, gauss_newton
+from solvers.noise_sweep import NoiseSweep, SweptScene, noise_sweep, noisy_scene
 from solvers.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty
 from solvers.pipeline import Pipeline, solve
 from solvers.result import History, Measurement, Outcome, Record, Run, Status
-from solvers.rotation_step import RStep
+from solvers.rotation_step import CustomRStep, RStep
 from solvers.soc import SOC, Coupling
 from solvers.solution import Solution, Stage
 
 if TYPE_CHECKING:
     from solvers.bregman import AlternatingBregman, Bregman, MethodOfMultipliers, TwoLineBregman, feasibility_bound
+    from solvers.changed_soc import ChangedSOC, ChangedStep
+    from solvers.error_forgetting import ErrorForgetting, error_forgetting
     from solvers.orthogonal_soc import OrthogonalSOC, OrthogonalSolution, solve_orthogonal
 
 # These import cvxpy, which takes half of the time of an import: loaded when one of their names is first used.
 _CVXPY_METHODS = {
+    "ChangedSOC": "solvers.changed_soc",
+    "ChangedStep": "solvers.changed_soc",
     "AlternatingBregman": "solvers.bregman",
     "Bregman": "solvers.bregman",
     "MethodOfMultipliers": "solvers.bregman",
     "TwoLineBregman": "solvers.bregman",
     "feasibility_bound": "solvers.bregman",
+    "ErrorForgetting": "solvers.error_forgetting",
+    "error_forgetting": "solvers.error_forgetting",
     "OrthogonalSOC": "solvers.orthogonal_soc",
     "OrthogonalSolution": "solvers.orthogonal_soc",
     "solve_orthogonal": "solvers.orthogonal_soc",
@@ -37,7 +44,11 @@ __all__ = [
     "Anderson",
     "BalancedPenalty",
     "Bregman",
+    "ChangedSOC",
+    "ChangedStep",
     "Coupling",
+    "CustomRStep",
+    "ErrorForgetting",
     "FixedPenalty",
     "History",
     "Measurement",
@@ -45,6 +56,7 @@ __all__ = [
     "MethodOfMultipliers",
     "MultiplierPenalty",
     "Newton",
+    "NoiseSweep",
     "OrthogonalSOC",
     "OrthogonalSolution",
     "Outcome",
@@ -56,10 +68,14 @@ __all__ = [
     "Solver",
     "Stage",
     "Status",
+    "SweptScene",
     "TwoLineBregman",
+    "error_forgetting",
     "feasibility_bound",
     "gauss_newton",
     "iterate",
+    "noise_sweep",
+    "noisy_scene",
     "run",
     "run_method",
     "solve",

@@ -85,8 +85,20 @@ class RotationStep(Protocol):
         """X, (N, d), for the shift V, (N, d)."""
 
 
-def prepare(subproblem: Subproblem, back_end: RStep) -> RotationStep:
+class CustomRStep(Protocol):
+    """A back end of one's own, in place of an RStep."""
+
+    def prepare(self, subproblem: Subproblem) -> RotationStep:
+        """Make the subproblem, or a changed one with the same rows, ready for many shifts."""
+
+
+BackEnd = RStep | CustomRStep
+
+
+def prepare(subproblem: Subproblem, back_end: BackEnd) -> RotationStep:
     """Factor, bound or compile the subproblem once, for many shifts."""
+    if not isinstance(back_end, RStep):
+        return back_end.prepare(subproblem)
     if back_end is RStep.FACTORIZED:
         return _Factorized(subproblem.analysis.factorize(subproblem.K), 0.5 * subproblem.penalty[:, None])
     if back_end is RStep.FISTA:

@@ -25,11 +25,13 @@ from pgo_models.rotations import Array, project_to_rotations, stack_transposes, 
 from solvers.acceleration import Anderson, AndersonMemory, extrapolate, over_relax
 from solvers.penalty import BalancedPenalty, MultiplierPenalty, PenaltyRule, rotation_scale, translation_scale
 from solvers.result import Measurement, Status
-from solvers.rotation_step import RStep
+from solvers.rotation_step import BackEnd, RStep
 from solvers.soc_paper import PaperState, init_paper, measure_paper, step_paper
 from solvers.team import Team, build_team
 
 _DIVERGED = 10.0  # times the smallest merit: go back and double the penalty
+_PATIENCE = 20  # steps without a new smallest merit: likewise, unless rho is `_ENOUGH` times m_i in the median
+_ENOUGH = 4.0  # 4 ||Lambda_i|| is, and at an optimum that can be certified ||Lambda_i|| is about m_i at most
 _MAX_RAISES = 20
 
 
@@ -64,7 +66,8 @@ class SOCState:
         Robots with their prepared subproblems.
     memory : AndersonMemory
     primal_residual, dual_residual : float
-        ||x - z||_rho and ||z - z_before||_rho, both over ||omega||_rho.
+        ||x - z||_rho and ||c (z - z_before)||_rho, both over ||omega||_rho, with c = max(1, rho / diagonal of M): a
+        penalty far above M makes short steps anywhere.
     merits : tuple of float
         Fixed-point residual ||x - z_before||_rho of the steps since rho last changed.
     best : (rows, d)
@@ -110,7 +113,7 @@ class SOC:
         Over-relaxation, in (0, 2). PAPER has none.
     acceleration : Anderson, optional
         None is the plain recursion. PAPER has none.
-    r_step : RStep
+    r_step : RStep or CustomRStep
         Back end of step (a).
     translation_penalty : float
         Penalty of separator translations in CONSENSUS, times their diagonal in M.
@@ -133,7 +136,7 @@ class SOC:
     penalty: PenaltyRule | None = None
     alpha: float = 1.0
     acceleration: Anderson | None = field(default_factory=Anderson)
-    r_step: RStep = RStep.FACTORIZED
+    r_step: BackEnd = RStep.FACTORIZED
     translation_penalty: float = 0.05
     separator_penalty: float = 0.3
     tolerance: float = 1e-5
@@ -202,7 +205,7 @@ class SOC:
             s=s,
             memory=memory,
             primal_residual=norm(weight * (x - following)) / size,
-            dual_residual=norm(weight * (following - z)) / size,
+            dual_residual=norm(_stationarity_weight(team) * (following - z)) / size,
             merits=(*state.merits, merit),
             best=state.s if merit <= min(state.merits, default=np.inf) else state.best,
         )
@@ -242,12 +245,11 @@ class SOC:
 
     def _with_penalty_due(self, problem: PGOProblem, state: SOCState) -> SOCState:
         """State with the penalty that the rule, or the safeguard, wants from now on; mostly the state itself."""
-        merits = state.merits
-        if len(merits) > 1 and merits[-1] > _DIVERGED * min(merits) and state.raises < _MAX_RAISES:
+        if self._is_penalty_too_small(problem, state) and state.raises < _MAX_RAISES:
             assert state.best is not None
             back = replace(state, s=state.best, z=_agree(state.team, state.best, problem)[1])
             return replace(self._rescaled(problem, back, 2.0), raises=state.raises + 1)
-        rule = self._rule
+        rule, merits = self._rule, state.merits
         if isinstance(rule, MultiplierPenalty):
             window = rule.stall_window
             stalled = len(merits) >= window and merits[-1] > rule.stall_ratio * merits[-window]
@@ -258,6 +260,16 @@ class SOC:
             if factor != 1.0 and (factor > 1.0 or state.raises == 0):
                 return replace(self._rescaled(problem, state, factor), refreshes=state.refreshes + 1)
         return state
+
+    def _is_penalty_too_small(self, problem: PGOProblem, state: SOCState) -> bool:
+        """Whether the merit has grown far, or, the iterates going round in a cycle, has long not been smaller."""
+        merits = state.merits
+        if len(merits) < 2:
+            return False
+        if merits[-1] > _DIVERGED * min(merits):
+            return True
+        steps_since_smallest = len(merits) - 1 - merits.index(min(merits))
+        return steps_since_smallest >= _PATIENCE and bool(np.median(state.rho / rotation_scale(problem)) < _ENOUGH)
 
     def _rescaled(self, problem: PGOProblem, state: SOCState, factor: float) -> SOCState:
         """State with factor * rho and the same unscaled multiplier rho B."""
@@ -321,3 +333,11 @@ def _norm_weight(team: Team) -> Array:
     """Square roots of the penalties: ||v||_rho is the norm of weight * v."""
     assert team.penalty is not None
     return np.sqrt(team.penalty)[:, None]
+
+
+def _stationarity_weight(team: Team) -> Array:
+    """Root of the penalty, times penalty over the diagonal of M where it is above that."""
+    assert team.penalty is not None
+    problem = team.problem
+    diagonal = problem.M.data[problem.diagonal_positions][team.row] / team.copies[team.row]
+    return np.asarray(_norm_weight(team) * np.maximum(1.0, team.penalty / diagonal)[:, None])

@@ -22,7 +22,7 @@ from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
 from solvers.penalty import BalancedPenalty, MultiplierPenalty, PenaltyRule
 from solvers.result import Measurement
-from solvers.rotation_step import RotationStep, RStep, Subproblem, prepare
+from solvers.rotation_step import BackEnd, RotationStep, Subproblem, prepare
 
 _PATIENCE = 20  # steps without a new smallest merit, after which rho goes up
 
@@ -83,11 +83,12 @@ class PaperState:
 
 
 def init_paper(
-    problem: PGOProblem, start: Poses, robots: Partition | None, rule: PenaltyRule, back_end: RStep
+    problem: PGOProblem, start: Poses, robots: Partition | None, rule: PenaltyRule, back_end: BackEnd
 ) -> PaperState:
     """State 0: R = omega = start, B = 0."""
     if isinstance(rule, MultiplierPenalty):
         raise SettingError("the paper has one rho for all poses; give a FixedPenalty or a BalancedPenalty")
+    problem.stacked(start)  # raises unless the poses fit
     if robots is None:
         robots = partition(problem.graph, method=PartitionMethod.SINGLETONS)
     blocks = _split(problem, robots)
@@ -104,7 +105,7 @@ def init_paper(
     )
 
 
-def step_paper(problem: PGOProblem, state: PaperState, rule: PenaltyRule, back_end: RStep) -> PaperState:
+def step_paper(problem: PGOProblem, state: PaperState, rule: PenaltyRule, back_end: BackEnd) -> PaperState:
     """Steps (a), (b), (c), then the adaptive rho with B rescaled."""
     neighbours = state.blocks.between @ stack_transposes(state.R)
     shift = stack_transposes(state.omega - state.B) - (2.0 / state.rho) * neighbours
@@ -131,7 +132,7 @@ def step_paper(problem: PGOProblem, state: PaperState, rule: PenaltyRule, back_e
 
 
 def _with_adapted_rho(
-    problem: PGOProblem, state: PaperState, rule: PenaltyRule, primal: float, change: float, back_end: RStep
+    problem: PGOProblem, state: PaperState, rule: PenaltyRule, primal: float, change: float, back_end: BackEnd
 ) -> PaperState:
     """State with the rho for the next step, B rescaled: balanced, and up again for good when the merit stays up."""
     if not isinstance(rule, BalancedPenalty):
@@ -168,7 +169,7 @@ def measure_paper(problem: PGOProblem, state: PaperState) -> Measurement:
     return Measurement(problem.objective_stacked(X), p_res, state.dual_residual)
 
 
-def _prepare(problem: PGOProblem, blocks: Blocks, rho: float, back_end: RStep) -> RotationStep:
+def _prepare(problem: PGOProblem, blocks: Blocks, rho: float, back_end: BackEnd) -> RotationStep:
     penalty = np.full(blocks.own.shape[0], rho)
     return prepare(
         Subproblem(

@@ -17,7 +17,7 @@ from pgo_models.partition import Partition
 from pgo_models.pose_graph import IntArray, PoseGraph
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array
-from solvers.rotation_step import RotationStep, RStep, Subproblem, prepare
+from solvers.rotation_step import BackEnd, RotationStep, Subproblem, prepare
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class Team:
     """
 
     problem: PGOProblem
-    back_end: RStep
+    back_end: BackEnd
     robots: tuple[Robot, ...]
     row: IntArray
     copies: IntArray
@@ -129,7 +129,7 @@ class Team:
         return gradient
 
 
-def build_team(problem: PGOProblem, partition: Partition | None, back_end: RStep) -> Team:
+def build_team(problem: PGOProblem, partition: Partition | None, back_end: BackEnd) -> Team:
     """Split a problem among robots; None is one robot that holds it all."""
     if partition is None or partition.num_robots == 1:
         robots: tuple[Robot, ...] = (_whole(problem),)

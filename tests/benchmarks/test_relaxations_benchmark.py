@@ -1,0 +1,37 @@
+"""The semidefinite relaxation from posing to proof, on one thread, with a certified gap to the solution of SOC."""
+
+import numpy as np
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from pgo_models.g2o import read_g2o
+from pgo_models.problem import PGOProblem
+from pgo_models.scenes import circle, grid, sphere
+from pgo_models.semidefinite import DEFAULT_RELAXATION_GAP, RelaxationSolution, solve_relaxation
+from solvers.pipeline import solve
+
+SCENES = {"grid": (grid, 3.0), "circle": (circle, 3.0), "sphere": (sphere, 10.0)}  # seconds
+
+
+def check(benchmark: BenchmarkFixture, problem: PGOProblem, seconds: float, rounds: int) -> RelaxationSolution:
+    solved = solve(problem)
+    solution = benchmark.pedantic(solve_relaxation, (problem,), rounds=rounds, warmup_rounds=rounds > 1)
+    assert solution.gap_to(solved.poses) <= DEFAULT_RELAXATION_GAP
+    assert benchmark.stats.stats.median < seconds
+    return solution
+
+
+@pytest.mark.parametrize("name", list(SCENES))
+def test_a_scene(benchmark: BenchmarkFixture, name: str) -> None:
+    scene, seconds = SCENES[name]
+    check(benchmark, PGOProblem(scene(np.random.default_rng(0))), seconds, rounds=3)
+
+
+def test_tinyGrid3D(benchmark: BenchmarkFixture, benchmark_data) -> None:
+    check(benchmark, PGOProblem(read_g2o(benchmark_data / "tinyGrid3D.g2o")), 0.2, rounds=5)
+
+
+@pytest.mark.parametrize(("first", "last"), [(2300, 3450), (0, 2000)])
+def test_a_long_trajectory_with_few_loops(benchmark: BenchmarkFixture, benchmark_data, first: int, last: int) -> None:
+    graph = read_g2o(benchmark_data / "kitti_00.g2o").subgraph(np.arange(first, last))
+    check(benchmark, PGOProblem(graph), 60.0, rounds=1)
