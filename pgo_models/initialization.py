@@ -6,7 +6,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order
 
-from pgo_models.errors import GraphError
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.pose_graph import IntArray, PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
@@ -56,9 +56,13 @@ def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
     ------
     GraphError
         When the graph is not connected.
+    SettingError
+        When root is no pose.
     """
     graph.check_connected()
     n = graph.num_poses
+    if not 0 <= root < n:
+        raise SettingError(f"root is {root}; give a pose, 0 to {n - 1}")
     # The stored number of an adjacency entry is 1 + the first edge between the two poses.
     pair = np.minimum(graph.i, graph.j) * n + np.maximum(graph.i, graph.j)
     first = np.unique(pair, return_index=True)[1]

@@ -47,7 +47,15 @@ class Partition:
         return np.bincount(self.robot, minlength=self.num_robots)
 
     def cut_edges(self, graph: PoseGraph) -> BoolArray:
-        """Whether an edge joins two robots, (m,)."""
+        """Whether an edge joins two robots, (m,).
+
+        Raises
+        ------
+        SettingError
+            When the partition is of another number of poses.
+        """
+        if len(self.robot) != graph.num_poses:
+            raise SettingError(f"{self!r} of {len(self.robot)} poses beside {graph!r}; give one robot for every pose")
         return np.asarray(self.robot[graph.i] != self.robot[graph.j])
 
     def separators(self, graph: PoseGraph) -> IntArray:

@@ -37,6 +37,8 @@ class Anderson:
     def __post_init__(self) -> None:
         if self.memory < 1:
             raise SettingError(f"memory must be at least 1, got {self.memory}")
+        if not self.regularization >= 0:
+            raise SettingError(f"regularization must not be negative, got {self.regularization}")
         if not self.restart_ratio > 1:
             raise SettingError(f"restart_ratio must be above 1, got {self.restart_ratio}")
 

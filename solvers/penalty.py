@@ -12,6 +12,8 @@ from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array
 
+_SMALLEST_RATIO = 1e-6  # of ||Lambda_i|| to m_i; M + D/2 keeps ten digits
+
 
 @dataclass(frozen=True)
 class MultiplierPenalty:
@@ -46,19 +48,22 @@ class MultiplierPenalty:
                 "stall_window must be at least 1 and stall_ratio in (0, 1), "
                 f"got {self.stall_window} and {self.stall_ratio}"
             )
+        if self.max_refreshes < 0:
+            raise SettingError(f"max_refreshes must not be negative, got {self.max_refreshes}")
 
     def initial(self, problem: PGOProblem, poses: Poses) -> Array:
         """rho, (n,), at poses."""
         norms = np.abs(np.linalg.eigvalsh(multipliers(problem, poses))).max(axis=1)
         scale = rotation_scale(problem)
-        # Where every multiplier is zero (measurements without noise) any penalty works.
-        floor = float(np.quantile(norms / scale, self.quantile)) or 1.0
+        # Where the multipliers are zero but for rounding (measurements without noise) any penalty works that M + D/2
+        # does not lose to rounding.
+        floor = max(float(np.quantile(norms / scale, self.quantile)), _SMALLEST_RATIO)
         return np.asarray(self.factor * np.maximum(norms, floor * scale))
 
 
 @dataclass(frozen=True)
 class FixedPenalty:
-    """rho_i = rho for all poses and iterations."""
+    """rho_i = rho for all poses, unless the safeguard of `solvers.soc` raises it."""
 
     rho: float
 

@@ -28,7 +28,7 @@ class Table:
 
     def __enter__(self) -> Table:
         if self._verbose:
-            self._console.print(f"{self._name}\n{_HEADER}", markup=False)
+            self._console.print(f"{self._name}\n{_HEADER}", markup=False, soft_wrap=True)
         return self
 
     def row(self, record: Record, elapsed: float) -> None:
@@ -39,6 +39,7 @@ class Table:
                 f"{record.k:>6}  {figures.objective:>18.10g}  {_figure(figures.primal_residual)}  "
                 f"{_figure(figures.dual_residual)}  {record.seconds:>9.3f}",
                 markup=False,
+                soft_wrap=True,
             )
         elif self._progress:
             if self._bar is None and elapsed > _BAR_AFTER_SECONDS:
@@ -52,7 +53,9 @@ class Table:
     def end(self, status: Status, iterations: int) -> None:
         """Show how the run ended."""
         if self._verbose:
-            self._console.print(f"{status.name} after {iterations} iterations: {status.value}", markup=False)
+            self._console.print(
+                f"{status.name} after {iterations} iterations: {status.value}", markup=False, soft_wrap=True
+            )
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

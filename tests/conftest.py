@@ -1,9 +1,21 @@
 """Fixtures that several test files share."""
 
 import os
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+from pgo_models.g2o import read_g2o
+from pgo_models.initialization import chordal_start
+from pgo_models.polish import polish
+from pgo_models.poses import Poses
+from pgo_models.problem import PGOProblem
+
+settings.register_profile("untimed", settings(), deadline=None)  # speed is measured in benchmarks
+settings.load_profile("untimed")
 
 
 @pytest.fixture(scope="session")
@@ -13,3 +25,15 @@ def benchmark_data() -> Path:
     if not folder:
         pytest.skip("PGO_DATA is unset; it names the folder with the public benchmark graphs")
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def benchmark_problem(benchmark_data: Path) -> Callable[[str], PGOProblem]:
+    """Problem of a public benchmark graph, read once."""
+    return cache(lambda name: PGOProblem(read_g2o(benchmark_data / f"{name}.g2o")))
+
+
+@pytest.fixture(scope="session")
+def benchmark_optimum(benchmark_problem: Callable[[str], PGOProblem]) -> Callable[[str], Poses]:
+    """Stationary poses that the chordal start of a benchmark graph polishes to, found once."""
+    return cache(lambda name: polish(benchmark_problem(name), chordal_start(benchmark_problem(name))))

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from hypothesis import strategies as st
 
+from pgo_models.initialization import chordal_start
+from pgo_models.polish import polish
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
@@ -82,3 +84,17 @@ def median_slope(
     """Median over moves (w, v) of the order in h of error(w, v, h), for h from 10^first to 10^last."""
     h = np.logspace(*exponents, 5)
     return float(np.median([np.polyfit(np.log(h), np.log([error(w, v, x) for x in h]), 1)[0] for w, v in moves]))
+
+
+def best_known(problem: PGOProblem, seed: int = 0) -> float:
+    """An upper bound on the global optimum: the best of what several starts polish to."""
+    n, d = problem.num_poses, problem.d
+    starts = [chordal_start(problem), *(random_poses(n, d, seed + k) for k in range(3))]
+    if problem.graph.truth is not None:
+        starts.append(problem.graph.truth)
+    return min(problem.objective(polish(problem, start)) for start in starts)
+
+
+def rounding_of_bound(problem: PGOProblem) -> float:
+    """What tr(Lambda) - eta n d may be off when a factorisation is as exact as double precision."""
+    return 10 * EPS * problem.side * float(problem.M.diagonal().max())

@@ -1,0 +1,286 @@
+"""What every solver promises, whatever its method."""
+
+import copy
+import dataclasses
+import enum
+from collections.abc import Callable
+from itertools import islice, pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, SEEDS, random_poses, varied_graph, varied_problem
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse import issparse
+
+from pgo_models.cholesky import CholeskyBackend
+from pgo_models.errors import GraphError, SettingError
+from pgo_models.partition import PartitionMethod, partition
+from pgo_models.poses import Poses
+from pgo_models.problem import PGOProblem
+from pgo_models.rotations import orthogonality_error
+from pgo_models.scenes import grid
+from solvers.loop import Solver, iterate, run
+from solvers.newton import Newton, gauss_newton
+from solvers.penalty import BalancedPenalty
+from solvers.result import Record, Status
+from solvers.soc import SOC, Coupling
+
+Make = Callable[..., Any]
+
+
+def three_robots(problem: PGOProblem, **changes: Any) -> SOC:
+    return SOC(robots=partition(problem.graph, min(3, problem.num_poses)), **changes)
+
+
+def singletons(problem: PGOProblem, **changes: Any) -> SOC:
+    return SOC(robots=partition(problem.graph, method=PartitionMethod.SINGLETONS), **changes)
+
+
+SOLVERS: dict[str, Make] = {
+    "soc_joint": lambda problem, **changes: SOC(**changes),
+    "soc_joint_plain": lambda problem, **changes: SOC(acceleration=None, alpha=1.5, **changes),
+    "soc_joint_balanced": lambda problem, **changes: SOC(penalty=BalancedPenalty(), **changes),
+    "soc_consensus": three_robots,
+    "soc_consensus_singletons": singletons,
+    "soc_paper": lambda problem, **changes: SOC(coupling=Coupling.PAPER, **changes),
+    "soc_paper_one_robot": lambda problem, **changes: SOC(
+        coupling=Coupling.PAPER, robots=partition(problem.graph, 1), **changes
+    ),
+    "newton": lambda problem, **changes: Newton(**changes),
+    "gauss_newton": lambda problem, **changes: dataclasses.replace(gauss_newton(), **changes),
+}
+EVERY = pytest.mark.parametrize("make", SOLVERS.values(), ids=SOLVERS)
+SIZES = st.integers(3, 10)
+
+
+def snapshot(value: Any) -> Any:
+    """Deep copy of all arrays and numbers that a state holds; what is opaque stays as it is."""
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if issparse(value):
+        return value.copy()
+    if isinstance(value, PGOProblem | enum.Enum):
+        return value
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: snapshot(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, tuple | list):
+        return [snapshot(item) for item in value]
+    return value
+
+
+def assert_same(one: Any, other: Any, where: str = "state") -> None:
+    """Bit for bit."""
+    assert type(one) is type(other), where
+    if isinstance(one, np.ndarray):
+        np.testing.assert_array_equal(one, other, err_msg=where)
+    elif issparse(one):
+        np.testing.assert_array_equal(one.toarray(), other.toarray(), err_msg=where)
+    elif isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for name in one:
+            assert_same(one[name], other[name], f"{where}.{name}")
+    elif isinstance(one, list):
+        assert len(one) == len(other), where
+        for index, (a, b) in enumerate(zip(one, other, strict=True)):
+            assert_same(a, b, f"{where}[{index}]")
+    else:
+        assert one is other or one == other or (one != one and other != other), where
+
+
+@EVERY
+@settings(max_examples=20)
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_a_step_leaves_its_state_alone(make: Make, seed: int, n: int, d: int) -> None:
+    problem = varied_problem(seed, n, d)
+    solver: Solver[Any] = make(problem)
+    state = solver.init(problem, random_poses(n, d, seed))
+    for _ in range(10):
+        before = snapshot(state)
+        following = solver.step(problem, state)
+        solver.measure(problem, state)
+        solver.poses(problem, state)
+        assert_same(snapshot(state), before)
+        assert following.k == state.k + 1
+        state = following
+
+
+@EVERY
+@settings(max_examples=10)
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, backend=st.sampled_from(CholeskyBackend))
+def test_a_list_of_states_is_a_film(make: Make, seed: int, n: int, d: int, backend: CholeskyBackend) -> None:
+    # Stepping again from an old state gives the frame that followed it, whatever was done meanwhile.
+    problem = PGOProblem(varied_graph(seed, n, d), backend)
+    solver: Solver[Any] = make(problem)
+    film = list(islice(iterate(solver, problem, random_poses(n, d, seed)), 8))
+    for state, following in pairwise(film):
+        again = solver.step(problem, state)
+        np.testing.assert_array_equal(solver.poses(problem, again).R, solver.poses(problem, following).R)
+        one, other = solver.measure(problem, again), solver.measure(problem, following)
+        assert one == other or np.isnan(one.objective)
+
+
+@EVERY
+@settings(max_examples=10)
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_a_start_is_left_alone_and_is_state_zero(make: Make, seed: int, n: int, d: int) -> None:
+    problem, start = varied_problem(seed, n, d), random_poses(n, d, seed)
+    kept = copy.deepcopy(start)
+    solver: Solver[Any] = make(problem, max_iterations=5)
+    np.testing.assert_array_equal(solver.poses(problem, solver.init(problem, start)).R, start.R)
+    result = run(solver, problem, start)
+    np.testing.assert_array_equal(start.R, kept.R)
+    np.testing.assert_array_equal(start.t, kept.t)
+    assert result.history.k[0] == 0
+
+
+@EVERY
+@settings(max_examples=10)
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_every_state_stands_for_feasible_poses_whose_F_is_measured(make: Make, seed: int, n: int, d: int) -> None:
+    problem = varied_problem(seed, n, d)
+    solver: Solver[Any] = make(problem)
+    for k, state in enumerate(islice(iterate(solver, problem, random_poses(n, d, seed)), 6)):
+        assert state.k == k
+        poses = solver.poses(problem, state)
+        assert orthogonality_error(poses.R).max() <= 1e-12
+        assert solver.measure(problem, state).objective == pytest.approx(problem.objective(poses), rel=1e-14)
+
+
+@EVERY
+def test_a_converged_state_stays(make: Make) -> None:
+    problem = PGOProblem(grid(np.random.default_rng(0)))
+    solver = tight(make, problem)
+    result = run(solver, problem)
+    assert result.status is Status.CONVERGED
+    state = result.state
+    for _ in range(5):
+        state = solver.step(problem, state)
+        poses = solver.poses(problem, state)
+        np.testing.assert_allclose(poses.R, result.poses.R, rtol=0, atol=1e-6)
+        assert problem.objective(poses) == pytest.approx(result.objective, rel=1e-6)
+
+
+@EVERY
+def test_a_warm_start_at_the_solution_ends_there(make: Make) -> None:
+    problem = PGOProblem(grid(np.random.default_rng(0)))
+    solver = tight(make, problem)
+    solution = run(solver, problem)
+    again = run(solver, problem, solution.poses)
+    assert again.status is Status.CONVERGED
+    assert again.objective == pytest.approx(solution.objective, rel=1e-6)
+    np.testing.assert_allclose(again.poses.with_gauge_at(0).R, solution.poses.with_gauge_at(0).R, rtol=0, atol=1e-4)
+
+
+def tight(make: Make, problem: PGOProblem) -> Solver[Any]:
+    """A solver that leaves about 1e-7 in the rotations: residuals are steps, the decrement of Newton a squared one."""
+    solver = make(problem)
+    tolerance = 1e-13 if isinstance(solver, Newton) else 1e-8
+    return dataclasses.replace(solver, tolerance=tolerance, max_iterations=5000)
+
+
+@EVERY
+def test_the_same_seed_gives_the_same_bits(make: Make) -> None:
+    results = []
+    for _ in range(2):
+        problem = PGOProblem(grid(np.random.default_rng(7)))
+        results.append(run(make(problem, max_iterations=30), problem))
+    one, other = results
+    assert (one.status, one.iterations) == (other.status, other.iterations)
+    np.testing.assert_array_equal(one.poses.R, other.poses.R)
+    np.testing.assert_array_equal(one.poses.t, other.poses.t)
+    for column in ("objective", "primal_residual", "dual_residual"):
+        np.testing.assert_array_equal(getattr(one.history, column), getattr(other.history, column))
+
+
+# Limits are reported.
+
+
+@pytest.fixture
+def problem() -> PGOProblem:
+    """Far enough from its start for a dozen steps of any method."""
+    return PGOProblem(grid(np.random.default_rng(1)))
+
+
+@pytest.fixture
+def start(problem: PGOProblem) -> Poses:
+    return random_poses(problem.num_poses, problem.d, 0)
+
+
+def assert_best(result: Any) -> None:
+    assert not result.status.is_success
+    finite = result.history.objective[np.isfinite(result.history.objective)]
+    assert result.objective == pytest.approx(finite.min(), rel=1e-14)
+
+
+@EVERY
+@pytest.mark.parametrize("limit", [0, 1, 3])
+def test_max_iterations_is_reported(make: Make, limit: int, problem: PGOProblem, start: Poses) -> None:
+    result = run(make(problem, max_iterations=limit), problem, start)
+    assert (result.status, result.iterations, len(result.history)) == (Status.MAX_ITERATIONS, limit, limit + 1)
+    assert_best(result)
+
+
+@EVERY
+def test_the_time_limit_is_reported(make: Make, problem: PGOProblem, start: Poses) -> None:
+    result = run(make(problem), problem, start, time_limit=1e-9)
+    assert (result.status, result.iterations) == (Status.TIME_LIMIT, 0)
+    assert_best(result)
+
+
+@EVERY
+def test_a_stop_by_the_callback_is_reported(make: Make, problem: PGOProblem, start: Poses) -> None:
+    result = run(make(problem), problem, start, callback=lambda state, record: state.k == 2)
+    assert (result.status, result.iterations) == (Status.STOPPED, 2)
+    assert_best(result)
+
+
+@EVERY
+def test_control_c_in_a_callback_is_reported(make: Make, problem: PGOProblem, start: Poses) -> None:
+    def interrupt(state: Any, record: Record) -> None:
+        if state.k == 2:
+            raise KeyboardInterrupt
+
+    result = run(make(problem), problem, start, callback=interrupt)
+    assert (result.status, result.iterations, len(result.history)) == (Status.INTERRUPTED, 2, 3)
+    assert_best(result)
+
+
+@EVERY
+def test_control_c_in_a_step_is_reported(
+    make: Make, problem: PGOProblem, start: Poses, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solver = make(problem)
+    step = type(solver).step
+
+    def interrupted(self: Any, problem: PGOProblem, state: Any) -> Any:
+        if state.k == 2:
+            raise KeyboardInterrupt
+        return step(self, problem, state)
+
+    monkeypatch.setattr(type(solver), "step", interrupted)
+    result = run(solver, problem, start)
+    assert (result.status, result.iterations, len(result.history)) == (Status.INTERRUPTED, 2, 3)
+    assert_best(result)
+
+
+# Settings.
+
+
+@EVERY
+def test_settings_are_frozen_and_checked(make: Make, problem: PGOProblem) -> None:
+    solver = make(problem)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        solver.tolerance = 1.0
+    for changes in ({"max_iterations": -1}, {"tolerance": 0.0}, {"tolerance": -1.0}, {"tolerance": float("nan")}):
+        with pytest.raises(SettingError):
+            make(problem, **changes)
+    assert dataclasses.replace(solver, max_iterations=3).max_iterations == 3
+
+
+@EVERY
+@pytest.mark.parametrize("poses", [Poses.identity(26, 3), Poses.identity(27, 2)])
+def test_a_start_of_another_size_is_refused(make: Make, poses: Poses, problem: PGOProblem) -> None:
+    with pytest.raises(GraphError, match="give one pose for every pose of the graph"):
+        run(make(problem), problem, poses)
