@@ -55,7 +55,7 @@ def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) 
     Returns
     -------
     csc_array, (side, side), symmetric; its pattern depends on the graph alone. A rigid motion of all poses is in its
-    null space at stationary points: ground a pose before factoring (`ground_pose`).
+    null space at stationary points: ground a pose before factoring, as `pgo_models.polish` does.
     """
     graph, d = problem.graph, problem.d
     layout = TangentLayout(problem.num_poses, d)

@@ -107,7 +107,11 @@ def polish(problem: PGOProblem, poses: Poses, max_steps: int = 100) -> Poses:
 
 
 def relative_decrement(problem: PGOProblem, poses: Poses) -> float:
-    """Half the squared Newton decrement of F at poses, over max(1, F); 0 at stationary points, inf at saddles."""
+    """Half the squared Newton decrement of F at poses, over max(1, F).
+
+    Where the Hessian is not positive definite, as at saddles, it is that of the damped Gauss-Newton matrix, and above
+    `STATIONARY_DECREMENT` in any case.
+    """
     state = start_polish(problem, poses)
     analysis, factor, is_newton = _factorize_model(problem, state, second_order=True)
     now = replace(state, analysis=analysis, factor=factor, is_newton=is_newton)

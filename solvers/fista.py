@@ -38,7 +38,7 @@ def fista(
 
     Returns
     -------
-    x, the best reached within `max_iterations`.
+    x, the last iterate where `max_iterations` are not enough.
 
     Raises
     ------
