@@ -171,7 +171,8 @@ def certify(problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP) -> Cert
         certificate = judge(problem, poses, replace(polished, source=BoundSource.POLISHED))
     if not _bound_is_tight(certificate):
         other = certify_stationary(problem, polish(problem, chordal_start(problem)), gap, stationarity)
-        if other.lower_bound > certificate.lower_bound:
+        # Of equal bounds, as two zeros, the one with the better poses.
+        if (other.lower_bound, -other.poses_objective) > (certificate.lower_bound, -certificate.poses_objective):
             certificate = judge(problem, poses, replace(other, source=BoundSource.CHORDAL))
     return certificate
 
