@@ -71,12 +71,12 @@ class SymbolicCholesky(ABC):
         """
 
     def _check(self, matrix: csc_array) -> None:
-        same = self._indices is matrix.indices and self._indptr is matrix.indptr
-        if not same and not (
+        same = (
             matrix.shape == self._shape
             and np.array_equal(matrix.indptr, self._indptr)
             and np.array_equal(matrix.indices, self._indices)
-        ):
+        )
+        if not same:
             raise ValueError("the matrix has another sparsity pattern than the one that was analysed")
         if not np.isfinite(matrix.data).all():
             raise NotPositiveDefiniteError("the matrix has nan or inf; check the weights and measurements")

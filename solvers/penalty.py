@@ -78,25 +78,22 @@ class FixedPenalty:
 
 @dataclass(frozen=True)
 class BalancedPenalty:
-    """rho that keeps primal and dual residual within a factor of each other (Boyd et al. 2011, section 3.4.1).
+    """rho that balances the primal and the dual residual (Boyd et al. 2011, section 3.4.1).
 
-    It starts at `scale` times m_i, the mean diagonal of M over the rotation rows of the pose. When one residual exceeds
-    `imbalance` times the other, rho is due to move towards it; it moves, and the matrices are factored again, once the
-    balance asks for a change by `refactor_ratio` or more (the rule of OSQP, Stellato et al. 2020, section 5.2). B is
-    rescaled with it. A rise of the merit puts rho up again (the safeguard of `solvers.soc`).
+    It starts at `scale` times m_i, the mean diagonal of M over the rotation rows of the pose. The balance asks for rho
+    times sqrt(primal / dual); rho moves that way by `refactor_ratio`, and the matrices are factored again, once that is
+    asked for or more (the rule of OSQP, Stellato et al. 2020, section 5.2). B is rescaled with it. A rise of the merit
+    puts rho up again (the safeguard of `solvers.soc`).
     """
 
     scale: float = 0.3
-    imbalance: float = 10.0
     refactor_ratio: float = 5.0
 
     def __post_init__(self) -> None:
         if not self.scale > 0:
             raise SettingError(f"scale must be positive, got {self.scale}")
-        if not (self.imbalance > 1 and self.refactor_ratio > 1):
-            raise SettingError(
-                f"imbalance and refactor_ratio must be above 1, got {self.imbalance} and {self.refactor_ratio}"
-            )
+        if not self.refactor_ratio > 1:
+            raise SettingError(f"refactor_ratio must be above 1, got {self.refactor_ratio}")
 
     def initial(self, problem: PGOProblem, poses: Poses) -> Array:
         """rho, (n,)."""
@@ -104,14 +101,12 @@ class BalancedPenalty:
 
     def factor(self, primal_residual: float, dual_residual: float) -> float:
         """Factor by which rho moves now; 1 for not at all."""
-        if primal_residual > self.imbalance * dual_residual:
-            wanted = np.sqrt(primal_residual / max(dual_residual, np.finfo(float).tiny))
-        elif dual_residual > self.imbalance * primal_residual:
-            wanted = 1.0 / np.sqrt(dual_residual / max(primal_residual, np.finfo(float).tiny))
-        else:
-            return 1.0
-        moved = float(np.clip(wanted, 1.0 / self.refactor_ratio, self.refactor_ratio))
-        return moved if max(wanted, 1.0 / wanted) >= self.refactor_ratio else 1.0
+        worth_it = self.refactor_ratio**2
+        if primal_residual > 0 and primal_residual >= worth_it * dual_residual:
+            return self.refactor_ratio
+        if dual_residual > 0 and dual_residual >= worth_it * primal_residual:
+            return 1.0 / self.refactor_ratio
+        return 1.0
 
 
 PenaltyRule = MultiplierPenalty | FixedPenalty | BalancedPenalty
