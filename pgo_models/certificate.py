@@ -210,7 +210,7 @@ def certify_stationary(problem: PGOProblem, poses: Poses, gap: float, stationari
 def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
     """Hold other poses of the same problem against the bound of a certificate."""
     objective = problem.objective(poses)
-    gap = (objective - certificate.lower_bound) / max(1.0, objective)
+    gap = relative_gap(objective, certificate.lower_bound)
     if gap <= certificate.wanted_gap:
         verdict = Verdict.CERTIFIED
     else:
@@ -218,9 +218,13 @@ def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certif
     return replace(certificate, objective=objective, gap=gap, verdict=verdict)
 
 
+def relative_gap(objective: float, lower_bound: float) -> float:
+    """(objective - lower_bound) / max(1, objective)."""
+    return (objective - lower_bound) / max(1.0, objective)
+
+
 def _bound_is_tight(certificate: Certificate) -> bool:
-    best = certificate.poses_objective
-    return (best - certificate.lower_bound) / max(1.0, best) <= certificate.wanted_gap
+    return relative_gap(certificate.poses_objective, certificate.lower_bound) <= certificate.wanted_gap
 
 
 def smallest_provable(problem: PGOProblem, Lambda: Array, gap: float, objective: float) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import cvxpy as cp
 
-from pgo_models.certificate import Verdict, smallest_provable
+from pgo_models.certificate import Verdict, relative_gap, smallest_provable
 from pgo_models.clique_relaxation import CliqueRelaxation, clique_relaxation
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.poses import Poses
@@ -93,7 +93,7 @@ class RelaxationSolution:
     @property
     def gap(self) -> float:
         """(objective - lower_bound) / max(1, objective) of the rounded poses."""
-        return self._gap_of(self.objective)
+        return relative_gap(self.objective, self.lower_bound)
 
     @property
     def verdict(self) -> Verdict:
@@ -104,7 +104,7 @@ class RelaxationSolution:
 
     def gap_to(self, poses: Poses) -> float:
         """The same gap for anybody's poses of the graph."""
-        return self._gap_of(self.relaxation.problem.objective(poses))
+        return relative_gap(self.relaxation.problem.objective(poses), self.lower_bound)
 
     def __str__(self) -> str:
         lines = [
@@ -118,9 +118,6 @@ class RelaxationSolution:
             f"verdict      {self.verdict.name}: {self.verdict.value}",
         ]
         return "\n".join(lines)
-
-    def _gap_of(self, objective: float) -> float:
-        return (objective - self.lower_bound) / max(1.0, objective)
 
 
 def solve_relaxation(

@@ -88,22 +88,16 @@ def chosen_pipeline(
         return Pipeline(soc=None, gap=gap)
     if method is Method.JOINT and (robots or 1) > 1:
         raise SettingError(f"--method joint has one robot, got --robots {robots}; use consensus or paper")
-    if method is Method.PAPER:
-        settings = SOC(coupling=Coupling.PAPER, robots=_robots(problem, robots, split, None), r_step=RStep[r_step.name])
-    else:
-        shared = _robots(problem, robots, split, problem.graph.num_robots) if method is Method.CONSENSUS else None
-        settings = SOC(
-            coupling=Coupling[method.name],
-            robots=shared,
-            r_step=RStep[r_step.name],
-            tolerance=HANDOVER_TOLERANCE,
-        )
+    shared = None
+    if method is not Method.JOINT:
+        shared = _robots(problem, robots, split, problem.graph.num_robots if method is Method.CONSENSUS else None)
+    handover = SOC.tolerance if method is Method.PAPER else HANDOVER_TOLERANCE
     soc = SOC(
-        coupling=settings.coupling,
-        robots=settings.robots,
-        r_step=settings.r_step,
-        tolerance=settings.tolerance if tolerance is None else tolerance,
-        max_iterations=settings.max_iterations if max_iterations is None else max_iterations,
+        coupling=Coupling[method.name],
+        robots=shared,
+        r_step=RStep[r_step.name],
+        tolerance=handover if tolerance is None else tolerance,
+        max_iterations=SOC.max_iterations if max_iterations is None else max_iterations,
     )
     return Pipeline(soc=soc, newton=gauss_newton() if method is Method.PAPER else Newton(), gap=gap)
 

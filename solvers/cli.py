@@ -29,7 +29,7 @@ from pgo_models.problem import PGOProblem
 from pgo_models.trajectories import read_kitti, read_tum, write_tum
 from solvers.choices import BackEnd, Method, Scene, Split, Start, chosen_pipeline, chosen_scene, chosen_start
 from solvers.pipeline import solve
-from solvers.solution import finite_or_none, versions
+from solvers.solution import check_format, finite_or_none, versions
 
 DONE, BAD_INPUT, NOT_CONVERGED, NOT_CERTIFIED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -88,6 +88,8 @@ def solve_command(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print a line an iteration.")] = False,
 ) -> None:
     """Solve a pose graph: poses, their cost F, a proven lower bound on the global optimum, and the gap."""
+    for path in out or []:
+        check_format(path)  # before a long solve, not after it
     problem = PGOProblem(_load(graph, unit_weights))
     pipeline = chosen_pipeline(problem, method, robots, split, r_step, gap, max_iterations, tolerance)
     solution = solve(
@@ -124,12 +126,12 @@ def certify_command(
     unit_weights: UnitWeightsOption = False,
 ) -> None:
     """Judge anybody's poses: how far their cost can be above the global optimum."""
+    if out is not None and out.suffix.lower() != ".json":
+        raise SettingError(f"cannot write {out}: a certificate is written as .json")
     problem = PGOProblem(_load(graph, unit_weights))
     certificate = certify(problem, _estimate(problem.graph, estimate), gap)
     typer.echo(str(certificate))
     if out is not None:
-        if out.suffix.lower() != ".json":
-            raise SettingError(f"cannot write {out}: a certificate is written as .json")
         record = {
             "objective": certificate.objective,
             "lower_bound": certificate.lower_bound,

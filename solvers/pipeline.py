@@ -148,7 +148,7 @@ def _attempt(
         # A start that is better than SOC's best iterate is kept: CSAIL's chordal start is within 1e-4.
         poses = soc.poses if soc.objective <= problem.objective(poses) else poses
     decrement = math.inf
-    if not stages or stages[-1].status not in (Status.INTERRUPTED, Status.TIME_LIMIT):
+    if stages[-1].status not in (Status.INTERRUPTED, Status.TIME_LIMIT):
         newton = run(
             pipeline.newton, problem, poses, time_limit=_seconds_left(deadline), verbose=verbose, progress=progress
         )

@@ -169,8 +169,7 @@ class SOC:
         """State 0: omega = R = start, B = 0. JOINT and CONSENSUS start at the chordal relaxation, PAPER at a tree."""
         if self.effective_coupling is Coupling.PAPER:
             poses = start if start is not None else spanning_tree_start(problem.graph)
-            rule = self.penalty if self.penalty is not None else BalancedPenalty()
-            return init_paper(problem, poses, self.robots, rule, self.r_step)
+            return init_paper(problem, poses, self.robots, self._rule, self.r_step)
         poses = start if start is not None else chordal_start(problem)
         rho = self._initial_rho(problem, poses)
         team = build_team(problem, self.robots, self.r_step).with_penalty(rho, self._rho_t(problem))
@@ -181,8 +180,7 @@ class SOC:
     def step(self, problem: PGOProblem, state: SOCState | PaperState) -> SOCState | PaperState:
         """One iteration: (a), (b), (c)."""
         if isinstance(state, PaperState):
-            rule = self.penalty if self.penalty is not None else BalancedPenalty()
-            return step_paper(problem, state, rule, self.r_step)
+            return step_paper(problem, state, self._rule, self.r_step)
         state = self._with_penalty_due(problem, state)
         team, z, B = state.team, state.z, state.B
         weight = _norm_weight(team)
@@ -231,7 +229,9 @@ class SOC:
 
     @property
     def _rule(self) -> PenaltyRule:
-        return self.penalty if self.penalty is not None else MultiplierPenalty()
+        if self.penalty is not None:
+            return self.penalty
+        return BalancedPenalty() if self.effective_coupling is Coupling.PAPER else MultiplierPenalty()
 
     def _initial_rho(self, problem: PGOProblem, poses: Poses) -> Array:
         rho = self._rule.initial(problem, poses)

@@ -130,6 +130,7 @@ class Solution:
             When the file cannot be written.
         """
         path = Path(path)
+        check_format(path)
         suffix = path.suffix.lower()
         if suffix == ".g2o":
             write_g2o(self.problem.graph, path, self.poses)
@@ -142,13 +143,8 @@ class Solution:
         elif suffix == ".json":
             with replace_when_done(path) as temporary:
                 temporary.write_text(json.dumps(self.as_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        elif is_picture(path):
-            save_figure(self.plot(), path)
         else:
-            raise SettingError(
-                f"cannot write {path}: no format has suffix {suffix!r}; "
-                "use .g2o, .tum, .kitti, .json, .png, .svg or .pdf"
-            )
+            save_figure(self.plot(), path)
 
     def plot(self) -> Figure:
         """Figure of the graph as it came (its own estimate, else a spanning tree) and as solved.
@@ -212,6 +208,15 @@ class Solution:
             ("verdict", f"{certificate.verdict.name}: {certificate.verdict.value}"),
             ("seconds", f"{self.seconds:.3g}"),
         ]
+
+
+def check_format(path: Path) -> None:
+    """Raise a SettingError when `Solution.save` knows no format for the suffix of `path`."""
+    suffix = path.suffix.lower()
+    if suffix not in ("", ".g2o", ".tum", ".txt", ".kitti", ".json") and not is_picture(path):
+        raise SettingError(
+            f"cannot write {path}: no format has suffix {suffix!r}; use .g2o, .tum, .kitti, .json, .png, .svg or .pdf"
+        )
 
 
 def versions(backend: CholeskyBackend | None) -> dict[str, str]:
