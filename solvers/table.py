@@ -1,54 +1,63 @@
-"""The one printed table of a run, and its progress bar."""
+"""The one printed table of a run, and its progress bar, in a terminal or in a notebook."""
 
 from __future__ import annotations
 
+import html
 import math
+import time
 from types import TracebackType
+from typing import Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from solvers.result import Record, Status
+from solvers.result import Measurement, Record, Status
 
 _HEADER = f"{'k':>6}  {'F':>18}  {'primal':>10}  {'dual':>10}  {'seconds':>9}"
+_HEADER_OF_ROBOTS = f"  {'rounds':>7}  {'MB sent':>9}"
 _BAR_AFTER_SECONDS = 1.0
+_SECONDS_BETWEEN_UPDATES = 0.1
 
 
 class Table:
     """Prints one line an iterate when `verbose`, and shows a bar on long runs when `progress`.
 
-    The bar appears after `_BAR_AFTER_SECONDS`, on stderr (or in the notebook), and goes away at the end.
+    The bar appears after `_BAR_AFTER_SECONDS`, on stderr or in the notebook, and goes away at the end. With `progress`
+    None it is shown in notebooks alone. The lines of the table take its place.
     """
 
-    def __init__(self, name: str, max_iterations: int, verbose: bool, progress: bool) -> None:
+    def __init__(self, name: str, max_iterations: int, verbose: bool, progress: bool | None) -> None:
         self._name, self._max_iterations = name, max_iterations
-        self._verbose, self._progress = verbose, progress
-        self._console = Console(highlight=False)
-        self._bar: Progress | None = None
+        self._in_notebook = Console().is_jupyter
+        self._verbose, self._progress = verbose, self._in_notebook if progress is None else progress
+        # In a notebook, too, lines are lines: rich would make an output of its own of each.
+        self._console = Console(highlight=False, force_jupyter=False)
+        self._bar: _Bar | None = None
 
     def __enter__(self) -> Table:
-        if self._verbose:
-            self._console.print(f"{self._name}\n{_HEADER}", markup=False, soft_wrap=True)
         return self
 
     def row(self, record: Record, elapsed: float) -> None:
         """Show one record; `elapsed` seconds of wall time have passed."""
         figures = record.measurement
         if self._verbose:
+            if record.k == 0:
+                robots = "" if figures.rounds is None else _HEADER_OF_ROBOTS
+                self._console.print(f"{self._name}\n{_HEADER}{robots}", markup=False, soft_wrap=True)
             self._console.print(
                 f"{record.k:>6}  {figures.objective:>18.10g}  {_figure(figures.primal_residual)}  "
-                f"{_figure(figures.dual_residual)}  {record.seconds:>9.3f}",
+                f"{_figure(figures.dual_residual)}  {record.seconds:>9.3f}{_communication(figures)}",
                 markup=False,
                 soft_wrap=True,
             )
         elif self._progress:
             if self._bar is None and elapsed > _BAR_AFTER_SECONDS:
-                self._bar = _progress_bar()
-                self._bar.start()
-                self._bar.add_task(self._name, total=self._max_iterations, figures="")
+                kind = _NotebookBar if self._in_notebook else _TerminalBar
+                self._bar = kind(self._name, self._max_iterations)
             if self._bar is not None:
                 text = f"F {figures.objective:.8g}  residual {max(figures.primal_residual, figures.dual_residual):.1e}"
-                self._bar.update(self._bar.task_ids[0], completed=record.k, figures=text)
+                sent = "" if figures.num_bytes is None else f"  {1e-6 * figures.num_bytes:.2f} MB"
+                self._bar.show(record.k, text + sent)
 
     def end(self, status: Status, iterations: int) -> None:
         """Show how the run ended."""
@@ -64,17 +73,68 @@ class Table:
             self._bar.stop()
 
 
+class _Bar(Protocol):
+    def show(self, k: int, text: str) -> None:
+        """Show iterate k and its figures."""
+
+    def stop(self) -> None:
+        """Go away."""
+
+
+class _TerminalBar:
+    def __init__(self, name: str, max_iterations: int) -> None:
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+            TextColumn("{task.fields[figures]}"),
+            TimeElapsedColumn(),
+            console=Console(stderr=True),
+            transient=True,
+        )
+        self._progress.start()
+        self._task = self._progress.add_task(name, total=max_iterations, figures="")
+
+    def show(self, k: int, text: str) -> None:
+        self._progress.update(self._task, completed=k, figures=text)
+
+    def stop(self) -> None:
+        self._progress.stop()
+
+
+class _NotebookBar:
+    """A bar of the browser's own in one output, changed in place: rich's bar asks for ipywidgets in notebooks."""
+
+    def __init__(self, name: str, max_iterations: int) -> None:
+        from IPython.display import HTML, DisplayHandle
+
+        self._name, self._max_iterations, self._html = html.escape(name), max_iterations, HTML
+        self._began = self._updated = time.perf_counter()
+        self._handle = DisplayHandle()
+        self._handle.display(HTML(self._page(0, "")))
+
+    def show(self, k: int, text: str) -> None:
+        now = time.perf_counter()
+        if now - self._updated >= _SECONDS_BETWEEN_UPDATES:
+            self._updated = now
+            self._handle.update(self._html(self._page(k, text)))
+
+    def stop(self) -> None:
+        self._handle.update(self._html(""))
+
+    def _page(self, k: int, text: str) -> str:
+        seconds = time.perf_counter() - self._began + _BAR_AFTER_SECONDS
+        return (
+            f'{self._name} <progress value="{k}" max="{self._max_iterations}"></progress> '
+            f"{k}/{self._max_iterations} {html.escape(text)} {seconds:.0f} s"
+        )
+
+
+def _communication(figures: Measurement) -> str:
+    if figures.rounds is None or figures.num_bytes is None:
+        return ""
+    return f"  {figures.rounds:>7}  {1e-6 * figures.num_bytes:>9.3f}"
+
+
 def _figure(value: float) -> str:
     return f"{'-':>10}" if math.isinf(value) else f"{value:>10.2e}"
-
-
-def _progress_bar() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        TextColumn("{task.fields[figures]}"),
-        TimeElapsedColumn(),
-        console=Console(stderr=True),
-        transient=True,
-    )

@@ -15,14 +15,95 @@ def test_every_edge_is_drawn_once_in_the_colour_of_its_robot(d):
 
     graph = pgo.grid_world(3, 10, np.random.default_rng(0), d=d)
     axes = Figure().add_subplot(projection="3d" if d == 3 else None)
-    pgo.draw_graph(graph, graph.truth, axes)
+    pgo.draw_graph(graph, graph.truth, axes, mark_edges=False)
     (lines,) = axes.collections
-    colours = lines.get_colors() if d == 2 else lines._colors3d if hasattr(lines, "_colors3d") else lines.get_colors()
-    assert len(colours) == graph.num_edges
-    same = graph.robots[graph.i] == graph.robots[graph.j]
-    assert len({tuple(colour) for colour in np.asarray(colours)[same]}) == 3
-    assert {tuple(colour) for colour in np.asarray(colours)[~same]} <= {(0.6, 0.6, 0.6, 1.0)}
+    colours = lines.get_colors()
+    drawn = [tuple(colour) for colour in np.asarray(colours)]
+    grey = (0.6, 0.6, 0.6, 1.0)
+    owner = np.where(graph.robots[graph.i] == graph.robots[graph.j], graph.robots[graph.i], 3)
+    assert sorted(map(drawn.count, set(drawn) - {grey})) == sorted(np.bincount(owner)[:3])
+    assert drawn.count(grey) == (owner == 3).sum()
     assert axes.get_xlabel() == "x (m)"
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_doubtful_edges_stand_out(d):
+    from matplotlib.colors import to_rgba
+    from matplotlib.figure import Figure
+
+    graph = pgo.grid_world(2, 12, np.random.default_rng(0), d=d)
+    cost = pgo.edge_residuals(graph, graph.truth).cost
+    wrong, unsure = np.argsort(cost)[:2]  # made to be what they are not
+    kappa, tau = graph.kappa.copy(), graph.tau.copy()
+    tau[unsure], kappa[wrong] = 0.01 * tau[unsure], 1e4 * kappa[wrong]
+    marked = graph.with_weights(kappa, tau)
+    assert pgo.edge_residuals(marked, graph.truth).is_misfit[wrong]
+    axes = Figure().add_subplot(projection="3d" if d == 3 else None)
+    pgo.draw_graph(marked, graph.truth, axes)
+    (lines,) = axes.collections
+    misfits = int(pgo.edge_residuals(marked, graph.truth).is_misfit.sum())
+    widths, styles = np.asarray(lines.get_linewidth()), lines.get_linestyle()
+    assert (widths == widths.max()).sum() == misfits
+    assert sum(pattern is not None for _, pattern in styles) == 1
+    colours = [tuple(colour) for colour in np.asarray(lines.get_colors())]
+    assert colours.count(to_rgba("#D55E00")) == misfits
+
+
+def test_the_legend_says_only_what_is_there():
+    graph = pgo.grid_world(3, 10, np.random.default_rng(0))
+    (legend,) = pgo.plot_graph(graph, graph.truth).legends
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert texts[:3] == ["robot 0", "robot 1", "robot 2"]
+    assert "between robots" in texts
+    assert not any("uncertain" in text for text in texts)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_errors_to_the_truth_are_those_after_alignment(d):
+    graph = pgo.grid_world(1, 12, np.random.default_rng(0), d=d)
+    estimate = pgo.spanning_tree_start(graph)
+    figure = pgo.plot_against_truth(graph, estimate)
+    metres = figure.axes[1].lines[0].get_ydata()
+    np.testing.assert_allclose(
+        np.sqrt(np.mean(metres**2)), pgo.absolute_trajectory_error(estimate, graph.truth), rtol=1e-12, atol=0
+    )
+
+
+def test_without_a_truth_one_line_says_so():
+    graph = pgo.grid_world(1, 12, np.random.default_rng(0))
+    from dataclasses import replace
+
+    with pytest.raises(pgo.GraphError, match="without a ground truth"):
+        pgo.plot_against_truth(replace(graph, truth=None), graph.truth)
+
+
+def test_figures_are_a_column_wide_and_readable_there(tmp_path):
+    graph = pgo.circle(np.random.default_rng(0))
+    problem = pgo.PGOProblem(graph)
+    solution = solvers.solve(problem)
+    stages = [(stage.name, stage.history) for stage in solution.stages]
+    figures = [
+        pgo.plot_graph(graph, graph.truth),
+        pgo.plot_against_truth(graph, solution.poses),
+        pgo.plot_spectrum(problem, solution.certificate),
+        pgo.plot_sparsity(problem),
+        pgo.plot_decay([("half", 0.5 ** np.arange(5))], "error (m)"),
+        pgo.plot_tightness([("circle", np.array([0.5, 1.0]), np.array([1.0, 0.5]))]),
+        solvers.plot_convergence(stages, solution.lower_bound),
+        solvers.plot_gaps([solvers.Curve("SOC", stages[1][1], solution.lower_bound)]),
+    ]
+    from matplotlib.text import Text
+
+    for figure in figures:
+        pgo.save_figure(figure, tmp_path / "figure.png")  # the texts are made when it is drawn
+        assert figure.get_figwidth() == 3.4
+        small = [text for text in figure.findobj(Text) if text.get_text() and text.get_fontsize() < 7]
+        assert not small
+
+
+def test_a_figure_shows_itself_in_a_notebook():
+    graph = pgo.circle(np.random.default_rng(0))
+    assert pgo.plot_graph(graph, graph.truth)._repr_png_().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])

@@ -1,4 +1,5 @@
-from types import TracebackType
+import sys
+from types import ModuleType, TracebackType
 
 import pytest
 from rich.progress import Progress
@@ -10,7 +11,7 @@ from solvers.table import Table
 RECORDS = [Record(k, 0.25 * k, Measurement(100.0 / (k + 1), 10.0**-k, 2 * 10.0**-k)) for k in range(3)]
 
 
-def shown(verbose: bool, progress: bool, elapsed: float = 0.0) -> None:
+def shown(verbose: bool, progress: bool | None, elapsed: float = 0.0) -> None:
     with Table("SOC", 100, verbose=verbose, progress=progress) as table:
         for record in RECORDS:
             table.row(record, elapsed)
@@ -48,8 +49,8 @@ def test_a_residual_that_is_not_yet_known_is_a_dash(capsys: pytest.CaptureFixtur
 
 
 def test_names_with_brackets_are_printed_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
-    with Table("SOC[bold]", 100, verbose=True, progress=False):
-        pass
+    with Table("SOC[bold]", 100, verbose=True, progress=False) as table:
+        table.row(RECORDS[0], 0.0)
     assert capsys.readouterr().out.splitlines()[0] == "SOC[bold]"
 
 
@@ -83,6 +84,59 @@ def test_the_table_takes_the_place_of_the_bar(capsys: pytest.CaptureFixture[str]
     out, err = capsys.readouterr()
     assert len(out.splitlines()) == 6
     assert err == ""
+
+
+class Notebook:
+    """Stands for IPython in a notebook: remembers what its outputs show."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.outputs: list[list[str]] = []
+        outputs = self.outputs
+
+        class DisplayHandle:
+            def display(self, shown: str) -> None:
+                self.output = [shown]
+                outputs.append(self.output)
+
+            def update(self, shown: str) -> None:
+                self.output.append(shown)
+
+        display = ModuleType("IPython.display")
+        display.HTML, display.DisplayHandle = str, DisplayHandle
+        monkeypatch.setitem(sys.modules, "IPython", ModuleType("IPython"))
+        monkeypatch.setitem(sys.modules, "IPython.display", display)
+        monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+        monkeypatch.setattr(table_module, "_SECONDS_BETWEEN_UPDATES", 0.0)
+
+
+@pytest.mark.parametrize("progress", [None, True])
+def test_a_long_run_shows_one_bar_in_a_notebook_and_takes_it_away(progress, monkeypatch, capsys) -> None:
+    notebook = Notebook(monkeypatch)
+    shown(verbose=False, progress=progress, elapsed=10.0)
+    (output,) = notebook.outputs
+    assert 'SOC <progress value="2" max="100">' in output[-2]
+    assert "F 33.333333" in output[-2]
+    assert output[-1] == ""
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(("progress", "elapsed"), [(False, 10.0), (None, 0.01)])
+def test_notebooks_show_no_bar_when_told_so_or_on_short_runs(progress, elapsed, monkeypatch) -> None:
+    notebook = Notebook(monkeypatch)
+    shown(verbose=False, progress=progress, elapsed=elapsed)
+    assert notebook.outputs == []
+
+
+def test_the_table_is_lines_in_a_notebook_too(monkeypatch, capsys) -> None:
+    notebook = Notebook(monkeypatch)
+    shown(verbose=True, progress=None, elapsed=10.0)
+    assert len(capsys.readouterr().out.splitlines()) == 6
+    assert notebook.outputs == []
+
+
+def test_no_bar_is_shown_by_default_outside_notebooks(capsys: pytest.CaptureFixture[str]) -> None:
+    shown(verbose=False, progress=None, elapsed=1e6)
+    assert capsys.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("error", [None, KeyboardInterrupt, ValueError])
