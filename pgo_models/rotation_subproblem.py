@@ -35,6 +35,17 @@ class RotationQP:
         sqrt(D) V on the rows whose penalty is not zero.
     penalty : (N,)
         The diagonal of D.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.problem import PGOProblem
+    >>> from pgo_models.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> A, w = problem.residual_matrix
+    >>> qp = rotation_qp(A, w, np.ones(problem.side), problem.d)
+    >>> qp.problem.is_qp(), qp.shift.shape
+    (True, (108, 3))
     """
 
     problem: cp.Problem
@@ -103,7 +114,7 @@ def rotation_qp(
     X : cp.Variable, (N, d), optional
         The variable, where terms or constraints are already written in it.
     terms : sequence of cp.Expression
-        Convex terms to add to the objective; `pgo_models.graph_qp` writes them on poses and edges.
+        Convex terms to add to the objective; `pgo_models.graph_subproblem` writes them on poses and edges.
     constraints : sequence of cp.Constraint
 
     Raises
@@ -115,6 +126,16 @@ def rotation_qp(
     -----
     rho is data, not a Parameter: as one it is DPP too, and small problems re-solve as fast with it, but compiling holds
     the product of all parameters with all entries, tens of gigabytes on 2500 poses.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.problem import PGOProblem
+    >>> from pgo_models.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> A, w = problem.residual_matrix
+    >>> rotation_qp(A, w, np.ones(problem.side), problem.d).X.shape
+    (108, 3)
     """
     if not ((penalty >= 0).all() and (penalty > 0).any()):
         raise SettingError("penalties must not be negative, and one must be positive")

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pgo_models.errors import SettingError
-from pgo_models.graph_qp import Change, Neighbours, PoseVariables, Unknowns, graph_qp, robot_qp
+from pgo_models.graph_subproblem import Change, Neighbours, PoseVariables, Unknowns, graph_qp, robot_qp
 from pgo_models.partition import partition
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array, stack_transposes

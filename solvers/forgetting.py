@@ -26,6 +26,11 @@ class ErrorForgetting:
     not_added_back : (iterations + 1,)
         What plain quadratic penalties give, with b held at 0: the error of the model itself, which stays.
     disturbed_steps : int
+
+    Examples
+    --------
+    >>> ErrorForgetting(np.ones(3), np.ones(3), np.ones(3), disturbed_steps=2).curves()[1][0]
+    'disturbed in its first 2 steps'
     """
 
     undisturbed: Array
@@ -69,6 +74,14 @@ def error_forgetting(
     ------
     SettingError
         When error_std is negative or there are fewer iterations than disturbed steps.
+
+    Examples
+    --------
+    >>> from pgo_models.bregman_examples import basis_pursuit
+    >>> problem = basis_pursuit(np.array([[1.0, 2.0]]), np.array([2.0]))
+    >>> study = error_forgetting(problem, np.array([0.0, 1.0]), np.random.default_rng(0), iterations=6)
+    >>> bool(study.disturbed[-1] < 1e-6 < study.disturbed[1])
+    True
     """
     if not error_std >= 0:
         raise SettingError(f"error_std must not be negative, got {error_std}")

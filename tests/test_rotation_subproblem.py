@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pgo_models.errors import PGOError, SettingError
-from pgo_models.rotation_qp import RotationQP, rotation_qp
+from pgo_models.rotation_subproblem import RotationQP, rotation_qp
 
 PENALISE_TRANSLATIONS = st.booleans()
 

@@ -3,7 +3,7 @@ import pytest
 from test_bregman import sparse_signal
 
 import pgo_models as pgo
-from solvers.error_forgetting import error_forgetting
+from solvers.forgetting import error_forgetting
 
 
 def test_errors_of_the_first_steps_are_forgotten_and_the_penalty_alone_keeps_its_own():

@@ -18,19 +18,36 @@ from scipy.sparse import csr_array, diags_array
 from pgo_models.errors import SettingError
 from pgo_models.matrices import residual_matrix, rotation_columns
 from pgo_models.pose_graph import IntArray, PoseGraph
-from pgo_models.rotation_qp import RotationQP, rotation_qp
+from pgo_models.rotation_subproblem import RotationQP, rotation_qp
 from pgo_models.rotations import Array, BoolArray
 
 
 class Unknowns(enum.Enum):
-    """What the quadratic program is solved for."""
+    """What the quadratic program is solved for.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> graph_qp(graph, np.ones(27), Unknowns.ROTATIONS).variables.num_translations
+    0
+    """
 
     ROTATIONS = "rotations only, on the rotation residuals: the paper's step (a)"
     POSES = "rotations and translations together"
 
 
 class Neighbours(enum.Enum):
-    """What a robot's program does with the poses of others that its edges lead to."""
+    """What a robot's program does with the poses of others that its edges lead to.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> robots = graph.with_robots(np.arange(27) // 9)
+    >>> robot_qp(robots, 0, np.ones(27), Neighbours.COPIES).variables.poses.size
+    18
+    """
 
     COPIES = "copies of them are unknowns too, and an edge between robots counts half"
     FROZEN = "they stay where they are, and enter the shift"
@@ -48,6 +65,14 @@ class PoseVariables:
         Poses of the graph that are unknown, ascending.
     X : cp.Variable
         Rows t_i (not for ROTATIONS), then the rows of every R_i^T.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> unknown = graph_qp(graph, np.ones(27)).variables
+    >>> unknown.R(4).shape, unknown.t(4).shape
+    ((3, 3), (3,))
     """
 
     graph: PoseGraph
@@ -100,6 +125,11 @@ class Change:
         Convex, in the same variables.
     replaced_edges : sequence of int
         Edges whose squared residuals leave F, where terms have another loss for them.
+
+    Examples
+    --------
+    >>> Change(replaced_edges=[0, 3]).replaced_edges
+    [0, 3]
     """
 
     terms: Sequence[cp.Expression] = ()
@@ -124,6 +154,14 @@ class GraphQP:
         Residuals and weights of the edges that count, in the rows of X.
     between : sparse (N_a, N)
         A_a^T diag(w) A on the frozen neighbours' rows of the whole graph; empty unless FROZEN.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> qp = graph_qp(graph, np.ones(27))
+    >>> qp.qp.problem.is_qp()
+    True
     """
 
     variables: PoseVariables
@@ -218,6 +256,14 @@ def robot_qp(
     ------
     SettingError
         When the robot owns no pose, or frozen neighbours pull on translations that have no penalty.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> robots = graph.with_robots(np.arange(27) // 9)
+    >>> robot_qp(robots, 1, np.ones(27)).variables.poses
+    array([ 9, 10, 11, 12, 13, 14, 15, 16, 17])
     """
     owned = graph.robots == robot
     if not owned.any():
