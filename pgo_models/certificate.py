@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csc_array
 
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
+from pgo_models.html_tables import facts_table
 from pgo_models.initialization import chordal_start
-from pgo_models.multipliers import certificate_matrix, multipliers
+from pgo_models.multipliers import factorize_certificate, multipliers
 from pgo_models.polish import STATIONARY_DECREMENT, polish, relative_decrement
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
@@ -29,7 +30,15 @@ _ROUNDING_FLOOR = 10.0 * float(np.finfo(float).eps)  # of the largest diagonal e
 
 
 class Verdict(enum.Enum):
-    """What the certificate says of the poses."""
+    """What the certificate says of the poses.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> certify(problem, polish(problem, chordal_start(problem))).verdict.name
+    'CERTIFIED'
+    """
 
     CERTIFIED = "globally optimal within the gap asked for"
     NOT_CERTIFIED = "not shown to be optimal: the bound holds, but the gap is wider than asked for"
@@ -37,11 +46,22 @@ class Verdict(enum.Enum):
 
 
 class BoundSource(enum.Enum):
-    """Where the multipliers of the bound were taken."""
+    """Where the multipliers of the bound were taken.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> certify(problem, chordal_start(problem)).source.name
+    'POLISHED'
+    """
 
     GIVEN = "at the poses given"
     POLISHED = "after polishing the poses given, which were not stationary"
     CHORDAL = "at the point that the chordal start polishes to, better than the one beside the poses given"
+    RELAXATION = (
+        "where the staircase solved the semidefinite relaxation, whose optimum is below F of all poses if not tight"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +90,16 @@ class Certificate:
         Multipliers, which with eta are the proof: anyone can check it with `prove_bound`.
     wanted_gap : float
     verdict : Verdict
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> certificate = certify(problem, chordal_start(problem))
+    >>> certificate
+    Certificate(F=110.9926545, gap=0.126, NOT_CERTIFIED)
+    >>> bool(certificate.lower_bound <= certificate.poses_objective <= certificate.objective)
+    True
     """
 
     objective: float
@@ -89,30 +119,48 @@ class Certificate:
         """Whether the gap is within the one asked for."""
         return self.verdict is Verdict.CERTIFIED
 
+    def __repr__(self) -> str:
+        return f"Certificate(F={self.objective:.10g}, gap={self.gap:.3g}, {self.verdict.name})"
+
     def __str__(self) -> str:
+        return "\n".join(f"{label:<12} {text}" for label, text in self._facts())
+
+    def _repr_html_(self) -> str:
+        return facts_table(self._facts())
+
+    def _facts(self) -> list[tuple[str, str]]:
         proof = "F is a sum of squares" if math.isnan(self.eta) else f"proved with eta = {self.eta:.3g}"
-        lines = [
-            f"F            {self.objective:.10g}   (stationary to {self.stationarity:.2g})",
-            f"lower bound  {self.lower_bound:.10g}   ({proof}; {self.source.value})",
-            f"gap          {self.gap:.3g}   (asked for: {self.wanted_gap:.3g})",
-            f"verdict      {self.verdict.name}: {self.verdict.value}",
+        facts = [
+            ("F", f"{self.objective:.10g}   (stationary to {self.stationarity:.2g})"),
+            ("lower bound", f"{self.lower_bound:.10g}   ({proof}; {self.source.value})"),
+            ("gap", f"{self.gap:.3g}   (asked for: {self.wanted_gap:.3g})"),
+            ("verdict", f"{self.verdict.name}: {self.verdict.value}"),
         ]
         if self.source is not BoundSource.GIVEN:
-            lines.insert(1, f"best known F {self.poses_objective:.10g}")
-        return "\n".join(lines)
+            facts.insert(1, ("best known F", f"{self.poses_objective:.10g}"))
+        return facts
 
 
 def prove_bound(problem: PGOProblem, Lambda: Array, eta: float) -> float | None:
     """tr(Lambda) - eta n d if S + eta blockdiag(0, I) is positive definite with t_0 grounded, else None.
 
-    Grounding loses nothing: S maps a common shift of all translations to zero. The proof is one sparse Cholesky
-    factorisation that goes through, so it is as exact as double precision; `certify` keeps eta above its level.
+    The proof is one sparse Cholesky factorisation that goes through (`factorize_certificate`), so it is as exact as
+    double precision; `smallest_shift` is above its level.
     Lambda is made symmetric first.
 
     Raises
     ------
     SettingError
         When eta is negative or Lambda has the wrong shape.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> poses = polish(problem, chordal_start(problem))
+    >>> bound = prove_bound(problem, multipliers(problem, poses), eta=1e-6)
+    >>> bool(bound < problem.objective(poses) < bound + 1e-3)
+    True
     """
     n, d = problem.num_poses, problem.d
     if not eta >= 0:
@@ -120,10 +168,8 @@ def prove_bound(problem: PGOProblem, Lambda: Array, eta: float) -> float | None:
     if Lambda.shape != (n, d, d):
         raise SettingError(f"Lambda has shape {Lambda.shape}; give one block for every pose, {(n, d, d)}")
     symmetric = 0.5 * (Lambda + np.swapaxes(Lambda, 1, 2))
-    shifted = certificate_matrix(problem, symmetric, eta)
-    _ground_translation(problem, shifted)
     try:
-        problem.analysis.factorize(shifted)
+        factorize_certificate(problem, symmetric, eta)
     except NotPositiveDefiniteError:
         return None
     return _trace(symmetric) - eta * n * d
@@ -185,10 +231,23 @@ def certify_stationary(problem: PGOProblem, poses: Poses, gap: float, stationari
     stationarity : float
         Relative decrement there, reported as it is.
     """
-    if not gap > 0:
-        raise SettingError(f"gap is {gap}; give a positive relative gap, as 1e-6")
     # With the best translations, the trace of the multipliers is F to rounding.
     Lambda = multipliers(problem, problem.with_best_translations(poses.R))
+    return certify_with(problem, poses, Lambda, gap, stationarity, BoundSource.GIVEN)
+
+
+def certify_with(
+    problem: PGOProblem, poses: Poses, Lambda: Array, gap: float, stationarity: float, source: BoundSource
+) -> Certificate:
+    """Certificate of poses with multipliers from anywhere: the proof asks nothing of them.
+
+    Raises
+    ------
+    SettingError
+        When gap is not positive or Lambda has the wrong shape.
+    """
+    if not gap > 0:
+        raise SettingError(f"gap is {gap}; give a positive relative gap, as 1e-6")
     objective = problem.objective(poses)
     eta, lower_bound = smallest_provable(problem, Lambda, gap, objective)
     unjudged = Certificate(
@@ -197,7 +256,7 @@ def certify_stationary(problem: PGOProblem, poses: Poses, gap: float, stationari
         gap=math.nan,
         eta=eta,
         stationarity=stationarity,
-        source=BoundSource.GIVEN,
+        source=source,
         poses=poses,
         poses_objective=objective,
         Lambda=Lambda,
@@ -229,19 +288,36 @@ def _bound_is_tight(certificate: Certificate) -> bool:
 
 def smallest_provable(problem: PGOProblem, Lambda: Array, gap: float, objective: float) -> tuple[float, float]:
     """Smallest eta found, from what the wanted gap allows upwards, and its bound; (nan, 0) when only F >= 0 is left."""
+    smallest = smallest_shift(problem, gap, objective)
     count = problem.num_poses * problem.d
-    floor = _ROUNDING_FLOOR * float(problem.M.data[problem.diagonal_positions].max())
-    eta, too_small = max(_ETA_SHARE * gap * max(1.0, objective) / count, floor), math.nan
+    return search_bound(lambda eta: prove_bound(problem, Lambda, eta), smallest, _trace(Lambda), count)
+
+
+def search_bound(
+    prove: Callable[[float], float | None], smallest: float, trace: float, count: int
+) -> tuple[float, float]:
+    """Smallest eta found for which `prove` gives a bound, and the bound; (nan, 0) when tr(Lambda) - eta n d is not > 0.
+
+    Parameters
+    ----------
+    prove : callable
+        tr(Lambda) - eta n d, or None where S + eta I is not positive definite.
+    smallest : float
+        First eta; from there on it grows until there is a bound, then the last step is bisected.
+    trace, count : float, int
+        tr(Lambda) and n d.
+    """
+    eta, too_small = smallest, math.nan
     bound = None
     while bound is None:
-        if not _trace(Lambda) - eta * count > 0.0:
+        if not trace - eta * count > 0.0:
             return math.nan, 0.0
-        bound = prove_bound(problem, Lambda, eta)
+        bound = prove(eta)
         if bound is None:
             too_small, eta = eta, _ETA_GROWTH * eta
     for _ in range(0 if math.isnan(too_small) else _ETA_BISECTIONS):
         middle = math.sqrt(too_small * eta)
-        tighter = prove_bound(problem, Lambda, middle)
+        tighter = prove(middle)
         if tighter is None:
             too_small = middle
         else:
@@ -249,10 +325,16 @@ def smallest_provable(problem: PGOProblem, Lambda: Array, gap: float, objective:
     return eta, bound
 
 
+def smallest_shift(problem: PGOProblem, gap: float, objective: float) -> float:
+    """Shift eta that spends a fixed share of a relative gap, and is no smaller than a factorisation can tell from 0."""
+    largest = float(problem.M.data[problem.diagonal_positions].max())
+    return shift_of_gap(largest, problem.num_poses * problem.d, gap, objective)
+
+
+def shift_of_gap(largest_diagonal: float, count: int, gap: float, objective: float) -> float:
+    """`smallest_shift` from the largest diagonal entry of M and count = n d."""
+    return max(_ETA_SHARE * gap * max(1.0, objective) / count, _ROUNDING_FLOOR * largest_diagonal)
+
+
 def _trace(Lambda: Array) -> float:
     return math.fsum(np.einsum("naa->na", Lambda).ravel())
-
-
-def _ground_translation(problem: PGOProblem, matrix: csc_array) -> None:
-    """Double the (t_0, t_0) entry: the matrix is definite if and only if grounding t_0 = 0 leaves the rest definite."""
-    matrix.data[problem.diagonal_positions[0]] *= 2.0

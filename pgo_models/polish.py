@@ -21,12 +21,12 @@ from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array, exp_map, project_to_rotations
 
 STATIONARY_DECREMENT = 1e-13
-_ROUNDING = 1e-14  # relative change of F that is not told apart from none
-_SUFFICIENT = 1e-4  # Armijo's constant
-_HALVINGS = 40
-_DAMPING_START, _DAMPING_GROWTH, _DAMPING_MAX = 1e-8, 10.0, 1e6
-_CHORD_STEPS = 3
-_CHORD_PROGRESS = 0.1
+ROUNDING = 1e-14  # relative change of F that is not told apart from none
+SUFFICIENT = 1e-4  # Armijo's constant
+HALVINGS = 40
+DAMPING_START, DAMPING_GROWTH, DAMPING_MAX = 1e-8, 10.0, 1e6
+CHORD_STEPS = 3
+CHORD_PROGRESS = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ def polish_step(problem: PGOProblem, state: PolishState, second_order: bool = Tr
     now = replace(state, analysis=analysis, factor=factor, is_newton=is_newton, moved=False)
     gradient, direction, decrement = _direction(problem, layout, now)
     now = replace(now, decrement=decrement)
-    for _ in range(1 + _CHORD_STEPS):
+    for _ in range(1 + CHORD_STEPS):
         if now.is_stationary:
             break
         candidate = _backtrack(problem, layout, now, gradient, direction)
@@ -89,7 +89,7 @@ def polish_step(problem: PGOProblem, state: PolishState, second_order: bool = Tr
         tie = candidate.objective >= now.objective
         if tie and decrement > 0.5 * now.decrement:
             break
-        enough = decrement <= _CHORD_PROGRESS * now.decrement
+        enough = decrement <= CHORD_PROGRESS * now.decrement
         now = replace(candidate, decrement=decrement, moved=True)
         if not enough:
             break
@@ -97,7 +97,17 @@ def polish_step(problem: PGOProblem, state: PolishState, second_order: bool = Tr
 
 
 def polish(problem: PGOProblem, poses: Poses, max_steps: int = 100) -> Poses:
-    """Stationary poses near the given ones, with F no higher; the best reached after `max_steps` factorisations."""
+    """Stationary poses near the given ones, with F no higher; the best reached after `max_steps` factorisations.
+
+    Examples
+    --------
+    >>> from pgo_models.initialization import chordal_start
+    >>> from pgo_models.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> start = chordal_start(problem)
+    >>> bool(problem.objective(polish(problem, start)) < problem.objective(start))
+    True
+    """
     state = start_polish(problem, poses)
     for _ in range(max_steps):
         state = polish_step(problem, state)
@@ -131,14 +141,14 @@ def _factorize_model(
     analysis = state.analysis
     if second_order:
         hessian = riemannian_hessian(problem, state.poses, multipliers(problem, state.poses))
-        _ground_pose(hessian, problem)
+        ground_pose(hessian, problem)
         analysis = analysis or analyze(hessian, problem.backend)
         try:
             return analysis, analysis.factorize(hessian, overwrite=state.factor), True
         except NotPositiveDefiniteError:
             pass
     gauss_newton = riemannian_hessian(problem, state.poses, None)
-    _ground_pose(gauss_newton, problem)
+    ground_pose(gauss_newton, problem)
     analysis = analysis or analyze(gauss_newton, problem.backend)
     diagonal = gauss_newton.diagonal()
     damping = 0.0
@@ -146,14 +156,14 @@ def _factorize_model(
         try:
             return analysis, analysis.factorize(gauss_newton), False
         except NotPositiveDefiniteError:
-            following = max(_DAMPING_START, _DAMPING_GROWTH * damping)
-            if following > _DAMPING_MAX:
+            following = max(DAMPING_START, DAMPING_GROWTH * damping)
+            if following > DAMPING_MAX:
                 raise
             gauss_newton.setdiag(diagonal * (1.0 + following))
             damping = following
 
 
-def _ground_pose(matrix: csc_array, problem: PGOProblem) -> None:
+def ground_pose(matrix: csc_array, problem: PGOProblem) -> None:
     """Double the diagonal of pose 0: rigid motions leave F as it is, so at a stationary point the step keeps pose 0."""
     layout = TangentLayout(problem.num_poses, problem.d)
     zero = np.zeros(1, dtype=np.int64)
@@ -178,14 +188,14 @@ def _backtrack(
     slope = inner(gradient, direction)
     w, v = layout.split(direction)
     length = 1.0
-    for _ in range(_HALVINGS):
+    for _ in range(HALVINGS):
         # The translations that are best for the turned rotations lie on the curved path that a straight move of both
         # leaves: on parking-garage this saves two thirds of the factorisations.
         poses = problem.with_best_translations(retract(state.poses, length * w, length * v).R)
         objective = problem.objective(poses)
-        if objective <= state.objective + _SUFFICIENT * length * slope:
+        if objective <= state.objective + SUFFICIENT * length * slope:
             return replace(state, poses=poses, objective=objective)
-        if length == 1.0 and objective <= state.objective * (1.0 + _ROUNDING):
+        if length == 1.0 and objective <= state.objective * (1.0 + ROUNDING):
             # Too near for F to tell; the decrement decides in the caller.
             return replace(state, poses=poses, objective=objective)
         length *= 0.5

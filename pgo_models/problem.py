@@ -152,8 +152,7 @@ class PGOProblem:
 
     def apply_Q(self, Y: Array) -> Array:
         """Q Y, (dn, k), for Y of shape (dn, k), without forming Q: M applied to Y and its best translations."""
-        t = self._translations_of_rows(Y)
-        return np.asarray(self.M[self.num_poses :] @ np.concatenate([t, Y]))
+        return np.asarray(self._M_rotation_rows @ np.concatenate([self.translations_for(Y), Y]))
 
     def riemannian_gradient(self, poses: Poses) -> tuple[Array, Array]:
         """Gradient of F(R_i Exp(hat(w_i)), t_i + v_i) in (w, v) at zero: (n, 1 or 3) and (n, d).
@@ -168,7 +167,13 @@ class PGOProblem:
 
     def recover_translations(self, R: Array) -> Array:
         """t, (n, d), that minimises F for given R, (n, d, d), with t_0 = 0: M_tt t = -M_tR Y, one sparse solve."""
-        return self._translations_of_rows(stack_transposes(R))
+        return self.translations_for(stack_transposes(R))
+
+    def translations_for(self, Y: Array) -> Array:
+        """t, (n, k), with t_0 = 0, that minimises tr(X^T M X) over t for X the rows of t and of given Y, (dn, k)."""
+        t = np.zeros((self.num_poses, Y.shape[1]))
+        t[1:] = self._translation_factor.solve(-(self._M_tR @ Y)[1:])
+        return t
 
     def with_best_translations(self, R: Array) -> Poses:
         """Poses (R, t) with the translations of `recover_translations`."""
@@ -196,7 +201,6 @@ class PGOProblem:
         n = self.num_poses
         return self.M[:n, n:].tocsr()
 
-    def _translations_of_rows(self, Y: Array) -> Array:
-        t = np.zeros((self.num_poses, Y.shape[1]))
-        t[1:] = self._translation_factor.solve(-(self._M_tR @ Y)[1:])
-        return t
+    @cached_property
+    def _M_rotation_rows(self) -> csr_array:
+        return self.M[self.num_poses :].tocsr()
