@@ -1,0 +1,175 @@
+# %% [markdown]
+# # 1. How far from the best possible is an answer?
+#
+# A robot measures how it moved between poses, and recognises places it has seen. Every measurement is a little
+# wrong, and together they contradict each other. *Pose graph optimisation* looks for the poses that contradict
+# them least. Many methods give an answer; this notebook is about knowing how good the answer is.
+
+# %%
+import numpy as np
+
+import pgo_models as pgo
+import solvers
+
+# %% [markdown]
+# ## A graph and its picture
+#
+# `sphere` is one of the three networks of the paper's section *Simulation results*: 50 poses on a sphere, 544
+# relative measurements with noise of 0.5 m and 30 degrees. It came with an estimate of each pose (GPS and an
+# IMU, as noisy as the measurements), and since it is a simulation we also know the truth.
+
+# %%
+graph = pgo.load("sphere")
+problem = pgo.PGOProblem(graph)
+graph
+
+# %%
+pgo.compare_poses(graph, [("truth", graph.truth), ("GPS and IMU", graph.initial)])
+
+# %% [markdown]
+# ## The cost
+#
+# An edge $(i, j)$ measures $R_{ij} \approx R_i^\top R_j$ and $t_{ij} \approx R_i^\top (t_j - t_i)$. The cost of
+# poses is what the paper's equation `min overall` says, each edge with its precisions $\kappa_{ij}, \tau_{ij}$:
+#
+# $$F(R, t) = \sum_{(i,j)} \kappa_{ij} \lVert R_j - R_i R_{ij} \rVert_F^2
+#   + \tau_{ij} \lVert t_j - t_i - R_i t_{ij} \rVert_2^2, \qquad R_i \in \mathrm{SO}(d).$$
+#
+# It is quadratic in $(R, t)$; what makes it hard is only that $R_i$ must be rotations. Here is $F$ by hand.
+
+
+# %%
+def cost(graph, poses):
+    total = 0.0
+    for e in range(graph.num_edges):
+        i, j = graph.i[e], graph.j[e]
+        R_error = poses.R[j] - poses.R[i] @ graph.R_ij[e]
+        t_error = poses.t[j] - poses.t[i] - poses.R[i] @ graph.t_ij[e]
+        total += graph.kappa[e] * np.sum(R_error**2) + graph.tau[e] * np.sum(t_error**2)
+    return total
+
+
+for name, poses in (("GPS and IMU", graph.initial), ("truth", graph.truth)):
+    print(f"{name:12} F = {cost(graph, poses):9.3f} by hand, {problem.objective(poses):9.3f} by the library")
+
+# %% [markdown]
+# ## Solve
+#
+# `solve` finds a start, runs SOC (the paper's method, [notebook 4](04_splitting_orthogonality.ipynb)), lets
+# Newton finish, and then certifies what it found.
+
+# %%
+solution = solvers.solve(problem)
+solution
+
+# %%
+pgo.plot_against_truth(graph, solution.poses)
+
+# %% [markdown]
+# Surprising at first: the solution costs *less* than the truth. The truth does not fit the noise; the optimum
+# does, as far as 50 poses can. So "F is as low as at the truth" proves nothing. What does?
+#
+# ## The certificate
+#
+# A *lower bound* $b$ with $b \le F(R, t)$ for **all** rotations and translations. Then
+#
+# $$\text{gap} = \frac{F(\text{answer}) - b}{\max(1, F(\text{answer}))}$$
+#
+# is the most, as a share of $F$, that any other answer could save. Where does $b$ come from? Stack all $t_i$
+# and the rows of all $R_i^\top$ in a matrix $X$, so that $F = \operatorname{tr}(X^\top M X)$. For any symmetric
+# matrices $\Lambda_i$, as $R_i R_i^\top = I$,
+#
+# $$F = \operatorname{tr}(X^\top S X) + \sum_i \operatorname{tr} \Lambda_i, \qquad
+#   S = M - \operatorname{blockdiag}(0, \Lambda).$$
+#
+# If $S + \eta \operatorname{blockdiag}(0, I)$ has no negative eigenvalue, then
+# $\operatorname{tr}(X^\top S X) \ge -\eta\, n d$ whatever the poses are, and
+# $b = \operatorname{tr} \Lambda - \eta\, n d$. Cholesky's factorisation exists exactly for positive definite
+# matrices: **that it goes through is the proof.** (A shift of all $t_i$ together costs nothing, so $t_0$ is
+# taken out.) The multipliers of the constraints at the answer are a good choice of $\Lambda$.
+
+# %%
+n, d, eta = problem.num_poses, problem.d, 1e-6
+X = solution.poses.stacked()
+MX_R = (problem.M @ X)[n:].reshape(n, d, d) @ solution.poses.R
+Lambda = (MX_R + np.swapaxes(MX_R, 1, 2)) / 2
+
+S = problem.M.toarray()
+for i in range(n):
+    rows = slice(n + d * i, n + d * i + d)
+    S[rows, rows] += eta * np.eye(d) - Lambda[i]
+np.linalg.cholesky(S[1:, 1:])  # raises LinAlgError where there is no factor
+bound_by_hand = np.trace(Lambda, axis1=1, axis2=2).sum() - eta * n * d
+
+print(f"F       {solution.objective:.7f}")
+print(f"bound   {bound_by_hand:.7f} by hand, {solution.lower_bound:.7f} by the library")
+
+# %% [markdown]
+# So nobody will ever find poses for these measurements with $F$ below that bound. `certify` does the same for
+# *anybody's* poses, here for the truth: it is 7.6 % above the optimum.
+
+# %%
+pgo.certify(problem, graph.truth)
+
+# %% [markdown]
+# ## Where a method fails and the certificate says so
+#
+# Thirty poses on a ring, each 12 degrees further round; every measurement nearly exact. Start a descent method
+# at random poses: it may stop where the chain of poses winds round once too often. There the gradient is zero
+# and every small change makes $F$ larger; nothing that is *local* can tell.
+
+# %%
+rng = np.random.default_rng(0)
+count = 30
+turn = pgo.exp_map(2 * np.pi / count + 0.05 * rng.standard_normal((count, 1)))
+ring = pgo.PoseGraph(
+    num_poses=count,
+    i=np.arange(count),
+    j=(np.arange(count) + 1) % count,
+    R_ij=turn,
+    t_ij=np.array([1.0, 0.0]) + 0.05 * rng.standard_normal((count, 2)),
+    kappa=np.full(count, 100.0),
+    tau=np.full(count, 100.0),
+    name="ring",
+)
+ring_problem = pgo.PGOProblem(ring)
+
+
+def random_start(seed):
+    rng = np.random.default_rng(seed)
+    return pgo.Poses(pgo.random_rotations(count, 2, rng), rng.normal(0.0, 3.0, (count, 2)))
+
+
+descents = [pgo.polish(ring_problem, random_start(seed)) for seed in range(8)]
+certificates = [pgo.certify(ring_problem, poses) for poses in descents]
+for seed, (poses, certificate) in enumerate(zip(descents, certificates, strict=True)):
+    gradient = np.concatenate([part.ravel() for part in ring_problem.riemannian_gradient(poses)])
+    print(f"start {seed}: gradient {np.abs(gradient).max():.0e}, {certificate!r}")
+
+# %%
+worst = max(certificates, key=lambda certificate: certificate.objective)
+stuck, best = descents[certificates.index(worst)], solvers.solve(ring)
+pgo.compare_poses(
+    ring, [(f"stuck, F = {worst.objective:.4g}", stuck), (f"optimal, F = {best.objective:.4g}", best.poses)]
+)
+
+# %% [markdown]
+# The gap of such an answer is nearly 1: almost all of its cost could be saved. A gap is not always a verdict on
+# the answer, though. If the noise is so strong that the bound itself is loose, an optimal answer keeps a gap:
+# [notebook 5](05_sdp_and_certificates.ipynb) looks for the noise at which that begins.
+
+# %%
+assert np.isclose(cost(graph, graph.truth), problem.objective(graph.truth))
+assert solution.is_certified
+assert solution.gap <= 1e-6
+assert abs(bound_by_hand - solution.lower_bound) < 1e-3
+rng = np.random.default_rng(1)
+for _ in range(100):
+    anything = pgo.Poses(pgo.random_rotations(n, d, rng), rng.normal(0.0, 3.0, (n, d)))
+    assert problem.objective(anything) >= solution.lower_bound
+assert bound_by_hand < solution.objective < problem.objective(graph.truth)
+assert worst.gap > 0.9
+for _ in range(100):  # a local minimum: nearby poses cost more
+    nearby = stuck.R @ pgo.exp_map(rng.normal(0.0, 0.01, (count, 1)))
+    assert ring_problem.objective(ring_problem.with_best_translations(nearby)) > worst.objective
+assert any(certificate.is_certified for certificate in certificates)

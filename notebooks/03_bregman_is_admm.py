@@ -1,0 +1,240 @@
+# %% [markdown]
+# # 3. What does it cost to minimise only a little before the multiplier moves?
+#
+# The paper's subsection *Equivalence to ADMM* says: iterate the minimisation of the augmented Lagrangian $T$
+# times, then update the multiplier; with $T = 1$ this is ADMM. Is $T = 1$ a sacrifice? This notebook counts.
+
+# %%
+import itertools
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import pgo_models as pgo
+import solvers
+
+plt.rcParams["figure.dpi"] = 150
+
+# %% [markdown]
+# ## Three names of one iteration
+#
+# The augmented Lagrangian of $\min J(x)$ s.t. $\mathcal{K} x = f$ is
+#
+# $$\mathcal{L}_\alpha(x, \lambda) = J(x) + \langle \lambda, f - \mathcal{K} x \rangle
+#   + \tfrac\alpha2 \lVert f - \mathcal{K} x \rVert^2,$$
+#
+# and the *method of multipliers* (equation `minbregman`) is
+# $x^{k+1} = \arg\min_x \mathcal{L}_\alpha(x, \lambda^k)$,
+# $\lambda^{k+1} = \lambda^k + \alpha (f - \mathcal{K} x^{k+1})$. Complete the square with
+# $b = -\lambda / \alpha$: it is the two-line form `bregman update` of [notebook 2](02_bregman.ipynb). Put
+# $p = \mathcal{K}^\top \lambda$: it is `update B`. No approximation is involved, as the same numbers in all
+# three show.
+
+# %%
+rng = np.random.default_rng(0)
+pursuit = pgo.basis_pursuit(rng.standard_normal((8, 20)), rng.standard_normal(8))
+forms = [solvers.Bregman(), solvers.TwoLineBregman(), solvers.MethodOfMultipliers()]
+runs = [list(itertools.islice(solvers.iterate(form, pursuit), 6)) for form in forms]
+for bregman, two_line, multiplier in zip(*runs, strict=True):
+    p = [bregman.p, -pursuit.K.T @ two_line.b, pursuit.K.T @ multiplier.lam]
+    x = [bregman.x, two_line.x, multiplier.x]
+    print(f"k = {multiplier.k}   x differs by {np.ptp(x, axis=0).max():.0e}, p by {np.ptp(p, axis=0).max():.0e}")
+
+# %% [markdown]
+# ## Two blocks
+#
+# The minimisation over all of $x$ at once can be as hard as the problem. Split $x$ into blocks that are easy
+# one by one. *Total variation denoising* of a signal $f$:
+#
+# $$\min_{u, d} \tfrac12 \lVert u - f \rVert^2 + w \lVert d \rVert_1 \quad \text{subject to} \quad D u - d = 0.$$
+#
+# Over $u$ alone it is a linear system, over $d$ alone soft thresholding. $T$ passes over both, then the
+# multiplier, in its scaled form $b$:
+
+
+# %%
+signal = np.repeat([0.0, 1.0, -0.5, 0.0, 2.0, 0.0], [20, 25, 25, 10, 10, 10])
+noisy = signal + 0.2 * rng.standard_normal(100)
+weight = 0.5
+D = np.diff(np.eye(100), axis=0)
+
+
+def alternate(alpha, passes, iterations):
+    d, b = np.zeros(99), np.zeros(99)
+    inverse = np.linalg.inv(np.eye(100) + alpha * D.T @ D)
+    for _ in range(iterations):
+        for _ in range(passes):
+            d_before = d
+            u = inverse @ (noisy + alpha * D.T @ (d - b))
+            v = D @ u + b
+            d = np.sign(v) * np.maximum(np.abs(v) - weight / alpha, 0.0)
+        b = b + D @ u - d
+        yield u, d, b, np.linalg.norm(D @ u - d), alpha * np.linalg.norm(D.T @ (d - d_before))
+
+
+# %% [markdown]
+# The last two numbers are the residuals (Boyd et al. 2011, section 3.3). The *primal* one says how far the
+# constraint is from holding. The *dual* one says how far $(u, d)$ is from minimising the Lagrangian: $u$ was
+# found with the old $d$.
+#
+# ## The library agrees
+#
+# `AlternatingBregman` knows nothing of thresholds: it gives each block to cvxpy and Clarabel. Its states are
+# the same.
+
+# %%
+denoising = pgo.total_variation_denoising(noisy, weight)
+worst_difference = {}
+for T in (1, 3):
+    states = list(itertools.islice(solvers.iterate(solvers.AlternatingBregman(alpha=1.0, passes=T), denoising), 16))
+    ours = list(alternate(1.0, T, 15))
+    worst_difference[T] = max(
+        np.abs(state.x - np.concatenate([u, d])).max() for state, (u, d, *_) in zip(states[1:], ours, strict=True)
+    )
+    print(f"T = {T}: the same to {worst_difference[T]:.0e} in 15 iterations")
+
+# %% [markdown]
+# ## T against alpha
+#
+# Count outer iterations, and inner passes in all, until both residuals are below $10^{-4}$.
+
+
+# %%
+def residuals(alpha, passes, most=3000):
+    pairs = []
+    for *_, primal, dual in alternate(alpha, passes, most):
+        pairs.append((primal, dual))
+        if max(primal, dual) < 1e-4:
+            break
+    return np.array(pairs)
+
+
+penalties, all_passes = [0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0], (1, 2, 5, 20)
+counts = np.array([[len(residuals(alpha, T)) for alpha in penalties] for T in all_passes], dtype=float)
+counts[counts == 3000] = np.nan  # not within the limit
+
+figure, (left, right) = plt.subplots(1, 2, figsize=(7.5, 2.8), layout="constrained", sharey=True)
+for T, row, marker in zip(all_passes, counts, "osD^", strict=True):
+    left.loglog(penalties, row, f"{marker}-", label=f"T = {T}")
+    right.loglog(penalties, T * row, f"{marker}-", label=f"T = {T}")
+left.set_ylabel("until 1e-4")
+for axes, title in ((left, "outer iterations"), (right, "passes over the blocks")):
+    axes.set_xlabel("penalty alpha")
+    axes.set_title(title, fontsize=10)
+_ = left.legend(fontsize=8)
+
+# %% [markdown]
+# Two regimes, and in neither is a large $T$ worth it:
+#
+# * **small penalty** (left of the valley): the multiplier moves by $\alpha$ times the residual, and that is
+#   what takes long. One pass already minimises well enough; more passes change nothing but the bill.
+# * **large penalty** (right of it): the blocks hold each other fast, and the passes are what takes long. $T$
+#   passes save a factor $T$ of outer iterations, so the number of passes is the same.
+#
+# $T = 1$ is no sacrifice then, and for robots, where a pass means a round of messages, it is the natural
+# choice. What matters is $\alpha$. Here are the residuals for three of them.
+
+# %%
+figure, panels = plt.subplots(1, 3, figsize=(7.5, 2.6), layout="constrained", sharey=True)
+for axes, alpha in zip(panels, (0.1, 3.0, 100.0), strict=True):
+    primal, dual = residuals(alpha, 1, most=120).T
+    axes.semilogy(primal, color="#0072B2", label="primal")
+    axes.semilogy(np.where(dual > 0, dual, np.nan), "--", color="#E69F00", label="dual")
+    axes.set_title(f"alpha = {alpha:g}", fontsize=10)
+    axes.set_xlabel("iteration")
+panels[0].set_ylabel("residual, T = 1")
+panels[0].set_ylim(1e-5, 10.0)
+_ = panels[0].legend(fontsize=8)
+
+# %% [markdown]
+# ## The adaptive penalty
+#
+# The picture holds the rule that the paper takes from Boyd et al. (section 3.4.1) in its subsection *The SOC
+# Algorithm*: with a small penalty the primal residual is far above the dual one, with a large penalty far
+# below. So double $\alpha$ when $r > \mu s$ and halve it when $s > \mu r$. One line is easily forgotten:
+# $b = -\lambda / \alpha$ is *scaled*. When $\alpha$ changes and $\lambda$ is not to jump, $b$ must be rescaled
+# by the inverse.
+
+
+# %%
+def adaptive(alpha, ratio, rescale=True, most=3000):
+    d, b = np.zeros(99), np.zeros(99)
+    k, worst = 0, np.inf
+    while worst >= 1e-4 and k < most:
+        d_before = d
+        u = np.linalg.solve(np.eye(100) + alpha * D.T @ D, noisy + alpha * D.T @ (d - b))
+        v = D @ u + b
+        d = np.sign(v) * np.maximum(np.abs(v) - weight / alpha, 0.0)
+        b = b + D @ u - d
+        primal, dual = np.linalg.norm(D @ u - d), alpha * np.linalg.norm(D.T @ (d - d_before))
+        k, worst = k + 1, max(primal, dual)
+        factor = 2.0 if primal > ratio * dual else 0.5 if dual > ratio * primal else 1.0
+        alpha, b = factor * alpha, b / factor if rescale else b
+    return k, alpha
+
+
+rescaled = {alpha: adaptive(alpha, 2.0) for alpha in (0.1, 1.0, 10.0, 100.0)}
+not_rescaled = {alpha: adaptive(alpha, 2.0, rescale=False, most=1000)[0] for alpha in rescaled}
+print("starting alpha     fixed   adaptive (ends at)   adaptive, b not rescaled")
+for alpha, (k, last) in rescaled.items():
+    print(f"{alpha:14g} {len(residuals(alpha, 1)):9} {k:10} ({last:.3g}) {not_rescaled[alpha]:20}")
+
+# %% [markdown]
+# From any start 70 to 80 iterations, and without the rescaling none of the runs ends within the limit of 1000:
+# every change of $\alpha$ throws the multiplier off, which changes the residuals, which changes $\alpha$.
+#
+# The library's `BalancedPenalty` is this rule for SOC, with two thoughts of OSQP added: move by a factor of
+# five, and only when the residuals differ by 25, because every new $\rho$ costs a factorisation. (A fixed
+# $\rho$ that is too small for SOC to converge at all, as 1 is here, is raised by a safeguard: [notebook
+# 4](04_splitting_orthogonality.ipynb).)
+
+# %%
+problem = pgo.PGOProblem(pgo.load("grid"))
+for start in (1.0, 10.0, 100.0, 1000.0):
+    fixed = solvers.run(solvers.SOC(penalty=solvers.FixedPenalty(start), acceleration=None), problem)
+    balanced = solvers.BalancedPenalty(scale=start / problem.M.diagonal()[problem.num_poses :].mean())
+    adapted = solvers.run(solvers.SOC(penalty=balanced, acceleration=None), problem)
+    print(f"rho = {start:6.0f}   fixed: {fixed.status.name} after {fixed.iterations}   adaptive: {adapted.iterations}")
+
+# %% [markdown]
+# ## Where it fails
+#
+# With two blocks and convex terms ADMM converges for every $\alpha > 0$. **With three it need not**, however
+# simple the problem. Chen, He, Ye and Yuan (2016) take $J = 0$ and $\mathcal{K} x = 0$, where $\mathcal{K}$ is
+# an invertible 3 by 3 matrix, so that the answer is zero. One pass over $x_1, x_2, x_3$ and the multiplier: it
+# spirals outwards.
+
+# %%
+K = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 2.0], [1.0, 2.0, 2.0]])
+
+
+def three_blocks(passes, iterations=400):
+    x, b = np.ones(3), np.zeros(3)
+    for _ in range(iterations):
+        for _ in range(passes):
+            for i in range(3):
+                others = K @ x - K[:, i] * x[i]
+                x[i] = -K[:, i] @ (others + b) / (K[:, i] @ K[:, i])
+        b = b + K @ x
+    return float(np.linalg.norm(x))
+
+
+spiral = {T: three_blocks(T) for T in (1, 2, 3, 5, 10)}
+for T, size in spiral.items():
+    print(f"T = {T:2}   ||x|| after 400 iterations {size:.1e}")
+
+# %% [markdown]
+# Here, for once, $T$ decides: with enough passes it is the method of multipliers, which converges. SOC has two
+# blocks, $R$ and $\omega$, so this does not hit it; what can hit it is that $\omega$'s set is not convex
+# ([notebook 4](04_splitting_orthogonality.ipynb)).
+
+# %%
+assert all(difference < 1e-5 for difference in worst_difference.values())
+assert np.nanmin(counts[0]) < 100
+assert np.ptp(counts[:, penalties.index(1.0)]) <= 2  # small penalty: T does not matter
+save = counts[0, -2] / counts[2, -2]
+assert 4.0 < save < 6.0  # large penalty: T = 5 saves a factor of about 5 outer iterations
+assert all(k < 90 for k, _ in rescaled.values())
+assert all(k == 1000 for k in not_rescaled.values())
+assert spiral[1] > 1e3
+assert spiral[10] < 1e-6

@@ -1,0 +1,243 @@
+# %% [markdown]
+# # 4. How can a convex solver be made to return rotations, and how large must rho be?
+#
+# The constraint $R^\top R = I$ is the whole difficulty of pose graph optimisation: without it, equation
+# `min overall` of the paper is a least-squares problem. *Splitting of orthogonality constraints* (SOC, Lai and
+# Osher 2014; the paper's Algorithm 1, `algo1: SOC`) gives every $R$ a copy $\omega$ that carries the
+# constraint, and lets Bregman iteration pull the two together.
+
+# %%
+import itertools
+import time
+
+import cvxpy as cp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import pgo_models as pgo
+import solvers
+
+plt.rcParams["figure.dpi"] = 150
+
+# %% [markdown]
+# ## The one problem with orthogonality that is easy
+#
+# The rotation nearest to a matrix $Y$:
+# $\lVert \omega - Y \rVert_F^2 = \text{const} - 2 \operatorname{tr}(\omega^\top Y)$. With the singular value
+# decomposition $Y = U D V^\top$ it is
+# $\operatorname{tr}(\omega^\top Y) = \operatorname{tr}(D \, V^\top \omega^\top U)$, where
+# $V^\top \omega^\top U$ is orthogonal and has no diagonal entry above
+# 1. So $\omega = U V^\top$ is best: step (b), and what the paper writes as $U I_{n \times n} V^\top$. If its
+#    determinant is $-1$ it is a reflection; then the smallest singular value pays:
+#    $\omega = U \operatorname{diag}(1, 1, -1) V^\top$.
+
+
+# %%
+def nearest_rotation(Y):
+    U, _, Vt = np.linalg.svd(Y)
+    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+
+
+rng = np.random.default_rng(0)
+Y = rng.standard_normal((50, 3, 3))
+by_svd = np.array([nearest_rotation(matrix) for matrix in Y])
+print("differs from the library by", np.abs(by_svd - pgo.project_to_rotations(Y)).max())
+
+# %% [markdown]
+# *Procrustes' problem*, $\min \lVert A X - C \rVert_F^2$ s.t. $X^\top X = I$, has the same closed form, with
+# $Y = A^\top C$. SOC does not know that: it needs the objective to be convex and no more. It finds the same.
+
+# %%
+A, C = rng.standard_normal((8, 3)), rng.standard_normal((8, 3))
+U, _, Vt = np.linalg.svd(A.T @ C)
+found = solvers.solve_orthogonal(pgo.procrustes(A, C), np.random.default_rng(0))
+closed_form = np.linalg.norm(A @ U @ Vt - C) ** 2
+print(f"closed form {closed_form:.8f}, SOC {found.objective:.8f}")
+
+# %% [markdown]
+# ## Algorithm 1 by hand
+#
+# $$\text{(a)}\; R = \arg\min_R f(R) + \tfrac\rho2 \lVert R - \omega + B \rVert_F^2, \qquad
+#   \text{(b)}\; \omega = \text{nearest rotation to } R + B, \qquad
+#   \text{(c)}\; B \leftarrow B + R - \omega.$$
+#
+# $f$ is the whole of equation `min overall` here, in rotations *and* translations. (The paper's step (a) has
+# rotations only, each robot with its neighbours frozen; [notebook 7](07_the_papers_tables.ipynb) runs that
+# one.) Its residuals are linear in $X$, which stacks the $t_i$ and the rows of all $R_i^\top$. (a) is a convex
+# quadratic program; cvxpy compiles it once, with $V = \omega - B$ as a parameter.
+
+# %%
+problem = pgo.PGOProblem(pgo.load("grid"))
+n, d, rho = problem.num_poses, problem.d, 12.0
+start = pgo.chordal_start(problem)
+
+residuals, w = problem.residual_matrix
+X, V = cp.Variable((problem.side, d)), cp.Parameter((n * d, d))
+edges = cp.sum_squares(cp.multiply(np.sqrt(w)[:, None], residuals @ X))
+step_a = cp.Problem(cp.Minimize(edges + rho / 2 * cp.sum_squares(X[n:] - V)))
+
+omega, B = start.R, np.zeros((n, d, d))
+by_hand = []
+for _ in range(20):
+    V.value = (omega - B).transpose(0, 2, 1).reshape(n * d, d)
+    step_a.solve(solver=cp.CLARABEL)
+    R = X.value[n:].reshape(n, d, d).transpose(0, 2, 1)
+    omega = np.array([nearest_rotation(matrix) for matrix in R + B])
+    B = B + R - omega
+    by_hand.append(omega)
+
+# %% [markdown]
+# ## The library agrees, with three back ends
+#
+# A convex QP without constraints is a linear system: $(M + \tfrac\rho2 D) X = \tfrac\rho2 D V$, with the same
+# matrix at every iteration. So factor it once (`FACTORIZED`); or use accelerated gradients as the paper does
+# (`FISTA`); or an interior-point method (`CLARABEL`).
+
+# %%
+best = solvers.solve(problem)
+plain = {"penalty": solvers.FixedPenalty(rho), "acceleration": None}
+differences, seconds = {}, {}
+for back_end in solvers.RStep:
+    began = time.perf_counter()
+    states = list(itertools.islice(solvers.iterate(solvers.SOC(r_step=back_end, **plain), problem), 21))
+    seconds[back_end] = time.perf_counter() - began
+    pairs = zip(states[1:], by_hand, strict=True)
+    differences[back_end] = max(np.abs(state.omega - mine).max() for state, mine in pairs)
+    print(f"{back_end.name:10}  differs from ours by {differences[back_end]:.0e}   {1e3 * seconds[back_end]:.0f} ms")
+
+# %% [markdown]
+# The iterates do not depend on the back end, the time does: two triangular solves beat everything else, because
+# the matrix never changes. FISTA pays where nothing can be factored; Clarabel where step (a) has constraints or
+# terms of one's own (`solvers.ChangedSOC`).
+#
+# ## How large must rho be?
+#
+# At a stationary point (a) says $2 (M X)_i + \rho (R_i - \omega_i + B_i)^\top = 0$ for the rows of pose $i$,
+# and $(M X)_i = \Lambda_i R_i^\top$ with the symmetric multipliers $\Lambda_i$ of $R_i R_i^\top = I$. With
+# $R = \omega$:
+#
+# $$B_i = -\tfrac{2}{\rho} R_i \Lambda_i, \qquad R_i + B_i = R_i \left( I - \tfrac2\rho \Lambda_i \right).$$
+#
+# Step (b) must give back $R_i$. A symmetric 3 by 3 matrix has $I$ as its nearest rotation if and only if its
+# two smallest eigenvalues have a sum $\ge 0$. With $\lambda_1 \ge \lambda_2$ the largest of $\Lambda_i$ that
+# reads
+#
+# $$\rho \ge \lambda_1(\Lambda_i) + \lambda_2(\Lambda_i) \quad \text{for every pose } i.$$
+#
+# **With a smaller $\rho$ the optimum is not even a fixed point**: the recursion cannot stay there. Let us put
+# it there and take one step.
+
+
+# %%
+def soc_step(omega, B, rho):
+    """One iteration, rho for every pose, (n,); t_0 is held at the origin."""
+    diagonal = np.concatenate([np.zeros(n), np.repeat(rho, d)]) / 2
+    matrix = problem.M.toarray() + np.diag(diagonal)
+    matrix[0, 0] *= 2
+    V = np.concatenate([np.zeros((n, d)), (omega - B).transpose(0, 2, 1).reshape(n * d, d)])
+    R = np.linalg.solve(matrix, diagonal[:, None] * V)[n:].reshape(n, d, d).transpose(0, 2, 1)
+    following = pgo.project_to_rotations(R + B)
+    return following, B + R - following
+
+
+Lambda = pgo.multipliers(problem, best.poses)
+eigenvalues = np.linalg.eigvalsh(Lambda)
+threshold = eigenvalues[:, -1] + eigenvalues[:, -2]
+moved = {}
+for factor in (0.5, 0.9, 0.99, 1.01, 1.1, 2.0):
+    B_star = -2 * best.poses.R @ Lambda / (factor * threshold)[:, None, None]
+    omega, _ = soc_step(best.poses.R, B_star, factor * threshold)
+    moved[factor] = np.abs(omega - best.poses.R).max()
+    print(
+        f"rho = {factor:4.2f} (lambda_1 + lambda_2): one step away from the optimum moves omega by {moved[factor]:.0e}"
+    )
+
+# %% [markdown]
+# The condition is sharp. It is necessary, not sufficient: a fixed point need not attract. From the chordal
+# start:
+
+
+# %%
+def gaps(rho, iterations=120):
+    omega, B, found = start.R, np.zeros((n, d, d)), []
+    for _ in range(iterations):
+        omega, B = soc_step(omega, B, rho)
+        found.append(problem.objective(problem.with_best_translations(omega)) / best.objective - 1)
+    return np.maximum(np.array(found), 1e-14)
+
+
+factors = (0.5, 1.0, 1.5, 2.0, 4.0, 16.0, 64.0)
+curves = {factor: gaps(factor * threshold) for factor in factors}
+figure, axes = plt.subplots(figsize=(6.0, 3.4), layout="constrained")
+for (factor, gap), colour in zip(curves.items(), plt.cm.viridis(np.linspace(0.0, 0.9, len(factors))), strict=True):
+    axes.semilogy(np.arange(1, len(gap) + 1), gap, color=colour, label=f"{factor:g}")
+axes.set_xlabel("iteration")
+axes.set_ylabel("F(omega) / F* - 1")
+_ = figure.legend(title="rho over\nlambda_1 + lambda_2", fontsize=8, title_fontsize=8, loc="outside right upper")
+
+# %% [markdown]
+# On this graph:
+#
+# * Up to 1.5 the run never settles at the optimum. At 1.5 it first comes within $10^{-5}$ of it, and is then
+#   thrown out again: *a small residual on the way is no proof of convergence.*
+# * At 2 the convergence is fastest of those shown; from there on a larger $\rho$ only makes the steps shorter,
+#   and the iterations grow about as $\rho$ does.
+#
+# The multipliers, which cost one product with $M$, tell where that valley is. The library's default,
+# `MultiplierPenalty`, takes $\rho_i = 8 \max(\lVert \Lambda_i \rVert, q\, m_i)$ at the chordal start: somewhat
+# to the safe side, and one $\rho$ for every pose, as the multipliers differ. Anderson acceleration then makes
+# up for what it costs.
+
+# %%
+everyday = {
+    "multiplier penalty": solvers.SOC(acceleration=None),
+    "... accelerated (the default)": solvers.SOC(),
+    "fixed rho = 1000": solvers.SOC(penalty=solvers.FixedPenalty(1000.0), acceleration=None),
+    "fixed rho = 1": solvers.SOC(penalty=solvers.FixedPenalty(1.0), acceleration=None),
+}
+runs = {name: solvers.run(soc, problem) for name, soc in everyday.items()}
+for name, run in runs.items():
+    print(f"{name:30} {run.status.name:15} {run.iterations:4} iterations, rho at the end {run.state.rho.mean():.3g}")
+
+# %% [markdown]
+# The last line asked for $\rho = 1$ and got 8: where the residual grows far above its smallest, the library
+# goes back to the best iterate and doubles $\rho$, keeping $\rho B$.
+#
+# ## Where it fails
+#
+# 1. $\rho$ below the threshold, as above.
+# 2. A limit of SOC is a *stationary point*. Convexity would make that a minimum; rotations are not convex. On
+#    the ring of [notebook 1](01_quickstart.ipynb), started where the ring winds round twice, SOC stays there,
+#    with residuals as small as anywhere.
+
+# %%
+count = 30
+ring = pgo.PoseGraph(
+    num_poses=count,
+    i=np.arange(count),
+    j=(np.arange(count) + 1) % count,
+    R_ij=pgo.exp_map(np.full((count, 1), 2 * np.pi / count)),
+    t_ij=np.tile([1.0, 0.0], (count, 1)),
+    kappa=np.full(count, 100.0),
+    tau=np.full(count, 100.0),
+    name="ring",
+)
+ring_problem = pgo.PGOProblem(ring)
+twice = ring_problem.with_best_translations(pgo.exp_map(4 * np.pi / count * np.arange(count)[:, None]))
+stuck = solvers.run(solvers.SOC(acceleration=None), ring_problem, twice)
+print(stuck)
+pgo.certify(ring_problem, stuck.poses)
+
+# %%
+assert np.allclose(by_svd, pgo.project_to_rotations(Y))
+assert np.isclose(found.objective, closed_form, rtol=1e-6)
+assert max(differences.values()) < 1e-6
+assert min(moved[factor] for factor in (0.5, 0.9, 0.99)) > 0.1
+assert max(moved[factor] for factor in (1.01, 1.1, 2.0)) < 1e-4
+assert curves[1.0][-1] > 0.1
+assert curves[1.5].min() < 1e-2 < curves[1.5][-1]
+assert curves[2.0][-1] < 1e-9 < curves[16.0][-1]
+assert runs["... accelerated (the default)"].iterations < runs["multiplier penalty"].iterations
+assert np.isclose(runs["fixed rho = 1"].objective, best.objective, rtol=1e-6)
+assert stuck.status is solvers.Status.CONVERGED
+assert stuck.objective > 100.0

@@ -1,0 +1,248 @@
+# %% [markdown]
+# # 7. Where do the last few percent of the paper's tables come from?
+#
+# In the paper's tables 1 and 3 SOC ends a few percent above the certified optimum: 3.9 % on the circle, 7.6 %
+# on the grid, 6.0 % on the sphere (as a share of its own $F$). Are those iterations that were not done, a local
+# minimum, or the model? This notebook runs the paper's experiment on its three networks, and then takes the
+# answer apart.
+
+# %%
+import itertools
+import json
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import pgo_models as pgo
+import solvers
+
+plt.rcParams["figure.dpi"] = 150
+NAMES = ("circle", "grid", "sphere")
+
+# %% [markdown]
+# ## What the paper reports
+#
+# `published_rows` has the paper's figures, from `data/reference.json`. The noise of its graphs is not
+# published, only its size, so ours are other draws of the same scenes: compare gaps, not costs.
+
+# %%
+published = {row.name: row for row in pgo.published_rows()}
+graphs = {name: pgo.load(name) for name in NAMES}
+optima = {name: solvers.solve(graph) for name, graph in graphs.items()}
+print("              paper: F*    DGS     SOC   gap of SOC      here: F*, certified to")
+for name in NAMES:
+    row, run = published[name], pgo.published_run(graphs[name])
+    print(
+        f"{name:12} {row.se_sync.objective:10.1f} {row.dgs.objective:6.1f} {row.soc.objective:7.1f} {run.gap:9.1%}"
+        f" {optima[name].objective:19.1f} {optima[name].gap:8.0e}"
+    )
+
+# %% [markdown]
+# ## Algorithm 1 to the letter
+#
+# Rotations only; one pose is one robot; every robot minimises step (a) over its own $R_i$ while its neighbours
+# stay where they were at the last iterate (the superscripts $k - 1$ in `algo1: SOC`). With one unknown matrix
+# the minimum can be written down. An edge $(i, j)$ pulls $R_i$ to $R_j R_{ij}^\top$, an edge $(j, i)$ to
+# $R_j R_{ji}$, so
+#
+# $$R_i = \frac{2 \sum_{(i,j)} \kappa_{ij} R_j R_{ij}^\top + 2 \sum_{(j,i)} \kappa_{ji} R_j R_{ji}
+#   + \rho (\omega_i - B_i)}
+#   {2 \sum \kappa + \rho},$$
+#
+# an average of what the neighbours say, and of $\omega_i - B_i$. The start is the estimate by GPS and IMU, as
+# in the paper.
+
+
+# %%
+def algorithm_1(graph, rho, iterations):
+    R = omega = graph.initial.R
+    B = np.zeros_like(R)
+    kappa = graph.kappa[:, None, None]
+    total = np.bincount(graph.i, graph.kappa, graph.num_poses) + np.bincount(graph.j, graph.kappa, graph.num_poses)
+    for _ in range(iterations):
+        pull = rho * (omega - B)
+        np.add.at(pull, graph.i, 2 * kappa * R[graph.j] @ graph.R_ij.transpose(0, 2, 1))
+        np.add.at(pull, graph.j, 2 * kappa * R[graph.i] @ graph.R_ij)
+        R = pull / (2 * total + rho)[:, None, None]
+        omega = pgo.project_to_rotations(R + B)
+        B = B + R - omega
+        yield omega
+
+
+def gap(name, rotations):
+    """F with the best translations for these rotations, over the certified optimum, minus 1."""
+    problem = optima[name].problem
+    return problem.objective(problem.with_best_translations(rotations)) / optima[name].objective - 1
+
+
+rho = 20.0  # ours: the smallest of 1, 5, 10, 20 and 50 with which all three graphs settle, see below
+by_hand = {name: list(algorithm_1(graph, rho, 150)) for name, graph in graphs.items()}
+
+# %% [markdown]
+# ## The library agrees
+
+# %%
+differences = {}
+for name, graph in graphs.items():
+    soc = solvers.SOC(coupling=solvers.Coupling.PAPER, penalty=solvers.FixedPenalty(rho))
+    states = itertools.islice(solvers.iterate(soc, optima[name].problem, graph.initial), 1, 151)
+    pairs = zip(states, by_hand[name], strict=True)
+    differences[name] = max(np.abs(state.omega - omega).max() for state, omega in pairs)
+    print(f"{name:8} differs from ours by {differences[name]:.0e} in 150 iterations")
+
+# %% [markdown]
+# ## It converges, a few percent too high
+
+# %%
+curves = {name: np.array([gap(name, omega) for omega in by_hand[name]]) for name in NAMES}
+adaptive, adaptive_curves = solvers.SOC(coupling=solvers.Coupling.PAPER), {}
+for name, graph in graphs.items():
+    states = itertools.islice(solvers.iterate(adaptive, optima[name].problem, graph.initial), 1, 151)
+    adaptive_curves[name] = np.array([gap(name, state.omega) for state in states])
+
+figure, axes = plt.subplots(figsize=(5.6, 3.2), layout="constrained")
+for name, colour in zip(NAMES, ("#0072B2", "#E69F00", "#009E73"), strict=True):
+    run = pgo.published_run(graphs[name])
+    axes.semilogy(np.arange(1, 151), curves[name], color=colour, label=name)
+    axes.semilogy(np.arange(1, 151), adaptive_curves[name], "--", color=colour, linewidth=0.8)
+    axes.semilogy(run.iterations, run.objective / run.optimum - 1, "*", color=colour, markersize=11)
+axes.set_xlabel("iteration")
+axes.set_ylabel("F(omega) / F* - 1")
+axes.set_title("rho = 20; dashed: adaptive rho; stars: the paper's SOC", fontsize=10)
+_ = axes.legend(fontsize=8)
+
+# %% [markdown]
+# All curves become flat at 4 to 9 %, the height of the stars. Read no more into where the solid ones pass the
+# stars: the paper gives no $\rho$ and adapts it, and our 20 was chosen after looking at such curves. With the
+# library's adaptive rule (dashed) the same height is reached, but the circle and the sphere are far above it
+# when the paper's iterations are over. *How soon* depends on $\rho$; *where* does not, and that is the question
+# here.
+#
+# So the last percents are not a matter of iterations. Is it a local minimum, then? Let us find the *certified
+# global* optimum of what Algorithm 1 minimises, which is the rotation part of $F$ alone: give the translations
+# next to no weight.
+
+# %%
+rotation_gaps = {}
+for name, graph in graphs.items():
+    rotations_only = pgo.PGOProblem(graph.with_weights(graph.kappa, 1e-7 * graph.tau))
+    certified = solvers.solve(rotations_only)
+    rotation_gaps[name] = gap(name, certified.poses.R)
+    print(
+        f"{name:8} best rotations by rotation measurements alone: {certified.certificate.verdict.name},"
+        f" {rotation_gaps[name]:.4f} above F*; Algorithm 1: {curves[name][-1]:.4f}"
+    )
+
+# %% [markdown]
+# Neither. **Algorithm 1 finds the global optimum of its own problem, and it is the problem that is a few
+# percent off**: the translation measurements $t_{ij} \approx R_i^\top (t_j - t_i)$ say something of $R_i$ too,
+# and rotations that were estimated without them fit them worse. The published gaps, of other draws of the
+# noise, are of the same size, so on these three scenes they *may* be those of the first stage alone. That is
+# our guess, not the paper's statement, and the full table below speaks against it for the cubicle and the
+# torus.
+#
+# Two ways to close the gap: the second stage that the paper proposes, Gauss-Newton on the full poses; or step
+# (a) over rotations and translations together from the beginning, as in [notebook
+# 4](04_splitting_orthogonality.ipynb).
+
+# %%
+endings = {}
+for name in NAMES:
+    problem = optima[name].problem
+    second = solvers.run(solvers.gauss_newton(), problem, problem.with_best_translations(by_hand[name][-1]))
+    joint = solvers.run(solvers.SOC(), problem)
+    endings[name] = (second.objective / optima[name].objective - 1, joint.objective / optima[name].objective - 1)
+    print(
+        f"{name:8} Gauss-Newton after it: {endings[name][0]:8.0e} in {second.iterations} steps;"
+        f" joint SOC: {endings[name][1]:8.0e} in {joint.iterations} iterations"
+    )
+
+# %% [markdown]
+# ## The tables
+#
+# `reproduce_tables` runs the methods of the tables as the paper does, SOC with as many rounds as the paper took
+# iterations, both its stages together. Here two draws of each scene; `pgo tables` on the command line takes
+# twenty, and the benchmark graphs.
+
+# %%
+tables = solvers.reproduce_tables(solvers.ReproductionSettings(only=NAMES, num_seeds=2), progress=False)
+print(f"{'graph':8} {'method':24} {'gap':>9}   {'paper':>6}   rounds")
+for row in tables.rows:
+    gap_here = np.mean([cell.gap for cell in row.cells])
+    gap_there = "-" if row.published_gap is None else f"{row.published_gap:.1%}"
+    counted = [cell.rounds for cell in row.cells if cell.rounds is not None]
+    rounds = f"{np.mean(counted):.0f}" if counted else "-"
+    print(f"{row.published.name:8} {row.contender.label:24} {gap_here:9.1e}   {gap_there:>6}   {rounds}")
+for finding in solvers.findings(tables):
+    print(finding)
+
+# %% [markdown]
+# ## The full table
+#
+# The cubicle and the torus take longer than a notebook should. Their figures are in `tables.json` beside this
+# notebook, made by
+#
+#     PGO_DATA=folder-with-the-graphs pgo tables --out notebooks/tables.json
+#
+# A row without figures has its reason as `remark` in the file: `rim` was not at hand when it was made.
+
+# %%
+full = json.loads(Path("tables.json").read_text(encoding="utf-8"))
+print(
+    f"{'graph':15} {'method':24} {'F':>10} {'gap':>8} {'SOC alone':>10}   {'paper: F':>9} {'gap':>6}   rounds (paper)"
+)
+for row in full["rows"]:
+    if row["objective"] is None:
+        print(f"{row['graph']:15} {row['method']:24} no figures")
+        continue
+    known = row["paper_objective"] is not None
+    paper = f"{row['paper_objective']:9.6g} {row['paper_gap']:6.1%}" if known else f"{'-':>9} {'-':>6}"
+    alone = "-" if row["gap_after_first_stage"] is None else f"{row['gap_after_first_stage']:.1e}"
+    rounds = "-" if row["rounds"] is None else f"{row['rounds']:.0f}"
+    theirs = "" if row["paper_iterations"] is None else f" ({row['paper_iterations']})"
+    print(
+        f"{row['graph']:15} {row['method']:24} {row['objective']:10.6g} {row['gap']:8.1e} {alone:>10}"
+        f"   {paper}   {rounds}{theirs}"
+    )
+
+# %% [markdown]
+# Compare like with like. Within the paper's iterations `SOC as in the paper` ends far below the paper's $F$,
+# but it is Gauss-Newton that brings it there, in those rounds that the first stage leaves over, and the paper
+# does not say how far it runs its own. After SOC alone (its own column, as a gap; at most half of the rounds)
+# our figures are *above* the paper's on all graphs but the garage. On the scenes the dashed curves show why. On
+# the cubicle and the torus it is no matter of rounds: there SOC has converged, and the paper's 724.56 and
+# 24449.94 are lower than where; this notebook cannot say why.
+
+# %% [markdown]
+# ## Where it fails
+#
+# The paper's coupling has its price: with its neighbours frozen, a robot sees their old rotations. Too small a
+# $\rho$ and the run never settles, as in [notebook 4](04_splitting_orthogonality.ipynb), but here it needs a
+# larger one; and information travels one edge an iteration: on the torus its first stage takes 981 of them.
+
+# %%
+never = {name: list(algorithm_1(graph, 1.0, 150))[-1] for name, graph in graphs.items()}
+for name in NAMES:
+    ends = {value: gap(name, list(algorithm_1(graphs[name], value, 150))[-1]) for value in (1.0, 5.0, 10.0, 20.0, 50.0)}
+    print(f"{name:8} above F* after 150 iterations:", *(f"rho {value:g}: {end:.3f} " for value, end in ends.items()))
+
+# %%
+assert all(difference < 1e-9 for difference in differences.values())
+for name in NAMES:
+    run = pgo.published_run(graphs[name])
+    assert optima[name].is_certified
+    assert 0.02 < curves[name][-1] < 0.12
+    assert abs(curves[name][-1] - rotation_gaps[name]) < 1e-3
+    assert abs(adaptive_curves[name][-1] - rotation_gaps[name]) < 1e-3
+    assert all(abs(ending) < 1e-5 for ending in endings[name])
+    assert gap(name, never[name]) > 1.5 * curves[name][-1]
+assert not any(finding.failed for finding in solvers.findings(tables))
+by_name = {(row["graph"], row["method"]): row for row in full["rows"]}
+for name in ("parking-garage", "cubicle", "torus3D"):
+    soc = by_name[name, "SOC as in the paper"]
+    assert soc["objective"] < soc["paper_objective"]
+    assert soc["rounds"] <= soc["paper_iterations"]
+for name in ("cubicle", "torus3D"):
+    soc = by_name[name, "SOC as in the paper"]
+    assert soc["gap_after_first_stage"] > soc["paper_gap"]

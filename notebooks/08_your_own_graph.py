@@ -1,0 +1,207 @@
+# %% [markdown]
+# # 8. You have a pose graph, and perhaps a solution: what now?
+#
+# This notebook starts from a `.g2o` file, as SLAM front ends write it, judges a solution that came from
+# elsewhere, looks for the measurement that is to blame, and hands the result on to
+# [evo](https://github.com/MichaelGrupp/evo).
+
+# %%
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+import pgo_models as pgo
+import solvers
+
+# %% [markdown]
+# ## A graph in text
+#
+# A line is a pose or a measurement. In the plane a pose is `VERTEX_SE2 id x y theta`, a measurement
+# `EDGE_SE2 i j dx dy dtheta` with the upper triangle of its information matrix, the inverse of its covariance.
+# (In space they are `VERTEX_SE3:QUAT` and `EDGE_SE3:QUAT`, with quaternions `qx qy qz qw`.) Let us write one by
+# hand: a robot drives three times round a square of 8 m, and whenever it passes a place again, it measures
+# where it was the round before.
+
+# %%
+rng = np.random.default_rng(3)
+side, rounds = 8, 3
+num_poses = 4 * side * rounds
+heading = (np.arange(num_poses) // side) % 4 * np.pi / 2
+position = np.zeros((num_poses, 2))
+position[1:] = np.cumsum(np.column_stack([np.cos(heading), np.sin(heading)])[:-1], axis=0)
+
+
+def measured(i, j, metres, radians):
+    c, s = np.cos(heading[i]), np.sin(heading[i])
+    dx, dy = np.array([[c, s], [-s, c]]) @ (position[j] - position[i]) + rng.normal(0.0, metres, 2)
+    turn = heading[j] - heading[i] + rng.normal(0.0, radians)
+    information = f"{metres**-2:.6g} 0 0 {metres**-2:.6g} 0 {radians**-2:.6g}"
+    return f"EDGE_SE2 {i} {j} {dx:.6f} {dy:.6f} {np.arctan2(np.sin(turn), np.cos(turn)):.6f} {information}"
+
+
+lines = [measured(i, i + 1, 0.05, 0.03) for i in range(num_poses - 1)]
+lines += [measured(i, i + 4 * side, 0.1, 0.05) for i in range(0, num_poses - 4 * side, 3)]
+folder = tempfile.TemporaryDirectory()
+path = Path(folder.name) / "square.g2o"
+path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+print(*lines[:2], lines[-1], sep="\n")
+
+# %% [markdown]
+# ## Read it
+#
+# The cost $F$ of the paper's equation `min overall` has one number for the rotation and one for the translation
+# of an edge. An information matrix becomes the precisions $\kappa$ and $\tau$ as in SE-Sync: in the plane
+# $\kappa = I_{\theta\theta}$, $\tau = 2 / \operatorname{tr}(I_{tt}^{-1})$; in space
+# $\kappa = 3 / (2 \operatorname{tr}(I_{rr}^{-1}))$, $\tau = 3 / \operatorname{tr}(I_{tt}^{-1})$.
+
+# %%
+graph = pgo.read_g2o(path)
+problem = pgo.PGOProblem(graph)
+print(graph)
+print(f"tau of a step {graph.tau[0]:.1f} = 0.05^-2 per m^2, kappa {graph.kappa[0]:.1f} = 0.03^-2 per rad^2")
+
+# %% [markdown]
+# A file that is wrong is refused in one line that says where, what, and what to do.
+
+# %%
+broken = Path(folder.name) / "broken.g2o"
+broken.write_text("\n".join([*lines[:5], "EDGE_SE2 5 6 1.0 0.0"]) + "\n", encoding="utf-8")
+message = ""
+try:
+    pgo.read_g2o(broken)
+except pgo.PGOError as error:
+    message = str(error)
+print(message.replace(folder.name, "..."))
+
+# %% [markdown]
+# ## Solve it
+#
+# There were no `VERTEX` lines, so there is no estimate to start from; none is needed. Composing the odometry,
+# which is what one would have without loop closures, drifts.
+
+# %%
+odometry = pgo.odometry_start(graph)
+solution = solvers.solve(graph)
+print(solution)
+names = (f"odometry, F = {problem.objective(odometry):.0f}", f"solved, F = {solution.objective:.1f}")
+pgo.compare_poses(graph, list(zip(names, (odometry, solution.poses), strict=True)))
+
+# %% [markdown]
+# ## Certify someone else's solution
+#
+# Somebody hands over a trajectory in a TUM file (`time x y z qx qy qz qw`). Say it is the chordal relaxation,
+# rounded, which many programs start from and some stop at. Its gap is the most that it leaves on the table,
+# proven, whoever made it and however.
+
+# %%
+theirs_path = Path(folder.name) / "theirs.tum"
+pgo.write_tum(pgo.chordal_start(problem), theirs_path)
+
+theirs = pgo.read_tum(theirs_path, d=2)
+certificate = pgo.certify(problem, theirs)
+print(certificate)
+
+# %% [markdown]
+# By hand that needs nothing but $F$ and somebody's proof of a bound:
+#
+# $$\text{gap} = \frac{F(\text{theirs}) - b}{\max(1, F(\text{theirs}))},$$
+#
+# and the proof can be checked by anyone: the certificate has $\Lambda$ and $\eta$, and one Cholesky
+# factorisation of $S + \eta I$ that goes through is all there is to it ([notebook 1](01_quickstart.ipynb)).
+
+# %%
+n, d = problem.num_poses, problem.d
+S = pgo.certificate_matrix(problem, certificate.Lambda, certificate.eta).toarray()
+np.linalg.cholesky(S[1:, 1:])  # t_0 is taken out: a common shift of all poses costs nothing
+bound = np.trace(certificate.Lambda, axis1=1, axis2=2).sum() - certificate.eta * n * d
+F_theirs = problem.objective(theirs)
+gap_by_hand = (F_theirs - bound) / max(1.0, F_theirs)
+print(f"gap {gap_by_hand:.6f} by hand, {certificate.gap:.6f} by the library")
+
+# %% [markdown]
+# ## Where it fails: a wrong loop closure
+#
+# The certificate says that no poses fit *these measurements* better. It does not say that the measurements are
+# right. Put in one wrong loop closure, a place taken for another 2 m further on that looks the same: the
+# solution is certified, and wrong.
+
+# %%
+wrong = f"EDGE_SE2 10 {12 + 4 * side} 0.000000 0.000000 0.000000 100 0 0 100 0 400"
+path.write_text("\n".join([*lines, wrong]) + "\n", encoding="utf-8")
+fooled = solvers.solve(pgo.read_g2o(path))
+suspect = pgo.edge_residuals(fooled.problem.graph, fooled.poses)
+worst = int(np.argmax(suspect.cost))
+print(f"{fooled!r}; F was {solution.objective:.1f} without that edge")
+print(f"worst: {fooled.problem.graph.edge_label(worst)}, {suspect.share[worst]:.0%} of F")
+print("edges that stand out:", np.flatnonzero(suspect.is_misfit))
+pgo.plot_graph(fooled.problem.graph, fooled.poses, "certified, and wrong")
+
+# %% [markdown]
+# (A grosser mistake may show itself: below, an edge that is wrong by 9 m leaves a gap, because the relaxation
+# is no longer tight. Do not count on it.)
+
+# %%
+gross = f"EDGE_SE2 10 {10 + 2 * side} 0.000000 0.000000 0.000000 100 0 0 100 0 400"
+path.write_text("\n".join([*lines, gross]) + "\n", encoding="utf-8")
+shown = solvers.solve(pgo.read_g2o(path))
+print(repr(shown))
+
+# %% [markdown]
+# What helps is to look at the residuals: of 118 edges one has a share of $F$ that nobody would expect by
+# chance, and the picture marks it. Two right ones beside it stand out as well, because it drags them along:
+# take out the worst, solve again, and look again.
+
+# %%
+truth = pgo.Poses(pgo.exp_map(heading[:, None]), position)
+for name, poses in (("odometry", odometry), ("with the wrong edge", fooled.poses), ("without it", solution.poses)):
+    metres, radians = pgo.relative_pose_error(poses, truth)
+    print(f"{name:20} ATE {pgo.absolute_trajectory_error(poses, truth):.3f} m   RPE {metres:.3f} m, {radians:.3f} rad")
+
+# %% [markdown]
+# ## Hand it on
+#
+# `Solution.save` writes what the suffix says: `.g2o` for the next optimiser, TUM and KITTI for evo, `.json` for
+# everything else. In the plane the trajectories are lifted to $z = 0$.
+
+# %%
+for name in ("solved.g2o", "solved.tum", "solved.kitti", "solved.json"):
+    solution.save(Path(folder.name) / name)
+pgo.write_tum(truth, Path(folder.name) / "truth.tum")
+for name in ("solved.tum", "solved.kitti"):
+    print(f"{name:13} {(Path(folder.name) / name).read_text(encoding='utf-8').splitlines()[1][:90]}")
+
+# %% [markdown]
+# On the command line:
+#
+#     pgo solve square.g2o --out solved.tum --report solved.html
+#     pgo certify square.g2o --estimate theirs.tum
+#     evo_ape tum truth.tum solved.tum --align --plot
+#
+# What was written comes back:
+
+# %%
+returned = pgo.read_tum(Path(folder.name) / "solved.tum", d=2)
+again = pgo.read_g2o(Path(folder.name) / "solved.g2o")
+kitti = pgo.read_kitti(Path(folder.name) / "solved.kitti", d=2)
+print(f"F of the poses: solved {solution.objective:.9f}, TUM {problem.objective(returned):.9f}, ", end="")
+print(f"KITTI {problem.objective(kitti):.9f}, g2o {problem.objective(again.initial):.9f}")
+
+# %%
+assert np.isclose(graph.tau[0], 0.05**-2, rtol=1e-5)
+assert np.isclose(graph.kappa[0], 0.03**-2, rtol=1e-5)
+assert "broken.g2o" in message
+assert "6" in message
+assert solution.is_certified
+assert np.isclose(gap_by_hand, certificate.gap)
+assert certificate.gap > 1e-6
+assert bound <= solution.objective <= F_theirs
+assert fooled.is_certified
+assert fooled.objective > 1.5 * solution.objective
+assert worst == graph.num_edges
+assert not shown.is_certified
+assert pgo.absolute_trajectory_error(solution.poses, truth) < 0.8 * pgo.absolute_trajectory_error(fooled.poses, truth)
+assert np.isclose(problem.objective(returned), solution.objective, rtol=1e-9)
+assert np.isclose(problem.objective(kitti), solution.objective, rtol=1e-9)
+assert np.isclose(problem.objective(again.initial), solution.objective, rtol=1e-9)
+folder.cleanup()

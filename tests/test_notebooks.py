@@ -1,0 +1,115 @@
+"""The notebooks: their sources run, use public names only and end with asserts; every .ipynb is built from its source.
+
+`python notebooks/build.py` builds them. Neither Jupyter nor jupytext is needed here: a percent script is Python.
+"""
+
+import ast
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import pgo_models
+import solvers
+
+FOLDER = Path(__file__).parent.parent / "notebooks"
+SOURCES = sorted(FOLDER.glob("[0-9][0-9]_*.py"))
+NAMES = [source.stem for source in SOURCES]
+LIBRARIES = {"cvxpy", "matplotlib", "numpy", "scipy"}
+MOST_BYTES = 400_000
+
+each_source = pytest.mark.parametrize("source", SOURCES, ids=NAMES)
+
+
+def cells(source: Path) -> list[tuple[str, str]]:
+    """Kind and text of every cell of a percent script."""
+    found: list[tuple[str, list[str]]] = []
+    for line in source.read_text(encoding="utf-8").splitlines():
+        if line in ("# %%", "# %% [markdown]"):
+            found.append(("markdown" if line.endswith("[markdown]") else "code", []))
+        elif found:
+            found[-1][1].append(line)
+        else:
+            assert not line.strip(), f"{source.name} has text before its first cell"
+    return [(kind, text_of(kind, lines)) for kind, lines in found]
+
+
+def text_of(kind: str, lines: list[str]) -> str:
+    if kind == "markdown":
+        assert all(line.startswith("#") or not line for line in lines), f"markdown without a comment sign: {lines}"
+        lines = [line.removeprefix("#").removeprefix(" ") for line in lines]
+    return "\n".join(lines).strip("\n")
+
+
+def test_there_is_a_notebook_for_every_topic():
+    assert [name[:2] for name in NAMES] == [f"{number:02d}" for number in range(1, 9)]
+    assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == NAMES
+
+
+@each_source
+def test_a_source_runs_and_leaves_nothing_behind(source):
+    before = sorted(FOLDER.iterdir())
+    environment = {name: value for name, value in os.environ.items() if name != "PGO_DATA"}
+    environment |= {
+        "MPLBACKEND": "Agg",
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "PYTHONPATH": str(FOLDER.parent),
+    }
+    ended = subprocess.run(  # where Jupyter would run it
+        [sys.executable, "-W", "error", source.name], cwd=FOLDER, env=environment, capture_output=True, text=True
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert sorted(FOLDER.iterdir()) == before
+
+
+@each_source
+def test_a_notebook_is_in_step_with_its_source(source):
+    notebook = json.loads(source.with_suffix(".ipynb").read_text(encoding="utf-8"))
+    built = [(cell["cell_type"], "".join(cell["source"])) for cell in notebook["cells"]]
+    assert built == cells(source), f"{source.name} has changed: run `python notebooks/build.py {source.name[:2]}`"
+
+
+@each_source
+def test_a_notebook_was_run_to_its_end_and_is_small(source):
+    path = source.with_suffix(".ipynb")
+    notebook = json.loads(path.read_text(encoding="utf-8"))
+    code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
+    outputs = [output for cell in code for output in cell["outputs"]]
+    assert not [output for output in outputs if output["output_type"] == "error" or output.get("name") == "stderr"]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) >= 1
+    assert path.stat().st_size <= MOST_BYTES
+
+
+@each_source
+def test_a_source_asks_a_question_and_ends_with_asserts(source):
+    parts = cells(source)
+    kind, opening = parts[0]
+    assert kind == "markdown"
+    assert opening.startswith(f"# {int(source.name[:2])}. ")
+    assert "?" in opening
+    kind, ending = [part for part in parts if part[0] == "code"][-1]
+    assert any(isinstance(node, ast.Assert) for node in ast.parse(ending).body)
+
+
+@each_source
+def test_a_source_uses_public_names_only(source):
+    tree = ast.parse(source.read_text(encoding="utf-8"))
+    packages = {"pgo": pgo_models.__all__, "solvers": solvers.__all__}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                if alias.name.startswith(("pgo_models", "solvers")):
+                    assert (alias.name, alias.asname) in (("pgo_models", "pgo"), ("solvers", None))
+                else:
+                    assert alias.name.split(".")[0] in LIBRARIES | sys.stdlib_module_names
+        elif isinstance(node, ast.ImportFrom):
+            assert node.module.split(".")[0] in LIBRARIES | sys.stdlib_module_names, f"import all of {node.module}"
+        elif isinstance(node, ast.Attribute):
+            assert not node.attr.startswith("_"), f"{node.attr} is private"
+            if isinstance(node.value, ast.Name) and node.value.id in packages:
+                assert node.attr in packages[node.value.id], f"{node.value.id}.{node.attr} is not public"
