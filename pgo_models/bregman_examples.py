@@ -21,6 +21,11 @@ def basis_pursuit(K: Array, f: Array) -> BregmanProblem:
 
     Bregman iteration ends after finitely many steps, and forgets errors made on the way (Yin et al. 2008; Yin & Osher
     2013).
+
+    Examples
+    --------
+    >>> basis_pursuit(np.ones((2, 5)), np.ones(2))
+    BregmanProblem(m=5, s=2, blocks=1)
     """
     x = cp.Variable(np.shape(K)[-1], name="x")
     return BregmanProblem(cp.norm1(x), x, K, f)
@@ -52,6 +57,12 @@ def total_variation_denoising(noisy: Array, weight: float) -> BregmanProblem:
     References
     ----------
     Rudin, Osher, Fatemi 1992; Goldstein & Osher 2009.
+
+    Examples
+    --------
+    >>> problem = total_variation_denoising(np.array([0.1, -0.1, 1.1, 0.9]), weight=0.2)
+    >>> problem
+    BregmanProblem(m=7, s=3, blocks=2)
     """
     noisy = finite_array(noisy, "noisy")
     if not 0 <= weight < np.inf:
@@ -67,6 +78,11 @@ def total_variation_scale_space(noisy: Array) -> BregmanProblem:
 
     They begin over-smoothed and take detail back, large contrasts first and noise last: stop when
     ||u - noisy|| falls below the norm of the noise (Osher et al. 2005).
+
+    Examples
+    --------
+    >>> total_variation_scale_space(np.zeros((3, 4)))
+    BregmanProblem(m=12, s=12, blocks=1)
     """
     noisy = finite_array(noisy, "noisy")
     u = cp.Variable(noisy.shape, name="u")
@@ -122,6 +138,15 @@ def shared_rotation_step(graph: PoseGraph, robots: Partition, V: Array, rho: flo
     ------
     SettingError
         When rho is not positive or V has another shape.
+
+    Examples
+    --------
+    >>> from pgo_models.partition import partition
+    >>> from pgo_models.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> step = shared_rotation_step(graph, partition(graph, 2), graph.truth.R, rho=1.0)
+    >>> [len(poses) for poses in step.held], step.problem
+    ([23, 22], BregmanProblem(m=405, s=162, blocks=2))
     """
     n, d = graph.num_poses, graph.d
     V = finite_array(V, "V")

@@ -27,6 +27,11 @@ class BregmanPoint:
 
     `lam` is the paper's lambda: the Lagrangian is J(x) + <lam, f - K x>, so that p = K^T lam is a subgradient of J at
     a solution, and b = -lam / alpha.
+
+    Examples
+    --------
+    >>> BregmanPoint(x=np.zeros(3), lam=np.zeros(1)).lam.shape
+    (1,)
     """
 
     x: Array

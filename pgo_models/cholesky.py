@@ -24,14 +24,26 @@ class _Capsule(Protocol):
 
 
 class CholeskyBackend(enum.Enum):
-    """Which library factors."""
+    """Which library factors.
+
+    Examples
+    --------
+    >>> factorize(csc_array([[4.0]]), CholeskyBackend.SUPERLU).solve(np.array([2.0]))
+    array([0.5])
+    """
 
     SUPERLU = "SuperLU (scipy)"
     CHOLMOD = "CHOLMOD (CVXOPT)"
 
 
 def default_backend() -> CholeskyBackend:
-    """CHOLMOD when CVXOPT is installed, SuperLU otherwise."""
+    """CHOLMOD when CVXOPT is installed, SuperLU otherwise.
+
+    Examples
+    --------
+    >>> default_backend() in CholeskyBackend
+    True
+    """
     installed = importlib.util.find_spec("cvxopt") is not None
     return CholeskyBackend.CHOLMOD if installed else CholeskyBackend.SUPERLU
 

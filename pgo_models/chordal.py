@@ -25,6 +25,14 @@ class CliqueTree:
         Poses of every clique, ascending; parents before children.
     parent : (K,)
         Parent of every clique, -1 for the root.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> tree = clique_tree(graph)
+    >>> len(tree.cliques) == len(tree.parent)
+    True
     """
 
     cliques: tuple[IntArray, ...]
@@ -46,12 +54,19 @@ def clique_tree(graph: PoseGraph) -> CliqueTree:
     """Eliminate poses in the order of least degree, and merge cliques of the elimination where that saves work.
 
     A child and its parent are merged when the cube of the union's side is at most the sum of their cubes and an
-    overhead; sides are those of `pgo_models.clique_relaxation`.
+    overhead; sides are those of `pgo_models.clique_sdp`.
 
     References
     ----------
     Vandenberghe & Andersen, Chordal graphs and semidefinite optimization, 2015, chapters 4 and 6; the merging is that
     of Garstka, Cannon & Goulart, A clique graph based merging strategy, 2020, on the edges of the tree.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> max(len(clique) for clique in clique_tree(graph).cliques) < graph.num_poses
+    True
     """
     members, parent = _eliminate(graph)
     d = graph.d

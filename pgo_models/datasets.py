@@ -66,19 +66,25 @@ SE_SYNC = Registry(
 )
 
 
-def load(name_or_path: str | Path, registry: Registry = SE_SYNC) -> PoseGraph:
+def load(name_or_path: str | Path, registry: Registry = SE_SYNC, *, download: bool = True) -> PoseGraph:
     """Pose graph of a file, a folder with one file for each robot, or a data set's name.
 
     A name is looked for in the project's data folder, in ./data, in the folder named by the environment variable
-    PGO_DATA, and in the user's cache; then it is downloaded. What the cache holds is checked against its checksum.
+    PGO_DATA, and in the user's cache; then it is downloaded, unless `download` is false. What the cache holds is
+    checked against its checksum.
     Beside `x.g2o`, or the folder `x`, a file `x.truth.tum` gives the ground truth, in the order of the poses.
 
     Raises
     ------
     DatasetError
-        When the name is unknown, the download fails, or what came does not have the right checksum.
+        When the name is unknown, the download fails or is not wanted, or what came does not have the right checksum.
     FileFormatError
         See `read_g2o`; also when the truth has not one pose for each of the graph.
+
+    Examples
+    --------
+    >>> load("sphere")
+    PoseGraph('sphere', d=3, poses=50, edges=544, robots=1)
     """
     path = Path(name_or_path)
     name = str(name_or_path)
@@ -98,11 +104,17 @@ def load(name_or_path: str | Path, registry: Registry = SE_SYNC) -> PoseGraph:
             f"no file and no data set {name!r}; {meant}known are {', '.join(known)}; "
             f"or give a path, or put {name}.g2o into the folder named by {DATA_VARIABLE}"
         )
-    return _read(_cached(name, registry))
+    return _read(_cached(name, registry, download))
 
 
 def known_datasets(registry: Registry = SE_SYNC) -> tuple[str, ...]:
-    """Names that `load` takes: what is in the data folders, and what the registry can download."""
+    """Names that `load` takes: what is in the data folders, and what the registry can download.
+
+    Examples
+    --------
+    >>> "sphere" in known_datasets()
+    True
+    """
     names = set(registry.checksums)
     for folder in _folders():
         names |= {file.stem for file in folder.glob("*.g2o") if file.is_file()}
@@ -110,9 +122,14 @@ def known_datasets(registry: Registry = SE_SYNC) -> tuple[str, ...]:
     return tuple(sorted(names, key=lambda name: (name.lower(), name)))
 
 
-def _folders() -> list[Path]:
+def project_folders() -> list[Path]:
+    """Where the project's own data can be: inside an installed package, beside the packages in a checkout."""
     package = Path(__file__).resolve().parent
-    folders = [package / "data", package.parent / "data", Path("data")]
+    return [package / "data", package.parent / "data"]
+
+
+def _folders() -> list[Path]:
+    folders = [*project_folders(), Path("data")]
     if os.environ.get(DATA_VARIABLE):
         folders.append(Path(os.environ[DATA_VARIABLE]))
     return [folder for folder in folders if folder.is_dir()]
@@ -135,13 +152,15 @@ def _read(path: Path) -> PoseGraph:
     return replace(graph, truth=truth)
 
 
-def _cached(name: str, registry: Registry) -> Path:
+def _cached(name: str, registry: Registry, download: bool) -> Path:
     import pooch  # here, since it and requests take longer to import than all the rest
 
     cache = Path(pooch.os_cache("pgo-splitting")) if registry.cache is None else registry.cache
     path = cache / f"{name}.g2o"
     if path.is_file() and _fits(path, registry.checksums[name]):
         return path
+    if not download:
+        raise DatasetError(f"{name} is not here; download it with: pgo info {name}, or {_by_hand(name)}")
     try:
         cache.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -6,19 +6,55 @@ from pathlib import Path
 
 
 class PGOError(Exception):
-    """Root of every error that a wrong input or a missing piece raises here."""
+    """Root of every error that a wrong input or a missing piece raises here.
+
+    Examples
+    --------
+    >>> issubclass(GraphError, PGOError), issubclass(SettingError, PGOError)
+    (True, True)
+    """
 
 
 class GraphError(PGOError):
-    """A pose graph, or poses, that cannot be what they claim to be."""
+    """A pose graph, or poses, that cannot be what they claim to be.
+
+    Examples
+    --------
+    >>> from pgo_models import Poses
+    >>> try:
+    ...     Poses.identity(3, 2).aligned_to(Poses.identity(4, 2))
+    ... except GraphError as error:
+    ...     print(error)
+    Poses(n=3, d=2) and Poses(n=4, d=2) have different sizes; give two estimates of the same poses
+    """
 
 
 class SettingError(PGOError, ValueError):
-    """A setting of a solver, a model or a scene that is out of its range."""
+    """A setting of a solver, a model or a scene that is out of its range.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import NoiseModel
+    >>> try:
+    ...     NoiseModel(rotation_std=-1.0)
+    ... except SettingError as error:
+    ...     print(error)
+    rotation_std must be positive and finite, got -1.0
+    """
 
 
 class FileFormatError(PGOError):
-    """A file that cannot be read; the message opens with `file:line`."""
+    """A file that cannot be read; the message opens with `file:line`.
+
+    Examples
+    --------
+    >>> from pgo_models import read_g2o
+    >>> try:
+    ...     read_g2o("missing.g2o")
+    ... except FileFormatError as error:
+    ...     print(error)
+    missing.g2o: no such file; check the path
+    """
 
     def __init__(self, path: Path | str, line: int | None, problem: str) -> None:
         """Say where (`path`, 1-based `line`) and what (`problem`, with the value and the way out)."""
@@ -26,20 +62,65 @@ class FileFormatError(PGOError):
         super().__init__(f"{where}: {problem}")
         self.path = Path(path)
         self.line = line
+        self._given = path, line, problem
+
+    def __reduce__(self) -> tuple[type[FileFormatError], tuple[Path | str, int | None, str]]:
+        return type(self), self._given
 
 
 class DatasetError(PGOError):
-    """A named data set that is nowhere to be found, or whose checksum does not fit."""
+    """A named data set that is nowhere to be found, or whose checksum does not fit.
+
+    Examples
+    --------
+    >>> from pgo_models import load
+    >>> try:
+    ...     load("sphere25000")
+    ... except DatasetError as error:
+    ...     print(str(error)[:37])
+    no file and no data set 'sphere25000'
+    """
 
 
 class NotPositiveDefiniteError(PGOError):
-    """A matrix that should have a Cholesky factorisation has none."""
+    """A matrix that should have a Cholesky factorisation has none.
+
+    Examples
+    --------
+    >>> from scipy.sparse import csc_array
+    >>> from pgo_models.cholesky import factorize
+    >>> try:
+    ...     factorize(csc_array([[1.0, 0.0], [0.0, -1.0]]))
+    ... except NotPositiveDefiniteError:
+    ...     print("not positive definite")
+    not positive definite
+    """
+
+
+class EngineError(PGOError):
+    """A place where robots run that cannot be reached, has no room for them, or loses them.
+
+    Examples
+    --------
+    >>> issubclass(EngineError, PGOError)
+    True
+    """
 
 
 class MissingExtraError(PGOError):
-    """An optional dependency is not installed; the message names the extra."""
+    """An optional dependency is not installed; the message names the extra.
+
+    Examples
+    --------
+    >>> print(MissingExtraError("matplotlib", "plot"))
+    matplotlib is not installed; run: pip install 'pgo-splitting[plot]'
+    """
 
     def __init__(self, package: str, extra: str) -> None:
         """Name the missing `package` and the `extra` that brings it."""
         super().__init__(f"{package} is not installed; run: pip install 'pgo-splitting[{extra}]'")
         self.extra = extra
+        self._package = package
+
+    def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str]]:
+        return type(self), (self._package, self.extra)

@@ -20,6 +20,7 @@ from pgo_models.poses import Poses
 from pgo_models.rotations import Array, log_map, quaternions_from_rotations
 
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
+MOST_SYMBOLS = len(_LETTERS)  # robots whose poses can be named by GTSAM symbols
 _LETTER_SHIFT = 56  # a GTSAM symbol is a letter in the top byte and an index below it
 
 
@@ -43,6 +44,15 @@ def read_g2o(path: Path | str) -> PoseGraph:
     ------
     FileFormatError
         See `read_lines`; also for a folder without g2o files, no edges, and a FIX line of an unknown pose.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pgo_models.scenes import grid
+    >>> path = Path(tempfile.mkdtemp()) / "grid.g2o"
+    >>> write_g2o(grid(np.random.default_rng(0)), path)
+    >>> read_g2o(path)
+    PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
     """
     path = Path(path)
     files = [read_lines(file) for file in _files_of(path)]
@@ -110,6 +120,15 @@ def write_g2o(graph: PoseGraph, path: Path | str, poses: Poses | None = None) ->
         When `poses` do not have the size of the graph.
     PGOError
         When the file cannot be written; what stood there stays.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pgo_models.scenes import grid
+    >>> path = Path(tempfile.mkdtemp()) / "grid.g2o"
+    >>> write_g2o(grid(np.random.default_rng(0)), path)
+    >>> path.read_text().split()[0]
+    'VERTEX_SE3:QUAT'
     """
     every = np.ones(graph.num_edges, dtype=bool)
     _write(graph, Path(path), _poses_to_write(graph, poses), np.ones(graph.num_poses, dtype=bool), every)
@@ -173,14 +192,31 @@ def symbol_ids(robots: IntArray) -> IntArray:
         For more than 52 robots: there are no more letters.
     """
     count = int(robots.max()) + 1
-    if count > len(_LETTERS):
-        raise GraphError(f"{count} robots, but symbols have {len(_LETTERS)} letters; number the poses instead")
+    if count > MOST_SYMBOLS:
+        raise GraphError(f"{count} robots, but symbols have {MOST_SYMBOLS} letters; number the poses instead")
     letters = _LETTERS[26:] if count <= 26 else _LETTERS
     ids = np.zeros(len(robots), dtype=np.int64)
     for robot in range(count):
         mine = robots == robot
         ids[mine] = (ord(letters[robot]) << _LETTER_SHIFT) + np.arange(mine.sum())
     return ids
+
+
+def pose_names(graph: PoseGraph) -> list[str]:
+    """Names of the poses for people: a GTSAM symbol as its letter and index, another id as it is.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from pgo_models.scenes import circle
+    >>> graph = circle(np.random.default_rng(0))
+    >>> pose_names(replace(graph, ids=symbol_ids(np.arange(25) // 13)))[11:15]
+    ['a11', 'a12', 'b0', 'b1']
+    """
+    ids = graph.pose_ids.tolist()
+    if not all(id_ >> _LETTER_SHIFT in map(ord, _LETTERS) for id_ in ids):
+        return [str(id_) for id_ in ids]
+    return [f"{chr(id_ >> _LETTER_SHIFT)}{id_ & ((1 << _LETTER_SHIFT) - 1)}" for id_ in ids]
 
 
 def _trace_of_inverse(A: Array) -> Array:

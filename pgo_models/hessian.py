@@ -38,7 +38,8 @@ class TangentLayout:
     def split(self, step: Array) -> tuple[Array, Array]:
         """Move (w, v) of a vector."""
         count = self.num_poses * self.d
-        return step[count:].reshape(self.num_poses, -1), step[:count].reshape(self.num_poses, self.d)
+        w = step[count:].reshape(self.num_poses, tangent_dimension(self.d))
+        return w, step[:count].reshape(self.num_poses, self.d)
 
     def translations(self, pose: IntArray) -> IntArray:
         """Columns (m, d) of v."""

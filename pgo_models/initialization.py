@@ -22,6 +22,11 @@ def gps_imu_start(truth: Poses, translation_std: float, rotation_std: float, rng
     translation_std, rotation_std : float
         Standard deviations, metres and radians.
     rng : np.random.Generator
+
+    Examples
+    --------
+    >>> gps_imu_start(Poses.identity(5, 3), 0.5, 0.1, np.random.default_rng(0))
+    Poses(n=5, d=3)
     """
     n, d = truth.num_poses, truth.d
     t = truth.t + rng.normal(0.0, translation_std, (n, d))
@@ -35,6 +40,14 @@ def odometry_start(graph: PoseGraph) -> Poses:
     ------
     GraphError
         When a link i -> i + 1 is missing: `spanning_tree_start` needs none.
+
+    Examples
+    --------
+    >>> turn = np.eye(2)[None].repeat(2, axis=0)
+    >>> step = np.array([[1.0, 0.0], [1.0, 0.0]])
+    >>> graph = PoseGraph(3, [0, 1], [1, 2], turn, step, np.ones(2), np.ones(2))
+    >>> odometry_start(graph).t.tolist()
+    [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]
     """
     n = graph.num_poses
     forward = np.flatnonzero(graph.j == graph.i + 1)
@@ -58,6 +71,13 @@ def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
         When the graph is not connected.
     SettingError
         When root is no pose.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> spanning_tree_start(graph).t[0].tolist()
+    [0.0, 0.0, 0.0]
     """
     graph.check_connected()
     n = graph.num_poses
@@ -84,6 +104,13 @@ def chordal_start(problem: PGOProblem) -> Poses:
 
     Joint in rotations and translations; after the projection the translations are the best ones for
     the rotations. One factorisation with the pattern of M.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> bool(problem.objective(chordal_start(problem)) < problem.objective(spanning_tree_start(problem.graph)))
+    True
     """
     n, d = problem.num_poses, problem.d
     fixed = np.concatenate([[0], n + np.arange(d)])

@@ -42,6 +42,12 @@ class OrthogonalPoint:
     normals : tuple of arrays
         For every term, rho B: the multiplier, as a vector normal to the set at the copy. At a stationary point minus
         their sum over the terms of a variable is a subgradient of J.
+
+    Examples
+    --------
+    >>> from pgo_models.orthogonal_examples import procrustes
+    >>> procrustes(np.eye(3), np.eye(3)).point([np.eye(3)]).copies[0].shape
+    (3, 3)
     """
 
     copies: tuple[Array, ...]
@@ -130,7 +136,7 @@ class OrthogonalProblem:
         object.__setattr__(self, "terms", tuple(terms))
 
     def __repr__(self) -> str:
-        parts = [f"{self.variables[term.variable].shape} {term.constraint!r}".rstrip("()") for term in self.terms]
+        parts = [f"{self.variables[term.variable].shape} {term.constraint!r}".removesuffix("()") for term in self.terms]
         return f"OrthogonalProblem({', '.join(parts)})"
 
     def point(self, values: Sequence[Array]) -> OrthogonalPoint:
@@ -269,6 +275,13 @@ class KKTResiduals:
     multipliers : tuple of arrays
         For X^T X = I the symmetric Lambda, (p, p), with X Lambda in the subdifferential of J; for the other sets the
         normal vector itself, minus.
+
+    Examples
+    --------
+    >>> from pgo_models.orthogonal_examples import procrustes
+    >>> problem = procrustes(np.eye(3), np.eye(3))
+    >>> kkt_residuals(problem, problem.point([np.eye(3)]), rho=1.0).feasibility
+    0.0
     """
 
     feasibility: float
@@ -291,6 +304,13 @@ def kkt_residuals(problem: OrthogonalProblem, point: OrthogonalPoint, rho: float
     point : OrthogonalPoint
     rho : float
         Of the order of the curvature of J.
+
+    Examples
+    --------
+    >>> from pgo_models.orthogonal_examples import procrustes
+    >>> problem = procrustes(np.eye(3), np.eye(3))
+    >>> bool(kkt_residuals(problem, problem.point([np.eye(3)]), rho=1.0).stationarity < 1e-9)
+    True
     """
     normals = [
         term.constraint.normal_part(copy, normal)

@@ -24,6 +24,11 @@ def procrustes(A: Array, B: Array, *, rotation: bool = False) -> OrthogonalProbl
     References
     ----------
     Schoenemann 1966; Lai & Osher 2014, section 4.
+
+    Examples
+    --------
+    >>> procrustes(np.eye(3), np.eye(3), rotation=True)
+    OrthogonalProblem((3, 3) Rotations)
     """
     A, B = _matrix(A, "A"), _matrix(B, "B")
     if len(A) != len(B):
@@ -42,6 +47,11 @@ def smallest_eigenvectors(A: Array, count: int) -> OrthogonalProblem:
     ------
     SettingError
         When A is not symmetric positive semidefinite.
+
+    Examples
+    --------
+    >>> smallest_eigenvectors(np.diag([1.0, 2.0, 3.0]), 2)
+    OrthogonalProblem((3, 2) Orthonormal)
     """
     A = _matrix(A, "A")
     X = cp.Variable((len(A), count), name="X")
@@ -53,6 +63,11 @@ def one_norm_components(A: Array, count: int) -> OrthogonalProblem:
 
     The 1-norm form of the last principal components. When most rows lie in a hyperplane, its normal is the answer for
     count = 1 whatever the other rows are, where the eigenvector of A^T A is turned by them (Tsakiris & Vidal 2018).
+
+    Examples
+    --------
+    >>> one_norm_components(np.eye(4), 2)
+    OrthogonalProblem((4, 2) Orthonormal)
     """
     A = _matrix(A, "A")
     X = cp.Variable((A.shape[1], count), name="X")
@@ -67,6 +82,11 @@ def sparse_components(A: Array, count: int, weight: float) -> OrthogonalProblem:
     References
     ----------
     Ozolins, Lai, Caflisch, Osher 2013.
+
+    Examples
+    --------
+    >>> sparse_components(np.eye(4), 2, weight=0.1)
+    OrthogonalProblem((4, 2) Orthonormal)
     """
     A = _matrix(A, "A")
     X = cp.Variable((len(A), count), name="X")
@@ -78,6 +98,13 @@ def rotation_averaging(graph: PoseGraph) -> OrthogonalProblem:
     """Minimise sum_e kappa ||R_j - R_i R_ij||_F^2 over rotations R_0 .. R_{n-1} (paper: `rotation`).
 
     The rotation part of F, one (d, d) variable a pose. A common rotation of all is free.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> len(rotation_averaging(graph).rotations)
+    27
     """
     R = [cp.Variable((graph.d, graph.d), name=f"R_{pose}") for pose in range(graph.num_poses)]
     root = np.sqrt(graph.kappa)
@@ -102,6 +129,11 @@ def sparse_low_rank(Y: Array, rank: int, nonzeros: int) -> OrthogonalProblem:
     References
     ----------
     Hou, Chau, Magnenat-Thalmann, He 2017 (SLRMA).
+
+    Examples
+    --------
+    >>> sparse_low_rank(np.outer(np.ones(4), np.ones(3)), rank=1, nonzeros=2)
+    OrthogonalProblem((4, 1) Orthonormal, (4, 1) Sparse(nonzeros=2))
     """
     Y = _matrix(Y, "Y")
     c = float(np.linalg.norm(Y, 2)) ** 2

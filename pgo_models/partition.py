@@ -14,7 +14,15 @@ from pgo_models.rotations import BoolArray
 
 
 class PartitionMethod(enum.Enum):
-    """How poses are given to robots."""
+    """How poses are given to robots.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> partition(graph, method=PartitionMethod.SINGLETONS).num_robots
+    27
+    """
 
     GIVEN = "as the graph names them"
     CONTIGUOUS = "contiguous in time"
@@ -31,6 +39,14 @@ class Partition:
     robot : (n,)
         0 .. num_robots - 1, every one of which owns a pose.
     method : PartitionMethod
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> halves = Partition(np.arange(27) // 14, PartitionMethod.CONTIGUOUS)
+    >>> halves.sizes, len(halves.separators(graph))
+    (array([14, 13]), 18)
     """
 
     robot: IntArray

@@ -10,6 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pgo_models.errors import GraphError
+from pgo_models.html_tables import facts_table
 from pgo_models.poses import ROTATION_TOLERANCE, Poses
 from pgo_models.rotations import Array, orthogonality_error
 
@@ -113,6 +114,20 @@ class PoseGraph:
             f"PoseGraph({self.name!r}, d={self.d}, poses={self.num_poses}, edges={self.num_edges}, "
             f"robots={self.num_robots})"
         )
+
+    def _repr_html_(self) -> str:
+        facts = [
+            ("graph", f"{self.name}, {self.d}D"),
+            ("poses", str(self.num_poses)),
+            ("edges", str(self.num_edges)),
+            ("robots", str(self.num_robots)),
+            ("components", str(len(self.components()))),
+            ("kappa", f"{self.kappa.min():.4g} to {self.kappa.max():.4g} per rad^2"),
+            ("tau", f"{self.tau.min():.4g} to {self.tau.max():.4g} per m^2"),
+            ("estimate", "with the graph" if self.initial is not None else "none"),
+            ("truth", "with the graph" if self.truth is not None else "none"),
+        ]
+        return facts_table(facts)
 
     def components(self) -> list[IntArray]:
         """Poses of every connected component, largest first."""

@@ -128,7 +128,15 @@ class Poses:
 
 
 def absolute_trajectory_error(estimate: Poses, truth: Poses) -> float:
-    """ATE: root mean square of ||t_i - t_i'|| in metres, after `estimate` is aligned to `truth`."""
+    """ATE: root mean square of ||t_i - t_i'|| in metres, after `estimate` is aligned to `truth`.
+
+    Examples
+    --------
+    >>> truth = Poses.identity(3, 2)
+    >>> moved = truth.moved(np.eye(2), np.array([5.0, 0.0]))
+    >>> absolute_trajectory_error(moved, truth)
+    0.0
+    """
     difference = estimate.aligned_to(truth).t - truth.t
     return float(np.sqrt(np.mean(np.sum(difference**2, axis=1))))
 
@@ -142,6 +150,13 @@ def relative_pose_error(estimate: Poses, truth: Poses, step: int = 1) -> tuple[f
     ------
     GraphError
         When the sizes differ or there is no such pair.
+
+    Examples
+    --------
+    >>> truth = Poses.identity(3, 2)
+    >>> drifted = Poses(truth.R, np.array([[0.0, 0.0], [0.1, 0.0], [0.2, 0.0]]))
+    >>> relative_pose_error(drifted, truth)
+    (0.1, 0.0)
     """
     _check_same_size(estimate, truth)
     if not 0 < step < truth.num_poses:

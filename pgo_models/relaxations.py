@@ -5,7 +5,7 @@
 
 Their common value is a lower bound on F, the relaxation being exact where Z has rank d (Rosen et al. 2019, problems 8
 and 9; Carlone et al. 2015). `pgo_models.semidefinite` chooses a form, solves, rounds and proves the bound;
-`pgo_models.clique_relaxation` has the form for large sparse graphs.
+`pgo_models.clique_sdp` has the form for large sparse graphs.
 """
 
 from __future__ import annotations
@@ -36,6 +36,14 @@ class PrimalRelaxation:
         Z_ii = I for every pose; cvxpy's dual value of each is -Lambda_i / scale.
     scale : float
         Q is divided by its largest entry.
+
+    Examples
+    --------
+    >>> from pgo_models.problem import PGOProblem
+    >>> from pgo_models.scenes import random_geometric
+    >>> problem = PGOProblem(random_geometric(4, np.random.default_rng(0)))
+    >>> primal_relaxation(problem).Z.shape
+    (12, 12)
     """
 
     problem: PGOProblem
@@ -60,6 +68,14 @@ def primal_relaxation(problem: PGOProblem) -> PrimalRelaxation:
     ------
     SettingError
         When Q would be larger than `pgo_models.matrices.MAX_DENSE_SIDE`.
+
+    Examples
+    --------
+    >>> from pgo_models.problem import PGOProblem
+    >>> from pgo_models.scenes import random_geometric
+    >>> problem = PGOProblem(random_geometric(4, np.random.default_rng(0)))
+    >>> len(primal_relaxation(problem).orthogonality)
+    4
     """
     n, d = problem.num_poses, problem.d
     scale = float(np.abs(problem.Q).max())
@@ -86,6 +102,14 @@ class DualRelaxation:
         row the dual has no interior. Its dual value is the Gram matrix of (t, Y).
     scale : float
         M is divided by its largest diagonal entry.
+
+    Examples
+    --------
+    >>> from pgo_models.problem import PGOProblem
+    >>> from pgo_models.scenes import random_geometric
+    >>> problem = PGOProblem(random_geometric(4, np.random.default_rng(0)))
+    >>> dual_relaxation(problem).model.is_dcp()
+    True
     """
 
     problem: PGOProblem
@@ -111,7 +135,16 @@ class DualRelaxation:
 
 
 def dual_relaxation(problem: PGOProblem) -> DualRelaxation:
-    """Pose the dual as one linear matrix inequality with the sparsity of M, on which Clarabel's decomposition acts."""
+    """Pose the dual as one linear matrix inequality with the sparsity of M, on which Clarabel's decomposition acts.
+
+    Examples
+    --------
+    >>> from pgo_models.problem import PGOProblem
+    >>> from pgo_models.scenes import random_geometric
+    >>> problem = PGOProblem(random_geometric(4, np.random.default_rng(0)))
+    >>> bool(dual_relaxation(problem).scale > 0)
+    True
+    """
     n, d = problem.num_poses, problem.d
     grounded = problem.M[1:, 1:].tocsc()
     side, scale = grounded.shape[0], float(grounded.diagonal().max())

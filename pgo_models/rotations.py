@@ -137,21 +137,40 @@ def vee(W: Array) -> Array:
 
 
 def exp_map(w: Array) -> Array:
-    """Rotations Exp(hat(w)) of tangent vectors w, (n, 1) or (n, 3), in radians."""
+    """Rotations Exp(hat(w)) of tangent vectors w, (n, 1) or (n, 3), in radians.
+
+    Examples
+    --------
+    >>> exp_map(np.array([[np.pi / 2]])).round(6).tolist()
+    [[[0.0, -1.0], [1.0, 0.0]]]
+    """
     if w.shape[-1] == 1:
         return _from_cosine_sine(np.cos(w[..., 0]), np.sin(w[..., 0]))
     return np.asarray(Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix()).reshape((*w.shape, 3))
 
 
 def log_map(R: Array) -> Array:
-    """Tangent vectors w, (n, 1) or (n, 3), in radians, with Exp(hat(w)) = R and ||w|| <= pi."""
+    """Tangent vectors w, (n, 1) or (n, 3), in radians, with Exp(hat(w)) = R and ||w|| <= pi.
+
+    Examples
+    --------
+    >>> log_map(exp_map(np.array([[0.1, 0.2, 0.3]]))).round(6).tolist()
+    [[0.1, 0.2, 0.3]]
+    """
     if R.shape[-1] == 2:
         return np.arctan2(R[..., 1, 0] - R[..., 0, 1], R[..., 0, 0] + R[..., 1, 1])[..., None]
     return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()).reshape(R.shape[:-1])
 
 
 def random_rotations(count: int, d: int, rng: np.random.Generator) -> Array:
-    """Rotations (count, d, d) drawn uniformly (by the Haar measure) from SO(d)."""
+    """Rotations (count, d, d) drawn uniformly (by the Haar measure) from SO(d).
+
+    Examples
+    --------
+    >>> R = random_rotations(4, 3, np.random.default_rng(0))
+    >>> R.shape, bool(np.linalg.det(R).min() > 0.999)
+    ((4, 3, 3), True)
+    """
     if d == 2:
         return exp_map(rng.uniform(-np.pi, np.pi, (count, 1)))
     quaternions = rng.standard_normal((count, 4))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cvxpy as cp
 
 from pgo_models.certificate import Verdict, relative_gap, smallest_provable
-from pgo_models.clique_relaxation import CliqueRelaxation, clique_relaxation
+from pgo_models.clique_sdp import CliqueRelaxation, clique_relaxation
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
@@ -35,7 +35,17 @@ Relaxation = PrimalRelaxation | DualRelaxation | CliqueRelaxation
 
 
 class RelaxationStatus(enum.Enum):
-    """How the solver ended."""
+    """How the solver ended.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.problem import PGOProblem
+    >>> from pgo_models.scenes import random_geometric
+    >>> problem = PGOProblem(random_geometric(4, np.random.default_rng(0)))
+    >>> solve_relaxation(problem).status.name
+    'OPTIMAL'
+    """
 
     OPTIMAL = "solved to the solver's tolerance"
     INACCURATE = (
@@ -74,6 +84,16 @@ class RelaxationSolution:
     iterations : int
     seconds : float
         From posing to proof.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.problem import PGOProblem
+    >>> from pgo_models.scenes import random_geometric
+    >>> problem = PGOProblem(random_geometric(4, np.random.default_rng(0)))
+    >>> solution = solve_relaxation(problem)
+    >>> bool(solution.lower_bound <= solution.objective)
+    True
     """
 
     relaxation: Relaxation

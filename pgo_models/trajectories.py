@@ -43,6 +43,14 @@ def write_tum(poses: Poses, path: Path | str, timestamps: Array | None = None) -
         When there is not one finite timestamp for each pose, or they do not ascend.
     PGOError
         When the file cannot be written; what stood there stays.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "poses.tum"
+    >>> write_tum(Poses.identity(2, 3), path)
+    >>> len(path.read_text().splitlines())
+    2
     """
     seconds = np.arange(poses.num_poses, dtype=float) if timestamps is None else np.asarray(timestamps, dtype=float)
     if seconds.shape != (poses.num_poses,) or not np.isfinite(seconds).all() or (np.diff(seconds) <= 0).any():
@@ -59,6 +67,14 @@ def read_tum(path: Path | str, d: int = 3) -> Poses:
     FileFormatError
         With file:line, for a row that is not 8 finite numbers, a zero quaternion, or, with d = 2, a pose out of the
         plane.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "poses.tum"
+    >>> write_tum(Poses.identity(2, 3), path)
+    >>> read_tum(path)
+    Poses(n=2, d=3)
     """
     rows, lines = read_table(path, 8)
     zero = np.linalg.norm(rows[:, 4:], axis=1) < _ZERO_QUATERNION
@@ -75,6 +91,14 @@ def write_kitti(poses: Poses, path: Path | str) -> None:
     ------
     PGOError
         When the file cannot be written; what stood there stays.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "poses.kitti"
+    >>> write_kitti(Poses.identity(2, 3), path)
+    >>> len(path.read_text().split())
+    24
     """
     R, t = _lifted(poses)
     _write_rows(np.concatenate([R, t[:, :, None]], axis=2).reshape(-1, 12), path)
@@ -88,6 +112,14 @@ def read_kitti(path: Path | str, d: int = 3) -> Poses:
     FileFormatError
         With file:line, for a row that is not 12 finite numbers, a matrix that is no rotation even to three digits, or,
         with d = 2, a pose out of the plane.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "poses.kitti"
+    >>> write_kitti(Poses.identity(2, 2), path)
+    >>> read_kitti(path, d=2)
+    Poses(n=2, d=2)
     """
     rows, lines = read_table(path, 12)
     matrices = rows.reshape(-1, 3, 4)

@@ -28,11 +28,20 @@ class Anderson:
         Relative Tikhonov term of the least-squares problem.
     restart_ratio : float
         The memory is emptied when the residual exceeds this many times the smallest since it was last emptied.
+    per_robot : bool
+        Every robot extrapolates its own rows with its own inner products, and nothing is summed over the robots.
+        Otherwise each round has one all-reduce, of the products of the newest difference with all others.
+
+    Examples
+    --------
+    >>> Anderson(memory=5)
+    Anderson(memory=5, regularization=1e-12, restart_ratio=2.0, per_robot=False)
     """
 
     memory: int = 40
     regularization: float = 1e-12
     restart_ratio: float = 2.0
+    per_robot: bool = False
 
     def __post_init__(self) -> None:
         if self.memory < 1:
@@ -91,3 +100,23 @@ def extrapolate(
     for coefficient, difference in zip(gamma, images, strict=True):
         following -= coefficient * difference
     return following, AndersonMemory(residuals, images, gram, residual, image, smallest)
+
+
+def extrapolate_parts(
+    settings: Anderson, memories: tuple[AndersonMemory, ...], residual: Array, image: Array, slices: tuple[slice, ...]
+) -> tuple[Array, tuple[AndersonMemory, ...]]:
+    """Extrapolate all rows together or, with `per_robot`, the rows of every robot on their own.
+
+    Parameters
+    ----------
+    memories : tuple of AndersonMemory
+        As returned by the step before; empty at first.
+    slices : tuple of slice
+        Rows of the robots.
+    """
+    parts = slices if settings.per_robot else (slice(None),)
+    following, kept = np.empty_like(image), []
+    for rows, memory in zip(parts, memories or (AndersonMemory(),) * len(parts), strict=True):
+        following[rows], remembered = extrapolate(settings, memory, residual[rows], image[rows])
+        kept.append(remembered)
+    return following, tuple(kept)

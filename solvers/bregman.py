@@ -183,6 +183,15 @@ class TwoLineBregman(_ExactForm):
     """Bregman iteration in two lines (paper: `bregman update`; Yin et al. 2008). Settings: `BregmanSettings`.
 
     x^{k+1} = argmin J(x) + alpha/2 ||K x - f + b^k||^2,    b^{k+1} = b^k + K x^{k+1} - f
+
+    Examples
+    --------
+    >>> from solvers.loop import run_method
+    >>> import cvxpy as cp, numpy as np
+    >>> x = cp.Variable(2)
+    >>> problem = BregmanProblem(cp.norm1(x), x, np.array([[1.0, 2.0]]), [2.0])
+    >>> run_method(TwoLineBregman(), problem).state.x.round(6).tolist()
+    [0.0, 1.0]
     """
 
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> TwoLineState:
@@ -209,6 +218,15 @@ class MethodOfMultipliers(_ExactForm):
         x^{k+1} = argmin L_alpha(x, lam^k),    lam^{k+1} = lam^k + alpha (f - K x^{k+1})
 
     with L_alpha(x, lam) = J(x) + <lam, f - K x> + alpha/2 ||f - K x||^2.
+
+    Examples
+    --------
+    >>> from solvers.loop import run_method
+    >>> import cvxpy as cp, numpy as np
+    >>> x = cp.Variable(2)
+    >>> problem = BregmanProblem(cp.norm1(x), x, np.array([[1.0, 2.0]]), [2.0])
+    >>> run_method(MethodOfMultipliers(), problem).state.x.round(6).tolist()
+    [0.0, 1.0]
     """
 
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> MultiplierState:
@@ -243,6 +261,14 @@ class AlternatingBregman(BregmanSettings):
     ----------
     passes : int
         T.
+
+    Examples
+    --------
+    >>> from pgo_models.bregman_examples import total_variation_denoising
+    >>> from solvers.loop import run_method
+    >>> problem = total_variation_denoising(np.array([0.1, -0.1, 1.1, 0.9]), weight=0.2)
+    >>> run_method(AlternatingBregman(passes=2), problem).status.name
+    'CONVERGED'
     """
 
     passes: int = 1
@@ -322,6 +348,11 @@ def feasibility_bound(initial_distance: float, alpha: float, k: int) -> float:
     References
     ----------
     Osher, Burger, Goldfarb, Xu, Yin 2005, Propositions 3.1 to 3.3, where the penalty is H itself.
+
+    Examples
+    --------
+    >>> [feasibility_bound(1.0, alpha=2.0, k=k) for k in (1, 4)]
+    [1.0, 0.5]
     """
     if not (initial_distance >= 0 and alpha > 0 and k >= 1):
         raise SettingError(f"need D_0 >= 0, alpha > 0 and k >= 1, got {initial_distance}, {alpha} and {k}")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pgo_models.errors import SettingError
-from pgo_models.graph_qp import Changer, GraphQP, graph_qp
+from pgo_models.graph_subproblem import Changer, GraphQP, graph_qp
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
@@ -24,6 +24,15 @@ class ChangedStep:
     """Step (a) with the change, for `SOC(r_step=...)`; JOINT coupling only.
 
     On its own it changes the iterates; `ChangedSOC` changes what is reported with them.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graph_subproblem import Change
+    >>> from pgo_models.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> ChangedStep(graph, lambda unknown: Change()).graph
+    PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
     """
 
     graph: PoseGraph
@@ -63,6 +72,18 @@ class ChangedSOC:
 
     What fixes the gauge, as a prior does, wants a start near it: the default is the chordal start of the unchanged
     problem with pose 0 unrotated, and a pose turned by 180 degrees from its prior is a stationary point too.
+
+    Examples
+    --------
+    >>> import cvxpy as cp, numpy as np
+    >>> from pgo_models.graph_subproblem import Change, PoseVariables
+    >>> from pgo_models.scenes import random_geometric
+    >>> problem = PGOProblem(random_geometric(4, np.random.default_rng(0)))
+    >>> def near(unknown: PoseVariables) -> Change:
+    ...     return Change(terms=[10.0 * cp.sum_squares(unknown.t(3) - np.array([1.0, 0.0, 0.0]))])
+    >>> from solvers.loop import run
+    >>> run(ChangedSOC(near), problem).status.name
+    'CONVERGED'
     """
 
     changer: Changer

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import enum
+import importlib.util
+import os
 
 import numpy as np
 
@@ -14,8 +16,10 @@ from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.scenes import MILD_NOISE, NoiseModel, circle, grid, random_geometric, sphere
+from solvers.engine import Engine, InProcess
 from solvers.newton import Newton, gauss_newton
 from solvers.pipeline import HANDOVER_TOLERANCE, Pipeline
+from solvers.ray_engine import RayEngine
 from solvers.rotation_step import RStep
 from solvers.soc import SOC, Coupling
 
@@ -24,9 +28,13 @@ class Method(enum.Enum):
     """First stage of a solve."""
 
     JOINT = "joint"
+    SUBSTRUCTURED = "substructured"
     CONSENSUS = "consensus"
     PAPER = "paper"
     NEWTON = "newton"
+
+
+ON_ROBOTS = (Method.SUBSTRUCTURED, Method.CONSENSUS, Method.NEWTON)  # methods that driver and robots run
 
 
 class Start(enum.Enum):
@@ -55,6 +63,14 @@ class Split(enum.Enum):
     SINGLETONS = "singletons"
 
 
+class Runner(enum.Enum):
+    """Where robots run."""
+
+    PROCESS = "process"
+    THREADS = "threads"
+    RAY = "ray"
+
+
 class Scene(enum.Enum):
     """Scenes that can be generated."""
 
@@ -66,10 +82,8 @@ class Scene(enum.Enum):
 
 
 def chosen_pipeline(
-    problem: PGOProblem,
-    method: Method | None,
-    robots: int | None,
-    split: Split | None,
+    method: Method,
+    robots: Partition | None,
     r_step: BackEnd,
     gap: float,
     max_iterations: int | None,
@@ -77,24 +91,26 @@ def chosen_pipeline(
 ) -> Pipeline:
     """Pipeline of the options of `pgo solve`.
 
+    Parameters
+    ----------
+    robots : Partition, optional
+        For CONSENSUS and PAPER.
+
     Raises
     ------
     SettingError
         When they do not go together.
     """
-    if method is None:
-        method = Method.JOINT if robots is None and split is None else Method.CONSENSUS
     if method is Method.NEWTON:
         return Pipeline(soc=None, gap=gap)
-    if method is Method.JOINT and (robots or 1) > 1:
-        raise SettingError(f"--method joint has one robot, got --robots {robots}; use consensus or paper")
-    shared = None
-    if method is not Method.JOINT:
-        shared = _robots(problem, robots, split, problem.graph.num_robots if method is Method.CONSENSUS else None)
+    if method is Method.SUBSTRUCTURED and r_step is not BackEnd.FACTORIZED:
+        raise SettingError(
+            f"--method substructured factors, got --r-step {r_step.value}; use joint, consensus or paper"
+        )
     handover = SOC.tolerance if method is Method.PAPER else HANDOVER_TOLERANCE
     soc = SOC(
         coupling=Coupling[method.name],
-        robots=shared,
+        robots=robots if method in (Method.CONSENSUS, Method.PAPER) else None,
         r_step=RStep[r_step.name],
         tolerance=handover if tolerance is None else tolerance,
         max_iterations=SOC.max_iterations if max_iterations is None else max_iterations,
@@ -102,11 +118,66 @@ def chosen_pipeline(
     return Pipeline(soc=soc, newton=gauss_newton() if method is Method.PAPER else Newton(), gap=gap)
 
 
-def _robots(problem: PGOProblem, robots: int | None, split: Split | None, default: int | None) -> Partition | None:
-    if robots is None and split is None and default is None:
+def chosen_method(method: Method | None, robots: int | None, is_shared: bool) -> Method:
+    """Method of a solve: as asked for, or the one that suits one robot or many.
+
+    Parameters
+    ----------
+    is_shared : bool
+        Whether another option than the method is about robots.
+
+    Raises
+    ------
+    SettingError
+        When many robots are to use a method that has one.
+    """
+    if method is Method.JOINT and (robots or 1) > 1:
+        raise SettingError(f"--method joint has one robot, got --robots {robots}; use substructured or consensus")
+    if method is None:
+        return Method.SUBSTRUCTURED if is_shared else Method.JOINT
+    return method
+
+
+def chosen_partition(graph: PoseGraph, number: int | None, split: Split | None) -> Partition:
+    """Partition of the options: as the file names the robots if it does, else with few cut edges where METIS is there.
+
+    Raises
+    ------
+    SettingError
+        When the number of robots does not fit.
+    MissingExtraError
+        When METIS is asked for and not installed.
+    """
+    number = graph.num_robots if number is None else number
+    if split is not None:
+        return partition(graph, number, PartitionMethod[split.name])
+    if graph.robot is not None and number == graph.num_robots:
+        return partition(graph, number, PartitionMethod.GIVEN)
+    has_metis = importlib.util.find_spec("pymetis") is not None
+    return partition(graph, number, PartitionMethod.METIS if has_metis else PartitionMethod.CONTIGUOUS)
+
+
+def chosen_engine(method: Method, engine: Runner | None, address: str | None, checkpoint: bool) -> Engine | None:
+    """Engine of the options; None where the method runs in one place.
+
+    Raises
+    ------
+    SettingError
+        When they do not go together.
+    """
+    asked = [name for name, given in (("--engine", engine), ("--address", address), ("--resume", checkpoint)) if given]
+    if method not in ON_ROBOTS:
+        if asked:
+            names = " or ".join(one.value for one in ON_ROBOTS)
+            raise SettingError(
+                f"{asked[0]} is for methods that run on robots, got --method {method.value}; use {names}"
+            )
         return None
-    number = robots if robots is not None else default
-    return partition(problem.graph, number, None if split is None else PartitionMethod[split.name])
+    if address is not None and engine not in (None, Runner.RAY):
+        raise SettingError(f"--address is that of a Ray cluster, got --engine {engine.value}; use --engine ray")
+    if engine is Runner.RAY or address is not None:
+        return RayEngine(address=address)
+    return InProcess(threads=(os.cpu_count() or 1) if engine is Runner.THREADS else 1)
 
 
 def chosen_start(problem: PGOProblem, start: Start | None) -> Poses | None:

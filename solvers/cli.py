@@ -1,4 +1,4 @@
-"""The command `pgo`: solve, certify, info, generate.
+"""The command `pgo`: solve, certify, info, generate, and the studies of `solvers.study_commands`.
 
 Exit codes: 0 done; 1 bad input, one line on stderr; 2 not converged, the result written all the same; 3 not certified.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -21,17 +22,35 @@ from pgo_models.certificate import DEFAULT_GAP, certify
 from pgo_models.datasets import known_datasets, load
 from pgo_models.errors import FileFormatError, PGOError, SettingError
 from pgo_models.files import replace_when_done
-from pgo_models.g2o import read_g2o_poses, symbol_ids, write_g2o, write_g2o_folder
+from pgo_models.g2o import MOST_SYMBOLS, read_g2o_poses, symbol_ids, write_g2o, write_g2o_folder
 from pgo_models.initialization import chordal_start, spanning_tree_start
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses, absolute_trajectory_error
 from pgo_models.problem import PGOProblem
+from pgo_models.separators import report_partition
 from pgo_models.trajectories import read_kitti, read_tum, write_tum
-from solvers.choices import BackEnd, Method, Scene, Split, Start, chosen_pipeline, chosen_scene, chosen_start
+from solvers.checkpoint import Checkpoint
+from solvers.choices import (
+    BackEnd,
+    Method,
+    Runner,
+    Scene,
+    Split,
+    Start,
+    chosen_engine,
+    chosen_method,
+    chosen_partition,
+    chosen_pipeline,
+    chosen_scene,
+    chosen_start,
+)
 from solvers.pipeline import solve
-from solvers.solution import check_format, finite_or_none, versions
+from solvers.report import check_report, write_report
+from solvers.solution import check_format, finite_or_none
+from solvers.study_commands import INTERRUPTED, compare_command, figures_command, tables_command
+from solvers.versions import versions
 
-DONE, BAD_INPUT, NOT_CONVERGED, NOT_CERTIFIED, INTERRUPTED = 0, 1, 2, 3, 130
+DONE, BAD_INPUT, NOT_CONVERGED, NOT_CERTIFIED = 0, 1, 2, 3
 
 app = typer.Typer(
     name="pgo",
@@ -45,6 +64,13 @@ app = typer.Typer(
 GraphArgument = Annotated[
     str,
     typer.Argument(help="A g2o file, a folder with one file a robot, or the name of a data set (pgo info lists them)."),
+]
+SplitOption = Annotated[
+    Split | None,
+    typer.Option(
+        help="How poses go to robots: as the file names them if it does, else with few cut edges where METIS is there, "
+        "else contiguous."
+    ),
 ]
 GapOption = Annotated[float, typer.Option(help="Relative gap to certify.")]
 UnitWeightsOption = Annotated[
@@ -66,15 +92,32 @@ def solve_command(
     method: Annotated[
         Method | None,
         typer.Option(
-            help="First stage: joint SOC (one robot), consensus SOC (several), SOC as in the paper, or none before "
-            "Newton. Joint unless there are robots."
+            help="First stage: joint SOC (one robot), substructured SOC (robots and a driver, the same iterates), "
+            "consensus SOC (robots alone), SOC as in the paper, or none before Newton. Joint unless given, or "
+            "substructured where an option is about robots."
         ),
     ] = None,
     robots: Annotated[
-        int | None, typer.Option(min=1, help="Number of robots that share the poses (paper: one a pose unless given).")
+        int | None,
+        typer.Option(
+            min=1,
+            help="Number of robots that share the poses; as many as the file names (paper: one a pose) unless given.",
+        ),
     ] = None,
-    split: Annotated[
-        Split | None, typer.Option(help="How poses go to robots: as the file names them if it does, else contiguous.")
+    split: SplitOption = None,
+    engine: Annotated[
+        Runner | None, typer.Option(help="Where robots run: in this process, in its threads, or as Ray actors.")
+    ] = None,
+    address: Annotated[
+        str | None,
+        typer.Option(help="HOST:PORT of a Ray cluster that this machine is part of; this machine unless given."),
+    ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            help="File to go on from, if it is there, and to write checkpoints to, for --resume after the run was "
+            "broken off. Removed when the solve has converged."
+        ),
     ] = None,
     start: Annotated[
         Start | None, typer.Option(help="Start: chordal relaxation (tree for the paper's method) unless given.")
@@ -85,17 +128,33 @@ def solve_command(
     tolerance: Annotated[float | None, typer.Option(help="Residual at which Newton takes over from SOC.")] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for the iterations.")] = math.inf,
     unit_weights: UnitWeightsOption = False,
+    report: Annotated[
+        Path | None,
+        typer.Option(help="Write a report as .html: one page that opens offline, with pictures, tables and advice."),
+    ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print a line an iteration.")] = False,
 ) -> None:
     """Solve a pose graph: poses, their cost F, a proven lower bound on the global optimum, and the gap."""
     for path in out or []:
         check_format(path)  # before a long solve, not after it
+    if report is not None:
+        check_report(report)
     problem = PGOProblem(_load(graph, unit_weights))
-    pipeline = chosen_pipeline(problem, method, robots, split, r_step, gap, max_iterations, tolerance)
+    about_robots = (robots, split, engine, address, resume)
+    is_shared = any(option is not None for option in about_robots)
+    chosen = chosen_method(method, robots, is_shared)
+    runs_on = chosen_engine(chosen, engine, address, resume is not None)
+    is_shared |= chosen in (Method.SUBSTRUCTURED, Method.CONSENSUS)
+    shared = chosen_partition(problem.graph, robots, split) if is_shared else None
+    # Robots factor; the other back ends of CONSENSUS have all robots in one place.
+    on_robots = shared is not None and runs_on is not None and r_step is BackEnd.FACTORIZED
     solution = solve(
         problem,
-        pipeline,
+        chosen_pipeline(chosen, shared, r_step, gap, max_iterations, tolerance),
         chosen_start(problem, start),
+        robots=shared if on_robots else None,
+        engine=runs_on if on_robots else None,
+        checkpoint=Checkpoint(resume) if resume is not None else None,
         time_limit=time_limit,
         verbose=verbose,
         progress=sys.stderr.isatty(),
@@ -107,6 +166,9 @@ def solve_command(
     for path in out or []:
         solution.save(path)
         typer.echo(f"written: {path}")
+    if report is not None:
+        write_report(solution, report, source=shlex.join([graph, *(["--unit-weights"] if unit_weights else [])]))
+        typer.echo(f"written: {report}")
     if not solution.status.is_success:
         raise typer.Exit(NOT_CONVERGED)
     raise typer.Exit(DONE if solution.is_certified else NOT_CERTIFIED)
@@ -155,16 +217,27 @@ def info_command(
     graph: Annotated[
         str | None, typer.Argument(help="A g2o file, folder or data set; without it, versions and data sets.")
     ] = None,
+    robots: Annotated[int | None, typer.Option(min=1, help="Show what sharing the poses among so many costs.")] = None,
+    split: SplitOption = None,
 ) -> None:
     """Show what a pose graph is made of, or what this installation has."""
     table = Table(show_header=False, box=None)
     if graph is None:
+        if robots is not None or split is not None:
+            raise SettingError("--robots and --split describe a graph; give one")
         for name, version in versions(None).items():
             table.add_row(name, version)
         table.add_row("data sets", ", ".join(known_datasets()))
     else:
-        for label, text in _describe(load(graph)):
+        loaded = load(graph)
+        for label, text in _describe(loaded):
             table.add_row(label, text)
+        if robots is not None or split is not None:
+            shared = chosen_partition(loaded, robots, split)
+            table.add_row("", "")
+            table.add_row("partition", shared.method.value)
+            for label, text in report_partition(shared, loaded).facts():
+                table.add_row(label, text)
     Console().print(table)
 
 
@@ -190,7 +263,9 @@ def generate_command(
     """Generate a scene with known truth, written beside it as NAME.truth.tum."""
     made = chosen_scene(scene, np.random.default_rng(seed), poses, robots, dimension, translation_noise, rotation_noise)
     if out.suffix == "":
-        write_g2o_folder(replace(made, ids=symbol_ids(made.robots)), out)
+        # Symbols have 52 letters; poses of more robots are numbered, and the files alone say whose they are.
+        named = replace(made, ids=symbol_ids(made.robots)) if made.num_robots <= MOST_SYMBOLS else made
+        write_g2o_folder(named, out)
     elif out.suffix.lower() == ".g2o":
         write_g2o(made, out)
     else:
@@ -199,6 +274,11 @@ def generate_command(
     truth = out.with_name(f"{out.stem}.truth.tum")
     write_tum(made.truth, truth)
     typer.echo(f"{made!r}\nwritten: {out}, {truth}")
+
+
+app.command("tables")(tables_command)
+app.command("compare")(compare_command)
+app.command("figures")(figures_command)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from typing import Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
 
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
 from pgo_models.poses import Poses
@@ -22,6 +23,13 @@ class Method(Protocol[P, X, S]):
     """What the loop needs of an iterative method: settings, and these functions of them.
 
     P is the kind of problem, X what a run can be started from, S the method's state.
+
+    Examples
+    --------
+    >>> from solvers.newton import Newton
+    >>> method: Method = Newton(max_iterations=7)
+    >>> method.max_iterations
+    7
     """
 
     @property
@@ -42,14 +50,37 @@ class Method(Protocol[P, X, S]):
 
 
 class Solver(Method[PGOProblem, Poses, S], Protocol[S]):
-    """A method for pose graphs: every state stands for feasible poses."""
+    """A method for pose graphs: every state stands for feasible poses.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.scenes import grid
+    >>> from solvers.newton import Newton
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> solver: Solver = Newton()
+    >>> solver.poses(problem, solver.init(problem, None))
+    Poses(n=27, d=3)
+    """
 
     def poses(self, problem: PGOProblem, state: S) -> Poses:
         """Feasible poses of a state, those whose F `measure` reports."""
 
 
 def iterate(method: Method[P, X, S], problem: P, start: X | None = None) -> Iterator[S]:
-    """Yield state 0, state 1, .. without end; take what you need with itertools.islice."""
+    """Yield state 0, state 1, .. without end; take what you need with itertools.islice.
+
+    Examples
+    --------
+    >>> import itertools
+    >>> import numpy as np
+    >>> from pgo_models.scenes import grid
+    >>> from solvers.newton import Newton
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> states = list(itertools.islice(iterate(Newton(), problem), 4))
+    >>> [problem.objective(Newton().poses(problem, state)) < 200 for state in states]
+    [True, True, True, True]
+    """
     state = method.init(problem, start)
     while True:
         yield state
@@ -64,7 +95,7 @@ def run(
     callback: Callable[[S, Record], bool | None] | None = None,
     time_limit: float = math.inf,
     verbose: bool = False,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> Run[S]:
     """Run a solver on a pose graph to its end: `run_method`, and the poses.
 
@@ -78,8 +109,9 @@ def run(
         Called with every state and its record; a true answer ends the run (Status.STOPPED).
     time_limit : float
         Seconds of wall time; looked at between steps.
-    verbose, progress : bool
-        Print the table; show a bar on long runs.
+    verbose : bool
+    progress : bool, optional
+        Print the table; show a bar on long runs, which None does in notebooks.
 
     Returns
     -------
@@ -90,6 +122,16 @@ def run(
     ------
     SettingError
         When time_limit is not positive.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.scenes import grid
+    >>> from solvers.newton import Newton
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> result = run(Newton(), problem)
+    >>> result.status.name, len(result.history) == result.iterations + 1
+    ('CONVERGED', True)
     """
     began = time.perf_counter()
     outcome = run_method(
@@ -105,6 +147,7 @@ def run(
         history=outcome.history,
         seconds=time.perf_counter() - began,
         poses=poses,
+        method=solver,
     )
 
 
@@ -113,27 +156,42 @@ def run_method(
     problem: P,
     start: X | None = None,
     *,
+    earlier: tuple[Record, ...] = (),
     callback: Callable[[S, Record], bool | None] | None = None,
     time_limit: float = math.inf,
     verbose: bool = False,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> Outcome[S]:
-    """Run a method on a problem of its kind to its end; parameters and errors as for `run`.
+    """Run a method on a problem of its kind to its end; other parameters and errors as for `run`.
+
+    Parameters
+    ----------
+    earlier : tuple of Record
+        Of a run that was broken off after them, whose next iterate is `start`: counted on from there.
 
     Returns
     -------
     Outcome
         Its state is the last iterate after success, else the best one: least infeasibility, then least objective.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.scenes import grid
+    >>> from solvers.newton import Newton
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> run_method(Newton(), problem, callback=lambda state, record: record.k == 2).status.name
+    'STOPPED'
     """
     if not time_limit > 0:
         raise SettingError(f"time_limit is {time_limit}; give positive seconds")
     name = type(method).__name__
     began = time.perf_counter()
     state = method.init(problem, start)
-    in_steps = time.perf_counter() - began
+    in_steps = time.perf_counter() - began + (earlier[-1].seconds if earlier else 0.0)
     best: tuple[Measurement, S] | None = None
-    records: list[Record] = []
-    k = 0
+    records = list(earlier)
+    k = len(earlier)
     with Table(name, method.max_iterations, verbose, progress) as table:
         try:
             while True:
@@ -170,7 +228,50 @@ def run_method(
         iterations=k,
         history=History(tuple(records)),
         seconds=time.perf_counter() - began,
+        method=method,
     )
+
+
+@dataclass(frozen=True)
+class Watch:
+    """How the runs of a longer job are watched: until when, and who is shown what; see `run`."""
+
+    deadline: float
+    verbose: bool = False
+    progress: bool | None = None
+    callback: Callable[[Any, Record], bool | None] | None = None
+
+    @property
+    def seconds_left(self) -> float:
+        """Time until the deadline, positive."""
+        return max(self.deadline - time.perf_counter(), 1e-3)
+
+    def run(self, solver: Solver[S], problem: PGOProblem, start: Poses | None) -> Run[S]:
+        """Run a solver on a pose graph."""
+        return run(
+            solver,
+            problem,
+            start,
+            callback=self.callback,
+            time_limit=self.seconds_left,
+            verbose=self.verbose,
+            progress=self.progress,
+        )
+
+    def run_method(
+        self, method: Method[P, X, S], problem: P, start: X | None = None, earlier: tuple[Record, ...] = ()
+    ) -> Outcome[S]:
+        """Run a method on a problem of its kind."""
+        return run_method(
+            method,
+            problem,
+            start,
+            earlier=earlier,
+            callback=self.callback,
+            time_limit=self.seconds_left,
+            verbose=self.verbose,
+            progress=self.progress,
+        )
 
 
 def _is_better(one: Measurement, other: Measurement) -> bool:

@@ -33,6 +33,14 @@ class Newton:
     max_iterations : int
     second_order : bool
         False is Gauss-Newton, the second layer of the paper's method.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> from solvers.loop import run
+    >>> import numpy as np
+    >>> run(Newton(), PGOProblem(grid(np.random.default_rng(0)))).status.name
+    'CONVERGED'
     """
 
     tolerance: float = STATIONARY_DECREMENT
@@ -69,5 +77,11 @@ class Newton:
 
 
 def gauss_newton(max_iterations: int = Newton.max_iterations) -> Newton:
-    """Newton with the Gauss-Newton matrix instead of the Hessian."""
+    """Newton with the Gauss-Newton matrix instead of the Hessian.
+
+    Examples
+    --------
+    >>> gauss_newton().second_order
+    False
+    """
     return replace(Newton(), max_iterations=max_iterations, second_order=False)

@@ -15,7 +15,13 @@ from solvers.pipeline import solve
 
 
 class SweptScene(enum.Enum):
-    """Which network."""
+    """Which network.
+
+    Examples
+    --------
+    >>> noisy_scene(SweptScene.GRID, 0.1, np.random.default_rng(0))
+    PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
+    """
 
     CIRCLE = "circle"
     GRID = "grid"
@@ -35,6 +41,13 @@ class NoiseSweep:
         relaxation is not tight, or the answer not optimal.
     gap : (levels, graphs)
         Certified gap of the answer; the relaxation's own is at most that.
+
+    Examples
+    --------
+    >>> certified = np.array([[True, True], [True, False]])
+    >>> sweep = NoiseSweep(SweptScene.GRID, np.array([0.5, 1.0]), certified, np.zeros((2, 2)))
+    >>> sweep.fraction, sweep.last_tight
+    (array([1. , 0.5]), 0.5)
     """
 
     scene: SweptScene
@@ -61,7 +74,13 @@ class NoiseSweep:
 
 
 def noisy_scene(scene: SweptScene, rotation_std: float, rng: np.random.Generator) -> PoseGraph:
-    """The paper's network with its geometry, weights and translation noise, and another rotation noise, in radians."""
+    """The paper's network with its geometry, weights and translation noise, and another rotation noise, in radians.
+
+    Examples
+    --------
+    >>> noisy_scene(SweptScene.CIRCLE, 0.1, np.random.default_rng(0))
+    PoseGraph('circle', d=3, poses=25, edges=300, robots=1)
+    """
     network = circle(rng) if scene is SweptScene.CIRCLE else grid(rng)
     assert network.truth is not None
     noise = NoiseModel(rotation_std=rotation_std)
@@ -84,6 +103,12 @@ def noise_sweep(scene: SweptScene, rotation_std: Array, graphs: int, rng: np.ran
     ------
     SettingError
         When the levels are not positive and ascending, or graphs is not positive.
+
+    Examples
+    --------
+    >>> sweep = noise_sweep(SweptScene.GRID, np.array([0.1]), 2, np.random.default_rng(0))
+    >>> sweep.fraction
+    array([1.])
     """
     levels = np.asarray(rotation_std, dtype=float)
     if levels.ndim != 1 or not len(levels) or not (levels > 0).all() or (np.diff(levels) <= 0).any():

@@ -92,6 +92,14 @@ class OrthogonalSOC:
     ------
     SettingError
         When a setting is out of its range.
+
+    Examples
+    --------
+    >>> from pgo_models.orthogonal_examples import procrustes
+    >>> from solvers.loop import run_method
+    >>> problem = procrustes(np.eye(3), np.eye(3), rotation=True)
+    >>> run_method(OrthogonalSOC(), problem, problem.point([np.eye(3)])).status.name
+    'CONVERGED'
     """
 
     penalty: float | None = None
@@ -242,6 +250,13 @@ class OrthogonalSolution:
         The run it came from: status, history, state.
     objectives : tuple of float
         J of every start, nan where a run did not converge.
+
+    Examples
+    --------
+    >>> from pgo_models.orthogonal_examples import procrustes
+    >>> solution = solve_orthogonal(procrustes(np.eye(3), np.eye(3), rotation=True), np.random.default_rng(0))
+    >>> solution.status.name, abs(round(solution.objective, 6))
+    ('CONVERGED', 0.0)
     """
 
     problem: OrthogonalProblem

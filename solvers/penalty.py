@@ -30,6 +30,15 @@ class MultiplierPenalty:
     stall_window, stall_ratio : int, float
         Stalled: the residual of the last `stall_window` iterations has not fallen below `stall_ratio` of what it was.
     max_refreshes : int
+
+    Examples
+    --------
+    >>> from pgo_models.initialization import chordal_start
+    >>> from pgo_models.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> rho = MultiplierPenalty(factor=8.0).initial(problem, chordal_start(problem))
+    >>> rho.shape, bool(rho.min() > 0)
+    ((27,), True)
     """
 
     factor: float = 8.0
@@ -55,15 +64,26 @@ class MultiplierPenalty:
         """rho, (n,), at poses."""
         norms = np.abs(np.linalg.eigvalsh(multipliers(problem, poses))).max(axis=1)
         scale = rotation_scale(problem)
+        return np.asarray(self.factor * np.maximum(norms, self.floor(norms / scale) * scale))
+
+    def floor(self, ratio: Array) -> float:
+        """Quantile q of ||Lambda_i||_2 / m_i over all poses, (n,)."""
         # Where the multipliers are zero but for rounding (measurements without noise) any penalty works that M + D/2
         # does not lose to rounding.
-        floor = max(float(np.quantile(norms / scale, self.quantile)), _SMALLEST_RATIO)
-        return np.asarray(self.factor * np.maximum(norms, floor * scale))
+        return max(float(np.quantile(ratio, self.quantile)), _SMALLEST_RATIO)
 
 
 @dataclass(frozen=True)
 class FixedPenalty:
-    """rho_i = rho for all poses, unless the safeguard of `solvers.soc` raises it."""
+    """rho_i = rho for all poses, unless the safeguard of `solvers.soc` raises it.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> FixedPenalty(2.0).initial(problem, problem.graph.truth)[:3]
+    array([2., 2., 2.])
+    """
 
     rho: float
 
@@ -84,6 +104,11 @@ class BalancedPenalty:
     times sqrt(primal / dual); rho moves that way by `refactor_ratio`, and the matrices are factored again, once that is
     asked for or more (the rule of OSQP, Stellato et al. 2020, section 5.2). B is rescaled with it. A rise of the merit
     puts rho up again (the safeguard of `solvers.soc`).
+
+    Examples
+    --------
+    >>> BalancedPenalty().factor(primal_residual=1.0, dual_residual=1e-3)
+    5.0
     """
 
     scale: float = 0.3

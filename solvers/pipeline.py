@@ -1,22 +1,34 @@
-"""solve(problem): start, SOC, Newton, certificate, in one Solution."""
+"""solve(problem): start, SOC, Newton, certificate, and where that fails the staircase, in one Solution."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
-from pgo_models.certificate import DEFAULT_GAP, Certificate, certify_stationary, judge
+import numpy as np
+
+from pgo_models.certificate import DEFAULT_GAP, BoundSource, Certificate, certify_stationary, certify_with, judge
 from pgo_models.errors import SettingError
 from pgo_models.initialization import chordal_start, spanning_tree_start
+from pgo_models.partition import Partition, partition
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
-from solvers.loop import run
+from solvers.checkpoint import Checkpoint, Journal, fingerprint
+from solvers.distributed import attempt_distributed, open_driver
+from solvers.engine import Engine, InProcess
+from solvers.loop import Watch
+from solvers.network import Faults
 from solvers.newton import Newton
-from solvers.result import History, Status
+from solvers.result import OUT_OF_TIME, History, Record, Stage, Status
+from solvers.rotation_step import RStep
 from solvers.soc import SOC, Coupling
-from solvers.solution import Solution, Stage
+from solvers.solution import Solution
+from solvers.staircase import DualBound, Staircase
 
 HANDOVER_TOLERANCE = 2e-3  # relative residual at which Newton needs one or two factorisations
 _SECOND_TRY_TOLERANCE = 1e-6
@@ -37,16 +49,33 @@ class Pipeline:
     second_try : bool
         Where the certificate is wider than asked for, run SOC to a fine tolerance and Newton again, and keep the better
         poses and the better bound.
+    staircase : Staircase, optional
+        Where the certificate is still wider, solve the semidefinite relaxation from the best poses, with the gap of the
+        pipeline, then Newton from what it rounds to; None goes without.
+    faults : Faults, optional
+        What goes wrong between robots in a CONSENSUS stage, which then does not wait: `solvers.asynchronous_soc`. Only
+        with `solve(.., robots=..)`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models import circle
+    >>> solve(circle(np.random.default_rng(0)), Pipeline(soc=None, gap=1e-8)).is_certified
+    True
     """
 
     soc: SOC | None = field(default_factory=lambda: SOC(tolerance=HANDOVER_TOLERANCE, max_iterations=100))
     newton: Newton = field(default_factory=Newton)
     gap: float = DEFAULT_GAP
     second_try: bool = True
+    staircase: Staircase | None = field(default_factory=Staircase)
+    faults: Faults | None = None
 
     def __post_init__(self) -> None:
         if not self.gap > 0:
             raise SettingError(f"gap must be positive, got {self.gap}; 1e-6 is usual")
+        if self.faults is not None and (self.soc is None or self.soc.effective_coupling is not Coupling.CONSENSUS):
+            raise SettingError("faults are of messages between robots; use SOC(robots=.., coupling=Coupling.CONSENSUS)")
 
 
 def solve(
@@ -54,14 +83,19 @@ def solve(
     pipeline: Pipeline | None = None,
     start: Poses | None = None,
     *,
+    robots: Partition | int | None = None,
+    engine: Engine | None = None,
+    checkpoint: Checkpoint | None = None,
+    callback: Callable[[Any, Record], bool | None] | None = None,
     time_limit: float = math.inf,
     verbose: bool = False,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> Solution:
     """Solve a pose graph and certify the answer.
 
     Start (chordal relaxation; a spanning tree for the paper's coupling), SOC until Newton can take over, Newton to
-    rounding level, then the dual certificate at the result.
+    rounding level, then the dual certificate at the result. Where it is wider than asked for, a second try and then
+    the Riemannian staircase, whose optimum is the best bound that the relaxation has.
 
     Parameters
     ----------
@@ -70,6 +104,16 @@ def solve(
         `Pipeline()` unless given.
     start : Poses, optional
         Instead of the method's own start.
+    robots : Partition or int, optional
+        Robots that share the poses: start, SOC, Newton and certificate are run by them and a driver, each as if there
+        were one, and what crosses the network is in `Solution.ledger`. A number stands for the robots of the pipeline's
+        SOC if they are so many, else for the default partition. Without robots everything is run in one place.
+    engine : Engine, optional
+        Where the robots run; in this process unless given.
+    checkpoint : Checkpoint, optional
+        File from which a solve by robots that was broken off goes on, and to which it writes what that takes.
+    callback : callable, optional
+        Called with every state of SOC and Newton and its record; a true answer ends that stage.
     time_limit : float
         Seconds for the iterative stages together. The certificate is found all the same.
     verbose, progress : bool
@@ -83,7 +127,8 @@ def solve(
     Raises
     ------
     PGOError
-        When the graph is not connected, the start does not fit it, or the time limit is not positive.
+        When the graph is not connected, the start does not fit it, the time limit is not positive, or the checkpoint is
+        of another run; when the robots cannot be started, are not those of the pipeline's SOC, or cannot run it.
 
     Examples
     --------
@@ -98,20 +143,35 @@ def solve(
         raise SettingError(f"time_limit is {time_limit}; give positive seconds")
     if isinstance(problem, PoseGraph):
         problem = PGOProblem(problem)
+    if robots is None and (engine is not None or checkpoint is not None):
+        raise SettingError("engine and checkpoint are for solves by robots; give robots, a number or a Partition")
     pipeline = pipeline if pipeline is not None else Pipeline()
-    first, name = (start, "given start") if start is not None else _own_start(problem, pipeline)
-    stages = [
-        Stage(name, Status.CONVERGED, 0, problem.objective(first), time.perf_counter() - began, History()),
-    ]
-    deadline = began + time_limit
-    poses, certificate = _attempt(problem, pipeline, first, stages, deadline, verbose, progress)
-    if pipeline.second_try and not certificate.is_certified and stages[-1].status.is_success:
-        soc = pipeline.soc if pipeline.soc is not None else SOC()
-        fine = replace(soc, tolerance=min(soc.tolerance, _SECOND_TRY_TOLERANCE), max_iterations=SOC.max_iterations)
-        again = replace(pipeline, soc=fine)
-        other, second = _attempt(problem, again, chordal_start(problem), stages, deadline, verbose, progress)
-        poses = other if second.poses_objective < certificate.poses_objective else poses
-        certificate = judge(problem, poses, max(certificate, second, key=lambda found: found.lower_bound))
+    if robots is None and pipeline.faults is not None:
+        raise SettingError("faults are of messages between robots; give solve() the robots of SOC, too")
+    stages: list[Stage] = []
+    watch = Watch(began + time_limit, verbose, progress, callback)
+    if robots is None:
+        poses, certificate = _tries(
+            partial(_attempt, problem, pipeline, stages, watch), problem, pipeline, start, stages
+        )
+        ledger = None
+    else:
+        robots = _robots_for(pipeline.soc, robots, problem.graph)
+        settings = pipeline.soc, pipeline.newton, pipeline.gap, pipeline.second_try, pipeline.faults
+        journal = Journal(checkpoint, fingerprint(problem, robots, settings, start), stages)
+        driver = open_driver(problem, robots, engine if engine is not None else InProcess())
+        try:
+            attempt = partial(
+                attempt_distributed, driver, problem, pipeline.newton, pipeline.gap, pipeline.faults, journal, watch
+            )
+            poses, certificate = _tries(attempt, problem, pipeline, start, stages)
+        finally:
+            driver.close()
+        ledger = driver.ledger
+        if stages[-1].status.is_success:
+            journal.end()
+    if pipeline.staircase is not None and not certificate.is_certified and stages[-1].status not in OUT_OF_TIME:
+        poses, certificate = _climb(problem, pipeline, poses, certificate, stages, watch)
     reference = problem.graph.initial
     poses = poses.aligned_to(reference) if reference is not None else poses.with_gauge_at(0)
     return Solution(
@@ -122,40 +182,117 @@ def solve(
         status=stages[-1].status,
         stages=tuple(stages),
         seconds=time.perf_counter() - began,
+        ledger=ledger,
+        robots=robots,
     )
 
 
-def _own_start(problem: PGOProblem, pipeline: Pipeline) -> tuple[Poses, str]:
-    if pipeline.soc is not None and pipeline.soc.effective_coupling is Coupling.PAPER:
-        return spanning_tree_start(problem.graph), "spanning tree"
-    return chordal_start(problem), "chordal start"
+def _robots_for(soc: SOC | None, robots: Partition | int, graph: PoseGraph) -> Partition:
+    """Robots of a solve, who are also those of its SOC.
+
+    Raises
+    ------
+    SettingError
+        When SOC is of other robots, or is not for robots.
+    """
+    own = soc.robots if soc is not None else None
+    if isinstance(robots, int):
+        robots = own if own is not None and own.num_robots == robots else partition(graph, robots)
+    if own is not None and not np.array_equal(own.robot, robots.robot):
+        raise SettingError(f"solve() has {robots}, SOC has {own}; give both the same robots, or SOC none")
+    if soc is not None and soc.effective_coupling is Coupling.PAPER:
+        raise SettingError("PAPER is run in one place; leave out the robots of solve(), or use Coupling.CONSENSUS")
+    if soc is not None and soc.r_step is not RStep.FACTORIZED:
+        raise SettingError(f"robots factor their subproblems, got r_step {soc.r_step}; use RStep.FACTORIZED")
+    return robots
+
+
+def _tries(
+    attempt: Callable[[SOC | None, Poses | None], tuple[Poses, Certificate]],
+    problem: PGOProblem,
+    pipeline: Pipeline,
+    start: Poses | None,
+    stages: list[Stage],
+) -> tuple[Poses, Certificate]:
+    """One attempt, and where its certificate is wider than asked for a second one with a finer SOC."""
+    poses, certificate = attempt(pipeline.soc, start)
+    if pipeline.second_try and not certificate.is_certified and stages[-1].status.is_success:
+        soc = pipeline.soc if pipeline.soc is not None else SOC()
+        fine = replace(soc, tolerance=min(soc.tolerance, _SECOND_TRY_TOLERANCE), max_iterations=SOC.max_iterations)
+        poses, certificate = _better(problem, poses, certificate, attempt(fine, None)[1])
+    return poses, certificate
 
 
 def _attempt(
     problem: PGOProblem,
     pipeline: Pipeline,
-    start: Poses,
     stages: list[Stage],
-    deadline: float,
-    verbose: bool,
-    progress: bool,
+    watch: Watch,
+    soc: SOC | None,
+    start: Poses | None,
 ) -> tuple[Poses, Certificate]:
     """SOC, Newton and certificate from a start; appends what was done to `stages`."""
-    poses = start
-    if pipeline.soc is not None:
-        soc = run(pipeline.soc, problem, poses, time_limit=_seconds_left(deadline), verbose=verbose, progress=progress)
-        stages.append(Stage.of(soc))
+    began = time.perf_counter()
+    poses, name = (start, "given start") if start is not None else _own_start(problem, soc)
+    seconds = time.perf_counter() - began
+    stages.append(Stage(name, Status.CONVERGED, 0, problem.objective(poses), seconds, History()))
+    if soc is not None:
+        first = watch.run(soc, problem, poses)
+        stages.append(Stage.of(first))
         # A start that is better than SOC's best iterate is kept: CSAIL's chordal start is within 1e-4.
-        poses = soc.poses if soc.objective <= problem.objective(poses) else poses
+        poses = first.poses if first.objective <= problem.objective(poses) else poses
+    return _polished(problem, pipeline, stages, watch, poses)
+
+
+def _polished(
+    problem: PGOProblem, pipeline: Pipeline, stages: list[Stage], watch: Watch, poses: Poses
+) -> tuple[Poses, Certificate]:
+    """Newton, unless the stage before was cut short, and certificate."""
     decrement = math.inf
-    if stages[-1].status not in (Status.INTERRUPTED, Status.TIME_LIMIT):
-        newton = run(
-            pipeline.newton, problem, poses, time_limit=_seconds_left(deadline), verbose=verbose, progress=progress
-        )
-        stages.append(Stage.of(newton))
-        poses, decrement = newton.poses, newton.state.polish.decrement
+    if stages[-1].status not in OUT_OF_TIME:
+        second = watch.run(pipeline.newton, problem, poses)
+        stages.append(Stage.of(second))
+        poses, decrement = second.poses, second.state.polish.decrement
     return poses, certify_stationary(problem, poses, pipeline.gap, decrement)
 
 
-def _seconds_left(deadline: float) -> float:
-    return max(deadline - time.perf_counter(), 1e-3)
+def _own_start(problem: PGOProblem, soc: SOC | None) -> tuple[Poses, str]:
+    if soc is not None and soc.effective_coupling is Coupling.PAPER:
+        return spanning_tree_start(problem.graph), "spanning tree"
+    return chordal_start(problem), "chordal start"
+
+
+def _climb(
+    problem: PGOProblem,
+    pipeline: Pipeline,
+    poses: Poses,
+    certificate: Certificate,
+    stages: list[Stage],
+    watch: Watch,
+) -> tuple[Poses, Certificate]:
+    """Staircase from the best poses, Newton from what it rounds to, and the relaxation's bound if still needed."""
+    assert pipeline.staircase is not None
+    bounds: list[DualBound | None] = []
+    # Of a run that was cut short the state with the best poses is kept, not the one with the best bound.
+    watching = replace(watch, callback=lambda state, record: bounds.append(state.bound))
+    climb = watching.run(replace(pipeline.staircase, gap=pipeline.gap), problem, poses)
+    stages.append(Stage.of(climb))
+    rounded = _polished(problem, pipeline, stages, watch, climb.poses)[1]
+    poses, certificate = _better(problem, poses, certificate, rounded)
+    bound = bounds[-1] if bounds else None
+    if bound is not None and not certificate.is_certified:
+        stationarity = certificate.stationarity
+        relaxed = certify_with(problem, poses, bound.Lambda, pipeline.gap, stationarity, BoundSource.RELAXATION)
+        certificate = max(certificate, relaxed, key=lambda found: found.lower_bound)
+    return poses, certificate
+
+
+def _better(
+    problem: PGOProblem, poses: Poses, certificate: Certificate, other: Certificate
+) -> tuple[Poses, Certificate]:
+    """The better of `poses`, which `certificate` judges, and the poses of `other`, held against the better bound."""
+    stationarity = certificate.stationarity
+    if other.poses_objective < certificate.objective:
+        poses, stationarity = other.poses, other.stationarity
+    bound = max(certificate, other, key=lambda found: found.lower_bound)
+    return poses, replace(judge(problem, poses, bound), stationarity=stationarity)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -15,7 +15,13 @@ S = TypeVar("S")
 
 
 class Status(enum.Enum):
-    """Why a run ended."""
+    """Why a run ended.
+
+    Examples
+    --------
+    >>> Status.CONVERGED.is_success, Status.TIME_LIMIT.is_success
+    (True, False)
+    """
 
     CONVERGED = "residuals are within tolerance"
     MAX_ITERATIONS = "iteration limit reached; raise max_iterations or loosen the tolerance"
@@ -29,6 +35,9 @@ class Status(enum.Enum):
     def is_success(self) -> bool:
         """Whether the run did what it was asked for."""
         return self in (Status.CONVERGED, Status.STALLED)
+
+
+OUT_OF_TIME = (Status.INTERRUPTED, Status.TIME_LIMIT)
 
 
 @dataclass(frozen=True)
@@ -46,17 +55,32 @@ class Measurement:
     infeasibility : float
         Distance of the point whose objective this is from the constraints; 0 where that point is feasible, as poses
         are. The best iterate of a run has the least infeasibility, and among those the least objective.
+    rounds, num_bytes : int, optional
+        Communication so far, of methods that run by many robots.
+
+    Examples
+    --------
+    >>> Measurement(objective=2.5, primal_residual=0.1, dual_residual=0.2).infeasibility
+    0.0
     """
 
     objective: float
     primal_residual: float
     dual_residual: float
     infeasibility: float = 0.0
+    rounds: int | None = None
+    num_bytes: int | None = None
 
 
 @dataclass(frozen=True)
 class Record:
-    """One row of a history: iterate k, seconds spent in steps up to it, and its figures."""
+    """One row of a history: iterate k, seconds spent in steps up to it, and its figures.
+
+    Examples
+    --------
+    >>> Record(k=3, seconds=0.5, measurement=Measurement(2.5, 0.1, 0.2)).k
+    3
+    """
 
     k: int
     seconds: float
@@ -65,7 +89,14 @@ class Record:
 
 @dataclass(frozen=True)
 class History:
-    """Records of all measured iterates, in order."""
+    """Records of all measured iterates, in order.
+
+    Examples
+    --------
+    >>> records = tuple(Record(k, 0.1 * k, Measurement(2.0 + 0.5**k, 0.0, 0.0)) for k in range(3))
+    >>> History(records).objective
+    array([3.  , 2.5 , 2.25])
+    """
 
     records: tuple[Record, ...] = ()
 
@@ -116,6 +147,13 @@ class Outcome(Generic[S]):
     history : History
     seconds : float
         Wall time of the whole run.
+    method : object
+        The method that ran, which is its settings.
+
+    Examples
+    --------
+    >>> Outcome("SOC", 2.5, None, Status.CONVERGED, 7, History(), 0.25)
+    Outcome(SOC: CONVERGED after 7 iterations, F = 2.5, 0.25 s)
     """
 
     name: str
@@ -125,6 +163,7 @@ class Outcome(Generic[S]):
     iterations: int
     history: History
     seconds: float
+    method: object = field(default=None, kw_only=True)
 
     def __repr__(self) -> str:
         return (
@@ -141,6 +180,47 @@ class Run(Outcome[S]):
     ----------
     poses : Poses
         Of the last iterate, or of the best one (lowest F) when the run did not succeed; `objective` is F of them.
+
+    Examples
+    --------
+    >>> Run("SOC", 2.5, None, Status.CONVERGED, 7, History(), 0.25, Poses.identity(4, 3)).poses
+    Poses(n=4, d=3)
     """
 
     poses: Poses
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What one stage of a solve did.
+
+    Attributes
+    ----------
+    name : str
+    status : Status
+    iterations : int
+    objective : float
+    seconds : float
+    history : History
+    method : object
+        The method that ran, which is its settings; None for a start.
+
+    Examples
+    --------
+    >>> run = Run("SOC", 2.5, None, Status.CONVERGED, 7, History(), 0.25, Poses.identity(4, 3))
+    >>> Stage.of(run).name
+    'SOC'
+    """
+
+    name: str
+    status: Status
+    iterations: int
+    objective: float
+    seconds: float
+    history: History
+    method: object = None
+
+    @classmethod
+    def of(cls, run: Run[S]) -> Stage:
+        """Stage of a finished run."""
+        return cls(run.name, run.status, run.iterations, run.objective, run.seconds, run.history, run.method)

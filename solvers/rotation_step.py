@@ -20,11 +20,18 @@ from pgo_models.rotations import Array
 from solvers.fista import fista
 
 if TYPE_CHECKING:
-    from pgo_models.rotation_qp import RotationQP
+    from pgo_models.rotation_subproblem import RotationQP
 
 
 class RStep(enum.Enum):
-    """Which back end solves the R-subproblem."""
+    """Which back end solves the R-subproblem.
+
+    Examples
+    --------
+    >>> from solvers.soc import SOC
+    >>> SOC(r_step=RStep.FISTA).r_step.name
+    'FISTA'
+    """
 
     FACTORIZED = "one sparse Cholesky factorisation, then two triangular solves an iteration"
     FISTA = "accelerated gradients, the paper's choice"
@@ -86,7 +93,19 @@ class RotationStep(Protocol):
 
 
 class CustomRStep(Protocol):
-    """A back end of one's own, in place of an RStep."""
+    """A back end of one's own, in place of an RStep.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.scenes import grid
+    >>> from pgo_models.graph_subproblem import Change
+    >>> from solvers.changed_soc import ChangedStep
+    >>> from solvers.soc import SOC
+    >>> own: CustomRStep = ChangedStep(grid(np.random.default_rng(0)), lambda unknown: Change())
+    >>> SOC(r_step=own).r_step is own
+    True
+    """
 
     def prepare(self, subproblem: Subproblem) -> RotationStep:
         """Make the subproblem, or a changed one with the same rows, ready for many shifts."""
@@ -103,7 +122,9 @@ def prepare(subproblem: Subproblem, back_end: BackEnd) -> RotationStep:
         return _Factorized(subproblem.analysis.factorize(subproblem.K), 0.5 * subproblem.penalty[:, None])
     if back_end is RStep.FISTA:
         return _Fista(subproblem)
-    from pgo_models.rotation_qp import rotation_qp  # cvxpy takes half of the import time, and only this needs it
+    from pgo_models.rotation_subproblem import (
+        rotation_qp,  # cvxpy takes half of the import time, and only this needs it
+    )
 
     qp = rotation_qp(subproblem.A, subproblem.w, subproblem.penalty, subproblem.d)
     return _Clarabel(qp, subproblem.num_translations if subproblem.needs_ground else 0)

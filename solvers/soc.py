@@ -10,6 +10,7 @@ Ebrahimi & Deghat, Algorithm 1 (`algo1: SOC`); Lai & Osher 2014.
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,30 +18,50 @@ import numpy as np
 from pgo_models.errors import SettingError
 from pgo_models.initialization import chordal_start, spanning_tree_start
 from pgo_models.matrices import norm
-from pgo_models.multipliers import multipliers
 from pgo_models.partition import Partition
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
-from solvers.acceleration import Anderson, AndersonMemory, extrapolate, over_relax
-from solvers.penalty import BalancedPenalty, MultiplierPenalty, PenaltyRule, rotation_scale, translation_scale
+from solvers.acceleration import Anderson, AndersonMemory, extrapolate_parts, over_relax
+from solvers.penalty import (
+    BalancedPenalty,
+    FixedPenalty,
+    MultiplierPenalty,
+    PenaltyRule,
+    rotation_scale,
+    translation_scale,
+)
 from solvers.result import Measurement, Status
 from solvers.rotation_step import BackEnd, RStep
+from solvers.safeguard import MAX_RAISES, has_diverged, has_stalled, is_going_round
 from solvers.soc_paper import PaperState, init_paper, measure_paper, step_paper
 from solvers.team import Team, build_team
+from solvers.team_vectors import (
+    agree,
+    balanced,
+    norm_of_omega,
+    norm_weight,
+    stationarity_weight,
+    stationary_mean,
+)
 
-_DIVERGED = 10.0  # times the smallest merit: go back and double the penalty
-_PATIENCE = 20  # steps without a new smallest merit: likewise, unless rho is `_ENOUGH` times m_i in the median
-_ENOUGH = 4.0  # 4 ||Lambda_i|| is, and at an optimum that can be certified ||Lambda_i|| is about m_i at most
-_MAX_RAISES = 20
+_TRANSLATION_PENALTY = 0.6  # times the stiffness of the separators
+_SEPARATOR_PENALTY, _MOST_SEPARATOR_PENALTY = 0.7, 0.3  # times the root of the translation penalty, and no more
 
 
 class Coupling(enum.Enum):
-    """How the R-subproblem is shared."""
+    """How the R-subproblem is shared.
+
+    Examples
+    --------
+    >>> SOC(coupling=Coupling.JOINT).effective_coupling.name
+    'JOINT'
+    """
 
     PAPER = "rotations only, every robot with its neighbours frozen (Algorithm 1 to the letter)"
     JOINT = "one robot, all rotations and translations in one QP"
     CONSENSUS = "many robots, omega agreed between the copies of separator poses"
+    SUBSTRUCTURED = "many robots and a driver: the program of JOINT, split by elimination to the separators"
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +83,14 @@ class SOCState:
         Scaled multiplier, s - z.
     rho : (n,)
         Penalty of every rotation.
+    rho_t : (n,)
+        Penalty of the translations of separators.
+    separator_rho : (n,)
+        Least penalty of the rotations of separators under a MultiplierPenalty.
     team : Team
         Robots with their prepared subproblems.
-    memory : AndersonMemory
+    memory : tuple of AndersonMemory
+        One for all robots, one for every robot, or none yet.
     primal_residual, dual_residual : float
         ||x - z||_rho and ||c (z - z_before)||_rho, both over ||omega||_rho, with c = max(1, rho / diagonal of M): a
         penalty far above M makes short steps anywhere.
@@ -82,8 +108,10 @@ class SOCState:
     z: Array
     s: Array
     rho: Array
+    rho_t: Array
+    separator_rho: Array
     team: Team
-    memory: AndersonMemory = field(default_factory=AndersonMemory)
+    memory: tuple[AndersonMemory, ...] = ()
     primal_residual: float = np.inf
     dual_residual: float = np.inf
     merits: tuple[float, ...] = ()
@@ -104,7 +132,8 @@ class SOC:
     Attributes
     ----------
     coupling : Coupling, optional
-        JOINT unless robots are given, then CONSENSUS.
+        JOINT unless robots are given, then CONSENSUS. SUBSTRUCTURED has the iterates of JOINT: here it is run as JOINT
+        is, by `solve(.., robots=..)` on robots.
     robots : Partition, optional
         Who owns which pose; for PAPER, one pose a robot unless given.
     penalty : MultiplierPenalty, FixedPenalty or BalancedPenalty, optional
@@ -115,11 +144,16 @@ class SOC:
         None is the plain recursion. PAPER has none.
     r_step : RStep or CustomRStep
         Back end of step (a).
-    translation_penalty : float
-        Penalty of separator translations in CONSENSUS, times their diagonal in M.
-    separator_penalty : float
+    local_passes : int
+        CONSENSUS only: how often a robot does (a) to (c) in a round, on the poses that it alone knows in all but the
+        last of them. It costs no message. 1 is the plain recursion.
+    translation_penalty : float, optional
+        Penalty of separator translations in CONSENSUS, times their diagonal in M. Unless given, 0.6 times the stiffness
+        of the separators, `Team.stiffness`: what the robots feel when they move one.
+    separator_penalty : float, optional
         Least penalty of separator rotations in CONSENSUS under a MultiplierPenalty, times their mean diagonal in M: on
-        graphs with little noise the multipliers alone would hold the copies too loosely together.
+        graphs with little noise the multipliers alone would hold the copies too loosely together. Unless given, 0.7
+        times the root of the translation penalty, at most 0.3.
     tolerance : float
         On the primal and the dual residual, both relative. For PAPER the primal one is the paper's KKT residual, the
         root mean square over poses of ||omega_i^T omega_i - I||^2 + ||omega_i - R_i||^2, the dual one its stationarity.
@@ -129,6 +163,13 @@ class SOC:
     ------
     SettingError
         When a setting is out of its range or does not go with the coupling.
+
+    Examples
+    --------
+    >>> from pgo_models.scenes import grid
+    >>> from solvers.loop import run
+    >>> run(SOC(tolerance=1e-4), PGOProblem(grid(np.random.default_rng(0)))).status.name
+    'CONVERGED'
     """
 
     coupling: Coupling | None = None
@@ -137,17 +178,20 @@ class SOC:
     alpha: float = 1.0
     acceleration: Anderson | None = field(default_factory=Anderson)
     r_step: BackEnd = RStep.FACTORIZED
-    translation_penalty: float = 0.05
-    separator_penalty: float = 0.3
+    local_passes: int = 10
+    translation_penalty: float | None = None
+    separator_penalty: float | None = None
     tolerance: float = 1e-5
     max_iterations: int = 500
 
     def __post_init__(self) -> None:
         if not 0 < self.alpha < 2:
             raise SettingError(f"alpha must be in (0, 2), got {self.alpha}")
-        if not self.translation_penalty > 0:
+        if self.local_passes < 1:
+            raise SettingError(f"local_passes must be at least 1, got {self.local_passes}")
+        if self.translation_penalty is not None and not self.translation_penalty > 0:
             raise SettingError(f"translation_penalty must be positive, got {self.translation_penalty}")
-        if not self.separator_penalty >= 0:
+        if self.separator_penalty is not None and not self.separator_penalty >= 0:
             raise SettingError(f"separator_penalty must not be negative, got {self.separator_penalty}")
         if not self.tolerance > 0:
             raise SettingError(f"tolerance must be positive, got {self.tolerance}")
@@ -165,35 +209,50 @@ class SOC:
             return self.coupling
         return Coupling.JOINT if self.robots is None else Coupling.CONSENSUS
 
+    @property
+    def _copies(self) -> Partition | None:
+        """Robots that hold copies; None for one that holds all."""
+        return self.robots if self.effective_coupling is Coupling.CONSENSUS else None
+
     def init(self, problem: PGOProblem, start: Poses | None) -> SOCState | PaperState:
-        """State 0: omega = R = start, B = 0. JOINT and CONSENSUS start at the chordal relaxation, PAPER at a tree."""
+        """State 0: omega = R = start. JOINT and CONSENSUS start at the chordal relaxation, PAPER at a tree.
+
+        B = 0, but for many robots under a MultiplierPenalty the stationary one, as after a refresh.
+        """
         if self.effective_coupling is Coupling.PAPER:
             poses = start if start is not None else spanning_tree_start(problem.graph)
-            return init_paper(problem, poses, self.robots, self._rule, self.r_step)
+            return init_paper(problem, poses, self.robots, self.effective_penalty, self.r_step)
         poses = start if start is not None else chordal_start(problem)
-        rho = self._initial_rho(problem, poses)
-        team = build_team(problem, self.robots, self.r_step).with_penalty(rho, self._rho_t(problem))
+        team = build_team(problem, self._copies, self.r_step)
+        rho = self.effective_penalty.initial(problem, poses)
+        rho_t, separator_rho = self._separator_penalties(problem, team, rho)
+        rho = np.maximum(rho, separator_rho)
+        team = team.with_penalty(rho, rho_t)
         X = problem.stacked(poses)
         z = X[team.row]
-        return SOCState(k=0, x=z, omega=poses.R, z=z, s=z + _balanced(team, X, np.zeros_like(X)), rho=rho, team=team)
+        is_stationary = len(team.robots) > 1 and isinstance(self.effective_penalty, MultiplierPenalty)
+        mean = stationary_mean(problem, poses, rho) if is_stationary else np.zeros_like(X)
+        s = z + balanced(team, X, mean)
+        return SOCState(0, z, poses.R, z, s, rho, rho_t, separator_rho, team)
 
     def step(self, problem: PGOProblem, state: SOCState | PaperState) -> SOCState | PaperState:
         """One iteration: (a), (b), (c)."""
         if isinstance(state, PaperState):
-            return step_paper(problem, state, self._rule, self.r_step)
+            return step_paper(problem, state, self.effective_penalty, self.r_step)
         state = self._with_penalty_due(problem, state)
-        team, z, B = state.team, state.z, state.B
-        weight = _norm_weight(team)
+        team, weight = state.team, norm_weight(state.team)
+        z, B, drift = self._between_exchanges(team, state)
         x = team.solve_all(z - B)  # (a)
         relaxed = over_relax(x, z, self.alpha)
         s, memory = relaxed + B, state.memory
-        merit = norm(weight * (relaxed - z))
+        residual = weight * (relaxed - z + drift)
+        merit = norm(residual)
         if self.acceleration is not None and np.isfinite(merit):
-            s, memory = extrapolate(self.acceleration, memory, weight * (relaxed - z), s)
+            s, memory = extrapolate_parts(self.acceleration, memory, residual, s, team.slices)
         if not np.isfinite(s).all():
             return replace(state, k=state.k + 1, x=x, primal_residual=np.nan, dual_residual=np.nan)
-        omega, following = _agree(team, s, problem)  # (b), and (c): B = s - z = B + x - z
-        size = _size(team)
+        omega, following = agree(team, s, problem)  # (b), and (c): B = s - z = B + x - z
+        size = norm_of_omega(team)
         return replace(
             state,
             k=state.k + 1,
@@ -203,7 +262,7 @@ class SOC:
             s=s,
             memory=memory,
             primal_residual=norm(weight * (x - following)) / size,
-            dual_residual=norm(_stationarity_weight(team) * (following - z)) / size,
+            dual_residual=norm(stationarity_weight(team) * (following - state.z)) / size,
             merits=(*state.merits, merit),
             best=state.s if merit <= min(state.merits, default=np.inf) else state.best,
         )
@@ -228,116 +287,98 @@ class SOC:
         return Status.CONVERGED if worst <= self.tolerance else None
 
     @property
-    def _rule(self) -> PenaltyRule:
+    def effective_penalty(self) -> PenaltyRule:
+        """The penalty rule that is used."""
         if self.penalty is not None:
             return self.penalty
         return BalancedPenalty() if self.effective_coupling is Coupling.PAPER else MultiplierPenalty()
 
-    def _initial_rho(self, problem: PGOProblem, poses: Poses) -> Array:
-        rho = self._rule.initial(problem, poses)
-        if self.robots is not None and isinstance(self._rule, MultiplierPenalty):
-            shared = self.robots.separators(problem.graph)
-            rho[shared] = np.maximum(rho[shared], self.separator_penalty * rotation_scale(problem)[shared])
-        return rho
+    def penalty_rule(self, norms: Array, scales: Array) -> Array:
+        """(a, b, c) of rho_i = max(a ||Lambda_i||_2, b m_i, c), from ||Lambda_i||_2 and m_i of all poses, (n,) each."""
+        rule = self.effective_penalty
+        if isinstance(rule, MultiplierPenalty):
+            return np.array([rule.factor, rule.factor * rule.floor(norms / scales), 0.0])
+        if isinstance(rule, FixedPenalty):
+            return np.array([0.0, 0.0, rule.rho])
+        return np.array([0.0, rule.scale, 0.0])
 
-    def _rho_t(self, problem: PGOProblem) -> Array:
-        return self.translation_penalty * translation_scale(problem)
+    def _between_exchanges(self, team: Team, state: SOCState) -> tuple[Array, Array, Array | float]:
+        """Return z and B after all but the last of the local passes, and by how much z + B has moved."""
+        z, B, private = state.z.copy(), state.B.copy(), team.private
+        is_alone = len(team.robots) == 1
+        if is_alone or self.local_passes == 1 or not private.any() or not np.isfinite(state.s).all():
+            return z, B, 0.0
+        for _ in range(self.local_passes - 1):
+            s = (team.solve_all(z - B) + B)[private]  # (a)
+            z[private] = stack_transposes(project_to_rotations(unstack_transposes(s)))  # (b)
+            B[private] = s - z[private]  # (c)
+        return z, B, z + B - state.s
+
+    def _separator_penalties(self, problem: PGOProblem, team: Team, rho: Array) -> tuple[Array, Array]:
+        """Penalty of separator translations and least penalty of separator rotations, (n,) each."""
+        if len(team.robots) == 1:
+            return translation_scale(problem), np.zeros(problem.num_poses)
+        relative = self.translation_penalty
+        if relative is None:
+            relative = translation_penalty_for(team.stiffness(rho))
+        separator_rho = np.zeros(problem.num_poses)
+        if isinstance(self.effective_penalty, MultiplierPenalty):
+            separator = team.separators
+            separator_rho[separator] = self.separator_penalty_for(relative) * rotation_scale(problem)[separator]
+        return relative * translation_scale(problem), separator_rho
+
+    def separator_penalty_for(self, translation_penalty: float) -> float:
+        """Least penalty of separator rotations, times m_i, beside a penalty of their translations."""
+        if self.separator_penalty is not None:
+            return self.separator_penalty
+        return min(_SEPARATOR_PENALTY * math.sqrt(translation_penalty), _MOST_SEPARATOR_PENALTY)
 
     def _with_penalty_due(self, problem: PGOProblem, state: SOCState) -> SOCState:
         """State with the penalty that the rule, or the safeguard, wants from now on; mostly the state itself."""
-        if self._is_penalty_too_small(problem, state) and state.raises < _MAX_RAISES:
+        is_too_small = has_diverged(state.merits) or is_going_round(state.merits, state.rho / rotation_scale(problem))
+        if is_too_small and state.raises < MAX_RAISES:
             assert state.best is not None
-            back = replace(state, s=state.best, z=_agree(state.team, state.best, problem)[1])
+            back = replace(state, s=state.best, z=agree(state.team, state.best, problem)[1])
             return replace(self._rescaled(problem, back, 2.0), raises=state.raises + 1)
-        rule, merits = self._rule, state.merits
-        if isinstance(rule, MultiplierPenalty):
-            window = rule.stall_window
-            stalled = len(merits) >= window and merits[-1] > rule.stall_ratio * merits[-window]
-            if stalled and state.refreshes < rule.max_refreshes:
-                return self._refreshed(problem, state)
+        rule, merits = self.effective_penalty, state.merits
+        if isinstance(rule, MultiplierPenalty) and has_stalled(rule, merits) and state.refreshes < rule.max_refreshes:
+            return self._refreshed(problem, state)
         if isinstance(rule, BalancedPenalty) and state.k > 0:
             factor = rule.factor(state.primal_residual, state.dual_residual)
             if factor != 1.0 and (factor > 1.0 or state.raises == 0):
                 return replace(self._rescaled(problem, state, factor), refreshes=state.refreshes + 1)
         return state
 
-    def _is_penalty_too_small(self, problem: PGOProblem, state: SOCState) -> bool:
-        """Whether the merit has grown far, or, the iterates going round in a cycle, has long not been smaller."""
-        merits = state.merits
-        if len(merits) < 2:
-            return False
-        if merits[-1] > _DIVERGED * min(merits):
-            return True
-        steps_since_smallest = len(merits) - 1 - merits.index(min(merits))
-        return steps_since_smallest >= _PATIENCE and bool(np.median(state.rho / rotation_scale(problem)) < _ENOUGH)
-
     def _rescaled(self, problem: PGOProblem, state: SOCState, factor: float) -> SOCState:
         """State with factor * rho and the same unscaled multiplier rho B."""
         rho = factor * state.rho
         before = state.team.penalty
-        team = state.team.with_penalty(rho, self._rho_t(problem))
+        team = state.team.with_penalty(rho, state.rho_t)
         assert before is not None
         assert team.penalty is not None
         s = state.z + (before / team.penalty)[:, None] * state.B
-        return replace(state, s=s, rho=rho, team=team, memory=AndersonMemory(), merits=(), best=None)
+        return replace(state, s=s, rho=rho, team=team, memory=(), merits=(), best=None)
 
     def _refreshed(self, problem: PGOProblem, state: SOCState) -> SOCState:
         """State with rho and B from the multipliers at omega, where the mean B_i is -2 Lambda_i R_i^T / rho_i."""
         poses = problem.with_best_translations(state.omega)
-        rho = self._initial_rho(problem, poses)
-        team = state.team.with_penalty(rho, self._rho_t(problem))
+        rho = np.maximum(self.effective_penalty.initial(problem, poses), state.separator_rho)
+        team = state.team.with_penalty(rho, state.rho_t)
         X = problem.stacked(poses)
-        normal = np.zeros_like(X)
-        transposes = np.swapaxes(multipliers(problem, poses) @ np.swapaxes(poses.R, 1, 2), 1, 2)
-        normal[problem.num_poses :] = stack_transposes(-2.0 * transposes / rho[:, None, None])
         z = X[team.row]
         return replace(
             state,
             z=z,
-            s=z + _balanced(team, X, normal),
+            s=z + balanced(team, X, stationary_mean(problem, poses, rho)),
             rho=rho,
             team=team,
-            memory=AndersonMemory(),
+            memory=(),
             merits=(),
             best=None,
             refreshes=state.refreshes + 1,
         )
 
 
-def _balanced(team: Team, X: Array, mean: Array) -> Array:
-    """B, (rows, d), whose mean over the copies is `mean`, (N, d), and which holds every robot's forces in balance at X.
-
-    At a stationary point 2 M_a x + rho_a B_a = 0 for every robot a. One robot alone has B = mean.
-    """
-    assert team.penalty is not None
-    B = -team.gradients(X) / team.penalty[:, None]
-    return B + (mean - team.average(B))[team.row]
-
-
-def _agree(team: Team, s: Array, problem: PGOProblem) -> tuple[Array, Array]:
-    """Step (b): omega from the mean of the copies, and omega and the mean separator translations handed out again."""
-    mean = team.average(s)
-    omega = project_to_rotations(unstack_transposes(mean[problem.num_poses :]))
-    mean[problem.num_poses :] = stack_transposes(omega)
-    return omega, mean[team.row]
-
-
-def _size(team: Team) -> float:
-    """||omega||_rho over all copies: the translations, which depend on the origin of the world, are left out."""
-    assert team.penalty is not None
-    rotations = team.row >= team.problem.num_poses
-    return float(np.sqrt(team.penalty[rotations].sum()))
-
-
-def _norm_weight(team: Team) -> Array:
-    """Square roots of the penalties: ||v||_rho is the norm of weight * v."""
-    assert team.penalty is not None
-    return np.sqrt(team.penalty)[:, None]
-
-
-def _stationarity_weight(team: Team) -> Array:
-    """Root of the penalty, times penalty over the diagonal of M where it is above that."""
-    assert team.penalty is not None
-    problem = team.problem
-    diagonal = problem.M.data[problem.diagonal_positions][team.row] / team.copies[team.row]
-    return np.asarray(_norm_weight(team) * np.maximum(1.0, team.penalty / diagonal)[:, None])
+def translation_penalty_for(stiffness: float) -> float:
+    """Penalty of separator translations, times their diagonal in M, from `Team.stiffness`."""
+    return _TRANSLATION_PENALTY * stiffness

@@ -2,48 +2,31 @@
 
 from __future__ import annotations
 
-import html
 import json
 import math
-import platform
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
-from pgo_models.certificate import Certificate, Verdict
-from pgo_models.cholesky import CholeskyBackend, default_backend
+from pgo_models.certificate import BoundSource, Certificate, Verdict
 from pgo_models.errors import SettingError
+from pgo_models.figures import is_picture, save_figure
 from pgo_models.files import replace_when_done
 from pgo_models.g2o import write_g2o, write_g2o_folder
+from pgo_models.html_tables import facts_table, rows_table
 from pgo_models.initialization import spanning_tree_start
-from pgo_models.plots import compare_poses, is_picture, save_figure
+from pgo_models.partition import Partition
+from pgo_models.plots import compare_poses
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.trajectories import write_kitti, write_tum
-from solvers.result import History, Run, Status
+from solvers.network import Ledger
+from solvers.report import write_report
+from solvers.result import Stage, Status
+from solvers.versions import versions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-S = TypeVar("S")
-
-
-@dataclass(frozen=True)
-class Stage:
-    """What one stage of a solve did."""
-
-    name: str
-    status: Status
-    iterations: int
-    objective: float
-    seconds: float
-    history: History
-
-    @classmethod
-    def of(cls, run: Run[S]) -> Stage:
-        """Stage of a finished run."""
-        return cls(run.name, run.status, run.iterations, run.objective, run.seconds, run.history)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +48,19 @@ class Solution:
         The start and the iterative stages, in order.
     seconds : float
         Wall time of it all.
+    ledger : Ledger, optional
+        What crossed the network, of a solve by many robots.
+    robots : Partition, optional
+        Who owned which pose in such a solve.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.scenes import circle
+    >>> from solvers.pipeline import solve
+    >>> solution = solve(circle(np.random.default_rng(0)))
+    >>> solution.is_certified, bool(solution.lower_bound <= solution.objective)
+    (True, True)
     """
 
     problem: PGOProblem
@@ -74,6 +70,8 @@ class Solution:
     status: Status
     stages: tuple[Stage, ...]
     seconds: float
+    ledger: Ledger | None = None
+    robots: Partition | None = None
 
     @property
     def lower_bound(self) -> float:
@@ -106,14 +104,10 @@ class Solution:
         return "\n".join(rows)
 
     def _repr_html_(self) -> str:
-        rows = "".join(f"<tr><th>{label}</th><td>{html.escape(text)}</td></tr>" for label, text in self._summary())
-        stages = "".join(
-            f"<tr><td>{html.escape(s.name)}</td><td>{s.iterations}</td><td>{s.objective:.10g}</td>"
-            f"<td>{s.seconds:.3f}</td><td>{html.escape(s.status.name)}</td></tr>"
-            for s in self.stages
-        )
-        heads = "".join(f"<th>{head}</th>" for head in ("stage", "iterations", "F", "seconds", "ended"))
-        return f"<table>{rows}</table><table><tr>{heads}</tr>{stages}</table>"
+        stages = [
+            (s.name, str(s.iterations), f"{s.objective:.10g}", f"{s.seconds:.3f}", s.status.name) for s in self.stages
+        ]
+        return facts_table(self._summary()) + rows_table(("stage", "iterations", "F", "seconds", "ended"), stages)
 
     def save(self, path: Path | str) -> None:
         """Write the solution in the format that the suffix of `path` names.
@@ -145,6 +139,20 @@ class Solution:
                 temporary.write_text(json.dumps(self.as_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
         else:
             save_figure(self.plot(), path)
+
+    def report(self, path: Path | str) -> None:
+        """Write one HTML page that opens offline: verdict, what to try next, pictures and tables; see `write_report`.
+
+        Raises
+        ------
+        MissingExtraError
+            Without plotly.
+        SettingError
+            When `path` does not end in .html.
+        PGOError
+            When the file cannot be written.
+        """
+        write_report(self, path)
 
     def plot(self) -> Figure:
         """Figure of the graph as it came (its own estimate, else a spanning tree) and as solved.
@@ -187,11 +195,26 @@ class Solution:
                 }
                 for stage in self.stages
             ],
+            **self._network_json(),
             "versions": versions(self.problem.backend),
             "ids": graph.pose_ids.tolist(),
             "R": self.poses.R.tolist(),
             "t": self.poses.t.tolist(),
         }
+
+    def _network_json(self) -> dict[str, object]:
+        if self.ledger is None or self.robots is None:
+            return {}
+        ledger = self.ledger
+        figures = {
+            "rounds": ledger.rounds,
+            "all_reduces": ledger.all_reduces,
+            "messages": ledger.messages,
+            "bytes": ledger.num_bytes,
+            "bytes_sent": ledger.bytes_sent.tolist(),
+            "bytes_received": ledger.bytes_received.tolist(),
+        }
+        return {"robots": self.robots.robot.tolist(), "network": figures}
 
     @property
     def _verdict(self) -> Verdict:
@@ -199,14 +222,28 @@ class Solution:
 
     def _summary(self) -> list[tuple[str, str]]:
         graph, certificate = self.problem.graph, self.certificate
+        relaxed = "   (the semidefinite relaxation's)" if certificate.source is BoundSource.RELAXATION else ""
         return [
             ("graph", f"{graph.name}: {graph.num_poses} poses, {graph.num_edges} edges, {graph.d}D"),
             ("status", f"{self.status.name}: {self.status.value}"),
             ("F", f"{self.objective:.10g}"),
-            ("lower bound", f"{certificate.lower_bound:.10g}"),
+            ("lower bound", f"{certificate.lower_bound:.10g}{relaxed}"),
             ("gap", f"{certificate.gap:.3g}"),
             ("verdict", f"{certificate.verdict.name}: {certificate.verdict.value}"),
             ("seconds", f"{self.seconds:.3g}"),
+            *self._network(),
+        ]
+
+    def _network(self) -> list[tuple[str, str]]:
+        """Robots and what crossed the network, of a solve by robots."""
+        if self.ledger is None or self.robots is None:
+            return []
+        ledger, sizes = self.ledger, self.robots.sizes
+        both_ways = ledger.bytes_sent + ledger.bytes_received
+        return [
+            ("robots", f"{len(sizes)}, {sizes.min()} to {sizes.max()} poses each, {self.robots.method.value}"),
+            ("network", f"{ledger.rounds} rounds, {ledger.all_reduces} all-reduces, {ledger.messages} messages"),
+            ("bytes", f"{ledger.num_bytes:,}; of one robot {both_ways.min():,} to {both_ways.max():,}"),
         ]
 
 
@@ -219,21 +256,6 @@ def check_format(path: Path) -> None:
         )
 
 
-def versions(backend: CholeskyBackend | None) -> dict[str, str]:
-    """Versions of what computed a result, for records."""
-    names = ("pgo-splitting", "numpy", "scipy", "cvxpy", "clarabel")
-    found = {name: metadata.version(name) for name in names if _is_installed(name)}
-    return {"python": platform.python_version(), **found, "cholesky": (backend or default_backend()).value}
-
-
 def finite_or_none(value: float) -> float | None:
     """Value for JSON, which knows neither nan (no eta was proved) nor inf (stationarity was not measured)."""
     return value if math.isfinite(value) else None
-
-
-def _is_installed(name: str) -> bool:
-    try:
-        metadata.distribution(name)
-    except metadata.PackageNotFoundError:
-        return False
-    return True

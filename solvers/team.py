@@ -7,6 +7,7 @@ each. One robot holds the graph.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array
@@ -16,8 +17,9 @@ from pgo_models.matrices import joint_matrix, residual_matrix
 from pgo_models.partition import Partition
 from pgo_models.pose_graph import IntArray, PoseGraph
 from pgo_models.problem import PGOProblem
-from pgo_models.rotations import Array
+from pgo_models.rotations import Array, BoolArray
 from solvers.rotation_step import BackEnd, RotationStep, Subproblem, prepare
+from solvers.stiffness import GROUND, separator_stiffness
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +36,8 @@ class Robot:
         The same rows in the X of the whole graph.
     A, w, M, analysis
         As in `solvers.rotation_step.Subproblem`.
+    components : (n_a,)
+        Which poses hang together by edges that it knows.
     """
 
     poses: IntArray
@@ -43,6 +47,7 @@ class Robot:
     w: Array
     M: csc_array
     analysis: SymbolicCholesky
+    components: IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,18 +92,20 @@ class Team:
         for robot, rows in zip(self.robots, self.slices, strict=True):
             penalty = np.zeros(robot.M.shape[0])
             penalty[robot.held] = share[rows]
-            subproblem = Subproblem(
-                A=robot.A,
-                w=robot.w,
-                M=robot.M,
-                d=d,
-                num_translations=len(robot.poses),
-                penalty=penalty,
-                analysis=robot.analysis,
-                backend=self.problem.backend,
-            )
-            steps.append(prepare(subproblem, self.back_end))
+            steps.append(prepare(self._subproblem(robot, penalty), self.back_end))
         return replace(self, steps=tuple(steps), penalty=share)
+
+    def _subproblem(self, robot: Robot, penalty: Array) -> Subproblem:
+        return Subproblem(
+            A=robot.A,
+            w=robot.w,
+            M=robot.M,
+            d=self.problem.d,
+            num_translations=len(robot.poses),
+            penalty=penalty,
+            analysis=robot.analysis,
+            backend=self.problem.backend,
+        )
 
     def solve_all(self, shift: Array) -> Array:
         """Step (a) of every robot: the held rows of X(shift), (rows, d)."""
@@ -108,6 +115,36 @@ class Team:
             V[robot.held] = shift[rows]
             solution[rows] = step.solve(V)[robot.held]
         return solution
+
+    @cached_property
+    def separators(self) -> IntArray:
+        """Poses that more than one robot holds, ascending."""
+        n = self.problem.num_poses
+        return np.flatnonzero(self.copies[n :: self.problem.d] > 1)
+
+    @cached_property
+    def private(self) -> BoolArray:
+        """Whether a row of a team vector is known to its robot alone, (rows,)."""
+        return np.asarray(self.copies[self.row] == 1)
+
+    def stiffness(self, rho: Array) -> float:
+        """How hard it is to move a separator while rho, (n,), holds the rotations: the median of the robots' stiffness.
+
+        See `solvers.stiffness`. Robots find theirs on their own, and exchange one number each.
+        """
+        return float(np.median([self._stiffness_of(robot, rho) for robot in self.robots]))
+
+    def _stiffness_of(self, robot: Robot, rho: Array) -> float:
+        problem, d = self.problem, self.problem.d
+        n, count = problem.num_poses, len(robot.poses)
+        held = robot.held[robot.held < count]
+        separators = robot.poses[held]
+        half_scale = 0.5 * problem.M.data[problem.diagonal_positions[separators]] / self.copies[separators]
+        penalty = np.zeros(robot.M.shape[0])
+        penalty[count:] = np.repeat(rho[robot.poses] / self.copies[n + d * robot.poses], d)
+        penalty[held] = 2.0 * GROUND * half_scale
+        factor = robot.analysis.factorize(self._subproblem(robot, penalty).K)
+        return separator_stiffness(factor, robot.M.shape[0], held, half_scale, robot.components[held])
 
     def average(self, vector: Array) -> Array:
         """Mean over the copies of every row of X, (N, d); rows without copies are zero."""
@@ -146,7 +183,8 @@ def build_team(problem: PGOProblem, partition: Partition | None, back_end: BackE
 def _whole(problem: PGOProblem) -> Robot:
     A, w = problem.residual_matrix
     held = np.arange(problem.num_poses, problem.side)
-    return Robot(np.arange(problem.num_poses), held, held, A, w, problem.M, problem.analysis)
+    poses, together = np.arange(problem.num_poses), np.zeros(problem.num_poses, dtype=np.int64)
+    return Robot(poses, held, held, A, w, problem.M, problem.analysis, together)
 
 
 def _share(problem: PGOProblem, owner: IntArray, a: int, separator: Array) -> Robot:
@@ -167,7 +205,10 @@ def _share(problem: PGOProblem, owner: IntArray, a: int, separator: Array) -> Ro
     M = joint_matrix(local)
     A, w = residual_matrix(local)
     held = np.concatenate([np.flatnonzero(separator[poses]), np.arange(len(poses), M.shape[0])])
-    return Robot(poses, held, _global_rows(poses, problem)[held], A, w, M, analyze(M, problem.backend))
+    components = np.empty(len(poses), dtype=np.int64)
+    for number, together in enumerate(local.components()):
+        components[together] = number
+    return Robot(poses, held, _global_rows(poses, problem)[held], A, w, M, analyze(M, problem.backend), components)
 
 
 def _global_rows(poses: IntArray, problem: PGOProblem) -> IntArray:

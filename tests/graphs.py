@@ -13,7 +13,7 @@ from pgo_models.polish import polish
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
-from pgo_models.rotations import Array, random_rotations
+from pgo_models.rotations import Array, exp_map, random_rotations
 from pgo_models.scenes import MILD_NOISE, NoiseModel, observe, random_geometric
 
 EPS = float(np.finfo(float).eps)
@@ -65,6 +65,17 @@ def exact_graph(seed: int, n: int, d: int) -> PoseGraph:
     rng = np.random.default_rng(seed)
     graph = observe("exact", pattern.truth, pattern.i, pattern.j, silence, 1.0, 1.0, rng)
     return replace(graph, kappa=pattern.kappa, tau=pattern.tau)
+
+
+def wound_ring(n: int, d: int) -> tuple[PGOProblem, Poses]:
+    """A ring of unrotated poses, and a start whose headings wind around once: a local minimum of its own."""
+    angle = 2 * np.pi * np.arange(n) / n
+    t = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(n)])[:, :d]
+    truth = Poses(np.broadcast_to(np.eye(d), (n, d, d)), t)
+    i, j = np.arange(n), (np.arange(n) + 1) % n
+    graph = observe("ring", truth, i, j, NoiseModel(0.01, 0.01), 100.0, 1.0, np.random.default_rng(0))
+    w = angle[:, None] if d == 2 else np.column_stack([np.zeros((n, 2)), angle])
+    return PGOProblem(graph), Poses(exp_map(w), t)
 
 
 def random_poses(n: int, d: int, seed: int, spread: float = 1.0) -> Poses:

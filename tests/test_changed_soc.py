@@ -9,7 +9,7 @@ from graphs import varied_problem
 from scipy.optimize import Bounds, minimize
 
 from pgo_models.errors import PGOError, SettingError
-from pgo_models.graph_qp import Change, Changer, PoseVariables
+from pgo_models.graph_subproblem import Change, Changer, PoseVariables
 from pgo_models.initialization import chordal_start
 from pgo_models.partition import partition
 from pgo_models.poses import Poses

@@ -13,6 +13,7 @@ import pytest
 
 import pgo_models as pgo
 import solvers
+from pgo_models.separators import report_partition
 from solvers import cli
 
 PGO = [sys.executable, "-c", "from solvers.cli import main; main()"]
@@ -46,7 +47,13 @@ def test_solve_prints_cost_bound_and_gap_and_ends_with_0(pgo_command):
         ("--method", "joint"),
         ("--method", "newton"),
         ("--method", "consensus", "--robots", "3"),
+        ("--method", "consensus", "--split", "contiguous", "--robots", "2"),
+        ("--method", "substructured"),
+        ("--method", "newton", "--robots", "4"),
         ("--robots", "3", "--split", "metis"),
+        ("--robots", "3", "--engine", "threads"),
+        ("--robots", "3", "--start", "tree"),
+        ("--robots", "3", "--engine", "process", "--split", "contiguous", "--start", "chordal"),
         ("--method", "paper", "--robots", "3"),
         ("--method", "paper", "--split", "singletons"),
         ("--r-step", "fista"),
@@ -85,6 +92,44 @@ def test_results_are_written_in_every_format(pgo_command, tmp_path):
         assert "at the poses given" in out
 
 
+def test_robots_show_what_crossed_the_network(pgo_command, tmp_path):
+    code, out, _ = pgo_command("solve", "robots", "--engine", "process", "--out", tmp_path / "result.json")
+    assert code == 0
+    assert re.search(r"^robots +4, 40 to 40 poses each, as the graph names them$", out, re.M)
+    rounds, messages = map(
+        int, re.search(r"^network +(\d+) rounds, \d+ all-reduces, (\d+) messages$", out, re.M).groups()
+    )
+    total, least, most = (
+        int(figure.replace(",", ""))
+        for figure in re.search(r"^bytes +(\S+); of one robot (\S+) to (\S+)$", out, re.M).groups()
+    )
+    network = json.loads((tmp_path / "result.json").read_text())["network"]
+    assert (network["rounds"], network["messages"], network["bytes"]) == (rounds, messages, total)
+    of_robots = np.array(network["bytes_sent"]) + np.array(network["bytes_received"])
+    assert (of_robots.min(), of_robots.max(), of_robots.sum()) == (least, most, total)  # the driver has the other end
+    assert "network" not in pgo_command("solve", "robots")[1]
+
+
+def test_resume_goes_on_from_the_file_and_removes_it(pgo_command, tmp_path):
+    options = ("solve", "sphere", "--robots", 3, "--resume", tmp_path / "run.ckpt")
+    code, out, _ = pgo_command(*options, "--time-limit", "1e-9")
+    assert code == 2
+    assert "TIME_LIMIT" in out
+    assert [path.name for path in tmp_path.iterdir()] == ["run.ckpt"]
+    assert "another partition" in pgo_command("solve", "sphere", "--robots", 2, *options[4:])[2]
+    code, out, _ = pgo_command(*options)
+    assert code == 0
+    assert "CERTIFIED" in out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_info_shows_what_a_partition_costs(pgo_command):
+    code, out, _ = pgo_command("info", "robots", "--robots", 3, "--split", "contiguous")
+    assert code == 0
+    for label, text in report_partition(pgo.partition(pgo.load("robots"), 3), pgo.load("robots")).facts():
+        assert re.search(rf"^ {label} +{re.escape(text)} *$", out, re.M)
+
+
 def test_certify_judges_poses_that_are_not_optimal_with_3(pgo_command, tmp_path):
     code, out, err = pgo_command("certify", "grid", "--out", tmp_path / "certificate.json")
     assert (code, err) == (3, "")
@@ -115,6 +160,14 @@ def test_generated_scenes_have_their_truth_and_solve(scene, pgo_command, tmp_pat
     code, out, _ = pgo_command("solve", tmp_path / "scene.g2o")
     assert code == 0
     assert "error to the truth (ATE)" in out
+
+
+def test_a_generated_folder_may_have_more_robots_than_there_are_letters(pgo_command, tmp_path):
+    world = tmp_path / "world"
+    assert pgo_command("generate", "grid-world", "--robots", 60, "--poses", 5, "--out", world)[0] == 0
+    graph = pgo.load(world)
+    assert (graph.num_robots, graph.num_poses) == (60, 300)
+    np.testing.assert_array_equal(np.bincount(graph.robots), 5)
 
 
 def test_a_generated_folder_holds_one_file_a_robot(pgo_command, tmp_path):
@@ -179,6 +232,15 @@ def test_info_names_the_components(pgo_command, tmp_path):
         ("solve", "sphere", "--robots", "0"),
         ("solve", "sphere", "--robots", "51"),
         ("solve", "sphere", "--method", "joint", "--robots", "2"),
+        ("solve", "sphere", "--method", "joint", "--engine", "process"),
+        ("solve", "sphere", "--method", "paper", "--resume", "run.ckpt"),
+        ("solve", "sphere", "--method", "substructured", "--r-step", "fista"),
+        ("solve", "sphere", "--robots", "2", "--engine", "process", "--address", "localhost:6379"),
+        ("solve", "sphere", "--robots", "2", "--address", "localhost"),
+        ("solve", "sphere", "--robots", "2", "--split", "given"),
+        ("solve", "sphere", "--robots", "2", "--resume", "no/such/folder/run.ckpt"),
+        ("info", "sphere", "--robots", "51"),
+        ("info", "--robots", "2"),
         ("solve", "sphere", "--gap", "-1"),
         ("solve", "sphere", "--time-limit", "-1"),
         ("solve", "sphere", "--tolerance", "0"),

@@ -160,6 +160,17 @@ def test_unknown_names_list_the_known(monkeypatch: pytest.MonkeyPatch) -> None:
         load("nothing")
 
 
+def test_without_download_only_what_is_here_is_taken(server: tuple[Path, str], tmp_path: Path) -> None:
+    folder, url = server
+    (folder / "far.g2o").write_bytes(GRAPH)
+    registry = Registry(url, {"far": sha256(GRAPH)}, tmp_path / "cache")
+    with pytest.raises(DatasetError, match=rf"far is not here; download it with: pgo info far, or .*{DATA_VARIABLE}"):
+        load("far", registry, download=False)
+    assert not (tmp_path / "cache").exists()
+    load("far", registry)
+    assert load("far", registry, download=False).num_edges == 1
+
+
 @pytest.mark.parametrize("checksum", [sha256, blob])
 def test_downloads_are_checked_and_kept(
     server: tuple[Path, str], tmp_path: Path, checksum: object, capfd: pytest.CaptureFixture[str]

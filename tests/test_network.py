@@ -1,10 +1,15 @@
-"""The ledger: what it counts."""
+"""The ledger: what it counts. The post: what it loses, delays and cuts off."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pgo_models.errors import SettingError
-from solvers.network import DRIVER, Ledger, Traffic
+from solvers.network import DRIVER, Faults, Ledger, Post, Traffic
+
+Link = tuple[int, int]
+LINKS = [(a, b) for a in range(4) for b in range(4) if a != b]
 
 
 def traffic(*messages: tuple[int, int, int]) -> Traffic:
@@ -46,3 +51,87 @@ def test_all_reduces_are_counted_apart() -> None:
 def test_a_message_needs_its_sender_receiver_and_size() -> None:
     with pytest.raises(SettingError, match="one of each"):
         Traffic(np.array([0]), np.array([1, 0]), np.array([8]))
+
+
+# Faults.
+
+
+def carried(faults: Faults, rounds: int) -> list[dict[Link, int]]:
+    """What arrives in every round when each robot writes the number of the round to all others."""
+    post: Post[int] = Post(faults)
+    return [post.carry(dict.fromkeys(LINKS, number)) for number in range(rounds)]
+
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def test_without_faults_everything_arrives_at_once() -> None:
+    assert carried(Faults(), 5) == [dict.fromkeys(LINKS, number) for number in range(5)]
+
+
+@given(loss=st.sampled_from([0.0, 0.2, 0.7]), seed=SEEDS)
+def test_the_share_of_messages_that_are_lost(loss: float, seed: int) -> None:
+    rounds = 100
+    arrived = carried(Faults(loss=loss, seed=seed), rounds)
+    assert all(letter == number for number, letters in enumerate(arrived) for letter in letters.values())
+    count, sent = sum(len(letters) for letters in arrived), rounds * len(LINKS)
+    allowed = 6 * np.sqrt(sent * loss * (1 - loss))  # standard deviations of a binomial
+    assert abs(count - (1 - loss) * sent) <= allowed
+
+
+@given(max_delay=st.integers(0, 6), loss=st.sampled_from([0.0, 0.3]), seed=SEEDS)
+def test_delays_are_within_bounds_and_nothing_older_follows(max_delay: int, loss: float, seed: int) -> None:
+    newest: dict[Link, int] = {}
+    delays = []
+    for number, letters in enumerate(carried(Faults(loss=loss, max_delay=max_delay, seed=seed), 80)):
+        for link, letter in letters.items():
+            assert 0 <= number - letter <= max_delay
+            assert letter > newest.get(link, -1)
+            newest[link] = letter
+            delays.append(number - letter)
+    assert set(delays) <= set(range(max_delay + 1))
+    assert min(delays) == 0
+    assert max_delay == 0 or max(delays) >= 1
+    # The newest of many overlapping letters wins: an old one is used only where no newer came earlier.
+    if loss == 0.0:
+        assert set(newest) == set(LINKS)
+        assert min(newest.values()) >= 79 - max_delay
+
+
+@given(seed=SEEDS, since=st.integers(0, 10), rounds=st.integers(0, 10), max_delay=st.integers(0, 3))
+def test_silence_cuts_both_ways(seed: int, since: int, rounds: int, max_delay: int) -> None:
+    faults = Faults(silent_robot=2, silent_from=since, silent_rounds=rounds, max_delay=max_delay, seed=seed)
+    for number, letters in enumerate(carried(faults, 30)):
+        is_silent = since <= number < since + rounds
+        assert [faults.is_silent(robot, number) for robot in range(4)] == [False, False, is_silent, False]
+        for (sender, receiver), letter in letters.items():
+            assert not (is_silent and receiver == 2)
+            if sender == 2 or receiver == 2:  # what was sent in the silence never arrives
+                assert not since <= letter < since + rounds
+        if max_delay == 0:
+            expected = [link for link in LINKS if not (is_silent and 2 in link)]
+            assert sorted(letters) == expected
+
+
+@given(seed=SEEDS)
+def test_the_same_seed_has_the_same_faults(seed: int) -> None:
+    faults = Faults(loss=0.3, max_delay=4, seed=seed)
+    assert carried(faults, 20) == carried(faults, 20)
+    assert carried(faults, 20) != carried(Faults(loss=0.3, max_delay=4, seed=seed + 1), 20)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"loss": 1.0}, r"loss must be in \[0, 1\), got 1\.0"),
+        ({"loss": -0.1}, r"loss must be in \[0, 1\)"),
+        ({"loss": np.nan}, r"loss must be in \[0, 1\)"),
+        ({"max_delay": -1}, "max_delay must not be negative, got -1"),
+        ({"silent_robot": -1}, "silent_robot must not be negative"),
+        ({"silent_from": -1}, "silent_from must not be negative"),
+        ({"silent_rounds": -1}, "silent_rounds must not be negative"),
+    ],
+)
+def test_faults_are_checked(changes: dict[str, float], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        Faults(**changes)

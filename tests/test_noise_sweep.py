@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from pgo_models.curves import plot_tightness
 from pgo_models.errors import SettingError
-from pgo_models.plots import plot_tightness
 from solvers.noise_sweep import NoiseSweep, SweptScene, noise_sweep, noisy_scene
 
 QUIET, LOUD = np.deg2rad(10.0), np.deg2rad(90.0)

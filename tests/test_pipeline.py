@@ -2,14 +2,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from graphs import OPTIMUM
+from graphs import OPTIMUM, wound_ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pgo_models as pgo
 import solvers
 from pgo_models.certificate import Verdict
-from pgo_models.scenes import NoiseModel, observe
+from pgo_models.scenes import NoiseModel
+from solvers.noise_sweep import SweptScene, noisy_scene
 from solvers.pipeline import HANDOVER_TOLERANCE
 
 
@@ -72,19 +73,49 @@ def test_newton_alone_and_the_papers_coupling_find_the_same_optimum():
 
 
 def test_a_bad_start_is_rescued_by_the_second_try():
-    # A ring whose rotations wind around once more than they should is a local minimum of its own.
-    n, rng = 20, np.random.default_rng(0)
-    angle = 2 * np.pi * np.arange(n) / n
-    truth = pgo.Poses(np.broadcast_to(np.eye(2), (n, 2, 2)), np.column_stack([np.cos(angle), np.sin(angle)]))
-    i, j = np.arange(n), (np.arange(n) + 1) % n
-    problem = pgo.PGOProblem(observe("ring", truth, i, j, NoiseModel(0.01, 0.01), 100.0, 1.0, rng))
-    wound = pgo.Poses(pgo.exp_map(angle[:, None]), truth.t)
-    stuck = solvers.solve(problem, solvers.Pipeline(soc=None, second_try=False), wound)
-    rescued = solvers.solve(problem, solvers.Pipeline(soc=None), wound)
+    problem, wound = wound_ring(20, 2)
+    stuck = solvers.solve(problem, solvers.Pipeline(soc=None, second_try=False, staircase=None), wound)
+    rescued = solvers.solve(problem, solvers.Pipeline(soc=None, staircase=None), wound)
     assert not stuck.is_certified
     assert rescued.is_certified
     assert rescued.objective < 0.1 * stuck.objective
     assert stuck.lower_bound <= rescued.objective
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_bad_start_is_rescued_by_the_staircase(d):
+    problem, wound = wound_ring(20, d)
+    solution = solvers.solve(problem, solvers.Pipeline(soc=None, second_try=False), wound)
+    assert [stage.name for stage in solution.stages] == ["given start", "Newton", "Staircase", "Newton"]
+    assert solution.is_certified
+    assert solution.certificate.source is pgo.BoundSource.GIVEN
+    assert solution.objective < 0.1 * solution.stages[1].objective
+    assert solution.objective == pytest.approx(solvers.solve(problem).objective, rel=1e-10)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_where_the_relaxation_is_not_tight_its_bound_is_reported(seed):
+    problem = pgo.PGOProblem(noisy_scene(SweptScene.GRID, np.deg2rad(90.0), np.random.default_rng(seed)))
+    without = solvers.solve(problem, solvers.Pipeline(staircase=None))
+    solution = solvers.solve(problem)
+    assert solution.certificate.source is pgo.BoundSource.RELAXATION
+    assert solution.certificate.verdict is Verdict.NOT_CERTIFIED
+    assert solution.objective <= without.objective
+    assert without.lower_bound < solution.lower_bound < solution.objective
+    assert solution.gap == pytest.approx((solution.objective - solution.lower_bound) / solution.objective)
+    relaxed = solvers.run(solvers.Staircase(), problem)
+    assert solution.lower_bound == pytest.approx(relaxed.state.point.value, rel=2 * pgo.certificate.DEFAULT_GAP)
+    certificate = solution.certificate
+    assert pgo.prove_bound(problem, certificate.Lambda, certificate.eta) == pytest.approx(solution.lower_bound)
+
+
+def test_a_staircase_that_is_cut_short_gives_a_valid_bound():
+    problem, wound = wound_ring(20, 3)
+    cut = solvers.Pipeline(soc=None, second_try=False, staircase=solvers.Staircase(max_iterations=8))
+    solution = solvers.solve(problem, cut, wound)
+    assert solution.stages[2].status is solvers.Status.MAX_ITERATIONS
+    assert solution.objective <= solution.stages[1].objective
+    assert solution.lower_bound <= solvers.solve(problem).objective
 
 
 def test_a_time_limit_ends_the_run_with_its_status_and_a_valid_bound():

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+import pgo_models as pgo
 from solvers import cli
 
 ROOT = Path(__file__).parent.parent
@@ -38,3 +39,10 @@ def test_ci_finds_its_lines(marker):
 def test_pictures_and_files_that_the_readme_names_are_there():
     for target in re.findall(r"\]\(([^)]+)\)", README):
         assert target.startswith("http") or (ROOT / target).exists(), target
+
+
+def test_the_papers_tables_stand_between_their_marks():
+    shown = re.search(r"<!-- pgo tables -->\n(.*)<!-- end of pgo tables -->", README, re.S)[1]
+    rows = re.findall(r"^\| ([\w-]+) \| (\d+) \| (\d+) \|", shown, re.M)
+    assert rows == [(row.name, str(row.num_poses), str(row.num_edges)) for row in pgo.published_rows()]
+    assert "NOT on" not in shown

@@ -22,10 +22,11 @@ from pgo_models.polish import polish, relative_decrement
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import orthogonality_error, project_by_svd, stack_transposes, unstack_transposes
 from pgo_models.scenes import grid
-from solvers.acceleration import Anderson
+from solvers.acceleration import Anderson, AndersonMemory, extrapolate
 from solvers.loop import iterate, run
 from solvers.penalty import (
     FixedPenalty,
+    MultiplierPenalty,
     rotation_scale,
     translation_scale,
 )
@@ -67,26 +68,48 @@ def test_joint_is_algorithm_one_with_translations(alpha: float, seed: int, n: in
         np.testing.assert_allclose(state.B, B, rtol=0, atol=1e-8)
 
 
-@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, method=METHODS, alpha=st.sampled_from([1.0, 1.5]))
+@given(
+    seed=SEEDS,
+    n=SIZES,
+    d=DIMENSIONS,
+    method=METHODS,
+    alpha=st.sampled_from([1.0, 1.5]),
+    local_passes=st.sampled_from([1, 3]),
+)
 def test_consensus_is_its_recursion_robot_by_robot(
-    seed: int, n: int, d: int, method: PartitionMethod, alpha: float
+    seed: int, n: int, d: int, method: PartitionMethod, alpha: float, local_passes: int
 ) -> None:
     problem = varied_problem(seed, n, d)
     rule = fixed_penalty(problem)
-    soc = SOC(robots=robots_of(problem, seed, method), penalty=rule, alpha=alpha, acceleration=None)
+    soc = SOC(
+        robots=robots_of(problem, seed, method),
+        penalty=rule,
+        alpha=alpha,
+        acceleration=None,
+        local_passes=local_passes,
+        translation_penalty=0.1,
+    )
     states = iterate(soc, problem)
     first = next(states)
     team = first.team
-    whole = np.concatenate([soc.translation_penalty * translation_scale(problem), np.full(d * n, rule.rho)])
+    whole = np.concatenate([0.1 * translation_scale(problem), np.full(d * n, rule.rho)])
     share = (whole / np.maximum(team.copies, 1))[team.row]
     z, B = first.z, first.B
     for state in islice(states, 8):
-        x = np.empty_like(z)
+        x, z, B = np.empty_like(z), z.copy(), B.copy()
         for robot, rows in zip(team.robots, team.slices, strict=True):
-            K, b = robot.M.toarray(), np.zeros((robot.M.shape[0], d))
-            K[robot.held, robot.held] += 0.5 * share[rows]
-            b[robot.held] = 0.5 * share[rows, None] * (z - B)[rows]
-            x[rows] = np.linalg.solve(K, b)[robot.held]
+            for left in range(local_passes)[::-1]:
+                K, b = robot.M.toarray(), np.zeros((robot.M.shape[0], d))
+                K[robot.held, robot.held] += 0.5 * share[rows]
+                b[robot.held] = 0.5 * share[rows, None] * (z - B)[rows]
+                x[rows] = np.linalg.solve(K, b)[robot.held]
+                for row in range(rows.start, rows.stop if left else rows.start):
+                    if team.row[row] < n or (team.row[row] - n) % d or team.copies[team.row[row]] > 1:
+                        continue
+                    pose = slice(row, row + d)  # no other robot knows it: its omega is its robot's own affair
+                    s = (x + B)[pose]
+                    z[pose] = project_by_svd(s.T[None])[0].T
+                    B[pose] = s - z[pose]
         relaxed = alpha * x + (1 - alpha) * z
         mean = np.zeros((problem.side, d))
         for row in np.unique(team.row):
@@ -120,6 +143,47 @@ def test_what_a_state_says_of_itself(seed: int, n: int, d: int, accelerated: boo
             stiff = np.maximum(1.0, root**2 / problem.M.diagonal()[n:, None])
             assert state.dual_residual == pytest.approx(np.linalg.norm(stiff * root * (state.z - before.z)) / size)
             assert state.merits[-1] == pytest.approx(np.linalg.norm(root * (state.x - before.z)))
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, method=METHODS)
+def test_separator_penalties_follow_from_the_stiffness(seed: int, n: int, d: int, method: PartitionMethod) -> None:
+    problem = varied_problem(seed, n, d)
+    robots = robots_of(problem, seed, method)
+    start = chordal_start(problem)
+    state = SOC(robots=robots).init(problem, start)
+    assert isinstance(state, SOCState)
+    wanted = MultiplierPenalty().initial(problem, start)
+    relative = 0.6 * state.team.stiffness(wanted)
+    np.testing.assert_allclose(state.rho_t, relative * translation_scale(problem), rtol=1e-12, atol=0)
+    shared = robots.separators(problem.graph)
+    wanted[shared] = np.maximum(wanted[shared], min(0.7 * relative**0.5, 0.3) * rotation_scale(problem)[shared])
+    np.testing.assert_allclose(state.rho, wanted, rtol=1e-12, atol=0)
+    given_state = SOC(robots=robots, translation_penalty=0.02, separator_penalty=5.0).init(problem, start)
+    assert isinstance(given_state, SOCState)
+    np.testing.assert_allclose(given_state.rho_t, 0.02 * translation_scale(problem), rtol=1e-12, atol=0)
+    assert (given_state.rho[shared] >= 5.0 * rotation_scale(problem)[shared]).all()
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, method=METHODS)
+def test_anderson_per_robot_sums_nothing_over_the_robots(seed: int, n: int, d: int, method: PartitionMethod) -> None:
+    problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE))
+    robots = robots_of(problem, seed, method)
+    soc = SOC(robots=robots, acceleration=Anderson(per_robot=True), local_passes=1)
+    plain = replace(soc, acceleration=None)
+    state = soc.init(problem, None)
+    memories: list[AndersonMemory] = [AndersonMemory()] * robots.num_robots
+    for _ in range(4):
+        assert isinstance(state, SOCState)
+        image = plain.step(problem, state)
+        following = soc.step(problem, state)
+        assert isinstance(image, SOCState)
+        assert isinstance(following, SOCState)
+        assert state.team.penalty is not None
+        residual = np.sqrt(state.team.penalty)[:, None] * (image.x - state.z)
+        for a, rows in enumerate(state.team.slices):
+            s, memories[a] = extrapolate(Anderson(), memories[a], residual[rows], (image.x + state.B)[rows])
+            np.testing.assert_array_equal(following.s[rows], s)
+        state = following
 
 
 def test_without_noise_state_zero_is_a_fixed_point() -> None:
@@ -186,6 +250,7 @@ def test_couplings_follow_from_the_robots() -> None:
         ({"alpha": 0.0}, r"alpha must be in \(0, 2\), got 0\.0"),
         ({"alpha": 2.0}, r"alpha must be in \(0, 2\)"),
         ({"alpha": np.nan}, r"alpha must be in \(0, 2\)"),
+        ({"local_passes": 0}, "local_passes must be at least 1, got 0"),
         ({"translation_penalty": 0.0}, "translation_penalty must be positive"),
         ({"separator_penalty": -1.0}, "separator_penalty must not be negative"),
         ({"tolerance": 0.0}, "tolerance must be positive"),

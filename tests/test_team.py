@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from graphs import DIMENSIONS, SEEDS, random_poses, rounding_of_objective, varied_problem
@@ -5,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pgo_models.partition import Partition, PartitionMethod, partition
+from pgo_models.pose_graph import PoseGraph
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array
 from solvers.penalty import rotation_scale, translation_scale
@@ -142,3 +145,50 @@ def test_one_robot_is_the_whole_graph(seed: int, n: int, d: int) -> None:
         assert whole.M is problem.M
         assert whole.analysis is problem.analysis
         np.testing.assert_array_equal(whole.held, np.arange(n, problem.side))
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, method=METHODS)
+def test_what_is_shared_and_what_is_private(seed: int, n: int, d: int, method: PartitionMethod) -> None:
+    problem, robots, team = team_of(seed, n, d, method)
+    np.testing.assert_array_equal(team.separators, robots.separators(problem.graph))
+    for robot, rows in zip(team.robots, team.slices, strict=True):
+        others = np.concatenate([[-1], *(other.held_global for other in team.robots if other is not robot)])
+        np.testing.assert_array_equal(team.private[rows], ~np.isin(robot.held_global, others))
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, method=METHODS, exponent=st.integers(-10, 10))
+def test_stiffness_has_no_unit(seed: int, n: int, d: int, method: PartitionMethod, exponent: int) -> None:
+    problem, robots, team = team_of(seed, n, d, method)
+    rho = rotation_scale(problem)
+    stiffness = team.stiffness(rho)
+    assert 0 < stiffness < np.inf
+    graph, scale = problem.graph, 2.0**exponent
+    scaled = PGOProblem(replace(graph, kappa=scale * graph.kappa, tau=scale * graph.tau))
+    again = build_team(scaled, robots, RStep.FACTORIZED).stiffness(scale * rho)
+    assert again == pytest.approx(stiffness, rel=1e-6)
+
+
+@pytest.mark.parametrize("links", [1, 5, 40])
+def test_stiffness_is_that_of_springs_in_series(links: int) -> None:
+    # Two chains of equal springs, joined at both ends. A robot holds its chain and, by half a spring, the other's ends.
+    n = links + 1
+    chain = np.arange(links)
+    graph = PoseGraph(
+        num_poses=2 * n,
+        i=np.concatenate([chain, n + chain, [0, links]]),
+        j=np.concatenate([chain + 1, n + chain + 1, [n, n + links]]),
+        R_ij=np.tile(np.eye(2), (2 * n, 1, 1)),
+        t_ij=np.zeros((2 * n, 2)),
+        kappa=np.ones(2 * n),
+        tau=np.ones(2 * n),
+    )
+    problem = PGOProblem(graph)
+    team = build_team(problem, Partition(np.repeat([0, 1], n), PartitionMethod.CONTIGUOUS), RStep.FACTORIZED)
+    compliances = np.array([2.0, links, 2.0])  # between the four separators, in a row
+    incidence = np.diff(np.eye(4), axis=0)
+    C = np.linalg.pinv(incidence.T @ np.diag(1 / compliances) @ incidence)
+    half_scale = np.full(4, 0.5 * 2.0 / 2)  # two springs at every end, two copies
+    shift = np.full((4, 4), 0.25)
+    C = (np.eye(4) - shift) @ (half_scale[:, None] ** 0.5 * C * half_scale**0.5) @ (np.eye(4) - shift)
+    # An estimate of the trace: its standard deviation is at most a quarter.
+    assert team.stiffness(np.ones(2 * n)) == pytest.approx(3.0 / np.trace(C), rel=0.5)

@@ -5,7 +5,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from pgo_models.g2o import read_g2o
-from pgo_models.graph_qp import graph_qp
+from pgo_models.graph_subproblem import graph_qp
 from pgo_models.initialization import chordal_start
 from pgo_models.problem import PGOProblem
 from solvers.penalty import MultiplierPenalty

@@ -1,0 +1,165 @@
+"""A whole solve by a driver and its robots: start, SOC, Newton and certificate, each as its central twin does it."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+
+from pgo_models.certificate import (
+    BoundSource,
+    Certificate,
+    Verdict,
+    judge,
+    search_bound,
+    shift_of_gap,
+)
+from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.partition import Partition
+from pgo_models.poses import Poses
+from pgo_models.problem import PGOProblem
+from pgo_models.rotations import Array
+from solvers.asynchronous_soc import AsynchronousSOC, AsynchronousState
+from solvers.checkpoint import Journal
+from solvers.consensus_soc import ConsensusSOC, ConsensusState
+from solvers.driver import Count, Driver
+from solvers.engine import Engine
+from solvers.loop import Watch
+from solvers.network import Faults
+from solvers.newton import Newton
+from solvers.result import OUT_OF_TIME, History, Outcome, Stage, Status
+from solvers.share import share_out
+from solvers.soc import SOC, Coupling
+from solvers.substructured_newton import SubstructuredNewton
+from solvers.substructured_soc import SubstructuredSOC, SubstructuredState
+
+
+def open_driver(problem: PGOProblem, robots: Partition, engine: Engine) -> Driver:
+    """Driver and robots for a graph."""
+    return Driver(share_out(problem.graph, robots), problem.num_poses, engine, problem.backend)
+
+
+def attempt_distributed(
+    driver: Driver,
+    problem: PGOProblem,
+    newton: Newton,
+    gap: float,
+    faults: Faults | None,
+    journal: Journal,
+    watch: Watch,
+    soc: SOC | None,
+    start: Poses | None,
+) -> tuple[Poses, Certificate]:
+    """Start, SOC, Newton and certificate; what was done goes to the stages of `journal`.
+
+    Of the whole `problem` nothing is used but F of the poses that are returned.
+    """
+    outcome, stages = journal.outcome_of_attempt(), journal.stages
+    if outcome is not None:
+        return outcome
+    if not journal.goes_on_with():
+        stages.append(_start(driver, start))
+    if soc is not None and not journal.goes_on_with(SubstructuredNewton):
+        stages.append(_run_soc(driver, soc, faults, journal, watch))
+    decrement = math.inf
+    if stages[-1].status not in OUT_OF_TIME:
+        second = journal.run(SubstructuredNewton(newton), driver, watch)
+        decrement = second.state.decrement
+        figures = second.status, second.iterations, driver.objective, second.seconds, second.history, newton
+        stages.append(Stage("Newton", *figures))
+    eta, lower_bound = prove_bound_distributed(driver, gap)
+    poses, Lambda = collect(driver)
+    unjudged = Certificate(
+        objective=driver.objective,
+        lower_bound=lower_bound,
+        gap=math.nan,
+        eta=eta,
+        stationarity=decrement,
+        source=BoundSource.GIVEN,
+        poses=poses,
+        poses_objective=driver.objective,
+        Lambda=Lambda,
+        wanted_gap=gap,
+        verdict=Verdict.TRIVIAL,
+    )
+    outcome = poses, judge(problem, poses, unjudged)
+    journal.end_attempt(outcome)
+    return outcome
+
+
+def _start(driver: Driver, start: Poses | None) -> Stage:
+    began = time.perf_counter()
+    if start is None:
+        driver.start()
+    else:
+        driver.stand(start)
+    name = "chordal start" if start is None else "given start"
+    return Stage(name, Status.CONVERGED, 0, driver.objective, time.perf_counter() - began, History())
+
+
+def _run_soc(driver: Driver, soc: SOC, faults: Faults | None, journal: Journal, watch: Watch) -> Stage:
+    """SOC from the poses at hand, which stay where it finds none that are better. Its factors go with it."""
+    began = time.perf_counter()
+    if not journal.goes_on_with():
+        driver.keep()
+    first: Outcome[AsynchronousState] | Outcome[ConsensusState] | Outcome[SubstructuredState]
+    if soc.effective_coupling is Coupling.CONSENSUS and faults is not None:
+        asynchronous = AsynchronousSOC(soc, faults)
+        first = watch.run_method(asynchronous, driver)  # what the post carries is in no checkpoint
+        asynchronous.finish(driver)
+    elif soc.effective_coupling is Coupling.CONSENSUS:
+        consensus = ConsensusSOC(soc)
+        first = journal.run(consensus, driver, watch)
+        consensus.finish(driver)
+    else:
+        substructured = SubstructuredSOC(soc)
+        first = journal.run(substructured, driver, watch)
+        substructured.finish(driver)
+    if not driver.objective <= driver.kept_objective:
+        driver.go_back()
+    seconds = time.perf_counter() - began
+    return Stage("SOC", first.status, first.iterations, driver.objective, seconds, first.history, soc)
+
+
+def prove(driver: Driver, eta: float) -> tuple[bool, float]:
+    """Whether S + eta blockdiag(0, I) is positive definite at the poses at hand, and tr(Lambda): one round."""
+    answers = driver.ask("certificate", {"eta": np.array([eta])})
+    Lambda = driver.multipliers
+    trace = math.fsum([*np.einsum("naa->na", Lambda).ravel(), *(float(answer["trace"][0]) for answer in answers)])
+    if not all(answer["definite"][0] for answer in answers):
+        return False, trace
+    g, d = len(driver.cover), driver.d
+    columns = driver.rotation_rows.reshape(g, d)
+    own = [(columns, eta * np.eye(d) - Lambda), *driver.grounded_translation()]
+    try:
+        driver.interface(1, d).factorize([answer["schur"] for answer in answers], own)
+    except NotPositiveDefiniteError:
+        return False, trace
+    return True, trace
+
+
+def prove_bound_distributed(driver: Driver, gap: float) -> tuple[float, float]:
+    """Smallest eta found and its bound, at the poses at hand; (nan, 0) when only F >= 0 is left. A round an eta."""
+    count = driver.num_poses * driver.d
+    smallest = shift_of_gap(driver.largest, count, gap, driver.objective)
+    is_proven, trace = prove(driver, smallest)
+    proven = {smallest: is_proven}
+
+    def bound(eta: float) -> float | None:
+        if eta not in proven:
+            proven[eta] = prove(driver, eta)[0]
+        return trace - eta * count if proven[eta] else None
+
+    return search_bound(bound, smallest, trace, count)
+
+
+def collect(driver: Driver) -> tuple[Poses, Array]:
+    """All poses and multipliers, for whoever asked for the solution; off the ledger."""
+    n, d = driver.num_poses, driver.d
+    R, t, Lambda = np.empty((n, d, d)), np.empty((n, d)), np.empty((n, d, d))
+    R[driver.cover], t[driver.cover], Lambda[driver.cover] = driver.R, driver.t, driver.multipliers
+    for answer in driver.ask("result", count=Count.OFF):
+        poses = answer["poses"]
+        R[poses], t[poses], Lambda[poses] = answer["R"], answer["t"], answer["Lambda"]
+    return Poses(R, t), Lambda

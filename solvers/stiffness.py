@@ -1,0 +1,54 @@
+"""How hard it is for a robot to move its separators: what their penalty is measured by."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pgo_models.cholesky import CholeskyFactor
+from pgo_models.pose_graph import IntArray
+from pgo_models.rotations import Array
+
+GROUND = 1e-7  # of the diagonal of M: holds the shifts that are left out
+_PROBES = 32  # vectors that estimate the mean
+
+
+def separator_stiffness(
+    factor: CholeskyFactor, side: int, held: IntArray, half_scale: Array, component: IntArray
+) -> float:
+    """Stiffness of one robot's separators, relative to the diagonal of M.
+
+    The robot pulls at its separator translations, which nothing else holds, while rho holds the rotations:
+    C = D^(1/2) (E^T (M_a + rho/2)^-1 E) D^(1/2), with E the separators and D half their shares of the diagonal of M.
+    The stiffness is one over the mean of the diagonal of C, common shifts left out: near 1 where every separator is
+    held by its neighbourhood, far below where long soft chains join them. The mean is estimated (Hutchinson 1990) with
+    the same vectors of signs in every run.
+
+    Parameters
+    ----------
+    factor : CholeskyFactor
+        Of M_a + rho/2, with `GROUND` times D on the separator translations.
+    side : int
+    held : (s,)
+        Rows of the separator translations.
+    half_scale : (s,)
+        D.
+    component : (s,)
+        Which of them hang together by edges that the robot knows.
+    """
+    degrees = len(held) - len(np.unique(component))
+    if degrees == 0:  # alone in its component, each: nothing but shifts
+        return 1.0
+    probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(held), _PROBES))
+    pulled = _without_shifts(probes, half_scale, component)
+    force = np.zeros((side, _PROBES))
+    force[held] = np.sqrt(half_scale)[:, None] * pulled
+    moved = np.sqrt(half_scale)[:, None] * factor.solve(force)[held]
+    return _PROBES * degrees / float(np.sum(pulled * moved))
+
+
+def _without_shifts(vectors: Array, half_scale: Array, component: IntArray) -> Array:
+    """Vectors, (s, k), less their share in common shifts of the translations of a component."""
+    shift = np.sqrt(half_scale)
+    size = np.bincount(component, weights=half_scale)
+    along = np.stack([np.bincount(component, weights=shift * column) for column in vectors.T], axis=1)
+    return np.asarray(vectors - shift[:, None] * (along / np.where(size > 0, size, 1.0)[:, None])[component])

@@ -1,0 +1,198 @@
+"""The second stage by driver and robots: the damped Riemannian Newton of `pgo_models.polish`, step for step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.hessian import TangentLayout
+from pgo_models.matrices import inner
+from pgo_models.polish import (
+    CHORD_PROGRESS,
+    CHORD_STEPS,
+    DAMPING_GROWTH,
+    DAMPING_MAX,
+    DAMPING_START,
+    HALVINGS,
+    ROUNDING,
+    STATIONARY_DECREMENT,
+    SUFFICIENT,
+    retract,
+)
+from pgo_models.pose_graph import IntArray
+from pgo_models.poses import Poses
+from pgo_models.rotations import Array
+from solvers.driver import Count, Driver
+from solvers.newton import Newton
+from solvers.result import Measurement, Status
+from solvers.robot import Message
+from solvers.substructure import InterfaceFactor
+
+
+@dataclass(frozen=True)
+class SubstructuredNewtonState:
+    """Figures of iterate k; the poses are with driver and robots."""
+
+    k: int
+    objective: float
+    decrement: float = math.inf
+    moved: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A factored model at the poses at hand, and the solution y = H^-1 g on the cover."""
+
+    factor: InterfaceFactor
+    y: Array
+    square: float  # g^T H^-1 g
+
+
+@dataclass(frozen=True)
+class SubstructuredNewton:
+    """Newton by a driver and its robots, from the poses that they hold; `newton` has the settings."""
+
+    newton: Newton = field(default_factory=Newton)
+
+    @property
+    def max_iterations(self) -> int:
+        """Most steps of a run."""
+        return self.newton.max_iterations
+
+    def init(self, driver: Driver, start: SubstructuredNewtonState | None) -> SubstructuredNewtonState:
+        """State 0, at the poses that driver and robots hold."""
+        return start if start is not None else SubstructuredNewtonState(0, driver.objective)
+
+    def step(self, driver: Driver, state: SubstructuredNewtonState) -> SubstructuredNewtonState:
+        """One factorisation and the moves it serves, two rounds each."""
+        model = self._factorize(driver)
+        decrement = _decrement(model, driver.objective)
+        moved = False
+        for _ in range(1 + CHORD_STEPS):
+            if decrement <= STATIONARY_DECREMENT:
+                break
+            found = _backtrack(driver, model)
+            if found is None:
+                break
+            trial, answers = found
+            following = _solved(driver, model.factor, answers)
+            after = _decrement(following, trial.objective)
+            if trial.objective >= driver.objective and after > 0.5 * decrement:
+                break
+            driver.ask("accept", count=Count.WITH_THE_NEXT)
+            driver.R, driver.t, driver.force = trial.R, trial.t, trial.force
+            driver.objective = trial.objective
+            enough = after <= CHORD_PROGRESS * decrement
+            model, decrement, moved = following, after, True
+            if not enough:
+                break
+        return SubstructuredNewtonState(state.k + 1, driver.objective, decrement, moved)
+
+    def measure(self, driver: Driver, state: SubstructuredNewtonState) -> Measurement:
+        """F and the relative decrement."""
+        return driver.measured(state.objective, 0.0, state.decrement)
+
+    def converged(self, state: SubstructuredNewtonState, measurement: Measurement) -> Status | None:
+        """CONVERGED within tolerance; STALLED when the last step could not move."""
+        if measurement.dual_residual <= self.newton.tolerance:
+            return Status.CONVERGED
+        return None if state.moved else Status.STALLED
+
+    def _factorize(self, driver: Driver) -> Model:
+        """Factor the Hessian if it is positive definite, else the Gauss-Newton matrix with the least damping."""
+        if self.newton.second_order:
+            model = model_at(driver, second_order=True, damping=0.0)
+            if model is not None:
+                return model
+        damping = 0.0
+        while True:
+            model = model_at(driver, second_order=False, damping=damping)
+            if model is not None:
+                return model
+            damping = max(DAMPING_START, DAMPING_GROWTH * damping)
+            if damping > DAMPING_MAX:
+                raise NotPositiveDefiniteError("the damped Gauss-Newton matrix is not positive definite")
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    R: Array
+    t: Array
+    objective: float
+    force: Array
+
+
+def model_at(driver: Driver, second_order: bool, damping: float) -> Model | None:
+    """Model at the poses at hand; None when a robot's interior, or the sum, is not positive definite."""
+    settings = np.array([float(second_order), damping])
+    answers = driver.ask("model", {"settings": settings}, Count.WITH_THE_NEXT)
+    if not all(answer["definite"][0] for answer in answers):
+        return None
+    interface = driver.interface(*driver.tangent)
+    try:
+        factor = interface.factorize([a["schur"] for a in answers], _own(driver, answers, second_order, damping))
+    except NotPositiveDefiniteError:
+        return None
+    return _solved(driver, factor, answers)
+
+
+def _own(
+    driver: Driver, answers: Sequence[Message], second_order: bool, damping: float
+) -> list[tuple[IntArray, Array]]:
+    """What the driver adds: the multipliers of the cover, the ground, the damping."""
+    g, d = len(driver.cover), driver.d
+    interface, layout = driver.interface(*driver.tangent), TangentLayout(g, d)
+    own: list[tuple[IntArray, Array]] = []
+    diagonal = interface.gather([answer["diagonal"][:, None] for answer in answers])[:, 0]
+    columns = layout.rotations(np.arange(g))
+    if second_order:
+        Lambda = driver.multipliers
+        trace = np.einsum("naa->n", Lambda)[:, None, None]
+        curvature = -2.0 * trace if d == 2 else -2.0 * (trace * np.eye(3) - Lambda)
+        own.append((columns, curvature))
+        diagonal[columns] += np.einsum("naa->na", curvature)
+    extra = np.zeros_like(diagonal)
+    zero = driver.ground(*driver.tangent)
+    extra[zero] = abs(diagonal[zero])
+    extra += damping * (diagonal + extra)
+    own.append((np.arange(interface.side)[:, None], extra[:, None, None]))
+    return own
+
+
+def _solved(driver: Driver, factor: InterfaceFactor, answers: Sequence[Message]) -> Model:
+    """Solution y = H^-1 g on the cover, and g^T H^-1 g."""
+    b = driver.interface(*driver.tangent).gather([answer["b"] for answer in answers])
+    y = factor.solve(b)
+    return Model(factor, y, math.fsum(float(answer["energy"][0]) for answer in answers) + inner(b, y))
+
+
+def _decrement(model: Model, objective: float) -> float:
+    return 0.5 * model.square / max(1.0, objective)
+
+
+def _backtrack(driver: Driver, model: Model) -> tuple[_Trial, list[Message]] | None:
+    """First of the moves -y, -y/2, .. that lowers F enough, and the robots' answers there; None when none does."""
+    now, layout = Poses(driver.R, driver.t), TangentLayout(len(driver.cover), driver.d)
+    w, v = layout.split(-model.y[:, 0])
+    length = 1.0
+    for _ in range(HALVINGS):
+        message = np.array([length])
+        if length == 1.0:
+            parts = driver.interface(*driver.tangent).scatter(model.y)
+            answers = driver.ask("move", [{"x": part, "length": message} for part in parts])
+        else:
+            answers = driver.ask("turn", {"length": message}, Count.WITH_THE_NEXT)
+        R = retract(now, length * w, length * v).R
+        t, answers = driver.best_translations(answers, "weigh")
+        objective, force = driver.state_of(answers)
+        trial = _Trial(R, t, objective, force)
+        if objective <= driver.objective - SUFFICIENT * length * model.square:
+            return trial, answers
+        if length == 1.0 and objective <= driver.objective * (1.0 + ROUNDING):
+            return trial, answers
+        length *= 0.5
+    return None

@@ -1,0 +1,264 @@
+"""Prints the README's tables of many robots: rounds, bytes and seconds, faults, and a world of 100 robots.
+
+    PGO_DATA=folder python tests/benchmarks/robots.py [substructured] [consensus] [seconds] [faults] [world]
+
+Every line runs in a process of its own, one thread, robots in this process.
+"""
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ[variable] = "1"
+
+import numpy as np
+from rich.box import MARKDOWN
+from rich.console import Console
+from rich.table import Table
+from unit import seconds_of_unit
+
+import pgo_models as pgo
+import solvers
+from solvers.asynchronous_soc import AsynchronousSOC, AsynchronousState
+from solvers.distributed import open_driver
+from solvers.driver import Count
+from solvers.engine import InProcess
+from solvers.loop import run_method
+from solvers.network import Faults
+
+REFERENCE = json.loads((Path(__file__).parents[2] / "data" / "reference.json").read_text())
+OPTIMUM = REFERENCE["certified_optimum"]
+AMM = REFERENCE["peers"]["amm_pgo"]
+NAMES = list(AMM["rounds"])
+LEVELS = (1e-3, 1e-4, 1e-6)
+MAX_ROUNDS = 400
+FAULTS = {
+    "none": Faults(),
+    "20 % lost": Faults(loss=0.2, seed=1),
+    "up to 5 late": Faults(max_delay=5, seed=1),
+    "one silent for 50": Faults(silent_robot=2, silent_from=5, silent_rounds=50),
+}
+METIS, CONTIGUOUS = pgo.PartitionMethod.METIS, pgo.PartitionMethod.CONTIGUOUS
+
+
+def substructured_job(name: str, robots: str, method: str) -> dict[str, object]:
+    """Whole solve by driver and robots."""
+    graph = pgo.load(name)
+    shared = pgo.partition(graph, int(robots), pgo.PartitionMethod[method])
+    solution = solvers.solve(graph, robots=shared)
+    assert solution.ledger is not None
+    return {
+        "cover": len(pgo.vertex_cover(shared, graph)),
+        "soc": solution.stages[1].iterations,
+        "rounds": solution.ledger.rounds,
+        "all_reduces": solution.ledger.all_reduces,
+        "sent": solution.ledger.bytes_sent.max() / 1e3,
+        "received": solution.ledger.bytes_received.max() / 1e3,
+        "gap": solution.gap,
+        "verdict": solution.certificate.verdict.name,
+        "seconds": solution.seconds,
+        "memory": memory(),
+    }
+
+
+def consensus_job(name: str, robots: str, method: str) -> dict[str, object]:
+    """Rounds of CONSENSUS from the chordal start to three relative gaps; default settings."""
+    problem = pgo.PGOProblem(pgo.load(name))
+    shared = pgo.partition(problem.graph, int(robots), pgo.PartitionMethod[method])
+    done = to_gap(problem, solvers.SOC(robots=shared, tolerance=1e-12, max_iterations=MAX_ROUNDS), OPTIMUM[name])
+    return {
+        "rounds": rounds_to(done.history, OPTIMUM[name]),
+        "seconds": float(done.history.seconds[-1]),
+        "memory": memory(),
+    }
+
+
+def faults_job(name: str, fault: str) -> dict[str, object]:
+    """Rounds of the asynchronous CONSENSUS, 5 robots, METIS partition, to 1e-6; the whole graph measures omega."""
+    graph = pgo.load(name)
+    problem = pgo.PGOProblem(graph)
+    shared = pgo.partition(graph, 5, METIS)
+    driver = open_driver(problem, shared, InProcess())
+    driver.start()
+    soc = solvers.SOC(robots=shared, tolerance=1e-12, max_iterations=MAX_ROUNDS)
+    gaps = []
+
+    def is_done(state: AsynchronousState, record: solvers.Record) -> bool:
+        R = np.empty((graph.num_poses, graph.d, graph.d))
+        for answer in driver.ask_all("own_rotations", count=Count.OFF):
+            R[answer["poses"]] = answer["R"]
+        gaps.append(gap_of(problem.objective(problem.with_best_translations(R)), OPTIMUM[name]))
+        return (
+            gaps[-1] <= LEVELS[-1] and not FAULTS[fault].is_silent(2, state.k) and state.k > FAULTS[fault].silent_from
+        )
+
+    outcome = run_method(AsynchronousSOC(soc, FAULTS[fault]), driver, callback=is_done)
+    return {"rounds": outcome.iterations if gaps[-1] <= LEVELS[-1] else None}
+
+
+def world_job() -> dict[str, object]:
+    """A world of 100 robots and 50,000 poses in space, read from the folder that `pgo generate` wrote."""
+    with tempfile.TemporaryDirectory() as folder:
+        world = Path(folder) / "world"
+        run_cli(["generate", "grid-world", "--robots", "100", "--poses", "500", "--out", str(world)])
+        began = time.perf_counter()
+        graph = pgo.load(str(world))
+        solution = solvers.solve(graph, robots=pgo.partition(graph, 100, METIS))
+        seconds = time.perf_counter() - began
+    assert solution.ledger is not None
+    return {
+        "poses": graph.num_poses,
+        "edges": graph.num_edges,
+        "rounds": solution.ledger.rounds,
+        "sent": solution.ledger.bytes_sent.max() / 1e6,
+        "received": solution.ledger.bytes_received.max() / 1e6,
+        "gap": solution.gap,
+        "verdict": solution.certificate.verdict.name,
+        "seconds": seconds,
+        "memory": memory(),
+    }
+
+
+def run_cli(arguments: list[str]) -> None:
+    """`pgo` with these arguments."""
+    code = "from solvers.cli import main; main()"
+    subprocess.run([sys.executable, "-c", code, *arguments], check=True, capture_output=True, env=os.environ)
+
+
+def to_gap(problem: pgo.PGOProblem, soc: solvers.SOC, optimum: float) -> solvers.Run:
+    """Run until the smallest of the levels is reached."""
+    return solvers.run(
+        soc, problem, callback=lambda state, record: gap_of(record.measurement.objective, optimum) <= LEVELS[-1]
+    )
+
+
+def gap_of(objective: float, optimum: float) -> float:
+    """Relative distance to the published optimum."""
+    return (objective - optimum) / max(1.0, optimum)
+
+
+def rounds_to(history: solvers.History, optimum: float) -> list[int | None]:
+    """First iterate within each of the levels."""
+    gaps = [gap_of(objective, optimum) for objective in history.objective]
+    return [next((k for k, gap in enumerate(gaps) if gap <= level), None) for level in LEVELS]
+
+
+def memory() -> float:
+    """Largest memory of this process, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def substructured_table() -> Table:
+    """SUBSTRUCTURED: start, SOC, Newton and certificate, METIS partition (then contiguous parts)."""
+    heads = ("graph", "robots", "cover", "SOC", "rounds", "all-reduces", "sent, kB", "received, kB", "gap", "s", "MB")
+    table = Table(*heads, box=MARKDOWN)
+    cases = [(name, k, METIS) for name in NAMES for k in (5, 25)]
+    cases += [(name, k, CONTIGUOUS) for name in ("sphere2500", "torus3D", "kitti_00") for k in (5, 25)]
+    for name, robots, method in cases:
+        row = child("substructured", name, str(robots), method.name)
+        table.add_row(
+            name + ("" if method is METIS else ", contiguous"),
+            str(robots),
+            *(str(row[key]) for key in ("cover", "soc", "rounds", "all_reduces")),
+            *(f"{row[key]:.0f}" for key in ("sent", "received")),
+            f"{row['gap']:.1e} {'' if row['verdict'] == 'CERTIFIED' else row['verdict']}",
+            f"{row['seconds']:.2f}",
+            f"{row['memory']:.0f}",
+        )
+    return table
+
+
+def consensus_table() -> Table:
+    """CONSENSUS from the chordal start, default settings: rounds to relative gaps of 1e-3 / 1e-4 / 1e-6."""
+    table = Table("graph", "5, METIS", "5, contiguous", "25, METIS", "25, contiguous", "AMM-PGO, 5", box=MARKDOWN)
+    for name in NAMES:
+        cells = [
+            as_text(child("consensus", name, str(robots), method.name)["rounds"])
+            for robots, method in ((5, METIS), (5, CONTIGUOUS), (25, METIS), (25, CONTIGUOUS))
+        ]
+        published = AMM["rounds"][name]
+        table.add_row(name, *cells, as_text([published[0], published[1], published[3]]))
+    return table
+
+
+def seconds_table() -> Table:
+    """Seconds to 1e-6, 5 robots, METIS partition, summed over robots: chordal start not included."""
+    table = Table("graph", "CONSENSUS, s", "u", "whole SUBSTRUCTURED solve, s", "u", "AMM-PGO, u", "MB", box=MARKDOWN)
+    for name in ("sphere2500", "torus3D", "cubicle"):
+        unit = seconds_of_unit()
+        one, other = child("consensus", name, "5", "METIS"), child("substructured", name, "5", "METIS")
+        table.add_row(
+            name,
+            f"{one['seconds']:.2f}",
+            f"{one['seconds'] / unit:.1f}",
+            f"{other['seconds']:.2f}",
+            f"{other['seconds'] / unit:.1f}",
+            f"{AMM['units'][name]:.1f}",
+            f"{max(one['memory'], other['memory']):.0f}",
+        )
+    return table
+
+
+def faults_table() -> Table:
+    """CONSENSUS without waiting (no all-reduce), 5 robots, METIS: rounds to 1e-6 under faults."""
+    table = Table("graph", *FAULTS, box=MARKDOWN)
+    for name in NAMES:
+        if name not in ("CSAIL", "parking-garage", "kitti_00", "city10000"):
+            table.add_row(name, *(str(child("faults", name, fault)["rounds"]) for fault in FAULTS))
+    return table
+
+
+def world_table() -> Table:
+    """100 robots, 50,000 poses: read, solved and certified in this process."""
+    row = child("world")
+    table = Table("poses", "edges", "rounds", "sent, MB a robot", "received", "gap", "seconds", "MB", box=MARKDOWN)
+    table.add_row(
+        *(str(row[key]) for key in ("poses", "edges", "rounds")),
+        *(f"{row[key]:.1f}" for key in ("sent", "received")),
+        f"{row['gap']:.1e} {row['verdict']}",
+        *(f"{row[key]:.0f}" for key in ("seconds", "memory")),
+    )
+    return table
+
+
+def as_text(rounds: list[int | None]) -> str:
+    """Rounds to the levels."""
+    return " / ".join("-" if count is None else str(count) for count in rounds)
+
+
+def child(*arguments: str) -> dict:
+    """Figures of a job in a process of its own."""
+    finished = subprocess.run(
+        [sys.executable, __file__, "--job", *arguments], capture_output=True, text=True, check=True, env=os.environ
+    )
+    return json.loads(finished.stdout)
+
+
+JOBS: dict[str, Callable[..., dict[str, object]]] = {
+    "substructured": substructured_job,
+    "consensus": consensus_job,
+    "faults": faults_job,
+    "world": world_job,
+}
+TABLES = {
+    "substructured": substructured_table,
+    "consensus": consensus_table,
+    "seconds": seconds_table,
+    "faults": faults_table,
+    "world": world_table,
+}
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--job"]:
+        print(json.dumps(JOBS[sys.argv[2]](*sys.argv[3:])))
+    else:
+        for chosen in sys.argv[1:] or TABLES:
+            print(TABLES[chosen].__doc__)
+            Console(width=150).print(TABLES[chosen]())

@@ -1,0 +1,114 @@
+"""Partitions of every kind, and robots whose messages are written down, that several test files share."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from graphs import MILD_NOISE
+from hypothesis import strategies as st
+
+from pgo_models.cholesky import CholeskyBackend
+from pgo_models.partition import Partition, PartitionMethod, partition
+from pgo_models.pose_graph import PoseGraph
+from pgo_models.poses import Poses
+from pgo_models.rotations import Array, random_rotations
+from pgo_models.scenes import observe
+from solvers.engine import Crew
+from solvers.member import Member
+from solvers.robot import Message
+from solvers.share import Share
+
+Partitioner = Callable[[PoseGraph, int], Partition]
+
+
+def contiguous(graph: PoseGraph, seed: int) -> Partition:
+    return partition(graph, _number(graph, seed), PartitionMethod.CONTIGUOUS)
+
+
+def metis(graph: PoseGraph, seed: int) -> Partition:
+    return partition(graph, _number(graph, seed), PartitionMethod.METIS)
+
+
+def scattered(graph: PoseGraph, seed: int) -> Partition:
+    """Poses to robots at random, every robot with at least one."""
+    number, rng = _number(graph, seed), np.random.default_rng(seed)
+    robot = np.concatenate([np.arange(number), rng.integers(0, number, graph.num_poses - number)])
+    return Partition(rng.permutation(robot), PartitionMethod.GIVEN)
+
+
+def singletons(graph: PoseGraph, seed: int) -> Partition:
+    return partition(graph, method=PartitionMethod.SINGLETONS)
+
+
+def one_robot(graph: PoseGraph, seed: int) -> Partition:
+    return partition(graph, 1)
+
+
+PARTITIONERS = st.sampled_from([contiguous, metis, scattered, singletons, one_robot])
+BACKENDS = st.sampled_from(list(CholeskyBackend))
+
+
+def _number(graph: PoseGraph, seed: int) -> int:
+    return 1 + seed % min(graph.num_poses, 8)
+
+
+def graph_of(pairs: Sequence[tuple[int, int]], d: int, seed: int = 0) -> PoseGraph:
+    """Graph with the given edges and random, slightly noisy poses."""
+    rng = np.random.default_rng(seed)
+    i, j = np.array(pairs).T
+    n = int(max(i.max(), j.max())) + 1
+    truth = Poses(random_rotations(n, d, rng), rng.standard_normal((n, d)))
+    return observe("small", truth, i, j, MILD_NOISE, 1.0, 1.0, rng)
+
+
+def star(center: int, d: int) -> tuple[PoseGraph, Partition]:
+    """Six robots of one pose around a center: the cover is the center, whose robot counts no edge."""
+    graph = graph_of([(min(center, k), max(center, k)) for k in range(7) if k != center], d)
+    return graph, partition(graph, method=PartitionMethod.SINGLETONS)
+
+
+def complete(d: int) -> tuple[PoseGraph, Partition]:
+    """Five robots of one pose, all joined: four poses in the cover, so robots without an interior count edges."""
+    graph = graph_of([(i, j) for i in range(5) for j in range(i + 1, 5)], d)
+    return graph, partition(graph, method=PartitionMethod.SINGLETONS)
+
+
+def corner_cases() -> list[tuple[PoseGraph, Partition]]:
+    """Pose 0 as the cover and inside an interior; parts without edges; interiors without poses; repeated edges."""
+    found = []
+    for d in (2, 3):
+        found += [star(0, d), star(6, d), complete(d)]
+        twice = graph_of([(0, 1), (1, 2), (2, 3), (1, 2), (2, 1), (3, 0)], d)
+        found.append((twice, partition(twice, 2)))
+    return found
+
+
+class Recording:
+    """Robots of this process, and all that was said: an engine that is its own crew."""
+
+    def __init__(self) -> None:
+        self.log: list[tuple[str, list[Message], list[Message]]] = []
+        self.shares: Sequence[Share] = ()
+        self.members: list[Member] = []
+        self.is_closed = False
+
+    def open(self, shares: Sequence[Share], backend: CholeskyBackend | None) -> Crew:
+        self.shares = shares
+        self.members = [Member(share, backend) for share in shares]
+        return self
+
+    def ask(self, order: str, messages: Sequence[Message]) -> list[Message]:
+        answers = [member.obey(order, message) for member, message in zip(self.members, messages, strict=True)]
+        self.log.append((order, list(messages), answers))
+        return answers
+
+    def close(self) -> None:
+        self.is_closed = True
+
+    def times(self, *orders: str) -> int:
+        """How often one of these orders was given."""
+        return sum(order in orders for order, _, _ in self.log)
+
+    def crossed(self, *orders: str) -> list[tuple[str, Array]]:
+        """Names and numbers of all arrays that crossed in orders other than these."""
+        both = [m for order, sent, got in self.log if order not in orders for m in (*sent, *got)]
+        return [(name, np.ravel(value).astype(float)) for message in both for name, value in message.items()]

@@ -1,0 +1,267 @@
+import gc
+import os
+import signal
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from graphs import varied_graph
+
+import pgo_models as pgo
+import solvers
+from pgo_models.errors import EngineError, MissingExtraError, NotPositiveDefiniteError, SettingError
+from pgo_models.pose_graph import PoseGraph
+from solvers import cli, ray_engine
+from solvers.member import Member
+from solvers.ray_engine import RayEngine, connect
+from solvers.recovery import Recovery
+from solvers.share import Share
+
+ray = pytest.importorskip("ray")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def local_ray():
+    """Ray on this machine, started once: an engine uses it and leaves it running."""
+    assert connect(num_cpus=2)
+    yield
+    ray.shutdown()
+
+
+@pytest.fixture(scope="module")
+def graph():
+    return varied_graph(0, 60, 3)
+
+
+@pytest.fixture(scope="module")
+def robots(graph):
+    return pgo.partition(graph, 3)
+
+
+@pytest.fixture
+def actors(monkeypatch):
+    """Places of the engines that are opened, with their actors."""
+    opened = []
+    start = ray_engine._RayPlace.start
+
+    def watched(place, robots):
+        if place not in opened:
+            opened.append(place)
+        start(place, robots)
+
+    monkeypatch.setattr(ray_engine._RayPlace, "start", watched)
+    return opened
+
+
+def pipeline(coupling, robots):
+    chosen = solvers.Pipeline()
+    return replace(chosen, soc=replace(chosen.soc, coupling=coupling, robots=robots, tolerance=1e-6))
+
+
+def pid_of(actor):
+    return ray.get(actor.__ray_call__.remote(lambda holder: os.getpid()))
+
+
+def assert_same(found, expected):
+    np.testing.assert_array_equal(found.poses.R, expected.poses.R)
+    np.testing.assert_array_equal(found.poses.t, expected.poses.t)
+    assert found.lower_bound == expected.lower_bound
+    assert repr(found.ledger) == repr(expected.ledger)
+
+
+def sent_arrays(value):
+    """All arrays of numbers in what was sent."""
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind in "fiub":
+            yield value
+    elif isinstance(value, dict):
+        for item in value.values():
+            yield from sent_arrays(item)
+    elif isinstance(value, tuple | list):
+        for item in value:
+            yield from sent_arrays(item)
+    elif hasattr(value, "__dict__"):
+        yield from sent_arrays(vars(value))
+
+
+@pytest.fixture
+def sent(monkeypatch):
+    """Arguments of all that crosses to every actor, those of its constructor first."""
+    from ray.actor import ActorClass, ActorMethod
+
+    crossed = {}
+    make, call = ActorClass._remote, ActorMethod._remote
+
+    def recording_make(self, args=None, kwargs=None, **options):
+        handle = make(self, args, kwargs, **options)
+        crossed[handle._actor_id] = [args, kwargs]
+        return handle
+
+    def recording_call(self, args=None, kwargs=None, **options):
+        crossed[self._actor._actor_id].append((args, kwargs))
+        return call(self, args, kwargs, **options)
+
+    monkeypatch.setattr(ActorClass, "_remote", recording_make)
+    monkeypatch.setattr(ActorMethod, "_remote", recording_call)
+    return crossed
+
+
+@pytest.mark.parametrize("coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS])
+def test_killed_actors_change_nothing_and_no_process_receives_anothers_private_edges(
+    coupling, graph, robots, actors, sent
+):
+    settings = pipeline(coupling, robots)
+    expected = solvers.solve(graph, settings, robots=robots)
+    steps = []
+
+    def kill(state, record):
+        steps.append(record.k)
+        (place,) = actors
+        if len(steps) == 3:
+            os.kill(pid_of(place.actors[1]), signal.SIGKILL)
+        if len(steps) == 12:
+            ray.kill(place.actors[0])
+
+    engine = RayEngine(recovery=Recovery(orders_between_snapshots=20))
+    found = solvers.solve(graph, settings, robots=robots, engine=engine, callback=kill)
+    assert len(steps) > 12
+    assert_same(found, expected)
+    assert ray.is_initialized()  # it was not the engine that started it
+    assert len(sent) == 5  # three, and two in place of those that were killed
+    for crossed in sent.values():
+        assert_only_own_edges(crossed, graph, robots)
+
+
+def assert_only_own_edges(crossed, graph, robots):
+    """The first thing sent is a share; in none of it is an edge that two poses of another robot have to themselves."""
+    share = crossed[0][0]
+    assert isinstance(share, Share)
+    assert set(vars(share)) == set(Share.__dataclass_fields__)  # nothing that was worked out of it
+    assert isinstance(share.graph, PoseGraph)
+    assert len(crossed) > 10
+    i, j = robots.robot[graph.i], robots.robot[graph.j]
+    others, own = np.flatnonzero((i == j) & (i != share.robot)), np.flatnonzero((i == share.robot) | (j == share.robot))
+    numbers = np.concatenate([array.ravel().astype(float) for array in sent_arrays(crossed)])
+    assert np.isin(graph.t_ij[own], numbers).all()
+    # Weights are drawn from continuous distributions. A pose at the end of a single edge may be that edge.
+    assert not np.isin([graph.kappa[others], graph.tau[others]], numbers).any()
+    for measured in (graph.t_ij[others], graph.R_ij[others].reshape(len(others), -1)):
+        assert not np.isin(measured, numbers).all(axis=1).any()
+
+
+def test_a_robot_that_is_lost_too_often_ends_the_run(graph, actors):
+    def kill(state, record):
+        ray.kill(actors[0].actors[1])
+
+    engine = RayEngine(recovery=Recovery(max_restarts=0))
+    with pytest.raises(EngineError, match=r"robot 1 was lost 1 times \(robot 1's actor is gone"):
+        solvers.solve(graph, robots=2, engine=engine, callback=kill)
+    assert actors[0].actors == {}
+
+
+def test_errors_of_robots_arrive_as_what_they_are(graph):
+    crew = RayEngine().open(solvers.share.share_out(graph, pgo.partition(graph, 1)), None)
+    try:
+        with pytest.raises(NotPositiveDefiniteError, match=r"^the matrix has nan or inf; check the weights"):
+            crew.ask("penalize", [{"rule": np.full(3, np.nan), "is_stationary": np.zeros(1)}])
+    finally:
+        crew.close()
+
+
+@pytest.mark.parametrize("error", [MissingExtraError("cvxopt", "fast"), pgo.FileFormatError("x.g2o", 3, "bad")])
+def test_errors_can_be_sent(error):
+    import pickle
+
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+def test_too_few_cpus_are_told_at_once(graph):
+    with pytest.raises(EngineError, match="too few CPUs: 5 robots with at most 2 a CPU, on 2; use fewer robots"):
+        solvers.solve(graph, robots=5, engine=RayEngine(robots_per_cpu=2))
+
+
+def test_cpus_that_others_use_are_told_in_time(graph):
+    busy = ray.remote(Member).options(num_cpus=2)
+    shares = solvers.share.share_out(graph, pgo.partition(graph, 2))
+    held = busy.remote(shares[0], None)
+    ray.get(held.obey.remote("keep", {}))
+    try:
+        with pytest.raises(
+            EngineError, match=r"too few CPUs: 2 of 2 robots have not started in 0\.5 s, 0 CPUs are free"
+        ):
+            solvers.solve(graph, robots=2, engine=RayEngine(patience=0.5))
+    finally:
+        ray.kill(held)
+
+
+@pytest.mark.parametrize("address", ["nonsense", "host:port", ":6379", "localhost:0", "ray://localhost:10001"])
+def test_an_address_that_is_none_is_refused(address):
+    with pytest.raises(SettingError, match=r"address is .*; give host:port"):
+        connect(address)
+
+
+def test_an_address_where_no_cluster_answers_is_told_in_one_line(monkeypatch, capfd):
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        free = f"127.0.0.1:{closed.getsockname()[1]}"
+    with pytest.raises(SystemExit) as end:
+        cli.main(["solve", "circle", "--robots", "2", "--engine", "ray", "--address", free])
+    assert end.value.code == 1
+    out, err = capfd.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert err.startswith(f"pgo: no Ray cluster answers at {free} (")
+    monkeypatch.setattr(ray_engine, "_SECONDS_TO_JOIN", 0.5)
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        with pytest.raises(EngineError, match="connected to Ray already"):
+            connect(f"127.0.0.1:{silent.getsockname()[1]}")
+        with pytest.raises(EngineError, match="is no Ray cluster that can be joined from here"):
+            ray_engine._check_cluster(f"127.0.0.1:{silent.getsockname()[1]}")
+
+
+def test_without_ray_the_extra_is_named(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'pgo-splitting\[ray\]'"):
+        connect()
+    with pytest.raises(SystemExit) as end:
+        cli.main(["solve", "circle", "--robots", "2", "--engine", "ray"])
+    assert end.value.code == 1
+    assert capsys.readouterr().err == "pgo: ray is not installed; run: pip install 'pgo-splitting[ray]'\n"
+
+
+@pytest.mark.parametrize("wrong", [{"num_cpus": 0}, {"robots_per_cpu": 0}, {"patience": 0.0}])
+def test_settings_are_checked(wrong):
+    with pytest.raises(SettingError, match=f"{next(iter(wrong))} must be positive, got 0"):
+        RayEngine(**wrong)
+
+
+def test_cpus_of_a_cluster_are_its_own():
+    with pytest.raises(SettingError, match="the cluster at host:1 has its own"):
+        RayEngine(address="host:1", num_cpus=2)
+
+
+@pytest.mark.slow
+def test_a_solve_starts_and_stops_ray_and_is_quiet(tmp_path):
+    path = Path(cli.__file__).parent.parent
+    command = [sys.executable, "-W", "error", "-c", "from solvers.cli import main; main()"]
+    options = ["solve", "robots", "--engine", "ray", "--resume", str(tmp_path / "run.ckpt")]
+    finished = subprocess.run(
+        [*command, *options],
+        env={**os.environ, "PYTHONPATH": str(path)},
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+    )
+    assert (finished.returncode, finished.stderr) == (0, "")
+    assert "4, 40 to 40 poses each, as the graph names them" in finished.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_left_open():
+    gc.collect()  # a ResourceWarning is an error here

@@ -1,0 +1,132 @@
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from graphs import varied_graph
+
+import solvers
+from pgo_models.errors import EngineError, NotPositiveDefiniteError, SettingError
+from pgo_models.partition import PartitionMethod, partition
+from solvers.member import Member
+from solvers.recovery import RecoveringCrew, Recovery, RobotLostError
+from solvers.share import share_out
+
+
+@dataclass(eq=False)
+class Leaky:
+    """A place that loses the robot of every order whose number is in `losses`, before or after it has obeyed."""
+
+    shares: tuple
+    losses: set
+    is_before: bool = True
+    members: dict = field(default_factory=dict)
+    count: int = 0
+    lost: int = 0
+
+    def start(self, robots):
+        self.members |= {robot: Member(replace(self.shares[robot]), None) for robot in robots}
+
+    def send(self, robot, order, message):
+        return order, message
+
+    def receive(self, robot, ticket):
+        self.count += 1
+        if self.count in self.losses and self.is_before:
+            self.lose(robot)
+        answer = self.members[robot].obey(*ticket)
+        if self.count in self.losses:
+            self.lose(robot)
+        return answer
+
+    def lose(self, robot):
+        del self.members[robot]
+        self.lost += 1
+        raise RobotLostError("gone")
+
+    def close(self):
+        self.members = {}
+
+
+@dataclass(frozen=True)
+class LeakyEngine:
+    """Settings of a `Leaky` place; what it has opened is in `opened`."""
+
+    losses: frozenset = frozenset()
+    recovery: Recovery = field(default_factory=lambda: Recovery(max_restarts=1000))
+    is_before: bool = True
+    opened: list = field(default_factory=list)
+
+    def open(self, shares, backend):
+        place = Leaky(shares, set(self.losses), self.is_before)
+        place.start(range(len(shares)))
+        self.opened.append(RecoveringCrew(place, len(shares), self.recovery))
+        return self.opened[-1]
+
+
+def pipeline(coupling, robots):
+    chosen = solvers.Pipeline()
+    return replace(chosen, soc=replace(chosen.soc, coupling=coupling, robots=robots, tolerance=1e-5))
+
+
+@pytest.mark.parametrize("coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS])
+@pytest.mark.parametrize("orders", [1, 7, 1000])
+@pytest.mark.parametrize("is_before", [True, False])
+def test_lost_robots_change_nothing(coupling, orders, is_before):
+    graph = varied_graph(orders, 60, 2 + orders % 2)
+    robots = partition(graph, 4, PartitionMethod.CONTIGUOUS)
+    expected = solvers.solve(graph, pipeline(coupling, robots), robots=robots)
+    losses = frozenset(np.random.default_rng(orders).integers(1, 300, 12).tolist())
+    engine = LeakyEngine(losses, Recovery(orders, max_restarts=1000), is_before)
+    found = solvers.solve(graph, pipeline(coupling, robots), robots=robots, engine=engine)
+    (crew,) = engine.opened
+    assert crew.place.lost > 3
+    assert sum(crew.restarts) == crew.place.lost
+    np.testing.assert_array_equal(found.poses.R, expected.poses.R)
+    np.testing.assert_array_equal(found.poses.t, expected.poses.t)
+    assert found.lower_bound == expected.lower_bound
+    assert repr(found.ledger) == repr(expected.ledger)
+
+
+def test_what_is_kept_for_a_robot_is_bounded():
+    graph = varied_graph(3, 30, 2)
+    engine = LeakyEngine(recovery=Recovery(orders_between_snapshots=5))
+    solvers.solve(graph, robots=3, engine=engine)
+    assert len(engine.opened[0]._log) < 5
+
+
+def test_a_robot_that_is_lost_again_and_again_ends_the_run():
+    graph = varied_graph(4, 30, 2)
+    engine = LeakyEngine(frozenset(range(20, 10_000)), Recovery(max_restarts=2))
+    with pytest.raises(EngineError, match=r"robot \d was lost 3 times \(gone\); look at the memory"):
+        solvers.solve(graph, robots=3, engine=engine)
+
+
+def test_a_robots_own_error_is_told_after_all_have_obeyed_and_is_passed_over_in_the_replay(monkeypatch):
+    graph = varied_graph(5, 24, 2)
+    shares = share_out(graph, partition(graph, 3))
+    obeyed = []
+
+    def obey(member, order, message):
+        obeyed.append((member.share.robot, order))
+        if order == "refuse" and member.share.robot == 0:
+            raise NotPositiveDefiniteError("no")
+        return {"robot": np.array([member.share.robot])}
+
+    monkeypatch.setattr(Member, "obey", obey)
+    place = Leaky(shares, losses={4})
+    place.start(range(3))
+    crew = RecoveringCrew(place, 3, Recovery())
+    with pytest.raises(NotPositiveDefiniteError, match="no"):
+        crew.ask("refuse", [{}] * 3)
+    assert obeyed == [(0, "refuse"), (1, "refuse"), (2, "refuse")]
+    answers = crew.ask("look", [{}] * 3)  # robot 0 is lost here
+    assert [int(answer["robot"][0]) for answer in answers] == [0, 1, 2]
+    assert obeyed[3:5] == [(0, "refuse"), (0, "look")]
+    crew.close()
+    assert place.members == {}
+
+
+@pytest.mark.parametrize("wrong", [{"orders_between_snapshots": 0}, {"max_restarts": -1}])
+def test_settings_are_checked(wrong):
+    with pytest.raises(SettingError, match=next(iter(wrong))):
+        Recovery(**wrong)
