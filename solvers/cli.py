@@ -148,6 +148,8 @@ def solve_command(
     shared = chosen_partition(problem.graph, robots, split) if is_shared else None
     # Robots factor; the other back ends of CONSENSUS have all robots in one place.
     on_robots = shared is not None and runs_on is not None and r_step is BackEnd.FACTORIZED
+    if not on_robots and any(option is not None for option in (engine, address, resume)):
+        raise SettingError(f"robots of an engine factor, got --r-step {r_step.value}; leave out --engine and --resume")
     solution = solve(
         problem,
         chosen_pipeline(chosen, shared, r_step, gap, max_iterations, tolerance),

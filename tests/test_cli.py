@@ -304,3 +304,11 @@ def test_ctrl_c_returns_the_best_iterate_so_far(tmp_path):
     assert "INTERRUPTED" in out
     assert "Traceback" not in err
     assert json.loads(path.read_text())["status"] == "INTERRUPTED"
+
+
+def test_robots_of_an_engine_factor(pgo_command):
+    code, _, error = pgo_command(
+        "solve", "robots", "--method", "consensus", "--r-step", "clarabel", "--engine", "process"
+    )
+    assert code == 1
+    assert "--r-step clarabel" in error

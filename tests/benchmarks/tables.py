@@ -1,6 +1,6 @@
-"""Prints the README's tables: the whole job beside SE-Sync, SOC's iterations, and SOC as in the paper.
+"""Prints the README's tables of one robot: the whole job beside SE-Sync, and SOC's iterations.
 
-    PGO_DATA=folder python tests/benchmarks/tables.py [solve] [iterations] [paper]
+    PGO_DATA=folder python tests/benchmarks/tables.py [solve] [iterations]
 
 Every graph of the first table runs in a process of its own, one thread: a first job, then five more; imports are apart.
 """
@@ -28,7 +28,6 @@ REFERENCE = json.loads((Path(__file__).parents[2] / "data" / "reference.json").r
 OPTIMUM = {name: value for name, value in REFERENCE["certified_optimum"].items() if name != "source"}
 SE_SYNC = REFERENCE["peers"]["se_sync_units"]
 ITERATIONS = REFERENCE["peers"]["prototype_iterations_to_1e-6"]
-PAPER = REFERENCE["paper_tables"]
 REPEATS = 5
 MAX_ITERATIONS = 400
 
@@ -95,27 +94,7 @@ def iterations_table() -> Table:
     return table
 
 
-def paper_table() -> Table:
-    """SOC as in the paper, one pose a robot, from the spanning tree, in the paper's iterations; then Gauss-Newton."""
-    table = Table("graph", "iterations", "F, SOC", "F, then Gauss-Newton", "F, the paper's SOC", "its iterations", "F*")
-    for name in ("parking-garage", "cubicle", "torus3D"):
-        problem, published = pgo.PGOProblem(pgo.load(name)), PAPER[name]
-        soc = solvers.SOC(coupling=solvers.Coupling.PAPER, max_iterations=published["iterations_soc"])
-        first = solvers.run(soc, problem)
-        second = solvers.run(solvers.gauss_newton(), problem, first.poses)
-        table.add_row(
-            name,
-            str(first.iterations),
-            f"{first.objective:.6g}",
-            f"{second.objective:.8g}",
-            f"{published['F_soc']:g}",
-            str(published["iterations_soc"]),
-            f"{OPTIMUM[name]:.8g}",
-        )
-    return table
-
-
-TABLES = {"solve": solve_table, "iterations": iterations_table, "paper": paper_table}
+TABLES = {"solve": solve_table, "iterations": iterations_table}
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--job"]:
