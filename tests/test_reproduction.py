@@ -242,10 +242,3 @@ def assert_row_shows_what_it_should(name: str) -> None:
 @pytest.mark.usefixtures("benchmark_data")
 def test_the_garage_shows_what_it_should():
     assert_row_shows_what_it_should("parking-garage")
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("benchmark_data")
-@pytest.mark.parametrize("name", ["cubicle", "torus3D"])
-def test_large_graphs_show_what_they_should(name):
-    assert_row_shows_what_it_should(name)

@@ -21,6 +21,7 @@ COMPARED = "cubicle"
 if __name__ == "__main__":
     tables = solvers.tables_as_text(solvers.reproduce_tables())
     tables.print()
+    tables.save(ROOT / "notebooks" / "tables.json")  # which notebook 7 loads
     before, _, after = re.split(f"(?<={MARKS[0]})(.*?)(?={MARKS[1]})", README.read_text(encoding="utf-8"), flags=re.S)
     README.write_text(f"{before}\n{tables.markdown()}\n{after}", encoding="utf-8")
     comparison = solvers.compare_methods(pgo.load(COMPARED))
