@@ -38,7 +38,7 @@ class Anderson:
     Anderson(memory=5, regularization=1e-12, restart_ratio=2.0, per_robot=False)
     """
 
-    memory: int = 40
+    memory: int = 60
     regularization: float = 1e-12
     restart_ratio: float = 2.0
     per_robot: bool = False
