@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from pgo_models.certificate import BoundSource, Certificate, Verdict, certify, prove_bound
+from pgo_models.certificate import BoundSource, Certificate, Verdict, certify, certify_at
 from pgo_models.cholesky import CholeskyBackend, default_backend
 from pgo_models.chordal import CliqueTree, clique_tree
 from pgo_models.curves import plot_decay, plot_tightness
@@ -21,6 +21,7 @@ from pgo_models.errors import (
     MissingExtraError,
     NotPositiveDefiniteError,
     PGOError,
+    ProofError,
     SettingError,
 )
 from pgo_models.figures import save_figure
@@ -29,6 +30,7 @@ from pgo_models.grid_world import grid_world
 from pgo_models.initialization import chordal_start, gps_imu_start, odometry_start, spanning_tree_start
 from pgo_models.interactive import animate_poses, explore_graph, save_page
 from pgo_models.lifted import LiftedPoint, hessian_product, lifted_point
+from pgo_models.lower_bound import LowerBound, prove_bound
 from pgo_models.matrices import connection_laplacian, joint_matrix, marginalized_matrix, residual_matrix
 from pgo_models.matrix_plots import FactorPattern, factor_pattern, plot_sparsity, plot_spectrum, smallest_eigenvalues
 from pgo_models.multipliers import certificate_matrix, multipliers
@@ -127,6 +129,7 @@ __all__ = [
     "GraphQP",
     "KKTResiduals",
     "LiftedPoint",
+    "LowerBound",
     "MissingExtraError",
     "Neighbours",
     "NoiseModel",
@@ -142,6 +145,7 @@ __all__ = [
     "PoseVariables",
     "Poses",
     "PrimalRelaxation",
+    "ProofError",
     "PublishedFigures",
     "PublishedRow",
     "PublishedRun",
@@ -160,6 +164,7 @@ __all__ = [
     "basis_pursuit",
     "certificate_matrix",
     "certify",
+    "certify_at",
     "chordal_start",
     "circle",
     "clique_relaxation",

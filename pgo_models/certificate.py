@@ -1,32 +1,27 @@
-"""Dual certificate: multipliers Lambda, matrix S, a proof that S + eta I is PSD, and the lower bound it gives.
+"""Certificate: poses held against a lower bound on the global optimum that holds in exact arithmetic.
 
-For every feasible X, tr(X^T M X) = tr(X^T S X) + sum_i tr(Lambda_i) with S = M - blockdiag(0, Lambda) and any symmetric
-Lambda_i. If S + eta blockdiag(0, I) is positive semidefinite, then F >= tr(Lambda) - eta n d for every feasible point,
-however Lambda was found (Rosen et al. 2019, theorem 7; Carlone et al. 2015).
+The bound and its proof are in `pgo_models.lower_bound`; here it is decided where to find it, and what it says of poses.
+gap = (F - lower_bound) / F: neither the units nor the number of measurements change it.
 """
 
 from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from pgo_models.errors import NotPositiveDefiniteError, SettingError
+from pgo_models.errors import ProofError, SettingError
 from pgo_models.html_tables import facts_table
 from pgo_models.initialization import chordal_start
-from pgo_models.multipliers import factorize_certificate, multipliers
+from pgo_models.lower_bound import LowerBound, best_bound
+from pgo_models.multipliers import multipliers
 from pgo_models.polish import STATIONARY_DECREMENT, polish, relative_decrement
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array
+from pgo_models.rounding_errors import objective_rounding
 
 DEFAULT_GAP = 1e-6
-_ETA_SHARE = 0.5  # of the wanted gap is spent on eta; the rest is for poses a little off the optimum
-_ETA_GROWTH, _ETA_BISECTIONS = 10.0, 3
-_ROUNDING_FLOOR = 10.0 * float(np.finfo(float).eps)  # of the largest diagonal entry of M: below, a proof proves nothing
 
 
 class Verdict(enum.Enum):
@@ -41,6 +36,7 @@ class Verdict(enum.Enum):
     """
 
     CERTIFIED = "globally optimal within the gap asked for"
+    EXACT = "globally optimal, exact to rounding: F cannot be told from zero"
     NOT_CERTIFIED = "not shown to be optimal: the bound holds, but the gap is wider than asked for"
     TRIVIAL = "not shown to be optimal: no bound better than zero was found"
 
@@ -72,27 +68,28 @@ class Certificate:
     ----------
     objective : float
         F of the poses that were given.
-    lower_bound : float
-        Proven: F(R, t) >= lower_bound for every choice of poses.
+    bound : LowerBound
+        Proven: F(R, t) >= bound.value for every choice of poses, in exact arithmetic.
     gap : float
-        (objective - lower_bound) / max(1, objective).
-    eta : float
-        Shift with which the factorisation of S + eta I went through; nan when only F >= 0 is left.
+        (objective - lower_bound) / objective; 0 where F is at its rounding level.
+    rounding_level : float
+        F below it cannot be told from zero (`objective_rounding`).
     stationarity : float
-        Half the squared Newton decrement of the given poses, over max(1, F): about the relative decrease of F down to
-        the stationary point beside them.
+        Half the squared Newton decrement of the given poses, over F: about the relative decrease of F down to the
+        stationary point beside them.
     source : BoundSource
     poses : Poses
         Where the bound was found.
     poses_objective : float
         F there: the best value known.
     Lambda : (n, d, d)
-        Multipliers, which with eta are the proof: anyone can check it with `prove_bound`.
+        Multipliers, which with eta and the poses are the proof: anyone can check it with `prove_bound`.
     wanted_gap : float
     verdict : Verdict
 
     Examples
     --------
+    >>> import numpy as np
     >>> from pgo_models.scenes import grid
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
     >>> certificate = certify(problem, chordal_start(problem))
@@ -103,9 +100,9 @@ class Certificate:
     """
 
     objective: float
-    lower_bound: float
+    bound: LowerBound
     gap: float
-    eta: float
+    rounding_level: float
     stationarity: float
     source: BoundSource
     poses: Poses
@@ -115,9 +112,24 @@ class Certificate:
     verdict: Verdict
 
     @property
+    def lower_bound(self) -> float:
+        """Proven: F(R, t) >= lower_bound for every choice of poses."""
+        return self.bound.value
+
+    @property
+    def eta(self) -> float:
+        """Shift of the proof: 0 where the certificate grounded at a pose needs none, nan when only F >= 0 is left."""
+        return self.bound.eta
+
+    @property
+    def digits(self) -> int:
+        """Digits of F that are proven: those in which it agrees with the bound."""
+        return proven_digits(self.gap)
+
+    @property
     def is_certified(self) -> bool:
-        """Whether the gap is within the one asked for."""
-        return self.verdict is Verdict.CERTIFIED
+        """Whether the gap is within the one asked for, or F exact to rounding."""
+        return self.verdict in (Verdict.CERTIFIED, Verdict.EXACT)
 
     def __repr__(self) -> str:
         return f"Certificate(F={self.objective:.10g}, gap={self.gap:.3g}, {self.verdict.name})"
@@ -129,50 +141,47 @@ class Certificate:
         return facts_table(self._facts())
 
     def _facts(self) -> list[tuple[str, str]]:
-        proof = "F is a sum of squares" if math.isnan(self.eta) else f"proved with eta = {self.eta:.3g}"
         facts = [
             ("F", f"{self.objective:.10g}   (stationary to {self.stationarity:.2g})"),
-            ("lower bound", f"{self.lower_bound:.10g}   ({proof}; {self.source.value})"),
-            ("gap", f"{self.gap:.3g}   (asked for: {self.wanted_gap:.3g})"),
+            ("lower bound", f"{self.lower_bound:.10g}   ({self.proof}; {self.source.value})"),
+            ("gap", f"{gap_text(self.gap)}   (asked for: {self.wanted_gap:.3g})"),
             ("verdict", f"{self.verdict.name}: {self.verdict.value}"),
         ]
         if self.source is not BoundSource.GIVEN:
             facts.insert(1, ("best known F", f"{self.poses_objective:.10g}"))
         return facts
 
+    @property
+    def proof(self) -> str:
+        """How the bound was proved, in a few words."""
+        if math.isnan(self.eta):
+            return "F is a sum of squares"
+        form = "grounded at a pose" if self.bound.is_grounded else "with a shift"
+        shift = f", eta = {self.eta:.3g}" if self.eta > 0 else ""
+        return f"proved {form}{shift}, less {self.bound.rounding:.2g} for rounding"
 
-def prove_bound(problem: PGOProblem, Lambda: Array, eta: float) -> float | None:
-    """tr(Lambda) - eta n d if S + eta blockdiag(0, I) is positive definite with t_0 grounded, else None.
 
-    The proof is one sparse Cholesky factorisation that goes through (`factorize_certificate`), so it is as exact as
-    double precision; `smallest_shift` is above its level.
-    Lambda is made symmetric first.
-
-    Raises
-    ------
-    SettingError
-        When eta is negative or Lambda has the wrong shape.
+def proven_digits(gap: float) -> int:
+    """Digits of F that a relative gap leaves no doubt of, 0 to 16.
 
     Examples
     --------
-    >>> from pgo_models.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> poses = polish(problem, chordal_start(problem))
-    >>> bound = prove_bound(problem, multipliers(problem, poses), eta=1e-6)
-    >>> bool(bound < problem.objective(poses) < bound + 1e-3)
-    True
+    >>> proven_digits(3e-13), proven_digits(0.2), proven_digits(0.0)
+    (12, 0, 16)
     """
-    n, d = problem.num_poses, problem.d
-    if not eta >= 0:
-        raise SettingError(f"eta is {eta}; a shift must not be negative")
-    if Lambda.shape != (n, d, d):
-        raise SettingError(f"Lambda has shape {Lambda.shape}; give one block for every pose, {(n, d, d)}")
-    symmetric = 0.5 * (Lambda + np.swapaxes(Lambda, 1, 2))
-    try:
-        factorize_certificate(problem, symmetric, eta)
-    except NotPositiveDefiniteError:
-        return None
-    return _trace(symmetric) - eta * n * d
+    return min(16, max(0, math.floor(-math.log10(gap)))) if gap > 0 else 16
+
+
+def gap_text(gap: float) -> str:
+    """A relative gap for tables, with the digits that it proves.
+
+    Examples
+    --------
+    >>> gap_text(3.2e-13), gap_text(0.2)
+    ('3.2e-13, proven to 12 digits', '0.2')
+    """
+    digits = proven_digits(gap)
+    return f"{gap:.3g}, proven to {digits} digits" if digits > 1 else f"{gap:.3g}"
 
 
 def certify(problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP) -> Certificate:
@@ -180,14 +189,15 @@ def certify(problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP) -> Cert
 
     The bound is found at a stationary point. Poses that are not stationary are polished first (damped Newton,
     `polish`); where that point does not give the gap, the one that the chordal start polishes to is tried, and the
-    better bound is taken. `source` says what was done; the gap is always that of the poses given.
+    better bound is taken. `source` says what was done; the gap is always that of the poses given. `certify_at` bounds
+    at the poses as they are.
 
     Parameters
     ----------
     problem : PGOProblem
     poses : Poses
     gap : float
-        The relative gap to certify; the smallest eta that is tried follows from it.
+        The relative gap to certify.
 
     Returns
     -------
@@ -196,7 +206,7 @@ def certify(problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP) -> Cert
     Raises
     ------
     SettingError
-        When gap is not positive.
+        When gap is not positive and finite.
     GraphError
         When the poses do not fit the graph.
 
@@ -211,50 +221,81 @@ def certify(problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP) -> Cert
     """
     stationarity = relative_decrement(problem, poses)
     if stationarity <= STATIONARY_DECREMENT:
-        certificate = certify_stationary(problem, poses, gap, stationarity)
+        certificate = certify_at(problem, poses, gap, stationarity)
     else:
-        polished = certify_stationary(problem, polish(problem, poses), gap, stationarity)
+        polished = certify_at(problem, polish(problem, poses), gap, stationarity)
         certificate = judge(problem, poses, replace(polished, source=BoundSource.POLISHED))
     if not _bound_is_tight(certificate):
-        other = certify_stationary(problem, polish(problem, chordal_start(problem)), gap, stationarity)
+        other = certify_at(problem, polish(problem, chordal_start(problem)), gap, stationarity)
         # Of equal bounds, as two zeros, the one with the better poses.
         if (other.lower_bound, -other.poses_objective) > (certificate.lower_bound, -certificate.poses_objective):
             certificate = judge(problem, poses, replace(other, source=BoundSource.CHORDAL))
     return certificate
 
 
-def certify_stationary(problem: PGOProblem, poses: Poses, gap: float, stationarity: float) -> Certificate:
-    """Certificate at poses known to be stationary; it holds for any, but is wide elsewhere.
+def certify_at(
+    problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP, stationarity: float = math.nan
+) -> Certificate:
+    """Certificate from the multipliers at the poses as they are: valid anywhere, and sharp near an optimum.
 
     Parameters
     ----------
+    problem : PGOProblem
+    poses : Poses
+    gap : float
     stationarity : float
-        Relative decrement there, reported as it is.
+        Relative decrement there, reported as it is; nan where it was not measured.
+
+    Raises
+    ------
+    SettingError
+        When gap is not positive and finite.
+    GraphError
+        When the poses do not fit the graph.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> near = polish(problem, chordal_start(problem), max_steps=1)
+    >>> certificate = certify_at(problem, near)
+    >>> bool(0.9 * certificate.objective < certificate.lower_bound <= certificate.objective)
+    True
     """
-    # With the best translations, the trace of the multipliers is F to rounding.
     Lambda = multipliers(problem, problem.with_best_translations(poses.R))
     return certify_with(problem, poses, Lambda, gap, stationarity, BoundSource.GIVEN)
 
 
 def certify_with(
-    problem: PGOProblem, poses: Poses, Lambda: Array, gap: float, stationarity: float, source: BoundSource
+    problem: PGOProblem,
+    poses: Poses,
+    Lambda: Array,
+    gap: float,
+    stationarity: float,
+    source: BoundSource,
+    bound: LowerBound | None = None,
 ) -> Certificate:
     """Certificate of poses with multipliers from anywhere: the proof asks nothing of them.
+
+    Parameters
+    ----------
+    bound : LowerBound, optional
+        One that was proved with these multipliers already; found here unless given.
 
     Raises
     ------
     SettingError
-        When gap is not positive or Lambda has the wrong shape.
+        When gap is not positive and finite, or Lambda has the wrong shape.
     """
-    if not gap > 0:
+    if not 0 < gap < math.inf:
         raise SettingError(f"gap is {gap}; give a positive relative gap, as 1e-6")
     objective = problem.objective(poses)
-    eta, lower_bound = smallest_provable(problem, Lambda, gap, objective)
     unjudged = Certificate(
         objective=objective,
-        lower_bound=lower_bound,
+        bound=bound if bound is not None else best_bound(problem, Lambda, poses, gap, objective),
         gap=math.nan,
-        eta=eta,
+        rounding_level=0.0,
         stationarity=stationarity,
         source=source,
         poses=poses,
@@ -267,74 +308,48 @@ def certify_with(
 
 
 def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
-    """Hold other poses of the same problem against the bound of a certificate."""
-    objective = problem.objective(poses)
-    gap = relative_gap(objective, certificate.lower_bound)
-    if gap <= certificate.wanted_gap:
-        verdict = Verdict.CERTIFIED
-    else:
-        verdict = Verdict.TRIVIAL if math.isnan(certificate.eta) else Verdict.NOT_CERTIFIED
-    return replace(certificate, objective=objective, gap=gap, verdict=verdict)
+    """Hold other poses of the same problem against the bound of a certificate.
+
+    Raises
+    ------
+    ProofError
+        When F of the poses is below the bound by more than the rounding of F: then one of the two is wrong.
+    """
+    objective, rounding = problem.objective(poses), objective_rounding(problem, poses)
+    bound = certificate.bound
+    if bound.value > objective + rounding.error:
+        raise ProofError(
+            f"lower bound {bound.value!r} is above F = {objective!r} of {problem!r}, which is known to "
+            f"{rounding.error:.2g}: a defect of pgo_models; please report it with the graph"
+        )
+    # The last bits of F may be below the bound's; a bound may be lowered.
+    bound = replace(bound, value=min(bound.value, objective))
+    gap = relative_gap(objective, bound.value, rounding.level)
+    return replace(
+        certificate,
+        objective=objective,
+        bound=bound,
+        gap=gap,
+        rounding_level=rounding.level,
+        verdict=verdict_of(objective, rounding.level, gap, bound, certificate.wanted_gap),
+    )
 
 
-def relative_gap(objective: float, lower_bound: float) -> float:
-    """(objective - lower_bound) / max(1, objective)."""
-    return (objective - lower_bound) / max(1.0, objective)
+def verdict_of(objective: float, level: float, gap: float, bound: LowerBound, wanted_gap: float) -> Verdict:
+    """Verdict on poses: F, its rounding level, their gap, and the bound."""
+    if objective <= level:
+        return Verdict.EXACT
+    if math.isnan(bound.eta):
+        return Verdict.TRIVIAL
+    return Verdict.CERTIFIED if gap <= wanted_gap else Verdict.NOT_CERTIFIED
+
+
+def relative_gap(objective: float, lower_bound: float, rounding_level: float = 0.0) -> float:
+    """(objective - lower_bound) / objective; 0 where F is at its rounding level, and so as good as zero."""
+    return (objective - lower_bound) / objective if objective > rounding_level else 0.0
 
 
 def _bound_is_tight(certificate: Certificate) -> bool:
+    if certificate.poses_objective <= certificate.rounding_level:
+        return True
     return relative_gap(certificate.poses_objective, certificate.lower_bound) <= certificate.wanted_gap
-
-
-def smallest_provable(problem: PGOProblem, Lambda: Array, gap: float, objective: float) -> tuple[float, float]:
-    """Smallest eta found, from what the wanted gap allows upwards, and its bound; (nan, 0) when only F >= 0 is left."""
-    smallest = smallest_shift(problem, gap, objective)
-    count = problem.num_poses * problem.d
-    return search_bound(lambda eta: prove_bound(problem, Lambda, eta), smallest, _trace(Lambda), count)
-
-
-def search_bound(
-    prove: Callable[[float], float | None], smallest: float, trace: float, count: int
-) -> tuple[float, float]:
-    """Smallest eta found for which `prove` gives a bound, and the bound; (nan, 0) when tr(Lambda) - eta n d is not > 0.
-
-    Parameters
-    ----------
-    prove : callable
-        tr(Lambda) - eta n d, or None where S + eta I is not positive definite.
-    smallest : float
-        First eta; from there on it grows until there is a bound, then the last step is bisected.
-    trace, count : float, int
-        tr(Lambda) and n d.
-    """
-    eta, too_small = smallest, math.nan
-    bound = None
-    while bound is None:
-        if not trace - eta * count > 0.0:
-            return math.nan, 0.0
-        bound = prove(eta)
-        if bound is None:
-            too_small, eta = eta, _ETA_GROWTH * eta
-    for _ in range(0 if math.isnan(too_small) else _ETA_BISECTIONS):
-        middle = math.sqrt(too_small * eta)
-        tighter = prove(middle)
-        if tighter is None:
-            too_small = middle
-        else:
-            eta, bound = middle, tighter
-    return eta, bound
-
-
-def smallest_shift(problem: PGOProblem, gap: float, objective: float) -> float:
-    """Shift eta that spends a fixed share of a relative gap, and is no smaller than a factorisation can tell from 0."""
-    largest = float(problem.M.data[problem.diagonal_positions].max())
-    return shift_of_gap(largest, problem.num_poses * problem.d, gap, objective)
-
-
-def shift_of_gap(largest_diagonal: float, count: int, gap: float, objective: float) -> float:
-    """`smallest_shift` from the largest diagonal entry of M and count = n d."""
-    return max(_ETA_SHARE * gap * max(1.0, objective) / count, _ROUNDING_FLOOR * largest_diagonal)
-
-
-def _trace(Lambda: Array) -> float:
-    return math.fsum(np.einsum("naa->na", Lambda).ravel())

@@ -31,6 +31,8 @@ from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array, project_to_rotations
 from pgo_models.rounding import RankReport, rank_report
 
+_LEAST_SCALE = 1e-6  # of the mean diagonal of L: noise-free graphs have F near zero
+
 
 @dataclass(frozen=True, eq=False)
 class CliqueRelaxation:
@@ -136,7 +138,7 @@ def clique_relaxation(
     tree = tree if tree is not None else clique_tree(problem.graph)
     centre = centre if centre is not None else polish(problem, chordal_start(problem))
     layout = _Layout.of(problem, tree, centre)
-    scale = max(1.0, problem.objective(centre))
+    scale = max(problem.objective(centre), _LEAST_SCALE * float(problem.L.diagonal().mean()))
     equations = _Equations(layout)
     _orthogonality(equations)
     _agreement(equations)

@@ -97,6 +97,16 @@ class NotPositiveDefiniteError(PGOError):
     """
 
 
+class ProofError(PGOError):
+    """Poses that cost less than a bound that was proved: a defect here, never to be printed as a result.
+
+    Examples
+    --------
+    >>> issubclass(ProofError, PGOError)
+    True
+    """
+
+
 class EngineError(PGOError):
     """A place where robots run that cannot be reached, has no room for them, or loses them.
 

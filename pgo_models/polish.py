@@ -19,6 +19,7 @@ from pgo_models.multipliers import multipliers
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array, exp_map, project_to_rotations
+from pgo_models.rounding_errors import rounding_level
 
 STATIONARY_DECREMENT = 1e-13
 ROUNDING = 1e-14  # relative change of F that is not told apart from none
@@ -38,8 +39,8 @@ class PolishState:
     poses : Poses
     objective : float
     decrement : float
-        Half the squared Newton decrement at the poses, over max(1, F): the relative decrease that the quadratic model
-        still promises. inf before the first factorisation.
+        Half the squared Newton decrement at the poses, less the rounding level of F, over F: the relative decrease that
+        the quadratic model still promises and F can show. inf before the first factorisation.
     is_newton : bool
         Whether the last factored matrix was the Hessian, not its damped Gauss-Newton part.
     moved : bool
@@ -117,7 +118,7 @@ def polish(problem: PGOProblem, poses: Poses, max_steps: int = 100) -> Poses:
 
 
 def relative_decrement(problem: PGOProblem, poses: Poses) -> float:
-    """Half the squared Newton decrement of F at poses, over max(1, F).
+    """Half the squared Newton decrement of F at poses, less the rounding level of F, over F (`scaled_decrement`).
 
     Where the Hessian is not positive definite, as at saddles, it is that of the damped Gauss-Newton matrix, and above
     `STATIONARY_DECREMENT` in any case.
@@ -174,11 +175,18 @@ def ground_pose(matrix: csc_array, problem: PGOProblem) -> None:
 
 
 def _direction(problem: PGOProblem, layout: TangentLayout, state: PolishState) -> tuple[Array, Array, float]:
-    """Gradient, step -H^-1 g and half the squared decrement over max(1, F) at the state's poses."""
+    """Gradient, step -H^-1 g and relative decrement at the state's poses."""
     assert state.factor is not None
     gradient = layout.join(*problem.riemannian_gradient(state.poses))
     direction = -state.factor.solve(gradient)
-    return gradient, direction, -0.5 * inner(gradient, direction) / max(1.0, state.objective)
+    level = rounding_level(problem, state.poses)
+    return gradient, direction, scaled_decrement(-inner(gradient, direction), state.objective, level)
+
+
+def scaled_decrement(square: float, objective: float, rounding_level: float) -> float:
+    """(g^T H^-1 g / 2 - level) / F, or 0 where that is not positive: what is left to gain, as a share of F."""
+    left = 0.5 * square - rounding_level
+    return left / objective if left > 0.0 else 0.0
 
 
 def _backtrack(

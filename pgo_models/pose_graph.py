@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from pgo_models.errors import GraphError
 from pgo_models.html_tables import facts_table
@@ -131,8 +131,7 @@ class PoseGraph:
 
     def components(self) -> list[IntArray]:
         """Poses of every connected component, largest first."""
-        adjacency = coo_array((np.ones(self.num_edges), (self.i, self.j)), shape=(self.num_poses, self.num_poses))
-        count, label = connected_components(adjacency, directed=False)
+        count, label = connected_components(_adjacency(self), directed=False)
         parts = [np.flatnonzero(label == c) for c in range(count)]
         return sorted(parts, key=lambda part: (-len(part), int(part[0])))
 
@@ -258,3 +257,32 @@ class PoseGraph:
             raise GraphError("ids are not unique; every pose needs a name of its own")
         if self.robot is not None and (self.robot.min() < 0 or len(np.unique(self.robot)) != self.robot.max() + 1):
             raise GraphError("robot must number the robots 0, 1, .. without a gap; see numpy.unique")
+
+
+def middle_pose(graph: PoseGraph) -> int:
+    """A pose half-way along a long shortest path of a connected graph, found by two breadth-first searches.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> chain = np.arange(4)
+    >>> turn = np.eye(2)[None].repeat(4, axis=0)
+    >>> middle_pose(PoseGraph(5, chain, chain + 1, turn, np.ones((4, 2)), np.ones(4), np.ones(4)))
+    2
+    """
+    end = poses_by_distance(graph, 0)[-1]
+    order, parent = breadth_first_order(_adjacency(graph), end, directed=False)
+    path = [int(order[-1])]
+    while path[-1] != end:
+        path.append(int(parent[path[-1]]))
+    return path[len(path) // 2]
+
+
+def poses_by_distance(graph: PoseGraph, pose: int) -> IntArray:
+    """Poses of a connected graph, (n,), by their number of edges to a pose, which is the first."""
+    return np.asarray(breadth_first_order(_adjacency(graph), pose, directed=False, return_predecessors=False))
+
+
+def _adjacency(graph: PoseGraph) -> csr_array:
+    shape = (graph.num_poses, graph.num_poses)
+    return coo_array((np.ones(graph.num_edges), (graph.i, graph.j)), shape=shape).tocsr()

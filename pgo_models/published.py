@@ -37,8 +37,8 @@ class PublishedRun:
 
     @property
     def gap(self) -> float:
-        """(objective - optimum) / max(1, objective)."""
-        return (self.objective - self.optimum) / max(1.0, self.objective)
+        """(objective - optimum) / objective."""
+        return (self.objective - self.optimum) / self.objective
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import cvxpy as cp
 
-from pgo_models.certificate import Verdict, relative_gap, smallest_provable
+from pgo_models.certificate import Verdict, gap_text, relative_gap, verdict_of
 from pgo_models.clique_sdp import CliqueRelaxation, clique_relaxation
 from pgo_models.errors import PGOError, SettingError
+from pgo_models.lower_bound import LowerBound, best_bound
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.relaxation_plan import (
@@ -25,6 +26,7 @@ from pgo_models.relaxation_plan import (
 from pgo_models.relaxations import DualRelaxation, PrimalRelaxation, dual_relaxation, primal_relaxation
 from pgo_models.rotations import Array
 from pgo_models.rounding import RankReport
+from pgo_models.rounding_errors import objective_rounding
 
 DEFAULT_RELAXATION_GAP = 1e-5
 CLARABEL_TOLERANCE = 1e-10
@@ -68,16 +70,15 @@ class RelaxationSolution:
         Optimal value as the solver reports it: evidence, not a bound.
     Lambda : (n, d, d)
         Multipliers from the duals.
-    lower_bound, eta : float
-        Proven bound on F and its shift (`pgo_models.certificate.prove_bound`): it holds whatever the solver did. Where
-        nothing above zero could be proved, 0 and nan.
+    bound : LowerBound
+        Proven bound on F (`pgo_models.lower_bound`): it holds whatever the solver did.
     poses : Poses
         Rounded.
     rank : RankReport
-    objective : float
-        F of the poses.
+    objective, rounding_level : float
+        F of the poses, and below what it could not be told from zero.
     gap : float
-        (objective - lower_bound) / max(1, objective).
+        (objective - lower_bound) / objective.
     wanted_gap : float
     verdict : Verdict
         On the poses.
@@ -101,26 +102,34 @@ class RelaxationSolution:
     status: RelaxationStatus
     value: float
     Lambda: Array
-    lower_bound: float
-    eta: float
+    bound: LowerBound
     poses: Poses
     rank: RankReport
     objective: float
+    rounding_level: float
     wanted_gap: float
     iterations: int
     seconds: float
 
     @property
+    def lower_bound(self) -> float:
+        """Proven: F of no poses is below it."""
+        return self.bound.value
+
+    @property
+    def eta(self) -> float:
+        """Shift of the proof; nan when only F >= 0 is left."""
+        return self.bound.eta
+
+    @property
     def gap(self) -> float:
-        """(objective - lower_bound) / max(1, objective) of the rounded poses."""
-        return relative_gap(self.objective, self.lower_bound)
+        """(objective - lower_bound) / objective of the rounded poses."""
+        return relative_gap(self.objective, self.lower_bound, self.rounding_level)
 
     @property
     def verdict(self) -> Verdict:
         """What the bound says of the rounded poses."""
-        if self.gap <= self.wanted_gap:
-            return Verdict.CERTIFIED
-        return Verdict.TRIVIAL if math.isnan(self.eta) else Verdict.NOT_CERTIFIED
+        return verdict_of(self.objective, self.rounding_level, self.gap, self.bound, self.wanted_gap)
 
     def gap_to(self, poses: Poses) -> float:
         """The same gap for anybody's poses of the graph."""
@@ -133,7 +142,7 @@ class RelaxationSolution:
             f"effort       {self.iterations} iterations, {self.seconds:.3g} s",
             f"F rounded    {self.objective:.10g}",
             f"lower bound  {self.lower_bound:.10g}   (solver: {self.value:.10g}; eta = {self.eta:.3g})",
-            f"gap          {self.gap:.3g}   (asked for: {self.wanted_gap:.3g})",
+            f"gap          {gap_text(self.gap)}   (asked for: {self.wanted_gap:.3g})",
             f"rank         {self.rank}",
             f"verdict      {self.verdict.name}: {self.verdict.value}",
         ]
@@ -159,7 +168,7 @@ def solve_relaxation(
     solver : SDPSolver, optional
         Both are chosen by `plan_relaxation` unless given.
     gap : float
-        Relative gap for the verdict; the smallest shift eta that is tried follows from it.
+        Relative gap for the verdict; where the proof needs a shift eta, the smallest that is tried follows from it.
     memory_limit : float
         Bytes; an estimate above it is refused before anything is formed.
     time_limit : float
@@ -194,18 +203,19 @@ def solve_relaxation(
     Lambda = relaxation.Lambda()
     poses, rank = relaxation.rounded()
     objective = problem.objective(poses)
-    eta, lower_bound = smallest_provable(problem, Lambda, gap, objective)
+    rounding = objective_rounding(problem, poses)
+    bound = best_bound(problem, Lambda, poses, gap, objective)
     solution = RelaxationSolution(
         relaxation=relaxation,
         plan=plan,
         status=status,
         value=float(relaxation.model.value) * relaxation.scale,
         Lambda=Lambda,
-        lower_bound=lower_bound,
-        eta=eta,
+        bound=bound,
         poses=poses,
         rank=rank,
         objective=objective,
+        rounding_level=rounding.level,
         wanted_gap=gap,
         iterations=int(relaxation.model.solver_stats.num_iters or 0),
         seconds=time.perf_counter() - began,

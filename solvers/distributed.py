@@ -12,10 +12,7 @@ from pgo_models.certificate import (
     Certificate,
     Verdict,
     judge,
-    search_bound,
-    shift_of_gap,
 )
-from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.partition import Partition
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
@@ -23,13 +20,14 @@ from pgo_models.rotations import Array
 from solvers.asynchronous_soc import AsynchronousSOC, AsynchronousState
 from solvers.checkpoint import Journal
 from solvers.consensus_soc import ConsensusSOC, ConsensusState
+from solvers.distributed_bound import best_bound_distributed
 from solvers.driver import Count, Driver
 from solvers.engine import Engine
 from solvers.loop import Watch
 from solvers.network import Faults
 from solvers.newton import Newton
 from solvers.result import OUT_OF_TIME, History, Outcome, Stage, Status
-from solvers.share import share_out
+from solvers.share import middle_separator, share_out
 from solvers.soc import SOC, Coupling
 from solvers.substructured_newton import SubstructuredNewton
 from solvers.substructured_soc import SubstructuredSOC, SubstructuredState
@@ -37,7 +35,8 @@ from solvers.substructured_soc import SubstructuredSOC, SubstructuredState
 
 def open_driver(problem: PGOProblem, robots: Partition, engine: Engine) -> Driver:
     """Driver and robots for a graph."""
-    return Driver(share_out(problem.graph, robots), problem.num_poses, engine, problem.backend)
+    shares = share_out(problem.graph, robots)
+    return Driver(shares, problem.num_poses, engine, problem.backend, grounded=middle_separator(problem.graph, shares))
 
 
 def attempt_distributed(
@@ -68,13 +67,13 @@ def attempt_distributed(
         decrement = second.state.decrement
         figures = second.status, second.iterations, driver.objective, second.seconds, second.history, newton
         stages.append(Stage("Newton", *figures))
-    eta, lower_bound = prove_bound_distributed(driver, gap)
+    bound = best_bound_distributed(driver, gap)
     poses, Lambda = collect(driver)
     unjudged = Certificate(
         objective=driver.objective,
-        lower_bound=lower_bound,
+        bound=bound,
         gap=math.nan,
-        eta=eta,
+        rounding_level=driver.rounding_level,
         stationarity=decrement,
         source=BoundSource.GIVEN,
         poses=poses,
@@ -120,38 +119,6 @@ def _run_soc(driver: Driver, soc: SOC, faults: Faults | None, journal: Journal, 
         driver.go_back()
     seconds = time.perf_counter() - began
     return Stage("SOC", first.status, first.iterations, driver.objective, seconds, first.history, soc)
-
-
-def prove(driver: Driver, eta: float) -> tuple[bool, float]:
-    """Whether S + eta blockdiag(0, I) is positive definite at the poses at hand, and tr(Lambda): one round."""
-    answers = driver.ask("certificate", {"eta": np.array([eta])})
-    Lambda = driver.multipliers
-    trace = math.fsum([*np.einsum("naa->na", Lambda).ravel(), *(float(answer["trace"][0]) for answer in answers)])
-    if not all(answer["definite"][0] for answer in answers):
-        return False, trace
-    g, d = len(driver.cover), driver.d
-    columns = driver.rotation_rows.reshape(g, d)
-    own = [(columns, eta * np.eye(d) - Lambda), *driver.grounded_translation()]
-    try:
-        driver.interface(1, d).factorize([answer["schur"] for answer in answers], own)
-    except NotPositiveDefiniteError:
-        return False, trace
-    return True, trace
-
-
-def prove_bound_distributed(driver: Driver, gap: float) -> tuple[float, float]:
-    """Smallest eta found and its bound, at the poses at hand; (nan, 0) when only F >= 0 is left. A round an eta."""
-    count = driver.num_poses * driver.d
-    smallest = shift_of_gap(driver.largest, count, gap, driver.objective)
-    is_proven, trace = prove(driver, smallest)
-    proven = {smallest: is_proven}
-
-    def bound(eta: float) -> float | None:
-        if eta not in proven:
-            proven[eta] = prove(driver, eta)[0]
-        return trace - eta * count if proven[eta] else None
-
-    return search_bound(bound, smallest, trace, count)
 
 
 def collect(driver: Driver) -> tuple[Poses, Array]:

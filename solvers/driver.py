@@ -55,15 +55,16 @@ class DriverMemory:
     Attributes
     ----------
     kept : tuple
-        R, t, force and objective that `Driver.keep` put aside.
+        R, t, force, objective and rounding level that `Driver.keep` put aside.
     """
 
     R: Array
     t: Array
     force: Array
     objective: float
+    rounding_level: float
     block: RotationBlock | None
-    kept: tuple[Array, Array, Array, float]
+    kept: tuple[Array, Array, Array, float, float]
     ledger: Ledger
 
 
@@ -77,12 +78,12 @@ class Driver:
         Poses of the cover.
     force : ((d+1) g, d)
         Rows of M X there.
-    objective : float
-        F of the poses that the robots and the driver hold.
+    objective, rounding_level : float
+        F of the poses that the robots and the driver hold, and below what it could not be told from zero.
     diagonal : ((d+1) g,)
         Diagonal of M there.
-    largest : float
-        Largest diagonal entry of M.
+    grounded : int
+        Which of the cover is left out when a bound is proved.
     block : RotationBlock, optional
         Rotations of the cover in SOC's recursion.
     """
@@ -94,6 +95,7 @@ class Driver:
         engine: Engine,
         backend: CholeskyBackend | None,
         memory: float = DEFAULT_MEMORY,
+        grounded: int = 0,
     ) -> None:
         """Start the robots; orders about interiors go to those that have an edge to count.
 
@@ -103,7 +105,7 @@ class Driver:
             When the separators would take more than `memory` bytes.
         """
         working = [share for share in shares if share.part is not None]
-        self.num_poses, self.d = num_poses, shares[0].graph.d
+        self.num_poses, self.d, self.grounded = num_poses, shares[0].graph.d, grounded
         cover = np.concatenate([share.poses[share.in_cover >= 0] for share in shares])
         place = np.concatenate([share.in_cover[share.in_cover >= 0] for share in shares])
         self.cover: IntArray = np.zeros(len(np.unique(place)), dtype=np.int64)
@@ -121,15 +123,13 @@ class Driver:
         self.ledger = Ledger(len(shares))
         self._traffic: dict[bytes, Traffic] = {}
         self.R, self.t = np.broadcast_to(np.eye(d), (g, d, d)).copy(), np.zeros((g, d))
-        self.force, self.objective = np.zeros(((d + 1) * g, d)), math.nan
+        self.force, self.objective, self.rounding_level = np.zeros(((d + 1) * g, d)), math.nan, 0.0
         self.block: RotationBlock | None = None
-        self._kept = (self.R, self.t, self.force, self.objective)
+        self._kept = (self.R, self.t, self.force, self.objective, self.rounding_level)
         self._laplacian: InterfaceFactor | None = None
         self._crew = engine.open(shares, backend)
         described = self.ask("describe", count=Count.OFF)
         self.diagonal = self.interface(1, d).gather([answer["diagonal"][:, None] for answer in described])[:, 0]
-        largest = [float(answer["largest"][0]) for answer in described]
-        self.largest = max([*largest, float(self.diagonal.max(initial=0.0))])
 
     # The network.
 
@@ -248,7 +248,9 @@ class Driver:
 
     def remembered(self) -> DriverMemory:
         """What `remember` needs; the factors are found again."""
-        return DriverMemory(self.R, self.t, self.force, self.objective, self.block, self._kept, self.ledger)
+        return DriverMemory(
+            self.R, self.t, self.force, self.objective, self.rounding_level, self.block, self._kept, self.ledger
+        )
 
     def snapshots(self) -> list[Message]:
         """What every robot needs to go on from here; nobody else looks into it, and it is off the ledger."""
@@ -257,7 +259,8 @@ class Driver:
     def remember(self, memory: DriverMemory, snapshots: Sequence[Message]) -> None:
         """Go on from what was remembered here and on the robots, who send the matrix of the translations again."""
         self._crew.ask(RESTORE, snapshots)
-        self.R, self.t, self.force, self.objective = memory.R, memory.t, memory.force, memory.objective
+        self.R, self.t, self.force = memory.R, memory.t, memory.force
+        self.objective, self.rounding_level = memory.objective, memory.rounding_level
         self.block, self._kept, self.ledger = memory.block, memory.kept, memory.ledger
         answers = self.ask("eliminated_translations", count=Count.WITH_THE_NEXT)
         if all(answers):
@@ -289,7 +292,7 @@ class Driver:
             )
         self.R, self.t = poses.R[self.cover], poses.t[self.cover]
         self.ask("stand", [{"R": poses.R[part], "t": poses.t[part]} for part in self._parts], Count.OFF)
-        self.objective, self.force = self.state_of(self.ask("look", count=Count.WITH_THE_NEXT))
+        self.objective, self.rounding_level, self.force = self.state_of(self.ask("look", count=Count.WITH_THE_NEXT))
 
     def poses_of_cover(self) -> list[Message]:
         """What every robot is sent of the cover's poses that it holds."""
@@ -297,7 +300,7 @@ class Driver:
 
     def keep(self) -> None:
         """Remember the poses at hand, here and on the robots."""
-        self._kept = (self.R, self.t, self.force, self.objective)
+        self._kept = (self.R, self.t, self.force, self.objective, self.rounding_level)
         self.ask("keep", count=Count.WITH_THE_NEXT)
 
     @property
@@ -307,13 +310,13 @@ class Driver:
 
     def go_back(self) -> None:
         """Return to the poses that were kept."""
-        self.R, self.t, self.force, self.objective = self._kept
+        self.R, self.t, self.force, self.objective, self.rounding_level = self._kept
         self.ask("go_back", count=Count.WITH_THE_NEXT)
 
     def settle(self, answers: Sequence[Message]) -> None:
         """Best translations for the rotations at hand, from the robots' right-hand sides: one round."""
         self.t, answers = self.best_translations(answers, "settle")
-        self.objective, self.force = self.state_of(answers)
+        self.objective, self.rounding_level, self.force = self.state_of(answers)
 
     def best_translations(self, answers: Sequence[Message], order: str) -> tuple[Array, list[Message]]:
         """Translations of the cover, and the robots' answers to an order that sends them on."""
@@ -323,10 +326,11 @@ class Driver:
         t = self._laplacian.solve(line.gather([answer["b"] for answer in answers]))
         return t, self.ask(order, [{"t": part} for part in line.scatter(t)])
 
-    def state_of(self, answers: Sequence[Message]) -> tuple[float, Array]:
-        """F, and the rows of M X on the cover."""
+    def state_of(self, answers: Sequence[Message]) -> tuple[float, float, Array]:
+        """F, its rounding level, and the rows of M X on the cover."""
         objective = math.fsum(float(answer["objective"][0]) for answer in answers)
-        return objective, self.interface(1, self.d).gather([answer["force"] for answer in answers])
+        level = math.fsum(float(answer["objective"][1]) for answer in answers)
+        return objective, level, self.interface(1, self.d).gather([answer["force"] for answer in answers])
 
     def scattered_rotations(self, z: Array) -> list[Message]:
         """What every robot is sent of rotation rows on the cover."""

@@ -17,10 +17,11 @@ from pgo_models.errors import NotPositiveDefiniteError, SettingError
 from pgo_models.hessian import TangentLayout, riemannian_hessian
 from pgo_models.initialization import chordal_start
 from pgo_models.matrices import inner
-from pgo_models.polish import STATIONARY_DECREMENT, ground_pose, retract
+from pgo_models.polish import STATIONARY_DECREMENT, ground_pose, retract, scaled_decrement
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array
+from pgo_models.rounding_errors import rounding_level
 from solvers.result import Measurement, Status
 
 _SMALLEST_FACTOR = 1.0 / 3.0  # of the damping, after a step that the model foresaw
@@ -69,7 +70,7 @@ class LevenbergMarquardtState:
 class LevenbergMarquardt:
     """Levenberg-Marquardt on the full poses, one factorisation a step, F never rises.
 
-    `dual_residual` is the relative decrement of the damped step: half of -<g, h> over max(1, F).
+    `dual_residual` is the relative decrement of the damped step: half of -<g, h>, less the rounding level of F, over F.
 
     Attributes
     ----------
@@ -107,7 +108,8 @@ class LevenbergMarquardt:
         objective = problem.objective(poses)
         matrix, gradient = _linearized(problem, poses)
         analysis = analyze(matrix, problem.backend)
-        step, decrement = _damped_step(matrix, gradient, analysis, self.damping, objective)
+        level = rounding_level(problem, poses)
+        step, decrement = _damped_step(matrix, gradient, analysis, self.damping, objective, level)
         return LevenbergMarquardtState(
             0, poses, objective, matrix, gradient, analysis, self.damping, _GROWTH, step, decrement
         )
@@ -131,7 +133,10 @@ class LevenbergMarquardt:
                 damping=max(factor * state.damping, _DAMPING_LIMITS[0]),
                 growth=_GROWTH,
             )
-        step, decrement = _damped_step(again.matrix, again.gradient, again.analysis, again.damping, again.objective)
+        level = rounding_level(problem, again.poses)
+        step, decrement = _damped_step(
+            again.matrix, again.gradient, again.analysis, again.damping, again.objective, level
+        )
         return replace(again, step=step, decrement=decrement)
 
     def measure(self, problem: PGOProblem, state: LevenbergMarquardtState) -> Measurement:
@@ -157,7 +162,7 @@ class LevenbergMarquardt:
         damped = state.damping * inner(state.step, state.matrix.diagonal() * state.step)
         foreseen = 0.5 * (damped - inner(state.gradient, state.step))
         # Below the rounding of F both decreases are noise, and their ratio is made to tend to one.
-        rounding = _ROUNDING * max(1.0, state.objective)
+        rounding = _ROUNDING * state.objective + rounding_level(problem, state.poses)
         return (state.objective - objective + rounding) / (foreseen + rounding), poses, objective
 
 
@@ -169,7 +174,7 @@ def _linearized(problem: PGOProblem, poses: Poses) -> tuple[csc_array, Array]:
 
 
 def _damped_step(
-    matrix: csc_array, gradient: Array, analysis: SymbolicCholesky, damping: float, objective: float
+    matrix: csc_array, gradient: Array, analysis: SymbolicCholesky, damping: float, objective: float, level: float
 ) -> tuple[Array, float]:
     damped = matrix.copy()
     damped.setdiag((1.0 + damping) * matrix.diagonal())
@@ -177,4 +182,4 @@ def _damped_step(
         step = -analysis.factorize(damped).solve(gradient)
     except NotPositiveDefiniteError:
         return np.full_like(gradient, np.nan), math.inf
-    return step, -0.5 * inner(gradient, step) / max(1.0, objective)
+    return step, scaled_decrement(-inner(gradient, step), objective, level)

@@ -9,13 +9,14 @@ from pgo_models.poses import Poses
 from solvers.copy_holder import CopyHolder
 from solvers.packing import pack, unpack
 from solvers.robot import Message, Robot
+from solvers.robot_proof import RobotProof
 from solvers.rotation_block import RotationBlock
 from solvers.share import Share
 from solvers.shared_anderson import AndersonShare, AndersonSums
 
 COPIES = "copies."  # prefix of the orders that concern copies; the others concern the interior
 SNAPSHOT, RESTORE = "snapshot", "restore"  # orders that concern all that the robot remembers
-_CLASSES = (AndersonShare, AndersonSums, Poses, RotationBlock)
+_CLASSES = (AndersonShare, AndersonSums, Poses, RobotProof, RotationBlock)
 
 
 class Member:

@@ -24,7 +24,7 @@ class NewtonState:
 class Newton:
     """Riemannian Newton on SE(d)^n (`pgo_models.polish`), one factorisation a step.
 
-    `dual_residual` is the relative Newton decrement: half its square over max(1, F).
+    `dual_residual` is the relative Newton decrement: half its square, less the rounding level of F, over F.
 
     Attributes
     ----------

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pgo_models.certificate import DEFAULT_GAP, BoundSource, Certificate, certify_stationary, certify_with, judge
+from pgo_models.certificate import DEFAULT_GAP, BoundSource, Certificate, certify_at, certify_with, judge
 from pgo_models.errors import SettingError
 from pgo_models.initialization import chordal_start, spanning_tree_start
 from pgo_models.partition import Partition, partition
@@ -253,7 +253,7 @@ def _polished(
         second = watch.run(pipeline.newton, problem, poses)
         stages.append(Stage.of(second))
         poses, decrement = second.poses, second.state.polish.decrement
-    return poses, certify_stationary(problem, poses, pipeline.gap, decrement)
+    return poses, certify_at(problem, poses, pipeline.gap, decrement)
 
 
 def _own_start(problem: PGOProblem, soc: SOC | None) -> tuple[Poses, str]:
@@ -282,7 +282,9 @@ def _climb(
     bound = bounds[-1] if bounds else None
     if bound is not None and not certificate.is_certified:
         stationarity = certificate.stationarity
-        relaxed = certify_with(problem, poses, bound.Lambda, pipeline.gap, stationarity, BoundSource.RELAXATION)
+        relaxed = certify_with(
+            problem, poses, bound.Lambda, pipeline.gap, stationarity, BoundSource.RELAXATION, bound.bound
+        )
         certificate = max(certificate, relaxed, key=lambda found: found.lower_bound)
     return poses, certificate
 

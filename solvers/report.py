@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from pgo_models.certificate import Certificate
+from pgo_models.certificate import Certificate, gap_text
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.files import replace_when_done
 from pgo_models.g2o import pose_names
@@ -207,7 +207,7 @@ def _verdict(solution: Solved) -> str:
     figures = [
         ("cost F", f"{solution.objective:.10g}"),
         ("lower bound", f"{certificate.lower_bound:.10g}"),
-        ("gap", f"{certificate.gap:.3g}"),
+        ("gap", gap_text(certificate.gap)),
         ("gap asked for", f"{certificate.wanted_gap:.3g}"),
         ("solve ended", solution.status.name),
     ]

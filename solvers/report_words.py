@@ -6,7 +6,7 @@ import math
 import shlex
 from dataclasses import dataclass
 
-from pgo_models.certificate import BoundSource, Certificate, Verdict
+from pgo_models.certificate import BoundSource, Certificate, Verdict, gap_text
 from pgo_models.datasets import known_datasets
 from pgo_models.pose_graph import PoseGraph
 from solvers.result import Status
@@ -33,6 +33,8 @@ class Advice:
 
 def headline(certificate: Certificate) -> str:
     """Return the verdict in one sentence."""
+    if certificate.verdict is Verdict.EXACT:
+        return "Certified: the measurements agree to the last digits of double precision, and the poses fit them all."
     if certificate.verdict is Verdict.CERTIFIED:
         return f"Certified: the cost of these poses is the least possible, to within {_excess(certificate)}."
     if certificate.verdict is Verdict.TRIVIAL:
@@ -46,6 +48,12 @@ def meaning(certificate: Certificate) -> list[str]:
     """Return what the figures mean, in a few sentences that need no further reading."""
     F, bound = certificate.objective, certificate.lower_bound
     sentences = [f"The poses cost F = {F:.10g}: the sum, over all measurements, of squared errors times precisions."]
+    if certificate.verdict is Verdict.EXACT:
+        sentences.append(
+            f"F cannot be told from zero: rounding alone makes up to {certificate.rounding_level:.2g} of it, and as a "
+            "sum of squares it is never below zero."
+        )
+        return sentences
     if certificate.verdict is Verdict.TRIVIAL:
         sentences.append(
             "The certificate matrix has an eigenvalue so far below zero that the bound it gives is worse than zero. "
@@ -55,15 +63,12 @@ def meaning(certificate: Certificate) -> list[str]:
         return sentences
     sentences.append(
         f"It is proven that no choice of poses whatever costs less than {bound:.10g}, so the best possible cost is "
-        f"between the two: the gap is {certificate.gap:.3g}, and {certificate.wanted_gap:.3g} was asked for."
+        f"between the two: the gap is {gap_text(certificate.gap)}, and {certificate.wanted_gap:.3g} was asked for."
     )
-    if math.isnan(certificate.eta):
-        sentences.append("That needs no proof: F is a sum of squares.")
-    else:
-        sentences.append(
-            f"The proof is a Cholesky factorisation that went through (eta = {certificate.eta:.3g}, "
-            f"{certificate.source.value}). It holds however the poses were found."
-        )
+    sentences.append(
+        f"The proof is a Cholesky factorisation that went through ({certificate.proof}; {certificate.source.value}). "
+        "It holds in exact arithmetic, however the poses were found."
+    )
     if certificate.verdict is Verdict.CERTIFIED:
         sentences.append(
             "Certified means optimal for these measurements and weights; it cannot vouch for the measurements."
@@ -138,10 +143,8 @@ def percent(share: float) -> str:
 
 
 def _excess(certificate: Certificate) -> str:
-    """How much of F there is above the bound: a share of it, or, where F is below 1, the amount itself."""
-    if certificate.objective >= 1.0:
-        return f"{percent(certificate.gap)} of it"
-    return f"{certificate.objective - certificate.lower_bound:.2g}"
+    """How much of F there is above the bound, as a share of it."""
+    return f"{percent(certificate.gap)} of it"
 
 
 def _source(graph: PoseGraph) -> str:

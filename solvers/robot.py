@@ -22,6 +22,8 @@ from pgo_models.multipliers import certificate_matrix, multipliers
 from pgo_models.polish import retract
 from pgo_models.poses import Poses
 from pgo_models.rotations import Array, project_to_rotations, stack_transposes, tangent_dimension, unstack_transposes
+from pgo_models.rounding_errors import evaluate_certificate, rounding_level
+from solvers.robot_proof import RobotProof, verify_interior
 from solvers.rotation_block import RotationBlock, block_at, stationary_B
 from solvers.share import Part, Share
 from solvers.substructure import Cut, Elimination, columns_of, eliminate
@@ -59,14 +61,14 @@ class Robot:
         self._x = np.zeros((0, d))
         self._step: tuple[Array, Array] | None = None
         self._trial = self._kept = self.poses
+        self._proof: RobotProof | None = None
 
     # The start: chordal relaxation, translations, multipliers.
 
     def describe(self) -> Message:
-        """Diagonal of M: on the boundary, and the largest entry in the interior."""
+        """Diagonal of M on the boundary."""
         diagonal = self.problem.M.data[self.problem.diagonal_positions]
-        cut = self._cuts[(1, self.problem.d)]
-        return {"diagonal": diagonal[cut.boundary], "largest": np.array([diagonal[cut.interior].max(initial=0.0)])}
+        return {"diagonal": diagonal[self._cuts[(1, self.problem.d)].boundary]}
 
     def chordal(self) -> Message:
         """M without the constraints, pose 0 at the identity."""
@@ -229,20 +231,54 @@ class Robot:
     # Certificate and answer.
 
     def certificate(self, message: Message) -> Message:
-        """S + eta blockdiag(0, I) with the interior eliminated, and the trace of the interior's multipliers."""
+        """S + eta blockdiag(0, I) with a share of its diagonal subtracted in the interior, and the interior eliminated.
+
+        `fixed` are rows of the driver that are left out; there is none of the first translation of the graph if a robot
+        has it. With `point`, rows of X of the separators in the frame of the pose that is left out, the right-hand side
+        is S X.
+        """
+        d, p = self.problem.d, self.problem.num_poses
         Lambda = self._multipliers()
         Lambda[self.part.boundary] = 0.0
-        S = certificate_matrix(self.problem, Lambda)
-        d = self.problem.d
-        S.data[self.problem.diagonal_positions[self._interior_rows]] += message["eta"][0]
-        if self._grounds:
-            S.data[self.problem.diagonal_positions[0]] *= 2.0
+        Lambda = 0.5 * (Lambda + np.swapaxes(Lambda, 1, 2))
         trace = np.array([math.fsum(np.einsum("naa->na", Lambda).ravel())])
-        try:
-            answer = self._eliminate(S, (1, d), np.zeros((self.problem.side, d)))
-        except NotPositiveDefiniteError:
+        self._proof = None
+        fixed = self._cuts[(1, d)].boundary[message["fixed"] > 0]
+        if not message["is_grounded"][0] and self._grounds:
+            fixed = np.append(fixed, 0)
+        S = certificate_matrix(self.problem, Lambda)
+        S.data[self.problem.diagonal_positions[self._interior_rows]] += message["eta"][0]
+        interior = self._cuts[(1, d)].interior
+        found = verify_interior(self.problem, S, self._cuts[(1, d)], fixed, message["share"][0], self.backend)
+        if found is None:
             return {"definite": np.zeros(1), "trace": trace}
-        return {"schur": answer["schur"], "definite": np.ones(1), "trace": trace}
+        matrix, self._elimination, slack = found
+        self._eliminated = matrix, (1, d)
+        self._cuts[(1, d)] = self._elimination.cut
+        answer = {"schur": self._elimination.schur, "definite": np.ones(1), "trace": trace}
+        if not message["is_grounded"][0]:
+            return answer
+        R, t = message["R"], message["t"]
+        X = Poses(R.T @ self.poses.R, (self.poses.t - t) @ R).stacked()
+        X[self._cuts[(1, d)].boundary] = message["point"]
+        self._proof = RobotProof(Lambda, X, np.zeros((p, d)), slack, interior)
+        return {**answer, **self._evaluated()}
+
+    def move_certificate(self, message: Message) -> Message:
+        """Move X by -S_r^-1 G: parts of the bound there."""
+        assert self._proof is not None
+        self._proof = self._proof.moved(self._back_substitute(message["x"]))
+        return self._evaluated()
+
+    def _evaluated(self) -> Message:
+        """Value with its error, the interior's quadratic terms, and S X on the boundary with its error; G reduced."""
+        assert self._proof is not None
+        proof, boundary = self._proof, self._cuts[(1, self.problem.d)].boundary
+        found = evaluate_certificate(self.problem, proof.Lambda, proof.X, proof.low)
+        left, quadratic = proof.quadratics(found)
+        figures = np.array([found.value, found.value_error, left, quadratic])
+        sums = {"figures": figures, "product": found.product[boundary], "error": found.product_error[boundary]}
+        return {**sums, **self._reduced(found.product)}
 
     def result(self) -> Message:
         """Interior poses and multipliers, for whoever may see them."""
@@ -364,7 +400,8 @@ class Robot:
     def _state_of(self, poses: Poses) -> Message:
         """Parts of F and of M X on the boundary."""
         force = self.problem.apply_M(self.problem.stacked(poses))[self._cuts[(1, self.problem.d)].boundary]
-        return {"objective": np.array([self.problem.objective(poses)]), "force": force}
+        objective = np.array([self.problem.objective(poses), rounding_level(self.problem, poses)])
+        return {"objective": objective, "force": force}
 
     def _multipliers(self) -> Array:
         """Lambda_i, right in the interior alone, where the robot has every edge."""

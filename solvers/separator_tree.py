@@ -178,6 +178,18 @@ def factorize_tree(tree: tuple[Front, ...], width: int, contribution: Callable[[
     return TreeFactor(tree, width, tuple(blocks))
 
 
+def tree_counts(tree: Sequence[Front], width: int, num_separators: int) -> tuple[IntArray, int]:
+    """Terms that are summed for an entry in the column of a separator, at most, (num_separators,); most in a row of R.
+
+    Eliminated unknowns of every front that the separator is in, and one for every addition of a front.
+    """
+    in_column, most = np.zeros(num_separators, dtype=np.int64), 0
+    for front in tree:
+        in_column[front.poses] += width * len(front.eliminated) + 1
+        most = max(most, width * len(front.poses))
+    return in_column, most
+
+
 def _rows(poses: IntArray, width: int) -> IntArray:
     return (width * poses[:, None] + np.arange(width)).ravel()
 

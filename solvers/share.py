@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from pgo_models.partition import Partition
-from pgo_models.pose_graph import IntArray, PoseGraph
+from pgo_models.pose_graph import IntArray, PoseGraph, middle_pose, poses_by_distance
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import BoolArray
 from pgo_models.separators import vertex_cover
@@ -122,12 +122,23 @@ def share_out(graph: PoseGraph, partition: Partition) -> tuple[Share, ...]:
     """
     cover = np.full(graph.num_poses, -1)
     solved_for = vertex_cover(partition, graph)
+    if not len(solved_for):  # the bound is grounded at a pose that the driver has
+        solved_for = np.array([middle_pose(graph)])
     cover[solved_for] = np.arange(len(solved_for))
     owner = partition.robot
     # An end outside the cover decides: such ends of one edge have one owner. Else the owner of the first end counts it.
     counts = np.where(cover[graph.j] < 0, owner[graph.j], owner[graph.i])
     holds = _holders(graph, owner, partition.num_robots)
     return tuple(_share(graph, owner, cover, counts, holds, robot) for robot in range(partition.num_robots))
+
+
+def middle_separator(graph: PoseGraph, shares: tuple[Share, ...]) -> int:
+    """Which of the poses that the driver solves for is nearest to the middle of the graph."""
+    in_cover = np.full(graph.num_poses, -1)
+    for share in shares:
+        in_cover[share.poses] = np.maximum(in_cover[share.poses], share.in_cover)
+    order = poses_by_distance(graph, middle_pose(graph))
+    return int(in_cover[order[np.argmax(in_cover[order] >= 0)]])
 
 
 def _holders(graph: PoseGraph, owner: IntArray, num_robots: int) -> csr_array:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pgo_models.certificate import BoundSource, Certificate, Verdict
+from pgo_models.certificate import BoundSource, Certificate, Verdict, gap_text
 from pgo_models.errors import SettingError
 from pgo_models.figures import is_picture, save_figure
 from pgo_models.files import replace_when_done
@@ -228,7 +228,7 @@ class Solution:
             ("status", f"{self.status.name}: {self.status.value}"),
             ("F", f"{self.objective:.10g}"),
             ("lower bound", f"{certificate.lower_bound:.10g}{relaxed}"),
-            ("gap", f"{certificate.gap:.3g}"),
+            ("gap", gap_text(certificate.gap)),
             ("verdict", f"{certificate.verdict.name}: {certificate.verdict.value}"),
             ("seconds", f"{self.seconds:.3g}"),
             *self._network(),

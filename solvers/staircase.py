@@ -12,19 +12,21 @@ from functools import partial
 
 import numpy as np
 
-from pgo_models.certificate import DEFAULT_GAP, prove_bound, smallest_shift
+from pgo_models.certificate import DEFAULT_GAP
 from pgo_models.cholesky import CholeskyFactor
 from pgo_models.errors import SettingError
 from pgo_models.initialization import chordal_start
 from pgo_models.lifted import LiftedPoint, hessian_product, lifted_point
+from pgo_models.lower_bound import LowerBound, best_bound, smallest_shift
 from pgo_models.matrices import inner
 from pgo_models.multipliers import factorize_certificate
 from pgo_models.negative_curvature import NegativeCurvature, negative_curvature
-from pgo_models.polish import STATIONARY_DECREMENT
+from pgo_models.polish import STATIONARY_DECREMENT, scaled_decrement
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array
 from pgo_models.rounding import round_factor
+from pgo_models.rounding_errors import rounding_level
 from pgo_models.stiefel import append_rank, project_to_tangent, retract
 from solvers.result import Measurement, Status
 from solvers.truncated_cg import truncated_cg
@@ -42,18 +44,21 @@ _SUFFICIENT, _HALVINGS = 0.25, 40
 
 @dataclass(frozen=True, eq=False)
 class DualBound:
-    """A proven lower bound on F over all poses, and its proof (`pgo_models.certificate.prove_bound`).
+    """A proven lower bound on F over all poses, and the multipliers it was proved with (`pgo_models.lower_bound`).
 
     Attributes
     ----------
-    lower_bound : float
+    bound : LowerBound
     Lambda : (n, d, d)
-    eta : float
     """
 
-    lower_bound: float
+    bound: LowerBound
     Lambda: Array
-    eta: float
+
+    @property
+    def lower_bound(self) -> float:
+        """F of no poses is below it."""
+        return self.bound.value
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,10 +74,12 @@ class StaircaseState:
         Of M + eps blockdiag(0, I), whose solves on the rotations are those with Q + eps I; after a climb, of S with a
         shift.
     decrement : float
-        <g, P g> / 4 over max(1, f), g the gradient and P the preconditioner projected to the tangent space: half the
-        squared Newton decrement if the Hessian were twice the preconditioner's matrix.
+        <g, P g> / 4, less the rounding level of f, over f, g the gradient and P the preconditioner projected to the
+        tangent space: half the squared Newton decrement if the Hessian were twice the preconditioner's matrix.
     radius : float
         Of the trust region, in the preconditioner's norm.
+    rounding_level : float
+        f below it cannot be told from zero; that of the start.
     inner_iterations : int
         Products with the Hessian so far.
     bound : DualBound, optional
@@ -90,6 +97,7 @@ class StaircaseState:
     preconditioner: CholeskyFactor
     decrement: float
     radius: float
+    rounding_level: float
     inner_iterations: int = 0
     bound: DualBound | None = None
     is_stationary: bool = False
@@ -102,7 +110,7 @@ class Staircase:
     """SE-Sync: Riemannian trust region on St(d, r)^n, dual certificate, escape to rank r + 1 (Rosen et al. 2019).
 
     A step is one trust-region iteration or, at a stationary point, the certificate and the climb to the next rank.
-    `primal_residual` is what rounding to poses loses, (F - f) / max(1, F), and 0 at rank d; `dual_residual` is the
+    `primal_residual` is what rounding to poses loses, (F - f) / F, and 0 at rank d; `dual_residual` is the
     decrement of `StaircaseState`. When it has converged, f is the optimum of the relaxation, within the gap: F of the
     poses can still be above it, where the relaxation is not tight.
 
@@ -148,7 +156,8 @@ class Staircase:
         shift = _SHIFT * float(rotation_diagonal.mean())
         no_multipliers = np.zeros((problem.num_poses, problem.d, problem.d))
         preconditioner = factorize_certificate(problem, no_multipliers, shift)
-        return self._arrive(problem, 0, lifted_point(problem, np.swapaxes(poses.R, 1, 2)), preconditioner)
+        level = rounding_level(problem, problem.with_best_translations(poses.R))
+        return self._arrive(problem, 0, lifted_point(problem, np.swapaxes(poses.R, 1, 2)), preconditioner, level)
 
     def step(self, problem: PGOProblem, state: StaircaseState) -> StaircaseState:
         """One trust-region iteration; at a stationary point the certificate and, if it fails, the climb."""
@@ -159,7 +168,11 @@ class Staircase:
     def measure(self, problem: PGOProblem, state: StaircaseState) -> Measurement:
         """F of the rounded poses, what rounding loses, and the decrement."""
         objective = problem.objective(self.poses(problem, state))
-        lost = 0.0 if state.point.rank == problem.d else (objective - state.point.value) / max(1.0, objective)
+        lost = (
+            0.0
+            if state.point.rank == problem.d
+            else (objective - state.point.value) / max(objective, state.rounding_level)
+        )
         return Measurement(objective, max(lost, 0.0), state.decrement)
 
     def poses(self, problem: PGOProblem, state: StaircaseState) -> Poses:
@@ -174,7 +187,7 @@ class Staircase:
 
     def _descend(self, problem: PGOProblem, state: StaircaseState) -> StaircaseState:
         """One iteration of the trust region (Absil, Mahony & Sepulchre, algorithm 10)."""
-        point, scale = state.point, max(1.0, state.point.value)
+        point, scale = state.point, max(state.point.value, state.rounding_level)
         trial = truncated_cg(
             point.gradient,
             partial(hessian_product, problem, point),
@@ -202,7 +215,7 @@ class Staircase:
             # Nothing to gain that double precision can see.
             stuck = trial.decrease <= rounding
             return replace(state, k=state.k + 1, radius=radius, inner_iterations=spent, is_stationary=stuck)
-        arrived = self._arrive(problem, state.k + 1, candidate, state.preconditioner)
+        arrived = self._arrive(problem, state.k + 1, candidate, state.preconditioner, state.rounding_level)
         stuck = trial.decrease <= rounding and arrived.decrement > 0.5 * state.decrement
         return replace(
             arrived,
@@ -215,33 +228,36 @@ class Staircase:
     def _climb(self, problem: PGOProblem, state: StaircaseState) -> StaircaseState:
         """Prove that the relaxation is solved, or leave along the eigenvector that shows it is not."""
         point, eta = state.point, smallest_shift(problem, self.gap, state.point.value)
-        proven = prove_bound(problem, point.Lambda, eta)
-        if proven is not None:
-            return replace(state, k=state.k + 1, bound=DualBound(proven, point.Lambda, eta), is_solved=True)
-        found = negative_curvature(problem, point.Lambda, eta, np.random.default_rng(state.k))
-        lower_bound = point.value - found.shift * problem.num_poses * problem.d
+        at_poses = self.poses(problem, state) if point.rank == problem.d else None
+        proven = best_bound(problem, point.Lambda, at_poses, self.gap, point.value)
         bound = state.bound
-        if bound is None or lower_bound > bound.lower_bound:
-            bound = DualBound(lower_bound, point.Lambda, found.shift)
-        below = _escape(problem, point, found)
+        if bound is None or proven.value > bound.lower_bound:
+            bound = DualBound(proven, point.Lambda)
+        if proven.eta <= eta:
+            return replace(state, k=state.k + 1, bound=bound, is_solved=True)
+        found = negative_curvature(problem, point.Lambda, eta, np.random.default_rng(state.k))
+        if found.value >= -eta:  # what the proof lacks is precision, not a way down
+            return replace(state, k=state.k + 1, bound=bound, is_solved=True)
+        below = _escape(problem, point, found, state.rounding_level)
         if below is None:
             return replace(state, k=state.k + 1, bound=bound, stalled=True)
         # S with the smallest definite shift is nearer to the Hessian than Q, and the nearer the less there is to climb.
-        arrived = self._arrive(problem, state.k + 1, below, found.factor)
+        arrived = self._arrive(problem, state.k + 1, below, found.factor, state.rounding_level)
         return replace(arrived, inner_iterations=state.inner_iterations, bound=bound)
 
     def _arrive(
-        self, problem: PGOProblem, k: int, point: LiftedPoint, preconditioner: CholeskyFactor
+        self, problem: PGOProblem, k: int, point: LiftedPoint, preconditioner: CholeskyFactor, level: float
     ) -> StaircaseState:
         """State at a point, with the first radius of a rank."""
         squared = inner(point.gradient, _precondition(problem, preconditioner, point.Y, point.gradient))
-        decrement = 0.25 * squared / max(1.0, point.value)
+        decrement = scaled_decrement(0.5 * squared, point.value, level)
         return StaircaseState(
             k=k,
             point=point,
             preconditioner=preconditioner,
             decrement=decrement,
             radius=_FIRST_RADIUS * math.sqrt(max(squared, 0.0)),
+            rounding_level=level,
             is_stationary=decrement <= self.tolerance,
         )
 
@@ -254,7 +270,7 @@ def _precondition(problem: PGOProblem, factor: CholeskyFactor, Y: Array, V: Arra
     return project_to_tangent(Y, factor.solve(right_hand_side)[n:].reshape(n, d, r))
 
 
-def _escape(problem: PGOProblem, point: LiftedPoint, found: NegativeCurvature) -> LiftedPoint | None:
+def _escape(problem: PGOProblem, point: LiftedPoint, found: NegativeCurvature, level: float) -> LiftedPoint | None:
     """First of the moves s v, s v/2, .. in a new column of Y that lowers f enough; None when none does.
 
     The block of v that is largest turns by 45 degrees at first. To second order f falls by s^2 |value|.
@@ -263,7 +279,7 @@ def _escape(problem: PGOProblem, point: LiftedPoint, found: NegativeCurvature) -
     length = 1.0 / float(np.linalg.norm(found.v, axis=1).max())
     for _ in range(_HALVINGS):
         promised = -(length**2) * found.value
-        if promised <= _ROUNDING * max(1.0, point.value):
+        if promised <= _ROUNDING * point.value + level:
             return None
         candidate = lifted_point(problem, retract(Y, length * column))
         if candidate.value <= point.value - _SUFFICIENT * promised:

@@ -18,14 +18,21 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csc_array, csr_array
 
-from pgo_models.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, analyze
+from pgo_models.cholesky import (
+    OUTWARD,
+    UNIT_ROUNDOFF,
+    CholeskyBackend,
+    CholeskyFactor,
+    SymbolicCholesky,
+    analyze,
+    column_error,
+    gamma,
+)
 from pgo_models.errors import SettingError
 from pgo_models.matrices import inner
 from pgo_models.pose_graph import IntArray
 from pgo_models.rotations import Array
-from solvers.separator_tree import Front, TreeFactor, factorize_tree, tree_bytes
-
-_CHUNK = 256  # columns of K_II^-1 K_IG that are held at a time
+from solvers.separator_tree import Front, TreeFactor, factorize_tree, tree_bytes, tree_counts
 
 
 def columns_of(poses: IntArray, num_poses: int, widths: tuple[int, ...]) -> IntArray:
@@ -66,6 +73,8 @@ class Elimination:
         Lower triangle of K_GG - K_GI K_II^-1 K_IG, `packed`.
     diagonal : (g,)
         Diagonal of K_GG.
+    interior_error : (i,)
+        Share of the diagonal of K_II that rounding can take, where it was asked for.
     """
 
     cut: Cut
@@ -73,6 +82,7 @@ class Elimination:
     factor: CholeskyFactor | None
     schur: Array
     diagonal: Array
+    interior_error: Array
 
     def reduce(self, b: Array) -> tuple[Array, float]:
         """b_G - K_GI K_II^-1 b_I, (g, k), and the inner product of b_I and K_II^-1 b_I."""
@@ -91,8 +101,14 @@ class Elimination:
         return x
 
 
-def eliminate(K: csc_array, cut: Cut, backend: CholeskyBackend | None) -> Elimination:
+def eliminate(K: csc_array, cut: Cut, backend: CholeskyBackend | None, is_verified: bool = False) -> Elimination:
     """Factor the interior of a robot's matrix and form its Schur complement.
+
+    K_GG - Z^T Z with Z = R^-T K_IG, R^T R = K_II, by forward substitution alone: [R, Z] are rows of the Cholesky
+    factor of the whole. So its rounding is that of one (`pgo_models.cholesky`), and with `is_verified` what rounding
+    can take of the separators' part is subtracted from the diagonal of the Schur complement: for the given K, exactly,
+
+        x^T K x >= x_G^T schur x_G - x_I^T diag(interior_error) diag(K_II) x_I.
 
     Raises
     ------
@@ -101,19 +117,30 @@ def eliminate(K: csc_array, cut: Cut, backend: CholeskyBackend | None) -> Elimin
     """
     interior, boundary = cut.interior, cut.boundary
     K_G = K[:, boundary].tocsc()
-    K_GG, K_IG = K_G[boundary].toarray(), K_G[interior].tocsr()
-    diagonal = K_GG.diagonal().copy()
+    schur, K_IG = K_G[boundary].toarray(), K_G[interior].tocsr()
+    diagonal, interior_error = schur.diagonal().copy(), np.zeros(0)
     if not len(interior):
-        return Elimination(cut, K_IG, None, packed(K_GG), diagonal)
+        return Elimination(cut, K_IG, None, packed(schur), diagonal, interior_error)
     K_II = K[interior][:, interior].tocsc()
     analysis = cut.analysis if cut.analysis is not None else analyze(K_II, backend)
     factor = analysis.factorize(K_II)
-    schur = K_GG
-    dense = K_IG.tocsc()
-    for first in range(0, len(boundary), _CHUNK):
-        part = slice(first, min(first + _CHUNK, len(boundary)))
-        schur[:, part] -= K_IG.T @ factor.solve(dense[:, part].toarray())
-    return Elimination(Cut(interior, boundary, analysis), K_IG, factor, packed(0.5 * (schur + schur.T)), diagonal)
+    Z = factor.half_solve(K_IG.toarray())
+    schur -= Z.T @ Z
+    if is_verified:
+        beside = np.count_nonzero(Z, axis=1)
+        squares = np.einsum("ig,ig->g", Z, Z)
+        error = column_error(np.count_nonzero(Z, axis=0), factor.most_in_row(beside)) * squares
+        error += 2.0 * UNIT_ROUNDOFF * row_sums(schur, np.maximum(diagonal, squares))
+        schur[np.diag_indices(len(schur))] -= OUTWARD * error
+        interior_error = factor.backward_error(beside)
+    cut = Cut(interior, boundary, analysis)
+    return Elimination(cut, K_IG, factor, packed(0.5 * (schur + schur.T)), diagonal, interior_error)
+
+
+def row_sums(matrix: Array, scale: Array) -> Array:
+    """Diagonal D with v^T |matrix| v <= v^T D v for every v: sum_h |matrix_gh| sqrt(scale_g / scale_h)."""
+    root = np.sqrt(np.where(scale > 0, scale, 1.0))
+    return np.asarray(root * (np.abs(matrix) @ (1.0 / root)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,6 +224,28 @@ class Interface:
             return unpacked(contributions[robot], len(inner_order))[np.ix_(inner_order, inner_order)]
 
         return InterfaceFactor(factorize_tree(self.tree, width, contribution, blocks), order)
+
+    def rounding(self, contributions: Sequence[Array], own: Sequence[tuple[IntArray, Array]], diagonal: Array) -> Array:
+        """Diagonal, (side,), that bounds what the factor of `factorize` can differ from the exact sum by.
+
+        Parameters
+        ----------
+        contributions, own
+            As given to `factorize`.
+        diagonal : (side,)
+            At least the diagonal of the sum.
+        """
+        in_column, most = tree_counts(self.tree, sum(self.widths), self.num_separators)
+        terms = np.concatenate([np.repeat(in_column, width) for width in self.widths]) + len(contributions)
+        sums = np.zeros(self.side)
+        for columns, packed_lower in zip(self.columns, contributions, strict=True):
+            sums[columns] += row_sums(unpacked(packed_lower, len(columns)), diagonal[columns])
+        for columns, values in own:
+            root = np.sqrt(diagonal[columns])
+            np.add.at(sums, columns, root * (np.abs(values) @ (1.0 / root)[:, :, None])[:, :, 0])
+        largest = gamma(float(terms.max(initial=0)) + 8.0)
+        shares: Array = largest * sums + column_error(terms.astype(float), float(most)) / (1.0 - largest) * diagonal
+        return OUTWARD * shares
 
     def gather(self, parts: Sequence[Array]) -> Array:
         """Sum of the robots' vectors on their boundaries, (side, k)."""

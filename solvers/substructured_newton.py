@@ -22,6 +22,7 @@ from pgo_models.polish import (
     STATIONARY_DECREMENT,
     SUFFICIENT,
     retract,
+    scaled_decrement,
 )
 from pgo_models.pose_graph import IntArray
 from pgo_models.poses import Poses
@@ -70,7 +71,7 @@ class SubstructuredNewton:
     def step(self, driver: Driver, state: SubstructuredNewtonState) -> SubstructuredNewtonState:
         """One factorisation and the moves it serves, two rounds each."""
         model = self._factorize(driver)
-        decrement = _decrement(model, driver.objective)
+        decrement = scaled_decrement(model.square, driver.objective, driver.rounding_level)
         moved = False
         for _ in range(1 + CHORD_STEPS):
             if decrement <= STATIONARY_DECREMENT:
@@ -80,12 +81,12 @@ class SubstructuredNewton:
                 break
             trial, answers = found
             following = _solved(driver, model.factor, answers)
-            after = _decrement(following, trial.objective)
+            after = scaled_decrement(following.square, trial.objective, trial.rounding_level)
             if trial.objective >= driver.objective and after > 0.5 * decrement:
                 break
             driver.ask("accept", count=Count.WITH_THE_NEXT)
             driver.R, driver.t, driver.force = trial.R, trial.t, trial.force
-            driver.objective = trial.objective
+            driver.objective, driver.rounding_level = trial.objective, trial.rounding_level
             enough = after <= CHORD_PROGRESS * decrement
             model, decrement, moved = following, after, True
             if not enough:
@@ -123,6 +124,7 @@ class _Trial:
     R: Array
     t: Array
     objective: float
+    rounding_level: float
     force: Array
 
 
@@ -170,10 +172,6 @@ def _solved(driver: Driver, factor: InterfaceFactor, answers: Sequence[Message])
     return Model(factor, y, math.fsum(float(answer["energy"][0]) for answer in answers) + inner(b, y))
 
 
-def _decrement(model: Model, objective: float) -> float:
-    return 0.5 * model.square / max(1.0, objective)
-
-
 def _backtrack(driver: Driver, model: Model) -> tuple[_Trial, list[Message]] | None:
     """First of the moves -y, -y/2, .. that lowers F enough, and the robots' answers there; None when none does."""
     now, layout = Poses(driver.R, driver.t), TangentLayout(len(driver.cover), driver.d)
@@ -188,8 +186,8 @@ def _backtrack(driver: Driver, model: Model) -> tuple[_Trial, list[Message]] | N
             answers = driver.ask("turn", {"length": message}, Count.WITH_THE_NEXT)
         R = retract(now, length * w, length * v).R
         t, answers = driver.best_translations(answers, "weigh")
-        objective, force = driver.state_of(answers)
-        trial = _Trial(R, t, objective, force)
+        objective, level, force = driver.state_of(answers)
+        trial = _Trial(R, t, objective, level, force)
         if objective <= driver.objective - SUFFICIENT * length * model.square:
             return trial, answers
         if length == 1.0 and objective <= driver.objective * (1.0 + ROUNDING):

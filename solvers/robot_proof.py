@@ -1,0 +1,103 @@
+"""A robot's part of the lower bound that holds in exact arithmetic: `pgo_models.lower_bound`, interior by interior."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csc_array
+
+from pgo_models.cholesky import OUTWARD, CholeskyBackend
+from pgo_models.definiteness import MARGIN
+from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.pose_graph import IntArray
+from pgo_models.problem import PGOProblem
+from pgo_models.rotations import Array
+from pgo_models.rounding_errors import Evaluation, matrix_error
+from solvers.substructure import Cut, Elimination, eliminate
+
+_ATTEMPTS = 3  # the error of a factor is known when it is there, and hardly changes with the shift
+
+
+@dataclass(frozen=True, eq=False)
+class RobotProof:
+    """Where a robot evaluates the certificate.
+
+    Attributes
+    ----------
+    Lambda : (p, d, d)
+        Multipliers, zero at the separators, which are the driver's.
+    X : (N, d)
+        Rows of its poses in the frame of the pose that is left out.
+    low : (p, d)
+        To be added to the translations.
+    slack : (i,)
+        S_r is at least so much in the rows of the interior.
+    interior : (i,)
+        Those rows.
+    """
+
+    Lambda: Array
+    X: Array
+    low: Array
+    slack: Array
+    interior: IntArray
+
+    def moved(self, step: Array) -> RobotProof:
+        """The same at X - step."""
+        p = len(self.low)
+        X = self.X.copy()
+        X[p:] -= step[p:]
+        return replace(self, X=X, low=self.low - step[:p])
+
+    def quadratics(self, found: Evaluation) -> tuple[float, float]:
+        """Sums of |G|^2 and (|G| + its error)^2 over slack, G the interior's rows of S X."""
+        G, error = found.product[self.interior], found.product_error[self.interior]
+        slack = self.slack[:, None]
+        return float(np.sum(G**2 / slack)), OUTWARD * float(np.sum((np.abs(G) + error) ** 2 / slack))
+
+
+def verify_interior(
+    problem: PGOProblem, S: csc_array, cut: Cut, fixed: IntArray, share: float, backend: CholeskyBackend | None
+) -> tuple[csc_array, Elimination, Array] | None:
+    """S less a share of its diagonal in the interior, its elimination, and the slack that is left there.
+
+    Parameters
+    ----------
+    problem : PGOProblem
+        Of the robot's edges.
+    S : csc_array, (N, N)
+        With its pattern of M; it is changed.
+    cut : Cut
+    fixed : (f,)
+        Rows that are left out.
+    share : float
+        At least so much of the diagonal is subtracted, more where rounding needs it.
+    """
+    diagonal = np.maximum(problem.M.data[problem.diagonal_positions], S.data[problem.diagonal_positions])
+    is_fixed = np.zeros(problem.side, dtype=bool)
+    is_fixed[fixed] = True
+    column = np.repeat(np.arange(problem.side), np.diff(S.indptr))
+    S.data[is_fixed[S.indices] | is_fixed[column]] = 0.0
+    inside = cut.interior
+    S.data[problem.diagonal_positions[inside[is_fixed[inside]]]] = 2.0 * diagonal[inside[is_fixed[inside]]]
+    entries = matrix_error(problem.graph)
+    expected = cut.analysis.expected_error(len(cut.boundary)) if cut.analysis is not None else None
+    error = entries + (expected if expected is not None else np.zeros(len(inside)))
+    data = S.data.copy()
+    # The entries of the separators are rounded, too.
+    data[problem.diagonal_positions[cut.boundary]] -= OUTWARD * entries * diagonal[cut.boundary]
+    for _ in range(_ATTEMPTS):
+        shift = np.maximum(share, MARGIN * error)
+        data[problem.diagonal_positions[inside]] = S.data[problem.diagonal_positions[inside]] - shift * diagonal[inside]
+        try:
+            matrix = problem.with_pattern_of_M(data.copy())
+            found = eliminate(matrix, cut, backend, is_verified=True)
+        except NotPositiveDefiniteError:
+            return None
+        error = OUTWARD * (entries + found.interior_error)
+        if (2.0 * error <= shift).all():
+            slack = (shift - error) / OUTWARD * diagonal[inside]
+            return matrix, found, np.where(is_fixed[inside], np.inf, slack)
+        cut = found.cut
+    return None
