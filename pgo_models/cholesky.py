@@ -91,8 +91,8 @@ class CholeskyFactor(ABC):
     def backward_error(self, beside: Array | int = 0) -> Array:
         """Shares epsilon, (N,), of the diagonal with A + diag(epsilon) diag(A) >= R^T R in exact arithmetic.
 
-        R is the computed factor, so that A + diag(epsilon) diag(A) is positive definite. See the file's opening for the argument; it holds for
-        diagonals between 1e-150 and 1e150, where nothing underflows that would count.
+        R is the computed factor, so that A + diag(epsilon) diag(A) is positive definite. See the file's opening for the
+        argument; it holds for diagonals between 1e-150 and 1e150, where nothing underflows that would count.
 
         Parameters
         ----------

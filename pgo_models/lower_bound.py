@@ -3,8 +3,8 @@
 For feasible X, tr(X^T M X) = tr(X^T S X) + tr(Lambda) with S = M - blockdiag(0, Lambda) and any symmetric Lambda_i.
 
 **Grounded at pose r.** Take any X' with X'_r = (0, I), feasible elsewhere or not, and G = S X'. For feasible X there is
-an orthogonal Q with X_r = X'_r Q once X is shifted, which S ignores. Z = X - X' Q vanishes at r, and with S_r, S without
-the rows and columns of pose r, positive definite,
+an orthogonal Q with X_r = X'_r Q once X is shifted, which S ignores. Z = X - X' Q vanishes at r, and with S_r, S
+without the rows and columns of pose r, positive definite,
 
     tr(X^T S X) = tr(X'^T S X') + 2 tr((G Q)^T Z) + tr(Z^T S_r Z) >= tr(X'^T S X') - tr(G_r^T S_r^-1 G_r).
 
@@ -180,13 +180,29 @@ def shift_of_gap(gap: float, objective: float, count: int) -> float:
     return _ETA_SHARE * gap * objective / count
 
 
+def squared_distances(moved: Array, rotations: Array) -> float:
+    """Bound on sum_i ||R_i^T - P_i Q||_F^2 over all rotations R_i, Q, for blocks P_i moved away from rotations.
+
+    Two rotations are at most sqrt(8) apart, P_i is ||P_i - P^_i|| from P^_i, and that, to rounding, a rotation.
+
+    Parameters
+    ----------
+    moved, rotations : (d n, d)
+        Rows of P_i and of P^_i.
+    """
+    d = rotations.shape[1]
+    blocks = rotations.reshape(-1, d, d)
+    slant = 2.0 * orthogonality_error(blocks) + 32.0 * UNIT_ROUNDOFF
+    apart = math.sqrt(8.0) + slant + np.linalg.norm((moved - rotations).reshape(-1, d * d), axis=1)
+    return OUTWARD * float(np.sum(apart**2))
+
+
 @dataclass(frozen=True, eq=False)
 class _Ground:
-    """X with pose r at (0, I) exactly, the rows of that pose, and how far the other blocks are from rotations."""
+    """X with pose r at (0, I) exactly, and the rows of that pose."""
 
     X: Array
     rows: IntArray
-    slant: float
 
 
 def _grounded_at(problem: PGOProblem, poses: Poses) -> _Ground:
@@ -196,7 +212,7 @@ def _grounded_at(problem: PGOProblem, poses: Poses) -> _Ground:
     X = problem.stacked(Poses(turned.R, turned.t - turned.t[r]))
     rows = pose_rows(r, n, d)
     X[rows] = np.concatenate([np.zeros((1, d)), np.eye(d)])
-    return _Ground(X, rows, 2.0 * float(orthogonality_error(turned.R).max()) + 32.0 * UNIT_ROUNDOFF)
+    return _Ground(X, rows)
 
 
 def pose_rows(pose: int, n: int, d: int) -> IntArray:
@@ -243,8 +259,7 @@ def _prove_grounded(problem: PGOProblem, Lambda: Array, eta: float, ground: _Gro
             break
         (X, low), found = there, moved
     quadratic = OUTWARD * float(np.sum((np.abs(found.product) + found.product_error)[free] ** 2 / slack))
-    apart = math.sqrt(8.0) + ground.slant + OUTWARD * np.linalg.norm((X - ground.X)[n:].reshape(n, -1), axis=1)
-    lost = OUTWARD * eta * float(np.sum(apart**2))
+    lost = OUTWARD * eta * squared_distances(X[n:], ground.X[n:])
     rounding = found.value_error + quadratic
     return bound_from([found.value, -lost], rounding, eta, is_grounded=True)
 

@@ -1,7 +1,7 @@
 """The lower bound by a driver and its robots: `pgo_models.lower_bound`, with every interior where it belongs.
 
 The pose that is left out is a separator, so that the driver leaves out its rows. An elimination and a solve are two
-rounds; what crosses are Schur complements, right-hand sides, rows of S X on the separators with their errors, and four
+rounds; what crosses are Schur complements, right-hand sides, rows of S X on the separators with their errors, and a few
 sums.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -18,12 +19,14 @@ from pgo_models.definiteness import FIRST_SHIFT, LEAST_SHIFT, MARGIN, SHRINK
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.lower_bound import (
     MOST_MOVES,
+    NO_BOUND,
     SETTLED,
     UNGROUNDED_SHIFT,
     LowerBound,
     bound_from,
     search_bound,
     shift_of_gap,
+    squared_distances,
 )
 from pgo_models.pose_graph import IntArray
 from pgo_models.rotations import Array, stack_transposes
@@ -45,19 +48,16 @@ class InterfaceProof:
 
 
 def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
-    """Grounded without eta where that goes through, else with the smallest eta found; at the poses at hand."""
-    share = FIRST_SHIFT
-    while share >= LEAST_SHIFT:
-        found = prove_grounded(driver, share)
-        if found is not None:
-            break
-        share *= SHRINK
+    """Grounded without eta where that goes through, else the better form with the smallest eta found; at the poses."""
+    found = prove_grounded(driver, 0.0)
     if found is not None and found.value > 0.0:
         return found
     count = driver.num_poses * driver.d
-    # At stationary poses tr(Lambda) is F; it only says where the search ends.
     smallest = shift_of_gap(gap, driver.objective, count)
-    return search_bound(lambda eta: prove_with_eta(driver, eta), smallest, driver.objective, count)
+    # At stationary poses tr(Lambda) is F; it only says where the search ends.
+    forms = prove_with_eta, prove_grounded
+    bounds = [search_bound(partial(form, driver), smallest, driver.objective, count) for form in forms]
+    return max([NO_BOUND, *bounds], key=lambda bound: bound.value)
 
 
 def prove_with_eta(driver: Driver, eta: float) -> LowerBound | None:
@@ -74,17 +74,21 @@ def prove_with_eta(driver: Driver, eta: float) -> LowerBound | None:
     return bound_from([*proof.traces, -lost], rounding, eta, is_grounded=False)
 
 
-def prove_grounded(driver: Driver, share: float) -> LowerBound | None:
-    """Bound grounded at the driver's pose, if S_r less a share of its diagonal is positive definite, else None."""
+def prove_grounded(driver: Driver, eta: float) -> LowerBound | None:
+    """Bound grounded at the driver's pose, if S_r + eta blockdiag(0, I) is positive definite, else None."""
     g, d, r = len(driver.cover), driver.d, driver.grounded
     fixed = columns_of(np.array([r]), g, (1, d))
     R, t = driver.R[r], driver.t[r]
     X = np.concatenate([(driver.t - t) @ R, stack_transposes(R.T @ driver.R)])
     X[fixed] = np.concatenate([np.zeros((1, d)), np.eye(d)])
-    message = {"fixed": _is_fixed(driver, fixed), "eta": np.zeros(1), "is_grounded": np.ones(1), "R": R, "t": t}
-    proof = _eliminate(driver, message, fixed, 0.0, share, X)
-    if proof is None:
-        return None
+    message = {"fixed": _is_fixed(driver, fixed), "eta": np.array([eta]), "is_grounded": np.ones(1), "R": R, "t": t}
+    share, proof = FIRST_SHIFT, None
+    while proof is None:
+        if share < LEAST_SHIFT:
+            return None
+        proof = _eliminate(driver, message, fixed, eta, share, X)
+        share *= SHRINK
+    start = X
     space, free = driver.interface(1, d), np.ones(len(X), dtype=bool)
     free[fixed] = False
     at = _sum_up(driver, proof, X, proof.answers, free)
@@ -102,7 +106,8 @@ def prove_grounded(driver: Driver, share: float) -> LowerBound | None:
         if not moved.left < at.left:
             break
         at = moved
-    return bound_from([at.value], at.value_error + at.quadratic, 0.0, is_grounded=True)
+    lost = OUTWARD * eta * (at.squared_distances + squared_distances(at.X[g:], start[g:]))
+    return bound_from([at.value, -lost], at.value_error + at.quadratic, eta, is_grounded=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +118,8 @@ class _Sums:
     value_error: float
     left: float
     quadratic: float
+    squared_distances: float  # of the interiors
+    X: Array
     own: Array  # the driver's part of S X
     answers: Sequence[Message]
 
@@ -136,6 +143,8 @@ def _sum_up(driver: Driver, proof: InterfaceProof, X: Array, answers: Sequence[M
         value_error=OUTWARD * value_error,
         left=float(figures[:, 2].sum()) + float(np.sum(product[free] ** 2 / slack)),
         quadratic=OUTWARD * (float(figures[:, 3].sum()) + float(np.sum((np.abs(product) + error)[free] ** 2 / slack))),
+        squared_distances=float(figures[:, 4].sum()),
+        X=X,
         own=own,
         answers=answers,
     )

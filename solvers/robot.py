@@ -261,7 +261,7 @@ class Robot:
         R, t = message["R"], message["t"]
         X = Poses(R.T @ self.poses.R, (self.poses.t - t) @ R).stacked()
         X[self._cuts[(1, d)].boundary] = message["point"]
-        self._proof = RobotProof(Lambda, X, np.zeros((p, d)), slack, interior)
+        self._proof = RobotProof(Lambda, X, X, np.zeros((p, d)), slack, interior)
         return {**answer, **self._evaluated()}
 
     def move_certificate(self, message: Message) -> Message:
@@ -271,12 +271,11 @@ class Robot:
         return self._evaluated()
 
     def _evaluated(self) -> Message:
-        """Value with its error, the interior's quadratic terms, and S X on the boundary with its error; G reduced."""
+        """Value with its error, the interior's sums, and S X on the boundary with its error; G reduced."""
         assert self._proof is not None
         proof, boundary = self._proof, self._cuts[(1, self.problem.d)].boundary
         found = evaluate_certificate(self.problem, proof.Lambda, proof.X, proof.low)
-        left, quadratic = proof.quadratics(found)
-        figures = np.array([found.value, found.value_error, left, quadratic])
+        figures = np.array([found.value, found.value_error, *proof.quadratics(found), proof.squared_distances()])
         sums = {"figures": figures, "product": found.product[boundary], "error": found.product_error[boundary]}
         return {**sums, **self._reduced(found.product)}
 

@@ -10,6 +10,7 @@ from scipy.sparse import csc_array
 from pgo_models.cholesky import OUTWARD, CholeskyBackend
 from pgo_models.definiteness import MARGIN
 from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.lower_bound import squared_distances
 from pgo_models.pose_graph import IntArray
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array
@@ -27,8 +28,8 @@ class RobotProof:
     ----------
     Lambda : (p, d, d)
         Multipliers, zero at the separators, which are the driver's.
-    X : (N, d)
-        Rows of its poses in the frame of the pose that is left out.
+    start, X : (N, d)
+        Rows of its poses in the frame of the pose that is left out; moved.
     low : (p, d)
         To be added to the translations.
     slack : (i,)
@@ -38,6 +39,7 @@ class RobotProof:
     """
 
     Lambda: Array
+    start: Array
     X: Array
     low: Array
     slack: Array
@@ -55,6 +57,11 @@ class RobotProof:
         G, error = found.product[self.interior], found.product_error[self.interior]
         slack = self.slack[:, None]
         return float(np.sum(G**2 / slack)), OUTWARD * float(np.sum((np.abs(G) + error) ** 2 / slack))
+
+    def squared_distances(self) -> float:
+        """`pgo_models.lower_bound.squared_distances` of the interior."""
+        rotations = self.interior[self.interior >= len(self.low)]
+        return squared_distances(self.X[rotations], self.start[rotations])
 
 
 def verify_interior(

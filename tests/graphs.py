@@ -14,6 +14,7 @@ from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array, exp_map, random_rotations
+from pgo_models.rounding_errors import objective_rounding
 from pgo_models.scenes import MILD_NOISE, NoiseModel, observe, random_geometric
 
 EPS = float(np.finfo(float).eps)
@@ -98,14 +99,14 @@ def median_slope(
 
 
 def best_known(problem: PGOProblem, seed: int = 0) -> float:
-    """An upper bound on the global optimum: the best of what several starts polish to."""
+    """An upper bound on the global optimum, rounding included: the best of what several starts polish to."""
     n, d = problem.num_poses, problem.d
     starts = [chordal_start(problem), *(random_poses(n, d, seed + k) for k in range(3))]
     if problem.graph.truth is not None:
         starts.append(problem.graph.truth)
-    return min(problem.objective(polish(problem, start)) for start in starts)
+    return min(rounded_up(problem, polish(problem, start)) for start in starts)
 
 
-def rounding_of_bound(problem: PGOProblem) -> float:
-    """What tr(Lambda) - eta n d may be off when a factorisation is as exact as double precision."""
-    return 10 * EPS * problem.side * float(problem.M.diagonal().max())
+def rounded_up(problem: PGOProblem, poses: Poses) -> float:
+    """F of poses, and what it can be off by."""
+    return problem.objective(poses) + objective_rounding(problem, poses).error

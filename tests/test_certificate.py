@@ -14,7 +14,7 @@ from graphs import (
     exact_graph,
     optimum_tolerance,
     random_poses,
-    rounding_of_bound,
+    rounded_up,
     varied_graph,
     varied_problem,
 )
@@ -27,13 +27,13 @@ from pgo_models.certificate import (
     Certificate,
     Verdict,
     certify,
-    certify_stationary,
+    certify_at,
     judge,
-    prove_bound,
 )
 from pgo_models.cholesky import CholeskyBackend
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.initialization import chordal_start
+from pgo_models.lower_bound import prove_bound
 from pgo_models.polish import STATIONARY_DECREMENT, polish, relative_decrement
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
@@ -67,19 +67,23 @@ def assert_holds_together(problem: PGOProblem, poses: Poses, certificate: Certif
     """A certificate says only what is so, whatever its verdict is."""
     objective = problem.objective(poses)
     assert certificate.objective == objective
-    assert certificate.lower_bound <= known + rounding_of_bound(problem)
-    assert certificate.gap == (objective - certificate.lower_bound) / max(1.0, objective)
-    assert certificate.gap >= (objective - known) / max(1.0, objective) - rounding_of_bound(problem) / max(
-        1.0, objective
-    )
+    assert certificate.lower_bound <= min(known, objective)
+    if certificate.verdict is Verdict.EXACT:
+        assert (objective <= certificate.rounding_level, certificate.gap) == (True, 0.0)
+    else:
+        assert certificate.gap == (objective - certificate.lower_bound) / objective
+        assert certificate.is_certified == (certificate.gap <= certificate.wanted_gap)
     assert certificate.poses_objective == problem.objective(certificate.poses)
     assert certificate.stationarity == relative_decrement(problem, poses)
-    assert certificate.is_certified == (certificate.gap <= certificate.wanted_gap)
     if math.isnan(certificate.eta):
         assert certificate.lower_bound == 0.0
+        assert certificate.verdict in (Verdict.TRIVIAL, Verdict.EXACT)
     else:
         assert certificate.lower_bound > 0.0
-        assert prove_bound(problem, certificate.Lambda, certificate.eta) == certificate.lower_bound
+        at = certificate.poses if certificate.bound.is_grounded else None
+        proven = prove_bound(problem, certificate.Lambda, certificate.eta, at)
+        assert proven is not None
+        assert certificate.lower_bound == min(proven, objective)
 
 
 # Anybody's poses.
@@ -134,7 +138,7 @@ def test_the_optimum_of_every_benchmark_is_certified(
     assert certificate.source is BoundSource.GIVEN
     assert certificate.stationarity <= STATIONARY_DECREMENT
     assert_holds_together(problem, poses, certificate, OPTIMUM[name] + optimum_tolerance(name))
-    assert certificate.lower_bound >= OPTIMUM[name] - optimum_tolerance(name) - DEFAULT_GAP * max(1.0, OPTIMUM[name])
+    assert certificate.lower_bound >= OPTIMUM[name] - optimum_tolerance(name) - DEFAULT_GAP * OPTIMUM[name]
 
 
 @BACKENDS
@@ -158,12 +162,12 @@ def test_graphs_without_noise_are_certified(seed: int, n: int, d: int) -> None:
     assert graph.truth is not None
     for poses in (graph.truth, chordal_start(problem)):
         certificate = certify(problem, poses)
-        assert certificate.verdict is Verdict.CERTIFIED
-        assert 0.0 <= certificate.lower_bound <= 1e-20
+        assert certificate.verdict is Verdict.EXACT
+        assert (certificate.gap, certificate.lower_bound) == (0.0, 0.0)
+        assert "exact to rounding" in str(certificate)
     # Poses elsewhere have no bound but zero.
     certificate = certify(problem, random_poses(n, d, seed))
-    assert certificate.verdict is Verdict.TRIVIAL
-    assert certificate.lower_bound <= rounding_of_bound(problem)
+    assert (certificate.verdict, certificate.lower_bound) == (Verdict.TRIVIAL, 0.0)
 
 
 # What was done is said.
@@ -200,8 +204,8 @@ def test_beside_a_bad_local_minimum_the_chordal_start_gives_the_bound() -> None:
         assert certificate.source is BoundSource.CHORDAL
         assert certificate.verdict is Verdict.NOT_CERTIFIED
         assert certificate.poses_objective == pytest.approx(problem.objective(best), rel=1e-12)
-        assert_holds_together(problem, poses, certificate, problem.objective(best))
-    alone = certify_stationary(problem, local, DEFAULT_GAP, 0.0)
+        assert_holds_together(problem, poses, certificate, rounded_up(problem, best))
+    alone = certify_at(problem, local)
     assert alone.source is BoundSource.GIVEN
     assert not alone.is_certified
     assert alone.lower_bound < certificate.lower_bound
@@ -273,13 +277,21 @@ def test_where_the_relaxation_is_not_tight_the_bound_holds_and_the_verdict_says_
 
 
 @pytest.mark.parametrize("gap", [1e-9, 1e-6, 1e-3, 0.1])
-def test_the_gap_asked_for_is_met_and_not_much_more(gap: float) -> None:
+def test_the_bound_does_not_depend_on_the_gap_asked_for(gap: float) -> None:
     problem = PGOProblem(grid(np.random.default_rng(0)))
     certificate = certify(problem, polish(problem, chordal_start(problem)), gap)
     assert certificate.is_certified
     assert certificate.wanted_gap == gap
-    # Half of the gap goes into eta.
-    assert certificate.eta * problem.num_poses * 3 == pytest.approx(0.5 * gap * certificate.objective, rel=1e-9)
+    assert (certificate.eta, certificate.bound.is_grounded) == (0.0, True)
+    assert certificate.gap <= 1e-13
+    assert certificate.digits >= 13
+
+
+@pytest.mark.parametrize("gap", [1.0, 2.0, 1e300])
+def test_no_gap_is_so_wide_that_the_trivial_bound_certifies(gap: float) -> None:
+    problem = varied_problem(0, 8, 3)
+    certificate = certify_at(problem, random_poses(8, 3, 0), gap)
+    assert (certificate.verdict, certificate.lower_bound) == (Verdict.TRIVIAL, 0.0)
 
 
 def test_a_gap_below_rounding_is_not_certified_but_bounded() -> None:
@@ -287,8 +299,8 @@ def test_a_gap_below_rounding_is_not_certified_but_bounded() -> None:
     poses = polish(problem, chordal_start(problem))
     certificate = certify(problem, poses, 1e-18)
     assert not certificate.is_certified
-    assert certificate.gap <= 1e-9
-    assert_holds_together(problem, poses, certificate, problem.objective(poses))
+    assert certificate.gap <= 1e-13
+    assert_holds_together(problem, poses, certificate, rounded_up(problem, poses))
 
 
 def test_other_poses_are_judged_against_a_certificate() -> None:
@@ -309,7 +321,7 @@ def test_poses_must_fit(poses: Poses) -> None:
         certify(varied_problem(0, 4, 3), poses)
 
 
-@pytest.mark.parametrize("gap", [0.0, -1e-6, math.nan])
+@pytest.mark.parametrize("gap", [0.0, -1e-6, math.nan, math.inf])
 def test_the_gap_must_be_positive(gap: float) -> None:
     problem = varied_problem(0, 4, 3)
     with pytest.raises(SettingError, match="give a positive relative gap"):

@@ -12,7 +12,6 @@ from graphs import (
     MILD_NOISE,
     SEEDS,
     best_known,
-    rounding_of_bound,
     rounding_of_objective,
     varied_graph,
     varied_problem,
@@ -21,11 +20,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, metis, scattered
 
-from pgo_models.certificate import DEFAULT_GAP, prove_bound, smallest_provable
+from pgo_models.certificate import DEFAULT_GAP
 from pgo_models.cholesky import CholeskyBackend
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.g2o import read_g2o
 from pgo_models.initialization import chordal_start
+from pgo_models.lower_bound import best_bound, prove_bound
 from pgo_models.multipliers import multipliers
 from pgo_models.partition import Partition, partition
 from pgo_models.polish import polish
@@ -33,7 +33,8 @@ from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.scenes import NoiseModel, grid
-from solvers.distributed import collect, open_driver, prove, prove_bound_distributed
+from solvers.distributed import collect, open_driver
+from solvers.distributed_bound import best_bound_distributed, prove_with_eta
 from solvers.engine import InProcess
 from solvers.newton import gauss_newton
 from solvers.pipeline import Pipeline, solve
@@ -52,12 +53,14 @@ def check_certificate(problem: PGOProblem, parts: Partition, poses: Poses) -> No
     driver.stand(poses)
     Lambda = multipliers(problem, poses)
     objective = problem.objective(poses)
-    eta, bound = smallest_provable(problem, Lambda, DEFAULT_GAP, objective)
-    found_eta, found_bound = prove_bound_distributed(driver, DEFAULT_GAP)
-    if not math.isnan(eta):
+    central = best_bound(problem, Lambda, poses, DEFAULT_GAP, objective)
+    found = best_bound_distributed(driver, DEFAULT_GAP)
+    if not math.isnan(central.eta):
         np.testing.assert_allclose(collect(driver)[1], Lambda, rtol=0, atol=1e-11 * problem.M.diagonal().max())
-    assert found_eta == pytest.approx(eta, rel=1e-9, nan_ok=True)
-    assert abs(found_bound - bound) <= rounding_of_bound(problem) + 1e-9 * abs(bound)
+    assert found.is_grounded == central.is_grounded
+    assert found.eta == pytest.approx(central.eta, rel=1e-9, nan_ok=True)
+    # Grounded at another pose with another slack.
+    assert found.value == pytest.approx(central.value, rel=1e-9, abs=found.rounding + central.rounding)
 
 
 @settings(max_examples=40)
@@ -110,9 +113,9 @@ def test_a_shift_is_proved_by_all_together_where_one_proves_it(
     for eta in (0.99 * high, 1.01 * high + 1e-9 * scale):
         if min(abs(eta - high), eta) <= 1e-11 * scale:
             continue
-        is_proven, trace = prove(driver, eta)
-        assert is_proven == (prove_bound(problem, Lambda, eta) is not None) == (eta > high)
-        assert trace == pytest.approx(np.trace(Lambda, axis1=1, axis2=2).sum(), abs=rounding_of_bound(problem))
+        found, central = prove_with_eta(driver, eta), prove_bound(problem, Lambda, eta)
+        assert (found is not None) == (central is not None) == (eta > high)
+        assert found is None or found.value == pytest.approx(central, rel=1e-12, abs=1e-12 * scale)
 
 
 # solve(.., robots=..)
@@ -122,15 +125,17 @@ def check_equal(distributed: Solution, central: Solution) -> None:
     problem = central.problem
     rounding = rounding_of_objective(problem, central.poses.stacked()) + 1e-12 * central.objective
     assert abs(distributed.objective - central.objective) <= rounding
-    assert abs(distributed.lower_bound - central.lower_bound) <= rounding + rounding_of_bound(problem)
-    assert distributed.gap == pytest.approx(central.gap, abs=(rounding + rounding_of_bound(problem)))
+    rounding += central.certificate.bound.rounding + distributed.certificate.bound.rounding
+    assert abs(distributed.lower_bound - central.lower_bound) <= rounding
+    assert distributed.gap == pytest.approx(central.gap, abs=2 * rounding / max(central.objective, 1e-300))
     assert distributed.certificate.verdict is central.certificate.verdict
     assert distributed.status is central.status
     assert [stage.name for stage in distributed.stages] == [stage.name for stage in central.stages]
     certificate = distributed.certificate
     if not math.isnan(certificate.eta):  # anyone can check it
-        bound = prove_bound(problem, certificate.Lambda, certificate.eta)
-        assert bound == pytest.approx(distributed.lower_bound, abs=rounding_of_bound(problem))
+        at = certificate.poses if certificate.bound.is_grounded else None
+        bound = prove_bound(problem, certificate.Lambda, certificate.eta, at)
+        assert bound == pytest.approx(distributed.lower_bound, abs=2 * rounding)
 
 
 @settings(max_examples=25)
@@ -172,7 +177,7 @@ def test_every_pipeline_ends_at_the_central_solution(pipeline: Pipeline, d: int,
 def test_a_bound_holds_where_nothing_is_certified(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, NoiseModel(translation_std=1.0, rotation_std=1.5)))
     solution = solve(problem, SHORT, robots=partitioner(problem.graph, seed))
-    assert 0 <= solution.lower_bound <= best_known(problem, seed) + rounding_of_bound(problem)
+    assert 0 <= solution.lower_bound <= best_known(problem, seed)
     assert solution.objective == pytest.approx(problem.objective(solution.poses), rel=1e-12)
 
 
@@ -183,7 +188,7 @@ def test_a_second_try_and_the_staircase_follow_where_the_gap_stays_wide(d: int) 
     solution = solve(problem, robots=3)
     central = solve(problem)
     assert [stage.name for stage in solution.stages] == [stage.name for stage in central.stages]
-    assert solution.lower_bound <= min(solution.objective, central.objective) + rounding_of_bound(problem)
+    assert solution.lower_bound <= min(solution.objective, central.objective)
     assert solution.gap == pytest.approx(central.gap, abs=1e-4)
 
 
@@ -233,7 +238,7 @@ def test_a_run_that_is_cut_short_gives_poses_and_a_bound_that_holds(
     assert solution.status is statuses[-1]
     assert solution.objective <= problem.objective(chordal_start(problem)) * (1 + 1e-12)
     assert solution.objective == pytest.approx(problem.objective(solution.poses), rel=1e-12)
-    assert solution.lower_bound <= best_known(problem) + rounding_of_bound(problem)
+    assert solution.lower_bound <= best_known(problem)
     assert solution.ledger is not None
     assert solution.ledger.rounds >= 3
 

@@ -66,6 +66,16 @@ def test_the_spectrum_is_drawn_by_sign_and_with_the_proofs_eta():
     figure = pgo.plot_spectrum(problem, certificate, 9)
     (axes,) = figure.axes
     assert sum(len(line.get_xdata()) for line in axes.lines) == 9
+    assert certificate.eta == 0
+    assert not any("eta" in label for label in axes.get_legend_handles_labels()[1])
+
+
+def test_the_spectrum_is_drawn_with_the_shift_of_a_loose_relaxation():
+    pytest.importorskip("matplotlib")
+    graph = pgo.random_geometric(6, np.random.default_rng(3), noise=pgo.NoiseModel(0.5, 1.5))
+    problem, certificate = certificate_of(graph)
+    assert certificate.eta > 0
+    (axes,) = pgo.plot_spectrum(problem, certificate, 9).axes
     assert f"{certificate.eta:.1e}" in axes.get_legend_handles_labels()[1][2]
 
 

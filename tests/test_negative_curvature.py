@@ -7,7 +7,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.linalg import block_diag
 
-from pgo_models.certificate import prove_bound, smallest_shift
+from pgo_models.lower_bound import prove_bound, smallest_shift
 from pgo_models.multipliers import multipliers
 from pgo_models.negative_curvature import negative_curvature
 

@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pgo_models import semidefinite
-from pgo_models.certificate import Verdict, prove_bound
+from pgo_models.certificate import Verdict
 from pgo_models.clique_sdp import clique_relaxation
 from pgo_models.errors import SettingError
 from pgo_models.g2o import read_g2o
+from pgo_models.lower_bound import prove_bound
 from pgo_models.multipliers import multipliers
 from pgo_models.polish import polish
 from pgo_models.problem import PGOProblem

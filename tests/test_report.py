@@ -11,6 +11,7 @@ from browser import Browser, find_browser
 import pgo_models as pgo
 import solvers
 from pgo_models.certificate import BoundSource
+from pgo_models.lower_bound import NO_BOUND
 from pgo_models.scenes import NoiseModel
 from solvers import cli
 from solvers.network import Ledger, Traffic
@@ -242,13 +243,14 @@ def cases(solution, uncertain):
     graph, certificate = solution.problem.graph, solution.certificate
     yield graph, certificate, solvers.Status.CONVERGED
     yield graph, replace(certificate, wanted_gap=1e-9), solvers.Status.CONVERGED
+    yield graph, replace(certificate, verdict=pgo.Verdict.EXACT, gap=0.0), solvers.Status.CONVERGED
     for status in solvers.Status:
         yield uncertain.problem.graph, uncertain.certificate, status
     wide = replace(certificate, verdict=pgo.Verdict.NOT_CERTIFIED, gap=0.25)
     yield graph, wide, solvers.Status.CONVERGED
     yield graph, replace(wide, source=BoundSource.RELAXATION), solvers.Status.CONVERGED
     yield graph, replace(wide, gap=3e-9, wanted_gap=1e-12), solvers.Status.CONVERGED
-    yield graph, replace(wide, verdict=pgo.Verdict.TRIVIAL, gap=1.0, eta=np.nan), solvers.Status.CONVERGED
+    yield graph, replace(wide, verdict=pgo.Verdict.TRIVIAL, gap=1.0, bound=NO_BOUND), solvers.Status.CONVERGED
 
 
 def test_every_case_has_a_verdict_and_something_to_try(solution, uncertain, monkeypatch, tmp_path):
