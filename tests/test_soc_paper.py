@@ -148,7 +148,8 @@ def test_residuals_are_the_paper_s(seed: int, n: int, d: int) -> None:
 def test_where_it_ends_the_lagrangian_is_stationary(seed: int, n: int, d: int, count: int) -> None:
     # 2 L R + rho B by entries, whatever the recursion says of itself; omega is the projection of omega + B.
     problem = varied_problem(seed, n, d)
-    soc = paper(penalty=FixedPenalty(float(problem.L.diagonal().mean())), robots=partition(problem.graph, min(count, n)))
+    rule, robots = FixedPenalty(float(problem.L.diagonal().mean())), partition(problem.graph, min(count, n))
+    soc = paper(penalty=rule, robots=robots)
     result = run(soc, problem)
     if result.status is not Status.CONVERGED:
         return
