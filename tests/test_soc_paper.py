@@ -23,6 +23,7 @@ from pgo_models.scenes import circle, grid, sphere
 from solvers.loop import iterate, run
 from solvers.newton import gauss_newton
 from solvers.penalty import BalancedPenalty, BoydPenalty, FixedPenalty, MultiplierPenalty
+from solvers.pipeline import solve
 from solvers.result import Status
 from solvers.rotation_step import RStep
 from solvers.soc import SOC, Coupling
@@ -283,3 +284,17 @@ def test_a_penalty_for_every_pose_is_not_the_paper_s() -> None:
 def test_boyd_s_one_penalty_is_the_paper_s_alone(coupling: Coupling | None) -> None:
     with pytest.raises(SettingError, match="has one rho; use a BalancedPenalty with"):
         SOC(coupling=coupling, penalty=BoydPenalty())
+
+
+@pytest.mark.parametrize("name", ["torus3D", "cubicle"])
+def test_the_certified_optimum_of_the_rotations_alone_is_above_the_paper_s_value(
+    name: str, benchmark_problem: Callable[[str], PGOProblem]
+) -> None:
+    # With t_ij = 0 the best translations are 0, and F is <R, L R>: what the first stage minimises.
+    problem = benchmark_problem(name)
+    rotations = replace(problem.graph, t_ij=np.zeros_like(problem.graph.t_ij), information=None)
+    solution = solve(rotations)
+    assert solution.is_certified
+    F = problem.objective(problem.with_best_translations(solution.poses.R))
+    assert round(F, 2) == REFERENCE["rotations_only_optimum"][name]
+    assert PAPER_TABLES[name]["F_soc"] < F
