@@ -30,12 +30,16 @@ pgo.compare_poses(graph, [("truth", graph.truth), ("GPS and IMU", graph.initial)
 # ## The cost
 #
 # An edge $(i, j)$ measures $R_{ij} \approx R_i^\top R_j$ and $t_{ij} \approx R_i^\top (t_j - t_i)$. The cost of
-# poses is what the paper's equation `min overall` says, each edge with its precisions $\kappa_{ij}, \tau_{ij}$:
+# poses is what the paper's equation `min overall` says, each edge with its weights $\kappa_{ij}, \tau_{ij}$:
 #
 # $$F(R, t) = \sum_{(i,j)} \kappa_{ij} \lVert R_j - R_i R_{ij} \rVert_F^2
 #   + \tau_{ij} \lVert t_j - t_i - R_i t_{ij} \rVert_2^2, \qquad R_i \in \mathrm{SO}(d).$$
 #
-# It is quadratic in $(R, t)$; what makes it hard is only that $R_i$ must be rotations. Here is $F$ by hand.
+# It is quadratic in $(R, t)$; what makes it hard is only that $R_i$ must be rotations. The weights should be
+# precisions: for this noise $\tau = 1 / \sigma_t^2 = 4$ and, in space,
+# $\kappa = 1 / (2 \sigma_R^2) = 1.8$. In this scene they are 0.5 and 0.5236, which are the *standard deviations*
+# (in metres and radians) themselves: so its source has it (Cristofalo et al. 2020), and so we keep it. Here is
+# $F$ by hand.
 
 
 # %%

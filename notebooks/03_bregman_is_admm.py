@@ -183,8 +183,10 @@ for alpha, (k, last) in rescaled.items():
 # From any start 70 to 80 iterations, and without the rescaling none of the runs ends within the limit of 1000:
 # every change of $\alpha$ throws the multiplier off, which changes the residuals, which changes $\alpha$.
 #
-# The library's `BalancedPenalty` is this rule for SOC, with two thoughts of OSQP added: move by a factor of
-# five, and only when the residuals differ by 25, because every new $\rho$ costs a factorisation. (A fixed
+# The library has this rule to the letter as `BoydPenalty`, for SOC as in the paper. Its dual residual carries the
+# unit of the weights, and so does its answer. `BalancedPenalty` compares relative residuals instead, without the
+# factor $\rho$, as OSQP does, and moves by a factor of five only when they differ by 25, because every new $\rho$
+# costs a factorisation. (A fixed
 # $\rho$ that is too small for SOC to converge at all, as 1 is here, is raised by a safeguard: [notebook
 # 4](04_splitting_orthogonality.ipynb).)
 

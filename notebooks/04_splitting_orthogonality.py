@@ -26,10 +26,9 @@ plt.rcParams["figure.dpi"] = 150
 # $\lVert \omega - Y \rVert_F^2 = \text{const} - 2 \operatorname{tr}(\omega^\top Y)$. With the singular value
 # decomposition $Y = U D V^\top$ it is
 # $\operatorname{tr}(\omega^\top Y) = \operatorname{tr}(D \, V^\top \omega^\top U)$, where
-# $V^\top \omega^\top U$ is orthogonal and has no diagonal entry above
-# 1. So $\omega = U V^\top$ is best: step (b), and what the paper writes as $U I_{n \times n} V^\top$. If its
-#    determinant is $-1$ it is a reflection; then the smallest singular value pays:
-#    $\omega = U \operatorname{diag}(1, 1, -1) V^\top$.
+# $V^\top \omega^\top U$ is orthogonal and no diagonal entry of it is above one. So $\omega = U V^\top$ is best:
+# step (b), and what the paper writes as $U I_{n \times n} V^\top$. If its determinant is $-1$ it is a
+# reflection; then the smallest singular value pays: $\omega = U \operatorname{diag}(1, 1, -1) V^\top$.
 
 
 # %%

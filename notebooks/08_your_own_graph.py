@@ -53,7 +53,9 @@ print(*lines[:2], lines[-1], sep="\n")
 # The cost $F$ of the paper's equation `min overall` has one number for the rotation and one for the translation
 # of an edge. An information matrix becomes the precisions $\kappa$ and $\tau$ as in SE-Sync: in the plane
 # $\kappa = I_{\theta\theta}$, $\tau = 2 / \operatorname{tr}(I_{tt}^{-1})$; in space
-# $\kappa = 3 / (2 \operatorname{tr}(I_{rr}^{-1}))$, $\tau = 3 / \operatorname{tr}(I_{tt}^{-1})$.
+# $\kappa = 3 / (2 \operatorname{tr}(I_{rr}^{-1}))$, $\tau = 3 / \operatorname{tr}(I_{tt}^{-1})$. In the plane that is
+# twice what a Gaussian says of a rotation; `weights=pgo.RotationWeight.GAUSSIAN` takes
+# $\kappa = I_{\theta\theta} / 2$.
 
 # %%
 graph = pgo.read_g2o(path)

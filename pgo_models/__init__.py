@@ -25,7 +25,7 @@ from pgo_models.errors import (
     SettingError,
 )
 from pgo_models.figures import save_figure
-from pgo_models.g2o import read_g2o, write_g2o
+from pgo_models.g2o import RotationWeight, read_g2o, write_g2o
 from pgo_models.grid_world import grid_world
 from pgo_models.initialization import chordal_start, gps_imu_start, odometry_start, spanning_tree_start
 from pgo_models.interactive import animate_poses, explore_graph, save_page
@@ -155,6 +155,7 @@ __all__ = [
     "RelaxationSolution",
     "RelaxationStatus",
     "RotationQP",
+    "RotationWeight",
     "SDPSolver",
     "SettingError",
     "Unknowns",

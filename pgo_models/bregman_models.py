@@ -48,7 +48,7 @@ class BregmanProblem:
     Attributes
     ----------
     J : cp.Expression
-        One real number, convex in the variables. `cp.indicator(constraints)` adds constraints.
+        One real number, convex in the variables. `cp.transforms.indicator(constraints)` adds constraints.
     variables : cp.Variable or sequence of them
         All variables of J.
     K : (s, m), dense or sparse

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from pgo_models.errors import DatasetError, FileFormatError
 from pgo_models.files import replace_when_done
-from pgo_models.g2o import read_g2o
+from pgo_models.g2o import RotationWeight, read_g2o
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.trajectories import read_tum
 
@@ -66,12 +66,18 @@ SE_SYNC = Registry(
 )
 
 
-def load(name_or_path: str | Path, registry: Registry = SE_SYNC, *, download: bool = True) -> PoseGraph:
+def load(
+    name_or_path: str | Path,
+    registry: Registry = SE_SYNC,
+    *,
+    download: bool = True,
+    weights: RotationWeight = RotationWeight.SE_SYNC,
+) -> PoseGraph:
     """Pose graph of a file, a folder with one file for each robot, or a data set's name.
 
     A name is looked for in the project's data folder, in ./data, in the folder named by the environment variable
     PGO_DATA, and in the user's cache; then it is downloaded, unless `download` is false. What the cache holds is
-    checked against its checksum.
+    checked against its checksum. `weights` as for `read_g2o`.
     Beside `x.g2o`, or the folder `x`, a file `x.truth.tum` gives the ground truth, in the order of the poses.
 
     Raises
@@ -89,13 +95,13 @@ def load(name_or_path: str | Path, registry: Registry = SE_SYNC, *, download: bo
     path = Path(name_or_path)
     name = str(name_or_path)
     if path.is_file() or (path.is_dir() and (_holds_g2o(path) or name not in known_datasets(registry))):
-        return _read(path)
+        return _read(path, weights)
     if isinstance(name_or_path, Path) or path.suffix == ".g2o" or name != path.name:
         raise FileFormatError(path, None, "no such file or folder; check the path, or give a data set's name")
     for folder in _folders():
         for candidate in (folder / f"{name}.g2o", folder / name):
             if candidate.is_file() or (candidate.is_dir() and _holds_g2o(candidate)):
-                return _read(candidate)
+                return _read(candidate, weights)
     if name not in registry.checksums:
         known = known_datasets(registry)
         close = difflib.get_close_matches(name, known, n=3)
@@ -104,7 +110,7 @@ def load(name_or_path: str | Path, registry: Registry = SE_SYNC, *, download: bo
             f"no file and no data set {name!r}; {meant}known are {', '.join(known)}; "
             f"or give a path, or put {name}.g2o into the folder named by {DATA_VARIABLE}"
         )
-    return _read(_cached(name, registry, download))
+    return _read(_cached(name, registry, download), weights)
 
 
 def known_datasets(registry: Registry = SE_SYNC) -> tuple[str, ...]:
@@ -139,8 +145,8 @@ def _holds_g2o(folder: Path) -> bool:
     return any(folder.glob("*.g2o"))
 
 
-def _read(path: Path) -> PoseGraph:
-    graph = read_g2o(path)
+def _read(path: Path, weights: RotationWeight) -> PoseGraph:
+    graph = read_g2o(path, weights)
     beside = path.with_name(f"{graph.name}.truth.tum")
     if not beside.is_file():
         return graph

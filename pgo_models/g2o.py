@@ -1,18 +1,20 @@
 """g2o files, one for all robots or a folder with one for each, as a PoseGraph and back.
 
 Information matrices become the precisions of SE-Sync (Rosen et al. 2019):
-d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I_tt^-1), kappa = I_theta.
+d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I_tt^-1), kappa = I_theta, or half of it
+with RotationWeight.GAUSSIAN.
 """
 
 from __future__ import annotations
 
+import enum
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from pgo_models.errors import FileFormatError, GraphError, PGOError
+from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
 from pgo_models.files import replace_when_done
 from pgo_models.g2o_lines import G2OLines, IntArray, information_of, poses_of, read_lines
 from pgo_models.pose_graph import PoseGraph
@@ -24,7 +26,25 @@ MOST_SYMBOLS = len(_LETTERS)  # robots whose poses can be named by GTSAM symbols
 _LETTER_SHIFT = 56  # a GTSAM symbol is a letter in the top byte and an index below it
 
 
-def read_g2o(path: Path | str) -> PoseGraph:
+class RotationWeight(enum.Enum):
+    """What kappa becomes of I_theta in the plane; in space both are kappa = 3 / (2 tr(I_rr^-1)).
+
+    A rotation error theta costs kappa ||R - I||_F^2 = 4 kappa (1 - cos theta), about 2 kappa theta^2. A Gaussian says
+    I_theta theta^2 (F has no factor 1/2, nor has tau ||.||^2), so that kappa = I_theta / 2, as it is in space.
+    SE-Sync's kappa = I_theta counts rotations twice against translations; published optima of 2D graphs are with it.
+
+    Examples
+    --------
+    >>> information = np.diag([4.0, 4.0, 6.0])[None]
+    >>> [float(precisions(information, weights)[0][0]) for weights in RotationWeight]
+    [6.0, 3.0]
+    """
+
+    SE_SYNC = "kappa = I_theta in the plane"
+    GAUSSIAN = "kappa = I_theta / 2 in the plane"
+
+
+def read_g2o(path: Path | str, weights: RotationWeight = RotationWeight.SE_SYNC) -> PoseGraph:
     """Pose graph of a g2o file, or of a folder with one g2o file for each robot.
 
     Read are EDGE_SE3:QUAT, EDGE_SE2, VERTEX_SE3:QUAT, VERTEX_SE2 and FIX lines. Poses are numbered by ascending id.
@@ -35,6 +55,12 @@ def read_g2o(path: Path | str) -> PoseGraph:
     pose of a folder belongs to the file with its VERTEX line, the first of them in the order 0, 1, .., 9, 10, or else
     to the first file that names it. An edge that stands in two files of a folder is one measurement, and the VERTEX
     line that counts is that of the pose's own robot.
+
+    Parameters
+    ----------
+    path : path
+    weights : RotationWeight
+        What kappa becomes of the information, in the plane.
 
     Returns
     -------
@@ -69,7 +95,7 @@ def read_g2o(path: Path | str) -> PoseGraph:
     robot = _robots(ids, files)
     R_ij, t_ij = poses_of(d, rows)
     information = information_of(d, rows)
-    kappa, tau = precisions(information)
+    kappa, tau = precisions(information, weights)
     both = np.searchsorted(ids, edge_ids)
     return PoseGraph(
         num_poses=len(ids),
@@ -112,7 +138,8 @@ def write_g2o(graph: PoseGraph, path: Path | str, poses: Poses | None = None) ->
     """Write VERTEX lines (of `poses`, else of `graph.initial`, else none), FIX lines and EDGE lines to one file.
 
     Numbers are written so that reading gives the same floats. Without `graph.information` the matrices are
-    tau I, 2 kappa I in space and diag(tau, tau, kappa) in the plane, which read back as the same kappa and tau.
+    tau I, 2 kappa I in space and diag(tau, tau, kappa) in the plane, which read back as the same kappa and tau
+    (RotationWeight.SE_SYNC).
 
     Raises
     ------
@@ -160,19 +187,27 @@ def write_g2o_folder(graph: PoseGraph, folder: Path | str, poses: Poses | None =
         _write(graph, folder / name, chosen, mine, mine[graph.i] | mine[graph.j])
 
 
-def precisions(information: Array) -> tuple[Array, Array]:
+def precisions(information: Array, weights: RotationWeight = RotationWeight.SE_SYNC) -> tuple[Array, Array]:
     """(kappa, tau), each (m,), of information matrices (m, 3, 3) in the plane or (m, 6, 6) in space.
 
-    d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I_tt^-1), kappa = I_theta.
+    d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I_tt^-1), kappa as `weights` say.
     The blocks themselves are inverted, not the marginal information. Per radian^2 and per metre^2.
+
+    Raises
+    ------
+    SettingError
+        When weights is no RotationWeight.
 
     Examples
     --------
     >>> precisions(np.diag([4.0, 4.0, 4.0, 6.0, 6.0, 6.0])[None])
     (array([3.]), array([4.]))
     """
+    if not isinstance(weights, RotationWeight):
+        raise SettingError(f"weights is {weights!r}; give RotationWeight.SE_SYNC or RotationWeight.GAUSSIAN")
     if information.shape[-1] == 3:
-        return information[:, 2, 2].copy(), 2.0 / _trace_of_inverse(information[:, :2, :2])
+        share = 0.5 if weights is RotationWeight.GAUSSIAN else 1.0
+        return share * information[:, 2, 2], 2.0 / _trace_of_inverse(information[:, :2, :2])
     tau = 3.0 / _trace_of_inverse(information[:, :3, :3])
     return 1.5 / _trace_of_inverse(information[:, 3:, 3:]), tau
 

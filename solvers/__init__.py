@@ -19,7 +19,7 @@ from solvers.network import Faults, Ledger, Traffic
 from solvers.newton import Newton, gauss_newton
 from solvers.noise_sweep import NoiseSweep, SweptScene, noise_sweep, noisy_scene
 from solvers.paper_figures import FigureSet, draw_paper_figures
-from solvers.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty
+from solvers.penalty import BalancedPenalty, BoydPenalty, FixedPenalty, MultiplierPenalty
 from solvers.pipeline import Pipeline, solve
 from solvers.ray_engine import RayEngine
 from solvers.recovery import Recovery
@@ -63,6 +63,7 @@ __all__ = [
     "AlternatingBregman",
     "Anderson",
     "BalancedPenalty",
+    "BoydPenalty",
     "Bregman",
     "ChangedSOC",
     "ChangedStep",

@@ -6,6 +6,7 @@ momentum is constant (Nesterov 2004, scheme 2.2.22); it is restarted when it poi
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -44,12 +45,18 @@ def fista(
     ------
     SettingError
         When the constants are not as they must be.
+
+    Warns
+    -----
+    RuntimeWarning
+        When `max_iterations` are not enough: which accuracy was reached, and the way out.
     """
     if not lipschitz >= strong_convexity > 0:
         raise SettingError(f"need lipschitz >= strong_convexity > 0, got {lipschitz} and {strong_convexity}")
     root = np.sqrt(strong_convexity / lipschitz)
     momentum = (1.0 - root) / (1.0 + root)
-    limit = tolerance * max(float(np.linalg.norm(b)), np.finfo(float).tiny)
+    size = max(float(np.linalg.norm(b)), np.finfo(float).tiny)
+    limit = tolerance * size
     x = start
     y = x
     for _ in range(max_iterations):
@@ -60,4 +67,12 @@ def fista(
         uphill = np.vdot(gradient, following - x) > 0
         y = following if uphill else following + momentum * (following - x)
         x = following
+    reached = float(np.linalg.norm(apply_H(x) - b))
+    if not reached <= limit:
+        warnings.warn(
+            f"FISTA ended at its {max_iterations} iterations with ||H x - b|| = {reached / size:.0e} ||b||, asked for "
+            f"was {tolerance:.0e}; use RStep.FACTORIZED or a larger penalty",
+            RuntimeWarning,
+            stacklevel=2,
+        )
     return x

@@ -1,4 +1,4 @@
-"""Rules for the ADMM penalty rho: from the multipliers, fixed, or balanced by residuals."""
+"""Rules for the ADMM penalty rho: from the multipliers, fixed, or balanced by residuals, relative or Boyd's."""
 
 from __future__ import annotations
 
@@ -98,12 +98,16 @@ class FixedPenalty:
 
 @dataclass(frozen=True)
 class BalancedPenalty:
-    """rho that balances the primal and the dual residual (Boyd et al. 2011, section 3.4.1).
+    """rho that balances relative residuals (after OSQP, Stellato et al. 2020, section 5.2).
 
     It starts at `scale` times m_i, the mean diagonal of M over the rotation rows of the pose. The balance asks for rho
     times sqrt(primal / dual); rho moves that way by `refactor_ratio`, and the matrices are factored again, once that is
-    asked for or more (the rule of OSQP, Stellato et al. 2020, section 5.2). B is rescaled with it. A rise of the merit
-    puts rho up again (the safeguard of `solvers.soc`).
+    asked for or more: once one residual is `refactor_ratio`^2 times the other. B is rescaled with it. A rise of the
+    merit puts rho up again (the safeguard of `solvers.soc`).
+
+    This is not the rule of Boyd et al. 2011, which is `BoydPenalty`: its dual residual has the factor rho, and so the
+    unit of the weights. Here both are lengths of rotations: ||R - omega|| and, without rho, ||omega - omega_last||.
+    They seldom differ by `refactor_ratio`^2; on the paper's scenes rho stays where it starts.
 
     Examples
     --------
@@ -134,7 +138,50 @@ class BalancedPenalty:
         return 1.0
 
 
-PenaltyRule = MultiplierPenalty | FixedPenalty | BalancedPenalty
+@dataclass(frozen=True)
+class BoydPenalty:
+    """One rho for all poses that balances residuals as in Boyd et al. 2011, section 3.4.1, (3.13); for Coupling.PAPER.
+
+    rho <- growth rho where ||r|| > imbalance ||s||, rho / growth where ||s|| > imbalance ||r||, with r = R - omega and
+    s = rho (omega - omega_last), and B is rescaled with it. There is no safeguard. s has the unit of the weights, so
+    that other units make other iterates.
+
+    Attributes
+    ----------
+    scale : float
+        First rho over the mean of m_i; Boyd gives none, and the paper neither.
+    imbalance, growth : float
+        Boyd's mu and tau.
+
+    Examples
+    --------
+    >>> rule = BoydPenalty()
+    >>> [rule.factor(primal, 1.0) for primal in (10.5, 9.5, 0.05)]
+    [2.0, 1.0, 0.5]
+    """
+
+    scale: float = 1.0
+    imbalance: float = 10.0
+    growth: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not self.scale > 0:
+            raise SettingError(f"scale must be positive, got {self.scale}")
+        if not self.imbalance > 1 or not self.growth > 1:
+            raise SettingError(f"imbalance and growth must be above 1, got {self.imbalance} and {self.growth}")
+
+    def initial(self, problem: PGOProblem, poses: Poses) -> Array:
+        """rho, (n,)."""
+        return self.scale * rotation_scale(problem)
+
+    def factor(self, primal_residual: float, dual_residual: float) -> float:
+        """Factor by which rho moves now, from ||r|| and ||s||; 1 for not at all."""
+        if primal_residual > self.imbalance * dual_residual:
+            return self.growth
+        return 1.0 / self.growth if dual_residual > self.imbalance * primal_residual else 1.0
+
+
+PenaltyRule = MultiplierPenalty | FixedPenalty | BalancedPenalty | BoydPenalty
 
 
 def rotation_scale(problem: PGOProblem) -> Array:

@@ -25,6 +25,7 @@ from pgo_models.rotations import Array, project_to_rotations, stack_transposes, 
 from solvers.acceleration import Anderson, AndersonMemory, extrapolate_parts, over_relax
 from solvers.penalty import (
     BalancedPenalty,
+    BoydPenalty,
     FixedPenalty,
     MultiplierPenalty,
     PenaltyRule,
@@ -136,8 +137,9 @@ class SOC:
         is, by `solve(.., robots=..)` on robots.
     robots : Partition, optional
         Who owns which pose; for PAPER, one pose a robot unless given.
-    penalty : MultiplierPenalty, FixedPenalty or BalancedPenalty, optional
-        MultiplierPenalty unless given; for PAPER a BalancedPenalty, the adaptive scheme the paper takes from Boyd.
+    penalty : MultiplierPenalty, FixedPenalty, BalancedPenalty or BoydPenalty, optional
+        MultiplierPenalty unless given; for PAPER a BalancedPenalty. BoydPenalty, the scheme that the paper names, is
+        for PAPER only.
     alpha : float
         Over-relaxation, in (0, 2). PAPER has none.
     acceleration : Anderson, optional
@@ -156,7 +158,8 @@ class SOC:
         times the root of the translation penalty, at most 0.3.
     tolerance : float
         On the primal and the dual residual, both relative. For PAPER the primal one is the paper's KKT residual, the
-        root mean square over poses of ||omega_i^T omega_i - I||^2 + ||omega_i - R_i||^2, the dual one its stationarity.
+        root mean square over poses of ||omega_i^T omega_i - I||^2 + ||omega_i - R_i||^2, the dual one the gradient of
+        the Lagrangian; see `solvers.soc_paper`.
     max_iterations : int
 
     Raises
@@ -201,6 +204,8 @@ class SOC:
             raise SettingError(f"JOINT has one robot, got {self.robots}; use Coupling.CONSENSUS")
         if self.coupling is Coupling.CONSENSUS and self.robots is None:
             raise SettingError("CONSENSUS needs robots; see pgo_models.partition()")
+        if isinstance(self.penalty, BoydPenalty) and self.coupling is not Coupling.PAPER:
+            raise SettingError(f"{self.penalty} has one rho; use a BalancedPenalty with {self.effective_coupling.name}")
 
     @property
     def effective_coupling(self) -> Coupling:

@@ -4,6 +4,12 @@ All robots' subproblems (a) are solved together: they are the diagonal blocks of
 neighbours of the last iterate on the right-hand side
 
     (L_blocks + rho/2) Y = rho/2 (omega - B) - L_between Y_last,     L = L_blocks + L_between.
+
+With the B that (c) makes of it, the gradient of the Lagrangian of min <Y, L Y> subject to Y = omega is at Y
+
+    2 L Y + rho B = 2 L_between (Y - Y_last) - rho (omega - omega_last),
+
+the dual residual: beside the change of omega, as in Boyd et al. 2011 (3.6), that of the frozen neighbours counts.
 """
 
 from __future__ import annotations
@@ -20,7 +26,7 @@ from pgo_models.partition import Partition, PartitionMethod, partition
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
-from solvers.penalty import BalancedPenalty, MultiplierPenalty, PenaltyRule
+from solvers.penalty import BalancedPenalty, BoydPenalty, MultiplierPenalty, PenaltyRule
 from solvers.result import Measurement
 from solvers.rotation_step import BackEnd, RotationStep, Subproblem, prepare
 
@@ -62,7 +68,7 @@ class PaperState:
     scale : float
         Mean diagonal of L, the unit in which the stationarity residual is measured.
     dual_residual : float
-        Stationarity, rho ||omega - omega_last||_F / scale over the root of n d.
+        Stationarity, ||2 L R + rho B||_F / scale over the root of n d, rows of R and B stacked as L has them.
     smallest_merit, steps_since_smallest, may_fall
         Safeguard of the adaptive rho: the smallest ||R - omega|| and ||omega - omega_last|| together since rho changed,
         how long ago, and whether rho may still be lowered.
@@ -87,7 +93,7 @@ def init_paper(
 ) -> PaperState:
     """State 0: R = omega = start, B = 0."""
     if isinstance(rule, MultiplierPenalty):
-        raise SettingError("the paper has one rho for all poses; give a FixedPenalty or a BalancedPenalty")
+        raise SettingError("the paper has one rho for all poses; give a FixedPenalty, BalancedPenalty or BoydPenalty")
     problem.stacked(start)  # raises unless the poses fit
     if robots is None:
         robots = partition(problem.graph, method=PartitionMethod.SINGLETONS)
@@ -116,6 +122,7 @@ def step_paper(problem: PGOProblem, state: PaperState, rule: PenaltyRule, back_e
     B = state.B + R - omega  # (c)
     root = np.sqrt(R.shape[0] * R.shape[1])
     primal, change = norm(omega - R) / root, norm(omega - state.omega) / root
+    gradient = 2.0 * (problem.L @ stack_transposes(R)) + state.rho * stack_transposes(B)
     merit = float(np.hypot(primal, change))
     smaller = merit < state.smallest_merit
     following = replace(
@@ -124,7 +131,7 @@ def step_paper(problem: PGOProblem, state: PaperState, rule: PenaltyRule, back_e
         R=R,
         omega=omega,
         B=B,
-        dual_residual=state.rho * change / state.scale,
+        dual_residual=norm(gradient) / (root * state.scale),
         smallest_merit=merit if smaller else state.smallest_merit,
         steps_since_smallest=0 if smaller else state.steps_since_smallest + 1,
     )
@@ -135,11 +142,15 @@ def _with_adapted_rho(
     problem: PGOProblem, state: PaperState, rule: PenaltyRule, primal: float, change: float, back_end: BackEnd
 ) -> PaperState:
     """State with the rho for the next step, B rescaled: balanced, and up again for good when the merit stays up."""
-    if not isinstance(rule, BalancedPenalty):
+    may_fall = state.may_fall
+    if isinstance(rule, BoydPenalty):
+        factor = rule.factor(primal, state.rho * change)
+    elif not isinstance(rule, BalancedPenalty):
         return state
-    factor, may_fall = rule.factor(primal, change), state.may_fall
-    if state.steps_since_smallest >= _PATIENCE:
+    elif state.steps_since_smallest >= _PATIENCE:
         factor, may_fall = rule.refactor_ratio, False
+    else:
+        factor = rule.factor(primal, change)
     if factor == 1.0 or (factor < 1.0 and not may_fall):
         return state
     rho = factor * state.rho

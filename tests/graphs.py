@@ -28,8 +28,8 @@ OPTIMUM: dict[str, float] = {k: v for k, v in REFERENCE["certified_optimum"].ite
 
 
 def optimum_tolerance(name: str) -> float:
-    """1e-7 of the published optimum, or half a unit of the last of its seven decimals."""
-    return max(1e-7 * OPTIMUM[name], 0.5e-7)
+    """1e-7 of the published optimum, or half a unit of the ninth decimal, the last of FRH's."""
+    return max(1e-7 * OPTIMUM[name], 0.5e-9)
 
 
 def varied_graph(seed: int, n: int, d: int, noise: NoiseModel = MILD_NOISE, weights: float = 1.0) -> PoseGraph:

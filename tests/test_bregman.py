@@ -214,6 +214,14 @@ def test_scale_space_stopped_at_the_noise_beats_the_data() -> None:
     np.testing.assert_allclose(full.state.x, noisy, rtol=0, atol=1e-5)
 
 
+def test_an_indicator_adds_constraints() -> None:
+    x = cp.Variable(3)
+    J = cp.sum_squares(x - np.array([-1.0, 2.0, 3.0])) + cp.transforms.indicator([x >= 0])
+    solved = run_method(MethodOfMultipliers(alpha=10.0), BregmanProblem(J, x, np.ones((1, 3)), [4.0]))
+    assert solved.status is Status.CONVERGED
+    np.testing.assert_allclose(solved.state.x, [0.0, 1.5, 2.5], rtol=0, atol=1e-5)  # without it: -1, 2, 3
+
+
 @pytest.mark.parametrize("form", [AlternatingBregman, MethodOfMultipliers])
 def test_two_robots_agree_on_the_r_step(form) -> None:
     rng = np.random.default_rng(0)

@@ -1,3 +1,6 @@
+import warnings
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from graphs import EPS, SEEDS
@@ -5,8 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pgo_models.errors import SettingError
+from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array
+from pgo_models.scenes import circle
 from solvers.fista import fista
+from solvers.loop import run
+from solvers.penalty import FixedPenalty
+from solvers.rotation_step import RStep
+from solvers.soc import SOC
 
 
 def quadratic(seed: int, side: int, condition: float) -> tuple[Array, float, float]:
@@ -65,9 +74,24 @@ def test_the_limit_is_kept(seed: int, side: int, limit: int) -> None:
         count += 1
         return H @ x
 
-    x = fista(counted, b, start, lipschitz, convexity, max_iterations=limit)
-    assert count <= limit
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        x = fista(counted, b, start, lipschitz, convexity, max_iterations=limit)
+    assert count <= limit + 1  # the last one is for what is said
     assert np.isfinite(x).all()
+    reached = np.linalg.norm(H @ x - b) / np.linalg.norm(b)
+    assert len(said) == (reached > 1e-12)
+    if said:
+        assert said[0].category is RuntimeWarning
+        assert f"ended at its {limit} iterations with ||H x - b|| = {reached:.0e} ||b||, asked" in str(said[0].message)
+
+
+def test_a_run_that_ends_too_early_says_so() -> None:
+    graph = circle(np.random.default_rng(0))
+    problem = PGOProblem(replace(graph, kappa=np.logspace(-5, 5, graph.num_edges)))
+    soc = SOC(r_step=RStep.FISTA, penalty=FixedPenalty(1e-7), max_iterations=1)
+    with pytest.warns(RuntimeWarning, match=r"FISTA ended at its 20000 iterations with .*; use RStep\.FACTORIZED or"):
+        run(soc, problem)
 
 
 def test_inputs_are_left_alone() -> None:

@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pgo_models.errors import FileFormatError, GraphError, PGOError
+from pgo_models.datasets import load
+from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
 from pgo_models.g2o import (
+    RotationWeight,
     isotropic_information,
     precisions,
     read_g2o,
@@ -20,6 +22,8 @@ from pgo_models.g2o import (
 from pgo_models.grid_world import grid_world
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
+from pgo_models.problem import PGOProblem
+from pgo_models.rotations import exp_map
 from pgo_models.scenes import random_geometric
 
 EPS = np.finfo(float).eps
@@ -117,6 +121,34 @@ def test_precisions_follow_their_formulas(seed: int, d: int) -> None:
         assert kappa[e] == pytest.approx(expected, rel=1e-9)
     again = precisions(isotropic_information(kappa, tau, d))
     np.testing.assert_allclose(again, [kappa, tau], rtol=8 * EPS, atol=0)
+
+
+@pytest.mark.parametrize(("weights", "share"), [(RotationWeight.SE_SYNC, 2.0), (RotationWeight.GAUSSIAN, 1.0)])
+@given(seed=SEEDS, d=DIMENSIONS)
+def test_gaussian_weights_give_the_chi_square_of_a_small_error(
+    weights: RotationWeight, share: float, seed: int, d: int
+) -> None:
+    # One edge of identities, its end pose off by a small turn and a step: I_theta theta^2 + I_t |t|^2, no 1/2.
+    rng = np.random.default_rng(seed)
+    I_t, I_theta = np.exp(rng.uniform(-5, 5, 2))
+    information = np.diag([I_t] * d + [I_theta] * (d * (d - 1) // 2))[None]
+    kappa, tau = precisions(information, weights)
+    one = np.array([0])
+    graph = PoseGraph(2, one, one + 1, np.eye(d)[None], np.zeros((1, d)), kappa, tau)
+    turn, step = 1e-4 * rng.standard_normal(d * (d - 1) // 2), rng.standard_normal(d)
+    poses = Poses(np.stack([np.eye(d), exp_map(turn[None])[0]]), np.stack([np.zeros(d), step]))
+    chi_square = I_t * step @ step + (share if d == 2 else 1.0) * I_theta * turn @ turn
+    np.testing.assert_allclose(PGOProblem(graph).objective(poses), chi_square, rtol=1e-6, atol=0)
+
+
+def test_a_file_is_read_with_the_weights_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "plane.g2o"
+    path.write_text("EDGE_SE2 0 1 1 0 0 4 0 0 4 0 6\n")
+    kappas = [float(load(path, weights=weights).kappa[0]) for weights in RotationWeight]
+    assert kappas == [6.0, 3.0] == [float(read_g2o(path, weights).kappa[0]) for weights in RotationWeight]
+    assert read_g2o(path).kappa[0] == load(path).kappa[0] == 6.0
+    with pytest.raises(SettingError, match="weights is 'gaussian'; give RotationWeight"):
+        read_g2o(path, "gaussian")
 
 
 @pytest.mark.parametrize("name", SIZES)

@@ -8,6 +8,7 @@ import json
 import os
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -94,6 +95,18 @@ def test_a_source_asks_a_question_and_ends_with_asserts(source):
     assert "?" in opening
     kind, ending = [part for part in parts if part[0] == "code"][-1]
     assert any(isinstance(node, ast.Assert) for node in ast.parse(ending).body)
+
+
+@each_source
+def test_no_sentence_turns_into_a_list(source):
+    # Markdown takes a line that opens with "1." for a list, also in the middle of a paragraph.
+    for kind, text in cells(source):
+        lines = text.splitlines() if kind == "markdown" else []
+        assert not [
+            line
+            for before, line in pairwise(lines)
+            if before and line.startswith(("1. ", "- ", "+ ", "* ")) and not before.startswith(("- ", "+ ", "* ", "  "))
+        ]
 
 
 @each_source

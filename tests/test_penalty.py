@@ -12,6 +12,7 @@ from pgo_models.multipliers import multipliers
 from pgo_models.problem import PGOProblem
 from solvers.penalty import (
     BalancedPenalty,
+    BoydPenalty,
     FixedPenalty,
     MultiplierPenalty,
     rotation_scale,
@@ -116,6 +117,9 @@ def test_balancing_bears_residuals_of_zero(primal: float, dual: float, direction
         (FixedPenalty, {"rho": np.nan}, "rho must be positive"),
         (BalancedPenalty, {"scale": 0.0}, "scale must be positive"),
         (BalancedPenalty, {"refactor_ratio": 0.5}, "refactor_ratio must be above 1"),
+        (BoydPenalty, {"scale": 0.0}, "scale must be positive"),
+        (BoydPenalty, {"imbalance": 1.0}, "imbalance and growth must be above 1"),
+        (BoydPenalty, {"growth": np.nan}, "imbalance and growth must be above 1"),
     ],
 )
 def test_settings_are_checked(rule: type, settings: dict[str, float], message: str) -> None:

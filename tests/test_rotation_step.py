@@ -5,6 +5,7 @@ import pytest
 from graphs import DIMENSIONS, SEEDS, SIZES, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.sparse import csr_array
 
 from pgo_models.cholesky import CholeskyBackend
 from pgo_models.initialization import chordal_start
@@ -14,7 +15,7 @@ from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array
 from pgo_models.scenes import circle, grid, sphere
 from solvers.penalty import FixedPenalty, MultiplierPenalty, rotation_scale, translation_scale
-from solvers.rotation_step import RStep, Subproblem, prepare
+from solvers.rotation_step import RStep, Subproblem, _largest_eigenvalue_bound, prepare
 from solvers.soc_paper import init_paper
 from solvers.team import build_team
 
@@ -123,6 +124,34 @@ def test_measurements_without_a_turn_hide_nothing_from_fista(d: int) -> None:
     subproblem = subproblem_of(problem, np.concatenate([np.zeros(6), np.full(6 * d, 1e-2)]))
     V = np.random.default_rng(0).standard_normal((problem.side, d))
     assert largest_difference([prepare(subproblem, back_end).solve(V) for back_end in RStep]) <= AGREEMENT
+
+
+@pytest.mark.parametrize("translation_penalty", [0.0, 1e4])
+@pytest.mark.parametrize(("d", "num_poses"), [(2, 400), (3, 100)])
+def test_a_loop_along_a_diagonal_hides_nothing_from_fista(d: int, num_poses: int, translation_penalty: float) -> None:
+    # There and back along (1, -1, 0): the top eigenvectors are orthogonal to ones, and the stiff edge tops all others.
+    i = np.arange(num_poses)
+    kappa = np.ones(num_poses)
+    kappa[num_poses // 3] = 4.0
+    t_ij = np.zeros((num_poses, d))
+    t_ij[:, 0] = 1.6 * np.where(i < num_poses // 2, 1.0, -1.0)
+    t_ij[:, 1] = -t_ij[:, 0]
+    turn = np.broadcast_to(np.eye(d), (num_poses, d, d))
+    problem = PGOProblem(PoseGraph(num_poses, i, (i + 1) % num_poses, turn, t_ij, kappa, np.ones(num_poses)))
+    penalty = np.concatenate([np.full(num_poses, translation_penalty), np.ones(num_poses * d)])
+    subproblem = subproblem_of(problem, penalty)
+    V = np.random.default_rng(0).standard_normal((problem.side, d))
+    assert largest_difference([prepare(subproblem, back_end).solve(V) for back_end in RStep]) <= AGREEMENT
+
+
+@given(seed=SEEDS, side=st.integers(1, 20), density=st.floats(0.0, 1.0), exponent=st.integers(-12, 12))
+def test_the_lipschitz_constant_is_a_bound(seed: int, side: int, density: float, exponent: int) -> None:
+    rng = np.random.default_rng(seed)
+    factor = rng.standard_normal((side, side)) * (rng.uniform(size=(side, side)) < density)
+    H = factor @ factor.T * 10.0**exponent + 0.5 * np.eye(side)
+    bound = _largest_eigenvalue_bound(csr_array(H))
+    assert np.linalg.eigvalsh(H)[-1] <= bound * (1 + 64 * np.finfo(float).eps)
+    assert bound <= np.abs(H).sum(axis=1).max() * (1 + 64 * np.finfo(float).eps)  # Gershgorin
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
