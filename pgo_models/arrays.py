@@ -89,7 +89,7 @@ def _numbers(values: object, name: str, wanted: str, error: type[PGOError]) -> N
     except ValueError as reason:  # rows of several lengths
         raise error(f"{name} is no array: {reason}") from reason
     if array.dtype.kind not in "fiu":
-        raise error(f"{name} has entries of type {array.dtype}; give {wanted}")
+        raise error(f"{name} must be {wanted}, got type {array.dtype}")
     return array
 
 

@@ -148,8 +148,10 @@ def solve(
         raise SettingError("engine and checkpoint are for solves by robots; give robots, a number or a Partition")
     pipeline = pipeline if pipeline is not None else Pipeline()
     if not isinstance(pipeline, Pipeline):
-        way_out = "give Pipeline(soc=SOC(..)), or run one method alone: solvers.run(SOC(..), problem)"
-        raise SettingError(f"the pipeline is a {type(pipeline).__name__}; {way_out}")
+        raise SettingError(
+            f"the pipeline is a {type(pipeline).__name__}; give Pipeline(soc=SOC(..)), or run one method alone: "
+            "solvers.run(SOC(..), problem)"
+        )
     if robots is None and pipeline.faults is not None:
         raise SettingError("faults are of messages between robots; give solve() the robots of SOC, too")
     stages: list[Stage] = []

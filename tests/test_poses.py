@@ -5,11 +5,19 @@ from hypothesis import strategies as st
 
 from pgo_models.errors import GraphError
 from pgo_models.poses import Poses, absolute_trajectory_error, relative_pose_error
-from pgo_models.rotations import Array, exp_map, random_rotations, tangent_dimension
+from pgo_models.rotations import (
+    Array,
+    exp_map,
+    orthogonality_error,
+    project_to_rotations,
+    random_rotations,
+    tangent_dimension,
+)
 
 SEEDS = st.integers(0, 2**32 - 1)
 DIMENSIONS = st.sampled_from([2, 3])
 COUNTS = st.integers(1, 12)
+TO_ROUNDING = 64 * float(np.finfo(float).eps)
 ROUNDING = 1e-12  # poses here are of order one, and the alignment is a handful of products
 
 
@@ -36,6 +44,9 @@ def assert_same(a: Poses, b: Poses) -> None:
         (np.stack([np.eye(2)] * 2), np.array([[0, 0], [0, np.inf]]), "t of pose 1 has nan or inf"),
         (np.stack([np.eye(3), 2 * np.eye(3)]), np.zeros((2, 3)), "R of pose 1 is no rotation"),
         (np.diag([1.0, -1.0])[None], np.zeros((1, 2)), "R of pose 0 is no rotation"),
+        (np.full((1, 2, 2), 1e200), np.zeros((1, 2)), "R of pose 0 is no rotation"),
+        (np.full((1, 3, 3), 1e308), np.zeros((1, 3)), "R of pose 0 is no rotation"),
+        (np.stack([np.eye(2), (1 + 1e-6) * np.eye(2)]), np.zeros((2, 2)), "R of pose 1 is no rotation"),
     ],
 )
 def test_what_is_no_pose_is_refused(R: Array, t: Array, message: str) -> None:
@@ -47,6 +58,37 @@ def test_identity_and_emptiness() -> None:
     poses = Poses.identity(4, 3)
     assert (poses.num_poses, poses.d, repr(poses)) == (4, 3, "Poses(n=4, d=3)")
     assert Poses(np.zeros((0, 2, 2)), np.zeros((0, 2))).num_poses == 0
+
+
+@given(seed=SEEDS, n=COUNTS, d=DIMENSIONS, exponent=st.floats(-13.5, -6.5))
+def test_what_is_a_rotation_only_nearly_is_projected(seed: int, n: int, d: int, exponent: float) -> None:
+    rng = np.random.default_rng(seed)
+    exact = random_rotations(n, d, rng)
+    off = rng.standard_normal((n, d, d))
+    R = exact + 10.0**exponent * off / np.linalg.norm(off, axis=(1, 2))[:, None, None]
+    held = Poses(R, np.zeros((n, d))).R
+    assert orthogonality_error(held).max() <= TO_ROUNDING
+    np.testing.assert_allclose(held, project_to_rotations(R), rtol=0, atol=TO_ROUNDING)
+
+
+@given(seed=SEEDS, n=COUNTS, d=DIMENSIONS)
+def test_rotations_to_rounding_are_held_as_they_are(seed: int, n: int, d: int) -> None:
+    rng = np.random.default_rng(seed)
+    R = random_rotations(n, d, rng) @ exp_map(rng.standard_normal((n, tangent_dimension(d))))
+    np.testing.assert_array_equal(Poses(R, np.zeros((n, d))).R, R)
+    mixed = R.copy()
+    mixed[0] *= 1.0 + 1e-8
+    np.testing.assert_array_equal(Poses(mixed, np.zeros((n, d))).R[1:], R[1:])
+    held = Poses(mixed, np.zeros((n, d)))
+    np.testing.assert_array_equal(Poses(held.R, held.t).R, held.R)
+
+
+def test_many_motions_leave_rotations_to_rounding() -> None:
+    rng = np.random.default_rng(0)
+    poses = random_poses(50, 3, rng)
+    for _ in range(200):
+        poses = poses.moved(*random_motion(3, rng))
+    assert orthogonality_error(poses.R).max() <= TO_ROUNDING
 
 
 @given(seed=SEEDS, n=COUNTS, d=DIMENSIONS)
