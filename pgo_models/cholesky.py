@@ -8,6 +8,8 @@ from __future__ import annotations
 import enum
 import importlib.util
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import ModuleType
 from typing import Protocol
 
@@ -209,28 +211,37 @@ class _Cholmod(SymbolicCholesky):
         self.spare: _Capsule | None = self._analyze()
 
     def _analyze(self) -> _Capsule:
-        _, cholmod = _import_cvxopt()
-        capsule: _Capsule = cholmod.symbolic(self._matrix)
+        with _supernodal() as cholmod:
+            capsule: _Capsule = cholmod.symbolic(self._matrix)
         return capsule
 
     def factorize(self, matrix: csc_array, overwrite: CholeskyFactor | None = None) -> CholeskyFactor:
         self._check(matrix)
-        cvxopt, cholmod = _import_cvxopt()
+        cvxopt, _ = _import_cvxopt()
         self._matrix.V = cvxopt.matrix(matrix.data[self._lower])
         if isinstance(overwrite, _CholmodFactor):
             overwrite.hand_back()
         numeric = self.spare if self.spare is not None else self._analyze()
         self.spare = None
-        saved = cholmod.options.get("supernodal", 2)
-        cholmod.options["supernodal"] = 2  # L L^T, which exists for positive definite matrices only
         try:
-            cholmod.numeric(self._matrix, numeric)
+            with _supernodal() as cholmod:
+                cholmod.numeric(self._matrix, numeric)
         except ArithmeticError as error:
             self.spare = numeric  # a failed factorisation leaves the symbolic part intact
             raise NotPositiveDefiniteError("the matrix has a pivot that is not positive") from error
-        finally:
-            cholmod.options["supernodal"] = saved
         return _CholmodFactor(numeric, self)
+
+
+@contextmanager
+def _supernodal() -> Iterator[ModuleType]:
+    """CHOLMOD set to L L^T, which exists for positive definite matrices only: to analyse for L D L^T accepts others."""
+    _, cholmod = _import_cvxopt()
+    saved = cholmod.options.get("supernodal", 2)
+    cholmod.options["supernodal"] = 2
+    try:
+        yield cholmod
+    finally:
+        cholmod.options["supernodal"] = saved
 
 
 def _import_cvxopt() -> tuple[ModuleType, ModuleType]:

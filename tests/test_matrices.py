@@ -167,7 +167,8 @@ def test_the_largest_side_is_allowed_and_takes_288_MB(monkeypatch: pytest.Monkey
     monkeypatch.setattr(matrices, "MAX_DENSE_SIDE", 30)
     assert marginalized_matrix(random_geometric(10, np.random.default_rng(0))).shape == (30, 30)
     assert marginalized_matrix(random_geometric(15, np.random.default_rng(0), d=2)).shape == (30, 30)
-    for n, d in ((11, 3), (16, 2)):
+    for n, d, largest in ((11, 3, 30), (16, 2, 30), (10, 3, 29), (15, 2, 29)):
+        monkeypatch.setattr(matrices, "MAX_DENSE_SIDE", largest)
         with pytest.raises(SettingError, match=r"use PGOProblem\.apply_Q"):
             marginalized_matrix(random_geometric(n, np.random.default_rng(0), d=d))
 
