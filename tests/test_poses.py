@@ -39,6 +39,8 @@ def assert_same(a: Poses, b: Poses) -> None:
     [
         (np.eye(3), np.zeros(3), r"R has shape \(3, 3\)"),
         (np.zeros((2, 4, 4)), np.zeros((2, 4)), "R has shape"),
+        (np.zeros((1, 2, 3)), np.zeros((1, 2)), r"R has shape \(1, 2, 3\)"),
+        (np.zeros((1, 3, 2)), np.zeros((1, 3)), r"R has shape \(1, 3, 2\)"),
         (np.eye(3)[None], np.zeros((1, 2)), r"t has shape \(1, 2\)"),
         (np.eye(3)[None] * np.nan, np.zeros((1, 3)), "R of pose 0 has nan"),
         (np.stack([np.eye(2)] * 2), np.array([[0, 0], [0, np.inf]]), "t of pose 1 has nan or inf"),
@@ -123,6 +125,22 @@ def test_gauge_puts_a_pose_at_the_origin(seed: int, n: int, d: int, data: st.Dat
     np.testing.assert_allclose(fixed.R[at], np.eye(d), rtol=0, atol=ROUNDING)
     np.testing.assert_allclose(fixed.t[at], np.zeros(d), rtol=0, atol=ROUNDING)
     assert_same(poses.moved(*random_motion(d, rng)).with_gauge_at(at), fixed)
+
+
+def test_the_gauge_is_at_pose_0_unless_another_is_named() -> None:
+    poses = random_poses(3, 3, np.random.default_rng(0))
+    assert_same(poses.with_gauge_at(), poses.with_gauge_at(0))
+
+
+@pytest.mark.parametrize(("ratio", "positions_decide"), [(1.1e-9, True), (0.9e-9, False)])
+def test_positions_on_a_line_to_nine_digits_do_not_fix_the_rotation(ratio: float, positions_decide: bool) -> None:
+    # The covariance of these positions is diag(2, 2 ratio, 0); the poses are turned around the line, the positions not.
+    off = np.sqrt(ratio)
+    t = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, off, 0.0], [0.0, -off, 0.0]])
+    turned = Poses(exp_map(np.tile([0.3, 0.0, 0.0], (4, 1))), t)
+    aligned = turned.aligned_to(Poses(np.tile(np.eye(3), (4, 1, 1)), t))
+    expected = turned.R if positions_decide else np.tile(np.eye(3), (4, 1, 1))
+    np.testing.assert_allclose(aligned.R, expected, rtol=0, atol=1e-7)
 
 
 @given(seed=SEEDS, n=COUNTS, d=DIMENSIONS)
