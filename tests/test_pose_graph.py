@@ -91,6 +91,10 @@ def test_disconnected_graphs_are_named() -> None:
     graph = dataclasses.replace(path_graph(4), num_poses=6)
     with pytest.raises(GraphError, match=r"3 components \(sizes 4, 1, 1; with poses 0, 4, 5\)"):
         graph.check_connected()
+    with pytest.raises(GraphError, match=r"5 components \(sizes 2, 1, 1, 1, 1; with poses 0, 2, 3, 4, 5\)"):
+        dataclasses.replace(path_graph(2), num_poses=6).check_connected()
+    with pytest.raises(GraphError, match=r"sizes 2, 1, 1, 1, 1 and 1 more; with poses 0, 2, 3, 4, 5 and 1 more"):
+        dataclasses.replace(path_graph(2), num_poses=7).check_connected()
 
 
 @given(seed=SEEDS, n=st.integers(3, 30), d=DIMENSIONS)
@@ -118,8 +122,11 @@ def test_subgraph_keeps_what_lies_in_it(seed: int, n: int, d: int) -> None:
     np.testing.assert_array_equal(part.robots[:, None] == part.robots, same_robot)
 
 
-def test_subgraph_of_everything_is_the_graph() -> None:
+@pytest.mark.parametrize("backwards", [False, True])
+def test_subgraph_of_everything_is_the_graph(backwards: bool) -> None:
     graph = random_geometric(10, np.random.default_rng(0))
+    if backwards:
+        graph = dataclasses.replace(graph, i=graph.j, j=graph.i)
     whole = graph.subgraph(np.arange(10))
     for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(graph, name))
