@@ -34,6 +34,9 @@ def test_defaults_and_properties() -> None:
     ("changes", "message"),
     [
         ({"i": [0, 1, 9]}, r"edge 2 \(9 -> 3\) names a pose outside 0 .. 3"),
+        ({"i": [0, 1, 4]}, r"edge 2 \(4 -> 3\) names a pose outside 0 .. 3"),
+        ({"fixed": [3, 4]}, r"fixed names a pose outside 0 \.\. 3"),
+        ({"fixed": [-1]}, r"fixed names a pose outside 0 \.\. 3"),
         ({"j": [-1, 2, 3]}, r"edge 0 \(0 -> -1\) names a pose outside"),
         ({"j": [1, 1, 3]}, r"edge 1 \(1 -> 1\) leads from a pose to itself"),
         ({"i": [0, 1], "j": [1, 2]}, "R_ij has shape"),
