@@ -16,13 +16,14 @@ import cvxpy as cp
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
+from pgo_models.arrays import ReadOnly, read_only, real_array
 from pgo_models.conic import TOLERANCE, check_convex, check_variable, finite_array, solve_compiled
 from pgo_models.errors import SettingError
 from pgo_models.rotations import Array
 
 
 @dataclass(frozen=True, eq=False)
-class BregmanPoint:
+class BregmanPoint(ReadOnly):
     """Where an iteration starts or ends: x, (m,), and the multiplier lam, (s,), of K x = f.
 
     `lam` is the paper's lambda: the Lagrangian is J(x) + <lam, f - K x>, so that p = K^T lam is a subgradient of J at
@@ -36,6 +37,10 @@ class BregmanPoint:
 
     x: Array
     lam: Array
+
+    def __post_init__(self) -> None:
+        for name in ("x", "lam"):
+            object.__setattr__(self, name, real_array(getattr(self, name), name, SettingError))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,14 +91,14 @@ class BregmanProblem:
                 raise SettingError(f"J has the variable {variable}, which is not among the variables named; add it")
         f = np.atleast_1d(finite_array(self.f, "f"))
         if issparse(self.K):
-            K = csr_array(self.K, dtype=float, copy=True)
-            finite_array(K.data, "the entries of K")
+            K = csr_array(self.K, copy=True)
+            K.data = finite_array(K.data, "the entries of K")
         else:
             K = csr_array(np.atleast_2d(finite_array(self.K, "K")))
         m = sum(int(variable.size) for variable in variables)
         if f.ndim != 1 or K.shape != (len(f), m):
             raise SettingError(f"K has shape {K.shape} and f {f.shape}; with m = {m} they must be (s, {m}) and (s,)")
-        for name, value in (("variables", variables), ("K", K), ("f", f)):
+        for name, value in (("variables", variables), ("K", read_only(K)), ("f", read_only(f))):
             object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:

@@ -19,6 +19,8 @@ from __future__ import annotations
 import enum
 import importlib.util
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Protocol, overload
@@ -370,8 +372,8 @@ class _Cholmod(SymbolicCholesky):
         return self._counts
 
     def _analyze(self) -> _Capsule:
-        _, cholmod = _import_cvxopt()
-        capsule: _Capsule = cholmod.symbolic(self._matrix)
+        with _supernodal() as cholmod:
+            capsule: _Capsule = cholmod.symbolic(self._matrix)
         return capsule
 
     def factorize(self, matrix: csc_array, overwrite: CholeskyFactor | None = None) -> CholeskyFactor:
@@ -390,13 +392,21 @@ class _Cholmod(SymbolicCholesky):
         """Fill the capsule with the factor of the matrix that has these values in its lower triangle."""
         cvxopt, cholmod = _import_cvxopt()
         self._matrix.V = cvxopt.matrix(lower)
-        saved = cholmod.options.get("supernodal", 2)
-        cholmod.options["supernodal"] = 2  # L L^T, which exists for positive definite matrices only
-        try:
+        with _supernodal():
             cholmod.numeric(self._matrix, capsule)
-        finally:
-            cholmod.options["supernodal"] = saved
         return capsule
+
+
+@contextmanager
+def _supernodal() -> Iterator[ModuleType]:
+    """CHOLMOD set to L L^T, which exists for positive definite matrices only: to analyse for L D L^T accepts others."""
+    _, cholmod = _import_cvxopt()
+    saved = cholmod.options.get("supernodal", 2)
+    cholmod.options["supernodal"] = 2
+    try:
+        yield cholmod
+    finally:
+        cholmod.options["supernodal"] = saved
 
 
 def _import_cvxopt() -> tuple[ModuleType, ModuleType]:

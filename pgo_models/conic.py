@@ -7,6 +7,7 @@ import warnings
 import cvxpy as cp
 import numpy as np
 
+from pgo_models.arrays import real_array
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.rotations import Array
 
@@ -101,17 +102,14 @@ def _status(problem: cp.Problem, tolerance: float) -> str:
 
 
 def finite_array(values: object, name: str) -> Array:
-    """Copy of `values` as floats.
+    """Read-only copy of `values` as doubles.
 
     Raises
     ------
     SettingError
-        When they are no numbers, or not finite.
+        When they are no real numbers, or not finite.
     """
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise SettingError(f"{name} is not an array of real numbers: {error}") from error
+    array = real_array(values, name, SettingError)
     bad = np.argwhere(~np.isfinite(array))
     if len(bad):
         where = tuple(int(index) for index in bad[0])

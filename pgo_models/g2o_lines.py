@@ -156,7 +156,8 @@ class _Source:
         kind = _TAGS[tag]
         if not at:
             return np.zeros((0, kind.num_ids), dtype=np.int64), np.zeros((0, kind.num_numbers))
-        if len(ids) != kind.num_ids * len(at) or not all(numbers):
+        joined = "".join(ids)
+        if len(ids) != kind.num_ids * len(at) or not all(numbers) or "_" in joined or not joined.isascii():
             self._diagnose(tag, at)
         try:
             parsed_ids = np.array(list(map(int, ids)), dtype=np.int64).reshape(-1, kind.num_ids)
@@ -170,7 +171,8 @@ class _Source:
     def integer(self, line: int, word: str) -> int:
         """Id of 64 bits."""
         try:
-            value = int(word)
+            # int() also takes 1_000 and the digits of other scripts; number files do not.
+            value = int(word if word.isascii() and "_" not in word else "")
         except ValueError:
             raise self._error(line, f"id {word[:40]!r} is no integer; number the poses") from None
         if not -(2**63) <= value < 2**63:

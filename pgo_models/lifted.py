@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pgo_models.arrays import read_only, real_array
 from pgo_models.matrices import inner
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array
@@ -64,6 +65,7 @@ def lifted_point(problem: PGOProblem, Y: Array) -> LiftedPoint:
     >>> bool(np.isclose(point.value, problem.objective(problem.with_best_translations(R))))
     True
     """
+    Y = real_array(Y, "Y")
     n, d, r = Y.shape
     rows = Y.reshape(n * d, r)
     A, w = problem.residual_matrix
@@ -72,7 +74,7 @@ def lifted_point(problem: PGOProblem, Y: Array) -> LiftedPoint:
     weighted = w[:, None] * residuals
     QY = np.asarray(A.T @ weighted)[n:].reshape(n, d, r)
     Lambda = row_products(QY, Y)
-    return LiftedPoint(Y, inner(residuals, weighted), Lambda, 2.0 * (QY - Lambda @ Y))
+    return LiftedPoint(Y, inner(residuals, weighted), read_only(Lambda), read_only(2.0 * (QY - Lambda @ Y)))
 
 
 def hessian_product(problem: PGOProblem, point: LiftedPoint, V: Array) -> Array:

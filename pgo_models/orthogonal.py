@@ -15,6 +15,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from pgo_models.arrays import real_array
 from pgo_models.conic import check_convex, check_variable, finite_array, solve_compiled
 from pgo_models.constraint_sets import ConstraintSet, Orthonormal, Rotations, Sparse, UnitColumns, UnitRows
 from pgo_models.errors import SettingError
@@ -52,6 +53,11 @@ class OrthogonalPoint:
 
     copies: tuple[Array, ...]
     normals: tuple[Array, ...]
+
+    def __post_init__(self) -> None:
+        for name in ("copies", "normals"):
+            arrays = tuple(real_array(array, f"the point's {name}", SettingError) for array in getattr(self, name))
+            object.__setattr__(self, name, arrays)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array
 
+from pgo_models.arrays import ReadOnly, whole_array, whole_number
 from pgo_models.errors import MissingExtraError, SettingError
-from pgo_models.pose_graph import IntArray, PoseGraph
+from pgo_models.pose_graph import IntArray, PoseGraph, has_no_gap
 from pgo_models.rotations import BoolArray
 
 
@@ -31,14 +32,19 @@ class PartitionMethod(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Partition:
+class Partition(ReadOnly):
     """Which robot owns which pose.
 
     Attributes
     ----------
     robot : (n,)
-        0 .. num_robots - 1, every one of which owns a pose.
+        0 .. num_robots - 1, every one of which owns a pose. A read-only copy.
     method : PartitionMethod
+
+    Raises
+    ------
+    SettingError
+        When `robot` does not number the robots so.
 
     Examples
     --------
@@ -51,6 +57,12 @@ class Partition:
 
     robot: IntArray
     method: PartitionMethod
+
+    def __post_init__(self) -> None:
+        robot = whole_array(self.robot, "robot", SettingError)
+        if robot.ndim != 1 or not has_no_gap(robot):
+            raise SettingError(f"robot, of shape {robot.shape}, must number the robots 0, 1, .. without a gap")
+        object.__setattr__(self, "robot", robot)
 
     @property
     def num_robots(self) -> int:
@@ -98,7 +110,7 @@ def partition(graph: PoseGraph, num_robots: int | None = None, method: Partition
     Raises
     ------
     SettingError
-        When the number of robots is not 1 to n, or GIVEN does not fit it.
+        When the number of robots is not a whole one of 1 to n, or GIVEN does not fit it.
     MissingExtraError
         When METIS is asked for without the extra `fast`.
 
@@ -110,6 +122,8 @@ def partition(graph: PoseGraph, num_robots: int | None = None, method: Partition
     Partition(3 robots, 9 to 9 poses each, contiguous in time)
     """
     n = graph.num_poses
+    if num_robots is not None:
+        num_robots = whole_number(num_robots, "num_robots", SettingError)
     named = graph.robot is not None and num_robots in (None, graph.num_robots)
     if method is None:
         method = PartitionMethod.GIVEN if named else PartitionMethod.CONTIGUOUS

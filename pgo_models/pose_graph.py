@@ -9,16 +9,17 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
+from pgo_models.arrays import ReadOnly, real_array, whole_array, whole_number
 from pgo_models.errors import GraphError
 from pgo_models.html_tables import facts_table
-from pgo_models.poses import ROTATION_TOLERANCE, Poses
-from pgo_models.rotations import Array, orthogonality_error
+from pgo_models.poses import Poses, rotations_to_rounding
+from pgo_models.rotations import Array
 
 IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class PoseGraph:
+class PoseGraph(ReadOnly):
     """n poses and m measured edges; edge e says x_i^-1 x_j = (R_ij, t_ij) with precisions kappa and tau.
 
     Attributes
@@ -27,7 +28,7 @@ class PoseGraph:
     i, j : (m,)
         0-based poses of every edge. Repeated edges all count.
     R_ij : (m, d, d)
-        Measured rotations.
+        Measured rotations; what is given is treated as by `Poses`.
     t_ij : (m, d)
         Measured translations, metres, in the frame of pose i.
     kappa, tau : (m,)
@@ -44,10 +45,13 @@ class PoseGraph:
         Poses that the file says are fixed. F does not depend on the gauge: this is kept for writing, not used.
     name : str
 
+    All arrays are read-only copies: `dataclasses.replace` makes a graph with others.
+
     Raises
     ------
     GraphError
-        On wrong shapes, an edge to itself or to no pose, nan or inf, no rotation, or a precision that is not positive.
+        On wrong shapes, entries that are no real or no whole numbers, an edge to itself or to no pose, nan or inf, no
+        rotation, or a precision that is not positive.
 
     Examples
     --------
@@ -73,16 +77,20 @@ class PoseGraph:
     name: str = "graph"
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "num_poses", whole_number(self.num_poses, "num_poses"))
         for name in ("i", "j", "ids", "robot", "fixed"):
             value = getattr(self, name)
             if value is not None:
-                object.__setattr__(self, name, np.asarray(value, dtype=np.int64))
+                object.__setattr__(self, name, whole_array(value, name))
         for name in ("R_ij", "t_ij", "kappa", "tau", "information"):
             value = getattr(self, name)
             if value is not None:
-                object.__setattr__(self, name, np.asarray(value, dtype=float))
+                object.__setattr__(self, name, real_array(value, name))
         self._check_shapes()
         self._check_values()
+        object.__setattr__(
+            self, "R_ij", rotations_to_rounding(self.R_ij, lambda edge: f"R_ij of {self.edge_label(edge)}")
+        )
 
     @property
     def d(self) -> int:
@@ -236,18 +244,11 @@ class PoseGraph:
             raise GraphError(f"{self.edge_label(int(np.argmax(loops)))} leads from a pose to itself; remove it")
         if ((self.fixed < 0) | (self.fixed >= self.num_poses)).any():
             raise GraphError(f"fixed names a pose outside 0 .. {self.num_poses - 1}")
-        for name in ("R_ij", "t_ij", "kappa", "tau"):
-            value = getattr(self, name).reshape(self.num_edges, -1)
-            finite = np.isfinite(value).all(axis=1)
-            if not finite.all():
+        for name in ("R_ij", "t_ij", "kappa", "tau", "information"):
+            value = getattr(self, name)
+            if value is not None and not np.isfinite(value).all():
+                finite = np.isfinite(value.reshape(self.num_edges, -1)).all(axis=1)
                 raise GraphError(f"{name} of {self.edge_label(int(np.argmin(finite)))} has nan or inf; remove the edge")
-        error = orthogonality_error(self.R_ij)
-        worst = int(np.argmax(error))
-        if error[worst] > ROTATION_TOLERANCE:
-            raise GraphError(
-                f"R_ij of {self.edge_label(worst)} is no rotation: ||R^T R - I|| or 1 - det R is {error[worst]:.3g}; "
-                "see pgo_models.project_to_rotations()"
-            )
         for name in ("kappa", "tau"):
             value = getattr(self, name)
             if not (value > 0).all():
@@ -255,8 +256,13 @@ class PoseGraph:
                 raise GraphError(f"{name} of {self.edge_label(e)} is {value[e]:.6g}; a precision must be positive")
         if self.ids is not None and len(np.unique(self.ids)) != self.num_poses:
             raise GraphError("ids are not unique; every pose needs a name of its own")
-        if self.robot is not None and (self.robot.min() < 0 or len(np.unique(self.robot)) != self.robot.max() + 1):
+        if self.robot is not None and not has_no_gap(self.robot):
             raise GraphError("robot must number the robots 0, 1, .. without a gap; see numpy.unique")
+
+
+def has_no_gap(robot: IntArray) -> bool:
+    """Whether the robots are numbered 0, 1, .. and every one owns a pose."""
+    return len(robot) > 0 and robot.min() == 0 and len(np.unique(robot)) == robot.max() + 1
 
 
 def middle_pose(graph: PoseGraph) -> int:

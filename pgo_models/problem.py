@@ -8,8 +8,9 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csc_array, csr_array
 
+from pgo_models.arrays import read_only
 from pgo_models.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, analyze, factorize
-from pgo_models.errors import GraphError
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.matrices import (
     connection_laplacian,
     entry_positions,
@@ -74,27 +75,28 @@ class PGOProblem:
         """N = (d + 1) n, the rows of X."""
         return (self.d + 1) * self.num_poses
 
-    # Matrices, each built when first asked for.
+    # Matrices, each built when first asked for, read-only: what follows from them is kept, too.
 
     @cached_property
     def M(self) -> csc_array:
         """M, (N, N): F = tr(X^T M X)."""
-        return joint_matrix(self.graph)
+        return read_only(joint_matrix(self.graph))
 
     @cached_property
     def L(self) -> csc_array:
         """L, (dn, dn): the rotation part of F is tr(Y^T L Y) for Y the rows R_i^T."""
-        return connection_laplacian(self.graph)
+        return read_only(connection_laplacian(self.graph))
 
     @cached_property
     def Q(self) -> Array:
         """Q, (dn, dn), dense: min over t of F is tr(Y^T Q Y) for Y the rows R_i^T; for small graphs."""
-        return marginalized_matrix(self.graph)
+        return read_only(marginalized_matrix(self.graph))
 
     @cached_property
     def residual_matrix(self) -> tuple[csr_array, Array]:
         """A, ((d+1) m, N), and w: F = sum_rows w ||A X||^2."""
-        return residual_matrix(self.graph)
+        A, w = residual_matrix(self.graph)
+        return read_only(A), read_only(w)
 
     @cached_property
     def analysis(self) -> SymbolicCholesky:
@@ -105,7 +107,7 @@ class PGOProblem:
     def diagonal_positions(self) -> IntArray:
         """Positions in `M.data` of the diagonal of M, (N,)."""
         all_rows = np.arange(self.side)
-        return entry_positions(self.M, all_rows, all_rows)
+        return read_only(entry_positions(self.M, all_rows, all_rows))
 
     @cached_property
     def block_positions(self) -> IntArray:
@@ -113,7 +115,7 @@ class PGOProblem:
         n, d = self.num_poses, self.d
         columns = rotation_columns(np.arange(n), n, d)
         rows = np.repeat(columns[:, :, None], d, axis=2)
-        return entry_positions(self.M, rows.ravel(), np.swapaxes(rows, 1, 2).ravel()).reshape(n, d, d)
+        return read_only(entry_positions(self.M, rows.ravel(), np.swapaxes(rows, 1, 2).ravel()).reshape(n, d, d))
 
     def with_pattern_of_M(self, data: Array) -> csc_array:
         """Return the matrix that has the pattern of M and the given stored values."""
@@ -185,8 +187,12 @@ class PGOProblem:
         Raises
         ------
         GraphError
-            When their number or dimension differs from the graph's.
+            When their number or dimension differs from the graph's, or they are no Poses.
         """
+        if not isinstance(poses, Poses):
+            raise GraphError(
+                f"poses are a {type(poses).__name__}; give Poses(R, t), or problem.with_best_translations(R)"
+            )
         if poses.t.shape != (self.num_poses, self.d):
             raise GraphError(f"{poses} beside {self}; give one pose for every pose of the graph, in its order")
         return poses.stacked()
@@ -204,3 +210,19 @@ class PGOProblem:
     @cached_property
     def _M_rotation_rows(self) -> csr_array:
         return self.M[self.num_poses :].tocsr()
+
+
+def as_problem(given: object) -> PGOProblem:
+    """Return the problem that is given, or that of the graph that is given.
+
+    Raises
+    ------
+    SettingError
+        When it is neither.
+    """
+    if isinstance(given, PoseGraph):
+        return PGOProblem(given)
+    if isinstance(given, PGOProblem):
+        return given
+    way_out = "pgo_models.load() reads a file or a data set"
+    raise SettingError(f"the problem is {given!r:.60}; give a PGOProblem or a PoseGraph: {way_out}")

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
+from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
-from pgo_models.problem import PGOProblem
+from pgo_models.problem import PGOProblem, as_problem
 from solvers.result import History, Measurement, Outcome, Record, Run, Status
 from solvers.table import Table
 
@@ -89,7 +90,7 @@ def iterate(method: Method[P, X, S], problem: P, start: X | None = None) -> Iter
 
 def run(
     solver: Solver[S],
-    problem: PGOProblem,
+    problem: PGOProblem | PoseGraph,
     start: Poses | None = None,
     *,
     callback: Callable[[S, Record], bool | None] | None = None,
@@ -102,7 +103,7 @@ def run(
     Parameters
     ----------
     solver : Solver
-    problem : PGOProblem
+    problem : PGOProblem or PoseGraph
     start : Poses, optional
         The method's own start unless given.
     callback : callable, optional
@@ -121,7 +122,7 @@ def run(
     Raises
     ------
     SettingError
-        When time_limit is not positive.
+        When time_limit is not positive, or the problem is none.
 
     Examples
     --------
@@ -133,6 +134,7 @@ def run(
     >>> result.status.name, len(result.history) == result.iterations + 1
     ('CONVERGED', True)
     """
+    problem = as_problem(problem)
     began = time.perf_counter()
     outcome = run_method(
         solver, problem, start, callback=callback, time_limit=time_limit, verbose=verbose, progress=progress

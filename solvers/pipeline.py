@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from pgo_models.arrays import whole_number
 from pgo_models.certificate import DEFAULT_GAP, BoundSource, Certificate, certify_at, certify_with, judge
 from pgo_models.errors import SettingError
 from pgo_models.initialization import chordal_start, spanning_tree_start
 from pgo_models.partition import Partition, partition
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
-from pgo_models.problem import PGOProblem
+from pgo_models.problem import PGOProblem, as_problem
 from solvers.checkpoint import Checkpoint, Journal, fingerprint
 from solvers.distributed import attempt_distributed, open_driver
 from solvers.engine import Engine, InProcess
@@ -127,8 +128,9 @@ def solve(
     Raises
     ------
     PGOError
-        When the graph is not connected, the start does not fit it, the time limit is not positive, or the checkpoint is
-        of another run; when the robots cannot be started, are not those of the pipeline's SOC, or cannot run it.
+        When the problem or the pipeline is something else; when the graph is not connected, the start does not fit it,
+        the time limit is not positive, or the checkpoint is of another run; when the robots cannot be started, are not
+        those of the pipeline's SOC, or cannot run it.
 
     Examples
     --------
@@ -141,11 +143,15 @@ def solve(
     began = time.perf_counter()
     if not time_limit > 0:
         raise SettingError(f"time_limit is {time_limit}; give positive seconds")
-    if isinstance(problem, PoseGraph):
-        problem = PGOProblem(problem)
+    problem = as_problem(problem)
     if robots is None and (engine is not None or checkpoint is not None):
         raise SettingError("engine and checkpoint are for solves by robots; give robots, a number or a Partition")
     pipeline = pipeline if pipeline is not None else Pipeline()
+    if not isinstance(pipeline, Pipeline):
+        raise SettingError(
+            f"the pipeline is a {type(pipeline).__name__}; give Pipeline(soc=SOC(..)), or run one method alone: "
+            "solvers.run(SOC(..), problem)"
+        )
     if robots is None and pipeline.faults is not None:
         raise SettingError("faults are of messages between robots; give solve() the robots of SOC, too")
     stages: list[Stage] = []
@@ -196,7 +202,8 @@ def _robots_for(soc: SOC | None, robots: Partition | int, graph: PoseGraph) -> P
         When SOC is of other robots, or is not for robots.
     """
     own = soc.robots if soc is not None else None
-    if isinstance(robots, int):
+    if not isinstance(robots, Partition):
+        robots = whole_number(robots, "robots", SettingError)
         robots = own if own is not None and own.num_robots == robots else partition(graph, robots)
     if own is not None and not np.array_equal(own.robot, robots.robot):
         raise SettingError(f"solve() has {robots}, SOC has {own}; give both the same robots, or SOC none")

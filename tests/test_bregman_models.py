@@ -81,7 +81,10 @@ def test_bad_objectives_are_refused(J, message: str) -> None:
         (np.ones((2, 3)), [1.0], r"f \(1,\)"),
         (np.full((1, 3), np.nan), [1.0], "K has 3 entries that are not finite"),
         (np.ones((1, 3)), [np.inf], r"f has 1 entries that are not finite, the first at \(0,\): inf"),
-        (np.ones((1, 3)), ["one"], "f is not an array of real numbers"),
+        (np.ones((1, 3)), ["one"], "f must be real numbers, got type <U3"),
+        (np.ones((1, 3)) * 1j, [1.0], "K must be real numbers, got type complex128"),
+        (csr_array(np.ones((1, 3)) * 1j), [1.0], r"the entries of K must be .* numbers, got type complex128"),
+        (np.ones((1, 3)), [1.0 + 1j], "f must be real numbers, got type complex128"),
     ],
 )
 def test_bad_constraints_are_refused(K, f, message: str) -> None:

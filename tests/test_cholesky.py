@@ -2,6 +2,7 @@ import sys
 
 import numpy as np
 import pytest
+from cvxopt import cholmod
 from graphs import DIMENSIONS, EPS, SEEDS, SIZES, varied_problem
 from hypothesis import given
 from hypothesis import strategies as st
@@ -145,6 +146,16 @@ def test_singular_and_indefinite_matrices_are_rejected(backend: CholeskyBackend,
     assert not is_positive_definite(matrix, backend)
     with pytest.raises(NotPositiveDefiniteError, match=r"singular|pivot"):
         factorize(matrix, backend)
+
+
+@pytest.mark.parametrize("rows", [[[-1.0]], [[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.0], [0.0, -1.0]]])
+@pytest.mark.parametrize("others", [0, 1])
+def test_an_option_that_others_set_lets_no_indefinite_matrix_pass(
+    others: int, rows: list[list[float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(cholmod.options, "supernodal", others)  # L D L^T, which indefinite matrices have
+    assert not is_positive_definite(dense_matrix(np.array(rows)), CholeskyBackend.CHOLMOD)
+    assert cholmod.options["supernodal"] == others
 
 
 @BACKENDS

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pgo_models.errors import FileFormatError
-from pgo_models.g2o_lines import information_of, read_lines
+from pgo_models.g2o_lines import information_of, poses_of, read_lines
 
 IDENTITY_3D = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
 EDGE_3D = f"EDGE_SE3:QUAT 0 1 1 2 3 0 0 0 1 {IDENTITY_3D}"
@@ -39,6 +39,11 @@ def write(folder: Path, *lines: str) -> Path:
         ([EDGE_3D, EDGE_3D[:-1] + "1e-320"], ":2", ["rotation block"]),
         ([EDGE_3D, EDGE_3D.replace(" 0 1 1 ", " 0 1.0 1 ", 1)], ":2", ["id '1.0' is no integer"]),
         ([EDGE_3D, EDGE_3D.replace(" 0 1 1 ", " 0 b1 1 ", 1)], ":2", ["id 'b1' is no integer"]),
+        ([EDGE_3D, EDGE_3D.replace(" 0 1 1 ", " 0 1_1 1 ", 1)], ":2", ["id '1_1' is no integer"]),
+        ([EDGE_3D, EDGE_3D.replace(" 0 1 1 ", " 0 0.5 1 ", 1)], ":2", ["id '0.5' is no integer"]),
+        ([EDGE_3D, EDGE_3D[:-1] + "nan"], ":2", ["nan is not finite"]),
+        ([EDGE_3D, EDGE_3D[:-1] + "1+0j"], ":2", ["'1+0j' is no number"]),
+        ([EDGE_3D, "FIX 0_1"], ":2", ["id '0_1' is no integer"]),
         ([EDGE_3D, EDGE_3D.replace(" 0 1 1 ", f" 0 {2**64} 1 ", 1)], ":2", ["does not fit 64 bits"]),
         ([EDGE_3D, EDGE_3D.replace("3 0 0 0 1", "3 0 0 0 0")], ":2", ["zero quaternion", "0 0 0 1"]),
         ([EDGE_3D, VERTEX_3D[:-1] + "0"], ":2", ["zero quaternion"]),
@@ -47,6 +52,10 @@ def write(folder: Path, *lines: str) -> Path:
         ([EDGE_3D, EDGE_3D.replace("1 1 0 0 0 0 0 1", "1 -1 0 0 0 0 0 1")], ":2", ["translation block", "-1"]),
         ([EDGE_2D, EDGE_2D[:-1] + "-9"], ":2", ["rotation block", "-9"]),
         ([EDGE_2D, EDGE_2D.replace("4 0 0 4", "4 4 0 4")], ":2", ["translation block"]),
+        ([EDGE_3D, EDGE_3D.replace("3 0 0 0 1", "3 0 0 0 9e-10")], ":2", ["zero quaternion"]),
+        ([EDGE_3D, VERTEX_3D[:-7] + "6e-10 0 6e-10 -3e-10"], ":2", ["zero quaternion"]),
+        ([EDGE_2D, EDGE_2D.replace("4 0 0 4", "1 1 0 1.0000000000000004")], ":2", ["translation block"]),
+        ([EDGE_3D, EDGE_3D[:-5] + "1 1 1.0000000000000004"], ":2", ["rotation block"]),
         ([VERTEX_3D, EDGE_3D, VERTEX_3D], ":3", ["second VERTEX line of pose 0", "line 1"]),
         ([EDGE_3D, EDGE_3D, EDGE_2D], ":3", ["2D and 3D", "line 1"]),
         ([EDGE_3D, "FIX first"], ":2", ["id 'first' is no integer"]),
@@ -91,3 +100,12 @@ def test_information_is_the_upper_triangle_by_rows(tmp_path: Path) -> None:
 def test_coupling_blocks_may_be_anything(tmp_path: Path) -> None:
     path = write(tmp_path, "EDGE_SE2 0 1 1 2 0.5 1 0 100 1 0 1")
     assert np.linalg.eigvalsh(information_of(2, read_lines(path).edges))[0, 0] < 0
+
+
+def test_what_is_just_no_fault_is_read(tmp_path: Path) -> None:
+    # Two pivots above the level at which a block counts as singular, and a short quaternion with a direction.
+    almost = EDGE_2D.replace("4 0 0 4", "1 1 0 1.000000000000002")
+    assert information_of(2, read_lines(write(tmp_path, almost)).edges)[0, 1, 1] > 1
+    found = read_lines(write(tmp_path, EDGE_3D.replace("3 0 0 0 1", "3 0 0 1.1e-9 0"), VERTEX_3D[:-1] + "-1.1e-9"))
+    np.testing.assert_allclose(poses_of(3, found.edges)[0][0], np.diag([-1.0, -1.0, 1.0]), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(poses_of(3, found.vertices)[0][0], np.eye(3), rtol=0, atol=1e-15)

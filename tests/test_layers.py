@@ -15,6 +15,7 @@ ORDER = {
         "files",
         "html_tables",
         "rotations",
+        "arrays",
         "stiefel",
         "poses",
         "pose_graph",

@@ -136,3 +136,42 @@ def test_a_disconnected_graph_is_refused_with_its_components_named():
 def test_settings_out_of_range_are_refused():
     with pytest.raises(pgo.SettingError, match="gap must be positive"):
         solvers.Pipeline(gap=0.0)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda problem: solvers.solve("grid"), r"the problem is 'grid'; give a PGOProblem or a PoseGraph: .*load\(\)"),
+        (lambda problem: solvers.run(solvers.Newton(), "grid"), "the problem is 'grid'; give a PGOProblem"),
+        (lambda problem: solvers.solve(problem, solvers.SOC()), r"pipeline is a SOC; give Pipeline\(soc=SOC\(..\)\)"),
+        (lambda problem: solvers.solve(problem, robots=True), "robots is True; give a whole number"),
+        (lambda problem: solvers.solve(problem, robots=2.5), r"robots is 2\.5; give a whole number"),
+        (lambda problem: solvers.solve(problem, robots="2"), "robots is '2'; give a whole number"),
+        (lambda problem: pgo.certify(problem, problem.graph.truth.R), r"poses are a ndarray; give Poses\(R, t\), or"),
+        (lambda problem: solvers.solve(problem, start=problem.graph.truth.R), "poses are a ndarray; give Poses"),
+        (lambda problem: problem.objective(None), "poses are a NoneType; give Poses"),
+    ],
+)
+def test_what_is_given_in_the_wrong_place_is_named_with_the_right_call(call, message):
+    with pytest.raises(pgo.PGOError, match=message):
+        call(pgo.PGOProblem(pgo.grid(np.random.default_rng(0))))
+
+
+def test_a_graph_is_as_good_as_its_problem():
+    graph = pgo.grid(np.random.default_rng(0))
+    one, other = (solvers.run(solvers.Newton(), given) for given in (graph, pgo.PGOProblem(graph)))
+    np.testing.assert_array_equal(one.poses.R, other.poses.R)
+    assert one.objective == other.objective
+
+
+@pytest.mark.parametrize("factor", [1 - 2e-7, 1 - 1e-10])
+def test_poses_that_are_nearly_rotations_are_not_below_the_optimum(factor):
+    problem = pgo.PGOProblem(pgo.grid(np.random.default_rng(0)))
+    optimum = solvers.solve(problem, solvers.Pipeline(gap=1e-12))
+    shrunk = factor * optimum.poses.R
+    near = pgo.Poses(shrunk, optimum.poses.t)
+    # In the equation itself, at the matrices as they are given, F is lower by about that factor.
+    X = np.concatenate([problem.recover_translations(shrunk), np.swapaxes(shrunk, 1, 2).reshape(-1, 3)])
+    assert problem.objective_stacked(X) < optimum.objective * (1 - 1e-11)
+    assert problem.objective(near) >= optimum.objective * (1 - 1e-14)
+    assert problem.objective(problem.with_best_translations(shrunk)) >= optimum.objective * (1 - 1e-14)

@@ -34,6 +34,9 @@ def test_defaults_and_properties() -> None:
     ("changes", "message"),
     [
         ({"i": [0, 1, 9]}, r"edge 2 \(9 -> 3\) names a pose outside 0 .. 3"),
+        ({"i": [0, 1, 4]}, r"edge 2 \(4 -> 3\) names a pose outside 0 .. 3"),
+        ({"fixed": [3, 4]}, r"fixed names a pose outside 0 \.\. 3"),
+        ({"fixed": [-1]}, r"fixed names a pose outside 0 \.\. 3"),
         ({"j": [-1, 2, 3]}, r"edge 0 \(0 -> -1\) names a pose outside"),
         ({"j": [1, 1, 3]}, r"edge 1 \(1 -> 1\) leads from a pose to itself"),
         ({"i": [0, 1], "j": [1, 2]}, "R_ij has shape"),
@@ -91,6 +94,10 @@ def test_disconnected_graphs_are_named() -> None:
     graph = dataclasses.replace(path_graph(4), num_poses=6)
     with pytest.raises(GraphError, match=r"3 components \(sizes 4, 1, 1; with poses 0, 4, 5\)"):
         graph.check_connected()
+    with pytest.raises(GraphError, match=r"5 components \(sizes 2, 1, 1, 1, 1; with poses 0, 2, 3, 4, 5\)"):
+        dataclasses.replace(path_graph(2), num_poses=6).check_connected()
+    with pytest.raises(GraphError, match=r"sizes 2, 1, 1, 1, 1 and 1 more; with poses 0, 2, 3, 4, 5 and 1 more"):
+        dataclasses.replace(path_graph(2), num_poses=7).check_connected()
 
 
 @given(seed=SEEDS, n=st.integers(3, 30), d=DIMENSIONS)
@@ -118,8 +125,11 @@ def test_subgraph_keeps_what_lies_in_it(seed: int, n: int, d: int) -> None:
     np.testing.assert_array_equal(part.robots[:, None] == part.robots, same_robot)
 
 
-def test_subgraph_of_everything_is_the_graph() -> None:
+@pytest.mark.parametrize("backwards", [False, True])
+def test_subgraph_of_everything_is_the_graph(backwards: bool) -> None:
     graph = random_geometric(10, np.random.default_rng(0))
+    if backwards:
+        graph = dataclasses.replace(graph, i=graph.j, j=graph.i)
     whole = graph.subgraph(np.arange(10))
     for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(graph, name))
@@ -130,6 +140,13 @@ def test_unit_weights() -> None:
     assert (graph.kappa == 1).all()
     assert (graph.tau == 1).all()
     assert graph.information is None
+
+
+@pytest.mark.parametrize("name", ["initial", "truth"])
+def test_its_table_says_what_came_with_it(name: str) -> None:
+    bare, given = path_graph(4), dataclasses.replace(path_graph(4), **{name: Poses.identity(4, 2)})
+    assert bare._repr_html_().count("none") == 2
+    assert given._repr_html_().count("none") == given._repr_html_().count("with the graph") == 1
 
 
 def test_with_robots() -> None:

@@ -5,11 +5,19 @@ from hypothesis import strategies as st
 
 from pgo_models.errors import GraphError
 from pgo_models.poses import Poses, absolute_trajectory_error, relative_pose_error
-from pgo_models.rotations import Array, exp_map, random_rotations, tangent_dimension
+from pgo_models.rotations import (
+    Array,
+    exp_map,
+    orthogonality_error,
+    project_to_rotations,
+    random_rotations,
+    tangent_dimension,
+)
 
 SEEDS = st.integers(0, 2**32 - 1)
 DIMENSIONS = st.sampled_from([2, 3])
 COUNTS = st.integers(1, 12)
+TO_ROUNDING = 64 * float(np.finfo(float).eps)
 ROUNDING = 1e-12  # poses here are of order one, and the alignment is a handful of products
 
 
@@ -31,11 +39,16 @@ def assert_same(a: Poses, b: Poses) -> None:
     [
         (np.eye(3), np.zeros(3), r"R has shape \(3, 3\)"),
         (np.zeros((2, 4, 4)), np.zeros((2, 4)), "R has shape"),
+        (np.zeros((1, 2, 3)), np.zeros((1, 2)), r"R has shape \(1, 2, 3\)"),
+        (np.zeros((1, 3, 2)), np.zeros((1, 3)), r"R has shape \(1, 3, 2\)"),
         (np.eye(3)[None], np.zeros((1, 2)), r"t has shape \(1, 2\)"),
         (np.eye(3)[None] * np.nan, np.zeros((1, 3)), "R of pose 0 has nan"),
         (np.stack([np.eye(2)] * 2), np.array([[0, 0], [0, np.inf]]), "t of pose 1 has nan or inf"),
         (np.stack([np.eye(3), 2 * np.eye(3)]), np.zeros((2, 3)), "R of pose 1 is no rotation"),
         (np.diag([1.0, -1.0])[None], np.zeros((1, 2)), "R of pose 0 is no rotation"),
+        (np.full((1, 2, 2), 1e200), np.zeros((1, 2)), "R of pose 0 is no rotation"),
+        (np.full((1, 3, 3), 1e308), np.zeros((1, 3)), "R of pose 0 is no rotation"),
+        (np.stack([np.eye(2), (1 + 1e-6) * np.eye(2)]), np.zeros((2, 2)), "R of pose 1 is no rotation"),
     ],
 )
 def test_what_is_no_pose_is_refused(R: Array, t: Array, message: str) -> None:
@@ -47,6 +60,37 @@ def test_identity_and_emptiness() -> None:
     poses = Poses.identity(4, 3)
     assert (poses.num_poses, poses.d, repr(poses)) == (4, 3, "Poses(n=4, d=3)")
     assert Poses(np.zeros((0, 2, 2)), np.zeros((0, 2))).num_poses == 0
+
+
+@given(seed=SEEDS, n=COUNTS, d=DIMENSIONS, exponent=st.floats(-13.5, -6.5))
+def test_what_is_a_rotation_only_nearly_is_projected(seed: int, n: int, d: int, exponent: float) -> None:
+    rng = np.random.default_rng(seed)
+    exact = random_rotations(n, d, rng)
+    off = rng.standard_normal((n, d, d))
+    R = exact + 10.0**exponent * off / np.linalg.norm(off, axis=(1, 2))[:, None, None]
+    held = Poses(R, np.zeros((n, d))).R
+    assert orthogonality_error(held).max() <= TO_ROUNDING
+    np.testing.assert_allclose(held, project_to_rotations(R), rtol=0, atol=TO_ROUNDING)
+
+
+@given(seed=SEEDS, n=COUNTS, d=DIMENSIONS)
+def test_rotations_to_rounding_are_held_as_they_are(seed: int, n: int, d: int) -> None:
+    rng = np.random.default_rng(seed)
+    R = random_rotations(n, d, rng) @ exp_map(rng.standard_normal((n, tangent_dimension(d))))
+    np.testing.assert_array_equal(Poses(R, np.zeros((n, d))).R, R)
+    mixed = R.copy()
+    mixed[0] *= 1.0 + 1e-8
+    np.testing.assert_array_equal(Poses(mixed, np.zeros((n, d))).R[1:], R[1:])
+    held = Poses(mixed, np.zeros((n, d)))
+    np.testing.assert_array_equal(Poses(held.R, held.t).R, held.R)
+
+
+def test_many_motions_leave_rotations_to_rounding() -> None:
+    rng = np.random.default_rng(0)
+    poses = random_poses(50, 3, rng)
+    for _ in range(200):
+        poses = poses.moved(*random_motion(3, rng))
+    assert orthogonality_error(poses.R).max() <= TO_ROUNDING
 
 
 @given(seed=SEEDS, n=COUNTS, d=DIMENSIONS)
@@ -81,6 +125,22 @@ def test_gauge_puts_a_pose_at_the_origin(seed: int, n: int, d: int, data: st.Dat
     np.testing.assert_allclose(fixed.R[at], np.eye(d), rtol=0, atol=ROUNDING)
     np.testing.assert_allclose(fixed.t[at], np.zeros(d), rtol=0, atol=ROUNDING)
     assert_same(poses.moved(*random_motion(d, rng)).with_gauge_at(at), fixed)
+
+
+def test_the_gauge_is_at_pose_0_unless_another_is_named() -> None:
+    poses = random_poses(3, 3, np.random.default_rng(0))
+    assert_same(poses.with_gauge_at(), poses.with_gauge_at(0))
+
+
+@pytest.mark.parametrize(("ratio", "positions_decide"), [(1.1e-9, True), (0.9e-9, False)])
+def test_positions_on_a_line_to_nine_digits_do_not_fix_the_rotation(ratio: float, positions_decide: bool) -> None:
+    # The covariance of these positions is diag(2, 2 ratio, 0); the poses are turned around the line, the positions not.
+    off = np.sqrt(ratio)
+    t = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, off, 0.0], [0.0, -off, 0.0]])
+    turned = Poses(exp_map(np.tile([0.3, 0.0, 0.0], (4, 1))), t)
+    aligned = turned.aligned_to(Poses(np.tile(np.eye(3), (4, 1, 1)), t))
+    expected = turned.R if positions_decide else np.tile(np.eye(3), (4, 1, 1))
+    np.testing.assert_allclose(aligned.R, expected, rtol=0, atol=1e-7)
 
 
 @given(seed=SEEDS, n=COUNTS, d=DIMENSIONS)

@@ -59,6 +59,30 @@ def test_an_edge_is_uncertain_by_either_precision(weak):
     assert not pgo.uncertain_edges(graph).any()
 
 
+@pytest.mark.parametrize(("worst", "is_misfit"), [(21.0, False), (21.1, True)])
+def test_a_misfit_costs_more_than_six_times_the_mean(worst, is_misfit):
+    # Of seven edges of cost 1 and one of cost 21 the mean is 3.5.
+    residuals = pgo.EdgeResiduals(np.zeros(8), np.zeros(8), np.array([worst, *np.ones(7)]))
+    assert residuals.is_misfit.tolist() == [is_misfit] + [False] * 7
+    assert residuals.share[0] == pytest.approx(worst / (worst + 7), rel=1e-15)
+
+
+def test_where_nothing_costs_anything_no_edge_has_a_share():
+    residuals = pgo.EdgeResiduals(np.zeros(2), np.zeros(2), np.zeros(2))
+    assert residuals.share.tolist() == [0.0, 0.0]
+    assert residuals.is_misfit.tolist() == [False, False]
+    assert pgo.EdgeResiduals(np.zeros(2), np.zeros(2), np.array([1e-300, 3e-300])).share.tolist() == [0.25, 0.75]
+
+
+@pytest.mark.parametrize("weak", ["kappa", "tau"])
+def test_an_uncertain_precision_is_under_a_tenth_of_the_median(weak):
+    graph = pgo.circle(np.random.default_rng(0)).unit_weights()
+    values = np.ones(graph.num_edges)
+    values[:2] = 0.1, 0.0999
+    weights = {"kappa": graph.kappa, "tau": graph.tau, weak: values}
+    assert np.flatnonzero(pgo.uncertain_edges(graph.with_weights(**weights))).tolist() == [1]
+
+
 def test_poses_of_another_graph_are_refused():
     with pytest.raises(pgo.GraphError, match="one pose for every pose"):
         pgo.edge_residuals(pgo.circle(np.random.default_rng(0)), pgo.Poses.identity(3, 3))

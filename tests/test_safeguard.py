@@ -1,12 +1,24 @@
 """When the penalty is raised or refreshed: decisions from the merits alone."""
 
+from dataclasses import replace
+from itertools import islice
+
 import numpy as np
 import pytest
+from graphs import varied_problem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from solvers.penalty import MultiplierPenalty
+from pgo_models.initialization import chordal_start
+from pgo_models.partition import partition
+from solvers.consensus_soc import ConsensusSOC
+from solvers.distributed import open_driver
+from solvers.engine import InProcess
+from solvers.loop import iterate
+from solvers.penalty import FixedPenalty, MultiplierPenalty
 from solvers.safeguard import has_diverged, has_stalled, is_going_round
+from solvers.soc import SOC, Coupling
+from solvers.substructured_soc import SubstructuredSOC
 
 MERITS = st.lists(st.floats(1e-12, 1e12), max_size=40).map(tuple)
 UNITS = st.integers(-20, 20).map(lambda exponent: 2.0**exponent)
@@ -60,3 +72,31 @@ def test_a_cycle_is_noticed_when_patience_is_over(before: int) -> None:
     # It is the median that counts: a few poses may have a penalty far above the others.
     assert is_going_round((*falling, *cycle), np.array([0.1, 3.0, 100.0]))
     assert not is_going_round((*falling, *cycle), np.array([0.1, 5.0, 100.0]))
+
+
+def test_a_hopeless_penalty_is_doubled_twenty_times_and_no_more() -> None:
+    # A million times as much is more than any rule here is wrong by.
+    soc = SOC(penalty=FixedPenalty(1e-14), acceleration=None)
+    states = list(islice(iterate(soc, varied_problem(0, 6, 2)), 600))
+    assert sorted({state.raises for state in states}) == list(range(21))
+    np.testing.assert_array_equal(states[-1].rho, 2.0**20 * states[0].rho)
+
+
+@pytest.mark.parametrize("coupling", [Coupling.JOINT, Coupling.CONSENSUS, Coupling.SUBSTRUCTURED])
+def test_the_twentieth_raise_is_the_last_whoever_runs_it(coupling: Coupling) -> None:
+    given = varied_problem(0, 6, 2)
+    if coupling is Coupling.JOINT:
+        method, problem = SOC(), given
+    else:
+        robots = partition(given.graph, 2)
+        problem = open_driver(given, robots, InProcess())
+        problem.stand(chordal_start(given))
+        soc = SOC(coupling=coupling, robots=robots)
+        method = ConsensusSOC(soc) if coupling is Coupling.CONSENSUS else SubstructuredSOC(soc)
+    *_, state = islice(iterate(method, problem), 4)
+    for raises in (19, 20):
+        diverged = replace(state, raises=raises, merits=(1.0, 11.0))
+        state = method.step(problem, diverged)
+        assert state.raises == 20
+        rho, before = (s.rho if coupling is Coupling.JOINT else s.ratio for s in (state, diverged))
+        np.testing.assert_array_equal(rho, 2.0 ** (20 - raises) * before)

@@ -72,6 +72,7 @@ def test_files_of_others_are_read(tmp_path: Path) -> None:
         ("0 1 2 3 0 0 0 one\n", "a:1: 'one' is no number"),
         ("0 1 2 nan 0 0 0 1\n", "a:1: nan is not finite"),
         ("#\n0 1 2 3 0 0 0 0\n", "a:2: zero quaternion"),
+        ("0 1 2 3 0 0 0 9e-10\n", "a:1: zero quaternion"),
         ("", "a: no rows"),
     ],
 )
@@ -79,6 +80,11 @@ def test_bad_tum_files_are_refused(tmp_path: Path, text: str, message: str) -> N
     (tmp_path / "a").write_text(text)
     with pytest.raises(FileFormatError, match=message):
         read_tum(tmp_path / "a")
+
+
+def test_a_short_quaternion_has_a_direction(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("0 1 2 3 0 0 1.1e-9 0\n")
+    np.testing.assert_allclose(read_tum(tmp_path / "a").R[0], np.diag([-1.0, -1.0, 1.0]), rtol=0, atol=8 * EPS)
 
 
 def test_bad_kitti_files_are_refused(tmp_path: Path) -> None:
