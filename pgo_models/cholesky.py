@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import enum
 import importlib.util
+import weakref
 from abc import ABC, abstractmethod
 from types import ModuleType
 from typing import Protocol
@@ -165,6 +166,8 @@ class _SuperLU(SymbolicCholesky):
         try:
             lu = splu(permuted, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         except RuntimeError as error:  # SuperLU's word for an exactly singular matrix
+            if "singular" not in str(error):
+                raise MemoryError(str(error)) from error  # its only other one
             raise NotPositiveDefiniteError("the matrix is singular") from error
         if not (np.array_equal(lu.perm_r, lu.perm_c) and (lu.U.diagonal() > 0).all()):
             raise NotPositiveDefiniteError("the matrix has a pivot that is not positive")
@@ -172,18 +175,17 @@ class _SuperLU(SymbolicCholesky):
 
 
 class _CholmodFactor(CholeskyFactor):
-    """CVXOPT factors in place, symbolic part included: a factor out of use hands it back for the next one."""
+    """CVXOPT factors in place, symbolic part included: that of a factor out of use is taken over by the next one."""
 
-    def __init__(self, numeric: _Capsule, analysis: _Cholmod) -> None:
+    def __init__(self, numeric: _Capsule) -> None:
         self._numeric: _Capsule | None = numeric
-        self._analysis = analysis
 
-    def __del__(self) -> None:
-        self.hand_back()
+    @property
+    def is_overwritten(self) -> bool:
+        return self._numeric is None
 
-    def hand_back(self) -> None:
-        if self._numeric is not None:
-            self._analysis.spare, self._numeric = self._numeric, None
+    def overwrite(self) -> None:
+        self._numeric = None
 
     def solve(self, right_hand_side: Array) -> Array:
         cvxopt, cholmod = _import_cvxopt()
@@ -206,7 +208,8 @@ class _Cholmod(SymbolicCholesky):
         self._matrix = cvxopt.spmatrix(
             1.0, cvxopt.matrix(rows), cvxopt.matrix(columns[self._lower].astype(np.int64)), pattern.shape
         )
-        self.spare: _Capsule | None = self._analyze()
+        # Symbolic parts with the factor that uses each. No finaliser gives them back: Ctrl-C in one would be lost.
+        self._taken: list[tuple[weakref.ref[_CholmodFactor] | None, _Capsule]] = [(None, self._analyze())]
 
     def _analyze(self) -> _Capsule:
         _, cholmod = _import_cvxopt()
@@ -218,19 +221,32 @@ class _Cholmod(SymbolicCholesky):
         cvxopt, cholmod = _import_cvxopt()
         self._matrix.V = cvxopt.matrix(matrix.data[self._lower])
         if isinstance(overwrite, _CholmodFactor):
-            overwrite.hand_back()
-        numeric = self.spare if self.spare is not None else self._analyze()
-        self.spare = None
+            overwrite.overwrite()
+        numeric = self._spare()
         saved = cholmod.options.get("supernodal", 2)
         cholmod.options["supernodal"] = 2  # L L^T, which exists for positive definite matrices only
         try:
             cholmod.numeric(self._matrix, numeric)
         except ArithmeticError as error:
-            self.spare = numeric  # a failed factorisation leaves the symbolic part intact
+            self._taken.append((None, numeric))  # a failed factorisation leaves the symbolic part intact
             raise NotPositiveDefiniteError("the matrix has a pivot that is not positive") from error
         finally:
             cholmod.options["supernodal"] = saved
-        return _CholmodFactor(numeric, self)
+        factor = _CholmodFactor(numeric)
+        self._taken.append((weakref.ref(factor), numeric))
+        return factor
+
+    def _spare(self) -> _Capsule:
+        """Take out a symbolic part that no factor uses, and let go of others like it."""
+        used, idle = [], []
+        for user, numeric in self._taken:
+            factor = None if user is None else user()
+            if factor is None or factor.is_overwritten:
+                idle.append(numeric)
+            else:
+                used.append((user, numeric))
+        self._taken = used
+        return idle[-1] if idle else self._analyze()
 
 
 def _import_cvxopt() -> tuple[ModuleType, ModuleType]:

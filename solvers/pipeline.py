@@ -11,7 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from pgo_models.certificate import DEFAULT_GAP, BoundSource, Certificate, certify_stationary, certify_with, judge
+from pgo_models.certificate import (
+    DEFAULT_GAP,
+    BoundSource,
+    Certificate,
+    Verdict,
+    certify_stationary,
+    certify_with,
+    judge,
+)
 from pgo_models.errors import SettingError
 from pgo_models.initialization import chordal_start, spanning_tree_start
 from pgo_models.partition import Partition, partition
@@ -31,6 +39,7 @@ from solvers.solution import Solution
 from solvers.staircase import DualBound, Staircase
 
 HANDOVER_TOLERANCE = 2e-3  # relative residual at which Newton needs one or two factorisations
+HANDOVER = SOC(tolerance=HANDOVER_TOLERANCE, max_iterations=100)
 _SECOND_TRY_TOLERANCE = 1e-6
 
 
@@ -64,7 +73,7 @@ class Pipeline:
     True
     """
 
-    soc: SOC | None = field(default_factory=lambda: SOC(tolerance=HANDOVER_TOLERANCE, max_iterations=100))
+    soc: SOC | None = field(default_factory=lambda: HANDOVER)
     newton: Newton = field(default_factory=Newton)
     gap: float = DEFAULT_GAP
     second_try: bool = True
@@ -72,8 +81,8 @@ class Pipeline:
     faults: Faults | None = None
 
     def __post_init__(self) -> None:
-        if not self.gap > 0:
-            raise SettingError(f"gap must be positive, got {self.gap}; 1e-6 is usual")
+        if not 0 < self.gap < math.inf:
+            raise SettingError(f"gap must be positive and finite, got {self.gap}; 1e-6 is usual")
         if self.faults is not None and (self.soc is None or self.soc.effective_coupling is not Coupling.CONSENSUS):
             raise SettingError("faults are of messages between robots; use SOC(robots=.., coupling=Coupling.CONSENSUS)")
 
@@ -151,9 +160,14 @@ def solve(
     stages: list[Stage] = []
     watch = Watch(began + time_limit, verbose, progress, callback)
     if robots is None:
-        poses, certificate = _tries(
-            partial(_attempt, problem, pipeline, stages, watch), problem, pipeline, start, stages
-        )
+        try:
+            poses, certificate = _tries(
+                partial(_attempt, problem, pipeline, stages, watch), problem, pipeline, start, stages
+            )
+        except KeyboardInterrupt:  # between the loops, which answer it themselves
+            if not watch.found:
+                raise
+            poses, certificate = _broken_off(problem, pipeline, watch, stages)
         ledger = None
     else:
         robots = _robots_for(pipeline.soc, robots, problem.graph)
@@ -171,7 +185,10 @@ def solve(
         if stages[-1].status.is_success:
             journal.end()
     if pipeline.staircase is not None and not certificate.is_certified and stages[-1].status not in OUT_OF_TIME:
-        poses, certificate = _climb(problem, pipeline, poses, certificate, stages, watch)
+        try:
+            poses, certificate = _climb(problem, pipeline, poses, certificate, stages, watch)
+        except KeyboardInterrupt:
+            stages.append(_interruption(problem.objective(poses)))
     reference = problem.graph.initial
     poses = poses.aligned_to(reference) if reference is not None else poses.with_gauge_at(0)
     return Solution(
@@ -236,6 +253,7 @@ def _attempt(
     poses, name = (start, "given start") if start is not None else _own_start(problem, soc)
     seconds = time.perf_counter() - began
     stages.append(Stage(name, Status.CONVERGED, 0, problem.objective(poses), seconds, History()))
+    watch.found.append(poses)
     if soc is not None:
         first = watch.run(soc, problem, poses)
         stages.append(Stage.of(first))
@@ -254,6 +272,33 @@ def _polished(
         stages.append(Stage.of(second))
         poses, decrement = second.poses, second.state.polish.decrement
     return poses, certify_stationary(problem, poses, pipeline.gap, decrement)
+
+
+def _broken_off(
+    problem: PGOProblem, pipeline: Pipeline, watch: Watch, stages: list[Stage]
+) -> tuple[Poses, Certificate]:
+    """Best poses found before an interruption, with the bound 0, which needs no proof."""
+    poses = min(watch.found, key=problem.objective)
+    objective = problem.objective(poses)
+    stages.append(_interruption(objective))
+    unjudged = Certificate(
+        objective=objective,
+        lower_bound=0.0,
+        gap=math.nan,
+        eta=math.nan,
+        stationarity=math.inf,
+        source=BoundSource.GIVEN,
+        poses=poses,
+        poses_objective=objective,
+        Lambda=np.zeros_like(poses.R),
+        wanted_gap=pipeline.gap,
+        verdict=Verdict.TRIVIAL,
+    )
+    return poses, judge(problem, poses, unjudged)
+
+
+def _interruption(objective: float) -> Stage:
+    return Stage("interruption", Status.INTERRUPTED, 0, objective, 0.0, History())
 
 
 def _own_start(problem: PGOProblem, soc: SOC | None) -> tuple[Poses, str]:

@@ -121,6 +121,8 @@ ORDER = {
         "reproduction",
         "reproduction_text",
         "paper_figures",
+        "shell",
+        "explanations",
         "study_commands",
         "choices",
         "cli",
