@@ -206,9 +206,9 @@ def chosen_start(problem: PGOProblem, start: Start | None) -> Poses | None:
 def chosen_scene(
     scene: Scene,
     rng: np.random.Generator,
-    poses: int,
-    robots: int,
-    d: int,
+    poses: int | None,
+    robots: int | None,
+    d: int | None,
     translation_noise: float | None,
     rotation_noise: float | None,
 ) -> PoseGraph:
@@ -217,17 +217,24 @@ def chosen_scene(
     Raises
     ------
     SettingError
-        When noise is given for one of the paper's scenes, whose noise is part of it, or is out of its range.
+        When something is given that is part of the scene: all of it in the paper's scenes, the number of robots in
+        `random`; when noise is out of its range.
     """
     paper = {Scene.CIRCLE: circle, Scene.GRID: grid, Scene.SPHERE: sphere}
+    settled: dict[str, float | None] = {} if scene is Scene.GRID_WORLD else {"--robots": robots}
     if scene in paper:
-        if translation_noise is not None or rotation_noise is not None:
-            raise SettingError(f"the noise of {scene.value} is part of the scene; use random or grid-world for others")
+        noises = {"--translation-noise": translation_noise, "--rotation-noise": rotation_noise}
+        settled |= {"--poses": poses, "--dimension": d, **noises}
+    for name, value in settled.items():
+        if value is not None:
+            raise SettingError(f"{name} does nothing for {scene.value}, of which it is a part; leave it out")
+    if scene in paper:
         return paper[scene](rng)
+    poses, d = poses if poses is not None else 100, d if d is not None else 3
     noise = NoiseModel(
         MILD_NOISE.translation_std if translation_noise is None else translation_noise,
         MILD_NOISE.rotation_std if rotation_noise is None else float(np.deg2rad(rotation_noise)),
     )
     if scene is Scene.RANDOM:
         return random_geometric(poses, rng, d=d, noise=noise)
-    return grid_world(robots, poses, rng, d=d, noise=noise)
+    return grid_world(robots if robots is not None else 4, poses, rng, d=d, noise=noise)

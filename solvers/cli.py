@@ -169,6 +169,8 @@ def solve_command(
     about_robots = (robots, split, engine, address, resume)
     is_shared = any(option is not None for option in about_robots)
     chosen = chosen_method(method, robots, is_shared)
+    if chosen is Method.JOINT and split is not None:
+        raise SettingError(f"--method joint has one robot, got --split {split.value}; use substructured or consensus")
     runs_on = chosen_engine(chosen, engine, address, resume is not None)
     is_shared |= chosen in (Method.SUBSTRUCTURED, Method.CONSENSUS)
     shared = chosen_partition(problem.graph, robots, split) if is_shared else None
@@ -279,11 +281,15 @@ def generate_command(
         Path, typer.Option("--out", "-o", help="A .g2o file, or a name without suffix: a folder with one file a robot.")
     ],
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random generator.")] = 0,
-    poses: Annotated[int, typer.Option(min=2, help="Poses: in all (random), or of every robot (grid-world).")] = 100,
-    robots: Annotated[int, typer.Option(min=1, help="Robots (grid-world).")] = 4,
+    poses: Annotated[
+        int | None,
+        typer.Option(min=2, help="Poses: in all (random), or of every robot (grid-world); 100 unless given."),
+    ] = None,
+    robots: Annotated[int | None, typer.Option(min=1, help="Robots (grid-world); 4 unless given.")] = None,
     dimension: Annotated[
-        int, typer.Option("--dimension", "-d", min=2, max=3, help="Of space (random, grid-world).")
-    ] = 3,
+        int | None,
+        typer.Option("--dimension", "-d", min=2, max=3, help="Of space (random, grid-world); 3 unless given."),
+    ] = None,
     translation_noise: Annotated[
         float | None, typer.Option(help="Standard deviation, metres (random, grid-world).")
     ] = None,

@@ -8,7 +8,7 @@ import pytest
 import pgo_models as pgo
 import solvers
 from pgo_models.separators import report_partition
-from solvers import cli
+from solvers import choices, cli
 
 
 @pytest.fixture
@@ -61,6 +61,16 @@ def test_every_way_to_solve_ends_at_the_same_optimum(options, pgo_command):
     assert code == 0
     costs = [float(re.search(r"^F +(\S+)", text, re.M)[1]) for text in (out, pgo_command("solve", "circle")[1])]
     np.testing.assert_allclose(costs[0], costs[1], rtol=1e-8, atol=0)
+
+
+def test_the_command_and_the_function_have_the_same_defaults():
+    joint, paper = (
+        choices.chosen_pipeline(method, None, None, 1e-6, None, None)
+        for method in (choices.Method.JOINT, choices.Method.PAPER)
+    )
+    default = solvers.Pipeline().soc
+    assert (joint.soc.max_iterations, joint.soc.tolerance) == (default.max_iterations, default.tolerance)
+    assert (paper.soc.max_iterations, paper.soc.tolerance) == (solvers.SOC.max_iterations, solvers.SOC.tolerance)
 
 
 def test_unit_weights_give_the_papers_equation(pgo_command):
@@ -147,7 +157,8 @@ def test_not_certified_ends_with_3(pgo_command, tmp_path):
 
 @pytest.mark.parametrize("scene", ["circle", "grid", "sphere", "random", "grid-world"])
 def test_generated_scenes_have_their_truth_and_solve(scene, pgo_command, tmp_path):
-    code, _, _ = pgo_command("generate", scene, "--poses", 15, "--robots", 2, "--out", tmp_path / "scene.g2o")
+    options = {"random": ("--poses", 15), "grid-world": ("--poses", 15, "--robots", 2)}.get(scene, ())
+    code, _, _ = pgo_command("generate", scene, *options, "--out", tmp_path / "scene.g2o")
     assert code == 0
     code, out, _ = pgo_command("solve", tmp_path / "scene.g2o")
     assert code == 0
@@ -225,6 +236,7 @@ def test_info_names_the_components(pgo_command, tmp_path):
         ("solve", "sphere", "--robots", "51"),
         ("solve", "sphere", "--method", "joint", "--robots", "2"),
         ("solve", "sphere", "--method", "joint", "--engine", "process"),
+        ("solve", "sphere", "--method", "joint", "--split", "contiguous"),
         ("solve", "sphere", "--method", "paper", "--resume", "run.ckpt"),
         ("solve", "sphere", "--method", "substructured", "--r-step", "fista"),
         ("solve", "sphere", "--robots", "2", "--engine", "process", "--address", "localhost:6379"),
@@ -261,6 +273,8 @@ def test_info_names_the_components(pgo_command, tmp_path):
         ("certify", "sphere", "--estimate", "no-such.xyz"),
         ("generate", "circle", "--rotation-noise", "3", "--out", "x.g2o"),
         ("generate", "random", "--rotation-noise", "-3", "--out", "x.g2o"),
+        ("generate", "circle", "--poses", "7", "--out", "x.g2o"),
+        ("generate", "random", "--robots", "2", "--out", "x.g2o"),
         ("generate", "circle", "--out", "x.xyz"),
         ("generate", "circle"),
         ("fly",),

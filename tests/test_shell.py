@@ -62,6 +62,7 @@ def test_a_signal_before_the_loop_is_one_line(tmp_path, number, code):
     with open(tmp_path / "graph", "w") as graph:  # opens when the command reads
         graph.write("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
         graph.flush()
+        time.sleep(0.5)  # now it waits for more
         process.send_signal(number)
         ending, out, err = ended(process)
     assert (ending, out, one_line(err)) == (code, "", True), err
