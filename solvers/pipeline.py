@@ -27,7 +27,7 @@ from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from solvers.checkpoint import Checkpoint, Journal, fingerprint
-from solvers.distributed import attempt_distributed, open_driver
+from solvers.distributed import attempt_distributed, collect, open_driver
 from solvers.engine import Engine, InProcess
 from solvers.loop import Watch
 from solvers.network import Faults
@@ -179,6 +179,11 @@ def solve(
                 attempt_distributed, driver, problem, pipeline.newton, pipeline.gap, pipeline.faults, journal, watch
             )
             poses, certificate = _tries(attempt, problem, pipeline, start, stages)
+        except KeyboardInterrupt:
+            if not stages:
+                raise
+            watch.found.append(collect(driver)[0])
+            poses, certificate = _broken_off(problem, pipeline, watch, stages)
         finally:
             driver.close()
         ledger = driver.ledger

@@ -17,7 +17,7 @@ import pgo_command
 import pgo_models as pgo
 from pgo_models import scenes
 from pgo_models.g2o import write_g2o
-from solvers import cli
+from solvers import cli, distributed, pipeline
 
 ROOT = Path(cli.__file__).parent.parent
 PGO = [sys.executable, "-c", "from pgo_command import main; main()"]
@@ -96,8 +96,6 @@ def test_a_signal_while_it_is_imported_is_one_line(number, code):
 
 
 def test_a_signal_between_the_loops_leaves_the_best_poses(monkeypatch):
-    import solvers.pipeline as pipeline
-
     def broken_off(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -108,6 +106,10 @@ def test_a_signal_between_the_loops_leaves_the_best_poses(monkeypatch):
     assert solution.status.name == "INTERRUPTED"
     assert solution.objective == pytest.approx(whole.objective, rel=1e-12)
     assert (solution.lower_bound, solution.certificate.verdict.name) == (0.0, "TRIVIAL")
+    monkeypatch.setattr(distributed, "prove_bound_distributed", broken_off)
+    shared = pipeline.solve(graph, robots=3)
+    assert (shared.status.name, shared.lower_bound) == ("INTERRUPTED", 0.0)
+    assert shared.objective == pytest.approx(whole.objective, rel=1e-12)
     monkeypatch.setattr(pipeline, "chordal_start", broken_off)
     with pytest.raises(KeyboardInterrupt):
         pipeline.solve(graph)
