@@ -43,7 +43,10 @@ def extreme_weight(graph: str) -> str:
     >>> extreme_weight("grid")[-103:]
     'are too far apart for a factorisation in doubles; correct the information matrix, or use --unit-weights'
     """
-    path, loaded = locate(graph), load(graph)
+    path = locate(graph)
+    if not (path.is_file() or path.is_dir()):
+        return f"{graph}: weights too far apart for a factorisation in doubles; as a file it would be read again for which"
+    loaded = load(path)
     ratios = {name: getattr(loaded, name) / np.median(getattr(loaded, name)) for name in ("kappa", "tau")}
     name = max(ratios, key=lambda one: float(np.abs(np.log(ratios[one])).max()))
     e = int(np.argmax(np.abs(np.log(ratios[name]))))

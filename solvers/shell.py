@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -20,6 +22,7 @@ from pgo_models.errors import PGOError, SettingError
 
 DONE, BAD_INPUT, BROKEN_OFF = 0, 1, 130
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SAME_SIGNAL = 0.5  # seconds: who hits Ctrl-C twice means it once, and the answer takes time
 _LONGEST_WORD = 300  # of an error message, which is to stay a line
 
 
@@ -89,6 +92,7 @@ class Broken:
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
+        self._last = -math.inf
 
     @property
     def word(self) -> str:
@@ -105,8 +109,10 @@ class Broken:
         """Watch for signals while the block runs."""
 
         def arrived(number: int, frame: FrameType | None) -> None:
-            self.signal = self.signal or signal.Signals(number)
-            raise KeyboardInterrupt
+            earlier, self._last = self._last, time.monotonic()
+            if self._last - earlier > _SAME_SIGNAL:
+                self.signal = self.signal or signal.Signals(number)
+                raise KeyboardInterrupt
 
         with _handled_by(arrived):
             yield

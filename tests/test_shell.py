@@ -46,7 +46,9 @@ def test_a_signal_in_the_loop_leaves_the_best_iterate_and_one_line(tmp_path, num
     for _ in range(12):
         process.stdout.readline()  # the run is under way
     time.sleep(0.2)
-    process.send_signal(number)
+    for _ in range(3):  # by an impatient hand
+        process.send_signal(number)
+        time.sleep(0.03)
     ending, out, err = ended(process)
     assert (ending, one_line(err)) == (code, True), err
     assert "INTERRUPTED" in out
