@@ -45,7 +45,7 @@ def extreme_weight(graph: str) -> str:
     """
     path = locate(graph)
     if not (path.is_file() or path.is_dir()):
-        return f"{graph}: weights too far apart for a factorisation in doubles; as a file it would be read again for which"
+        return f"{graph}: weights too far apart for a factorisation in doubles; give it as a file to be told which"
     loaded = load(path)
     ratios = {name: getattr(loaded, name) / np.median(getattr(loaded, name)) for name in ("kappa", "tau")}
     name = max(ratios, key=lambda one: float(np.abs(np.log(ratios[one])).max()))
@@ -55,6 +55,7 @@ def extreme_weight(graph: str) -> str:
     return (
         f"{edge_place(path, (i, j))}: {name} of edge {i} -> {j} is {value:.3g}, {ratios[name][e]:.3g} "
         f"times the median; weights from {min(loaded.kappa.min(), loaded.tau.min()):.3g} to "
-        f"{max(loaded.kappa.max(), loaded.tau.max()):.3g} are too far apart for a factorisation in doubles; "
+        f"{max(loaded.kappa.max(), loaded.tau.max()):.3g} and lengths up to {np.abs(loaded.t_ij).max():.3g} m are too far "
+        "apart for a factorisation in doubles; "
         "correct the information matrix, or use --unit-weights"
     )
