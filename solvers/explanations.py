@@ -55,7 +55,6 @@ def extreme_weight(graph: str) -> str:
     return (
         f"{edge_place(path, (i, j))}: {name} of edge {i} -> {j} is {value:.3g}, {ratios[name][e]:.3g} "
         f"times the median; weights from {min(loaded.kappa.min(), loaded.tau.min()):.3g} to "
-        f"{max(loaded.kappa.max(), loaded.tau.max()):.3g} and lengths up to {np.abs(loaded.t_ij).max():.3g} m are too far "
-        "apart for a factorisation in doubles; "
-        "correct the information matrix, or use --unit-weights"
+        f"{max(loaded.kappa.max(), loaded.tau.max()):.3g} and lengths up to {np.abs(loaded.t_ij).max():.3g} m "
+        "are too far apart for a factorisation in doubles; correct the information matrix, or use --unit-weights"
     )
