@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import enum
 import importlib.util
+import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -271,6 +272,8 @@ class _SuperLU(SymbolicCholesky):
         try:
             lu = splu(permuted, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         except RuntimeError as error:  # SuperLU's word for an exactly singular matrix
+            if "singular" not in str(error):
+                raise MemoryError(str(error)) from error  # its only other one
             raise NotPositiveDefiniteError("the matrix is singular") from error
         if not (np.array_equal(lu.perm_r, lu.perm_c) and (lu.U.diagonal() > 0).all()):
             raise NotPositiveDefiniteError("the matrix has a pivot that is not positive")
@@ -278,18 +281,18 @@ class _SuperLU(SymbolicCholesky):
 
 
 class _CholmodFactor(CholeskyFactor):
-    """CVXOPT factors in place, symbolic part included: a factor out of use hands it back for the next one."""
+    """CVXOPT factors in place, symbolic part included: that of a factor out of use is taken over by the next one."""
 
     def __init__(self, numeric: _Capsule, analysis: _Cholmod) -> None:
         self._numeric: _Capsule | None = numeric
         self._analysis = analysis
 
-    def __del__(self) -> None:
-        self.hand_back()
+    @property
+    def is_overwritten(self) -> bool:
+        return self._numeric is None
 
-    def hand_back(self) -> None:
-        if self._numeric is not None:
-            self._analysis.spare, self._numeric = self._numeric, None
+    def overwrite(self) -> None:
+        self._numeric = None
 
     def half_solve(self, right_hand_side: Array) -> Array:
         cvxopt, cholmod = _import_cvxopt()
@@ -344,7 +347,8 @@ class _Cholmod(SymbolicCholesky):
         self._matrix = cvxopt.spmatrix(
             1.0, cvxopt.matrix(rows), cvxopt.matrix(columns[self._lower].astype(np.int64)), pattern.shape
         )
-        self.spare: _Capsule | None = self._analyze()
+        # Symbolic parts with the factor that uses each. No finaliser gives them back: Ctrl-C in one would be lost.
+        self._taken: list[tuple[weakref.ref[_CholmodFactor] | None, _Capsule]] = [(None, self._analyze())]
         self._counts: _Counts | None = None
 
     def expected_error(self, beside: int = 0) -> Array | None:
@@ -354,14 +358,13 @@ class _Cholmod(SymbolicCholesky):
         """Counts of every factor with this pattern."""
         if self._counts is None:
             # CVXOPT shows the non-zeros of a numeric factor alone, and takes it apart. One out of use will do.
-            capsule, self.spare = self.spare, None
+            capsule = self._spare()
             cvxopt, cholmod = _import_cvxopt()
             order = cvxopt.matrix(np.arange(self._shape[0], dtype=float))
             try:
                 cholmod.solve(capsule, order, sys=_PERMUTE)
-            except (TypeError, ValueError):  # there is none, or it is symbolic
-                identity = np.where(self._is_diagonal, 1.0, 0.0)
-                capsule = self._numeric(identity, capsule if capsule is not None else self._analyze())
+            except ValueError:  # it is symbolic
+                capsule = self._numeric(np.where(self._is_diagonal, 1.0, 0.0), capsule)
                 cholmod.solve(capsule, order, sys=_PERMUTE)
             pointers, rows, _ = cholmod.getfactor(capsule).CCS
             in_row = np.diff(np.array(pointers).ravel())
@@ -379,14 +382,27 @@ class _Cholmod(SymbolicCholesky):
     def factorize(self, matrix: csc_array, overwrite: CholeskyFactor | None = None) -> CholeskyFactor:
         self._check(matrix)
         if isinstance(overwrite, _CholmodFactor):
-            overwrite.hand_back()
-        capsule = self.spare if self.spare is not None else self._analyze()
-        self.spare = None
+            overwrite.overwrite()
+        capsule = self._spare()
         try:
-            return _CholmodFactor(self._numeric(matrix.data[self._lower], capsule), self)
+            factor = _CholmodFactor(self._numeric(matrix.data[self._lower], capsule), self)
         except ArithmeticError as error:
-            self.spare = capsule  # a failed factorisation leaves the symbolic part intact
+            self._taken.append((None, capsule))  # a failed factorisation leaves the symbolic part intact
             raise NotPositiveDefiniteError("the matrix has a pivot that is not positive") from error
+        self._taken.append((weakref.ref(factor), capsule))
+        return factor
+
+    def _spare(self) -> _Capsule:
+        """Take out a symbolic part that no factor uses, and let go of others like it."""
+        used, idle = [], []
+        for user, numeric in self._taken:
+            factor = None if user is None else user()
+            if factor is None or factor.is_overwritten:
+                idle.append(numeric)
+            else:
+                used.append((user, numeric))
+        self._taken = used
+        return idle[-1] if idle else self._analyze()
 
     def _numeric(self, lower: Array, capsule: _Capsule) -> _Capsule:
         """Fill the capsule with the factor of the matrix that has these values in its lower triangle."""

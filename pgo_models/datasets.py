@@ -92,16 +92,33 @@ def load(
     >>> load("sphere")
     PoseGraph('sphere', d=3, poses=50, edges=544, robots=1)
     """
+    return _read(locate(name_or_path, registry, download=download), weights)
+
+
+def locate(name_or_path: str | Path, registry: Registry = SE_SYNC, *, download: bool = True) -> Path:
+    """File or folder that `load` reads; parameters and errors as there.
+
+    Examples
+    --------
+    >>> locate("sphere").name
+    'sphere.g2o'
+    """
     path = Path(name_or_path)
     name = str(name_or_path)
-    if path.is_file() or (path.is_dir() and (_holds_g2o(path) or name not in known_datasets(registry))):
-        return _read(path, weights)
+    if not name:
+        raise DatasetError("the name of the graph is empty; give a g2o file, a folder or a data set's name")
+    # os.path, since a name too long for the system is no file, and no error; a pipe or a device is read like a file.
+    if os.path.isdir(path):
+        if _holds_g2o(path) or name not in known_datasets(registry):
+            return path
+    elif os.path.exists(path):
+        return path
     if isinstance(name_or_path, Path) or path.suffix == ".g2o" or name != path.name:
         raise FileFormatError(path, None, "no such file or folder; check the path, or give a data set's name")
     for folder in _folders():
         for candidate in (folder / f"{name}.g2o", folder / name):
-            if candidate.is_file() or (candidate.is_dir() and _holds_g2o(candidate)):
-                return _read(candidate, weights)
+            if os.path.isfile(candidate) or (os.path.isdir(candidate) and _holds_g2o(candidate)):
+                return candidate
     if name not in registry.checksums:
         known = known_datasets(registry)
         close = difflib.get_close_matches(name, known, n=3)
@@ -110,7 +127,7 @@ def load(
             f"no file and no data set {name!r}; {meant}known are {', '.join(known)}; "
             f"or give a path, or put {name}.g2o into the folder named by {DATA_VARIABLE}"
         )
-    return _read(_cached(name, registry, download), weights)
+    return _cached(name, registry, download)
 
 
 def known_datasets(registry: Registry = SE_SYNC) -> tuple[str, ...]:
@@ -147,8 +164,8 @@ def _holds_g2o(folder: Path) -> bool:
 
 def _read(path: Path, weights: RotationWeight) -> PoseGraph:
     graph = read_g2o(path, weights)
-    beside = path.with_name(f"{graph.name}.truth.tum")
-    if not beside.is_file():
+    beside = path.absolute().parent / f"{graph.name}.truth.tum"
+    if not os.path.isfile(beside):
         return graph
     truth = read_tum(beside, d=graph.d)
     if truth.num_poses != graph.num_poses:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import secrets
+import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,12 @@ from numpy.typing import NDArray
 from pgo_models.errors import FileFormatError, PGOError
 
 LARGEST = 1e100  # beyond it squares and determinants would overflow; no measured number is near
+FARTHEST = 1e15  # metres: beyond it neighbouring doubles are more than 0.1 m apart
+LONGEST_LINE = 10_000  # characters; an edge in space with all its digits has 750
 
 
 def read_text(path: Path | str) -> str:
-    """Text of a UTF-8 file.
+    """Text of a UTF-8 file, a pipe or a device; its lines end with LF, whatever they end with there (CRLF, CR).
 
     Raises
     ------
@@ -38,7 +41,20 @@ def read_text(path: Path | str) -> str:
         line = data.count(b"\n", 0, error.start) + 1
     if line is not None:
         raise FileFormatError(path, line, "bytes that are no text; give a text file, unpacked if it was compressed")
-    return text
+    return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+
+
+def check_length(path: Path | str, line: int, text: str) -> None:
+    """Raise a FileFormatError when a line of numbers is longer than `LONGEST_LINE`: to take it apart takes minutes."""
+    if len(text) > LONGEST_LINE:
+        problem = f"{len(text)} characters, and no line of numbers has over {LONGEST_LINE}; break or remove it"
+        raise FileFormatError(path, line, problem)
+
+
+def too_far(path: Path | str, line: int, distance: float) -> FileFormatError:
+    """Error of a position or translation beyond `FARTHEST`."""
+    problem = f"{distance:.3g} m is beyond {FARTHEST:g} m, where doubles cannot tell metres apart; correct the line"
+    return FileFormatError(path, line, problem)
 
 
 def finite_number(path: Path | str, line: int, word: str) -> float:
@@ -76,6 +92,7 @@ def read_table(path: Path | str, columns: int) -> tuple[NDArray[np.float64], lis
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
+        check_length(path, number, line)
         rows.append([finite_number(path, number, word) for word in words])
         lines.append(number)
         if len(words) != columns:
@@ -105,14 +122,43 @@ def replace_when_done(path: Path | str) -> Iterator[Path]:
     >>> [file.name for file in folder.iterdir()]
     ['one.txt']
     """
-    target = Path(path).resolve()
-    if target.exists() and not target.is_file():
-        raise PGOError(f"cannot write {path}: it is not a regular file; choose another name")
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
+    with _temporary_beside(path) as (temporary, target):
+        yield temporary
+        os.replace(temporary, target)
+
+
+def check_writable(path: Path | str) -> None:
+    """Raise what `replace_when_done` would for this path, before there is anything to write.
+
+    Raises
+    ------
+    PGOError
+        See `replace_when_done`.
+
+    Examples
+    --------
+    >>> try:
+    ...     check_writable("no/such/folder/a.txt")
+    ... except PGOError as error:
+    ...     print(error)
+    cannot write no/such/folder/a.txt: No such file or directory; choose a place that can be written
+    """
+    with _temporary_beside(path) as (temporary, _):
+        temporary.touch()
+
+
+@contextmanager
+def _temporary_beside(path: Path | str) -> Iterator[tuple[Path, Path]]:
+    """A new name in the folder of `path`, gone when the block ends, and `path` without links; errors become ours."""
     try:
+        target = Path(path).resolve()
+        with suppress(FileNotFoundError):
+            if not stat.S_ISREG(target.stat().st_mode):
+                raise PGOError(f"cannot write {path}: it is not a regular file; choose another name")
+        # Of a long name the beginning, so that a name as long as the system allows can be written.
+        temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(4)}.part")
         try:
-            yield temporary
-            os.replace(temporary, target)
+            yield temporary, target
         finally:
             # An error of clearing up would hide the one that brought us here.
             if temporary.exists():

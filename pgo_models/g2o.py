@@ -8,6 +8,7 @@ with RotationWeight.GAUSSIAN.
 from __future__ import annotations
 
 import enum
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
-from pgo_models.files import replace_when_done
+from pgo_models.files import check_writable, replace_when_done
 from pgo_models.g2o_lines import G2OLines, IntArray, information_of, poses_of, read_lines
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
@@ -110,8 +111,27 @@ def read_g2o(path: Path | str, weights: RotationWeight = RotationWeight.SE_SYNC)
         robot=robot,
         initial=_initial(ids, robot, files),
         fixed=_fixed(ids, files),
-        name=path.resolve().stem if path.is_file() else path.resolve().name,
+        name=_name_of(path),
     )
+
+
+def edge_place(path: Path | str, ids: tuple[int, int]) -> str:
+    """`file:line` of the first edge between two pose ids in a g2o file or folder that has been read.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pgo_models.scenes import grid
+    >>> path = Path(tempfile.mkdtemp()) / "grid.g2o"
+    >>> write_g2o(grid(np.random.default_rng(0)), path)
+    >>> edge_place(path, (0, 1)).endswith("grid.g2o:28")
+    True
+    """
+    for file in map(read_lines, _files_of(Path(path))):
+        at = np.flatnonzero((file.edge_ids == ids).all(axis=1))
+        if at.size:
+            return f"{file.path}:{file.edge_lines[at[0]]}"
+    return str(path)
 
 
 def read_g2o_poses(path: Path | str, graph: PoseGraph) -> Poses:
@@ -175,16 +195,34 @@ def write_g2o_folder(graph: PoseGraph, folder: Path | str, poses: Poses | None =
     """
     chosen, folder = _poses_to_write(graph, poses), Path(folder)
     names = [f"{robot}.g2o" for robot in range(graph.num_robots)]
+    check_g2o_folder(folder, graph.num_robots)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise PGOError(f"cannot write {folder}: {error.strerror}; choose a place that can be written") from error
-    strangers = sorted({file.name for file in folder.glob("*.g2o")} - set(names))
-    if strangers:
-        raise PGOError(f"cannot write {folder}: it holds another graph's {strangers[0]}; choose an empty folder")
     for robot, name in enumerate(names):
         mine = graph.robots == robot
         _write(graph, folder / name, chosen, mine, mine[graph.i] | mine[graph.j])
+
+
+def check_g2o_folder(folder: Path | str, num_robots: int) -> None:
+    """Raise what `write_g2o_folder` would for this folder, before there is anything to write.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> check_g2o_folder(Path(tempfile.mkdtemp()) / "new" / "folder", num_robots=4)
+    """
+    folder = Path(folder)
+    present, inside = folder.absolute(), folder.absolute() / "0.g2o"
+    while not os.path.lexists(present):
+        present, inside = present.parent, present
+    if not present.is_dir():
+        raise PGOError(f"cannot write {folder}: {present} is no folder, and a name without a suffix stands for one")
+    check_writable(inside)
+    strangers = {file.name for file in folder.glob("*.g2o")} - {f"{robot}.g2o" for robot in range(num_robots)}
+    if strangers:
+        raise PGOError(f"cannot write {folder}: it holds another graph's {min(strangers)}; choose an empty folder")
 
 
 def precisions(information: Array, weights: RotationWeight = RotationWeight.SE_SYNC) -> tuple[Array, Array]:
@@ -256,6 +294,12 @@ def pose_names(graph: PoseGraph) -> list[str]:
 
 def _trace_of_inverse(A: Array) -> Array:
     return np.asarray(np.trace(np.linalg.inv(A), axis1=1, axis2=2))
+
+
+def _name_of(path: Path) -> str:
+    if path.is_dir():
+        return path.resolve().name
+    return path.resolve().stem if path.is_file() else path.stem  # a pipe has no better name than that it was asked by
 
 
 def _files_of(path: Path) -> list[Path]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgo_models.errors import FileFormatError
-from pgo_models.files import LARGEST, finite_number, read_text
+from pgo_models.files import FARTHEST, LARGEST, check_length, finite_number, read_text, too_far
 from pgo_models.rotations import Array, exp_map, rotations_from_quaternions
 
 IntArray = NDArray[np.int64]
@@ -57,6 +57,7 @@ class G2OLines:
     edge_ids : (m, 2)
     edges : (m, 9) or (m, 28)
         The measurement like a vertex, then the upper triangle of its information matrix, row by row.
+    edge_lines : (m,)
     fixed : (f,)
         Ids of the FIX lines.
     fixed_lines : (f,)
@@ -69,6 +70,7 @@ class G2OLines:
     vertices: Array
     edge_ids: IntArray
     edges: Array
+    edge_lines: IntArray
     fixed: IntArray
     fixed_lines: IntArray
 
@@ -80,9 +82,10 @@ def read_lines(path: Path | str) -> G2OLines:
     ------
     FileFormatError
         With file:line, for: a file that is missing, binary or without VERTEX and EDGE lines; an unknown tag; too few or
-        too many numbers on a line; a word, nan or inf where a number belongs; an id that is no integer of 64 bits; a
-        zero quaternion; an information matrix whose translation or rotation block is not positive definite; an edge to
-        itself; a second VERTEX line of the same id; 2D and 3D in one file.
+        too many numbers on a line, or thousands of them; a word, nan or inf where a number belongs; an id that is no
+        integer of 64 bits; a zero quaternion; a length beyond `FARTHEST`; an information matrix whose translation or
+        rotation block is not positive definite; an edge to itself; a second VERTEX line of the same id; 2D and 3D in
+        one file.
     """
     path = Path(path)
     lines = read_text(path).split("\n")
@@ -96,6 +99,7 @@ def read_lines(path: Path | str) -> G2OLines:
             continue
         tag = parts[0]
         if tag in _TAGS:
+            check_length(path, number, line)
             gathered[tag].append(number)
             if tag[0] == "E":
                 ids[tag] += parts[1:3]
@@ -122,10 +126,16 @@ def read_lines(path: Path | str) -> G2OLines:
         vertices,
         edge_ids,
         edges,
+        np.array(gathered[edge], dtype=np.int64),
         np.array([source.integer(number, word) for number, word in fix], dtype=np.int64),
         np.array([number for number, _ in fix], dtype=np.int64),
     )
-    _check(found, np.array(gathered[edge], dtype=np.int64))
+    for rows, at in ((vertices, found.vertex_lines), (edges, found.edge_lines)):
+        far = np.abs(rows[:, :d]).max(axis=1, initial=0.0)
+        if (far > FARTHEST).any():
+            raise too_far(path, int(at[np.argmax(far)]), float(far.max()))
+    for number, problem in _faults(found):
+        raise FileFormatError(path, number, problem)
     return found
 
 
@@ -214,15 +224,10 @@ def _dimension(path: Path, gathered: dict[str, list[int]]) -> int:
     return 2 if first[2] else 3
 
 
-def _check(found: G2OLines, edge_lines: IntArray) -> None:
-    for line, problem in _faults(found, edge_lines):
-        raise FileFormatError(found.path, line, problem)
-
-
-def _faults(found: G2OLines, edge_lines: IntArray) -> Iterator[tuple[int, str]]:
+def _faults(found: G2OLines) -> Iterator[tuple[int, str]]:
     """Line and description of what the numbers of a file cannot be."""
     if found.d == 3:
-        for rows, lines in ((found.vertices, found.vertex_lines), (found.edges, edge_lines)):
+        for rows, lines in ((found.vertices, found.vertex_lines), (found.edges, found.edge_lines)):
             zero = np.linalg.norm(rows[:, 3:7], axis=1) < _ZERO_QUATERNION
             if zero.any():
                 yield int(lines[np.argmax(zero)]), "zero quaternion; it is no rotation: 0 0 0 1 is the unrotated one"
@@ -238,7 +243,7 @@ def _faults(found: G2OLines, edge_lines: IntArray) -> Iterator[tuple[int, str]]:
     loops = found.edge_ids[:, 0] == found.edge_ids[:, 1]
     if loops.any():
         at = int(np.argmax(loops))
-        yield int(edge_lines[at]), f"an edge from pose {found.edge_ids[at, 0]} to itself; remove it"
+        yield int(found.edge_lines[at]), f"an edge from pose {found.edge_ids[at, 0]} to itself; remove it"
     # The blocks alone are asked for: the precisions use nothing else, and the coupling blocks of the public cubicle
     # graph make 5,021 of its whole matrices indefinite.
     information = information_of(found.d, found.edges)
@@ -248,7 +253,7 @@ def _faults(found: G2OLines, edge_lines: IntArray) -> Iterator[tuple[int, str]]:
             at = int(np.argmax(bad))
             smallest = np.linalg.eigvalsh(information[at, block, block])[0]
             yield (
-                int(edge_lines[at]),
+                int(found.edge_lines[at]),
                 f"{name} block of the information matrix is not positive definite (smallest eigenvalue "
                 f"{smallest:.3g}); give the upper triangle row by row, or remove the line",
             )

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pgo_models.errors import FileFormatError, GraphError
-from pgo_models.files import read_table, replace_when_done
+from pgo_models.files import FARTHEST, read_table, replace_when_done, too_far
 from pgo_models.poses import Poses
 from pgo_models.rotations import (
     Array,
@@ -65,8 +65,8 @@ def read_tum(path: Path | str, d: int = 3) -> Poses:
     Raises
     ------
     FileFormatError
-        With file:line, for a row that is not 8 finite numbers, a zero quaternion, or, with d = 2, a pose out of the
-        plane.
+        With file:line, for a row that is not 8 finite numbers, a zero quaternion, a position beyond `FARTHEST`, or,
+        with d = 2, a pose out of the plane.
 
     Examples
     --------
@@ -110,8 +110,8 @@ def read_kitti(path: Path | str, d: int = 3) -> Poses:
     Raises
     ------
     FileFormatError
-        With file:line, for a row that is not 12 finite numbers, a matrix that is no rotation even to three digits, or,
-        with d = 2, a pose out of the plane.
+        With file:line, for a row that is not 12 finite numbers, a matrix that is no rotation even to three digits, a
+        position beyond `FARTHEST`, or, with d = 2, a pose out of the plane.
 
     Examples
     --------
@@ -142,6 +142,9 @@ def _lifted(poses: Poses) -> tuple[Array, Array]:
 
 
 def _in_dimension(R: Array, t: Array, d: int, path: Path | str, lines: Sequence[int]) -> Poses:
+    far = np.abs(t).max(axis=1)
+    if (far > FARTHEST).any():
+        raise too_far(path, lines[int(np.argmax(far))], float(far.max()))
     if d == 3:
         return Poses(R, t)
     out = np.maximum(np.abs(t[:, 2]), np.abs(R[:, 2, :] - [0.0, 0.0, 1.0]).max(axis=1))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 import importlib.util
 import os
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from pgo_models.problem import PGOProblem
 from pgo_models.scenes import MILD_NOISE, NoiseModel, circle, grid, random_geometric, sphere
 from solvers.engine import Engine, InProcess
 from solvers.newton import Newton, gauss_newton
-from solvers.pipeline import HANDOVER_TOLERANCE, Pipeline
+from solvers.pipeline import HANDOVER, Pipeline
 from solvers.ray_engine import RayEngine
 from solvers.rotation_step import RStep
 from solvers.soc import SOC, Coupling
@@ -84,7 +85,7 @@ class Scene(enum.Enum):
 def chosen_pipeline(
     method: Method,
     robots: Partition | None,
-    r_step: BackEnd,
+    r_step: BackEnd | None,
     gap: float,
     max_iterations: int | None,
     tolerance: float | None,
@@ -102,18 +103,24 @@ def chosen_pipeline(
         When they do not go together.
     """
     if method is Method.NEWTON:
+        of_soc = (("--r-step", r_step), ("--max-iterations", max_iterations), ("--tolerance", tolerance))
+        for name, value in of_soc:
+            if value is not None:
+                raise SettingError(f"{name} is for SOC, which --method newton leaves out; leave out one of the two")
         return Pipeline(soc=None, gap=gap)
+    r_step = BackEnd.FACTORIZED if r_step is None else r_step
     if method is Method.SUBSTRUCTURED and r_step is not BackEnd.FACTORIZED:
         raise SettingError(
             f"--method substructured factors, got --r-step {r_step.value}; use joint, consensus or paper"
         )
-    handover = SOC.tolerance if method is Method.PAPER else HANDOVER_TOLERANCE
-    soc = SOC(
+    usual = SOC() if method is Method.PAPER else HANDOVER
+    soc = replace(
+        usual,
         coupling=Coupling[method.name],
         robots=robots if method in (Method.CONSENSUS, Method.PAPER) else None,
         r_step=RStep[r_step.name],
-        tolerance=handover if tolerance is None else tolerance,
-        max_iterations=SOC.max_iterations if max_iterations is None else max_iterations,
+        tolerance=usual.tolerance if tolerance is None else tolerance,
+        max_iterations=usual.max_iterations if max_iterations is None else max_iterations,
     )
     return Pipeline(soc=soc, newton=gauss_newton() if method is Method.PAPER else Newton(), gap=gap)
 
@@ -199,9 +206,9 @@ def chosen_start(problem: PGOProblem, start: Start | None) -> Poses | None:
 def chosen_scene(
     scene: Scene,
     rng: np.random.Generator,
-    poses: int,
-    robots: int,
-    d: int,
+    poses: int | None,
+    robots: int | None,
+    d: int | None,
     translation_noise: float | None,
     rotation_noise: float | None,
 ) -> PoseGraph:
@@ -210,17 +217,24 @@ def chosen_scene(
     Raises
     ------
     SettingError
-        When noise is given for one of the paper's scenes, whose noise is part of it, or is out of its range.
+        When something is given that is part of the scene: all of it in the paper's scenes, the number of robots in
+        `random`; when noise is out of its range.
     """
     paper = {Scene.CIRCLE: circle, Scene.GRID: grid, Scene.SPHERE: sphere}
+    settled: dict[str, float | None] = {} if scene is Scene.GRID_WORLD else {"--robots": robots}
     if scene in paper:
-        if translation_noise is not None or rotation_noise is not None:
-            raise SettingError(f"the noise of {scene.value} is part of the scene; use random or grid-world for others")
+        noises = {"--translation-noise": translation_noise, "--rotation-noise": rotation_noise}
+        settled |= {"--poses": poses, "--dimension": d, **noises}
+    for name, value in settled.items():
+        if value is not None:
+            raise SettingError(f"{name} does nothing for {scene.value}, of which it is a part; leave it out")
+    if scene in paper:
         return paper[scene](rng)
+    poses, d = poses if poses is not None else 100, d if d is not None else 3
     noise = NoiseModel(
         MILD_NOISE.translation_std if translation_noise is None else translation_noise,
         MILD_NOISE.rotation_std if rotation_noise is None else float(np.deg2rad(rotation_noise)),
     )
     if scene is Scene.RANDOM:
         return random_geometric(poses, rng, d=d, noise=noise)
-    return grid_world(robots, poses, rng, d=d, noise=noise)
+    return grid_world(robots if robots is not None else 4, poses, rng, d=d, noise=noise)

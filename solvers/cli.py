@@ -1,6 +1,7 @@
 """The command `pgo`: solve, certify, info, generate, and the studies of `solvers.study_commands`.
 
-Exit codes: 0 done; 1 bad input, one line on stderr; 2 not converged, the result written all the same; 3 not certified.
+Exit codes: 0 done; 1 bad input, one line on stderr; 2 not converged, the result written all the same; 3 not certified;
+130 and 143 after SIGINT (Ctrl-C) and SIGTERM, the best iterate written if there was one.
 """
 
 from __future__ import annotations
@@ -9,7 +10,9 @@ import json
 import math
 import shlex
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -20,8 +23,8 @@ from rich.table import Table
 
 from pgo_models.certificate import DEFAULT_GAP, certify
 from pgo_models.datasets import known_datasets, load
-from pgo_models.errors import FileFormatError, PGOError, SettingError
-from pgo_models.files import replace_when_done
+from pgo_models.errors import FileFormatError, SettingError
+from pgo_models.files import check_writable, replace_when_done
 from pgo_models.g2o import MOST_SYMBOLS, read_g2o_poses, symbol_ids, write_g2o, write_g2o_folder
 from pgo_models.initialization import chordal_start, spanning_tree_start
 from pgo_models.pose_graph import PoseGraph
@@ -44,21 +47,31 @@ from solvers.choices import (
     chosen_scene,
     chosen_start,
 )
-from solvers.pipeline import solve
+from solvers.explanations import explained_by_its_graph
+from solvers.pipeline import HANDOVER, solve
 from solvers.report import check_report, write_report
-from solvers.solution import check_format, finite_or_none
-from solvers.study_commands import INTERRUPTED, compare_command, figures_command, tables_command
+from solvers.shell import DONE, Commands, run_command, save_then_show
+from solvers.soc import SOC
+from solvers.solution import check_format, check_target, finite_or_none
+from solvers.study_commands import compare_command, figures_command, tables_command
 from solvers.versions import versions
 
-DONE, BAD_INPUT, NOT_CONVERGED, NOT_CERTIFIED = 0, 1, 2, 3
+NOT_CONVERGED, NOT_CERTIFIED = 2, 3
 
 app = typer.Typer(
     name="pgo",
+    cls=Commands,
     help="Pose graph optimisation by splitting, with a certified distance to the global optimum.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+
+def _finite_gap(gap: float) -> float:
+    if not 0 < gap < math.inf:
+        raise typer.BadParameter(f"{gap} is no positive, finite number; 1e-6 is usual")
+    return gap
 
 
 GraphArgument = Annotated[
@@ -72,13 +85,14 @@ SplitOption = Annotated[
         "else contiguous."
     ),
 ]
-GapOption = Annotated[float, typer.Option(help="Relative gap to certify.")]
+GapOption = Annotated[float, typer.Option(callback=_finite_gap, help="Relative gap to certify.")]
 UnitWeightsOption = Annotated[
     bool, typer.Option("--unit-weights", help="Set kappa = tau = 1, the weights of the paper's equation.")
 ]
 
 
 @app.command("solve")
+@explained_by_its_graph
 def solve_command(
     graph: GraphArgument,
     out: Annotated[
@@ -122,9 +136,16 @@ def solve_command(
     start: Annotated[
         Start | None, typer.Option(help="Start: chordal relaxation (tree for the paper's method) unless given.")
     ] = None,
-    r_step: Annotated[BackEnd, typer.Option("--r-step", help="Back end of SOC's R-subproblem.")] = BackEnd.FACTORIZED,
+    r_step: Annotated[
+        BackEnd | None, typer.Option("--r-step", help="Back end of SOC's R-subproblem; factorized unless given.")
+    ] = None,
     gap: GapOption = DEFAULT_GAP,
-    max_iterations: Annotated[int | None, typer.Option(min=0, help="Most SOC iterations.")] = None,
+    max_iterations: Annotated[
+        int | None,
+        typer.Option(
+            min=0, help=f"Most SOC iterations; {HANDOVER.max_iterations} ({SOC.max_iterations}: paper) unless given."
+        ),
+    ] = None,
     tolerance: Annotated[float | None, typer.Option(help="Residual at which Newton takes over from SOC.")] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for the iterations.")] = math.inf,
     unit_weights: UnitWeightsOption = False,
@@ -140,15 +161,22 @@ def solve_command(
     if report is not None:
         check_report(report)
     problem = PGOProblem(_load(graph, unit_weights))
+    for path in out or []:
+        check_target(path, problem.graph.num_robots)
+    for other in (report, resume):
+        if other is not None:
+            check_writable(other)
     about_robots = (robots, split, engine, address, resume)
     is_shared = any(option is not None for option in about_robots)
     chosen = chosen_method(method, robots, is_shared)
+    if chosen is Method.JOINT and split is not None:
+        raise SettingError(f"--method joint has one robot, got --split {split.value}; use substructured or consensus")
     runs_on = chosen_engine(chosen, engine, address, resume is not None)
     is_shared |= chosen in (Method.SUBSTRUCTURED, Method.CONSENSUS)
     shared = chosen_partition(problem.graph, robots, split) if is_shared else None
     # Robots factor; the other back ends of CONSENSUS have all robots in one place.
-    on_robots = shared is not None and runs_on is not None and r_step is BackEnd.FACTORIZED
-    if not on_robots and any(option is not None for option in (engine, address, resume)):
+    on_robots = shared is not None and runs_on is not None and r_step in (None, BackEnd.FACTORIZED)
+    if r_step is not None and not on_robots and any(option is not None for option in (engine, address, resume)):
         raise SettingError(f"robots of an engine factor, got --r-step {r_step.value}; leave out --engine and --resume")
     solution = solve(
         problem,
@@ -161,22 +189,21 @@ def solve_command(
         verbose=verbose,
         progress=sys.stderr.isatty(),
     )
-    typer.echo(str(solution))
-    truth = problem.graph.truth
+    text, truth = str(solution), problem.graph.truth
     if truth is not None:
-        typer.echo(f"\nerror to the truth (ATE): {absolute_trajectory_error(solution.poses, truth):.4g} m")
-    for path in out or []:
-        solution.save(path)
-        typer.echo(f"written: {path}")
+        text += f"\n\nerror to the truth (ATE): {absolute_trajectory_error(solution.poses, truth):.4g} m"
+    targets: list[tuple[Path, Callable[[Path], None]]] = [(path, solution.save) for path in out or []]
     if report is not None:
-        write_report(solution, report, source=shlex.join([graph, *(["--unit-weights"] if unit_weights else [])]))
-        typer.echo(f"written: {report}")
+        source = shlex.join([graph, *(["--unit-weights"] if unit_weights else [])])
+        targets.append((report, partial(write_report, solution, source=source)))
+    save_then_show(targets, lambda: typer.echo(text))
     if not solution.status.is_success:
         raise typer.Exit(NOT_CONVERGED)
     raise typer.Exit(DONE if solution.is_certified else NOT_CERTIFIED)
 
 
 @app.command("certify")
+@explained_by_its_graph
 def certify_command(
     graph: GraphArgument,
     estimate: Annotated[
@@ -190,31 +217,35 @@ def certify_command(
     unit_weights: UnitWeightsOption = False,
 ) -> None:
     """Judge anybody's poses: how far their cost can be above the global optimum."""
-    if out is not None and out.suffix.lower() != ".json":
-        raise SettingError(f"cannot write {out}: a certificate is written as .json")
+    if out is not None:
+        if out.suffix.lower() != ".json":
+            raise SettingError(f"cannot write {out}: a certificate is written as .json")
+        check_writable(out)
     problem = PGOProblem(_load(graph, unit_weights))
     certificate = certify(problem, _estimate(problem.graph, estimate), gap)
-    typer.echo(str(certificate))
-    if out is not None:
-        record = {
-            "objective": certificate.objective,
-            "lower_bound": certificate.lower_bound,
-            "gap": certificate.gap,
-            "wanted_gap": certificate.wanted_gap,
-            "eta": finite_or_none(certificate.eta),
-            "stationarity": finite_or_none(certificate.stationarity),
-            "source": certificate.source.name,
-            "best_known_objective": certificate.poses_objective,
-            "verdict": certificate.verdict.name,
-            "versions": versions(problem.backend),
-        }
-        with replace_when_done(out) as temporary:
+    record = {
+        "objective": certificate.objective,
+        "lower_bound": certificate.lower_bound,
+        "gap": certificate.gap,
+        "wanted_gap": certificate.wanted_gap,
+        "eta": finite_or_none(certificate.eta),
+        "stationarity": finite_or_none(certificate.stationarity),
+        "source": certificate.source.name,
+        "best_known_objective": certificate.poses_objective,
+        "verdict": certificate.verdict.name,
+        "versions": versions(problem.backend),
+    }
+
+    def save(path: Path) -> None:
+        with replace_when_done(path) as temporary:
             temporary.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        typer.echo(f"written: {out}")
+
+    save_then_show([(out, save)] if out is not None else [], lambda: typer.echo(str(certificate)))
     raise typer.Exit(DONE if certificate.is_certified else NOT_CERTIFIED)
 
 
 @app.command("info")
+@explained_by_its_graph
 def info_command(
     graph: Annotated[
         str | None, typer.Argument(help="A g2o file, folder or data set; without it, versions and data sets.")
@@ -250,11 +281,15 @@ def generate_command(
         Path, typer.Option("--out", "-o", help="A .g2o file, or a name without suffix: a folder with one file a robot.")
     ],
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random generator.")] = 0,
-    poses: Annotated[int, typer.Option(min=2, help="Poses: in all (random), or of every robot (grid-world).")] = 100,
-    robots: Annotated[int, typer.Option(min=1, help="Robots (grid-world).")] = 4,
+    poses: Annotated[
+        int | None,
+        typer.Option(min=2, help="Poses: in all (random), or of every robot (grid-world); 100 unless given."),
+    ] = None,
+    robots: Annotated[int | None, typer.Option(min=1, help="Robots (grid-world); 4 unless given.")] = None,
     dimension: Annotated[
-        int, typer.Option("--dimension", "-d", min=2, max=3, help="Of space (random, grid-world).")
-    ] = 3,
+        int | None,
+        typer.Option("--dimension", "-d", min=2, max=3, help="Of space (random, grid-world); 3 unless given."),
+    ] = None,
     translation_noise: Annotated[
         float | None, typer.Option(help="Standard deviation, metres (random, grid-world).")
     ] = None,
@@ -273,7 +308,7 @@ def generate_command(
     else:
         raise SettingError(f"cannot write {out}: give a name that ends in .g2o, or a folder's name without a suffix")
     assert made.truth is not None
-    truth = out.with_name(f"{out.stem}.truth.tum")
+    truth = out.absolute().parent / f"{out.absolute().stem}.truth.tum"
     write_tum(made.truth, truth)
     typer.echo(f"{made!r}\nwritten: {out}, {truth}")
 
@@ -285,21 +320,7 @@ app.command("figures")(figures_command)
 
 def main(arguments: list[str] | None = None) -> None:
     """Run `pgo` and leave with its exit code; every error of ours is one line on stderr."""
-    # Every error of the command line itself derives from the base of typer's BadParameter.
-    usage_error: type[Exception] = typer.BadParameter.__mro__[1]
-    try:
-        code = app(args=arguments, standalone_mode=False)
-    except PGOError as error:
-        print(f"pgo: {error}", file=sys.stderr)
-        code = BAD_INPUT
-    except usage_error as error:
-        message = error.format_message() if isinstance(error, typer.BadParameter) else str(error)
-        print(f"pgo: {message.rstrip('.')}; see pgo --help", file=sys.stderr)
-        code = BAD_INPUT
-    except (KeyboardInterrupt, typer.Abort):
-        print("pgo: interrupted before there was a result", file=sys.stderr)
-        code = INTERRUPTED
-    raise SystemExit(code or DONE)
+    raise SystemExit(run_command(app, sys.argv[1:] if arguments is None else arguments))
 
 
 def _load(graph: str, unit_weights: bool) -> PoseGraph:

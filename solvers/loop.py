@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
@@ -236,12 +236,13 @@ def run_method(
 
 @dataclass(frozen=True)
 class Watch:
-    """How the runs of a longer job are watched: until when, and who is shown what; see `run`."""
+    """How the runs of a longer job are watched: until when, and who is shown what; see `run`. Their poses are kept."""
 
     deadline: float
     verbose: bool = False
     progress: bool | None = None
     callback: Callable[[Any, Record], bool | None] | None = None
+    found: list[Poses] = field(default_factory=list)
 
     @property
     def seconds_left(self) -> float:
@@ -250,7 +251,7 @@ class Watch:
 
     def run(self, solver: Solver[S], problem: PGOProblem, start: Poses | None) -> Run[S]:
         """Run a solver on a pose graph."""
-        return run(
+        found = run(
             solver,
             problem,
             start,
@@ -259,6 +260,8 @@ class Watch:
             verbose=self.verbose,
             progress=self.progress,
         )
+        self.found.append(found.poses)
+        return found
 
     def run_method(
         self, method: Method[P, X, S], problem: P, start: X | None = None, earlier: tuple[Record, ...] = ()

@@ -15,12 +15,13 @@ from pgo_models.arrays import whole_number
 from pgo_models.certificate import DEFAULT_GAP, BoundSource, Certificate, certify_at, certify_with, judge
 from pgo_models.errors import SettingError
 from pgo_models.initialization import chordal_start, spanning_tree_start
+from pgo_models.lower_bound import NO_BOUND
 from pgo_models.partition import Partition, partition
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem, as_problem
 from solvers.checkpoint import Checkpoint, Journal, fingerprint
-from solvers.distributed import attempt_distributed, open_driver
+from solvers.distributed import attempt_distributed, collect, open_driver
 from solvers.engine import Engine, InProcess
 from solvers.loop import Watch
 from solvers.network import Faults
@@ -32,6 +33,7 @@ from solvers.solution import Solution
 from solvers.staircase import DualBound, Staircase
 
 HANDOVER_TOLERANCE = 2e-3  # relative residual at which Newton needs one or two factorisations
+HANDOVER = SOC(tolerance=HANDOVER_TOLERANCE, max_iterations=100)
 _SECOND_TRY_TOLERANCE = 1e-6
 
 
@@ -65,7 +67,7 @@ class Pipeline:
     True
     """
 
-    soc: SOC | None = field(default_factory=lambda: SOC(tolerance=HANDOVER_TOLERANCE, max_iterations=100))
+    soc: SOC | None = field(default_factory=lambda: HANDOVER)
     newton: Newton = field(default_factory=Newton)
     gap: float = DEFAULT_GAP
     second_try: bool = True
@@ -73,8 +75,8 @@ class Pipeline:
     faults: Faults | None = None
 
     def __post_init__(self) -> None:
-        if not self.gap > 0:
-            raise SettingError(f"gap must be positive, got {self.gap}; 1e-6 is usual")
+        if not 0 < self.gap < math.inf:
+            raise SettingError(f"gap must be positive and finite, got {self.gap}; 1e-6 is usual")
         if self.faults is not None and (self.soc is None or self.soc.effective_coupling is not Coupling.CONSENSUS):
             raise SettingError("faults are of messages between robots; use SOC(robots=.., coupling=Coupling.CONSENSUS)")
 
@@ -157,9 +159,14 @@ def solve(
     stages: list[Stage] = []
     watch = Watch(began + time_limit, verbose, progress, callback)
     if robots is None:
-        poses, certificate = _tries(
-            partial(_attempt, problem, pipeline, stages, watch), problem, pipeline, start, stages
-        )
+        try:
+            poses, certificate = _tries(
+                partial(_attempt, problem, pipeline, stages, watch), problem, pipeline, start, stages
+            )
+        except KeyboardInterrupt:  # between the loops, which answer it themselves
+            if not watch.found:
+                raise
+            poses, certificate = _broken_off(problem, pipeline, watch, stages)
         ledger = None
     else:
         robots = _robots_for(pipeline.soc, robots, problem.graph)
@@ -171,13 +178,21 @@ def solve(
                 attempt_distributed, driver, problem, pipeline.newton, pipeline.gap, pipeline.faults, journal, watch
             )
             poses, certificate = _tries(attempt, problem, pipeline, start, stages)
+        except KeyboardInterrupt:
+            if not stages:
+                raise
+            watch.found.append(collect(driver)[0])
+            poses, certificate = _broken_off(problem, pipeline, watch, stages)
         finally:
             driver.close()
         ledger = driver.ledger
         if stages[-1].status.is_success:
             journal.end()
     if pipeline.staircase is not None and not certificate.is_certified and stages[-1].status not in OUT_OF_TIME:
-        poses, certificate = _climb(problem, pipeline, poses, certificate, stages, watch)
+        try:
+            poses, certificate = _climb(problem, pipeline, poses, certificate, stages, watch)
+        except KeyboardInterrupt:
+            stages.append(_interruption(problem.objective(poses)))
     reference = problem.graph.initial
     poses = poses.aligned_to(reference) if reference is not None else poses.with_gauge_at(0)
     return Solution(
@@ -243,6 +258,7 @@ def _attempt(
     poses, name = (start, "given start") if start is not None else _own_start(problem, soc)
     seconds = time.perf_counter() - began
     stages.append(Stage(name, Status.CONVERGED, 0, problem.objective(poses), seconds, History()))
+    watch.found.append(poses)
     if soc is not None:
         first = watch.run(soc, problem, poses)
         stages.append(Stage.of(first))
@@ -261,6 +277,20 @@ def _polished(
         stages.append(Stage.of(second))
         poses, decrement = second.poses, second.state.polish.decrement
     return poses, certify_at(problem, poses, pipeline.gap, decrement)
+
+
+def _broken_off(
+    problem: PGOProblem, pipeline: Pipeline, watch: Watch, stages: list[Stage]
+) -> tuple[Poses, Certificate]:
+    """Best poses found before an interruption, with the bound 0, which needs no proof."""
+    poses = min(watch.found, key=problem.objective)
+    stages.append(_interruption(problem.objective(poses)))
+    nothing = np.zeros_like(poses.R)
+    return poses, certify_with(problem, poses, nothing, pipeline.gap, math.inf, BoundSource.GIVEN, NO_BOUND)
+
+
+def _interruption(objective: float) -> Stage:
+    return Stage("interruption", Status.INTERRUPTED, 0, objective, 0.0, History())
 
 
 def _own_start(problem: PGOProblem, soc: SOC | None) -> tuple[Poses, str]:

@@ -8,9 +8,11 @@ from __future__ import annotations
 import logging
 import math
 import os
+import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -125,10 +127,11 @@ def connect(address: str | None = None, num_cpus: int | None = None) -> bool:
     with _environment(_ENVIRONMENT), _hushed("ray"):
         quiet = {"log_to_driver": False, "logging_level": logging.CRITICAL, "configure_logging": False}
         try:
-            if address is not None:
-                ray.init(address=address, **quiet)
-            else:
-                ray.init(address="local", num_cpus=num_cpus, include_dashboard=False, **quiet)
+            with _own_sigterm():
+                if address is not None:
+                    ray.init(address=address, **quiet)
+                else:
+                    ray.init(address="local", num_cpus=num_cpus, include_dashboard=False, **quiet)
         # Ray ends the process, where it does not raise, when its own patience is over.
         except (RuntimeError, ValueError, OSError, SystemExit) as error:
             where = "Ray does not start here" if address is None else f"cannot join the Ray cluster at {address}"
@@ -240,6 +243,25 @@ def _check_address(address: str) -> None:
             f"no Ray cluster answers at {address} ({error.strerror or error}); start one with `ray start --head`, or "
             "leave the address out"
         ) from error
+
+
+@contextmanager
+def _own_sigterm() -> Iterator[None]:
+    """Keep the handler of SIGTERM, which Ray replaces by one that ends the process with a stack trace."""
+    earlier = signal.getsignal(signal.SIGTERM)
+    is_main = threading.current_thread() is threading.main_thread()
+    is_terminated = False
+    try:
+        yield
+    except SystemExit as error:  # how Ray's handler answers
+        is_terminated = is_main and error.code == signal.SIGTERM
+        if not is_terminated:
+            raise
+    finally:
+        if is_main:
+            signal.signal(signal.SIGTERM, earlier)
+    if is_terminated:
+        signal.raise_signal(signal.SIGTERM)
 
 
 def _check_cluster(address: str) -> None:

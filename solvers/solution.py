@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import math
 from dataclasses import dataclass
@@ -9,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pgo_models.certificate import BoundSource, Certificate, Verdict, gap_text
-from pgo_models.errors import SettingError
+from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.figures import is_picture, save_figure
-from pgo_models.files import replace_when_done
-from pgo_models.g2o import write_g2o, write_g2o_folder
+from pgo_models.files import check_writable, replace_when_done
+from pgo_models.g2o import check_g2o_folder, write_g2o, write_g2o_folder
 from pgo_models.html_tables import facts_table, rows_table
 from pgo_models.initialization import spanning_tree_start
 from pgo_models.partition import Partition
@@ -248,12 +249,23 @@ class Solution:
 
 
 def check_format(path: Path) -> None:
-    """Raise a SettingError when `Solution.save` knows no format for the suffix of `path`."""
+    """Raise what `Solution.save` would for the suffix of `path`: a SettingError, or if matplotlib is missing."""
     suffix = path.suffix.lower()
     if suffix not in ("", ".g2o", ".tum", ".txt", ".kitti", ".json") and not is_picture(path):
         raise SettingError(
             f"cannot write {path}: no format has suffix {suffix!r}; use .g2o, .tum, .kitti, .json, .png, .svg or .pdf"
         )
+    if is_picture(path) and importlib.util.find_spec("matplotlib") is None:
+        raise MissingExtraError("matplotlib", "plot")
+
+
+def check_target(path: Path, num_robots: int) -> None:
+    """Raise what `Solution.save` would for `path`, before there is a solution of so many robots to write."""
+    check_format(path)
+    if path.suffix == "":
+        check_g2o_folder(path, num_robots)
+    else:
+        check_writable(path)
 
 
 def finite_or_none(value: float) -> float | None:

@@ -10,15 +10,16 @@ import typer
 
 from pgo_models.datasets import load
 from pgo_models.errors import PGOError, SettingError
+from pgo_models.files import check_writable
 from pgo_models.problem import PGOProblem
 from solvers.comparison import ComparisonSettings, check_plot_format, compare_methods
+from solvers.explanations import explained_by_its_graph
 from solvers.paper_figures import FigureSet, draw_paper_figures
 from solvers.reproduction import ReproductionSettings, reproduce_tables
 from solvers.reproduction_text import tables_as_text
-from solvers.table_formats import ResultTable, check_table_format
+from solvers.shell import BROKEN_OFF, save_then_show
+from solvers.table_formats import check_table_format
 from solvers.trials import Contender, TrialSettings
-
-INTERRUPTED = 130
 
 KEPT_FILE = Path("pgo-tables.json")
 DownloadOption = Annotated[
@@ -50,13 +51,16 @@ def tables_command(
 ) -> None:
     """Run the paper's tables 1 to 4, row for row: its figures beside ours, held against proven bounds."""
     _check_tables(out)
+    check_writable(keep)
     settings = ReproductionSettings(_split(only), seeds, robots, download)
     tables = reproduce_tables(settings, keep, is_fresh=fresh)
-    _show(tables_as_text(tables), out)
+    table = tables_as_text(tables)
+    save_then_show([(path, table.save) for path in out or []], table.print)
     if not tables.is_complete:
-        raise typer.Exit(INTERRUPTED)
+        raise typer.Exit(BROKEN_OFF)
 
 
+@explained_by_its_graph
 def compare_command(
     graph: Annotated[
         str, typer.Argument(help="A g2o file, a folder with one file a robot, or the name of a data set.")
@@ -82,15 +86,15 @@ def compare_command(
     _check_tables(out)
     for path in plot or []:
         check_plot_format(path)
+        check_writable(path)
     settings = ComparisonSettings(_contenders(methods), TrialSettings(robots, time_limit=time_limit))
     loaded = load(graph)
     comparison = compare_methods(PGOProblem(loaded.unit_weights() if unit_weights else loaded), settings)
-    _show(comparison.table(), out)
-    for path in plot or []:
-        comparison.save_plot(path)
-        typer.echo(f"written: {path}")
+    table = comparison.table()
+    targets = [(path, table.save) for path in out or []] + [(path, comparison.save_plot) for path in plot or []]
+    save_then_show(targets, table.print)
     if not comparison.is_complete:
-        raise typer.Exit(INTERRUPTED)
+        raise typer.Exit(BROKEN_OFF)
 
 
 def figures_command(
@@ -130,10 +134,4 @@ def _split(names: str) -> tuple[str, ...]:
 def _check_tables(out: list[Path] | None) -> None:
     for path in out or []:
         check_table_format(path)  # before a long run, not after it
-
-
-def _show(table: ResultTable, out: list[Path] | None) -> None:
-    table.print()
-    for path in out or []:
-        table.save(path)
-        typer.echo(f"written: {path}")
+        check_writable(path)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse import csc_array
 
-from pgo_models.cholesky import CholeskyBackend, analyze, default_backend, factorize, is_positive_definite
+from pgo_models.cholesky import CholeskyBackend, _Cholmod, analyze, default_backend, factorize, is_positive_definite
 from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
@@ -85,6 +85,19 @@ def test_one_analysis_serves_many_matrices(backend: CholeskyBackend, seed: int, 
     np.testing.assert_array_equal(kept.solve(b), before)  # its own memory, as it was not given away
     again = analysis.factorize(first, overwrite=other)
     np.testing.assert_array_equal(again.solve(b), before)
+
+
+def test_the_memory_of_a_factor_out_of_use_is_taken_over_without_a_finaliser() -> None:
+    pytest.importorskip("cvxopt")
+    matrix = definite(pattern_of(0, 9), np.random.default_rng(0))
+    analysis = analyze(matrix, CholeskyBackend.CHOLMOD)
+    kept = analysis.factorize(matrix)
+    for _ in range(5):
+        factor = analysis.factorize(matrix)
+        assert not hasattr(factor, "__del__")  # Ctrl-C in one would be printed and lost
+    assert isinstance(analysis, _Cholmod)
+    assert len(analysis._taken) <= 3
+    assert_solves(matrix, kept.solve(np.ones(9)), np.ones(9))
 
 
 @BACKENDS

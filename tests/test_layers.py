@@ -125,6 +125,8 @@ ORDER = {
         "reproduction",
         "reproduction_text",
         "paper_figures",
+        "shell",
+        "explanations",
         "study_commands",
         "choices",
         "cli",

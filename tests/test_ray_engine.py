@@ -27,7 +27,9 @@ ray = pytest.importorskip("ray")
 @pytest.fixture(scope="module", autouse=True)
 def local_ray():
     """Ray on this machine, started once: an engine uses it and leaves it running."""
+    earlier = signal.getsignal(signal.SIGTERM)
     assert connect(num_cpus=2)
+    assert signal.getsignal(signal.SIGTERM) is earlier  # Ray's own would end a solve without its best iterate
     yield
     ray.shutdown()
 

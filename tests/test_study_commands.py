@@ -64,7 +64,7 @@ def test_ctrl_c_prints_what_is_done_and_the_same_command_goes_on(tmp_path):
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (130, "")
+    assert (process.returncode, err) == (130, "pgo: interrupted before it was done\n")
     assert "the same command goes on where it was" in out
     assert "of 400 not run yet" in out
     done = json.loads(kept.read_text())["results"]

@@ -73,6 +73,8 @@ def test_files_of_others_are_read(tmp_path: Path) -> None:
         ("0 1 2 nan 0 0 0 1\n", "a:1: nan is not finite"),
         ("#\n0 1 2 3 0 0 0 0\n", "a:2: zero quaternion"),
         ("0 1 2 3 0 0 0 9e-10\n", "a:1: zero quaternion"),
+        ("0 1 2 3 0 0 0 1\n1e18 1 -1e100 3 0 0 0 1\n", r"a:2: 1e\+100 m is beyond 1e\+15 m"),
+        ("0 1 2 3 0 0 0 1" + " 0" * 10_000, "a:1: 20015 characters"),
         ("", "a: no rows"),
     ],
 )

@@ -1,0 +1,60 @@
+"""Errors of a command explained by its graph: which weight cannot be factored, what took the memory."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import numpy as np
+
+from pgo_models.datasets import load, locate
+from pgo_models.errors import NotPositiveDefiniteError, PGOError
+from pgo_models.g2o import edge_place
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def explained_by_its_graph(command: Callable[P, T]) -> Callable[P, T]:
+    """Wrap a command with an argument `graph`: errors that speak of no file are raised as ones that do."""
+
+    @functools.wraps(command)
+    def explained(*args: P.args, **kwargs: P.kwargs) -> T:
+        graph = str(kwargs["graph"])
+        try:
+            return command(*args, **kwargs)
+        except NotPositiveDefiniteError as error:
+            raise NotPositiveDefiniteError(f"{extreme_weight(graph)} ({error})") from error
+        except MemoryError as error:
+            raise PGOError(
+                f"{graph} takes more memory than there is; raise the limit, or share it among machines: "
+                "pgo solve --robots K --address HOST:PORT"
+            ) from error
+
+    return explained
+
+
+def extreme_weight(graph: str) -> str:
+    """Sentence on the precision farthest from the median of its kind: file and line, edge, value, and the way out.
+
+    Examples
+    --------
+    >>> extreme_weight("grid")[-103:]
+    'are too far apart for a factorisation in doubles; correct the information matrix, or use --unit-weights'
+    """
+    path = locate(graph)
+    if not (path.is_file() or path.is_dir()):
+        return f"{graph}: weights too far apart for a factorisation in doubles; give it as a file to be told which"
+    loaded = load(path)
+    ratios = {name: getattr(loaded, name) / np.median(getattr(loaded, name)) for name in ("kappa", "tau")}
+    name = max(ratios, key=lambda one: float(np.abs(np.log(ratios[one])).max()))
+    e = int(np.argmax(np.abs(np.log(ratios[name]))))
+    i, j = int(loaded.pose_ids[loaded.i[e]]), int(loaded.pose_ids[loaded.j[e]])
+    value = float(getattr(loaded, name)[e])
+    return (
+        f"{edge_place(path, (i, j))}: {name} of edge {i} -> {j} is {value:.3g}, {ratios[name][e]:.3g} "
+        f"times the median; weights from {min(loaded.kappa.min(), loaded.tau.min()):.3g} to "
+        f"{max(loaded.kappa.max(), loaded.tau.max()):.3g} and lengths up to {np.abs(loaded.t_ij).max():.3g} m "
+        "are too far apart for a factorisation in doubles; correct the information matrix, or use --unit-weights"
+    )

@@ -1,0 +1,199 @@
+"""What the shell does to `pgo`, each in a process of its own: signals, closed pipes, full disks, pipes as files."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pgo_command
+import pgo_models as pgo
+from pgo_models import scenes
+from pgo_models.g2o import write_g2o
+from solvers import cli, distributed, pipeline
+
+ROOT = Path(cli.__file__).parent.parent
+PGO = [sys.executable, "-c", "from pgo_command import main; main()"]
+ENDLESS = ["solve", "sphere", "--method", "paper", "--tolerance", "1e-300", "--max-iterations", "100000000"]
+SIGNALS = pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+
+
+def started(*arguments: object, **streams: object) -> subprocess.Popen[str]:
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    piped = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **streams}
+    return subprocess.Popen([*PGO, *map(str, arguments)], env=env, text=True, **piped)  # type: ignore[call-overload]
+
+
+def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    out, err = process.communicate(timeout=60)
+    return process.returncode, out, err
+
+
+def one_line(err: str) -> bool:
+    return err.startswith("pgo: ") and err.count("\n") == 1
+
+
+@SIGNALS
+def test_a_signal_in_the_loop_leaves_the_best_iterate_and_one_line(tmp_path, number, code):
+    process = started(*ENDLESS, "--verbose", "--out", tmp_path / "so_far.json")
+    for _ in range(12):
+        process.stdout.readline()  # the run is under way
+    time.sleep(0.2)
+    for _ in range(3):  # by an impatient hand
+        process.send_signal(number)
+        time.sleep(0.03)
+    ending, out, err = ended(process)
+    assert (ending, one_line(err)) == (code, True), err
+    assert "INTERRUPTED" in out
+    assert "the best so far" in err
+    assert json.loads((tmp_path / "so_far.json").read_text())["status"] == "INTERRUPTED"
+    assert os.listdir(tmp_path) == ["so_far.json"]
+
+
+@SIGNALS
+def test_a_signal_before_the_loop_is_one_line(tmp_path, number, code):
+    os.mkfifo(tmp_path / "graph")
+    process = started("solve", tmp_path / "graph", "--out", tmp_path / "x.tum")
+    with open(tmp_path / "graph", "w") as graph:  # opens when the command reads
+        graph.write("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
+        graph.flush()
+        time.sleep(0.5)  # now it waits for more
+        process.send_signal(number)
+        ending, out, err = ended(process)
+    assert (ending, out, one_line(err)) == (code, "", True), err
+    assert "before it was done" in err
+    assert os.listdir(tmp_path) == ["graph"]
+
+
+@SIGNALS
+def test_a_signal_while_it_is_imported_is_one_line(number, code):
+    # The import itself says when it has begun, and then waits.
+    program = (
+        "import sys, types, time\n"
+        "class Slow:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'solvers': print('importing', flush=True); time.sleep(30)\n"
+        "sys.meta_path.insert(0, Slow())\n"
+        "from pgo_command import main; main()"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, "info"],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout.readline() == "importing\n"
+    process.send_signal(number)
+    ending, _, err = ended(process)
+    assert (ending, one_line(err)) == (code, True), err
+    assert Path(pgo_command.__file__).parent == ROOT
+
+
+def test_a_signal_between_the_loops_leaves_the_best_poses(monkeypatch):
+    def broken_off(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    graph = scenes.grid(np.random.default_rng(0))
+    whole = pipeline.solve(graph)
+    monkeypatch.setattr(pipeline, "certify_stationary", broken_off)
+    solution = pipeline.solve(graph)
+    assert solution.status.name == "INTERRUPTED"
+    assert solution.objective == pytest.approx(whole.objective, rel=1e-12)
+    assert (solution.lower_bound, solution.certificate.verdict.name) == (0.0, "TRIVIAL")
+    monkeypatch.setattr(distributed, "prove_bound_distributed", broken_off)
+    shared = pipeline.solve(graph, robots=3)
+    assert (shared.status.name, shared.lower_bound) == ("INTERRUPTED", 0.0)
+    assert shared.objective == pytest.approx(whole.objective, rel=1e-12)
+    monkeypatch.setattr(pipeline, "chordal_start", broken_off)
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.solve(graph)
+
+
+@pytest.mark.parametrize("options", [(), ("--verbose",)])
+def test_a_pipe_that_closes_is_no_error_and_the_file_is_written(tmp_path, options):
+    reading, writing = os.pipe()
+    os.close(reading)
+    process = started("solve", "grid", "--out", tmp_path / "x.tum", *options, stdout=writing)
+    os.close(writing)
+    assert ended(process) == (0, None, "")
+    assert len((tmp_path / "x.tum").read_text().splitlines()) == 27
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device of Linux")
+def test_a_full_disk_behind_the_output_is_one_line_and_the_file_is_written(tmp_path):
+    with open("/dev/full", "w") as full:
+        ending, _, err = ended(started("solve", "grid", "--out", tmp_path / "x.tum", stdout=full))
+    assert (ending, err) == (1, "pgo: cannot print: No space left on device; --out is written all the same\n")
+    assert (tmp_path / "x.tum").exists()
+
+
+def test_one_file_that_cannot_be_written_does_not_keep_the_others(tmp_path):
+    # No check before the solve can see it: the g2o file outgrows what the process may write, the trajectory does not.
+    limited = {"preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (8_000, 8_000))}
+    outs = (word for name in ("x.g2o", "x.tum") for word in ("-o", tmp_path / name))
+    ending, out, err = ended(started("solve", "grid", *outs, **limited))
+    assert (ending, err) == (
+        1,
+        f"pgo: cannot write {tmp_path}/x.g2o: File too large; choose a place that can be written\n",
+    )
+    assert f"written: {tmp_path}/x.tum" in out
+    assert os.listdir(tmp_path) == ["x.tum"]
+
+
+@pytest.mark.parametrize("name", ["/dev/stdin", "fifo"])
+def test_a_graph_may_come_through_a_pipe(tmp_path, name):
+    text = Path(ROOT / "data" / "grid.g2o").read_text()
+    if name == "/dev/stdin":
+        process = started("info", name, stdin=subprocess.PIPE)
+        out, err = process.communicate(text, timeout=60)
+    else:
+        os.mkfifo(tmp_path / name)
+        process = started("info", tmp_path / name)
+        writer = threading.Thread(target=(tmp_path / name).write_text, args=(text,))
+        writer.start()
+        _, out, err = ended(process)
+        writer.join()
+    assert (process.returncode, err) == (0, "")
+    assert f"{Path(name).name}, 3D" in out
+    assert "108" in out
+
+
+def test_a_graph_beyond_the_memory_is_one_line_with_its_file(tmp_path):
+    path = tmp_path / "big.g2o"
+    with path.open("w") as file:
+        step = np.random.default_rng(0).integers(2, 1000, 130_000)
+        for k in range(129_000):
+            file.write(f"EDGE_SE2 {k} {k + 1} 1 0 0 1 0 0 1 0 1\n")
+            if k % 3 == 0:
+                file.write(f"EDGE_SE2 {k} {k + step[k]} 20 0 0 1 0 0 1 0 1\n")
+    limited = {"preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_AS, (2**30, 2**30))}
+    ending, out, err = ended(started("solve", path, **limited))
+    assert (ending, out, one_line(err)) == (1, "", True), err
+    assert "big.g2o takes more memory than there is" in err
+
+
+def test_weights_that_cannot_be_factored_are_named_with_line_and_edge(tmp_path):
+    lines = [f"EDGE_SE2 {k} {k + 1} 1 0 0 {(w := 1e30 if k == 77 else 1)} 0 0 {w} 0 1\n" for k in range(199)]
+    lines += [f"EDGE_SE2 {k} {k + 20} 20 0 0.01 1 0 0 1 0 1\n" for k in range(0, 180, 7)]
+    (tmp_path / "weights.g2o").write_text("".join(lines))
+    ending, out, err = ended(started("solve", tmp_path / "weights.g2o"))
+    assert (ending, out, one_line(err)) == (1, "", True), err
+    assert "weights.g2o:78: tau of edge 77 -> 78 is 1e+30, 1e+30 times the median" in err
+    assert "correct the information matrix" in err
+
+
+def test_the_same_graph_is_read_whatever_ends_its_lines(tmp_path):
+    graph = scenes.grid(np.random.default_rng(0))
+    write_g2o(graph, tmp_path / "lf.g2o")
+    data = (tmp_path / "lf.g2o").read_bytes()
+    for name, end in (("cr", b"\r"), ("crlf", b"\r\n")):
+        (tmp_path / f"{name}.g2o").write_bytes(data.replace(b"\n", end))
+        np.testing.assert_array_equal(pgo.read_g2o(tmp_path / f"{name}.g2o").t_ij, graph.t_ij)
