@@ -116,11 +116,10 @@ class ConsensusSOC:
 
     def finish(self, driver: Driver) -> None:
         """Leave omega and the best translations for it with driver and robots: two rounds."""
-        answers = driver.ask_all("finish")
         driver.R = np.empty_like(driver.R)
-        for answer in answers:
+        for answer in driver.ask_all("finish", count=Count.WITH_THE_NEXT):
             driver.R[answer["cover"]] = answer["R"]
-        driver.settle([answers[robot] for robot in driver.robots.tolist()])
+        driver.adopt()  # copies of robots that do not wait differ: all take the owners'
 
     def _penalized(self, driver: Driver, before: ConsensusState | None) -> ConsensusState:
         """State 0 at the poses that driver and robots hold; separators are held as `before`, if that is given."""

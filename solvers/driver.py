@@ -23,6 +23,7 @@ from pgo_models.poses import Poses
 from pgo_models.rotations import (
     Array,
     project_to_rotations,
+    stack_transposes,
     tangent_dimension,
     unstack_transposes,
 )
@@ -309,6 +310,11 @@ class Driver:
         """Return to the poses that were kept."""
         self.R, self.t, self.force, self.objective = self._kept
         self.ask("go_back", count=Count.WITH_THE_NEXT)
+
+    def adopt(self) -> None:
+        """Give the robots the rotations of the cover, and all the best translations for them: two rounds."""
+        messages = self.scattered_rotations(stack_transposes(self.R))
+        self.settle(self.ask("adopt", messages))
 
     def settle(self, answers: Sequence[Message]) -> None:
         """Best translations for the rotations at hand, from the robots' right-hand sides: one round."""

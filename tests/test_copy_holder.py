@@ -44,7 +44,7 @@ STAR = {  # to and from whoever sums up: settings, figures of all poses in no or
     ),
 }
 ROUNDS = (  # orders that are, or end, a round
-    *("project", "settle", "move", "weigh", "certificate", "copies.finish", "copies.begin", "copies.penalize"),
+    *("project", "settle", "move", "weigh", "certificate", "adopt", "copies.begin", "copies.penalize"),
     *("copies.extrapolate", "copies.back_at_best"),
 )
 ENDS, POSES = ("copies.begin", "copies.finish"), ("R", "t", "cover", "schur", "b")  # with the driver, at the cover
