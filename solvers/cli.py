@@ -9,6 +9,7 @@ import json
 import math
 import shlex
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -284,7 +285,8 @@ app.command("figures")(figures_command)
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run `pgo` and leave with its exit code; every error of ours is one line on stderr."""
+    """Run `pgo` and leave with its exit code; every error and warning of ours is one line on stderr."""
+    warnings.showwarning = _say
     # Every error of the command line itself derives from the base of typer's BadParameter.
     usage_error: type[Exception] = typer.BadParameter.__mro__[1]
     try:
@@ -300,6 +302,10 @@ def main(arguments: list[str] | None = None) -> None:
         print("pgo: interrupted before there was a result", file=sys.stderr)
         code = INTERRUPTED
     raise SystemExit(code or DONE)
+
+
+def _say(message: Warning | str, *_: object, **__: object) -> None:
+    print(f"pgo: warning: {message}", file=sys.stderr)
 
 
 def _load(graph: str, unit_weights: bool) -> PoseGraph:

@@ -2,6 +2,7 @@ import inspect
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import solvers
 from pgo_models.separators import report_partition
 from solvers import cli
 
+ROOT = Path(__file__).parent.parent
 PGO = [sys.executable, "-c", "from solvers.cli import main; main()"]
 
 
@@ -30,6 +32,16 @@ def pgo_command(capsys):
         return end.value.code, streams.out, streams.err
 
     return call
+
+
+def test_the_whole_graph_beside_the_robots_is_one_line_on_stderr(tmp_path):
+    folder = tmp_path / "robots"
+    shutil.copytree(ROOT / "data" / "robots", folder)
+    pgo.write_g2o(pgo.read_g2o(folder), folder / "fullGraph.g2o")
+    done = subprocess.run([*PGO, "info", str(folder)], capture_output=True, text=True, check=True)
+    left_out = f"{folder / 'fullGraph.g2o'}: left out, it repeats the edges of the other 4 files; remove it"
+    assert done.stderr == f"pgo: warning: {left_out}\n"
+    assert re.search(r"^ *robots +4 *$", done.stdout, re.M)
 
 
 def test_solve_prints_cost_bound_and_gap_and_ends_with_0(pgo_command):
