@@ -13,7 +13,8 @@ from solvers.penalty import BalancedPenalty, MultiplierPenalty
 from solvers.result import Measurement, Status
 from solvers.safeguard import MAX_RAISES, has_diverged, has_stalled, is_going_round
 from solvers.shared_anderson import AndersonSums
-from solvers.soc import SOC, translation_penalty_for
+from solvers.soc import SOC
+from solvers.stiffness import adapted_penalty, translation_penalty_for
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,14 +154,24 @@ class ConsensusSOC:
         if state.raises < MAX_RAISES and (has_diverged(merits) or is_going_round(merits, state.ratio)):
             return replace(self._rescaled(driver, state, 2.0, from_best=True), raises=state.raises + 1)
         if isinstance(rule, MultiplierPenalty) and has_stalled(rule, merits) and state.refreshes < rule.max_refreshes:
+            before = self._adapted(driver, state)
             self.finish(driver)
-            fresh = self._penalized(driver, state)
+            fresh = self._penalized(driver, before)
             return replace(fresh, k=state.k, refreshes=state.refreshes + 1, raises=state.raises)
         if isinstance(rule, BalancedPenalty) and state.k > 0:
             factor = rule.factor(state.primal_residual, state.dual_residual)
             if factor != 1.0 and (factor > 1.0 or state.raises == 0):
                 return replace(self._rescaled(driver, state, factor, from_best=False), refreshes=state.refreshes + 1)
         return state
+
+    def _adapted(self, driver: Driver, state: ConsensusState) -> ConsensusState:
+        """State with the penalties of separators that the way so far suggests."""
+        if self.soc.translation_penalty is not None or driver.ledger.num_robots == 1:
+            return state
+        sums = np.sum([answer["travel"] for answer in driver.ask_all("travel", count=Count.ALL_REDUCE)], axis=0)
+        translation = adapted_penalty(state.translation_penalty, sums)
+        rotation = self.soc.separator_penalty_for(translation)
+        return replace(state, translation_penalty=translation, separator_penalty=rotation)
 
     def _rescaled(self, driver: Driver, state: ConsensusState, factor: float, from_best: bool) -> ConsensusState:
         """State with factor * rho and the same unscaled multiplier rho B."""

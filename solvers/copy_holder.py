@@ -26,7 +26,7 @@ from solvers.robot import Message
 from solvers.rotation_block import stationary_B
 from solvers.share import PartProblem, Share
 from solvers.shared_anderson import AndersonShare, AndersonSums
-from solvers.stiffness import GROUND, separator_stiffness
+from solvers.stiffness import GROUND, separator_stiffness, travel
 from solvers.substructure import columns_of
 
 # What follows from the share, and the factor: all other attributes are remembered.
@@ -64,6 +64,7 @@ class CopyHolder:
         self.rho, self.diagonal, self.pull = np.ones(n), np.ones((n, d + 1)), np.zeros((n, d * d))
         self.penalty = np.zeros((d + 1) * n)
         self.z = self.s = self.x = self.best = self.X
+        self._origin = self.z, self.s
         self.anderson, self.sums = AndersonShare(), AndersonSums()
         self._gamma: Array | None = None
         self._Lambda, self._force = np.zeros((n, d, d)), self.X
@@ -147,6 +148,7 @@ class CopyHolder:
         self.z = self.x = np.where(self.held, self.X, 0.0)
         self.s = self.best = self.z + np.where(self.held, balanced + mean, 0.0)
         self.anderson, self.sums = AndersonShare(), AndersonSums()
+        self._origin = self.z, self.s
         return {"size": np.array([d * self.rho[self.own].sum()]), "ratio": (self.rho / self._scale)[self.own]}
 
     # The recursion.
@@ -236,6 +238,12 @@ class CopyHolder:
         self._newest, self._waited = {}, dict.fromkeys(self.neighbours, 0)
         self._excess, self._least, self._turns_since = 1.0, math.inf, 0
         return self._to_neighbours(self.s)
+
+    def travel(self) -> Message:
+        """How far separator translations, and their multipliers, went since the start: see `solvers.stiffness`."""
+        at, (z, s) = np.flatnonzero(self.share.copies > 1), self._origin
+        pulled = self.penalty[at, None] * (self.s - self.z - s + z)[at]
+        return {"travel": travel((self.z - z)[at], pulled, self.diagonal[at, 0] / self.share.copies[at])}
 
     def back_at_best(self) -> Message:
         """Return to the s of the smallest merit; its rows for every neighbour."""
