@@ -120,6 +120,14 @@ def solve_command(
             "broken off. Removed when the solve has converged."
         ),
     ] = None,
+    driver_memory: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="GB that the driver of a solve by robots may take, 4 unless given; 0 is no driver, with --method "
+            "consensus: poses from a spanning tree, and no certificate.",
+        ),
+    ] = None,
     start: Annotated[
         Start | None, typer.Option(help="Start: chordal relaxation (tree for the paper's method) unless given.")
     ] = None,
@@ -141,7 +149,7 @@ def solve_command(
     if report is not None:
         check_report(report)
     problem = PGOProblem(_load(graph, unit_weights))
-    about_robots = (robots, split, engine, address, resume)
+    about_robots = (robots, split, engine, address, resume, driver_memory)
     is_shared = any(option is not None for option in about_robots)
     chosen = chosen_method(method, robots, is_shared)
     runs_on = chosen_engine(chosen, engine, address, resume is not None)
@@ -149,11 +157,13 @@ def solve_command(
     shared = chosen_partition(problem.graph, robots, split) if is_shared else None
     # Robots factor; the other back ends of CONSENSUS have all robots in one place.
     on_robots = shared is not None and runs_on is not None and r_step is BackEnd.FACTORIZED
-    if not on_robots and any(option is not None for option in (engine, address, resume)):
-        raise SettingError(f"robots of an engine factor, got --r-step {r_step.value}; leave out --engine and --resume")
+    if not on_robots and any(option is not None for option in (engine, address, resume, driver_memory)):
+        raise SettingError(
+            f"robots of an engine factor, got --r-step {r_step.value}; leave out --engine, --resume and --driver-memory"
+        )
     solution = solve(
         problem,
-        chosen_pipeline(chosen, shared, r_step, gap, max_iterations, tolerance),
+        chosen_pipeline(chosen, shared, r_step, gap, max_iterations, tolerance, driver_memory),
         chosen_start(problem, start),
         robots=shared if on_robots else None,
         engine=runs_on if on_robots else None,

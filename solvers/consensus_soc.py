@@ -56,9 +56,13 @@ class ConsensusSOC:
     ----------
     soc : SOC
         Settings; its coupling and robots are not looked at.
+    has_driver : bool
+        Whether a driver sends the cover's poses at the start, and finds the best translations where penalties are taken
+        anew. Else robots begin at poses that they know, and go on from the translations that they agreed on.
     """
 
     soc: SOC = field(default_factory=SOC)
+    has_driver: bool = True
 
     @property
     def max_iterations(self) -> int:
@@ -124,7 +128,13 @@ class ConsensusSOC:
 
     def _penalized(self, driver: Driver, before: ConsensusState | None) -> ConsensusState:
         """State 0 at the poses that driver and robots hold; separators are held as `before`, if that is given."""
-        rows = driver.hand_on(driver.ask_all("begin", driver.poses_of_cover(), Count.WITH_THE_NEXT))
+        if self.has_driver:
+            answers = driver.ask_all("begin", driver.poses_of_cover(), Count.WITH_THE_NEXT)
+        elif before is None:  # all know where they start
+            answers = driver.ask_all("begin", driver.poses_of_cover(), Count.OFF)
+        else:
+            answers = driver.ask_all("begin_here", count=Count.WITH_THE_NEXT)
+        rows = driver.hand_on(answers)
         answers = driver.ask_all("stiffness", rows, Count.ALL_REDUCE)
         norms = np.concatenate([answer["norms"] for answer in answers])
         scales = np.concatenate([answer["scale"] for answer in answers])
@@ -155,7 +165,8 @@ class ConsensusSOC:
             return replace(self._rescaled(driver, state, 2.0, from_best=True), raises=state.raises + 1)
         if isinstance(rule, MultiplierPenalty) and has_stalled(rule, merits) and state.refreshes < rule.max_refreshes:
             before = self._adapted(driver, state)
-            self.finish(driver)
+            if self.has_driver:
+                self.finish(driver)
             fresh = self._penalized(driver, before)
             return replace(fresh, k=state.k, refreshes=state.refreshes + 1, raises=state.raises)
         if isinstance(rule, BalancedPenalty) and state.k > 0:

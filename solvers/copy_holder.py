@@ -80,6 +80,10 @@ class CopyHolder:
         self.X = poses.stacked()
         return self._to_holders(lambda mine: self.X[columns_of(mine, len(self.is_own), (1, self.d))])
 
+    def begin_here(self) -> Message:
+        """Start at omega, with the translations agreed on, and of step (a) in the interior."""
+        return self.begin(self._poses)
+
     def stiffness(self, message: Message = _NOTHING) -> Message:
         """Take the owners' poses: ||Lambda_i||_2 and m_i of the robot's own."""
         self._from_owners(message, lambda theirs, rows: self._set_rows(self.X, theirs, rows))
@@ -270,9 +274,14 @@ class CopyHolder:
         """Rotations of the robot's poses, (n_a, d, d)."""
         return unstack_transposes(self.z[len(self.is_own) :])
 
-    def own_rotations(self) -> Message:
-        """Rotations omega of the own poses, for whoever may see them."""
-        return {"poses": self.share.poses[self.own], "R": self.omega[self.own]}
+    @property
+    def _poses(self) -> Poses:
+        return Poses(self.omega, np.where(self.held, self.z, self.X)[: len(self.is_own)])
+
+    def own_poses(self) -> Message:
+        """Omega and the translations at hand of the own poses, for whoever may see them."""
+        mine = self._poses[self.own]
+        return {"poses": self.share.poses[self.own], "R": mine.R, "t": mine.t}
 
     def cost(self) -> Message:
         """Part of F at omega, the translations agreed on, and inside those of step (a)."""

@@ -23,7 +23,7 @@ from pgo_models.rotations import Array
 from solvers.asynchronous_soc import AsynchronousSOC, AsynchronousState
 from solvers.checkpoint import Journal
 from solvers.consensus_soc import ConsensusSOC, ConsensusState
-from solvers.driver import Count, Driver
+from solvers.driver import DEFAULT_MEMORY, Count, Driver
 from solvers.engine import Engine
 from solvers.loop import Watch
 from solvers.network import Faults
@@ -35,9 +35,9 @@ from solvers.substructured_newton import SubstructuredNewton
 from solvers.substructured_soc import SubstructuredSOC, SubstructuredState
 
 
-def open_driver(problem: PGOProblem, robots: Partition, engine: Engine) -> Driver:
+def open_driver(problem: PGOProblem, robots: Partition, engine: Engine, memory: float = DEFAULT_MEMORY) -> Driver:
     """Driver and robots for a graph."""
-    return Driver(share_out(problem.graph, robots), problem.num_poses, engine, problem.backend)
+    return Driver(share_out(problem.graph, robots), problem.num_poses, engine, problem.backend, memory)
 
 
 def attempt_distributed(

@@ -98,6 +98,8 @@ class Driver:
     ) -> None:
         """Start the robots; orders about interiors go to those that have an edge to count.
 
+        With no `memory` it stands for the network alone: it hands on what robots send each other, and sums.
+
         Raises
         ------
         SettingError
@@ -112,10 +114,11 @@ class Driver:
         g, d = len(self.cover), self.d
         self.tangent = (d, tangent_dimension(d))
         touched = tuple(share.part.in_cover[share.part.boundary] for share in working if share.part is not None)
-        tree = separator_tree(touched, g)
+        tree = separator_tree(touched, g) if memory else ()
         kinds: tuple[tuple[int, ...], ...] = ((1,), (1, d), self.tangent)
         self._interfaces = {widths: Interface(g, widths, touched, tree) for widths in kinds}
-        self._interfaces[self.tangent].check_memory(memory)
+        if memory:
+            self._interfaces[self.tangent].check_memory(memory)
         self._held_cover = [share.in_cover[share.in_cover >= 0] for share in shares]
         self._parts = [share.part.poses for share in working if share.part is not None]
         self.robots = np.array([share.robot for share in working])
@@ -284,13 +287,23 @@ class Driver:
         GraphError
             When their number or dimension differs from the graph's.
         """
+        self.hand_out(poses)
+        self.objective, self.force = self.state_of(self.ask("look", count=Count.WITH_THE_NEXT))
+
+    def hand_out(self, poses: Poses) -> None:
+        """Give driver and robots all poses, as they are.
+
+        Raises
+        ------
+        GraphError
+            When their number or dimension differs from the graph's.
+        """
         if poses.t.shape != (self.num_poses, self.d):
             raise GraphError(
                 f"{poses} for {self.num_poses} poses in {self.d}D; give one pose for every pose of the graph"
             )
         self.R, self.t = poses.R[self.cover], poses.t[self.cover]
         self.ask("stand", [{"R": poses.R[part], "t": poses.t[part]} for part in self._parts], Count.OFF)
-        self.objective, self.force = self.state_of(self.ask("look", count=Count.WITH_THE_NEXT))
 
     def poses_of_cover(self) -> list[Message]:
         """What every robot is sent of the cover's poses that it holds."""

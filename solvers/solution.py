@@ -52,6 +52,8 @@ class Solution:
         What crossed the network, of a solve by many robots.
     robots : Partition, optional
         Who owned which pose in such a solve.
+    note : str
+        What the certificate lacks, and why; empty where it lacks nothing.
 
     Examples
     --------
@@ -72,6 +74,7 @@ class Solution:
     seconds: float
     ledger: Ledger | None = None
     robots: Partition | None = None
+    note: str = ""
 
     @property
     def lower_bound(self) -> float:
@@ -183,6 +186,7 @@ class Solution:
             "eta": finite_or_none(certificate.eta),
             "stationarity": finite_or_none(certificate.stationarity),
             "verdict": certificate.verdict.name,
+            "note": self.note,
             "status": self.status.name,
             "seconds": self.seconds,
             "stages": [
@@ -230,6 +234,7 @@ class Solution:
             ("lower bound", f"{certificate.lower_bound:.10g}{relaxed}"),
             ("gap", f"{certificate.gap:.3g}"),
             ("verdict", f"{certificate.verdict.name}: {certificate.verdict.value}"),
+            *([("note", self.note)] if self.note else []),
             ("seconds", f"{self.seconds:.3g}"),
             *self._network(),
         ]

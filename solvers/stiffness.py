@@ -74,8 +74,8 @@ def adapted_penalty(penalty: float, sums: Array) -> float:
     ADMM is fastest where penalties are the ratio of the distances to the optimum of multipliers and of variables; the
     way so far, without a common shift, estimates it (Xu, Figueiredo & Goldstein 2017 take the ratio of the last steps).
     Where that is below the penalty, as after a start with several times the optimal cost, the penalty falls by the
-    square of what is missing, to a tenth at most: the square took fewer rounds than the ratio itself on M3500, manhattan
-    and intel. It is never raised, which took more rounds on sphere2500.
+    square of what is missing, to a tenth at most: that took fewer rounds than the ratio itself on M3500, manhattan and
+    intel. It is never raised, which took more rounds on sphere2500.
 
     Parameters
     ----------

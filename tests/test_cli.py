@@ -34,6 +34,22 @@ def pgo_command(capsys):
     return call
 
 
+def test_consensus_goes_without_a_driver_and_says_so(pgo_command):
+    code, out, err = pgo_command("solve", "robots", "--method", "consensus", "--driver-memory", "0")
+    assert (code, err) == (3, "")
+    assert re.search(r"^lower bound +0$", out, re.M)
+    assert re.search(r"^note +no driver: Newton and the certificate were left out", out, re.M)
+    assert re.search(r"^spanning tree .*\nSOC .*CONVERGED$", out, re.M)
+    code, out, err = pgo_command("solve", "robots", "--driver-memory", "0.000001")
+    assert (code, out) == (1, "")
+    assert "raise driver_memory (--driver-memory), or set it to 0" in err
+    for options in (("--method", "joint"), ("--method", "paper"), ("--method", "consensus", "--r-step", "fista")):
+        code, out, err = pgo_command("solve", "robots", "--driver-memory", "4", *options)
+        assert (code, out) == (1, "")
+        assert "--driver-memory" in err
+    assert pgo_command("solve", "robots", "--driver-memory", "0")[0] == 1  # substructured is by a driver
+
+
 def test_the_whole_graph_beside_the_robots_is_one_line_on_stderr(tmp_path):
     folder = tmp_path / "robots"
     shutil.copytree(ROOT / "data" / "robots", folder)

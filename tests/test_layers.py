@@ -96,6 +96,7 @@ ORDER = {
         "substructured_newton",
         "checkpoint",
         "distributed",
+        "leaderless",
         "schedule",
         "block_relaxation",
         "gauss_seidel",
