@@ -11,7 +11,7 @@ from pgo_models.rotations import Array
 GROUND = 1e-7  # of the diagonal of M: holds the shifts that are left out
 _PROBES = 32  # vectors that estimate the mean
 _TRANSLATION_PENALTY = 0.6  # times the stiffness of the separators
-_LEAST_FACTOR = 0.1  # by which the translation penalty is lowered at once
+_LEAST_FACTOR, _ENOUGH = 0.1, 1.0 / 3.0  # by which the translation penalty is lowered at once
 
 
 def separator_stiffness(
@@ -73,9 +73,10 @@ def adapted_penalty(penalty: float, sums: Array) -> float:
 
     ADMM is fastest where penalties are the ratio of the distances to the optimum of multipliers and of variables; the
     way so far, without a common shift, estimates it (Xu, Figueiredo & Goldstein 2017 take the ratio of the last steps).
-    Where that is below the penalty, as after a start with several times the optimal cost, the penalty falls by the
-    square of what is missing, to a tenth at most: that took fewer rounds than the ratio itself on M3500, manhattan and
-    intel. It is never raised, which took more rounds on sphere2500.
+    Where that is far below the penalty, as after a start with several times the optimal cost, the penalty falls by the
+    square of the quotient, to a tenth at most. The square, and the factor of three from which on it falls, were chosen
+    on M3500, manhattan and intel, which take fewer rounds with them; city10000 took more where a smaller factor was
+    enough, and sphere2500 where the penalty was raised.
 
     Parameters
     ----------
@@ -86,7 +87,8 @@ def adapted_penalty(penalty: float, sums: Array) -> float:
     distance = moved - along @ along / scale if scale > 0 else 0.0
     if not distance > 0:
         return penalty
-    return penalty * float(np.clip(pulled / (penalty**2 * distance), _LEAST_FACTOR, 1.0))
+    factor = pulled / (penalty**2 * distance)
+    return penalty * max(factor, _LEAST_FACTOR) if factor <= _ENOUGH else penalty
 
 
 def _without_shifts(vectors: Array, half_scale: Array, component: IntArray) -> Array:
