@@ -217,7 +217,8 @@ class Driver:
     def measured(self, objective: float, primal_residual: float, dual_residual: float) -> Measurement:
         """Figures of an iterate, with the account so far."""
         ledger = self.ledger
-        return Measurement(objective, primal_residual, dual_residual, rounds=ledger.rounds, num_bytes=ledger.num_bytes)
+        sent = {"rounds": ledger.rounds, "num_bytes": ledger.num_bytes, "all_reduces": ledger.all_reduces}
+        return Measurement(objective, primal_residual, dual_residual, **sent)
 
     # Columns of the driver's unknowns.
 

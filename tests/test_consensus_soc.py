@@ -185,7 +185,7 @@ def test_robots_forget_when_the_acceleration_restarts(seed: int) -> None:
         check_acceleration(one, other, engine, soc)
         orders = [down[0]["restart"][0] for order, down, _ in engine.log if order == "copies.extrapolate"]
         restarts.append(bool(orders) and bool(orders[-1]))
-    assert 1 <= sum(restarts[:-3])  # and steps follow
+    assert sum(restarts[:-3]) >= 1  # and steps follow
 
 
 @pytest.mark.parametrize("d", [2, 3])
