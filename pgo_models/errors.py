@@ -29,6 +29,16 @@ class GraphError(PGOError):
     """
 
 
+class GraphWarning(UserWarning):
+    """Something in the files of a pose graph that was not taken as it stands.
+
+    Examples
+    --------
+    >>> issubclass(GraphWarning, UserWarning)
+    True
+    """
+
+
 class SettingError(PGOError, ValueError):
     """A setting of a solver, a model or a scene that is out of its range.
 

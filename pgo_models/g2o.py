@@ -10,12 +10,13 @@ from __future__ import annotations
 import enum
 import os
 import re
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
+from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOError, SettingError
 from pgo_models.files import check_writable, replace_when_done
 from pgo_models.g2o_lines import G2OLines, IntArray, information_of, poses_of, read_lines
 from pgo_models.pose_graph import PoseGraph
@@ -55,7 +56,9 @@ def read_g2o(path: Path | str, weights: RotationWeight = RotationWeight.SE_SYNC)
     Robots. When every id is a GTSAM symbol (a letter in the top byte), the rank of its letter is the robot. Otherwise a
     pose of a folder belongs to the file with its VERTEX line, the first of them in the order 0, 1, .., 9, 10, or else
     to the first file that names it. An edge that stands in two files of a folder is one measurement, and the VERTEX
-    line that counts is that of the pose's own robot.
+    line that counts is that of the pose's own robot. A file beside those of two robots or more whose edges are those of
+    all others once more, under the same ids or others, is the whole graph, no robot: a `GraphWarning` names it, and it
+    is left out (`fullGraph.g2o` of distributed-mapper's folders).
 
     Parameters
     ----------
@@ -82,7 +85,7 @@ def read_g2o(path: Path | str, weights: RotationWeight = RotationWeight.SE_SYNC)
     PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
     """
     path = Path(path)
-    files = [read_lines(file) for file in _files_of(path)]
+    files = _robots_files([read_lines(file) for file in _files_of(path)])
     for file in files[1:]:
         if file.d != files[0].d:
             raise FileFormatError(file.path, None, f"{file.d}D, but {files[0].path} is {files[0].d}D; part the folder")
@@ -309,6 +312,44 @@ def _files_of(path: Path) -> list[Path]:
     if not found:
         raise FileFormatError(path, None, "a folder without g2o files; give a file, or a folder with a file a robot")
     return sorted(found, key=lambda file: [(len(part), part) for part in re.findall(r"\d+|\D+", file.name)])
+
+
+def _robots_files(files: list[G2OLines]) -> list[G2OLines]:
+    """All files but one that repeats the others."""
+    most = max(len(file.edges) for file in files)
+    for whole in files:
+        others = [file for file in files if file is not whole]
+        if len(whole.edges) == most and len(others) >= 2 and _is_whole(whole, others):
+            message = f"{whole.path}: left out, it repeats the edges of the other {len(others)} files; remove it"
+            warnings.warn(message, GraphWarning, stacklevel=3)
+            return others
+    return files
+
+
+def _is_whole(whole: G2OLines, others: list[G2OLines]) -> bool:
+    """Whether a file has the edges of all others, and cannot be a robot's whose poses every one of them touches."""
+    width = 3 if whole.d == 2 else 7
+    exact = np.r_[: whole.d, width : whole.edges.shape[1]]  # a rotation may have been normalised, or turned its sign
+    if any(file.d != whole.d for file in others) or not all(
+        (whole.edges[:, exact] == file.edges[0, exact]).all(axis=1).any() for file in others if len(file.edges)
+    ):
+        return False
+    joined = _join_edges(others)
+    ids = np.concatenate([file.edge_ids[kept] for file, kept in zip(others, joined, strict=True)])
+    edges = np.concatenate([file.edges[kept] for file, kept in zip(others, joined, strict=True)])
+    if len(edges) != len(whole.edges):
+        return False
+    mine, theirs = (rows[np.lexsort(rows[:, exact].T)] for rows in (whole.edges, edges))
+    R, R_theirs = (poses_of(whole.d, rows)[0] for rows in (mine, theirs))
+    if not np.array_equal(mine[:, exact], theirs[:, exact]) or np.abs(R - R_theirs).max() > 1e-9:
+        return False
+    if not np.array_equal(np.unique(whole.edge_ids, axis=0), np.unique(ids, axis=0)):
+        return True  # it numbers the poses in its own way
+    # An edge between two of the others has no end at a robot whose file has all edges.
+    if sum(len(file.edges) for file in others) > len(edges):
+        return True
+    known = np.concatenate([file.vertex_ids for file in others])
+    return len(whole.vertex_ids) > 0 and bool(np.isin(whole.vertex_ids, known).all())
 
 
 def _join_edges(files: list[G2OLines]) -> list[np.ndarray]:

@@ -80,9 +80,15 @@ def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
     [0.0, 0.0, 0.0]
     """
     graph.check_connected()
+    if not 0 <= root < graph.num_poses:
+        raise SettingError(f"root is {root}; give a pose, 0 to {graph.num_poses - 1}")
+    order, parent, edge = spanning_tree(graph, root)
+    return _compose(graph, order, parent, edge, graph.j[edge] == order[1:])
+
+
+def spanning_tree(graph: PoseGraph, root: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Breadth-first tree: poses in its order, the parent of every pose, and the edges to order[1:]."""
     n = graph.num_poses
-    if not 0 <= root < n:
-        raise SettingError(f"root is {root}; give a pose, 0 to {n - 1}")
     # The stored number of an adjacency entry is 1 + the first edge between the two poses.
     pair = np.minimum(graph.i, graph.j) * n + np.maximum(graph.i, graph.j)
     first = np.unique(pair, return_index=True)[1]
@@ -95,8 +101,7 @@ def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
     )
     order, parent = breadth_first_order(adjacency, root, directed=False)
     child = order[1:]
-    edge = np.asarray(adjacency[child, parent[child]]).astype(np.int64).ravel() - 1
-    return _compose(graph, order, parent, edge, graph.j[edge] == child)
+    return order, parent, np.asarray(adjacency[child, parent[child]]).astype(np.int64).ravel() - 1
 
 
 def chordal_start(problem: PGOProblem) -> Poses:

@@ -63,6 +63,8 @@ class AsynchronousSOC:
         Over-relaxation, in (0, 2).
     damping : float
         Share of a step that is taken, in (0, 1].
+    has_driver : bool
+        As in `ConsensusSOC`.
 
     Raises
     ------
@@ -74,6 +76,7 @@ class AsynchronousSOC:
     faults: Faults = field(default_factory=Faults)
     alpha: float = 1.8
     damping: float = 1.0
+    has_driver: bool = True
 
     def __post_init__(self) -> None:
         if not 0 < self.alpha < 2:
@@ -97,7 +100,7 @@ class AsynchronousSOC:
         number, silent = driver.ledger.num_robots, self.faults.silent_robot
         if silent is not None and silent >= number:
             raise SettingError(f"silent_robot is {silent}; give 0 to {number - 1}")
-        state = ConsensusSOC(self.soc).init(driver, None)
+        state = ConsensusSOC(self.soc, self.has_driver).init(driver, None)
         messages = driver.hand_on(driver.ask_all("announce", count=Count.WITH_THE_NEXT), self._settings)
         return AsynchronousState(0, state.size, Post(self.faults), messages)
 

@@ -17,6 +17,7 @@ from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.scenes import MILD_NOISE, NoiseModel, circle, grid, random_geometric, sphere
+from solvers.driver import DEFAULT_MEMORY
 from solvers.engine import Engine, InProcess
 from solvers.newton import Newton, gauss_newton
 from solvers.pipeline import HANDOVER, Pipeline
@@ -89,6 +90,7 @@ def chosen_pipeline(
     gap: float,
     max_iterations: int | None,
     tolerance: float | None,
+    driver_memory: float | None = None,
 ) -> Pipeline:
     """Pipeline of the options of `pgo solve`.
 
@@ -96,24 +98,29 @@ def chosen_pipeline(
     ----------
     robots : Partition, optional
         For CONSENSUS and PAPER.
+    driver_memory : float, optional
+        GB.
 
     Raises
     ------
     SettingError
         When they do not go together.
     """
+    if driver_memory is not None and method not in ON_ROBOTS:
+        raise SettingError(f"--driver-memory is for methods that run on robots, got --method {method.value}")
+    memory = DEFAULT_MEMORY if driver_memory is None else 1e9 * driver_memory
     if method is Method.NEWTON:
         of_soc = (("--r-step", r_step), ("--max-iterations", max_iterations), ("--tolerance", tolerance))
         for name, value in of_soc:
             if value is not None:
                 raise SettingError(f"{name} is for SOC, which --method newton leaves out; leave out one of the two")
-        return Pipeline(soc=None, gap=gap)
+        return Pipeline(soc=None, gap=gap, driver_memory=memory)
     r_step = BackEnd.FACTORIZED if r_step is None else r_step
     if method is Method.SUBSTRUCTURED and r_step is not BackEnd.FACTORIZED:
         raise SettingError(
             f"--method substructured factors, got --r-step {r_step.value}; use joint, consensus or paper"
         )
-    usual = SOC() if method is Method.PAPER else HANDOVER
+    usual = HANDOVER if method is not Method.PAPER and memory > 0 else SOC()
     soc = replace(
         usual,
         coupling=Coupling[method.name],
@@ -122,7 +129,8 @@ def chosen_pipeline(
         tolerance=usual.tolerance if tolerance is None else tolerance,
         max_iterations=usual.max_iterations if max_iterations is None else max_iterations,
     )
-    return Pipeline(soc=soc, newton=gauss_newton() if method is Method.PAPER else Newton(), gap=gap)
+    newton = gauss_newton() if method is Method.PAPER else Newton()
+    return Pipeline(soc=soc, newton=newton, gap=gap, driver_memory=memory)
 
 
 def chosen_method(method: Method | None, robots: int | None, is_shared: bool) -> Method:

@@ -10,6 +10,7 @@ import json
 import math
 import shlex
 import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -133,6 +134,14 @@ def solve_command(
             "broken off. Removed when the solve has converged."
         ),
     ] = None,
+    driver_memory: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="GB that the driver of a solve by robots may take, 4 unless given; 0 is no driver, with --method "
+            "consensus: poses from a spanning tree, and no certificate.",
+        ),
+    ] = None,
     start: Annotated[
         Start | None, typer.Option(help="Start: chordal relaxation (tree for the paper's method) unless given.")
     ] = None,
@@ -166,7 +175,7 @@ def solve_command(
     for other in (report, resume):
         if other is not None:
             check_writable(other)
-    about_robots = (robots, split, engine, address, resume)
+    about_robots = (robots, split, engine, address, resume, driver_memory)
     is_shared = any(option is not None for option in about_robots)
     chosen = chosen_method(method, robots, is_shared)
     if chosen is Method.JOINT and split is not None:
@@ -176,11 +185,14 @@ def solve_command(
     shared = chosen_partition(problem.graph, robots, split) if is_shared else None
     # Robots factor; the other back ends of CONSENSUS have all robots in one place.
     on_robots = shared is not None and runs_on is not None and r_step in (None, BackEnd.FACTORIZED)
-    if r_step is not None and not on_robots and any(option is not None for option in (engine, address, resume)):
-        raise SettingError(f"robots of an engine factor, got --r-step {r_step.value}; leave out --engine and --resume")
+    of_robots = (engine, address, resume, driver_memory)
+    if r_step is not None and not on_robots and any(option is not None for option in of_robots):
+        raise SettingError(
+            f"robots of an engine factor, got --r-step {r_step.value}; leave out --engine, --resume and --driver-memory"
+        )
     solution = solve(
         problem,
-        chosen_pipeline(chosen, shared, r_step, gap, max_iterations, tolerance),
+        chosen_pipeline(chosen, shared, r_step, gap, max_iterations, tolerance, driver_memory),
         chosen_start(problem, start),
         robots=shared if on_robots else None,
         engine=runs_on if on_robots else None,
@@ -319,8 +331,13 @@ app.command("figures")(figures_command)
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run `pgo` and leave with its exit code; every error of ours is one line on stderr."""
+    """Run `pgo` and leave with its exit code; every error and warning of ours is one line on stderr."""
+    warnings.showwarning = _say
     raise SystemExit(run_command(app, sys.argv[1:] if arguments is None else arguments))
+
+
+def _say(message: Warning | str, *_: object, **__: object) -> None:
+    print(f"pgo: warning: {message}", file=sys.stderr)
 
 
 def _load(graph: str, unit_weights: bool) -> PoseGraph:

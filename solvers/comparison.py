@@ -26,7 +26,18 @@ from solvers.table_formats import Part, ResultTable, Value, percent
 from solvers.trial_runs import run_trial
 from solvers.trials import Contender, Trial, TrialSettings
 
-_HEADS = ("method", "F", "gap (%)", "iterations", "rounds", "MB sent", "seconds", "seconds a robot", "remark")
+_HEADS = (
+    "method",
+    "F",
+    "gap (%)",
+    "iterations",
+    "rounds",
+    "all-reduces",
+    "MB sent",
+    "seconds",
+    "seconds a robot",
+    "remark",
+)
 
 
 @dataclass(frozen=True)
@@ -106,6 +117,7 @@ class Comparison:
                     percent(gap) if trial.is_answer else "-",
                     " + ".join(map(str, trial.iterations)),
                     "-" if trial.rounds is None else str(trial.rounds),
+                    "-" if trial.all_reduces is None else str(trial.all_reduces),
                     "-" if trial.num_bytes is None else f"{1e-6 * trial.num_bytes:.3g}",
                     f"{trial.seconds:.3g}",
                     f"{trial.seconds_per_robot:.3g}",
@@ -120,7 +132,7 @@ class Comparison:
         notes = [
             f"{graph.name}: {graph.num_poses} poses, {graph.num_edges} edges; best F {self.optimum:.10g}, proven lower "
             f"bound {self.lower_bound:.10g}; gaps are to the bound, over F",
-            "rounds and MB: where they are counted; seconds a robot: side by side",
+            "rounds, all-reduces and MB: where they are counted; seconds a robot: side by side",
         ]
         if not self.is_complete:
             notes.append("interrupted: the methods left out were not run")
@@ -221,6 +233,7 @@ def _record(contender: Contender, trial: Trial | None, gap: float, remark: str) 
         "iterations_first_stage": iterations[0] if iterations else None,
         "iterations_second_stage": iterations[1] if len(iterations) > 1 else None,
         "rounds": trial.rounds if trial is not None else None,
+        "all_reduces": trial.all_reduces if trial is not None else None,
         "bytes": trial.num_bytes if trial is not None else None,
         "seconds": trial.seconds if trial is not None else None,
         "seconds_per_robot": trial.seconds_per_robot if trial is not None else None,

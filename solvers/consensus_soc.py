@@ -13,7 +13,8 @@ from solvers.penalty import BalancedPenalty, MultiplierPenalty
 from solvers.result import Measurement, Status
 from solvers.safeguard import MAX_RAISES, has_diverged, has_stalled, is_going_round
 from solvers.shared_anderson import AndersonSums
-from solvers.soc import SOC, translation_penalty_for
+from solvers.soc import SOC
+from solvers.stiffness import adapted_penalty, translation_penalty_for
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +56,13 @@ class ConsensusSOC:
     ----------
     soc : SOC
         Settings; its coupling and robots are not looked at.
+    has_driver : bool
+        Whether a driver sends the cover's poses at the start, and finds the best translations where penalties are taken
+        anew. Else robots begin at poses that they know, and go on from the translations that they agreed on.
     """
 
     soc: SOC = field(default_factory=SOC)
+    has_driver: bool = True
 
     @property
     def max_iterations(self) -> int:
@@ -116,15 +121,20 @@ class ConsensusSOC:
 
     def finish(self, driver: Driver) -> None:
         """Leave omega and the best translations for it with driver and robots: two rounds."""
-        answers = driver.ask_all("finish")
         driver.R = np.empty_like(driver.R)
-        for answer in answers:
+        for answer in driver.ask_all("finish", count=Count.WITH_THE_NEXT):
             driver.R[answer["cover"]] = answer["R"]
-        driver.settle([answers[robot] for robot in driver.robots.tolist()])
+        driver.adopt()  # copies of robots that do not wait differ: all take the owners'
 
     def _penalized(self, driver: Driver, before: ConsensusState | None) -> ConsensusState:
         """State 0 at the poses that driver and robots hold; separators are held as `before`, if that is given."""
-        rows = driver.hand_on(driver.ask_all("begin", driver.poses_of_cover(), Count.WITH_THE_NEXT))
+        if self.has_driver:
+            answers = driver.ask_all("begin", driver.poses_of_cover(), Count.WITH_THE_NEXT)
+        elif before is None:  # all know where they start
+            answers = driver.ask_all("begin", driver.poses_of_cover(), Count.OFF)
+        else:
+            answers = driver.ask_all("begin_here", count=Count.WITH_THE_NEXT)
+        rows = driver.hand_on(answers)
         answers = driver.ask_all("stiffness", rows, Count.ALL_REDUCE)
         norms = np.concatenate([answer["norms"] for answer in answers])
         scales = np.concatenate([answer["scale"] for answer in answers])
@@ -154,14 +164,25 @@ class ConsensusSOC:
         if state.raises < MAX_RAISES and (has_diverged(merits) or is_going_round(merits, state.ratio)):
             return replace(self._rescaled(driver, state, 2.0, from_best=True), raises=state.raises + 1)
         if isinstance(rule, MultiplierPenalty) and has_stalled(rule, merits) and state.refreshes < rule.max_refreshes:
-            self.finish(driver)
-            fresh = self._penalized(driver, state)
+            before = self._adapted(driver, state)
+            if self.has_driver:
+                self.finish(driver)
+            fresh = self._penalized(driver, before)
             return replace(fresh, k=state.k, refreshes=state.refreshes + 1, raises=state.raises)
         if isinstance(rule, BalancedPenalty) and state.k > 0:
             factor = rule.factor(state.primal_residual, state.dual_residual)
             if factor != 1.0 and (factor > 1.0 or state.raises == 0):
                 return replace(self._rescaled(driver, state, factor, from_best=False), refreshes=state.refreshes + 1)
         return state
+
+    def _adapted(self, driver: Driver, state: ConsensusState) -> ConsensusState:
+        """State with the penalties of separators that the way so far suggests."""
+        if self.soc.translation_penalty is not None or driver.ledger.num_robots == 1:
+            return state
+        sums = np.sum([answer["travel"] for answer in driver.ask_all("travel", count=Count.ALL_REDUCE)], axis=0)
+        translation = adapted_penalty(state.translation_penalty, sums)
+        rotation = self.soc.separator_penalty_for(translation)
+        return replace(state, translation_penalty=translation, separator_penalty=rotation)
 
     def _rescaled(self, driver: Driver, state: ConsensusState, factor: float, from_best: bool) -> ConsensusState:
         """State with factor * rho and the same unscaled multiplier rho B."""

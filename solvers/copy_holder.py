@@ -26,7 +26,7 @@ from solvers.robot import Message
 from solvers.rotation_block import stationary_B
 from solvers.share import PartProblem, Share
 from solvers.shared_anderson import AndersonShare, AndersonSums
-from solvers.stiffness import GROUND, separator_stiffness
+from solvers.stiffness import GROUND, separator_stiffness, travel
 from solvers.substructure import columns_of
 
 # What follows from the share, and the factor: all other attributes are remembered.
@@ -64,6 +64,7 @@ class CopyHolder:
         self.rho, self.diagonal, self.pull = np.ones(n), np.ones((n, d + 1)), np.zeros((n, d * d))
         self.penalty = np.zeros((d + 1) * n)
         self.z = self.s = self.x = self.best = self.X
+        self._origin = self.z, self.s
         self.anderson, self.sums = AndersonShare(), AndersonSums()
         self._gamma: Array | None = None
         self._Lambda, self._force = np.zeros((n, d, d)), self.X
@@ -78,6 +79,10 @@ class CopyHolder:
         """Start at own poses, (n_a): rows of the others' copies come from their owners."""
         self.X = poses.stacked()
         return self._to_holders(lambda mine: self.X[columns_of(mine, len(self.is_own), (1, self.d))])
+
+    def begin_here(self) -> Message:
+        """Start at omega, with the translations agreed on, and of step (a) in the interior."""
+        return self.begin(self._poses)
 
     def stiffness(self, message: Message = _NOTHING) -> Message:
         """Take the owners' poses: ||Lambda_i||_2 and m_i of the robot's own."""
@@ -147,6 +152,7 @@ class CopyHolder:
         self.z = self.x = np.where(self.held, self.X, 0.0)
         self.s = self.best = self.z + np.where(self.held, balanced + mean, 0.0)
         self.anderson, self.sums = AndersonShare(), AndersonSums()
+        self._origin = self.z, self.s
         return {"size": np.array([d * self.rho[self.own].sum()]), "ratio": (self.rho / self._scale)[self.own]}
 
     # The recursion.
@@ -237,6 +243,12 @@ class CopyHolder:
         self._excess, self._least, self._turns_since = 1.0, math.inf, 0
         return self._to_neighbours(self.s)
 
+    def travel(self) -> Message:
+        """How far separator translations, and their multipliers, went since the start: see `solvers.stiffness`."""
+        at, (z, s) = np.flatnonzero(self.share.copies > 1), self._origin
+        pulled = self.penalty[at, None] * (self.s - self.z - s + z)[at]
+        return {"travel": travel((self.z - z)[at], pulled, self.diagonal[at, 0] / self.share.copies[at])}
+
     def back_at_best(self) -> Message:
         """Return to the s of the smallest merit; its rows for every neighbour."""
         self.s = self.best
@@ -262,9 +274,14 @@ class CopyHolder:
         """Rotations of the robot's poses, (n_a, d, d)."""
         return unstack_transposes(self.z[len(self.is_own) :])
 
-    def own_rotations(self) -> Message:
-        """Rotations omega of the own poses, for whoever may see them."""
-        return {"poses": self.share.poses[self.own], "R": self.omega[self.own]}
+    @property
+    def _poses(self) -> Poses:
+        return Poses(self.omega, np.where(self.held, self.z, self.X)[: len(self.is_own)])
+
+    def own_poses(self) -> Message:
+        """Omega and the translations at hand of the own poses, for whoever may see them."""
+        mine = self._poses[self.own]
+        return {"poses": self.share.poses[self.own], "R": mine.R, "t": mine.t}
 
     def cost(self) -> Message:
         """Part of F at omega, the translations agreed on, and inside those of step (a)."""

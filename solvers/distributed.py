@@ -7,12 +7,7 @@ import time
 
 import numpy as np
 
-from pgo_models.certificate import (
-    BoundSource,
-    Certificate,
-    Verdict,
-    judge,
-)
+from pgo_models.certificate import BoundSource, Certificate, certify_with
 from pgo_models.partition import Partition
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
@@ -21,7 +16,7 @@ from solvers.asynchronous_soc import AsynchronousSOC, AsynchronousState
 from solvers.checkpoint import Journal
 from solvers.consensus_soc import ConsensusSOC, ConsensusState
 from solvers.distributed_bound import best_bound_distributed
-from solvers.driver import Count, Driver
+from solvers.driver import DEFAULT_MEMORY, Count, Driver
 from solvers.engine import Engine
 from solvers.loop import Watch
 from solvers.network import Faults
@@ -33,10 +28,11 @@ from solvers.substructured_newton import SubstructuredNewton
 from solvers.substructured_soc import SubstructuredSOC, SubstructuredState
 
 
-def open_driver(problem: PGOProblem, robots: Partition, engine: Engine) -> Driver:
+def open_driver(problem: PGOProblem, robots: Partition, engine: Engine, memory: float = DEFAULT_MEMORY) -> Driver:
     """Driver and robots for a graph."""
     shares = share_out(problem.graph, robots)
-    return Driver(shares, problem.num_poses, engine, problem.backend, grounded=middle_separator(problem.graph, shares))
+    grounded = middle_separator(problem.graph, shares)
+    return Driver(shares, problem.num_poses, engine, problem.backend, memory, grounded)
 
 
 def attempt_distributed(
@@ -69,20 +65,7 @@ def attempt_distributed(
         stages.append(Stage("Newton", *figures))
     bound = best_bound_distributed(driver, gap)
     poses, Lambda = collect(driver)
-    unjudged = Certificate(
-        objective=driver.objective,
-        bound=bound,
-        gap=math.nan,
-        rounding_level=driver.rounding_level,
-        stationarity=decrement,
-        source=BoundSource.GIVEN,
-        poses=poses,
-        poses_objective=driver.objective,
-        Lambda=Lambda,
-        wanted_gap=gap,
-        verdict=Verdict.TRIVIAL,
-    )
-    outcome = poses, judge(problem, poses, unjudged)
+    outcome = poses, certify_with(problem, poses, Lambda, gap, decrement, BoundSource.GIVEN, bound)
     journal.end_attempt(outcome)
     return outcome
 

@@ -23,6 +23,7 @@ from pgo_models.poses import Poses
 from pgo_models.rotations import (
     Array,
     project_to_rotations,
+    stack_transposes,
     tangent_dimension,
     unstack_transposes,
 )
@@ -99,6 +100,8 @@ class Driver:
     ) -> None:
         """Start the robots; orders about interiors go to those that have an edge to count.
 
+        With no `memory` it stands for the network alone: it hands on what robots send each other, and sums.
+
         Raises
         ------
         SettingError
@@ -113,10 +116,11 @@ class Driver:
         g, d = len(self.cover), self.d
         self.tangent = (d, tangent_dimension(d))
         touched = tuple(share.part.in_cover[share.part.boundary] for share in working if share.part is not None)
-        tree = separator_tree(touched, g)
+        tree = separator_tree(touched, g) if memory else ()
         kinds: tuple[tuple[int, ...], ...] = ((1,), (1, d), self.tangent)
         self._interfaces = {widths: Interface(g, widths, touched, tree) for widths in kinds}
-        self._interfaces[self.tangent].check_memory(memory)
+        if memory:
+            self._interfaces[self.tangent].check_memory(memory)
         self._held_cover = [share.in_cover[share.in_cover >= 0] for share in shares]
         self._parts = [share.part.poses for share in working if share.part is not None]
         self.robots = np.array([share.robot for share in working])
@@ -213,7 +217,8 @@ class Driver:
     def measured(self, objective: float, primal_residual: float, dual_residual: float) -> Measurement:
         """Figures of an iterate, with the account so far."""
         ledger = self.ledger
-        return Measurement(objective, primal_residual, dual_residual, rounds=ledger.rounds, num_bytes=ledger.num_bytes)
+        sent = {"rounds": ledger.rounds, "num_bytes": ledger.num_bytes, "all_reduces": ledger.all_reduces}
+        return Measurement(objective, primal_residual, dual_residual, **sent)
 
     # Columns of the driver's unknowns.
 
@@ -286,13 +291,23 @@ class Driver:
         GraphError
             When their number or dimension differs from the graph's.
         """
+        self.hand_out(poses)
+        self.objective, self.rounding_level, self.force = self.state_of(self.ask("look", count=Count.WITH_THE_NEXT))
+
+    def hand_out(self, poses: Poses) -> None:
+        """Give driver and robots all poses, as they are.
+
+        Raises
+        ------
+        GraphError
+            When their number or dimension differs from the graph's.
+        """
         if poses.t.shape != (self.num_poses, self.d):
             raise GraphError(
                 f"{poses} for {self.num_poses} poses in {self.d}D; give one pose for every pose of the graph"
             )
         self.R, self.t = poses.R[self.cover], poses.t[self.cover]
         self.ask("stand", [{"R": poses.R[part], "t": poses.t[part]} for part in self._parts], Count.OFF)
-        self.objective, self.rounding_level, self.force = self.state_of(self.ask("look", count=Count.WITH_THE_NEXT))
 
     def poses_of_cover(self) -> list[Message]:
         """What every robot is sent of the cover's poses that it holds."""
@@ -312,6 +327,11 @@ class Driver:
         """Return to the poses that were kept."""
         self.R, self.t, self.force, self.objective, self.rounding_level = self._kept
         self.ask("go_back", count=Count.WITH_THE_NEXT)
+
+    def adopt(self) -> None:
+        """Give the robots the rotations of the cover, and all the best translations for them: two rounds."""
+        messages = self.scattered_rotations(stack_transposes(self.R))
+        self.settle(self.ask("adopt", messages))
 
     def settle(self, answers: Sequence[Message]) -> None:
         """Best translations for the rotations at hand, from the robots' right-hand sides: one round."""

@@ -200,7 +200,7 @@ class GaussSeidel:
         relaxed = 0.0
         if state.stage is DGSStage.ROTATIONS:
             relaxed = norm(stack_transposes(poses.R[1:]) - state.x) / math.sqrt(problem.num_poses * problem.d)
-        return Measurement(problem.objective(poses), relaxed, state.change)
+        return Measurement(problem.objective(poses), relaxed, state.change, all_reduces=state.ledger.all_reduces)
 
     def poses(self, problem: PGOProblem, state: GaussSeidelState) -> Poses:
         """Rotations projected, in the first stage with the best translations for them: these no robot knows yet."""

@@ -89,12 +89,11 @@ class Member:
         return self.copies.begin(Poses(R, t))
 
     def _finish(self) -> Message:
-        """Take omega for the interior: right-hand side of the translations, and the own rotations of the cover."""
+        """Take omega for the interior; the own rotations of the cover."""
         assert self.copies is not None
         share, omega = self.share, self.copies.omega
+        if self.interior is not None:
+            place = np.searchsorted(share.poses, self.interior.part.poses)
+            self.interior.poses = Poses(omega[place], self.interior.poses.t)
         own = np.flatnonzero(share.is_own & (share.in_cover >= 0))
-        answer = {"cover": share.in_cover[own], "R": omega[own]}
-        if self.interior is None:
-            return answer
-        place = np.searchsorted(share.poses, self.interior.part.poses)
-        return {**answer, **self.interior.place({"R": omega[place]})}
+        return {"cover": share.in_cover[own], "R": omega[own]}

@@ -22,7 +22,9 @@ from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem, as_problem
 from solvers.checkpoint import Checkpoint, Journal, fingerprint
 from solvers.distributed import attempt_distributed, collect, open_driver
+from solvers.driver import DEFAULT_MEMORY
 from solvers.engine import Engine, InProcess
+from solvers.leaderless import NO_CERTIFICATE, attempt_leaderless
 from solvers.loop import Watch
 from solvers.network import Faults
 from solvers.newton import Newton
@@ -58,6 +60,9 @@ class Pipeline:
     faults : Faults, optional
         What goes wrong between robots in a CONSENSUS stage, which then does not wait: `solvers.asynchronous_soc`. Only
         with `solve(.., robots=..)`.
+    driver_memory : float
+        Bytes that the driver of a solve by robots may take; it is refused before they are spent. 0 is no driver:
+        CONSENSUS alone, see `solvers.leaderless`, with poses and no certificate.
 
     Examples
     --------
@@ -73,12 +78,20 @@ class Pipeline:
     second_try: bool = True
     staircase: Staircase | None = field(default_factory=Staircase)
     faults: Faults | None = None
+    driver_memory: float = DEFAULT_MEMORY
 
     def __post_init__(self) -> None:
         if not 0 < self.gap < math.inf:
             raise SettingError(f"gap must be positive and finite, got {self.gap}; 1e-6 is usual")
         if self.faults is not None and (self.soc is None or self.soc.effective_coupling is not Coupling.CONSENSUS):
             raise SettingError("faults are of messages between robots; use SOC(robots=.., coupling=Coupling.CONSENSUS)")
+        if not self.driver_memory >= 0:
+            raise SettingError(f"driver_memory must not be negative, got {self.driver_memory}; 0 is no driver")
+        is_consensus = self.soc is not None and self.soc.effective_coupling is Coupling.CONSENSUS
+        if self.driver_memory == 0 and not is_consensus:
+            raise SettingError(
+                "without a driver there is CONSENSUS alone; use SOC(robots=.., ..), or give driver_memory"
+            )
 
 
 def solve(
@@ -156,6 +169,10 @@ def solve(
         )
     if robots is None and pipeline.faults is not None:
         raise SettingError("faults are of messages between robots; give solve() the robots of SOC, too")
+    if robots is None and pipeline.driver_memory != DEFAULT_MEMORY:
+        raise SettingError("driver_memory is for solves by robots; give solve() the robots, too")
+    if pipeline.driver_memory == 0:
+        pipeline = replace(pipeline, second_try=False, staircase=None)
     stages: list[Stage] = []
     watch = Watch(began + time_limit, verbose, progress, callback)
     if robots is None:
@@ -171,12 +188,18 @@ def solve(
     else:
         robots = _robots_for(pipeline.soc, robots, problem.graph)
         settings = pipeline.soc, pipeline.newton, pipeline.gap, pipeline.second_try, pipeline.faults
-        journal = Journal(checkpoint, fingerprint(problem, robots, settings, start), stages)
-        driver = open_driver(problem, robots, engine if engine is not None else InProcess())
+        has_driver = pipeline.driver_memory > 0
+        journal = Journal(checkpoint, fingerprint(problem, robots, (*settings, has_driver), start), stages)
+        engine = engine if engine is not None else InProcess()
+        driver = open_driver(problem, robots, engine, pipeline.driver_memory)
         try:
             attempt = partial(
                 attempt_distributed, driver, problem, pipeline.newton, pipeline.gap, pipeline.faults, journal, watch
             )
+            if not has_driver:
+                attempt = partial(
+                    attempt_leaderless, driver, problem, robots, pipeline.gap, pipeline.faults, journal, watch
+                )
             poses, certificate = _tries(attempt, problem, pipeline, start, stages)
         except KeyboardInterrupt:
             if not stages:
@@ -205,6 +228,7 @@ def solve(
         seconds=time.perf_counter() - began,
         ledger=ledger,
         robots=robots,
+        note=NO_CERTIFICATE if pipeline.driver_memory == 0 else "",
     )
 
 

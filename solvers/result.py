@@ -55,7 +55,7 @@ class Measurement:
     infeasibility : float
         Distance of the point whose objective this is from the constraints; 0 where that point is feasible, as poses
         are. The best iterate of a run has the least infeasibility, and among those the least objective.
-    rounds, num_bytes : int, optional
+    rounds, num_bytes, all_reduces : int, optional
         Communication so far, of methods that run by many robots.
 
     Examples
@@ -70,6 +70,7 @@ class Measurement:
     infeasibility: float = 0.0
     rounds: int | None = None
     num_bytes: int | None = None
+    all_reduces: int | None = None
 
 
 @dataclass(frozen=True)

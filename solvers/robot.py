@@ -103,9 +103,11 @@ class Robot:
         """Parts of F and of M X on the boundary, at the poses at hand."""
         return self._state_of(self.poses)
 
-    def place(self, message: Message) -> Message:
-        """Take rotations from elsewhere, (p, d, d); then `translations`."""
-        self.poses = Poses(message["R"], self.poses.t)
+    def adopt(self, message: Message) -> Message:
+        """Take rotations of the cover's poses; then `translations`."""
+        R = self.poses.R.copy()
+        R[self.part.boundary] = unstack_transposes(message["z"])
+        self.poses = Poses(R, self.poses.t)
         return self.translations()
 
     def keep(self) -> Message:

@@ -36,8 +36,10 @@ from solvers.result import Measurement, Status
 from solvers.rotation_step import BackEnd, RStep
 from solvers.safeguard import MAX_RAISES, has_diverged, has_stalled, is_going_round
 from solvers.soc_paper import PaperState, init_paper, measure_paper, step_paper
+from solvers.stiffness import translation_penalty_for
 from solvers.team import Team, build_team
 from solvers.team_vectors import (
+    adapted,
     agree,
     balanced,
     norm_of_omega,
@@ -46,7 +48,6 @@ from solvers.team_vectors import (
     stationary_mean,
 )
 
-_TRANSLATION_PENALTY = 0.6  # times the stiffness of the separators
 _SEPARATOR_PENALTY, _MOST_SEPARATOR_PENALTY = 0.7, 0.3  # times the root of the translation penalty, and no more
 
 
@@ -99,6 +100,8 @@ class SOCState:
         Fixed-point residual ||x - z_before||_rho of the steps since rho last changed.
     best : (rows, d)
         The s of the smallest merit.
+    origin : tuple of two (rows, d), optional
+        z and s when the penalty rule last set rho.
     refreshes, raises : int
         How often the penalty rule, and the safeguard against divergence, changed rho.
     """
@@ -117,6 +120,7 @@ class SOCState:
     dual_residual: float = np.inf
     merits: tuple[float, ...] = ()
     best: Array | None = None
+    origin: tuple[Array, Array] | None = None
     refreshes: int = 0
     raises: int = 0
 
@@ -151,7 +155,8 @@ class SOC:
         last of them. It costs no message. 1 is the plain recursion.
     translation_penalty : float, optional
         Penalty of separator translations in CONSENSUS, times their diagonal in M. Unless given, 0.6 times the stiffness
-        of the separators, `Team.stiffness`: what the robots feel when they move one.
+        of the separators, `Team.stiffness`: what the robots feel when they move one; lowered where the penalties are
+        taken anew, if the translations went far for what changed in their multipliers (`solvers.stiffness`).
     separator_penalty : float, optional
         Least penalty of separator rotations in CONSENSUS under a MultiplierPenalty, times their mean diagonal in M: on
         graphs with little noise the multipliers alone would hold the copies too loosely together. Unless given, 0.7
@@ -230,7 +235,10 @@ class SOC:
         poses = start if start is not None else chordal_start(problem)
         team = build_team(problem, self._copies, self.r_step)
         rho = self.effective_penalty.initial(problem, poses)
-        rho_t, separator_rho = self._separator_penalties(problem, team, rho)
+        relative = self.translation_penalty
+        if relative is None and len(team.robots) > 1:
+            relative = translation_penalty_for(team.stiffness(rho))
+        rho_t, separator_rho = self._separator_penalties(problem, team, relative)
         rho = np.maximum(rho, separator_rho)
         team = team.with_penalty(rho, rho_t)
         X = problem.stacked(poses)
@@ -238,7 +246,7 @@ class SOC:
         is_stationary = len(team.robots) > 1 and isinstance(self.effective_penalty, MultiplierPenalty)
         mean = stationary_mean(problem, poses, rho) if is_stationary else np.zeros_like(X)
         s = z + balanced(team, X, mean)
-        return SOCState(0, z, poses.R, z, s, rho, rho_t, separator_rho, team)
+        return SOCState(0, z, poses.R, z, s, rho, rho_t, separator_rho, team, origin=(z, s))
 
     def step(self, problem: PGOProblem, state: SOCState | PaperState) -> SOCState | PaperState:
         """One iteration: (a), (b), (c)."""
@@ -319,13 +327,10 @@ class SOC:
             B[private] = s - z[private]  # (c)
         return z, B, z + B - state.s
 
-    def _separator_penalties(self, problem: PGOProblem, team: Team, rho: Array) -> tuple[Array, Array]:
+    def _separator_penalties(self, problem: PGOProblem, team: Team, relative: float | None) -> tuple[Array, Array]:
         """Penalty of separator translations and least penalty of separator rotations, (n,) each."""
-        if len(team.robots) == 1:
+        if relative is None or len(team.robots) == 1:
             return translation_scale(problem), np.zeros(problem.num_poses)
-        relative = self.translation_penalty
-        if relative is None:
-            relative = translation_penalty_for(team.stiffness(rho))
         separator_rho = np.zeros(problem.num_poses)
         if isinstance(self.effective_penalty, MultiplierPenalty):
             separator = team.separators
@@ -367,23 +372,26 @@ class SOC:
     def _refreshed(self, problem: PGOProblem, state: SOCState) -> SOCState:
         """State with rho and B from the multipliers at omega, where the mean B_i is -2 Lambda_i R_i^T / rho_i."""
         poses = problem.with_best_translations(state.omega)
-        rho = np.maximum(self.effective_penalty.initial(problem, poses), state.separator_rho)
-        team = state.team.with_penalty(rho, state.rho_t)
+        rho_t, separator_rho = state.rho_t, state.separator_rho
+        if self.translation_penalty is None and len(state.team.robots) > 1:
+            relative = adapted(problem, state.team, state.rho_t, state.origin, (state.z, state.s))
+            rho_t, separator_rho = self._separator_penalties(problem, state.team, relative)
+        rho = np.maximum(self.effective_penalty.initial(problem, poses), separator_rho)
+        team = state.team.with_penalty(rho, rho_t)
         X = problem.stacked(poses)
         z = X[team.row]
+        s = z + balanced(team, X, stationary_mean(problem, poses, rho))
         return replace(
             state,
             z=z,
-            s=z + balanced(team, X, stationary_mean(problem, poses, rho)),
+            s=s,
+            origin=(z, s),
             rho=rho,
+            rho_t=rho_t,
+            separator_rho=separator_rho,
             team=team,
             memory=(),
             merits=(),
             best=None,
             refreshes=state.refreshes + 1,
         )
-
-
-def translation_penalty_for(stiffness: float) -> float:
-    """Penalty of separator translations, times their diagonal in M, from `Team.stiffness`."""
-    return _TRANSLATION_PENALTY * stiffness

@@ -53,6 +53,8 @@ class Solution:
         What crossed the network, of a solve by many robots.
     robots : Partition, optional
         Who owned which pose in such a solve.
+    note : str
+        What the certificate lacks, and why; empty where it lacks nothing.
 
     Examples
     --------
@@ -73,6 +75,7 @@ class Solution:
     seconds: float
     ledger: Ledger | None = None
     robots: Partition | None = None
+    note: str = ""
 
     @property
     def lower_bound(self) -> float:
@@ -184,6 +187,7 @@ class Solution:
             "eta": finite_or_none(certificate.eta),
             "stationarity": finite_or_none(certificate.stationarity),
             "verdict": certificate.verdict.name,
+            "note": self.note,
             "status": self.status.name,
             "seconds": self.seconds,
             "stages": [
@@ -231,6 +235,7 @@ class Solution:
             ("lower bound", f"{certificate.lower_bound:.10g}{relaxed}"),
             ("gap", gap_text(certificate.gap)),
             ("verdict", f"{certificate.verdict.name}: {certificate.verdict.value}"),
+            *([("note", self.note)] if self.note else []),
             ("seconds", f"{self.seconds:.3g}"),
             *self._network(),
         ]

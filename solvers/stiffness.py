@@ -10,6 +10,8 @@ from pgo_models.rotations import Array
 
 GROUND = 1e-7  # of the diagonal of M: holds the shifts that are left out
 _PROBES = 32  # vectors that estimate the mean
+_TRANSLATION_PENALTY = 0.6  # times the stiffness of the separators
+_LEAST_FACTOR, _ENOUGH = 0.1, 1.0 / 3.0  # by which the translation penalty is lowered at once
 
 
 def separator_stiffness(
@@ -44,6 +46,49 @@ def separator_stiffness(
     force[held] = np.sqrt(half_scale)[:, None] * pulled
     moved = np.sqrt(half_scale)[:, None] * factor.solve(force)[held]
     return _PROBES * degrees / float(np.sum(pulled * moved))
+
+
+def translation_penalty_for(stiffness: float) -> float:
+    """Penalty of separator translations, times their diagonal in M, at the start."""
+    return _TRANSLATION_PENALTY * stiffness
+
+
+def travel(moved: Array, pulled: Array, scale: Array) -> Array:
+    """Sums over copies of how far translations went, and how much their multipliers changed on the way: (3 + d,).
+
+    Parameters
+    ----------
+    moved, pulled : (q, d)
+        Change of the translations agreed on, and of the unscaled multipliers.
+    scale : (q,)
+        Shares of the copies in the diagonal of M.
+    """
+    weighted = scale[:, None] * moved
+    sums = np.sum(pulled * (pulled / scale[:, None])), np.sum(weighted * moved), np.sum(scale)
+    return np.array([*sums, *weighted.sum(axis=0)])
+
+
+def adapted_penalty(penalty: float, sums: Array) -> float:
+    """Penalty of separator translations, times their diagonal in M, after the way that they went with it.
+
+    ADMM is fastest where penalties are the ratio of the distances to the optimum of multipliers and of variables; the
+    way so far, without a common shift, estimates it (Xu, Figueiredo & Goldstein 2017 take the ratio of the last steps).
+    Where that is far below the penalty, as after a start with several times the optimal cost, the penalty falls by the
+    square of the quotient, to a tenth at most. The square, and the factor of three from which on it falls, were chosen
+    on M3500, manhattan and intel, which take fewer rounds with them; city10000 took more where a smaller factor was
+    enough, and sphere2500 where the penalty was raised.
+
+    Parameters
+    ----------
+    sums : (3 + d,)
+        `travel`, of all robots.
+    """
+    pulled, moved, scale, along = sums[0], sums[1], sums[2], sums[3:]
+    distance = moved - along @ along / scale if scale > 0 else 0.0
+    if not distance > 0:
+        return penalty
+    factor = pulled / (penalty**2 * distance)
+    return penalty * max(factor, _LEAST_FACTOR) if factor <= _ENOUGH else penalty
 
 
 def _without_shifts(vectors: Array, half_scale: Array, component: IntArray) -> Array:

@@ -192,7 +192,9 @@ class Interface:
         if self.num_bytes > limit:
             raise SettingError(
                 f"the driver would need {1e-9 * self.num_bytes:.1f} GB for {self.num_separators} separators, more than "
-                f"{1e-9 * limit:.1f} GB; use a METIS partition or fewer robots, or Coupling.CONSENSUS"
+                f"{1e-9 * limit:.1f} GB: it solves for them in the start, Newton and the certificate, whatever the "
+                "coupling; use a METIS partition or fewer robots, raise driver_memory (--driver-memory), or set it to "
+                "0: CONSENSUS without a driver, which gives poses and no certificate"
             )
 
     def factorize(self, contributions: Sequence[Array], own: Sequence[tuple[IntArray, Array]] = ()) -> InterfaceFactor:

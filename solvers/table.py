@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from solvers.result import Measurement, Record, Status
 
 _HEADER = f"{'k':>6}  {'F':>18}  {'primal':>10}  {'dual':>10}  {'seconds':>9}"
-_HEADER_OF_ROBOTS = f"  {'rounds':>7}  {'MB sent':>9}"
+_HEADER_OF_ROBOTS = f"  {'rounds':>7}  {'reduces':>7}  {'MB sent':>9}"
 _BAR_AFTER_SECONDS = 1.0
 _SECONDS_BETWEEN_UPDATES = 0.1
 
@@ -133,7 +133,8 @@ class _NotebookBar:
 def _communication(figures: Measurement) -> str:
     if figures.rounds is None or figures.num_bytes is None:
         return ""
-    return f"  {figures.rounds:>7}  {1e-6 * figures.num_bytes:>9.3f}"
+    reduces = "-" if figures.all_reduces is None else str(figures.all_reduces)
+    return f"  {figures.rounds:>7}  {reduces:>7}  {1e-6 * figures.num_bytes:>9.3f}"
 
 
 def _figure(value: float) -> str:

@@ -8,7 +8,9 @@ from pgo_models.multipliers import multipliers
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
+from solvers.penalty import translation_scale
 from solvers.rotation_block import stationary_B
+from solvers.stiffness import adapted_penalty, travel
 from solvers.team import Team
 
 
@@ -55,3 +57,16 @@ def stationarity_weight(team: Team) -> Array:
     problem = team.problem
     diagonal = problem.M.data[problem.diagonal_positions][team.row] / team.copies[team.row]
     return np.asarray(norm_weight(team) * np.maximum(1.0, team.penalty / diagonal)[:, None])
+
+
+def adapted(
+    problem: PGOProblem, team: Team, rho_t: Array, origin: tuple[Array, Array] | None, now: tuple[Array, Array]
+) -> float:
+    """Translation penalty, times the diagonal of M, that the way from z and s when it was set to those now suggests."""
+    assert origin is not None
+    assert team.penalty is not None
+    at, scale = team.row < problem.num_poses, translation_scale(problem)
+    moved, change = now[0] - origin[0], now[1] - origin[1]
+    pulled = team.penalty[at, None] * (change - moved)[at]  # of B = s - z
+    sums = travel(moved[at], pulled, scale[team.row[at]] / team.copies[team.row[at]])
+    return adapted_penalty(float(rho_t[0] / scale[0]), sums)

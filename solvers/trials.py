@@ -187,6 +187,12 @@ class Trial:
         return None if joined is None else int(joined[-1])
 
     @property
+    def all_reduces(self) -> int | None:
+        """All-reduces in all; None where they are not counted."""
+        counts = [leg.history.records[-1].measurement.all_reduces for leg in self.legs]
+        return None if None in counts else counts[-1]  # of one ledger
+
+    @property
     def num_bytes(self) -> int | None:
         """Bytes sent in all; None where they are not counted."""
         joined = _joined([leg.num_bytes for leg in self.legs])

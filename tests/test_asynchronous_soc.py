@@ -120,7 +120,7 @@ def rounds_to_optimum(problem: PGOProblem, parts: Partition, faults: Faults) -> 
 
 def gap_at(problem: PGOProblem, driver: Driver, best: float) -> float:
     R = np.empty((problem.num_poses, problem.d, problem.d))
-    for answer in driver.ask_all("own_rotations", count=Count.OFF):
+    for answer in driver.ask_all("own_poses", count=Count.OFF):
         R[answer["poses"]] = answer["R"]
     return (problem.objective(problem.with_best_translations(R)) - best) / max(1.0, best)
 

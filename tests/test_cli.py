@@ -1,6 +1,10 @@
 import inspect
 import json
 import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +13,9 @@ import pgo_models as pgo
 import solvers
 from pgo_models.separators import report_partition
 from solvers import choices, cli
+
+ROOT = Path(__file__).parent.parent
+PGO = [sys.executable, "-c", "from solvers.cli import main; main()"]
 
 
 @pytest.fixture
@@ -22,6 +29,32 @@ def pgo_command(capsys):
         return end.value.code, streams.out, streams.err
 
     return call
+
+
+def test_consensus_goes_without_a_driver_and_says_so(pgo_command):
+    code, out, err = pgo_command("solve", "robots", "--method", "consensus", "--driver-memory", "0")
+    assert (code, err) == (3, "")
+    assert re.search(r"^lower bound +0$", out, re.M)
+    assert re.search(r"^note +no driver: Newton and the certificate were left out", out, re.M)
+    assert re.search(r"^spanning tree .*\nSOC .*CONVERGED$", out, re.M)
+    code, out, err = pgo_command("solve", "robots", "--driver-memory", "0.000001")
+    assert (code, out) == (1, "")
+    assert "raise driver_memory (--driver-memory), or set it to 0" in err
+    for options in (("--method", "joint"), ("--method", "paper"), ("--method", "consensus", "--r-step", "fista")):
+        code, out, err = pgo_command("solve", "robots", "--driver-memory", "4", *options)
+        assert (code, out) == (1, "")
+        assert "--driver-memory" in err
+    assert pgo_command("solve", "robots", "--driver-memory", "0")[0] == 1  # substructured is by a driver
+
+
+def test_the_whole_graph_beside_the_robots_is_one_line_on_stderr(tmp_path):
+    folder = tmp_path / "robots"
+    shutil.copytree(ROOT / "data" / "robots", folder)
+    pgo.write_g2o(pgo.read_g2o(folder), folder / "fullGraph.g2o")
+    done = subprocess.run([*PGO, "info", str(folder)], capture_output=True, text=True, check=True)
+    left_out = f"{folder / 'fullGraph.g2o'}: left out, it repeats the edges of the other 4 files; remove it"
+    assert done.stderr == f"pgo: warning: {left_out}\n"
+    assert re.search(r"^ *robots +4 *$", done.stdout, re.M)
 
 
 def test_solve_prints_cost_bound_and_gap_and_ends_with_0(pgo_command):

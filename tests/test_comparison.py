@@ -46,7 +46,13 @@ def test_all_methods_stand_in_one_table_against_one_bound(compared):
         assert record["objective"] == trial.objective
         assert record["gap"] == (trial.objective - compared.lower_bound) / trial.objective
         assert (record["rounds"], record["bytes"]) == (trial.rounds, trial.num_bytes)
-    assert table.parts[0].rows[0][4:6] == ("-", "-")
+    assert table.parts[0].rows[0][4:7] == ("-", "-", "-")
+    consensus = next(trial for trial in compared.trials if trial.contender is Contender.CONSENSUS)
+    # Three to begin with and two an iteration of SOC, which robots wait for as they do for rounds.
+    assert consensus.all_reduces is not None
+    assert consensus.all_reduces >= 3 + 2 * consensus.iterations[0]
+    at = [trial.contender for trial in compared.trials].index(Contender.CONSENSUS)
+    assert table.parts[0].rows[at][5] == str(table.records[at]["all_reduces"]) == str(consensus.all_reduces)
 
 
 def test_all_that_can_be_run_here_are_run_unless_chosen():

@@ -29,7 +29,7 @@ from pgo_models.pose_graph import PoseGraph
 from pgo_models.problem import PGOProblem
 from pgo_models.scenes import NoiseModel, grid
 from solvers import safeguard
-from solvers.acceleration import Anderson
+from solvers.acceleration import Anderson, AndersonMemory
 from solvers.consensus_soc import ConsensusSOC, ConsensusState
 from solvers.distributed import collect, open_driver
 from solvers.driver import Driver
@@ -64,6 +64,22 @@ def check_state(one: SOCState, other: ConsensusState, engine: Recording) -> None
             np.testing.assert_allclose(local[robot.held], whole[rows], rtol=0, atol=SAME * (1 + np.abs(whole).max()))
 
 
+def check_acceleration(one: SOCState, other: ConsensusState, engine: Recording, soc: SOC) -> None:
+    """Robots remember as much as one place does, and the sums are those of what they remember."""
+    if soc.acceleration is None:
+        return
+    number = len(engine.members)
+    is_alone = soc.acceleration.per_robot
+    memories = one.memory or (AndersonMemory(),) * (number if is_alone else 1)
+    for robot, member in enumerate(engine.members):
+        assert member.copies is not None
+        memory = memories[robot if is_alone else 0]
+        sums = member.copies.sums if is_alone else other.sums
+        known = len(memory.residual_differences)
+        assert len(sums.gram) == len(member.copies.anderson.residual_differences) == known
+        np.testing.assert_allclose(sums.smallest, memory.smallest, rtol=1e-6, atol=1e-8)
+
+
 def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> SOCState:
     """Compare iterate by iterate until only rounding is left, and what the runs leave behind; the last central one."""
     engine, start = Recording(), chordal_start(problem)
@@ -73,6 +89,7 @@ def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> SOCSta
     for one, other in zip(central, iterate(ConsensusSOC(soc), driver), strict=False):
         assert isinstance(one, SOCState)
         check_state(one, other, engine)
+        check_acceleration(one, other, engine, soc)
         if max(one.primal_residual, one.dual_residual) <= CONVERGED:
             break
     ConsensusSOC(soc).finish(driver)
@@ -150,6 +167,25 @@ def test_every_change_of_the_penalty_is_the_central_one(
     monkeypatch.setattr(safeguard, "_DIVERGED", 1.0)  # any step back counts as divergence
     weak = FixedPenalty(0.1 * float(np.median(rotation_scale(problem))))
     assert check(problem, parts, replace(soc, penalty=weak, acceleration=None, alpha=1.9), 14).raises >= 1
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_robots_forget_when_the_acceleration_restarts(seed: int) -> None:
+    problem = varied_problem(seed, 14, 3, LOUD_NOISE)
+    parts, start = metis(problem.graph, 5), chordal_start(problem)
+    acceleration = Anderson(memory=3, restart_ratio=1.001)
+    soc = SOC(coupling=Coupling.CONSENSUS, robots=parts, penalty=BalancedPenalty(), acceleration=acceleration)
+    engine = Recording()
+    driver = open_driver(problem, parts, engine)
+    driver.stand(start)
+    restarts = []
+    for one, other in islice(zip(iterate(soc, problem, start), iterate(ConsensusSOC(soc), driver), strict=False), 16):
+        assert isinstance(one, SOCState)
+        check_state(one, other, engine)
+        check_acceleration(one, other, engine, soc)
+        orders = [down[0]["restart"][0] for order, down, _ in engine.log if order == "copies.extrapolate"]
+        restarts.append(bool(orders) and bool(orders[-1]))
+    assert sum(restarts[:-3]) >= 1  # and steps follow
 
 
 @pytest.mark.parametrize("d", [2, 3])

@@ -30,6 +30,7 @@ STAR = {  # to and from whoever sums up: settings, figures of all poses in no or
     *("passes", "alpha", "memory", "alone", "rule", "is_stationary", "translation_penalty", "separator_penalty"),
     *(
         "norms",
+        "travel",
         "scale",
         "stiffness",
         "size",
@@ -44,11 +45,11 @@ STAR = {  # to and from whoever sums up: settings, figures of all poses in no or
     ),
 }
 ROUNDS = (  # orders that are, or end, a round
-    *("project", "settle", "move", "weigh", "certificate", "copies.finish", "copies.begin", "copies.penalize"),
+    *("project", "settle", "move", "weigh", "certificate", "adopt", "copies.begin", "copies.penalize"),
     *("copies.extrapolate", "copies.back_at_best"),
 )
 ENDS, POSES = ("copies.begin", "copies.finish"), ("R", "t", "cover", "schur", "b")  # with the driver, at the cover
-ALL_REDUCES = ("copies.stiffness", "copies.feel", "copies.start", "copies.solve", "copies.agree")
+ALL_REDUCES = ("copies.travel", "copies.stiffness", "copies.feel", "copies.start", "copies.solve", "copies.agree")
 OFF = ("describe", "stand", "cost", "copies.cost", "result")
 
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,13 +34,15 @@ from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.scenes import NoiseModel, grid
+from solvers.acceleration import Anderson
 from solvers.distributed import collect, open_driver
 from solvers.distributed_bound import best_bound_distributed, prove_with_eta
 from solvers.engine import InProcess
-from solvers.newton import gauss_newton
+from solvers.network import Faults
+from solvers.newton import Newton, gauss_newton
 from solvers.pipeline import Pipeline, solve
 from solvers.result import Record, Status
-from solvers.soc import SOC
+from solvers.soc import SOC, Coupling
 from solvers.solution import Solution
 
 ROOT = Path(__file__).parent.parent
@@ -241,6 +244,41 @@ def test_a_run_that_is_cut_short_gives_poses_and_a_bound_that_holds(
     assert solution.lower_bound <= best_known(problem)
     assert solution.ledger is not None
     assert solution.ledger.rounds >= 3
+
+
+STAGES = {
+    "substructured": (SOC(coupling=Coupling.SUBSTRUCTURED, max_iterations=4), None),
+    "consensus": (SOC(max_iterations=4), None),
+    "consensus, each accelerates alone": (SOC(max_iterations=4, acceleration=Anderson(per_robot=True)), None),
+    "consensus, loss": (SOC(max_iterations=9), Faults(loss=0.3, seed=1)),
+    "consensus, delay": (SOC(max_iterations=9), Faults(max_delay=4, seed=2)),
+    "consensus, silence": (SOC(max_iterations=9), Faults(silent_robot=1, silent_from=2, silent_rounds=9)),
+}
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("stage", STAGES)
+def test_every_stage_reports_f_of_its_poses(stage: str, d: int, threads: int) -> None:
+    # Each run ends after one more stage, so that the poses are those of its last one.
+    problem = varied_problem(3, 15, d, LOUD_NOISE)
+    parts = scattered(problem.graph, 3)
+    soc, faults = STAGES[stage]
+    if soc.coupling is None:
+        soc = replace(soc, coupling=Coupling.CONSENSUS, robots=parts)
+    stay = Newton(max_iterations=0)
+    for start in (None, problem.graph.truth):
+        for pipeline in (
+            Pipeline(soc=None, newton=stay),
+            *(Pipeline(soc=soc, newton=newton, faults=faults) for newton in (stay, Newton())),
+        ):
+            short = replace(pipeline, second_try=False, staircase=None)
+            solution = solve(problem, short, start, robots=parts, engine=InProcess(threads))
+            rounding = 1e-12 * solution.objective
+            assert solution.objective == pytest.approx(problem.objective(solution.poses), abs=rounding)
+            assert solution.stages[-1].objective == pytest.approx(solution.objective, abs=rounding)
+            if pipeline.newton is stay:
+                assert solution.stages[-2].objective == pytest.approx(solution.objective, abs=rounding)
 
 
 # Folders with one file a robot.

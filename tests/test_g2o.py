@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pgo_models.datasets import load
-from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
+from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOError, SettingError
 from pgo_models.g2o import (
     RotationWeight,
     isotropic_information,
@@ -231,6 +231,55 @@ def test_a_folder_without_symbols_goes_by_vertex_lines_then_by_first_mention(tmp
     np.testing.assert_array_equal(graph.robots, [0, 1, 1])
     assert graph.num_edges == 2
     assert graph.initial is None
+
+
+NAMINGS = {"the same ids": lambda ids: ids, "ids of its own": lambda ids: np.unique(ids, return_inverse=True)[1]}
+
+
+@pytest.mark.parametrize("naming", NAMINGS)
+@pytest.mark.parametrize("has_vertices", [True, False])
+@pytest.mark.parametrize("name", ["fullGraph.g2o", "-1.g2o"])
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_whole_graph_beside_the_robots_is_said_and_left_out(
+    tmp_path: Path, d: int, name: str, has_vertices: bool, naming: str
+) -> None:
+    robots = np.arange(12) // 4
+    graph = dataclasses.replace(random_graph(3, 12, d), robot=robots, ids=symbol_ids(robots))
+    if not has_vertices:
+        graph = dataclasses.replace(graph, initial=None)
+    write_g2o_folder(graph, tmp_path)
+    expected = read_g2o(tmp_path)
+    order = np.random.default_rng(0).permutation(graph.num_edges)
+    shuffled = {key: getattr(graph, key)[order] for key in ("i", "j", "R_ij", "t_ij", "kappa", "tau")}
+    information = graph.information[order] if graph.information is not None else None
+    whole = dataclasses.replace(graph, **shuffled, information=information, ids=NAMINGS[naming](graph.pose_ids))
+    write_g2o(whole, tmp_path / name)
+    with pytest.warns(GraphWarning, match=f"{name}: left out, it repeats the edges of the other 3 files; remove it"):
+        found = read_g2o(tmp_path)
+    assert found.num_robots == 3
+    np.testing.assert_array_equal(found.pose_ids, expected.pose_ids)
+    np.testing.assert_array_equal(found.robots, expected.robots)
+    assert_same_measurements(found, expected)
+
+
+def test_a_robot_that_touches_every_edge_is_not_taken_for_the_whole_graph(tmp_path: Path) -> None:
+    hub, first, second = symbol_ids(np.arange(3))
+    spokes = EDGE.format(hub, first), EDGE.format(hub, second)
+    for texts in (
+        ("".join(spokes), *spokes),
+        tuple(VERTEX.format(pose, 0) for pose in (hub, first, second)),
+    ):
+        for number, text in enumerate(texts):
+            with (tmp_path / f"{number}.g2o").open("a") as file:
+                file.write(text)
+        np.testing.assert_array_equal(read_g2o(tmp_path).robots, [0, 1, 2])
+    assert read_g2o(tmp_path).initial is not None
+
+
+def test_two_files_with_the_same_edges_are_two_robots(tmp_path: Path) -> None:
+    for number in range(2):
+        (tmp_path / f"{number}.g2o").write_text(VERTEX.format(number, number) + EDGE.format(0, 1))
+    np.testing.assert_array_equal(read_g2o(tmp_path).robots, [0, 1])
 
 
 def test_the_own_robot_says_where_a_pose_is(tmp_path: Path) -> None:

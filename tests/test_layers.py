@@ -100,6 +100,7 @@ ORDER = {
         "substructured_newton",
         "checkpoint",
         "distributed",
+        "leaderless",
         "schedule",
         "block_relaxation",
         "gauss_seidel",

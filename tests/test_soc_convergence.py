@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from pgo_models.initialization import chordal_start
 from pgo_models.partition import Partition, PartitionMethod, partition
 from pgo_models.polish import polish
+from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.scenes import MILD_NOISE, NoiseModel, circle, grid
 from solvers.acceleration import Anderson
@@ -195,6 +196,17 @@ def test_rounds_to_the_gap_on_benchmarks(
     most = MOST_ROUNDS[name][method is PartitionMethod.CONTIGUOUS]
     soc = SOC(robots=partition(problem.graph, 5, method), tolerance=1e-8, max_iterations=most)
     assert run(soc, problem, callback=until_gap(OPTIMUM[name])).status is Status.STOPPED
+
+
+def test_the_translation_penalty_falls_where_the_start_is_far_away(
+    benchmark_problem: Callable[[str], PGOProblem], benchmark_optimum: Callable[[str], Poses]
+) -> None:
+    # The chordal start of M3500 has six times the optimal cost; with the penalty of the start 400 rounds are too few.
+    problem = benchmark_problem("M3500")
+    optimum = problem.objective(benchmark_optimum("M3500"))
+    robots = partition(problem.graph, 25, PartitionMethod.METIS)
+    result = run(SOC(robots=robots, tolerance=1e-9, max_iterations=300), problem, callback=until_gap(optimum))
+    assert result.status is Status.STOPPED
 
 
 @pytest.mark.parametrize("method", [PartitionMethod.METIS, PartitionMethod.CONTIGUOUS])

@@ -12,7 +12,7 @@ from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array
 from pgo_models.scenes import NoiseModel
 from solvers.penalty import rotation_scale, translation_scale
-from solvers.stiffness import GROUND, separator_stiffness
+from solvers.stiffness import GROUND, adapted_penalty, separator_stiffness, travel
 
 PROBES = 32
 SIZES = st.integers(2, 20)
@@ -91,3 +91,20 @@ def test_separators_that_nothing_joins_feel_nothing_but_shifts() -> None:
     assert separator_stiffness(factor, problem.side, held, half_scale, np.arange(3)) == 1.0
     none = np.zeros(0, dtype=int)
     assert separator_stiffness(factor, problem.side, none, np.zeros(0), none) == 1.0
+
+
+@given(seed=SEEDS, q=st.integers(2, 12), d=DIMENSIONS, penalty=st.sampled_from([1e-3, 0.1, 2.0]))
+def test_the_adapted_penalty_falls_by_the_square_of_the_ratio_of_the_ways(
+    seed: int, q: int, d: int, penalty: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    scale, moved = rng.uniform(0.5, 2.0, q), rng.standard_normal((q, d))
+    moved -= (scale @ moved) / scale.sum()
+    shift, half = rng.standard_normal(d), q // 2
+    for ratio, expected in ((0.5, 0.25), (0.57, 0.3249), (0.58, 1.0), (0.01, 0.1), (1.0, 1.0), (7.0, 1.0)):
+        pulled = ratio * penalty * scale[:, None] * moved
+        for other in (moved, moved + shift):  # a common shift is no way
+            parts = [travel(other[part], pulled[part], scale[part]) for part in (slice(half), slice(half, q))]
+            assert adapted_penalty(penalty, np.sum(parts, axis=0)) == pytest.approx(expected * penalty, rel=1e-9)
+    assert adapted_penalty(penalty, travel(np.zeros((q, d)), pulled, scale)) == penalty
+    assert adapted_penalty(penalty, travel(np.zeros((0, d)), np.zeros((0, d)), np.zeros(0))) == penalty

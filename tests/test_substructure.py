@@ -252,6 +252,6 @@ def test_what_would_not_fit_is_refused_with_the_way_out() -> None:
     interface = Interface(160, (3, 3), touched, separator_tree(touched, 160))
     interface.check_memory(interface.num_bytes)
     with pytest.raises(
-        SettingError, match=r"for 160 separators, more than .* METIS partition or fewer robots, or Coupling\.CONSENSUS"
+        SettingError, match=r"for 160 separators, more than .* METIS partition or fewer robots, raise driver_memory"
     ):
         interface.check_memory(interface.num_bytes - 1)

@@ -92,7 +92,7 @@ def faults_job(name: str, fault: str) -> dict[str, object]:
 
     def is_done(state: AsynchronousState, record: solvers.Record) -> bool:
         R = np.empty((graph.num_poses, graph.d, graph.d))
-        for answer in driver.ask_all("own_rotations", count=Count.OFF):
+        for answer in driver.ask_all("own_poses", count=Count.OFF):
             R[answer["poses"]] = answer["R"]
         gaps.append(gap_of(problem.objective(problem.with_best_translations(R)), OPTIMUM[name]))
         return (
