@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -158,18 +159,17 @@ def solve(
     else:
         robots = _robots_for(pipeline.soc, robots, problem.graph)
         settings = pipeline.soc, pipeline.newton, pipeline.gap, pipeline.second_try, pipeline.faults
-        journal = Journal(checkpoint, fingerprint(problem, robots, settings, start), stages)
-        driver = open_driver(problem, robots, engine if engine is not None else InProcess())
-        try:
+        with (
+            closing(Journal(checkpoint, fingerprint(problem, robots, settings, start), stages)) as journal,
+            closing(open_driver(problem, robots, engine if engine is not None else InProcess())) as driver,
+        ):
             attempt = partial(
                 attempt_distributed, driver, problem, pipeline.newton, pipeline.gap, pipeline.faults, journal, watch
             )
             poses, certificate = _tries(attempt, problem, pipeline, start, stages)
-        finally:
-            driver.close()
+            if stages[-1].status.is_success:
+                journal.end()
         ledger = driver.ledger
-        if stages[-1].status.is_success:
-            journal.end()
     if pipeline.staircase is not None and not certificate.is_certified and stages[-1].status not in OUT_OF_TIME:
         poses, certificate = _climb(problem, pipeline, poses, certificate, stages, watch)
     reference = problem.graph.initial

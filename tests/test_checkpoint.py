@@ -1,3 +1,4 @@
+import io
 import os
 import signal
 import subprocess
@@ -9,12 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from graphs import LOUD_NOISE, varied_graph
+from hypothesis import HealthCheck, given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
 
 import pgo_models as pgo
 import solvers
-from pgo_models.errors import FileFormatError, SettingError
+from pgo_models.errors import EngineError, FileFormatError, PGOError, SettingError
 from pgo_models.partition import partition
-from solvers.checkpoint import Checkpoint
+from solvers import checkpoint
+from solvers.checkpoint import Checkpoint, Journal
 from solvers.choices import BackEnd, Method, chosen_partition, chosen_pipeline
 from solvers.engine import InProcess
 
@@ -162,14 +167,158 @@ def test_a_file_that_is_no_checkpoint_is_refused_and_left_alone(damage, broken_o
         path.mkdir()
     else:
         path.write_bytes({"text": b"VERTEX_SE2 0 0 0 0\n", "half": whole[: len(whole) // 2], "empty": b""}[damage])
-    with pytest.raises(FileFormatError, match=r"run\.ckpt: (no checkpoint|cannot be read)"):
+    wrong = {"half": "a damaged checkpoint, its checksum", "directory": "cannot be read"}.get(damage, "no checkpoint")
+    with pytest.raises(FileFormatError, match=rf"run\.ckpt: {wrong}"):
         solvers.solve(graph, robots=3, checkpoint=Checkpoint(path))
-    assert path.exists()
+    assert [one.name for one in path.parent.iterdir()] == ["run.ckpt"]  # and no lock
+
+
+@given(
+    place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7), length=st.none() | st.floats(0, 1, exclude_max=True)
+)
+@hypothesis_settings(max_examples=500, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_flipped_bit_or_a_lost_end_is_one_error(broken_off, place, bit, length):
+    path = broken_off[1]
+    whole = path.read_bytes()
+    damaged = bytearray(whole)
+    damaged[int(place * len(whole))] ^= 1 << bit
+    other = path.with_name("damaged.ckpt")
+    other.write_bytes(damaged if length is None else whole[: int(length * len(whole))])
+    with pytest.raises(FileFormatError, match=r"damaged\.ckpt: (no checkpoint of a solve|a damaged checkpoint)"):
+        Journal(Checkpoint(other), {}, [])
+
+
+@pytest.mark.parametrize("arrays", [{}, {"run/tree": np.array("{}")}, {"run/tree": np.array("no JSON")}])
+def test_a_whole_file_of_another_version_is_refused(arrays, broken_off, monkeypatch):
+    path, save = broken_off[1], np.savez
+    kept = {"header": np.array(["graph", "partition", "settings"])}
+    monkeypatch.setattr(np, "savez", lambda file, **options: save(file, **kept, **arrays))
+    checkpoint._write(path, dict.fromkeys(checkpoint._PARTS, ""), None, [])
+    with pytest.raises(FileFormatError, match="a checkpoint of another version of this package; remove it"):
+        Journal(Checkpoint(path), {part: part for part in checkpoint._PARTS}, [])
+
+
+def content(path):
+    """Arrays of a checkpoint, which follow two lines."""
+    return np.load(io.BytesIO(path.read_bytes().split(b"\n", 2)[2]), allow_pickle=False)
 
 
 def test_a_checkpoint_holds_no_pickle(broken_off):
-    with np.load(broken_off[1], allow_pickle=False) as file:
+    with content(broken_off[1]) as file:
         assert {file[name].dtype.kind for name in file.files} <= set("fiUb")
+
+
+LIMITED = """
+import resource, signal, sys
+import pgo_models as pgo, solvers
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # a write beyond the limit is an error, as on a full disk
+graph, seen = pgo.load("circle"), []
+def fill(state, record):
+    seen.append(record.k)
+    if len(seen) == int(sys.argv[2]):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), resource.RLIM_INFINITY))
+    if len(seen) == 40:
+        raise SystemExit(7)
+pipeline = solvers.Pipeline(soc=solvers.SOC(coupling=solvers.Coupling.SUBSTRUCTURED, tolerance=1e-300))
+solvers.solve(graph, pipeline, robots=3, checkpoint=solvers.Checkpoint(sys.argv[1], rounds=3), callback=fill)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of the size of files are POSIX")
+@pytest.mark.parametrize("size", [0, 60, 5000, 30_000])
+@pytest.mark.parametrize("full_after", [1, 20])
+def test_a_full_disk_is_told_once_and_the_last_checkpoint_stays(size, full_after, tmp_path):
+    path = tmp_path / "run.ckpt"
+    command = [sys.executable, "-c", LIMITED, str(path), str(full_after), str(size)]
+    environment = {**os.environ, "PYTHONPATH": str(Path(solvers.__file__).parent.parent)}
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 7, ended.stderr
+    assert ended.stderr == (
+        f"the solve goes on without a new checkpoint: cannot write {path}: File too large; choose a place that can be "
+        "written\n"
+    )
+    assert [one.name for one in tmp_path.iterdir()] == ["run.ckpt"]
+    graph, seen = pgo.load("circle"), []
+    soc = solvers.SOC(coupling=solvers.Coupling.SUBSTRUCTURED, tolerance=1e-300)
+
+    def look(state, record):
+        seen.append(record.k)
+        return True
+
+    solvers.solve(graph, solvers.Pipeline(soc=soc), robots=3, checkpoint=Checkpoint(path), callback=look)
+    assert full_after - 4 <= seen[0] < full_after  # it goes on from the last one before the disk was full
+
+
+def test_room_on_the_disk_again_means_checkpoints_again(tmp_path, monkeypatch, caplog):
+    graph, path, written = varied_graph(6, 30, 2), tmp_path / "run.ckpt", []
+    write = checkpoint._write
+
+    def failing(*arguments):
+        written.append(path.exists())
+        if len(written) in (2, 3, 5):
+            raise PGOError(f"cannot write {path}: No space left on device; choose a place that can be written")
+        write(*arguments)
+
+    monkeypatch.setattr(checkpoint, "_write", failing)
+    found = solvers.solve(graph, robots=3, checkpoint=Checkpoint(path, rounds=1))
+    assert len(written) > 6
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert_same(found, solvers.solve(graph, robots=3))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_checkpoint_that_cannot_be_written_or_removed_loses_no_result(tmp_path, caplog):
+    graph, path = varied_graph(6, 30, 2), tmp_path / "run.ckpt"
+
+    def block(state, record):
+        if path.is_file():
+            path.unlink()
+            path.mkdir()
+
+    found = solvers.solve(graph, robots=3, checkpoint=Checkpoint(path, rounds=1), callback=block)
+    assert_same(found, solvers.solve(graph, robots=3))
+    first, last = caplog.messages
+    assert first.startswith(
+        f"the solve goes on without a new checkpoint: cannot write {path}: it is not a regular file"
+    )
+    assert last.startswith(f"cannot remove {path}: ")
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+def test_a_second_run_on_a_checkpoint_is_refused(is_there, tmp_path):
+    graph, path = varied_graph(9, 30, 2), tmp_path / "run.ckpt"
+    if is_there:
+        with pytest.raises(Killed):
+            solvers.solve(graph, robots=3, checkpoint=Checkpoint(path), callback=killed_after(2))
+    link = tmp_path / "link.ckpt"
+    link.symlink_to(path)
+    refusals = []
+
+    def second(state, record):
+        for name in (path, link):
+            with pytest.raises(SettingError, match=r"run\.ckpt is in use by another run; wait until") as refused:
+                solvers.solve(graph, robots=3, checkpoint=Checkpoint(name))
+            refusals.append(str(refused.value))
+
+    found = solvers.solve(graph, robots=3, checkpoint=Checkpoint(path), callback=second)
+    assert refusals
+    assert_same(found, solvers.solve(graph, robots=3))
+    assert list(tmp_path.iterdir()) == [link]
+
+
+def test_where_nothing_can_be_written_is_told_before_the_solve(tmp_path):
+    with pytest.raises(FileFormatError, match=r"missing/run\.ckpt: cannot be written \(No such file or directory\)"):
+        solvers.solve(varied_graph(9, 30, 2), robots=3, checkpoint=Checkpoint(tmp_path / "missing" / "run.ckpt"))
+
+
+def test_the_lock_is_let_go_when_the_robots_cannot_start(tmp_path):
+    class Nowhere:
+        def open(self, shares, backend):
+            raise EngineError("nowhere")
+
+    with pytest.raises(EngineError, match="nowhere"):
+        solvers.solve(varied_graph(9, 30, 2), robots=3, engine=Nowhere(), checkpoint=Checkpoint(tmp_path / "run.ckpt"))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_rounds_are_positive():
@@ -189,8 +338,17 @@ def test_a_killed_process_goes_on_where_it_was(tmp_path):
         time.sleep(1e-3)
         if path.exists():
             written.add(path.stat().st_mtime_ns)
+    second = subprocess.run(
+        [*PGO, "solve", "circle", *options], env=environment, capture_output=True, text=True, check=False
+    )
+    assert (second.returncode, second.stdout) == (1, "")
+    assert second.stderr == (
+        f"pgo: {path} is in use by another run; wait until that has ended, or choose another name\n"
+    )
+    assert process.poll() is None
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
+    assert path.with_name("run.ckpt.lock").exists()  # a dead process's: it holds nobody up
     graph = pgo.load("circle")
     robots = chosen_partition(graph, 3, None)
     settings = chosen_pipeline(Method.SUBSTRUCTURED, robots, BackEnd.FACTORIZED, 1e-6, iterations, 1e-300)
