@@ -23,6 +23,7 @@ from solvers.checkpoint import Checkpoint, Journal
 from solvers.choices import BackEnd, Method, chosen_partition, chosen_pipeline
 from solvers.engine import InProcess
 
+MEASURED = ("R_ij", "t_ij", "kappa", "tau")
 PGO = [sys.executable, "-c", "from solvers.cli import main; main()"]
 
 
@@ -136,20 +137,42 @@ def broken_off(tmp_path):
     return graph, path
 
 
-def test_another_graph_partition_or_setting_is_refused(broken_off):
+def changed_graph(graph, name):
+    array = getattr(graph, name).copy()
+    array.flat[0] = np.nextafter(array.flat[0], 2.0)
+    return replace(graph, **{name: array})
+
+
+def renamed(robots):
+    return replace(robots, robot=robots.num_robots - 1 - robots.robot)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        *(("graph", lambda graph, part=part: {"problem": changed_graph(graph, part)}) for part in MEASURED),
+        ("graph", lambda graph: {"problem": replace(graph, i=graph.j, j=graph.i)}),
+        ("partition", lambda graph: {"robots": 2}),
+        ("partition", lambda graph: {"robots": renamed(partition(graph, 3))}),
+        ("settings", lambda graph: {"pipeline": solvers.Pipeline(gap=1e-5)}),
+        ("settings", lambda graph: {"pipeline": solvers.Pipeline(second_try=False)}),
+        ("settings", lambda graph: {"pipeline": solvers.Pipeline(newton=solvers.Newton(max_iterations=7))}),
+        ("settings", lambda graph: {"pipeline": solvers.Pipeline(soc=None)}),
+        ("settings", lambda graph: {"start": pgo.spanning_tree_start(graph)}),
+    ],
+)
+def test_another_graph_partition_or_setting_is_refused(name, change, broken_off):
     graph, path = broken_off
-    moved = graph.t_ij.copy()
-    moved[0, 0] += 1e-9
-    changes = {
-        "graph": ({"problem": replace(graph, t_ij=moved)}),
-        "partition": ({"robots": 2}),
-        "settings": ({"pipeline": solvers.Pipeline(gap=1e-5)}),
-    }
-    for name, change in changes.items():
-        arguments = {"problem": graph, "robots": 3, "checkpoint": Checkpoint(path), **change}
-        with pytest.raises(SettingError, match=rf"run with another {name}; go on with the same"):
-            solvers.solve(**arguments)
-        assert path.exists()
+    arguments = {"problem": graph, "robots": 3, "checkpoint": Checkpoint(path), **change(graph)}
+    with pytest.raises(SettingError, match=rf"run with another {name}; go on with the same"):
+        solvers.solve(**arguments)
+    assert [one.name for one in path.parent.iterdir()] == ["run.ckpt"]
+
+
+def test_all_that_is_another_is_named(broken_off):
+    graph, path = broken_off
+    with pytest.raises(SettingError, match="run with another graph and another settings; go on"):
+        solvers.solve(changed_graph(graph, "t_ij"), solvers.Pipeline(gap=1e-5), robots=3, checkpoint=Checkpoint(path))
 
 
 @pytest.mark.parametrize("damage", ["text", "half", "empty", "array", "npz", "directory"])

@@ -181,6 +181,12 @@ def test_errors_can_be_sent(error):
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
+@pytest.mark.parametrize(("robots", "share"), [(1, 1.0), (2, 1.0), (3, 0.5), (4, 0.5), (6, 0.3333)])
+def test_every_cpu_has_room_for_as_many_robots(robots, share, graph):
+    shares = solvers.share.share_out(graph, pgo.partition(graph, robots))
+    assert ray_engine._RayPlace(ray, shares, None, RayEngine(robots_per_cpu=3), False)._cpus_a_robot == share
+
+
 def test_too_few_cpus_are_told_at_once(graph):
     with pytest.raises(EngineError, match="too few CPUs: 5 robots with at most 2 a CPU, on 2; use fewer robots"):
         solvers.solve(graph, robots=5, engine=RayEngine(robots_per_cpu=2))
