@@ -128,6 +128,26 @@ def test_the_file_stays_when_the_run_was_stopped_and_goes_when_it_converged(tmp_
     assert not path.exists()
 
 
+def test_a_checkpoint_is_due_after_so_many_rounds(tmp_path, monkeypatch):
+    graph, write, written = varied_graph(8, 40, 2), checkpoint._write, []
+
+    def recording(path, fingerprint, saved, snapshots):
+        written.append((saved.method, saved.driver.ledger.rounds))
+        write(path, fingerprint, saved, snapshots)
+
+    def writes(rounds):
+        written.clear()
+        solvers.solve(graph, robots=2, checkpoint=Checkpoint(tmp_path / "run.ckpt", rounds))
+        return [rounds for method, rounds in written if method == "SubstructuredSOC"]
+
+    monkeypatch.setattr(checkpoint, "_write", recording)
+    every_state = writes(1)
+    assert len(every_state) > 5
+    (rounds_a_step,) = set(np.diff(every_state[1:]))
+    assert writes(int(rounds_a_step)) == every_state
+    assert writes(int(3 * rounds_a_step))[1:] == every_state[3::3]
+
+
 @pytest.fixture
 def broken_off(tmp_path):
     """Graph, and path of the checkpoint of a solve of it by three robots."""

@@ -141,6 +141,29 @@ def test_what_is_kept_for_a_robot_is_bounded():
     assert len(engine.opened[0]._log) < 5
 
 
+def test_a_snapshot_is_taken_after_so_many_orders(monkeypatch):
+    obeyed = []
+    monkeypatch.setattr(Member, "obey", lambda member, order, message: obeyed.append(order) or {})
+    place = Leaky(share_out(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 1)), set())
+    place.start([0])
+    crew = RecoveringCrew(place, 1, Recovery(orders_between_snapshots=3))
+    for _ in range(7):
+        crew.ask("go", [{}])
+        assert len(crew._log) < 3
+    assert obeyed == [*3 * ["go"], SNAPSHOT, *3 * ["go"], SNAPSHOT, "go"]
+
+
+def test_of_two_refusals_the_first_robots_is_told(monkeypatch):
+    def obey(member, order, message):
+        raise NotPositiveDefiniteError(f"robot {member.share.robot}")
+
+    monkeypatch.setattr(Member, "obey", obey)
+    place = Leaky(share_out(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 2)), set())
+    place.start(range(2))
+    with pytest.raises(NotPositiveDefiniteError, match="robot 0"):
+        RecoveringCrew(place, 2, Recovery()).ask("go", [{}] * 2)
+
+
 def test_a_robot_that_is_lost_again_and_again_ends_the_run():
     graph = varied_graph(4, 30, 2)
     engine = LeakyEngine(frozenset(range(20, 10_000)), Recovery(max_restarts=2))
