@@ -174,6 +174,22 @@ def test_errors_of_robots_arrive_as_what_they_are(graph):
         crew.close()
 
 
+def test_a_slow_answer_is_waited_for_while_the_cluster_lives(graph, actors, monkeypatch):
+    crew = RayEngine().open(solvers.share.share_out(graph, pgo.partition(graph, 1)), None)
+    monkeypatch.setattr(ray_engine, "_SECONDS_TO_ANSWER", 0.1)
+    try:
+        ticket = actors[0].actors[0].__ray_call__.remote(lambda holder: time.sleep(1) or {"slow": 1})
+        assert actors[0].receive(0, ticket) == {"slow": 1}
+        monkeypatch.setattr(ray_engine, "_SECONDS_TO_COME_BACK", 0.5)
+        monkeypatch.setattr(ray, "nodes", lambda: [{"Alive": False}])
+        ticket = actors[0].actors[0].__ray_call__.remote(lambda holder: time.sleep(5) or {})
+        with pytest.raises(EngineError, match=r"has died \(none of its machines is left\); solve again"):
+            actors[0].receive(0, ticket)
+        assert actors[0].actors == {}
+    finally:
+        crew.close()
+
+
 @pytest.mark.parametrize("error", [MissingExtraError("cvxopt", "fast"), pgo.FileFormatError("x.g2o", 3, "bad")])
 def test_errors_can_be_sent(error):
     import pickle
@@ -380,7 +396,7 @@ def test_a_cluster_that_refuses_and_one_that_dies_are_one_line_each(head, tmp_pa
     try:
         wait_for(path.exists)
         for pid in processes(process.pid)[1:]:
-            if "gcs_server" in Path(f"/proc/{pid}/cmdline").read_text():
+            if "raylet/raylet" in Path(f"/proc/{pid}/cmdline").read_text().partition("\0")[0]:
                 os.kill(pid, signal.SIGKILL)
         out, err = solving.communicate(timeout=120)
     finally:
