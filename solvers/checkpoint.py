@@ -7,10 +7,11 @@ last one, in the same place or in another, and ends with the same numbers.
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
-import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from io import BufferedRandom, BufferedReader
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgo_models.certificate import BoundSource, Certificate, Verdict
-from pgo_models.errors import FileFormatError, SettingError
+from pgo_models.errors import FileFormatError, PGOError, SettingError
 from pgo_models.files import replace_when_done
 from pgo_models.partition import Partition, PartitionMethod
 from pgo_models.poses import Poses
@@ -34,6 +35,7 @@ from solvers.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty
 from solvers.result import History, Measurement, Outcome, Record, Stage, Status
 from solvers.rotation_block import RotationBlock
 from solvers.rotation_step import RStep
+from solvers.run_lock import RunLock
 from solvers.separator_tree import TreeFactor
 from solvers.shared_anderson import AndersonShare, AndersonSums
 from solvers.soc import SOC, Coupling
@@ -43,7 +45,9 @@ from solvers.substructured_soc import SubstructuredState
 
 S = TypeVar("S")
 Attempt = tuple[Poses, Certificate]
-_FORMAT = "pgo-splitting checkpoint 1"
+_FORMAT = b"pgo-splitting checkpoint 2\n"  # first line of a file; the second is the SHA-256 of all that follows
+_DIGEST_SIZE = 65
+_LOG = logging.getLogger(__name__)
 _PARTS = ("graph", "partition", "settings")
 
 
@@ -52,7 +56,8 @@ class Checkpoint:
     """Where and how often a solve writes what it needs to go on.
 
     If the file is there when a solve begins, the solve goes on from it. It is removed when the solve has converged, and
-    stays when the solve was stopped, interrupted or out of time.
+    stays when the solve was stopped, interrupted or out of time. While a solve runs it is locked for others. One that
+    cannot be written, say on a full disk, is told once, and the solve goes on with the last one that could.
 
     Attributes
     ----------
@@ -110,7 +115,7 @@ _CLASSES = (
 
 
 class Journal:
-    """Writes the checkpoints of one solve, and hands out the one that it goes on from.
+    """Writes the checkpoints of one solve, and hands out the one that it goes on from; to be closed after the solve.
 
     Attributes
     ----------
@@ -124,18 +129,30 @@ class Journal:
         Raises
         ------
         FileFormatError
-            When the file is no checkpoint.
+            When the file is no checkpoint, is damaged, or is where none can be written.
         SettingError
-            When it is one of another graph, partition or settings.
+            When it is one of another graph, partition or settings, or another run uses it.
         """
         self.stages = stages
         self._checkpoint, self._fingerprint = checkpoint, fingerprint
         self._finished: list[Attempt] = []
         self._saved: Saved | None = None
         self._snapshots: list[dict[str, NDArray[Any]]] = []
-        if checkpoint is not None and Path(checkpoint.path).exists():
-            self._saved, self._snapshots = _read(Path(checkpoint.path), fingerprint)
-            stages[:] = self._saved.stages
+        self._has_warned = False
+        self._lock = RunLock(Path(checkpoint.path)) if checkpoint is not None else None
+        try:
+            if checkpoint is not None and Path(checkpoint.path).exists():
+                self._saved, self._snapshots = _read(Path(checkpoint.path), fingerprint)
+                stages[:] = self._saved.stages
+        except PGOError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Let other runs have the checkpoint."""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
 
     def outcome_of_attempt(self) -> Attempt | None:
         """Outcome of the attempt that begins, if the checkpoint is of a later one."""
@@ -168,7 +185,10 @@ class Journal:
     def end(self) -> None:
         """Remove the checkpoint: the solve is done."""
         if self._checkpoint is not None:
-            Path(self._checkpoint.path).unlink(missing_ok=True)
+            try:
+                Path(self._checkpoint.path).unlink(missing_ok=True)
+            except OSError as error:
+                _LOG.warning("cannot remove %s: %s; the solve is done without it", error.filename, error.strerror)
 
     def _writing(
         self, name: str, driver: Driver, watch: Watch, records: list[Record], is_due: bool
@@ -184,7 +204,13 @@ class Journal:
                 at_rest = state.at_rest() if isinstance(state, SubstructuredState) else state
                 done = tuple(self._finished), tuple(self.stages)
                 saved = Saved(*done, name, at_rest, tuple(records), driver.remembered())
-                _write(Path(self._checkpoint.path), self._fingerprint, saved, driver)
+                snapshots = driver.snapshots()
+                try:
+                    _write(Path(self._checkpoint.path), self._fingerprint, saved, snapshots)
+                except PGOError as error:  # the disk's, which may have room again by the next time
+                    if not self._has_warned:
+                        _LOG.warning("the solve goes on without a new checkpoint: %s", error)
+                    self._has_warned = True
             records.append(record)
             return watch.callback(state, record) if watch.callback is not None else None
 
@@ -218,34 +244,48 @@ def _digest(*arrays: NDArray[Any]) -> str:
     return found.hexdigest()
 
 
-def _write(path: Path, fingerprint: Mapping[str, str], saved: Saved, driver: Driver) -> None:
-    parts: dict[str, Mapping[str, NDArray[Any]]] = {"run": pack(saved)}
-    parts |= {f"robot {robot}": snapshot for robot, snapshot in enumerate(driver.snapshots())}
+def _digest_of_rest(stream: BufferedReader | BufferedRandom) -> bytes:
+    """SHA-256 of a stream from where it stands to its end, as a line."""
+    return hashlib.file_digest(stream, "sha256").hexdigest().encode() + b"\n"
+
+
+def _write(
+    path: Path, fingerprint: Mapping[str, str], saved: Saved, snapshots: Sequence[Mapping[str, NDArray[Any]]]
+) -> None:
+    parts = {"run": pack(saved)} | {f"robot {robot}": dict(snapshot) for robot, snapshot in enumerate(snapshots)}
     arrays = {f"{part}/{name}": array for part, found in parts.items() for name, array in found.items()}
-    header = np.array([_FORMAT, *(fingerprint[part] for part in _PARTS)])
-    with replace_when_done(path) as temporary, temporary.open("wb") as file:
+    header = np.array([fingerprint[part] for part in _PARTS])
+    with replace_when_done(path) as temporary, temporary.open("w+b") as file:
+        file.write(_FORMAT + b"0" * _DIGEST_SIZE)
         np.savez(file, allow_pickle=False, **{"header": header, **arrays})
+        file.seek(len(_FORMAT) + _DIGEST_SIZE)
+        digest = _digest_of_rest(file)
+        file.seek(len(_FORMAT))
+        file.write(digest)
 
 
 def _read(path: Path, fingerprint: Mapping[str, str]) -> tuple[Saved, list[dict[str, NDArray[Any]]]]:
     parts: dict[str, dict[str, NDArray[Any]]] = {}
     try:
         with path.open("rb") as stream:
+            if stream.read(len(_FORMAT)) != _FORMAT:
+                raise FileFormatError(path, None, "no checkpoint of a solve; choose another name or remove it")
+            if stream.read(_DIGEST_SIZE) != _digest_of_rest(stream):
+                raise FileFormatError(path, None, "a damaged checkpoint, its checksum does not fit; remove it")
+            stream.seek(len(_FORMAT) + _DIGEST_SIZE)
             file = np.load(stream, allow_pickle=False)
-            header = [str(text) for text in file["header"]]
-            if header[0] != _FORMAT:
-                raise ValueError(header[0])
             for key in file:
                 part, _, name = key.partition("/")
                 parts.setdefault(part, {})[name] = file[key]
-        other = [part for part, found in zip(_PARTS, header[1:], strict=True) if found != fingerprint[part]]
+        header = [str(text) for text in parts["header"][""]]
+        other = [part for part, found in zip(_PARTS, header, strict=True) if found != fingerprint[part]]
         if not other:
             saved: Saved = unpack(parts["run"], _CLASSES)
             return saved, [parts[f"robot {robot}"] for robot in range(saved.driver.ledger.num_robots)]
     except OSError as error:
         raise FileFormatError(path, None, f"cannot be read: {error.strerror or error}; choose another name") from error
-    except (ValueError, IndexError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise FileFormatError(path, None, "no checkpoint of a solve; choose another name or remove it") from error
+    except (ValueError, KeyError) as error:  # whole, but of another version
+        raise FileFormatError(path, None, "a checkpoint of another version of this package; remove it") from error
     raise SettingError(
         f"{path} is the checkpoint of a run with another {' and another '.join(other)}; go on with the same ones, or "
         "remove the file to start anew"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -189,10 +190,12 @@ def solve(
         robots = _robots_for(pipeline.soc, robots, problem.graph)
         settings = pipeline.soc, pipeline.newton, pipeline.gap, pipeline.second_try, pipeline.faults
         has_driver = pipeline.driver_memory > 0
-        journal = Journal(checkpoint, fingerprint(problem, robots, (*settings, has_driver), start), stages)
+        mark = fingerprint(problem, robots, (*settings, has_driver), start)
         engine = engine if engine is not None else InProcess()
-        driver = open_driver(problem, robots, engine, pipeline.driver_memory)
-        try:
+        with (
+            closing(Journal(checkpoint, mark, stages)) as journal,
+            closing(open_driver(problem, robots, engine, pipeline.driver_memory)) as driver,
+        ):
             attempt = partial(
                 attempt_distributed, driver, problem, pipeline.newton, pipeline.gap, pipeline.faults, journal, watch
             )
@@ -200,17 +203,16 @@ def solve(
                 attempt = partial(
                     attempt_leaderless, driver, problem, robots, pipeline.gap, pipeline.faults, journal, watch
                 )
-            poses, certificate = _tries(attempt, problem, pipeline, start, stages)
-        except KeyboardInterrupt:
-            if not stages:
-                raise
-            watch.found.append(collect(driver)[0])
-            poses, certificate = _broken_off(problem, pipeline, watch, stages)
-        finally:
-            driver.close()
+            try:
+                poses, certificate = _tries(attempt, problem, pipeline, start, stages)
+            except KeyboardInterrupt:
+                if not stages:
+                    raise
+                watch.found.append(collect(driver)[0])
+                poses, certificate = _broken_off(problem, pipeline, watch, stages)
+            if stages[-1].status.is_success:
+                journal.end()
         ledger = driver.ledger
-        if stages[-1].status.is_success:
-            journal.end()
     if pipeline.staircase is not None and not certificate.is_certified and stages[-1].status not in OUT_OF_TIME:
         try:
             poses, certificate = _climb(problem, pipeline, poses, certificate, stages, watch)

@@ -8,14 +8,18 @@ from __future__ import annotations
 import logging
 import math
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
+import textwrap
 import threading
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from ipaddress import ip_address
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +34,7 @@ from solvers.share import Share
 if TYPE_CHECKING:
     from ray import ObjectRef
 
-_SECONDS_TO_ANSWER, _SECONDS_TO_JOIN = 3.0, 15.0
+_SECONDS_TO_ANSWER, _SECONDS_TO_JOIN, _SECONDS_TO_COME_BACK = 3.0, 15.0, 10.0
 # Read by Ray when it starts: robots are the parallel part, and nothing is told to anybody.
 _ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -39,14 +43,21 @@ _ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
+# Where Ray says why a cluster cannot be joined, best first; its last line often says that it failed, and no more.
+_REASONS = (
+    r"^ray\.exceptions\.\w+: (.+)",
+    r"^\w+Error: (?!Failed to connect to )([\s\S]+)",
+    r"\.(?:cc|h):\d+: (.+)",
+)
 
 
 @dataclass(frozen=True)
 class RayEngine:
     """Robots as Ray actors.
 
-    Ray is started on this machine, and stopped when the robots are let go, unless this process is connected already or
-    an address is given. The package has to be installed wherever actors run, in the same version.
+    Ray is started on this machine, where it listens to this machine alone, and stopped when the robots are let go,
+    unless this process is connected already or an address is given. The package has to be installed wherever actors
+    run, in the same version.
 
     Attributes
     ----------
@@ -106,6 +117,8 @@ class RayEngine:
 def connect(address: str | None = None, num_cpus: int | None = None) -> bool:
     """Connect this process to Ray, quietly: to a cluster, or to one started here. False when it was connected before.
 
+    One that is started here has all its sockets on the loopback, at ports that Ray chooses, and no dashboard.
+
     Raises
     ------
     MissingExtraError
@@ -113,7 +126,7 @@ def connect(address: str | None = None, num_cpus: int | None = None) -> bool:
     SettingError
         When the address is none.
     EngineError
-        When there is no Ray cluster that can be joined.
+        When there is no Ray cluster that can be joined, or Ray cannot be started for this machine alone.
     """
     ray = _ray()
     if address is not None:
@@ -124,7 +137,11 @@ def connect(address: str | None = None, num_cpus: int | None = None) -> bool:
         return False
     if address is not None:
         _check_cluster(address)
-    with _environment(_ENVIRONMENT), _hushed("ray"):
+    # What a dying cluster tells would be printed to stdout, whatever `log_to_driver` is.
+    silent = _replaced(ray._private.worker, listen_error_messages=lambda worker, threads_stopped: None)
+    # Ray's rule on Windows and macOS, and its only way to listen on the loopback: _node_ip_address does not take that.
+    local = _replaced(ray._private.ray_constants, **({"ENABLE_RAY_CLUSTER": False} if address is None else {}))
+    with _environment(_ENVIRONMENT), _hushed("ray"), silent, local:
         quiet = {"log_to_driver": False, "logging_level": logging.CRITICAL, "configure_logging": False}
         try:
             with _own_sigterm():
@@ -135,8 +152,10 @@ def connect(address: str | None = None, num_cpus: int | None = None) -> bool:
         # Ray ends the process, where it does not raise, when its own patience is over.
         except (RuntimeError, ValueError, OSError, SystemExit) as error:
             where = "Ray does not start here" if address is None else f"cannot join the Ray cluster at {address}"
-            reason = str(error).strip().split("\n")[0] or type(error).__name__
-            raise EngineError(f"{where}: {reason}; robots run without Ray too: --engine process") from error
+            raise EngineError(f"{where}: {_reason(error)}; robots run without Ray too: --engine process") from error
+    if address is None and not ip_address(found := ray.util.get_node_ip_address()).is_loopback:
+        ray.shutdown()
+        raise EngineError(f"Ray {ray.__version__} would listen at {found}, not on the loopback; take another version")
     return True
 
 
@@ -148,8 +167,10 @@ class _RayPlace:
     engine: RayEngine
     is_ours: bool
     actors: dict[int, Any] = field(init=False, default_factory=dict)
+    _seen: float = field(init=False, default=-math.inf)
 
     def start(self, robots: Sequence[int]) -> None:
+        self._look()
         for robot in robots:
             if robot in self.actors:
                 self.ray.kill(self.actors.pop(robot))
@@ -167,13 +188,18 @@ class _RayPlace:
 
     def receive(self, robot: int, ticket: ObjectRef[Message]) -> Message:
         errors = self.ray.exceptions
-        try:
-            answer: Message = self.ray.get(ticket)
-        except errors.RayTaskError as error:
-            raise error.cause from None
-        except (errors.RayActorError, errors.ObjectLostError, errors.OutOfMemoryError) as error:
-            raise RobotLostError(f"robot {robot}'s actor is gone: {_reason(error)}") from error
-        return answer
+        while True:
+            if time.monotonic() > self._seen + _SECONDS_TO_ANSWER:
+                self._look()
+            try:
+                answer: Message = self.ray.get(ticket, timeout=_SECONDS_TO_ANSWER)
+            except errors.GetTimeoutError:
+                continue
+            except errors.RayTaskError as error:
+                raise error.cause from None
+            except errors.RayError as error:
+                raise RobotLostError(f"robot {robot}'s actor is gone: {_reason(error)}") from error
+            return answer
 
     def close(self) -> None:
         if self.ray.is_initialized():
@@ -198,7 +224,12 @@ class _RayPlace:
 
     def _wait(self, tickets: Mapping[int, ObjectRef[Message]]) -> None:
         """Wait until robots are there."""
-        _, missing = self.ray.wait(list(tickets.values()), num_returns=len(tickets), timeout=self.engine.patience)
+        deadline = time.monotonic() + self.engine.patience
+        missing = list(tickets.values())
+        while missing and (left := deadline - time.monotonic()) > 0:
+            patience = min(left, _SECONDS_TO_ANSWER)
+            _, missing = self.ray.wait(list(tickets.values()), num_returns=len(tickets), timeout=patience)
+            self._look()
         if missing:
             free, patience = self.ray.available_resources().get("CPU", 0.0), self.engine.patience
             raise EngineError(
@@ -207,6 +238,34 @@ class _RayPlace:
             )
         for robot, ticket in tickets.items():
             self.receive(robot, ticket)
+
+    def _look(self) -> None:
+        """Whether the cluster is there: a minute after it has gone Ray would end this process, with words of its own.
+
+        Raises
+        ------
+        EngineError
+            When it has died; its actors are not asked for any more.
+        """
+        address = self.ray.get_runtime_context().gcs_address
+        host, _, port = address.rpartition(":")
+        deadline = time.monotonic() + _SECONDS_TO_COME_BACK
+        while True:
+            try:
+                socket.create_connection((host.strip("[]"), int(port)), timeout=_SECONDS_TO_ANSWER).close()
+                problem = "" if any(node["Alive"] for node in self.ray.nodes()) else "none of its machines is left"
+            except OSError as error:
+                problem = error.strerror or str(error)
+            self._seen = time.monotonic()
+            if not problem:
+                return
+            if self._seen > deadline:
+                self.actors = {}
+                raise EngineError(
+                    f"the Ray cluster at {address} has died ({problem}); solve again when there is one: a run with "
+                    "--resume FILE goes on from its last checkpoint"
+                )
+            time.sleep(0.2)
 
 
 class _Actor:
@@ -267,18 +326,20 @@ def _own_sigterm() -> Iterator[None]:
 def _check_cluster(address: str) -> None:
     """Refuse an address where no Ray cluster can be joined, in seconds; Ray itself would try for minutes, loudly."""
     program = f"import ray; ray.init(address={address!r}, log_to_driver=False)"
-    environment = {**os.environ, **_ENVIRONMENT}
+    environment = {**os.environ, **_ENVIRONMENT, "RAY_NUM_REDIS_GET_RETRIES": "3"}  # one a second
     try:
-        joined = subprocess.run(
-            [sys.executable, "-c", program], env=environment, capture_output=True, timeout=_SECONDS_TO_JOIN, check=False
+        subprocess.run(
+            [sys.executable, "-c", program], env=environment, capture_output=True, timeout=_SECONDS_TO_JOIN, check=True
         )
-    except subprocess.TimeoutExpired:
-        joined = None
-    if joined is None or joined.returncode != 0:
+    except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
+        told = (error.stderr or b"").decode(errors="replace")
+        reasons = (found[-1] for pattern in _REASONS if (found := re.findall(pattern, told, re.MULTILINE)))
+        reason = textwrap.shorten(next(reasons, f"no answer in {_SECONDS_TO_JOIN:g} s"), 260, placeholder=" ..")
         raise EngineError(
-            f"what answers at {address} is no Ray cluster that can be joined from here; check the port (6379 unless "
-            "chosen), that this machine is one of the cluster's, and that Ray's version and RAY_AUTH_MODE are the same"
-        )
+            f"what answers at {address} is no Ray cluster that can be joined from here: {reason}; check the port (6379 "
+            "unless chosen), that this machine is one of the cluster's, and that Ray's version and RAY_AUTH_MODE are "
+            "the same"
+        ) from error
 
 
 @contextmanager
@@ -294,6 +355,19 @@ def _environment(wanted: Mapping[str, str]) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def _replaced(module: ModuleType, **values: object) -> Iterator[None]:
+    """Other values for names of a module, where it has them."""
+    before = {name: getattr(module, name) for name in values if hasattr(module, name)}
+    for name in before:
+        setattr(module, name, values[name])
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(module, name, value)
 
 
 @contextmanager
@@ -317,5 +391,5 @@ def _loggers_below(name: str) -> list[logging.Logger]:
     ]
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: BaseException) -> str:
     return str(error).strip().split("\n")[0] or type(error).__name__

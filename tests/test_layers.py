@@ -86,6 +86,7 @@ ORDER = {
         "separator_tree",
         "substructure",
         "packing",
+        "run_lock",
         "robot",
         "copy_holder",
         "member",

@@ -1,3 +1,4 @@
+import json
 import math
 from dataclasses import dataclass
 
@@ -60,6 +61,31 @@ def test_a_class_that_is_not_expected_is_not_made():
         unpack(pack(Other(1)), (Poses,))
     with pytest.raises(ValueError, match="not packed here"):
         unpack({"0": np.zeros(2)}, ())
+
+
+def test_what_is_packed_and_what_is_unpacked_are_copies():
+    original = np.arange(3.0)
+    packed = pack((original,))
+    original[:] = 7.0
+    unpack(packed, ())[0][:] = 8.0
+    np.testing.assert_array_equal(unpack(packed, ())[0], [0.0, 1.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        {"class": "Poses", "fields": {}},
+        {"class": "Poses", "fields": {"R": 1, "t": 2, "more": 3}},
+        {"class": "Other", "fields": {}},
+        {"enum": "Status", "member": "GONE"},
+        {"array": 0},
+        {"keys": ["a", "b"], "values": [1]},
+        {},
+    ],
+)
+def test_a_tree_of_another_version_is_a_value_error(tree):
+    with pytest.raises(ValueError, match=r"not packed here|zip"):
+        unpack({"tree": np.array(json.dumps(tree))}, (Poses, Status))
 
 
 def test_what_is_no_data_is_refused():

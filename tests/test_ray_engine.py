@@ -4,6 +4,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -174,11 +175,33 @@ def test_errors_of_robots_arrive_as_what_they_are(graph):
         crew.close()
 
 
+def test_a_slow_answer_is_waited_for_while_the_cluster_lives(graph, actors, monkeypatch):
+    crew = RayEngine().open(solvers.share.share_out(graph, pgo.partition(graph, 1)), None)
+    monkeypatch.setattr(ray_engine, "_SECONDS_TO_ANSWER", 0.1)
+    try:
+        ticket = actors[0].actors[0].__ray_call__.remote(lambda holder: time.sleep(1) or {"slow": 1})
+        assert actors[0].receive(0, ticket) == {"slow": 1}
+        monkeypatch.setattr(ray_engine, "_SECONDS_TO_COME_BACK", 0.5)
+        monkeypatch.setattr(ray, "nodes", lambda: [{"Alive": False}])
+        ticket = actors[0].actors[0].__ray_call__.remote(lambda holder: time.sleep(5) or {})
+        with pytest.raises(EngineError, match=r"has died \(none of its machines is left\); solve again"):
+            actors[0].receive(0, ticket)
+        assert actors[0].actors == {}
+    finally:
+        crew.close()
+
+
 @pytest.mark.parametrize("error", [MissingExtraError("cvxopt", "fast"), pgo.FileFormatError("x.g2o", 3, "bad")])
 def test_errors_can_be_sent(error):
     import pickle
 
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+@pytest.mark.parametrize(("robots", "share"), [(1, 1.0), (2, 1.0), (3, 0.5), (4, 0.5), (6, 0.3333)])
+def test_every_cpu_has_room_for_as_many_robots(robots, share, graph):
+    shares = solvers.share.share_out(graph, pgo.partition(graph, robots))
+    assert ray_engine._RayPlace(ray, shares, None, RayEngine(robots_per_cpu=3), False)._cpus_a_robot == share
 
 
 def test_too_few_cpus_are_told_at_once(graph):
@@ -224,6 +247,32 @@ def test_an_address_where_no_cluster_answers_is_told_in_one_line(monkeypatch, ca
             connect(f"127.0.0.1:{silent.getsockname()[1]}")
         with pytest.raises(EngineError, match="is no Ray cluster that can be joined from here"):
             ray_engine._check_cluster(f"127.0.0.1:{silent.getsockname()[1]}")
+
+
+def test_a_ray_that_does_not_keep_to_the_loopback_is_refused(monkeypatch):
+    stopped = []
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(ray, "init", lambda **options: None)
+    monkeypatch.setattr(ray, "shutdown", lambda: stopped.append(True))
+    monkeypatch.setattr(ray.util, "get_node_ip_address", lambda: "192.0.2.2")
+    with pytest.raises(EngineError, match=r"would listen at 192\.0\.2\.2, not on the loopback"):
+        connect()
+    assert stopped == [True]
+
+
+def test_names_of_a_module_are_replaced_for_a_while_where_it_has_them():
+    module = type(sys)("module")
+    module.one = 1
+
+    def fail():
+        with ray_engine._replaced(module, one=2, two=2):
+            assert module.one == 2
+            assert not hasattr(module, "two")
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert module.one == 1
 
 
 def test_without_ray_the_extra_is_named(monkeypatch, capsys):

@@ -7,7 +7,7 @@ from graphs import varied_graph
 import solvers
 from pgo_models.errors import EngineError, NotPositiveDefiniteError, SettingError
 from pgo_models.partition import PartitionMethod, partition
-from solvers.member import Member
+from solvers.member import RESTORE, SNAPSHOT, Member
 from solvers.recovery import RecoveringCrew, Recovery, RobotLostError
 from solvers.share import share_out
 
@@ -87,11 +87,81 @@ def test_lost_robots_change_nothing(coupling, orders, is_before):
     assert repr(found.ledger) == repr(expected.ledger)
 
 
+@pytest.mark.parametrize("orders", [7, 1000])
+def test_a_run_that_goes_on_from_a_checkpoint_can_lose_robots(orders, tmp_path):
+    class KilledError(BaseException):
+        pass
+
+    def kill(state, record):
+        if record.k == 9:
+            raise KilledError
+
+    graph, checkpoint = varied_graph(6, 60, 3), solvers.Checkpoint(tmp_path / "run.ckpt", rounds=2)
+    settings = pipeline(solvers.Coupling.SUBSTRUCTURED, None)
+    expected = solvers.solve(graph, settings, robots=4)
+    losses = frozenset(np.random.default_rng(orders).integers(5, 100, 8).tolist())
+    first, second = (LeakyEngine(losses, Recovery(orders, max_restarts=1000)) for _ in range(2))
+    with pytest.raises(KilledError):
+        solvers.solve(graph, settings, robots=4, engine=first, checkpoint=checkpoint, callback=kill)
+    found = solvers.solve(graph, settings, robots=4, engine=second, checkpoint=checkpoint)
+    assert second.opened[0].place.lost > 3
+    np.testing.assert_array_equal(found.poses.t, expected.poses.t)
+    assert found.lower_bound == expected.lower_bound
+
+
+def test_a_snapshot_and_a_restore_take_the_place_of_the_orders_before(monkeypatch):
+    obeyed = []
+
+    def obey(member, order, message):
+        obeyed.append((order, message))
+        return {"of": member.share.robot}
+
+    monkeypatch.setattr(Member, "obey", obey)
+    graph = varied_graph(5, 24, 2)
+    place = Leaky(share_out(graph, partition(graph, 2)), set())
+    place.start(range(2))
+    crew = RecoveringCrew(place, 2, Recovery())
+    crew.ask("one", [{}] * 2)
+    for order, messages, kept in (
+        (SNAPSHOT, [{}] * 2, {"of": 1}),
+        (RESTORE, [{"earlier": 0}, {"earlier": 1}], {"earlier": 1}),
+    ):
+        crew.ask(order, messages)
+        crew.ask("two", [{}] * 2)
+        obeyed.clear()
+        place.losses = {place.count + 2}  # robot 1, before it obeys
+        crew.ask("three", [{}] * 2)
+        assert obeyed == [("three", {}), (RESTORE, kept), ("two", {}), ("three", {})]
+
+
 def test_what_is_kept_for_a_robot_is_bounded():
     graph = varied_graph(3, 30, 2)
     engine = LeakyEngine(recovery=Recovery(orders_between_snapshots=5))
     solvers.solve(graph, robots=3, engine=engine)
     assert len(engine.opened[0]._log) < 5
+
+
+def test_a_snapshot_is_taken_after_so_many_orders(monkeypatch):
+    obeyed = []
+    monkeypatch.setattr(Member, "obey", lambda member, order, message: obeyed.append(order) or {})
+    place = Leaky(share_out(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 1)), set())
+    place.start([0])
+    crew = RecoveringCrew(place, 1, Recovery(orders_between_snapshots=3))
+    for _ in range(7):
+        crew.ask("go", [{}])
+        assert len(crew._log) < 3
+    assert obeyed == [*3 * ["go"], SNAPSHOT, *3 * ["go"], SNAPSHOT, "go"]
+
+
+def test_of_two_refusals_the_first_robots_is_told(monkeypatch):
+    def obey(member, order, message):
+        raise NotPositiveDefiniteError(f"robot {member.share.robot}")
+
+    monkeypatch.setattr(Member, "obey", obey)
+    place = Leaky(share_out(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 2)), set())
+    place.start(range(2))
+    with pytest.raises(NotPositiveDefiniteError, match="robot 0"):
+        RecoveringCrew(place, 2, Recovery()).ask("go", [{}] * 2)
 
 
 def test_a_robot_that_is_lost_again_and_again_ends_the_run():
