@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 from pgo_models.errors import ProofError, SettingError
 from pgo_models.html_tables import facts_table
 from pgo_models.initialization import chordal_start
-from pgo_models.lower_bound import LowerBound, best_bound
+from pgo_models.lower_bound import NO_BOUND, LowerBound, best_bound
 from pgo_models.multipliers import multipliers
 from pgo_models.polish import STATIONARY_DECREMENT, polish, relative_decrement
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array
-from pgo_models.rounding_errors import objective_rounding
+from pgo_models.rounding_errors import objective_rounding, rounding_level
 
 DEFAULT_GAP = 1e-6
 
@@ -291,9 +291,12 @@ def certify_with(
     if not 0 < gap < math.inf:
         raise SettingError(f"gap is {gap}; give a positive relative gap, as 1e-6")
     objective = problem.objective(poses)
+    if bound is None:
+        is_exact = objective <= rounding_level(problem, poses)
+        bound = NO_BOUND if is_exact else best_bound(problem, Lambda, poses, gap, objective)
     unjudged = Certificate(
         objective=objective,
-        bound=bound if bound is not None else best_bound(problem, Lambda, poses, gap, objective),
+        bound=bound,
         gap=math.nan,
         rounding_level=0.0,
         stationarity=stationarity,

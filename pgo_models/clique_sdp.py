@@ -53,7 +53,7 @@ class CliqueRelaxation:
     semidefinite : tuple of cp.Constraint
         W_C PSD, one for every clique.
     scale : float
-        The objective is divided by it: max(1, F) at the centre.
+        The objective is divided by it: F at the centre, or for noise-free graphs a share of L.
 
     Examples
     --------

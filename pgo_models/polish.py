@@ -22,9 +22,11 @@ from pgo_models.rotations import Array, exp_map, project_to_rotations
 from pgo_models.rounding_errors import rounding_level
 
 STATIONARY_DECREMENT = 1e-13
+SMALL_DECREMENT = 1e-9
 ROUNDING = 1e-14  # relative change of F that is not told apart from none
 SUFFICIENT = 1e-4  # Armijo's constant
 HALVINGS = 40
+NEARLY_EXACT = 1e4  # times its rounding level: then F is what the solve for the translations leaves
 DAMPING_START, DAMPING_GROWTH, DAMPING_MAX = 1e-8, 10.0, 1e6
 CHORD_STEPS = 3
 CHORD_PROGRESS = 0.1
@@ -45,6 +47,8 @@ class PolishState:
         Whether the last factored matrix was the Hessian, not its damped Gauss-Newton part.
     moved : bool
         Whether the last step changed the poses.
+    is_at_rounding : bool
+        Whether a Newton step, which squares a small decrement, hardly changed it: the gradient is rounding.
     analysis, factor
         Symbolic and last numeric factorisation, for the next step to reuse.
     """
@@ -54,13 +58,14 @@ class PolishState:
     decrement: float = np.inf
     is_newton: bool = False
     moved: bool = True
+    is_at_rounding: bool = False
     analysis: SymbolicCholesky | None = None
     factor: CholeskyFactor | None = None
 
     @property
     def is_stationary(self) -> bool:
         """Whether nothing is left to gain above the rounding level."""
-        return self.decrement <= STATIONARY_DECREMENT
+        return self.decrement <= STATIONARY_DECREMENT or self.is_at_rounding
 
 
 def start_polish(problem: PGOProblem, poses: Poses) -> PolishState:
@@ -87,11 +92,13 @@ def polish_step(problem: PGOProblem, state: PolishState, second_order: bool = Tr
         if candidate is None:
             break
         gradient, direction, decrement = _direction(problem, layout, candidate)
+        at_rounding = reached_rounding(now.decrement, decrement, is_newton and not now.moved)
         tie = candidate.objective >= now.objective
         if tie and decrement > 0.5 * now.decrement:
+            now = replace(now, is_at_rounding=at_rounding)
             break
         enough = decrement <= CHORD_PROGRESS * now.decrement
-        now = replace(candidate, decrement=decrement, moved=True)
+        now = replace(candidate, decrement=decrement, moved=True, is_at_rounding=at_rounding)
         if not enough:
             break
     return now
@@ -115,6 +122,11 @@ def polish(problem: PGOProblem, poses: Poses, max_steps: int = 100) -> Poses:
         if state.is_stationary or not state.moved:
             break
     return state.poses
+
+
+def reached_rounding(before: float, after: float, is_newton_step: bool) -> bool:
+    """Whether a decrement so small that a Newton step squares it was not even cut to a tenth by one."""
+    return is_newton_step and before <= SMALL_DECREMENT and after > CHORD_PROGRESS * before
 
 
 def relative_decrement(problem: PGOProblem, poses: Poses) -> float:
@@ -201,6 +213,9 @@ def _backtrack(
         # leaves: on parking-garage this saves two thirds of the factorisations.
         poses = problem.with_best_translations(retract(state.poses, length * w, length * v).R)
         objective = problem.objective(poses)
+        if length == 1.0 and objective <= NEARLY_EXACT * rounding_level(problem, poses):
+            poses = problem.with_refined_translations(poses)
+            objective = problem.objective(poses)
         if objective <= state.objective + SUFFICIENT * length * slope:
             return replace(state, poses=poses, objective=objective)
         if length == 1.0 and objective <= state.objective * (1.0 + ROUNDING):

@@ -181,6 +181,20 @@ class PGOProblem:
         """Poses (R, t) with the translations of `recover_translations`."""
         return Poses(R, self.recover_translations(R))
 
+    def with_refined_translations(self, poses: Poses) -> Poses:
+        """Poses after steps of iterative refinement of the translations, as many as lower F, with t_0 where it is.
+
+        A solve leaves errors in proportion to its condition; a step with residuals edge by edge takes most of it away.
+        """
+        objective = self.objective(poses)
+        while True:
+            t = poses.t.copy()
+            t[1:] -= self._translation_factor.solve(self.apply_M(self.stacked(poses))[1 : self.num_poses])
+            refined = Poses(poses.R, t)
+            if not self.objective(refined) < 0.5 * objective:
+                return refined if self.objective(refined) < objective else poses
+            poses, objective = refined, self.objective(refined)
+
     def stacked(self, poses: Poses) -> Array:
         """X of poses, after a check that they fit this graph.
 

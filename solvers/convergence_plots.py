@@ -79,7 +79,7 @@ class Curve:
 
     @property
     def gap(self) -> Array:
-        """(objective - lower_bound) / max(1, objective) of every record."""
+        """(objective - lower_bound) / objective of every record."""
         return np.array([relative_gap(objective, self.lower_bound) for objective in self.history.objective])
 
     def effort(self, effort: Effort) -> Array:
@@ -112,7 +112,7 @@ def plot_convergence(
         For example `[(stage.name, stage.history) for stage in solution.stages]`; the later ones go on where the earlier
         ones end.
     lower_bound : float
-        The gap is (F - lower_bound) / max(1, F).
+        The gap is (F - lower_bound) / F.
     published : PublishedRun, optional
         The paper's gap and iterations as a star; as a line with the figures where these are far to the right.
 

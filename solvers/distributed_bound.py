@@ -49,6 +49,8 @@ class InterfaceProof:
 
 def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
     """Grounded without eta where that goes through, else the better form with the smallest eta found; at the poses."""
+    if driver.objective <= driver.rounding_level:
+        return NO_BOUND
     found = prove_grounded(driver, 0.0)
     if found is not None and found.value > 0.0:
         return found

@@ -51,7 +51,7 @@ class LevenbergMarquardtState:
     step : Array
         h; nan where the matrix with this damping has no Cholesky factor.
     decrement : float
-        -<g, h> / 2 over max(1, F).
+        -<g, h> / 2, less the rounding level of F, over F.
     """
 
     k: int

@@ -70,8 +70,8 @@ class Newton:
         return state.polish.poses
 
     def converged(self, state: NewtonState, measurement: Measurement) -> Status | None:
-        """CONVERGED within tolerance; STALLED when the last step could not move."""
-        if measurement.dual_residual <= self.tolerance:
+        """CONVERGED within tolerance or where the gradient is rounding; STALLED when the last step could not move."""
+        if measurement.dual_residual <= self.tolerance or state.polish.is_at_rounding:
             return Status.CONVERGED
         return None if state.polish.moved else Status.STALLED
 

@@ -165,7 +165,7 @@ _CURVE_HINT = (
 _GLOSSARY = [
     ("F", "cost: sum over edges of kappa ||R_j - R_i R_ij||^2 + tau ||t_j - t_i - R_i t_ij||^2"),
     ("lower bound", "proven: no poses cost less"),
-    ("gap", "(F - lower bound) / max(1, F)"),
+    ("gap", "(F - lower bound) / F"),
     ("kappa", "precision of an edge's rotation, per rad^2: the larger, the surer"),
     ("tau", "precision of an edge's translation, per m^2"),
     ("separator", "pose with an edge to another robot: what robots have to tell each other"),

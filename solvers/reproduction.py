@@ -91,7 +91,7 @@ class Optimum:
 
     @property
     def gap(self) -> float:
-        """(objective - lower_bound) / max(1, objective), proven."""
+        """(objective - lower_bound) / objective, proven."""
         return relative_gap(self.objective, self.lower_bound)
 
 

@@ -84,7 +84,7 @@ class Solution:
 
     @property
     def gap(self) -> float:
-        """(objective - lower_bound) / max(1, objective)."""
+        """(objective - lower_bound) / objective; 0 where F is at its rounding level."""
         return self.certificate.gap
 
     @property

@@ -21,6 +21,7 @@ from pgo_models.polish import (
     ROUNDING,
     STATIONARY_DECREMENT,
     SUFFICIENT,
+    reached_rounding,
     retract,
     scaled_decrement,
 )
@@ -42,12 +43,14 @@ class SubstructuredNewtonState:
     objective: float
     decrement: float = math.inf
     moved: bool = True
+    is_at_rounding: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A factored model at the poses at hand, and the solution y = H^-1 g on the cover."""
+    """A factored model at the poses at hand, Newton's or another, and the solution y = H^-1 g on the cover."""
 
+    is_newton: bool
     factor: InterfaceFactor
     y: Array
     square: float  # g^T H^-1 g
@@ -71,6 +74,7 @@ class SubstructuredNewton:
     def step(self, driver: Driver, state: SubstructuredNewtonState) -> SubstructuredNewtonState:
         """One factorisation and the moves it serves, two rounds each."""
         model = self._factorize(driver)
+        at_rounding = False
         decrement = scaled_decrement(model.square, driver.objective, driver.rounding_level)
         moved = False
         for _ in range(1 + CHORD_STEPS):
@@ -80,8 +84,9 @@ class SubstructuredNewton:
             if found is None:
                 break
             trial, answers = found
-            following = _solved(driver, model.factor, answers)
+            following = _solved(driver, model.is_newton, model.factor, answers)
             after = scaled_decrement(following.square, trial.objective, trial.rounding_level)
+            at_rounding = reached_rounding(decrement, after, model.is_newton and not moved)
             if trial.objective >= driver.objective and after > 0.5 * decrement:
                 break
             driver.ask("accept", count=Count.WITH_THE_NEXT)
@@ -91,15 +96,15 @@ class SubstructuredNewton:
             model, decrement, moved = following, after, True
             if not enough:
                 break
-        return SubstructuredNewtonState(state.k + 1, driver.objective, decrement, moved)
+        return SubstructuredNewtonState(state.k + 1, driver.objective, decrement, moved, at_rounding)
 
     def measure(self, driver: Driver, state: SubstructuredNewtonState) -> Measurement:
         """F and the relative decrement."""
         return driver.measured(state.objective, 0.0, state.decrement)
 
     def converged(self, state: SubstructuredNewtonState, measurement: Measurement) -> Status | None:
-        """CONVERGED within tolerance; STALLED when the last step could not move."""
-        if measurement.dual_residual <= self.newton.tolerance:
+        """CONVERGED within tolerance or where the gradient is rounding; STALLED when the last step could not move."""
+        if measurement.dual_residual <= self.newton.tolerance or state.is_at_rounding:
             return Status.CONVERGED
         return None if state.moved else Status.STALLED
 
@@ -139,7 +144,7 @@ def model_at(driver: Driver, second_order: bool, damping: float) -> Model | None
         factor = interface.factorize([a["schur"] for a in answers], _own(driver, answers, second_order, damping))
     except NotPositiveDefiniteError:
         return None
-    return _solved(driver, factor, answers)
+    return _solved(driver, second_order, factor, answers)
 
 
 def _own(
@@ -165,11 +170,11 @@ def _own(
     return own
 
 
-def _solved(driver: Driver, factor: InterfaceFactor, answers: Sequence[Message]) -> Model:
+def _solved(driver: Driver, is_newton: bool, factor: InterfaceFactor, answers: Sequence[Message]) -> Model:
     """Solution y = H^-1 g on the cover, and g^T H^-1 g."""
     b = driver.interface(*driver.tangent).gather([answer["b"] for answer in answers])
     y = factor.solve(b)
-    return Model(factor, y, math.fsum(float(answer["energy"][0]) for answer in answers) + inner(b, y))
+    return Model(is_newton, factor, y, math.fsum(float(answer["energy"][0]) for answer in answers) + inner(b, y))
 
 
 def _backtrack(driver: Driver, model: Model) -> tuple[_Trial, list[Message]] | None:
