@@ -77,40 +77,80 @@ pgo.plot_against_truth(graph, solution.poses)
 #
 # A *lower bound* $b$ with $b \le F(R, t)$ for **all** rotations and translations. Then
 #
-# $$\text{gap} = \frac{F(\text{answer}) - b}{\max(1, F(\text{answer}))}$$
+# $$\text{gap} = \frac{F(\text{answer}) - b}{F(\text{answer})}$$
 #
-# is the most, as a share of $F$, that any other answer could save. Where does $b$ come from? Stack all $t_i$
-# and the rows of all $R_i^\top$ in a matrix $X$, so that $F = \operatorname{tr}(X^\top M X)$. For any symmetric
-# matrices $\Lambda_i$, as $R_i R_i^\top = I$,
+# is the most, as a share of $F$, that any other answer could save; neither the units nor the number of
+# measurements change it. Where does $b$ come from? Stack all $t_i$ and the rows of all $R_i^\top$ in a matrix
+# $X$, so that $F = \operatorname{tr}(X^\top M X)$. For any symmetric matrices $\Lambda_i$, as
+# $R_i R_i^\top = I$,
 #
-# $$F = \operatorname{tr}(X^\top S X) + \sum_i \operatorname{tr} \Lambda_i, \qquad
+# $$F(X) = \operatorname{tr}(X^\top S X) + \sum_i \operatorname{tr} \Lambda_i, \qquad
 #   S = M - \operatorname{blockdiag}(0, \Lambda).$$
 #
-# If $S + \eta \operatorname{blockdiag}(0, I)$ has no negative eigenvalue, then
-# $\operatorname{tr}(X^\top S X) \ge -\eta\, n d$ whatever the poses are, and
-# $b = \operatorname{tr} \Lambda - \eta\, n d$. Cholesky's factorisation exists exactly for positive definite
-# matrices: **that it goes through is the proof.** (A shift of all $t_i$ together costs nothing, so $t_0$ is
-# taken out.) The multipliers of the constraints at the answer are a good choice of $\Lambda$.
+# Were $S$ positive definite, we could minimise the right side over all $X$ whatsoever. It cannot be: turning or
+# shifting all poses together changes nothing. So **ground one pose** $r$. Turn and shift the answer, call it
+# $\hat X$, so that pose $r$ is $(0, I)$; let $G = S \hat X$, and let $S_r$ and $G_r$ be $S$ and $G$ without the
+# rows of pose $r$. If $S_r$ is positive definite, then for **all** poses $X$
+#
+# $$F(X) \ge b = F(\hat X) - \operatorname{tr}(G_r^\top S_r^{-1} G_r).$$
+#
+# The proof has three lines:
+#
+# * Turn and shift $X$ too until its pose $r$ is $(0, I)$; $F(X)$ stays. So $Z = X - \hat X$ is zero at pose $r$.
+# * $F(X) - F(\hat X) = 2 \operatorname{tr}(G^\top Z) + \operatorname{tr}(Z^\top S Z)
+#   = 2 \operatorname{tr}(G_r^\top Z_r) + \operatorname{tr}(Z_r^\top S_r Z_r)$.
+# * Over *all* matrices $Z_r$ that is smallest at $Z_r = -S_r^{-1} G_r$, where it is
+#   $-\operatorname{tr}(G_r^\top S_r^{-1} G_r)$.
+#
+# Cholesky's factorisation exists exactly for positive definite matrices: **that it goes through is the proof.**
+# A good choice of $\Lambda$ are the multipliers of the constraints at the answer, $\operatorname{sym}((M X)_i R_i)$;
+# with them $G = 0$ at an optimum, and $b$ is $F$ itself.
+
 
 # %%
-n, d, eta = problem.num_poses, problem.d, 1e-6
-X = solution.poses.stacked()
-MX_R = (problem.M @ X)[n:].reshape(n, d, d) @ solution.poses.R
-Lambda = (MX_R + np.swapaxes(MX_R, 1, 2)) / 2
+def loss_by_hand(problem, poses):
+    n, d = problem.num_poses, problem.d
+    X = poses.with_gauge_at(0).stacked()  # r = 0
+    R = X[n:].reshape(n, d, d).swapaxes(1, 2)
+    MX_R = (problem.M @ X)[n:].reshape(n, d, d) @ R
+    Lambda = (MX_R + MX_R.swapaxes(1, 2)) / 2
+    S = problem.M.toarray()
+    for i in range(n):
+        rows = slice(n + d * i, n + d * i + d)
+        S[rows, rows] -= Lambda[i]
+    kept = np.r_[1:n, n + d : n + d * n]  # all rows but those of pose 0
+    factor = np.linalg.cholesky(S[np.ix_(kept, kept)])  # raises LinAlgError where there is none
+    half = np.linalg.solve(factor, (S @ X)[kept])  # tr(G^T S^-1 G) is the sum of its squares
+    return np.sum(half**2)
 
-S = problem.M.toarray()
-for i in range(n):
-    rows = slice(n + d * i, n + d * i + d)
-    S[rows, rows] += eta * np.eye(d) - Lambda[i]
-np.linalg.cholesky(S[1:, 1:])  # raises LinAlgError where there is no factor
-bound_by_hand = np.trace(Lambda, axis1=1, axis2=2).sum() - eta * n * d
 
-print(f"F       {solution.objective:.7f}")
-print(f"bound   {bound_by_hand:.7f} by hand, {solution.lower_bound:.7f} by the library")
+n, d = problem.num_poses, problem.d
+turned = solution.poses.R @ pgo.exp_map(np.random.default_rng(0).normal(0.0, 1e-3, (n, 3)))
+nearby = problem.with_best_translations(turned)  # every pose turned by about 0.1 degrees
+rows = {}
+for name, poses in (("the solution", solution.poses), ("0.1 degrees off", nearby)):
+    objective, by_library = problem.objective(poses), pgo.certify_at(problem, poses).lower_bound
+    rows[name] = (objective, objective - loss_by_hand(problem, poses), by_library)
+    print("{:16} F {:.10f}   b {:.10f} by hand, {:.10f} by the library".format(name, *rows[name]))
+
+# %% [markdown]
+# Even poses that are a little off give a bound that is nearly sharp: both $F$ and $b$ are off by the *square* of
+# the error. (Then $b$ depends a little on which pose is grounded; the library takes one in the middle.)
+#
+# By hand, the numbers come from a computer that rounds, and the proof is for exact ones. The library bounds
+# every rounding error, in the entries of $S_r$, its factorisation, $G$ and $F$, and subtracts them all: its
+# bound is a little smaller, and holds *in exact arithmetic* for the measurements as they are stored.
+
+# %%
+certificate = solution.certificate
+print(f"F - b {solution.objective - solution.lower_bound:.1e}, about tr(G^T S^-1 G)", end=" ")
+print(f"{loss_by_hand(problem, solution.poses):.1e} and, for rounding, {certificate.bound.rounding:.1e}")
+print(f"gap   {solution.gap:.1e}: {certificate.digits} digits of F are proven")
 
 # %% [markdown]
 # So nobody will ever find poses for these measurements with $F$ below that bound. `certify` does the same for
-# *anybody's* poses, here for the truth: it is 7.6 % above the optimum.
+# *anybody's* poses (it first looks for the optimum beside them). Here for the truth: 7.6 % of its $F$ could be
+# saved.
 
 # %%
 pgo.certify(problem, graph.truth)
@@ -159,19 +199,25 @@ pgo.compare_poses(
 
 # %% [markdown]
 # The gap of such an answer is nearly 1: almost all of its cost could be saved. A gap is not always a verdict on
-# the answer, though. If the noise is so strong that the bound itself is loose, an optimal answer keeps a gap:
-# [notebook 5](05_sdp_and_certificates.ipynb) looks for the noise at which that begins.
+# the answer, though. If the noise is very strong, $S_r$ is not positive definite even at the optimum. The library
+# then adds a shift $\eta$ to make it so, pays for that, and an optimal answer keeps a gap: [notebook
+# 5](05_sdp_and_certificates.ipynb) looks for the noise at which that begins.
 
 # %%
 assert np.isclose(cost(graph, graph.truth), problem.objective(graph.truth))
 assert solution.is_certified
-assert solution.gap <= 1e-6
-assert abs(bound_by_hand - solution.lower_bound) < 1e-3
+assert certificate.eta == 0
+assert certificate.digits >= 11
+objective, by_hand, _ = rows["the solution"]
+assert np.isclose(by_hand, solution.lower_bound, rtol=1e-11, atol=0)
+objective, by_hand, by_library = rows["0.1 degrees off"]
+assert np.isclose(by_hand, by_library, rtol=1e-7, atol=0)
+assert max(by_hand, by_library) < solution.objective < objective
 rng = np.random.default_rng(1)
 for _ in range(100):
     anything = pgo.Poses(pgo.random_rotations(n, d, rng), rng.normal(0.0, 3.0, (n, d)))
     assert problem.objective(anything) >= solution.lower_bound
-assert bound_by_hand < solution.objective < problem.objective(graph.truth)
+assert solution.lower_bound <= solution.objective < problem.objective(graph.truth)
 assert worst.gap > 0.9
 for _ in range(100):  # a local minimum: nearby poses cost more
     nearby = stuck.R @ pgo.exp_map(rng.normal(0.0, 0.01, (count, 1)))

@@ -4,9 +4,11 @@
 # SE-Sync, which the paper compares with, finds certified global optima of a problem that is not convex. The
 # reason is a semidefinite relaxation that is *tight* as long as the noise is not too strong. This notebook
 # writes the relaxation and its dual in a few lines, shows which number is the certificate and which only looks
-# like one, and finds the noise at which tightness ends.
+# like one, watches the proven bound close in on $F$, and finds the noise at which tightness ends.
 
 # %%
+import itertools
+
 import cvxpy as cp
 import matplotlib.pyplot as plt
 import numpy as np
@@ -78,8 +80,9 @@ print(f"value of the dual {dual.value:.6f}")
 # The value of the dual that Clarabel just returned lies a little *above* $F$ of poses that we hold in our
 # hands. A bound it is not: a solver stops a little before or beyond feasibility.
 #
-# `solve_relaxation` chooses the form (primal, dual, or decomposed over cliques) and the solver by size, and its
-# `lower_bound` is proven by a Cholesky factorisation of $S + \eta I$, whatever the solver did.
+# `solve_relaxation` chooses the form (primal, dual, or decomposed over cliques) and the solver by size. Its
+# `lower_bound` is proven in exact arithmetic from the multipliers that the solver returned, as in notebook 1,
+# whatever the solver did: a worse $\Lambda$ gives a smaller bound, never a wrong one.
 
 # %%
 relaxed = pgo.solve_relaxation(problem)
@@ -134,11 +137,23 @@ for name, judged, poses in candidates:
 #
 # What distinguishes the optimum is whether that $\Lambda$ is *feasible*: $\lambda_{\min}(S) \ge 0$. At the
 # optimum of a tight problem, $d$ eigenvalues are exactly zero ($S Y = 0$), so in floating point the smallest
-# comes out as $\pm 10^{-15}$ or so. That is why the library proves $S + \eta I \succ 0$ with a small $\eta$ and
-# pays $\eta\, n d$ of the bound for it. The shaded band below is $|\lambda| \le \eta$.
+# comes out as $\pm 10^{-15}$ or so, and double precision cannot tell on which side of zero it is.
 
 # %%
 pgo.plot_spectrum(problem, answer.certificate, count=10)
+
+# %% [markdown]
+# But we know what those $d$ directions are: all poses turned together, the *gauge*. **Ground one pose**, as in
+# [notebook 1](01_quickstart.ipynb), and they are gone. What is left is positive definite by a wide margin, so
+# that its Cholesky factorisation goes through with room for every rounding error.
+
+# %%
+S = problem.Q.copy()
+for rows_i, block_i in zip(block, from_poses, strict=True):
+    S[rows_i, rows_i] -= block_i
+smallest = [np.linalg.eigvalsh(matrix)[:5] for matrix in (S, S[d:, d:])]
+print("smallest eigenvalues, whole:       ", *(f"{value:8.0e}" for value in smallest[0]))
+print("smallest eigenvalues, one grounded:", *(f"{value:8.2g}" for value in smallest[1]))
 
 # %% [markdown]
 # In the local minimum the negative eigenvalues are no rounding errors; each is a direction in which a *lifted*
@@ -150,6 +165,51 @@ eigenvalues = pgo.smallest_eigenvalues(ring, pgo.multipliers(ring, candidates[3]
 climbed = solvers.run(solvers.Staircase(), ring, candidates[3][2])
 print("smallest eigenvalues there:", eigenvalues.round(2))
 print(f"F in the local minimum {stuck.objective:.4f}, after the staircase {climbed.objective:.4f}")
+
+# %% [markdown]
+# ## Two bounds that close in
+#
+# The proof asks nothing of the poses: any multipliers give a bound that holds, and the margin is so wide that
+# those of a method *on its way* will do. Every iterate of SOC gives an upper bound on the optimum, its own $F$,
+# and `certify_at` a lower one for the price of a factorisation and a solve.
+
+
+# %%
+def closing_in(problem, iterations=25):
+    soc = solvers.SOC()
+    states = itertools.islice(solvers.iterate(soc, problem), iterations)
+    return [pgo.certify_at(problem, soc.poses(problem, state)) for state in states]
+
+
+problems = {
+    "sphere, 50 poses": pgo.PGOProblem(pgo.load("sphere")),
+    "grid world, 1000 poses": pgo.PGOProblem(pgo.grid_world(1, 1000, np.random.default_rng(0))),
+}
+optima = {name: solvers.solve(judged) for name, judged in problems.items()}
+on_the_way = {name: closing_in(judged) for name, judged in problems.items()}
+
+figure, axes = plt.subplots(figsize=(5.6, 3.2), layout="constrained")
+for (name, certificates), colour in zip(on_the_way.items(), ("#0072B2", "#E69F00"), strict=True):
+    above = np.array([item.objective for item in certificates]) / optima[name].lower_bound - 1
+    below = np.array([item.lower_bound for item in certificates]) / optima[name].objective - 1
+    iterations = np.arange(len(certificates))
+    axes.plot(iterations, above, "v-", iterations, below, "^-", color=colour, markersize=4)
+    axes.fill_between(iterations, below, above, color=colour, alpha=0.3, label=name)
+    shifted = sum(item.eta > 0 for item in certificates)
+    print(f"{name:22} gap after 0, 6, 12, 18, 24:", *(f"{item.gap:.0e}" for item in certificates[::6]), end="")
+    print(f"; {shifted} iterates needed a shift")
+axes.set_yscale("symlog", linthresh=1e-15, linscale=0.5)
+axes.set_yticks([sign * 10.0**power for sign in (-1, 1) for power in (-12, -8, -4, 0)] + [0.0])
+axes.set_xlabel("iteration of SOC")
+axes.set_ylabel("relative to the optimum")
+axes.set_title("above: F of the poses; below: the bound proven there", fontsize=10)
+_ = axes.legend(fontsize=8)
+
+# %% [markdown]
+# The optimum is in the shaded wedge, proven, at every iteration; what is shaded is the gap, and nobody needs to
+# know the optimum for it: one may stop as soon as it is small enough. Both sides close in at the same pace, on
+# the sphere down to the rounding level, without Newton. Its first three iterates are too far off for $S_r$ to be
+# positive definite. There is a bound even then, with the shift of the next section, but a poorer one.
 
 # %% [markdown]
 # ## Where it fails: the end of tightness
@@ -182,10 +242,25 @@ print("rank of Z:", loose_relaxed.rank)
 print(f"{loose_relaxed.lower_bound:.3f} <= optimum <= {loose.objective:.3f}; Z rounded: {loose_relaxed.objective:.3f}")
 
 # %% [markdown]
-# $Z$ has rank 4, no rotations have that Gram matrix, and rounding it costs something. The verdict is
-# `NOT_CERTIFIED`, **which does not mean that the poses are wrong**: they may be optimal. What is known is the
-# gap, 0.2 %: no poses whatever are better by more. A bound remains useful when tightness is gone; a yes or no
-# would not.
+# $Z$ has rank 4, no rotations have that Gram matrix, and rounding it costs something. Now $S$ has *four* zero
+# eigenvalues at the best $\Lambda$, and grounding a pose takes out only three. What is left is on the verge of
+# being definite, and the library needs a shift after all: if $S + \eta \operatorname{blockdiag}(0, I)$ is
+# positive definite without one translation, then $\operatorname{tr}(X^\top S X) \ge -\eta\, n d$, because
+# $R_i R_i^\top = I$, and
+#
+# $$F(X) \ge \operatorname{tr} \Lambda - \eta\, n d.$$
+#
+# It looks for a small $\eta$ that goes through. The shaded band is what that leaves open,
+# $|\lambda| \le \eta$; all four zeros are in it.
+
+# %%
+print(f"eta {loose.certificate.eta:.2g}: {loose.certificate.source.value}")
+pgo.plot_spectrum(loose_problem, loose.certificate, count=10)
+
+# %% [markdown]
+# The verdict is `NOT_CERTIFIED`, **which does not mean that the poses are wrong**: they may be optimal. What is
+# known is the gap, 0.2 %: no poses whatever are better by more. A bound remains useful when tightness is gone; a
+# yes or no would not.
 
 # %%
 assert np.isclose(primal.value, answer.objective, rtol=1e-5)
@@ -199,10 +274,19 @@ assert rows["ring, optimum"][2] > -1e-6
 assert rows["8 poses, random"][2] < -1.0
 assert rows["ring, local minimum"][2] < -1.0
 assert climbed.objective < 0.02 * stuck.objective
+assert answer.certificate.eta == 0
+assert np.abs(smallest[0][:d]).max() < 1e-9 < 1e-2 < smallest[1][0]
+for name, certificates in on_the_way.items():
+    assert all(item.lower_bound <= optima[name].objective <= item.objective * (1 + 1e-12) for item in certificates)
+    assert certificates[0].gap > 0.1
+    assert all(item.eta == 0 for item in certificates[5:])
+    assert certificates[-1].gap < 1e-8
 assert sweeps["circle"].fraction[0] == sweeps["grid"].fraction[0] == 1.0
 assert sweeps["circle"].fraction[-1] < 0.5
 assert sweeps["grid"].fraction[-1] == 0.0
 assert sweeps["circle"].last_tight > sweeps["grid"].last_tight
 assert loose_relaxed.rank.rank == 4
+assert loose.certificate.eta > 0
+assert loose.lower_bound < loose.objective
 assert loose_relaxed.lower_bound <= loose.objective < loose_relaxed.objective
 assert 1e-4 < loose.gap < 0.01

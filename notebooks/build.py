@@ -30,12 +30,17 @@ def small_png(data: str) -> str:
     return base64.b64encode(smaller.getvalue()).decode("ascii")
 
 
+def is_spent_bar(output: nbformat.NotebookNode) -> bool:
+    """Whether a progress bar stood here, which is emptied at the end; it is there only where a run took long."""
+    return output.output_type == "display_data" and not "".join(output.data.get("text/html", "shown"))
+
+
 def tidy(cell: nbformat.NotebookNode) -> None:
     """Drop what a reader does not see, from one cell: times of execution, progress bars; shrink pictures."""
     cell.metadata = nbformat.NotebookNode()
     if cell.cell_type != "code":
         return
-    cell.outputs = [output for output in cell.outputs if output.get("name") != "stderr"]
+    cell.outputs = [output for output in cell.outputs if output.get("name") != "stderr" and not is_spent_bar(output)]
     for output in cell.outputs:
         data = output.get("data", {})
         if "image/png" in data:

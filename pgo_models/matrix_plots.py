@@ -73,8 +73,8 @@ def smallest_eigenvalues(problem: PGOProblem, Lambda: Array, count: int = 12) ->
 def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12) -> Figure:
     """Figure of the smallest eigenvalues of S at the point of a certificate; see `smallest_eigenvalues`.
 
-    Eigenvalues stand on a logarithmic axis, negative ones as vermilion triangles. The shaded band is what the proof
-    leaves open, |lambda| <= eta.
+    Eigenvalues stand on a logarithmic axis, negative ones as vermilion triangles. The shaded band, where the
+    proof needs an eta, is what that leaves open, |lambda| <= eta.
 
     Raises
     ------
