@@ -26,7 +26,7 @@ from pgo_models.errors import (
     SettingError,
 )
 from pgo_models.figures import save_figure
-from pgo_models.g2o import RotationWeight, read_g2o, write_g2o
+from pgo_models.g2o import read_g2o, write_g2o
 from pgo_models.grid_world import grid_world
 from pgo_models.initialization import chordal_start, gps_imu_start, odometry_start, spanning_tree_start
 from pgo_models.interactive import animate_poses, explore_graph, save_page
@@ -40,6 +40,7 @@ from pgo_models.plots import compare_poses, draw_graph, plot_against_truth, plot
 from pgo_models.polish import polish
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses, absolute_trajectory_error, relative_pose_error
+from pgo_models.precisions import RotationWeight
 from pgo_models.problem import PGOProblem
 from pgo_models.published import PublishedFigures, PublishedRow, PublishedRun, published_rows, published_run
 from pgo_models.relaxation_plan import RelaxationForm, RelaxationPlan, SDPSolver, plan_relaxation

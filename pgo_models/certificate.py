@@ -29,6 +29,7 @@ class Verdict(enum.Enum):
 
     Examples
     --------
+    >>> import numpy as np
     >>> from pgo_models.scenes import grid
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
     >>> certify(problem, polish(problem, chordal_start(problem))).verdict.name
@@ -46,6 +47,7 @@ class BoundSource(enum.Enum):
 
     Examples
     --------
+    >>> import numpy as np
     >>> from pgo_models.scenes import grid
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
     >>> certify(problem, chordal_start(problem)).source.name
@@ -122,6 +124,11 @@ class Certificate:
         return self.bound.eta
 
     @property
+    def is_best_in_doubles(self) -> bool:
+        """Whether S_r is definite and the gap below 1e-6: a smaller one takes precision, not other poses."""
+        return self.bound.is_grounded and self.eta == 0.0 and self.gap <= DEFAULT_GAP
+
+    @property
     def digits(self) -> int:
         """Digits of F that are proven: those in which it agrees with the bound."""
         return proven_digits(self.gap)
@@ -141,8 +148,10 @@ class Certificate:
         return facts_table(self._facts())
 
     def _facts(self) -> list[tuple[str, str]]:
+        measured = not math.isnan(self.stationarity)
+        stationary = f"   (stationary to {self.stationarity:.2g})" if measured else ""
         facts = [
-            ("F", f"{self.objective:.10g}   (stationary to {self.stationarity:.2g})"),
+            ("F", f"{self.objective:.10g}{stationary}"),
             ("lower bound", f"{self.lower_bound:.10g}   ({self.proof}; {self.source.value})"),
             ("gap", f"{gap_text(self.gap)}   (asked for: {self.wanted_gap:.3g})"),
             ("verdict", f"{self.verdict.name}: {self.verdict.value}"),
@@ -181,7 +190,7 @@ def gap_text(gap: float) -> str:
     ('3.2e-13, proven to 12 digits', '0.2')
     """
     digits = proven_digits(gap)
-    return f"{gap:.3g}, proven to {digits} digits" if digits > 1 else f"{gap:.3g}"
+    return f"{gap:.3g}, proven to {digits} digits" if digits > 3 else f"{gap:.3g}"
 
 
 def certify(problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP) -> Certificate:
@@ -258,8 +267,7 @@ def certify_at(
     >>> import numpy as np
     >>> from pgo_models.scenes import grid
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> near = polish(problem, chordal_start(problem), max_steps=1)
-    >>> certificate = certify_at(problem, near)
+    >>> certificate = certify_at(problem, polish(problem, chordal_start(problem), max_steps=3))
     >>> bool(0.9 * certificate.objective < certificate.lower_bound <= certificate.objective)
     True
     """

@@ -2,16 +2,8 @@
 
 SuperLU (scipy) is always there; CHOLMOD comes through CVXOPT with the extra `fast` and is found at run time.
 
-Every factor knows how far it can be from exact, so that one that went through proves something in exact arithmetic
-(Rump 2006, *Verification of positive definiteness*; Demmel 1989; Higham 2002, theorem 10.3). The product R^T R of the
-computed factor, taken exactly, is A + E with |E_ij| <= gamma sum_k |R_ki| |R_kj|, gamma counting the non-zeros of
-column i or j of R, whichever has fewer, in any order of summation; the squares in column j of R sum to at most
-a_jj / (1 - gamma). With c_j non-zeros in column j of R and at most p in a row, Cauchy-Schwarz bounds
-
-    v^T |E| v <= sum_k (sum_j sqrt(gamma_(c_j)) |R_kj| |v_j|)^2 <= sum_j epsilon_j a_jj v_j^2,
-    epsilon_j = p gamma_(c_j) / (1 - gamma_(c_j)).
-
-A bound a row, not one for all: a loop leaves one long column beside thousands of short ones.
+Every factor knows how far it can be from exact (`pgo_models.floating_point`), so that one that went through
+proves something in exact arithmetic.
 """
 
 from __future__ import annotations
@@ -22,30 +14,16 @@ import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from types import ModuleType
-from typing import Protocol, overload
+from typing import Protocol
 
 import numpy as np
 from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 
 from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError
+from pgo_models.floating_point import OUTWARD, UNIT_ROUNDOFF, FactorCounts, error_of_counts, gamma
 from pgo_models.rotations import Array
-
-UNIT_ROUNDOFF = 2.0**-53
-# A bound is a sum of non-negative terms of fewer than 2^20 operations each: this makes up for its own rounding.
-OUTWARD = 1.0 + 2.0**-30
-
-
-@overload
-def gamma(count: float) -> float: ...
-@overload
-def gamma(count: Array) -> Array: ...
-def gamma(count: float | Array) -> float | Array:
-    """Relative error that k roundings make at most, k u / (1 - k u), rounded up."""
-    return count * UNIT_ROUNDOFF / (1.0 - count * UNIT_ROUNDOFF) * OUTWARD
-
 
 _PERMUTE, _FORWARD = 7, 4  # CVXOPT's codes of x = P b and L x = b
 
@@ -94,8 +72,9 @@ class CholeskyFactor(ABC):
     def backward_error(self, beside: Array | int = 0) -> Array:
         """Shares epsilon, (N,), of the diagonal with A + diag(epsilon) diag(A) >= R^T R in exact arithmetic.
 
-        R is the computed factor, so that A + diag(epsilon) diag(A) is positive definite. See the file's opening for the
-        argument; it holds for diagonals between 1e-150 and 1e150, where nothing underflows that would count.
+        R is the computed factor, so that A + diag(epsilon) diag(A) is positive definite. The
+        argument (`pgo_models.floating_point`) holds for diagonals between 1e-150 and 1e150, where nothing underflows
+        that would count.
 
         Parameters
         ----------
@@ -193,20 +172,6 @@ def is_positive_definite(matrix: csc_array, backend: CholeskyBackend | None = No
     return True
 
 
-def column_error(in_column: Array, most_in_row: float) -> Array:
-    """Share p gamma of the squares in columns with so many non-zeros: a bound on E there (the file's opening)."""
-    # Beside the sum: a root or division, one by a rounded reciprocal, scaling, and underflow, which is less than these.
-    share: Array = OUTWARD * most_in_row * gamma(in_column + 6.0)
-    return share
-
-
-def _error_of_counts(in_column: Array, most_in_row: float) -> Array:
-    """Bound epsilon of the file's opening from the non-zeros of R."""
-    # Beside the sum: a root or division, one by a rounded reciprocal, and underflow, which is less than a rounding.
-    each = gamma(in_column + 3.0)
-    return np.where(each < 0.5, OUTWARD * most_in_row * each / (1.0 - np.minimum(each, 0.5)), np.inf)
-
-
 class _SuperLUFactor(CholeskyFactor):
     def __init__(self, lu: SuperLU, order: np.ndarray, diagonal: Array) -> None:
         self._lu = lu
@@ -245,7 +210,7 @@ class _SuperLUFactor(CholeskyFactor):
         error = np.empty(len(a))
         error[self._rows] = OUTWARD * 0.5 * (of_L / balance + balance * of_W)
         if np.any(beside):
-            error[self._rows] += _error_of_counts(np.diff(L.indptr), self.most_in_row(beside))
+            error[self._rows] += error_of_counts(np.diff(L.indptr), self.most_in_row(beside))
         return error
 
     def solve(self, right_hand_side: Array) -> Array:
@@ -317,23 +282,6 @@ class _CholmodFactor(CholeskyFactor):
         return np.array(solution).reshape(right_hand_side.shape)
 
 
-@dataclass(frozen=True, eq=False)
-class _Counts:
-    """Non-zeros in the columns and rows of R, in the order of elimination, and which row of A comes when."""
-
-    in_column: Array
-    in_row: Array
-    order: Array
-
-    def most_in_row(self, beside: Array | int) -> float:
-        return float((self.in_row + beside).max(initial=0))
-
-    def error(self, beside: Array | int) -> Array:
-        found = np.empty(len(self.order))
-        found[self.order] = _error_of_counts(self.in_column, self.most_in_row(beside))
-        return found
-
-
 class _Cholmod(SymbolicCholesky):
     """Supernodal L L^T of the lower triangle; AMD order."""
 
@@ -349,12 +297,12 @@ class _Cholmod(SymbolicCholesky):
         )
         # Symbolic parts with the factor that uses each. No finaliser gives them back: Ctrl-C in one would be lost.
         self._taken: list[tuple[weakref.ref[_CholmodFactor] | None, _Capsule]] = [(None, self._analyze())]
-        self._counts: _Counts | None = None
+        self._counts: FactorCounts | None = None
 
     def expected_error(self, beside: int = 0) -> Array | None:
         return self.counts().error(beside)
 
-    def counts(self) -> _Counts:
+    def counts(self) -> FactorCounts:
         """Counts of every factor with this pattern."""
         if self._counts is None:
             # CVXOPT shows the non-zeros of a numeric factor alone, and takes it apart. One out of use will do.
@@ -363,13 +311,13 @@ class _Cholmod(SymbolicCholesky):
             order = cvxopt.matrix(np.arange(self._shape[0], dtype=float))
             try:
                 cholmod.solve(capsule, order, sys=_PERMUTE)
-            except ValueError:  # it is symbolic
+            except (ValueError, ArithmeticError):  # it is symbolic, or of a matrix that was not positive definite
                 capsule = self._numeric(np.where(self._is_diagonal, 1.0, 0.0), capsule)
                 cholmod.solve(capsule, order, sys=_PERMUTE)
             pointers, rows, _ = cholmod.getfactor(capsule).CCS
             in_row = np.diff(np.array(pointers).ravel())
             in_column = np.bincount(np.array(rows).ravel(), minlength=len(in_row))
-            self._counts = _Counts(
+            self._counts = FactorCounts(
                 in_column.astype(float), in_row.astype(float), np.array(order).ravel().astype(np.int64)
             )
         return self._counts

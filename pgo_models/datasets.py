@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 
 from pgo_models.errors import DatasetError, FileFormatError
 from pgo_models.files import replace_when_done
-from pgo_models.g2o import RotationWeight, read_g2o
+from pgo_models.g2o import read_g2o
 from pgo_models.pose_graph import PoseGraph
+from pgo_models.precisions import RotationWeight
 from pgo_models.trajectories import read_tum
 
 if TYPE_CHECKING:

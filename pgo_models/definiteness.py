@@ -16,8 +16,9 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import LinearOperator, cg
 
-from pgo_models.cholesky import OUTWARD, CholeskyFactor
+from pgo_models.cholesky import CholeskyFactor
 from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.floating_point import OUTWARD
 from pgo_models.multipliers import certificate_matrix
 from pgo_models.pose_graph import IntArray
 from pgo_models.problem import PGOProblem

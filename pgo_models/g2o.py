@@ -7,7 +7,6 @@ with RotationWeight.GAUSSIAN.
 
 from __future__ import annotations
 
-import enum
 import os
 import re
 import warnings
@@ -16,34 +15,17 @@ from pathlib import Path
 
 import numpy as np
 
-from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOError, SettingError
+from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOError
 from pgo_models.files import check_writable, replace_when_done
 from pgo_models.g2o_lines import G2OLines, IntArray, information_of, poses_of, read_lines
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
+from pgo_models.precisions import RotationWeight, isotropic_information, precisions
 from pgo_models.rotations import Array, log_map, quaternions_from_rotations
 
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
 MOST_SYMBOLS = len(_LETTERS)  # robots whose poses can be named by GTSAM symbols
 _LETTER_SHIFT = 56  # a GTSAM symbol is a letter in the top byte and an index below it
-
-
-class RotationWeight(enum.Enum):
-    """What kappa becomes of I_theta in the plane; in space both are kappa = 3 / (2 tr(I_rr^-1)).
-
-    A rotation error theta costs kappa ||R - I||_F^2 = 4 kappa (1 - cos theta), about 2 kappa theta^2. A Gaussian says
-    I_theta theta^2 (F has no factor 1/2, nor has tau ||.||^2), so that kappa = I_theta / 2, as it is in space.
-    SE-Sync's kappa = I_theta counts rotations twice against translations; published optima of 2D graphs are with it.
-
-    Examples
-    --------
-    >>> information = np.diag([4.0, 4.0, 6.0])[None]
-    >>> [float(precisions(information, weights)[0][0]) for weights in RotationWeight]
-    [6.0, 3.0]
-    """
-
-    SE_SYNC = "kappa = I_theta in the plane"
-    GAUSSIAN = "kappa = I_theta / 2 in the plane"
 
 
 def read_g2o(path: Path | str, weights: RotationWeight = RotationWeight.SE_SYNC) -> PoseGraph:
@@ -228,37 +210,6 @@ def check_g2o_folder(folder: Path | str, num_robots: int) -> None:
         raise PGOError(f"cannot write {folder}: it holds another graph's {min(strangers)}; choose an empty folder")
 
 
-def precisions(information: Array, weights: RotationWeight = RotationWeight.SE_SYNC) -> tuple[Array, Array]:
-    """(kappa, tau), each (m,), of information matrices (m, 3, 3) in the plane or (m, 6, 6) in space.
-
-    d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I_tt^-1), kappa as `weights` say.
-    The blocks themselves are inverted, not the marginal information. Per radian^2 and per metre^2.
-
-    Raises
-    ------
-    SettingError
-        When weights is no RotationWeight.
-
-    Examples
-    --------
-    >>> precisions(np.diag([4.0, 4.0, 4.0, 6.0, 6.0, 6.0])[None])
-    (array([3.]), array([4.]))
-    """
-    if not isinstance(weights, RotationWeight):
-        raise SettingError(f"weights is {weights!r}; give RotationWeight.SE_SYNC or RotationWeight.GAUSSIAN")
-    if information.shape[-1] == 3:
-        share = 0.5 if weights is RotationWeight.GAUSSIAN else 1.0
-        return share * information[:, 2, 2], 2.0 / _trace_of_inverse(information[:, :2, :2])
-    tau = 3.0 / _trace_of_inverse(information[:, :3, :3])
-    return 1.5 / _trace_of_inverse(information[:, 3:, 3:]), tau
-
-
-def isotropic_information(kappa: Array, tau: Array, d: int) -> Array:
-    """Diagonal information matrices, (m, 3, 3) or (m, 6, 6), whose `precisions` are kappa and tau."""
-    diagonal = [tau, tau, kappa] if d == 2 else [tau, tau, tau, 2 * kappa, 2 * kappa, 2 * kappa]
-    return np.asarray(np.stack(diagonal, axis=1)[:, :, None] * np.eye(len(diagonal)))
-
-
 def symbol_ids(robots: IntArray) -> IntArray:
     """GTSAM symbols a0, a1, .., b0, .. for poses owned by `robots`, (n,): up to 26 robots a to z, up to 52 A to z.
 
@@ -293,10 +244,6 @@ def pose_names(graph: PoseGraph) -> list[str]:
     if not all(id_ >> _LETTER_SHIFT in map(ord, _LETTERS) for id_ in ids):
         return [str(id_) for id_ in ids]
     return [f"{chr(id_ >> _LETTER_SHIFT)}{id_ & ((1 << _LETTER_SHIFT) - 1)}" for id_ in ids]
-
-
-def _trace_of_inverse(A: Array) -> Array:
-    return np.asarray(np.trace(np.linalg.inv(A), axis1=1, axis2=2))
 
 
 def _name_of(path: Path) -> str:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.cholesky import OUTWARD, UNIT_ROUNDOFF, gamma
+from pgo_models.floating_point import OUTWARD, UNIT_ROUNDOFF, gamma
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem

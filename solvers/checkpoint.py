@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pgo_models.certificate import BoundSource, Certificate, Verdict
 from pgo_models.errors import FileFormatError, PGOError, SettingError
 from pgo_models.files import replace_when_done
+from pgo_models.lower_bound import LowerBound
 from pgo_models.partition import Partition, PartitionMethod
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
@@ -107,7 +108,19 @@ class Saved:
 
 
 _CLASSES = (
-    *(Saved, DriverMemory, Poses, Certificate, BoundSource, Verdict, Ledger, Traffic, RotationBlock, AndersonShare),
+    *(
+        Saved,
+        DriverMemory,
+        Poses,
+        Certificate,
+        LowerBound,
+        BoundSource,
+        Verdict,
+        Ledger,
+        Traffic,
+        RotationBlock,
+        AndersonShare,
+    ),
     *(Stage, Status, History, Record, Measurement, AndersonSums, InterfaceFactor, TreeFactor),
     *(SubstructuredState, ConsensusState, SubstructuredNewtonState, Partition, PartitionMethod),
     *(SOC, Newton, Anderson, Coupling, RStep, MultiplierPenalty, FixedPenalty, BalancedPenalty),

@@ -14,9 +14,9 @@ from functools import partial
 
 import numpy as np
 
-from pgo_models.cholesky import OUTWARD, UNIT_ROUNDOFF, gamma
 from pgo_models.definiteness import FIRST_SHIFT, LEAST_SHIFT, MARGIN, SHRINK
 from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.floating_point import OUTWARD, UNIT_ROUNDOFF, gamma
 from pgo_models.lower_bound import (
     MOST_MOVES,
     NO_BOUND,
@@ -65,7 +65,7 @@ def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
 def prove_with_eta(driver: Driver, eta: float) -> LowerBound | None:
     """Bound tr(Lambda) - eta n d if S + eta blockdiag(0, I) without a translation is positive definite: one round."""
     none = np.zeros(0, dtype=np.int64)
-    message = {"fixed": _is_fixed(driver, none), "eta": np.array([eta]), "is_grounded": np.zeros(1)}
+    message = {"fixed": _is_fixed(driver, none), "eta": np.array([eta])}
     fixed = driver.ground(1).ravel()
     message["fixed"][fixed] = True
     proof = _eliminate(driver, message, fixed, eta, UNGROUNDED_SHIFT)
@@ -83,7 +83,7 @@ def prove_grounded(driver: Driver, eta: float) -> LowerBound | None:
     R, t = driver.R[r], driver.t[r]
     X = np.concatenate([(driver.t - t) @ R, stack_transposes(R.T @ driver.R)])
     X[fixed] = np.concatenate([np.zeros((1, d)), np.eye(d)])
-    message = {"fixed": _is_fixed(driver, fixed), "eta": np.array([eta]), "is_grounded": np.ones(1), "R": R, "t": t}
+    message = {"fixed": _is_fixed(driver, fixed), "eta": np.array([eta])}
     share, proof = FIRST_SHIFT, None
     while proof is None:
         if share < LEAST_SHIFT:

@@ -349,7 +349,7 @@ class Driver:
     def state_of(self, answers: Sequence[Message]) -> tuple[float, float, Array]:
         """F, its rounding level, and the rows of M X on the cover."""
         objective = math.fsum(float(answer["objective"][0]) for answer in answers)
-        level = math.fsum(float(answer["objective"][1]) for answer in answers)
+        level = math.fsum(float(answer["level"][0]) for answer in answers)
         return objective, level, self.interface(1, self.d).gather([answer["force"] for answer in answers])
 
     def scattered_rotations(self, z: Array) -> list[Message]:

@@ -22,8 +22,8 @@ from pgo_models.multipliers import certificate_matrix, multipliers
 from pgo_models.polish import retract
 from pgo_models.poses import Poses
 from pgo_models.rotations import Array, project_to_rotations, stack_transposes, tangent_dimension, unstack_transposes
-from pgo_models.rounding_errors import evaluate_certificate, rounding_level
-from solvers.robot_proof import RobotProof, verify_interior
+from pgo_models.rounding_errors import rounding_level
+from solvers.robot_proof import RobotProof, begin_proof, verify_interior
 from solvers.rotation_block import RotationBlock, block_at, stationary_B
 from solvers.share import Part, Share
 from solvers.substructure import Cut, Elimination, columns_of, eliminate
@@ -233,38 +233,25 @@ class Robot:
     # Certificate and answer.
 
     def certificate(self, message: Message) -> Message:
-        """S + eta blockdiag(0, I) with a share of its diagonal subtracted in the interior, and the interior eliminated.
-
-        `fixed` are rows of the driver that are left out; there is none of the first translation of the graph if a robot
-        has it. With `point`, rows of X of the separators in the frame of the pose that is left out, the right-hand side
-        is S X.
-        """
-        d, p = self.problem.d, self.problem.num_poses
-        Lambda = self._multipliers()
+        """Eliminate S for a proof, and with `point` begin one (`solvers.robot_proof`)."""
+        d, Lambda = self.problem.d, self._multipliers()
         Lambda[self.part.boundary] = 0.0
-        Lambda = 0.5 * (Lambda + np.swapaxes(Lambda, 1, 2))
         trace = np.array([math.fsum(np.einsum("naa->na", Lambda).ravel())])
         self._proof = None
         fixed = self._cuts[(1, d)].boundary[message["fixed"] > 0]
-        if not message["is_grounded"][0] and self._grounds:
-            fixed = np.append(fixed, 0)
+        fixed = np.append(fixed, 0) if "point" not in message and self._grounds else fixed
         S = certificate_matrix(self.problem, Lambda)
         S.data[self.problem.diagonal_positions[self._interior_rows]] += message["eta"][0]
-        interior = self._cuts[(1, d)].interior
         found = verify_interior(self.problem, S, self._cuts[(1, d)], fixed, message["share"][0], self.backend)
         if found is None:
             return {"definite": np.zeros(1), "trace": trace}
         matrix, self._elimination, slack = found
-        self._eliminated = matrix, (1, d)
-        self._cuts[(1, d)] = self._elimination.cut
+        self._eliminated, self._cuts[(1, d)] = (matrix, (1, d)), self._elimination.cut
         answer = {"schur": self._elimination.schur, "definite": np.ones(1), "trace": trace}
-        if not message["is_grounded"][0]:
-            return answer
-        R, t = message["R"], message["t"]
-        X = Poses(R.T @ self.poses.R, (self.poses.t - t) @ R).stacked()
-        X[self._cuts[(1, d)].boundary] = message["point"]
-        self._proof = RobotProof(Lambda, X, X, np.zeros((p, d)), slack, interior)
-        return {**answer, **self._evaluated()}
+        if "point" in message:
+            self._proof = begin_proof(self.part, self.poses, Lambda, slack, self._elimination.cut, message["point"])
+            answer |= self._evaluated()
+        return answer
 
     def move_certificate(self, message: Message) -> Message:
         """Move X by -S_r^-1 G: parts of the bound there."""
@@ -273,13 +260,9 @@ class Robot:
         return self._evaluated()
 
     def _evaluated(self) -> Message:
-        """Value with its error, the interior's sums, and S X on the boundary with its error; G reduced."""
         assert self._proof is not None
-        proof, boundary = self._proof, self._cuts[(1, self.problem.d)].boundary
-        found = evaluate_certificate(self.problem, proof.Lambda, proof.X, proof.low)
-        figures = np.array([found.value, found.value_error, *proof.quadratics(found), proof.squared_distances()])
-        sums = {"figures": figures, "product": found.product[boundary], "error": found.product_error[boundary]}
-        return {**sums, **self._reduced(found.product)}
+        sums, product = self._proof.evaluated(self.problem, self._cuts[(1, self.problem.d)].boundary)
+        return {**sums, **self._reduced(product)}
 
     def result(self) -> Message:
         """Interior poses and multipliers, for whoever may see them."""
@@ -401,8 +384,8 @@ class Robot:
     def _state_of(self, poses: Poses) -> Message:
         """Parts of F and of M X on the boundary."""
         force = self.problem.apply_M(self.problem.stacked(poses))[self._cuts[(1, self.problem.d)].boundary]
-        objective = np.array([self.problem.objective(poses), rounding_level(self.problem, poses)])
-        return {"objective": objective, "force": force}
+        objective, level = self.problem.objective(poses), rounding_level(self.problem, poses)
+        return {"objective": np.array([objective]), "level": np.array([level]), "force": force}
 
     def _multipliers(self) -> Array:
         """Lambda_i, right in the interior alone, where the robot has every edge."""

@@ -7,14 +7,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.cholesky import OUTWARD, CholeskyBackend
+from pgo_models.cholesky import CholeskyBackend
 from pgo_models.definiteness import MARGIN
 from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.floating_point import OUTWARD
 from pgo_models.lower_bound import squared_distances
 from pgo_models.pose_graph import IntArray
+from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array
-from pgo_models.rounding_errors import Evaluation, matrix_error
+from pgo_models.rounding_errors import evaluate_certificate, matrix_error
+from solvers.share import Part
 from solvers.substructure import Cut, Elimination, eliminate
 
 _ATTEMPTS = 3  # the error of a factor is known when it is there, and hardly changes with the shift
@@ -52,16 +55,35 @@ class RobotProof:
         X[p:] -= step[p:]
         return replace(self, X=X, low=self.low - step[:p])
 
-    def quadratics(self, found: Evaluation) -> tuple[float, float]:
-        """Sums of |G|^2 and (|G| + its error)^2 over slack, G the interior's rows of S X."""
-        G, error = found.product[self.interior], found.product_error[self.interior]
-        slack = self.slack[:, None]
-        return float(np.sum(G**2 / slack)), OUTWARD * float(np.sum((np.abs(G) + error) ** 2 / slack))
+    def evaluated(self, problem: PGOProblem, boundary: IntArray) -> tuple[dict[str, Array], Array]:
+        """Parts of the bound at X, and S X.
 
-    def squared_distances(self) -> float:
-        """`pgo_models.lower_bound.squared_distances` of the interior."""
+        `figures` are the value of `evaluate_certificate` with its error and, of the interior alone, sums of |G|^2 and
+        (|G| + its error)^2 over slack, G the rows of S X, and the squared distances that an eta costs. `product` and
+        `error` are the rows of S X on the boundary.
+        """
+        found = evaluate_certificate(problem, self.Lambda, self.X, self.low)
+        G, error, slack = found.product[self.interior], found.product_error[self.interior], self.slack[:, None]
+        left, quadratic = float(np.sum(G**2 / slack)), OUTWARD * float(np.sum((np.abs(G) + error) ** 2 / slack))
         rotations = self.interior[self.interior >= len(self.low)]
-        return squared_distances(self.X[rotations], self.start[rotations])
+        apart = squared_distances(self.X[rotations], self.start[rotations])
+        figures = np.array([found.value, found.value_error, left, quadratic, apart])
+        sums = {"figures": figures, "product": found.product[boundary], "error": found.product_error[boundary]}
+        return sums, found.product
+
+
+def begin_proof(part: Part, poses: Poses, Lambda: Array, slack: Array, cut: Cut, point: Array) -> RobotProof:
+    """Proof at given poses, turned to the frame in which the driver gives the rows of X on the boundary, `point`.
+
+    One separator is enough to know that frame: with its pose (R, t) here and its rows s and P^T there, it is turned by
+    R P^T and lies at t - R P^T s.
+    """
+    d, g = poses.d, len(part.boundary)
+    first = part.boundary[0]
+    R = poses.R[first] @ point[g : g + d]
+    X = Poses(R.T @ poses.R, (poses.t - poses.t[first]) @ R + point[0]).stacked()
+    X[cut.boundary] = point
+    return RobotProof(Lambda, X, X, np.zeros((poses.num_poses, d)), slack, cut.interior)
 
 
 def verify_interior(

@@ -17,7 +17,7 @@ from pgo_models.cholesky import CholeskyFactor
 from pgo_models.errors import SettingError
 from pgo_models.initialization import chordal_start
 from pgo_models.lifted import LiftedPoint, hessian_product, lifted_point
-from pgo_models.lower_bound import LowerBound, best_bound, smallest_shift
+from pgo_models.lower_bound import NO_BOUND, LowerBound, best_bound, smallest_shift
 from pgo_models.matrices import inner
 from pgo_models.multipliers import factorize_certificate
 from pgo_models.negative_curvature import NegativeCurvature, negative_curvature
@@ -228,6 +228,8 @@ class Staircase:
     def _climb(self, problem: PGOProblem, state: StaircaseState) -> StaircaseState:
         """Prove that the relaxation is solved, or leave along the eigenvector that shows it is not."""
         point, eta = state.point, smallest_shift(problem, self.gap, state.point.value)
+        if point.value <= state.rounding_level:
+            return replace(state, k=state.k + 1, bound=DualBound(NO_BOUND, point.Lambda), is_solved=True)
         at_poses = self.poses(problem, state) if point.rank == problem.d else None
         proven = best_bound(problem, point.Lambda, at_poses, self.gap, point.value)
         bound = state.bound

@@ -18,17 +18,9 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csc_array, csr_array
 
-from pgo_models.cholesky import (
-    OUTWARD,
-    UNIT_ROUNDOFF,
-    CholeskyBackend,
-    CholeskyFactor,
-    SymbolicCholesky,
-    analyze,
-    column_error,
-    gamma,
-)
+from pgo_models.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, analyze
 from pgo_models.errors import SettingError
+from pgo_models.floating_point import OUTWARD, UNIT_ROUNDOFF, column_error, gamma
 from pgo_models.matrices import inner
 from pgo_models.pose_graph import IntArray
 from pgo_models.rotations import Array
@@ -105,8 +97,9 @@ def eliminate(K: csc_array, cut: Cut, backend: CholeskyBackend | None, is_verifi
     """Factor the interior of a robot's matrix and form its Schur complement.
 
     K_GG - Z^T Z with Z = R^-T K_IG, R^T R = K_II, by forward substitution alone: [R, Z] are rows of the Cholesky
-    factor of the whole. So its rounding is that of one (`pgo_models.cholesky`), and with `is_verified` what rounding
-    can take of the separators' part is subtracted from the diagonal of the Schur complement: for the given K, exactly,
+    factor of the whole. So its rounding is that of one (`pgo_models.floating_point`), and with `is_verified` what
+    rounding can take of the separators' part is subtracted from the diagonal of the Schur complement: for the given K,
+    exactly,
 
         x^T K x >= x_G^T schur x_G - x_I^T diag(interior_error) diag(K_II) x_I.
 

@@ -36,6 +36,9 @@ STAR = {  # to and from whoever sums up: settings, figures of all poses in no or
         "size",
         "ratio",
         "objective",
+        "level",
+        "figures",
+        "share",
         "sums",
         "gamma",
         "is_best",
@@ -45,7 +48,17 @@ STAR = {  # to and from whoever sums up: settings, figures of all poses in no or
     ),
 }
 ROUNDS = (  # orders that are, or end, a round
-    *("project", "settle", "move", "weigh", "certificate", "adopt", "copies.begin", "copies.penalize"),
+    *(
+        "project",
+        "settle",
+        "move",
+        "weigh",
+        "certificate",
+        "move_certificate",
+        "adopt",
+        "copies.begin",
+        "copies.penalize",
+    ),
     *("copies.extrapolate", "copies.back_at_best"),
 )
 ENDS, POSES = ("copies.begin", "copies.finish"), ("R", "t", "cover", "schur", "b")  # with the driver, at the cover
@@ -120,8 +133,8 @@ def test_rounds_of_a_whole_solve_are_as_documented() -> None:
     assert solution.ledger is not None
     assert engine.times("copies.begin", "copies.back_at_best") == 1  # no refresh, no raise
     assert [record.measurement.rounds for record in stage.history.records] == [4 + k for k in range(len(stage.history))]
-    # 2 to start, 2 for poses and penalties, 1 a step, 2 for the result of SOC, 2 a move of Newton, 1 for the proof.
-    assert solution.ledger.rounds == 2 + (2 + stage.iterations + 2) + 2 * engine.times("move") + 1
+    # 2 to start, 2 for poses and penalties, 1 a step, 2 for the result of SOC, 2 a move of Newton, 2 for the proof.
+    assert solution.ledger.rounds == 2 + (2 + stage.iterations + 2) + 2 * engine.times("move") + 2
     assert solution.ledger.all_reduces == 3 + 2 * stage.iterations
 
 

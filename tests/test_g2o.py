@@ -9,19 +9,11 @@ from hypothesis import strategies as st
 
 from pgo_models.datasets import load
 from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOError, SettingError
-from pgo_models.g2o import (
-    RotationWeight,
-    isotropic_information,
-    precisions,
-    read_g2o,
-    read_g2o_poses,
-    symbol_ids,
-    write_g2o,
-    write_g2o_folder,
-)
+from pgo_models.g2o import read_g2o, read_g2o_poses, symbol_ids, write_g2o, write_g2o_folder
 from pgo_models.grid_world import grid_world
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
+from pgo_models.precisions import RotationWeight, isotropic_information, precisions
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import exp_map
 from pgo_models.scenes import random_geometric

@@ -92,7 +92,7 @@ def test_the_decrement_predicts_what_is_left(seed: int, n: int, d: int) -> None:
     best = polish(problem, chordal_start(problem))
     rng = np.random.default_rng(seed)
     near = retract(best, 1e-4 * rng.standard_normal((n, tangent_dimension(d))), 1e-4 * rng.standard_normal((n, d)))
-    left = (problem.objective(near) - problem.objective(best)) / max(1.0, problem.objective(near))
+    left = (problem.objective(near) - problem.objective(best)) / problem.objective(near)
     # To first order in the distance, 1e-4, times the condition of the random weights.
     assert relative_decrement(problem, near) == pytest.approx(left, rel=0.05, abs=1e-12)
 

@@ -44,8 +44,9 @@ def test_three_roads_lead_to_one_optimum(seed: int, n: int, d: int, form: Relaxa
     allowed = DEFAULT_RELAXATION_GAP * max(1.0, F)
     assert solved.is_certified
     assert restarts(problem, 12, seed) == pytest.approx(F, abs=1e-6 * max(1.0, F))
-    assert relaxed.verdict is Verdict.CERTIFIED
-    assert relaxed.gap_to(solved.poses) <= DEFAULT_RELAXATION_GAP
+    if solved.certificate.verdict is not Verdict.EXACT:  # else the relaxation's poses are exact to its accuracy alone
+        assert relaxed.verdict is Verdict.CERTIFIED
+        assert relaxed.gap_to(solved.poses) <= DEFAULT_RELAXATION_GAP
     assert relaxed.lower_bound <= F
     assert relaxed.objective == pytest.approx(F, abs=allowed)
     if relaxed.status is RelaxationStatus.OPTIMAL:
@@ -134,7 +135,8 @@ def test_time_is_limited() -> None:
 @pytest.mark.parametrize("form", list(RelaxationForm))
 def test_measurements_without_noise_cost_nothing(form: RelaxationForm) -> None:
     solution = solve_relaxation(PGOProblem(exact_graph(3, 6, 3)), form, SDPSolver.CLARABEL)
-    assert solution.verdict is Verdict.CERTIFIED
+    assert solution.verdict in (Verdict.EXACT, Verdict.TRIVIAL)  # of zero nothing better than zero is a bound
+    assert solution.lower_bound == 0.0
     assert solution.objective <= 1e-6
     assert abs(solution.value) <= 1e-5
 
@@ -180,7 +182,7 @@ def test_the_choice_follows_the_cliques() -> None:
 
 
 def test_the_reason_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    solution = solve_relaxation(varied_problem(0, 4, 2), verbose=True)
+    solution = solve_relaxation(varied_problem(1, 8, 2), verbose=True)
     printed = capsys.readouterr().out
     assert solution.plan.reason in printed
     assert "verdict      CERTIFIED" in printed

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pgo_models.errors import SettingError
-from pgo_models.g2o import isotropic_information, precisions
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
+from pgo_models.precisions import isotropic_information, precisions
 from pgo_models.rotations import log_map
 from pgo_models.scenes import NoiseModel, circle, grid, observe, random_geometric, sphere
 

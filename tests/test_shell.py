@@ -103,12 +103,12 @@ def test_a_signal_between_the_loops_leaves_the_best_poses(monkeypatch):
 
     graph = scenes.grid(np.random.default_rng(0))
     whole = pipeline.solve(graph)
-    monkeypatch.setattr(pipeline, "certify_stationary", broken_off)
+    monkeypatch.setattr(pipeline, "certify_at", broken_off)
     solution = pipeline.solve(graph)
     assert solution.status.name == "INTERRUPTED"
     assert solution.objective == pytest.approx(whole.objective, rel=1e-12)
     assert (solution.lower_bound, solution.certificate.verdict.name) == (0.0, "TRIVIAL")
-    monkeypatch.setattr(distributed, "prove_bound_distributed", broken_off)
+    monkeypatch.setattr(distributed, "best_bound_distributed", broken_off)
     shared = pipeline.solve(graph, robots=3)
     assert (shared.status.name, shared.lower_bound) == ("INTERRUPTED", 0.0)
     assert shared.objective == pytest.approx(whole.objective, rel=1e-12)

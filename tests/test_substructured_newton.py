@@ -19,6 +19,7 @@ from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import tangent_dimension
+from pgo_models.rounding_errors import rounding_level
 from pgo_models.scenes import NoiseModel
 from solvers.distributed import collect, open_driver
 from solvers.driver import Driver
@@ -53,6 +54,8 @@ def check(problem: PGOProblem, parts: Partition, start: Poses, newton: Newton, s
         objective = one.polish.objective
         assert other.k == one.k
         assert other.objective == pytest.approx(objective, rel=1e-7, abs=1e-12)
+        if objective <= 1e6 * rounding_level(problem, one.polish.poses):  # an optimum of zero: F is rounding, too
+            break
         assert other.decrement == pytest.approx(one.polish.decrement, rel=1e-5, abs=1e-13)
         if one.polish.decrement <= 1e-10:  # what is left is rounding
             break
