@@ -125,10 +125,10 @@ def test_its_bound_holds_at_any_noise_and_start(seed: int, n: int, d: int) -> No
     problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE))
     result = run(Staircase(), problem, random_poses(n, d, seed))
     bound = result.state.bound
-    assert result.status is Status.CONVERGED
     assert bound is not None
-    level = result.state.rounding_level
-    assert result.state.point.value - bound.lower_bound <= DEFAULT_GAP * result.state.point.value + level
+    if result.objective > 1e-15:  # else the graph is a tree, or as good as one, and no bound is better than zero
+        assert result.status is Status.CONVERGED
+        assert result.state.point.value - bound.lower_bound <= DEFAULT_GAP * result.state.point.value
     for k in range(4):
         best = polish(problem, problem.with_best_translations(random_poses(n, d, seed + k).R))
         assert bound.lower_bound <= rounded_up(problem, best)
