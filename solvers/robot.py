@@ -18,7 +18,7 @@ from scipy.sparse import csc_array
 from pgo_models.cholesky import CholeskyBackend
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.hessian import TangentLayout, riemannian_hessian
-from pgo_models.multipliers import certificate_matrix, multipliers
+from pgo_models.multipliers import multipliers
 from pgo_models.polish import retract
 from pgo_models.poses import Poses
 from pgo_models.rotations import Array, project_to_rotations, stack_transposes, tangent_dimension, unstack_transposes
@@ -246,10 +246,8 @@ class Robot:
         fixed = self._cuts[(1, d)].boundary[message["fixed"] > 0]
         if not message["is_grounded"][0] and self._grounds:
             fixed = np.append(fixed, 0)
-        S = certificate_matrix(self.problem, Lambda)
-        S.data[self.problem.diagonal_positions[self._interior_rows]] += message["eta"][0]
-        interior = self._cuts[(1, d)].interior
-        found = verify_interior(self.problem, S, self._cuts[(1, d)], fixed, message["share"][0], self.backend)
+        eta, share, cut = message["eta"][0], message["share"][0], self._cuts[(1, d)]
+        found = verify_interior(self.problem, Lambda, eta, cut, fixed, share, self.backend)
         if found is None:
             return {"definite": np.zeros(1), "trace": trace}
         matrix, self._elimination, slack = found
@@ -261,7 +259,7 @@ class Robot:
         R, t = message["R"], message["t"]
         X = Poses(R.T @ self.poses.R, (self.poses.t - t) @ R).stacked()
         X[self._cuts[(1, d)].boundary] = message["point"]
-        self._proof = RobotProof(Lambda, X, np.zeros((p, d)), slack, interior)
+        self._proof = RobotProof(Lambda, X, np.zeros((p, d)), slack, cut.interior)
         return {**answer, **self._evaluated()}
 
     def move_certificate(self, message: Message) -> Message:
