@@ -152,7 +152,7 @@ def search_bound(prove: Callable[[float], LowerBound | None], smallest: float, t
     trace, count : float, int
         tr(Lambda) and n d.
     """
-    eta, too_small = smallest, math.nan
+    eta, too_small = max(smallest, UNIT_ROUNDOFF * trace / count), math.nan  # at F = 0 the smallest would never grow
     bound = None
     while bound is None:
         if not trace - eta * count > 0.0:
