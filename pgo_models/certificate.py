@@ -67,7 +67,7 @@ class Certificate:
     Attributes
     ----------
     objective : float
-        F of the poses that were given.
+        F of the poses that were given, their rotations made exact.
     bound : LowerBound
         Proven: F(R, t) >= bound.value for every choice of poses, in exact arithmetic.
     gap : float
@@ -219,6 +219,7 @@ def certify(problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP) -> Cert
     >>> certificate.verdict.name, certificate.source.name, bool(0 < certificate.lower_bound < certificate.objective)
     ('NOT_CERTIFIED', 'POLISHED', True)
     """
+    poses = poses.with_exact_rotations()
     stationarity = relative_decrement(problem, poses)
     if stationarity <= STATIONARY_DECREMENT:
         certificate = certify_at(problem, poses, gap, stationarity)
@@ -263,6 +264,7 @@ def certify_at(
     >>> bool(0.9 * certificate.objective < certificate.lower_bound <= certificate.objective)
     True
     """
+    poses = poses.with_exact_rotations()
     Lambda = multipliers(problem, problem.with_best_translations(poses.R))
     return certify_with(problem, poses, Lambda, gap, stationarity, BoundSource.GIVEN)
 
@@ -290,6 +292,7 @@ def certify_with(
     """
     if not 0 < gap < math.inf:
         raise SettingError(f"gap is {gap}; give a positive relative gap, as 1e-6")
+    poses = poses.with_exact_rotations()
     objective = problem.objective(poses)
     unjudged = Certificate(
         objective=objective,
@@ -315,6 +318,7 @@ def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certif
     ProofError
         When F of the poses is below the bound by more than the rounding of F: then one of the two is wrong.
     """
+    poses = poses.with_exact_rotations()
     objective, rounding = problem.objective(poses), objective_rounding(problem, poses)
     bound = certificate.bound
     if bound.value > objective + rounding.error:

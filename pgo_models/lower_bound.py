@@ -192,7 +192,7 @@ class _Ground:
 def _grounded_at(problem: PGOProblem, poses: Poses) -> _Ground:
     n, d = problem.num_poses, problem.d
     r = middle_pose(problem.graph)
-    turned = problem.with_best_translations(poses.with_gauge_at(r).R)
+    turned = problem.with_best_translations(poses.with_exact_rotations().with_gauge_at(r).R)
     X = problem.stacked(Poses(turned.R, turned.t - turned.t[r]))
     rows = pose_rows(r, n, d)
     X[rows] = np.concatenate([np.zeros((1, d)), np.eye(d)])

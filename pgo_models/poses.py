@@ -17,6 +17,7 @@ from pgo_models.rotations import (
 )
 
 ROTATION_TOLERANCE = 1e-6
+ROTATION_ROUNDING = 1e-14  # what a few products of rotations are off by
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +101,11 @@ class Poses:
     def moved(self, R: Array, t: Array) -> Poses:
         """Return the same poses seen from another world: (R R_i, R t_i + t), R (d, d) and t (d,)."""
         return Poses(R @ self.R, self.t @ R.T + t)
+
+    def with_exact_rotations(self) -> Poses:
+        """The same poses with the nearest rotations, where theirs are not rotations to rounding."""
+        is_exact = float(orthogonality_error(self.R).max(initial=0.0)) <= ROTATION_ROUNDING
+        return self if is_exact else Poses(project_to_rotations(self.R), self.t)
 
     def with_gauge_at(self, index: int = 0) -> Poses:
         """Move the world so that pose `index` is the identity; F does not change."""
