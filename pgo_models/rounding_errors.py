@@ -158,8 +158,8 @@ class ObjectiveRounding:
 def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     """Rounding level of F at poses, and a bound on its error there.
 
-    A residual is off by its own evaluation, by the last bit of the coordinates as seen from the first pose, and by how far the stored R are from
-    rotations (`orthogonality_error`):
+    A residual is off by its own evaluation, by the last bit of the coordinates as seen from the first pose, and by how
+    far the stored R are from rotations (`orthogonality_error`):
 
         e_t = (2 d + 3) u (||t_i|| + ||t_j|| + ||t_ij||) + omega ||t_ij||,   e_R = 2 sqrt(d) (2 d + 3) u + 2 omega
 
