@@ -196,8 +196,9 @@ class _SuperLUFactor(CholeskyFactor):
         """
         L, U = self._lu.L.tocsr(), self._lu.U.tocsc()
         pivots, a = U.diagonal(), self._diagonal
-        count = gamma(np.diff(L.indptr) + 3.0)
-        if not float(count.max(initial=0.0)) < 0.5:
+        # Of U, whose terms these are: scipy leaves out zeros, where a term is exact, of L and U each on its own.
+        count = gamma(np.diff(U.indptr) + 3.0)
+        if not (float(count.max(initial=0.0)) < 0.5 and (a > 0).all()):
             return np.full(len(a), np.inf)
         D = diags_array(pivots)
         product = (D @ L.T).tocsc()

@@ -94,6 +94,7 @@ def prove_definite(
     """
     stored = certificate_matrix(problem, Lambda, eta)
     diagonal = np.maximum(problem.M.data[problem.diagonal_positions], stored.data[problem.diagonal_positions])
+    diagonal[problem.num_poses :] += eta  # M - Lambda was rounded before eta was added, and can be as large
     if not (np.isfinite(stored.data).all() and diagonal.min() >= _SMALLEST and diagonal.max() <= _LARGEST):
         return None
     is_fixed = np.zeros(problem.side, dtype=bool)

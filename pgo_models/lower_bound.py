@@ -40,7 +40,6 @@ from pgo_models.rounding_errors import evaluate_certificate, has_safe_scale
 
 _ETA_SHARE = 0.5  # of the wanted gap is spent on eta; the rest is for poses a little off the optimum
 _ETA_GROWTH, _ETA_BISECTIONS = 10.0, 3
-_LEAST_SHARE = 1e-20  # of tr(Lambda), for eta n d: where the search starts when F is zero
 UNGROUNDED_SHIFT = 1e-11  # of the diagonal: with eta, what is subtracted for rounding has to be made up for
 MOST_MOVES = 3
 SETTLED = 1e-14  # of the value: G adds less, and moving again would gain nothing
@@ -158,7 +157,7 @@ def search_bound(prove: Callable[[float], LowerBound | None], smallest: float, t
     trace, count : float, int
         tr(Lambda) and n d.
     """
-    eta, too_small = max(smallest, trace * _LEAST_SHARE / count), math.nan
+    eta, too_small = max(smallest, UNIT_ROUNDOFF * trace / count), math.nan  # at F = 0 the smallest would never grow
     bound = None
     while bound is None:
         if not trace - eta * count > 0.0:

@@ -158,8 +158,8 @@ class ObjectiveRounding:
 def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     """Rounding level of F at poses, and a bound on its error there.
 
-    A residual is off by its own evaluation, by the last bit of the coordinates, and by how far the stored R are from
-    rotations (`orthogonality_error`):
+    A residual is off by its own evaluation, by the last bit of the coordinates as seen from the first pose, and by how
+    far the stored R are from rotations (`orthogonality_error`):
 
         e_t = (2 d + 3) u (||t_i|| + ||t_j|| + ||t_ij||) + omega ||t_ij||,   e_R = 2 sqrt(d) (2 d + 3) u + 2 omega
 
@@ -193,7 +193,8 @@ def _residual_errors(problem: PGOProblem, poses: Poses) -> tuple[Array, float]:
     graph, d = problem.graph, problem.d
     share = (2 * d + 3) * UNIT_ROUNDOFF
     omega = float(orthogonality_error(poses.R).max(initial=0.0)) + d * gamma(d + 2)
-    size, length = np.linalg.norm(poses.t, axis=1), np.linalg.norm(graph.t_ij, axis=1)
+    # From the first pose: t_j - t_i is summed first, so that where the world begins rounds nothing.
+    size, length = np.linalg.norm(poses.t - poses.t[:1], axis=1), np.linalg.norm(graph.t_ij, axis=1)
     e_t = share * (size[graph.i] + size[graph.j] + length) + omega * length
     return e_t, 2.0 * math.sqrt(d) * share + 2.0 * omega
 

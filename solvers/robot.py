@@ -18,7 +18,7 @@ from scipy.sparse import csc_array
 from pgo_models.cholesky import CholeskyBackend
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.hessian import TangentLayout, riemannian_hessian
-from pgo_models.multipliers import certificate_matrix, multipliers
+from pgo_models.multipliers import multipliers
 from pgo_models.polish import retract
 from pgo_models.poses import Poses
 from pgo_models.rotations import Array, project_to_rotations, stack_transposes, tangent_dimension, unstack_transposes
@@ -240,9 +240,8 @@ class Robot:
         self._proof = None
         fixed = self._cuts[(1, d)].boundary[message["fixed"] > 0]
         fixed = np.append(fixed, 0) if "point" not in message and self._grounds else fixed
-        S = certificate_matrix(self.problem, Lambda)
-        S.data[self.problem.diagonal_positions[self._interior_rows]] += message["eta"][0]
-        found = verify_interior(self.problem, S, self._cuts[(1, d)], fixed, message["share"][0], self.backend)
+        eta, share, cut = message["eta"][0], message["share"][0], self._cuts[(1, d)]
+        found = verify_interior(self.problem, Lambda, eta, cut, fixed, share, self.backend)
         if found is None:
             return {"definite": np.zeros(1), "trace": trace}
         matrix, self._elimination, slack = found

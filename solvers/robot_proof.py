@@ -12,6 +12,7 @@ from pgo_models.definiteness import MARGIN
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.floating_point import OUTWARD
 from pgo_models.lower_bound import squared_distances
+from pgo_models.multipliers import certificate_matrix
 from pgo_models.pose_graph import IntArray
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
@@ -87,28 +88,41 @@ def begin_proof(part: Part, poses: Poses, Lambda: Array, slack: Array, cut: Cut,
 
 
 def verify_interior(
-    problem: PGOProblem, S: csc_array, cut: Cut, fixed: IntArray, share: float, backend: CholeskyBackend | None
+    problem: PGOProblem,
+    Lambda: Array,
+    eta: float,
+    cut: Cut,
+    fixed: IntArray,
+    share: float,
+    backend: CholeskyBackend | None,
 ) -> tuple[csc_array, Elimination, Array] | None:
-    """S less a share of its diagonal in the interior, its elimination, and the slack that is left there.
+    """S + eta blockdiag(0, I) less a share of its diagonal in the interior, its elimination, and the slack that is left.
 
     Parameters
     ----------
     problem : PGOProblem
         Of the robot's edges.
-    S : csc_array, (N, N)
-        With its pattern of M; it is changed.
+    Lambda : (p, d, d)
+        Zero at the separators.
+    eta : float
+        Added in the interior: the separators are the driver's.
     cut : Cut
     fixed : (f,)
         Rows that are left out.
     share : float
         At least so much of the diagonal is subtracted, more where rounding needs it.
     """
-    diagonal = np.maximum(problem.M.data[problem.diagonal_positions], S.data[problem.diagonal_positions])
+    inside = cut.interior
+    shifts = np.zeros(problem.side)
+    shifts[inside[inside >= problem.num_poses]] = eta
+    S = certificate_matrix(problem, Lambda)
+    S.data[problem.diagonal_positions] += shifts
+    # M - Lambda was rounded before eta was added, and can be as large.
+    diagonal = np.maximum(problem.M.data[problem.diagonal_positions], S.data[problem.diagonal_positions]) + shifts
     is_fixed = np.zeros(problem.side, dtype=bool)
     is_fixed[fixed] = True
     column = np.repeat(np.arange(problem.side), np.diff(S.indptr))
     S.data[is_fixed[S.indices] | is_fixed[column]] = 0.0
-    inside = cut.interior
     S.data[problem.diagonal_positions[inside[is_fixed[inside]]]] = 2.0 * diagonal[inside[is_fixed[inside]]]
     entries = matrix_error(problem.graph)
     expected = cut.analysis.expected_error(len(cut.boundary)) if cut.analysis is not None else None
