@@ -247,22 +247,22 @@ def _prove_grounded(problem: PGOProblem, Lambda: Array, eta: float, ground: _Gro
     proof = prove_definite(problem, Lambda, eta, ground.rows)
     if proof is None:
         return None
-    free = np.ones(problem.side, dtype=bool)
-    free[ground.rows] = False
+    free = proof.slack > 0.0
     slack = proof.slack[free, None]
-    X, low = ground.X.copy(), np.zeros((n, d))
-    found = evaluate_certificate(problem, Lambda, X, low)
+    X, low, left = ground.X, np.zeros((n, d)), math.inf
+    product = problem.apply_M(X)
+    product[n:] -= (Lambda @ X[n:].reshape(n, d, d)).reshape(-1, d)
     for _ in range(MOST_MOVES):
-        left = float(np.sum(found.product[free] ** 2 / slack))
-        if left <= SETTLED * abs(found.value):
-            break
-        step = proof.solve(found.product)
+        step = proof.solve(product)
         there = X.copy(), low - step[:n]
         there[0][n:] -= step[n:]
         moved = evaluate_certificate(problem, Lambda, *there)
-        if not float(np.sum(moved.product[free] ** 2 / slack)) < left:
+        after = float(np.sum(moved.product[free] ** 2 / slack))
+        if not after < left:
             break
-        (X, low), found = there, moved
+        (X, low), found, product, left = there, moved, moved.product, after
+        if left <= SETTLED * abs(found.value):
+            break
     quadratic = OUTWARD * float(np.sum((np.abs(found.product) + found.product_error)[free] ** 2 / slack))
     lost = OUTWARD * eta * squared_distances(X[n:], ground.X[n:])
     rounding = found.value_error + quadratic

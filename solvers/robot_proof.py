@@ -96,7 +96,7 @@ def verify_interior(
     share: float,
     backend: CholeskyBackend | None,
 ) -> tuple[csc_array, Elimination, Array] | None:
-    """S + eta blockdiag(0, I) less a share of its diagonal in the interior, its elimination, and the slack that is left.
+    """S + eta blockdiag(0, I) less a share of its diagonal in the interior, its elimination, and the slack left there.
 
     Parameters
     ----------
