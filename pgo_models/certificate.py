@@ -10,14 +10,16 @@ import enum
 import math
 from dataclasses import dataclass, replace
 
+from pgo_models.arrays import ReadOnly, real_array
 from pgo_models.errors import ProofError, SettingError
 from pgo_models.html_tables import facts_table
 from pgo_models.initialization import chordal_start
 from pgo_models.lower_bound import NO_BOUND, LowerBound, best_bound
 from pgo_models.multipliers import multipliers
 from pgo_models.polish import STATIONARY_DECREMENT, polish, relative_decrement
+from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
-from pgo_models.problem import PGOProblem
+from pgo_models.problem import PGOProblem, as_problem
 from pgo_models.rotations import Array
 from pgo_models.rounding_errors import objective_rounding, rounding_level
 
@@ -63,7 +65,7 @@ class BoundSource(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Certificate:
+class Certificate(ReadOnly):
     """A proven lower bound on the global optimum beside the cost of given poses.
 
     Attributes
@@ -112,6 +114,9 @@ class Certificate:
     Lambda: Array
     wanted_gap: float
     verdict: Verdict
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "Lambda", real_array(self.Lambda, "Lambda", SettingError))
 
     @property
     def lower_bound(self) -> float:
@@ -193,7 +198,7 @@ def gap_text(gap: float) -> str:
     return f"{gap:.3g}, proven to {digits} digits" if digits > 3 else f"{gap:.3g}"
 
 
-def certify(problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP) -> Certificate:
+def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_GAP) -> Certificate:
     """Judge anybody's poses: a proven lower bound on the global optimum, and how far F is above it.
 
     The bound is found at a stationary point. Poses that are not stationary are polished first (damped Newton,
@@ -203,7 +208,7 @@ def certify(problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP) -> Cert
 
     Parameters
     ----------
-    problem : PGOProblem
+    problem : PGOProblem or PoseGraph
     poses : Poses
     gap : float
         The relative gap to certify.
@@ -228,6 +233,7 @@ def certify(problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP) -> Cert
     >>> certificate.verdict.name, certificate.source.name, bool(0 < certificate.lower_bound < certificate.objective)
     ('NOT_CERTIFIED', 'POLISHED', True)
     """
+    problem = as_problem(problem)
     stationarity = relative_decrement(problem, poses)
     if stationarity <= STATIONARY_DECREMENT:
         certificate = certify_at(problem, poses, gap, stationarity)

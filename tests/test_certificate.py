@@ -340,3 +340,16 @@ def test_it_prints_what_it_says() -> None:
     assert "best known F" in text
     exact = PGOProblem(exact_graph(0, 5, 2))
     assert "F is a sum of squares" in str(certify(exact, chordal_start(exact)))
+
+
+def test_a_graph_is_judged_like_its_problem() -> None:
+    problem = varied_problem(0, 8, 3)
+    poses = chordal_start(problem)
+    assert certify(problem.graph, poses).lower_bound == certify(problem, poses).lower_bound
+
+
+def test_multipliers_of_a_certificate_cannot_be_changed() -> None:
+    problem = varied_problem(0, 8, 3)
+    certificate = certify_at(problem, polish(problem, chordal_start(problem)))
+    with pytest.raises(ValueError, match="read-only"):
+        certificate.Lambda[:] = 0.0

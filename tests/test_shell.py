@@ -11,9 +11,9 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pgo_command
 import pytest
 
-import pgo_command
 import pgo_models as pgo
 from pgo_models import scenes
 from pgo_models.g2o import write_g2o
