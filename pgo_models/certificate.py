@@ -21,7 +21,7 @@ from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem, as_problem
 from pgo_models.rotations import Array
-from pgo_models.rounding_errors import objective_rounding, rounding_level
+from pgo_models.rounding_errors import ObjectiveRounding, objective_rounding
 
 DEFAULT_GAP = 1e-6
 
@@ -277,8 +277,8 @@ def certify_at(
     >>> bool(0.9 * certificate.objective < certificate.lower_bound <= certificate.objective)
     True
     """
-    Lambda = multipliers(problem, problem.with_best_translations(poses.R))
-    return certify_with(problem, poses, Lambda, gap, stationarity, BoundSource.GIVEN)
+    best = problem.with_best_translations(poses.R)
+    return certify_with(problem, poses, multipliers(problem, best), gap, stationarity, BoundSource.GIVEN, ground=best)
 
 
 def certify_with(
@@ -289,6 +289,7 @@ def certify_with(
     stationarity: float,
     source: BoundSource,
     bound: LowerBound | None = None,
+    ground: Poses | None = None,
 ) -> Certificate:
     """Certificate of poses with multipliers from anywhere: the proof asks nothing of them.
 
@@ -296,6 +297,8 @@ def certify_with(
     ----------
     bound : LowerBound, optional
         One that was proved with these multipliers already; found here unless given.
+    ground : Poses, optional
+        Poses at one of which the proof is grounded; the given ones with their best translations unless given.
 
     Raises
     ------
@@ -304,15 +307,16 @@ def certify_with(
     """
     if not 0 < gap < math.inf:
         raise SettingError(f"gap is {gap}; give a positive relative gap, as 1e-6")
-    objective = problem.objective(poses)
+    objective, rounding = problem.objective(poses), objective_rounding(problem, poses)
     if bound is None:
-        is_exact = objective <= rounding_level(problem, poses)
-        bound = NO_BOUND if is_exact else best_bound(problem, Lambda, poses, gap, objective)
+        is_exact = objective <= rounding.level
+        ground = ground if ground is not None else problem.with_best_translations(poses.R)
+        bound = NO_BOUND if is_exact else best_bound(problem, Lambda, ground, gap, objective)
     unjudged = Certificate(
         objective=objective,
         bound=bound,
         gap=math.nan,
-        rounding_level=0.0,
+        rounding_level=rounding.level,
         stationarity=stationarity,
         source=source,
         poses=poses,
@@ -321,7 +325,7 @@ def certify_with(
         wanted_gap=gap,
         verdict=Verdict.TRIVIAL,
     )
-    return judge(problem, poses, unjudged)
+    return _judged(problem, unjudged, objective, rounding)
 
 
 def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
@@ -332,7 +336,12 @@ def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certif
     ProofError
         When F of the poses is below the bound by more than the rounding of F: then one of the two is wrong.
     """
-    objective, rounding = problem.objective(poses), objective_rounding(problem, poses)
+    return _judged(problem, certificate, problem.objective(poses), objective_rounding(problem, poses))
+
+
+def _judged(
+    problem: PGOProblem, certificate: Certificate, objective: float, rounding: ObjectiveRounding
+) -> Certificate:
     bound = certificate.bound
     if bound.value > objective + rounding.error:
         raise ProofError(

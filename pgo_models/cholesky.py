@@ -83,6 +83,14 @@ class CholeskyFactor(ABC):
             larger matrix, and their own columns' share of E is counted apart (`column_error`).
         """
 
+    def known_error(self) -> Array | None:
+        """`backward_error` where it costs nothing but a look at the factor."""
+        return self.backward_error()
+
+    def last_error(self) -> Array:
+        """`backward_error` of a factor that is not used any more, which may make it cheaper."""
+        return self.backward_error()
+
     @abstractmethod
     def most_in_row(self, beside: Array | int = 0) -> float:
         """Most non-zeros in a row of R."""
@@ -267,6 +275,15 @@ class _CholmodFactor(CholeskyFactor):
             cholmod.solve(self._numeric, half, sys=system)
         return np.array(half).reshape(right_hand_side.shape)
 
+    def known_error(self) -> Array | None:
+        return self._analysis.expected_error()
+
+    def last_error(self) -> Array:
+        if self._numeric is not None and self.known_error() is None:
+            numeric, self._numeric = self._numeric, None
+            self._analysis.count(numeric)
+        return self.backward_error()
+
     def most_in_row(self, beside: Array | int = 0) -> float:
         return self._analysis.counts().most_in_row(beside)
 
@@ -301,27 +318,28 @@ class _Cholmod(SymbolicCholesky):
         self._counts: FactorCounts | None = None
 
     def expected_error(self, beside: int = 0) -> Array | None:
-        return self.counts().error(beside)
+        return self._counts.error(beside) if self._counts is not None else None
 
     def counts(self) -> FactorCounts:
-        """Counts of every factor with this pattern."""
+        """Counts of every factor with this pattern, if need be of one that is out of use."""
         if self._counts is None:
-            # CVXOPT shows the non-zeros of a numeric factor alone, and takes it apart. One out of use will do.
-            capsule = self._spare()
-            cvxopt, cholmod = _import_cvxopt()
-            order = cvxopt.matrix(np.arange(self._shape[0], dtype=float))
-            try:
-                cholmod.solve(capsule, order, sys=_PERMUTE)
-            except (ValueError, ArithmeticError):  # it is symbolic, or of a matrix that was not positive definite
-                capsule = self._numeric(np.where(self._is_diagonal, 1.0, 0.0), capsule)
-                cholmod.solve(capsule, order, sys=_PERMUTE)
-            pointers, rows, _ = cholmod.getfactor(capsule).CCS
-            in_row = np.diff(np.array(pointers).ravel())
-            in_column = np.bincount(np.array(rows).ravel(), minlength=len(in_row))
-            self._counts = FactorCounts(
-                in_column.astype(float), in_row.astype(float), np.array(order).ravel().astype(np.int64)
-            )
+            self.count(self._spare())
+        assert self._counts is not None
         return self._counts
+
+    def count(self, capsule: _Capsule) -> None:
+        """Find the counts. CVXOPT shows the non-zeros of a numeric factor alone, and takes it apart."""
+        cvxopt, cholmod = _import_cvxopt()
+        order = cvxopt.matrix(np.arange(self._shape[0], dtype=float))
+        try:
+            cholmod.solve(capsule, order, sys=_PERMUTE)
+        except (ValueError, ArithmeticError):  # it is symbolic, or of a matrix that was not positive definite
+            capsule = self._numeric(np.where(self._is_diagonal, 1.0, 0.0), capsule)
+            cholmod.solve(capsule, order, sys=_PERMUTE)
+        pointers, rows, _ = cholmod.getfactor(capsule).CCS
+        in_row = np.diff(np.array(pointers).ravel()).astype(float)
+        in_column = np.bincount(np.array(rows).ravel(), minlength=len(in_row)).astype(float)
+        self._counts = FactorCounts(in_column, in_row, np.array(order).ravel().astype(np.int64))
 
     def _analyze(self) -> _Capsule:
         with _supernodal() as cholmod:

@@ -22,7 +22,7 @@ from pgo_models.floating_point import OUTWARD
 from pgo_models.multipliers import certificate_matrix
 from pgo_models.pose_graph import IntArray
 from pgo_models.problem import PGOProblem
-from pgo_models.rotations import Array
+from pgo_models.rotations import Array, BoolArray
 from pgo_models.rounding_errors import matrix_error
 
 FIRST_SHIFT = 1e-9  # of the diagonal; what is not needed for rounding makes the bound sharper
@@ -35,7 +35,7 @@ _SMALLEST, _LARGEST = 1e-150, 1e150  # of diagonal entries: nothing that counts 
 
 @dataclass(frozen=True, eq=False)
 class DefiniteProof:
-    """S + eta blockdiag(0, I), the rows `fixed` left out, is at least diag(slack), which is positive.
+    """S + eta blockdiag(0, I), without some rows, factored with a share of its diagonal subtracted.
 
     Attributes
     ----------
@@ -43,23 +43,40 @@ class DefiniteProof:
         The matrix in double precision; only its diagonal in the rows left out.
     factor : CholeskyFactor
         Of `stored` with the shift subtracted.
-    slack : (N,)
-        0 in the rows left out.
+    diagonal : (N,)
+        That it is a share of; 0 in the rows left out.
+    shift, entries : (N,)
+        Share that is subtracted, and share that the rounding of the entries takes.
     is_marginal : bool
         Whether a larger shift failed: the factor may be far from one of the matrix without a shift.
     """
 
     stored: csc_array
     factor: CholeskyFactor
-    slack: Array
+    diagonal: Array
+    shift: Array
+    entries: Array
     is_marginal: bool
+
+    @property
+    def free(self) -> BoolArray:
+        """Rows that are not left out, (N,)."""
+        return np.asarray(self.diagonal > 0.0)
+
+    def slack(self) -> Array | None:
+        """Diagonal that the exact matrix is at least, (N,), positive in free rows; None if rounding takes over half.
+
+        The factor may be taken apart for it: solve before.
+        """
+        error = OUTWARD * (self.entries + self.factor.last_error())
+        return (self.shift - error) / OUTWARD * self.diagonal if (2.0 * error <= self.shift).all() else None
 
     def solve(self, product: Array) -> Array:
         """About S^-1 product, (N, d), in the rows that are not left out, and zero in those.
 
         By the factor, or where that is marginal by conjugate gradients with the factor as preconditioner.
         """
-        free = self.slack > 0.0
+        free = self.free
         step = self.factor.solve(np.where(free[:, None], product, 0.0))
         if self.is_marginal:
             preconditioner = LinearOperator(self.stored.shape, matvec=self.factor.solve, dtype=float)
@@ -116,15 +133,17 @@ def prove_definite(
     found = search_shift(attempt, entries, expected if expected is not None else 0.0 * entries, first_shift)
     if found is None:
         return None
-    factor, share, is_marginal = found
-    slack = np.where(is_fixed, 0.0, share / OUTWARD * diagonal)
-    return DefiniteProof(stored, factor, slack, is_marginal)
+    factor, shift, is_marginal = found
+    return DefiniteProof(stored, factor, np.where(is_fixed, 0.0, diagonal), shift, entries, is_marginal)
 
 
 def search_shift(
     attempt: Callable[[Array], CholeskyFactor | None], entries: Array, expected: Array, first_shift: float
 ) -> tuple[CholeskyFactor, Array, bool] | None:
-    """First factor found that leaves at least half of its shift over, what is left over, and whether a larger failed.
+    """First factor found that leaves at least half of its shift over, the shift, and whether a larger one failed.
+
+    A factor with the first shift whose error is not known before it is taken apart (`CholeskyFactor.known_error`) is
+    returned as it is.
 
     Parameters
     ----------
@@ -141,8 +160,11 @@ def search_shift(
         if factor is None:
             uniform, is_marginal = SHRINK * uniform, True
             continue
-        error = OUTWARD * (entries + factor.backward_error())
+        known = factor.backward_error() if is_marginal else factor.known_error()
+        if known is None:
+            return factor, shift, is_marginal
+        error = OUTWARD * (entries + known)
         if (2.0 * error <= shift).all():
-            return factor, shift - error, is_marginal
+            return factor, shift, is_marginal
         expected = np.maximum(expected, error)
     return None

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.definiteness import prove_definite
+from pgo_models.definiteness import DefiniteProof, prove_definite
 from pgo_models.errors import SettingError
 from pgo_models.floating_point import OUTWARD, UNIT_ROUNDOFF
 from pgo_models.matrices import rotation_columns
@@ -36,7 +36,7 @@ from pgo_models.pose_graph import IntArray, middle_pose
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array, orthogonality_error
-from pgo_models.rounding_errors import evaluate_certificate, has_safe_scale
+from pgo_models.rounding_errors import Evaluation, evaluate_certificate, has_safe_scale
 
 _ETA_SHARE = 0.5  # of the wanted gap is spent on eta; the rest is for poses a little off the optimum
 _ETA_GROWTH, _ETA_BISECTIONS = 10.0, 3
@@ -116,7 +116,7 @@ def prove_bound(problem: PGOProblem, Lambda: Array, eta: float = 0.0, poses: Pos
     >>> bool(prove_bound(problem, Lambda, eta=1e-6) < bound), prove_bound(problem, Lambda, eta=0.0)
     (True, None)
     """
-    point = _grounded_at(problem, poses) if poses is not None else None
+    point = _grounded_at(problem, problem.with_best_translations(poses.R)) if poses is not None else None
     found = _prove(problem, _symmetric(problem, Lambda), eta, point)
     return found.value if found is not None else None
 
@@ -128,7 +128,7 @@ def best_bound(problem: PGOProblem, Lambda: Array, poses: Poses | None, gap: flo
     ----------
     Lambda : (n, d, d)
     poses : Poses or None
-        None leaves the form that asks nothing of poses.
+        With their best translations, to ground the proof at; None leaves the form that asks nothing of poses.
     gap, objective : float
         The smallest eta that is tried follows from them.
     """
@@ -213,8 +213,9 @@ class _Ground:
 def _grounded_at(problem: PGOProblem, poses: Poses) -> _Ground:
     n, d = problem.num_poses, problem.d
     r = middle_pose(problem.graph)
-    turned = problem.with_best_translations(poses.with_gauge_at(r).R)
-    X = problem.stacked(Poses(turned.R, turned.t - turned.t[r]))
+    X = problem.stacked(poses)
+    X[:n] -= poses.t[r]
+    X = X @ poses.R[r]
     rows = pose_rows(r, n, d)
     X[rows] = np.concatenate([np.zeros((1, d)), np.eye(d)])
     return _Ground(X, rows)
@@ -235,7 +236,10 @@ def _prove(problem: PGOProblem, Lambda: Array, eta: float, ground: _Ground | Non
 
 def _prove_with_eta(problem: PGOProblem, Lambda: Array, eta: float) -> LowerBound | None:
     first = np.zeros(1, dtype=np.int64)
-    if prove_definite(problem, Lambda, eta, first, UNGROUNDED_SHIFT) is None:
+    proof = prove_definite(problem, Lambda, eta, first, UNGROUNDED_SHIFT)
+    if proof is not None and proof.slack() is None:
+        proof = prove_definite(problem, Lambda, eta, first, UNGROUNDED_SHIFT)
+    if proof is None:
         return None
     trace, lost = _trace(Lambda), eta * problem.num_poses * problem.d
     rounding = OUTWARD * 4.0 * UNIT_ROUNDOFF * (abs(trace) + lost)
@@ -243,13 +247,26 @@ def _prove_with_eta(problem: PGOProblem, Lambda: Array, eta: float) -> LowerBoun
 
 
 def _prove_grounded(problem: PGOProblem, Lambda: Array, eta: float, ground: _Ground) -> LowerBound | None:
-    n, d = problem.num_poses, problem.d
     proof = prove_definite(problem, Lambda, eta, ground.rows)
     if proof is None:
         return None
-    free = proof.slack > 0.0
-    slack = proof.slack[free, None]
-    X, low, left = ground.X, np.zeros((n, d)), math.inf
+    X, found = _move(problem, Lambda, ground.X, proof)
+    slack = proof.slack()
+    if slack is None:  # now the rounding of the factorisation is known
+        return _prove_grounded(problem, Lambda, eta, ground)
+    free, n = proof.free, problem.num_poses
+    sizes = np.abs(found.product) + found.product_error
+    quadratic = OUTWARD * float(np.sum(sizes[free] ** 2 / slack[free, None]))
+    lost = OUTWARD * eta * squared_distances(X[n:], ground.X[n:])
+    rounding = found.value_error + quadratic
+    return bound_from([found.value, -lost], rounding, eta, is_grounded=True)
+
+
+def _move(problem: PGOProblem, Lambda: Array, X: Array, proof: DefiniteProof) -> tuple[Array, Evaluation]:
+    """X - S_r^-1 S X, again while that helps, and the certificate there."""
+    n, d, free = problem.num_poses, problem.d, proof.free
+    weight = (proof.shift * proof.diagonal)[free, None]
+    low, left = np.zeros((n, d)), math.inf
     product = problem.apply_M(X)
     product[n:] -= (Lambda @ X[n:].reshape(n, d, d)).reshape(-1, d)
     for _ in range(MOST_MOVES):
@@ -257,16 +274,13 @@ def _prove_grounded(problem: PGOProblem, Lambda: Array, eta: float, ground: _Gro
         there = X.copy(), low - step[:n]
         there[0][n:] -= step[n:]
         moved = evaluate_certificate(problem, Lambda, *there)
-        after = float(np.sum(moved.product[free] ** 2 / slack))
+        after = float(np.sum(moved.product[free] ** 2 / weight))
         if not after < left:
             break
         (X, low), found, product, left = there, moved, moved.product, after
         if left <= SETTLED * abs(found.value):
             break
-    quadratic = OUTWARD * float(np.sum((np.abs(found.product) + found.product_error)[free] ** 2 / slack))
-    lost = OUTWARD * eta * squared_distances(X[n:], ground.X[n:])
-    rounding = found.value_error + quadratic
-    return bound_from([found.value, -lost], rounding, eta, is_grounded=True)
+    return X, found
 
 
 def bound_from(terms: list[float], rounding: float, eta: float, is_grounded: bool) -> LowerBound:

@@ -83,15 +83,16 @@ def polish_step(problem: PGOProblem, state: PolishState, second_order: bool = Tr
     analysis, factor, is_newton = _factorize_model(problem, state, second_order)
     layout = TangentLayout(problem.num_poses, problem.d)
     now = replace(state, analysis=analysis, factor=factor, is_newton=is_newton, moved=False)
-    gradient, direction, decrement = _direction(problem, layout, now)
+    level = rounding_level(problem, state.poses)  # hardly moves with them
+    gradient, direction, decrement = _direction(problem, layout, now, level)
     now = replace(now, decrement=decrement)
     for _ in range(1 + CHORD_STEPS):
         if now.is_stationary:
             break
-        candidate = _backtrack(problem, layout, now, gradient, direction)
+        candidate = _backtrack(problem, layout, now, gradient, direction, level)
         if candidate is None:
             break
-        gradient, direction, decrement = _direction(problem, layout, candidate)
+        gradient, direction, decrement = _direction(problem, layout, candidate, level)
         at_rounding = reached_rounding(now.decrement, decrement, is_newton and not now.moved)
         tie = candidate.objective >= now.objective
         if tie and decrement > 0.5 * now.decrement:
@@ -138,7 +139,8 @@ def relative_decrement(problem: PGOProblem, poses: Poses) -> float:
     state = start_polish(problem, poses)
     analysis, factor, is_newton = _factorize_model(problem, state, second_order=True)
     now = replace(state, analysis=analysis, factor=factor, is_newton=is_newton)
-    decrement = _direction(problem, TangentLayout(problem.num_poses, problem.d), now)[2]
+    layout, level = TangentLayout(problem.num_poses, problem.d), rounding_level(problem, poses)
+    decrement = _direction(problem, layout, now, level)[2]
     return decrement if is_newton else max(decrement, 2.0 * STATIONARY_DECREMENT)
 
 
@@ -186,12 +188,13 @@ def ground_pose(matrix: csc_array, problem: PGOProblem) -> None:
         matrix.data[position] += abs(matrix.data[position])
 
 
-def _direction(problem: PGOProblem, layout: TangentLayout, state: PolishState) -> tuple[Array, Array, float]:
+def _direction(
+    problem: PGOProblem, layout: TangentLayout, state: PolishState, level: float
+) -> tuple[Array, Array, float]:
     """Gradient, step -H^-1 g and relative decrement at the state's poses."""
     assert state.factor is not None
     gradient = layout.join(*problem.riemannian_gradient(state.poses))
     direction = -state.factor.solve(gradient)
-    level = rounding_level(problem, state.poses)
     return gradient, direction, scaled_decrement(-inner(gradient, direction), state.objective, level)
 
 
@@ -202,7 +205,7 @@ def scaled_decrement(square: float, objective: float, rounding_level: float) -> 
 
 
 def _backtrack(
-    problem: PGOProblem, layout: TangentLayout, state: PolishState, gradient: Array, direction: Array
+    problem: PGOProblem, layout: TangentLayout, state: PolishState, gradient: Array, direction: Array, level: float
 ) -> PolishState | None:
     """First of the moves direction, direction/2, .. that lowers F enough; None when none does."""
     slope = inner(gradient, direction)
@@ -213,7 +216,7 @@ def _backtrack(
         # leaves: on parking-garage this saves two thirds of the factorisations.
         poses = problem.with_best_translations(retract(state.poses, length * w, length * v).R)
         objective = problem.objective(poses)
-        if length == 1.0 and objective <= NEARLY_EXACT * rounding_level(problem, poses):
+        if length == 1.0 and objective <= NEARLY_EXACT * level:
             poses = problem.with_refined_translations(poses)
             objective = problem.objective(poses)
         if objective <= state.objective + SUFFICIENT * length * slope:

@@ -80,11 +80,15 @@ def evaluate_edges(problem: PGOProblem, X: Array, low: Array) -> Evaluation:
     A, w = problem.residual_matrix
     weighted = w[:, None] * residuals
     costs = weighted * residuals
-    value_error = 2.0 * float(np.sum(np.abs(weighted) * errors)) + 4.0 * UNIT_ROUNDOFF * float(np.sum(costs))
+    of_edges = np.concatenate(
+        [costs[: graph.num_edges].sum(axis=1), costs[graph.num_edges :].reshape(-1, d * d).sum(axis=1)]
+    )
+    value = math.fsum(of_edges)
+    value_error = 2.0 * float(np.sum(np.abs(weighted) * errors)) + gamma(d * d + 4) * value
     most = int(np.bincount(A.indices, minlength=1).max()) + 2
     sizes = w[:, None] * (errors + gamma(most) * np.abs(residuals))
     return Evaluation(
-        value=math.fsum(costs.ravel()),
+        value=value,
         value_error=OUTWARD * value_error,
         product=np.asarray(A.T @ weighted),
         product_error=OUTWARD * np.asarray(abs(A).T @ sizes),
@@ -99,9 +103,9 @@ def evaluate_multipliers(Lambda: Array, P: Array) -> Evaluation:
     sizes = gamma(d) * (np.abs(P) @ np.abs(transposed)) + UNIT_ROUNDOFF * np.abs(defect)
     absolute = np.abs(Lambda)
     terms = Lambda * defect
-    value_error = float(np.sum(absolute * sizes)) + 2.0 * UNIT_ROUNDOFF * float(np.sum(np.abs(terms)))
+    value_error = float(np.sum(absolute * sizes)) + gamma(d * d + 3) * float(np.sum(np.abs(terms)))
     return Evaluation(
-        value=math.fsum(terms.ravel()),
+        value=math.fsum(terms.reshape(-1, d * d).sum(axis=1)),
         value_error=OUTWARD * value_error,
         product=-(Lambda @ P).reshape(-1, d),
         product_error=OUTWARD * gamma(d) * (absolute @ np.abs(P)).reshape(-1, d),
