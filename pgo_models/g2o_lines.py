@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgo_models.errors import FileFormatError
-from pgo_models.files import FARTHEST, LARGEST, check_length, finite_number, read_text, too_far
+from pgo_models.files import FARTHEST, LARGEST, LONGEST_LINE, check_length, finite_number, read_text, too_far
 from pgo_models.rotations import Array, exp_map, rotations_from_quaternions
 
 IntArray = NDArray[np.int64]
@@ -99,7 +99,8 @@ def read_lines(path: Path | str) -> G2OLines:
             continue
         tag = parts[0]
         if tag in _TAGS:
-            check_length(path, number, line)
+            if len(line) > LONGEST_LINE:
+                check_length(path, number, line)
             gathered[tag].append(number)
             if tag[0] == "E":
                 ids[tag] += parts[1:3]
