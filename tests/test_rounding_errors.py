@@ -132,13 +132,16 @@ def test_multipliers_are_evaluated_within_their_errors(seed: int, n: int, d: int
         assert exact(found.value) != value
 
 
-@given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, kind=st.sampled_from(KINDS))
-@settings(max_examples=30)
-def test_the_certificate_is_evaluated_within_its_errors(seed: int, n: int, d: int, kind: str) -> None:
+@given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, kind=st.sampled_from(KINDS), size=st.sampled_from([1.0, 1e8]))
+@settings(max_examples=40)
+def test_the_certificate_is_evaluated_within_its_errors(seed: int, n: int, d: int, kind: str, size: float) -> None:
     graph, rng = varied_graph(seed, n, d), np.random.default_rng(seed)
     problem = PGOProblem(graph)
     X, low = points(problem, kind, rng)
     Lambda = multipliers(problem, polish(problem, chordal_start(problem)))
+    if size > 1.0:  # far above M, so that their rounding shows
+        Lambda = size * rng.standard_normal((n, d, d))
+        Lambda += np.swapaxes(Lambda, 1, 2)
     found = evaluate_certificate(problem, Lambda, X, low)
     at = exact(X)
     at[:n] += exact(low)
