@@ -436,3 +436,32 @@ def test_poses_off_rotations_are_known_to_their_error() -> None:
     deviation = abs(exact(problem.objective(off)) - ExactGraph.of_doubles(problem.graph).objective_of(off))
     assert deviation <= exact(objective_rounding(problem, off).error)
     assert deviation > exact(objective_rounding(problem, best).error)
+
+
+@given(seed=SEEDS, d=DIMENSIONS)
+def test_F_that_is_computed_as_zero_is_known_to_its_level(seed: int, d: int) -> None:
+    """The stored rotation fits to the last bit, but the exact one nearest to it does not."""
+    R = np.repeat(random_rotations(1, d, np.random.default_rng(seed)), 2, axis=0)
+    t = np.stack([np.zeros(d), R[0, :, 0]])
+    one = np.ones(1)
+    graph = PoseGraph(2, np.array([0]), np.array([1]), np.eye(d)[None], np.eye(d)[:1], one, one)
+    problem, poses = PGOProblem(graph), Poses(R, t)
+    assert problem.objective(poses) == 0.0
+    assert 0.0 < ExactGraph.of_doubles(graph).objective_of(poses) <= exact(objective_rounding(problem, poses).error)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_F_of_a_road_without_noise_is_at_its_level(d: int, offset: float) -> None:
+    """All that is left there is the last bit of coordinates, which are kilometres."""
+    pattern, rng = road(0, 500, 10.0, d), np.random.default_rng(0)
+    assert pattern.truth is not None
+    truth = pattern.truth.moved(random_rotations(1, d, rng)[0], np.zeros(d))
+    R_i = np.swapaxes(truth.R[pattern.i], 1, 2)
+    t_ij = np.einsum("eab,eb->ea", R_i, truth.t[pattern.j] - truth.t[pattern.i])
+    problem = PGOProblem(replace(pattern, R_ij=R_i @ truth.R[pattern.j], t_ij=t_ij, truth=None))
+    poses = truth.moved(random_rotations(1, d, rng)[0], np.zeros(d))
+    rounding = objective_rounding(problem, poses)
+    assert 0.0 < problem.objective(poses) <= rounding.level < 1e-12
+    away = objective_rounding(problem, Poses(poses.R, poses.t + offset))
+    assert away.level == pytest.approx(rounding.level, rel=1e-3)
