@@ -55,7 +55,7 @@ from pgo_models.rounding_errors import (
 from pgo_models.scenes import NoiseModel
 from solvers.robot_proof import verify_interior
 from solvers.separator_tree import separator_tree
-from solvers.share import share_out
+from solvers.share import Part, share_out
 from solvers.substructure import Cut, Interface, InterfaceFactor, columns_of, eliminate, packed, unpacked
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
@@ -302,6 +302,41 @@ def test_an_elimination_is_below_its_matrix(backend: CholeskyBackend, coupling: 
     assert any(needed)
 
 
+def is_true_of_robot(
+    problem: PGOProblem, part: Part, Lambda: Array, eta: float, share: float, backend: CholeskyBackend
+) -> bool | None:
+    """Whether the exact S of a robot is above its Schur complement and slack; None where it proves nothing."""
+    p, d = problem.num_poses, problem.d
+    cut = Cut(columns_of(part.interior, p, (1, d)), columns_of(part.boundary, p, (1, d)), None)
+    proved = verify_interior(problem, Lambda, eta, cut, np.zeros(0, dtype=np.int64), share, backend)
+    if proved is None:
+        return None
+    _, found, slack = proved
+    rows = ExactGraph.of_doubles(problem.graph).certificate_matrix(Lambda)
+    S = np.array([[row.get(column, MP.mpf(0)) for column in range(len(rows))] for row in rows], dtype=object)
+    inside = cut.interior
+    S[inside, inside] += np.where(inside >= p, exact(eta), MP.mpf(0)) - exact(slack)
+    S[np.ix_(cut.boundary, cut.boundary)] -= exact(unpacked(found.schur, len(cut.boundary)))
+    return is_positive_definite([dict(enumerate(row)) for row in S])
+
+
+@BACKENDS
+@pytest.mark.parametrize("exponent", range(24, 34))
+def test_no_rounding_is_lost_between_multipliers_and_eta_by_a_robot(backend: CholeskyBackend, exponent: int) -> None:
+    n, d = 12, 2
+    i = np.arange(n)
+    measured = np.broadcast_to(np.eye(d), (n, d, d)), np.zeros((n, d))
+    graph = PoseGraph(n, i, (i + 1) % n, *measured, np.full(n, 0.7), np.ones(n))
+    eta = 0.75 * 2.0**exponent
+    for share in share_out(graph, partition(graph, 2)):
+        assert share.part is not None
+        interior = share.part.interior
+        Lambda = np.zeros((share.part.problem.num_poses, d, d))
+        above = np.where(np.arange(len(interior)) % 4 == 0, np.spacing(eta), 0.0)
+        Lambda[interior] = (eta + above)[:, None, None] * np.eye(d)
+        assert is_true_of_robot(share.part.problem, share.part, Lambda, eta, 1e-11, backend) is not False
+
+
 @BACKENDS
 @settings(max_examples=10)
 @given(seed=SEEDS, n=st.integers(4, 9), d=DIMENSIONS, eta=st.sampled_from([0.0, 1e-3, 1e9]))
@@ -316,17 +351,7 @@ def test_what_a_robot_hands_on_is_below_its_part_of_S(
         p = problem.num_poses
         Lambda = np.zeros((p, d, d))
         Lambda[part.interior] = rng.uniform(0.0, 2.0) * eta * np.eye(d)
-        cut = Cut(columns_of(part.interior, p, (1, d)), columns_of(part.boundary, p, (1, d)), None)
-        proved = verify_interior(problem, Lambda, eta, cut, np.zeros(0, dtype=np.int64), 1e-15, backend)
-        if proved is None:
-            continue
-        _, found, slack = proved
-        rows = ExactGraph.of_doubles(problem.graph).certificate_matrix(Lambda)
-        S = np.array([[row.get(column, MP.mpf(0)) for column in range(len(rows))] for row in rows], dtype=object)
-        inside = cut.interior
-        S[inside, inside] += np.where(inside >= p, exact(eta), MP.mpf(0)) - exact(slack)
-        S[np.ix_(cut.boundary, cut.boundary)] -= exact(unpacked(found.schur, len(cut.boundary)))
-        assert is_positive_definite([dict(enumerate(row)) for row in S])
+        assert is_true_of_robot(problem, part, Lambda, eta, 1e-15, backend) is not False
 
 
 @pytest.mark.parametrize("cancelling", [0.0, 1e6])
@@ -465,3 +490,27 @@ def test_F_of_a_road_without_noise_is_at_its_level(d: int, offset: float) -> Non
     assert 0.0 < problem.objective(poses) <= rounding.level < 1e-12
     away = objective_rounding(problem, Poses(poses.R, poses.t + offset))
     assert away.level == pytest.approx(rounding.level, rel=1e-3)
+
+
+@BACKENDS
+def test_a_long_column_takes_as_many_roundings_as_it_has_entries(backend: CholeskyBackend) -> None:
+    """An arrow: every square that is subtracted from the last pivot is rounded up on its own."""
+    side, corner = 401, 1.5 * 2.0**30
+    k, last = np.arange(side - 1), np.full(side - 1, side - 1)
+    edge = np.full(side - 1, np.sqrt(2.0**-23 + 2.0**-40))
+    values = np.concatenate([np.ones(side - 1), [corner], edge, edge])
+    rows, columns = np.concatenate([np.arange(side), k, last]), np.concatenate([np.arange(side), last, k])
+    A = csc_array((values, (rows, columns)), shape=(side, side))
+    analysis = analyze(A, backend)
+    factor = analysis.factorize(A)
+    allowed = factor.backward_error()[side - 1] * corner
+    if isinstance(factor, _SuperLUFactor):
+        row = int(np.flatnonzero(factor._rows == side - 1)[0])
+        squares = exact(factor._lu.L.toarray()[row]) ** 2 * exact(factor._lu.U.diagonal())
+    else:
+        assert isinstance(factor, _CholmodFactor)
+        assert isinstance(analysis, _Cholmod)
+        row = int(np.flatnonzero(analysis.counts().order == side - 1)[0])
+        squares = exact(np.array(cvxopt.matrix(cholmod.getfactor(factor._numeric)))[row]) ** 2
+    deviation = abs(total(squares) - exact(corner))
+    assert 100 * 2.0**-53 * corner < deviation <= exact(allowed)
