@@ -55,7 +55,7 @@ from pgo_models.rounding_errors import (
 from pgo_models.scenes import NoiseModel
 from solvers.robot_proof import verify_interior
 from solvers.separator_tree import separator_tree
-from solvers.share import share_out
+from solvers.share import Part, share_out
 from solvers.substructure import Cut, Interface, InterfaceFactor, columns_of, eliminate, packed, unpacked
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
@@ -113,7 +113,7 @@ def test_edges_are_evaluated_within_their_errors(kind: str, seed: int, n: int, d
     value, product = exact_edges(ExactGraph.of_doubles(graph), X, low)
     assert exact(found.value) - exact(found.value_error) <= value
     assert (abs(exact(found.product) - product) <= exact(found.product_error)).all()
-    assert (exact(found.product) != product).any()
+    assert kind == "poses" or (exact(found.product) != product).any()
 
 
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, size=st.floats(-8.0, 8.0))
@@ -132,13 +132,16 @@ def test_multipliers_are_evaluated_within_their_errors(seed: int, n: int, d: int
         assert exact(found.value) != value
 
 
-@given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, kind=st.sampled_from(KINDS))
-@settings(max_examples=30)
-def test_the_certificate_is_evaluated_within_its_errors(seed: int, n: int, d: int, kind: str) -> None:
+@given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, kind=st.sampled_from(KINDS), size=st.sampled_from([1.0, 1e8]))
+@settings(max_examples=40)
+def test_the_certificate_is_evaluated_within_its_errors(seed: int, n: int, d: int, kind: str, size: float) -> None:
     graph, rng = varied_graph(seed, n, d), np.random.default_rng(seed)
     problem = PGOProblem(graph)
     X, low = points(problem, kind, rng)
     Lambda = multipliers(problem, polish(problem, chordal_start(problem)))
+    if size > 1.0:  # far above M, so that their rounding shows
+        Lambda = size * rng.standard_normal((n, d, d))
+        Lambda += np.swapaxes(Lambda, 1, 2)
     found = evaluate_certificate(problem, Lambda, X, low)
     at = exact(X)
     at[:n] += exact(low)
@@ -146,7 +149,7 @@ def test_the_certificate_is_evaluated_within_its_errors(seed: int, n: int, d: in
     value = total(at * product) + total(np.einsum("naa->na", exact(Lambda)))
     assert exact(found.value) - exact(found.value_error) <= value
     assert (abs(exact(found.product) - product) <= exact(found.product_error)).all()
-    assert (exact(found.product) != product).any()
+    assert kind == "poses" or (exact(found.product) != product).any()
 
 
 def test_a_sum_over_many_edges_is_within_its_error() -> None:
@@ -183,7 +186,7 @@ def slanted(graph: PoseGraph) -> PoseGraph:
 @given(seed=SEEDS, n=st.integers(2, 6), d=DIMENSIONS)
 def test_entries_of_S_are_within_their_share_of_the_diagonal(kind: str, seed: int, n: int, d: int) -> None:
     graph = varied_graph(seed, n, d)
-    graph = slanted(graph) if kind == "slanted" else hub(60, np.random.default_rng(0)) if kind == "hub" else graph
+    graph = slanted(graph) if kind == "slanted" else hub(40, np.random.default_rng(0)) if kind == "hub" else graph
     problem = PGOProblem(graph)
     Lambda = multipliers(problem, polish(problem, chordal_start(problem)))
     stored = certificate_matrix(problem, Lambda).toarray()
@@ -244,7 +247,7 @@ def test_a_factor_is_within_its_backward_error(
     factor = analysis.factorize(stored)
     epsilon = factor.backward_error()
     difference = square_of(factor, analysis) - exact(A)
-    assert (epsilon < 1e-11).all()
+    assert (epsilon < 1e-8).all()
     assert largest_share(difference, A.diagonal()) > 0.0
     assert largest_share(difference - np.diag(exact(epsilon * A.diagonal())), A.diagonal()) < 0.0
 
@@ -299,6 +302,41 @@ def test_an_elimination_is_below_its_matrix(backend: CholeskyBackend, coupling: 
     assert any(needed)
 
 
+def is_true_of_robot(
+    problem: PGOProblem, part: Part, Lambda: Array, eta: float, share: float, backend: CholeskyBackend
+) -> bool | None:
+    """Whether the exact S of a robot is above its Schur complement and slack; None where it proves nothing."""
+    p, d = problem.num_poses, problem.d
+    cut = Cut(columns_of(part.interior, p, (1, d)), columns_of(part.boundary, p, (1, d)), None)
+    proved = verify_interior(problem, Lambda, eta, cut, np.zeros(0, dtype=np.int64), share, backend)
+    if proved is None:
+        return None
+    _, found, slack = proved
+    rows = ExactGraph.of_doubles(problem.graph).certificate_matrix(Lambda)
+    S = np.array([[row.get(column, MP.mpf(0)) for column in range(len(rows))] for row in rows], dtype=object)
+    inside = cut.interior
+    S[inside, inside] += np.where(inside >= p, exact(eta), MP.mpf(0)) - exact(slack)
+    S[np.ix_(cut.boundary, cut.boundary)] -= exact(unpacked(found.schur, len(cut.boundary)))
+    return is_positive_definite([dict(enumerate(row)) for row in S])
+
+
+@BACKENDS
+@pytest.mark.parametrize("exponent", range(24, 34))
+def test_no_rounding_is_lost_between_multipliers_and_eta_by_a_robot(backend: CholeskyBackend, exponent: int) -> None:
+    n, d = 12, 2
+    i = np.arange(n)
+    measured = np.broadcast_to(np.eye(d), (n, d, d)), np.zeros((n, d))
+    graph = PoseGraph(n, i, (i + 1) % n, *measured, np.full(n, 0.7), np.ones(n))
+    eta = 0.75 * 2.0**exponent
+    for share in share_out(graph, partition(graph, 2)):
+        assert share.part is not None
+        interior = share.part.interior
+        Lambda = np.zeros((share.part.problem.num_poses, d, d))
+        above = np.where(np.arange(len(interior)) % 4 == 0, np.spacing(eta), 0.0)
+        Lambda[interior] = (eta + above)[:, None, None] * np.eye(d)
+        assert is_true_of_robot(share.part.problem, share.part, Lambda, eta, 1e-11, backend) is not False
+
+
 @BACKENDS
 @settings(max_examples=10)
 @given(seed=SEEDS, n=st.integers(4, 9), d=DIMENSIONS, eta=st.sampled_from([0.0, 1e-3, 1e9]))
@@ -313,17 +351,7 @@ def test_what_a_robot_hands_on_is_below_its_part_of_S(
         p = problem.num_poses
         Lambda = np.zeros((p, d, d))
         Lambda[part.interior] = rng.uniform(0.0, 2.0) * eta * np.eye(d)
-        cut = Cut(columns_of(part.interior, p, (1, d)), columns_of(part.boundary, p, (1, d)), None)
-        proved = verify_interior(problem, Lambda, eta, cut, np.zeros(0, dtype=np.int64), 1e-15, backend)
-        if proved is None:
-            continue
-        _, found, slack = proved
-        rows = ExactGraph.of_doubles(problem.graph).certificate_matrix(Lambda)
-        S = np.array([[row.get(column, MP.mpf(0)) for column in range(len(rows))] for row in rows], dtype=object)
-        inside = cut.interior
-        S[inside, inside] += np.where(inside >= p, exact(eta), MP.mpf(0)) - exact(slack)
-        S[np.ix_(cut.boundary, cut.boundary)] -= exact(unpacked(found.schur, len(cut.boundary)))
-        assert is_positive_definite([dict(enumerate(row)) for row in S])
+        assert is_true_of_robot(problem, part, Lambda, eta, 1e-15, backend) is not False
 
 
 @pytest.mark.parametrize("cancelling", [0.0, 1e6])
@@ -371,12 +399,8 @@ def square_of_tree(factor: InterfaceFactor) -> Exact:
 def test_the_bound_with_eta_alone_is_below_its_two_terms(seed: int, n: int, d: int) -> None:
     """tr(Lambda) and eta n d nearly cancel, so that their rounding is in plain sight."""
     problem, rng = PGOProblem(varied_graph(seed, n, d, NoiseModel(0.3, 0.3))), np.random.default_rng(seed)
-    sizes = 1e3 * rng.random(n)
-    eta = float(sizes.max())
-    Lambda = sizes[:, None, None] * np.eye(d)
-    Lambda[:, 0, 0] += (eta - sizes) * d - rng.random(n) * 1e-9
-    Lambda *= 0.0
-    Lambda += (eta + 1e-7 * rng.uniform(-1.0, 2.0, n))[:, None, None] * np.eye(d)
+    eta = 1e3 * float(rng.random())
+    Lambda = (eta + 1e-7 * rng.uniform(-1.0, 2.0, n))[:, None, None] * np.eye(d)
     bound = prove_bound(problem, Lambda, eta)
     if bound is not None and bound > 0:
         assert exact(bound) <= total(np.einsum("naa->na", exact(Lambda))) - exact(eta) * n * d
@@ -437,3 +461,56 @@ def test_poses_off_rotations_are_known_to_their_error() -> None:
     deviation = abs(exact(problem.objective(off)) - ExactGraph.of_doubles(problem.graph).objective_of(off))
     assert deviation <= exact(objective_rounding(problem, off).error)
     assert deviation > exact(objective_rounding(problem, best).error)
+
+
+@given(seed=SEEDS, d=DIMENSIONS)
+def test_F_that_is_computed_as_zero_is_known_to_its_level(seed: int, d: int) -> None:
+    """The stored rotation fits to the last bit, but the exact one nearest to it does not."""
+    R = np.repeat(random_rotations(1, d, np.random.default_rng(seed)), 2, axis=0)
+    t = np.stack([np.zeros(d), R[0, :, 0]])
+    one = np.ones(1)
+    graph = PoseGraph(2, np.array([0]), np.array([1]), np.eye(d)[None], np.eye(d)[:1], one, one)
+    problem, poses = PGOProblem(graph), Poses(R, t)
+    assert problem.objective(poses) == 0.0
+    assert 0.0 < ExactGraph.of_doubles(graph).objective_of(poses) <= exact(objective_rounding(problem, poses).error)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_F_of_a_road_without_noise_is_at_its_level(d: int, offset: float) -> None:
+    """All that is left there is the last bit of coordinates, which are kilometres."""
+    pattern, rng = road(0, 500, 10.0, d), np.random.default_rng(0)
+    assert pattern.truth is not None
+    truth = pattern.truth.moved(random_rotations(1, d, rng)[0], np.zeros(d))
+    R_i = np.swapaxes(truth.R[pattern.i], 1, 2)
+    t_ij = np.einsum("eab,eb->ea", R_i, truth.t[pattern.j] - truth.t[pattern.i])
+    problem = PGOProblem(replace(pattern, R_ij=R_i @ truth.R[pattern.j], t_ij=t_ij, truth=None))
+    poses = truth.moved(random_rotations(1, d, rng)[0], np.zeros(d))
+    rounding = objective_rounding(problem, poses)
+    assert 0.0 < problem.objective(poses) <= rounding.level < 1e-12
+    away = objective_rounding(problem, Poses(poses.R, poses.t + offset))
+    assert away.level == pytest.approx(rounding.level, rel=1e-3)
+
+
+@BACKENDS
+def test_a_long_column_takes_as_many_roundings_as_it_has_entries(backend: CholeskyBackend) -> None:
+    """An arrow: every square that is subtracted from the last pivot is rounded up on its own."""
+    side, corner = 401, 1.5 * 2.0**30
+    k, last = np.arange(side - 1), np.full(side - 1, side - 1)
+    edge = np.full(side - 1, np.sqrt(2.0**-23 + 2.0**-40))
+    values = np.concatenate([np.ones(side - 1), [corner], edge, edge])
+    rows, columns = np.concatenate([np.arange(side), k, last]), np.concatenate([np.arange(side), last, k])
+    A = csc_array((values, (rows, columns)), shape=(side, side))
+    analysis = analyze(A, backend)
+    factor = analysis.factorize(A)
+    allowed = factor.backward_error()[side - 1] * corner
+    if isinstance(factor, _SuperLUFactor):
+        row = int(np.flatnonzero(factor._rows == side - 1)[0])
+        squares = exact(factor._lu.L.toarray()[row]) ** 2 * exact(factor._lu.U.diagonal())
+    else:
+        assert isinstance(factor, _CholmodFactor)
+        assert isinstance(analysis, _Cholmod)
+        row = int(np.flatnonzero(analysis.counts().order == side - 1)[0])
+        squares = exact(np.array(cvxopt.matrix(cholmod.getfactor(factor._numeric)))[row]) ** 2
+    deviation = abs(total(squares) - exact(corner))
+    assert 100 * 2.0**-53 * corner < deviation <= exact(allowed)

@@ -1,0 +1,128 @@
+"""Bounds by a driver and robots, as they were proved, held against F in exact arithmetic."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from exact_arithmetic import ExactGraph, exact, is_positive_definite, less_diagonal, without
+from graphs import DIMENSIONS, SEEDS, random_poses, varied_graph, wound_ring
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from roads import Shape, road
+from robots import BACKENDS, PARTITIONERS, Partitioner, contiguous, metis
+
+from pgo_models.cholesky import CholeskyBackend
+from pgo_models.initialization import chordal_start
+from pgo_models.lower_bound import pose_rows
+from pgo_models.partition import Partition
+from pgo_models.polish import polish
+from pgo_models.poses import Poses
+from pgo_models.problem import PGOProblem
+from pgo_models.rotations import exp_map
+from pgo_models.scenes import NoiseModel
+from solvers import distributed_bound
+from solvers.distributed import collect, open_driver
+from solvers.distributed_bound import best_bound_distributed, prove_grounded, prove_with_eta
+from solvers.driver import Driver
+from solvers.engine import InProcess
+from solvers.substructure import columns_of
+
+
+@contextmanager
+def team_at(problem: PGOProblem, parts: Partition, poses: Poses) -> Iterator[Driver]:
+    """Driver and robots at poses."""
+    driver = open_driver(problem, parts, InProcess())
+    try:
+        driver.stand(poses)
+        yield driver
+    finally:
+        driver.close()
+
+
+@settings(max_examples=12)
+@given(seed=SEEDS, n=st.integers(4, 14), d=DIMENSIONS, cut=PARTITIONERS, backend=BACKENDS, noise=st.floats(0.01, 2.0))
+def test_no_bound_of_robots_is_above_F(
+    seed: int, n: int, d: int, cut: Partitioner, backend: CholeskyBackend, noise: float
+) -> None:
+    problem = PGOProblem(varied_graph(seed, n, d, NoiseModel(0.1, noise)), backend)
+    graph = ExactGraph.of_doubles(problem.graph)
+    starts = [chordal_start(problem), *(random_poses(n, d, seed + k) for k in range(2))]
+    best = min((polish(problem, start) for start in starts), key=problem.objective)
+    F = graph.objective_of(best)
+    for poses in (best, starts[0], polish(problem, starts[1])):
+        with team_at(problem, cut(problem.graph, seed), poses) as driver:
+            assert best_bound_distributed(driver, 1e-6).value <= F
+            for eta in (1e-3, 1.0):
+                bound = prove_with_eta(driver, eta)
+                assert bound is None or bound.value <= F
+
+
+@pytest.mark.parametrize("cut", [contiguous, metis])
+@settings(max_examples=10)
+@given(seed=SEEDS, n=st.integers(30, 150), spacing=st.floats(1.0, 100.0), d=DIMENSIONS, shape=st.sampled_from(Shape))
+def test_no_bound_of_robots_is_above_F_on_long_roads(
+    cut: Partitioner, seed: int, n: int, spacing: float, d: int, shape: Shape
+) -> None:
+    problem = PGOProblem(road(seed, n, spacing, d, shape, loops=5))
+    poses = polish(problem, chordal_start(problem))
+    F = ExactGraph.of_doubles(problem.graph).objective_of(poses)
+    with team_at(problem, cut(problem.graph, 3), poses) as driver:
+        bound = best_bound_distributed(driver, 1e-6)
+    assert (1.0 - 1e-6) * F <= bound.value <= F
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_bound_of_robots_holds_wherever_it_is_grounded(d: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a move G is not rounding, and its quadratic terms are all that keeps the bound below F."""
+    monkeypatch.setattr(distributed_bound, "MOST_MOVES", 0)
+    problem = PGOProblem(varied_graph(0, 12, d))
+    best = polish(problem, chordal_start(problem))
+    F, rng = ExactGraph.of_doubles(problem.graph).objective_of(best), np.random.default_rng(0)
+    for size in (1e-3, 1e-5, 1e-7):
+        away = problem.with_best_translations(best.R @ exp_map(size * rng.standard_normal((12, 1 if d == 2 else 3))))
+        with team_at(problem, contiguous(problem.graph, 2), away) as driver:
+            bound = prove_grounded(driver, 1e-9)
+        assert bound is not None
+        assert bound.value <= F < ExactGraph.of_doubles(problem.graph).objective_of(away)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_what_eta_adds_is_taken_off_by_robots(d: int) -> None:
+    problem, start = wound_ring(12, d)
+    local, best = polish(problem, start), polish(problem, chordal_start(problem))
+    F = ExactGraph.of_doubles(problem.graph).objective_of(best)
+    with team_at(problem, contiguous(problem.graph, 2), local) as driver:
+        found = [prove_with_eta(driver, float(eta)) for eta in 2.0 ** np.arange(-20, 10)]
+    assert any(bound is not None for bound in found)
+    assert all(bound is None or bound.value <= F for bound in found)
+
+
+@settings(max_examples=10)
+@given(seed=SEEDS, n=st.integers(4, 10), d=DIMENSIONS, cut=PARTITIONERS, backend=BACKENDS)
+def test_what_a_driver_says_to_be_definite_is(
+    seed: int, n: int, d: int, cut: Partitioner, backend: CholeskyBackend
+) -> None:
+    """S_r, less what the driver has left over on the separators, is positive definite."""
+    problem = PGOProblem(varied_graph(seed, n, d), backend)
+    poses = polish(problem, chordal_start(problem))
+    with team_at(problem, cut(problem.graph, seed), poses) as driver:
+        g, r = len(driver.cover), driver.grounded
+        fixed = columns_of(np.array([r]), g, (1, d))
+        message = {
+            "fixed": distributed_bound._is_fixed(driver, fixed),
+            "eta": np.zeros(1),
+            "is_grounded": np.ones(1),
+            "R": np.eye(d),
+            "t": np.zeros(d),
+        }
+        X = np.zeros(((d + 1) * g, d))
+        proof = distributed_bound._eliminate(driver, message, fixed, 0.0, 1e-9, X)
+        _, Lambda = collect(driver)
+        rows = columns_of(driver.cover, n, (1, d))
+        left_out = pose_rows(int(driver.cover[r]), n, d)
+    assert proof is not None
+    slack = np.zeros(problem.side)
+    slack[rows] = proof.slack
+    S = ExactGraph.of_doubles(problem.graph).certificate_matrix(Lambda)
+    assert is_positive_definite(less_diagonal(without(S, left_out), exact(np.delete(slack, left_out))))
