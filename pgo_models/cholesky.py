@@ -15,7 +15,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
-from typing import Protocol
 
 import numpy as np
 from scipy.sparse import csc_array, diags_array
@@ -28,8 +27,7 @@ from pgo_models.rotations import Array
 _PERMUTE, _FORWARD = 7, 4  # CVXOPT's codes of x = P b and L x = b
 
 
-class _Capsule(Protocol):
-    """A factorisation that CVXOPT keeps to itself."""
+_Capsule = object  # a factorisation, which CVXOPT keeps to itself
 
 
 class CholeskyBackend(enum.Enum):
@@ -280,8 +278,8 @@ class _CholmodFactor(CholeskyFactor):
 
     def last_error(self) -> Array:
         if self._numeric is not None and self.known_error() is None:
-            numeric, self._numeric = self._numeric, None
-            self._analysis.count(numeric)
+            self._analysis.count(self._numeric)
+            self.overwrite()
         return self.backward_error()
 
     def most_in_row(self, beside: Array | int = 0) -> float:
@@ -328,7 +326,8 @@ class _Cholmod(SymbolicCholesky):
         return self._counts
 
     def count(self, capsule: _Capsule) -> None:
-        """Find the counts. CVXOPT shows the non-zeros of a numeric factor alone, and takes it apart."""
+        """Find the counts of a numeric factor, which CVXOPT takes apart for it: the next one would be L D L^T in it."""
+        self._taken = [(user, other) for user, other in self._taken if other is not capsule]
         cvxopt, cholmod = _import_cvxopt()
         order = cvxopt.matrix(np.arange(self._shape[0], dtype=float))
         try:
@@ -377,6 +376,7 @@ class _Cholmod(SymbolicCholesky):
         self._matrix.V = cvxopt.matrix(lower)
         with _supernodal():
             cholmod.numeric(self._matrix, capsule)
+        cholmod.diag(capsule)  # raises ValueError for L D L^T, which indefinite matrices have, too
         return capsule
 
 

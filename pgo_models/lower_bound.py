@@ -266,7 +266,7 @@ def _move(problem: PGOProblem, Lambda: Array, X: Array, proof: DefiniteProof) ->
     """X - S_r^-1 S X, again while that helps, and the certificate there."""
     n, d, free = problem.num_poses, problem.d, proof.free
     weight = (proof.shift * proof.diagonal)[free, None]
-    low, left = np.zeros((n, d)), math.inf
+    low, left, found = np.zeros((n, d)), math.inf, None
     product = problem.apply_M(X)
     product[n:] -= (Lambda @ X[n:].reshape(n, d, d)).reshape(-1, d)
     for _ in range(MOST_MOVES):
@@ -280,7 +280,7 @@ def _move(problem: PGOProblem, Lambda: Array, X: Array, proof: DefiniteProof) ->
         (X, low), found, product, left = there, moved, moved.product, after
         if left <= SETTLED * abs(found.value):
             break
-    return X, found
+    return X, found if found is not None else evaluate_certificate(problem, Lambda, X, low)
 
 
 def bound_from(terms: list[float], rounding: float, eta: float, is_grounded: bool) -> LowerBound:

@@ -109,14 +109,8 @@ def test_what_a_driver_says_to_be_definite_is(
     with team_at(problem, cut(problem.graph, seed), poses) as driver:
         g, r = len(driver.cover), driver.grounded
         fixed = columns_of(np.array([r]), g, (1, d))
-        message = {
-            "fixed": distributed_bound._is_fixed(driver, fixed),
-            "eta": np.zeros(1),
-            "is_grounded": np.ones(1),
-            "R": np.eye(d),
-            "t": np.zeros(d),
-        }
-        X = np.zeros(((d + 1) * g, d))
+        message = {"fixed": distributed_bound._is_fixed(driver, fixed), "eta": np.zeros(1)}
+        X = Poses(driver.R, driver.t).stacked()
         proof = distributed_bound._eliminate(driver, message, fixed, 0.0, 1e-9, X)
         _, Lambda = collect(driver)
         rows = columns_of(driver.cover, n, (1, d))
