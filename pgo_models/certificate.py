@@ -348,9 +348,10 @@ def _judged(
             f"lower bound {bound.value!r} is above F = {objective!r} of {problem!r}, which is known to "
             f"{rounding.error:.2g}: a defect of pgo_models; please report it with the graph"
         )
-    # The last bits of F may be below the bound's; a bound may be lowered.
+    # F may come out below a true bound by its own rounding, which is then what the gap is known to.
+    least = bound.value if bound.value < objective else objective - rounding.error
+    gap = relative_gap(objective, least, rounding.level)
     bound = replace(bound, value=min(bound.value, objective))
-    gap = relative_gap(objective, bound.value, rounding.level)
     return replace(
         certificate,
         objective=objective,

@@ -279,7 +279,7 @@ class _CholmodFactor(CholeskyFactor):
     def last_error(self) -> Array:
         if self._numeric is not None and self.known_error() is None:
             self._analysis.count(self._numeric)
-            self.overwrite()
+            self._numeric = None
         return self.backward_error()
 
     def most_in_row(self, beside: Array | int = 0) -> float:
@@ -320,12 +320,9 @@ class _Cholmod(SymbolicCholesky):
 
     def counts(self) -> FactorCounts:
         """Counts of every factor with this pattern, if need be of one that is out of use."""
-        if self._counts is None:
-            self.count(self._spare())
-        assert self._counts is not None
-        return self._counts
+        return self._counts if self._counts is not None else self.count(self._spare())
 
-    def count(self, capsule: _Capsule) -> None:
+    def count(self, capsule: _Capsule) -> FactorCounts:
         """Find the counts of a numeric factor, which CVXOPT takes apart for it: the next one would be L D L^T in it."""
         self._taken = [(user, other) for user, other in self._taken if other is not capsule]
         cvxopt, cholmod = _import_cvxopt()
@@ -339,6 +336,7 @@ class _Cholmod(SymbolicCholesky):
         in_row = np.diff(np.array(pointers).ravel()).astype(float)
         in_column = np.bincount(np.array(rows).ravel(), minlength=len(in_row)).astype(float)
         self._counts = FactorCounts(in_column, in_row, np.array(order).ravel().astype(np.int64))
+        return self._counts
 
     def _analyze(self) -> _Capsule:
         with _supernodal() as cholmod:

@@ -20,6 +20,7 @@ from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array, orthogonality_error
 
+_SUMMED = 80  # roundings of a weighted square and of numpy's sum in pairs: blocks of 128, then halves of 2^60 at most
 _SMALLEST, _LARGEST = 1e-100, 1e100  # of weights: products of four stay far from underflow and overflow
 
 
@@ -162,13 +163,14 @@ class ObjectiveRounding:
 def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     """Rounding level of F at poses, and a bound on its error there.
 
-    A residual is off by its own evaluation, by the last bit of the coordinates as seen from the first pose, and by how
-    far the stored R are from rotations (`orthogonality_error`):
+    As computed, a residual is off by its evaluation and by how far the stored R are from rotations
+    (`orthogonality_error`), at most
 
-        e_t = (2 d + 3) u (||t_i|| + ||t_j|| + ||t_ij||) + omega ||t_ij||,   e_R = 2 sqrt(d) (2 d + 3) u + 2 omega
+        e_t = (2 d + 3) u (||t_j - t_i|| + ||t_ij||) + omega ||t_ij||,   e_R = 2 sqrt(d) (2 d + 3) u + 2 omega
 
-    in the Euclidean norm of its d, or d^2, numbers. The level is sum tau e_t^2 + kappa e_R^2, and the error
-    sum tau (2 ||r_t|| e_t + e_t^2) + kappa (2 ||r_R|| e_R + e_R^2) and the rounding of the sum itself.
+    in the Euclidean norm of its d, or d^2, numbers; the error is sum tau (2 ||r_t|| e_t + e_t^2) + kappa (2 ||r_R|| e_R
+    + e_R^2) and the rounding of the sum. The level is sum tau e_t^2 + kappa e_R^2 with ||t_i|| + ||t_j||, seen from the
+    first pose, for ||t_j - t_i||: no poses can do better than the last bits of their coordinates.
 
     Examples
     --------
@@ -179,29 +181,28 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     True
     """
     graph, d, m = problem.graph, problem.d, problem.graph.num_edges
-    e_t, e_R = _residual_errors(problem, poses)
+    e_t, e_R = _residual_errors(problem, poses, np.linalg.norm(poses.t[graph.j] - poses.t[graph.i], axis=1))
     squares = np.sum(problem.residuals(problem.stacked(poses)) ** 2, axis=1)
     r_t, r_R = squares[:m], squares[m:].reshape(m, d).sum(axis=1)
-    level = _level(graph, e_t, e_R)
     cross = float(np.sum(graph.tau * np.sqrt(r_t) * e_t)) + e_R * float(np.sum(graph.kappa * np.sqrt(r_R)))
     F = float(graph.tau @ r_t + graph.kappa @ r_R)
-    return ObjectiveRounding(level, OUTWARD * (level + 2.0 * cross + gamma(d * len(squares) + 4) * F))
+    error = _sum_of_squares(graph, e_t, e_R) + 2.0 * cross + _SUMMED * UNIT_ROUNDOFF * F
+    return ObjectiveRounding(rounding_level(problem, poses), OUTWARD * error)
 
 
 def rounding_level(problem: PGOProblem, poses: Poses) -> float:
     """Level of `objective_rounding`."""
-    return _level(problem.graph, *_residual_errors(problem, poses))
+    graph, size = problem.graph, np.linalg.norm(poses.t - poses.t[:1], axis=1)
+    return _sum_of_squares(graph, *_residual_errors(problem, poses, size[graph.i] + size[graph.j]))
 
 
-def _residual_errors(problem: PGOProblem, poses: Poses) -> tuple[Array, float]:
-    graph, d = problem.graph, problem.d
+def _residual_errors(problem: PGOProblem, poses: Poses, distance: Array) -> tuple[Array, float]:
+    d = problem.d
     share = (2 * d + 3) * UNIT_ROUNDOFF
     omega = float(orthogonality_error(poses.R).max(initial=0.0)) + d * gamma(d + 2)
-    # From the first pose: t_j - t_i is summed first, so that where the world begins rounds nothing.
-    size, length = np.linalg.norm(poses.t - poses.t[:1], axis=1), np.linalg.norm(graph.t_ij, axis=1)
-    e_t = share * (size[graph.i] + size[graph.j] + length) + omega * length
-    return e_t, 2.0 * math.sqrt(d) * share + 2.0 * omega
+    length = np.linalg.norm(problem.graph.t_ij, axis=1)
+    return share * (distance + length) + omega * length, 2.0 * math.sqrt(d) * share + 2.0 * omega
 
 
-def _level(graph: PoseGraph, e_t: Array, e_R: float) -> float:
+def _sum_of_squares(graph: PoseGraph, e_t: Array, e_R: float) -> float:
     return OUTWARD * (float(np.sum(graph.tau * e_t**2)) + float(np.sum(graph.kappa)) * e_R**2)
