@@ -176,14 +176,14 @@ class Certificate(ReadOnly):
 
 
 def proven_digits(gap: float) -> int:
-    """Digits of F that a relative gap leaves no doubt of, 0 to 16.
+    """Digits of F that a relative gap leaves no doubt of; none where it is 0, as F is rounding then.
 
     Examples
     --------
     >>> proven_digits(3e-13), proven_digits(0.2), proven_digits(0.0)
-    (12, 0, 16)
+    (12, 0, 0)
     """
-    return min(16, max(0, math.floor(-math.log10(gap)))) if gap > 0 else 16
+    return max(0, math.floor(-math.log10(gap))) if gap > 0 else 0
 
 
 def gap_text(gap: float) -> str:
@@ -191,9 +191,11 @@ def gap_text(gap: float) -> str:
 
     Examples
     --------
-    >>> gap_text(3.2e-13), gap_text(0.2)
-    ('3.2e-13, proven to 12 digits', '0.2')
+    >>> gap_text(3.2e-13), gap_text(0.2), gap_text(0.0)
+    ('3.2e-13, proven to 12 digits', '0.2', '0: F is at its rounding level')
     """
+    if gap == 0.0:
+        return "0: F is at its rounding level"
     digits = proven_digits(gap)
     return f"{gap:.3g}, proven to {digits} digits" if digits > 3 else f"{gap:.3g}"
 
