@@ -204,7 +204,7 @@ class Staircase:
             return replace(state, k=state.k + 1, radius=radius, inner_iterations=spent)
         candidate = lifted_point(problem, retract(point.Y, trial.step))
         # Near the end both decreases are below rounding, and their ratio is made to tend to one (Conn et al., 17.4.2).
-        rounding = _ROUNDING * scale
+        rounding = _ROUNDING * scale + state.rounding_level
         ratio = (point.value - candidate.value + rounding) / (trial.decrease + rounding)
         radius = state.radius
         if not ratio >= _POOR:

@@ -138,7 +138,8 @@ def test_a_checkpoint_is_due_after_so_many_rounds(tmp_path, monkeypatch):
 
     def writes(rounds):
         written.clear()
-        solvers.solve(graph, robots=2, checkpoint=Checkpoint(tmp_path / "run.ckpt", rounds))
+        finer = solvers.Pipeline(soc=solvers.SOC(tolerance=2e-3))
+        solvers.solve(graph, finer, robots=2, checkpoint=Checkpoint(tmp_path / "run.ckpt", rounds))
         return [rounds for method, rounds in written if method == "SubstructuredSOC"]
 
     monkeypatch.setattr(checkpoint, "_write", recording)
