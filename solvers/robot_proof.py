@@ -17,7 +17,7 @@ from pgo_models.pose_graph import IntArray
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array
-from pgo_models.rounding_errors import evaluate_certificate, matrix_error
+from pgo_models.rounding_errors import evaluate_certificate, has_safe_scale, matrix_error
 from solvers.share import Part
 from solvers.substructure import Cut, Elimination, eliminate
 
@@ -112,6 +112,8 @@ def verify_interior(
     share : float
         At least so much of the diagonal is subtracted, more where rounding needs it.
     """
+    if not has_safe_scale(problem.graph):
+        return None
     inside = cut.interior
     shifts = np.zeros(problem.side)
     shifts[inside[inside >= problem.num_poses]] = eta

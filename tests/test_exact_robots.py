@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from robots import BACKENDS, PARTITIONERS, Partitioner, contiguous, metis
 
 from pgo_models.cholesky import CholeskyBackend
 from pgo_models.initialization import chordal_start
-from pgo_models.lower_bound import pose_rows
+from pgo_models.lower_bound import pose_rows, prove_bound
+from pgo_models.multipliers import multipliers
 from pgo_models.partition import Partition
 from pgo_models.polish import polish
 from pgo_models.poses import Poses
@@ -120,3 +122,12 @@ def test_what_a_driver_says_to_be_definite_is(
     slack[rows] = proof.slack
     S = ExactGraph.of_doubles(problem.graph).certificate_matrix(Lambda)
     assert is_positive_definite(less_diagonal(without(S, left_out), exact(np.delete(slack, left_out))))
+
+
+def test_weights_that_could_underflow_prove_nothing_by_robots_either() -> None:
+    graph = varied_graph(0, 8, 2)
+    problem = PGOProblem(replace(graph, kappa=1e-120 * graph.kappa, tau=1e-120 * graph.tau))
+    poses = chordal_start(problem)
+    with team_at(problem, contiguous(problem.graph, 2), poses) as driver:
+        assert distributed_bound.prove_grounded(driver, 0.0) is None
+    assert prove_bound(problem, multipliers(problem, poses), poses=poses) is None
