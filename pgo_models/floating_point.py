@@ -46,7 +46,7 @@ def error_of_counts(in_column: Array, most_in_row: float) -> Array:
     """Bound epsilon of the file's opening from the non-zeros of R."""
     # Beside the sum: a root or division, one by a rounded reciprocal, and underflow, which is less than a rounding.
     each = gamma(in_column + 3.0)
-    return np.where(each < 0.5, OUTWARD * most_in_row * each / (1.0 - np.minimum(each, 0.5)), np.inf)
+    return np.where((each >= 0) & (each < 0.5), OUTWARD * most_in_row * each / (1.0 - np.minimum(each, 0.5)), np.inf)
 
 
 @dataclass(frozen=True, eq=False)
