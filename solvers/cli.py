@@ -53,7 +53,7 @@ from solvers.pipeline import HANDOVER, solve
 from solvers.report import check_report, write_report
 from solvers.shell import DONE, Commands, run_command, save_then_show
 from solvers.soc import SOC
-from solvers.solution import check_format, check_target, finite_or_none
+from solvers.solution import certificate_json, check_format, check_target
 from solvers.study_commands import compare_command, figures_command, tables_command
 from solvers.versions import versions
 
@@ -237,17 +237,9 @@ def certify_command(
     certificate = certify(problem, _estimate(problem.graph, estimate), gap)
     record = {
         "objective": certificate.objective,
-        "lower_bound": certificate.lower_bound,
-        "gap": certificate.gap,
-        "wanted_gap": certificate.wanted_gap,
-        "eta": finite_or_none(certificate.eta),
-        "grounded": certificate.bound.is_grounded,
-        "rounding": certificate.bound.rounding,
-        "digits": certificate.digits,
-        "stationarity": finite_or_none(certificate.stationarity),
+        **certificate_json(certificate),
         "source": certificate.source.name,
         "best_known_objective": certificate.poses_objective,
-        "verdict": certificate.verdict.name,
         "versions": versions(problem.backend),
     }
 

@@ -181,15 +181,7 @@ class Solution:
         return {
             "graph": {"name": graph.name, "d": graph.d, "poses": graph.num_poses, "edges": graph.num_edges},
             "objective": self.objective,
-            "lower_bound": certificate.lower_bound,
-            "gap": certificate.gap,
-            "wanted_gap": certificate.wanted_gap,
-            "eta": finite_or_none(certificate.eta),
-            "grounded": certificate.bound.is_grounded,
-            "rounding": certificate.bound.rounding,
-            "digits": certificate.digits,
-            "stationarity": finite_or_none(certificate.stationarity),
-            "verdict": certificate.verdict.name,
+            **certificate_json(certificate),
             "note": self.note,
             "status": self.status.name,
             "seconds": self.seconds,
@@ -274,6 +266,21 @@ def check_target(path: Path, num_robots: int) -> None:
         check_g2o_folder(path, num_robots)
     else:
         check_writable(path)
+
+
+def certificate_json(certificate: Certificate) -> dict[str, object]:
+    """What `.json` files hold of a certificate."""
+    return {
+        "lower_bound": certificate.lower_bound,
+        "gap": certificate.gap,
+        "wanted_gap": certificate.wanted_gap,
+        "eta": finite_or_none(certificate.eta),
+        "grounded": certificate.bound.is_grounded,
+        "rounding": certificate.bound.rounding,
+        "digits": certificate.digits,
+        "stationarity": finite_or_none(certificate.stationarity),
+        "verdict": certificate.verdict.name,
+    }
 
 
 def finite_or_none(value: float) -> float | None:
