@@ -42,7 +42,7 @@ _ETA_SHARE = 0.5  # of the wanted gap is spent on eta; the rest is for poses a l
 _ETA_GROWTH, _ETA_BISECTIONS = 10.0, 3
 UNGROUNDED_SHIFT = 1e-11  # of the diagonal: with eta, what is subtracted for rounding has to be made up for
 MOST_MOVES = 3
-SETTLED = 1e-14  # of the value: G adds less, and moving again would gain nothing
+SETTLED = 1e-13  # of the value: G adds less, and moving again would gain nothing
 
 
 @dataclass(frozen=True)
