@@ -14,6 +14,7 @@ from roads import Shape, road
 from robots import BACKENDS, PARTITIONERS, Partitioner, contiguous, metis
 
 from pgo_models.cholesky import CholeskyBackend
+from pgo_models.floating_point import gamma
 from pgo_models.initialization import chordal_start
 from pgo_models.lower_bound import pose_rows, prove_bound
 from pgo_models.multipliers import multipliers
@@ -22,13 +23,14 @@ from pgo_models.polish import polish
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import exp_map
+from pgo_models.rounding_errors import evaluate_multipliers
 from pgo_models.scenes import NoiseModel
 from solvers import distributed_bound
 from solvers.distributed import collect, open_driver
-from solvers.distributed_bound import best_bound_distributed, prove_grounded, prove_with_eta
+from solvers.distributed_bound import InterfaceProof, best_bound_distributed, prove_grounded, prove_with_eta
 from solvers.driver import Driver
 from solvers.engine import InProcess
-from solvers.substructure import columns_of
+from solvers.substructure import Interface, columns_of
 
 
 @contextmanager
@@ -131,3 +133,43 @@ def test_weights_that_could_underflow_prove_nothing_by_robots_either() -> None:
     with team_at(problem, contiguous(problem.graph, 2), poses) as driver:
         assert distributed_bound.prove_grounded(driver, 0.0) is None
     assert prove_bound(problem, multipliers(problem, poses), poses=poses) is None
+
+
+def test_every_term_of_a_driver_s_errors_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    u, enough = 2.0**-53, 1.0 - 1e-12
+    problem = PGOProblem(varied_graph(3, 16, 3))
+    poses = polish(problem, chordal_start(problem))
+    with team_at(problem, contiguous(problem.graph, 3), poses) as driver:
+        g, d, rng = len(driver.cover), driver.d, np.random.default_rng(0)
+        space = driver.interface(1, d)
+        X = Poses(driver.R, driver.t).stacked()
+        Lambda, slack = driver.multipliers, rng.uniform(1.0, 2.0, len(X))
+        blocks = evaluate_multipliers(Lambda, X[g:].reshape(g, d, d))
+        own, error = np.zeros_like(X), np.zeros_like(X)
+        own[g:], error[g:] = blocks.product, blocks.product_error
+        # Robots that leave nothing of S X, so that only errors are left, and of the values the driver's own alone.
+        parts, left = [], own.copy()
+        for columns in space.columns:
+            parts.append(-left[columns])
+            left[columns] = 0.0
+        figures = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
+        answers = [{"product": part, "error": 1e-15 * abs(part), "figures": figures} for part in parts]
+        proof = InterfaceProof(None, slack, answers, Lambda, [])  # type: ignore[arg-type]
+        sums = distributed_bound._sum_up(driver, proof, X, answers, np.ones(len(X), dtype=bool))
+        assert (left == 0.0).all()
+        error += 1e-15 * abs(own) + gamma(len(parts) + 2.0) * 2.0 * abs(own)
+        assert sums.quadratic >= enough * np.sum(error**2 / slack[:, None]) > 0.0
+        assert sums.value_error >= enough * (blocks.value_error + u * abs(sums.value)) > 0.0
+        monkeypatch.setattr(Interface, "rounding", lambda self, contributions, own, diagonal: 0.0 * diagonal)
+        fixed = driver.ground(1).ravel()
+        message = {"fixed": distributed_bound._is_fixed(driver, fixed), "eta": np.array([1.0])}
+        found = distributed_bound._eliminate(driver, message, fixed, 1.0, 1e-13, None)
+        assert found is not None
+        diagonal = driver.diagonal.copy()
+        rows = driver.rotation_rows
+        diagonal[rows] += np.maximum(1.0 - np.einsum("naa->na", Lambda).ravel(), 0.0)
+        assert (found.slack <= (1e-13 - 8 * u) * diagonal * (1.0 + 1e-12)).all()
+        monkeypatch.undo()
+        bound = prove_with_eta(driver, 1.0)
+        assert bound is not None
+        assert bound.rounding >= enough * 4 * u * (sum(map(abs, found.traces)) + driver.num_poses * d)
