@@ -27,16 +27,7 @@ DEFAULT_GAP = 1e-6
 
 
 class Verdict(enum.Enum):
-    """What the certificate says of the poses.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> certify(problem, polish(problem, chordal_start(problem))).verdict.name
-    'CERTIFIED'
-    """
+    """What the certificate says of the poses."""
 
     CERTIFIED = "globally optimal within the gap asked for"
     EXACT = "globally optimal, exact to rounding: F cannot be told from zero"
@@ -45,16 +36,7 @@ class Verdict(enum.Enum):
 
 
 class BoundSource(enum.Enum):
-    """Where the multipliers of the bound were taken.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> certify(problem, chordal_start(problem)).source.name
-    'POLISHED'
-    """
+    """Where the multipliers of the bound were taken."""
 
     GIVEN = "at the poses given"
     POLISHED = "after polishing the poses given, which were not stationary"
@@ -132,6 +114,11 @@ class Certificate(ReadOnly):
     def is_best_in_doubles(self) -> bool:
         """Whether S_r is definite and the gap below 1e-6: a smaller one takes precision, not other poses."""
         return self.bound.is_grounded and self.eta == 0.0 and self.gap <= DEFAULT_GAP
+
+    @property
+    def can_improve(self) -> bool:
+        """Whether other poses, or multipliers of another rank, could give what was asked for."""
+        return not (self.is_certified or self.is_best_in_doubles)
 
     @property
     def digits(self) -> int:

@@ -25,19 +25,11 @@ from pgo_models.floating_point import OUTWARD, UNIT_ROUNDOFF, FactorCounts, erro
 from pgo_models.rotations import Array
 
 _PERMUTE, _FORWARD = 7, 4  # CVXOPT's codes of x = P b and L x = b
-
-
 _Capsule = object  # a factorisation, which CVXOPT keeps to itself
 
 
 class CholeskyBackend(enum.Enum):
-    """Which library factors.
-
-    Examples
-    --------
-    >>> factorize(csc_array([[4.0]]), CholeskyBackend.SUPERLU).solve(np.array([2.0]))
-    array([0.5])
-    """
+    """Which library factors."""
 
     SUPERLU = "SuperLU (scipy)"
     CHOLMOD = "CHOLMOD (CVXOPT)"
@@ -124,6 +116,10 @@ class SymbolicCholesky(ABC):
         """What `CholeskyFactor.backward_error` will be about, where it is known before a factor is."""
         return None
 
+    def crude_error(self) -> float:
+        """Bound on `CholeskyFactor.backward_error` for any number of non-zeros; inf if there is none."""
+        return np.inf
+
     def _check(self, matrix: csc_array) -> None:
         same = (
             matrix.shape == self._shape
@@ -167,15 +163,6 @@ def factorize(matrix: csc_array, backend: CholeskyBackend | None = None) -> Chol
     array([1., 2.])
     """
     return analyze(matrix, backend).factorize(matrix)
-
-
-def is_positive_definite(matrix: csc_array, backend: CholeskyBackend | None = None) -> bool:
-    """Whether the sparse Cholesky factorisation of a symmetric matrix goes through."""
-    try:
-        factorize(matrix, backend)
-    except NotPositiveDefiniteError:
-        return False
-    return True
 
 
 class _SuperLUFactor(CholeskyFactor):
@@ -317,6 +304,11 @@ class _Cholmod(SymbolicCholesky):
 
     def expected_error(self, beside: int = 0) -> Array | None:
         return self._counts.error(beside) if self._counts is not None else None
+
+    def crude_error(self) -> float:
+        """Bound from rows and columns of N non-zeros."""
+        side = float(self._shape[0])
+        return float(error_of_counts(np.array(side), side))
 
     def counts(self) -> FactorCounts:
         """Counts of every factor with this pattern, if need be of one that is out of use."""

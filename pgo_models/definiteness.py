@@ -49,6 +49,8 @@ class DefiniteProof:
         Share that is subtracted, and share that the rounding of the entries takes.
     is_marginal : bool
         Whether a larger shift failed: the factor may be far from one of the matrix without a shift.
+    error : (N,), optional
+        Share that the rounding of the factorisation takes, where the factor need not be asked.
     """
 
     stored: csc_array
@@ -57,6 +59,7 @@ class DefiniteProof:
     shift: Array
     entries: Array
     is_marginal: bool
+    error: Array | None = None
 
     @property
     def free(self) -> BoolArray:
@@ -68,7 +71,7 @@ class DefiniteProof:
 
         The factor may be taken apart for it: solve before.
         """
-        error = OUTWARD * (self.entries + self.factor.last_error())
+        error = OUTWARD * (self.entries + (self.error if self.error is not None else self.factor.last_error()))
         return (self.shift - error) / OUTWARD * self.diagonal if (2.0 * error <= self.shift).all() else None
 
     def solve(self, product: Array) -> Array:
@@ -94,7 +97,12 @@ class DefiniteProof:
 
 
 def prove_definite(
-    problem: PGOProblem, Lambda: Array, eta: float, fixed: IntArray, first_shift: float = FIRST_SHIFT
+    problem: PGOProblem,
+    Lambda: Array,
+    eta: float,
+    fixed: IntArray,
+    first_shift: float = FIRST_SHIFT,
+    turned: Array | None = None,
 ) -> DefiniteProof | None:
     """Proof that S + eta blockdiag(0, I) is positive definite without some rows; None when none is found.
 
@@ -108,17 +116,17 @@ def prove_definite(
     first_shift : float
         Share of the diagonal that is subtracted first; less where the matrix is not definite with it, more where
         rounding needs more.
+    turned : (N, d), optional
+        Moves that leave F almost as it is, as a turn of all poses but those left out, which S then holds but weakly:
+        no share above their Rayleigh quotient can be subtracted. Where one far below it is enough for rounding whatever
+        the factor's non-zeros are, they are not counted.
     """
-    stored = certificate_matrix(problem, Lambda, eta)
-    diagonal = np.maximum(problem.M.data[problem.diagonal_positions], stored.data[problem.diagonal_positions])
-    diagonal[problem.num_poses :] += eta  # M - Lambda was rounded before eta was added, and can be as large
+    shifts = np.zeros(problem.side)
+    shifts[problem.num_poses :] = eta
+    stored, diagonal = shifted_certificate(problem, Lambda, shifts)
     if not (np.isfinite(stored.data).all() and diagonal.min() >= _SMALLEST and diagonal.max() <= _LARGEST):
         return None
-    is_fixed = np.zeros(problem.side, dtype=bool)
-    is_fixed[fixed] = True
-    column = np.repeat(np.arange(problem.side), np.diff(stored.indptr))
-    stored.data[is_fixed[stored.indices] | is_fixed[column]] = 0.0
-    stored.data[problem.diagonal_positions[fixed]] = 2.0 * diagonal[fixed]
+    problem.leave_out(stored.data, fixed, 2.0 * diagonal[fixed])
 
     def attempt(shift: Array) -> CholeskyFactor | None:
         data = stored.data.copy()
@@ -128,13 +136,39 @@ def prove_definite(
         except NotPositiveDefiniteError:
             return None
 
-    expected = problem.analysis.expected_error()
+    free = diagonal.copy()
+    free[fixed] = 0.0
+    expected, crude = problem.analysis.expected_error(), problem.analysis.crude_error()
     entries = np.full(problem.side, matrix_error(problem.graph))
+    if expected is None and turned is not None and crude < np.inf:
+        enough = np.maximum(first_shift, MARGIN * (entries + crude))
+        if enough.max() <= SHRINK * _softest(stored, free, turned):
+            factor = attempt(enough)
+            if factor is not None:
+                return DefiniteProof(stored, factor, free, enough, entries, False, np.full(problem.side, crude))
     found = search_shift(attempt, entries, expected if expected is not None else 0.0 * entries, first_shift)
     if found is None:
         return None
     factor, shift, is_marginal = found
-    return DefiniteProof(stored, factor, np.where(is_fixed, 0.0, diagonal), shift, entries, is_marginal)
+    return DefiniteProof(stored, factor, free, shift, entries, is_marginal)
+
+
+def shifted_certificate(problem: PGOProblem, Lambda: Array, shifts: Array) -> tuple[csc_array, Array]:
+    """S + diag(shifts) in double precision, (N, N), and a diagonal, (N,), no smaller than any its rounding comes from.
+
+    M - Lambda was rounded before the shifts were added, and can be as large.
+    """
+    S = certificate_matrix(problem, Lambda)
+    S.data[problem.diagonal_positions] += shifts
+    stored = S.data[problem.diagonal_positions]
+    return S, np.maximum(problem.M.data[problem.diagonal_positions], stored) + shifts
+
+
+def _softest(stored: csc_array, free: Array, moves: Array) -> float:
+    """Least Rayleigh quotient of the moves, zero where a row is left out, with respect to the diagonal."""
+    moves = np.where(free[:, None] > 0.0, moves, 0.0)
+    energies = np.einsum("rc,rc->c", moves, stored @ moves)
+    return float(np.min(energies / np.einsum("rc,r,rc->c", moves, free, moves)))
 
 
 def search_shift(

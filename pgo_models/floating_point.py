@@ -22,7 +22,8 @@ import numpy as np
 from pgo_models.rotations import Array
 
 UNIT_ROUNDOFF = 2.0**-53
-# A bound is a sum of non-negative terms of fewer than 2^20 operations each: this makes up for its own rounding.
+# A bound is itself a sum of fewer than 2^22 non-negative terms, each of a few operations: this makes up for their
+# rounding.
 OUTWARD = 1.0 + 2.0**-30
 
 

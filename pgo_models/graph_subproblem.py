@@ -23,31 +23,14 @@ from pgo_models.rotations import Array, BoolArray
 
 
 class Unknowns(enum.Enum):
-    """What the quadratic program is solved for.
-
-    Examples
-    --------
-    >>> from pgo_models.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> graph_qp(graph, np.ones(27), Unknowns.ROTATIONS).variables.num_translations
-    0
-    """
+    """What the quadratic program is solved for."""
 
     ROTATIONS = "rotations only, on the rotation residuals: the paper's step (a)"
     POSES = "rotations and translations together"
 
 
 class Neighbours(enum.Enum):
-    """What a robot's program does with the poses of others that its edges lead to.
-
-    Examples
-    --------
-    >>> from pgo_models.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> robots = graph.with_robots(np.arange(27) // 9)
-    >>> robot_qp(robots, 0, np.ones(27), Neighbours.COPIES).variables.poses.size
-    18
-    """
+    """What a robot's program does with the poses of others that its edges lead to."""
 
     COPIES = "copies of them are unknowns too, and an edge between robots counts half"
     FROZEN = "they stay where they are, and enter the shift"

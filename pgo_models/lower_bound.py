@@ -137,8 +137,8 @@ def best_bound(problem: PGOProblem, Lambda: Array, poses: Poses | None, gap: flo
     found = _prove(problem, Lambda, 0.0, point) if point is not None else None
     if found is not None and found.value > 0.0:
         return found
-    smallest, most = smallest_shift(problem, gap, objective), _trace(Lambda)
-    count = problem.num_poses * problem.d
+    count, most = problem.num_poses * problem.d, _trace(Lambda)
+    smallest = smallest_shift(gap, objective, count)
     bounds = [search_bound(lambda eta: _prove(problem, Lambda, eta, None), smallest, most, count)]
     if point is not None:
         bounds.append(search_bound(lambda eta: _prove(problem, Lambda, eta, point), smallest, most, count))
@@ -175,20 +175,21 @@ def search_bound(prove: Callable[[float], LowerBound | None], smallest: float, t
     return bound if bound.value > 0.0 else NO_BOUND
 
 
-def smallest_shift(problem: PGOProblem, gap: float, objective: float) -> float:
-    """Shift eta that spends a fixed share of a relative gap."""
-    return shift_of_gap(gap, objective, problem.num_poses * problem.d)
-
-
-def shift_of_gap(gap: float, objective: float, count: int) -> float:
-    """`smallest_shift` from count = n d."""
+def smallest_shift(gap: float, objective: float, count: int) -> float:
+    """Shift eta that spends a fixed share of a relative gap, count = n d."""
     return _ETA_SHARE * gap * objective / count
+
+
+def quadratic_loss(product: Array, error: Array | float, slack: Array) -> float:
+    """Bound on tr(G^T S_r^-1 G), sum (|G| + error)^2 / slack, for S_r >= diag(slack) and G known to an error."""
+    return OUTWARD * float(np.sum((np.abs(product) + error) ** 2 / slack[:, None]))
 
 
 def squared_distances(moved: Array, rotations: Array) -> float:
     """Bound on sum_i ||R_i^T - P_i Q||_F^2 over all rotations R_i, Q, for blocks P_i moved away from rotations.
 
-    Two rotations are at most sqrt(8) apart, P_i is ||P_i - P^_i|| from P^_i, and that, to rounding, a rotation.
+    Two rotations are at most sqrt(8) apart, P_i is ||P_i - P^_i|| from P^_i, and that ||P^_i P^_i^T - I|| from one.
+    Rounding of these, a few u beside sqrt(8), is what `OUTWARD` is for.
 
     Parameters
     ----------
@@ -197,8 +198,8 @@ def squared_distances(moved: Array, rotations: Array) -> float:
     """
     d = rotations.shape[1]
     blocks = rotations.reshape(-1, d, d)
-    slant = 2.0 * orthogonality_error(blocks) + 32.0 * UNIT_ROUNDOFF
-    apart = math.sqrt(8.0) + slant + np.linalg.norm((moved - rotations).reshape(-1, d * d), axis=1)
+    away = np.linalg.norm((moved - rotations).reshape(-1, d * d), axis=1)
+    apart = math.sqrt(8.0) + orthogonality_error(blocks) + away
     return OUTWARD * float(np.sum(apart**2))
 
 
@@ -247,7 +248,7 @@ def _prove_with_eta(problem: PGOProblem, Lambda: Array, eta: float) -> LowerBoun
 
 
 def _prove_grounded(problem: PGOProblem, Lambda: Array, eta: float, ground: _Ground) -> LowerBound | None:
-    proof = prove_definite(problem, Lambda, eta, ground.rows)
+    proof = prove_definite(problem, Lambda, eta, ground.rows, turned=ground.X)
     if proof is None:
         return None
     X, found = _move(problem, Lambda, ground.X, proof)
@@ -255,8 +256,7 @@ def _prove_grounded(problem: PGOProblem, Lambda: Array, eta: float, ground: _Gro
     if slack is None:  # now the rounding of the factorisation is known
         return _prove_grounded(problem, Lambda, eta, ground)
     free, n = proof.free, problem.num_poses
-    sizes = np.abs(found.product) + found.product_error
-    quadratic = OUTWARD * float(np.sum(sizes[free] ** 2 / slack[free, None]))
+    quadratic = quadratic_loss(found.product[free], found.product_error[free], slack[free])
     lost = OUTWARD * eta * squared_distances(X[n:], ground.X[n:])
     rounding = found.value_error + quadratic
     return bound_from([found.value, -lost], rounding, eta, is_grounded=True)
@@ -265,7 +265,7 @@ def _prove_grounded(problem: PGOProblem, Lambda: Array, eta: float, ground: _Gro
 def _move(problem: PGOProblem, Lambda: Array, X: Array, proof: DefiniteProof) -> tuple[Array, Evaluation]:
     """X - S_r^-1 S X, again while that helps, and the certificate there."""
     n, d, free = problem.num_poses, problem.d, proof.free
-    weight = (proof.shift * proof.diagonal)[free, None]
+    weight = (proof.shift * proof.diagonal)[free]
     low, left, found = np.zeros((n, d)), math.inf, None
     product = problem.apply_M(X)
     product[n:] -= (Lambda @ X[n:].reshape(n, d, d)).reshape(-1, d)
@@ -274,7 +274,7 @@ def _move(problem: PGOProblem, Lambda: Array, X: Array, proof: DefiniteProof) ->
         there = X.copy(), low - step[:n]
         there[0][n:] -= step[n:]
         moved = evaluate_certificate(problem, Lambda, *there)
-        after = float(np.sum(moved.product[free] ** 2 / weight))
+        after = quadratic_loss(moved.product[free], 0.0, weight)
         if not after < left:
             break
         (X, low), found, product, left = there, moved, moved.product, after

@@ -15,15 +15,7 @@ from pgo_models.rotations import BoolArray
 
 
 class PartitionMethod(enum.Enum):
-    """How poses are given to robots.
-
-    Examples
-    --------
-    >>> from pgo_models.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> partition(graph, method=PartitionMethod.SINGLETONS).num_robots
-    27
-    """
+    """How poses are given to robots."""
 
     GIVEN = "as the graph names them"
     CONTIGUOUS = "contiguous in time"

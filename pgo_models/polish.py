@@ -2,6 +2,10 @@
 
 It stands with the problem because a certificate speaks of stationary points: judging anybody's poses needs the one
 beside them. `solvers.newton` runs the same step in the common loop.
+
+One factorisation serves several moves. After the first, the factored matrix is the one that L-BFGS begins with
+(Nocedal & Wright 2006, algorithm 7.4), which learns from every move what has changed: sphere2500 needs one
+factorisation where moves with the factor alone need two.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from pgo_models.matrices import inner
 from pgo_models.multipliers import multipliers
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
-from pgo_models.rotations import Array, exp_map, project_to_rotations
+from pgo_models.rotations import Array, exp_map, project_to_rotations, vee
 from pgo_models.rounding_errors import rounding_level
 
 STATIONARY_DECREMENT = 1e-13
@@ -28,8 +32,8 @@ SUFFICIENT = 1e-4  # Armijo's constant
 HALVINGS = 40
 NEARLY_EXACT = 1e4  # times its rounding level: then F is what the solve for the translations leaves
 DAMPING_START, DAMPING_GROWTH, DAMPING_MAX = 1e-8, 10.0, 1e6
-CHORD_STEPS = 3
-CHORD_PROGRESS = 0.1
+CHORD_STEPS, SECANT_STEPS = 3, 8  # further moves with one factor, as it is and with the secants of the moves before
+PROGRESS = 0.1  # what a move has to leave at most of the decrement for another one with the same factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,32 +77,40 @@ def start_polish(problem: PGOProblem, poses: Poses) -> PolishState:
     return PolishState(poses=poses, objective=problem.objective(poses))
 
 
-def polish_step(problem: PGOProblem, state: PolishState, second_order: bool = True) -> PolishState:
+def polish_step(
+    problem: PGOProblem, state: PolishState, second_order: bool = True, secants: bool = True
+) -> PolishState:
     """Factor once, then move as long as the same factor serves; F never rises.
 
     The first move solves H y = -g with the Riemannian Hessian H, or, where H is not positive definite or
     `second_order` is False, with its Gauss-Newton part, damped until it is. Backtracking (Armijo) keeps F monotone.
-    Further moves with the same factor (chord steps) go on while each cuts the decrement to a tenth.
+    Further moves take the same factor, with the secants of those before (L-BFGS) or, without `secants`, as it is (chord
+    steps), while each cuts the decrement to a tenth.
     """
     analysis, factor, is_newton = _factorize_model(problem, state, second_order)
     layout = TangentLayout(problem.num_poses, problem.d)
     now = replace(state, analysis=analysis, factor=factor, is_newton=is_newton, moved=False)
     level = rounding_level(problem, state.poses)  # hardly moves with them
-    gradient, direction, decrement = _direction(problem, layout, now, level)
-    now = replace(now, decrement=decrement)
-    for _ in range(1 + CHORD_STEPS):
+    gradient, learned = layout.join(*problem.riemannian_gradient(state.poses)), list[_Secant]()
+    direction = -factor.solve(gradient)
+    now = replace(now, decrement=scaled_decrement(-inner(gradient, direction), now.objective, level))
+    for _ in range(1 + (SECANT_STEPS if secants else CHORD_STEPS)):
         if now.is_stationary:
             break
         candidate = _backtrack(problem, layout, now, gradient, direction, level)
         if candidate is None:
             break
-        gradient, direction, decrement = _direction(problem, layout, candidate, level)
+        before, gradient = gradient, layout.join(*problem.riemannian_gradient(candidate.poses))
+        if secants:
+            learned.append(_Secant(_move_between(layout, now.poses, candidate.poses), gradient - before))
+        direction = -_apply_inverse(factor, learned, gradient)
+        decrement = scaled_decrement(-inner(gradient, direction), candidate.objective, level)
         at_rounding = reached_rounding(now.decrement, decrement, is_newton and not now.moved)
         tie = candidate.objective >= now.objective
         if tie and decrement > 0.5 * now.decrement:
             now = replace(now, is_at_rounding=at_rounding)
             break
-        enough = decrement <= CHORD_PROGRESS * now.decrement
+        enough = decrement <= PROGRESS * now.decrement
         now = replace(candidate, decrement=decrement, moved=True, is_at_rounding=at_rounding)
         if not enough:
             break
@@ -127,7 +139,7 @@ def polish(problem: PGOProblem, poses: Poses, max_steps: int = 100) -> Poses:
 
 def reached_rounding(before: float, after: float, is_newton_step: bool) -> bool:
     """Whether a decrement so small that a Newton step squares it was not even cut to a tenth by one."""
-    return is_newton_step and before <= SMALL_DECREMENT and after > CHORD_PROGRESS * before
+    return is_newton_step and before <= SMALL_DECREMENT and after > PROGRESS * before
 
 
 def relative_decrement(problem: PGOProblem, poses: Poses) -> float:
@@ -137,10 +149,10 @@ def relative_decrement(problem: PGOProblem, poses: Poses) -> float:
     `STATIONARY_DECREMENT` in any case.
     """
     state = start_polish(problem, poses)
-    analysis, factor, is_newton = _factorize_model(problem, state, second_order=True)
-    now = replace(state, analysis=analysis, factor=factor, is_newton=is_newton)
-    layout, level = TangentLayout(problem.num_poses, problem.d), rounding_level(problem, poses)
-    decrement = _direction(problem, layout, now, level)[2]
+    _, factor, is_newton = _factorize_model(problem, state, second_order=True)
+    gradient = TangentLayout(problem.num_poses, problem.d).join(*problem.riemannian_gradient(poses))
+    square = inner(gradient, factor.solve(gradient))
+    decrement = scaled_decrement(square, state.objective, rounding_level(problem, poses))
     return decrement if is_newton else max(decrement, 2.0 * STATIONARY_DECREMENT)
 
 
@@ -188,14 +200,29 @@ def ground_pose(matrix: csc_array, problem: PGOProblem) -> None:
         matrix.data[position] += abs(matrix.data[position])
 
 
-def _direction(
-    problem: PGOProblem, layout: TangentLayout, state: PolishState, level: float
-) -> tuple[Array, Array, float]:
-    """Gradient, step -H^-1 g and relative decrement at the state's poses."""
-    assert state.factor is not None
-    gradient = layout.join(*problem.riemannian_gradient(state.poses))
-    direction = -state.factor.solve(gradient)
-    return gradient, direction, scaled_decrement(-inner(gradient, direction), state.objective, level)
+@dataclass(frozen=True, eq=False)
+class _Secant:
+    """A move and the change of the gradient along it."""
+
+    move: Array
+    change: Array
+
+
+def _move_between(layout: TangentLayout, start: Poses, end: Poses) -> Array:
+    return layout.join(vee(np.swapaxes(start.R, 1, 2) @ end.R), end.t - start.t)
+
+
+def _apply_inverse(factor: CholeskyFactor, secants: list[_Secant], gradient: Array) -> Array:
+    """H^-1 g by the two loops of L-BFGS (Nocedal & Wright 2006, algorithm 7.4), from H the factored matrix."""
+    curved = [one for one in secants if inner(one.move, one.change) > 0.0]
+    g, shares = gradient.copy(), []
+    for one in reversed(curved):
+        shares.append(inner(one.move, g) / inner(one.move, one.change))
+        g -= shares[-1] * one.change
+    step = factor.solve(g)
+    for one, share in zip(curved, reversed(shares), strict=True):
+        step += (share - inner(one.change, step) / inner(one.move, one.change)) * one.move
+    return step
 
 
 def scaled_decrement(square: float, objective: float, rounding_level: float) -> float:

@@ -16,12 +16,6 @@ class RotationWeight(enum.Enum):
     A rotation error theta costs kappa ||R - I||_F^2 = 4 kappa (1 - cos theta), about 2 kappa theta^2. A Gaussian says
     I_theta theta^2 (F has no factor 1/2, nor has tau ||.||^2), so that kappa = I_theta / 2, as it is in space.
     SE-Sync's kappa = I_theta counts rotations twice against translations; published optima of 2D graphs are with it.
-
-    Examples
-    --------
-    >>> information = np.diag([4.0, 4.0, 6.0])[None]
-    >>> [float(precisions(information, weights)[0][0]) for weights in RotationWeight]
-    [6.0, 3.0]
     """
 
     SE_SYNC = "kappa = I_theta in the plane"

@@ -123,6 +123,13 @@ class PGOProblem:
         matrix.has_canonical_format = True
         return matrix
 
+    def leave_out(self, data: Array, rows: IntArray, diagonal: Array | float) -> None:
+        """Overwrite stored values of a matrix with the pattern of M: rows and columns then hold but a diagonal."""
+        is_out = np.zeros(self.side, dtype=bool)
+        is_out[rows] = True
+        data[is_out[self.M.indices] | np.repeat(is_out, np.diff(self.M.indptr))] = 0.0
+        data[self.diagonal_positions[rows]] = diagonal
+
     # The cost and its derivatives.
 
     def residuals(self, X: Array) -> Array:

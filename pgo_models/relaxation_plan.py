@@ -27,17 +27,7 @@ _CONE_BYTES = 1.2e5  # of cvxpy's for every cone
 
 
 class RelaxationForm(enum.Enum):
-    """How the relaxation is posed.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.problem import PGOProblem
-    >>> from pgo_models.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> plan_relaxation(problem).form.name
-    'CLIQUES'
-    """
+    """How the relaxation is posed."""
 
     PRIMAL = "min tr(Q Z), Z_ii = I, Z PSD: one dense cone, translations marginalised out"
     DUAL = "max tr(Lambda), M - blockdiag(0, Lambda) PSD: one sparse linear matrix inequality"
@@ -45,17 +35,7 @@ class RelaxationForm(enum.Enum):
 
 
 class SDPSolver(enum.Enum):
-    """Which solver it is given to.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.problem import PGOProblem
-    >>> from pgo_models.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> plan_relaxation(problem).solver.name
-    'CLARABEL'
-    """
+    """Which solver it is given to."""
 
     CLARABEL = "interior point, accurate; its work grows with the sixth power of a cone's side"
     SCS = "first order, rougher; its work grows with the third power of a cone's side"

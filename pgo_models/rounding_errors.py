@@ -2,9 +2,8 @@
 
 Every bound holds for any order of summation and with or without fused multiply-add (Higham 2002, *Accuracy and
 Stability of Numerical Algorithms*, sections 3.1 and 4.2): a sum of k products is off by at most gamma_k times the sum
-of their absolute values, gamma_k = k u / (1 - k u), u = 2^-53. Bounds are themselves sums of fewer than 2^22
-non-negative terms, each the product of a few numbers: their own rounding is below the 2^-30 they are enlarged by.
-Underflow is kept out by `has_safe_scale`.
+of their absolute values, gamma_k = k u / (1 - k u), u = 2^-53. Bounds are rounded up by `OUTWARD`; underflow is kept
+out by `has_safe_scale`.
 """
 
 from __future__ import annotations

@@ -37,17 +37,7 @@ Relaxation = PrimalRelaxation | DualRelaxation | CliqueRelaxation
 
 
 class RelaxationStatus(enum.Enum):
-    """How the solver ended.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.problem import PGOProblem
-    >>> from pgo_models.scenes import random_geometric
-    >>> problem = PGOProblem(random_geometric(4, np.random.default_rng(0)))
-    >>> solve_relaxation(problem).status.name
-    'OPTIMAL'
-    """
+    """How the solver ended."""
 
     OPTIMAL = "solved to the solver's tolerance"
     INACCURATE = (

@@ -28,13 +28,7 @@ _LINES = ("-", "--", ":", "-.")
 
 
 class Effort(enum.Enum):
-    """What the progress of methods is held against; the value is the label of the axis.
-
-    Examples
-    --------
-    >>> Effort.ROUNDS.value
-    'communication rounds'
-    """
+    """What the progress of methods is held against; the value is the label of the axis."""
 
     ITERATIONS = "iterations"
     ROUNDS = "communication rounds"

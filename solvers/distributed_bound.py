@@ -24,8 +24,9 @@ from pgo_models.lower_bound import (
     UNGROUNDED_SHIFT,
     LowerBound,
     bound_from,
+    quadratic_loss,
     search_bound,
-    shift_of_gap,
+    smallest_shift,
     squared_distances,
 )
 from pgo_models.pose_graph import IntArray
@@ -55,7 +56,7 @@ def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
     if found is not None and found.value > 0.0:
         return found
     count = driver.num_poses * driver.d
-    smallest = shift_of_gap(gap, driver.objective, count)
+    smallest = smallest_shift(gap, driver.objective, count)
     # At stationary poses tr(Lambda) is F; it only says where the search ends.
     forms = prove_with_eta, prove_grounded
     bounds = [search_bound(partial(form, driver), smallest, driver.objective, count) for form in forms]
@@ -136,15 +137,15 @@ def _sum_up(driver: Driver, proof: InterfaceProof, X: Array, answers: Sequence[M
     sizes = space.gather([np.abs(part) for part in parts]) + np.abs(own)
     error += space.gather([answer["error"] for answer in answers]) + gamma(len(parts) + 2.0) * sizes
     product = space.gather(parts) + own
-    slack = proof.slack[free, None]
+    slack = proof.slack[free]
     figures = np.array([answer["figures"] for answer in answers])
     values = [*figures[:, 0].tolist(), blocks.value]
     value_error = float(figures[:, 1].sum()) + blocks.value_error + UNIT_ROUNDOFF * abs(math.fsum(values))
     return _Sums(
         value=math.fsum(values),
         value_error=OUTWARD * value_error,
-        left=float(figures[:, 2].sum()) + float(np.sum(product[free] ** 2 / slack)),
-        quadratic=OUTWARD * (float(figures[:, 3].sum()) + float(np.sum((np.abs(product) + error)[free] ** 2 / slack))),
+        left=float(figures[:, 2].sum()) + quadratic_loss(product[free], 0.0, slack),
+        quadratic=OUTWARD * (float(figures[:, 3].sum()) + quadratic_loss(product[free], error[free], slack)),
         squared_distances=float(figures[:, 4].sum()),
         X=X,
         own=own,

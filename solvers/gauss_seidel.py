@@ -38,13 +38,7 @@ from solvers.schedule import Schedule, Sweep, schedule
 
 
 class DGSStage(enum.Enum):
-    """Which of the two linear problems is being solved.
-
-    Examples
-    --------
-    >>> [stage.name for stage in DGSStage]
-    ['ROTATIONS', 'POSES']
-    """
+    """Which of the two linear problems is being solved."""
 
     ROTATIONS = "rotations, orthogonality dropped"
     POSES = "full poses, linearised"

@@ -29,13 +29,7 @@ from solvers.result import History, Measurement, Record, Run, Status
 
 
 class GtsamMethod(enum.Enum):
-    """Which of its optimisers.
-
-    Examples
-    --------
-    >>> Gtsam(GtsamMethod.GAUSS_NEWTON).method.value
-    'Gauss-Newton'
-    """
+    """Which of its optimisers."""
 
     LEVENBERG_MARQUARDT = "Levenberg-Marquardt"
     GAUSS_NEWTON = "Gauss-Newton"

@@ -39,7 +39,8 @@ class LevenbergMarquardtState:
     ----------
     k : int
     poses : Poses
-    objective : float
+    objective, level : float
+        F, and its rounding level.
     matrix : csc_array
         A, the Gauss-Newton matrix at the poses, pose 0 grounded.
     gradient : Array
@@ -57,6 +58,7 @@ class LevenbergMarquardtState:
     k: int
     poses: Poses
     objective: float
+    level: float
     matrix: csc_array
     gradient: Array
     analysis: SymbolicCholesky
@@ -111,7 +113,7 @@ class LevenbergMarquardt:
         level = rounding_level(problem, poses)
         step, decrement = _damped_step(matrix, gradient, analysis, self.damping, objective, level)
         return LevenbergMarquardtState(
-            0, poses, objective, matrix, gradient, analysis, self.damping, _GROWTH, step, decrement
+            0, poses, objective, level, matrix, gradient, analysis, self.damping, _GROWTH, step, decrement
         )
 
     def step(self, problem: PGOProblem, state: LevenbergMarquardtState) -> LevenbergMarquardtState:
@@ -128,14 +130,14 @@ class LevenbergMarquardt:
                 k=state.k + 1,
                 poses=candidate,
                 objective=objective,
+                level=rounding_level(problem, candidate),
                 matrix=matrix,
                 gradient=gradient,
                 damping=max(factor * state.damping, _DAMPING_LIMITS[0]),
                 growth=_GROWTH,
             )
-        level = rounding_level(problem, again.poses)
         step, decrement = _damped_step(
-            again.matrix, again.gradient, again.analysis, again.damping, again.objective, level
+            again.matrix, again.gradient, again.analysis, again.damping, again.objective, again.level
         )
         return replace(again, step=step, decrement=decrement)
 
@@ -162,7 +164,7 @@ class LevenbergMarquardt:
         damped = state.damping * inner(state.step, state.matrix.diagonal() * state.step)
         foreseen = 0.5 * (damped - inner(state.gradient, state.step))
         # Below the rounding of F both decreases are noise, and their ratio is made to tend to one.
-        rounding = _ROUNDING * state.objective + rounding_level(problem, state.poses)
+        rounding = _ROUNDING * state.objective + state.level
         return (state.objective - objective + rounding) / (foreseen + rounding), poses, objective
 
 

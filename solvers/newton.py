@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from pgo_models.errors import SettingError
 from pgo_models.initialization import chordal_start
@@ -33,6 +33,9 @@ class Newton:
     max_iterations : int
     second_order : bool
         False is Gauss-Newton, the second layer of the paper's method.
+    secants : bool
+        Whether moves with one factorisation learn from those before (L-BFGS); robots do without, as each learned one
+        would cost them a reduction.
 
     Examples
     --------
@@ -46,6 +49,7 @@ class Newton:
     tolerance: float = STATIONARY_DECREMENT
     max_iterations: int = 100
     second_order: bool = True
+    secants: bool = True
 
     def __post_init__(self) -> None:
         if not self.tolerance > 0:
@@ -59,7 +63,7 @@ class Newton:
 
     def step(self, problem: PGOProblem, state: NewtonState) -> NewtonState:
         """One factorisation and the moves it serves."""
-        return NewtonState(state.k + 1, polish_step(problem, state.polish, self.second_order))
+        return NewtonState(state.k + 1, polish_step(problem, state.polish, self.second_order, self.secants))
 
     def measure(self, problem: PGOProblem, state: NewtonState) -> Measurement:
         """F and the relative decrement."""
@@ -84,4 +88,4 @@ def gauss_newton(max_iterations: int = Newton.max_iterations) -> Newton:
     >>> gauss_newton().second_order
     False
     """
-    return replace(Newton(), max_iterations=max_iterations, second_order=False)
+    return Newton(max_iterations=max_iterations, second_order=False, secants=False)

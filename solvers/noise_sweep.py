@@ -15,13 +15,7 @@ from solvers.pipeline import solve
 
 
 class SweptScene(enum.Enum):
-    """Which network.
-
-    Examples
-    --------
-    >>> noisy_scene(SweptScene.GRID, 0.1, np.random.default_rng(0))
-    PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
-    """
+    """Which network."""
 
     CIRCLE = "circle"
     GRID = "grid"

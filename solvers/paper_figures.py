@@ -40,13 +40,7 @@ _EYE = {"x": 1.1, "y": -1.9, "z": 1.25}  # from where matplotlib looks
 
 
 class FigureSet(enum.Enum):
-    """Which of the paper's figures.
-
-    Examples
-    --------
-    >>> FigureSet("scenes").graphs
-    ('circle', 'sphere', 'grid')
-    """
+    """Which of the paper's figures."""
 
     SCENES = "scenes"
     BENCHMARKS = "benchmarks"

@@ -213,8 +213,7 @@ def solve(
             if stages[-1].status.is_success:
                 journal.end()
         ledger = driver.ledger
-    can_improve = not (certificate.is_certified or certificate.is_best_in_doubles)
-    if pipeline.staircase is not None and can_improve and stages[-1].status not in OUT_OF_TIME:
+    if pipeline.staircase is not None and certificate.can_improve and stages[-1].status not in OUT_OF_TIME:
         try:
             poses, certificate = _climb(problem, pipeline, poses, certificate, stages, watch)
         except KeyboardInterrupt:
@@ -265,8 +264,7 @@ def _tries(
 ) -> tuple[Poses, Certificate]:
     """One attempt, and where its certificate is wider than asked for a second one with a finer SOC."""
     poses, certificate = attempt(pipeline.soc, start)
-    can_improve = not (certificate.is_certified or certificate.is_best_in_doubles)
-    if pipeline.second_try and can_improve and stages[-1].status.is_success:
+    if pipeline.second_try and certificate.can_improve and stages[-1].status.is_success:
         soc = pipeline.soc if pipeline.soc is not None else SOC()
         fine = replace(soc, tolerance=min(soc.tolerance, _SECOND_TRY_TOLERANCE), max_iterations=SOC.max_iterations)
         poses, certificate = _better(problem, poses, certificate, attempt(fine, None)[1])

@@ -15,13 +15,7 @@ S = TypeVar("S")
 
 
 class Status(enum.Enum):
-    """Why a run ended.
-
-    Examples
-    --------
-    >>> Status.CONVERGED.is_success, Status.TIME_LIMIT.is_success
-    (True, False)
-    """
+    """Why a run ended."""
 
     CONVERGED = "residuals are within tolerance"
     MAX_ITERATIONS = "iteration limit reached; raise max_iterations or loosen the tolerance"

@@ -78,12 +78,8 @@ class Robot:
             fixed = columns_of(np.zeros(1, dtype=np.int64), p, (1, d))
             at = np.concatenate([np.zeros((1, d)), np.eye(d)])
             b -= K[:, fixed] @ at
-            is_fixed = np.zeros(self.problem.side, dtype=bool)
-            is_fixed[fixed] = True
             data = K.data.copy()
-            column = np.repeat(np.arange(self.problem.side), np.diff(K.indptr))
-            data[is_fixed[K.indices] | is_fixed[column]] = 0.0
-            data[self.problem.diagonal_positions[fixed]] = 1.0
+            self.problem.leave_out(data, fixed, 1.0)
             b[fixed] = at
             K = self.problem.with_pattern_of_M(data)
         return self._eliminate(K, (1, d), b)

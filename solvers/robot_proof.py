@@ -8,11 +8,10 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from pgo_models.cholesky import CholeskyBackend
-from pgo_models.definiteness import MARGIN
+from pgo_models.definiteness import MARGIN, shifted_certificate
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.floating_point import OUTWARD
-from pgo_models.lower_bound import squared_distances
-from pgo_models.multipliers import certificate_matrix
+from pgo_models.lower_bound import quadratic_loss, squared_distances
 from pgo_models.pose_graph import IntArray
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
@@ -64,8 +63,8 @@ class RobotProof:
         `error` are the rows of S X on the boundary.
         """
         found = evaluate_certificate(problem, self.Lambda, self.X, self.low)
-        G, error, slack = found.product[self.interior], found.product_error[self.interior], self.slack[:, None]
-        left, quadratic = float(np.sum(G**2 / slack)), OUTWARD * float(np.sum((np.abs(G) + error) ** 2 / slack))
+        G, error = found.product[self.interior], found.product_error[self.interior]
+        left, quadratic = quadratic_loss(G, 0.0, self.slack), quadratic_loss(G, error, self.slack)
         rotations = self.interior[self.interior >= len(self.low)]
         apart = squared_distances(self.X[rotations], self.start[rotations])
         figures = np.array([found.value, found.value_error, left, quadratic, apart])
@@ -117,15 +116,10 @@ def verify_interior(
     inside = cut.interior
     shifts = np.zeros(problem.side)
     shifts[inside[inside >= problem.num_poses]] = eta
-    S = certificate_matrix(problem, Lambda)
-    S.data[problem.diagonal_positions] += shifts
-    # M - Lambda was rounded before eta was added, and can be as large.
-    diagonal = np.maximum(problem.M.data[problem.diagonal_positions], S.data[problem.diagonal_positions]) + shifts
-    is_fixed = np.zeros(problem.side, dtype=bool)
-    is_fixed[fixed] = True
-    column = np.repeat(np.arange(problem.side), np.diff(S.indptr))
-    S.data[is_fixed[S.indices] | is_fixed[column]] = 0.0
-    S.data[problem.diagonal_positions[inside[is_fixed[inside]]]] = 2.0 * diagonal[inside[is_fixed[inside]]]
+    S, diagonal = shifted_certificate(problem, Lambda, shifts)
+    is_fixed = np.isin(inside, fixed)
+    problem.leave_out(S.data, fixed, 0.0)
+    S.data[problem.diagonal_positions[inside[is_fixed]]] = 2.0 * diagonal[inside[is_fixed]]
     entries = matrix_error(problem.graph)
     expected = cut.analysis.expected_error(len(cut.boundary)) if cut.analysis is not None else None
     error = entries + (expected if expected is not None else np.zeros(len(inside)))
@@ -143,6 +137,6 @@ def verify_interior(
         error = OUTWARD * (entries + found.interior_error)
         if (2.0 * error <= shift).all():
             slack = (shift - error) / OUTWARD * diagonal[inside]
-            return matrix, found, np.where(is_fixed[inside], np.inf, slack)
+            return matrix, found, np.where(is_fixed, np.inf, slack)
         cut = found.cut
     return None

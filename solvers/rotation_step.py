@@ -25,14 +25,7 @@ _BOUND_SWEEPS = 10  # then at most 1.27 times the largest eigenvalue of H on the
 
 
 class RStep(enum.Enum):
-    """Which back end solves the R-subproblem.
-
-    Examples
-    --------
-    >>> from solvers.soc import SOC
-    >>> SOC(r_step=RStep.FISTA).r_step.name
-    'FISTA'
-    """
+    """Which back end solves the R-subproblem."""
 
     FACTORIZED = "one sparse Cholesky factorisation, then two triangular solves an iteration"
     FISTA = "accelerated gradients, the paper's choice"

@@ -20,13 +20,7 @@ from solvers.network import BYTES_PER_NUMBER, Traffic
 
 
 class Sweep(enum.Enum):
-    """In which order the robots update once each.
-
-    Examples
-    --------
-    >>> Sweep["COLORS"].value.split(":")[0]
-    'robots of one colour at once, colour after colour'
-    """
+    """In which order the robots update once each."""
 
     JACOBI = "all robots at once: block Jacobi, and JOR when alpha is not 1"
     COLORS = "robots of one colour at once, colour after colour: Gauss-Seidel, and SOR when alpha is not 1"

@@ -52,13 +52,7 @@ _SEPARATOR_PENALTY, _MOST_SEPARATOR_PENALTY = 0.7, 0.3  # times the root of the 
 
 
 class Coupling(enum.Enum):
-    """How the R-subproblem is shared.
-
-    Examples
-    --------
-    >>> SOC(coupling=Coupling.JOINT).effective_coupling.name
-    'JOINT'
-    """
+    """How the R-subproblem is shared."""
 
     PAPER = "rotations only, every robot with its neighbours frozen (Algorithm 1 to the letter)"
     JOINT = "one robot, all rotations and translations in one QP"

@@ -227,7 +227,7 @@ class Staircase:
 
     def _climb(self, problem: PGOProblem, state: StaircaseState) -> StaircaseState:
         """Prove that the relaxation is solved, or leave along the eigenvector that shows it is not."""
-        point, eta = state.point, smallest_shift(problem, self.gap, state.point.value)
+        point, eta = state.point, smallest_shift(self.gap, state.point.value, problem.num_poses * problem.d)
         if point.value <= state.rounding_level:
             return replace(state, k=state.k + 1, bound=DualBound(NO_BOUND, point.Lambda), is_solved=True)
         at_poses = self.poses(problem, state) if point.rank == problem.d else None

@@ -1,4 +1,4 @@
-"""The second stage by driver and robots: the damped Riemannian Newton of `pgo_models.polish`, step for step."""
+"""The second stage by driver and robots: the damped Newton of `pgo_models.polish` without secants, step for step."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.hessian import TangentLayout
 from pgo_models.matrices import inner
 from pgo_models.polish import (
-    CHORD_PROGRESS,
     CHORD_STEPS,
     DAMPING_GROWTH,
     DAMPING_MAX,
     DAMPING_START,
     HALVINGS,
+    PROGRESS,
     ROUNDING,
     STATIONARY_DECREMENT,
     SUFFICIENT,
@@ -92,7 +92,7 @@ class SubstructuredNewton:
             driver.ask("accept", count=Count.WITH_THE_NEXT)
             driver.R, driver.t, driver.force = trial.R, trial.t, trial.force
             driver.objective, driver.rounding_level = trial.objective, trial.rounding_level
-            enough = after <= CHORD_PROGRESS * decrement
+            enough = after <= PROGRESS * decrement
             model, decrement, moved = following, after, True
             if not enough:
                 break

@@ -18,13 +18,7 @@ from solvers.result import History, Status
 
 
 class Contender(enum.Enum):
-    """Methods that can be held against each other, by the name that `pgo compare` knows.
-
-    Examples
-    --------
-    >>> Contender("gauss-seidel").label
-    'DGS'
-    """
+    """Methods that can be held against each other, by the name that `pgo compare` knows."""
 
     JOINT = "joint"
     CONSENSUS = "consensus"

@@ -13,7 +13,7 @@ from pgo_models.polish import polish
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
-from pgo_models.rotations import Array, exp_map, random_rotations
+from pgo_models.rotations import Array, exp_map, random_rotations, tangent_dimension
 from pgo_models.rounding_errors import objective_rounding
 from pgo_models.scenes import MILD_NOISE, NoiseModel, observe, random_geometric
 
@@ -77,6 +77,20 @@ def wound_ring(n: int, d: int) -> tuple[PGOProblem, Poses]:
     graph = observe("ring", truth, i, j, NoiseModel(0.01, 0.01), 100.0, 1.0, np.random.default_rng(0))
     w = angle[:, None] if d == 2 else np.column_stack([np.zeros((n, 2)), angle])
     return PGOProblem(graph), Poses(exp_map(w), t)
+
+
+def still_ring(n: int, d: int) -> PoseGraph:
+    """A ring of poses measured in one place, unturned, with kappa 0.7 and tau 1."""
+    i = np.arange(n)
+    return PoseGraph(
+        n, i, (i + 1) % n, np.broadcast_to(np.eye(d), (n, d, d)), np.zeros((n, d)), np.full(n, 0.7), np.ones(n)
+    )
+
+
+def turned_away(problem: PGOProblem, poses: Poses, size: float, seed: int) -> Poses:
+    """The poses, every rotation turned at random by about so many radians, with their best translations."""
+    w = size * np.random.default_rng(seed).standard_normal((problem.num_poses, tangent_dimension(problem.d)))
+    return problem.with_best_translations(poses.R @ exp_map(w))
 
 
 def random_poses(n: int, d: int, seed: int, spread: float = 1.0) -> Poses:

@@ -204,9 +204,12 @@ def test_what_an_eta_costs_and_the_last_rounding() -> None:
     rng = np.random.default_rng(0)
     rotations = random_rotations(5, 3, rng).reshape(-1, 3)
     moved = rotations + 0.1 * rng.standard_normal(rotations.shape)
-    slant = 2 * orthogonality_error(rotations.reshape(-1, 3, 3)) + 32 * u
     move = np.linalg.norm((moved - rotations).reshape(5, 9), axis=1)
-    assert squared_distances(moved, rotations) >= ENOUGH * np.sum((np.sqrt(8.0) + slant + move) ** 2)
-    assert squared_distances(rotations, rotations) >= ENOUGH * np.sum((np.sqrt(8.0) + slant) ** 2)
+    assert squared_distances(moved, rotations) >= ENOUGH * np.sum((np.sqrt(8.0) + move) ** 2)
+    half_turn = np.diag([1.0, -1.0, -1.0])
+    for shrink in (1e-9, 1e-6, 1e-3):  # as far from a rotation as the distance to the one opposite grows
+        stretched = (1.0 + shrink) * rotations
+        opposite = (half_turn @ rotations.reshape(5, 3, 3)).reshape(-1, 3)
+        assert squared_distances(stretched, stretched) >= np.sum((stretched - opposite) ** 2)
     assert bound_from([1.0, 2.0**-60], 0.0, 0.0, is_grounded=True).value < 1.0
     assert bound_from([1.0], 0.25, 0.0, is_grounded=True).value < 0.75

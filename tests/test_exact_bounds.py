@@ -15,7 +15,7 @@ from exact_arithmetic import (
     nearest_rotations,
     without,
 )
-from graphs import DIMENSIONS, SEEDS, random_poses, varied_graph
+from graphs import DIMENSIONS, SEEDS, random_poses, still_ring, varied_graph
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from roads import Shape, road
@@ -347,12 +347,9 @@ def test_what_is_barely_said_to_be_definite_is(
 @pytest.mark.parametrize("exponent", range(20, 34))
 def test_no_rounding_is_lost_between_multipliers_and_eta(backend: CholeskyBackend, exponent: int) -> None:
     """M - Lambda is rounded to the last bit of Lambda, and that is not gone when eta makes up for it."""
-    n, d = 12, 2
-    i = np.arange(n)
-    measured = np.broadcast_to(np.eye(d), (n, d, d)), np.zeros((n, d))
-    problem = PGOProblem(PoseGraph(n, i, (i + 1) % n, *measured, np.full(n, 0.7), np.ones(n)), backend)
+    problem = PGOProblem(still_ring(12, 2), backend)
     eta = 0.75 * 2.0**exponent
-    Lambda = (eta + np.where(i % 4 == 0, np.spacing(eta), 0.0))[:, None, None] * np.eye(d)
+    Lambda = (eta + np.where(np.arange(12) % 4 == 0, np.spacing(eta), 0.0))[:, None, None] * np.eye(2)
     proof = prove_definite(problem, Lambda, eta, np.zeros(1, dtype=np.int64), 1e-11)
     assert proof is None, "unrotated poses have X^T (S + eta I) X = n d eta - tr(Lambda) < 0"
 

@@ -17,7 +17,7 @@ from exact_arithmetic import (
     largest_share,
     total,
 )
-from graphs import DIMENSIONS, SEEDS, varied_graph
+from graphs import DIMENSIONS, SEEDS, still_ring, varied_graph
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from roads import road
@@ -32,8 +32,8 @@ from pgo_models.cholesky import (
     _SuperLUFactor,
     analyze,
 )
+from pgo_models.floating_point import gamma
 from pgo_models.partition import partition
-from pgo_models.pose_graph import PoseGraph
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import Array
 from solvers.robot_proof import verify_interior
@@ -115,6 +115,9 @@ def test_counts_of_a_pattern_do_not_depend_on_numbers() -> None:
         np.testing.assert_array_equal(counts.in_column, untouched.counts().in_column)
         np.testing.assert_array_equal(counts.in_row, untouched.counts().in_row)
         np.testing.assert_array_equal(counts.order, untouched.counts().order)
+    assert untouched.crude_error() >= untouched.counts().error(0).max() > 0
+    side = float(M.shape[0])
+    assert untouched.crude_error() >= side * gamma(side)
 
 
 def bordered(seed: int, coupling: float) -> tuple[Array, Cut]:
@@ -169,10 +172,7 @@ def is_true_of_robot(
 @BACKENDS
 @pytest.mark.parametrize("exponent", range(24, 34))
 def test_no_rounding_is_lost_between_multipliers_and_eta_by_a_robot(backend: CholeskyBackend, exponent: int) -> None:
-    n, d = 12, 2
-    i = np.arange(n)
-    measured = np.broadcast_to(np.eye(d), (n, d, d)), np.zeros((n, d))
-    graph = PoseGraph(n, i, (i + 1) % n, *measured, np.full(n, 0.7), np.ones(n))
+    graph, d = still_ring(12, 2), 2
     eta = 0.75 * 2.0**exponent
     for share in share_out(graph, partition(graph, 2)):
         assert share.part is not None

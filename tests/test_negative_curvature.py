@@ -19,7 +19,7 @@ def test_it_is_the_smallest_eigenpair_of_the_marginalised_matrix(seed: int, n: i
     Lambda = multipliers(problem, poses)
     S = problem.Q - block_diag(*Lambda)
     smallest = np.linalg.eigvalsh(S)[0]
-    eta = smallest_shift(problem, 1e-6, problem.objective(poses))
+    eta = smallest_shift(1e-6, problem.objective(poses), problem.num_poses * problem.d)
     assume(smallest < -10 * eta)
     found = negative_curvature(problem, Lambda, eta, np.random.default_rng(0))
     assert found.value == pytest.approx(smallest, rel=1e-2)

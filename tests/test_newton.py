@@ -125,7 +125,7 @@ def test_a_state_tells_of_its_poses() -> None:
 
 def test_gauss_newton_is_newton_with_another_matrix() -> None:
     method = gauss_newton(7)
-    assert method == Newton(max_iterations=7, second_order=False)
+    assert method == Newton(max_iterations=7, second_order=False, secants=False)
     problem = varied_problem(0, 8, 3)
     state = method.init(problem, None)
     for _ in range(3):

@@ -19,10 +19,13 @@ from graphs import (
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pgo_models.cholesky import CholeskyBackend
+from pgo_models.cholesky import CholeskyBackend, factorize
+from pgo_models.hessian import TangentLayout, riemannian_hessian
 from pgo_models.initialization import chordal_start
 from pgo_models.polish import (
     STATIONARY_DECREMENT,
+    _apply_inverse,
+    _Secant,
     polish,
     polish_step,
     relative_decrement,
@@ -33,6 +36,8 @@ from pgo_models.pose_graph import PoseGraph
 from pgo_models.poses import Poses
 from pgo_models.problem import PGOProblem
 from pgo_models.rotations import exp_map, orthogonality_error, tangent_dimension
+from solvers.loop import run
+from solvers.soc import SOC
 
 ROUNDING = 1e-14  # the relative change of F that polish does not tell apart from none
 
@@ -170,6 +175,33 @@ def test_a_state_can_be_stepped_from_twice(seed: int, n: int, d: int) -> None:
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_a_move_is_learned_from(seed: int, n: int, d: int) -> None:
+    """The secant equation: a change of the gradient that was seen is answered by the move that made it."""
+    problem, layout = PGOProblem(varied_graph(seed, n, d)), TangentLayout(n, d)
+    matrix = riemannian_hessian(problem, random_poses(n, d, seed), None)
+    matrix.setdiag(2.0 * matrix.diagonal())
+    factor, rng = factorize(matrix), np.random.default_rng(seed)
+    moves = rng.standard_normal((3, layout.side))
+    curved = [_Secant(move, matrix @ move + 0.1 * rng.uniform() * move) for move in moves]
+    level = _Secant(moves[0], -moves[0])  # of negative curvature: left out
+    g = curved[-1].change
+    np.testing.assert_allclose(_apply_inverse(factor, curved, g), moves[-1], rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(_apply_inverse(factor, [level], g), factor.solve(g))
+
+
+@pytest.mark.parametrize(("secants", "factorisations"), [(True, 1), (False, 2)])
+def test_secants_save_a_factorisation(
+    secants: bool, factorisations: int, benchmark_problem: Callable[[str], PGOProblem]
+) -> None:
+    problem = benchmark_problem("sphere2500")
+    state = start_polish(problem, run(SOC(tolerance=5e-3), problem).poses)
+    for _ in range(factorisations):
+        assert not state.is_stationary
+        state = polish_step(problem, state, secants=secants)
+    assert state.is_stationary
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_retract_moves_along_the_exponential(seed: int, n: int, d: int) -> None:
     poses = random_poses(n, d, seed)
     rng = np.random.default_rng(seed)
@@ -189,5 +221,4 @@ def test_units_of_the_weights_do_not_matter(scale: float) -> None:
     poses = polish(problem, chordal_start(problem))
     assert relative_decrement(problem, poses) <= STATIONARY_DECREMENT
     least = scale * expected.objective(polish(expected, chordal_start(expected)))
-    # The decrement is relative to max(1, F).
     assert problem.objective(poses) == pytest.approx(least, rel=1e-12, abs=STATIONARY_DECREMENT)
