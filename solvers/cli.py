@@ -48,7 +48,7 @@ from solvers.choices import (
     chosen_scene,
     chosen_start,
 )
-from solvers.explanations import explained_by_its_graph
+from solvers.explanations import explained_by_its_graph, warn_of_weights
 from solvers.pipeline import HANDOVER, solve
 from solvers.report import check_report, write_report
 from solvers.shell import DONE, Commands, run_command, save_then_show
@@ -209,6 +209,7 @@ def solve_command(
         source = shlex.join([graph, *(["--unit-weights"] if unit_weights else [])])
         targets.append((report, partial(write_report, solution, source=source)))
     save_then_show(targets, lambda: typer.echo(text))
+    warn_of_weights(graph, problem, solution.certificate)
     if not solution.status.is_success:
         raise typer.Exit(NOT_CONVERGED)
     raise typer.Exit(DONE if solution.is_certified else NOT_CERTIFIED)
@@ -248,6 +249,7 @@ def certify_command(
             temporary.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
     save_then_show([(out, save)] if out is not None else [], lambda: typer.echo(str(certificate)))
+    warn_of_weights(graph, problem, certificate)
     raise typer.Exit(DONE if certificate.is_certified else NOT_CERTIFIED)
 
 

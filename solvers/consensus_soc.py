@@ -14,7 +14,7 @@ from solvers.result import Measurement, Status
 from solvers.safeguard import MAX_RAISES, has_diverged, has_stalled, is_going_round
 from solvers.shared_anderson import AndersonSums
 from solvers.soc import SOC
-from solvers.stiffness import adapted_penalty, translation_penalty_for
+from solvers.stiffness import adapted_penalty, fell_most, is_second_look, translation_penalty_for
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,12 +163,15 @@ class ConsensusSOC:
         rule, merits = self.soc.effective_penalty, state.merits
         if state.raises < MAX_RAISES and (has_diverged(merits) or is_going_round(merits, state.ratio)):
             return replace(self._rescaled(driver, state, 2.0, from_best=True), raises=state.raises + 1)
-        if isinstance(rule, MultiplierPenalty) and has_stalled(rule, merits) and state.refreshes < rule.max_refreshes:
-            before = self._adapted(driver, state)
-            if self.has_driver:
-                self.finish(driver)
-            fresh = self._penalized(driver, before)
-            return replace(fresh, k=state.k, refreshes=state.refreshes + 1, raises=state.raises)
+        if isinstance(rule, MultiplierPenalty):
+            is_stalled = has_stalled(rule, merits) and state.refreshes < rule.max_refreshes
+            looks_again = is_second_look(state.refreshes, merits, max(state.primal_residual, state.dual_residual))
+            adapted = self._adapted(driver, state) if is_stalled or looks_again else state
+            if is_stalled or fell_most(state.translation_penalty, adapted.translation_penalty):
+                if self.has_driver:
+                    self.finish(driver)
+                fresh = self._penalized(driver, adapted)
+                return replace(fresh, k=state.k, refreshes=state.refreshes + 1, raises=state.raises)
         if isinstance(rule, BalancedPenalty) and state.k > 0:
             factor = rule.factor(state.primal_residual, state.dual_residual)
             if factor != 1.0 and (factor > 1.0 or state.raises == 0):

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import functools
+import warnings
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
 import numpy as np
 
+from pgo_models.certificate import Certificate
 from pgo_models.datasets import load, locate
-from pgo_models.errors import NotPositiveDefiniteError, PGOError
+from pgo_models.errors import GraphWarning, NotPositiveDefiniteError, PGOError
+from pgo_models.floating_point import UNIT_ROUNDOFF
 from pgo_models.g2o import edge_place
+from pgo_models.pose_graph import PoseGraph
+from pgo_models.problem import PGOProblem
+from pgo_models.rotations import Array
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -35,19 +41,30 @@ def explained_by_its_graph(command: Callable[P, T]) -> Callable[P, T]:
     return explained
 
 
+def warn_of_weights(graph: str, problem: PGOProblem, certificate: Certificate) -> None:
+    """Name the weight beside which rounding hides more of the others than the gap asked for, if there is no proof."""
+    heaviest = max(float(ratio.max()) for ratio in _ratios(problem.graph).values())
+    if not certificate.is_certified and heaviest * UNIT_ROUNDOFF > certificate.wanted_gap:
+        warnings.warn(extreme_weight(graph), GraphWarning, stacklevel=2)
+
+
+def _ratios(graph: PoseGraph) -> dict[str, Array]:
+    return {name: getattr(graph, name) / np.median(getattr(graph, name)) for name in ("kappa", "tau")}
+
+
 def extreme_weight(graph: str) -> str:
     """Sentence on the precision farthest from the median of its kind: file and line, edge, value, and the way out.
 
     Examples
     --------
-    >>> extreme_weight("grid")[-103:]
-    'are too far apart for a factorisation in doubles; correct the information matrix, or use --unit-weights'
+    >>> extreme_weight("grid")[-84:]
+    'are too far apart for doubles; correct the information matrix, or use --unit-weights'
     """
     path = locate(graph)
     if not (path.is_file() or path.is_dir()):
-        return f"{graph}: weights too far apart for a factorisation in doubles; give it as a file to be told which"
+        return f"{graph}: weights too far apart for doubles; give it as a file to be told which"
     loaded = load(path)
-    ratios = {name: getattr(loaded, name) / np.median(getattr(loaded, name)) for name in ("kappa", "tau")}
+    ratios = _ratios(loaded)
     name = max(ratios, key=lambda one: float(np.abs(np.log(ratios[one])).max()))
     e = int(np.argmax(np.abs(np.log(ratios[name]))))
     i, j = int(loaded.pose_ids[loaded.i[e]]), int(loaded.pose_ids[loaded.j[e]])
@@ -56,5 +73,5 @@ def extreme_weight(graph: str) -> str:
         f"{edge_place(path, (i, j))}: {name} of edge {i} -> {j} is {value:.3g}, {ratios[name][e]:.3g} "
         f"times the median; weights from {min(loaded.kappa.min(), loaded.tau.min()):.3g} to "
         f"{max(loaded.kappa.max(), loaded.tau.max()):.3g} and lengths up to {np.abs(loaded.t_ij).max():.3g} m "
-        "are too far apart for a factorisation in doubles; correct the information matrix, or use --unit-weights"
+        "are too far apart for doubles; correct the information matrix, or use --unit-weights"
     )

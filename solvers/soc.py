@@ -36,7 +36,7 @@ from solvers.result import Measurement, Status
 from solvers.rotation_step import BackEnd, RStep
 from solvers.safeguard import MAX_RAISES, has_diverged, has_stalled, is_going_round
 from solvers.soc_paper import PaperState, init_paper, measure_paper, step_paper
-from solvers.stiffness import translation_penalty_for
+from solvers.stiffness import fell_most, is_second_look, translation_penalty_for
 from solvers.team import Team, build_team
 from solvers.team_vectors import (
     adapted,
@@ -345,8 +345,12 @@ class SOC:
             back = replace(state, s=state.best, z=agree(state.team, state.best, problem)[1])
             return replace(self._rescaled(problem, back, 2.0), raises=state.raises + 1)
         rule, merits = self.effective_penalty, state.merits
-        if isinstance(rule, MultiplierPenalty) and has_stalled(rule, merits) and state.refreshes < rule.max_refreshes:
-            return self._refreshed(problem, state)
+        if isinstance(rule, MultiplierPenalty):
+            is_stalled = has_stalled(rule, merits) and state.refreshes < rule.max_refreshes
+            looks_again = is_second_look(state.refreshes, merits, max(state.primal_residual, state.dual_residual))
+            before, after = self._adapted(problem, state) if is_stalled or looks_again else (1.0, 1.0)
+            if is_stalled or fell_most(before, after):
+                return self._refreshed(problem, state, after)
         if isinstance(rule, BalancedPenalty) and state.k > 0:
             factor = rule.factor(state.primal_residual, state.dual_residual)
             if factor != 1.0 and (factor > 1.0 or state.raises == 0):
@@ -363,13 +367,18 @@ class SOC:
         s = state.z + (before / team.penalty)[:, None] * state.B
         return replace(state, s=s, rho=rho, team=team, memory=(), merits=(), best=None)
 
-    def _refreshed(self, problem: PGOProblem, state: SOCState) -> SOCState:
+    def _adapted(self, problem: PGOProblem, state: SOCState) -> tuple[float, float]:
+        """Translation penalty, times the diagonal of M, and what the way so far suggests instead."""
+        if self.translation_penalty is not None or len(state.team.robots) == 1:
+            given = self.translation_penalty if self.translation_penalty is not None else 1.0
+            return given, given
+        relative = float(state.rho_t[0] / translation_scale(problem)[0])
+        return relative, adapted(problem, state.team, relative, state.origin, (state.z, state.s))
+
+    def _refreshed(self, problem: PGOProblem, state: SOCState, relative: float) -> SOCState:
         """State with rho and B from the multipliers at omega, where the mean B_i is -2 Lambda_i R_i^T / rho_i."""
         poses = problem.with_best_translations(state.omega)
-        rho_t, separator_rho = state.rho_t, state.separator_rho
-        if self.translation_penalty is None and len(state.team.robots) > 1:
-            relative = adapted(problem, state.team, state.rho_t, state.origin, (state.z, state.s))
-            rho_t, separator_rho = self._separator_penalties(problem, state.team, relative)
+        rho_t, separator_rho = self._separator_penalties(problem, state.team, relative)
         rho = np.maximum(self.effective_penalty.initial(problem, poses), separator_rho)
         team = state.team.with_penalty(rho, rho_t)
         X = problem.stacked(poses)

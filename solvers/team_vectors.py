@@ -60,13 +60,13 @@ def stationarity_weight(team: Team) -> Array:
 
 
 def adapted(
-    problem: PGOProblem, team: Team, rho_t: Array, origin: tuple[Array, Array] | None, now: tuple[Array, Array]
+    problem: PGOProblem, team: Team, penalty: float, origin: tuple[Array, Array] | None, now: tuple[Array, Array]
 ) -> float:
-    """Translation penalty, times the diagonal of M, that the way from z and s when it was set to those now suggests."""
+    """Translation penalty, times the diagonal of M, after the way with `penalty` from the first z, s to those now."""
     assert origin is not None
     assert team.penalty is not None
     at, scale = team.row < problem.num_poses, translation_scale(problem)
     moved, change = now[0] - origin[0], now[1] - origin[1]
     pulled = team.penalty[at, None] * (change - moved)[at]  # of B = s - z
     sums = travel(moved[at], pulled, scale[team.row[at]] / team.copies[team.row[at]])
-    return adapted_penalty(float(rho_t[0] / scale[0]), sums)
+    return adapted_penalty(penalty, sums)

@@ -28,7 +28,7 @@ from pgo_models.partition import Partition, PartitionMethod, partition
 from pgo_models.pose_graph import PoseGraph
 from pgo_models.problem import PGOProblem
 from pgo_models.scenes import NoiseModel, grid
-from solvers import safeguard
+from solvers import safeguard, stiffness
 from solvers.acceleration import Anderson, AndersonMemory
 from solvers.consensus_soc import ConsensusSOC, ConsensusState
 from solvers.distributed import collect, open_driver
@@ -167,6 +167,16 @@ def test_every_change_of_the_penalty_is_the_central_one(
     monkeypatch.setattr(safeguard, "_DIVERGED", 1.0)  # any step back counts as divergence
     weak = FixedPenalty(0.1 * float(np.median(rotation_scale(problem))))
     assert check(problem, parts, replace(soc, penalty=weak, acceleration=None, alpha=1.9), 14).raises >= 1
+
+
+def test_the_second_look_at_the_translation_penalty_is_the_central_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stiffness, "_SECOND_LOOK", 2)
+    monkeypatch.setattr(stiffness, "_FAR_AWAY", 0.0)
+    monkeypatch.setattr(stiffness, "_LEAST_FACTOR", 0.999)
+    monkeypatch.setattr(stiffness, "_ENOUGH", np.inf)  # any fall is taken
+    problem = varied_problem(5, 14, 3, LOUD_NOISE)
+    parts = metis(problem.graph, 5)
+    assert check(problem, parts, SOC(coupling=Coupling.CONSENSUS, robots=parts, penalty=STALLED), 12).refreshes >= 2
 
 
 @pytest.mark.parametrize("seed", [3, 5])

@@ -190,6 +190,25 @@ def test_weights_that_cannot_be_factored_are_named_with_line_and_edge(tmp_path):
     assert "correct the information matrix" in err
 
 
+def test_a_weight_that_hides_the_others_is_named_where_there_is_no_proof(tmp_path):
+    lines = (Path(__file__).parent.parent / "data" / "grid.g2o").read_text().splitlines()
+    edge = next(k for k, line in enumerate(lines) if line.startswith("EDGE"))
+    fields = lines[edge].split()
+    path = tmp_path / "heavy.g2o"
+    for ratio, ending in ((1e9, 0), (1e15, 3)):
+        heavy = [*fields[:10], *(repr(ratio * float(value)) for value in fields[10:])]
+        path.write_text("\n".join([*lines[:edge], " ".join(heavy), *lines[edge + 1 :]]) + "\n")
+        found, out, err = ended(started("solve", path))
+        assert found == ending, err
+        if ratio > 1e9:
+            assert "TRIVIAL" in out
+            assert one_line(err), err
+            assert f"heavy.g2o:{edge + 1}: kappa of edge {fields[1]} -> {fields[2]} is 5.24e+14, 1e+15 times" in err
+            assert "--unit-weights" in err
+        else:
+            assert ("CERTIFIED" in out, err) == (True, "")
+
+
 def test_the_same_graph_is_read_whatever_ends_its_lines(tmp_path):
     graph = scenes.grid(np.random.default_rng(0))
     write_g2o(graph, tmp_path / "lf.g2o")

@@ -198,13 +198,15 @@ def test_rounds_to_the_gap_on_benchmarks(
     assert run(soc, problem, callback=until_gap(OPTIMUM[name])).status is Status.STOPPED
 
 
+@pytest.mark.parametrize("method", [PartitionMethod.METIS, PartitionMethod.CONTIGUOUS])
 def test_the_translation_penalty_falls_where_the_start_is_far_away(
-    benchmark_problem: Callable[[str], PGOProblem], benchmark_optimum: Callable[[str], Poses]
+    method: PartitionMethod, benchmark_problem: Callable[[str], PGOProblem], benchmark_optimum: Callable[[str], Poses]
 ) -> None:
     # The chordal start of M3500 has six times the optimal cost; with the penalty of the start 400 rounds are too few.
+    # Contiguous robots stall before their way shows that, and find it out at the second look.
     problem = benchmark_problem("M3500")
     optimum = problem.objective(benchmark_optimum("M3500"))
-    robots = partition(problem.graph, 25, PartitionMethod.METIS)
+    robots = partition(problem.graph, 25, method)
     result = run(SOC(robots=robots, tolerance=1e-9, max_iterations=300), problem, callback=until_gap(optimum))
     assert result.status is Status.STOPPED
 
