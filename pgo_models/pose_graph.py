@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
-from pgo_models.arrays import ReadOnly, real_array, whole_array, whole_number
+from pgo_models.arrays import ReadOnly, read_only, real_array, whole_array, whole_number
 from pgo_models.errors import GraphError
 from pgo_models.html_tables import facts_table
 from pgo_models.poses import Poses, rotations_to_rounding
@@ -137,9 +138,15 @@ class PoseGraph(ReadOnly):
         ]
         return facts_table(facts)
 
+    @cached_property
+    def adjacency(self) -> csr_array:
+        """Number of edges from pose to pose, (n, n)."""
+        edges = np.ones(self.num_edges), (self.i, self.j)
+        return read_only(coo_array(edges, shape=(self.num_poses, self.num_poses)).tocsr())
+
     def components(self) -> list[IntArray]:
         """Poses of every connected component, largest first."""
-        count, label = connected_components(_adjacency(self), directed=False)
+        count, label = connected_components(self.adjacency, directed=False)
         parts = [np.flatnonzero(label == c) for c in range(count)]
         return sorted(parts, key=lambda part: (-len(part), int(part[0])))
 
@@ -277,7 +284,7 @@ def middle_pose(graph: PoseGraph) -> int:
     2
     """
     end = poses_by_distance(graph, 0)[-1]
-    order, parent = breadth_first_order(_adjacency(graph), end, directed=False)
+    order, parent = breadth_first_order(graph.adjacency, end, directed=False)
     path = [int(order[-1])]
     while path[-1] != end:
         path.append(int(parent[path[-1]]))
@@ -286,9 +293,4 @@ def middle_pose(graph: PoseGraph) -> int:
 
 def poses_by_distance(graph: PoseGraph, pose: int) -> IntArray:
     """Poses of a connected graph, (n,), by their number of edges to a pose, which is the first."""
-    return np.asarray(breadth_first_order(_adjacency(graph), pose, directed=False, return_predecessors=False))
-
-
-def _adjacency(graph: PoseGraph) -> csr_array:
-    shape = (graph.num_poses, graph.num_poses)
-    return coo_array((np.ones(graph.num_edges), (graph.i, graph.j)), shape=shape).tocsr()
+    return np.asarray(breadth_first_order(graph.adjacency, pose, directed=False, return_predecessors=False))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -63,6 +64,11 @@ class Poses(ReadOnly):
                 raise GraphError(f"{name} of pose {int(np.argmin(finite))} has nan or inf; poses must be finite")
         object.__setattr__(self, "R", rotations_to_rounding(R, "R of pose {}".format))
         object.__setattr__(self, "t", t)
+
+    @cached_property
+    def orthogonality_error(self) -> float:
+        """Largest distance of a stored R_i from a rotation (`pgo_models.rotations.orthogonality_error`)."""
+        return float(orthogonality_error(self.R).max(initial=0.0))
 
     @classmethod
     def identity(cls, n: int, d: int) -> Poses:

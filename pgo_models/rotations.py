@@ -99,7 +99,10 @@ def _polar(X: Array, cofactors: Array, determinant: Array) -> tuple[Array, BoolA
 def _determinants(X: Array) -> Array:
     if X.shape[-1] == 2:
         return np.asarray(X[..., 0, 0] * X[..., 1, 1] - X[..., 0, 1] * X[..., 1, 0])
-    return np.asarray(np.einsum("nb,nb->n", X[:, 0], np.cross(X[:, 1], X[:, 2])))
+    u, v, w = np.moveaxis(X, -2, 0)  # rows; numpy's cross product takes twice as long
+    first = u[..., 0] * (v[..., 1] * w[..., 2] - v[..., 2] * w[..., 1])
+    second = u[..., 1] * (v[..., 2] * w[..., 0] - v[..., 0] * w[..., 2])
+    return np.asarray(first + second + u[..., 2] * (v[..., 0] * w[..., 1] - v[..., 1] * w[..., 0]))
 
 
 def _cofactors(X: Array) -> Array:

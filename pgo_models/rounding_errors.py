@@ -198,7 +198,7 @@ def rounding_level(problem: PGOProblem, poses: Poses) -> float:
 def _residual_errors(problem: PGOProblem, poses: Poses, distance: Array) -> tuple[Array, float]:
     d = problem.d
     share = (2 * d + 3) * UNIT_ROUNDOFF
-    omega = float(orthogonality_error(poses.R).max(initial=0.0)) + d * gamma(d + 2)
+    omega = poses.orthogonality_error + d * gamma(d + 2)
     length = np.linalg.norm(problem.graph.t_ij, axis=1)
     return share * (distance + length) + omega * length, 2.0 * math.sqrt(d) * share + 2.0 * omega
 
