@@ -10,6 +10,7 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
+from pgo_models.plots.graph_plots import plot_against_truth
 
 # %% [markdown]
 # ## A graph and its picture
@@ -67,7 +68,7 @@ solution = solvers.solve(problem)
 solution
 
 # %%
-pgo.plot_against_truth(graph, solution.poses)
+plot_against_truth(graph, solution.poses)
 
 # %% [markdown]
 # Surprising at first: the solution costs *less* than the truth. The truth does not fit the noise; the optimum

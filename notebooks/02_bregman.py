@@ -16,8 +16,10 @@ import cvxpy as cp
 import matplotlib.pyplot as plt
 import numpy as np
 
-import pgo_models as pgo
 import solvers
+from pgo_models.convex.bregman_examples import basis_pursuit, total_variation_scale_space
+from pgo_models.plots.curves import plot_decay
+from solvers.convex.bregman import feasibility_bound
 
 plt.rcParams["figure.dpi"] = 150
 
@@ -109,13 +111,13 @@ for x_bregman, p_bregman in by_hand:
 # `solvers.iterate` yields the states of any method one by one.
 
 # %%
-problem = pgo.basis_pursuit(K, f)
+problem = basis_pursuit(K, f)
 for name, method in (("update B", solvers.Bregman(alpha=alpha)), ("two lines", solvers.TwoLineBregman(alpha=alpha))):
     states = list(itertools.islice(solvers.iterate(method, problem), len(by_hand) + 1))
     worst = max(np.abs(state.x - mine).max() for state, (mine, _) in zip(states[1:], by_hand, strict=True))
     print(f"{name:10} differs from ours by at most {worst:.0e}")
-run = solvers.run_method(solvers.TwoLineBregman(alpha=alpha), problem)
-run
+result = solvers.run(solvers.TwoLineBregman(alpha=alpha), problem)
+result
 
 # %% [markdown]
 # How fast is it guaranteed to be? With $D_0 = J(\tilde x) - \min J$ for any feasible $\tilde x$, Osher et al.
@@ -124,9 +126,9 @@ run
 
 # %%
 D_0 = np.abs(truth).sum()
-residuals = run.history.primal_residual * max(1.0, np.linalg.norm(f))
-bounds = [solvers.feasibility_bound(D_0, alpha, k) for k in range(1, len(residuals))]
-pgo.plot_decay([("||K x - f||", residuals), ("its bound", np.array([np.nan, *bounds]))], "residual")
+residuals = result.history.primal_residual * max(1.0, np.linalg.norm(f))
+bounds = [feasibility_bound(D_0, alpha, k) for k in range(1, len(residuals))]
+plot_decay([("||K x - f||", residuals), ("its bound", np.array([np.nan, *bounds]))], "residual")
 
 # %% [markdown]
 # ## It forgets its errors
@@ -138,7 +140,7 @@ pgo.plot_decay([("||K x - f||", residuals), ("its bound", np.array([np.nan, *bou
 
 # %%
 study = solvers.error_forgetting(problem, truth, np.random.default_rng(1), method=solvers.TwoLineBregman(alpha=alpha))
-pgo.plot_decay(study.curves(), "||x - truth||")
+plot_decay(study.curves(), "||x - truth||")
 
 # %% [markdown]
 # ## When the iterates are what we want
@@ -152,7 +154,7 @@ pgo.plot_decay(study.curves(), "||x - truth||")
 signal = np.repeat([0.0, 1.0, -0.5, 0.0, 2.0, 0.0], [20, 25, 25, 10, 10, 10])
 noise_std = 0.2
 noisy = signal + rng.normal(0.0, noise_std, 100)
-scale_space = pgo.total_variation_scale_space(noisy)
+scale_space = total_variation_scale_space(noisy)
 states = list(itertools.islice(solvers.iterate(solvers.TwoLineBregman(alpha=0.05), scale_space), 151))
 iterates = np.array([state.x for state in states[1:]])
 to_data = np.linalg.norm(iterates - noisy, axis=1) / 10.0
@@ -184,14 +186,14 @@ _ = right.legend(fontsize=8)
 #    4](04_splitting_orthogonality.ipynb) shows what is left then.
 
 # %%
-impossible = pgo.basis_pursuit(np.vstack([K[:3], K[:1]]), np.append(f[:3], f[0] + 1.0))
+impossible = basis_pursuit(np.vstack([K[:3], K[:1]]), np.append(f[:3], f[0] + 1.0))
 states = list(itertools.islice(solvers.iterate(solvers.TwoLineBregman(alpha=alpha), impossible), 41))
 growth = [float(np.linalg.norm(state.b)) for state in states]
 print("||b|| at k = 10, 20, 30, 40:", np.round(growth[10::10], 2))
 
 # %%
-assert np.linalg.norm(run.state.x - truth) < 1e-5
-assert run.status is solvers.Status.CONVERGED
+assert np.linalg.norm(result.state.x - truth) < 1e-5
+assert result.status is solvers.Status.CONVERGED
 assert (residuals[1:] <= np.array(bounds) * (1 + 1e-6)).all()
 assert study.disturbed[-1] < 1e-4 < 0.1 < study.not_added_back[-1]
 assert np.all(np.diff(to_data) <= 1e-6)

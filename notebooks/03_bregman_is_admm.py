@@ -12,6 +12,7 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
+from pgo_models.convex.bregman_examples import basis_pursuit, total_variation_denoising
 
 plt.rcParams["figure.dpi"] = 150
 
@@ -32,7 +33,7 @@ plt.rcParams["figure.dpi"] = 150
 
 # %%
 rng = np.random.default_rng(0)
-pursuit = pgo.basis_pursuit(rng.standard_normal((8, 20)), rng.standard_normal(8))
+pursuit = basis_pursuit(rng.standard_normal((8, 20)), rng.standard_normal(8))
 forms = [solvers.Bregman(), solvers.TwoLineBregman(), solvers.MethodOfMultipliers()]
 runs = [list(itertools.islice(solvers.iterate(form, pursuit), 6)) for form in forms]
 for bregman, two_line, multiplier in zip(*runs, strict=True):
@@ -83,7 +84,7 @@ def alternate(alpha, passes, iterations):
 # the same.
 
 # %%
-denoising = pgo.total_variation_denoising(noisy, weight)
+denoising = total_variation_denoising(noisy, weight)
 worst_difference = {}
 for T in (1, 3):
     states = list(itertools.islice(solvers.iterate(solvers.AlternatingBregman(alpha=1.0, passes=T), denoising), 16))

@@ -16,6 +16,7 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
+from pgo_models.convex.orthogonality_examples import procrustes
 
 plt.rcParams["figure.dpi"] = 150
 
@@ -49,7 +50,7 @@ print("differs from the library by", np.abs(by_svd - pgo.project_to_rotations(Y)
 # %%
 A, C = rng.standard_normal((8, 3)), rng.standard_normal((8, 3))
 U, _, Vt = np.linalg.svd(A.T @ C)
-found = solvers.solve_orthogonal(pgo.procrustes(A, C), np.random.default_rng(0))
+found = solvers.solve_orthogonal(procrustes(A, C), np.random.default_rng(0))
 closed_form = np.linalg.norm(A @ U @ Vt - C) ** 2
 print(f"closed form {closed_form:.8f}, SOC {found.objective:.8f}")
 
@@ -107,7 +108,7 @@ for back_end in solvers.RStep:
 # %% [markdown]
 # The iterates do not depend on the back end, the time does: two triangular solves beat everything else, because
 # the matrix never changes. FISTA pays where nothing can be factored; Clarabel where step (a) has constraints or
-# terms of one's own (`solvers.ChangedSOC`).
+# terms of one's own (`solvers.ExtendedSOC`).
 #
 # ## How large must rho be?
 #

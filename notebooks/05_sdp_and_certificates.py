@@ -15,6 +15,10 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
+from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.plots.curves import plot_tightness
+from pgo_models.plots.matrix_plots import plot_spectrum, smallest_eigenvalues
+from solvers.studies.tightness import SweptScene, noisy_scene
 
 plt.rcParams["figure.dpi"] = 150
 
@@ -30,7 +34,7 @@ plt.rcParams["figure.dpi"] = 150
 # (and the determinants): a convex problem is left, whose value cannot be larger.
 
 # %%
-graph = pgo.random_geometric(8, np.random.default_rng(1), noise=pgo.NoiseModel(0.3, 0.3))
+graph = pgo.random_geometric(8, np.random.default_rng(1), noise=NoiseModel(0.3, 0.3))
 problem = pgo.PGOProblem(graph)
 n, d = problem.num_poses, problem.d
 block = [slice(d * i, d * i + d) for i in range(n)]
@@ -140,7 +144,7 @@ for name, judged, poses in candidates:
 # comes out as $\pm 10^{-15}$ or so, and double precision cannot tell on which side of zero it is.
 
 # %%
-pgo.plot_spectrum(problem, answer.certificate, count=10)
+plot_spectrum(problem, answer.certificate, count=10)
 
 # %% [markdown]
 # But we know what those $d$ directions are: all poses turned together, the *gauge*. **Ground one pose**, as in
@@ -161,7 +165,7 @@ print("smallest eigenvalues, one grounded:", *(f"{value:8.2g}" for value in smal
 
 # %%
 stuck = pgo.certify(ring, candidates[3][2])
-eigenvalues = pgo.smallest_eigenvalues(ring, pgo.multipliers(ring, candidates[3][2]), count=6)
+eigenvalues = smallest_eigenvalues(ring, pgo.multipliers(ring, candidates[3][2]), count=6)
 climbed = solvers.run(solvers.Staircase(), ring, candidates[3][2])
 print("smallest eigenvalues there:", eigenvalues.round(2))
 print(f"F in the local minimum {stuck.objective:.4f}, after the staircase {climbed.objective:.4f}")
@@ -221,9 +225,9 @@ _ = axes.legend(fontsize=8)
 degrees = np.array([30.0, 40.0, 45.0, 50.0, 55.0, 60.0, 70.0])
 sweeps = {
     scene.value: solvers.noise_sweep(scene, np.deg2rad(degrees), 4, np.random.default_rng(0))
-    for scene in solvers.SweptScene
+    for scene in SweptScene
 }
-pgo.plot_tightness([(name, sweep.rotation_std, sweep.fraction) for name, sweep in sweeps.items()])
+plot_tightness([(name, sweep.rotation_std, sweep.fraction) for name, sweep in sweeps.items()])
 
 # %% [markdown]
 # Four graphs at every level, so that a step is 25 %: enough for the picture, not for the third digit. The
@@ -232,7 +236,7 @@ pgo.plot_tightness([(name, sweep.rotation_std, sweep.fraction) for name, sweep i
 # of the grid with 60 degrees.
 
 # %%
-loose_problem = pgo.PGOProblem(solvers.noisy_scene(solvers.SweptScene.GRID, np.deg2rad(60), np.random.default_rng(3)))
+loose_problem = pgo.PGOProblem(noisy_scene(SweptScene.GRID, np.deg2rad(60), np.random.default_rng(3)))
 loose = solvers.solve(loose_problem)
 loose
 
@@ -255,7 +259,7 @@ print(f"{loose_relaxed.lower_bound:.3f} <= optimum <= {loose.objective:.3f}; Z r
 
 # %%
 print(f"eta {loose.certificate.eta:.2g}: {loose.certificate.source.value}")
-pgo.plot_spectrum(loose_problem, loose.certificate, count=10)
+plot_spectrum(loose_problem, loose.certificate, count=10)
 
 # %% [markdown]
 # The verdict is `NOT_CERTIFIED`, **which does not mean that the poses are wrong**: they may be optimal. What is

@@ -15,6 +15,8 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
+from pgo_models.graphs.separators import report_partition
+from pgo_models.plots.curves import plot_decay
 
 plt.rcParams["figure.dpi"] = 150
 
@@ -37,9 +39,9 @@ pgo.plot_graph(graph, best.poses, "four robots, 160 poses")
 
 # %%
 robots = pgo.partition(graph)
-print(pgo.report_partition(robots, graph))
+print(report_partition(robots, graph))
 print("\nas METIS would split it, were it not given who measured what:\n")
-print(pgo.report_partition(pgo.partition(graph, 4, pgo.PartitionMethod.METIS), graph))
+print(report_partition(pgo.partition(graph, 4, pgo.PartitionMethod.METIS), graph))
 
 # %% [markdown]
 # ## Consensus: omega is what the copies agree on
@@ -207,7 +209,7 @@ def lossy(share, seed=0, **options):
 
 losses = {f"{share:.0%} lost": np.array(lossy(share)) for share in (0.0, 0.3, 0.6, 0.9)}
 losses["30% lost, only what arrived"] = np.array(lossy(0.3, only_what_arrived=True))
-pgo.plot_decay([(name, np.maximum(gaps, 1e-12)) for name, gaps in losses.items()], "F / F* - 1")
+plot_decay([(name, np.maximum(gaps, 1e-12)) for name, gaps in losses.items()], "F / F* - 1")
 
 # %% [markdown]
 # Surprisingly little happens: with 30 % of the messages lost there is hardly a difference, and nine lost out of

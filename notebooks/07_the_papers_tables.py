@@ -16,6 +16,9 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
+from pgo_models.graphs.published_results import published_rows, published_run
+from solvers.studies.paper_tables import ReproductionSettings
+from solvers.studies.paper_tables_text import findings
 
 plt.rcParams["figure.dpi"] = 150
 NAMES = ("circle", "grid", "sphere")
@@ -27,12 +30,12 @@ NAMES = ("circle", "grid", "sphere")
 # published, only its size, so ours are other draws of the same scenes: compare gaps, not costs.
 
 # %%
-published = {row.name: row for row in pgo.published_rows()}
+published = {row.name: row for row in published_rows()}
 graphs = {name: pgo.load(name) for name in NAMES}
 optima = {name: solvers.solve(graph) for name, graph in graphs.items()}
 print("              paper: F*    DGS     SOC   gap of SOC      here: F*, certified to")
 for name in NAMES:
-    row, run = published[name], pgo.published_run(graphs[name])
+    row, run = published[name], published_run(graphs[name])
     print(
         f"{name:12} {row.se_sync.objective:10.1f} {row.dgs.objective:6.1f} {row.soc.objective:7.1f} {run.gap:9.1%}"
         f" {optima[name].objective:19.1f} {optima[name].gap:8.0e}"
@@ -85,7 +88,7 @@ by_hand = {name: list(algorithm_1(graph, rho, 150)) for name, graph in graphs.it
 # %%
 differences = {}
 for name, graph in graphs.items():
-    soc = solvers.SOC(coupling=solvers.Coupling.PAPER, penalty=solvers.FixedPenalty(rho))
+    soc = solvers.PaperSOC(penalty=solvers.FixedPenalty(rho))
     states = itertools.islice(solvers.iterate(soc, optima[name].problem, graph.initial), 1, 151)
     pairs = zip(states, by_hand[name], strict=True)
     differences[name] = max(np.abs(state.omega - omega).max() for state, omega in pairs)
@@ -96,14 +99,14 @@ for name, graph in graphs.items():
 
 # %%
 curves = {name: np.array([gap(name, omega) for omega in by_hand[name]]) for name in NAMES}
-adaptive, adaptive_curves = solvers.SOC(coupling=solvers.Coupling.PAPER), {}
+adaptive, adaptive_curves = solvers.PaperSOC(), {}
 for name, graph in graphs.items():
     states = itertools.islice(solvers.iterate(adaptive, optima[name].problem, graph.initial), 1, 151)
     adaptive_curves[name] = np.array([gap(name, state.omega) for state in states])
 
 figure, axes = plt.subplots(figsize=(5.6, 3.2), layout="constrained")
 for name, colour in zip(NAMES, ("#0072B2", "#E69F00", "#009E73"), strict=True):
-    run = pgo.published_run(graphs[name])
+    run = published_run(graphs[name])
     axes.semilogy(np.arange(1, 151), curves[name], color=colour, label=name)
     axes.semilogy(np.arange(1, 151), adaptive_curves[name], "--", color=colour, linewidth=0.8)
     axes.semilogy(run.iterations, run.objective / run.optimum - 1, "*", color=colour, markersize=11)
@@ -166,7 +169,7 @@ for name in NAMES:
 # twenty, and the benchmark graphs.
 
 # %%
-tables = solvers.reproduce_tables(solvers.ReproductionSettings(only=NAMES, num_seeds=2), progress=False)
+tables = solvers.reproduce_tables(ReproductionSettings(only=NAMES, num_seeds=2), progress=False)
 print(f"{'graph':8} {'method':24} {'gap':>9}   {'paper':>6}   rounds")
 for row in tables.rows:
     gap_here = np.mean([cell.gap for cell in row.cells])
@@ -174,7 +177,7 @@ for row in tables.rows:
     counted = [cell.rounds for cell in row.cells if cell.rounds is not None]
     rounds = f"{np.mean(counted):.0f}" if counted else "-"
     print(f"{row.published.name:8} {row.contender.label:24} {gap_here:9.1e}   {gap_there:>6}   {rounds}")
-for finding in solvers.findings(tables):
+for finding in findings(tables):
     print(finding)
 
 # %% [markdown]
@@ -241,14 +244,14 @@ for name in NAMES:
 # %%
 assert all(difference < 1e-9 for difference in differences.values())
 for name in NAMES:
-    run = pgo.published_run(graphs[name])
+    run = published_run(graphs[name])
     assert optima[name].is_certified
     assert 0.02 < curves[name][-1] < 0.12
     assert abs(curves[name][-1] - rotation_gaps[name]) < 1e-3
     assert abs(adaptive_curves[name][-1] - rotation_gaps[name]) < 1e-3
     assert all(abs(ending) < 1e-5 for ending in endings[name])
     assert gap(name, never[name]) > 1.5 * curves[name][-1]
-assert not any(finding.failed for finding in solvers.findings(tables))
+assert not any(finding.failed for finding in findings(tables))
 by_name = {(row["graph"], row["method"]): row for row in full["rows"]}
 for name in ("parking-garage", "cubicle", "torus3D"):
     soc = by_name[name, "SOC as in the paper"]

@@ -13,6 +13,7 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
+from pgo_models.graphs.trajectories import read_kitti
 
 # %% [markdown]
 # ## A graph in text
@@ -192,7 +193,7 @@ for name in ("solved.tum", "solved.kitti"):
 # %%
 returned = pgo.read_tum(Path(folder.name) / "solved.tum", d=2)
 again = pgo.read_g2o(Path(folder.name) / "solved.g2o")
-kitti = pgo.read_kitti(Path(folder.name) / "solved.kitti", d=2)
+kitti = read_kitti(Path(folder.name) / "solved.kitti", d=2)
 print(f"F of the poses: solved {solution.objective:.9f}, TUM {problem.objective(returned):.9f}, ", end="")
 print(f"KITTI {problem.objective(kitti):.9f}, g2o {problem.objective(again.initial):.9f}")
 

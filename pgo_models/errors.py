@@ -16,55 +16,19 @@ class PGOError(Exception):
 
 
 class GraphError(PGOError):
-    """A pose graph, or poses, that cannot be what they claim to be.
-
-    Examples
-    --------
-    >>> from pgo_models import Poses
-    >>> try:
-    ...     Poses.identity(3, 2).aligned_to(Poses.identity(4, 2))
-    ... except GraphError as error:
-    ...     print(error)
-    Poses(n=3, d=2) and Poses(n=4, d=2) have different sizes; give two estimates of the same poses
-    """
+    """A pose graph, or poses, that cannot be what they claim to be."""
 
 
 class GraphWarning(UserWarning):
-    """Something in the files of a pose graph that was not taken as it stands.
-
-    Examples
-    --------
-    >>> issubclass(GraphWarning, UserWarning)
-    True
-    """
+    """Something in the files of a pose graph that was not taken as it stands."""
 
 
 class SettingError(PGOError, ValueError):
-    """A setting of a solver, a model or a scene that is out of its range.
-
-    Examples
-    --------
-    >>> from pgo_models.scenes import NoiseModel
-    >>> try:
-    ...     NoiseModel(rotation_std=-1.0)
-    ... except SettingError as error:
-    ...     print(error)
-    rotation_std must be positive and finite, got -1.0
-    """
+    """A setting of a solver, a model or a scene that is out of its range."""
 
 
 class FileFormatError(PGOError):
-    """A file that cannot be read; the message opens with `file:line`.
-
-    Examples
-    --------
-    >>> from pgo_models import read_g2o
-    >>> try:
-    ...     read_g2o("missing.g2o")
-    ... except FileFormatError as error:
-    ...     print(error)
-    missing.g2o: no such file; check the path
-    """
+    """A file that cannot be read; the message opens with `file:line`."""
 
     def __init__(self, path: Path | str, line: int | None, problem: str) -> None:
         """Say where (`path`, 1-based `line`) and what (`problem`, with the value and the way out)."""
@@ -79,62 +43,23 @@ class FileFormatError(PGOError):
 
 
 class DatasetError(PGOError):
-    """A named data set that is nowhere to be found, or whose checksum does not fit.
-
-    Examples
-    --------
-    >>> from pgo_models import load
-    >>> try:
-    ...     load("sphere25000")
-    ... except DatasetError as error:
-    ...     print(str(error)[:37])
-    no file and no data set 'sphere25000'
-    """
+    """A named data set that is nowhere to be found, or whose checksum does not fit."""
 
 
 class NotPositiveDefiniteError(PGOError):
-    """A matrix that should have a Cholesky factorisation has none.
-
-    Examples
-    --------
-    >>> from scipy.sparse import csc_array
-    >>> from pgo_models.cholesky import factorize
-    >>> try:
-    ...     factorize(csc_array([[1.0, 0.0], [0.0, -1.0]]))
-    ... except NotPositiveDefiniteError:
-    ...     print("not positive definite")
-    not positive definite
-    """
+    """A matrix that should have a Cholesky factorisation has none."""
 
 
 class ProofError(PGOError):
-    """Poses that cost less than a bound that was proved: a defect here, never to be printed as a result.
-
-    Examples
-    --------
-    >>> issubclass(ProofError, PGOError)
-    True
-    """
+    """Poses that cost less than a bound that was proved: a defect here, never to be printed as a result."""
 
 
 class EngineError(PGOError):
-    """A place where robots run that cannot be reached, has no room for them, or loses them.
-
-    Examples
-    --------
-    >>> issubclass(EngineError, PGOError)
-    True
-    """
+    """A place where robots run that cannot be reached, has no room for them, or loses them."""
 
 
 class MissingExtraError(PGOError):
-    """An optional dependency is not installed; the message names the extra.
-
-    Examples
-    --------
-    >>> print(MissingExtraError("matplotlib", "plot"))
-    matplotlib is not installed; run: pip install 'pgo-splitting[plot]'
-    """
+    """An optional dependency is not installed; the message names the extra."""
 
     def __init__(self, package: str, extra: str) -> None:
         """Name the missing `package` and the `extra` that brings it."""

@@ -1,4 +1,4 @@
-"""The command `pgo`: solve, certify, info, generate, and the studies of `solvers.study_commands`.
+"""The command `pgo`: solve, certify, info, generate, and the studies of `solvers.studies.commands`.
 
 Exit codes: 0 done; 1 bad input, one line on stderr; 2 not converged, the result written all the same; 3 not certified;
 130 and 143 after SIGINT (Ctrl-C) and SIGTERM, the best iterate written if there was one.
@@ -22,19 +22,18 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from pgo_models.certificate import DEFAULT_GAP, certify
-from pgo_models.datasets import known_datasets, load
+from pgo_models.certificates.certificate import DEFAULT_GAP, certify
 from pgo_models.errors import FileFormatError, SettingError
 from pgo_models.files import check_writable, replace_when_done
-from pgo_models.g2o import MOST_SYMBOLS, read_g2o_poses, symbol_ids, write_g2o, write_g2o_folder
-from pgo_models.initialization import chordal_start, spanning_tree_start
-from pgo_models.pose_graph import PoseGraph
-from pgo_models.poses import Poses, absolute_trajectory_error
-from pgo_models.problem import PGOProblem
-from pgo_models.separators import report_partition
-from pgo_models.trajectories import read_kitti, read_tum, write_tum
-from solvers.checkpoint import Checkpoint
-from solvers.choices import (
+from pgo_models.geometry.poses import Poses, absolute_trajectory_error
+from pgo_models.graphs.datasets import known_datasets, load
+from pgo_models.graphs.g2o import MOST_SYMBOLS, read_g2o_poses, symbol_ids, write_g2o, write_g2o_folder
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.separators import report_partition
+from pgo_models.graphs.trajectories import read_kitti, read_tum, write_tum
+from pgo_models.problem.initialization import chordal_start, spanning_tree_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.cli_options import (
     BackEnd,
     Method,
     Runner,
@@ -48,14 +47,15 @@ from solvers.choices import (
     chosen_scene,
     chosen_start,
 )
+from solvers.distributed.checkpoint import Checkpoint
 from solvers.explanations import explained_by_its_graph, warn_of_weights
 from solvers.pipeline import HANDOVER, solve
-from solvers.report import check_report, write_report
+from solvers.reporting.report import check_report, write_report
+from solvers.reporting.versions import versions
 from solvers.shell import DONE, Commands, run_command, save_then_show
-from solvers.soc import SOC
+from solvers.soc.soc import SOC
 from solvers.solution import certificate_json, check_format, check_target
-from solvers.study_commands import compare_command, figures_command, tables_command
-from solvers.versions import versions
+from solvers.studies.commands import compare_command, figures_command, tables_command
 
 NOT_CONVERGED, NOT_CERTIFIED = 2, 3
 

@@ -9,14 +9,14 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from pgo_models.certificate import Certificate
-from pgo_models.datasets import load, locate
+from pgo_models.certificates.certificate import Certificate
 from pgo_models.errors import GraphWarning, NotPositiveDefiniteError, PGOError
-from pgo_models.floating_point import UNIT_ROUNDOFF
-from pgo_models.g2o import edge_place
-from pgo_models.pose_graph import PoseGraph
-from pgo_models.problem import PGOProblem
-from pgo_models.rotations import Array
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.datasets import load, locate
+from pgo_models.graphs.g2o import edge_place
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.problem.floating_point import UNIT_ROUNDOFF
+from pgo_models.problem.problem import PGOProblem
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from dataclasses import dataclass, field, fields
+from typing import Any, Protocol, TypeVar, cast, overload
 
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
-from pgo_models.pose_graph import PoseGraph
-from pgo_models.poses import Poses
-from pgo_models.problem import PGOProblem, as_problem
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.problem.problem import PGOProblem, as_problem
+from solvers.progress import Table
 from solvers.result import History, Measurement, Outcome, Record, Run, Status
-from solvers.table import Table
 
 P = TypeVar("P", contravariant=True)
 X = TypeVar("X", contravariant=True)
@@ -27,7 +27,7 @@ class Method(Protocol[P, X, S]):
 
     Examples
     --------
-    >>> from solvers.newton import Newton
+    >>> from solvers.riemannian.newton import Newton
     >>> method: Method = Newton(max_iterations=7)
     >>> method.max_iterations
     7
@@ -56,8 +56,8 @@ class Solver(Method[PGOProblem, Poses, S], Protocol[S]):
     Examples
     --------
     >>> import numpy as np
-    >>> from pgo_models.scenes import grid
-    >>> from solvers.newton import Newton
+    >>> from pgo_models.graphs.scenes import grid
+    >>> from solvers.riemannian.newton import Newton
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
     >>> solver: Solver = Newton()
     >>> solver.poses(problem, solver.init(problem, None))
@@ -75,8 +75,8 @@ def iterate(method: Method[P, X, S], problem: P, start: X | None = None) -> Iter
     --------
     >>> import itertools
     >>> import numpy as np
-    >>> from pgo_models.scenes import grid
-    >>> from solvers.newton import Newton
+    >>> from pgo_models.graphs.scenes import grid
+    >>> from solvers.riemannian.newton import Newton
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
     >>> states = list(itertools.islice(iterate(Newton(), problem), 4))
     >>> [problem.objective(Newton().poses(problem, state)) < 200 for state in states]
@@ -88,8 +88,9 @@ def iterate(method: Method[P, X, S], problem: P, start: X | None = None) -> Iter
         state = method.step(problem, state)
 
 
+@overload
 def run(
-    solver: Solver[S],
+    method: Solver[S],
     problem: PGOProblem | PoseGraph,
     start: Poses | None = None,
     *,
@@ -97,15 +98,40 @@ def run(
     time_limit: float = math.inf,
     verbose: bool = False,
     progress: bool | None = None,
-) -> Run[S]:
-    """Run a solver on a pose graph to its end: `run_method`, and the poses.
+) -> Run[S]: ...
+@overload
+def run(
+    method: Method[P, X, S],
+    problem: P,
+    start: X | None = None,
+    *,
+    earlier: tuple[Record, ...] = (),
+    callback: Callable[[S, Record], bool | None] | None = None,
+    time_limit: float = math.inf,
+    verbose: bool = False,
+    progress: bool | None = None,
+) -> Outcome[S]: ...
+def run(
+    method: Method[Any, Any, S],
+    problem: Any,
+    start: Any = None,
+    *,
+    earlier: tuple[Record, ...] = (),
+    callback: Callable[[S, Record], bool | None] | None = None,
+    time_limit: float = math.inf,
+    verbose: bool = False,
+    progress: bool | None = None,
+) -> Outcome[S]:
+    """Run a method on a problem of its kind to its end.
 
     Parameters
     ----------
-    solver : Solver
-    problem : PGOProblem or PoseGraph
-    start : Poses, optional
+    method : Method
+    problem : PGOProblem or PoseGraph for a Solver, or another method's own kind
+    start : Poses, or the kind of point that the method starts at, optional
         The method's own start unless given.
+    earlier : tuple of Record
+        Of a run that was broken off after them, whose next iterate is `start`: counted on from there.
     callback : callable, optional
         Called with every state and its record; a true answer ends the run (Status.STOPPED).
     time_limit : float
@@ -116,75 +142,29 @@ def run(
 
     Returns
     -------
-    Run
-        Ctrl-C ends it with Status.INTERRUPTED and the best iterate so far.
+    Run, or Outcome of a method that has no poses
+        Its state is the last iterate after success, else the best one: least infeasibility, then least objective.
+        Ctrl-C ends it with Status.INTERRUPTED.
 
     Raises
     ------
     SettingError
-        When time_limit is not positive, or the problem is none.
+        When time_limit is not positive, or a Solver's problem is none.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from pgo_models.scenes import grid
-    >>> from solvers.newton import Newton
+    >>> from pgo_models.graphs.scenes import grid
+    >>> from solvers.riemannian.newton import Newton
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
     >>> result = run(Newton(), problem)
     >>> result.status.name, len(result.history) == result.iterations + 1
     ('CONVERGED', True)
-    """
-    problem = as_problem(problem)
-    began = time.perf_counter()
-    outcome = run_method(
-        solver, problem, start, callback=callback, time_limit=time_limit, verbose=verbose, progress=progress
-    )
-    poses = solver.poses(problem, outcome.state)
-    return Run(
-        name=outcome.name,
-        objective=problem.objective(poses),
-        state=outcome.state,
-        status=outcome.status,
-        iterations=outcome.iterations,
-        history=outcome.history,
-        seconds=time.perf_counter() - began,
-        poses=poses,
-        method=solver,
-    )
-
-
-def run_method(
-    method: Method[P, X, S],
-    problem: P,
-    start: X | None = None,
-    *,
-    earlier: tuple[Record, ...] = (),
-    callback: Callable[[S, Record], bool | None] | None = None,
-    time_limit: float = math.inf,
-    verbose: bool = False,
-    progress: bool | None = None,
-) -> Outcome[S]:
-    """Run a method on a problem of its kind to its end; other parameters and errors as for `run`.
-
-    Parameters
-    ----------
-    earlier : tuple of Record
-        Of a run that was broken off after them, whose next iterate is `start`: counted on from there.
-
-    Returns
-    -------
-    Outcome
-        Its state is the last iterate after success, else the best one: least infeasibility, then least objective.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.scenes import grid
-    >>> from solvers.newton import Newton
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> run_method(Newton(), problem, callback=lambda state, record: record.k == 2).status.name
+    >>> run(Newton(), problem, callback=lambda state, record: record.k == 2).status.name
     'STOPPED'
     """
+    if hasattr(method, "poses"):
+        problem = as_problem(problem)
     if not time_limit > 0:
         raise SettingError(f"time_limit is {time_limit}; give positive seconds")
     name = type(method).__name__
@@ -222,7 +202,7 @@ def run_method(
     objective = records[-1].measurement.objective if records else math.nan
     if best is not None and not status.is_success:
         objective, state = best[0].objective, best[1]
-    return Outcome(
+    outcome = Outcome(
         name=name,
         objective=objective,
         state=state,
@@ -232,6 +212,14 @@ def run_method(
         seconds=time.perf_counter() - began,
         method=method,
     )
+    return _with_poses(outcome, problem, began) if hasattr(method, "poses") else outcome
+
+
+def _with_poses(outcome: Outcome[S], problem: PGOProblem, began: float) -> Run[S]:
+    poses = cast(Solver[S], outcome.method).poses(problem, outcome.state)
+    known = {item.name: getattr(outcome, item.name) for item in fields(outcome)}
+    seconds = time.perf_counter() - began
+    return Run(**{**known, "objective": problem.objective(poses), "seconds": seconds}, poses=poses)
 
 
 @dataclass(frozen=True)
@@ -249,25 +237,17 @@ class Watch:
         """Time until the deadline, positive."""
         return max(self.deadline - time.perf_counter(), 1e-3)
 
-    def run(self, solver: Solver[S], problem: PGOProblem, start: Poses | None) -> Run[S]:
-        """Run a solver on a pose graph."""
-        found = run(
-            solver,
-            problem,
-            start,
-            callback=self.callback,
-            time_limit=self.seconds_left,
-            verbose=self.verbose,
-            progress=self.progress,
-        )
-        self.found.append(found.poses)
-        return found
-
-    def run_method(
+    @overload
+    def run(self, method: Solver[S], problem: PGOProblem, start: Poses | None = None) -> Run[S]: ...
+    @overload
+    def run(
         self, method: Method[P, X, S], problem: P, start: X | None = None, earlier: tuple[Record, ...] = ()
+    ) -> Outcome[S]: ...
+    def run(
+        self, method: Method[Any, Any, S], problem: Any, start: Any = None, earlier: tuple[Record, ...] = ()
     ) -> Outcome[S]:
         """Run a method on a problem of its kind."""
-        return run_method(
+        found = run(
             method,
             problem,
             start,
@@ -277,6 +257,9 @@ class Watch:
             verbose=self.verbose,
             progress=self.progress,
         )
+        if isinstance(found, Run):
+            self.found.append(found.poses)
+        return found
 
 
 def _is_better(one: Measurement, other: Measurement) -> bool:

@@ -12,28 +12,29 @@ from typing import Any
 
 import numpy as np
 
-from pgo_models.arrays import whole_number
-from pgo_models.certificate import DEFAULT_GAP, BoundSource, Certificate, certify_at, certify_with, judge
+from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, Certificate, certify_at, certify_with, judge
+from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.errors import SettingError
-from pgo_models.initialization import chordal_start, spanning_tree_start
-from pgo_models.lower_bound import NO_BOUND
-from pgo_models.partition import Partition, partition
-from pgo_models.pose_graph import PoseGraph
-from pgo_models.poses import Poses
-from pgo_models.problem import PGOProblem, as_problem
-from solvers.checkpoint import Checkpoint, Journal, fingerprint
-from solvers.distributed import attempt_distributed, collect, open_driver
-from solvers.driver import DEFAULT_MEMORY
-from solvers.engine import Engine, InProcess
-from solvers.leaderless import NO_CERTIFICATE, attempt_leaderless
+from pgo_models.geometry.arrays import whole_number
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.partitioning import Partition, partition
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.problem.initialization import chordal_start, spanning_tree_start
+from pgo_models.problem.problem import PGOProblem, as_problem
+from solvers.distributed.checkpoint import Checkpoint, Journal, fingerprint
+from solvers.distributed.driver import DEFAULT_MEMORY
+from solvers.distributed.leaderless import NO_CERTIFICATE, attempt_leaderless
+from solvers.distributed.stages import attempt_distributed, collect, open_driver
 from solvers.loop import Watch
-from solvers.network import Faults
-from solvers.newton import Newton
-from solvers.result import OUT_OF_TIME, History, Record, Stage, Status
-from solvers.rotation_step import RStep
-from solvers.soc import SOC, Coupling
+from solvers.network.engine import Engine, InProcess
+from solvers.network.faults import Faults
+from solvers.result import OUT_OF_TIME, History, Record, Run, Stage, Status
+from solvers.riemannian.newton import Newton
+from solvers.riemannian.staircase import DualBound, Staircase
+from solvers.soc.paper import PaperSOC
+from solvers.soc.r_step import RStep
+from solvers.soc.soc import SOC, Coupling
 from solvers.solution import Solution
-from solvers.staircase import DualBound, Staircase
 
 HANDOVER_TOLERANCE = 5e-3  # relative residual at which Newton needs one or two factorisations on all graphs tried
 HANDOVER = SOC(tolerance=HANDOVER_TOLERANCE, max_iterations=100)
@@ -46,7 +47,7 @@ class Pipeline:
 
     Attributes
     ----------
-    soc : SOC, optional
+    soc : SOC or PaperSOC, optional
         First stage; None goes from the start straight to Newton. Its tolerance says when Newton takes over.
     newton : Newton
         Second stage.
@@ -59,11 +60,11 @@ class Pipeline:
         Where the certificate is still wider, solve the semidefinite relaxation from the best poses, with the gap of the
         pipeline, then Newton from what it rounds to; None goes without.
     faults : Faults, optional
-        What goes wrong between robots in a CONSENSUS stage, which then does not wait: `solvers.asynchronous_soc`. Only
-        with `solve(.., robots=..)`.
+        What goes wrong between robots in a CONSENSUS stage, which then does not wait:
+        `solvers.distributed.asynchronous`. Only with `solve(.., robots=..)`.
     driver_memory : float
         Bytes that the driver of a solve by robots may take; it is refused before they are spent. 0 is no driver:
-        CONSENSUS alone, see `solvers.leaderless`, with poses and no certificate.
+        CONSENSUS alone, see `solvers.distributed.leaderless`, with poses and no certificate.
 
     Examples
     --------
@@ -73,7 +74,7 @@ class Pipeline:
     True
     """
 
-    soc: SOC | None = field(default_factory=lambda: HANDOVER)
+    soc: SOC | PaperSOC | None = field(default_factory=lambda: HANDOVER)
     newton: Newton = field(default_factory=Newton)
     gap: float = DEFAULT_GAP
     second_try: bool = True
@@ -84,11 +85,11 @@ class Pipeline:
     def __post_init__(self) -> None:
         if not 0 < self.gap < math.inf:
             raise SettingError(f"gap must be positive and finite, got {self.gap}; 1e-6 is usual")
-        if self.faults is not None and (self.soc is None or self.soc.effective_coupling is not Coupling.CONSENSUS):
+        is_consensus = isinstance(self.soc, SOC) and self.soc.effective_coupling is Coupling.CONSENSUS
+        if self.faults is not None and not is_consensus:
             raise SettingError("faults are of messages between robots; use SOC(robots=.., coupling=Coupling.CONSENSUS)")
         if not self.driver_memory >= 0:
             raise SettingError(f"driver_memory must not be negative, got {self.driver_memory}; 0 is no driver")
-        is_consensus = self.soc is not None and self.soc.effective_coupling is Coupling.CONSENSUS
         if self.driver_memory == 0 and not is_consensus:
             raise SettingError(
                 "without a driver there is CONSENSUS alone; use SOC(robots=.., ..), or give driver_memory"
@@ -234,7 +235,7 @@ def solve(
     )
 
 
-def _robots_for(soc: SOC | None, robots: Partition | int, graph: PoseGraph) -> Partition:
+def _robots_for(soc: SOC | PaperSOC | None, robots: Partition | int, graph: PoseGraph) -> Partition:
     """Robots of a solve, who are also those of its SOC.
 
     Raises
@@ -248,15 +249,15 @@ def _robots_for(soc: SOC | None, robots: Partition | int, graph: PoseGraph) -> P
         robots = own if own is not None and own.num_robots == robots else partition(graph, robots)
     if own is not None and not np.array_equal(own.robot, robots.robot):
         raise SettingError(f"solve() has {robots}, SOC has {own}; give both the same robots, or SOC none")
-    if soc is not None and soc.effective_coupling is Coupling.PAPER:
-        raise SettingError("PAPER is run in one place; leave out the robots of solve(), or use Coupling.CONSENSUS")
+    if isinstance(soc, PaperSOC):
+        raise SettingError("PaperSOC is run in one place; leave out the robots of solve(), or use SOC(robots=..)")
     if soc is not None and soc.r_step is not RStep.FACTORIZED:
         raise SettingError(f"robots factor their subproblems, got r_step {soc.r_step}; use RStep.FACTORIZED")
     return robots
 
 
 def _tries(
-    attempt: Callable[[SOC | None, Poses | None], tuple[Poses, Certificate]],
+    attempt: Callable[[SOC | PaperSOC | None, Poses | None], tuple[Poses, Certificate]],
     problem: PGOProblem,
     pipeline: Pipeline,
     start: Poses | None,
@@ -276,7 +277,7 @@ def _attempt(
     pipeline: Pipeline,
     stages: list[Stage],
     watch: Watch,
-    soc: SOC | None,
+    soc: SOC | PaperSOC | None,
     start: Poses | None,
 ) -> tuple[Poses, Certificate]:
     """SOC, Newton and certificate from a start; appends what was done to `stages`."""
@@ -286,7 +287,7 @@ def _attempt(
     stages.append(Stage(name, Status.CONVERGED, 0, problem.objective(poses), seconds, History()))
     watch.found.append(poses)
     if soc is not None:
-        first = watch.run(soc, problem, poses)
+        first: Run[Any] = watch.run(soc, problem, poses)
         stages.append(Stage.of(first))
         # A start that is better than SOC's best iterate is kept: CSAIL's chordal start is within 1e-4.
         poses = first.poses if first.objective <= problem.objective(poses) else poses
@@ -321,8 +322,8 @@ def _interruption(objective: float) -> Stage:
     return Stage("interruption", Status.INTERRUPTED, 0, objective, 0.0, History())
 
 
-def _own_start(problem: PGOProblem, soc: SOC | None) -> tuple[Poses, str]:
-    if soc is not None and soc.effective_coupling is Coupling.PAPER:
+def _own_start(problem: PGOProblem, soc: SOC | PaperSOC | None) -> tuple[Poses, str]:
+    if isinstance(soc, PaperSOC):
         return spanning_tree_start(problem.graph), "spanning tree"
     return chordal_start(problem), "chordal start"
 

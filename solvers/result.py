@@ -8,8 +8,8 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from pgo_models.poses import Poses
-from pgo_models.rotations import Array
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
 
 S = TypeVar("S")
 
@@ -144,11 +144,6 @@ class Outcome(Generic[S]):
         Wall time of the whole run.
     method : object
         The method that ran, which is its settings.
-
-    Examples
-    --------
-    >>> Outcome("SOC", 2.5, None, Status.CONVERGED, 7, History(), 0.25)
-    Outcome(SOC: CONVERGED after 7 iterations, F = 2.5, 0.25 s)
     """
 
     name: str

@@ -9,22 +9,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pgo_models.certificate import BoundSource, Certificate, Verdict, gap_text
+from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, gap_text
 from pgo_models.errors import MissingExtraError, SettingError
-from pgo_models.figures import is_picture, save_figure
 from pgo_models.files import check_writable, replace_when_done
-from pgo_models.g2o import check_g2o_folder, write_g2o, write_g2o_folder
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.g2o import check_g2o_folder, write_g2o, write_g2o_folder
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.graphs.trajectories import write_kitti, write_tum
 from pgo_models.html_tables import facts_table, rows_table
-from pgo_models.initialization import spanning_tree_start
-from pgo_models.partition import Partition
-from pgo_models.plots import compare_poses
-from pgo_models.poses import Poses
-from pgo_models.problem import PGOProblem
-from pgo_models.trajectories import write_kitti, write_tum
-from solvers.network import Ledger
-from solvers.report import write_report
+from pgo_models.plots.graph_plots import compare_poses
+from pgo_models.plots.style import is_picture, save_figure
+from pgo_models.problem.initialization import spanning_tree_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.network.ledger import Ledger
+from solvers.reporting.report import write_report
+from solvers.reporting.versions import versions
 from solvers.result import Stage, Status
-from solvers.versions import versions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,7 +59,7 @@ class Solution:
     Examples
     --------
     >>> import numpy as np
-    >>> from pgo_models.scenes import circle
+    >>> from pgo_models.graphs.scenes import circle
     >>> from solvers.pipeline import solve
     >>> solution = solve(circle(np.random.default_rng(0)))
     >>> solution.is_certified, bool(solution.lower_bound <= solution.objective)

@@ -8,14 +8,16 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from pgo_models.g2o import read_g2o
-from pgo_models.initialization import chordal_start
-from pgo_models.polish import polish
-from pgo_models.poses import Poses
-from pgo_models.problem import PGOProblem
+from pgo_models.certificates.newton_polish import polish
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.g2o import read_g2o
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
 
-settings.register_profile("untimed", settings(), deadline=None)  # speed is measured in benchmarks
-settings.load_profile("untimed")
+# Speed is measured in benchmarks. HYPOTHESIS_PROFILE=thorough draws four times as many examples.
+settings.register_profile("light", max_examples=25, deadline=None)
+settings.register_profile("thorough", max_examples=100, deadline=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "light"))
 
 
 @pytest.fixture(scope="session")

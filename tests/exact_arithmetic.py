@@ -11,10 +11,10 @@ import numpy as np
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from pgo_models.matrices import rotation_columns
-from pgo_models.pose_graph import IntArray, PoseGraph
-from pgo_models.poses import Poses
-from pgo_models.rotations import Array
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.problem.matrices import rotation_columns
 
 Exact = Any  # an array of 300-bit numbers, or one of them
 Rows = list[dict[int, Any]]  # a sparse symmetric matrix: of every row the entries by column
@@ -95,7 +95,7 @@ class ExactGraph:
         return self.objective(nearest_rotations(poses.R), exact(poses.t))
 
     def residual_rows(self) -> list[tuple[Any, dict[int, Any]]]:
-        """Weight and entries of every row of A, in the order of `pgo_models.matrices.residual_matrix`."""
+        """Weight and entries of every row of A, in the order of `pgo_models.problem.matrices.residual_matrix`."""
         n, d = self.num_poses, self.d
         columns_i, columns_j = rotation_columns(self.i, n, d), rotation_columns(self.j, n, d)
         rows = []

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from hypothesis import strategies as st
 
-from pgo_models.initialization import chordal_start
-from pgo_models.polish import polish
-from pgo_models.pose_graph import PoseGraph
-from pgo_models.poses import Poses
-from pgo_models.problem import PGOProblem
-from pgo_models.rotations import Array, exp_map, random_rotations, tangent_dimension
-from pgo_models.rounding_errors import objective_rounding
-from pgo_models.scenes import MILD_NOISE, NoiseModel, observe, random_geometric
+from pgo_models.certificates.newton_polish import polish
+from pgo_models.certificates.rounding_errors import objective_rounding
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, exp_map, random_rotations, tangent_dimension
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, observe, random_geometric
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
 
 EPS = float(np.finfo(float).eps)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -4,9 +4,9 @@ import enum
 
 import numpy as np
 
-from pgo_models.pose_graph import PoseGraph
-from pgo_models.poses import Poses
-from pgo_models.rotations import exp_map
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import exp_map
+from pgo_models.graphs.pose_graph import PoseGraph
 
 
 class Shape(enum.Enum):

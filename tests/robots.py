@@ -6,16 +6,16 @@ import numpy as np
 from graphs import MILD_NOISE
 from hypothesis import strategies as st
 
-from pgo_models.cholesky import CholeskyBackend
-from pgo_models.partition import Partition, PartitionMethod, partition
-from pgo_models.pose_graph import PoseGraph
-from pgo_models.poses import Poses
-from pgo_models.rotations import Array, random_rotations
-from pgo_models.scenes import observe
-from solvers.engine import Crew
-from solvers.member import Member
-from solvers.robot import Message
-from solvers.share import Share
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, random_rotations
+from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import observe
+from pgo_models.problem.cholesky import CholeskyBackend
+from solvers.distributed.robots.agent import Agent
+from solvers.distributed.robots.subgraph import Share
+from solvers.network.engine import WorkerPool
+from solvers.network.messages import Message
 
 Partitioner = Callable[[PoseGraph, int], Partition]
 
@@ -88,16 +88,16 @@ class Recording:
     def __init__(self) -> None:
         self.log: list[tuple[str, list[Message], list[Message]]] = []
         self.shares: Sequence[Share] = ()
-        self.members: list[Member] = []
+        self.agents: list[Agent] = []
         self.is_closed = False
 
-    def open(self, shares: Sequence[Share], backend: CholeskyBackend | None) -> Crew:
+    def open(self, make: Callable[[Share], Agent], shares: Sequence[Share]) -> WorkerPool:
         self.shares = shares
-        self.members = [Member(share, backend) for share in shares]
+        self.agents = [make(share) for share in shares]
         return self
 
     def ask(self, order: str, messages: Sequence[Message]) -> list[Message]:
-        answers = [member.obey(order, message) for member, message in zip(self.members, messages, strict=True)]
+        answers = [agent.obey(order, message) for agent, message in zip(self.agents, messages, strict=True)]
         self.log.append((order, list(messages), answers))
         return answers
 

@@ -11,8 +11,9 @@ import pytest
 
 import pgo_models as pgo
 import solvers
-from pgo_models.separators import report_partition
-from solvers import choices, cli
+from pgo_models.graphs.separators import report_partition
+from solvers import cli
+from solvers import cli_options as choices
 
 ROOT = Path(__file__).parent.parent
 PGO = [sys.executable, "-c", "from solvers.cli import main; main()"]

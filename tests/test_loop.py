@@ -8,12 +8,12 @@ import pytest
 from graphs import random_poses, varied_problem
 
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
-from pgo_models.poses import Poses
-from pgo_models.problem import PGOProblem
+from pgo_models.geometry.poses import Poses
+from pgo_models.problem.problem import PGOProblem
 from solvers.loop import iterate, run
-from solvers.newton import Newton
 from solvers.result import Measurement, Record, Status
-from solvers.soc import SOC
+from solvers.riemannian.newton import Newton
+from solvers.soc.soc import SOC
 
 
 @dataclass(frozen=True)

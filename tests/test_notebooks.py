@@ -121,7 +121,9 @@ def test_a_source_uses_public_names_only(source):
                 else:
                     assert alias.name.split(".")[0] in LIBRARIES | sys.stdlib_module_names
         elif isinstance(node, ast.ImportFrom):
-            assert node.module.split(".")[0] in LIBRARIES | sys.stdlib_module_names, f"import all of {node.module}"
+            assert node.module.split(".")[0] in LIBRARIES | {"pgo_models", "solvers"} | sys.stdlib_module_names
+            assert node.module not in ("pgo_models", "solvers"), f"import all of {node.module}"
+            assert not [alias.name for alias in node.names if alias.name.startswith("_")]
         elif isinstance(node, ast.Attribute):
             assert not node.attr.startswith("_"), f"{node.attr} is private"
             if isinstance(node.value, ast.Name) and node.value.id in packages:

@@ -8,10 +8,11 @@ from hypothesis import strategies as st
 
 import pgo_models as pgo
 import solvers
-from pgo_models.certificate import Verdict
-from pgo_models.scenes import NoiseModel
-from solvers.noise_sweep import SweptScene, noisy_scene
+from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, Verdict
+from pgo_models.errors import GraphError, SettingError
+from pgo_models.graphs.scenes import NoiseModel
 from solvers.pipeline import HANDOVER_TOLERANCE
+from solvers.studies.tightness import SweptScene, noisy_scene
 
 
 @pytest.mark.parametrize("name", OPTIMUM)
@@ -66,10 +67,10 @@ def test_newton_alone_and_the_papers_coupling_find_the_same_optimum():
     problem = pgo.PGOProblem(pgo.grid(np.random.default_rng(0)))
     expected = solvers.solve(problem).objective
     alone = solvers.solve(problem, solvers.Pipeline(soc=None))
-    paper = solvers.solve(problem, solvers.Pipeline(soc=solvers.SOC(coupling=solvers.Coupling.PAPER)))
+    paper = solvers.solve(problem, solvers.Pipeline(soc=solvers.PaperSOC()))
     np.testing.assert_allclose([alone.objective, paper.objective], expected, rtol=1e-10, atol=0)
     assert [stage.name for stage in alone.stages] == ["chordal start", "Newton"]
-    assert [stage.name for stage in paper.stages] == ["spanning tree", "SOC", "Newton"]
+    assert [stage.name for stage in paper.stages] == ["spanning tree", "PaperSOC", "Newton"]
 
 
 def test_a_bad_start_is_rescued_by_the_second_try():
@@ -88,7 +89,7 @@ def test_a_bad_start_is_rescued_by_the_staircase(d):
     solution = solvers.solve(problem, solvers.Pipeline(soc=None, second_try=False), wound)
     assert [stage.name for stage in solution.stages] == ["given start", "Newton", "Staircase", "Newton"]
     assert solution.is_certified
-    assert solution.certificate.source is pgo.BoundSource.GIVEN
+    assert solution.certificate.source is BoundSource.GIVEN
     assert solution.objective < 0.1 * solution.stages[1].objective
     assert solution.objective == pytest.approx(solvers.solve(problem).objective, rel=1e-10)
 
@@ -98,13 +99,13 @@ def test_where_the_relaxation_is_not_tight_its_bound_is_reported(seed):
     problem = pgo.PGOProblem(noisy_scene(SweptScene.GRID, np.deg2rad(90.0), np.random.default_rng(seed)))
     without = solvers.solve(problem, solvers.Pipeline(staircase=None))
     solution = solvers.solve(problem)
-    assert solution.certificate.source is pgo.BoundSource.RELAXATION
+    assert solution.certificate.source is BoundSource.RELAXATION
     assert solution.certificate.verdict is Verdict.NOT_CERTIFIED
     assert solution.objective <= without.objective
     assert without.lower_bound < solution.lower_bound < solution.objective
     assert solution.gap == pytest.approx((solution.objective - solution.lower_bound) / solution.objective)
     relaxed = solvers.run(solvers.Staircase(), problem)
-    assert solution.lower_bound == pytest.approx(relaxed.state.point.value, rel=2 * pgo.certificate.DEFAULT_GAP)
+    assert solution.lower_bound == pytest.approx(relaxed.state.point.value, rel=2 * DEFAULT_GAP)
     certificate = solution.certificate
     assert pgo.prove_bound(problem, certificate.Lambda, certificate.eta) == solution.lower_bound
 
@@ -129,12 +130,12 @@ def test_a_time_limit_ends_the_run_with_its_status_and_a_valid_bound():
 def test_a_disconnected_graph_is_refused_with_its_components_named():
     R, t = np.broadcast_to(np.eye(2), (2, 2, 2)), np.ones((2, 2))
     graph = pgo.PoseGraph(4, np.array([0, 2]), np.array([1, 3]), R, t, np.ones(2), np.ones(2))
-    with pytest.raises(pgo.GraphError, match="2 components"):
+    with pytest.raises(GraphError, match="2 components"):
         solvers.solve(graph)
 
 
 def test_settings_out_of_range_are_refused():
-    with pytest.raises(pgo.SettingError, match="gap must be positive"):
+    with pytest.raises(SettingError, match="gap must be positive"):
         solvers.Pipeline(gap=0.0)
 
 

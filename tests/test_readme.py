@@ -4,11 +4,20 @@ from pathlib import Path
 
 import pytest
 
-import pgo_models as pgo
+from pgo_models.graphs.published_results import published_rows
 from solvers import cli
 
 ROOT = Path(__file__).parent.parent
+BENCHMARKS_PAGE = ROOT / "tests" / "benchmarks" / "README.md"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+BENCHMARKS = BENCHMARKS_PAGE.read_text(encoding="utf-8")
+
+
+def results(page: str) -> list[dict[str, str]]:
+    """Rows of the table from file to certificate, by the heads of its columns."""
+    table = re.search(r"^\| graph \| poses / edges \| F \| gap .*\n(?:\|.*\n)+", page, re.M)[0]
+    heads, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines())
+    return [dict(zip(heads, row, strict=True)) for row in rows]
 
 
 def test_the_python_of_the_readme_runs_as_it_stands(monkeypatch, capsys):
@@ -40,13 +49,37 @@ def test_ci_finds_its_lines(marker):
     assert re.search(rf"<!-- {marker} -->\n```sh\n.*\.venv/bin/.*\n```", README)
 
 
-def test_pictures_and_files_that_the_readme_names_are_there():
-    for target in re.findall(r"\]\(([^)]+)\)", README):
-        assert target.startswith("http") or (ROOT / target).exists(), target
+@pytest.mark.parametrize("page", [ROOT / "README.md", BENCHMARKS_PAGE], ids=["readme", "benchmarks"])
+def test_pictures_and_files_that_a_page_names_are_there(page):
+    targets = re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8"))
+    assert targets
+    for target in targets:
+        assert target.startswith("http") or (page.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("page", [README, BENCHMARKS], ids=["readme", "benchmarks"])
+def test_paths_and_files_that_a_page_names_in_code_are_there(page):
+    for path in re.findall(r"`((?:pgo_models|solvers|tests|notebooks|data)/[\w./-]+)`", page):
+        assert (ROOT / path).exists(), path
+
+
+def test_every_room_is_on_the_map():
+    doors = [*ROOT.glob("pgo_models/*/__init__.py"), *ROOT.glob("solvers/*/__init__.py")]
+    rooms = {door.parent.relative_to(ROOT).as_posix() for door in doors} - {"solvers/command"}
+    assert set(re.findall(r"^\| `((?:pgo_models|solvers)/\w+)` \|", README, re.M)) == rooms
+
+
+def test_the_results_of_the_readme_are_those_of_the_benchmarks():
+    measured = results(BENCHMARKS)
+    assert len(measured) == len(results(README)) > 0
+    for shown, row in zip(results(README), measured, strict=True):
+        seconds, _, first = row["seconds (first)"].partition(" ")
+        assert first
+        assert shown == {head: row[head] for head in ("graph", "poses / edges", "F", "gap")} | {"seconds": seconds}
 
 
 def test_the_papers_tables_stand_between_their_marks():
-    shown = re.search(r"<!-- pgo tables -->\n(.*)<!-- end of pgo tables -->", README, re.S)[1]
+    shown = re.search(r"<!-- pgo tables -->\n(.*)<!-- end of pgo tables -->", BENCHMARKS, re.S)[1]
     rows = re.findall(r"^\| ([\w-]+) \| (\d+) \| (\d+) \|", shown, re.M)
-    assert rows == [(row.name, str(row.num_poses), str(row.num_edges)) for row in pgo.published_rows()]
+    assert rows == [(row.name, str(row.num_poses), str(row.num_edges)) for row in published_rows()]
     assert "NOT on" not in shown

@@ -3,8 +3,8 @@ import pytest
 from graphs import varied_problem
 
 from solvers.loop import run
-from solvers.newton import Newton
 from solvers.result import History, Measurement, Record, Run, Status
+from solvers.riemannian.newton import Newton
 
 
 def history() -> History:

@@ -15,9 +15,10 @@ import pgo_command
 import pytest
 
 import pgo_models as pgo
-from pgo_models import scenes
-from pgo_models.g2o import write_g2o
-from solvers import cli, distributed, pipeline
+from pgo_models.graphs import scenes
+from pgo_models.graphs.g2o import write_g2o
+from solvers import cli, pipeline
+from solvers.distributed import stages as distributed
 
 ROOT = Path(cli.__file__).parent.parent
 PGO = [sys.executable, "-c", "from pgo_command import main; main()"]

@@ -5,6 +5,8 @@ import pytest
 
 import pgo_models as pgo
 import solvers
+from pgo_models.errors import SettingError
+from pgo_models.graphs.trajectories import read_kitti
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +38,7 @@ def test_a_solved_graph_reads_back_with_the_same_cost(solution, tmp_path):
 
 
 def test_trajectories_read_back(solution, tmp_path):
-    for suffix, read in ((".tum", pgo.read_tum), (".kitti", pgo.read_kitti)):
+    for suffix, read in ((".tum", pgo.read_tum), (".kitti", read_kitti)):
         solution.save(tmp_path / f"poses{suffix}")
         poses = read(tmp_path / f"poses{suffix}")
         np.testing.assert_allclose(poses.t, solution.poses.t, rtol=0, atol=1e-12)
@@ -55,7 +57,7 @@ def test_json_holds_the_figures_and_the_poses(solution, tmp_path):
 
 
 def test_an_unknown_suffix_is_refused_and_nothing_is_written(solution, tmp_path):
-    with pytest.raises(pgo.SettingError, match=r"no format has suffix '\.xyz'"):
+    with pytest.raises(SettingError, match=r"no format has suffix '\.xyz'"):
         solution.save(tmp_path / "solution.xyz")
     assert list(tmp_path.iterdir()) == []
 
@@ -66,7 +68,7 @@ def test_an_unwritable_place_is_one_error(solution, tmp_path):
 
 
 def test_the_uncertified_solution_of_an_impossible_graph_saves_too(tmp_path):
-    from pgo_models.scenes import NoiseModel
+    from pgo_models.graphs.scenes import NoiseModel
 
     graph = pgo.random_geometric(12, np.random.default_rng(5), noise=NoiseModel(1.0, 2.5))
     solution = solvers.solve(graph)

@@ -14,22 +14,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import issparse
 
-from pgo_models.cholesky import CholeskyBackend
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.partition import PartitionMethod, partition
-from pgo_models.poses import Poses
-from pgo_models.problem import PGOProblem
-from pgo_models.rotations import orthogonality_error
-from pgo_models.scenes import grid
-from solvers.gauss_seidel import GaussSeidel
-from solvers.levenberg_marquardt import LevenbergMarquardt
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import orthogonality_error
+from pgo_models.graphs.partitioning import PartitionMethod, partition
+from pgo_models.graphs.scenes import grid
+from pgo_models.problem.cholesky import CholeskyBackend
+from pgo_models.problem.problem import PGOProblem
+from solvers.baselines.gauss_seidel import GaussSeidel
+from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
+from solvers.baselines.sweep_order import Sweep
 from solvers.loop import Solver, iterate, run
-from solvers.newton import Newton, gauss_newton
-from solvers.penalty import BalancedPenalty
 from solvers.result import Record, Status
-from solvers.schedule import Sweep
-from solvers.soc import SOC, Coupling
-from solvers.staircase import Staircase
+from solvers.riemannian.newton import Newton, gauss_newton
+from solvers.riemannian.staircase import Staircase
+from solvers.soc.paper import PaperSOC
+from solvers.soc.penalty import BalancedPenalty
+from solvers.soc.soc import SOC
 
 Make = Callable[..., Any]
 
@@ -48,10 +49,8 @@ SOLVERS: dict[str, Make] = {
     "soc_joint_balanced": lambda problem, **changes: SOC(penalty=BalancedPenalty(), **changes),
     "soc_consensus": three_robots,
     "soc_consensus_singletons": singletons,
-    "soc_paper": lambda problem, **changes: SOC(coupling=Coupling.PAPER, **changes),
-    "soc_paper_one_robot": lambda problem, **changes: SOC(
-        coupling=Coupling.PAPER, robots=partition(problem.graph, 1), **changes
-    ),
+    "soc_paper": lambda problem, **changes: PaperSOC(**changes),
+    "soc_paper_one_robot": lambda problem, **changes: PaperSOC(robots=partition(problem.graph, 1), **changes),
     "gauss_seidel": lambda problem, **changes: GaussSeidel(
         robots=partition(problem.graph, min(3, problem.num_poses)), **changes
     ),

@@ -1,4 +1,4 @@
-"""Runs the paper's tables anew and puts them into the README, between its two marks, and draws the README's comparison.
+"""Runs the paper's tables anew, puts them between the two marks of README.md beside this file, draws its comparison.
 
 PGO_DATA=folder-with-the-graphs python tests/benchmarks/readme_tables.py
 """
@@ -12,18 +12,19 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import pgo_models as pgo
 import solvers
+from solvers.studies.paper_tables_text import tables_as_text
 
 ROOT = Path(__file__).parents[2]
-README, PICTURE = ROOT / "README.md", ROOT / "notebooks" / "pictures" / "compare-cubicle.png"
+PAGE, PICTURE = Path(__file__).with_name("README.md"), ROOT / "notebooks" / "pictures" / "compare-cubicle.png"
 MARKS = "<!-- pgo tables -->\n", "<!-- end of pgo tables -->"
 COMPARED = "cubicle"
 
 if __name__ == "__main__":
-    tables = solvers.tables_as_text(solvers.reproduce_tables())
+    tables = tables_as_text(solvers.reproduce_tables())
     tables.print()
     tables.save(ROOT / "notebooks" / "tables.json")  # which notebook 7 loads
-    before, _, after = re.split(f"(?<={MARKS[0]})(.*?)(?={MARKS[1]})", README.read_text(encoding="utf-8"), flags=re.S)
-    README.write_text(f"{before}\n{tables.markdown()}\n{after}", encoding="utf-8")
+    before, _, after = re.split(f"(?<={MARKS[0]})(.*?)(?={MARKS[1]})", PAGE.read_text(encoding="utf-8"), flags=re.S)
+    PAGE.write_text(f"{before}\n{tables.markdown()}\n{after}", encoding="utf-8")
     comparison = solvers.compare_methods(pgo.load(COMPARED))
     comparison.table().print()
     comparison.save_plot(PICTURE)

@@ -1,4 +1,4 @@
-"""Prints the README's tables of many robots: rounds, bytes and seconds, faults, and a world of 100 robots.
+"""Prints the tables of many robots (README.md beside this file): rounds, bytes, seconds, faults, a world of 100 robots.
 
     PGO_DATA=folder python tests/benchmarks/robots.py [substructured] [consensus] [seconds] [faults] [world]
 
@@ -26,12 +26,13 @@ from unit import seconds_of_unit
 
 import pgo_models as pgo
 import solvers
-from solvers.asynchronous_soc import AsynchronousSOC, AsynchronousState
-from solvers.distributed import open_driver
-from solvers.driver import Count
-from solvers.engine import InProcess
-from solvers.loop import run_method
-from solvers.network import Faults
+from pgo_models.graphs.separators import vertex_cover
+from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
+from solvers.distributed.driver import Count
+from solvers.distributed.stages import open_driver
+from solvers.loop import run
+from solvers.network.engine import InProcess
+from solvers.network.faults import Faults
 
 REFERENCE = json.loads((Path(__file__).parents[2] / "data" / "reference.json").read_text())
 OPTIMUM = REFERENCE["certified_optimum"]
@@ -55,7 +56,7 @@ def substructured_job(name: str, robots: str, method: str) -> dict[str, object]:
     solution = solvers.solve(graph, robots=shared)
     assert solution.ledger is not None
     return {
-        "cover": len(pgo.vertex_cover(shared, graph)),
+        "cover": len(vertex_cover(shared, graph)),
         "soc": solution.stages[1].iterations,
         "rounds": solution.ledger.rounds,
         "all_reduces": solution.ledger.all_reduces,
@@ -99,7 +100,7 @@ def faults_job(name: str, fault: str) -> dict[str, object]:
             gaps[-1] <= LEVELS[-1] and not FAULTS[fault].is_silent(2, state.k) and state.k > FAULTS[fault].silent_from
         )
 
-    outcome = run_method(AsynchronousSOC(soc, FAULTS[fault]), driver, callback=is_done)
+    outcome = run(AsynchronousSOC(soc, FAULTS[fault]), driver, callback=is_done)
     return {"rounds": outcome.iterations if gaps[-1] <= LEVELS[-1] else None}
 
 

@@ -4,7 +4,9 @@ import os
 
 import pytest
 
-from solvers import ReproductionSettings, findings, reproduce_tables
+from solvers import reproduce_tables
+from solvers.studies.paper_tables import ReproductionSettings
+from solvers.studies.paper_tables_text import findings
 
 
 @pytest.mark.skipif(not os.environ.get("PGO_DATA"), reason="PGO_DATA names the folder with the public graphs")

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from pgo_models.g2o import read_g2o
-from pgo_models.problem import PGOProblem
-from pgo_models.scenes import circle, grid, sphere
-from pgo_models.semidefinite import DEFAULT_RELAXATION_GAP, RelaxationSolution, solve_relaxation
+from pgo_models.graphs.g2o import read_g2o
+from pgo_models.graphs.scenes import circle, grid, sphere
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.relaxations.solve_sdp import DEFAULT_RELAXATION_GAP, RelaxationSolution, solve_relaxation
 from solvers.pipeline import solve
 
 SCENES = {"grid": (grid, 3.0), "circle": (circle, 3.0), "sphere": (sphere, 10.0)}  # seconds

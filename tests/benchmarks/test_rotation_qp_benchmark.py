@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from pgo_models.g2o import read_g2o
-from pgo_models.graph_subproblem import graph_qp
-from pgo_models.initialization import chordal_start
-from pgo_models.problem import PGOProblem
-from solvers.penalty import MultiplierPenalty
-from solvers.rotation_step import RStep
-from solvers.team import build_team
+from pgo_models.convex.graph_subproblem import graph_qp
+from pgo_models.graphs.g2o import read_g2o
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.soc.local_copies import build_team
+from solvers.soc.penalty import MultiplierPenalty
+from solvers.soc.r_step import RStep
 
 LIMITS = {"tinyGrid3D": 3e-3, "smallGrid3D": 15e-3}  # seconds
 

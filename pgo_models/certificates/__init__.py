@@ -1,0 +1,1 @@
+"""A proven lower bound on F for anybody's poses."""

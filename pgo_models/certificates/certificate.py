@@ -1,0 +1,371 @@
+"""Certificate: poses held against a lower bound on the global optimum that holds in exact arithmetic.
+
+The bound and its proof are in `pgo_models.certificates.lower_bound`; here it is decided where to find it, and what it
+says of poses. gap = (F - lower_bound) / F: neither the units nor the number of measurements change it.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass, replace
+
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, best_bound
+from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, polish, relative_decrement
+from pgo_models.certificates.rounding_errors import ObjectiveRounding, objective_rounding
+from pgo_models.errors import ProofError, SettingError
+from pgo_models.geometry.arrays import ReadOnly, real_array
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.html_tables import facts_table
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem, as_problem
+
+DEFAULT_GAP = 1e-6
+
+
+class Verdict(enum.Enum):
+    """What the certificate says of the poses."""
+
+    CERTIFIED = "globally optimal within the gap asked for"
+    EXACT = "globally optimal, exact to rounding: F cannot be told from zero"
+    NOT_CERTIFIED = "not shown to be optimal: the bound holds, but the gap is wider than asked for"
+    TRIVIAL = "not shown to be optimal: no bound better than zero was found"
+
+
+class BoundSource(enum.Enum):
+    """Where the multipliers of the bound were taken."""
+
+    GIVEN = "at the poses given"
+    POLISHED = "after polishing the poses given, which were not stationary"
+    CHORDAL = "at the point that the chordal start polishes to, better than the one beside the poses given"
+    RELAXATION = (
+        "where the staircase solved the semidefinite relaxation, whose optimum is below F of all poses if not tight"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate(ReadOnly):
+    """A proven lower bound on the global optimum beside the cost of given poses.
+
+    Attributes
+    ----------
+    objective : float
+        F of the poses that were given.
+    bound : LowerBound
+        Proven: F(R, t) >= bound.value for every choice of poses, in exact arithmetic.
+    gap : float
+        (objective - lower_bound) / objective; 0 where F is at its rounding level.
+    rounding_level : float
+        F below it cannot be told from zero (`objective_rounding`).
+    stationarity : float
+        Half the squared Newton decrement of the given poses, over F: about the relative decrease of F down to the
+        stationary point beside them.
+    source : BoundSource
+    poses : Poses
+        Where the bound was found.
+    poses_objective : float
+        F there: the best value known.
+    Lambda : (n, d, d)
+        Multipliers, which with eta and the poses are the proof: anyone can check it with `prove_bound`.
+    wanted_gap : float
+    verdict : Verdict
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> certificate = certify(problem, chordal_start(problem))
+    >>> certificate
+    Certificate(F=110.9926545, gap=0.126, NOT_CERTIFIED)
+    >>> bool(certificate.lower_bound <= certificate.poses_objective <= certificate.objective)
+    True
+    """
+
+    objective: float
+    bound: LowerBound
+    gap: float
+    rounding_level: float
+    stationarity: float
+    source: BoundSource
+    poses: Poses
+    poses_objective: float
+    Lambda: Array
+    wanted_gap: float
+    verdict: Verdict
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "Lambda", real_array(self.Lambda, "Lambda", SettingError))
+
+    @property
+    def lower_bound(self) -> float:
+        """Proven: F(R, t) >= lower_bound for every choice of poses."""
+        return self.bound.value
+
+    @property
+    def eta(self) -> float:
+        """Shift of the proof: 0 where the certificate grounded at a pose needs none, nan when only F >= 0 is left."""
+        return self.bound.eta
+
+    @property
+    def is_best_in_doubles(self) -> bool:
+        """Whether S_r is definite and the gap below 1e-6: a smaller one takes precision, not other poses."""
+        return self.bound.is_grounded and self.eta == 0.0 and self.gap <= DEFAULT_GAP
+
+    @property
+    def can_improve(self) -> bool:
+        """Whether other poses, or multipliers of another rank, could give what was asked for."""
+        return not (self.is_certified or self.is_best_in_doubles)
+
+    @property
+    def digits(self) -> int:
+        """Digits of F that are proven: those in which it agrees with the bound."""
+        return proven_digits(self.gap)
+
+    @property
+    def is_certified(self) -> bool:
+        """Whether the gap is within the one asked for, or F exact to rounding."""
+        return self.verdict in (Verdict.CERTIFIED, Verdict.EXACT)
+
+    def __repr__(self) -> str:
+        return f"Certificate(F={self.objective:.10g}, gap={self.gap:.3g}, {self.verdict.name})"
+
+    def __str__(self) -> str:
+        return "\n".join(f"{label:<12} {text}" for label, text in self._facts())
+
+    def _repr_html_(self) -> str:
+        return facts_table(self._facts())
+
+    def _facts(self) -> list[tuple[str, str]]:
+        measured = not math.isnan(self.stationarity)
+        stationary = f"   (stationary to {self.stationarity:.2g})" if measured else ""
+        facts = [
+            ("F", f"{self.objective:.10g}{stationary}"),
+            ("lower bound", f"{self.lower_bound:.10g}   ({self.proof}; {self.source.value})"),
+            ("gap", f"{gap_text(self.gap)}   (asked for: {self.wanted_gap:.3g})"),
+            ("verdict", f"{self.verdict.name}: {self.verdict.value}"),
+        ]
+        if self.source is not BoundSource.GIVEN:
+            facts.insert(1, ("best known F", f"{self.poses_objective:.10g}"))
+        return facts
+
+    @property
+    def proof(self) -> str:
+        """How the bound was proved, in a few words."""
+        if math.isnan(self.eta):
+            return "F is a sum of squares"
+        form = "grounded at a pose" if self.bound.is_grounded else "with a shift"
+        shift = f", eta = {self.eta:.3g}" if self.eta > 0 else ""
+        return f"proved {form}{shift}, less {self.bound.rounding:.2g} for rounding"
+
+
+def proven_digits(gap: float) -> int:
+    """Digits of F that a relative gap leaves no doubt of; none where it is 0, as F is rounding then.
+
+    Examples
+    --------
+    >>> proven_digits(3e-13), proven_digits(0.2), proven_digits(0.0)
+    (12, 0, 0)
+    """
+    return max(0, math.floor(-math.log10(gap))) if gap > 0 else 0
+
+
+def gap_text(gap: float) -> str:
+    """A relative gap for tables, with the digits that it proves.
+
+    Examples
+    --------
+    >>> gap_text(3.2e-13), gap_text(0.2), gap_text(0.0)
+    ('3.2e-13, proven to 12 digits', '0.2', '0: F is at its rounding level')
+    """
+    if gap == 0.0:
+        return "0: F is at its rounding level"
+    digits = proven_digits(gap)
+    return f"{gap:.3g}, proven to {digits} digits" if digits > 3 else f"{gap:.3g}"
+
+
+def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_GAP) -> Certificate:
+    """Judge anybody's poses: a proven lower bound on the global optimum, and how far F is above it.
+
+    The bound is found at a stationary point. Poses that are not stationary are polished first (damped Newton,
+    `polish`); where that point does not give the gap, the one that the chordal start polishes to is tried, and the
+    better bound is taken. `source` says what was done; the gap is always that of the poses given. `certify_at` bounds
+    at the poses as they are.
+
+    Parameters
+    ----------
+    problem : PGOProblem or PoseGraph
+    poses : Poses
+    gap : float
+        The relative gap to certify.
+
+    Returns
+    -------
+    Certificate
+
+    Raises
+    ------
+    SettingError
+        When gap is not positive and finite.
+    GraphError
+        When the poses do not fit the graph.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> certificate = certify(PGOProblem(graph), graph.truth)
+    >>> certificate.verdict.name, certificate.source.name, bool(0 < certificate.lower_bound < certificate.objective)
+    ('NOT_CERTIFIED', 'POLISHED', True)
+    """
+    problem = as_problem(problem)
+    stationarity = relative_decrement(problem, poses)
+    if stationarity <= STATIONARY_DECREMENT:
+        certificate = certify_at(problem, poses, gap, stationarity)
+    else:
+        polished = certify_at(problem, polish(problem, poses), gap, stationarity)
+        certificate = judge(problem, poses, replace(polished, source=BoundSource.POLISHED))
+    if not _bound_is_tight(certificate):
+        other = certify_at(problem, polish(problem, chordal_start(problem)), gap, stationarity)
+        # Of equal bounds, as two zeros, the one with the better poses.
+        if (other.lower_bound, -other.poses_objective) > (certificate.lower_bound, -certificate.poses_objective):
+            certificate = judge(problem, poses, replace(other, source=BoundSource.CHORDAL))
+    return certificate
+
+
+def certify_at(
+    problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP, stationarity: float = math.nan
+) -> Certificate:
+    """Certificate from the multipliers at the poses as they are: valid anywhere, and sharp near an optimum.
+
+    Parameters
+    ----------
+    problem : PGOProblem
+    poses : Poses
+    gap : float
+    stationarity : float
+        Relative decrement there, reported as it is; nan where it was not measured.
+
+    Raises
+    ------
+    SettingError
+        When gap is not positive and finite.
+    GraphError
+        When the poses do not fit the graph.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> certificate = certify_at(problem, polish(problem, chordal_start(problem), max_steps=3))
+    >>> bool(0.9 * certificate.objective < certificate.lower_bound <= certificate.objective)
+    True
+    """
+    best = problem.with_best_translations(poses.R)
+    return certify_with(problem, poses, multipliers(problem, best), gap, stationarity, BoundSource.GIVEN, ground=best)
+
+
+def certify_with(
+    problem: PGOProblem,
+    poses: Poses,
+    Lambda: Array,
+    gap: float,
+    stationarity: float,
+    source: BoundSource,
+    bound: LowerBound | None = None,
+    ground: Poses | None = None,
+) -> Certificate:
+    """Certificate of poses with multipliers from anywhere: the proof asks nothing of them.
+
+    Parameters
+    ----------
+    bound : LowerBound, optional
+        One that was proved with these multipliers already; found here unless given.
+    ground : Poses, optional
+        Poses at one of which the proof is grounded; the given ones with their best translations unless given.
+
+    Raises
+    ------
+    SettingError
+        When gap is not positive and finite, or Lambda has the wrong shape.
+    """
+    if not 0 < gap < math.inf:
+        raise SettingError(f"gap is {gap}; give a positive relative gap, as 1e-6")
+    objective, rounding = problem.objective(poses), objective_rounding(problem, poses)
+    if bound is None:
+        is_exact = objective <= rounding.level
+        ground = ground if ground is not None else problem.with_best_translations(poses.R)
+        bound = NO_BOUND if is_exact else best_bound(problem, Lambda, ground, gap, objective)
+    unjudged = Certificate(
+        objective=objective,
+        bound=bound,
+        gap=math.nan,
+        rounding_level=rounding.level,
+        stationarity=stationarity,
+        source=source,
+        poses=poses,
+        poses_objective=objective,
+        Lambda=Lambda,
+        wanted_gap=gap,
+        verdict=Verdict.TRIVIAL,
+    )
+    return _judged(problem, unjudged, objective, rounding)
+
+
+def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
+    """Hold other poses of the same problem against the bound of a certificate.
+
+    Raises
+    ------
+    ProofError
+        When F of the poses is below the bound by more than the rounding of F: then one of the two is wrong.
+    """
+    return _judged(problem, certificate, problem.objective(poses), objective_rounding(problem, poses))
+
+
+def _judged(
+    problem: PGOProblem, certificate: Certificate, objective: float, rounding: ObjectiveRounding
+) -> Certificate:
+    bound = certificate.bound
+    if bound.value > objective + rounding.error:
+        raise ProofError(
+            f"lower bound {bound.value!r} is above F = {objective!r} of {problem!r}, which is known to "
+            f"{rounding.error:.2g}: a defect of pgo_models; please report it with the graph"
+        )
+    # F may come out below a true bound by its own rounding, which is then what the gap is known to.
+    least = bound.value if bound.value < objective else objective - rounding.error
+    gap = relative_gap(objective, least, rounding.level)
+    bound = replace(bound, value=min(bound.value, objective))
+    return replace(
+        certificate,
+        objective=objective,
+        bound=bound,
+        gap=gap,
+        rounding_level=rounding.level,
+        verdict=verdict_of(objective, rounding.level, gap, bound, certificate.wanted_gap),
+    )
+
+
+def verdict_of(objective: float, level: float, gap: float, bound: LowerBound, wanted_gap: float) -> Verdict:
+    """Verdict on poses: F, its rounding level, their gap, and the bound."""
+    if objective <= level:
+        return Verdict.EXACT
+    if math.isnan(bound.eta):
+        return Verdict.TRIVIAL
+    return Verdict.CERTIFIED if gap <= wanted_gap else Verdict.NOT_CERTIFIED
+
+
+def relative_gap(objective: float, lower_bound: float, rounding_level: float = 0.0) -> float:
+    """(objective - lower_bound) / objective; 0 where F is at its rounding level, and so as good as zero."""
+    return (objective - lower_bound) / objective if objective > rounding_level else 0.0
+
+
+def _bound_is_tight(certificate: Certificate) -> bool:
+    if certificate.poses_objective <= certificate.rounding_level:
+        return True
+    return relative_gap(certificate.poses_objective, certificate.lower_bound) <= certificate.wanted_gap

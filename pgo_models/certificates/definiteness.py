@@ -1,0 +1,204 @@
+"""A proof in exact arithmetic that the certificate matrix, some rows left out, is positive definite.
+
+S without the rows of one translation, or of one whole pose, is stored and factored in double precision with a share
+`shift` of its diagonal subtracted. When that factorisation goes through, R^T R of the computed factor is positive
+definite, and what it differs by from the exact S, the rounding of the entries (`matrix_error`) and of the factorisation
+(`CholeskyFactor.backward_error`), is at most `error` times the diagonal. So S - (shift - error) diag is positive
+definite (Rump 2006, *Verification of positive definiteness*; Jansson, Chaykin & Keil 2007, VSDP).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import LinearOperator, cg
+
+from pgo_models.certificates.dual_variables import certificate_matrix
+from pgo_models.certificates.rounding_errors import matrix_error
+from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.problem.cholesky import CholeskyFactor
+from pgo_models.problem.floating_point import OUTWARD
+from pgo_models.problem.problem import PGOProblem
+
+FIRST_SHIFT = 1e-9  # of the diagonal; what is not needed for rounding makes the bound sharper
+SHRINK = 1.0 / 32.0
+LEAST_SHIFT = 1e-15  # below the rounding of any matrix with a few non-zeros in a row
+MARGIN = 2.125  # twice the rounding, and what the estimate of it may be off by
+_CG_TOLERANCE, _CG_ITERATIONS = 1e-4, 50
+_SMALLEST, _LARGEST = 1e-150, 1e150  # of diagonal entries: nothing that counts underflows
+
+
+@dataclass(frozen=True, eq=False)
+class DefiniteProof:
+    """S + eta blockdiag(0, I), without some rows, factored with a share of its diagonal subtracted.
+
+    Attributes
+    ----------
+    stored : csc_array, (N, N)
+        The matrix in double precision; only its diagonal in the rows left out.
+    factor : CholeskyFactor
+        Of `stored` with the shift subtracted.
+    diagonal : (N,)
+        That it is a share of; 0 in the rows left out.
+    shift, entries : (N,)
+        Share that is subtracted, and share that the rounding of the entries takes.
+    is_marginal : bool
+        Whether a larger shift failed: the factor may be far from one of the matrix without a shift.
+    error : (N,), optional
+        Share that the rounding of the factorisation takes, where the factor need not be asked.
+    """
+
+    stored: csc_array
+    factor: CholeskyFactor
+    diagonal: Array
+    shift: Array
+    entries: Array
+    is_marginal: bool
+    error: Array | None = None
+
+    @property
+    def free(self) -> BoolArray:
+        """Rows that are not left out, (N,)."""
+        return np.asarray(self.diagonal > 0.0)
+
+    def slack(self) -> Array | None:
+        """Diagonal that the exact matrix is at least, (N,), positive in free rows; None if rounding takes over half.
+
+        The factor may be taken apart for it: solve before.
+        """
+        error = OUTWARD * (self.entries + (self.error if self.error is not None else self.factor.last_error()))
+        return (self.shift - error) / OUTWARD * self.diagonal if (2.0 * error <= self.shift).all() else None
+
+    def solve(self, product: Array) -> Array:
+        """About S^-1 product, (N, d), in the rows that are not left out, and zero in those.
+
+        By the factor, or where that is marginal by conjugate gradients with the factor as preconditioner.
+        """
+        free = self.free
+        step = self.factor.solve(np.where(free[:, None], product, 0.0))
+        if self.is_marginal:
+            preconditioner = LinearOperator(self.stored.shape, matvec=self.factor.solve, dtype=float)
+            for column in range(step.shape[1]):
+                step[:, column], _ = cg(
+                    self.stored,
+                    np.where(free, product[:, column], 0.0),
+                    step[:, column],
+                    rtol=_CG_TOLERANCE,
+                    maxiter=_CG_ITERATIONS,
+                    M=preconditioner,
+                )
+        step[~free] = 0.0
+        return step
+
+
+def prove_definite(
+    problem: PGOProblem,
+    Lambda: Array,
+    eta: float,
+    fixed: IntArray,
+    first_shift: float = FIRST_SHIFT,
+    turned: Array | None = None,
+) -> DefiniteProof | None:
+    """Proof that S + eta blockdiag(0, I) is positive definite without some rows; None when none is found.
+
+    Parameters
+    ----------
+    problem : PGOProblem
+    Lambda : (n, d, d), symmetric
+    eta : float
+    fixed : (f,)
+        Rows of X that are left out.
+    first_shift : float
+        Share of the diagonal that is subtracted first; less where the matrix is not definite with it, more where
+        rounding needs more.
+    turned : (N, d), optional
+        Moves that leave F almost as it is, as a turn of all poses but those left out, which S then holds but weakly:
+        no share above their Rayleigh quotient can be subtracted. Where one far below it is enough for rounding whatever
+        the factor's non-zeros are, they are not counted.
+    """
+    shifts = np.zeros(problem.side)
+    shifts[problem.num_poses :] = eta
+    stored, diagonal = shifted_certificate(problem, Lambda, shifts)
+    if not (np.isfinite(stored.data).all() and diagonal.min() >= _SMALLEST and diagonal.max() <= _LARGEST):
+        return None
+    problem.leave_out(stored.data, fixed, 2.0 * diagonal[fixed])
+
+    def attempt(shift: Array) -> CholeskyFactor | None:
+        data = stored.data.copy()
+        data[problem.diagonal_positions] -= shift * diagonal
+        try:
+            return problem.analysis.factorize(problem.with_pattern_of_M(data))
+        except NotPositiveDefiniteError:
+            return None
+
+    free = diagonal.copy()
+    free[fixed] = 0.0
+    expected, crude = problem.analysis.expected_error(), problem.analysis.crude_error()
+    entries = np.full(problem.side, matrix_error(problem.graph))
+    if expected is None and turned is not None and crude < np.inf:
+        enough = np.maximum(first_shift, MARGIN * (entries + crude))
+        if enough.max() <= SHRINK * _softest(stored, free, turned):
+            factor = attempt(enough)
+            if factor is not None:
+                return DefiniteProof(stored, factor, free, enough, entries, False, np.full(problem.side, crude))
+    found = search_shift(attempt, entries, expected if expected is not None else 0.0 * entries, first_shift)
+    if found is None:
+        return None
+    factor, shift, is_marginal = found
+    return DefiniteProof(stored, factor, free, shift, entries, is_marginal)
+
+
+def shifted_certificate(problem: PGOProblem, Lambda: Array, shifts: Array) -> tuple[csc_array, Array]:
+    """S + diag(shifts) in double precision, (N, N), and a diagonal, (N,), no smaller than any its rounding comes from.
+
+    M - Lambda was rounded before the shifts were added, and can be as large.
+    """
+    S = certificate_matrix(problem, Lambda)
+    S.data[problem.diagonal_positions] += shifts
+    stored = S.data[problem.diagonal_positions]
+    return S, np.maximum(problem.M.data[problem.diagonal_positions], stored) + shifts
+
+
+def _softest(stored: csc_array, free: Array, moves: Array) -> float:
+    """Least Rayleigh quotient of the moves, zero where a row is left out, with respect to the diagonal."""
+    moves = np.where(free[:, None] > 0.0, moves, 0.0)
+    energies = np.einsum("rc,rc->c", moves, stored @ moves)
+    return float(np.min(energies / np.einsum("rc,r,rc->c", moves, free, moves)))
+
+
+def search_shift(
+    attempt: Callable[[Array], CholeskyFactor | None], entries: Array, expected: Array, first_shift: float
+) -> tuple[CholeskyFactor, Array, bool] | None:
+    """First factor found that leaves at least half of its shift over, the shift, and whether a larger one failed.
+
+    A factor with the first shift whose error is not known before it is taken apart (`CholeskyFactor.known_error`) is
+    returned as it is.
+
+    Parameters
+    ----------
+    attempt : callable
+        Factor with these shares, (N,), of the diagonal subtracted, or None when it does not go through.
+    entries, expected : (N,)
+        Shares of the diagonal that the rounding of the entries takes, and that the factorisation is expected to take.
+    first_shift : float
+    """
+    uniform, is_marginal = first_shift, False
+    while uniform >= LEAST_SHIFT:
+        shift = np.maximum(uniform, MARGIN * (entries + expected))
+        factor = attempt(shift)
+        if factor is None:
+            uniform, is_marginal = SHRINK * uniform, True
+            continue
+        known = factor.backward_error() if is_marginal else factor.known_error()
+        if known is None:
+            return factor, shift, is_marginal
+        error = OUTWARD * (entries + known)
+        if (2.0 * error <= shift).all():
+            return factor, shift, is_marginal
+        expected = np.maximum(expected, error)
+    return None

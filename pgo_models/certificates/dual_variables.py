@@ -1,0 +1,65 @@
+"""Multipliers Lambda of the orthogonality constraints, and the certificate matrix S they give."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import csc_array
+
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.problem.cholesky import CholeskyFactor
+from pgo_models.problem.problem import PGOProblem
+
+
+def multipliers(problem: PGOProblem, poses: Poses) -> Array:
+    """Lambda_i = sym((M X)_i R_i), (n, d, d): the multipliers of R_i R_i^T = I at poses.
+
+    At a stationary point (M X)_i = Lambda_i R_i^T exactly, and tr(Lambda) = F.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> multipliers(problem, problem.graph.truth).shape
+    (27, 3, 3)
+    """
+    n, d = problem.num_poses, problem.d
+    product = problem.apply_M(problem.stacked(poses))[n:].reshape(n, d, d) @ poses.R
+    return 0.5 * (product + np.swapaxes(product, 1, 2))
+
+
+def certificate_matrix(problem: PGOProblem, Lambda: Array, eta: float = 0.0) -> csc_array:
+    """S + eta blockdiag(0, I), (N, N), with S = M - blockdiag(0, Lambda); the pattern is that of M.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> Lambda = multipliers(problem, problem.graph.truth)
+    >>> S = certificate_matrix(problem, Lambda)
+    >>> bool(abs(S - S.T).max() < 1e-12)
+    True
+    """
+    data = problem.M.data.copy()
+    data[problem.block_positions] -= Lambda
+    data[problem.diagonal_positions[problem.num_poses :]] += eta
+    return problem.with_pattern_of_M(data)
+
+
+def factorize_certificate(problem: PGOProblem, Lambda: Array, eta: float) -> CholeskyFactor:
+    """Cholesky factor of S + eta blockdiag(0, I) with t_0 grounded.
+
+    Grounding loses nothing: S maps a common shift of all translations to zero, so the matrix is positive semidefinite
+    if it is positive definite with its (t_0, t_0) entry doubled. For a right-hand side that is zero on translations,
+    the rotation part of the solution is that of (Q - blockdiag(Lambda) + eta I) y = b: elimination marginalises them.
+
+    Raises
+    ------
+    NotPositiveDefiniteError
+        When it has a negative eigenvalue, or a zero one beside that of the common shift.
+    """
+    shifted = certificate_matrix(problem, Lambda, eta)
+    shifted.data[problem.diagonal_positions[0]] *= 2.0
+    return problem.analysis.factorize(shifted)

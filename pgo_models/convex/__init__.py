@@ -1,0 +1,1 @@
+"""cvxpy models: the R-subproblem, orthogonality constraints, and Bregman iteration."""

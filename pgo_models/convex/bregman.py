@@ -1,0 +1,238 @@
+"""min J(x) s.t. K x = f for any convex cvxpy J, and the subproblems of Bregman iteration on it (paper, section 2).
+
+Equations of the paper by label: `problem bregman` is the problem; `update B`, `bregman update` and `minbregman` are the
+three forms of the iteration whose subproblems are compiled here, each with one Parameter (DPP); `bregman ADMM`
+alternates over the blocks of x. The iterations themselves are in solvers/bregman.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+from scipy.sparse import csr_array, issparse
+
+from pgo_models.convex.clarabel import TOLERANCE, check_convex, check_variable, finite_array, solve_compiled
+from pgo_models.errors import SettingError
+from pgo_models.geometry.arrays import ReadOnly, read_only, real_array
+from pgo_models.geometry.rotations import Array
+
+
+@dataclass(frozen=True, eq=False)
+class BregmanPoint(ReadOnly):
+    """Where an iteration starts or ends: x, (m,), and the multiplier lam, (s,), of K x = f.
+
+    `lam` is the paper's lambda: the Lagrangian is J(x) + <lam, f - K x>, so that p = K^T lam is a subgradient of J at
+    a solution, and b = -lam / alpha.
+    """
+
+    x: Array
+    lam: Array
+
+    def __post_init__(self) -> None:
+        for name in ("x", "lam"):
+            object.__setattr__(self, name, real_array(getattr(self, name), name, SettingError))
+
+
+@dataclass(frozen=True, eq=False)
+class BregmanProblem:
+    """Minimise J(x) subject to K x = f (paper: `problem bregman`).
+
+    x stacks the variables, each flattened row by row; m is its length. Several variables are the blocks over which
+    `AlternatingBregman` alternates.
+
+    Attributes
+    ----------
+    J : cp.Expression
+        One real number, convex in the variables. `cp.transforms.indicator(constraints)` adds constraints.
+    variables : cp.Variable or sequence of them
+        All variables of J.
+    K : (s, m), dense or sparse
+    f : (s,)
+
+    Raises
+    ------
+    SettingError
+        When J is not convex or not one real number, has a variable that is not named or one that is named is not
+        continuous and real, or when K and f have other shapes or entries that are not finite.
+
+    Examples
+    --------
+    >>> import cvxpy as cp, numpy as np
+    >>> x = cp.Variable(3)
+    >>> BregmanProblem(cp.norm1(x), x, np.ones((1, 3)), [1.0])
+    BregmanProblem(m=3, s=1, blocks=1)
+    """
+
+    J: Any
+    variables: Any
+    K: Any
+    f: Any
+
+    def __post_init__(self) -> None:
+        check_convex(self.J, "J")
+        variables = (self.variables,) if isinstance(self.variables, cp.Variable) else tuple(self.variables)
+        for position, variable in enumerate(variables):
+            check_variable(variable, f"variables[{position}]")
+        known = {variable.id for variable in variables}
+        if not variables or len(known) < len(variables):
+            raise SettingError(f"variables are {variables}; name at least one, each once")
+        for variable in self.J.variables():
+            if variable.id not in known:
+                raise SettingError(f"J has the variable {variable}, which is not among the variables named; add it")
+        f = np.atleast_1d(finite_array(self.f, "f"))
+        if issparse(self.K):
+            K = csr_array(self.K, copy=True)
+            K.data = finite_array(K.data, "the entries of K")
+        else:
+            K = csr_array(np.atleast_2d(finite_array(self.K, "K")))
+        m = sum(int(variable.size) for variable in variables)
+        if f.ndim != 1 or K.shape != (len(f), m):
+            raise SettingError(f"K has shape {K.shape} and f {f.shape}; with m = {m} they must be (s, {m}) and (s,)")
+        for name, value in (("variables", variables), ("K", read_only(K)), ("f", read_only(f))):
+            object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        return f"BregmanProblem(m={self.K.shape[1]}, s={self.K.shape[0]}, blocks={len(self.variables)})"
+
+    @property
+    def blocks(self) -> tuple[slice, ...]:
+        """Where each variable is in x."""
+        ends = np.cumsum([0, *(variable.size for variable in self.variables)])
+        return tuple(slice(int(start), int(end)) for start, end in pairwise(ends))
+
+    def stacked(self, values: Sequence[Array]) -> Array:
+        """x, (m,), of one array for every variable."""
+        return np.concatenate([np.ravel(value) for value in values])
+
+    def unstacked(self, x: Array) -> tuple[Array, ...]:
+        """One array for every variable, in its shape; the inverse of `stacked`."""
+        return tuple(
+            x[block].reshape(variable.shape) for block, variable in zip(self.blocks, self.variables, strict=True)
+        )
+
+    def objective(self, x: Array) -> float:
+        """J(x); inf outside its domain."""
+        for variable, value in zip(self.variables, self.unstacked(x), strict=True):
+            variable.save_value(value)
+        with np.errstate(all="ignore"):  # outside the domain of J the value says so
+            return float(self.J.value)
+
+    def residual(self, x: Array) -> Array:
+        """K x - f, (s,)."""
+        return np.asarray(self.K @ x - self.f)
+
+
+@dataclass(frozen=True, eq=False)
+class Subproblem:
+    """A compiled minimisation over x, or over one block of it.
+
+    Attributes
+    ----------
+    problem : cp.Problem
+    variables : tuple of cp.Variable
+    parameter : cp.Parameter
+        p, (m,), or lam, (s,), or the scaled shift, (s,).
+    scale : float
+        The parameter's value is `scale` times what `solve` is given.
+    tolerance : float
+        Clarabel's.
+    """
+
+    problem: cp.Problem
+    variables: tuple[cp.Variable, ...]
+    parameter: cp.Parameter
+    scale: float
+    tolerance: float
+
+    def solve(self, value: Array) -> Array:
+        """Minimiser, stacked.
+
+        Raises
+        ------
+        PGOError
+            When Clarabel ends without a solution: J may be unbounded below on K x = const.
+        """
+        self.parameter.value = self.scale * value
+        solve_compiled(self.problem, "Bregman subproblem", self.tolerance)
+        return np.concatenate([np.ravel(variable.value) for variable in self.variables])
+
+
+def bregman_subproblem(problem: BregmanProblem, alpha: float, tolerance: float = TOLERANCE) -> Subproblem:
+    """Solve p -> argmin J(x) - <p, x> + alpha/2 ||K x - f||^2 (paper: `update B`, constants dropped)."""
+    p = cp.Parameter(problem.K.shape[1], name="p")
+    x = _stack(problem.variables)
+    penalty = cp.sum_squares(np.sqrt(alpha / 2) * (problem.K @ x - problem.f))
+    return _compiled(problem.J - p @ x + penalty, problem.variables, p, 1.0, tolerance)
+
+
+def two_line_subproblem(problem: BregmanProblem, alpha: float, tolerance: float = TOLERANCE) -> Subproblem:
+    """Solve f - b -> argmin J(x) + alpha/2 ||K x - f + b||^2 (paper: `bregman update`)."""
+    root = float(np.sqrt(alpha / 2))
+    shift = cp.Parameter(problem.K.shape[0], name="shift")
+    penalty = cp.sum_squares((root * problem.K) @ _stack(problem.variables) - shift)
+    return _compiled(problem.J + penalty, problem.variables, shift, root, tolerance)
+
+
+def augmented_lagrangian_subproblem(problem: BregmanProblem, alpha: float, tolerance: float = TOLERANCE) -> Subproblem:
+    """Solve lam -> argmin J(x) + <lam, f - K x> + alpha/2 ||f - K x||^2 (paper: `minbregman`)."""
+    lam = cp.Parameter(problem.K.shape[0], name="lam")
+    residual = problem.f - problem.K @ _stack(problem.variables)
+    penalty = cp.sum_squares(np.sqrt(alpha / 2) * residual)
+    return _compiled(problem.J + lam @ residual + penalty, problem.variables, lam, 1.0, tolerance)
+
+
+def block_subproblems(problem: BregmanProblem, alpha: float, tolerance: float = TOLERANCE) -> tuple[Subproblem, ...]:
+    """Solve, for block i, c -> argmin J_i(x_i) + alpha/2 ||K_i x_i - c||^2 (paper: `bregman ADMM`).
+
+    Minimises the augmented Lagrangian over x_i when c = f + lam / alpha - sum of K_j x_j over the other blocks.
+
+    Raises
+    ------
+    SettingError
+        When J is not a sum of terms of one variable each.
+    """
+    root = float(np.sqrt(alpha / 2))
+    separated = _terms_by_variable(problem)
+    compiled = []
+    for variable, block, J_i in zip(problem.variables, problem.blocks, separated, strict=True):
+        c = cp.Parameter(problem.K.shape[0], name="c")
+        penalty = cp.sum_squares((root * problem.K[:, block]) @ _stack((variable,)) - c)
+        compiled.append(_compiled(J_i + penalty, (variable,), c, root, tolerance))
+    return tuple(compiled)
+
+
+def _terms_by_variable(problem: BregmanProblem) -> list[cp.Expression]:
+    """J_i, the terms of J in variable i; constants are dropped."""
+    position = {variable.id: index for index, variable in enumerate(problem.variables)}
+    separated: list[Any] = [cp.Constant(0.0) for _ in problem.variables]
+    addition = type(problem.J + 1.0)
+    for term in problem.J.args if isinstance(problem.J, addition) else [problem.J]:
+        owners = term.variables()
+        if len(owners) > 1:
+            names = ", ".join(str(variable) for variable in owners)
+            raise SettingError(
+                f"the term {term} of J couples the variables {names}; write J as a sum of terms of one variable each, "
+                "with a copy of the shared variable and K x = f to tie the copies"
+            )
+        if owners:
+            separated[position[owners[0].id]] += term
+    return separated
+
+
+def _stack(variables: Sequence[cp.Variable]) -> cp.Expression:
+    return cp.hstack([cp.vec(variable, order="C") for variable in variables])
+
+
+def _compiled(
+    objective: cp.Expression,
+    variables: tuple[cp.Variable, ...],
+    parameter: cp.Parameter,
+    scale: float,
+    tolerance: float,
+) -> Subproblem:
+    return Subproblem(cp.Problem(cp.Minimize(objective)), variables, parameter, scale, tolerance)

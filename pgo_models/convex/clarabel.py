@@ -1,0 +1,117 @@
+"""How the compiled cvxpy models of Bregman iteration and SOC are checked and solved: convex, by Clarabel, tightly."""
+
+from __future__ import annotations
+
+import warnings
+
+import cvxpy as cp
+import numpy as np
+
+from pgo_models.errors import PGOError, SettingError
+from pgo_models.geometry.arrays import real_array
+from pgo_models.geometry.rotations import Array
+
+TOLERANCE = 1e-14  # an interior-point iterate errs by about the square root of the gap where the objective is flat
+LOOSEST_TOLERANCE = 1e-8  # what still counts as solved where rounding allows no more
+_MEANING = {
+    cp.INFEASIBLE: "its constraints contradict each other",
+    cp.UNBOUNDED: "its objective has no minimum; add a term or a bound",
+}
+
+
+def check_convex(expression: cp.Expression, name: str) -> None:
+    """Raise unless an expression is one real number, convex by the rules of disciplined convex programming.
+
+    Raises
+    ------
+    SettingError
+        With the shape, or the curvature and the part that has it.
+    """
+    if not isinstance(expression, cp.Expression):
+        raise SettingError(f"{name} is a {type(expression).__name__}; give a cvxpy expression")
+    if expression.size != 1:
+        raise SettingError(f"{name} has shape {expression.shape}; it must be one number")
+    if not expression.is_real():
+        raise SettingError(f"{name} is complex; write it in real and imaginary parts")
+    if not expression.is_convex():
+        raise SettingError(
+            f"{name} is not convex: cvxpy finds it {expression.curvature.lower()}, {expression}; "
+            "rewrite it by the rules of disciplined convex programming"
+        )
+
+
+def check_variable(variable: cp.Variable, name: str) -> None:
+    """Raise unless `variable` is a continuous real cvxpy Variable.
+
+    Raises
+    ------
+    SettingError
+    """
+    if not isinstance(variable, cp.Variable):
+        raise SettingError(f"{name} is a {type(variable).__name__}; give a cvxpy Variable")
+    if not variable.is_real():
+        raise SettingError(f"{name} ({variable}) is complex; write it in real and imaginary parts")
+    if variable.attributes["boolean"] or variable.attributes["integer"]:
+        raise SettingError(f"{name} ({variable}) is boolean or integer; only continuous variables are convex")
+
+
+def solve_compiled(problem: cp.Problem, name: str, tolerance: float = TOLERANCE) -> None:
+    """Solve a compiled problem by Clarabel, cold, so that equal parameters give equal bits.
+
+    Parameters
+    ----------
+    problem : cp.Problem
+        Its variables hold the solution afterwards.
+    name : str
+        For messages.
+    tolerance : float
+        On the gap and on feasibility, absolute and relative. Where rounding does not allow it, 100 times as much is
+        tried, and so on up to LOOSEST_TOLERANCE.
+
+    Raises
+    ------
+    PGOError
+        When Clarabel ends without a solution; the message has its status and what it means.
+    """
+    while True:
+        status = _status(problem, tolerance)
+        if status == cp.OPTIMAL:
+            return
+        if status in _MEANING or tolerance >= LOOSEST_TOLERANCE:
+            meaning = _MEANING.get(status, "check its scaling")
+            raise PGOError(f"Clarabel ended with status {status} on the {name}: {meaning}")
+        tolerance = min(100.0 * tolerance, LOOSEST_TOLERANCE)
+
+
+def _status(problem: cp.Problem, tolerance: float) -> str:
+    """How Clarabel ended on a problem."""
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
+            problem.solve(
+                solver=cp.CLARABEL,
+                warm_start=False,
+                max_threads=1,
+                tol_gap_abs=tolerance,
+                tol_gap_rel=tolerance,
+                tol_feas=tolerance,
+            )
+    except cp.SolverError:
+        return str(cp.SOLVER_ERROR)
+    return str(problem.status)
+
+
+def finite_array(values: object, name: str) -> Array:
+    """Read-only copy of `values` as doubles.
+
+    Raises
+    ------
+    SettingError
+        When they are no real numbers, or not finite.
+    """
+    array = real_array(values, name, SettingError)
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        where = tuple(int(index) for index in bad[0])
+        raise SettingError(f"{name} has {len(bad)} entries that are not finite, the first at {where}: {array[where]}")
+    return array

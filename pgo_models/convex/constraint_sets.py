@@ -1,0 +1,215 @@
+"""The sets of SOC: orthonormal columns, SO(d), unit columns and rows, few nonzeros, each with its projection.
+
+The projection onto orthonormal columns is Theorem 1 of Lai & Osher 2014 and step (b) of the paper's Algorithm 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import Array, project_by_svd
+
+
+class ConstraintSet(Protocol):
+    """A closed set of matrices with a closed-form projection."""
+
+    def check_shape(self, shape: tuple[int, ...], name: str) -> None:
+        """Raise SettingError unless the set has matrices of this shape; `name` is for the message."""
+
+    def project(self, V: Array) -> Array:
+        """One nearest point of the set to V."""
+
+    def normal_part(self, P: Array, G: Array) -> Array:
+        """Projection of G onto the normal space of the set at its point P."""
+
+    def least_penalty(self, P: Array, N: Array) -> float:
+        """Smallest rho at which P is still the projection of P + N / rho, for N normal at P."""
+
+    def distance(self, P: Array) -> float:
+        """How far P is from satisfying the equations of the set."""
+
+    def random(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+        """Random point of the set."""
+
+
+@dataclass(frozen=True)
+class Orthonormal:
+    """X^T X = I, columns at most as many as rows: the Stiefel manifold; O(p) when X is square."""
+
+    def check_shape(self, shape: tuple[int, ...], name: str) -> None:
+        """Two dimensions, not more columns than rows."""
+        if len(shape) != 2 or shape[1] > shape[0]:
+            raise SettingError(
+                f"{name} has shape {shape}; X^T X = I needs at least as many rows as columns, give the transpose"
+            )
+
+    def project(self, V: Array) -> Array:
+        """U V^T of the SVD."""
+        U, _, Vt = np.linalg.svd(V, full_matrices=False)
+        return np.asarray(U @ Vt)
+
+    def normal_part(self, P: Array, G: Array) -> Array:
+        """P Lambda, with Lambda = sym(P^T G)."""
+        return np.asarray(P @ _symmetric(P.T @ G))
+
+    def least_penalty(self, P: Array, N: Array) -> float:
+        """Largest eigenvalue of -Lambda, N = P Lambda: the polar factor of P (I + Lambda / rho) must be P."""
+        return max(0.0, float(-np.linalg.eigvalsh(_symmetric(P.T @ N))[0]))
+
+    def distance(self, P: Array) -> float:
+        """||P^T P - I||_F."""
+        return float(np.linalg.norm(P.T @ P - np.eye(P.shape[1])))
+
+    def random(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+        """Uniform (Haar) point."""
+        return self.project(rng.standard_normal(shape))
+
+
+@dataclass(frozen=True)
+class Rotations:
+    """X^T X = I and det X = 1: SO(d), for square X of any side."""
+
+    def check_shape(self, shape: tuple[int, ...], name: str) -> None:
+        """Square."""
+        if len(shape) != 2 or shape[0] != shape[1]:
+            raise SettingError(f"{name} has shape {shape}; a rotation must be square, use `orthogonal` for X^T X = I")
+
+    def project(self, V: Array) -> Array:
+        """U diag(1, .., 1, det(U V^T)) V^T of the SVD."""
+        return project_by_svd(V)
+
+    def normal_part(self, P: Array, G: Array) -> Array:
+        """P Lambda, with Lambda = sym(P^T G): SO(d) is a part of O(d)."""
+        return np.asarray(P @ _symmetric(P.T @ G))
+
+    def least_penalty(self, P: Array, N: Array) -> float:
+        """Minus half the sum of Lambda's two smallest eigenvalues: one may be negative in a nearest rotation."""
+        return max(0.0, float(-np.mean(np.linalg.eigvalsh(_symmetric(P.T @ N))[:2])))
+
+    def distance(self, P: Array) -> float:
+        """max(||P^T P - I||_F, 1 - det P)."""
+        return max(float(np.linalg.norm(P.T @ P - np.eye(len(P)))), 1.0 - float(np.linalg.det(P)))
+
+    def random(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+        """Uniform (Haar) point."""
+        return self.project(rng.standard_normal(shape))
+
+
+@dataclass(frozen=True)
+class UnitColumns:
+    """||x_j|| = 1 for every column x_j; a vector is one column."""
+
+    def check_shape(self, shape: tuple[int, ...], name: str) -> None:
+        """One or two dimensions."""
+        _check_vector_or_matrix(shape, name)
+
+    def project(self, V: Array) -> Array:
+        """Columns over their norms; a zero column becomes the first unit vector."""
+        norms = np.linalg.norm(V, axis=0)
+        first = np.zeros(V.shape)
+        first[0] = 1.0
+        return np.asarray(np.where(norms > 0, V, first) / np.where(norms > 0, norms, 1.0))
+
+    def normal_part(self, P: Array, G: Array) -> Array:
+        """P diag(Lambda), with Lambda_j = <p_j, g_j>."""
+        return np.asarray(P * np.sum(P * G, axis=0))
+
+    def least_penalty(self, P: Array, N: Array) -> float:
+        """Largest -Lambda_j, N = P diag(Lambda)."""
+        return max(0.0, float(-np.min(np.sum(P * N, axis=0))))
+
+    def distance(self, P: Array) -> float:
+        """Norm of the vector of ||p_j||^2 - 1."""
+        return float(np.linalg.norm(np.sum(P**2, axis=0) - 1.0))
+
+    def random(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+        """Uniform point."""
+        return self.project(rng.standard_normal(shape))
+
+
+@dataclass(frozen=True)
+class UnitRows:
+    """||x_i|| = 1 for every row x_i; of a vector, every entry is -1 or 1."""
+
+    def check_shape(self, shape: tuple[int, ...], name: str) -> None:
+        """One or two dimensions."""
+        _check_vector_or_matrix(shape, name)
+
+    def project(self, V: Array) -> Array:
+        """Rows over their norms."""
+        return UnitColumns().project(_rows_as_columns(V)).T.reshape(V.shape)
+
+    def normal_part(self, P: Array, G: Array) -> Array:
+        """diag(Lambda) P, with Lambda_i the product of rows i of P and G."""
+        return UnitColumns().normal_part(_rows_as_columns(P), _rows_as_columns(G)).T.reshape(P.shape)
+
+    def least_penalty(self, P: Array, N: Array) -> float:
+        """Largest -Lambda_i, N = diag(Lambda) P."""
+        return UnitColumns().least_penalty(_rows_as_columns(P), _rows_as_columns(N))
+
+    def distance(self, P: Array) -> float:
+        """Norm of the vector of ||p_i||^2 - 1."""
+        return UnitColumns().distance(_rows_as_columns(P))
+
+    def random(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+        """Uniform point."""
+        return self.project(rng.standard_normal(shape))
+
+
+@dataclass(frozen=True)
+class Sparse:
+    """At most `nonzeros` entries are not zero: ||X||_0 <= nonzeros."""
+
+    nonzeros: int
+
+    def __post_init__(self) -> None:
+        if self.nonzeros < 1:
+            raise SettingError(f"nonzeros must be at least 1, got {self.nonzeros}")
+
+    def check_shape(self, shape: tuple[int, ...], name: str) -> None:
+        """One or two dimensions."""
+        _check_vector_or_matrix(shape, name)
+
+    def project(self, V: Array) -> Array:
+        """Hard thresholding: the largest entries are kept; of equal ones the first."""
+        if self.nonzeros >= V.size:
+            return V.copy()
+        kept = np.argsort(-np.abs(V), axis=None, kind="stable")[: self.nonzeros]
+        P = np.zeros(V.shape)
+        P.flat[kept] = V.flat[kept]
+        return P
+
+    def normal_part(self, P: Array, G: Array) -> Array:
+        """G off the support of P; 0 where P has room for another nonzero."""
+        if np.count_nonzero(P) < self.nonzeros:
+            return np.zeros(P.shape)
+        return np.where(P == 0, G, 0.0)
+
+    def least_penalty(self, P: Array, N: Array) -> float:
+        """Return 0: largest |N| off the support over smallest |P| on it is no scale to hold rho by, both can jump."""
+        return 0.0
+
+    def distance(self, P: Array) -> float:
+        """Norm of the entries that hard thresholding would drop."""
+        return float(np.linalg.norm(P - self.project(P)))
+
+    def random(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+        """Projection of normal entries."""
+        return self.project(rng.standard_normal(shape))
+
+
+def _symmetric(A: Array) -> Array:
+    return 0.5 * (A + A.T)
+
+
+def _rows_as_columns(V: Array) -> Array:
+    return V.reshape(1, -1) if V.ndim == 1 else V.T
+
+
+def _check_vector_or_matrix(shape: tuple[int, ...], name: str) -> None:
+    if len(shape) not in (1, 2):
+        raise SettingError(f"{name} has shape {shape}; give a vector or a matrix")

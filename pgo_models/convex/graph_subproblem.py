@@ -1,0 +1,279 @@
+"""The R-subproblem of a graph or of one robot as a cvxpy model on named poses and edges, open to terms of one's own.
+
+    minimise   sum_e kappa ||R_j - R_i R_ij||_F^2 + tau ||t_j - t_i - R_i t_ij||^2  +  rho/2 ||R - omega + B||^2
+
+Step (a) of the paper's Algorithm 1 (`algo1: SOC`): rotations only as the paper has it, or joint in (R, t).
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cvxpy as cp
+import numpy as np
+from scipy.sparse import csr_array, diags_array
+
+from pgo_models.convex.rotation_subproblem import RotationQP, rotation_qp
+from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.problem.matrices import residual_matrix, rotation_columns
+
+
+class Unknowns(enum.Enum):
+    """What the quadratic program is solved for."""
+
+    ROTATIONS = "rotations only, on the rotation residuals: the paper's step (a)"
+    POSES = "rotations and translations together"
+
+
+class Neighbours(enum.Enum):
+    """What a robot's program does with the poses of others that its edges lead to."""
+
+    COPIES = "copies of them are unknowns too, and an edge between robots counts half"
+    FROZEN = "they stay where they are, and enter the shift"
+
+
+@dataclass(frozen=True, eq=False)
+class PoseVariables:
+    """The unknowns of a program by the names of the graph.
+
+    Attributes
+    ----------
+    graph : PoseGraph
+    unknowns : Unknowns
+    poses : (n_a,)
+        Poses of the graph that are unknown, ascending.
+    X : cp.Variable
+        Rows t_i (not for ROTATIONS), then the rows of every R_i^T.
+    """
+
+    graph: PoseGraph
+    unknowns: Unknowns
+    poses: IntArray
+    X: cp.Variable
+
+    @property
+    def num_translations(self) -> int:
+        """Rows of X before the rotations."""
+        return len(self.poses) if self.unknowns is Unknowns.POSES else 0
+
+    def R(self, pose: int) -> cp.Expression:
+        """R_i, (d, d)."""
+        first = self.num_translations + self.graph.d * self._place(pose)
+        return self.X[first : first + self.graph.d].T
+
+    def t(self, pose: int) -> cp.Expression:
+        """t_i, (d,)."""
+        if self.unknowns is Unknowns.ROTATIONS:
+            raise SettingError("a program in rotations only has no translations; use Unknowns.POSES")
+        return self.X[self._place(pose)]
+
+    def rotation_residual(self, e: int) -> cp.Expression:
+        """R_j - R_i R_ij of edge e, (d, d)."""
+        graph = self.graph
+        return self.R(int(graph.j[e])) - self.R(int(graph.i[e])) @ graph.R_ij[e]
+
+    def translation_residual(self, e: int) -> cp.Expression:
+        """t_j - t_i - R_i t_ij of edge e, (d,)."""
+        i, j = int(self.graph.i[e]), int(self.graph.j[e])
+        return self.t(j) - self.t(i) - self.R(i) @ self.graph.t_ij[e]
+
+    def _place(self, pose: int) -> int:
+        place = int(np.searchsorted(self.poses, pose))
+        if not (place < len(self.poses) and self.poses[place] == pose):
+            raise SettingError(f"pose {pose} is not among the {len(self.poses)} unknown poses of this program")
+        return place
+
+
+@dataclass(frozen=True, eq=False)
+class ModelChange:
+    """What one's own model adds to the program, or takes out of it.
+
+    Attributes
+    ----------
+    terms : sequence of cp.Expression
+        Convex, in the variables that `PoseVariables` names and no others; added to F.
+    constraints : sequence of cp.Constraint
+        Convex, in the same variables.
+    replaced_edges : sequence of int
+        Edges whose squared residuals leave F, where terms have another loss for them.
+    """
+
+    terms: Sequence[cp.Expression] = ()
+    constraints: Sequence[cp.Constraint] = ()
+    replaced_edges: Sequence[int] = ()
+
+
+Changer = Callable[[PoseVariables], ModelChange]
+
+
+@dataclass(frozen=True, eq=False)
+class GraphQP:
+    """A compiled R-subproblem on the poses of a graph.
+
+    Attributes
+    ----------
+    variables : PoseVariables
+    qp : RotationQP
+        The cvxpy problem and its Parameter.
+    change : ModelChange
+    A, w
+        Residuals and weights of the edges that count, in the rows of X.
+    between : sparse (N_a, N)
+        A_a^T diag(w) A on the frozen neighbours' rows of the whole graph; empty unless FROZEN.
+    """
+
+    variables: PoseVariables
+    qp: RotationQP
+    change: ModelChange
+    A: csr_array
+    w: Array
+    between: csr_array
+
+    def solve(self, V: Array, neighbours: Array | None = None) -> Array:
+        """X for the shift V = omega - B, both (N_a, d).
+
+        Parameters
+        ----------
+        V : (N_a, d)
+        neighbours : (N, d), optional
+            X of the whole graph, for FROZEN: the shift becomes V - 2 D^-1 M_between X.
+
+        Raises
+        ------
+        SettingError
+            When frozen neighbours are missing.
+        PGOError
+            When Clarabel does not end with a solution, as where constraints contradict each other.
+        """
+        if self.between.nnz:
+            if neighbours is None:
+                raise SettingError("the neighbours are frozen; give X of the whole graph, whose rows say where")
+            pull = 2.0 * (self.between @ neighbours)
+            held = self.qp.penalty > 0
+            V = V.copy()
+            V[held] -= pull[held] / self.qp.penalty[held, None]
+        return self.qp.solve(V)
+
+    def cost(self, X: Array) -> float:
+        """F of the edges that count plus the added terms, without the penalty; X need not be feasible."""
+        residuals = self.A @ X
+        self.variables.X.value = X
+        added = sum(float(term.value) for term in self.change.terms)
+        return float(self.w @ np.einsum("rc,rc->r", residuals, residuals)) + added
+
+
+def graph_qp(
+    graph: PoseGraph,
+    rho: Array,
+    unknowns: Unknowns = Unknowns.POSES,
+    changer: Changer | None = None,
+    rho_t: Array | None = None,
+) -> GraphQP:
+    """Pose the R-subproblem of a whole graph.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    rho : (n,)
+        Penalty of every rotation.
+    unknowns : Unknowns
+    changer : callable, optional
+        Given the variables, returns the ModelChange: terms, constraints, and edges whose loss they replace.
+    rho_t : (n,), optional
+        Penalty of every translation; none unless given.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> def prior(unknown: PoseVariables) -> ModelChange:
+    ...     return ModelChange(terms=[10.0 * cp.sum_squares(unknown.t(3) - np.array([1.0, 0.0, 0.0]))])
+    >>> qp = graph_qp(graph, np.full(27, 5.0), changer=prior)
+    >>> qp.qp.problem.is_dcp(dpp=True), len(qp.qp.problem.parameters())
+    (True, 1)
+    """
+    everyone = np.ones(graph.num_poses, dtype=bool)
+    return _posed(graph, everyone, np.ones(graph.num_edges), rho, rho_t, unknowns, changer)
+
+
+def robot_qp(
+    graph: PoseGraph,
+    robot: int,
+    rho: Array,
+    neighbours: Neighbours = Neighbours.FROZEN,
+    unknowns: Unknowns = Unknowns.ROTATIONS,
+    changer: Changer | None = None,
+    rho_t: Array | None = None,
+) -> GraphQP:
+    """Pose the R-subproblem of one robot of `graph.robots` with its neighbours' terms; parameters as `graph_qp`.
+
+    With COPIES and `rho_t` on the separators it is the subproblem of SOC's CONSENSUS coupling, whose penalties are the
+    shares of the copies; with FROZEN and ROTATIONS it is the paper's.
+
+    Raises
+    ------
+    SettingError
+        When the robot owns no pose, or frozen neighbours pull on translations that have no penalty.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> robots = graph.with_robots(np.arange(27) // 9)
+    >>> robot_qp(robots, 1, np.ones(27)).variables.poses
+    array([ 9, 10, 11, 12, 13, 14, 15, 16, 17])
+    """
+    owned = graph.robots == robot
+    if not owned.any():
+        raise SettingError(f"robot {robot} owns no pose; the graph has robots 0 to {graph.num_robots - 1}")
+    touches = owned[graph.i].astype(int) + owned[graph.j]
+    if neighbours is Neighbours.FROZEN:
+        share = (touches > 0).astype(float)
+        unknown = owned
+    else:
+        share = 0.5 * touches
+        unknown = owned.copy()
+        unknown[np.concatenate([graph.i[touches > 0], graph.j[touches > 0]])] = True
+    return _posed(graph, unknown, share, rho, rho_t, unknowns, changer)
+
+
+def _posed(
+    graph: PoseGraph,
+    unknown: BoolArray,
+    share: Array,
+    rho: Array,
+    rho_t: Array | None,
+    unknowns: Unknowns,
+    changer: Changer | None,
+) -> GraphQP:
+    n, m, d = graph.num_poses, graph.num_edges, graph.d
+    poses = np.flatnonzero(unknown)
+    rotations = rotation_columns(poses, n, d).ravel()
+    joint = unknowns is Unknowns.POSES
+    mine = np.concatenate([poses, rotations]) if joint else rotations
+    penalty_t = np.zeros(n) if rho_t is None else rho_t
+    penalty = np.concatenate([penalty_t[poses] if joint else np.zeros(0), np.repeat(rho[poses], d)])
+
+    X = cp.Variable((len(mine), d), name="X")
+    variables = PoseVariables(graph, unknowns, poses, X)
+    change = changer(variables) if changer is not None else ModelChange()
+    share = share.copy()
+    share[list(change.replaced_edges)] = 0.0
+    whole, weights = residual_matrix(graph)
+    weights = weights * np.concatenate([share if joint else np.zeros(m), np.repeat(share, d)])
+    counted = weights > 0
+    whole, w = whole[counted], weights[counted]
+    A = whole[:, mine].tocsr()
+    frozen = np.ones((d + 1) * n)
+    frozen[mine] = 0.0
+    between = csr_array(A.T @ diags_array(w) @ whole @ diags_array(frozen))
+    between.eliminate_zeros()
+    pulled = np.diff(between.indptr) > 0
+    if (penalty[pulled] == 0).any():
+        raise SettingError("frozen neighbours enter the shift, so every row they pull on needs a penalty; give rho_t")
+    qp = rotation_qp(A, w, penalty, d, X, change.terms, change.constraints)
+    return GraphQP(variables, qp, change, A, w, between)

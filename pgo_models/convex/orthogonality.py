@@ -1,0 +1,349 @@
+"""Any convex cvxpy problem plus X^T X = I on some of its variables, and its split form (Lai & Osher 2014).
+
+    minimise J(X, y) over the convex constraints, with X in a set of orthonormal columns, rotations, unit columns, ..
+
+The split form is step (a) of the paper's Algorithm 1 for any J: the same cvxpy problem with the sets taken out and
+rho/2 ||X - V||^2 added, compiled once. The iteration is in solvers/orthogonal_soc.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from pgo_models.convex.clarabel import check_convex, check_variable, finite_array, solve_compiled
+from pgo_models.convex.constraint_sets import ConstraintSet, Orthonormal, Rotations, Sparse, UnitColumns, UnitRows
+from pgo_models.errors import SettingError
+from pgo_models.geometry.arrays import real_array
+from pgo_models.geometry.rotations import Array
+
+_IN_SET = 1e-6
+
+
+@dataclass(frozen=True)
+class Term:
+    """One non-convex constraint: the variable of this number is in this set."""
+
+    variable: int
+    constraint: ConstraintSet
+
+
+@dataclass(frozen=True, eq=False)
+class OrthogonalPoint:
+    """Where SOC starts or ends.
+
+    Attributes
+    ----------
+    copies : tuple of arrays
+        For every term, a point of its set.
+    normals : tuple of arrays
+        For every term, rho B: the multiplier, as a vector normal to the set at the copy. At a stationary point minus
+        their sum over the terms of a variable is a subgradient of J.
+    """
+
+    copies: tuple[Array, ...]
+    normals: tuple[Array, ...]
+
+    def __post_init__(self) -> None:
+        for name in ("copies", "normals"):
+            arrays = tuple(real_array(array, f"the point's {name}", SettingError) for array in getattr(self, name))
+            object.__setattr__(self, name, arrays)
+
+
+@dataclass(frozen=True, eq=False)
+class OrthogonalProblem:
+    """A convex cvxpy problem with non-convex sets for some of its variables.
+
+    Attributes
+    ----------
+    problem : cp.Problem
+        Minimise convex or maximise concave; J is the function that is minimised.
+    orthogonal : sequence of (n, p) variables, n >= p
+        X^T X = I.
+    rotations : sequence of (d, d) variables
+        X in SO(d).
+    unit_columns, unit_rows : sequence of variables
+        Every column, or row, has norm 1.
+    sparse : sequence of (variable, int)
+        At most so many nonzeros. A variable may be here and in one of the other lists too.
+
+    Raises
+    ------
+    SettingError
+        When J or a constraint is not convex, a variable is not in the problem, not real, or has the wrong shape, or
+        no variable is named.
+
+    Examples
+    --------
+    >>> import cvxpy as cp, numpy as np
+    >>> X = cp.Variable((3, 2))
+    >>> OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(X - np.ones((3, 2))))), orthogonal=[X])
+    OrthogonalProblem((3, 2) Orthonormal)
+    """
+
+    problem: Any
+    orthogonal: Sequence[Any] = ()
+    rotations: Sequence[Any] = ()
+    unit_columns: Sequence[Any] = ()
+    unit_rows: Sequence[Any] = ()
+    sparse: Sequence[tuple[Any, int]] = ()
+    J: Any = field(init=False)
+    variables: tuple[Any, ...] = field(init=False)
+    others: tuple[Any, ...] = field(init=False)
+    terms: tuple[Term, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.problem, cp.Problem):
+            raise SettingError(f"the problem is a {type(self.problem).__name__}; give a cvxpy Problem")
+        named: list[tuple[Any, ConstraintSet, str]] = []
+        simple: tuple[tuple[str, Sequence[Any], ConstraintSet], ...] = (
+            ("orthogonal", self.orthogonal, Orthonormal()),
+            ("rotations", self.rotations, Rotations()),
+            ("unit_columns", self.unit_columns, UnitColumns()),
+            ("unit_rows", self.unit_rows, UnitRows()),
+        )
+        for kind, chosen, constraint in simple:
+            if isinstance(chosen, cp.Expression):
+                raise SettingError(f"{kind} is one expression; give a list of variables")
+            named += [(variable, constraint, f"{kind}[{place}]") for place, variable in enumerate(chosen)]
+        for place, (variable, nonzeros) in enumerate(self.sparse):
+            named.append((variable, Sparse(nonzeros), f"sparse[{place}]"))
+        if not named:
+            raise SettingError("no variable is named; a convex problem is solved by problem.solve()")
+        own = {variable.id for variable in self.problem.variables()}
+        place_of: dict[int, int] = {}
+        variables: list[Any] = []
+        terms: list[Term] = []
+        for variable, constraint, name in named:
+            check_variable(variable, name)
+            constraint.check_shape(variable.shape, name)
+            if variable.id not in own:
+                raise SettingError(f"{name} ({variable}) is not a variable of the problem; use it in the objective")
+            if variable.id not in place_of:
+                place_of[variable.id] = len(variables)
+                variables.append(variable)
+            terms.append(Term(place_of[variable.id], constraint))
+        others = [variable for variable in self.problem.variables() if variable.id not in place_of]
+        for variable in others:
+            check_variable(variable, "a variable of the problem")
+        object.__setattr__(self, "J", _minimised(self.problem))
+        object.__setattr__(self, "variables", tuple(variables))
+        object.__setattr__(self, "others", tuple(others))
+        object.__setattr__(self, "terms", tuple(terms))
+
+    def __repr__(self) -> str:
+        parts = [f"{self.variables[term.variable].shape} {term.constraint!r}".removesuffix("()") for term in self.terms]
+        return f"OrthogonalProblem({', '.join(parts)})"
+
+    def point(self, values: Sequence[Array]) -> OrthogonalPoint:
+        """Point with the projections of `values`, one for every variable in `variables`, and no multipliers.
+
+        Raises
+        ------
+        SettingError
+            When their number or shapes do not fit, or entries are not finite.
+        """
+        if len(values) != len(self.variables):
+            raise SettingError(f"{len(values)} values for {len(self.variables)} variables")
+        checked = [finite_array(value, f"values[{place}]") for place, value in enumerate(values)]
+        for place, (value, variable) in enumerate(zip(checked, self.variables, strict=True)):
+            if value.shape != variable.shape:
+                raise SettingError(f"values[{place}] has shape {value.shape}, its variable {variable.shape}")
+        copies = tuple(term.constraint.project(checked[term.variable]) for term in self.terms)
+        return OrthogonalPoint(copies, tuple(np.zeros(copy.shape) for copy in copies))
+
+    def check_point(self, point: OrthogonalPoint) -> None:
+        """Raise SettingError unless the arrays of a point fit and are finite, and its copies are in their sets."""
+        shapes = [self.variables[term.variable].shape for term in self.terms]
+        for name, arrays in (("copies", point.copies), ("normals", point.normals)):
+            if [np.shape(array) for array in arrays] != shapes:
+                raise SettingError(f"the point's {name} have shapes {[np.shape(a) for a in arrays]}; need {shapes}")
+            for array in arrays:
+                finite_array(array, f"the point's {name}")
+        for term, copy in zip(self.terms, point.copies, strict=True):
+            distance = term.constraint.distance(copy)
+            if distance > _IN_SET:
+                raise SettingError(
+                    f"a copy is {distance:.2g} away from {term.constraint}; OrthogonalProblem.point projects"
+                )
+
+    def random_point(self, rng: np.random.Generator) -> OrthogonalPoint:
+        """Point whose variables are random points of their first sets."""
+        return self.point([self.terms_of(place)[0].random(v.shape, rng) for place, v in enumerate(self.variables)])
+
+    def terms_of(self, variable: int) -> list[ConstraintSet]:
+        """Sets that the variable of this number is in."""
+        return [term.constraint for term in self.terms if term.variable == variable]
+
+    def values(self, copies: Sequence[Array]) -> tuple[Array, ...]:
+        """For every variable, the copy in the first of its sets."""
+        first: dict[int, Array] = {}
+        for term, copy in zip(self.terms, copies, strict=True):
+            first.setdefault(term.variable, copy)
+        return tuple(first[place] for place in range(len(self.variables)))
+
+    def assign(self, values: Sequence[Array], others: Sequence[Array] = ()) -> None:
+        """Put values into the cvxpy variables, `variables` and then `others`."""
+        for variable, value in zip((*self.variables, *self.others), (*values, *others), strict=False):
+            variable.save_value(value)
+
+    def objective(self, values: Sequence[Array], others: Sequence[Array] = ()) -> float:
+        """J at values of `variables` and `others`."""
+        self.assign(values, others)
+        with np.errstate(all="ignore"):  # outside the domain of J the value says so
+            return float(self.J.value)
+
+    def infeasibility(self, copies: Sequence[Array], others: Sequence[Array] = ()) -> float:
+        """Norm of what is violated: sets (rounding only), agreement of a variable's copies, convex constraints."""
+        values = self.values(copies)
+        parts = [term.constraint.distance(copy) for term, copy in zip(self.terms, copies, strict=True)]
+        parts += [
+            float(np.linalg.norm(copy - values[term.variable])) for term, copy in zip(self.terms, copies, strict=True)
+        ]
+        self.assign(values, others)
+        parts += [float(np.linalg.norm(constraint.violation())) for constraint in self.problem.constraints]
+        return float(np.linalg.norm(parts))
+
+    def split(self) -> SplitProblem:
+        """Compile the subproblem."""
+        root = cp.Parameter(nonneg=True, name="root")
+        shifts = tuple(cp.Parameter(variable.shape, name="shift") for variable in self.variables)
+        counts = tuple(len(self.terms_of(place)) for place in range(len(self.variables)))
+        penalty = sum(
+            0.5 * count * cp.sum_squares(root * variable - shift)
+            for count, variable, shift in zip(counts, self.variables, shifts, strict=True)
+        )
+        problem = cp.Problem(cp.Minimize(self.J + penalty), self.problem.constraints)
+        if not problem.is_dcp(dpp=True):
+            raise SettingError("a Parameter of the problem is not used by the rules of DPP; see cvxpy's manual")
+        return SplitProblem(problem, self.variables, self.others, tuple(self.terms), root, shifts)
+
+
+@dataclass(frozen=True, eq=False)
+class SplitProblem:
+    """The compiled subproblem: min J(X, y) + sum over the terms of rho/2 ||X - V_term||^2, convex.
+
+    The terms of one variable add up to count * rho/2 ||X - mean V||^2. Its Parameters, root = sqrt(rho) and
+    shift = sqrt(rho) mean V, enter affinely (DPP), so that neither a new V nor a new rho compiles again.
+    """
+
+    problem: cp.Problem
+    variables: tuple[cp.Variable, ...]
+    others: tuple[cp.Variable, ...]
+    terms: tuple[Term, ...]
+    root: cp.Parameter
+    shifts: tuple[cp.Parameter, ...]
+
+    def solve(self, V: Sequence[Array], rho: float) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        """Minimisers X, one for every variable, and y, for one V for every term.
+
+        Optimality of X gives a subgradient of J without differentiating J: at X, and partially minimised over y and the
+        convex constraints, the sum over the terms of rho (V_term - X) is one.
+
+        Raises
+        ------
+        PGOError
+            When the convex constraints contradict each other, or J has no minimum over y.
+        """
+        self.root.value = np.sqrt(rho)
+        for place, shift in enumerate(self.shifts):
+            of_variable = [V_term for term, V_term in zip(self.terms, V, strict=True) if term.variable == place]
+            shift.value = np.sqrt(rho) * np.mean(of_variable, axis=0)
+        solve_compiled(self.problem, "split subproblem")
+        return (
+            tuple(np.array(variable.value, dtype=float) for variable in self.variables),
+            tuple(np.array(variable.value, dtype=float) for variable in self.others),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class KKTResiduals:
+    """How far a point is from satisfying the KKT conditions of the non-convex problem.
+
+    Attributes
+    ----------
+    feasibility : float
+        Norm of the violation of X^T X = I, of the convex constraints, and of the agreement of a variable's copies.
+    stationarity : float
+        rho ||X - Z||_F, see `kkt_residuals`.
+    gradient_norm : float
+        Norm of the subgradient of J that the multipliers balance: the scale of `stationarity`.
+    multipliers : tuple of arrays
+        For X^T X = I the symmetric Lambda, (p, p), with X Lambda in the subdifferential of J; for the other sets the
+        normal vector itself, minus.
+    """
+
+    feasibility: float
+    stationarity: float
+    gradient_norm: float
+    multipliers: tuple[Array, ...]
+
+
+def kkt_residuals(problem: OrthogonalProblem, point: OrthogonalPoint, rho: float) -> KKTResiduals:
+    """Judge a point by one convex solve, whatever found it.
+
+    The normals N of the point, projected once more onto the normal spaces, are its multipliers: for X^T X = I they are
+    -X Lambda. X is stationary if and only if -sum N is a subgradient of J at X, and that holds if and only if X is
+    Z = argmin J + sum rho/2 ||Z - (X - N / rho)||^2. In general -sum N + rho (X - Z) is a subgradient at Z (times the
+    number of terms of the variable), so rho ||X - Z|| is what stationarity lacks.
+
+    Parameters
+    ----------
+    problem : OrthogonalProblem
+    point : OrthogonalPoint
+    rho : float
+        Of the order of the curvature of J.
+
+    Examples
+    --------
+    >>> from pgo_models.convex.orthogonality_examples import procrustes
+    >>> problem = procrustes(np.eye(3), np.eye(3))
+    >>> bool(kkt_residuals(problem, problem.point([np.eye(3)]), rho=1.0).stationarity < 1e-9)
+    True
+    """
+    normals = [
+        term.constraint.normal_part(copy, normal)
+        for term, copy, normal in zip(problem.terms, point.copies, point.normals, strict=True)
+    ]
+    V = [copy - normal / rho for copy, normal in zip(point.copies, normals, strict=True)]
+    Z, others = problem.split().solve(V, rho)
+    values = problem.values(point.copies)
+    gaps = [len(problem.terms_of(place)) * rho * (X - Z[place]) for place, X in enumerate(values)]
+    gradients = [np.zeros(X.shape) for X in values]
+    for term, normal in zip(problem.terms, normals, strict=True):
+        gradients[term.variable] -= normal
+    multipliers = tuple(
+        -copy.T @ normal if isinstance(term.constraint, Orthonormal | Rotations) else -normal
+        for term, copy, normal in zip(problem.terms, point.copies, normals, strict=True)
+    )
+    return KKTResiduals(
+        feasibility=problem.infeasibility(point.copies, others),
+        stationarity=_norm(gaps),
+        gradient_norm=_norm(gradients),
+        multipliers=multipliers,
+    )
+
+
+def _norm(arrays: Sequence[Array]) -> float:
+    return float(np.sqrt(sum(float(np.sum(array**2)) for array in arrays)))
+
+
+def _minimised(problem: cp.Problem) -> cp.Expression:
+    """J, checked, of a problem whose constraints are convex."""
+    maximises = isinstance(problem.objective, cp.Maximize)
+    expression = problem.objective.args[0]
+    if maximises and not expression.is_concave():
+        raise SettingError(
+            f"the problem maximises {expression}, which is {expression.curvature.lower()}; only a concave function can "
+            "be maximised. On X^T X = I the constant c ||X||_F^2 may be subtracted to make it so"
+        )
+    J = -expression if maximises else expression
+    check_convex(J, "the objective")
+    for place, constraint in enumerate(problem.constraints):
+        if not constraint.is_dcp():
+            raise SettingError(f"constraints[{place}], {constraint}, is not convex by the rules of DCP")
+    return J

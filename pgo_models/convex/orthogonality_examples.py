@@ -1,0 +1,168 @@
+"""Worked models with orthogonality constraints whose answers are known, for solvers.solve_orthogonal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cvxpy as cp
+import numpy as np
+
+from pgo_models.convex.clarabel import finite_array
+from pgo_models.convex.orthogonality import OrthogonalProblem
+from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import PoseGraph
+
+
+def procrustes(A: Array, B: Array, *, rotation: bool = False) -> OrthogonalProblem:
+    """Minimise ||A X - B||_F^2 s.t. X^T X = I, or X in SO(d).
+
+    Balanced, A (l, n) and B (l, n): X = U V^T of the SVD of A^T B, with the sign of the last singular pair changed for
+    SO(d) when det(U V^T) < 0. With A = I, the nearest orthonormal matrix to B. Unbalanced, B (l, p) with p < n, has no
+    closed form (Elden & Park 1999).
+
+    References
+    ----------
+    Schoenemann 1966; Lai & Osher 2014, section 4.
+
+    Examples
+    --------
+    >>> procrustes(np.eye(3), np.eye(3), rotation=True)
+    OrthogonalProblem((3, 3) Rotations)
+    """
+    A, B = _matrix(A, "A"), _matrix(B, "B")
+    if len(A) != len(B):
+        raise SettingError(f"A has {len(A)} rows and B {len(B)}; they must agree")
+    X = cp.Variable((A.shape[1], B.shape[1]), name="X")
+    problem = cp.Problem(cp.Minimize(cp.sum_squares(A @ X - B)))
+    return OrthogonalProblem(problem, rotations=[X]) if rotation else OrthogonalProblem(problem, orthogonal=[X])
+
+
+def smallest_eigenvectors(A: Array, count: int) -> OrthogonalProblem:
+    """Minimise tr(X^T A X) s.t. X^T X = I, A symmetric positive semidefinite: the sum of the smallest eigenvalues.
+
+    X spans their eigenvectors. For the largest ones of A give c I - A, c at least the largest eigenvalue.
+
+    Raises
+    ------
+    SettingError
+        When A is not symmetric positive semidefinite.
+
+    Examples
+    --------
+    >>> smallest_eigenvectors(np.diag([1.0, 2.0, 3.0]), 2)
+    OrthogonalProblem((3, 2) Orthonormal)
+    """
+    A = _matrix(A, "A")
+    X = cp.Variable((len(A), count), name="X")
+    return OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(_root(A) @ X))), orthogonal=[X])
+
+
+def one_norm_components(A: Array, count: int) -> OrthogonalProblem:
+    """Minimise sum |A X| s.t. X^T X = I: the `count` directions in which the rows of A are smallest in the 1-norm.
+
+    The 1-norm form of the last principal components. When most rows lie in a hyperplane, its normal is the answer for
+    count = 1 whatever the other rows are, where the eigenvector of A^T A is turned by them (Tsakiris & Vidal 2018).
+
+    Examples
+    --------
+    >>> one_norm_components(np.eye(4), 2)
+    OrthogonalProblem((4, 2) Orthonormal)
+    """
+    A = _matrix(A, "A")
+    X = cp.Variable((A.shape[1], count), name="X")
+    return OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum(cp.abs(A @ X)))), orthogonal=[X])
+
+
+def sparse_components(A: Array, count: int, weight: float) -> OrthogonalProblem:
+    """Minimise tr(X^T A X) + weight * sum |X| s.t. X^T X = I, A positive semidefinite: compressed modes.
+
+    No answer is below the sum of the smallest eigenvalues + weight * count, since a unit column has 1-norm at least 1.
+
+    References
+    ----------
+    Ozolins, Lai, Caflisch, Osher 2013.
+
+    Examples
+    --------
+    >>> sparse_components(np.eye(4), 2, weight=0.1)
+    OrthogonalProblem((4, 2) Orthonormal)
+    """
+    A = _matrix(A, "A")
+    X = cp.Variable((len(A), count), name="X")
+    objective = cp.sum_squares(_root(A) @ X) + weight * cp.sum(cp.abs(X))
+    return OrthogonalProblem(cp.Problem(cp.Minimize(objective)), orthogonal=[X])
+
+
+def rotation_averaging(graph: PoseGraph) -> OrthogonalProblem:
+    """Minimise sum_e kappa ||R_j - R_i R_ij||_F^2 over rotations R_0 .. R_{n-1} (paper: `rotation`).
+
+    The rotation part of F, one (d, d) variable a pose. A common rotation of all is free.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> len(rotation_averaging(graph).rotations)
+    27
+    """
+    R = [cp.Variable((graph.d, graph.d), name=f"R_{pose}") for pose in range(graph.num_poses)]
+    root = np.sqrt(graph.kappa)
+    residuals = [
+        root[edge] * (R[j] - R[i] @ graph.R_ij[edge])
+        for edge, (i, j) in enumerate(zip(graph.i.tolist(), graph.j.tolist(), strict=True))
+    ]
+    return OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(cp.vstack(residuals)))), rotations=R)
+
+
+def sparse_low_rank(Y: Array, rank: int, nonzeros: int) -> OrthogonalProblem:
+    """Minimise ||Y - B C||_F^2 s.t. B^T B = I, ||B||_0 <= nonzeros: sparse low-rank approximation (the paper's remark).
+
+    Y, (n, samples), is the data in a transform (wavelet, graph Fourier) in which they are sparse. For B given C = B^T Y
+    is best, which leaves ||Y||_F^2 - ||B^T Y||_F^2. It is concave in B, but on B^T B = I it is
+    tr(B^T (c I - Y Y^T) B) + ||Y||_F^2 - c rank, convex with c = ||Y||_2^2. This is J: the squared error. B is in two
+    sets and has a copy for each, one from the SVD step and one from hard thresholding.
+
+    Start at the left singular vectors of Y, with a fixed penalty of 3 c or more: two non-convex sets have many
+    stationary points, and from a random start SOC mostly ends at a poor one, or does not end.
+
+    References
+    ----------
+    Hou, Chau, Magnenat-Thalmann, He 2017 (SLRMA).
+
+    Examples
+    --------
+    >>> sparse_low_rank(np.outer(np.ones(4), np.ones(3)), rank=1, nonzeros=2)
+    OrthogonalProblem((4, 1) Orthonormal, (4, 1) Sparse(nonzeros=2))
+    """
+    Y = _matrix(Y, "Y")
+    c = float(np.linalg.norm(Y, 2)) ** 2
+    B = cp.Variable((len(Y), rank), name="B")
+    spectral = cp.sum_squares(_root(c * np.eye(len(Y)) - Y @ Y.T) @ B)
+    objective = spectral + float(np.sum(Y**2)) - c * rank
+    return OrthogonalProblem(cp.Problem(cp.Minimize(objective)), orthogonal=[B], sparse=[(B, nonzeros)])
+
+
+def polar_factor(A: Array, *, rotation: bool = False) -> Array:
+    """The exact answer of balanced Procrustes for A^T B = `A`: U V^T, with its determinant made 1 for rotations."""
+    U, _, Vt = np.linalg.svd(_matrix(A, "A"), full_matrices=False)
+    if rotation and np.linalg.det(U @ Vt) < 0:
+        U[:, -1] *= -1.0
+    return np.asarray(U @ Vt)
+
+
+def _root(A: Array) -> Array:
+    """A^(1/2) of a positive semidefinite matrix, so that tr(X^T A X) is a sum of squares."""
+    if A.shape[0] != A.shape[1] or not np.allclose(A, A.T, rtol=1e-10, atol=1e-10 * max(1.0, float(np.abs(A).max()))):
+        raise SettingError(f"A, {A.shape}, is not symmetric")
+    values, vectors = np.linalg.eigh(A)
+    if values[0] < -1e-10 * max(1.0, float(values[-1])):
+        raise SettingError(f"A has the eigenvalue {values[0]:.3g}; it must be positive semidefinite, add c I")
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+
+
+def _matrix(A: Array | Sequence[Sequence[float]], name: str) -> Array:
+    matrix = finite_array(A, name)
+    if matrix.ndim != 2:
+        raise SettingError(f"{name} has shape {matrix.shape}; give a matrix")
+    return matrix

@@ -1,0 +1,258 @@
+"""Pose graphs by name: from data/, from the folder named by PGO_DATA, or by a download that is checked."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+from pgo_models.errors import DatasetError, FileFormatError
+from pgo_models.files import replace_when_done
+from pgo_models.graphs.g2o import read_g2o
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.precisions import RotationWeight
+from pgo_models.graphs.trajectories import read_tum
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+DATA_VARIABLE = "PGO_DATA"
+_TIMEOUT = 30.0  # seconds without an answer
+
+
+@dataclass(frozen=True)
+class Registry:
+    """A public folder of g2o files with their checksums.
+
+    Attributes
+    ----------
+    base_url : str
+        The file of a name is at `base_url/name.g2o`.
+    checksums : mapping of str to str
+        `sha256:` and the digest of the file, or `blob:` and its git blob id, the SHA-1 of "blob <size>", a zero byte
+        and the file.
+    cache : Path, optional
+        Folder for downloads; the user's cache unless given.
+    """
+
+    base_url: str
+    checksums: Mapping[str, str]
+    cache: Path | None = None
+
+
+SE_SYNC = Registry(
+    base_url="https://raw.githubusercontent.com/david-m-rosen/SE-Sync/master/data",
+    checksums=MappingProxyType(
+        {
+            "CSAIL": "sha256:66d99ac857a9849d814d214a9ebd0d4876d5d40f0a37be9330c1ff6e6e9daaa6",
+            "city10000": "sha256:df5988994339e990be198a36e7f640e31a5a1b26df3ed400363fafc49d5ca630",
+            "cubicle": "sha256:f7781d485383cec86d47d7650970132c36d6f3a1f4e5d62a49b7f8245c0a6465",
+            "grid3D": "blob:0dee46a9e43e1f51b9d4466ac6119e5bb6966954",
+            "intel": "sha256:3e0724c048e0ba524be9dd268a8b78e19a2497043143584cbb61310638b15c4b",
+            "kitti_00": "sha256:8a9807f604852a44254910100917918def94d7357748c633e1fd7ce73dd17468",
+            "manhattan": "sha256:6ae8d30971720c1af24a00c4b2dd5c5ddafbbbe488bfc771145c47decbffb248",
+            "parking-garage": "sha256:3ac0a31bfb601d7455d451e2546655cb5dececf51a7823f57c8a7e0fe1ca6527",
+            "rim": "blob:0c2f783b9d71012a612f09673f5aed87ae65f954",
+            "smallGrid3D": "sha256:9ea56c2ad1ebcc322560eb2f8d83cb3a60f99e2e2acc35e097b1162cdbafd649",
+            "sphere2500": "sha256:104ab57593394f24351d9f692f3b923f8b98fff1eb638c64356cf5049e06cf3c",
+            "tinyGrid3D": "sha256:c341eb0d09f7556b337be5a62b9354384885333a25fa718fd699fafb19620493",
+            "torus3D": "sha256:1ef8831023b372188d33ca63ce0da079d51df89364df71f2bce1c5c7c69ed5ec",
+        }
+    ),
+)
+
+
+def load(
+    name_or_path: str | Path,
+    registry: Registry = SE_SYNC,
+    *,
+    download: bool = True,
+    weights: RotationWeight = RotationWeight.SE_SYNC,
+) -> PoseGraph:
+    """Pose graph of a file, a folder with one file for each robot, or a data set's name.
+
+    A name is looked for in the project's data folder, in ./data, in the folder named by the environment variable
+    PGO_DATA, and in the user's cache; then it is downloaded, unless `download` is false. What the cache holds is
+    checked against its checksum. `weights` as for `read_g2o`.
+    Beside `x.g2o`, or the folder `x`, a file `x.truth.tum` gives the ground truth, in the order of the poses.
+
+    Raises
+    ------
+    DatasetError
+        When the name is unknown, the download fails or is not wanted, or what came does not have the right checksum.
+    FileFormatError
+        See `read_g2o`; also when the truth has not one pose for each of the graph.
+
+    Examples
+    --------
+    >>> load("sphere")
+    PoseGraph('sphere', d=3, poses=50, edges=544, robots=1)
+    """
+    return _read(locate(name_or_path, registry, download=download), weights)
+
+
+def locate(name_or_path: str | Path, registry: Registry = SE_SYNC, *, download: bool = True) -> Path:
+    """File or folder that `load` reads; parameters and errors as there.
+
+    Examples
+    --------
+    >>> locate("sphere").name
+    'sphere.g2o'
+    """
+    path = Path(name_or_path)
+    name = str(name_or_path)
+    if not name:
+        raise DatasetError("the name of the graph is empty; give a g2o file, a folder or a data set's name")
+    # os.path, since a name too long for the system is no file, and no error; a pipe or a device is read like a file.
+    if os.path.isdir(path):
+        if _holds_g2o(path) or name not in known_datasets(registry):
+            return path
+    elif os.path.exists(path):
+        return path
+    if isinstance(name_or_path, Path) or path.suffix == ".g2o" or name != path.name:
+        raise FileFormatError(path, None, "no such file or folder; check the path, or give a data set's name")
+    for folder in _folders():
+        for candidate in (folder / f"{name}.g2o", folder / name):
+            if os.path.isfile(candidate) or (os.path.isdir(candidate) and _holds_g2o(candidate)):
+                return candidate
+    if name not in registry.checksums:
+        known = known_datasets(registry)
+        close = difflib.get_close_matches(name, known, n=3)
+        meant = f"did you mean {' or '.join(close)}? " if close else ""
+        raise DatasetError(
+            f"no file and no data set {name!r}; {meant}known are {', '.join(known)}; "
+            f"or give a path, or put {name}.g2o into the folder named by {DATA_VARIABLE}"
+        )
+    return _cached(name, registry, download)
+
+
+def known_datasets(registry: Registry = SE_SYNC) -> tuple[str, ...]:
+    """Names that `load` takes: what is in the data folders, and what the registry can download.
+
+    Examples
+    --------
+    >>> "sphere" in known_datasets()
+    True
+    """
+    names = set(registry.checksums)
+    for folder in _folders():
+        names |= {file.stem for file in folder.glob("*.g2o") if file.is_file()}
+        names |= {file.name for file in folder.iterdir() if file.is_dir() and _holds_g2o(file)}
+    return tuple(sorted(names, key=lambda name: (name.lower(), name)))
+
+
+def project_folders() -> list[Path]:
+    """Where the project's own data can be: inside an installed package, beside the packages in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    return [package / "data", package.parent / "data"]
+
+
+def _folders() -> list[Path]:
+    folders = [*project_folders(), Path("data")]
+    if os.environ.get(DATA_VARIABLE):
+        folders.append(Path(os.environ[DATA_VARIABLE]))
+    return [folder for folder in folders if folder.is_dir()]
+
+
+def _holds_g2o(folder: Path) -> bool:
+    return any(folder.glob("*.g2o"))
+
+
+def _read(path: Path, weights: RotationWeight) -> PoseGraph:
+    graph = read_g2o(path, weights)
+    beside = path.absolute().parent / f"{graph.name}.truth.tum"
+    if not os.path.isfile(beside):
+        return graph
+    truth = read_tum(beside, d=graph.d)
+    if truth.num_poses != graph.num_poses:
+        raise FileFormatError(
+            beside, None, f"{truth.num_poses} poses, but {path} has {graph.num_poses}; remove or redo it"
+        )
+    return replace(graph, truth=truth)
+
+
+def _cached(name: str, registry: Registry, download: bool) -> Path:
+    import pooch  # here, since it and requests take longer to import than all the rest
+
+    cache = Path(pooch.os_cache("pgo-splitting")) if registry.cache is None else registry.cache
+    path = cache / f"{name}.g2o"
+    if path.is_file() and _fits(path, registry.checksums[name]):
+        return path
+    if not download:
+        raise DatasetError(f"{name} is not here; download it with: pgo info {name}, or {_by_hand(name)}")
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DatasetError(f"cannot make the cache folder {cache}: {error.strerror}; {_by_hand(name)}") from error
+    url = f"{registry.base_url}/{name}.g2o"
+    with replace_when_done(path) as temporary:
+        _download(url, temporary, name)
+        if not _fits(temporary, registry.checksums[name]):
+            wanted = registry.checksums[name]
+            raise DatasetError(f"{url} does not have the checksum {wanted}; try again, or {_by_hand(name)}")
+    return path
+
+
+def _download(url: str, path: Path, name: str) -> None:
+    import pooch
+    from requests.exceptions import RequestException, Timeout
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("downloading {task.description}"), BarColumn(), DownloadColumn())
+    try:
+        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+            fetch = pooch.HTTPDownloader(progressbar=_Bar(progress, progress.add_task(name)), timeout=_TIMEOUT)
+            fetch(url, str(path), None)
+    except RequestException as error:
+        reason = "no answer in time" if isinstance(error, Timeout) else "no connection"
+        if error.response is not None:
+            reason = f"status {error.response.status_code}"
+        raise DatasetError(f"{name} is not here, and {url} cannot be had ({reason}); {_by_hand(name)}") from error
+
+
+def _by_hand(name: str) -> str:
+    return f"get {name}.g2o in another way and put it into ./data or the folder named by {DATA_VARIABLE}"
+
+
+def _fits(path: Path, checksum: str) -> bool:
+    kind, _, expected = checksum.partition(":")
+    data = path.read_bytes()
+    if kind == "blob":
+        found = hashlib.sha1(b"blob %d\0" % len(data) + data, usedforsecurity=False).hexdigest()
+    else:
+        found = hashlib.sha256(data).hexdigest()
+    return found == expected
+
+
+class _Bar:
+    """What pooch asks of a progress bar, drawn by rich."""
+
+    def __init__(self, progress: Progress, task: TaskID) -> None:
+        self._progress = progress
+        self._task = task
+        self._total = 0
+
+    @property
+    def total(self) -> int:
+        return self._total
+
+    @total.setter
+    def total(self, value: int) -> None:
+        self._total = value
+        self._progress.update(self._task, total=value or None)
+
+    def update(self, value: int) -> None:
+        self._progress.update(self._task, advance=value)
+
+    def reset(self) -> None:
+        self._progress.reset(self._task, total=self._total or None)
+
+    def close(self) -> None:
+        self._progress.stop_task(self._task)

@@ -1,0 +1,274 @@
+"""The lines of one g2o file as arrays, every fault named by file:line; the tags are those of SE-Sync's data sets.
+
+The way through a sound file is short: one pass over the lines, one call that parses the numbers of all lines of a tag.
+Only when that fails are the lines looked at one by one, to name the one that is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pgo_models.errors import FileFormatError
+from pgo_models.files import FARTHEST, LARGEST, LONGEST_LINE, check_length, finite_number, read_text, too_far
+from pgo_models.geometry.rotations import Array, exp_map, rotations_from_quaternions
+
+IntArray = NDArray[np.int64]
+
+_ZERO_QUATERNION = 1e-9  # a norm below this gives no direction: files hold about six digits
+_SINGULAR = 1e-15  # a pivot below this part of its diagonal entry is rounding
+
+
+@dataclass(frozen=True)
+class _Tag:
+    """What stands on a line behind its tag: `num_ids` integers, then `num_numbers` numbers."""
+
+    d: int
+    num_ids: int
+    num_numbers: int
+
+
+_TAGS = {
+    "VERTEX_SE2": _Tag(d=2, num_ids=1, num_numbers=3),
+    "VERTEX_SE3:QUAT": _Tag(d=3, num_ids=1, num_numbers=7),
+    "EDGE_SE2": _Tag(d=2, num_ids=2, num_numbers=3 + 6),
+    "EDGE_SE3:QUAT": _Tag(d=3, num_ids=2, num_numbers=7 + 21),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class G2OLines:
+    """What one g2o file says, in the order of its lines.
+
+    Attributes
+    ----------
+    path : Path
+    d : int
+        2 or 3.
+    vertex_ids, vertex_lines : (v,)
+        Ids of the VERTEX lines, and the lines they stand on, from 1.
+    vertices : (v, 3) or (v, 7)
+        x y theta, or x y z qx qy qz qw.
+    edge_ids : (m, 2)
+    edges : (m, 9) or (m, 28)
+        The measurement like a vertex, then the upper triangle of its information matrix, row by row.
+    edge_lines : (m,)
+    fixed : (f,)
+        Ids of the FIX lines.
+    fixed_lines : (f,)
+    """
+
+    path: Path
+    d: int
+    vertex_ids: IntArray
+    vertex_lines: IntArray
+    vertices: Array
+    edge_ids: IntArray
+    edges: Array
+    edge_lines: IntArray
+    fixed: IntArray
+    fixed_lines: IntArray
+
+
+def read_lines(path: Path | str) -> G2OLines:
+    """Read and check the lines of one g2o file; blank lines, comments (#) and PARAMS_ lines are skipped.
+
+    Raises
+    ------
+    FileFormatError
+        With file:line, for: a file that is missing, binary or without VERTEX and EDGE lines; an unknown tag; too few or
+        too many numbers on a line, or thousands of them; a word, nan or inf where a number belongs; an id that is no
+        integer of 64 bits; a zero quaternion; a length beyond `FARTHEST`; an information matrix whose translation or
+        rotation block is not positive definite; an edge to itself; a second VERTEX line of the same id; 2D and 3D in
+        one file.
+    """
+    path = Path(path)
+    lines = read_text(path).split("\n")
+    gathered: dict[str, list[int]] = {tag: [] for tag in _TAGS}
+    ids: dict[str, list[str]] = {tag: [] for tag in _TAGS}
+    numbers: dict[str, list[str]] = {tag: [] for tag in _TAGS}
+    fix: list[tuple[int, str]] = []
+    for number, line in enumerate(lines, 1):
+        parts = line.split(None, 3)
+        if not parts or parts[0][0] == "#":
+            continue
+        tag = parts[0]
+        if tag in _TAGS:
+            if len(line) > LONGEST_LINE:
+                check_length(path, number, line)
+            gathered[tag].append(number)
+            if tag[0] == "E":
+                ids[tag] += parts[1:3]
+                numbers[tag].append(parts[-1])
+            else:
+                ids[tag] += parts[1:2]
+                numbers[tag].append(" ".join(parts[2:]))
+        elif tag == "FIX":
+            fix += [(number, word) for word in line.split()[1:]]
+        elif not tag.startswith("PARAMS_"):
+            raise FileFormatError(
+                path, number, f"unknown tag {tag[:40]!r}; supported are {', '.join(_TAGS)} and FIX: remove the line"
+            )
+    d = _dimension(path, gathered)
+    source = _Source(path, lines)
+    vertex, edge = ("VERTEX_SE2", "EDGE_SE2") if d == 2 else ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
+    vertex_ids, vertices = source.parse(vertex, gathered[vertex], ids[vertex], numbers[vertex])
+    edge_ids, edges = source.parse(edge, gathered[edge], ids[edge], numbers[edge])
+    found = G2OLines(
+        path,
+        d,
+        vertex_ids[:, 0],
+        np.array(gathered[vertex], dtype=np.int64),
+        vertices,
+        edge_ids,
+        edges,
+        np.array(gathered[edge], dtype=np.int64),
+        np.array([source.integer(number, word) for number, word in fix], dtype=np.int64),
+        np.array([number for number, _ in fix], dtype=np.int64),
+    )
+    for rows, at in ((vertices, found.vertex_lines), (edges, found.edge_lines)):
+        far = np.abs(rows[:, :d]).max(axis=1, initial=0.0)
+        if (far > FARTHEST).any():
+            raise too_far(path, int(at[np.argmax(far)]), float(far.max()))
+    for number, problem in _faults(found):
+        raise FileFormatError(path, number, problem)
+    return found
+
+
+def poses_of(d: int, numbers: Array) -> tuple[Array, Array]:
+    """Rotations (n, d, d) and translations (n, d) of rows that open with x y theta, or x y z qx qy qz qw."""
+    if d == 2:
+        return exp_map(numbers[:, 2:3]), numbers[:, :2].copy()
+    return rotations_from_quaternions(numbers[:, 3:7]), numbers[:, :3].copy()
+
+
+def information_of(d: int, edges: Array) -> Array:
+    """Information matrices (m, k, k) of EDGE rows, k = 3 in the plane and 6 in space."""
+    k, first = (3, 3) if d == 2 else (6, 7)
+    place = np.zeros((k, k), dtype=np.int64)
+    place[np.triu_indices(k)] = np.arange(k * (k + 1) // 2)
+    return np.asarray(edges[:, first + np.maximum(place, place.T)])
+
+
+class _Source:
+    """The lines of a file, to parse and, when that fails, to say which one is wrong."""
+
+    def __init__(self, path: Path, lines: list[str]) -> None:
+        self.path = path
+        self.lines = lines
+
+    def parse(self, tag: str, at: list[int], ids: list[str], numbers: list[str]) -> tuple[IntArray, Array]:
+        """Ids (n, num_ids) and finite numbers (n, num_numbers) of all lines of one tag."""
+        kind = _TAGS[tag]
+        if not at:
+            return np.zeros((0, kind.num_ids), dtype=np.int64), np.zeros((0, kind.num_numbers))
+        joined = "".join(ids)
+        if len(ids) != kind.num_ids * len(at) or not all(numbers) or "_" in joined or not joined.isascii():
+            self._diagnose(tag, at)
+        try:
+            parsed_ids = np.array(list(map(int, ids)), dtype=np.int64).reshape(-1, kind.num_ids)
+            parsed = np.loadtxt(numbers, comments=None, ndmin=2)
+        except (ValueError, OverflowError):
+            self._diagnose(tag, at)
+        if parsed.shape != (len(at), kind.num_numbers) or not (np.abs(parsed) <= LARGEST).all():
+            self._diagnose(tag, at)
+        return parsed_ids, parsed
+
+    def integer(self, line: int, word: str) -> int:
+        """Id of 64 bits."""
+        try:
+            # int() also takes 1_000 and the digits of other scripts; number files do not.
+            value = int(word if word.isascii() and "_" not in word else "")
+        except ValueError:
+            raise self._error(line, f"id {word[:40]!r} is no integer; number the poses") from None
+        if not -(2**63) <= value < 2**63:
+            raise self._error(line, f"id {word[:40]} does not fit 64 bits; renumber the poses")
+        return value
+
+    def _diagnose(self, tag: str, at: list[int]) -> NoReturn:
+        kind = _TAGS[tag]
+        for line in at:
+            words = self.lines[line - 1].split()[1:]
+            for word in words[: kind.num_ids]:
+                self.integer(line, word)
+            for word in words[kind.num_ids :]:
+                finite_number(self.path, line, word)
+            expected = kind.num_ids + kind.num_numbers
+            if len(words) != expected:
+                few = "the line is cut off" if len(words) < expected else "the line is too long"
+                raise self._error(
+                    line,
+                    f"{tag} needs {kind.num_ids} id{'s' * (kind.num_ids > 1)} and {kind.num_numbers} numbers, "
+                    f"{expected} in all, found {len(words)}; {few}: complete or remove it",
+                )
+        raise self._error(at[0], f"the {tag} lines cannot be read; write numbers like 1.5e-3, separated by blanks")
+
+    def _error(self, line: int, problem: str) -> FileFormatError:
+        return FileFormatError(self.path, line, problem)
+
+
+def _dimension(path: Path, gathered: dict[str, list[int]]) -> int:
+    first = {d: min((at[0] for tag, at in gathered.items() if at and _TAGS[tag].d == d), default=0) for d in (2, 3)}
+    if not first[2] and not first[3]:
+        raise FileFormatError(path, None, f"no measurement in it; a pose graph needs lines of {' or '.join(_TAGS)}")
+    if first[2] and first[3]:
+        raise FileFormatError(
+            path,
+            max(first.values()),
+            f"2D and 3D lines in one file (the other kind is on line {min(first.values())}); give one file for each",
+        )
+    return 2 if first[2] else 3
+
+
+def _faults(found: G2OLines) -> Iterator[tuple[int, str]]:
+    """Line and description of what the numbers of a file cannot be."""
+    if found.d == 3:
+        for rows, lines in ((found.vertices, found.vertex_lines), (found.edges, found.edge_lines)):
+            zero = np.linalg.norm(rows[:, 3:7], axis=1) < _ZERO_QUATERNION
+            if zero.any():
+                yield int(lines[np.argmax(zero)]), "zero quaternion; it is no rotation: 0 0 0 1 is the unrotated one"
+    order = np.argsort(found.vertex_ids, kind="stable")
+    again = np.flatnonzero(np.diff(found.vertex_ids[order]) == 0)
+    if again.size:
+        earlier, later = order[again[0]], order[again[0] + 1]
+        first = found.vertex_lines[earlier]
+        yield (
+            int(found.vertex_lines[later]),
+            f"a second VERTEX line of pose {found.vertex_ids[later]} (the first is line {first}); remove one",
+        )
+    loops = found.edge_ids[:, 0] == found.edge_ids[:, 1]
+    if loops.any():
+        at = int(np.argmax(loops))
+        yield int(found.edge_lines[at]), f"an edge from pose {found.edge_ids[at, 0]} to itself; remove it"
+    # The blocks alone are asked for: the precisions use nothing else, and the coupling blocks of the public cubicle
+    # graph make 5,021 of its whole matrices indefinite.
+    information = information_of(found.d, found.edges)
+    for name, block in (("translation", slice(None, found.d)), ("rotation", slice(found.d, None))):
+        bad = ~_is_positive_definite(information[:, block, block])
+        if bad.any():
+            at = int(np.argmax(bad))
+            smallest = np.linalg.eigvalsh(information[at, block, block])[0]
+            yield (
+                int(found.edge_lines[at]),
+                f"{name} block of the information matrix is not positive definite (smallest eigenvalue "
+                f"{smallest:.3g}); give the upper triangle row by row, or remove the line",
+            )
+
+
+def _is_positive_definite(A: Array) -> NDArray[np.bool_]:
+    """Whether every (k, k) matrix of a stack is positive definite, by the signs of the pivots."""
+    schur = A.copy()
+    diagonal = np.einsum("mkk->mk", A)
+    positive = np.ones(len(A), dtype=bool)
+    with np.errstate(all="ignore"):  # a matrix already known to be bad may divide by zero
+        for p in range(A.shape[-1]):
+            pivot = schur[:, p, p]
+            positive &= (pivot > 1 / LARGEST) & (pivot > _SINGULAR * diagonal[:, p])
+            column = schur[:, p + 1 :, p]
+            schur[:, p + 1 :, p + 1 :] -= column[:, :, None] * (column / pivot[:, None])[:, None, :]
+    return positive

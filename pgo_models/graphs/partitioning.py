@@ -1,0 +1,150 @@
+"""Poses to robots: as the graph names them, contiguous in time, balanced by METIS, or one pose a robot."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+
+from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.geometry.arrays import ReadOnly, whole_array, whole_number
+from pgo_models.geometry.rotations import BoolArray
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, has_no_gap
+
+
+class PartitionMethod(enum.Enum):
+    """How poses are given to robots."""
+
+    GIVEN = "as the graph names them"
+    CONTIGUOUS = "contiguous in time"
+    METIS = "balanced, few cut edges (METIS)"
+    SINGLETONS = "one pose a robot"
+
+
+@dataclass(frozen=True, eq=False)
+class Partition(ReadOnly):
+    """Which robot owns which pose.
+
+    Attributes
+    ----------
+    robot : (n,)
+        0 .. num_robots - 1, every one of which owns a pose. A read-only copy.
+    method : PartitionMethod
+
+    Raises
+    ------
+    SettingError
+        When `robot` does not number the robots so.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> halves = Partition(np.arange(27) // 14, PartitionMethod.CONTIGUOUS)
+    >>> halves.sizes, len(halves.separators(graph))
+    (array([14, 13]), 18)
+    """
+
+    robot: IntArray
+    method: PartitionMethod
+
+    def __post_init__(self) -> None:
+        robot = whole_array(self.robot, "robot", SettingError)
+        if robot.ndim != 1 or not has_no_gap(robot):
+            raise SettingError(f"robot, of shape {robot.shape}, must number the robots 0, 1, .. without a gap")
+        object.__setattr__(self, "robot", robot)
+
+    @property
+    def num_robots(self) -> int:
+        """Number of robots."""
+        return int(self.robot.max()) + 1
+
+    @property
+    def sizes(self) -> IntArray:
+        """Number of poses of every robot, (num_robots,)."""
+        return np.bincount(self.robot, minlength=self.num_robots)
+
+    def cut_edges(self, graph: PoseGraph) -> BoolArray:
+        """Whether an edge joins two robots, (m,).
+
+        Raises
+        ------
+        SettingError
+            When the partition is of another number of poses.
+        """
+        if len(self.robot) != graph.num_poses:
+            raise SettingError(f"{self!r} of {len(self.robot)} poses beside {graph!r}; give one robot for every pose")
+        return np.asarray(self.robot[graph.i] != self.robot[graph.j])
+
+    def separators(self, graph: PoseGraph) -> IntArray:
+        """Poses with an edge to another robot, ascending."""
+        cut = self.cut_edges(graph)
+        return np.unique(np.concatenate([graph.i[cut], graph.j[cut]]))
+
+    def __repr__(self) -> str:
+        sizes = self.sizes
+        return f"Partition({self.num_robots} robots, {sizes.min()} to {sizes.max()} poses each, {self.method.value})"
+
+
+def partition(graph: PoseGraph, num_robots: int | None = None, method: PartitionMethod | None = None) -> Partition:
+    """Give the poses of a graph to robots.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    num_robots : int, optional
+        Needed unless the graph names its robots or every pose is its own.
+    method : PartitionMethod, optional
+        GIVEN when the graph names as many robots as asked for, else CONTIGUOUS.
+
+    Raises
+    ------
+    SettingError
+        When the number of robots is not a whole one of 1 to n, or GIVEN does not fit it.
+    MissingExtraError
+        When METIS is asked for without the extra `fast`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.scenes import grid
+    >>> partition(grid(np.random.default_rng(0)), 3)
+    Partition(3 robots, 9 to 9 poses each, contiguous in time)
+    """
+    n = graph.num_poses
+    if num_robots is not None:
+        num_robots = whole_number(num_robots, "num_robots", SettingError)
+    named = graph.robot is not None and num_robots in (None, graph.num_robots)
+    if method is None:
+        method = PartitionMethod.GIVEN if named else PartitionMethod.CONTIGUOUS
+    if method is PartitionMethod.SINGLETONS:
+        return Partition(np.arange(n), method)
+    if method is PartitionMethod.GIVEN:
+        if not named:
+            raise SettingError(f"{graph!r} names {graph.num_robots} robots, asked for {num_robots}; use CONTIGUOUS")
+        return Partition(graph.robots, method)
+    if num_robots is None or not 1 <= num_robots <= n:
+        raise SettingError(f"num_robots is {num_robots}; give 1 to {n}, the number of poses")
+    if method is PartitionMethod.CONTIGUOUS or num_robots == 1:
+        return Partition(np.arange(n) * num_robots // n, method)
+    return Partition(_metis(graph, num_robots), method)
+
+
+def _metis(graph: PoseGraph, num_robots: int) -> IntArray:
+    try:
+        import pymetis
+    except ImportError as error:
+        raise MissingExtraError("pymetis", "fast") from error
+    ones = np.ones(graph.num_edges, dtype=np.int64)
+    adjacency = coo_array((ones, (graph.i, graph.j)), shape=(graph.num_poses, graph.num_poses)).tocsr()
+    adjacency = (adjacency + adjacency.T).tocsr()
+    adjacency.sort_indices()
+    _, part = pymetis.part_graph(
+        num_robots,
+        adjacency=pymetis.CSRAdjacency(adjacency.indptr.tolist(), adjacency.indices.tolist()),
+        eweights=adjacency.data.tolist(),
+        options=pymetis.Options(contig=True, seed=0),
+    )
+    return np.asarray(np.unique(np.asarray(part), return_inverse=True)[1], dtype=np.int64)

@@ -1,0 +1,57 @@
+"""Information matrices as the precisions kappa and tau of the isotropic cost, and back (SE-Sync: Rosen et al. 2019)."""
+
+from __future__ import annotations
+
+import enum
+
+import numpy as np
+
+from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import Array
+
+
+class RotationWeight(enum.Enum):
+    """What kappa becomes of I_theta in the plane; in space both are kappa = 3 / (2 tr(I_rr^-1)).
+
+    A rotation error theta costs kappa ||R - I||_F^2 = 4 kappa (1 - cos theta), about 2 kappa theta^2. A Gaussian says
+    I_theta theta^2 (F has no factor 1/2, nor has tau ||.||^2), so that kappa = I_theta / 2, as it is in space.
+    SE-Sync's kappa = I_theta counts rotations twice against translations; published optima of 2D graphs are with it.
+    """
+
+    SE_SYNC = "kappa = I_theta in the plane"
+    GAUSSIAN = "kappa = I_theta / 2 in the plane"
+
+
+def precisions(information: Array, weights: RotationWeight = RotationWeight.SE_SYNC) -> tuple[Array, Array]:
+    """(kappa, tau), each (m,), of information matrices (m, 3, 3) in the plane or (m, 6, 6) in space.
+
+    d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I_tt^-1), kappa as `weights` say.
+    The blocks themselves are inverted, not the marginal information. Per radian^2 and per metre^2.
+
+    Raises
+    ------
+    SettingError
+        When weights is no RotationWeight.
+
+    Examples
+    --------
+    >>> precisions(np.diag([4.0, 4.0, 4.0, 6.0, 6.0, 6.0])[None])
+    (array([3.]), array([4.]))
+    """
+    if not isinstance(weights, RotationWeight):
+        raise SettingError(f"weights is {weights!r}; give RotationWeight.SE_SYNC or RotationWeight.GAUSSIAN")
+    if information.shape[-1] == 3:
+        share = 0.5 if weights is RotationWeight.GAUSSIAN else 1.0
+        return share * information[:, 2, 2], 2.0 / _trace_of_inverse(information[:, :2, :2])
+    tau = 3.0 / _trace_of_inverse(information[:, :3, :3])
+    return 1.5 / _trace_of_inverse(information[:, 3:, 3:]), tau
+
+
+def isotropic_information(kappa: Array, tau: Array, d: int) -> Array:
+    """Diagonal information matrices, (m, 3, 3) or (m, 6, 6), whose `precisions` are kappa and tau."""
+    diagonal = [tau, tau, kappa] if d == 2 else [tau, tau, tau, 2 * kappa, 2 * kappa, 2 * kappa]
+    return np.asarray(np.stack(diagonal, axis=1)[:, :, None] * np.eye(len(diagonal)))
+
+
+def _trace_of_inverse(A: Array) -> Array:
+    return np.asarray(np.trace(np.linalg.inv(A), axis1=1, axis2=2))

@@ -1,0 +1,150 @@
+"""What a partition costs: separators, a vertex cover of the edges between robots, cut edges and balance."""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+
+from pgo_models.geometry.rotations import BoolArray
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.html_tables import facts_table
+
+
+def vertex_cover(partition: Partition, graph: PoseGraph) -> IntArray:
+    """Poses, ascending, such that every edge between two robots has an end among them.
+
+    Greedy: the pose with most uncovered edges is taken until none is left, then poses that the later ones made
+    superfluous are dropped. The smallest cover is NP-hard to find; this one leaves out no pose that could be.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.scenes import grid
+    >>> from pgo_models.graphs.partitioning import partition
+    >>> graph = grid(np.random.default_rng(0))
+    >>> robots = partition(graph, 3)
+    >>> len(vertex_cover(robots, graph)), len(robots.separators(graph))
+    (9, 27)
+    """
+    cut = partition.cut_edges(graph)
+    adjacency = _adjacency(graph, cut)
+    degree = np.diff(adjacency.indptr)
+    chosen = np.zeros(graph.num_poses, dtype=bool)
+    queue = [(-int(degree[pose]), int(pose)) for pose in np.flatnonzero(degree)]
+    heapq.heapify(queue)
+    order = []
+    while queue:
+        negative, pose = heapq.heappop(queue)
+        if -negative != degree[pose]:  # an entry that later choices have overtaken
+            continue
+        if degree[pose] == 0:
+            break
+        chosen[pose] = True
+        order.append(pose)
+        neighbours = adjacency.indices[adjacency.indptr[pose] : adjacency.indptr[pose + 1]]
+        degree[pose] = 0
+        for other in neighbours[~chosen[neighbours]].tolist():
+            degree[other] -= 1
+            heapq.heappush(queue, (-int(degree[other]), other))
+    for pose in order:
+        neighbours = adjacency.indices[adjacency.indptr[pose] : adjacency.indptr[pose + 1]]
+        if chosen[neighbours].all():
+            chosen[pose] = False
+    return np.flatnonzero(chosen)
+
+
+@dataclass(frozen=True, eq=False)
+class PartitionReport:
+    """What a partition costs.
+
+    Attributes
+    ----------
+    num_robots : int
+    sizes : (num_robots,)
+        Poses of every robot.
+    num_cut_edges, num_edges : int
+    separators : (num_robots,)
+        Poses of every robot that have an edge to another.
+    cover : int
+        Poses of the vertex cover: what the driver of the substructured coupling solves for.
+    copies : int
+        Copies of separator poses that robots hold of others' poses.
+    """
+
+    num_robots: int
+    sizes: IntArray
+    num_cut_edges: int
+    num_edges: int
+    separators: IntArray
+    cover: int
+    copies: int
+
+    @property
+    def balance(self) -> float:
+        """Poses of the largest robot over the mean; 1 is balanced."""
+        return float(self.sizes.max() / self.sizes.mean())
+
+    def __str__(self) -> str:
+        return "\n".join(f"{label:<12} {text}" for label, text in self.facts())
+
+    def _repr_html_(self) -> str:
+        return facts_table(self.facts())
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Labels and figures, as they are printed."""
+        share = self.num_cut_edges / self.num_edges
+        return [
+            ("robots", f"{self.num_robots}"),
+            ("poses each", f"{self.sizes.min()} to {self.sizes.max()} (largest over mean {self.balance:.3g})"),
+            ("cut edges", f"{self.num_cut_edges} of {self.num_edges} ({100 * share:.1f} %)"),
+            ("separators", f"{self.separators.sum()} ({self.separators.min()} to {self.separators.max()} a robot)"),
+            ("vertex cover", f"{self.cover}"),
+            ("copies", f"{self.copies}"),
+        ]
+
+
+def report_partition(partition: Partition, graph: PoseGraph) -> PartitionReport:
+    """Count what a partition of a graph costs.
+
+    Raises
+    ------
+    SettingError
+        When the partition is of another number of poses.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.scenes import grid
+    >>> from pgo_models.graphs.partitioning import partition
+    >>> graph = grid(np.random.default_rng(0))
+    >>> print(report_partition(partition(graph, 3), graph))
+    robots       3
+    poses each   9 to 9 (largest over mean 1)
+    cut edges    36 of 108 (33.3 %)
+    separators   27 (9 to 9 a robot)
+    vertex cover 9
+    copies       36
+    """
+    cut = partition.cut_edges(graph)
+    robot, i, j = partition.robot, graph.i[cut], graph.j[cut]
+    held = np.unique(np.concatenate([robot[i] * graph.num_poses + j, robot[j] * graph.num_poses + i]))
+    return PartitionReport(
+        num_robots=partition.num_robots,
+        sizes=partition.sizes,
+        num_cut_edges=int(cut.sum()),
+        num_edges=graph.num_edges,
+        separators=np.bincount(robot[partition.separators(graph)], minlength=partition.num_robots),
+        cover=len(vertex_cover(partition, graph)),
+        copies=len(held),
+    )
+
+
+def _adjacency(graph: PoseGraph, chosen: BoolArray) -> csr_array:
+    """Neighbours of every pose by the chosen edges, each once."""
+    i, j = graph.i[chosen], graph.j[chosen]
+    ends = (np.concatenate([i, j]), np.concatenate([j, i]))
+    return csr_array(coo_array((np.ones(2 * len(i)), ends), shape=(graph.num_poses, graph.num_poses)))

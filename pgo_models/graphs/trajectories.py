@@ -1,0 +1,161 @@
+"""Trajectories in the TUM and KITTI text formats, as evo reads and writes them; poses in the plane are lifted to z = 0.
+
+TUM: a line `timestamp tx ty tz qx qy qz qw` for each pose. KITTI: the 12 numbers of the 3 x 4 matrix (R_i, t_i), row by
+row. Both hold world from body, metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pgo_models.errors import FileFormatError, GraphError
+from pgo_models.files import FARTHEST, read_table, replace_when_done, too_far
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import (
+    Array,
+    orthogonality_error,
+    project_to_rotations,
+    quaternions_from_rotations,
+    rotations_from_quaternions,
+)
+
+_ZERO_QUATERNION = 1e-9
+_PLANE_TOLERANCE = 1e-6  # metres, and of the entries of R that vanish when a pose lies in the plane
+_MATRIX_TOLERANCE = 1e-3  # KITTI's own files have about seven digits; this tells digits from a wrong matrix
+
+
+def write_tum(poses: Poses, path: Path | str, timestamps: Array | None = None) -> None:
+    """Write one line `timestamp tx ty tz qx qy qz qw` for each pose; the floats come back exactly.
+
+    Parameters
+    ----------
+    poses : Poses
+    path : Path or str
+    timestamps : (n,), optional
+        Seconds, ascending; 0, 1, .. unless given.
+
+    Raises
+    ------
+    GraphError
+        When there is not one finite timestamp for each pose, or they do not ascend.
+    PGOError
+        When the file cannot be written; what stood there stays.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "poses.tum"
+    >>> write_tum(Poses.identity(2, 3), path)
+    >>> len(path.read_text().splitlines())
+    2
+    """
+    seconds = np.arange(poses.num_poses, dtype=float) if timestamps is None else np.asarray(timestamps, dtype=float)
+    if seconds.shape != (poses.num_poses,) or not np.isfinite(seconds).all() or (np.diff(seconds) <= 0).any():
+        raise GraphError(f"timestamps of shape {seconds.shape} for {poses}; give {poses.num_poses} that ascend")
+    R, t = _lifted(poses)
+    _write_rows(np.column_stack([seconds, t, quaternions_from_rotations(R)]), path)
+
+
+def read_tum(path: Path | str, d: int = 3) -> Poses:
+    """Poses of a TUM file, in the order of its lines; the timestamps are not kept.
+
+    Raises
+    ------
+    FileFormatError
+        With file:line, for a row that is not 8 finite numbers, a zero quaternion, a position beyond `FARTHEST`, or,
+        with d = 2, a pose out of the plane.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "poses.tum"
+    >>> write_tum(Poses.identity(2, 3), path)
+    >>> read_tum(path)
+    Poses(n=2, d=3)
+    """
+    rows, lines = read_table(path, 8)
+    zero = np.linalg.norm(rows[:, 4:], axis=1) < _ZERO_QUATERNION
+    if zero.any():
+        problem = "zero quaternion; it is no rotation: 0 0 0 1 is the unrotated one"
+        raise FileFormatError(path, lines[int(np.argmax(zero))], problem)
+    return _in_dimension(rotations_from_quaternions(rows[:, 4:]), rows[:, 1:4], d, path, lines)
+
+
+def write_kitti(poses: Poses, path: Path | str) -> None:
+    """Write one line of 12 numbers for each pose: the 3 x 4 matrix (R_i, t_i) row by row; the floats come back exactly.
+
+    Raises
+    ------
+    PGOError
+        When the file cannot be written; what stood there stays.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "poses.kitti"
+    >>> write_kitti(Poses.identity(2, 3), path)
+    >>> len(path.read_text().split())
+    24
+    """
+    R, t = _lifted(poses)
+    _write_rows(np.concatenate([R, t[:, :, None]], axis=2).reshape(-1, 12), path)
+
+
+def read_kitti(path: Path | str, d: int = 3) -> Poses:
+    """Poses of a KITTI file; the rotations are projected, since its files have few digits.
+
+    Raises
+    ------
+    FileFormatError
+        With file:line, for a row that is not 12 finite numbers, a matrix that is no rotation even to three digits, a
+        position beyond `FARTHEST`, or, with d = 2, a pose out of the plane.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "poses.kitti"
+    >>> write_kitti(Poses.identity(2, 2), path)
+    >>> read_kitti(path, d=2)
+    Poses(n=2, d=2)
+    """
+    rows, lines = read_table(path, 12)
+    matrices = rows.reshape(-1, 3, 4)
+    error = orthogonality_error(matrices[:, :, :3])
+    worst = int(np.argmax(error))
+    if not error[worst] < _MATRIX_TOLERANCE:
+        problem = (
+            f"the 3 x 3 part is no rotation: ||R^T R - I|| or 1 - det R is {error[worst]:.3g}; give (R, t) by rows"
+        )
+        raise FileFormatError(path, lines[worst], problem)
+    return _in_dimension(project_to_rotations(matrices[:, :, :3]), matrices[:, :, 3], d, path, lines)
+
+
+def _lifted(poses: Poses) -> tuple[Array, Array]:
+    if poses.d == 3:
+        return poses.R, poses.t
+    R = np.tile(np.eye(3), (poses.num_poses, 1, 1))
+    R[:, :2, :2] = poses.R
+    return R, np.column_stack([poses.t, np.zeros(poses.num_poses)])
+
+
+def _in_dimension(R: Array, t: Array, d: int, path: Path | str, lines: Sequence[int]) -> Poses:
+    far = np.abs(t).max(axis=1)
+    if (far > FARTHEST).any():
+        raise too_far(path, lines[int(np.argmax(far))], float(far.max()))
+    if d == 3:
+        return Poses(R, t)
+    out = np.maximum(np.abs(t[:, 2]), np.abs(R[:, 2, :] - [0.0, 0.0, 1.0]).max(axis=1))
+    worst = int(np.argmax(out))
+    if out[worst] > _PLANE_TOLERANCE:
+        raise FileFormatError(
+            path, lines[worst], f"pose is out of the x-y plane by {out[worst]:.3g}; read it with d = 3"
+        )
+    return Poses(project_to_rotations(R[:, :2, :2]), t[:, :2])
+
+
+def _write_rows(rows: Array, path: Path | str) -> None:
+    with replace_when_done(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
+        file.writelines(" ".join(map(repr, row)) + "\n" for row in rows.tolist())

@@ -1,0 +1,1 @@
+"""Pictures of graphs, matrices and curves, by matplotlib and plotly."""

@@ -1,0 +1,241 @@
+"""Pictures of pose graphs with matplotlib (extra `plot`): by robot, doubtful edges marked, truth against estimate."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pgo_models.errors import GraphError
+from pgo_models.geometry.poses import Poses, absolute_trajectory_error
+from pgo_models.geometry.rotations import Array, log_map
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.residuals import edge_residuals, uncertain_edges
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, column_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+OWN, BETWEEN, UNCERTAIN, MISFIT = range(4)
+_WIDTHS = np.array([0.6, 0.5, 0.5, 1.8])
+_NAMES = {
+    BETWEEN: "between robots",
+    UNCERTAIN: "uncertain: precision under a tenth of the median",
+    MISFIT: "misfit: over six times the mean share of F",
+}
+_ZOOM = 0.82  # leaves room for the labels of axes in space, which the layout does not see
+_MOST_NAMED_ROBOTS = len(COLOURS)
+
+
+def edge_kinds(graph: PoseGraph, poses: Poses) -> IntArray:
+    """How every edge is drawn, (m,): OWN, BETWEEN (two robots), UNCERTAIN or MISFIT; the last that fits.
+
+    Raises
+    ------
+    GraphError
+        When the poses are not those of the graph.
+    """
+    kind = np.where(graph.robots[graph.i] == graph.robots[graph.j], OWN, BETWEEN)
+    kind[uncertain_edges(graph)] = UNCERTAIN
+    kind[edge_residuals(graph, poses).is_misfit] = MISFIT
+    return kind
+
+
+def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = True) -> None:
+    """Draw positions and edges: each robot's own edges in its colour, those between robots in grey.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    poses : Poses
+    axes : matplotlib Axes
+        Of projection "3d" for graphs in space.
+    mark_edges : bool
+        Draw edges with a low precision dotted, and those with a large share of F thick and vermilion.
+
+    Raises
+    ------
+    GraphError
+        When the poses are not those of the graph.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> axes = Figure().add_subplot(projection="3d")
+    >>> draw_graph(graph, graph.truth, axes)
+    >>> axes.get_xlabel()
+    'x (m)'
+    """
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import to_rgb
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+    kind = edge_kinds(graph, poses)
+    if not mark_edges:
+        kind = np.minimum(kind, np.where(graph.robots[graph.i] == graph.robots[graph.j], OWN, BETWEEN))
+    order = np.argsort(kind, kind="stable")  # what stands out is drawn last
+    kind, i, j = kind[order], graph.i[order], graph.j[order]
+    palette = np.array([to_rgb(name) for name in (*COLOURS, QUIET_COLOUR, ALARM_COLOUR)])
+    colour = np.where(graph.robots[i] == graph.robots[j], graph.robots[i] % len(COLOURS), len(COLOURS))
+    colour[kind == MISFIT] = len(COLOURS) + 1
+    collection = LineCollection if graph.d == 2 else Line3DCollection
+    lines = collection(
+        list(np.stack([poses.t[i], poses.t[j]], axis=1)),
+        colors=palette[colour],
+        linewidths=_WIDTHS[kind],
+        linestyles=[(0, (1, 1.5)) if one == UNCERTAIN else "solid" for one in kind],
+    )
+    axes.add_collection(lines)
+    _frame(axes, poses.t)
+
+
+def plot_graph(graph: PoseGraph, poses: Poses, title: str = "") -> Figure:
+    """Figure of a graph by robot, with a legend; see `draw_graph`.
+
+    Raises
+    ------
+    GraphError
+        When the poses are not those of the graph.
+    MissingExtraError
+        Without matplotlib.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> plot_graph(graph, graph.truth, "27 poses").axes[0].get_title()
+    '27 poses'
+    """
+    with column_figure(height=1.15) as figure:
+        axes = figure.add_subplot(projection="3d" if graph.d == 3 else None)
+        draw_graph(graph, poses, axes)
+        axes.set_title(title or graph.name)
+        handles = _legend(graph, edge_kinds(graph, poses))
+        if handles:
+            figure.legend(handles=handles, loc="outside lower center", ncols=3 if graph.num_robots > 1 else 1)
+    return figure
+
+
+def compare_poses(graph: PoseGraph, panels: list[tuple[str, Poses]]) -> Figure:
+    """Figure with one panel for every (title, poses), side by side.
+
+    Raises
+    ------
+    MissingExtraError
+        Without matplotlib.
+
+    Examples
+    --------
+    >>> from pgo_models.problem.initialization import spanning_tree_start
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> figure = compare_poses(graph, [("truth", graph.truth), ("tree", spanning_tree_start(graph))])
+    >>> [axes.get_title() for axes in figure.axes]
+    ['truth', 'tree']
+    """
+    with column_figure(height=1.0, width=len(panels)) as figure:
+        for place, (title, poses) in enumerate(panels, 1):
+            axes = figure.add_subplot(1, len(panels), place, projection="3d" if graph.d == 3 else None)
+            draw_graph(graph, poses, axes, mark_edges=False)
+            axes.set_title(title)
+    return figure
+
+
+def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = None) -> Figure:
+    """Figure of an estimate on top of the truth, and of its errors pose by pose, in metres and degrees.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    poses : Poses
+        The estimate; it is aligned to the truth first.
+    truth : Poses, optional
+        The graph's own unless given.
+
+    Raises
+    ------
+    GraphError
+        When there is no truth, or the sizes differ.
+    MissingExtraError
+        Without matplotlib.
+
+    Examples
+    --------
+    >>> from pgo_models.problem.initialization import spanning_tree_start
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> figure = plot_against_truth(graph, spanning_tree_start(graph))
+    >>> [axes.get_ylabel() for axes in figure.axes]
+    ['y (m)', 'position (m)', 'rotation (deg)']
+    """
+    if truth is None:
+        truth = graph.truth
+    if truth is None:
+        raise GraphError(f"{graph!r} came without a ground truth; give one as truth=")
+    aligned = poses.aligned_to(truth)
+    metres = np.linalg.norm(aligned.t - truth.t, axis=1)
+    degrees = np.rad2deg(np.linalg.norm(log_map(np.swapaxes(truth.R, 1, 2) @ aligned.R), axis=1))
+    with column_figure(height=1.6) as figure:
+        from matplotlib.gridspec import GridSpec
+
+        grid = GridSpec(3, 1, figure=figure, height_ratios=[3.2, 1, 1])
+        axes = figure.add_subplot(grid[0], projection="3d" if graph.d == 3 else None)
+        axes.plot(*truth.t.T, color="black", linewidth=0.8, label="truth")
+        axes.plot(*aligned.t.T, color=COLOURS[0], linewidth=0.8, label="estimate, aligned")
+        _draw_errors(axes, aligned.t, truth.t)
+        _frame(axes, np.concatenate([aligned.t, truth.t]))
+        ate = absolute_trajectory_error(poses, truth)
+        axes.set_title(f"{graph.name}: ATE {ate:.3g} m, rotation {np.sqrt(np.mean(degrees**2)):.3g} deg (rms)")
+        below: Axes | None = None
+        for row, (error, label) in enumerate([(metres, "position (m)"), (degrees, "rotation (deg)")], 1):
+            below = figure.add_subplot(grid[row], sharex=below)
+            below.plot(error, color=ALARM_COLOUR, linewidth=0.7)
+            below.set_ylabel(label)
+            below.set_ylim(bottom=0.0)
+        assert below is not None
+        below.set_xlabel("pose")
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+def _frame(axes: Axes, points: Array) -> None:
+    """Equal scales, limits around points, (k, d), and labels with the unit."""
+    from mpl_toolkits.mplot3d import Axes3D
+
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    margin = 1.0 if points.shape[1] == 3 else 1.04  # in space the axes have a margin of their own
+    middle, half = (lower + upper) / 2, max(margin * float((upper - lower).max()) / 2, 1e-9)
+    for letter, centre in zip("xyz", middle, strict=False):
+        getattr(axes, f"set_{letter}lim")(centre - half, centre + half)
+        getattr(axes, f"set_{letter}label")(f"{letter} (m)")
+    if isinstance(axes, Axes3D):
+        axes.set_box_aspect((1, 1, 1), zoom=_ZOOM)
+    else:
+        axes.set_aspect("equal")
+
+
+def _draw_errors(axes: Axes, estimate: Array, truth: Array) -> None:
+    from matplotlib.collections import LineCollection
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+    collection = LineCollection if truth.shape[1] == 2 else Line3DCollection
+    segments = list(np.stack([estimate, truth], axis=1))
+    axes.add_collection(collection(segments, colors=ALARM_COLOUR, linewidths=0.5, label="error"))
+
+
+def _legend(graph: PoseGraph, kind: IntArray) -> list[Line2D]:
+    from matplotlib.lines import Line2D
+
+    handles = []
+    if 1 < graph.num_robots <= _MOST_NAMED_ROBOTS:
+        handles = [Line2D([], [], color=COLOURS[a], label=f"robot {a}") for a in range(graph.num_robots)]
+    style = {BETWEEN: (QUIET_COLOUR, "solid"), UNCERTAIN: (COLOURS[0], "dotted"), MISFIT: (ALARM_COLOUR, "solid")}
+    for one, label in _NAMES.items():
+        if (kind == one).any():
+            colour, line = style[one]
+            handles.append(Line2D([], [], color=colour, linestyle=line, linewidth=2 * _WIDTHS[one], label=label))
+    return handles

@@ -1,0 +1,286 @@
+"""Pictures to explore with plotly (extra `plot`): a graph to turn and hover over, and a film of iterates."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pgo_models.errors import GraphError, MissingExtraError
+from pgo_models.files import replace_when_done
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.g2o import pose_names
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.residuals import EdgeResiduals, edge_residuals
+from pgo_models.plots.graph_plots import BETWEEN, MISFIT, OWN, UNCERTAIN, edge_kinds
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR
+
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
+
+
+Trace = dict[str, object]  # a plotly trace is plain data
+
+_MOST_NAMED_ROBOTS = 12
+_FILM_BYTES = 8_000_000
+_BYTES_PER_NUMBER = 7.5  # a float32 in base64, of which plotly writes every / as six characters
+_FRAME_MILLISECONDS = 150
+# Nothing on a page leaves it: plotly's button to share a chart uploads it.
+PAGE_CONFIG: dict[str, object] = {
+    "displaylogo": False,
+    "showSendToCloud": False,
+    "modeBarButtonsToRemove": ["sendChartToCloud"],
+    "responsive": True,
+}
+
+
+def explore_graph(graph: PoseGraph, poses: Poses, title: str = "") -> Figure:
+    """Plotly figure of a graph by robot; poses and misfitting edges say who they are under the pointer.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    poses : Poses
+        Drawn to seven digits (float32).
+    title : str
+
+    Raises
+    ------
+    GraphError
+        When the poses are not those of the graph.
+    MissingExtraError
+        Without plotly.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> [trace.name for trace in explore_graph(graph, graph.truth).data]
+    ['edges and poses', 'edges and poses', 'misfit']
+    """
+    go = _plotly()
+    kind, residuals = edge_kinds(graph, poses), edge_residuals(graph, poses)
+    names, several = np.array(pose_names(graph)), graph.num_robots > 1
+    traces = []
+    for a in range(graph.num_robots):
+        mine, own = graph.robots == a, (kind == OWN) & (graph.robots[graph.i] == a)
+        colour, in_legend = COLOURS[a % len(COLOURS)], a < _MOST_NAMED_ROBOTS
+        name = f"robot {a}" if several else "edges and poses"
+        own_lines = _lines(graph, poses.t, np.flatnonzero(own), name, colour, 1.0, "solid", False)
+        text = [f"pose {one}, robot {a}" if several else f"pose {one}" for one in names[mine]]
+        # One entry of the legend shows and hides both; a robot may have no edge of its own, but has poses.
+        for trace, shown in ((own_lines, False), (_dots(poses.t[mine], text, name, colour, 4.0), in_legend)):
+            traces.append({**trace, "legendgroup": name, "showlegend": shown})
+    for one, name, colour, width, dash in (
+        (BETWEEN, "between robots", QUIET_COLOUR, 1.0, "solid"),
+        (UNCERTAIN, "uncertain: precision under a tenth of the median", QUIET_COLOUR, 1.5, "dot"),
+        (MISFIT, "misfit: over six times the mean share of F", ALARM_COLOUR, 5.0, "solid"),
+    ):
+        edges = np.flatnonzero(kind == one)
+        if len(edges):
+            traces.append(_lines(graph, poses.t, edges, name, colour, width, dash, True))
+    misfits = np.flatnonzero(kind == MISFIT)
+    middles = 0.5 * (poses.t[graph.i[misfits]] + poses.t[graph.j[misfits]])
+    text = _misfit_text(graph, misfits, residuals)
+    traces.append(_dots(middles, text, "misfit", ALARM_COLOUR, 6.0))
+    figure = go.Figure(traces)
+    _arrange(figure, poses.t, title)
+    return figure
+
+
+def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[str] | None = None) -> Figure:
+    """Plotly film of iterates with a slider and a play button, to step through.
+
+    Edges are drawn straight between the positions of every iterate; the colours are the robots'. A film of a large
+    graph is thinned evenly to about 8 MB, first and last iterate kept.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    iterates : sequence of Poses
+        For example `[soc.poses(problem, state) for state in itertools.islice(iterate(soc, problem), 30)]`. Each is
+        aligned with the last one, so that only what changes moves.
+    labels : sequence of str, optional
+        What the slider shows; `k = 0`, `k = 1`, .. unless given.
+
+    Raises
+    ------
+    GraphError
+        When there are no iterates, their labels are not as many, or they are not poses of the graph.
+    MissingExtraError
+        Without plotly.
+
+    Examples
+    --------
+    >>> from pgo_models.problem.initialization import spanning_tree_start
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> film = animate_poses(graph, [spanning_tree_start(graph), graph.truth], ["tree", "truth"])
+    >>> [frame.name for frame in film.frames]
+    ['tree', 'truth']
+    """
+    go = _plotly()
+    if not iterates:
+        raise GraphError("there are no iterates; give at least one set of poses")
+    names = [f"k = {k}" for k in range(len(iterates))] if labels is None else list(labels)
+    if len(names) != len(iterates):
+        raise GraphError(f"{len(names)} labels for {len(iterates)} iterates; give one each")
+    for poses in iterates:
+        if poses.t.shape != (graph.num_poses, graph.d):
+            raise GraphError(f"{poses} beside {graph!r}; give one pose for every pose of the graph")
+    shown = _evenly(len(iterates), int(_FILM_BYTES / (3 * graph.d * graph.num_edges * _BYTES_PER_NUMBER)))
+    positions = [iterates[k].aligned_to(iterates[-1]).t for k in shown]
+    names = [names[k] for k in shown]
+    owner = np.where(graph.robots[graph.i] == graph.robots[graph.j], graph.robots[graph.i], -1)
+
+    def traces(t: Array) -> list[Trace]:
+        drawn = []
+        for a in [*range(graph.num_robots), -1]:
+            edges = np.flatnonzero(owner == a)
+            if len(edges):
+                name = "between robots" if a < 0 else f"robot {a}"
+                colour = QUIET_COLOUR if a < 0 else COLOURS[a % len(COLOURS)]
+                in_legend = graph.num_robots > 1 and a < _MOST_NAMED_ROBOTS
+                drawn.append(_lines(graph, t, edges, name, colour, 1.0, "solid", in_legend))
+        return drawn
+
+    frames = [go.Frame(data=traces(t), name=name) for t, name in zip(positions, names, strict=True)]
+    figure = go.Figure(data=traces(positions[0]), frames=frames)
+    _arrange(figure, np.concatenate(positions), f"{graph.name}: {len(iterates)} iterates")
+    _add_controls(figure, names)
+    return figure
+
+
+def save_page(figure: Figure, path: Path | str) -> None:
+    """Write a plotly figure as one HTML page that opens offline, plotly's own script inside (about 5 MB).
+
+    Raises
+    ------
+    PGOError
+        When the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> page = Path(tempfile.mkdtemp()) / "graph.html"
+    >>> save_page(explore_graph(graph, graph.truth), page)
+    >>> "Plotly.newPlot" in page.read_text(encoding="utf-8")
+    True
+    """
+    page = figure.to_html(
+        include_plotlyjs=True, full_html=True, config=PAGE_CONFIG, auto_play=False, default_height="96vh"
+    )
+    with replace_when_done(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def _plotly() -> ModuleType:
+    try:
+        from plotly import graph_objects
+    except ImportError as error:
+        raise MissingExtraError("plotly", "plot") from error
+    module: ModuleType = graph_objects
+    return module
+
+
+def _points(points: Array) -> Trace:
+    """Trace at points, (k, d), which plotly packs as float32 in base64."""
+    x, y, *z = np.ascontiguousarray(points.T, dtype=np.float32)
+    return {"type": "scatter3d", "x": x, "y": y, "z": z[0]} if z else {"type": "scattergl", "x": x, "y": y}
+
+
+def _lines(
+    graph: PoseGraph, t: Array, edges: IntArray, name: str, colour: str, width: float, dash: str, in_legend: bool
+) -> Trace:
+    """One trace for many edges: start, end, and a gap."""
+    ends = np.full((len(edges), 3, graph.d), np.nan)
+    ends[:, 0], ends[:, 1] = t[graph.i[edges]], t[graph.j[edges]]
+    return {
+        **_points(ends.reshape(-1, graph.d)),
+        "mode": "lines",
+        "line": {"color": colour, "width": width if graph.d == 2 else 2.0 * width, "dash": dash},
+        "name": name,
+        "hoverinfo": "skip",
+        "showlegend": in_legend,
+    }
+
+
+def _dots(points: Array, text: list[str], name: str, colour: str, size: float) -> Trace:
+    return {
+        **_points(points),
+        "mode": "markers",
+        "marker": {"color": colour, "size": size if points.shape[1] == 2 else 0.6 * size},
+        "text": text,
+        "hovertemplate": "%{text}<extra></extra>",
+        "name": name,
+        "showlegend": False,
+    }
+
+
+def _misfit_text(graph: PoseGraph, edges: IntArray, residuals: EdgeResiduals) -> list[str]:
+    names, share = pose_names(graph), residuals.share
+    return [
+        f"edge {e}: {names[graph.i[e]]} to {names[graph.j[e]]}<br>{100 * share[e]:.3g} % of F<br>"
+        f"{residuals.translation[e]:.3g} m, {np.rad2deg(residuals.rotation[e]):.3g} deg"
+        for e in edges
+    ]
+
+
+def _arrange(figure: Figure, points: Array, title: str) -> None:
+    """Equal scales, labels with the unit, a white ground."""
+    figure.update_layout(
+        template="none",
+        title={"text": html.escape(title), "font": {"size": 14}},
+        margin={"l": 60, "r": 10, "t": 40 if title else 10, "b": 50},
+        legend={"itemsizing": "constant", "orientation": "h", "y": -0.12 if points.shape[1] == 2 else 0.0},
+        hovermode="closest",
+    )
+    if points.shape[1] == 2:
+        figure.update_xaxes(title_text="x (m)", zeroline=False, gridcolor="#eeeeee")
+        figure.update_yaxes(title_text="y (m)", zeroline=False, gridcolor="#eeeeee", scaleanchor="x")
+        return
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    middle, half = (lower + upper) / 2, max(0.52 * float((upper - lower).max()), 1e-9)
+    figure.update_scenes(
+        aspectmode="cube",
+        **{
+            f"{letter}axis": {"title": {"text": f"{letter} (m)"}, "range": [centre - half, centre + half]}
+            for letter, centre in zip("xyz", middle.tolist(), strict=True)
+        },
+    )
+
+
+def _evenly(number: int, most: int) -> list[int]:
+    """Return at most `most`, but two, of 0 .. number - 1, evenly, first and last among them."""
+    chosen = np.linspace(0, number - 1, min(number, max(most, 2))).round()
+    return [int(k) for k in np.unique(chosen)]
+
+
+def _add_controls(figure: Figure, names: list[str]) -> None:
+    def shown(milliseconds: int) -> dict[str, object]:
+        return {
+            "frame": {"duration": milliseconds, "redraw": True},
+            "mode": "immediate",
+            "transition": {"duration": 0},
+        }
+
+    steps = [{"args": [[name], shown(0)], "label": name, "method": "animate"} for name in names]
+    buttons = [
+        {"label": "play", "method": "animate", "args": [None, {**shown(_FRAME_MILLISECONDS), "fromcurrent": True}]},
+        {"label": "pause", "method": "animate", "args": [[None], shown(0)]},
+    ]
+    figure.update_layout(
+        margin={"b": 20},
+        legend={"orientation": "v", "x": 0.0, "y": 1.0, "yanchor": "top"},
+        sliders=[{"steps": steps, "x": 0.16, "len": 0.84, "pad": {"t": 45}, "currentvalue": {"prefix": ""}}],
+        updatemenus=[
+            {"type": "buttons", "direction": "left", "buttons": buttons, "x": 0.13, "y": 0, "pad": {"t": 60}},
+        ],
+    )

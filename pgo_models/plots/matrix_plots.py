@@ -1,0 +1,205 @@
+"""Pictures of the matrices: the spectrum of S near zero, and the sparsity of M and of its Cholesky factor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.sparse import csc_array, eye_array, tril
+from scipy.sparse.linalg import LinearOperator, eigsh, splu
+
+from pgo_models.certificates.certificate import Certificate
+from pgo_models.certificates.dual_variables import factorize_certificate
+from pgo_models.errors import NotPositiveDefiniteError, SettingError
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, SMALL_POINTS, column_figure
+from pgo_models.problem.cholesky import CholeskyFactor
+from pgo_models.problem.problem import PGOProblem
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_FIRST_SHIFT, _SHIFT_GROWTH = 1e-6, 10.0  # of the mean diagonal entry of M
+_DENSE_SIDE = 200  # below it all eigenvalues are had at once
+_CELLS = 300  # a side of the picture of a pattern
+
+
+def smallest_eigenvalues(problem: PGOProblem, Lambda: Array, count: int = 12) -> Array:
+    """Smallest eigenvalues of S with the translations marginalised, ascending, (count,).
+
+    S_Q = S_RR - S_Rt S_tt^+ S_tR = Q - blockdiag(Lambda) acts on rotations alone, so that all its eigenvalues have the
+    unit of kappa (per rad^2) and are those that eta shifts: S + eta blockdiag(0, I) is positive semidefinite if and
+    only if lambda_min(S_Q) >= -eta. At a global optimum whose relaxation is tight d of them are zero. Found by
+    shift-invert Lanczos below the spectrum: an estimate for the eye; the proof is `prove_bound`.
+
+    Raises
+    ------
+    SettingError
+        When count is not 1 to d n.
+
+    Examples
+    --------
+    >>> from pgo_models.certificates.certificate import certify
+    >>> from pgo_models.graphs.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> certificate = certify(problem, problem.graph.truth)
+    >>> smallest = smallest_eigenvalues(problem, certificate.Lambda, 4)
+    >>> bool(np.abs(smallest[:3]).max() < 1e-6 < smallest[3])
+    True
+    """
+    side = problem.num_poses * problem.d
+    if not 1 <= count <= side:
+        raise SettingError(f"count is {count}; S has {side} eigenvalues, give 1 to {side}")
+    eta, factor = _factor_below_spectrum(problem, Lambda)
+    n = problem.num_poses
+
+    def invert(vectors: Array) -> Array:
+        whole = np.zeros((problem.side, vectors.shape[1] if vectors.ndim == 2 else 1))
+        whole[n:] = vectors.reshape(side, -1)
+        return factor.solve(whole)[n:].reshape(vectors.shape)
+
+    if side <= _DENSE_SIDE or count >= side - 1:
+        inverse = np.linalg.eigvalsh(invert(np.eye(side)))
+    else:
+        operator = LinearOperator((side, side), matvec=invert, matmat=invert, dtype=float)
+        start = np.random.default_rng(0).standard_normal(side)  # only so that the same question has the same answer
+        inverse = eigsh(operator, k=count, which="LA", v0=start, return_eigenvectors=False)
+    return np.sort(1.0 / np.sort(inverse)[::-1][:count] - eta)
+
+
+def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12) -> Figure:
+    """Figure of the smallest eigenvalues of S at the point of a certificate; see `smallest_eigenvalues`.
+
+    Eigenvalues stand on a logarithmic axis, negative ones as vermilion triangles. The shaded band, where the
+    proof needs an eta, is what that leaves open, |lambda| <= eta.
+
+    Raises
+    ------
+    SettingError
+        When count is not 1 to d n.
+    MissingExtraError
+        Without matplotlib.
+
+    Examples
+    --------
+    >>> from pgo_models.certificates.certificate import certify
+    >>> from pgo_models.graphs.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> plot_spectrum(problem, certify(problem, problem.graph.truth)).axes[0].get_xlabel()
+    'k-th smallest eigenvalue of S'
+    """
+    eigenvalues = smallest_eigenvalues(problem, certificate.Lambda, count)
+    k, negative = np.arange(1, count + 1), eigenvalues < 0
+    with column_figure(height=0.8) as figure:
+        from matplotlib.ticker import MaxNLocator
+
+        axes = figure.add_subplot()
+        axes.set_yscale("log")
+        size = np.maximum(np.abs(eigenvalues), np.finfo(float).tiny)
+        axes.plot(k[~negative], size[~negative], "o", color=COLOURS[0], label="positive")
+        axes.plot(k[negative], size[negative], "v", color=ALARM_COLOUR, label="negative (size)")
+        lowest = 0.3 * size.min()
+        if certificate.eta > 0:
+            lowest = min(lowest, 0.3 * certificate.eta)
+            label = f"within eta = {certificate.eta:.1e}"
+            axes.axhspan(lowest, certificate.eta, color=QUIET_COLOUR, alpha=0.3, linewidth=0, label=label)
+        axes.set_ylim(bottom=lowest)
+        axes.set_xlabel("k-th smallest eigenvalue of S")
+        axes.set_ylabel("|eigenvalue| (per rad$^2$)")
+        axes.set_title(f"{problem.graph.name}: gap {certificate.gap:.1e}, {certificate.verdict.name}")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        figure.legend(loc="outside lower center", ncols=3, columnspacing=1.0, handletextpad=0.4)
+    return figure
+
+
+@dataclass(frozen=True, eq=False)
+class FactorPattern:
+    """Where the Cholesky factor of M is not zero.
+
+    Attributes
+    ----------
+    order : (N,)
+        Fill-reducing order of the rows and columns of M.
+    factor : csc_array, (N, N)
+        L, lower triangular, of M in that order; ones where it is stored.
+    fill_in : int
+        Entries of L where the lower triangle of M in that order has none.
+    """
+
+    order: IntArray
+    factor: csc_array
+    fill_in: int
+
+
+def factor_pattern(problem: PGOProblem) -> FactorPattern:
+    """Pattern of the Cholesky factor of M, in SuperLU's minimum degree order of M + M^T.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> pattern = factor_pattern(problem)
+    >>> pattern.factor.nnz == tril(problem.M).nnz + pattern.fill_in
+    True
+    """
+    ones = csc_array((np.ones(problem.M.nnz), problem.M.indices, problem.M.indptr), shape=problem.M.shape)
+    # Diagonally dominant with off-diagonal entries of one sign: nothing cancels, so the numbers show the pattern.
+    dominant = csc_array((2.0 * float(ones.sum(axis=0).max())) * eye_array(problem.side) - ones)
+    lu = splu(dominant, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    factor = csc_array(lu.L)
+    factor.data[:] = 1.0
+    return FactorPattern(np.argsort(lu.perm_c), factor, int(factor.nnz - tril(ones).nnz))
+
+
+def plot_sparsity(problem: PGOProblem) -> Figure:
+    """Figure of the patterns of M, in the order of the poses, and of its Cholesky factor, with the fill-in counted.
+
+    Raises
+    ------
+    MissingExtraError
+        Without matplotlib.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> figure = plot_sparsity(PGOProblem(grid(np.random.default_rng(0))))
+    >>> figure.axes[0].get_title().splitlines()[0]
+    'M, 108 x 108'
+    """
+    pattern = factor_pattern(problem)
+    with column_figure(height=0.6) as figure:
+        left, right = figure.subplots(1, 2)
+        _draw_pattern(left, problem.M)
+        _draw_pattern(right, pattern.factor)
+        left.set_title(f"M, {problem.side} x {problem.side}\n{problem.M.nnz:,} entries")
+        right.set_title(f"Cholesky factor\n{pattern.factor.nnz:,} entries")
+        share = 100.0 * pattern.fill_in / pattern.factor.nnz
+        figure.supxlabel(f"fill-in: {pattern.fill_in:,} entries, {share:.0f} % of the factor", fontsize=SMALL_POINTS)
+    return figure
+
+
+def _factor_below_spectrum(problem: PGOProblem, Lambda: Array) -> tuple[float, CholeskyFactor]:
+    """Smallest tried eta for which S + eta blockdiag(0, I), one translation grounded, has a factor; and the factor."""
+    eta = _FIRST_SHIFT * float(problem.M.diagonal().mean())
+    while True:
+        try:
+            return eta, factorize_certificate(problem, Lambda, eta)
+        except NotPositiveDefiniteError:
+            eta *= _SHIFT_GROWTH
+
+
+def _draw_pattern(axes: Axes, matrix: csc_array) -> None:
+    """Draw the share of stored entries cell by cell; a cell is an entry while the matrix is small."""
+    side = matrix.shape[0]
+    cells = min(side, _CELLS)
+    columns = np.repeat(np.arange(side), np.diff(matrix.indptr))
+    number = (matrix.indices * cells // side) * cells + columns * cells // side
+    count = np.bincount(number, minlength=cells * cells).reshape(cells, cells)
+    shown = np.where(count > 0, np.log1p(count), np.nan)
+    shown_most = float(np.nanmax(shown))  # the lighter half of the colours is too faint for single cells
+    axes.imshow(shown, cmap="cividis_r", extent=(0, side, side, 0), interpolation="nearest", vmin=-shown_most)
+    axes.set_xticks([0, side])
+    axes.set_yticks([0, side])

@@ -1,0 +1,1 @@
+"""The cost F with its matrices and derivatives, sparse Cholesky factorisation, and starts."""

@@ -1,0 +1,391 @@
+"""The one seam to sparse Cholesky: analyse a pattern, factor, solve many right-hand sides, factor again.
+
+SuperLU (scipy) is always there; CHOLMOD comes through CVXOPT with the extra `fast` and is found at run time.
+
+Every factor knows how far it can be from exact (`pgo_models.problem.floating_point`), so that one that went through
+proves something in exact arithmetic.
+"""
+
+from __future__ import annotations
+
+import enum
+import importlib.util
+import weakref
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+
+import numpy as np
+from scipy.sparse import csc_array, diags_array
+from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
+
+from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError
+from pgo_models.geometry.rotations import Array
+from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, FactorCounts, error_of_counts, gamma
+
+_PERMUTE, _FORWARD = 7, 4  # CVXOPT's codes of x = P b and L x = b
+_Capsule = object  # a factorisation, which CVXOPT keeps to itself
+
+
+class CholeskyBackend(enum.Enum):
+    """Which library factors."""
+
+    SUPERLU = "SuperLU (scipy)"
+    CHOLMOD = "CHOLMOD (CVXOPT)"
+
+
+def default_backend() -> CholeskyBackend:
+    """CHOLMOD when CVXOPT is installed, SuperLU otherwise.
+
+    Examples
+    --------
+    >>> default_backend() in CholeskyBackend
+    True
+    """
+    installed = importlib.util.find_spec("cvxopt") is not None
+    return CholeskyBackend.CHOLMOD if installed else CholeskyBackend.SUPERLU
+
+
+class CholeskyFactor(ABC):
+    """A factorisation of one symmetric positive definite matrix."""
+
+    @abstractmethod
+    def solve(self, right_hand_side: Array) -> Array:
+        """Solution of A x = b for b of shape (N,) or (N, k)."""
+
+    @abstractmethod
+    def half_solve(self, right_hand_side: Array) -> Array:
+        """R^-T P b by forward substitution, (N, k), for b of shape (N, k): more columns of R, P the order it is in."""
+
+    @abstractmethod
+    def backward_error(self, beside: Array | int = 0) -> Array:
+        """Shares epsilon, (N,), of the diagonal with A + diag(epsilon) diag(A) >= R^T R in exact arithmetic.
+
+        R is the computed factor, so that A + diag(epsilon) diag(A) is positive definite. The argument
+        (`pgo_models.problem.floating_point`) holds for diagonals between 1e-150 and 1e150, where nothing that counts
+        underflows.
+
+        Parameters
+        ----------
+        beside : int or (N,)
+            Non-zeros of further columns of R in its rows, as of `half_solve`: with them A is the leading block of a
+            larger matrix, and their own columns' share of E is counted apart (`column_error`).
+        """
+
+    def known_error(self) -> Array | None:
+        """`backward_error` where it costs nothing but a look at the factor."""
+        return self.backward_error()
+
+    def last_error(self) -> Array:
+        """`backward_error` of a factor that is not used any more, which may make it cheaper."""
+        return self.backward_error()
+
+    @abstractmethod
+    def most_in_row(self, beside: Array | int = 0) -> float:
+        """Most non-zeros in a row of R."""
+
+
+class SymbolicCholesky(ABC):
+    """A sparsity pattern, ordered and analysed once.
+
+    Matrices passed to `factorize` are symmetric, in canonical CSC form, and have exactly the analysed pattern
+    (explicit zeros included).
+    """
+
+    def __init__(self, pattern: csc_array) -> None:
+        self._indptr, self._indices, self._shape = pattern.indptr, pattern.indices, pattern.shape
+
+    @abstractmethod
+    def factorize(self, matrix: csc_array, overwrite: CholeskyFactor | None = None) -> CholeskyFactor:
+        """Factor a matrix of the analysed pattern.
+
+        Parameters
+        ----------
+        matrix : csc_array, (N, N)
+        overwrite : CholeskyFactor, optional
+            A factor from this analysis that is no longer needed; its memory may be taken over.
+
+        Raises
+        ------
+        NotPositiveDefiniteError
+            When the matrix is not positive definite in floating-point arithmetic, or has nan or inf.
+        """
+
+    def expected_error(self, beside: int = 0) -> Array | None:
+        """What `CholeskyFactor.backward_error` will be about, where it is known before a factor is."""
+        return None
+
+    def crude_error(self) -> float:
+        """Bound on `CholeskyFactor.backward_error` for any number of non-zeros; inf if there is none."""
+        return np.inf
+
+    def _check(self, matrix: csc_array) -> None:
+        same = (
+            matrix.shape == self._shape
+            and np.array_equal(matrix.indptr, self._indptr)
+            and np.array_equal(matrix.indices, self._indices)
+        )
+        if not same:
+            raise ValueError("the matrix has another sparsity pattern than the one that was analysed")
+        if not np.isfinite(matrix.data).all():
+            raise NotPositiveDefiniteError("the matrix has nan or inf; check the weights and measurements")
+
+
+def analyze(pattern: csc_array, backend: CholeskyBackend | None = None) -> SymbolicCholesky:
+    """Order and analyse the pattern of a symmetric matrix.
+
+    Parameters
+    ----------
+    pattern : csc_array, (N, N)
+        Only its pattern counts; its diagonal must be stored in full.
+    backend : CholeskyBackend, optional
+        `default_backend()` unless given.
+
+    Raises
+    ------
+    MissingExtraError
+        When CHOLMOD is asked for without the extra `fast`.
+    """
+    pattern.sort_indices()
+    chosen = backend or default_backend()
+    return _Cholmod(pattern) if chosen is CholeskyBackend.CHOLMOD else _SuperLU(pattern)
+
+
+def factorize(matrix: csc_array, backend: CholeskyBackend | None = None) -> CholeskyFactor:
+    """Factor one symmetric positive definite matrix; see `SymbolicCholesky.factorize`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.sparse import csc_array
+    >>> factorize(csc_array([[4.0, 0.0], [0.0, 2.0]])).solve(np.array([4.0, 4.0]))
+    array([1., 2.])
+    """
+    return analyze(matrix, backend).factorize(matrix)
+
+
+class _SuperLUFactor(CholeskyFactor):
+    def __init__(self, lu: SuperLU, order: np.ndarray, diagonal: Array) -> None:
+        self._lu = lu
+        self._order = order
+        self._rows = order[np.argsort(lu.perm_c)]  # in the order of elimination
+        self._diagonal = diagonal[self._rows]
+
+    def half_solve(self, right_hand_side: Array) -> Array:
+        L = self._lu.L.tocsr()
+        columns = np.asfortranarray(right_hand_side[self._rows], dtype=float)
+        half = spsolve_triangular(L, columns, lower=True, overwrite_b=True, unit_diagonal=True)
+        return np.asarray(half / np.sqrt(self._lu.U.diagonal())[:, None])
+
+    def most_in_row(self, beside: Array | int = 0) -> float:
+        return float((np.diff(self._lu.L.tocsc().indptr) + beside).max(initial=0))
+
+    def backward_error(self, beside: Array | int = 0) -> Array:
+        """Bound as for Cholesky, with R = diag(u)^(1/2) L^T, u the pivots; U is only about diag(u) L^T.
+
+        A = L U - E with |E| <= gamma |L| |U|, so that |R^T R - A| <= |L| (|diag(u) L^T - U| + gamma |U|). Both factors
+        are at hand, and v^T |L| |W| v <= (s^-1 |v^T |L| diag(u)^(1/2)|^2 + s |diag(u)^(-1/2) |W| v|^2) / 2 for any s.
+        """
+        L, U = self._lu.L.tocsr(), self._lu.U.tocsc()
+        pivots, a = U.diagonal(), self._diagonal
+        # Of U, whose terms these are: scipy leaves out zeros, where a term is exact, of L and U each on its own.
+        count = gamma(np.diff(U.indptr) + 3.0)
+        if not (float(count.max(initial=0.0)) < 0.5 and (a > 0).all()):
+            return np.full(len(a), np.inf)
+        D = diags_array(pivots)
+        product = (D @ L.T).tocsc()
+        W = abs(product - U) + UNIT_ROUNDOFF * abs(product) + abs(U) @ diags_array(count)
+        W.data **= 2
+        L.data **= 2
+        most = np.maximum((L != 0).sum(axis=0), (W != 0).sum(axis=1))  # in the sums of Cauchy-Schwarz
+        of_L, of_W = (L @ (pivots * most)) / a, ((most / pivots) @ W) / a
+        balance = np.sqrt(of_L.mean() / max(of_W.mean(), np.finfo(float).tiny))
+        error = np.empty(len(a))
+        error[self._rows] = OUTWARD * 0.5 * (of_L / balance + balance * of_W)
+        if np.any(beside):
+            error[self._rows] += error_of_counts(np.diff(L.indptr), self.most_in_row(beside))
+        return error
+
+    def solve(self, right_hand_side: Array) -> Array:
+        solution = np.empty_like(right_hand_side, dtype=float)
+        solution[self._order] = self._lu.solve(np.asfortranarray(right_hand_side[self._order], dtype=float))
+        return solution
+
+
+class _SuperLU(SymbolicCholesky):
+    """LU in symmetric mode without pivoting: L D L^T, whose D shows the inertia."""
+
+    def __init__(self, pattern: csc_array) -> None:
+        super().__init__(pattern)
+        # A dominant diagonal on the same pattern is factored once, only for its fill-reducing order.
+        n = pattern.shape[0]
+        dominant = csc_array((np.zeros(pattern.nnz), pattern.indices, pattern.indptr), shape=pattern.shape)
+        dominant.setdiag(np.ones(n))
+        lu = splu(dominant, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        self._order = np.argsort(lu.perm_c)
+
+    def factorize(self, matrix: csc_array, overwrite: CholeskyFactor | None = None) -> CholeskyFactor:
+        self._check(matrix)
+        permuted = matrix[self._order][:, self._order].tocsc()
+        try:
+            lu = splu(permuted, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        except RuntimeError as error:  # SuperLU's word for an exactly singular matrix
+            if "singular" not in str(error):
+                raise MemoryError(str(error)) from error  # its only other one
+            raise NotPositiveDefiniteError("the matrix is singular") from error
+        if not (np.array_equal(lu.perm_r, lu.perm_c) and (lu.U.diagonal() > 0).all()):
+            raise NotPositiveDefiniteError("the matrix has a pivot that is not positive")
+        return _SuperLUFactor(lu, self._order, matrix.diagonal())
+
+
+class _CholmodFactor(CholeskyFactor):
+    """CVXOPT factors in place, symbolic part included: that of a factor out of use is taken over by the next one."""
+
+    def __init__(self, numeric: _Capsule, analysis: _Cholmod) -> None:
+        self._numeric: _Capsule | None = numeric
+        self._analysis = analysis
+
+    @property
+    def is_overwritten(self) -> bool:
+        return self._numeric is None
+
+    def overwrite(self) -> None:
+        self._numeric = None
+
+    def half_solve(self, right_hand_side: Array) -> Array:
+        cvxopt, cholmod = _import_cvxopt()
+        half = cvxopt.matrix(np.asfortranarray(right_hand_side, dtype=float))
+        for system in (_PERMUTE, _FORWARD):
+            cholmod.solve(self._numeric, half, sys=system)
+        return np.array(half).reshape(right_hand_side.shape)
+
+    def known_error(self) -> Array | None:
+        return self._analysis.expected_error()
+
+    def last_error(self) -> Array:
+        if self._numeric is not None and self.known_error() is None:
+            self._analysis.count(self._numeric)
+            self._numeric = None
+        return self.backward_error()
+
+    def most_in_row(self, beside: Array | int = 0) -> float:
+        return self._analysis.counts().most_in_row(beside)
+
+    def backward_error(self, beside: Array | int = 0) -> Array:
+        """Bound from the counts of non-zeros, which are those of the pattern."""
+        return self._analysis.counts().error(beside)
+
+    def solve(self, right_hand_side: Array) -> Array:
+        cvxopt, cholmod = _import_cvxopt()
+        solution = cvxopt.matrix(np.asfortranarray(right_hand_side, dtype=float))
+        if self._numeric is None:
+            raise ValueError("this factor was overwritten by a later one")
+        cholmod.solve(self._numeric, solution)
+        return np.array(solution).reshape(right_hand_side.shape)
+
+
+class _Cholmod(SymbolicCholesky):
+    """Supernodal L L^T of the lower triangle; AMD order."""
+
+    def __init__(self, pattern: csc_array) -> None:
+        super().__init__(pattern)
+        cvxopt, _ = _import_cvxopt()
+        columns = np.repeat(np.arange(pattern.shape[1]), np.diff(pattern.indptr))
+        self._lower = np.flatnonzero(pattern.indices >= columns)
+        rows = pattern.indices[self._lower].astype(np.int64)
+        self._is_diagonal = rows == columns[self._lower]
+        self._matrix = cvxopt.spmatrix(
+            1.0, cvxopt.matrix(rows), cvxopt.matrix(columns[self._lower].astype(np.int64)), pattern.shape
+        )
+        # Symbolic parts with the factor that uses each. No finaliser gives them back: Ctrl-C in one would be lost.
+        self._taken: list[tuple[weakref.ref[_CholmodFactor] | None, _Capsule]] = [(None, self._analyze())]
+        self._counts: FactorCounts | None = None
+
+    def expected_error(self, beside: int = 0) -> Array | None:
+        return self._counts.error(beside) if self._counts is not None else None
+
+    def crude_error(self) -> float:
+        """Bound from rows and columns of N non-zeros."""
+        side = float(self._shape[0])
+        return float(error_of_counts(np.array(side), side))
+
+    def counts(self) -> FactorCounts:
+        """Counts of every factor with this pattern, if need be of one that is out of use."""
+        return self._counts if self._counts is not None else self.count(self._spare())
+
+    def count(self, capsule: _Capsule) -> FactorCounts:
+        """Find the counts of a numeric factor, which CVXOPT takes apart for it: the next one would be L D L^T in it."""
+        self._taken = [(user, other) for user, other in self._taken if other is not capsule]
+        cvxopt, cholmod = _import_cvxopt()
+        order = cvxopt.matrix(np.arange(self._shape[0], dtype=float))
+        try:
+            cholmod.solve(capsule, order, sys=_PERMUTE)
+        except (ValueError, ArithmeticError):  # it is symbolic, or of a matrix that was not positive definite
+            capsule = self._numeric(np.where(self._is_diagonal, 1.0, 0.0), capsule)
+            cholmod.solve(capsule, order, sys=_PERMUTE)
+        pointers, rows, _ = cholmod.getfactor(capsule).CCS
+        in_row = np.diff(np.array(pointers).ravel()).astype(float)
+        in_column = np.bincount(np.array(rows).ravel(), minlength=len(in_row)).astype(float)
+        self._counts = FactorCounts(in_column, in_row, np.array(order).ravel().astype(np.int64))
+        return self._counts
+
+    def _analyze(self) -> _Capsule:
+        with _supernodal() as cholmod:
+            capsule: _Capsule = cholmod.symbolic(self._matrix)
+        return capsule
+
+    def factorize(self, matrix: csc_array, overwrite: CholeskyFactor | None = None) -> CholeskyFactor:
+        self._check(matrix)
+        if isinstance(overwrite, _CholmodFactor):
+            overwrite.overwrite()
+        capsule = self._spare()
+        try:
+            factor = _CholmodFactor(self._numeric(matrix.data[self._lower], capsule), self)
+        except ArithmeticError as error:
+            self._taken.append((None, capsule))  # a failed factorisation leaves the symbolic part intact
+            raise NotPositiveDefiniteError("the matrix has a pivot that is not positive") from error
+        self._taken.append((weakref.ref(factor), capsule))
+        return factor
+
+    def _spare(self) -> _Capsule:
+        """Take out a symbolic part that no factor uses, and let go of others like it."""
+        used, idle = [], []
+        for user, numeric in self._taken:
+            factor = None if user is None else user()
+            if factor is None or factor.is_overwritten:
+                idle.append(numeric)
+            else:
+                used.append((user, numeric))
+        self._taken = used
+        return idle[-1] if idle else self._analyze()
+
+    def _numeric(self, lower: Array, capsule: _Capsule) -> _Capsule:
+        """Fill the capsule with the factor of the matrix that has these values in its lower triangle."""
+        cvxopt, cholmod = _import_cvxopt()
+        self._matrix.V = cvxopt.matrix(lower)
+        with _supernodal():
+            cholmod.numeric(self._matrix, capsule)
+        cholmod.diag(capsule)  # raises ValueError for L D L^T, which indefinite matrices have, too
+        return capsule
+
+
+@contextmanager
+def _supernodal() -> Iterator[ModuleType]:
+    """CHOLMOD set to L L^T, which exists for positive definite matrices only: to analyse for L D L^T accepts others."""
+    _, cholmod = _import_cvxopt()
+    saved = cholmod.options.get("supernodal", 2)
+    cholmod.options["supernodal"] = 2
+    try:
+        yield cholmod
+    finally:
+        cholmod.options["supernodal"] = saved
+
+
+def _import_cvxopt() -> tuple[ModuleType, ModuleType]:
+    try:
+        import cvxopt
+        from cvxopt import cholmod
+    except ImportError as error:
+        raise MissingExtraError("cvxopt", "fast") from error
+    return cvxopt, cholmod

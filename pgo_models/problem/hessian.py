@@ -1,0 +1,126 @@
+"""Riemannian Hessian of F as one sparse matrix, and its Gauss-Newton part, from the certificate matrix S.
+
+For moves R_i Exp(hat(w_i)), t_i + v_i the second derivative is 2 tr(V^T (M - theta blockdiag(0, Lambda)) V) with
+V_{t_i} = v_i^T and V_{R_i} = -hat(w_i) R_i^T: theta = 1 is Newton; theta = 0 is Gauss-Newton, the residuals being
+linear in X (Rosen et al. 2019, section 4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csc_array
+
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, hat, tangent_dimension
+from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.problem.matrices import assemble, rotation_columns
+from pgo_models.problem.problem import PGOProblem
+
+
+@dataclass(frozen=True, eq=False)
+class TangentLayout:
+    """Unknowns of a step: first v, d numbers a pose, then w, 1 or 3 numbers a pose."""
+
+    num_poses: int
+    d: int
+
+    @property
+    def side(self) -> int:
+        """Number of unknowns."""
+        return self.num_poses * (self.d + tangent_dimension(self.d))
+
+    def join(self, w: Array, v: Array) -> Array:
+        """Vector of a move (w, v)."""
+        return np.concatenate([v.ravel(), w.ravel()])
+
+    def split(self, step: Array) -> tuple[Array, Array]:
+        """Move (w, v) of a vector."""
+        count = self.num_poses * self.d
+        w = step[count:].reshape(self.num_poses, tangent_dimension(self.d))
+        return w, step[:count].reshape(self.num_poses, self.d)
+
+    def translations(self, pose: IntArray) -> IntArray:
+        """Columns (m, d) of v."""
+        return rotation_columns(pose, 0, self.d)
+
+    def rotations(self, pose: IntArray) -> IntArray:
+        """Columns (m, 1 or 3) of w."""
+        return rotation_columns(pose, self.num_poses * self.d, tangent_dimension(self.d))
+
+
+def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) -> csc_array:
+    """Hessian of F(R Exp(hat(w)), t + v) in (v, w), with theta Lambda given as `Lambda`; None is Gauss-Newton.
+
+    Returns
+    -------
+    csc_array, (side, side), symmetric; its pattern depends on the graph alone. A rigid motion of all poses is in its
+    null space at stationary points: ground a pose before factoring, as `pgo_models.certificates.newton_polish` does.
+    """
+    graph, d = problem.graph, problem.d
+    layout = TangentLayout(problem.num_poses, d)
+    i, j, R = graph.i, graph.j, poses.R
+    v_i, v_j, w_i, w_j = layout.translations(i), layout.translations(j), layout.rotations(i), layout.rotations(j)
+    tau = np.repeat(2.0 * graph.tau[:, None], d, axis=1)
+    lever = 2.0 * graph.tau[:, None, None] * (R[i] @ _lever(graph.t_ij))
+    relative = np.swapaxes(R[i], 1, 2) @ R[j]
+    coupling = -2.0 * graph.kappa[:, None, None] * double_cross(relative, graph.R_ij)
+    own = _diagonal_blocks(problem, Lambda)
+    poses_w = layout.rotations(np.arange(problem.num_poses))
+    blocks = [
+        (v_i, v_i, tau),
+        (v_j, v_j, tau),
+        (v_i, v_j, -tau),
+        (v_j, v_i, -tau),
+        (*_grid(v_i, w_i), -lever),
+        (*_grid(w_i, v_i), -np.swapaxes(lever, 1, 2)),
+        (*_grid(v_j, w_i), lever),
+        (*_grid(w_i, v_j), np.swapaxes(lever, 1, 2)),
+        (*_grid(w_i, w_j), coupling),
+        (*_grid(w_j, w_i), np.swapaxes(coupling, 1, 2)),
+        (*_grid(poses_w, poses_w), own),
+    ]
+    return assemble(blocks, layout.side)
+
+
+def double_cross(A: Array, B: Array) -> Array:
+    """K with u^T K v = <hat(u) A hat(v)^T, B>: (n, 3, 3) in space, (n, 1, 1) in the plane; K = 2 cof(A) for B = A.
+
+    In space it is the polarised cofactor, (tr A tr B - tr AB) I + (AB + BA)^T - tr(A) B^T - tr(B) A^T.
+    """
+    if A.shape[-1] == 2:
+        # hat(1) A hat(1)^T is the cofactor matrix of A.
+        inner = A[:, 1, 1] * B[:, 0, 0] + A[:, 0, 0] * B[:, 1, 1] - A[:, 1, 0] * B[:, 0, 1] - A[:, 0, 1] * B[:, 1, 0]
+        return np.asarray(inner)[:, None, None]
+    AB = A @ B
+    trace_A, trace_B = _trace(A), _trace(B)
+    symmetric_part = np.swapaxes(AB + B @ A - trace_A * B - trace_B * A, 1, 2)
+    return np.asarray((trace_A * trace_B - _trace(AB)) * np.eye(3) + symmetric_part)
+
+
+def _diagonal_blocks(problem: PGOProblem, Lambda: Array | None) -> Array:
+    """2 (tr(S_ii) I - S_ii) in space, 2 tr(S_ii) in the plane, with S_ii the diagonal rotation blocks of S."""
+    S_ii = problem.M.data[problem.block_positions]
+    if Lambda is not None:
+        S_ii = S_ii - Lambda
+    trace = _trace(S_ii)
+    return 2.0 * trace if problem.d == 2 else 2.0 * (trace * np.eye(3) - S_ii)
+
+
+def _lever(t_ij: Array) -> Array:
+    """T with R_i hat(w) t_ij = -R_i T w: hat(t_ij) in space, -hat(1) t_ij in the plane."""
+    if t_ij.shape[1] == 2:
+        return np.stack([t_ij[:, 1], -t_ij[:, 0]], axis=1)[:, :, None]
+    return hat(t_ij)
+
+
+def _trace(A: Array) -> Array:
+    return np.asarray(np.einsum("naa->n", A))[:, None, None]
+
+
+def _grid(rows: IntArray, columns: IntArray) -> tuple[IntArray, IntArray]:
+    return (
+        np.repeat(rows[:, :, None], columns.shape[1], axis=2),
+        np.repeat(columns[:, None, :], rows.shape[1], axis=1),
+    )

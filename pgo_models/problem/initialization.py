@@ -1,0 +1,161 @@
+"""Starts: noisy truth (GPS / IMU), odometry, breadth-first spanning tree, and the chordal relaxation."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import breadth_first_order
+
+from pgo_models.errors import GraphError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import (
+    BoolArray,
+    exp_map,
+    project_to_rotations,
+    tangent_dimension,
+    unstack_transposes,
+)
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.problem.problem import PGOProblem
+
+
+def gps_imu_start(truth: Poses, translation_std: float, rotation_std: float, rng: np.random.Generator) -> Poses:
+    """Truth under noise: t_i + N(0, translation_std^2 I) and R_i Exp(N(0, rotation_std^2 I)) (paper: section `sec3`).
+
+    Parameters
+    ----------
+    truth : Poses
+    translation_std, rotation_std : float
+        Standard deviations, metres and radians.
+    rng : np.random.Generator
+
+    Examples
+    --------
+    >>> gps_imu_start(Poses.identity(5, 3), 0.5, 0.1, np.random.default_rng(0))
+    Poses(n=5, d=3)
+    """
+    n, d = truth.num_poses, truth.d
+    t = truth.t + rng.normal(0.0, translation_std, (n, d))
+    return Poses(truth.R @ exp_map(rng.normal(0.0, rotation_std, (n, tangent_dimension(d)))), t)
+
+
+def odometry_start(graph: PoseGraph) -> Poses:
+    """Compose the measurements i -> i + 1 from pose 0 on; the first of repeated ones counts.
+
+    Raises
+    ------
+    GraphError
+        When a link i -> i + 1 is missing: `spanning_tree_start` needs none.
+
+    Examples
+    --------
+    >>> turn = np.eye(2)[None].repeat(2, axis=0)
+    >>> step = np.array([[1.0, 0.0], [1.0, 0.0]])
+    >>> graph = PoseGraph(3, [0, 1], [1, 2], turn, step, np.ones(2), np.ones(2))
+    >>> odometry_start(graph).t.tolist()
+    [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]
+    """
+    n = graph.num_poses
+    forward = np.flatnonzero(graph.j == graph.i + 1)
+    edge = np.full(n - 1, -1)
+    edge[graph.i[forward][::-1]] = forward[::-1]
+    if n > 1 and edge.min() < 0:
+        missing = int(np.argmin(edge))
+        raise GraphError(
+            f"no odometry from pose {graph.pose_ids[missing]} to {graph.pose_ids[missing + 1]}; "
+            "use spanning_tree_start() or chordal_start()"
+        )
+    return _compose(graph, np.arange(n), np.arange(-1, n - 1), edge, np.ones(n - 1, dtype=bool))
+
+
+def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
+    """Compose measurements along a breadth-first spanning tree from pose `root`, the paper's start for SLAM graphs.
+
+    Raises
+    ------
+    GraphError
+        When the graph is not connected.
+    SettingError
+        When root is no pose.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> spanning_tree_start(graph).t[0].tolist()
+    [0.0, 0.0, 0.0]
+    """
+    graph.check_connected()
+    if not 0 <= root < graph.num_poses:
+        raise SettingError(f"root is {root}; give a pose, 0 to {graph.num_poses - 1}")
+    order, parent, edge = spanning_tree(graph, root)
+    return _compose(graph, order, parent, edge, graph.j[edge] == order[1:])
+
+
+def spanning_tree(graph: PoseGraph, root: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Breadth-first tree: poses in its order, the parent of every pose, and the edges to order[1:]."""
+    n = graph.num_poses
+    # The stored number of an adjacency entry is 1 + the first edge between the two poses.
+    pair = np.minimum(graph.i, graph.j) * n + np.maximum(graph.i, graph.j)
+    first = np.unique(pair, return_index=True)[1]
+    rows, columns, number = graph.i[first], graph.j[first], first + 1.0
+    adjacency = csr_array(
+        coo_array(
+            (np.concatenate([number, number]), (np.concatenate([rows, columns]), np.concatenate([columns, rows]))),
+            shape=(n, n),
+        )
+    )
+    order, parent = breadth_first_order(adjacency, root, directed=False)
+    child = order[1:]
+    return order, parent, np.asarray(adjacency[child, parent[child]]).astype(np.int64).ravel() - 1
+
+
+def chordal_start(problem: PGOProblem) -> Poses:
+    """Minimise tr(X^T M X) without the constraints, pose 0 fixed at the identity, and project the rotations.
+
+    Joint in rotations and translations; after the projection the translations are the best ones for
+    the rotations. One factorisation with the pattern of M.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> bool(problem.objective(chordal_start(problem)) < problem.objective(spanning_tree_start(problem.graph)))
+    True
+    """
+    n, d = problem.num_poses, problem.d
+    fixed = np.concatenate([[0], n + np.arange(d)])
+    X_fixed = np.zeros((problem.side, d))
+    X_fixed[fixed[1:]] = np.eye(d)
+    right_hand_side = -(problem.M @ X_fixed)
+    right_hand_side[fixed] = X_fixed[fixed]
+    is_fixed = np.zeros(problem.side, dtype=bool)
+    is_fixed[fixed] = True
+    data = problem.M.data.copy()
+    data[is_fixed[problem.M.indices]] = 0.0
+    for column in fixed:
+        data[problem.M.indptr[column] : problem.M.indptr[column + 1]] = 0.0
+    data[problem.diagonal_positions[fixed]] = 1.0
+    X = problem.analysis.factorize(problem.with_pattern_of_M(data)).solve(right_hand_side)
+    return problem.with_best_translations(project_to_rotations(unstack_transposes(X[n:])))
+
+
+def _compose(graph: PoseGraph, order: IntArray, parent: IntArray, edge: IntArray, forward: BoolArray) -> Poses:
+    """Poses of a tree: order[k] hangs on its parent by edge[k-1], which ends at it if forward[k-1].
+
+    Pointer jumping: every pose holds its transform from an ancestor, which doubles its distance until it is the root.
+    """
+    n, d = graph.num_poses, graph.d
+    root, child = order[0], order[1:]
+    R, t = np.broadcast_to(np.eye(d), (n, d, d)).copy(), np.zeros((n, d))
+    R_step, t_step = graph.R_ij[edge], graph.t_ij[edge]
+    back = ~forward
+    R_step[back] = np.swapaxes(R_step[back], 1, 2)
+    t_step[back] = -np.einsum("nab,nb->na", R_step[back], t_step[back])
+    R[child], t[child] = R_step, t_step
+    ancestor = np.where(parent >= 0, parent, root)
+    while (ancestor != root).any():
+        t = t[ancestor] + np.einsum("nab,nb->na", R[ancestor], t)
+        R = project_to_rotations(R[ancestor] @ R)
+        ancestor = ancestor[ancestor]
+    return Poses(R, t)

@@ -1,0 +1,186 @@
+"""The matrices of the problem: A, L, M and Q, one equation each (the paper's equation `min overall`).
+
+Unknowns are stacked in X, (N, d) with N = (d+1) n: first the n rows t_i, then the d rows of every R_i^T.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.sparse import csc_array, csr_array
+
+from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.problem.cholesky import factorize
+
+MAX_DENSE_SIDE = 6000  # a dense Q of this side takes 288 MB
+
+
+def residual_matrix(graph: PoseGraph) -> tuple[csr_array, Array]:
+    """A, ((d+1) m, N), and weights w, ((d+1) m,), with F = sum_rows w ||A X||^2.
+
+    Its first m rows give t_j^T - t_i^T - t_ij^T R_i^T with weight tau; then d rows an edge give
+    R_j^T - R_ij^T R_i^T with weight kappa (equations `translation` and `rotation` of the paper).
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> A, w = residual_matrix(graph)
+    >>> A.shape == (4 * graph.num_edges, 4 * graph.num_poses), w.shape
+    (True, (432,))
+    """
+    n, m, d = graph.num_poses, graph.num_edges, graph.d
+    edge = np.arange(m)
+    rotation_row = m + d * edge[:, None] + np.arange(d)
+    block_i, block_j = rotation_columns(graph.i, n, d), rotation_columns(graph.j, n, d)
+    rows = [edge, edge, np.repeat(edge, d), rotation_row.ravel(), np.repeat(rotation_row, d)]
+    columns = [graph.j, graph.i, block_i.ravel(), block_j.ravel(), np.repeat(block_i[:, None], d, axis=1).ravel()]
+    values = [
+        np.ones(m),
+        -np.ones(m),
+        -graph.t_ij.ravel(),
+        np.ones(m * d),
+        -np.swapaxes(graph.R_ij, 1, 2).ravel(),
+    ]
+    A = csr_array(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=((d + 1) * m, (d + 1) * n)
+    )
+    return A, np.concatenate([graph.tau, np.repeat(graph.kappa, d)])
+
+
+def joint_matrix(graph: PoseGraph) -> csc_array:
+    """M, (N, N), symmetric, with F = tr(X^T M X) = tr(X^T A^T diag(w) A X).
+
+    Edge (i, j) adds, in the rows and columns of t_i, t_j, R_i, R_j:
+
+        t_i:  tau          t_j: -tau     R_i: tau t_ij^T
+        t_j:               tau           R_i: -tau t_ij^T
+        R_i:  kappa I + tau t_ij t_ij^T           R_j: -kappa R_ij
+        R_j:  kappa I
+
+    The pattern holds every diagonal d x d block in full, so that multipliers can be subtracted in place.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> A, w = residual_matrix(graph)
+    >>> bool(abs(joint_matrix(graph) - A.T @ (w[:, None] * A)).max() < 1e-12)
+    True
+    """
+    n, d = graph.num_poses, graph.d
+    i, j, kappa, tau, t_ij = graph.i, graph.j, graph.kappa, graph.tau, graph.t_ij
+    block_i, block_j = rotation_columns(i, n, d), rotation_columns(j, n, d)
+    tau_t = tau[:, None] * t_ij
+    eye = kappa[:, None, None] * np.eye(d)
+    t_i = np.repeat(i[:, None], d, axis=1)
+    t_j = np.repeat(j[:, None], d, axis=1)
+    blocks = [
+        (i, i, tau),
+        (j, j, tau),
+        (i, j, -tau),
+        (j, i, -tau),
+        (t_i, block_i, tau_t),
+        (block_i, t_i, tau_t),
+        (t_j, block_i, -tau_t),
+        (block_i, t_j, -tau_t),
+        (*_square(block_i, block_i), eye + tau_t[:, :, None] * t_ij[:, None, :]),
+        (*_square(block_j, block_j), eye),
+        (*_square(block_i, block_j), -kappa[:, None, None] * graph.R_ij),
+        (*_square(block_j, block_i), -kappa[:, None, None] * np.swapaxes(graph.R_ij, 1, 2)),
+    ]
+    return assemble(blocks, (d + 1) * n)
+
+
+def connection_laplacian(graph: PoseGraph) -> csc_array:
+    """L, (dn, dn), the rotation-only part of M: sum_e kappa ||R_j - R_i R_ij||_F^2 = tr(Y^T L Y), Y the rows R_i^T.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> connection_laplacian(graph).shape
+    (81, 81)
+    """
+    n, d = graph.num_poses, graph.d
+    block_i, block_j = rotation_columns(graph.i, 0, d), rotation_columns(graph.j, 0, d)
+    eye = graph.kappa[:, None, None] * np.eye(d)
+    coupling = -graph.kappa[:, None, None] * graph.R_ij
+    blocks = [
+        (*_square(block_i, block_i), eye),
+        (*_square(block_j, block_j), eye),
+        (*_square(block_i, block_j), coupling),
+        (*_square(block_j, block_i), np.swapaxes(coupling, 1, 2)),
+    ]
+    return assemble(blocks, d * n)
+
+
+def marginalized_matrix(graph: PoseGraph) -> Array:
+    """Q, (dn, dn) and dense: min over t of F = tr(Y^T Q Y), Y the rows R_i^T.
+
+    Q = M_RR - M_Rt (M_tt)^+ M_tR, the Schur complement of the translations (SE-Sync: Rosen et al. 2019, equation 22).
+
+    Raises
+    ------
+    SettingError
+        When its side would exceed `MAX_DENSE_SIDE`; `PGOProblem.apply_Q` multiplies with it at any size.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> bool(np.linalg.eigvalsh(marginalized_matrix(graph)).min() > -1e-9)
+    True
+    """
+    n, d = graph.num_poses, graph.d
+    if d * n > MAX_DENSE_SIDE:
+        raise SettingError(
+            f"Q is dense with side {d * n}, {8e-9 * (d * n) ** 2:.1f} GB; use PGOProblem.apply_Q, which forms no Q"
+        )
+    M = joint_matrix(graph)
+    M_Rt, M_RR = M[n:, :n], M[n:, n:].toarray()
+    grounded = factorize(M[1:n, 1:n].tocsc())  # columns of M_tR sum to zero, so t_0 = 0 loses nothing
+    return np.asarray(M_RR - M_Rt[:, 1:] @ grounded.solve(M_Rt[:, 1:].toarray().T))
+
+
+def rotation_columns(pose: IntArray, first: int, d: int) -> IntArray:
+    """Columns (m, d) that the rows of R_i^T have in X when rotations begin at `first`."""
+    return np.asarray(first + d * pose[:, None] + np.arange(d))
+
+
+def inner(A: Array, B: Array) -> float:
+    """Frobenius inner product sum_ab A_ab B_ab of two arrays of one shape.
+
+    einsum, not BLAS: a sum of this size is over before a pool of threads has woken up to share it.
+    """
+    return float(np.einsum("r,r->", A.ravel(), B.ravel()))
+
+
+def norm(A: Array) -> float:
+    """Frobenius norm, by `inner`."""
+    return math.sqrt(inner(A, A))
+
+
+def assemble(blocks: list[tuple[IntArray, IntArray, Array]], side: int) -> csc_array:
+    """Sum (rows, columns, values) triplets, each of one shape, into a canonical CSC matrix; its pattern keeps zeros."""
+    rows = np.concatenate([np.ravel(block[0]) for block in blocks])
+    columns = np.concatenate([np.ravel(block[1]) for block in blocks])
+    values = np.concatenate([np.ravel(block[2]) for block in blocks])
+    return csc_array((values, (rows, columns)), shape=(side, side))
+
+
+def entry_positions(matrix: csc_array, rows: IntArray, columns: IntArray) -> IntArray:
+    """Positions in `matrix.data` of stored entries (rows, columns) of a canonical CSC matrix."""
+    side = np.int64(matrix.shape[0])
+    stored = np.repeat(np.arange(matrix.shape[1], dtype=np.int64), np.diff(matrix.indptr)) * side + matrix.indices
+    return np.searchsorted(stored, columns.astype(np.int64) * side + rows)
+
+
+def _square(block_rows: IntArray, block_columns: IntArray) -> tuple[IntArray, IntArray]:
+    """Rows and columns (m, d, d) of d x d blocks."""
+    d = block_rows.shape[1]
+    rows = np.repeat(block_rows[:, :, None], d, axis=2)
+    return rows, np.repeat(block_columns[:, None, :], d, axis=1)

@@ -1,0 +1,1 @@
+"""The semidefinite relaxation in all its forms."""

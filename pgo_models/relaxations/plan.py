@@ -1,0 +1,155 @@
+"""Which form of the semidefinite relaxation to pose, and which solver to give it: by the sizes of the cliques."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+
+from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import Array
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.relaxations.clique_tree import CliqueTree, clique_side, clique_tree
+
+DEFAULT_MEMORY_LIMIT = 4e9  # bytes
+
+# Measured on one core (tests/benchmarks/test_relaxations_benchmark.py). Clarabel factors a dense matrix of the order of
+# every cone's triangle at every iteration, about 15 of them; SCS takes an eigendecomposition of every cone, about 1000
+# times.
+_CLARABEL_ITERATIONS, _CLARABEL_RATE = 15, 2e10
+_SCS_ITERATIONS, _SCS_RATE = 1000, 2e9
+_PATIENCE = 2.0  # seconds: up to here the interior point is preferred for its accuracy
+_CLARABEL_BYTES = 56.0  # for every entry of those dense matrices: matrix and factor
+_SCS_BYTES = 400.0  # for every entry of a cone's triangle: constraint matrices, work vectors, cvxpy's copies
+_DENSE_BYTES = 64.0  # for every entry of a dense matrix of the model
+_CONE_BYTES = 1.2e5  # of cvxpy's for every cone
+
+
+class RelaxationForm(enum.Enum):
+    """How the relaxation is posed."""
+
+    PRIMAL = "min tr(Q Z), Z_ii = I, Z PSD: one dense cone, translations marginalised out"
+    DUAL = "max tr(Lambda), M - blockdiag(0, Lambda) PSD: one sparse linear matrix inequality"
+    CLIQUES = "one small cone for every clique of a chordal extension"
+
+
+class SDPSolver(enum.Enum):
+    """Which solver it is given to."""
+
+    CLARABEL = "interior point, accurate; its work grows with the sixth power of a cone's side"
+    SCS = "first order, rougher; its work grows with the third power of a cone's side"
+
+
+@dataclass(frozen=True, eq=False)
+class RelaxationPlan:
+    """A form and a solver, what they will take, and why they were chosen.
+
+    Attributes
+    ----------
+    form : RelaxationForm
+    solver : SDPSolver
+    tree : CliqueTree
+    seconds : float
+        Rough estimate.
+    memory : float
+        Estimate in bytes.
+    reason : str
+    """
+
+    form: RelaxationForm
+    solver: SDPSolver
+    tree: CliqueTree
+    seconds: float
+    memory: float
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.form.name} with {self.solver.name}, about {_bytes(self.memory)}: {self.reason}"
+
+
+def plan_relaxation(
+    problem: PGOProblem,
+    form: RelaxationForm | None = None,
+    solver: SDPSolver | None = None,
+    memory_limit: float = DEFAULT_MEMORY_LIMIT,
+) -> RelaxationPlan:
+    """Choose what is not given: the cliques with Clarabel where they are small, else the dense primal with SCS.
+
+    Nothing larger than the clique tree is formed.
+
+    Raises
+    ------
+    SettingError
+        When the estimate exceeds `memory_limit`, in bytes, or the limit is not positive.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import circle
+    >>> plan = plan_relaxation(PGOProblem(circle(np.random.default_rng(0))))
+    >>> plan.form.name, plan.solver.name
+    ('PRIMAL', 'SCS')
+    """
+    if not memory_limit > 0:
+        raise SettingError(f"memory_limit is {memory_limit}; give positive bytes")
+    tree = clique_tree(problem.graph)
+    largest = int(clique_side(int(tree.sizes.max()), problem.d))
+    shape = (
+        f"the largest of {len(tree.cliques)} cliques has side {largest}, the dense cone {problem.d * problem.num_poses}"
+    )
+    if form is None and solver is None:
+        small = _seconds(problem, tree, RelaxationForm.CLIQUES, SDPSolver.CLARABEL)
+        dense = _seconds(problem, tree, RelaxationForm.PRIMAL, SDPSolver.SCS)
+        if small <= max(_PATIENCE, dense):
+            form, solver = RelaxationForm.CLIQUES, SDPSolver.CLARABEL
+        else:
+            form, solver = RelaxationForm.PRIMAL, SDPSolver.SCS
+        reason = f"{shape}; estimated {small:.2g} s for the cliques with Clarabel, {dense:.2g} s dense with SCS"
+    else:
+        asked = [choice.name for choice in (form, solver) if choice is not None]
+        solver = solver or (SDPSolver.SCS if form is RelaxationForm.PRIMAL else SDPSolver.CLARABEL)
+        form = form or (RelaxationForm.PRIMAL if solver is SDPSolver.SCS else RelaxationForm.CLIQUES)
+        reason = f"{' and '.join(asked)} as asked for; {shape}"
+    memory = _memory(problem, tree, form, solver)
+    if memory > memory_limit:
+        raise SettingError(
+            f"the relaxation of {problem!r} as {form.name} with {solver.name} needs about {_bytes(memory)}, above the "
+            f"limit of {_bytes(memory_limit)} ({reason}); use certify(problem, poses), which proves the same bound by "
+            "one sparse factorisation, or raise memory_limit"
+        )
+    return RelaxationPlan(form, solver, tree, _seconds(problem, tree, form, solver), memory, reason)
+
+
+def _sides(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm) -> Array:
+    """Sides of the cones."""
+    if form is RelaxationForm.PRIMAL:
+        return np.array([float(problem.d * problem.num_poses)])
+    if form is RelaxationForm.CLIQUES:
+        return np.asarray(clique_side(1, problem.d) + (problem.d + 1.0) * (tree.sizes - 1))
+    return np.asarray((problem.d + 1.0) * tree.sizes)  # as Clarabel will decompose it, about
+
+
+def _seconds(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm, solver: SDPSolver) -> float:
+    sides = _sides(problem, tree, form)
+    if solver is SDPSolver.CLARABEL:
+        return float(_CLARABEL_ITERATIONS * np.sum(_triangle(sides) ** 3) / _CLARABEL_RATE)
+    return float(_SCS_ITERATIONS * np.sum(sides**3) / _SCS_RATE)
+
+
+def _memory(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm, solver: SDPSolver) -> float:
+    triangles = _triangle(_sides(problem, tree, form))
+    cones = _CLARABEL_BYTES * np.sum(triangles**2) if solver is SDPSolver.CLARABEL else 0.0
+    dense_side = {
+        RelaxationForm.PRIMAL: problem.d * problem.num_poses,
+        RelaxationForm.DUAL: problem.side,  # cvxpy vectorises the inequality as a whole
+        RelaxationForm.CLIQUES: 0,
+    }[form]
+    return float(cones + _SCS_BYTES * np.sum(triangles) + _CONE_BYTES * len(triangles) + _DENSE_BYTES * dense_side**2)
+
+
+def _triangle(side: Array) -> Array:
+    return side * (side + 1) / 2
+
+
+def _bytes(count: float) -> str:
+    return f"{count / 1e9:.2g} GB" if count >= 1e9 else f"{count / 1e6:.2g} MB"

@@ -1,0 +1,108 @@
+"""From a solution of the semidefinite relaxation, Z or its factor Y, to rotations; how far it is from having rank d."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, project_to_rotations, unstack_transposes
+from pgo_models.problem.problem import PGOProblem
+
+RANK_TOLERANCE = 1e-3  # of the largest singular value; interior points and first-order methods leave about 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class RankReport:
+    """Singular values of a PSD matrix that has rank d exactly when the relaxation is tight.
+
+    Attributes
+    ----------
+    singular_values : (side,)
+        Descending.
+    d : int
+    rank : int
+        How many are above `RANK_TOLERANCE` of the largest.
+    tightness : float
+        Ratio of singular value d + 1 to singular value d; 0 for an exact rank d.
+    """
+
+    singular_values: Array
+    d: int
+    rank: int
+    tightness: float
+
+    @property
+    def is_tight(self) -> bool:
+        """Whether the rank is d to `RANK_TOLERANCE`: evidence that rounding loses nothing, not a proof."""
+        return self.rank <= self.d
+
+    def __str__(self) -> str:
+        leading = ", ".join(f"{value:.3g}" for value in self.singular_values[: self.d + 2])
+        return f"rank {self.rank} (d = {self.d}); ratio {self.tightness:.2g}; singular values {leading}, .."
+
+
+def rank_report(Z: Array, d: int) -> RankReport:
+    """Report of a symmetric matrix, (side, side)."""
+    values = np.sort(np.abs(np.linalg.eigvalsh(Z)))[::-1]
+    following = float(values[d]) if len(values) > d else 0.0
+    rank = int(np.count_nonzero(values > RANK_TOLERANCE * values[0]))
+    return RankReport(values, d, rank, following / float(values[d - 1]))
+
+
+def round_gram(problem: PGOProblem, Z: Array) -> tuple[Poses, RankReport]:
+    """Nearest rank d factor of Z, (dn, dn), its blocks projected to SO(d), and the best translations for them.
+
+    Z = Y Y^T with the rows R_i^T of every pose in Y, up to one orthogonal matrix on the right; if it has determinant
+    -1 on most blocks, a column changes its sign (Rosen et al. 2019, algorithm 2).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.problem.problem import PGOProblem
+    >>> from pgo_models.graphs.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> Y = problem.graph.truth.R.reshape(-1, 3)
+    >>> poses, report = round_gram(problem, Y @ Y.T)
+    >>> report.rank
+    3
+    """
+    d = problem.d
+    symmetric = 0.5 * (Z + Z.T)
+    values, vectors = np.linalg.eigh(symmetric)
+    Y = vectors[:, -d:] * np.sqrt(np.maximum(values[-d:], 0.0))
+    return _rounded(problem, Y), rank_report(symmetric, d)
+
+
+def round_factor(problem: PGOProblem, Y: Array) -> tuple[Poses, RankReport]:
+    """Poses of a low-rank factor, (n, d, r): what `round_gram` makes of Z = Y Y^T, without forming it.
+
+    Rotations, which r = d gives as long as no block reflects, are returned as they are.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.problem.problem import PGOProblem
+    >>> from pgo_models.graphs.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> poses, report = round_factor(problem, np.swapaxes(problem.graph.truth.R, 1, 2))
+    >>> report.rank, bool(np.allclose(poses.R, problem.graph.truth.R))
+    (3, True)
+    """
+    n, d, r = Y.shape
+    stacked = Y.reshape(n * d, r)
+    gram = stacked.T @ stacked
+    report = rank_report(gram, d)
+    if r == d and (np.linalg.det(Y) > 0).all():
+        return problem.with_best_translations(np.swapaxes(Y, 1, 2)), report
+    _, vectors = np.linalg.eigh(gram)
+    return _rounded(problem, stacked @ vectors[:, -d:]), report
+
+
+def _rounded(problem: PGOProblem, Y: Array) -> Poses:
+    """Poses of a factor of rank d, (dn, d), turned over if most of its blocks reflect."""
+    d = problem.d
+    if np.count_nonzero(np.linalg.det(Y.reshape(-1, d, d)) < 0) > problem.num_poses / 2:
+        Y = Y * np.where(np.arange(d) == 0, -1.0, 1.0)
+    return problem.with_best_translations(project_to_rotations(unstack_transposes(Y)))

@@ -1,0 +1,246 @@
+"""solve_relaxation: pose the semidefinite relaxation, solve it, round it, and prove the bound that its duals give."""
+
+from __future__ import annotations
+
+import enum
+import math
+import time
+import warnings
+from dataclasses import dataclass
+
+import cvxpy as cp
+
+from pgo_models.certificates.certificate import Verdict, gap_text, relative_gap, verdict_of
+from pgo_models.certificates.lower_bound import LowerBound, best_bound
+from pgo_models.certificates.rounding_errors import objective_rounding
+from pgo_models.errors import PGOError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.relaxations.clique_decomposition import CliqueRelaxation, clique_relaxation
+from pgo_models.relaxations.plan import DEFAULT_MEMORY_LIMIT, RelaxationForm, RelaxationPlan, SDPSolver, plan_relaxation
+from pgo_models.relaxations.primal_dual import DualRelaxation, PrimalRelaxation, dual_relaxation, primal_relaxation
+from pgo_models.relaxations.rounding import RankReport
+
+DEFAULT_RELAXATION_GAP = 1e-5
+CLARABEL_TOLERANCE = 1e-10
+SCS_TOLERANCE = 1e-7
+_SCS_MAX_ITERATIONS = 20_000
+
+Relaxation = PrimalRelaxation | DualRelaxation | CliqueRelaxation
+
+
+class RelaxationStatus(enum.Enum):
+    """How the solver ended."""
+
+    OPTIMAL = "solved to the solver's tolerance"
+    INACCURATE = (
+        "stopped where rounding lets it go no further, short of the tolerance; the bound is proven all the same"
+    )
+    LIMIT = "stopped by its limit of time or iterations; the bound is proven all the same, but may be wide"
+
+
+@dataclass(frozen=True, eq=False)
+class RelaxationSolution:
+    """What the relaxation says of a pose graph.
+
+    Attributes
+    ----------
+    relaxation : PrimalRelaxation, DualRelaxation or CliqueRelaxation
+        The model with its variables and duals as solved.
+    plan : RelaxationPlan
+    status : RelaxationStatus
+    value : float
+        Optimal value as the solver reports it: evidence, not a bound.
+    Lambda : (n, d, d)
+        Multipliers from the duals.
+    bound : LowerBound
+        Proven bound on F (`pgo_models.certificates.lower_bound`): it holds whatever the solver did.
+    poses : Poses
+        Rounded.
+    rank : RankReport
+    objective, rounding_level : float
+        F of the poses, and below what it could not be told from zero.
+    gap : float
+        (objective - lower_bound) / objective.
+    wanted_gap : float
+    verdict : Verdict
+        On the poses.
+    iterations : int
+    seconds : float
+        From posing to proof.
+    """
+
+    relaxation: Relaxation
+    plan: RelaxationPlan
+    status: RelaxationStatus
+    value: float
+    Lambda: Array
+    bound: LowerBound
+    poses: Poses
+    rank: RankReport
+    objective: float
+    rounding_level: float
+    wanted_gap: float
+    iterations: int
+    seconds: float
+
+    @property
+    def lower_bound(self) -> float:
+        """Proven: F of no poses is below it."""
+        return self.bound.value
+
+    @property
+    def eta(self) -> float:
+        """Shift of the proof; nan when only F >= 0 is left."""
+        return self.bound.eta
+
+    @property
+    def gap(self) -> float:
+        """(objective - lower_bound) / objective of the rounded poses."""
+        return relative_gap(self.objective, self.lower_bound, self.rounding_level)
+
+    @property
+    def verdict(self) -> Verdict:
+        """What the bound says of the rounded poses."""
+        return verdict_of(self.objective, self.rounding_level, self.gap, self.bound, self.wanted_gap)
+
+    def gap_to(self, poses: Poses) -> float:
+        """The same gap for anybody's poses of the graph."""
+        return relative_gap(self.relaxation.problem.objective(poses), self.lower_bound)
+
+    def __str__(self) -> str:
+        lines = [
+            f"relaxation   {self.plan}",
+            f"status       {self.status.name}: {self.status.value}",
+            f"effort       {self.iterations} iterations, {self.seconds:.3g} s",
+            f"F rounded    {self.objective:.10g}",
+            f"lower bound  {self.lower_bound:.10g}   (solver: {self.value:.10g}; eta = {self.eta:.3g})",
+            f"gap          {gap_text(self.gap)}   (asked for: {self.wanted_gap:.3g})",
+            f"rank         {self.rank}",
+            f"verdict      {self.verdict.name}: {self.verdict.value}",
+        ]
+        return "\n".join(lines)
+
+
+def solve_relaxation(
+    problem: PGOProblem,
+    form: RelaxationForm | None = None,
+    solver: SDPSolver | None = None,
+    *,
+    gap: float = DEFAULT_RELAXATION_GAP,
+    memory_limit: float = DEFAULT_MEMORY_LIMIT,
+    time_limit: float = math.inf,
+    verbose: bool = False,
+) -> RelaxationSolution:
+    """Solve the semidefinite relaxation of a pose graph.
+
+    Parameters
+    ----------
+    problem : PGOProblem
+    form : RelaxationForm, optional
+    solver : SDPSolver, optional
+        Both are chosen by `plan_relaxation` unless given.
+    gap : float
+        Relative gap for the verdict; where the proof needs a shift eta, the smallest that is tried follows from it.
+    memory_limit : float
+        Bytes; an estimate above it is refused before anything is formed.
+    time_limit : float
+        Seconds for the solver.
+    verbose : bool
+        Print the plan with its reason, the solver's table, and the result.
+
+    Raises
+    ------
+    SettingError
+        When a limit or the gap is not positive, or the memory would not do.
+    PGOError
+        When the solver ends without an iterate.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.scenes import circle
+    >>> solution = solve_relaxation(PGOProblem(circle(np.random.default_rng(0))))
+    >>> solution.status.name, solution.verdict.name, solution.rank.rank
+    ('OPTIMAL', 'CERTIFIED', 3)
+    """
+    for name, value in (("gap", gap), ("time_limit", time_limit)):
+        if not value > 0:
+            raise SettingError(f"{name} is {value}; it must be positive")
+    began = time.perf_counter()
+    plan = plan_relaxation(problem, form, solver, memory_limit)
+    if verbose:
+        print(plan)
+    relaxation = _posed(problem, plan)
+    status = _solve(relaxation.model, plan.solver, time_limit, verbose)
+    Lambda = relaxation.Lambda()
+    poses, rank = relaxation.rounded()
+    objective = problem.objective(poses)
+    rounding = objective_rounding(problem, poses)
+    bound = best_bound(problem, Lambda, poses, gap, objective)
+    solution = RelaxationSolution(
+        relaxation=relaxation,
+        plan=plan,
+        status=status,
+        value=float(relaxation.model.value) * relaxation.scale,
+        Lambda=Lambda,
+        bound=bound,
+        poses=poses,
+        rank=rank,
+        objective=objective,
+        rounding_level=rounding.level,
+        wanted_gap=gap,
+        iterations=int(relaxation.model.solver_stats.num_iters or 0),
+        seconds=time.perf_counter() - began,
+    )
+    if verbose:
+        print(solution)
+    return solution
+
+
+def _posed(problem: PGOProblem, plan: RelaxationPlan) -> Relaxation:
+    if plan.form is RelaxationForm.PRIMAL:
+        return primal_relaxation(problem)
+    if plan.form is RelaxationForm.DUAL:
+        return dual_relaxation(problem)
+    return clique_relaxation(problem, tree=plan.tree)
+
+
+def _solve(model: cp.Problem, solver: SDPSolver, time_limit: float, verbose: bool) -> RelaxationStatus:
+    limited = math.isfinite(time_limit)
+    try:
+        with warnings.catch_warnings():
+            # Said by the status, and made good by the proof of the bound.
+            warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
+            if solver is SDPSolver.CLARABEL:
+                model.solve(
+                    solver=cp.CLARABEL,
+                    verbose=verbose,
+                    max_threads=1,
+                    tol_gap_abs=CLARABEL_TOLERANCE,
+                    tol_gap_rel=CLARABEL_TOLERANCE,
+                    tol_feas=CLARABEL_TOLERANCE,
+                    time_limit=time_limit,
+                )
+            else:
+                model.solve(
+                    solver=cp.SCS,
+                    verbose=verbose,
+                    eps_abs=SCS_TOLERANCE,
+                    eps_rel=SCS_TOLERANCE,
+                    max_iters=_SCS_MAX_ITERATIONS,
+                    time_limit_secs=time_limit if limited else 0.0,
+                )
+    except cp.SolverError as error:
+        raise PGOError(f"{solver.name} failed on the relaxation: {error}; try the other solver or form") from error
+    if model.value is None or not math.isfinite(model.value):
+        raise PGOError(
+            f"{solver.name} ended with status {model.status} on the relaxation and gave no iterate; "
+            "raise time_limit, or try the other solver or form"
+        )
+    if model.status == cp.OPTIMAL:
+        return RelaxationStatus.OPTIMAL
+    # SCS calls inaccurate what its limits stopped.
+    stalled = model.status == cp.OPTIMAL_INACCURATE and solver is SDPSolver.CLARABEL
+    return RelaxationStatus.INACCURATE if stalled else RelaxationStatus.LIMIT

@@ -1,0 +1,220 @@
+"""GTSAM as a rival: the same graph as its factors, solved by its optimiser, the poses judged by our F.
+
+GTSAM minimises sum_e 1/2 ||Log(z_e^-1 x_i^-1 x_j)||^2 in units of standard deviations. A rotation residual of angle
+theta adds kappa ||R_j - R_i R_ij||_F^2 = 4 kappa (1 - cos theta) = 2 kappa theta^2 + O(theta^4) to F, in the plane as
+in space, so that
+
+    sigma_R = 1 / (2 sqrt(kappa)),        sigma_t = 1 / sqrt(2 tau)
+
+make its cost F to leading order. Its optimum is that of the angles, not of the chords, and lies above ours in F by what
+is of fourth order. GTSAM is BSD-licensed: https://gtsam.org; the extra `peers` brings it.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+import time
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, cast
+
+import numpy as np
+
+from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, exp_map, log_map, project_to_rotations
+from pgo_models.problem.problem import PGOProblem
+from solvers.result import History, Measurement, Record, Run, Status
+
+
+class GtsamMethod(enum.Enum):
+    """Which of its optimisers."""
+
+    LEVENBERG_MARQUARDT = "Levenberg-Marquardt"
+    GAUSS_NEWTON = "Gauss-Newton"
+
+
+@dataclass(frozen=True)
+class Gtsam:
+    """Settings of a run of GTSAM.
+
+    Attributes
+    ----------
+    method : GtsamMethod
+    tolerance : float
+        On the relative change of its cost in one iteration; the default is GTSAM's.
+    max_iterations : int
+
+    Raises
+    ------
+    SettingError
+        When a setting is out of its range.
+    """
+
+    method: GtsamMethod = GtsamMethod.LEVENBERG_MARQUARDT
+    tolerance: float = 1e-5
+    max_iterations: int = 100
+
+    def __post_init__(self) -> None:
+        if not self.tolerance > 0:
+            raise SettingError(f"tolerance must be positive, got {self.tolerance}")
+        if self.max_iterations < 0:
+            raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
+
+
+def run_gtsam(problem: PGOProblem, settings: Gtsam | None = None, start: Poses | None = None) -> Run[Poses]:
+    """Solve a pose graph by GTSAM.
+
+    Parameters
+    ----------
+    problem : PGOProblem
+    settings : Gtsam, optional
+        `Gtsam()` unless given.
+    start : Poses, optional
+        GTSAM's own initialisation unless given: chordal rotations and a Gauss-Newton step in space, LAGO in the plane.
+
+    Returns
+    -------
+    Run
+        History and objective are our F at its iterates. Seconds hold the making of the factors and the start, and leave
+        out importing GTSAM and judging its poses.
+
+    Raises
+    ------
+    MissingExtraError
+        Without GTSAM.
+    NotPositiveDefiniteError
+        When GTSAM meets a singular linear system, as Gauss-Newton does far from a solution.
+    GraphError
+        When the start does not fit the graph.
+
+    Examples
+    --------
+    >>> from pgo_models import certify, grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> result = run_gtsam(problem)                                        # doctest: +SKIP
+    >>> certify(problem, result.poses).verdict.name                        # doctest: +SKIP
+    'NOT_CERTIFIED'
+    """
+    gtsam = _import_gtsam()
+    settings = settings if settings is not None else Gtsam()
+    if start is not None:
+        problem.stacked(start)  # raises unless the poses fit
+    began = time.perf_counter()
+    graph = factor_graph(problem, start)
+    try:
+        values = _own_start(gtsam, problem, graph) if start is None else _values(gtsam, start)
+        optimizer = _optimizer(gtsam, settings, graph, values)
+    except RuntimeError as error:
+        raise _singular(error) from error
+    seconds = time.perf_counter() - began
+    poses = _poses(gtsam, optimizer.values(), problem.d)
+    best = (problem.objective(poses), poses)
+    records = [Record(0, seconds, Measurement(best[0], 0.0, math.inf))]
+    status, k = Status.MAX_ITERATIONS, 0
+    while k < settings.max_iterations:
+        before, began = optimizer.error(), time.perf_counter()
+        try:
+            optimizer.iterate()
+        except RuntimeError as error:
+            raise _singular(error) from error
+        seconds += time.perf_counter() - began
+        k += 1
+        cost = optimizer.error()
+        if not math.isfinite(cost):
+            records.append(Record(k, seconds, Measurement(math.nan, math.nan, math.nan)))
+            status = Status.NOT_FINITE
+            break
+        change = abs(before - cost) / max(before, np.finfo(float).tiny)
+        poses = _poses(gtsam, optimizer.values(), problem.d)
+        objective = problem.objective(poses)
+        records.append(Record(k, seconds, Measurement(objective, 0.0, change)))
+        best = min(best, (objective, poses), key=lambda pair: pair[0])
+        if change <= settings.tolerance or cost <= np.finfo(float).tiny:
+            status, best = Status.CONVERGED, (objective, poses)
+            break
+    return Run(
+        name=f"GTSAM {settings.method.value}",
+        objective=best[0],
+        state=best[1],
+        status=status,
+        iterations=k,
+        history=History(tuple(records)),
+        seconds=seconds,
+        poses=best[1],
+    )
+
+
+def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noqa: ANN401  GTSAM has no types
+    """The `gtsam.NonlinearFactorGraph` of a problem, keys 0 .. n-1, with a prior on pose 0.
+
+    The prior, at pose 0 of `start` or at the identity, fixes the gauge, on which F does not depend.
+
+    Raises
+    ------
+    MissingExtraError
+        Without GTSAM.
+    """
+    gtsam, graph, d = _import_gtsam(), problem.graph, problem.d
+    sigma_R, sigma_t = 0.5 / np.sqrt(graph.kappa), 1.0 / np.sqrt(2.0 * graph.tau)
+    # A tangent vector of Pose3 begins with the rotation, one of Pose2 with the translation.
+    turns, moves = np.repeat(sigma_R[:, None], 2 * d - 3, axis=1), np.repeat(sigma_t[:, None], d, axis=1)
+    sigmas = np.concatenate([turns, moves] if d == 3 else [moves, turns], axis=1)
+    between = gtsam.BetweenFactorPose3 if d == 3 else gtsam.BetweenFactorPose2
+    factors = gtsam.NonlinearFactorGraph()
+    measured = _gtsam_poses(gtsam, Poses(graph.R_ij, graph.t_ij))
+    for i, j, pose, sigma in zip(graph.i.tolist(), graph.j.tolist(), measured, sigmas, strict=True):
+        factors.add(between(i, j, pose, gtsam.noiseModel.Diagonal.Sigmas(sigma)))
+    prior = gtsam.PriorFactorPose3 if d == 3 else gtsam.PriorFactorPose2
+    at = _gtsam_poses(gtsam, Poses.identity(1, d) if start is None else start[:1])[0]
+    factors.add(prior(0, at, gtsam.noiseModel.Diagonal.Sigmas(sigmas.min(axis=0))))
+    return factors
+
+
+def _import_gtsam() -> ModuleType:
+    try:
+        import gtsam
+    except ImportError as error:
+        raise MissingExtraError("gtsam", "peers") from error
+    return cast(ModuleType, gtsam)
+
+
+def _own_start(gtsam: ModuleType, problem: PGOProblem, graph: Any) -> Any:  # noqa: ANN401
+    if problem.d == 3:
+        return gtsam.InitializePose3.initialize(graph)
+    return gtsam.lago.initialize(graph, False)  # not every graph has an odometric path
+
+
+def _optimizer(gtsam: ModuleType, settings: Gtsam, graph: Any, values: Any) -> Any:  # noqa: ANN401
+    if settings.method is GtsamMethod.GAUSS_NEWTON:
+        return gtsam.GaussNewtonOptimizer(graph, values, gtsam.GaussNewtonParams())
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams())
+
+
+def _singular(error: RuntimeError) -> NotPositiveDefiniteError:
+    first_paragraph = " ".join(str(error).strip().split("\n\n")[0].split())
+    return NotPositiveDefiniteError(f"GTSAM met a singular linear system: {first_paragraph}; try another start")
+
+
+def _gtsam_poses(gtsam: ModuleType, poses: Poses) -> list[Any]:
+    if poses.d == 3:
+        return [gtsam.Pose3(gtsam.Rot3(R), t) for R, t in zip(poses.R, poses.t, strict=True)]
+    angles: Array = log_map(poses.R)[:, 0]
+    return [gtsam.Pose2(t[0], t[1], angle) for t, angle in zip(poses.t.tolist(), angles.tolist(), strict=True)]
+
+
+def _values(gtsam: ModuleType, poses: Poses) -> Any:  # noqa: ANN401
+    values = gtsam.Values()
+    for key, pose in enumerate(_gtsam_poses(gtsam, poses)):
+        values.insert(key, pose)
+    return values
+
+
+def _poses(gtsam: ModuleType, values: Any, d: int) -> Poses:  # noqa: ANN401
+    """Poses of values with keys 0 .. n-1, cleaned of rounding."""
+    if d == 3:
+        rows = np.asarray(gtsam.utilities.extractPose3(values))
+        return Poses(project_to_rotations(rows[:, :9].reshape(-1, 3, 3)), rows[:, 9:])
+    rows = np.asarray(gtsam.utilities.extractPose2(values))
+    return Poses(exp_map(rows[:, 2:]), rows[:, :2])

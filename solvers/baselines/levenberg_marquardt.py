@@ -1,0 +1,187 @@
+"""Levenberg-Marquardt on SE(d)^n: the Gauss-Newton matrix with a damping that the actual decrease steers.
+
+The baseline of g2o and GTSAM, with the damping rule of Nielsen (Madsen, Nielsen & Tingleff 2004, Methods for Non-Linear
+Least Squares Problems, algorithm 3.16) and the scaling of Marquardt (1963): rotations and translations differ in units.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csc_array
+
+from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, ground_pose, retract, scaled_decrement
+from pgo_models.certificates.rounding_errors import rounding_level
+from pgo_models.errors import NotPositiveDefiniteError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.problem.cholesky import SymbolicCholesky, analyze
+from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.matrices import inner
+from pgo_models.problem.problem import PGOProblem
+from solvers.result import Measurement, Status
+
+_SMALLEST_FACTOR = 1.0 / 3.0  # of the damping, after a step that the model foresaw
+_GROWTH = 2.0  # of the damping after the first step that was refused in a row; squared after the second, and so on
+_DAMPING_LIMITS = 1e-15, 1e15
+_TRUSTED_DAMPING = 1e-4  # above, the decrement is that of the damping, not of F
+_ROUNDING = 1e-14  # relative change of F that is not told apart from none
+
+
+@dataclass(frozen=True, eq=False)
+class LevenbergMarquardtState:
+    """State k.
+
+    Attributes
+    ----------
+    k : int
+    poses : Poses
+    objective, level : float
+        F, and its rounding level.
+    matrix : csc_array
+        A, the Gauss-Newton matrix at the poses, pose 0 grounded.
+    gradient : Array
+    analysis : SymbolicCholesky
+    damping : float
+        mu, of the next step: it solves (A + mu diag(A)) h = -g.
+    growth : float
+        Factor on mu if that step is refused.
+    step : Array
+        h; nan where the matrix with this damping has no Cholesky factor.
+    decrement : float
+        -<g, h> / 2, less the rounding level of F, over F.
+    """
+
+    k: int
+    poses: Poses
+    objective: float
+    level: float
+    matrix: csc_array
+    gradient: Array
+    analysis: SymbolicCholesky
+    damping: float
+    growth: float
+    step: Array
+    decrement: float
+
+
+@dataclass(frozen=True)
+class LevenbergMarquardt:
+    """Levenberg-Marquardt on the full poses, one factorisation a step, F never rises.
+
+    `dual_residual` is the relative decrement of the damped step: half of -<g, h>, less the rounding level of F, over F.
+
+    Attributes
+    ----------
+    tolerance : float
+        On the decrement, once the damping is small.
+    max_iterations : int
+        Refused steps count.
+    damping : float
+        First mu, relative to the diagonal of the Gauss-Newton matrix.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.scenes import grid
+    >>> from solvers.loop import run
+    >>> graph = grid(np.random.default_rng(0))
+    >>> run(LevenbergMarquardt(), PGOProblem(graph), graph.initial).status.name
+    'CONVERGED'
+    """
+
+    tolerance: float = STATIONARY_DECREMENT
+    max_iterations: int = 200
+    damping: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name, value in (("tolerance", self.tolerance), ("damping", self.damping)):
+            if not value > 0:
+                raise SettingError(f"{name} must be positive, got {value}")
+        if self.max_iterations < 0:
+            raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
+
+    def init(self, problem: PGOProblem, start: Poses | None) -> LevenbergMarquardtState:
+        """State 0: `start`, or the chordal relaxation."""
+        poses = start if start is not None else chordal_start(problem)
+        objective = problem.objective(poses)
+        matrix, gradient = _linearized(problem, poses)
+        analysis = analyze(matrix, problem.backend)
+        level = rounding_level(problem, poses)
+        step, decrement = _damped_step(matrix, gradient, analysis, self.damping, objective, level)
+        return LevenbergMarquardtState(
+            0, poses, objective, level, matrix, gradient, analysis, self.damping, _GROWTH, step, decrement
+        )
+
+    def step(self, problem: PGOProblem, state: LevenbergMarquardtState) -> LevenbergMarquardtState:
+        """Take the step if F falls, and set the damping by how well the model foresaw it."""
+        ratio, candidate, objective = self._tried(problem, state)
+        if not ratio > 0:
+            damping = min(state.growth * state.damping, _DAMPING_LIMITS[1])
+            again = replace(state, k=state.k + 1, damping=damping, growth=_GROWTH * state.growth)
+        else:
+            factor = max(_SMALLEST_FACTOR, 1.0 - (2.0 * min(ratio, 1.0) - 1.0) ** 3)
+            matrix, gradient = _linearized(problem, candidate)
+            again = replace(
+                state,
+                k=state.k + 1,
+                poses=candidate,
+                objective=objective,
+                level=rounding_level(problem, candidate),
+                matrix=matrix,
+                gradient=gradient,
+                damping=max(factor * state.damping, _DAMPING_LIMITS[0]),
+                growth=_GROWTH,
+            )
+        step, decrement = _damped_step(
+            again.matrix, again.gradient, again.analysis, again.damping, again.objective, again.level
+        )
+        return replace(again, step=step, decrement=decrement)
+
+    def measure(self, problem: PGOProblem, state: LevenbergMarquardtState) -> Measurement:
+        """F and the relative decrement."""
+        return Measurement(state.objective, 0.0, state.decrement)
+
+    def poses(self, problem: PGOProblem, state: LevenbergMarquardtState) -> Poses:
+        """Poses of the state."""
+        return state.poses
+
+    def converged(self, state: LevenbergMarquardtState, measurement: Measurement) -> Status | None:
+        """CONVERGED within tolerance under a small damping; STALLED when no damping is large enough."""
+        if measurement.dual_residual <= self.tolerance and state.damping <= _TRUSTED_DAMPING:
+            return Status.CONVERGED
+        return Status.STALLED if state.damping >= _DAMPING_LIMITS[1] else None
+
+    def _tried(self, problem: PGOProblem, state: LevenbergMarquardtState) -> tuple[float, Poses, float]:
+        """Ratio of actual to foreseen decrease, and the poses after the step with their F."""
+        if not np.isfinite(state.step).all():
+            return -math.inf, state.poses, state.objective
+        poses = retract(state.poses, *TangentLayout(problem.num_poses, problem.d).split(state.step))
+        objective = problem.objective(poses)
+        damped = state.damping * inner(state.step, state.matrix.diagonal() * state.step)
+        foreseen = 0.5 * (damped - inner(state.gradient, state.step))
+        # Below the rounding of F both decreases are noise, and their ratio is made to tend to one.
+        rounding = _ROUNDING * state.objective + state.level
+        return (state.objective - objective + rounding) / (foreseen + rounding), poses, objective
+
+
+def _linearized(problem: PGOProblem, poses: Poses) -> tuple[csc_array, Array]:
+    matrix = riemannian_hessian(problem, poses, None)
+    ground_pose(matrix, problem)
+    gradient = TangentLayout(problem.num_poses, problem.d).join(*problem.riemannian_gradient(poses))
+    return matrix, gradient
+
+
+def _damped_step(
+    matrix: csc_array, gradient: Array, analysis: SymbolicCholesky, damping: float, objective: float, level: float
+) -> tuple[Array, float]:
+    damped = matrix.copy()
+    damped.setdiag((1.0 + damping) * matrix.diagonal())
+    try:
+        step = -analysis.factorize(damped).solve(gradient)
+    except NotPositiveDefiniteError:
+        return np.full_like(gradient, np.nan), math.inf
+    return step, scaled_decrement(-inner(gradient, step), objective, level)

@@ -1,0 +1,160 @@
+"""Who goes when: order and colouring of the robots' neighbour graph, and which separators they send to whom.
+
+Flagged initialisation of Choudhary et al. 2017: in a first sweep, from the robot of pose 0 on, a robot listens only to
+neighbours that already have an estimate. Later sweeps have a fixed order.
+"""
+
+from __future__ import annotations
+
+import enum
+import heapq
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from solvers.network.ledger import BYTES_PER_NUMBER, Traffic
+
+
+class Sweep(enum.Enum):
+    """In which order the robots update once each."""
+
+    JACOBI = "all robots at once: block Jacobi, and JOR when alpha is not 1"
+    COLORS = "robots of one colour at once, colour after colour: Gauss-Seidel, and SOR when alpha is not 1"
+    ROBOTS = "one robot after another: Gauss-Seidel, and SOR when alpha is not 1"
+
+
+@dataclass(frozen=True, eq=False)
+class Schedule:
+    """Turns of a sweep.
+
+    Attributes
+    ----------
+    robot : (n,)
+        Owner of every pose.
+    group : (n,)
+        In which turn of a sweep the pose is updated. Robots of one turn are no neighbours, except in `Sweep.JACOBI`,
+        which has one turn.
+    first : (n,)
+        In which turn of the flagged first sweep the pose gets its first estimate.
+    sent, receiver : (q,)
+        Separator poses, and a robot that has an edge to them.
+    """
+
+    robot: IntArray
+    group: IntArray
+    first: IntArray
+    sent: IntArray
+    receiver: IntArray
+
+    @property
+    def num_robots(self) -> int:
+        """Number of robots."""
+        return int(self.robot.max()) + 1
+
+    def traffic(self, poses: IntArray, numbers: int) -> Traffic:
+        """Messages that hand `numbers` numbers of each of these poses to the neighbours that need them."""
+        is_due = np.zeros(len(self.robot), dtype=bool)
+        is_due[poses] = True
+        due = is_due[self.sent]
+        link = self.robot[self.sent[due]] * self.num_robots + self.receiver[due]
+        links, count = np.unique(link, return_counts=True)
+        return Traffic(links // self.num_robots, links % self.num_robots, BYTES_PER_NUMBER * numbers * count)
+
+
+def schedule(graph: PoseGraph, robots: Partition, sweep: Sweep) -> Schedule:
+    """Fix the turns of all robots.
+
+    The order starts at the robot of pose 0 and goes on with the robot that has the most edges to those before it. Each
+    robot takes, in that order, the first colour that no neighbour has. In the flagged sweep of `Sweep.ROBOTS` this is
+    also the order of the first estimates; otherwise all robots go at once that have a neighbour with an estimate. A
+    robot whose poses fall into pieces that only other robots connect estimates each piece when it is reached.
+
+    Raises
+    ------
+    SettingError
+        When the partition is of another number of poses.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.partitioning import partition
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> turns = schedule(graph, partition(graph, 3), Sweep.COLORS)
+    >>> turns.group[[0, 9, 18]], turns.first[[0, 9, 18]]
+    (array([0, 1, 0]), array([0, 1, 2]))
+    """
+    cut = robots.cut_edges(graph)
+    robot, num_robots = robots.robot, robots.num_robots
+    inner = _adjacency(graph.i[~cut], graph.j[~cut], graph.num_poses)
+    num_pieces, piece = connected_components(inner, directed=False)
+    piece = piece.astype(np.int64)
+    between = _adjacency(piece[graph.i[cut]], piece[graph.j[cut]], num_pieces)
+    order = _most_anchored_first(between, int(piece[0]))
+    owner = np.empty(num_pieces, dtype=np.int64)
+    owner[piece] = robot
+    seen, at = np.unique(owner[order], return_index=True)
+    robot_order = seen[np.argsort(at)]
+    if sweep is Sweep.JACOBI:
+        group = np.zeros(num_robots, dtype=np.int64)
+    elif sweep is Sweep.COLORS:
+        group = _greedy_colors(_adjacency(robot[graph.i[cut]], robot[graph.j[cut]], num_robots), robot_order)
+    else:
+        group = _ranks(robot_order)
+    if sweep is Sweep.ROBOTS:
+        first = _ranks(order)
+    else:
+        first = dijkstra(between, unweighted=True, indices=int(piece[0])).astype(np.int64)
+    sent, receiver = _separators(graph, robots)
+    return Schedule(robot=robot, group=group[robot], first=first[piece], sent=sent, receiver=receiver)
+
+
+def _separators(graph: PoseGraph, robots: Partition) -> tuple[IntArray, IntArray]:
+    cut, num_robots = robots.cut_edges(graph), robots.num_robots
+    i, j = graph.i[cut], graph.j[cut]
+    pose, other = np.concatenate([i, j]), np.concatenate([j, i])
+    pair = np.unique(pose * num_robots + robots.robot[other])
+    return pair // num_robots, pair % num_robots
+
+
+def _adjacency(i: IntArray, j: IntArray, size: int) -> csr_array:
+    """Symmetric matrix with the number of edges between every two."""
+    ends = (np.concatenate([i, j]), np.concatenate([j, i]))
+    return csr_array(coo_array((np.ones(2 * len(i)), ends), shape=(size, size)))
+
+
+def _most_anchored_first(adjacency: csr_array, root: int) -> IntArray:
+    """All members from `root` on, next always the one with the most edges to those before it."""
+    anchors = np.zeros(adjacency.shape[0])
+    done = np.zeros(adjacency.shape[0], dtype=bool)
+    order, waiting = [], [(0.0, root)]
+    while waiting:
+        _, member = heapq.heappop(waiting)
+        if done[member]:
+            continue
+        done[member] = True
+        order.append(member)
+        row = slice(adjacency.indptr[member], adjacency.indptr[member + 1])
+        for neighbour, count in zip(adjacency.indices[row].tolist(), adjacency.data[row].tolist(), strict=True):
+            if not done[neighbour]:
+                anchors[neighbour] += count
+                heapq.heappush(waiting, (-anchors[neighbour], neighbour))
+    return np.array(order, dtype=np.int64)
+
+
+def _greedy_colors(adjacency: csr_array, order: IntArray) -> IntArray:
+    color = np.full(adjacency.shape[0], -1, dtype=np.int64)
+    for member in order.tolist():
+        taken = set(color[adjacency.indices[adjacency.indptr[member] : adjacency.indptr[member + 1]]].tolist())
+        color[member] = next(c for c in range(len(taken) + 1) if c not in taken)
+    return color
+
+
+def _ranks(order: IntArray) -> IntArray:
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    return rank

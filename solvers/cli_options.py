@@ -1,0 +1,249 @@
+"""What the options of `pgo` stand for: methods, starts, partitions and scenes by name."""
+
+from __future__ import annotations
+
+import enum
+import importlib.util
+import os
+from dataclasses import replace
+
+import numpy as np
+
+from pgo_models.errors import SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.grid_worlds import grid_world
+from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, circle, grid, random_geometric, sphere
+from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.driver import DEFAULT_MEMORY
+from solvers.network.engine import Engine, InProcess
+from solvers.network.ray_engine import RayEngine
+from solvers.pipeline import HANDOVER, Pipeline
+from solvers.riemannian.newton import gauss_newton
+from solvers.soc.paper import PaperSOC
+from solvers.soc.r_step import RStep
+from solvers.soc.soc import SOC, Coupling
+
+
+class Method(enum.Enum):
+    """First stage of a solve."""
+
+    JOINT = "joint"
+    SUBSTRUCTURED = "substructured"
+    CONSENSUS = "consensus"
+    PAPER = "paper"
+    NEWTON = "newton"
+
+
+ON_ROBOTS = (Method.SUBSTRUCTURED, Method.CONSENSUS, Method.NEWTON)  # methods that driver and robots run
+
+
+class Start(enum.Enum):
+    """Where a solve starts."""
+
+    CHORDAL = "chordal"
+    TREE = "tree"
+    ODOMETRY = "odometry"
+    FILE = "file"
+
+
+class BackEnd(enum.Enum):
+    """Names of the R-step's back ends."""
+
+    FACTORIZED = "factorized"
+    FISTA = "fista"
+    CLARABEL = "clarabel"
+
+
+class Split(enum.Enum):
+    """Names of the partitions."""
+
+    GIVEN = "given"
+    CONTIGUOUS = "contiguous"
+    METIS = "metis"
+    SINGLETONS = "singletons"
+
+
+class Runner(enum.Enum):
+    """Where robots run."""
+
+    PROCESS = "process"
+    THREADS = "threads"
+    RAY = "ray"
+
+
+class Scene(enum.Enum):
+    """Scenes that can be generated."""
+
+    CIRCLE = "circle"
+    GRID = "grid"
+    SPHERE = "sphere"
+    RANDOM = "random"
+    GRID_WORLD = "grid-world"
+
+
+def chosen_pipeline(
+    method: Method,
+    robots: Partition | None,
+    r_step: BackEnd | None,
+    gap: float,
+    max_iterations: int | None,
+    tolerance: float | None,
+    driver_memory: float | None = None,
+) -> Pipeline:
+    """Pipeline of the options of `pgo solve`.
+
+    Parameters
+    ----------
+    robots : Partition, optional
+        For CONSENSUS and PAPER.
+    driver_memory : float, optional
+        GB.
+
+    Raises
+    ------
+    SettingError
+        When they do not go together.
+    """
+    if driver_memory is not None and method not in ON_ROBOTS:
+        raise SettingError(f"--driver-memory is for methods that run on robots, got --method {method.value}")
+    memory = DEFAULT_MEMORY if driver_memory is None else 1e9 * driver_memory
+    if method is Method.NEWTON:
+        of_soc = (("--r-step", r_step), ("--max-iterations", max_iterations), ("--tolerance", tolerance))
+        for name, value in of_soc:
+            if value is not None:
+                raise SettingError(f"{name} is for SOC, which --method newton leaves out; leave out one of the two")
+        return Pipeline(soc=None, gap=gap, driver_memory=memory)
+    r_step = BackEnd.FACTORIZED if r_step is None else r_step
+    if method is Method.SUBSTRUCTURED and r_step is not BackEnd.FACTORIZED:
+        raise SettingError(
+            f"--method substructured factors, got --r-step {r_step.value}; use joint, consensus or paper"
+        )
+    usual = PaperSOC() if method is Method.PAPER else HANDOVER if memory > 0 else SOC()
+    chosen = replace(
+        usual,
+        robots=robots if method in (Method.CONSENSUS, Method.PAPER) else None,
+        r_step=RStep[r_step.name],
+        tolerance=usual.tolerance if tolerance is None else tolerance,
+        max_iterations=usual.max_iterations if max_iterations is None else max_iterations,
+    )
+    if isinstance(chosen, SOC):
+        return Pipeline(soc=replace(chosen, coupling=Coupling[method.name]), gap=gap, driver_memory=memory)
+    return Pipeline(soc=chosen, newton=gauss_newton(), gap=gap, driver_memory=memory)
+
+
+def chosen_method(method: Method | None, robots: int | None, is_shared: bool) -> Method:
+    """Method of a solve: as asked for, or the one that suits one robot or many.
+
+    Parameters
+    ----------
+    is_shared : bool
+        Whether another option than the method is about robots.
+
+    Raises
+    ------
+    SettingError
+        When many robots are to use a method that has one.
+    """
+    if method is Method.JOINT and (robots or 1) > 1:
+        raise SettingError(f"--method joint has one robot, got --robots {robots}; use substructured or consensus")
+    if method is None:
+        return Method.SUBSTRUCTURED if is_shared else Method.JOINT
+    return method
+
+
+def chosen_partition(graph: PoseGraph, number: int | None, split: Split | None) -> Partition:
+    """Partition of the options: as the file names the robots if it does, else with few cut edges where METIS is there.
+
+    Raises
+    ------
+    SettingError
+        When the number of robots does not fit.
+    MissingExtraError
+        When METIS is asked for and not installed.
+    """
+    number = graph.num_robots if number is None else number
+    if split is not None:
+        return partition(graph, number, PartitionMethod[split.name])
+    if graph.robot is not None and number == graph.num_robots:
+        return partition(graph, number, PartitionMethod.GIVEN)
+    has_metis = importlib.util.find_spec("pymetis") is not None
+    return partition(graph, number, PartitionMethod.METIS if has_metis else PartitionMethod.CONTIGUOUS)
+
+
+def chosen_engine(method: Method, engine: Runner | None, address: str | None, checkpoint: bool) -> Engine | None:
+    """Engine of the options; None where the method runs in one place.
+
+    Raises
+    ------
+    SettingError
+        When they do not go together.
+    """
+    asked = [name for name, given in (("--engine", engine), ("--address", address), ("--resume", checkpoint)) if given]
+    if method not in ON_ROBOTS:
+        if asked:
+            names = " or ".join(one.value for one in ON_ROBOTS)
+            raise SettingError(
+                f"{asked[0]} is for methods that run on robots, got --method {method.value}; use {names}"
+            )
+        return None
+    if address is not None and engine not in (None, Runner.RAY):
+        raise SettingError(f"--address is that of a Ray cluster, got --engine {engine.value}; use --engine ray")
+    if engine is Runner.RAY or address is not None:
+        return RayEngine(address=address)
+    return InProcess(threads=(os.cpu_count() or 1) if engine is Runner.THREADS else 1)
+
+
+def chosen_start(problem: PGOProblem, start: Start | None) -> Poses | None:
+    """Poses of a start; None leaves it to the method."""
+    graph = problem.graph
+    if start is Start.CHORDAL:
+        return chordal_start(problem)
+    if start is Start.TREE:
+        return spanning_tree_start(graph)
+    if start is Start.ODOMETRY:
+        return odometry_start(graph)
+    if start is Start.FILE:
+        if graph.initial is None:
+            raise SettingError(f"{graph.name} has no VERTEX line for every pose; use --start chordal or tree")
+        return graph.initial
+    return None
+
+
+def chosen_scene(
+    scene: Scene,
+    rng: np.random.Generator,
+    poses: int | None,
+    robots: int | None,
+    d: int | None,
+    translation_noise: float | None,
+    rotation_noise: float | None,
+) -> PoseGraph:
+    """Scene with noise in metres and degrees.
+
+    Raises
+    ------
+    SettingError
+        When something is given that is part of the scene: all of it in the paper's scenes, the number of robots in
+        `random`; when noise is out of its range.
+    """
+    paper = {Scene.CIRCLE: circle, Scene.GRID: grid, Scene.SPHERE: sphere}
+    settled: dict[str, float | None] = {} if scene is Scene.GRID_WORLD else {"--robots": robots}
+    if scene in paper:
+        noises = {"--translation-noise": translation_noise, "--rotation-noise": rotation_noise}
+        settled |= {"--poses": poses, "--dimension": d, **noises}
+    for name, value in settled.items():
+        if value is not None:
+            raise SettingError(f"{name} does nothing for {scene.value}, of which it is a part; leave it out")
+    if scene in paper:
+        return paper[scene](rng)
+    poses, d = poses if poses is not None else 100, d if d is not None else 3
+    noise = NoiseModel(
+        MILD_NOISE.translation_std if translation_noise is None else translation_noise,
+        MILD_NOISE.rotation_std if rotation_noise is None else float(np.deg2rad(rotation_noise)),
+    )
+    if scene is Scene.RANDOM:
+        return random_geometric(poses, rng, d=d, noise=noise)
+    return grid_world(robots if robots is not None else 4, poses, rng, d=d, noise=noise)

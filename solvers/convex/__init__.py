@@ -1,0 +1,1 @@
+"""The same splittings for any cvxpy problem."""

@@ -1,0 +1,373 @@
+"""Bregman iteration for min J(x) s.t. K x = f, in the forms of the paper's section 2, to step through and compare.
+
+    Bregman             p   <- p - alpha K^T (K x - f)  x minimises the Bregman distance + penalty    (`update B`)
+    TwoLineBregman      b   <- b + K x - f              x minimises J + alpha/2 ||Kx - f + b||^2      (`bregman update`)
+    MethodOfMultipliers lam <- lam + alpha (f - K x)    x minimises the augmented Lagrangian          (`minbregman`)
+    AlternatingBregman  lam <- lam + alpha (f - K x)    x by T passes over its blocks; T = 1 is ADMM  (`bregman ADMM`)
+
+The first three have the same x, with p = K^T lam and lam = -alpha b. Osher et al. 2005; Yin et al. 2008; Esser 2009.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pgo_models.convex.bregman import (
+    BregmanPoint,
+    BregmanProblem,
+    Subproblem,
+    augmented_lagrangian_subproblem,
+    block_subproblems,
+    bregman_subproblem,
+    two_line_subproblem,
+)
+from pgo_models.convex.clarabel import TOLERANCE, finite_array
+from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import Array
+from solvers.result import Measurement, Status
+
+
+@dataclass(frozen=True, eq=False)
+class BregmanState:
+    """Iterate k of `Bregman`: x, (m,), the subgradient p, (m,), of J at x, and the compiled subproblem."""
+
+    k: int
+    x: Array
+    p: Array
+    subproblem: Subproblem
+
+
+@dataclass(frozen=True, eq=False)
+class TwoLineState:
+    """Iterate k of `TwoLineBregman`: x, (m,), the residuals added up, b, (s,), and the compiled subproblem."""
+
+    k: int
+    x: Array
+    b: Array
+    subproblem: Subproblem
+
+
+@dataclass(frozen=True, eq=False)
+class MultiplierState:
+    """Iterate k of `MethodOfMultipliers`: x, (m,), the multiplier lam, (s,), and the compiled subproblem."""
+
+    k: int
+    x: Array
+    lam: Array
+    subproblem: Subproblem
+
+
+@dataclass(frozen=True, eq=False)
+class AlternatingState:
+    """Iterate k of `AlternatingBregman`.
+
+    Attributes
+    ----------
+    x : (m,)
+    lam : (s,)
+        Multiplier of K x = f.
+    subproblems : tuple of Subproblem
+        One for every block.
+    stationarity : float
+        Distance of 0 from the subdifferential of the Lagrangian at x and lam; inf before the first step.
+    """
+
+    k: int
+    x: Array
+    lam: Array
+    subproblems: tuple[Subproblem, ...]
+    stationarity: float = math.inf
+
+
+@dataclass(frozen=True)
+class BregmanSettings:
+    """Settings that all forms share.
+
+    Attributes
+    ----------
+    alpha : float
+        The penalty parameter of the paper's section 2; lam has the unit of alpha K x.
+    tolerance : float
+        On ||K x - f|| / max(1, ||f||) and on the distance from stationarity over max(1, ||K^T lam||).
+    max_iterations : int
+    subproblem_tolerance : float
+        Clarabel's. Loosen it to see that Bregman iteration forgets the errors of its subproblems (Yin & Osher 2013).
+
+    Raises
+    ------
+    SettingError
+        When a setting is out of its range.
+    """
+
+    alpha: float = 1.0
+    tolerance: float = 1e-6
+    max_iterations: int = 1000
+    subproblem_tolerance: float = TOLERANCE
+
+    def __post_init__(self) -> None:
+        positive = {
+            "alpha": self.alpha,
+            "tolerance": self.tolerance,
+            "subproblem_tolerance": self.subproblem_tolerance,
+        }
+        for name, value in positive.items():
+            if not 0 < value < math.inf:
+                raise SettingError(f"{name} must be positive and finite, got {value}")
+        if self.max_iterations < 0:
+            raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
+
+    def _figures(self, problem: BregmanProblem, x: Array, stationarity: float) -> Measurement:
+        infeasibility = float(np.linalg.norm(problem.residual(x)))
+        primal = infeasibility / max(1.0, float(np.linalg.norm(problem.f)))
+        return Measurement(problem.objective(x), primal, stationarity, infeasibility)
+
+    def _ending(self, measurement: Measurement) -> Status | None:
+        worst = max(measurement.primal_residual, measurement.dual_residual)
+        return Status.CONVERGED if worst <= self.tolerance else None
+
+
+@dataclass(frozen=True)
+class _ExactForm(BregmanSettings):
+    """A form that minimises over the whole of x: every iterate after the first step is stationary."""
+
+    def measure(self, problem: BregmanProblem, state: BregmanState | TwoLineState | MultiplierState) -> Measurement:
+        """J(x) and ||K x - f||, relative; the dual residual is 0, or inf before the first step."""
+        return self._figures(problem, state.x, 0.0 if state.k > 0 else math.inf)
+
+    def converged(
+        self, state: BregmanState | TwoLineState | MultiplierState, measurement: Measurement
+    ) -> Status | None:
+        """CONVERGED when K x = f within tolerance, after at least one step."""
+        return self._ending(measurement)
+
+
+@dataclass(frozen=True)
+class Bregman(_ExactForm):
+    """Bregman iteration with subgradients (paper: `update B`; Osher et al. 2005). Settings: `BregmanSettings`.
+
+        x^{k+1} = argmin J(x) - J(x^k) - <p^k, x - x^k> + alpha/2 ||K x - f||^2
+        p^{k+1} = p^k - alpha K^T (K x^{k+1} - f), a subgradient of J at x^{k+1}
+
+    Examples
+    --------
+    >>> import cvxpy as cp, numpy as np
+    >>> from solvers.loop import run
+    >>> x = cp.Variable(2)
+    >>> problem = BregmanProblem(cp.norm1(x), x, np.array([[1.0, 2.0]]), [2.0])
+    >>> run(Bregman(alpha=1.0), problem).state.x.round(6).tolist()
+    [0.0, 1.0]
+    """
+
+    def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> BregmanState:
+        """State 0 at `start`, else at x = 0 and p = 0."""
+        point = _checked_start(problem, start)
+        subproblem = bregman_subproblem(problem, self.alpha, self.subproblem_tolerance)
+        return BregmanState(0, point.x, np.asarray(problem.K.T @ point.lam), subproblem)
+
+    def step(self, problem: BregmanProblem, state: BregmanState) -> BregmanState:
+        """One iteration."""
+        x = state.subproblem.solve(state.p)
+        p = state.p - self.alpha * (problem.K.T @ problem.residual(x))
+        return BregmanState(state.k + 1, x, p, state.subproblem)
+
+    def point(self, problem: BregmanProblem, state: BregmanState) -> BregmanPoint:
+        """x, and the least-squares lam of p = K^T lam."""
+        return BregmanPoint(state.x, np.linalg.lstsq(problem.K.T.toarray(), state.p, rcond=None)[0])
+
+
+@dataclass(frozen=True)
+class TwoLineBregman(_ExactForm):
+    """Bregman iteration in two lines (paper: `bregman update`; Yin et al. 2008). Settings: `BregmanSettings`.
+
+    x^{k+1} = argmin J(x) + alpha/2 ||K x - f + b^k||^2,    b^{k+1} = b^k + K x^{k+1} - f
+
+    Examples
+    --------
+    >>> from solvers.loop import run
+    >>> import cvxpy as cp, numpy as np
+    >>> x = cp.Variable(2)
+    >>> problem = BregmanProblem(cp.norm1(x), x, np.array([[1.0, 2.0]]), [2.0])
+    >>> run(TwoLineBregman(), problem).state.x.round(6).tolist()
+    [0.0, 1.0]
+    """
+
+    def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> TwoLineState:
+        """State 0 at `start`, else at x = 0 and b = 0."""
+        point = _checked_start(problem, start)
+        subproblem = two_line_subproblem(problem, self.alpha, self.subproblem_tolerance)
+        return TwoLineState(0, point.x, -point.lam / self.alpha, subproblem)
+
+    def step(self, problem: BregmanProblem, state: TwoLineState) -> TwoLineState:
+        """One iteration."""
+        x = state.subproblem.solve(problem.f - state.b)
+        b = state.b + problem.residual(x)
+        return TwoLineState(state.k + 1, x, b, state.subproblem)
+
+    def point(self, problem: BregmanProblem, state: TwoLineState) -> BregmanPoint:
+        """x, and lam = -alpha b."""
+        return BregmanPoint(state.x, -self.alpha * state.b)
+
+
+@dataclass(frozen=True)
+class MethodOfMultipliers(_ExactForm):
+    """Method of multipliers (paper: `minbregman`). Settings: `BregmanSettings`.
+
+        x^{k+1} = argmin L_alpha(x, lam^k),    lam^{k+1} = lam^k + alpha (f - K x^{k+1})
+
+    with L_alpha(x, lam) = J(x) + <lam, f - K x> + alpha/2 ||f - K x||^2.
+
+    Examples
+    --------
+    >>> from solvers.loop import run
+    >>> import cvxpy as cp, numpy as np
+    >>> x = cp.Variable(2)
+    >>> problem = BregmanProblem(cp.norm1(x), x, np.array([[1.0, 2.0]]), [2.0])
+    >>> run(MethodOfMultipliers(), problem).state.x.round(6).tolist()
+    [0.0, 1.0]
+    """
+
+    def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> MultiplierState:
+        """State 0 at `start`, else at x = 0 and lam = 0."""
+        point = _checked_start(problem, start)
+        subproblem = augmented_lagrangian_subproblem(problem, self.alpha, self.subproblem_tolerance)
+        return MultiplierState(0, point.x, point.lam, subproblem)
+
+    def step(self, problem: BregmanProblem, state: MultiplierState) -> MultiplierState:
+        """One iteration."""
+        x = state.subproblem.solve(state.lam)
+        lam = state.lam - self.alpha * problem.residual(x)
+        return MultiplierState(state.k + 1, x, lam, state.subproblem)
+
+    def point(self, problem: BregmanProblem, state: MultiplierState) -> BregmanPoint:
+        """The state's x and lam."""
+        return BregmanPoint(state.x, state.lam)
+
+
+@dataclass(frozen=True)
+class AlternatingBregman(BregmanSettings):
+    """Method of multipliers whose x-step is T passes over the blocks of x (paper: `bregman ADMM`; Esser 2009).
+
+        T times, for every block i:   x_i = argmin over x_i of L_alpha(x, lam^k)
+        lam^{k+1} = lam^k + alpha (f - K x^{k+1})
+
+    T = 1 with two blocks is ADMM, also known as split Bregman (Goldstein & Osher 2009). T to infinity is
+    `MethodOfMultipliers`. ADMM need not converge with three blocks or more. J must be a sum of terms of one variable
+    each. Further settings: `BregmanSettings`.
+
+    Attributes
+    ----------
+    passes : int
+        T.
+
+    Examples
+    --------
+    >>> from pgo_models.convex.bregman_examples import total_variation_denoising
+    >>> from solvers.loop import run
+    >>> problem = total_variation_denoising(np.array([0.1, -0.1, 1.1, 0.9]), weight=0.2)
+    >>> run(AlternatingBregman(passes=2), problem).status.name
+    'CONVERGED'
+    """
+
+    passes: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.passes < 1:
+            raise SettingError(f"passes must be at least 1, got {self.passes}")
+
+    def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> AlternatingState:
+        """State 0 at `start`, else at x = 0 and lam = 0.
+
+        Raises
+        ------
+        SettingError
+            When J is not a sum of terms of one variable each.
+        """
+        point = _checked_start(problem, start)
+        subproblems = block_subproblems(problem, self.alpha, self.subproblem_tolerance)
+        return AlternatingState(0, point.x, point.lam, subproblems)
+
+    def step(self, problem: BregmanProblem, state: AlternatingState) -> AlternatingState:
+        """T passes and the multiplier."""
+        x = state.x
+        for _ in range(self.passes):
+            before = x
+            x = x.copy()
+            for block, subproblem in zip(problem.blocks, state.subproblems, strict=True):
+                others = problem.K @ x - problem.K[:, block] @ x[block]
+                x[block] = subproblem.solve(problem.f + state.lam / self.alpha - others)
+        lam = state.lam - self.alpha * problem.residual(x)
+        stationarity = self._stationarity(problem, x - before)
+        stationarity /= max(1.0, float(np.linalg.norm(problem.K.T @ lam)))
+        return AlternatingState(state.k + 1, x, lam, state.subproblems, stationarity)
+
+    def measure(self, problem: BregmanProblem, state: AlternatingState) -> Measurement:
+        """J(x), ||K x - f||, relative, and the distance from stationarity, relative."""
+        return self._figures(problem, state.x, state.stationarity)
+
+    def converged(self, state: AlternatingState, measurement: Measurement) -> Status | None:
+        """CONVERGED when both residuals are within tolerance."""
+        return self._ending(measurement)
+
+    def point(self, problem: BregmanProblem, state: AlternatingState) -> BregmanPoint:
+        """The state's x and lam."""
+        return BregmanPoint(state.x, state.lam)
+
+    def _stationarity(self, problem: BregmanProblem, change: Array) -> float:
+        """||r||, r_i = alpha K_i^T sum_{j > i} K_j dx_j: block i was minimised with the old x_j of the last pass.
+
+        Its optimality condition is K_i^T lam^{k+1} - r_i in the subdifferential of J_i at x_i (Boyd et al. 2011, 3.3).
+        """
+        moved = problem.K @ change
+        squares = 0.0
+        for block in problem.blocks:
+            K_i = problem.K[:, block]
+            moved = moved - K_i @ change[block]
+            squares += float(np.sum((K_i.T @ moved) ** 2))
+        return self.alpha * math.sqrt(squares)
+
+
+def feasibility_bound(initial_distance: float, alpha: float, k: int) -> float:
+    """Bound on ||K x^k - f|| of the exact forms: sqrt(2 D_0 / (alpha k)), for k >= 1.
+
+    D_0 = J(x~) - J(x^0) - <p^0, x~ - x^0> is the Bregman distance from the start to any x~ with K x~ = f; from p^0 = 0
+    and x^0 a minimiser of J it is J(x~) - min J.
+
+    With H(x) = alpha/2 ||K x - f||^2 and D_k the distance at iterate k, optimality of x^{k+1} and convexity of H give
+    D_{k+1} + D(x^{k+1}, x^k) + H(x^{k+1}) <= D_k + H(x~), and H(x~) = 0. H(x^k) does not rise, because x^{k+1} beats
+    x^k in its own subproblem. Summed over k steps: k H(x^k) <= D_0.
+
+    Raises
+    ------
+    SettingError
+        When D_0 is negative, alpha not positive or k below 1.
+
+    References
+    ----------
+    Osher, Burger, Goldfarb, Xu, Yin 2005, Propositions 3.1 to 3.3, where the penalty is H itself.
+
+    Examples
+    --------
+    >>> [feasibility_bound(1.0, alpha=2.0, k=k) for k in (1, 4)]
+    [1.0, 0.5]
+    """
+    if not (initial_distance >= 0 and alpha > 0 and k >= 1):
+        raise SettingError(f"need D_0 >= 0, alpha > 0 and k >= 1, got {initial_distance}, {alpha} and {k}")
+    return math.sqrt(2.0 * initial_distance / (alpha * k))
+
+
+def _checked_start(problem: BregmanProblem, start: BregmanPoint | None) -> BregmanPoint:
+    """`start` or zeros, checked; J must be finite there."""
+    s, m = problem.K.shape
+    if start is None:
+        point = BregmanPoint(np.zeros(m), np.zeros(s))
+    else:
+        point = BregmanPoint(finite_array(start.x, "the start's x"), finite_array(start.lam, "the start's lam"))
+    if point.x.shape != (m,) or point.lam.shape != (s,):
+        raise SettingError(f"the start's x and lam have shapes {point.x.shape} and {point.lam.shape}; need {m} and {s}")
+    if not math.isfinite(problem.objective(point.x)):
+        raise SettingError("J is not finite at the start; give a start in the domain of J, as a BregmanPoint")
+    return point

@@ -1,0 +1,1 @@
+"""Methods by many robots, with a driver or without."""

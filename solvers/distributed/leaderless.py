@@ -1,0 +1,99 @@
+"""CONSENSUS without a driver: robots alone find poses, from a spanning tree, and nothing is proved about them.
+
+In a solve by robots the driver solves for the separators in the chordal start, the best translations of given
+rotations, Newton and the certificate. Robots alone start at a spanning tree, or at given poses, and end with the
+rotations and translations that they agree on: as near to the optimum as SOC's tolerance says, for there is no second
+stage.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+
+from pgo_models.certificates.certificate import BoundSource, Certificate, certify_with
+from pgo_models.certificates.lower_bound import NO_BOUND
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.problem.initialization import spanning_tree, spanning_tree_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
+from solvers.distributed.checkpoint import Journal
+from solvers.distributed.consensus import ConsensusSOC, ConsensusState
+from solvers.distributed.driver import Count, Driver
+from solvers.loop import Watch
+from solvers.network.faults import Faults
+from solvers.network.ledger import BYTES_PER_NUMBER, Traffic
+from solvers.result import History, Outcome, Stage, Status
+from solvers.soc.soc import SOC
+
+NO_CERTIFICATE = "no driver: Newton and the certificate were left out, and F >= 0 is all that is known of the optimum"
+
+
+def attempt_leaderless(
+    driver: Driver,
+    problem: PGOProblem,
+    robots: Partition,
+    gap: float,
+    faults: Faults | None,
+    journal: Journal,
+    watch: Watch,
+    soc: SOC | None,
+    start: Poses | None,
+) -> tuple[Poses, Certificate]:
+    """Start and CONSENSUS; what was done goes to the stages of `journal`. The bound is F >= 0.
+
+    Of the whole `problem` nothing is used but the tree, and F of the start and of the poses that are returned.
+    """
+    assert soc is not None
+    began = time.perf_counter()
+    before = start if start is not None else spanning_tree_start(problem.graph)
+    if not journal.goes_on_with():
+        driver.hand_out(before)
+        if start is None:
+            for traffic in tree_traffic(problem, robots):
+                driver.ledger = driver.ledger.after_round(traffic)
+        name = "spanning tree" if start is None else "given start"
+        seconds = time.perf_counter() - began
+        journal.stages.append(Stage(name, Status.CONVERGED, 0, problem.objective(before), seconds, History()))
+    began = time.perf_counter()
+    first: Outcome[AsynchronousState] | Outcome[ConsensusState]
+    if faults is not None:
+        first = watch.run(AsynchronousSOC(soc, faults, has_driver=False), driver)
+    else:
+        first = journal.run(ConsensusSOC(soc, has_driver=False), driver, watch)
+    poses = collect_copies(driver)
+    if not problem.objective(poses) <= problem.objective(before):
+        poses = before
+    objective, seconds = problem.objective(poses), time.perf_counter() - began
+    journal.stages.append(Stage("SOC", first.status, first.iterations, objective, seconds, first.history, soc))
+    nothing = np.zeros((problem.num_poses, problem.d, problem.d))
+    return poses, certify_with(problem, poses, nothing, gap, math.inf, BoundSource.GIVEN, NO_BOUND)
+
+
+def collect_copies(driver: Driver) -> Poses:
+    """Poses that the robots agreed on, for whoever asked for the solution; off the ledger."""
+    n, d = driver.num_poses, driver.d
+    R, t = np.empty((n, d, d)), np.empty((n, d))
+    for answer in driver.ask_all("own_poses", count=Count.OFF):
+        R[answer["poses"]], t[answer["poses"]] = answer["R"], answer["t"]
+    return Poses(R, t)
+
+
+def tree_traffic(problem: PGOProblem, robots: Partition) -> list[Traffic]:
+    """Messages of every round of a spanning tree: a pose goes along each of its edges that join two robots."""
+    order, parent, _ = spanning_tree(problem.graph, 0)
+    owner, child = robots.robot, order[1:]
+    depth = np.zeros(problem.num_poses, dtype=np.int64)
+    is_cut = owner[child] != owner[parent[child]]
+    for pose, crosses in zip(child.tolist(), is_cut.tolist(), strict=True):
+        depth[pose] = depth[parent[pose]] + crosses
+    size = BYTES_PER_NUMBER * problem.d * (problem.d + 1)
+    found = []
+    for number in range(1, int(depth.max()) + 1):
+        at = child[is_cut & (depth[child] == number)]
+        links, poses = np.unique(np.stack([owner[parent[at]], owner[at]]), axis=1, return_counts=True)
+        found.append(Traffic(links[0], links[1], size * poses))
+    return found

@@ -1,0 +1,195 @@
+"""The lower bound of `pgo_models.certificates.lower_bound` by a driver and its robots, every interior where it belongs.
+
+The pose that is left out is a separator, so that the driver leaves out its rows. An elimination and a solve are two
+rounds; what crosses are Schur complements, right-hand sides, rows of S X on the separators with their errors, and a few
+sums.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from pgo_models.certificates.definiteness import FIRST_SHIFT, LEAST_SHIFT, MARGIN, SHRINK
+from pgo_models.certificates.lower_bound import (
+    MOST_MOVES,
+    NO_BOUND,
+    SETTLED,
+    UNGROUNDED_SHIFT,
+    LowerBound,
+    bound_from,
+    quadratic_loss,
+    search_bound,
+    smallest_shift,
+    squared_distances,
+)
+from pgo_models.certificates.rounding_errors import evaluate_multipliers
+from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.geometry.rotations import Array, stack_transposes
+from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, gamma
+from solvers.distributed.driver import Driver
+from solvers.distributed.interface import InterfaceFactor
+from solvers.distributed.robots.elimination import columns_of
+from solvers.network.messages import Message
+
+
+@dataclass(frozen=True, eq=False)
+class InterfaceProof:
+    """S on the separators: its factor, what it is at least, the robots' answers, and parts of tr(Lambda)."""
+
+    factor: InterfaceFactor
+    slack: Array
+    answers: list[Message]
+    Lambda: Array
+    traces: list[float]
+
+
+def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
+    """Grounded without eta where that goes through, else the better form with the smallest eta found; at the poses."""
+    if driver.objective <= driver.rounding_level:
+        return NO_BOUND
+    found = prove_grounded(driver, 0.0)
+    if found is not None and found.value > 0.0:
+        return found
+    count = driver.num_poses * driver.d
+    smallest = smallest_shift(gap, driver.objective, count)
+    # At stationary poses tr(Lambda) is F; it only says where the search ends.
+    forms = prove_with_eta, prove_grounded
+    bounds = [search_bound(partial(form, driver), smallest, driver.objective, count) for form in forms]
+    return max([NO_BOUND, *bounds], key=lambda bound: bound.value)
+
+
+def prove_with_eta(driver: Driver, eta: float) -> LowerBound | None:
+    """Bound tr(Lambda) - eta n d if S + eta blockdiag(0, I) without a translation is positive definite: one round."""
+    none = np.zeros(0, dtype=np.int64)
+    message = {"fixed": _is_fixed(driver, none), "eta": np.array([eta])}
+    fixed = driver.ground(1).ravel()
+    message["fixed"][fixed] = True
+    proof = _eliminate(driver, message, fixed, eta, UNGROUNDED_SHIFT)
+    if proof is None:
+        return None
+    lost = eta * driver.num_poses * driver.d
+    rounding = OUTWARD * 4.0 * UNIT_ROUNDOFF * (sum(map(abs, proof.traces)) + lost)
+    return bound_from([*proof.traces, -lost], rounding, eta, is_grounded=False)
+
+
+def prove_grounded(driver: Driver, eta: float) -> LowerBound | None:
+    """Bound grounded at the driver's pose, if S_r + eta blockdiag(0, I) is positive definite, else None."""
+    g, d, r = len(driver.cover), driver.d, driver.grounded
+    fixed = columns_of(np.array([r]), g, (1, d))
+    R, t = driver.R[r], driver.t[r]
+    X = np.concatenate([(driver.t - t) @ R, stack_transposes(R.T @ driver.R)])
+    X[fixed] = np.concatenate([np.zeros((1, d)), np.eye(d)])
+    message = {"fixed": _is_fixed(driver, fixed), "eta": np.array([eta])}
+    share, proof = FIRST_SHIFT, None
+    while proof is None:
+        if share < LEAST_SHIFT:
+            return None
+        proof = _eliminate(driver, message, fixed, eta, share, X)
+        share *= SHRINK
+    start = X
+    space, free = driver.interface(1, d), np.ones(len(X), dtype=bool)
+    free[fixed] = False
+    at = _sum_up(driver, proof, X, proof.answers, free)
+    for _ in range(MOST_MOVES):
+        if at.left <= SETTLED * abs(at.value):
+            break
+        b = space.gather([answer["b"] for answer in at.answers]) + at.own
+        b[fixed] = 0.0
+        step = proof.factor.solve(b)
+        step[fixed] = 0.0
+        answers = driver.ask("move_certificate", [{"x": part} for part in space.scatter(step)])
+        X = X.copy()
+        X[g:] -= step[g:]  # the translations matter in the residuals alone, which the robots have
+        moved = _sum_up(driver, proof, X, answers, free)
+        if not moved.left < at.left:
+            break
+        at = moved
+    lost = OUTWARD * eta * (at.squared_distances + squared_distances(at.X[g:], start[g:]))
+    return bound_from([at.value, -lost], at.value_error + at.quadratic, eta, is_grounded=True)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """What `pgo_models.certificates.lower_bound` needs at one X: sums over robots and driver."""
+
+    value: float
+    value_error: float
+    left: float
+    quadratic: float
+    squared_distances: float  # of the interiors
+    X: Array
+    own: Array  # the driver's part of S X
+    answers: Sequence[Message]
+
+
+def _sum_up(driver: Driver, proof: InterfaceProof, X: Array, answers: Sequence[Message], free: Array) -> _Sums:
+    g, d = len(driver.cover), driver.d
+    space = driver.interface(1, d)
+    blocks = evaluate_multipliers(proof.Lambda, X[g:].reshape(g, d, d))
+    own, error = np.zeros_like(X), np.zeros_like(X)
+    own[g:], error[g:] = blocks.product, blocks.product_error
+    parts = [answer["product"] for answer in answers]
+    sizes = space.gather([np.abs(part) for part in parts]) + np.abs(own)
+    error += space.gather([answer["error"] for answer in answers]) + gamma(len(parts) + 2.0) * sizes
+    product = space.gather(parts) + own
+    slack = proof.slack[free]
+    figures = np.array([answer["figures"] for answer in answers])
+    values = [*figures[:, 0].tolist(), blocks.value]
+    value_error = float(figures[:, 1].sum()) + blocks.value_error + UNIT_ROUNDOFF * abs(math.fsum(values))
+    return _Sums(
+        value=math.fsum(values),
+        value_error=OUTWARD * value_error,
+        left=float(figures[:, 2].sum()) + quadratic_loss(product[free], 0.0, slack),
+        quadratic=OUTWARD * (float(figures[:, 3].sum()) + quadratic_loss(product[free], error[free], slack)),
+        squared_distances=float(figures[:, 4].sum()),
+        X=X,
+        own=own,
+        answers=answers,
+    )
+
+
+def _is_fixed(driver: Driver, fixed: IntArray) -> Array:
+    marked = np.zeros((driver.d + 1) * len(driver.cover))
+    marked[fixed] = 1.0
+    return marked
+
+
+def _eliminate(
+    driver: Driver, message: dict[str, Array], fixed: IntArray, eta: float, share: float, X: Array | None = None
+) -> InterfaceProof | None:
+    """One elimination of S + eta blockdiag(0, I) less a share of its diagonal; None when it is not shown definite."""
+    g, d = len(driver.cover), driver.d
+    space = driver.interface(1, d)
+    messages: list[Message] = [
+        {**message, "share": np.array([share]), "fixed": part} for part in space.scatter(message["fixed"])
+    ]
+    if X is not None:
+        messages = [{**one, "point": part} for one, part in zip(messages, space.scatter(X), strict=True)]
+    answers = driver.ask("certificate", messages)
+    Lambda = driver.multipliers
+    traces = [*np.einsum("naa->na", Lambda).ravel().tolist(), *(float(answer["trace"][0]) for answer in answers)]
+    if not all(answer["definite"][0] for answer in answers):
+        return None
+    added = eta * np.eye(d) - Lambda
+    columns = driver.rotation_rows.reshape(g, d)
+    diagonal = driver.diagonal.copy()
+    diagonal[columns] += np.maximum(np.einsum("naa->na", added), 0.0)
+    is_fixed = np.zeros(len(diagonal), dtype=bool)
+    is_fixed[fixed] = True
+    added[is_fixed[columns].any(axis=1)] = 0.0
+    contributions = [answer["schur"] for answer in answers]
+    lost = space.rounding(contributions, [(columns, added)], diagonal) + 8.0 * UNIT_ROUNDOFF * diagonal
+    shift = np.maximum(share * diagonal, MARGIN * lost)
+    shifted = np.where(is_fixed, diagonal, -shift)
+    own = [(columns, added), (np.arange(len(diagonal))[:, None], shifted[:, None, None])]
+    try:
+        factor = space.factorize(contributions, own)
+    except NotPositiveDefiniteError:
+        return None
+    return InterfaceProof(factor, (shift - lost) / OUTWARD, answers, Lambda, traces)

@@ -1,0 +1,1 @@
+"""What one robot knows and does."""

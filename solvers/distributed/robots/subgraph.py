@@ -1,0 +1,171 @@
+"""What one robot is given: its own poses, the edges that touch them, and where its neighbours' separators fit in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from pgo_models.geometry.rotations import BoolArray
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, middle_pose, poses_by_distance
+from pgo_models.graphs.separators import vertex_cover
+from pgo_models.problem.problem import PGOProblem
+
+
+class PartProblem(PGOProblem):
+    """The cost of some of the edges; what they leave apart, other robots hold together."""
+
+    def __post_init__(self) -> None:
+        """Accept graphs that are not connected."""
+
+
+@dataclass(frozen=True, eq=False)
+class Share:
+    """A robot's share of a graph: all that it ever learns of it before the first round.
+
+    Attributes
+    ----------
+    robot : int
+    graph : PoseGraph
+        Its poses and edges, renumbered: its own poses, and the poses of others at the far end of its edges.
+    poses : (n_a,)
+        Their numbers in the whole graph, ascending.
+    owner : (n_a,)
+        Which robot owns each.
+    in_cover : (n_a,)
+        Position of each among the poses that the driver solves for, or -1.
+    is_counted : (m_a,)
+        Whether an edge is this robot's in sums over robots; every edge of the whole graph is counted once. An edge to a
+        pose that the driver does not solve for is counted by the owner of that pose.
+    copies : (n_a,)
+        How many robots hold each pose.
+    common : tuple of (int, (q,))
+        For every other robot that holds some of the same poses: which of `poses` they are, ascending.
+    """
+
+    robot: int
+    graph: PoseGraph
+    poses: IntArray
+    owner: IntArray
+    in_cover: IntArray
+    is_counted: BoolArray
+    copies: IntArray
+    common: tuple[tuple[int, IntArray], ...]
+
+    @cached_property
+    def is_own(self) -> BoolArray:
+        """Whether a pose is the robot's own, (n_a,)."""
+        return np.asarray(self.owner == self.robot)
+
+    @cached_property
+    def part(self) -> Part | None:
+        """The edges that this robot counts; None when there are none."""
+        if not self.is_counted.any():
+            return None
+        graph, kept = self.graph, self.is_counted
+        poses, ends = np.unique(np.concatenate([graph.i[kept], graph.j[kept]]), return_inverse=True)
+        i, j = np.split(ends, 2)
+        counted = PoseGraph(
+            len(poses), i, j, graph.R_ij[kept], graph.t_ij[kept], graph.kappa[kept], graph.tau[kept], name=graph.name
+        )
+        return Part(PartProblem(counted), self.poses[poses], self.in_cover[poses])
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The cost of the edges that one robot counts.
+
+    Attributes
+    ----------
+    problem : PartProblem
+    poses : (p,)
+        Numbers of its poses in the whole graph.
+    in_cover : (p,)
+        Position of each among the poses that the driver solves for, or -1 for the robot's interior.
+    """
+
+    problem: PartProblem
+    poses: IntArray
+    in_cover: IntArray
+
+    @cached_property
+    def interior(self) -> IntArray:
+        """Poses of the part that only this robot knows."""
+        return np.flatnonzero(self.in_cover < 0)
+
+    @cached_property
+    def boundary(self) -> IntArray:
+        """Poses of the part that the driver solves for, in the driver's order."""
+        found = np.flatnonzero(self.in_cover >= 0)
+        return found[np.argsort(self.in_cover[found])]
+
+
+def share_out(graph: PoseGraph, partition: Partition) -> tuple[Share, ...]:
+    """Give every robot its share.
+
+    Raises
+    ------
+    SettingError
+        When the partition is of another number of poses.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models import grid, partition
+    >>> graph = grid(np.random.default_rng(0))
+    >>> shares = share_out(graph, partition(graph, 3))
+    >>> sum(int(share.is_counted.sum()) for share in shares) == graph.num_edges
+    True
+    """
+    cover = np.full(graph.num_poses, -1)
+    solved_for = vertex_cover(partition, graph)
+    if not len(solved_for):  # the bound is grounded at a pose that the driver has
+        solved_for = np.array([middle_pose(graph)])
+    cover[solved_for] = np.arange(len(solved_for))
+    owner = partition.robot
+    # An end outside the cover decides: such ends of one edge have one owner. Else the owner of the first end counts it.
+    counts = np.where(cover[graph.j] < 0, owner[graph.j], owner[graph.i])
+    holds = _holders(graph, owner, partition.num_robots)
+    return tuple(_share(graph, owner, cover, counts, holds, robot) for robot in range(partition.num_robots))
+
+
+def middle_separator(graph: PoseGraph, shares: tuple[Share, ...]) -> int:
+    """Which of the poses that the driver solves for is nearest to the middle of the graph."""
+    in_cover = np.full(graph.num_poses, -1)
+    for share in shares:
+        in_cover[share.poses] = np.maximum(in_cover[share.poses], share.in_cover)
+    order = poses_by_distance(graph, middle_pose(graph))
+    return int(in_cover[order[np.argmax(in_cover[order] >= 0)]])
+
+
+def _holders(graph: PoseGraph, owner: IntArray, num_robots: int) -> csr_array:
+    """Whether a robot holds a pose, (n, num_robots): its own, and the far ends of its edges."""
+    pose = np.concatenate([np.arange(graph.num_poses), graph.i, graph.j])
+    robot = np.concatenate([owner, owner[graph.j], owner[graph.i]])
+    once = np.unique(pose * num_robots + robot)
+    pose, robot = np.divmod(once, num_robots)
+    return csr_array((np.ones(len(once)), (pose, robot)), shape=(graph.num_poses, num_robots))
+
+
+def _share(graph: PoseGraph, owner: IntArray, cover: IntArray, counts: IntArray, holds: csr_array, robot: int) -> Share:
+    edges = np.flatnonzero((owner[graph.i] == robot) | (owner[graph.j] == robot))
+    poses = np.unique(np.concatenate([np.flatnonzero(owner == robot), graph.i[edges], graph.j[edges]]))
+    local = PoseGraph(
+        num_poses=len(poses),
+        i=np.searchsorted(poses, graph.i[edges]),
+        j=np.searchsorted(poses, graph.j[edges]),
+        R_ij=graph.R_ij[edges],
+        t_ij=graph.t_ij[edges],
+        kappa=graph.kappa[edges],
+        tau=graph.tau[edges],
+        ids=graph.pose_ids[poses],
+        name=f"{graph.name}, robot {robot}",
+    )
+    held = holds[poses].tocsc()
+    others = [other for other in np.flatnonzero(np.diff(held.indptr)).tolist() if other != robot]
+    common = tuple((other, np.sort(held.indices[held.indptr[other] : held.indptr[other + 1]])) for other in others)
+    copies = np.diff(holds[poses].indptr)
+    return Share(robot, local, poses, owner[poses], cover[poses], counts[edges] == robot, copies, common)

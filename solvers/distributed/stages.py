@@ -1,0 +1,115 @@
+"""A whole solve by a driver and its robots: start, SOC, Newton and certificate, each as its central twin does it."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+
+from pgo_models.certificates.certificate import BoundSource, Certificate, certify_with
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
+from solvers.distributed.checkpoint import Journal
+from solvers.distributed.consensus import ConsensusSOC, ConsensusState
+from solvers.distributed.driver import DEFAULT_MEMORY, Count, Driver
+from solvers.distributed.lower_bound import best_bound_distributed
+from solvers.distributed.newton import SubstructuredNewton
+from solvers.distributed.robots.subgraph import middle_separator, share_out
+from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
+from solvers.loop import Watch
+from solvers.network.engine import Engine
+from solvers.network.faults import Faults
+from solvers.result import OUT_OF_TIME, History, Outcome, Stage, Status
+from solvers.riemannian.newton import Newton
+from solvers.soc.soc import SOC, Coupling
+
+
+def open_driver(problem: PGOProblem, robots: Partition, engine: Engine, memory: float = DEFAULT_MEMORY) -> Driver:
+    """Driver and robots for a graph."""
+    shares = share_out(problem.graph, robots)
+    grounded = middle_separator(problem.graph, shares)
+    return Driver(shares, problem.num_poses, engine, problem.backend, memory, grounded)
+
+
+def attempt_distributed(
+    driver: Driver,
+    problem: PGOProblem,
+    newton: Newton,
+    gap: float,
+    faults: Faults | None,
+    journal: Journal,
+    watch: Watch,
+    soc: SOC | None,
+    start: Poses | None,
+) -> tuple[Poses, Certificate]:
+    """Start, SOC, Newton and certificate; what was done goes to the stages of `journal`.
+
+    Of the whole `problem` nothing is used but F of the poses that are returned.
+    """
+    outcome, stages = journal.outcome_of_attempt(), journal.stages
+    if outcome is not None:
+        return outcome
+    if not journal.goes_on_with():
+        stages.append(_start(driver, start))
+    if soc is not None and not journal.goes_on_with(SubstructuredNewton):
+        stages.append(_run_soc(driver, soc, faults, journal, watch))
+    decrement = math.inf
+    if stages[-1].status not in OUT_OF_TIME:
+        second = journal.run(SubstructuredNewton(newton), driver, watch)
+        decrement = second.state.decrement
+        figures = second.status, second.iterations, driver.objective, second.seconds, second.history, newton
+        stages.append(Stage("Newton", *figures))
+    bound = best_bound_distributed(driver, gap)
+    poses, Lambda = collect(driver)
+    outcome = poses, certify_with(problem, poses, Lambda, gap, decrement, BoundSource.GIVEN, bound)
+    journal.end_attempt(outcome)
+    return outcome
+
+
+def _start(driver: Driver, start: Poses | None) -> Stage:
+    began = time.perf_counter()
+    if start is None:
+        driver.start()
+    else:
+        driver.set_poses(start)
+    name = "chordal start" if start is None else "given start"
+    return Stage(name, Status.CONVERGED, 0, driver.objective, time.perf_counter() - began, History())
+
+
+def _run_soc(driver: Driver, soc: SOC, faults: Faults | None, journal: Journal, watch: Watch) -> Stage:
+    """SOC from the poses at hand, which stay where it finds none that are better. Its factors go with it."""
+    began = time.perf_counter()
+    if not journal.goes_on_with():
+        driver.save_poses()
+    first: Outcome[AsynchronousState] | Outcome[ConsensusState] | Outcome[SubstructuredState]
+    if soc.effective_coupling is Coupling.CONSENSUS and faults is not None:
+        asynchronous = AsynchronousSOC(soc, faults)
+        first = watch.run(asynchronous, driver)  # messages under way are in no checkpoint
+        asynchronous.finish(driver)
+    elif soc.effective_coupling is Coupling.CONSENSUS:
+        consensus = ConsensusSOC(soc)
+        first = journal.run(consensus, driver, watch)
+        consensus.finish(driver)
+    else:
+        substructured = SubstructuredSOC(soc)
+        first = journal.run(substructured, driver, watch)
+        substructured.finish(driver)
+    if not driver.objective <= driver.kept_objective:
+        driver.restore_poses()
+    seconds = time.perf_counter() - began
+    return Stage("SOC", first.status, first.iterations, driver.objective, seconds, first.history, soc)
+
+
+def collect(driver: Driver) -> tuple[Poses, Array]:
+    """All poses and multipliers, for whoever asked for the solution; off the ledger."""
+    n, d = driver.num_poses, driver.d
+    R, t, Lambda = np.empty((n, d, d)), np.empty((n, d)), np.empty((n, d, d))
+    R[driver.cover], t[driver.cover], Lambda[driver.cover] = driver.R, driver.t, driver.multipliers
+    for answer in driver.ask("result", count=Count.OFF):
+        poses = answer["poses"]
+        R[poses], t[poses], Lambda[poses] = answer["R"], answer["t"], answer["Lambda"]
+    return Poses(R, t), Lambda

@@ -1,0 +1,1 @@
+"""Where workers run and what crosses between them; no mathematics."""

@@ -1,0 +1,76 @@
+"""Where robots run: the seam, and robots in this process, in order or in threads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+from pgo_models.errors import SettingError
+from solvers.network.messages import Message, Worker
+
+T = TypeVar("T")
+
+
+class WorkerPool(Protocol):
+    """Robots that wait for orders."""
+
+    def ask(self, order: str, messages: Sequence[Message]) -> list[Message]:
+        """Give every robot an order, each with its message, and wait for all answers."""
+
+    def close(self) -> None:
+        """Let the robots go."""
+
+
+class Engine(Protocol):
+    """Settings of a place where robots can run."""
+
+    def open(self, make: Callable[[T], Worker], shares: Sequence[T]) -> WorkerPool:
+        """Start an agent, made of it, for every share; each is sent its own and no other."""
+
+
+@dataclass(frozen=True)
+class InProcess:
+    """Robots in this process, one after the other, or in threads; the answers are the same.
+
+    Attributes
+    ----------
+    threads : int
+        The factorisations of some back ends hold Python's lock: expect little of more than one.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models import grid
+    >>> from solvers.pipeline import solve
+    >>> solution = solve(grid(np.random.default_rng(0)), robots=3, engine=InProcess(threads=2))
+    >>> solution.is_certified, solution.ledger.num_robots
+    (True, 3)
+    """
+
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        if self.threads < 1:
+            raise SettingError(f"threads must be at least 1, got {self.threads}")
+
+    def open(self, make: Callable[[T], Worker], shares: Sequence[T]) -> WorkerPool:
+        """Agents as objects of this process."""
+        return _LocalPool([make(share) for share in shares], self.threads)
+
+
+class _LocalPool:
+    def __init__(self, workers: list[Worker], threads: int) -> None:
+        self._workers = workers
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+
+    def ask(self, order: str, messages: Sequence[Message]) -> list[Message]:
+        pairs = zip(self._workers, messages, strict=True)
+        if self._pool is None:
+            return [worker.obey(order, message) for worker, message in pairs]
+        return list(self._pool.map(lambda pair: pair[0].obey(order, pair[1]), pairs))
+
+    def close(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown()

@@ -1,0 +1,97 @@
+"""What goes wrong between robots, for study: messages lost, late, or of a robot that is silent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from pgo_models.errors import SettingError
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What goes wrong between robots, for study; the same seed gives the same faults.
+
+    `Pipeline(faults=..)` runs its CONSENSUS stage with them: robots then do not wait for each other.
+
+    Attributes
+    ----------
+    loss : float
+        Probability that a message is lost.
+    max_delay : int
+        A message arrives 0 to this many rounds late, each equally likely; one that a later one overtook is dropped.
+    silent_robot : int, optional
+        A robot that neither sends nor receives ..
+    silent_from, silent_rounds : int
+        .. from this round on, for so many rounds.
+    seed : int
+
+    Raises
+    ------
+    SettingError
+        When a setting is out of its range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models import grid, partition
+    >>> from solvers.pipeline import Pipeline, solve
+    >>> from solvers.soc.soc import SOC
+    >>> graph = grid(np.random.default_rng(0))
+    >>> robots = partition(graph, 3)
+    >>> pipeline = Pipeline(soc=SOC(robots=robots, tolerance=2e-3), faults=Faults(loss=0.2, seed=1))
+    >>> solve(graph, pipeline, robots=robots).is_certified
+    True
+    """
+
+    loss: float = 0.0
+    max_delay: int = 0
+    silent_robot: int | None = None
+    silent_from: int = 0
+    silent_rounds: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.loss < 1:
+            raise SettingError(f"loss must be in [0, 1), got {self.loss}")
+        for name in ("max_delay", "silent_robot", "silent_from", "silent_rounds"):
+            if (getattr(self, name) or 0) < 0:
+                raise SettingError(f"{name} must not be negative, got {getattr(self, name)}")
+
+    def is_silent(self, robot: int, number: int) -> bool:
+        """Whether a robot is cut off in a round."""
+        since = number - self.silent_from
+        return robot == self.silent_robot and 0 <= since < self.silent_rounds
+
+
+class LossyChannel(Generic[T]):
+    """Carries messages between robots, with faults; the first round is 0."""
+
+    def __init__(self, faults: Faults) -> None:
+        self.faults = faults
+        self._rng = np.random.default_rng(faults.seed)
+        self._number = 0
+        self._under_way: list[tuple[int, int, tuple[int, int], T]] = []
+        self._newest: dict[tuple[int, int], int] = {}
+
+    def carry(self, messages: Mapping[tuple[int, int], T]) -> dict[tuple[int, int], T]:
+        """Take what every (sender, receiver) sends in this round; what arrives in it."""
+        faults, number = self.faults, self._number
+        for link in sorted(messages):
+            is_lost = self._rng.random() < faults.loss
+            delay = int(self._rng.integers(faults.max_delay + 1))
+            if not is_lost and not any(faults.is_silent(robot, number) for robot in link):
+                self._under_way.append((number + delay, number, link, messages[link]))
+        arriving = [message for message in self._under_way if message[0] <= number]
+        self._under_way = [message for message in self._under_way if message[0] > number]
+        arrived: dict[tuple[int, int], T] = {}
+        for _, sent, link, message in sorted(arriving, key=lambda entry: entry[1]):
+            if sent >= self._newest.get(link, 0) and not faults.is_silent(link[1], number):
+                arrived[link], self._newest[link] = message, sent
+        self._number += 1
+        return arrived

@@ -1,0 +1,144 @@
+"""What crosses the network: rounds, messages and bytes by link."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from pgo_models.errors import SettingError
+from pgo_models.graphs.pose_graph import IntArray
+
+T = TypeVar("T")
+
+DRIVER = -1  # the number that stands for the driver among senders and receivers
+BYTES_PER_NUMBER = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Traffic:
+    """Messages of one exchange; the same object may be counted many times.
+
+    Attributes
+    ----------
+    sender, receiver : (q,)
+        Robots, or `DRIVER`.
+    num_bytes : (q,)
+        Payload of every message: eight bytes a number.
+    """
+
+    sender: IntArray
+    receiver: IntArray
+    num_bytes: IntArray
+
+    def __post_init__(self) -> None:
+        if not self.sender.shape == self.receiver.shape == self.num_bytes.shape:
+            raise SettingError(
+                f"senders, receivers and bytes have shapes {self.sender.shape}, {self.receiver.shape} and "
+                f"{self.num_bytes.shape}; give one of each for every message"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Ledger:
+    """Account of a distributed run.
+
+    A round is one exchange that robots wait for: between neighbours, or to the driver and back. An all-reduce, by which
+    all robots come to know a sum of a few numbers, is counted apart.
+
+    Attributes
+    ----------
+    num_robots : int
+    rounds, all_reduces : int
+    all_reduce_bytes : int
+        Payload of all all-reduces, once up and once down for every robot.
+    counted : tuple of (Traffic, int)
+        Exchanges, and how often each took place.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> both_ways = Traffic(np.array([0, 1]), np.array([1, 0]), np.array([80, 160]))
+    >>> ledger = Ledger(2).after_round(both_ways).after_round(both_ways)
+    >>> ledger
+    Ledger(2 robots, 2 rounds, 4 messages, 480 bytes)
+    >>> ledger.bytes_sent
+    array([160, 320])
+    """
+
+    num_robots: int
+    rounds: int = 0
+    all_reduces: int = 0
+    all_reduce_bytes: int = 0
+    counted: tuple[tuple[Traffic, int], ...] = ()
+
+    def after_round(self, *exchanged: Traffic) -> Ledger:
+        """Return the ledger after one more round with these exchanges."""
+        counted = self.counted
+        for traffic in exchanged:
+            known = next((p for p, (other, _) in enumerate(counted) if other is traffic), None)
+            if known is None:
+                counted = (*counted, (traffic, 1))
+            else:
+                counted = (*counted[:known], (traffic, counted[known][1] + 1), *counted[known + 1 :])
+        return replace(self, rounds=self.rounds + 1, counted=counted)
+
+    def after_exchange(self, traffic: Traffic, is_round: bool) -> Ledger:
+        """Return the ledger after an exchange; one that is no round is part of the next round or of an all-reduce."""
+        after = self.after_round(traffic)
+        return after if is_round else replace(after, rounds=self.rounds)
+
+    def after_all_reduce(self, count: int) -> Ledger:
+        """Return the ledger after one more all-reduce of `count` numbers."""
+        num_bytes = 2 * BYTES_PER_NUMBER * count * self.num_robots
+        return replace(self, all_reduces=self.all_reduces + 1, all_reduce_bytes=self.all_reduce_bytes + num_bytes)
+
+    @property
+    def messages(self) -> int:
+        """Messages in all, all-reduces left out."""
+        return sum(times * len(traffic.sender) for traffic, times in self.counted)
+
+    @property
+    def num_bytes(self) -> int:
+        """Payload in all, all-reduces left out."""
+        return int(self.by_link()[3].sum())
+
+    @property
+    def bytes_sent(self) -> IntArray:
+        """Payload that every robot sent, (num_robots,)."""
+        sender, _, _, num_bytes = self.by_link()
+        return self._per_robot(sender, num_bytes)
+
+    @property
+    def bytes_received(self) -> IntArray:
+        """Payload that every robot received, (num_robots,)."""
+        _, receiver, _, num_bytes = self.by_link()
+        return self._per_robot(receiver, num_bytes)
+
+    def by_link(self) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+        """Sender, receiver, messages and bytes of every link that was used, each (links,), in order of the links."""
+        if not self.counted:
+            none = np.zeros(0, dtype=np.int64)
+            return none, none, none, none
+        times = np.concatenate([np.full(len(traffic.sender), count) for traffic, count in self.counted])
+        sender = np.concatenate([traffic.sender for traffic, _ in self.counted])
+        receiver = np.concatenate([traffic.receiver for traffic, _ in self.counted])
+        num_bytes = np.concatenate([traffic.num_bytes for traffic, _ in self.counted]) * times
+        side = self.num_robots + 1  # the driver is -1
+        link, position = np.unique((sender + 1) * side + receiver + 1, return_inverse=True)
+        messages = np.bincount(position, weights=times, minlength=len(link)).astype(np.int64)
+        payload = np.bincount(position, weights=num_bytes, minlength=len(link)).astype(np.int64)
+        return link // side - 1, link % side - 1, messages, payload
+
+    def _per_robot(self, robot: IntArray, num_bytes: IntArray) -> IntArray:
+        of_robots = robot != DRIVER
+        total = np.bincount(robot[of_robots], weights=num_bytes[of_robots], minlength=self.num_robots)
+        return total.astype(np.int64)
+
+    def __repr__(self) -> str:
+        reduced = f", {self.all_reduces} all-reduces" if self.all_reduces else ""
+        return (
+            f"Ledger({self.num_robots} robots, {self.rounds} rounds{reduced}, {self.messages} messages, "
+            f"{self.num_bytes} bytes)"
+        )

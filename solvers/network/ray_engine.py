@@ -1,0 +1,394 @@
+"""Robots as Ray actors, on this machine or on a cluster; each is a process that is sent its own share and no other.
+
+What a lost actor held is made anew by `solvers.network.recovery`.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from ipaddress import ip_address
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from pgo_models.errors import EngineError, MissingExtraError, SettingError
+from solvers.network.engine import WorkerPool
+from solvers.network.messages import Message, Worker
+from solvers.network.recovery import RecoveringPool, Recovery, RobotLostError
+
+T = TypeVar("T")
+
+if TYPE_CHECKING:
+    from ray import ObjectRef
+
+_SECONDS_TO_ANSWER, _SECONDS_TO_JOIN, _SECONDS_TO_COME_BACK = 3.0, 15.0, 10.0
+# Read by Ray when it starts: robots are the parallel part, and nothing is told to anybody.
+_ENVIRONMENT = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
+# Where Ray says why a cluster cannot be joined, best first; its last line often says that it failed, and no more.
+_REASONS = (
+    r"^ray\.exceptions\.\w+: (.+)",
+    r"^\w+Error: (?!Failed to connect to )([\s\S]+)",
+    r"\.(?:cc|h):\d+: (.+)",
+)
+
+
+@dataclass(frozen=True)
+class RayEngine:
+    """Robots as Ray actors.
+
+    Ray is started on this machine, where it listens to this machine alone, and stopped when the robots are let go,
+    unless this process is connected already or an address is given. The package has to be installed wherever actors
+    run, in the same version.
+
+    Attributes
+    ----------
+    address : str, optional
+        Of a cluster, "host:port" as `ray start --head` prints it. This machine has to be one of the cluster's.
+    num_cpus : int, optional
+        CPUs of this machine to use, where Ray is started; all unless given.
+    robots_per_cpu : int
+        Most robots that share a CPU; as few as the CPUs allow do. Every robot is a process of 100 MB and more.
+    patience : float
+        Seconds to wait for robots to start.
+    recovery : Recovery
+
+    Examples
+    --------
+    >>> RayEngine(num_cpus=2).robots_per_cpu
+    25
+    """
+
+    address: str | None = None
+    num_cpus: int | None = None
+    robots_per_cpu: int = 25
+    patience: float = 120.0
+    recovery: Recovery = field(default_factory=Recovery)
+
+    def __post_init__(self) -> None:
+        for name in ("num_cpus", "robots_per_cpu", "patience"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise SettingError(f"{name} must be positive, got {value}")
+        if self.address is not None and self.num_cpus is not None:
+            raise SettingError(f"num_cpus is for Ray on this machine; the cluster at {self.address} has its own")
+
+    def open(self, make: Callable[[T], Worker], shares: Sequence[T]) -> WorkerPool:
+        """Robots as actors.
+
+        Raises
+        ------
+        MissingExtraError
+            Without Ray.
+        EngineError
+            When the address is no Ray cluster's, or there are too few CPUs.
+        """
+        is_ours = connect(self.address, self.num_cpus)
+        place = _RayPlace(_ray(), make, shares, self, is_ours)
+        try:
+            place.start(range(len(shares)))
+        except RobotLostError as error:
+            place.close()
+            raise EngineError(f"{error}; install the same version of this package on every machine") from error
+        except BaseException:  # also Ctrl-C: nothing stays behind
+            place.close()
+            raise
+        return RecoveringPool(place, len(shares), self.recovery)
+
+
+def connect(address: str | None = None, num_cpus: int | None = None) -> bool:
+    """Connect this process to Ray, quietly: to a cluster, or to one started here. False when it was connected before.
+
+    One that is started here has all its sockets on the loopback, at ports that Ray chooses, and no dashboard.
+
+    Raises
+    ------
+    MissingExtraError
+        Without Ray.
+    SettingError
+        When the address is none.
+    EngineError
+        When there is no Ray cluster that can be joined, or Ray cannot be started for this machine alone.
+    """
+    ray = _ray()
+    if address is not None:
+        _check_address(address)
+    if ray.is_initialized():
+        if address is not None:
+            raise EngineError(f"this process is connected to Ray already; leave out the address {address}")
+        return False
+    if address is not None:
+        _check_cluster(address)
+    # What a dying cluster tells would be printed to stdout, whatever `log_to_driver` is.
+    silent = _replaced(ray._private.worker, listen_error_messages=lambda worker, threads_stopped: None)
+    # Ray's rule on Windows and macOS, and its only way to listen on the loopback: _node_ip_address does not take that.
+    local = _replaced(ray._private.ray_constants, **({"ENABLE_RAY_CLUSTER": False} if address is None else {}))
+    with _environment(_ENVIRONMENT), _hushed("ray"), silent, local:
+        quiet = {"log_to_driver": False, "logging_level": logging.CRITICAL, "configure_logging": False}
+        try:
+            with _own_sigterm():
+                if address is not None:
+                    ray.init(address=address, **quiet)
+                else:
+                    ray.init(address="local", num_cpus=num_cpus, include_dashboard=False, **quiet)
+        # Ray ends the process, where it does not raise, when its own patience is over.
+        except (RuntimeError, ValueError, OSError, SystemExit) as error:
+            where = "Ray does not start here" if address is None else f"cannot join the Ray cluster at {address}"
+            raise EngineError(f"{where}: {_reason(error)}; robots run without Ray too: --engine process") from error
+    if address is None and not ip_address(found := ray.util.get_node_ip_address()).is_loopback:
+        ray.shutdown()
+        raise EngineError(f"Ray {ray.__version__} would listen at {found}, not on the loopback; take another version")
+    return True
+
+
+@dataclass(eq=False)
+class _RayPlace:
+    ray: ModuleType
+    make: Callable[[Any], Worker]
+    shares: Sequence[Any]
+    engine: RayEngine
+    is_ours: bool
+    actors: dict[int, Any] = field(init=False, default_factory=dict)
+    _seen: float = field(init=False, default=-math.inf)
+
+    def start(self, robots: Sequence[int]) -> None:
+        self._look()
+        for robot in robots:
+            if robot in self.actors:
+                self.ray.kill(self.actors.pop(robot))
+        # replace() leaves behind what the share has worked out of itself.
+        made = self.ray.remote(_Actor).options(
+            num_cpus=self._cpus_a_robot, max_restarts=0, scheduling_strategy="SPREAD"
+        )
+        for robot in robots:
+            self.actors[robot] = made.remote(self.make, replace(self.shares[robot]))
+        self._wait({robot: self.actors[robot].ready.remote() for robot in robots})
+
+    def send(self, robot: int, order: str, message: Message) -> ObjectRef[Message]:
+        ticket: ObjectRef[Message] = self.actors[robot].obey.remote(order, dict(message))
+        return ticket
+
+    def receive(self, robot: int, ticket: ObjectRef[Message]) -> Message:
+        errors = self.ray.exceptions
+        while True:
+            if time.monotonic() > self._seen + _SECONDS_TO_ANSWER:
+                self._look()
+            try:
+                answer: Message = self.ray.get(ticket, timeout=_SECONDS_TO_ANSWER)
+            except errors.GetTimeoutError:
+                continue
+            except errors.RayTaskError as error:
+                raise error.cause from None
+            except errors.RayError as error:
+                raise RobotLostError(f"robot {robot}'s actor is gone: {_reason(error)}") from error
+            return answer
+
+    def close(self) -> None:
+        if self.ray.is_initialized():
+            for actor in self.actors.values():
+                self.ray.kill(actor)
+            if self.is_ours:
+                self.ray.shutdown()
+        self.actors = {}
+
+    @property
+    def _cpus_a_robot(self) -> float:
+        """Share of a CPU such that every CPU has room for the same number of robots."""
+        cpus = math.floor(self.ray.cluster_resources().get("CPU", 0.0))
+        robots = len(self.shares)
+        a_cpu = math.ceil(robots / cpus) if cpus else math.inf
+        if a_cpu > self.engine.robots_per_cpu:
+            raise EngineError(
+                f"too few CPUs: {robots} robots with at most {self.engine.robots_per_cpu} a CPU, on {cpus}; use fewer "
+                "robots, more CPUs, or run in this process (--engine process)"
+            )
+        return math.floor(1e4 / a_cpu) / 1e4  # Ray counts in steps of 1e-4
+
+    def _wait(self, tickets: Mapping[int, ObjectRef[Message]]) -> None:
+        """Wait until robots are there."""
+        deadline = time.monotonic() + self.engine.patience
+        missing = list(tickets.values())
+        while missing and (left := deadline - time.monotonic()) > 0:
+            patience = min(left, _SECONDS_TO_ANSWER)
+            _, missing = self.ray.wait(list(tickets.values()), num_returns=len(tickets), timeout=patience)
+            self._look()
+        if missing:
+            free, patience = self.ray.available_resources().get("CPU", 0.0), self.engine.patience
+            raise EngineError(
+                f"too few CPUs: {len(missing)} of {len(tickets)} robots have not started in {patience:g} s, {free:.3g} "
+                "CPUs are free; stop other work there, use fewer robots, or run in this process (--engine process)"
+            )
+        for robot, ticket in tickets.items():
+            self.receive(robot, ticket)
+
+    def _look(self) -> None:
+        """Whether the cluster is there: a minute after it has gone Ray would end this process, with words of its own.
+
+        Raises
+        ------
+        EngineError
+            When it has died; its actors are not asked for any more.
+        """
+        address = self.ray.get_runtime_context().gcs_address
+        host, _, port = address.rpartition(":")
+        deadline = time.monotonic() + _SECONDS_TO_COME_BACK
+        while True:
+            try:
+                socket.create_connection((host.strip("[]"), int(port)), timeout=_SECONDS_TO_ANSWER).close()
+                problem = "" if any(node["Alive"] for node in self.ray.nodes()) else "none of its machines is left"
+            except OSError as error:
+                problem = error.strerror or str(error)
+            self._seen = time.monotonic()
+            if not problem:
+                return
+            if self._seen > deadline:
+                self.actors = {}
+                raise EngineError(
+                    f"the Ray cluster at {address} has died ({problem}); solve again when there is one: a run with "
+                    "--resume FILE goes on from its last checkpoint"
+                )
+            time.sleep(0.2)
+
+
+class _Actor:
+    """A robot in a process of its own."""
+
+    def __init__(self, make: Callable[[T], Worker], share: T) -> None:
+        self._worker = make(share)
+
+    def ready(self) -> Message:
+        return {}
+
+    def obey(self, order: str, message: Message) -> Message:
+        return self._worker.obey(order, message)
+
+
+def _ray() -> ModuleType:
+    try:
+        import ray
+        import ray.exceptions
+    except ImportError as error:
+        raise MissingExtraError("ray", "ray") from error
+    return ray
+
+
+def _check_address(address: str) -> None:
+    """Refuse an address where nothing listens."""
+    host, colon, port = address.rpartition(":")
+    if not colon or not host or "/" in host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise SettingError(f"address is {address!r}; give host:port, as `ray start --head` prints it")
+    try:
+        socket.create_connection((host, int(port)), timeout=_SECONDS_TO_ANSWER).close()
+    except OSError as error:
+        raise EngineError(
+            f"no Ray cluster answers at {address} ({error.strerror or error}); start one with `ray start --head`, or "
+            "leave the address out"
+        ) from error
+
+
+@contextmanager
+def _own_sigterm() -> Iterator[None]:
+    """Keep the handler of SIGTERM, which Ray replaces by one that ends the process with a stack trace."""
+    earlier = signal.getsignal(signal.SIGTERM)
+    is_main = threading.current_thread() is threading.main_thread()
+    is_terminated = False
+    try:
+        yield
+    except SystemExit as error:  # how Ray's handler answers
+        is_terminated = is_main and error.code == signal.SIGTERM
+        if not is_terminated:
+            raise
+    finally:
+        if is_main:
+            signal.signal(signal.SIGTERM, earlier)
+    if is_terminated:
+        signal.raise_signal(signal.SIGTERM)
+
+
+def _check_cluster(address: str) -> None:
+    """Refuse an address where no Ray cluster can be joined, in seconds; Ray itself would try for minutes, loudly."""
+    program = f"import ray; ray.init(address={address!r}, log_to_driver=False)"
+    environment = {**os.environ, **_ENVIRONMENT, "RAY_NUM_REDIS_GET_RETRIES": "3"}  # one a second
+    try:
+        subprocess.run(
+            [sys.executable, "-c", program], env=environment, capture_output=True, timeout=_SECONDS_TO_JOIN, check=True
+        )
+    except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
+        told = (error.stderr or b"").decode(errors="replace")
+        reasons = (found[-1] for pattern in _REASONS if (found := re.findall(pattern, told, re.MULTILINE)))
+        reason = textwrap.shorten(next(reasons, f"no answer in {_SECONDS_TO_JOIN:g} s"), 260, placeholder=" ..")
+        raise EngineError(
+            f"what answers at {address} is no Ray cluster that can be joined from here: {reason}; check the port (6379 "
+            "unless chosen), that this machine is one of the cluster's, and that Ray's version and RAY_AUTH_MODE are "
+            "the same"
+        ) from error
+
+
+@contextmanager
+def _environment(wanted: Mapping[str, str]) -> Iterator[None]:
+    """Environment for processes that are started within."""
+    before = {name: os.environ.get(name) for name in wanted}
+    os.environ.update(wanted)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _replaced(module: ModuleType, **values: object) -> Iterator[None]:
+    """Other values for names of a module, where it has them."""
+    before = {name: getattr(module, name) for name in values if hasattr(module, name)}
+    for name in before:
+        setattr(module, name, values[name])
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(module, name, value)
+
+
+@contextmanager
+def _hushed(name: str) -> Iterator[None]:
+    """Keep a library's log away from the terminal."""
+    loggers = [logging.getLogger(name), *_loggers_below(name)]
+    before = [logger.disabled for logger in loggers]
+    for logger in loggers:
+        logger.disabled = True
+    try:
+        yield
+    finally:
+        for logger, was_disabled in zip(loggers, before, strict=True):
+            logger.disabled = was_disabled
+
+
+def _loggers_below(name: str) -> list[logging.Logger]:
+    known = logging.Logger.manager.loggerDict
+    return [
+        logger for key, logger in known.items() if key.startswith(f"{name}.") and isinstance(logger, logging.Logger)
+    ]
+
+
+def _reason(error: BaseException) -> str:
+    return str(error).strip().split("\n")[0] or type(error).__name__

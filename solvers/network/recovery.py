@@ -1,0 +1,166 @@
+"""Fault tolerance: a failed worker is restarted from its last snapshot, and the requests logged since are replayed.
+
+A worker is deterministic: its state follows from its subgraph and the requests it was given. What a replay sends again
+is not in the ledger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Generic, Protocol, TypeVar
+
+from pgo_models.errors import EngineError, PGOError, SettingError
+from solvers.network.messages import RESTORE, SNAPSHOT, Message
+
+T = TypeVar("T")
+
+
+class RobotLostError(EngineError):
+    """A robot is not there any more, and what it held with it."""
+
+
+class Place(Protocol[T]):
+    """Where robots run that can be lost; T is what stands for an order under way."""
+
+    def start(self, robots: Sequence[int]) -> None:
+        """Start robots, or start them again, each from its share.
+
+        Raises
+        ------
+        RobotLostError
+            When one was lost while it started.
+        """
+
+    def send(self, robot: int, order: str, message: Message) -> T:
+        """Give a robot an order."""
+
+    def receive(self, robot: int, ticket: T) -> Message:
+        """Wait for its answer.
+
+        Raises
+        ------
+        RobotLostError
+            When there will be none.
+        """
+
+    def close(self) -> None:
+        """Let the robots go."""
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """How lost robots are made anew.
+
+    Attributes
+    ----------
+    orders_between_snapshots : int
+        An iteration of SOC takes three orders or four. What is kept for a robot is its snapshot and so many orders.
+    max_restarts : int
+        Of one robot; then the run ends with an error.
+    """
+
+    orders_between_snapshots: int = 40
+    max_restarts: int = 3
+
+    def __post_init__(self) -> None:
+        if self.orders_between_snapshots < 1:
+            raise SettingError(f"orders_between_snapshots must be at least 1, got {self.orders_between_snapshots}")
+        if self.max_restarts < 0:
+            raise SettingError(f"max_restarts must not be negative, got {self.max_restarts}")
+
+
+@dataclass(eq=False)
+class RecoveringPool(Generic[T]):
+    """Robots in a place where they can be lost; answers are those of robots that never are.
+
+    Attributes
+    ----------
+    place : Place
+        With all robots started.
+    num_robots : int
+    recovery : Recovery
+    restarts : list of int
+        How often every robot was started again.
+    """
+
+    place: Place[T]
+    num_robots: int
+    recovery: Recovery
+    restarts: list[int] = field(init=False)
+    _log: list[tuple[str, tuple[Message, ...]]] = field(init=False, default_factory=list)
+    _snapshots: list[Message] = field(init=False, default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.restarts = [0] * self.num_robots
+
+    def ask(self, order: str, messages: Sequence[Message]) -> list[Message]:
+        """Give every robot an order, each with its message, and wait for all answers.
+
+        Raises
+        ------
+        EngineError
+            When a robot was lost more often than it may be.
+        """
+        try:
+            answers = self._asked(order, messages)
+        finally:  # an order that failed on one robot was obeyed by the others
+            self._log.append((order, tuple(messages)))
+        if order == SNAPSHOT:
+            self._snapshots, self._log = answers, []
+        elif order == RESTORE:
+            self._snapshots, self._log = list(messages), []
+        elif len(self._log) >= self.recovery.orders_between_snapshots:
+            self.ask(SNAPSHOT, [{}] * self.num_robots)
+        return answers
+
+    def close(self) -> None:
+        """Let the robots go."""
+        self.place.close()
+
+    def _asked(self, order: str, messages: Sequence[Message]) -> list[Message]:
+        tickets = [self.place.send(robot, order, message) for robot, message in enumerate(messages)]
+        answers: list[Message] = []
+        refusal: PGOError | None = None
+        for robot, ticket in enumerate(tickets):
+            try:
+                try:
+                    answers.append(self.place.receive(robot, ticket))
+                except RobotLostError as lost:
+                    answers.append(self._recovered(robot, order, messages[robot], lost))
+            except EngineError:
+                raise
+            except PGOError as error:  # the robot's own; the others' answers are waited for all the same
+                refusal = refusal or error
+        if refusal is not None:
+            raise refusal
+        return answers
+
+    def _recovered(self, robot: int, order: str, message: Message, lost: RobotLostError) -> Message:
+        """Answer of a robot that was lost before it gave one."""
+        while self.restarts[robot] < self.recovery.max_restarts:
+            self.restarts[robot] += 1
+            try:
+                self.place.start([robot])
+                if self._snapshots:
+                    self._order(robot, RESTORE, self._snapshots[robot])
+                for earlier, messages in self._log:
+                    self._again(robot, earlier, messages[robot])
+                return self._order(robot, order, message)
+            except RobotLostError as error:
+                lost = error
+        raise EngineError(
+            f"robot {robot} was lost {self.restarts[robot] + 1} times ({lost}); look at the memory of its machine, or "
+            "run in this process"
+        ) from lost
+
+    def _order(self, robot: int, order: str, message: Message) -> Message:
+        return self.place.receive(robot, self.place.send(robot, order, message))
+
+    def _again(self, robot: int, order: str, message: Message) -> None:
+        try:
+            self._order(robot, order, message)
+        except EngineError:
+            raise
+        except PGOError:  # as it was the first time, when the driver was told
+            return

@@ -1,0 +1,1 @@
+"""A solution in words, tables and pictures."""

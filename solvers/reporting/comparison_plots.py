@@ -1,0 +1,150 @@
+"""Pictures of methods beside each other: the gap against rounds, bytes and seconds, one panel for each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.geometry.rotations import Array
+from pgo_models.plots.style import COLOURS, MARKERS, column_figure
+from solvers.reporting.convergence_plots import Curve, Effort
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from plotly.graph_objects import Figure as PlotlyFigure
+
+_PANELS = (Effort.ROUNDS, Effort.BYTES, Effort.SECONDS)
+_LINES = ("-", "--", ":", "-.")
+_DASHES = ("solid", "dash", "dot", "dashdot")
+_MARKER_DISTANCE = 0.08  # of the diagonal of a panel
+_MOST_POINTS = 400  # of a curve in a page: sweeps by the thousand would make it slow
+
+
+def plot_efforts(curves: Sequence[Curve]) -> Figure:
+    """Figure of the gap of several methods over what they spent; a panel holds those whose effort is counted.
+
+    Raises
+    ------
+    SettingError
+        When there is no curve with a gap above zero.
+    MissingExtraError
+        Without matplotlib.
+
+    Examples
+    --------
+    >>> from solvers.result import History, Measurement, Record
+    >>> records = tuple(Record(k, 0.1 * k, Measurement(2.0 + 0.5**k, 0.5**k, 0.5**k)) for k in range(9))
+    >>> one = Curve("in one place", History(records), 2.0)
+    >>> many = Curve("by robots", History(records), 2.0, rounds=np.arange(9.0))
+    >>> [axes.get_xlabel() for axes in plot_efforts([one, many]).axes]
+    ['communication rounds', 'time in steps (s)']
+    """
+    panels = _panels(curves)
+    styles = _styles(curves, _LINES)
+    with column_figure(height=0.95, width=max(1.0, 0.9 * len(panels))) as figure:
+        handles = {}
+        grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for axes, (effort, shown) in zip(grid, panels, strict=True):
+            for curve in shown:
+                colour, marker, line = styles[curve.name]
+                x, y = _points(curve, effort)
+                form = f"{marker}{line}"
+                (handles[curve.name],) = axes.loglog(x, y, form, color=colour, markevery=_MARKER_DISTANCE)
+            axes.set_xlabel(effort.value)
+        grid[0].set_ylabel("relative gap")
+        names = [curve.name for curve in curves if curve.name in handles]
+        columns = min(len(names), 2 * len(panels))
+        figure.legend([handles[name] for name in names], names, loc="outside upper center", ncols=columns)
+    return figure
+
+
+def explore_efforts(curves: Sequence[Curve], title: str = "") -> PlotlyFigure:
+    """Plotly figure of what `plot_efforts` shows; an entry of the legend shows and hides a method in all panels.
+
+    Raises
+    ------
+    SettingError
+        When there is no curve with a gap above zero.
+    MissingExtraError
+        Without plotly.
+
+    Examples
+    --------
+    >>> from solvers.result import History, Measurement, Record
+    >>> records = tuple(Record(k, 0.1 * k, Measurement(2.0 + 0.5**k, 0.5**k, 0.5**k)) for k in range(9))
+    >>> [trace.name for trace in explore_efforts([Curve("halving", History(records), 2.0)]).data]
+    ['halving']
+    """
+    try:
+        from plotly.subplots import make_subplots
+    except ImportError as error:
+        raise MissingExtraError("plotly", "plot") from error
+    panels = _panels(curves)
+    styles = _styles(curves, _DASHES)
+    figure = make_subplots(1, len(panels), shared_yaxes=True, horizontal_spacing=0.03)
+    named: set[str] = set()
+    for column, (effort, shown) in enumerate(panels, 1):
+        for curve in shown:
+            colour, _, dash = styles[curve.name]
+            x, y = _points(curve, effort)
+            kept = np.unique(np.linspace(0, len(x) - 1, min(len(x), _MOST_POINTS)).round().astype(int))
+            figure.add_scatter(
+                x=[float(f"{value:.5g}") for value in x[kept]],
+                y=[float(f"{value:.5g}") for value in y[kept]],
+                name=curve.name,
+                legendgroup=curve.name,
+                showlegend=curve.name not in named,
+                line={"color": colour, "dash": dash},
+                mode="lines",
+                row=1,
+                col=column,
+            )
+            named.add(curve.name)
+        figure.update_xaxes(title_text=effort.value, row=1, col=column)
+    axis = {"type": "log", "dtick": 1, "exponentformat": "power", "gridcolor": "#eeeeee", "zeroline": False}
+    figure.update_xaxes(**axis)
+    figure.update_yaxes(**axis)
+    figure.update_yaxes(title_text="relative gap", row=1, col=1)
+    figure.update_layout(
+        template="none",
+        title={"text": title, "font": {"size": 14}},
+        margin={"l": 80, "r": 10, "t": 40 if title else 10, "b": 50},
+        legend={"orientation": "h", "y": -0.16},
+        hovermode="closest",
+    )
+    return figure
+
+
+def _panels(curves: Sequence[Curve]) -> list[tuple[Effort, list[Curve]]]:
+    panels = []
+    for effort in _PANELS:
+        shown = [curve for curve in curves if _is_counted(curve, effort) and len(_points(curve, effort)[0])]
+        if shown:
+            panels.append((effort, shown))
+    if not panels:
+        raise SettingError("no method has a gap above zero to be drawn; give runs that took at least a step")
+    return panels
+
+
+def _is_counted(curve: Curve, effort: Effort) -> bool:
+    known = {Effort.ROUNDS: curve.rounds, Effort.BYTES: curve.num_bytes}
+    return effort not in known or known[effort] is not None
+
+
+def _points(curve: Curve, effort: Effort) -> tuple[Array, Array]:
+    """What logarithmic axes can show of a curve."""
+    x, y = curve.effort(effort), curve.gap
+    shown = (x > 0) & np.isfinite(y) & (y > 0)
+    return x[shown], y[shown]
+
+
+def _styles(curves: Sequence[Curve], lines: Sequence[str]) -> dict[str, tuple[str, str, str]]:
+    """Colour, marker and line of every method, in all panels the same."""
+    number = len(COLOURS)
+    return {
+        curve.name: (COLOURS[k % number], MARKERS[(k + k // number) % len(MARKERS)], lines[k // number % len(lines)])
+        for k, curve in enumerate(curves)
+    }

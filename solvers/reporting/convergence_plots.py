@@ -1,0 +1,279 @@
+"""Pictures of runs: residuals and gap over the iterations with the paper's mark, and methods beside each other."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import cycle
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pgo_models.certificates.certificate import relative_gap
+from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.published_results import PublishedRun
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, MARKERS, column_figure
+from solvers.result import History
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from plotly.graph_objects import Figure as PlotlyFigure
+
+_MOST_MARKERS = 12
+_STAR_WITHIN = 3.0  # times our own iterations; a mark farther out is a line with its figures, lest it squeeze the rest
+_LINES = ("-", "--", ":", "-.")
+
+
+class Effort(enum.Enum):
+    """What the progress of methods is held against; the value is the label of the axis."""
+
+    ITERATIONS = "iterations"
+    ROUNDS = "communication rounds"
+    BYTES = "communication (bytes)"
+    SECONDS = "time in steps (s)"
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A run to be compared: its history, the bound it is held against, and what it cost.
+
+    Attributes
+    ----------
+    name : str
+    history : History
+    lower_bound : float
+        Proven for the graph, or the best value known.
+    rounds, num_bytes : (len(history),), optional
+        Communication up to every record.
+    """
+
+    name: str
+    history: History
+    lower_bound: float
+    rounds: Array | None = None
+    num_bytes: Array | None = None
+
+    def __post_init__(self) -> None:
+        for label in ("rounds", "num_bytes"):
+            given: Array | None = getattr(self, label)
+            if given is not None and len(given) != len(self.history):
+                raise SettingError(
+                    f"{label} of {self.name} has {len(given)} entries for {len(self.history)} records; give one each"
+                )
+
+    @property
+    def gap(self) -> Array:
+        """(objective - lower_bound) / objective of every record."""
+        return np.array([relative_gap(objective, self.lower_bound) for objective in self.history.objective])
+
+    def effort(self, effort: Effort) -> Array:
+        """What was spent up to every record.
+
+        Raises
+        ------
+        SettingError
+            When the curve does not know its communication.
+        """
+        known = {
+            Effort.ITERATIONS: self.history.k,
+            Effort.SECONDS: self.history.seconds,
+            Effort.ROUNDS: self.rounds,
+            Effort.BYTES: self.num_bytes,
+        }[effort]
+        if known is None:
+            raise SettingError(f"{self.name} has no count of {effort.value}; give it to the Curve, or leave it out")
+        return np.asarray(known, dtype=float)
+
+
+def plot_convergence(
+    stages: Sequence[tuple[str, History]], lower_bound: float, published: PublishedRun | None = None
+) -> Figure:
+    """Figure of primal and dual residual, and of the gap, over the iterations of one or more stages in a row.
+
+    Parameters
+    ----------
+    stages : sequence of (name, History)
+        For example `[(stage.name, stage.history) for stage in solution.stages]`; the later ones go on where the earlier
+        ones end.
+    lower_bound : float
+        The gap is (F - lower_bound) / F.
+    published : PublishedRun, optional
+        The paper's gap and iterations as a star; as a line with the figures where these are far to the right.
+
+    Raises
+    ------
+    SettingError
+        When no stage has a record.
+    MissingExtraError
+        Without matplotlib.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> from solvers.pipeline import solve
+    >>> solution = solve(grid(np.random.default_rng(0)))
+    >>> stages = [(stage.name, stage.history) for stage in solution.stages]
+    >>> [axes.get_ylabel() for axes in plot_convergence(stages, solution.lower_bound).axes]
+    ['relative residual', 'relative gap']
+    """
+    run = _with_records(stages)
+    with column_figure(height=1.3) as figure:
+        above, below = figure.subplots(2, 1, sharex=True)
+        begin = 0.0
+        for (name, history), colour, line in zip(run, cycle(COLOURS), cycle(_LINES), strict=False):
+            curve = Curve(name, history, lower_bound)
+            k, every = begin + history.k, max(1, len(history) // _MOST_MARKERS)
+            style = {"color": colour, "markevery": every}
+            _semilogy(above, k, history.primal_residual, f"{name}, primal", "o-", style)
+            _semilogy(above, k, history.dual_residual, f"{name}, dual", "s--", style)
+            _semilogy(below, k, curve.gap, f"{name}, gap", f"^{line}", style)
+            begin = float(k[-1])
+        above.set_ylabel("relative residual")
+        below.set_ylabel("relative gap")
+        below.set_xlabel("iteration")
+        if published is not None:
+            _mark(below, published, begin)
+        figure.legend(loc="outside lower center", ncols=2)
+    return figure
+
+
+def plot_gaps(curves: Sequence[Curve], effort: Effort = Effort.ITERATIONS) -> Figure:
+    """Figure of the gap of several methods against what they spent; what starts at zero starts at the left edge.
+
+    Parameters
+    ----------
+    curves : sequence of Curve
+    effort : Effort
+        Iterations, rounds, bytes or seconds; all but iterations on a logarithmic axis.
+
+    Raises
+    ------
+    SettingError
+        When a curve does not know this effort.
+    MissingExtraError
+        Without matplotlib.
+
+    Examples
+    --------
+    >>> from solvers.result import Measurement, Record
+    >>> records = tuple(Record(k, 0.1 * k, Measurement(2.0 + 0.5**k, 0.5**k, 0.5**k)) for k in range(9))
+    >>> figure = plot_gaps([Curve("halving", History(records), 2.0)], Effort.SECONDS)
+    >>> figure.axes[0].get_xlabel()
+    'time in steps (s)'
+    """
+    with column_figure(height=0.85) as figure:
+        axes = figure.add_subplot()
+        styles = zip(cycle(COLOURS), cycle(MARKERS), cycle(_LINES), strict=True)
+        for curve, (colour, marker, line) in zip(curves, styles, strict=False):
+            style = {"color": colour, "markevery": max(1, len(curve.history) // _MOST_MARKERS)}
+            _semilogy(axes, curve.effort(effort), curve.gap, curve.name, f"{marker}{line}", style)
+        if effort is not Effort.ITERATIONS:
+            _logarithmic(axes)
+        axes.set_xlabel(effort.value)
+        axes.set_ylabel("relative gap")
+        figure.legend(loc="outside upper center", ncols=2)
+    return figure
+
+
+def explore_convergence(
+    stages: Sequence[tuple[str, History]], lower_bound: float, published: PublishedRun | None = None
+) -> PlotlyFigure:
+    """Plotly figure of what `plot_convergence` shows: gap above, residuals below, figures under the pointer.
+
+    Raises
+    ------
+    SettingError
+        When no stage has a record.
+    MissingExtraError
+        Without plotly.
+
+    Examples
+    --------
+    >>> from solvers.result import Measurement, Record
+    >>> records = tuple(Record(k, 0.1 * k, Measurement(2.0 + 0.5**k, 0.5**k, 0.5**k)) for k in range(9))
+    >>> [trace.name for trace in explore_convergence([("halving", History(records))], 2.0).data]
+    ['halving: gap', 'halving: primal residual', 'halving: dual residual']
+    """
+    run = _with_records(stages)
+    try:
+        from plotly import graph_objects as go
+    except ImportError as error:
+        raise MissingExtraError("plotly", "plot") from error
+    figure = go.Figure()
+    begin = 0.0
+    for (name, history), colour in zip(run, cycle(COLOURS), strict=False):
+        k = begin + history.k
+        for values, what, axis, dash, symbol in (
+            (Curve(name, history, lower_bound).gap, "gap", "y", "solid", "circle"),
+            (history.primal_residual, "primal residual", "y2", "solid", "square"),
+            (history.dual_residual, "dual residual", "y2", "dash", "diamond"),
+        ):
+            shown = np.isfinite(values) & (values > 0)
+            if shown.any():
+                figure.add_scatter(
+                    x=k[shown].tolist(),
+                    y=[float(f"{value:.5g}") for value in values[shown]],
+                    name=f"{name}: {what}",
+                    yaxis=axis,
+                    line={"color": colour, "dash": dash},
+                    marker={"symbol": symbol, "size": 6},
+                    mode="lines+markers",
+                )
+        begin = float(k[-1])
+    if published is not None and published.gap > 0:
+        text = f"paper's SOC: {published.gap:.1e} after {published.iterations} iterations"
+        figure.add_scatter(
+            x=[0.0, max(begin, 1.0)],
+            y=[published.gap, published.gap],
+            name=text,
+            mode="lines",
+            line={"color": ALARM_COLOUR, "dash": "dot"},
+        )
+    logarithmic = {"type": "log", "exponentformat": "power", "gridcolor": "#eeeeee", "zeroline": False}
+    figure.update_layout(
+        template="none",
+        margin={"l": 80, "r": 10, "t": 10, "b": 50},
+        legend={"orientation": "h", "y": -0.14},
+        xaxis={"title": {"text": "iteration"}, "anchor": "y2", "gridcolor": "#eeeeee", "zeroline": False},
+        yaxis={**logarithmic, "title": {"text": "relative gap"}, "domain": [0.54, 1.0]},
+        yaxis2={**logarithmic, "title": {"text": "relative residual"}, "domain": [0.0, 0.46]},
+    )
+    return figure
+
+
+def _with_records(stages: Sequence[tuple[str, History]]) -> list[tuple[str, History]]:
+    run = [(name, history) for name, history in stages if len(history)]
+    if not run:
+        raise SettingError("no stage has a record; give histories of runs that took at least their start")
+    return run
+
+
+def _semilogy(axes: Axes, k: Array, values: Array, label: str, form: str, style: dict[str, object]) -> None:
+    """Draw what a logarithmic axis can show: zeros, nan and inf are left out."""
+    shown = np.isfinite(values) & (values > 0)
+    if shown.any():
+        axes.semilogy(k[shown], values[shown], form, label=label, **style)
+
+
+def _logarithmic(axes: Axes) -> None:
+    """Logarithmic axis below, with few labels: 1, 2, 5, 10 over a short range, powers of ten over a long one."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    axes.set_xscale("log")
+    lowest, highest = axes.get_xlim()
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if highest > 100 * lowest else (1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _mark(axes: Axes, published: PublishedRun, last: float) -> None:
+    if published.gap <= 0:
+        return
+    text = f"paper's SOC: {published.gap:.1e} after {published.iterations}"
+    if published.iterations <= _STAR_WITHIN * max(last, 1.0):
+        axes.plot(published.iterations, published.gap, "*", color=ALARM_COLOUR, markersize=8, label=text)
+    else:
+        axes.axhline(published.gap, color=ALARM_COLOUR, linestyle=":", label=text)

@@ -1,0 +1,188 @@
+"""What a report says in words: what the verdict means for this answer, and what to try next."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from dataclasses import dataclass
+
+from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, gap_text
+from pgo_models.graphs.datasets import known_datasets
+from pgo_models.graphs.pose_graph import PoseGraph
+from solvers.result import Status
+
+_NEARLY = 1e-4  # a gap below it is called nearly closed
+_FINER_GAP = 1e-9
+_SMALL_GAP = 1e-8
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Something to try next.
+
+    Attributes
+    ----------
+    text : str
+    command : str, optional
+        What to type; empty where there is nothing to type.
+    """
+
+    text: str
+    command: str = ""
+
+
+def headline(certificate: Certificate) -> str:
+    """Return the verdict in one sentence."""
+    if certificate.verdict is Verdict.EXACT:
+        return "Certified: the measurements agree to the last digits of double precision, and the poses fit them all."
+    if certificate.verdict is Verdict.CERTIFIED:
+        return f"Certified: the cost of these poses is the least possible, to within {_excess(certificate)}."
+    if certificate.verdict is Verdict.TRIVIAL:
+        return "Not certified: nothing better than F >= 0 is proven, so these poses may be far from the best ones."
+    return (
+        f"Not certified: the cost of these poses may be too high by up to {_excess(certificate)}; less was asked for."
+    )
+
+
+def meaning(certificate: Certificate) -> list[str]:
+    """Return what the figures mean, in a few sentences that need no further reading."""
+    F, bound = certificate.objective, certificate.lower_bound
+    sentences = [f"The poses cost F = {F:.10g}: the sum, over all measurements, of squared errors times precisions."]
+    if certificate.verdict is Verdict.EXACT:
+        sentences.append(
+            f"F cannot be told from zero: rounding alone makes up to {certificate.rounding_level:.2g} of it, and as a "
+            "sum of squares it is never below zero."
+        )
+        return sentences
+    if certificate.verdict is Verdict.TRIVIAL:
+        sentences.append(
+            "The certificate matrix has an eigenvalue so far below zero that the bound it gives is worse than zero. "
+            "Either the poses are a local optimum, or the measurements contradict each other so much that the "
+            "relaxation says nothing."
+        )
+        return sentences
+    sentences.append(
+        f"It is proven that no choice of poses whatever costs less than {bound:.10g}, so the best possible cost is "
+        f"between the two: the gap is {gap_text(certificate.gap)}, and {certificate.wanted_gap:.3g} was asked for."
+    )
+    sentences.append(
+        f"The proof is a Cholesky factorisation that went through ({certificate.proof}; {certificate.source.value}). "
+        "It holds in exact arithmetic, however the poses were found."
+    )
+    if certificate.verdict is Verdict.CERTIFIED:
+        sentences.append(
+            "Certified means optimal for these measurements and weights; it cannot vouch for the measurements."
+        )
+    elif certificate.gap <= _NEARLY:
+        sentences.append("The gap is nearly closed: the poses are as good as optimal for most purposes.")
+    elif certificate.source is BoundSource.RELAXATION:
+        sentences.append(
+            "The bound is the best that the semidefinite relaxation has: it is not tight for these measurements, which "
+            "happens when they are very noisy or some are wrong. The poses may be optimal all the same; this method "
+            "cannot tell."
+        )
+    else:
+        sentences.append("The poses may be optimal all the same, or a local optimum; this bound cannot tell.")
+    return sentences
+
+
+def advice(
+    graph: PoseGraph, certificate: Certificate, status: Status, misfits: int, source: str | None = None
+) -> list[Advice]:
+    """Return what to try next, most promising first.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    certificate : Certificate
+    status : Status
+        How the solve ended.
+    misfits : int
+        Number of edges that stand out.
+    source : str, optional
+        What stands for the graph in commands, as typed; its name unless given.
+    """
+    name = source if source is not None else shlex.quote(_source(graph))
+    solve = f"pgo solve {name}"
+    found = []
+    if not status.is_success:
+        found.append(_unfinished(status, solve))
+    if certificate.is_certified:
+        found.append(Advice("Keep the poses, for example as g2o.", f"{solve} --out solved.g2o"))
+        found.append(Advice("Check them independently of this solve.", f"pgo certify {name} --estimate solved.g2o"))
+        if certificate.wanted_gap > _SMALL_GAP:
+            found.append(Advice("Ask for a tighter proof.", f"{solve} --gap {_FINER_GAP:g}"))
+    else:
+        found += _uncertified(graph, certificate, solve)
+    if misfits:
+        some = "1 edge costs" if misfits == 1 else f"{misfits} edges cost"
+        found.append(
+            Advice(f"{some} over six times the mean: look at the worst edges below, and remove or weaken wrong ones.")
+        )
+    elif certificate.is_certified:
+        found.append(Advice("No edge stands out; if the map still looks wrong, suspect the weights."))
+    return found
+
+
+def percent(share: float) -> str:
+    """Return a share as a percentage for people.
+
+    Examples
+    --------
+    >>> percent(5e-7), percent(0.25)
+    ('0.00005 %', '25 %')
+    """
+    value = 100.0 * share
+    if value <= 0:
+        return "0 %"
+    if value < 1e-5:
+        return f"{value:.2g} %"
+    digits = max(0, 1 - math.floor(math.log10(value)))
+    text = f"{value:.{digits}f}"
+    return f"{text.rstrip('0').rstrip('.') if '.' in text else text} %"
+
+
+def _excess(certificate: Certificate) -> str:
+    """How much of F there is above the bound, as a share of it."""
+    return f"{percent(certificate.gap)} of it"
+
+
+def _source(graph: PoseGraph) -> str:
+    return graph.name if graph.name in known_datasets() else f"{graph.name}.g2o"
+
+
+def _unfinished(status: Status, solve: str) -> Advice:
+    if status is Status.MAX_ITERATIONS:
+        return Advice("The run ended at its iteration limit: give it more.", f"{solve} --max-iterations 2000")
+    if status is Status.NOT_FINITE:
+        return Advice("The first stage overflowed: go without it.", f"{solve} --method newton")
+    return Advice(f"The run did not finish ({status.value}): let it.", solve)
+
+
+def _uncertified(graph: PoseGraph, certificate: Certificate, solve: str) -> list[Advice]:
+    if certificate.gap <= _NEARLY and certificate.verdict is not Verdict.TRIVIAL:
+        reached = 10.0 ** math.ceil(math.log10(max(certificate.gap, 1e-16)))
+        return [
+            Advice(
+                "The gap asked for is finer than what was proven here; ask for the one that was reached.",
+                f"{solve} --gap {reached:g}",
+            )
+        ]
+    found = [
+        Advice(
+            "Look for better poses, which would close the gap from above: start from a spanning tree of the edges.",
+            f"{solve} --start tree",
+        ),
+        Advice("Go straight from the chordal start to Newton.", f"{solve} --method newton"),
+    ]
+    if graph.initial is not None:
+        found.insert(1, Advice("Start from the estimate that came with the graph.", f"{solve} --start file"))
+    if certificate.source is BoundSource.RELAXATION:
+        found.append(
+            Advice(
+                "Better poses may not exist; then only better measurements close the gap: more of them, less noisy "
+                "ones, or without those that are wrong."
+            )
+        )
+    found.append(Advice("Keep what there is, with the gap as a warning.", f"{solve} --out solved.g2o"))
+    return found

@@ -1,0 +1,1 @@
+"""Methods on the manifold: the second stage, and the staircase."""

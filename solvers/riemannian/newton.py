@@ -1,0 +1,91 @@
+"""Second stage: damped Riemannian Newton, or Gauss-Newton, with sparse Cholesky; F never rises (paper: after SOC)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, PolishState, polish_step, start_polish
+from pgo_models.errors import SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.result import Measurement, Status
+
+
+@dataclass(frozen=True, eq=False)
+class NewtonState:
+    """State k: the poses and factorisations of `pgo_models.certificates.newton_polish`."""
+
+    k: int
+    polish: PolishState
+
+
+@dataclass(frozen=True)
+class Newton:
+    """Riemannian Newton on SE(d)^n (`pgo_models.certificates.newton_polish`), one factorisation a step.
+
+    `dual_residual` is the relative Newton decrement: half its square, less the rounding level of F, over F.
+
+    Attributes
+    ----------
+    tolerance : float
+        On the relative decrement: about the relative decrease of F that is left.
+    max_iterations : int
+    second_order : bool
+        False is Gauss-Newton, the second layer of the paper's method.
+    secants : bool
+        Whether moves with one factorisation learn from those before (L-BFGS); robots do without, as each learned one
+        would cost them a reduction.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> from solvers.loop import run
+    >>> import numpy as np
+    >>> run(Newton(), PGOProblem(grid(np.random.default_rng(0)))).status.name
+    'CONVERGED'
+    """
+
+    tolerance: float = STATIONARY_DECREMENT
+    max_iterations: int = 100
+    second_order: bool = True
+    secants: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.tolerance > 0:
+            raise SettingError(f"tolerance must be positive, got {self.tolerance}")
+        if self.max_iterations < 0:
+            raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
+
+    def init(self, problem: PGOProblem, start: Poses | None) -> NewtonState:
+        """State 0: `start`, or the chordal relaxation."""
+        return NewtonState(0, start_polish(problem, start if start is not None else chordal_start(problem)))
+
+    def step(self, problem: PGOProblem, state: NewtonState) -> NewtonState:
+        """One factorisation and the moves it serves."""
+        return NewtonState(state.k + 1, polish_step(problem, state.polish, self.second_order, self.secants))
+
+    def measure(self, problem: PGOProblem, state: NewtonState) -> Measurement:
+        """F and the relative decrement."""
+        return Measurement(state.polish.objective, 0.0, state.polish.decrement)
+
+    def poses(self, problem: PGOProblem, state: NewtonState) -> Poses:
+        """Poses of the state."""
+        return state.polish.poses
+
+    def converged(self, state: NewtonState, measurement: Measurement) -> Status | None:
+        """CONVERGED within tolerance or where the gradient is rounding; STALLED when the last step could not move."""
+        if measurement.dual_residual <= self.tolerance or state.polish.is_at_rounding:
+            return Status.CONVERGED
+        return None if state.polish.moved else Status.STALLED
+
+
+def gauss_newton(max_iterations: int = Newton.max_iterations) -> Newton:
+    """Newton with the Gauss-Newton matrix instead of the Hessian.
+
+    Examples
+    --------
+    >>> gauss_newton().second_order
+    False
+    """
+    return Newton(max_iterations=max_iterations, second_order=False, secants=False)

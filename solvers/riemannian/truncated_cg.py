@@ -1,0 +1,106 @@
+"""Truncated conjugate gradients: the minimum of a quadratic model in a trust region, roughly (Steihaug 1983)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from pgo_models.geometry.rotations import Array
+from pgo_models.problem.matrices import inner
+
+
+@dataclass(frozen=True, eq=False)
+class TruncatedStep:
+    """What `truncated_cg` found.
+
+    Attributes
+    ----------
+    step : Array
+        Of the shape of the gradient.
+    decrease : float
+        What the model promises: -<g, s> - <s, H s> / 2, positive.
+    length : float
+        Norm of the step in the preconditioner's metric, the one that measures the trust region.
+    iterations : int
+        Products with H.
+    is_at_boundary : bool
+        Whether the region, or negative curvature, ended it.
+    """
+
+    step: Array
+    decrease: float
+    length: float
+    iterations: int
+    is_at_boundary: bool
+
+
+def truncated_cg(
+    gradient: Array,
+    hessian: Callable[[Array], Array],
+    precondition: Callable[[Array], Array],
+    radius: float,
+    forcing: float,
+    floor: float,
+    max_iterations: int,
+) -> TruncatedStep:
+    """Minimise <g, s> + <s, H s> / 2 over ||s||_P <= radius by preconditioned conjugate gradients.
+
+    It ends inside when the residual has fallen by the factor `forcing`, and at the boundary along the first direction
+    that leaves the region or has no positive curvature.
+
+    Parameters
+    ----------
+    gradient : Array
+    hessian : callable
+        H, symmetric on the tangent space.
+    precondition : callable
+        P^-1, symmetric and positive definite on the tangent space.
+    radius : float
+        In the norm ||s||_P^2 = <s, P s>, in which the iterates grow.
+    forcing : float
+        Relative residual, in the norm of P^-1, that is enough.
+    floor : float
+        Squared residual <r, P^-1 r> that is enough.
+    max_iterations : int
+
+    References
+    ----------
+    Steihaug 1983; Toint 1981; Conn, Gould & Toint, Trust-Region Methods, algorithm 7.5.1.
+    """
+    step, H_step, residual = np.zeros_like(gradient), np.zeros_like(gradient), gradient
+    z = precondition(residual)
+    direction = -z
+    squared = inner(residual, z)
+    enough = max(forcing**2 * squared, floor)
+    # <s, s>, <s, p> and <p, p> in the norm of P, by recurrence: P itself is never applied.
+    step_step, step_direction, direction_direction = 0.0, 0.0, squared
+    iterations, is_at_boundary = 0, False
+    while squared > enough and iterations < max_iterations:
+        H_direction = hessian(direction)
+        iterations += 1
+        curvature = inner(direction, H_direction)
+        length = squared / curvature if curvature > 0 else math.inf
+        following = step_step + length * (2.0 * step_direction + length * direction_direction)
+        if not following < radius**2:
+            is_at_boundary = True
+            room = (radius**2 - step_step) * direction_direction
+            length = (math.sqrt(step_direction**2 + room) - step_direction) / direction_direction
+            following = radius**2
+        step = step + length * direction
+        H_step = H_step + length * H_direction
+        if is_at_boundary:
+            step_step = following
+            break
+        residual = residual + length * H_direction
+        z = precondition(residual)
+        previous, squared = squared, inner(residual, z)
+        ratio = squared / previous
+        step_direction = ratio * (step_direction + length * direction_direction)
+        direction_direction = squared + ratio**2 * direction_direction
+        step_step = following
+        direction = ratio * direction - z
+    decrease = -inner(gradient, step) - 0.5 * inner(step, H_step)
+    return TruncatedStep(step, decrease, math.sqrt(step_step), iterations, is_at_boundary)

@@ -1,0 +1,1 @@
+"""Splitting of orthogonality constraints: the paper's recursion and its parts."""

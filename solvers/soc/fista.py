@@ -1,0 +1,78 @@
+"""FISTA for a strongly convex quadratic: min 1/2 <x, H x> - <b, x> with gradients only (Beck & Teboulle 2009).
+
+The paper solves step (a) of Algorithm 1 this way. With the Lipschitz constant and the strong convexity known, the
+momentum is constant (Nesterov 2004, scheme 2.2.22); it is restarted when it points uphill (O'Donoghue & Candes 2015).
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+
+from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import Array
+
+
+def fista(
+    apply_H: Callable[[Array], Array],
+    b: Array,
+    start: Array,
+    lipschitz: float,
+    strong_convexity: float,
+    tolerance: float = 1e-12,
+    max_iterations: int = 20_000,
+) -> Array:
+    """Solution of H x = b.
+
+    Parameters
+    ----------
+    apply_H : callable
+        x -> H x, symmetric, with eigenvalues in [strong_convexity, lipschitz].
+    b, start : arrays of one shape
+    lipschitz, strong_convexity : float
+        lipschitz >= strong_convexity > 0; a lipschitz that is too small diverges.
+    tolerance : float
+        On ||H x - b|| / ||b||.
+    max_iterations : int
+
+    Returns
+    -------
+    x, the last iterate where `max_iterations` are not enough.
+
+    Raises
+    ------
+    SettingError
+        When the constants are not as they must be.
+
+    Warns
+    -----
+    RuntimeWarning
+        When `max_iterations` are not enough: which accuracy was reached, and the way out.
+    """
+    if not lipschitz >= strong_convexity > 0:
+        raise SettingError(f"need lipschitz >= strong_convexity > 0, got {lipschitz} and {strong_convexity}")
+    root = np.sqrt(strong_convexity / lipschitz)
+    momentum = (1.0 - root) / (1.0 + root)
+    size = max(float(np.linalg.norm(b)), np.finfo(float).tiny)
+    limit = tolerance * size
+    x = start
+    y = x
+    for _ in range(max_iterations):
+        gradient = apply_H(y) - b
+        if np.linalg.norm(gradient) <= limit:
+            return y
+        following = y - gradient / lipschitz
+        uphill = np.vdot(gradient, following - x) > 0
+        y = following if uphill else following + momentum * (following - x)
+        x = following
+    reached = float(np.linalg.norm(apply_H(x) - b))
+    if not reached <= limit:
+        warnings.warn(
+            f"FISTA ended at its {max_iterations} iterations with ||H x - b|| = {reached / size:.0e} ||b||, asked for "
+            f"was {tolerance:.0e}; use RStep.FACTORIZED or a larger penalty",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return x

@@ -1,0 +1,275 @@
+"""SOC as the paper has it: rotations only, every robot with its neighbours frozen (Algorithm 1, `algo1: SOC`).
+
+All robots' subproblems (a) are solved together: they are the diagonal blocks of L, one a robot, so that with the
+neighbours of the last iterate on the right-hand side
+
+    (L_blocks + rho/2) Y = rho/2 (omega - B) - L_between Y_last,     L = L_blocks + L_between.
+
+With the B that (c) makes of it, the gradient of the Lagrangian of min <Y, L Y> subject to Y = omega is at Y
+
+    2 L Y + rho B = 2 L_between (Y - Y_last) - rho (omega - omega_last),
+
+the dual residual: beside the change of omega, as in Boyd et al. 2011 (3.6), that of the frozen neighbours counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.sparse import csc_array, csr_array, vstack
+
+from pgo_models.errors import SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
+from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
+from pgo_models.problem.cholesky import SymbolicCholesky, analyze
+from pgo_models.problem.initialization import spanning_tree_start
+from pgo_models.problem.matrices import assemble, norm, residual_matrix, rotation_columns
+from pgo_models.problem.problem import PGOProblem
+from solvers.result import Measurement, Status
+from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty
+from solvers.soc.r_step import BackEnd, RotationStep, RStep, Subproblem, prepare
+
+PaperPenalty = FixedPenalty | BalancedPenalty | BoydPenalty
+_PATIENCE = 20  # steps without a new smallest merit, after which rho goes up
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """L split by robots: what a robot knows of its own rotations, and what ties them to frozen neighbours.
+
+    Attributes
+    ----------
+    A, w, own : sparse (rows, dn), (rows,), sparse (dn, dn)
+        own = A^T diag(w) A: edges within a robot, and kappa I for both ends of an edge between robots.
+    between : sparse (dn, dn)
+        L - own.
+    analysis : SymbolicCholesky
+    """
+
+    A: csr_array
+    w: Array
+    own: csc_array
+    between: csr_array
+    analysis: SymbolicCholesky
+
+
+@dataclass(frozen=True, eq=False)
+class PaperState:
+    """Iterate k of the paper's recursion; names as in Algorithm 1.
+
+    Attributes
+    ----------
+    k : int
+    R, omega, B : (n, d, d)
+    rho : float
+        One penalty for all poses, as in the paper.
+    blocks, r_step
+        The split matrix, and the prepared back end for the present rho.
+    scale : float
+        Mean diagonal of L, the unit in which the stationarity residual is measured.
+    dual_residual : float
+        Stationarity, ||2 L R + rho B||_F / scale over the root of n d, rows of R and B stacked as L has them.
+    smallest_merit, steps_since_smallest, may_fall
+        Safeguard of the adaptive rho: the smallest ||R - omega|| and ||omega - omega_last|| together since rho changed,
+        how long ago, and whether rho may still be lowered.
+    """
+
+    k: int
+    R: Array
+    omega: Array
+    B: Array
+    rho: float
+    blocks: Blocks
+    r_step: RotationStep
+    scale: float
+    dual_residual: float = np.inf
+    smallest_merit: float = np.inf
+    steps_since_smallest: int = 0
+    may_fall: bool = True
+
+
+@dataclass(frozen=True)
+class PaperSOC:
+    """Algorithm 1 to the letter (`algo1: SOC`): rotations only, every robot with its neighbours frozen.
+
+    Attributes
+    ----------
+    robots : Partition, optional
+        Who owns which pose; one pose a robot, as in the paper, unless given.
+    penalty : FixedPenalty, BalancedPenalty or BoydPenalty
+        One rho for all poses. BoydPenalty is the scheme that the paper names.
+    r_step : RStep
+        Back end of step (a).
+    tolerance : float
+        On the paper's KKT residual, the root mean square over poses of ||omega_i^T omega_i - I||^2 +
+        ||omega_i - R_i||^2, and on the gradient of the Lagrangian, over the scale of L.
+    max_iterations : int
+
+    Raises
+    ------
+    SettingError
+        When a setting is out of its range.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> from solvers.loop import run
+    >>> run(PaperSOC(tolerance=1e-3), PGOProblem(grid(np.random.default_rng(0)))).status.name
+    'CONVERGED'
+    """
+
+    robots: Partition | None = None
+    penalty: PaperPenalty = field(default_factory=BalancedPenalty)
+    r_step: BackEnd = RStep.FACTORIZED
+    tolerance: float = 1e-5
+    max_iterations: int = 500
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.penalty, PaperPenalty):
+            raise SettingError(
+                f"the paper has one rho for all poses, got {self.penalty}; give a FixedPenalty, BalancedPenalty or "
+                "BoydPenalty"
+            )
+        if not self.tolerance > 0:
+            raise SettingError(f"tolerance must be positive, got {self.tolerance}")
+        if self.max_iterations < 0:
+            raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
+
+    def init(self, problem: PGOProblem, start: Poses | None) -> PaperState:
+        """State 0: R = omega = start, a spanning tree unless given; B = 0."""
+        start = start if start is not None else spanning_tree_start(problem.graph)
+        problem.stacked(start)  # raises unless the poses fit
+        robots = self.robots
+        if robots is None:
+            robots = partition(problem.graph, method=PartitionMethod.SINGLETONS)
+        blocks = _split(problem, robots)
+        rho = float(self.penalty.initial(problem, start).mean())
+        return PaperState(
+            k=0,
+            R=start.R,
+            omega=start.R,
+            B=np.zeros_like(start.R),
+            rho=rho,
+            blocks=blocks,
+            r_step=_prepare(problem, blocks, rho, self.r_step),
+            scale=float(problem.L.diagonal().mean()),
+        )
+
+    def step(self, problem: PGOProblem, state: PaperState) -> PaperState:
+        """Steps (a), (b), (c), then the adaptive rho with B rescaled."""
+        neighbours = state.blocks.between @ stack_transposes(state.R)
+        shift = stack_transposes(state.omega - state.B) - (2.0 / state.rho) * neighbours
+        R = unstack_transposes(state.r_step.solve(shift))  # (a)
+        if not np.isfinite(R).all():
+            return replace(state, k=state.k + 1, R=R, dual_residual=np.nan)
+        omega = project_to_rotations(R + state.B)  # (b)
+        B = state.B + R - omega  # (c)
+        root = np.sqrt(R.shape[0] * R.shape[1])
+        primal, change = norm(omega - R) / root, norm(omega - state.omega) / root
+        gradient = 2.0 * (problem.L @ stack_transposes(R)) + state.rho * stack_transposes(B)
+        merit = float(np.hypot(primal, change))
+        smaller = merit < state.smallest_merit
+        following = replace(
+            state,
+            k=state.k + 1,
+            R=R,
+            omega=omega,
+            B=B,
+            dual_residual=norm(gradient) / (root * state.scale),
+            smallest_merit=merit if smaller else state.smallest_merit,
+            steps_since_smallest=0 if smaller else state.steps_since_smallest + 1,
+        )
+        return _with_adapted_rho(problem, following, self.penalty, primal, change, self.r_step)
+
+    def measure(self, problem: PGOProblem, state: PaperState) -> Measurement:
+        """F at omega with the best translations, and the paper's KKT residual p_res per pose.
+
+        p_res = sqrt(||omega^T omega - I||^2 + ||omega - R||^2) over the root of n. The paper stops when its tolerance
+        is at most this value; the inequality belongs the other way round.
+        """
+        if np.isnan(state.dual_residual):
+            return Measurement(np.nan, np.nan, np.nan)
+        omega, d = state.omega, state.omega.shape[1]
+        orthogonality = norm(np.swapaxes(omega, 1, 2) @ omega - np.eye(d))
+        p_res = float(np.hypot(orthogonality, norm(omega - state.R))) / np.sqrt(len(omega))
+        X = np.concatenate([problem.recover_translations(omega), stack_transposes(omega)])
+        return Measurement(problem.objective_stacked(X), p_res, state.dual_residual)
+
+    def poses(self, problem: PGOProblem, state: PaperState) -> Poses:
+        """Omega with the best translations."""
+        return problem.with_best_translations(state.omega)
+
+    def converged(self, state: PaperState, measurement: Measurement) -> Status | None:
+        """CONVERGED when both residuals are within tolerance."""
+        worst = max(measurement.primal_residual, measurement.dual_residual)
+        return Status.CONVERGED if worst <= self.tolerance else None
+
+
+def _with_adapted_rho(
+    problem: PGOProblem, state: PaperState, rule: PaperPenalty, primal: float, change: float, back_end: BackEnd
+) -> PaperState:
+    """State with the rho for the next step, B rescaled: balanced, and up again for good when the merit stays up."""
+    may_fall = state.may_fall
+    if isinstance(rule, BoydPenalty):
+        factor = rule.factor(primal, state.rho * change)
+    elif not isinstance(rule, BalancedPenalty):
+        return state
+    elif state.steps_since_smallest >= _PATIENCE:
+        factor, may_fall = rule.refactor_ratio, False
+    else:
+        factor = rule.factor(primal, change)
+    if factor == 1.0 or (factor < 1.0 and not may_fall):
+        return state
+    rho = factor * state.rho
+    return replace(
+        state,
+        rho=rho,
+        B=state.B / factor,
+        r_step=_prepare(problem, state.blocks, rho, back_end),
+        smallest_merit=np.inf,
+        steps_since_smallest=0,
+        may_fall=may_fall,
+    )
+
+
+def _prepare(problem: PGOProblem, blocks: Blocks, rho: float, back_end: BackEnd) -> RotationStep:
+    penalty = np.full(blocks.own.shape[0], rho)
+    return prepare(
+        Subproblem(
+            A=blocks.A,
+            w=blocks.w,
+            M=blocks.own,
+            d=problem.d,
+            num_translations=0,
+            penalty=penalty,
+            analysis=blocks.analysis,
+            backend=problem.backend,
+        ),
+        back_end,
+    )
+
+
+def _split(problem: PGOProblem, robots: Partition) -> Blocks:
+    graph, n, d = problem.graph, problem.num_poses, problem.d
+    cut = robots.cut_edges(graph)
+    A, w = residual_matrix(graph)
+    rotation_rows = (graph.num_edges + d * np.flatnonzero(~cut)[:, None] + np.arange(d)).ravel()
+    inner = A[:, n:].tocsr()[rotation_rows]
+    ends = np.concatenate([graph.i[cut], graph.j[cut]])
+    columns = rotation_columns(ends, 0, d).ravel()
+    alone = csr_array((np.ones(len(columns)), columns, np.arange(len(columns) + 1)), shape=(len(columns), n * d))
+    A_own = vstack([inner, alone], format="csr")
+    w_own = np.concatenate([w[rotation_rows], np.repeat(np.tile(graph.kappa[cut], 2), d)])
+    every = np.arange(n)
+    full_blocks = rotation_columns(every, 0, d)
+    zero = (
+        np.repeat(full_blocks[:, :, None], d, axis=2),
+        np.repeat(full_blocks[:, None, :], d, axis=1),
+        np.zeros((n, d, d)),
+    )
+    product = (A_own.T @ (A_own * w_own[:, None])).tocoo()
+    own = assemble([(product.row, product.col, product.data), zero], n * d)
+    between = (problem.L - own).tocsr()
+    return Blocks(A_own, w_own, own, between, analyze(own, problem.backend))

@@ -1,0 +1,223 @@
+"""Rules for the ADMM penalty rho: from the multipliers, fixed, or balanced by residuals, relative or Boyd's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.errors import SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.problem.problem import PGOProblem
+
+_SMALLEST_RATIO = 1e-6  # of ||Lambda_i|| to m_i; M + D/2 keeps ten digits
+
+
+@dataclass(frozen=True)
+class MultiplierPenalty:
+    """rho_i = factor max(||Lambda_i||_2, q m_i), one for every pose.
+
+    m_i is the mean diagonal of M over the rotation rows of pose i and q a quantile of ||Lambda_i||_2 / m_i over all
+    poses. The multipliers measure how far from convex the constraint makes each pose. They are taken at the start, and
+    once more where the recursion stalls; B then restarts at its stationary value there, -2 Lambda_i R_i^T / rho_i.
+
+    Attributes
+    ----------
+    factor : float
+    quantile : float
+    stall_window, stall_ratio : int, float
+        Stalled: the residual of the last `stall_window` iterations has not fallen below `stall_ratio` of what it was.
+    max_refreshes : int
+
+    Examples
+    --------
+    >>> from pgo_models.problem.initialization import chordal_start
+    >>> from pgo_models.graphs.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> rho = MultiplierPenalty(factor=8.0).initial(problem, chordal_start(problem))
+    >>> rho.shape, bool(rho.min() > 0)
+    ((27,), True)
+    """
+
+    factor: float = 8.0
+    quantile: float = 0.8
+    stall_window: int = 6
+    stall_ratio: float = 0.5
+    max_refreshes: int = 1
+
+    def __post_init__(self) -> None:
+        if not self.factor > 0:
+            raise SettingError(f"factor must be positive, got {self.factor}")
+        if not 0 <= self.quantile <= 1:
+            raise SettingError(f"quantile must be in [0, 1], got {self.quantile}")
+        if self.stall_window < 1 or not 0 < self.stall_ratio < 1:
+            raise SettingError(
+                "stall_window must be at least 1 and stall_ratio in (0, 1), "
+                f"got {self.stall_window} and {self.stall_ratio}"
+            )
+        if self.max_refreshes < 0:
+            raise SettingError(f"max_refreshes must not be negative, got {self.max_refreshes}")
+
+    def initial(self, problem: PGOProblem, poses: Poses) -> Array:
+        """rho, (n,), at poses."""
+        norms = np.abs(np.linalg.eigvalsh(multipliers(problem, poses))).max(axis=1)
+        scale = rotation_scale(problem)
+        return np.asarray(self.factor * np.maximum(norms, self.floor(norms / scale) * scale))
+
+    def floor(self, ratio: Array) -> float:
+        """Quantile q of ||Lambda_i||_2 / m_i over all poses, (n,)."""
+        # Where the multipliers are zero but for rounding (measurements without noise) any penalty works that M + D/2
+        # does not lose to rounding.
+        return max(float(np.quantile(ratio, self.quantile)), _SMALLEST_RATIO)
+
+
+@dataclass(frozen=True)
+class FixedPenalty:
+    """rho_i = rho for all poses, unless the safeguard of `solvers.soc.soc` raises it.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> FixedPenalty(2.0).initial(problem, problem.graph.truth)[:3]
+    array([2., 2., 2.])
+    """
+
+    rho: float
+
+    def __post_init__(self) -> None:
+        if not self.rho > 0:
+            raise SettingError(f"rho must be positive, got {self.rho}")
+
+    def initial(self, problem: PGOProblem, poses: Poses) -> Array:
+        """rho, (n,)."""
+        return np.full(problem.num_poses, self.rho)
+
+
+@dataclass(frozen=True)
+class BalancedPenalty:
+    """rho that balances relative residuals (after OSQP, Stellato et al. 2020, section 5.2).
+
+    It starts at `scale` times m_i, the mean diagonal of M over the rotation rows of the pose. The balance asks for rho
+    times sqrt(primal / dual); rho moves that way by `refactor_ratio`, and the matrices are factored again, once that is
+    asked for or more: once one residual is `refactor_ratio`^2 times the other. B is rescaled with it. A rise of the
+    merit puts rho up again (the safeguard of `solvers.soc.soc`).
+
+    This is not the rule of Boyd et al. 2011, which is `BoydPenalty`: its dual residual has the factor rho, and so the
+    unit of the weights. Here both are lengths of rotations: ||R - omega|| and, without rho, ||omega - omega_last||.
+    They seldom differ by `refactor_ratio`^2; on the paper's scenes rho stays where it starts.
+
+    Examples
+    --------
+    >>> BalancedPenalty().factor(primal_residual=1.0, dual_residual=1e-3)
+    5.0
+    """
+
+    scale: float = 0.3
+    refactor_ratio: float = 5.0
+
+    def __post_init__(self) -> None:
+        if not self.scale > 0:
+            raise SettingError(f"scale must be positive, got {self.scale}")
+        if not self.refactor_ratio > 1:
+            raise SettingError(f"refactor_ratio must be above 1, got {self.refactor_ratio}")
+
+    def initial(self, problem: PGOProblem, poses: Poses) -> Array:
+        """rho, (n,)."""
+        return self.scale * rotation_scale(problem)
+
+    def factor(self, primal_residual: float, dual_residual: float) -> float:
+        """Factor by which rho moves now; 1 for not at all."""
+        worth_it = self.refactor_ratio**2
+        if primal_residual > 0 and primal_residual >= worth_it * dual_residual:
+            return self.refactor_ratio
+        if dual_residual > 0 and dual_residual >= worth_it * primal_residual:
+            return 1.0 / self.refactor_ratio
+        return 1.0
+
+
+@dataclass(frozen=True)
+class BoydPenalty:
+    """One rho for all poses that balances residuals as in Boyd et al. 2011, section 3.4.1, (3.13); for PaperSOC.
+
+    rho <- growth rho where ||r|| > imbalance ||s||, rho / growth where ||s|| > imbalance ||r||, with r = R - omega and
+    s = rho (omega - omega_last), and B is rescaled with it. There is no safeguard. s has the unit of the weights, so
+    that other units make other iterates.
+
+    Attributes
+    ----------
+    scale : float
+        First rho over the mean of m_i; Boyd gives none, and the paper neither.
+    imbalance, growth : float
+        Boyd's mu and tau.
+
+    Examples
+    --------
+    >>> rule = BoydPenalty()
+    >>> [rule.factor(primal, 1.0) for primal in (10.5, 9.5, 0.05)]
+    [2.0, 1.0, 0.5]
+    """
+
+    scale: float = 1.0
+    imbalance: float = 10.0
+    growth: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not self.scale > 0:
+            raise SettingError(f"scale must be positive, got {self.scale}")
+        if not self.imbalance > 1 or not self.growth > 1:
+            raise SettingError(f"imbalance and growth must be above 1, got {self.imbalance} and {self.growth}")
+
+    def initial(self, problem: PGOProblem, poses: Poses) -> Array:
+        """rho, (n,)."""
+        return self.scale * rotation_scale(problem)
+
+    def factor(self, primal_residual: float, dual_residual: float) -> float:
+        """Factor by which rho moves now, from ||r|| and ||s||; 1 for not at all."""
+        if primal_residual > self.imbalance * dual_residual:
+            return self.growth
+        return 1.0 / self.growth if dual_residual > self.imbalance * primal_residual else 1.0
+
+
+PenaltyRule = MultiplierPenalty | FixedPenalty | BalancedPenalty
+
+
+def rotation_scale(problem: PGOProblem) -> Array:
+    """m_i, (n,): the mean diagonal of M over the rotation rows of every pose."""
+    diagonal = problem.M.data[problem.diagonal_positions[problem.num_poses :]]
+    return np.asarray(diagonal.reshape(problem.num_poses, problem.d).mean(axis=1))
+
+
+def translation_scale(problem: PGOProblem) -> Array:
+    """Diagonal of M over the translation row of every pose, (n,)."""
+    return np.asarray(problem.M.data[problem.diagonal_positions[: problem.num_poses]])
+
+
+# When SOC's penalty is too small, or no longer fits: decisions from the merits of its steps alone.
+
+
+MAX_RAISES = 20
+_DIVERGED = 10.0  # times the smallest merit: go back and double the penalty
+_PATIENCE = 20  # steps without a new smallest merit: likewise, unless rho is `_ENOUGH` times m_i in the median
+_ENOUGH = 4.0  # 4 ||Lambda_i|| is, and at an optimum that can be certified ||Lambda_i|| is about m_i at most
+
+
+def has_stalled(rule: MultiplierPenalty, merits: tuple[float, ...]) -> bool:
+    """Whether the last `stall_window` steps have not brought the merit below `stall_ratio` of what it was."""
+    window = rule.stall_window
+    return len(merits) >= window and merits[-1] > rule.stall_ratio * merits[-window]
+
+
+def has_diverged(merits: tuple[float, ...]) -> bool:
+    """Whether the merit has grown far above the smallest."""
+    return len(merits) >= 2 and merits[-1] > _DIVERGED * min(merits)
+
+
+def is_going_round(merits: tuple[float, ...], ratio: Array) -> bool:
+    """Stagnation: no new best residual in 20 iterations, with rho_i / m_i so small that cycling is suspected."""
+    if len(merits) < 2:
+        return False
+    steps_since_smallest = len(merits) - 1 - merits.index(min(merits))
+    return steps_since_smallest >= _PATIENCE and bool(np.median(ratio) < _ENOUGH)

@@ -1,0 +1,75 @@
+"""Iterate of SOC in one place: what is carried from step to step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pgo_models.geometry.rotations import Array
+from solvers.soc.anderson import AndersonMemory
+from solvers.soc.local_copies import Team
+
+
+@dataclass(frozen=True, eq=False)
+class SOCState:
+    """Iterate k of JOINT or CONSENSUS. Team vectors are (rows, d): see `solvers.soc.local_copies.Team`.
+
+    Attributes
+    ----------
+    k : int
+    x : (rows, d)
+        Rotations (and separator translations) of step (a), every robot's copy.
+    omega : (n, d, d)
+        Rotations agreed on.
+    z : (rows, d)
+        omega and the agreed separator translations, handed out to the copies.
+    s : (rows, d)
+        x + B before the projection, extrapolated: the variable of the fixed-point map.
+    B : (rows, d)
+        Scaled multiplier, s - z.
+    rho : (n,)
+        Penalty of every rotation.
+    rho_t : (n,)
+        Penalty of the translations of separators.
+    separator_rho : (n,)
+        Least penalty of the rotations of separators under a MultiplierPenalty.
+    team : Team
+        Robots with their prepared subproblems.
+    memory : tuple of AndersonMemory
+        One for all robots, one for every robot, or none yet.
+    primal_residual, dual_residual : float
+        ||x - z||_rho and ||c (z - z_before)||_rho, both over ||omega||_rho, with c = max(1, rho / diagonal of M): a
+        penalty far above M makes short steps anywhere.
+    merits : tuple of float
+        Fixed-point residual ||x - z_before||_rho of the steps since rho last changed.
+    best : (rows, d)
+        The s of the smallest merit.
+    origin : tuple of two (rows, d), optional
+        z and s when the penalty rule last set rho.
+    refreshes, raises : int
+        How often the penalty rule, and the safeguard against divergence, changed rho.
+    """
+
+    k: int
+    x: Array
+    omega: Array
+    z: Array
+    s: Array
+    rho: Array
+    rho_t: Array
+    separator_rho: Array
+    team: Team
+    memory: tuple[AndersonMemory, ...] = ()
+    primal_residual: float = np.inf
+    dual_residual: float = np.inf
+    merits: tuple[float, ...] = ()
+    best: Array | None = None
+    origin: tuple[Array, Array] | None = None
+    refreshes: int = 0
+    raises: int = 0
+
+    @property
+    def B(self) -> Array:
+        """Scaled multiplier (Bregman variable), (rows, d)."""
+        return self.s - self.z

@@ -1,0 +1,217 @@
+"""What a method did on a graph, start to end: its stages, and their cost in iterations, rounds, bytes and seconds."""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
+from pgo_models.graphs.pose_graph import PoseGraph
+from solvers.reporting.convergence_plots import Curve
+from solvers.result import History, Status
+
+
+class BenchmarkMethod(enum.Enum):
+    """Methods that can be held against each other, by the name that `pgo compare` knows."""
+
+    JOINT = "joint"
+    CONSENSUS = "consensus"
+    PAPER = "paper"
+    SUBSTRUCTURED = "substructured"
+    STAIRCASE = "staircase"
+    GAUSS_SEIDEL = "gauss-seidel"
+    NEWTON = "newton"
+    LEVENBERG_MARQUARDT = "levenberg-marquardt"
+    GTSAM = "gtsam"
+
+    @property
+    def label(self) -> str:
+        """Name in tables and pictures."""
+        return _LABELS[self]
+
+
+_LABELS = {
+    BenchmarkMethod.JOINT: "SOC joint + Newton",
+    BenchmarkMethod.CONSENSUS: "SOC consensus + Newton",
+    BenchmarkMethod.PAPER: "SOC as in the paper",
+    BenchmarkMethod.SUBSTRUCTURED: "SOC substructured + Newton",
+    BenchmarkMethod.STAIRCASE: "SE-Sync (staircase)",
+    BenchmarkMethod.GAUSS_SEIDEL: "DGS",
+    BenchmarkMethod.NEWTON: "Newton",
+    BenchmarkMethod.LEVENBERG_MARQUARDT: "Levenberg-Marquardt",
+    BenchmarkMethod.GTSAM: "GTSAM",
+}
+
+
+@dataclass(frozen=True)
+class BenchmarkSettings:
+    """What all contenders share.
+
+    Attributes
+    ----------
+    num_robots : int
+        Of CONSENSUS, SUBSTRUCTURED, GAUSS_SEIDEL and the second stages; at most one a pose. Poses stay with the robots
+        that the graph names if they are as many; otherwise METIS shares them out, without it they go in order of time.
+        The first stage of PAPER has one pose a robot, as the paper has.
+    max_rounds : int, optional
+        Of PAPER, both stages together.
+    time_limit : float
+        Seconds for each contender.
+
+    Raises
+    ------
+    SettingError
+        When a setting is out of its range.
+    """
+
+    num_robots: int = 5
+    max_rounds: int | None = None
+    time_limit: float = math.inf
+
+    def __post_init__(self) -> None:
+        if self.num_robots < 1:
+            raise SettingError(f"num_robots is {self.num_robots}; give at least 1")
+        if self.max_rounds is not None and self.max_rounds < 2:
+            raise SettingError(f"max_rounds is {self.max_rounds}; give at least 2, one for each stage")
+        if not self.time_limit > 0:
+            raise SettingError(f"time_limit is {self.time_limit}; give positive seconds")
+
+    def robots(self, graph: PoseGraph) -> Partition:
+        """Who owns which pose."""
+        number = min(self.num_robots, graph.num_poses)
+        if graph.num_robots == number > 1:
+            return partition(graph, number, PartitionMethod.GIVEN)
+        try:
+            return partition(graph, number, PartitionMethod.METIS)
+        except MissingExtraError:
+            return partition(graph, number, PartitionMethod.CONTIGUOUS)
+
+
+@dataclass(frozen=True, eq=False)
+class StageRecord:
+    """One stage of a trial.
+
+    Attributes
+    ----------
+    name : str
+    status : Status
+    history : History
+        Seconds and communication count from the beginning of the leg.
+    num_robots : int
+        Among which its seconds are divided; 1 when all is done in one place.
+    rounds, num_bytes : (len(history),), optional
+        Communication up to every record, where it is counted.
+    """
+
+    name: str
+    status: Status
+    history: History
+    num_robots: int = 1
+    rounds: Array | None = None
+    num_bytes: Array | None = None
+
+    @property
+    def seconds(self) -> float:
+        """Seconds in steps."""
+        return float(self.history.seconds[-1])
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BenchmarkRun:
+    """What a contender did on a graph.
+
+    Attributes
+    ----------
+    contender : BenchmarkMethod
+    legs : tuple of StageRecord
+    poses : Poses
+        Where it ended.
+    objective : float
+        F of them.
+    status : Status
+        How the last leg ended, or an earlier one that ran out of time.
+    remark : str
+        What has to be said beside the figures; empty when all went as it should.
+    is_answer : bool
+        Whether the figures are the contender's: not those of a method that was cut short in a stage without an answer.
+    """
+
+    contender: BenchmarkMethod
+    legs: tuple[StageRecord, ...]
+    poses: Poses
+    objective: float
+    status: Status
+    remark: str = ""
+    is_answer: bool = True
+
+    @property
+    def iterations(self) -> tuple[int, ...]:
+        """Of every stage."""
+        return tuple(int(leg.history.k[-1]) for leg in self.legs)
+
+    @property
+    def first_objective(self) -> float | None:
+        """F of the poses that the first of two stages handed on; None where there is only one."""
+        return float(self.legs[1].history.objective[0]) if len(self.legs) > 1 else None
+
+    @property
+    def rounds(self) -> int | None:
+        """Rounds in all; None where they are not counted."""
+        joined = _joined([leg.rounds for leg in self.legs])
+        return None if joined is None else int(joined[-1])
+
+    @property
+    def all_reduces(self) -> int | None:
+        """All-reduces in all; None where they are not counted."""
+        counts = [leg.history.records[-1].measurement.all_reduces for leg in self.legs]
+        return None if None in counts else counts[-1]  # of one ledger
+
+    @property
+    def num_bytes(self) -> int | None:
+        """Bytes sent in all; None where they are not counted."""
+        joined = _joined([leg.num_bytes for leg in self.legs])
+        return None if joined is None else int(joined[-1])
+
+    @property
+    def seconds(self) -> float:
+        """Seconds in steps, all robots together."""
+        return math.fsum(leg.seconds for leg in self.legs)
+
+    @property
+    def seconds_per_robot(self) -> float:
+        """Seconds of every leg divided by its number of robots: what it would take side by side on a free network."""
+        return math.fsum(leg.seconds / leg.num_robots for leg in self.legs)
+
+    def curve(self, lower_bound: float) -> Curve:
+        """All legs in a row, to be plotted."""
+        records, k, seconds = [], 0, 0.0
+        for leg in self.legs:
+            for record in leg.history.records:
+                records.append(replace(record, k=k + record.k, seconds=seconds + record.seconds))
+            k, seconds = records[-1].k, records[-1].seconds
+        rounds, num_bytes = _joined([leg.rounds for leg in self.legs]), _joined([leg.num_bytes for leg in self.legs])
+        return Curve(self.contender.label, History(tuple(records)), lower_bound, rounds, num_bytes)
+
+    def __repr__(self) -> str:
+        rounds = "" if self.rounds is None else f", {self.rounds} rounds"
+        return (
+            f"BenchmarkRun({self.contender.label}: {self.status.name} after {' + '.join(map(str, self.iterations))} "
+            f"iterations{rounds}, F = {self.objective:.10g}, {self.seconds:.3g} s)"
+        )
+
+
+def _joined(parts: list[Array | None]) -> Array | None:
+    """Counts of all legs in a row; None when a leg has none."""
+    joined, before = [], 0.0
+    for part in parts:
+        if part is None:
+            return None
+        joined.append(before + part)
+        before = float(joined[-1][-1])
+    return np.concatenate(joined)

@@ -1,0 +1,138 @@
+"""Commands of `pgo` that hold methods against each other: tables, compare, figures."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pgo_models.errors import PGOError, SettingError
+from pgo_models.files import check_writable
+from pgo_models.graphs.datasets import load
+from pgo_models.problem.problem import PGOProblem
+from solvers.explanations import explained_by_its_graph
+from solvers.reporting.result_table import check_table_format
+from solvers.shell import BROKEN_OFF, save_then_show
+from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
+from solvers.studies.comparison import ComparisonSettings, check_plot_format, compare_methods
+from solvers.studies.paper_figures import FigureSet, draw_paper_figures
+from solvers.studies.paper_tables import ReproductionSettings, reproduce_tables
+from solvers.studies.paper_tables_text import tables_as_text
+
+KEPT_FILE = Path("pgo-tables.json")
+DownloadOption = Annotated[
+    bool, typer.Option("--download", help="Download the benchmark graphs that are not here; each is checked.")
+]
+TableOption = Annotated[
+    list[Path] | None,
+    typer.Option("--out", "-o", help="Write the table: .md, .csv or .json; may be given several times."),
+]
+
+
+def tables_command(
+    only: Annotated[
+        str,
+        typer.Option(help="Rows, with commas between: circle, grid, sphere, parking-garage, cubicle, torus3D, rim."),
+    ] = "",
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Draws of the random scenes circle, grid and sphere.")
+    ] = ReproductionSettings.num_seeds,
+    robots: Annotated[
+        int, typer.Option(min=1, help="Robots that share a graph; SOC as in the paper has one a pose.")
+    ] = ReproductionSettings.num_robots,
+    out: TableOption = None,
+    keep: Annotated[
+        Path, typer.Option(help="File that keeps every finished figure: the same command goes on where it was.")
+    ] = KEPT_FILE,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Leave aside what is kept, and run all anew.")] = False,
+    download: DownloadOption = False,
+) -> None:
+    """Run the paper's tables 1 to 4, row for row: its figures beside ours, held against proven bounds."""
+    _check_tables(out)
+    check_writable(keep)
+    settings = ReproductionSettings(_split(only), seeds, robots, download)
+    tables = reproduce_tables(settings, keep, is_fresh=fresh)
+    table = tables_as_text(tables)
+    save_then_show([(path, table.save) for path in out or []], table.print)
+    if not tables.is_complete:
+        raise typer.Exit(BROKEN_OFF)
+
+
+@explained_by_its_graph
+def compare_command(
+    graph: Annotated[
+        str, typer.Argument(help="A g2o file, a folder with one file a robot, or the name of a data set.")
+    ],
+    methods: Annotated[
+        str,
+        typer.Option(
+            help=f"With commas between: {', '.join(one.value for one in BenchmarkMethod)}. "
+            "All that run here unless given."
+        ),
+    ] = "",
+    robots: Annotated[int, typer.Option(min=1, help="Robots that share the graph.")] = BenchmarkSettings.num_robots,
+    out: TableOption = None,
+    plot: Annotated[
+        list[Path] | None,
+        typer.Option(help="Write the gap against rounds, bytes and seconds: .png, .svg, .pdf or .html."),
+    ] = None,
+    time_limit: Annotated[float, typer.Option(help="Seconds for every method.")] = math.inf,
+    unit_weights: Annotated[
+        bool, typer.Option("--unit-weights", help="Set kappa = tau = 1, the weights of the paper's equation.")
+    ] = False,
+) -> None:
+    """Run several methods on a graph and hold them against each other and a proven bound."""
+    _check_tables(out)
+    for path in plot or []:
+        check_plot_format(path)
+        check_writable(path)
+    settings = ComparisonSettings(_contenders(methods), BenchmarkSettings(robots, time_limit=time_limit))
+    loaded = load(graph)
+    comparison = compare_methods(PGOProblem(loaded.unit_weights() if unit_weights else loaded), settings)
+    table = comparison.table()
+    targets = [(path, table.save) for path in out or []] + [(path, comparison.save_plot) for path in plot or []]
+    save_then_show(targets, table.print)
+    if not comparison.is_complete:
+        raise typer.Exit(BROKEN_OFF)
+
+
+def figures_command(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures.")] = Path("figures"),
+    only: Annotated[
+        str, typer.Option(help=f"With commas between: {', '.join(one.value for one in FigureSet)}. All unless given.")
+    ] = "",
+    download: DownloadOption = False,
+) -> None:
+    """Draw the paper's figures anew, as PNG and as pages to explore."""
+    known = {one.value: one for one in FigureSet}
+    for name in _split(only):
+        if name not in known:
+            raise SettingError(f"there is no figure {name!r}; there are {', '.join(known)}")
+    written, reasons = draw_paper_figures(out, tuple(known[name] for name in _split(only)), download=download)
+    for path in written:
+        typer.echo(f"written: {path}")
+    for reason in reasons:
+        typer.echo(f"left out: {reason}", err=True)
+    if not written:
+        raise PGOError("no figure could be drawn: no graph is here")
+
+
+def _contenders(methods: str) -> tuple[BenchmarkMethod, ...]:
+    known = {one.value: one for one in BenchmarkMethod}
+    for name in _split(methods):
+        if name not in known:
+            raise SettingError(f"there is no method {name!r}; there are {', '.join(known)}")
+    return tuple(known[name] for name in _split(methods))
+
+
+def _split(names: str) -> tuple[str, ...]:
+    """Names between commas, each once."""
+    return tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
+
+
+def _check_tables(out: list[Path] | None) -> None:
+    for path in out or []:
+        check_table_format(path)  # before a long run, not after it
+        check_writable(path)

@@ -1,0 +1,229 @@
+"""Chosen methods on one graph, side by side: a table, and the gap against rounds, bytes and seconds."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from pgo_models.certificates.certificate import relative_gap
+from pgo_models.errors import PGOError, SettingError
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.plots.interactive_plots import save_page
+from pgo_models.plots.style import is_picture, save_figure
+from pgo_models.problem.problem import PGOProblem
+from solvers.pipeline import solve
+from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
+from solvers.reporting.convergence_plots import Curve
+from solvers.reporting.result_table import Part, ResultTable, Value, percent
+from solvers.result import Status
+from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings
+from solvers.studies.benchmark_runs import run_benchmark
+
+_HEADS = (
+    "method",
+    "F",
+    "gap (%)",
+    "iterations",
+    "rounds",
+    "all-reduces",
+    "MB sent",
+    "seconds",
+    "seconds a robot",
+    "remark",
+)
+
+
+@dataclass(frozen=True)
+class ComparisonSettings:
+    """Which methods, and what they share.
+
+    Attributes
+    ----------
+    contenders : tuple of BenchmarkMethod
+        All that can be run here unless given: GTSAM only where it is installed.
+    trial : BenchmarkSettings
+    """
+
+    contenders: tuple[BenchmarkMethod, ...] = ()
+    trial: BenchmarkSettings = field(default_factory=BenchmarkSettings)
+
+    @property
+    def chosen(self) -> tuple[BenchmarkMethod, ...]:
+        """The methods to be run, in order."""
+        if self.contenders:
+            return self.contenders
+        has_gtsam = importlib.util.find_spec("gtsam") is not None
+        return tuple(one for one in BenchmarkMethod if one is not BenchmarkMethod.GTSAM or has_gtsam)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Methods side by side on one graph.
+
+    Attributes
+    ----------
+    problem : PGOProblem
+    optimum, lower_bound : float
+        The best F known, from `solve` or one of the methods, and the bound that is proven.
+    trials : tuple of BenchmarkRun
+    reasons : tuple of (BenchmarkMethod, str)
+        Methods without figures, and why.
+    is_complete : bool
+        Whether all were run; after Ctrl-C they were not.
+    """
+
+    problem: PGOProblem
+    optimum: float
+    lower_bound: float
+    trials: tuple[BenchmarkRun, ...]
+    reasons: tuple[tuple[BenchmarkMethod, str], ...]
+    is_complete: bool = True
+
+    @property
+    def curves(self) -> list[Curve]:
+        """Curves of all that have an answer, their gaps held against the proven bound."""
+        return [trial.curve(self.lower_bound) for trial in self.trials if trial.is_answer]
+
+    def table(self) -> ResultTable:
+        """Return a row for every method, those without figures last, with their reasons."""
+        rows: list[tuple[str, ...]] = []
+        records = []
+        for trial in self.trials:
+            gap = relative_gap(trial.objective, self.lower_bound)
+            rows.append(
+                (
+                    trial.contender.label,
+                    f"{trial.objective:.9g}" if trial.is_answer else "-",
+                    percent(gap) if trial.is_answer else "-",
+                    " + ".join(map(str, trial.iterations)),
+                    "-" if trial.rounds is None else str(trial.rounds),
+                    "-" if trial.all_reduces is None else str(trial.all_reduces),
+                    "-" if trial.num_bytes is None else f"{1e-6 * trial.num_bytes:.3g}",
+                    f"{trial.seconds:.3g}",
+                    f"{trial.seconds_per_robot:.3g}",
+                    trial.remark,
+                )
+            )
+            records.append(_record(trial.contender, trial, gap, trial.remark))
+        for contender, reason in self.reasons:
+            rows.append((contender.label, *("-",) * (len(_HEADS) - 2), reason))
+            records.append(_record(contender, None, math.nan, reason))
+        graph = self.problem.graph
+        notes = [
+            f"{graph.name}: {graph.num_poses} poses, {graph.num_edges} edges; best F {self.optimum:.10g}, proven lower "
+            f"bound {self.lower_bound:.10g}; gaps are to the bound, over F",
+            "rounds, all-reduces and MB: where they are counted; seconds a robot: side by side",
+        ]
+        if not self.is_complete:
+            notes.append("interrupted: the methods left out were not run")
+        return ResultTable((Part(_HEADS, tuple(rows)),), tuple(records), tuple(notes))
+
+    def save_plot(self, path: Path | str) -> None:
+        """Write the gap against rounds, bytes and seconds as a picture or, for .html, as a page to explore.
+
+        Raises
+        ------
+        SettingError
+            On another suffix, or when there is nothing to draw.
+        MissingExtraError
+            Without matplotlib or plotly.
+        PGOError
+            When the file cannot be written.
+        """
+        path = Path(path)
+        check_plot_format(path)
+        if path.suffix.lower() == ".html":
+            save_page(explore_efforts(self.curves, self.problem.graph.name), path)
+        else:
+            save_figure(plot_efforts(self.curves), path)
+
+
+def compare_methods(
+    problem: PGOProblem | PoseGraph, settings: ComparisonSettings | None = None, *, progress: bool | None = None
+) -> Comparison:
+    """Run methods on a graph, one after the other, and hold them against a proven lower bound.
+
+    Parameters
+    ----------
+    problem : PGOProblem or PoseGraph
+    settings : ComparisonSettings, optional
+        `ComparisonSettings()` unless given.
+    progress : bool, optional
+        Show a bar on stderr; where that is a terminal, unless given.
+
+    Returns
+    -------
+    Comparison
+        Also after Ctrl-C: what was done until then. A method that fails leaves its reason.
+
+    Raises
+    ------
+    PGOError
+        When the graph is not connected.
+    KeyboardInterrupt
+        After Ctrl-C before the bound is there.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> comparison = compare_methods(grid(np.random.default_rng(0)), ComparisonSettings((BenchmarkMethod.STAIRCASE,)))
+    >>> bool(comparison.optimum - comparison.lower_bound < 1e-3), len(comparison.trials)
+    (True, 1)
+    """
+    settings = settings if settings is not None else ComparisonSettings()
+    problem = PGOProblem(problem) if isinstance(problem, PoseGraph) else problem
+    solution = solve(problem, progress=False)
+    if any(stage.status is Status.INTERRUPTED for stage in solution.stages):
+        raise KeyboardInterrupt
+    trials: list[BenchmarkRun] = []
+    reasons: list[tuple[BenchmarkMethod, str]] = []
+    is_complete = True
+    is_shown = sys.stderr.isatty() if progress is None else progress
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not is_shown) as bar:
+        task = bar.add_task("", total=len(settings.chosen))
+        try:
+            for contender in settings.chosen:
+                bar.update(task, description=contender.label)
+                try:
+                    trials.append(run_benchmark(contender, problem, settings.trial))
+                except (PGOError, np.linalg.LinAlgError, MemoryError) as error:
+                    reasons.append((contender, str(error) or type(error).__name__))
+                bar.advance(task)
+        except KeyboardInterrupt:
+            is_complete = False
+    known = [solution.objective, solution.certificate.poses_objective]
+    known += [trial.objective for trial in trials if math.isfinite(trial.objective)]
+    return Comparison(problem, min(known), solution.lower_bound, tuple(trials), tuple(reasons), is_complete)
+
+
+def check_plot_format(path: Path) -> None:
+    """Raise a SettingError when `Comparison.save_plot` knows no format for the suffix of `path`."""
+    if path.suffix.lower() != ".html" and not is_picture(path):
+        raise SettingError(f"cannot write {path}: no plot has suffix {path.suffix!r}; use .html, .png, .svg or .pdf")
+
+
+def _record(contender: BenchmarkMethod, trial: BenchmarkRun | None, gap: float, remark: str) -> dict[str, Value]:
+    has_answer = trial is not None and trial.is_answer
+    iterations = trial.iterations if trial is not None else ()
+    return {
+        "method": contender.value,
+        "objective": trial.objective if trial is not None and has_answer else None,
+        "gap": gap if has_answer else None,
+        "iterations_first_stage": iterations[0] if iterations else None,
+        "iterations_second_stage": iterations[1] if len(iterations) > 1 else None,
+        "rounds": trial.rounds if trial is not None else None,
+        "all_reduces": trial.all_reduces if trial is not None else None,
+        "bytes": trial.num_bytes if trial is not None else None,
+        "seconds": trial.seconds if trial is not None else None,
+        "seconds_per_robot": trial.seconds_per_robot if trial is not None else None,
+        "status": trial.status.name if trial is not None else None,
+        "remark": remark,
+    }

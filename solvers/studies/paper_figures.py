@@ -1,0 +1,303 @@
+"""The paper's figures, drawn anew: truth and result of its scenes, results on the benchmarks, residuals of its SOC."""
+
+from __future__ import annotations
+
+import enum
+import html
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from pgo_models.certificates.certificate import relative_gap
+from pgo_models.errors import MissingExtraError, PGOError
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.published_results import PublishedRow, published_rows, published_run
+from pgo_models.plots.graph_plots import draw_graph
+from pgo_models.plots.interactive_plots import explore_graph, save_page
+from pgo_models.plots.style import column_figure, save_figure
+from pgo_models.problem.problem import PGOProblem
+from solvers.pipeline import solve
+from solvers.reporting.convergence_plots import explore_convergence, plot_convergence
+from solvers.reporting.result_table import percent
+from solvers.result import History
+from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings, StageRecord
+from solvers.studies.benchmark_runs import run_benchmark
+from solvers.studies.paper_tables import SCENES, graph_of_row
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from plotly.graph_objects import Figure as PlotlyFigure
+
+_STAGES = ("SOC", "Gauss-Newton")
+_PLAIN = "edges and poses"  # as `explore_graph` names what does not stand out
+_EYE = {"x": 1.1, "y": -1.9, "z": 1.25}  # from where matplotlib looks
+
+
+class FigureSet(enum.Enum):
+    """Which of the paper's figures."""
+
+    SCENES = "scenes"
+    BENCHMARKS = "benchmarks"
+    CONVERGENCE = "convergence"
+
+    @property
+    def graphs(self) -> tuple[str, ...]:
+        """What it shows, in the paper's order."""
+        scenes, benchmarks = ("circle", "sphere", "grid"), ("parking-garage", "cubicle", "torus3D")
+        return {"scenes": scenes, "benchmarks": benchmarks, "convergence": (*scenes, *benchmarks)}[self.value]
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A graph with what the paper's method made of it.
+
+    Attributes
+    ----------
+    graph : PoseGraph
+    trial : BenchmarkRun
+    lower_bound : float
+    """
+
+    graph: PoseGraph
+    trial: BenchmarkRun
+    lower_bound: float
+
+    @property
+    def result(self) -> Poses:
+        """Its poses, aligned with the truth or the estimate that the graph came with."""
+        reference = self.graph.truth if self.graph.truth is not None else self.graph.initial
+        poses = self.trial.poses
+        return poses if reference is None else poses.aligned_to(reference)
+
+    @property
+    def title(self) -> str:
+        """Of the picture of the result."""
+        gap = relative_gap(self.trial.objective, self.lower_bound)
+        return f"{self.graph.name}, SOC: F = {self.trial.objective:.6g}, gap {percent(gap)} %"
+
+    @property
+    def panels(self) -> list[tuple[str, PoseGraph, Poses]]:
+        """Truth, if known, and result."""
+        shown = [(self.title, self.graph, self.result)]
+        if self.graph.truth is not None:
+            shown.insert(0, (f"{self.graph.name}, ground truth", self.graph, self.graph.truth))
+        return shown
+
+
+def draw_paper_figures(
+    folder: Path | str,
+    only: tuple[FigureSet, ...] = (),
+    *,
+    download: bool = False,
+    progress: bool | None = None,
+) -> tuple[list[Path], list[str]]:
+    """Run the paper's SOC on its graphs, as the tables do, and write the figures as PNG and interactive HTML.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if it is not there.
+    only : tuple of FigureSet
+        All unless given.
+    download : bool
+        Whether graphs that are not here are downloaded; otherwise they are left out.
+    progress : bool, optional
+        Show a bar on stderr; where that is a terminal, unless given.
+
+    Returns
+    -------
+    written : list of Path
+    reasons : list of str
+        Why graphs were left out.
+
+    Raises
+    ------
+    MissingExtraError
+        Without matplotlib or plotly.
+    PGOError
+        When a file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> written, _ = draw_paper_figures(tempfile.mkdtemp(), (FigureSet.SCENES,))
+    >>> [path.name for path in written]
+    ['scenes.png', 'scenes.html']
+    """
+    sets = only or tuple(FigureSet)
+    folder = Path(folder)
+    _check_extras()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise PGOError(f"cannot make the folder {folder}: {error.strerror}; choose another") from error
+    wanted = tuple(dict.fromkeys(name for one in sets for name in one.graphs))
+    shown, reasons = _run_all(wanted, download, sys.stderr.isatty() if progress is None else progress)
+    written: list[Path] = []
+    for one in sets:
+        here = [shown[name] for name in one.graphs if name in shown]
+        if here:
+            written += (_write_convergence if one is FigureSet.CONVERGENCE else _write_grid)(one, here, folder)
+    return written, reasons
+
+
+def plot_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> Figure:
+    """Figure with a row of pictures for every list of (title, graph, poses).
+
+    Raises
+    ------
+    MissingExtraError
+        Without matplotlib.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> [axes.get_title() for axes in plot_panels([[("truth", graph, graph.truth)]]).axes]
+    ['truth']
+    """
+    columns = max(len(row) for row in panels)
+    with column_figure(height=1.0 * len(panels), width=columns) as figure:
+        for r, row in enumerate(panels):
+            for c, (title, graph, poses) in enumerate(row):
+                place = r * columns + c + 1
+                axes = figure.add_subplot(len(panels), columns, place, projection="3d" if graph.d == 3 else None)
+                draw_graph(graph, poses, axes, mark_edges=False)
+                axes.set_title(title)
+    return figure
+
+
+def explore_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> PlotlyFigure:
+    """Plotly figure of the same pictures of graphs in space, each to turn on its own.
+
+    Raises
+    ------
+    MissingExtraError
+        Without plotly.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> figure = explore_panels([[("truth", graph, graph.truth), ("again", graph, graph.truth)]])
+    >>> sorted({trace.scene for trace in figure.data})
+    ['scene', 'scene2']
+    """
+    from plotly.graph_objects import Figure
+
+    columns, figure, number = max(len(row) for row in panels), Figure(), 0
+    named: set[str] = set()
+    for r, row in enumerate(panels):
+        for c, (title, graph, poses) in enumerate(row):
+            number += 1
+            scene = "scene" if number == 1 else f"scene{number}"
+            picture = explore_graph(graph, poses)
+            left, right = c / columns + 0.01, (c + 1) / columns - 0.01
+            top, bottom = 1.0 - r / len(panels), 1.0 - (r + 1) / len(panels)
+            for trace in picture.data:
+                # Of edges that stand out the legend says once why; it shows and hides them everywhere.
+                is_named = trace.showlegend and trace.name not in named and trace.name != _PLAIN
+                named |= {trace.name} if is_named else set()
+                trace.update(scene=scene, showlegend=is_named, legendgroup=trace.name)
+                figure.add_trace(trace)
+            place = {"x": [left, right], "y": [bottom + 0.01, top - 0.08]}
+            layout = {**picture.layout.scene.to_plotly_json(), "domain": place, "camera": {"eye": _EYE}}
+            figure.update_layout({scene: layout})
+            figure.add_annotation(
+                text=html.escape(title).replace(": ", "<br>"),
+                x=(left + right) / 2,
+                y=top,
+                xanchor="center",
+                yanchor="top",
+                showarrow=False,
+                xref="paper",
+                yref="paper",
+            )
+    figure.update_layout(
+        template="none",
+        margin={"l": 10, "r": 10, "t": 40, "b": 10},
+        height=480 * len(panels),
+        legend={"orientation": "h", "y": 0.0},
+    )
+    return figure
+
+
+def _run_all(names: tuple[str, ...], download: bool, is_shown: bool) -> tuple[dict[str, Shown], list[str]]:
+    shown: dict[str, Shown] = {}
+    reasons: list[str] = []
+    rows = {row.name: row for row in published_rows()}
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not is_shown) as bar:
+        task = bar.add_task("", total=len(names))
+        for name in names:
+            bar.update(task, description=name)
+            try:
+                shown[name] = _run(rows[name], download)
+            except PGOError as error:
+                reasons.append(str(error))
+            bar.advance(task)
+    return shown, reasons
+
+
+def _run(row: PublishedRow, download: bool) -> Shown:
+    graph = graph_of_row(row, 0, download)
+    problem = PGOProblem(graph)
+    bound = solve(problem, progress=False).lower_bound
+    start = graph.initial if row.name in SCENES else None
+    return Shown(
+        graph,
+        run_benchmark(BenchmarkMethod.PAPER, problem, BenchmarkSettings(max_rounds=row.soc.iterations), start),
+        bound,
+    )
+
+
+def _write_grid(one: FigureSet, here: list[Shown], folder: Path) -> list[Path]:
+    columns = [shown.panels for shown in here]
+    panels = [[column[r] for column in columns if r < len(column)] for r in range(max(map(len, columns)))]
+    return [
+        _written(folder / f"{one.value}.png", lambda path: save_figure(plot_panels(panels), path)),
+        _written(folder / f"{one.value}.html", lambda path: save_page(explore_panels(panels), path)),
+    ]
+
+
+def _write_convergence(one: FigureSet, here: list[Shown], folder: Path) -> list[Path]:
+    written = []
+    for shown in here:
+        stages = [(name, _from_step_one(leg)) for name, leg in zip(_STAGES, shown.trial.legs, strict=True)]
+        published = published_run(shown.graph)
+        picture = plot_convergence(stages, shown.lower_bound, published)
+        page = explore_convergence(stages, shown.lower_bound, published)
+        name = f"{one.value}-{shown.graph.name}"
+        save_figure(picture, folder / f"{name}.png")
+        save_page(page, folder / f"{name}.html")
+        written += [folder / f"{name}.png", folder / f"{name}.html"]
+    return written
+
+
+def _from_step_one(leg: StageRecord) -> History:
+    """History in which state 0 of SOC, where R and omega are the same start, has no primal residual but zero."""
+    first, *others = leg.history.records
+    return History((replace(first, measurement=replace(first.measurement, primal_residual=0.0)), *others))
+
+
+def _written(path: Path, write: Callable[[Path], None]) -> Path:
+    write(path)
+    return path
+
+
+def _check_extras() -> None:
+    """Both kinds of pictures can be drawn: asked before the runs, not after."""
+    with column_figure(height=1.0):
+        pass
+    try:
+        import plotly  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError("plotly", "plot") from error

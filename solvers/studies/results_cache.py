@@ -1,0 +1,97 @@
+"""Finished results of a long job in a JSON file, so that the job can go on where it was interrupted."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pgo_models.errors import FileFormatError
+from pgo_models.files import read_text, replace_when_done
+from pgo_models.graphs.pose_graph import PoseGraph
+from solvers.reporting.versions import versions
+
+Entry = dict[str, Any]
+
+
+class KeptResults:
+    """Results by key; the file is written anew, whole, whenever one is added.
+
+    Results that other versions of the software made are not taken up again.
+
+    Parameters
+    ----------
+    path : Path, optional
+        None keeps nothing beyond the job.
+    is_fresh : bool
+        Leave aside what the file holds.
+
+    Raises
+    ------
+    FileFormatError
+        When the file is there and holds no results.
+    """
+
+    def __init__(self, path: Path | None, is_fresh: bool = False) -> None:
+        self._path = path
+        self._header = {"kind": "results of pgo, by key", "versions": versions(None)}
+        self._entries: dict[str, Entry] = {}
+        if path is not None and path.exists():
+            found = self._read(path)  # in any case: a file of something else is not to be written over
+            self._entries = {} if is_fresh else found
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def get(self, key: str) -> Entry | None:
+        """Result of a key, if there is one."""
+        return self._entries.get(key)
+
+    def add(self, key: str, entry: Entry) -> None:
+        """Keep a result.
+
+        Raises
+        ------
+        PGOError
+            When the file cannot be written.
+        """
+        self._entries[key] = entry
+        if self._path is not None:
+            text = json.dumps({**self._header, "results": self._entries}, indent=1, allow_nan=False)
+            with replace_when_done(self._path) as temporary:
+                temporary.write_text(text + "\n", encoding="utf-8")
+
+    def _read(self, path: Path) -> dict[str, Entry]:
+        way_out = "remove it or name another file"
+        try:
+            content = json.loads(read_text(path))
+        except json.JSONDecodeError as error:
+            raise FileFormatError(path, error.lineno, f"no JSON: {error.msg}; {way_out}") from error
+        if not isinstance(content, dict) or content.get("kind") != self._header["kind"]:
+            raise FileFormatError(path, None, f"no results of pgo; {way_out}")
+        if content.get("versions") != self._header["versions"]:
+            return {}
+        results: dict[str, Entry] = content.get("results", {})
+        return results
+
+
+def fingerprint(graph: PoseGraph) -> str:
+    """Short text that differs between graphs with different measurements or estimates.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> one, other = (grid(np.random.default_rng(seed)) for seed in (0, 1))
+    >>> fingerprint(one) == fingerprint(one), fingerprint(one) == fingerprint(other)
+    (True, False)
+    """
+    digest = hashlib.sha256()
+    arrays = [graph.i, graph.j, graph.R_ij, graph.t_ij, graph.kappa, graph.tau]
+    if graph.initial is not None:
+        arrays += [graph.initial.R, graph.initial.t]
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:12]

@@ -1,0 +1,125 @@
+"""GTSAM beside ours: the same costs, the same optimum where noise is small, and one clear line without it."""
+
+import importlib.util
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, OPTIMUM, SEEDS, exact_graph, random_poses, varied_graph, varied_problem
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pgo_models.certificates.certificate import certify
+from pgo_models.certificates.newton_polish import polish
+from pgo_models.errors import GraphError, MissingExtraError, NotPositiveDefiniteError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import exp_map
+from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.problem.problem import PGOProblem
+from solvers.baselines.gtsam import Gtsam, GtsamMethod, factor_graph, run_gtsam
+from solvers.result import Status
+
+needs_gtsam = pytest.mark.skipif(importlib.util.find_spec("gtsam") is None, reason="GTSAM is an optional rival")
+QUIET_NOISE = NoiseModel(translation_std=0.01, rotation_std=0.01)
+
+
+def test_without_gtsam_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    problem = varied_problem(0, 5, 3)
+    for use in (run_gtsam, factor_graph):
+        with pytest.raises(
+            MissingExtraError, match=r"gtsam is not installed; run: pip install 'pgo-splitting\[peers\]'"
+        ):
+            use(problem)
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    for changes in ({"tolerance": 0.0}, {"tolerance": float("nan")}, {"max_iterations": -1}):
+        with pytest.raises(SettingError, match=next(iter(changes))):
+            Gtsam(**changes)
+
+
+@needs_gtsam
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS, n=st.integers(2, 10), d=DIMENSIONS)
+def test_its_cost_is_F_to_leading_order(seed: int, n: int, d: int) -> None:
+    # A turn and move of size h away from where all residuals are zero costs h^2; what differs is of higher order.
+    import gtsam
+
+    problem = PGOProblem(exact_graph(seed, n, d))
+    truth = problem.graph.truth.with_gauge_at(0)
+    rng = np.random.default_rng(seed)
+    w, v = rng.standard_normal((n, 2 * d - 3)), rng.standard_normal((n, d))
+    w[0], v[0] = 0.0, 0.0
+    factors = factor_graph(problem)
+    errors = []
+    for h in (1e-2, 1e-3):
+        poses = Poses(truth.R @ exp_map(h * w), truth.t + h * v)
+        values = gtsam.Values()
+        for key in range(n):
+            if d == 3:
+                values.insert(key, gtsam.Pose3(gtsam.Rot3(poses.R[key]), poses.t[key]))
+            else:
+                turn = float(np.arctan2(poses.R[key, 1, 0], poses.R[key, 0, 0]))
+                values.insert(key, gtsam.Pose2(poses.t[key, 0], poses.t[key, 1], turn))
+        errors.append(abs(factors.error(values) / problem.objective(poses) - 1.0))
+    assert errors[1] <= 1e-2
+    assert errors[1] <= 0.2 * errors[0] + 1e-6
+
+
+@needs_gtsam
+@pytest.mark.parametrize("method", GtsamMethod)
+@pytest.mark.parametrize("d", [2, 3])
+def test_with_little_noise_it_reaches_our_optimum(d: int, method: GtsamMethod) -> None:
+    problem = PGOProblem(varied_graph(3, 40, d, QUIET_NOISE))
+    result = run_gtsam(problem, Gtsam(method=method, tolerance=1e-12))
+    assert result.status is Status.CONVERGED
+    assert result.objective == problem.objective(result.poses) == result.history.objective[-1]
+    optimum = problem.objective(polish(problem, result.poses))
+    assert optimum <= result.objective <= optimum * (1 + 1e-3)
+    assert certify(problem, result.poses, gap=1e-3).is_certified
+
+
+@needs_gtsam
+def test_a_given_start_is_state_zero_and_is_left_alone() -> None:
+    for d in (2, 3):
+        problem = varied_problem(4, 12, d)
+        start = random_poses(12, d, 4)
+        kept = start.R.copy(), start.t.copy()
+        result = run_gtsam(problem, Gtsam(max_iterations=3, tolerance=1e-12), start)
+        assert result.history.objective[0] == pytest.approx(problem.objective(start), rel=1e-12)
+        assert (result.status, result.iterations, len(result.history)) == (Status.MAX_ITERATIONS, 3, 4)
+        assert result.objective == result.history.objective.min()
+        np.testing.assert_array_equal(start.R, kept[0])
+        np.testing.assert_array_equal(start.t, kept[1])
+        with pytest.raises(GraphError, match="give one pose for every pose"):
+            run_gtsam(problem, start=random_poses(11, d, 0))
+
+
+@needs_gtsam
+@pytest.mark.parametrize("name", ["smallGrid3D", "intel", "parking-garage"])
+def test_it_solves_public_graphs(name: str, benchmark_problem: Callable[[str], PGOProblem]) -> None:
+    problem = benchmark_problem(name)
+    result = run_gtsam(problem)
+    assert result.status is Status.CONVERGED
+    # Of fourth order in the residuals: 1e-4 on the noisiest of these.
+    assert result.objective == pytest.approx(OPTIMUM[name], rel=2e-4)
+
+
+@needs_gtsam
+def test_a_singular_system_is_named() -> None:
+    problem = varied_problem(1, 30, 3)
+    start = random_poses(30, 3, 1, spread=1e5)
+    with pytest.raises(
+        NotPositiveDefiniteError, match="GTSAM met a singular linear system: Indeterminate linear system"
+    ):
+        run_gtsam(problem, Gtsam(method=GtsamMethod.GAUSS_NEWTON, max_iterations=500), start)
+
+
+@needs_gtsam
+def test_what_was_measured_exactly_is_recovered() -> None:
+    for d in (2, 3):
+        result = run_gtsam(PGOProblem(exact_graph(0, 10, d)))
+        assert result.status is Status.CONVERGED
+        assert result.objective <= 1e-12

@@ -1,0 +1,216 @@
+"""Every term of an error is there: each bound is at least its formula, written out here entry by entry.
+
+That the formulas are bounds is held against exact arithmetic elsewhere (test_rounding_errors, test_factor_errors);
+there one term often covers another, and to leave one out would be seen by nobody.
+"""
+
+import numpy as np
+import pytest
+from graphs import varied_graph
+from scipy.sparse import csc_array
+
+from pgo_models.certificates.lower_bound import bound_from, squared_distances
+from pgo_models.certificates.rounding_errors import (
+    evaluate_certificate,
+    evaluate_edges,
+    evaluate_multipliers,
+    matrix_error,
+    objective_rounding,
+    rounding_level,
+)
+from pgo_models.geometry.rotations import Array, orthogonality_error, random_rotations
+from pgo_models.problem.cholesky import CholeskyBackend, analyze
+from pgo_models.problem.floating_point import UNIT_ROUNDOFF as u
+from pgo_models.problem.floating_point import column_error, error_of_counts, gamma
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.interface import Interface
+from solvers.distributed.multifrontal import separator_tree
+from solvers.distributed.robots import elimination as substructure
+from solvers.distributed.robots.elimination import Cut, eliminate, packed, row_sums
+
+ENOUGH = 1.0 - 1e-12  # the formulas here are rounded, too; the bounds are rounded up by 2^-30
+SIZES = [(t, low, P) for t in (1e-6, 1.0, 1e6) for low in (0.0, 1.0, 1e9) for P in (1e-6, 1.0, 1e4)]
+
+
+def written_out(problem: PGOProblem, t: Array, low: Array, P: Array) -> tuple[float, float, Array, Array]:
+    """Value, its error, M X and its error of `evaluate_edges`, one edge after the other."""
+    graph, n, d = problem.graph, problem.num_poses, problem.d
+    product, error = np.zeros((n * (d + 1), d)), np.zeros((n * (d + 1), d))
+    value = value_error = 0.0
+    degree = np.bincount(np.concatenate([graph.i, np.repeat(graph.i, d), graph.j]), minlength=n)
+    # Non-zeros in the longest column of A: one for a translation's edge, and of a rotation row one a t_ij and d or one.
+    A, _ = problem.residual_matrix
+    most = int(np.diff(A.tocsc().indptr).max())
+    assert degree.max() > 0
+    for e in range(graph.num_edges):
+        i, j, tau, kappa, R, s = (x[e] for x in (graph.i, graph.j, graph.tau, graph.kappa, graph.R_ij, graph.t_ij))
+        high, lower = t[j] - t[i], low[j] - low[i]
+        r_t, r_R = high + lower - s @ P[i], P[j] - R.T @ P[i]
+        e_t = u * (abs(high) + abs(lower) + abs(high + lower) + abs(r_t)) + gamma(d) * (abs(s) @ abs(P[i]))
+        e_R = u * abs(r_R) + gamma(d) * (abs(R.T) @ abs(P[i]))
+        for weight, residual, its_error, rows in (
+            (tau, r_t[None], e_t[None], [(j, 1.0, None), (i, -1.0, None), (i, None, -s[None])]),
+            (kappa, r_R, e_R, [(j, None, np.eye(d)), (i, None, -R.T)]),
+        ):
+            value += weight * np.sum(residual**2)
+            value_error += weight * np.sum(2 * abs(residual) * its_error + gamma(d * d + 4) * residual**2)
+            size = weight * (its_error + gamma(most + 2) * abs(residual))
+            for pose, translation, block in rows:
+                at = slice(pose, pose + 1) if block is None else slice(n + d * pose, n + d * pose + d)
+                matrix = np.array([[translation]]) if block is None else block
+                product[at] += weight * matrix.T @ residual
+                error[at] += abs(matrix).T @ size
+    return value, value_error, product, error
+
+
+@pytest.mark.parametrize(("of_t", "of_low", "of_P"), SIZES)
+@pytest.mark.parametrize("d", [2, 3])
+def test_errors_of_edges(d: int, of_t: float, of_low: float, of_P: float) -> None:
+    problem = PGOProblem(varied_graph(1, 6, d))
+    rng = np.random.default_rng(0)
+    t, low = of_t * rng.standard_normal((6, d)), of_low * rng.standard_normal((6, d))
+    P = of_P * rng.standard_normal((6, d, d))
+    found = evaluate_edges(problem, np.concatenate([t, P.reshape(-1, d)]), low)
+    value, value_error, product, error = written_out(problem, t, low, P)
+    assert found.value == pytest.approx(value, rel=1e-12)
+    np.testing.assert_allclose(found.product, product, rtol=1e-9, atol=1e-9 * abs(product).max())
+    assert found.value_error >= ENOUGH * value_error
+    assert (found.product_error >= ENOUGH * error).all()
+
+
+@pytest.mark.parametrize("defect", [0.0, 1e-3, 10.0])
+@pytest.mark.parametrize("d", [2, 3])
+def test_errors_of_multipliers_and_of_the_certificate(d: int, defect: float) -> None:
+    problem = PGOProblem(varied_graph(2, 5, d))
+    rng = np.random.default_rng(1)
+    assert problem.graph.truth is not None
+    P = np.swapaxes(problem.graph.truth.R, 1, 2) + defect * rng.standard_normal((5, d, d))
+    Lambda = rng.standard_normal((5, d, d))
+    Lambda += np.swapaxes(Lambda, 1, 2)
+    found = evaluate_multipliers(Lambda, P)
+    value_error, error = 0.0, np.zeros((5, d, d))
+    for k in range(5):
+        off = np.eye(d) - P[k] @ P[k].T
+        of_off = gamma(d) * (abs(P[k]) @ abs(P[k].T)) + u * abs(off)
+        value_error += np.sum(abs(Lambda[k]) * (of_off + gamma(d * d + 3) * abs(off)))
+        error[k] = gamma(d) * (abs(Lambda[k]) @ abs(P[k]))
+    assert found.value_error >= ENOUGH * value_error
+    assert (found.product_error >= ENOUGH * error.reshape(-1, d)).all()
+    X, low = np.concatenate([problem.graph.truth.t, P.reshape(-1, d)]), np.zeros((5, d))
+    whole, edges = evaluate_certificate(problem, Lambda, X, low), evaluate_edges(problem, X, low)
+    assert whole.value_error >= ENOUGH * (edges.value_error + found.value_error + u * abs(whole.value))
+    of_rotations = edges.product_error[5:] + found.product_error + u * abs(whole.product[5:])
+    assert (whole.product_error[5:] >= ENOUGH * of_rotations).all()
+    assert (whole.product_error[:5] >= ENOUGH * edges.product_error[:5]).all()
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_errors_of_the_matrix_and_of_F(d: int) -> None:
+    problem = PGOProblem(varied_graph(3, 9, d))
+    graph, m = problem.graph, problem.graph.num_edges
+    most = np.bincount(np.concatenate([graph.i, graph.j])).max()
+    slant = orthogonality_error(graph.R_ij).max() + d * gamma(d + 2)
+    formula = (d + 2) * gamma(most + 4.0) * (1 + slant) + slant + 4 * d * u
+    assert matrix_error(graph) >= ENOUGH * formula
+    poses = graph.truth
+    assert poses is not None
+    omega, share = orthogonality_error(poses.R).max() + d * gamma(d + 2), (2 * d + 3) * u
+    residuals = problem.residuals(poses.stacked())
+    level = error = F = 0.0
+    for e in range(m):
+        i, j, length = graph.i[e], graph.j[e], np.linalg.norm(graph.t_ij[e])
+        e_R = 2 * np.sqrt(d) * share + 2 * omega
+        sizes = [np.linalg.norm(poses.t[k] - poses.t[0]) for k in (i, j)]
+        near, far = np.linalg.norm(poses.t[j] - poses.t[i]), sum(sizes)
+        r_t, r_R = np.linalg.norm(residuals[e]), np.linalg.norm(residuals[m + d * e : m + d * e + d])
+        for weight, r, its_error, at_level in (
+            (graph.tau[e], r_t, share * (near + length) + omega * length, share * (far + length) + omega * length),
+            (graph.kappa[e], r_R, e_R, e_R),
+        ):
+            level += weight * at_level**2
+            error += weight * (2 * r * its_error + its_error**2)
+            F += weight * r**2
+    assert rounding_level(problem, poses) >= ENOUGH * level
+    assert objective_rounding(problem, poses).error >= ENOUGH * (error + 80 * u * F)
+
+
+def test_errors_of_counts() -> None:
+    count, most = np.array([1.0, 7.0, 400.0]), 12.0
+    assert (error_of_counts(count, most) >= ENOUGH * most * gamma(count + 3.0) / (1.0 - gamma(count + 3.0))).all()
+    assert (column_error(count, most) >= ENOUGH * most * gamma(count + 6.0)).all()
+    assert np.isinf(error_of_counts(np.array([2.0**53]), 1.0)).all()
+
+
+def arrow(seed: int, side: int) -> csc_array:
+    """Diagonally dominant, with one long row, in canonical form."""
+    rng = np.random.default_rng(seed)
+    A = np.diag(rng.uniform(1.0, 2.0, side) * side)
+    A[-1, :-1] = A[:-1, -1] = rng.standard_normal(side - 1)
+    A[0, 1:4] = A[1:4, 0] = rng.standard_normal(3)
+    found = csc_array(A)
+    found.sort_indices()
+    return found
+
+
+@pytest.mark.parametrize("beside", [0, 3])
+def test_errors_of_superlu(beside: int) -> None:
+    A = arrow(0, 9)
+    factor = analyze(A, CholeskyBackend.SUPERLU).factorize(A)
+    L, U, order = factor._lu.L.toarray(), factor._lu.U.toarray(), factor._rows
+    pivots, a = U.diagonal(), A.diagonal()[order]
+    DL = pivots[:, None] * L.T
+    W = abs(DL - U) + u * abs(DL) + abs(U) * gamma((U != 0).sum(axis=0) + 3.0)
+    most = np.maximum((L != 0).sum(axis=0), (W != 0).sum(axis=1))
+    of_L, of_W = (L**2 @ (pivots * most)) / a, ((most / pivots) @ W**2) / a
+    balance = np.sqrt(of_L.mean() / of_W.mean())
+    formula = 0.5 * (of_L / balance + balance * of_W)
+    if beside:
+        formula = formula + error_of_counts(
+            (L != 0).sum(axis=1).astype(float), float((L != 0).sum(axis=0).max() + beside)
+        )
+    assert (factor.backward_error(beside)[order] >= ENOUGH * formula).all()
+
+
+@pytest.mark.parametrize("backend", CholeskyBackend)
+def test_errors_of_an_elimination_and_of_the_driver(backend: CholeskyBackend, monkeypatch: pytest.MonkeyPatch) -> None:
+    K = arrow(1, 12)
+    cut = Cut(np.arange(2, 11), np.array([0, 1, 11]), None)
+    plain, verified = (eliminate(K, cut, backend, is_verified) for is_verified in (False, True))
+    assert plain.factor is not None
+    Z = plain.factor.half_solve(plain.K_IG.toarray())
+    squares, beside = (Z**2).sum(axis=0), (Z != 0).sum(axis=1)
+    sums = row_sums(K.toarray()[np.ix_(cut.boundary, cut.boundary)] - Z.T @ Z, np.maximum(plain.diagonal, squares))
+    for share in (1e-3, 0.0):  # of the squares, in place of one that is as small as the entries' own last bits
+        monkeypatch.setattr(substructure, "column_error", lambda count, most, share=share: share + 0.0 * count)
+        lost = plain.schur - eliminate(K, cut, backend, is_verified=True).schur
+        last_bits = 2 * u * np.abs(plain.schur).max()
+        np.testing.assert_allclose(
+            lost[[0, 2, 5]], share * squares + 2 * u * sums, rtol=1e-6, atol=last_bits if share else 0.9 * last_bits
+        )
+    monkeypatch.undo()
+    assert (verified.interior_error >= ENOUGH * plain.factor.backward_error(beside)).all()
+    touched = (np.array([0, 1]), np.array([1, 2]))
+    interface = Interface(3, (1,), touched, separator_tree(touched, 3))
+    parts = [np.array([[2.0, 1.0], [1.0, 3.0]]), np.array([[5.0, -1.0], [-1.0, 4.0]])]
+    diagonal = np.array([2.0, 8.0, 4.0])
+    found = interface.rounding([packed(part) for part in parts], [], diagonal)
+    sums = np.zeros(3)
+    for poses, part in zip(touched, parts, strict=True):
+        sums[poses] += row_sums(part, diagonal[poses])
+    # Of every pose at least its own column, two contributions and eight more roundings.
+    assert (found >= ENOUGH * (gamma(11.0) * sums + column_error(np.full(3, 3.0), 2.0) * diagonal)).all()
+
+
+def test_what_an_eta_costs_and_the_last_rounding() -> None:
+    rng = np.random.default_rng(0)
+    rotations = random_rotations(5, 3, rng).reshape(-1, 3)
+    moved = rotations + 0.1 * rng.standard_normal(rotations.shape)
+    move = np.linalg.norm((moved - rotations).reshape(5, 9), axis=1)
+    assert squared_distances(moved, rotations) >= ENOUGH * np.sum((np.sqrt(8.0) + move) ** 2)
+    half_turn = np.diag([1.0, -1.0, -1.0])
+    for shrink in (1e-9, 1e-6, 1e-3):  # as far from a rotation as the distance to the one opposite grows
+        stretched = (1.0 + shrink) * rotations
+        opposite = (half_turn @ rotations.reshape(5, 3, 3)).reshape(-1, 3)
+        assert squared_distances(stretched, stretched) >= np.sum((stretched - opposite) ** 2)
+    assert bound_from([1.0, 2.0**-60], 0.0, 0.0, is_grounded=True).value < 1.0
+    assert bound_from([1.0], 0.25, 0.0, is_grounded=True).value < 0.75

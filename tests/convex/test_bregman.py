@@ -1,0 +1,328 @@
+import itertools
+import math
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from signals import sparse_signal
+
+import solvers
+from pgo_models.convex.bregman import BregmanPoint, BregmanProblem
+from pgo_models.convex.bregman_examples import (
+    differences,
+    shared_rotation_step,
+    total_variation_denoising,
+    total_variation_scale_space,
+)
+from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import Array, random_rotations, stack_transposes
+from pgo_models.graphs.partitioning import partition
+from pgo_models.graphs.scenes import grid
+from pgo_models.problem.matrices import connection_laplacian
+from solvers.convex.bregman import AlternatingBregman, Bregman, MethodOfMultipliers, TwoLineBregman, feasibility_bound
+from solvers.loop import iterate, run
+from solvers.result import Status
+
+EQUIVALENCE = 1e-7  # state by state, as the forms are stated in the paper
+INTERIOR = 1e-5  # an interior-point iterate is accurate to the square root of its gap where J is flat
+SEEDS = st.integers(0, 2**32 - 1)
+ALPHAS = st.sampled_from([0.3, 1.0, 5.0])
+FORMS = [Bregman, TwoLineBregman, MethodOfMultipliers, AlternatingBregman]
+
+
+def states(method, problem, count: int, start=None):
+    return list(itertools.islice(iterate(method, problem, start), count))
+
+
+def lasso(seed: int, m: int = 6, s: int = 3) -> BregmanProblem:
+    """1/2 ||A x - c||^2 + ||x||_1 s.t. K x = f: strongly convex, not smooth."""
+    rng = np.random.default_rng(seed)
+    A, c = rng.standard_normal((m + 2, m)) + 2.0 * np.eye(m + 2, m), rng.standard_normal(m + 2)
+    x = cp.Variable(m, name="x")
+    return BregmanProblem(
+        0.5 * cp.sum_squares(A @ x - c) + cp.norm1(x), x, rng.standard_normal((s, m)), rng.standard_normal(s)
+    )
+
+
+def split_lasso(seed: int) -> tuple[BregmanProblem, Array, Array]:
+    """1/2 ||A u - c||^2 + 0.5 ||v||_1 s.t. u - v = 0."""
+    rng = np.random.default_rng(seed)
+    A, c = rng.standard_normal((8, 5)) + 2.0 * np.eye(8, 5), rng.standard_normal(8)
+    u, v = cp.Variable(5, name="u"), cp.Variable(5, name="v")
+    J = 0.5 * cp.sum_squares(A @ u - c) + 0.5 * cp.norm1(v)
+    return BregmanProblem(J, (u, v), np.hstack([np.eye(5), -np.eye(5)]), np.zeros(5)), A, c
+
+
+def soft(x: Array, threshold: float) -> Array:
+    return np.sign(x) * np.maximum(np.abs(x) - threshold, 0.0)
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=SEEDS, alpha=ALPHAS)
+def test_three_forms_have_the_same_states(seed: int, alpha: float) -> None:
+    problem = lasso(seed)
+    one, two, three = (states(form(alpha=alpha), problem, 10) for form in FORMS[:3])
+    for bregman, two_line, multipliers in zip(one, two, three, strict=True):
+        np.testing.assert_allclose(bregman.x, two_line.x, rtol=0, atol=EQUIVALENCE)
+        np.testing.assert_allclose(bregman.x, multipliers.x, rtol=0, atol=EQUIVALENCE)
+        np.testing.assert_allclose(bregman.p, problem.K.T @ multipliers.lam, rtol=0, atol=EQUIVALENCE)
+        np.testing.assert_allclose(multipliers.lam, -alpha * two_line.b, rtol=0, atol=EQUIVALENCE)
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=SEEDS, alpha=ALPHAS)
+def test_p_is_a_subgradient_of_J(seed: int, alpha: float) -> None:
+    problem = lasso(seed)
+    rng = np.random.default_rng(seed)
+    for state in states(Bregman(alpha=alpha), problem, 6)[1:]:
+        J = problem.objective(state.x)
+        for _ in range(5):
+            other = state.x + rng.standard_normal(state.x.shape)
+            assert problem.objective(other) >= J + state.p @ (other - state.x) - EQUIVALENCE
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=SEEDS, alpha=ALPHAS)
+def test_one_pass_is_admm(seed: int, alpha: float) -> None:
+    problem, A, c = split_lasso(seed)
+    u, v, scaled = np.zeros(5), np.zeros(5), np.zeros(5)
+    for state in states(AlternatingBregman(alpha=alpha), problem, 10)[1:]:
+        u = np.linalg.solve(A.T @ A + alpha * np.eye(5), A.T @ c + alpha * (v - scaled))
+        v = soft(u + scaled, 0.5 / alpha)
+        scaled = scaled + u - v
+        np.testing.assert_allclose(state.x, np.r_[u, v], rtol=0, atol=EQUIVALENCE)
+        np.testing.assert_allclose(state.lam, -alpha * scaled, rtol=0, atol=EQUIVALENCE)
+
+
+def test_many_passes_are_the_method_of_multipliers() -> None:
+    problem, _, _ = split_lasso(0)
+    many = states(AlternatingBregman(alpha=1.0, passes=80), problem, 4)
+    for state, exact in zip(many, states(MethodOfMultipliers(alpha=1.0), problem, 4), strict=True):
+        np.testing.assert_allclose(state.x, exact.x, rtol=0, atol=EQUIVALENCE)
+        np.testing.assert_allclose(state.lam, exact.lam, rtol=0, atol=EQUIVALENCE)
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=SEEDS, alpha=ALPHAS)
+def test_residual_falls_and_keeps_its_bound(seed: int, alpha: float) -> None:
+    problem, solution = sparse_signal(seed, m=20, s=8, nonzeros=3)
+    found = states(TwoLineBregman(alpha=alpha), problem, 12)
+    residuals = [float(np.linalg.norm(problem.residual(state.x))) for state in found]
+    for k, (before, after) in enumerate(itertools.pairwise(residuals), start=1):
+        assert after <= before + INTERIOR
+        assert after <= feasibility_bound(problem.objective(solution), alpha, k) + INTERIOR
+
+
+def test_bound_refuses_what_it_does_not_hold_for() -> None:
+    with pytest.raises(SettingError, match="k >= 1"):
+        feasibility_bound(1.0, 1.0, 0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_basis_pursuit_recovers_a_sparse_signal(seed: int) -> None:
+    problem, solution = sparse_signal(seed)
+    outcome = run(TwoLineBregman(alpha=5.0), problem)
+    assert outcome.status is Status.CONVERGED
+    assert outcome.iterations <= 10
+    np.testing.assert_allclose(outcome.state.x, solution, rtol=0, atol=INTERIOR)
+
+
+def test_errors_on_the_way_are_forgotten() -> None:
+    problem, solution = sparse_signal(0)
+    method = TwoLineBregman(alpha=5.0)
+    state = method.init(problem, None)
+    rng = np.random.default_rng(0)
+    errors = []
+    for k in range(15):
+        state = method.step(problem, state)
+        if k < 3:
+            error = 0.1 * rng.standard_normal(state.x.shape)
+            state = type(state)(state.k, state.x + error, state.b + problem.K @ error, state.subproblem)
+        errors.append(np.linalg.norm(state.x - solution))
+    assert min(errors[:3]) > 0.1
+    assert errors[-1] < INTERIOR
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_errors_of_loose_subproblems_do_not_add_up(seed: int) -> None:
+    problem, solution = sparse_signal(seed)
+    loose = states(TwoLineBregman(alpha=5.0, subproblem_tolerance=1e-2), problem, 20)
+    error = [np.linalg.norm(state.x - solution) for state in loose]
+    assert error[-1] < error[10] < error[4]
+
+
+def rof(noisy: Array, weight: float) -> tuple[Array, float]:
+    u = cp.Variable(noisy.shape)
+    J = 0.5 * cp.sum_squares(u - noisy) + weight * cp.norm1(differences(noisy.shape) @ cp.vec(u, order="C"))
+    value = cp.Problem(cp.Minimize(J)).solve(solver=cp.CLARABEL)
+    return np.asarray(u.value), float(value)
+
+
+def steps_signal(rng: np.random.Generator) -> tuple[Array, Array]:
+    truth = np.repeat([0.0, 1.0, 0.3, 2.0], 10)
+    return truth, truth + 0.1 * rng.standard_normal(truth.shape)
+
+
+def test_split_bregman_denoises_a_signal() -> None:
+    truth, noisy = steps_signal(np.random.default_rng(0))
+    problem = total_variation_denoising(noisy, 0.3)
+    outcome = run(AlternatingBregman(alpha=1.0), problem)
+    assert outcome.status is Status.CONVERGED
+    u = problem.unstacked(outcome.state.x)[0]
+    expected, value = rof(noisy, 0.3)
+    assert outcome.objective == pytest.approx(value, rel=1e-5)
+    np.testing.assert_allclose(u, expected, rtol=0, atol=1e-4)
+    assert np.linalg.norm(u - truth) < np.linalg.norm(noisy - truth)
+
+
+def test_split_bregman_denoises_an_image() -> None:
+    rng = np.random.default_rng(0)
+    truth = np.kron(rng.integers(0, 2, (3, 3)), np.ones((4, 4)))
+    noisy = truth + 0.2 * rng.standard_normal(truth.shape)
+    problem = total_variation_denoising(noisy, 0.3)
+    outcome = run(AlternatingBregman(alpha=0.5, tolerance=1e-4), problem)
+    assert outcome.status is Status.CONVERGED
+    u = problem.unstacked(outcome.state.x)[0]
+    expected, value = rof(noisy, 0.3)
+    assert outcome.objective == pytest.approx(value, rel=1e-3)
+    np.testing.assert_allclose(u, expected, rtol=0, atol=1e-2)
+    assert np.linalg.norm(u - truth) < np.linalg.norm(noisy - truth)
+
+
+def test_scale_space_stopped_at_the_noise_beats_the_data() -> None:
+    truth, noisy = steps_signal(np.random.default_rng(0))
+    noise = np.linalg.norm(noisy - truth)
+    problem = total_variation_scale_space(noisy)
+    outcome = run(
+        TwoLineBregman(alpha=0.05),
+        problem,
+        callback=lambda state, record: record.measurement.infeasibility <= noise,
+    )
+    assert outcome.status is Status.STOPPED
+    assert np.linalg.norm(outcome.state.x - truth) < 0.5 * noise
+    full = run(TwoLineBregman(alpha=10.0), problem)
+    np.testing.assert_allclose(full.state.x, noisy, rtol=0, atol=1e-5)
+
+
+def test_an_indicator_adds_constraints() -> None:
+    x = cp.Variable(3)
+    J = cp.sum_squares(x - np.array([-1.0, 2.0, 3.0])) + cp.transforms.indicator([x >= 0])
+    solved = run(MethodOfMultipliers(alpha=10.0), BregmanProblem(J, x, np.ones((1, 3)), [4.0]))
+    assert solved.status is Status.CONVERGED
+    np.testing.assert_allclose(solved.state.x, [0.0, 1.5, 2.5], rtol=0, atol=1e-5)  # without it: -1, 2, 3
+
+
+@pytest.mark.parametrize("form", [AlternatingBregman, MethodOfMultipliers])
+def test_two_robots_agree_on_the_r_step(form) -> None:
+    rng = np.random.default_rng(0)
+    graph = grid(rng)
+    V, rho = random_rotations(graph.num_poses, 3, rng), 20.0
+    shared = shared_rotation_step(graph, partition(graph, 2), V, rho)
+    outcome = run(form(alpha=10.0), shared.problem)
+    assert outcome.status is Status.CONVERGED
+    L = connection_laplacian(graph).toarray()
+    expected = np.linalg.solve(L + 0.5 * rho * np.eye(len(L)), 0.5 * rho * stack_transposes(V))
+    found = stack_transposes(shared.rotations(outcome.state.x))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=10 * form.tolerance)
+
+
+# The contract of every solver.
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_step_leaves_its_input_alone(form) -> None:
+    problem = lasso(1) if form is not AlternatingBregman else split_lasso(1)[0]
+    method = form(alpha=1.0)
+    state = states(method, problem, 3)[-1]
+    arrays = {name: value.copy() for name, value in vars(state).items() if isinstance(value, np.ndarray)}
+    first, second = method.step(problem, state), method.step(problem, state)
+    for name, value in arrays.items():
+        np.testing.assert_array_equal(getattr(state, name), value)
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    assert (state.k, first.k) == (2, 3)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_warm_start_at_the_solution_stays(form) -> None:
+    problem = lasso(2) if form is not AlternatingBregman else split_lasso(2)[0]
+    method = form(alpha=5.0, tolerance=1e-9)
+    first = run(method, problem)
+    again = run(form(alpha=5.0, tolerance=1e-7), problem, method.point(problem, first.state))
+    assert again.status is Status.CONVERGED
+    assert again.iterations <= 1
+    np.testing.assert_allclose(again.state.x, first.state.x, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_limits_are_reported(form) -> None:
+    problem = lasso(3) if form is not AlternatingBregman else split_lasso(3)[0]
+    outcome = run(form(alpha=0.1, tolerance=1e-12, max_iterations=2), problem)
+    assert outcome.status is Status.MAX_ITERATIONS
+    assert (outcome.iterations, len(outcome.history)) == (2, 3)
+    # The best iterate is the least infeasible one, not the start, where J is smaller.
+    assert np.linalg.norm(problem.residual(outcome.state.x)) == min(
+        record.measurement.infeasibility for record in outcome.history.records
+    )
+    assert run(form(tolerance=1e-12), problem, time_limit=1e-9).status is Status.TIME_LIMIT
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_same_problem_gives_the_same_bits(form) -> None:
+    one, other = (lasso(4) if form is not AlternatingBregman else split_lasso(4)[0] for _ in range(2))
+    np.testing.assert_array_equal(states(form(), one, 5)[-1].x, states(form(), other, 5)[-1].x)
+
+
+def test_history_has_a_row_per_state() -> None:
+    problem, _ = sparse_signal(0)
+    method = TwoLineBregman(alpha=1.0)
+    outcome = run(method, problem)
+    residuals = [
+        np.linalg.norm(problem.residual(state.x)) / max(1.0, np.linalg.norm(problem.f))
+        for state in states(method, problem, outcome.iterations + 1)
+    ]
+    np.testing.assert_array_equal(outcome.history.primal_residual, residuals)
+    assert math.isinf(outcome.history.dual_residual[0])
+
+
+@pytest.mark.parametrize(
+    ("settings_given", "message"),
+    [
+        ({"alpha": 0.0}, "alpha must be positive and finite, got 0.0"),
+        ({"alpha": -1.0}, "alpha must be positive"),
+        ({"alpha": math.nan}, "alpha must be positive"),
+        ({"tolerance": 0.0}, "tolerance must be positive"),
+        ({"subproblem_tolerance": math.inf}, "subproblem_tolerance must be positive"),
+        ({"max_iterations": -1}, "max_iterations must not be negative"),
+    ],
+)
+@pytest.mark.parametrize("form", FORMS)
+def test_settings_are_checked(form, settings_given, message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        form(**settings_given)
+
+
+def test_passes_are_checked() -> None:
+    with pytest.raises(SettingError, match="passes must be at least 1"):
+        AlternatingBregman(passes=0)
+
+
+def test_starts_are_checked() -> None:
+    problem = lasso(0)
+    with pytest.raises(SettingError, match="shapes"):
+        Bregman().init(problem, BregmanPoint(np.zeros(2), np.zeros(3)))
+    with pytest.raises(SettingError, match="not finite"):
+        Bregman().init(problem, BregmanPoint(np.full(6, np.nan), np.zeros(3)))
+    x = cp.Variable(2, name="x")
+    barrier = BregmanProblem(-cp.sum(cp.log(x)), x, [[1.0, 1.0]], [1.0])
+    with pytest.raises(SettingError, match="J is not finite at the start"):
+        Bregman().init(barrier, None)
+    outcome = run(TwoLineBregman(alpha=10.0), barrier, BregmanPoint(np.ones(2), np.zeros(1)))
+    np.testing.assert_allclose(outcome.state.x, [0.5, 0.5], rtol=0, atol=1e-5)
+
+
+def test_public_names_are_loaded_when_used() -> None:
+    assert solvers.Bregman is Bregman
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = solvers.nothing

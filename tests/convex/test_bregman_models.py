@@ -1,0 +1,202 @@
+import cvxpy as cp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse import csr_array
+
+from pgo_models.convex.bregman import (
+    BregmanProblem,
+    augmented_lagrangian_subproblem,
+    block_subproblems,
+    bregman_subproblem,
+    two_line_subproblem,
+)
+from pgo_models.convex.bregman_examples import (
+    basis_pursuit,
+    differences,
+    shared_rotation_step,
+    total_variation_denoising,
+    total_variation_scale_space,
+)
+from pgo_models.convex.clarabel import solve_compiled
+from pgo_models.errors import PGOError, SettingError
+from pgo_models.geometry.rotations import random_rotations
+from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
+from pgo_models.graphs.scenes import grid
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def small_problem() -> BregmanProblem:
+    x = cp.Variable(3, name="x")
+    return BregmanProblem(cp.norm1(x), x, np.ones((1, 3)), [1.0])
+
+
+def test_values_are_stacked_row_by_row_in_the_order_named() -> None:
+    u, v = cp.Variable((2, 2)), cp.Variable(3)
+    problem = BregmanProblem(cp.sum_squares(u) + cp.norm1(v), (u, v), np.zeros((1, 7)), [0.0])
+    x = problem.stacked([np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([5.0, 6.0, 7.0])])
+    np.testing.assert_array_equal(x, np.arange(1.0, 8.0))
+    np.testing.assert_array_equal(problem.unstacked(x)[0], [[1.0, 2.0], [3.0, 4.0]])
+    assert problem.objective(x) == pytest.approx(30.0 + 18.0, rel=1e-14)
+
+
+def test_dense_and_sparse_constraints_are_the_same() -> None:
+    x = cp.Variable(3)
+    K = np.array([[1.0, 0.0, 2.0]])
+    for given_as in (K, csr_array(K), K.tolist()):
+        problem = BregmanProblem(cp.norm1(x), x, given_as, [4.0])
+        np.testing.assert_array_equal(problem.residual(np.ones(3)), [-1.0])
+
+
+def test_problem_does_not_share_arrays_with_its_caller() -> None:
+    x = cp.Variable(2)
+    K, f = np.eye(2), np.ones(2)
+    problem = BregmanProblem(cp.norm1(x), x, K, f)
+    K[:], f[:] = np.nan, np.nan
+    np.testing.assert_array_equal(problem.residual(np.zeros(2)), [-1.0, -1.0])
+
+
+@pytest.mark.parametrize(
+    ("J", "message"),
+    [
+        (lambda x: -cp.sum_squares(x), "not convex: cvxpy finds it concave"),
+        (lambda x: cp.sqrt(cp.sum_squares(x)), "not convex: cvxpy finds it quasiconvex"),
+        (lambda x: cp.abs(x), "must be one number"),
+        (lambda x: 1.0, "give a cvxpy expression"),
+        (lambda x: cp.norm1(x) + cp.norm1(cp.Variable(2, name="stranger")), "stranger"),
+    ],
+)
+def test_bad_objectives_are_refused(J, message: str) -> None:
+    x = cp.Variable(3)
+    with pytest.raises(SettingError, match=message):
+        BregmanProblem(J(x), x, np.ones((1, 3)), [1.0])
+
+
+@pytest.mark.parametrize(
+    ("K", "f", "message"),
+    [
+        (np.ones((1, 2)), [1.0], r"K has shape \(1, 2\)"),
+        (np.ones((2, 3)), [1.0], r"f \(1,\)"),
+        (np.full((1, 3), np.nan), [1.0], "K has 3 entries that are not finite"),
+        (np.ones((1, 3)), [np.inf], r"f has 1 entries that are not finite, the first at \(0,\): inf"),
+        (np.ones((1, 3)), ["one"], "f must be real numbers, got type <U3"),
+        (np.ones((1, 3)) * 1j, [1.0], "K must be real numbers, got type complex128"),
+        (csr_array(np.ones((1, 3)) * 1j), [1.0], r"the entries of K must be .* numbers, got type complex128"),
+        (np.ones((1, 3)), [1.0 + 1j], "f must be real numbers, got type complex128"),
+    ],
+)
+def test_bad_constraints_are_refused(K, f, message: str) -> None:
+    x = cp.Variable(3)
+    with pytest.raises(SettingError, match=message):
+        BregmanProblem(cp.norm1(x), x, K, f)
+
+
+@pytest.mark.parametrize(
+    ("variable", "message"),
+    [
+        (cp.Variable(3, complex=True), "complex"),
+        (cp.Variable(3, boolean=True), "boolean"),
+        (np.zeros(3), "give a cvxpy Variable"),
+    ],
+)
+def test_bad_variables_are_refused(variable, message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        BregmanProblem(cp.Constant(0.0), [variable], np.ones((1, 3)), [1.0])
+
+
+def test_subproblems_are_compiled_once() -> None:
+    problem = small_problem()
+    for compiled in (
+        bregman_subproblem(problem, 1.0),
+        two_line_subproblem(problem, 1.0),
+        augmented_lagrangian_subproblem(problem, 1.0),
+        *block_subproblems(problem, 1.0),
+    ):
+        assert compiled.problem.is_dcp(dpp=True)
+        assert [parameter.id for parameter in compiled.problem.parameters()] == [compiled.parameter.id]
+        compiled.solve(np.full(compiled.parameter.shape, 0.1))
+        program = compiled.problem._cache.param_prog
+        assert program is not None
+        compiled.solve(np.full(compiled.parameter.shape, 0.2))
+        assert compiled.problem._cache.param_prog is program
+
+
+def test_a_term_that_couples_the_blocks_is_refused() -> None:
+    u, v = cp.Variable(2, name="u"), cp.Variable(2, name="v")
+    problem = BregmanProblem(cp.sum_squares(u) + cp.sum_squares(u - v), (u, v), np.zeros((1, 4)), [0.0])
+    with pytest.raises(SettingError, match="couples the variables u, v"):
+        block_subproblems(problem, 1.0)
+
+
+def test_unbounded_and_infeasible_subproblems_say_so() -> None:
+    x = cp.Variable(2)
+    unbounded = bregman_subproblem(BregmanProblem(cp.sum(x), x, [[1.0, 1.0]], [1.0]), 1.0)
+    with pytest.raises(PGOError, match="unbounded on the Bregman subproblem: its objective has no minimum"):
+        unbounded.solve(np.array([0.0, 2.0]))
+    infeasible = cp.Problem(cp.Minimize(cp.sum(x)), [x >= 1, x <= 0])
+    with pytest.raises(PGOError, match="infeasible on the toy: its constraints contradict"):
+        solve_compiled(infeasible, "toy")
+
+
+@given(seed=SEEDS, height=st.integers(1, 5), width=st.integers(2, 5))
+def test_differences_are_numpy_differences(seed: int, height: int, width: int) -> None:
+    image = np.random.default_rng(seed).standard_normal((height, width))
+    expected = np.concatenate([np.diff(image, axis=0).ravel(), np.diff(image, axis=1).ravel()])
+    np.testing.assert_array_equal(differences(image.shape) @ image.ravel(), expected)
+    np.testing.assert_array_equal(differences((width,)) @ image[0], np.diff(image[0]))
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (2, 2, 2)])
+def test_differences_need_a_signal_or_an_image(shape: tuple[int, ...]) -> None:
+    with pytest.raises(SettingError, match="signal or an image"):
+        differences(shape)
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=SEEDS)
+def test_total_variation_models_have_the_right_objectives(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    noisy, u = rng.standard_normal((2, 4, 3))
+    total_variation = np.abs(np.diff(u, axis=0)).sum() + np.abs(np.diff(u, axis=1)).sum()
+    split = total_variation_denoising(noisy, 0.7)
+    x = split.stacked([u, differences(u.shape) @ u.ravel()])
+    assert np.linalg.norm(split.residual(x)) < 1e-14
+    assert split.objective(x) == pytest.approx(0.5 * np.sum((u - noisy) ** 2) + 0.7 * total_variation, rel=1e-12)
+    space = total_variation_scale_space(noisy)
+    assert space.objective(u.ravel()) == pytest.approx(total_variation, rel=1e-12)
+    np.testing.assert_array_equal(space.residual(noisy.ravel()), np.zeros(noisy.size))
+
+
+def test_examples_check_their_settings() -> None:
+    with pytest.raises(SettingError, match="weight must not be negative"):
+        total_variation_denoising(np.zeros(3), -1.0)
+    graph = grid(np.random.default_rng(0))
+    robots, V = partition(graph, 2), np.zeros((graph.num_poses, 3, 3))
+    with pytest.raises(SettingError, match="rho must be positive"):
+        shared_rotation_step(graph, robots, V, 0.0)
+    with pytest.raises(SettingError, match="V has shape"):
+        shared_rotation_step(graph, robots, V[1:], 1.0)
+
+
+@settings(max_examples=5, deadline=None)
+@given(seed=SEEDS, num_robots=st.integers(1, 3))
+def test_shared_rotation_step_adds_up_to_the_whole_graph(seed: int, num_robots: int) -> None:
+    rng = np.random.default_rng(seed)
+    graph = grid(rng)
+    robots = Partition(
+        np.r_[np.arange(num_robots), rng.integers(0, num_robots, 27 - num_robots)], PartitionMethod.GIVEN
+    )
+    V, R = random_rotations(27, 3, rng), random_rotations(27, 3, rng)
+    model = shared_rotation_step(graph, robots, V, 3.0)
+    x = model.problem.stacked([np.swapaxes(R[poses], 1, 2) for poses in model.held])
+    assert np.linalg.norm(model.problem.residual(x)) == 0.0
+    np.testing.assert_array_equal(model.rotations(x), R)
+    error = R[graph.j] - R[graph.i] @ graph.R_ij
+    expected = np.sum(graph.kappa[:, None, None] * error**2) + 1.5 * np.sum((R - V) ** 2)
+    assert model.problem.objective(x) == pytest.approx(expected, rel=1e-12)
+
+
+def test_basis_pursuit_takes_any_matrix() -> None:
+    assert basis_pursuit(np.ones((2, 5)), np.ones(2)).K.shape == (2, 5)

@@ -1,0 +1,159 @@
+import cvxpy as cp
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, SEEDS, random_poses, varied_problem
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pgo_models.convex.graph_subproblem import ModelChange, Neighbours, PoseVariables, Unknowns, graph_qp, robot_qp
+from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import Array, stack_transposes
+from pgo_models.graphs.partitioning import partition
+from pgo_models.problem.problem import PGOProblem
+from solvers.soc.local_copies import build_team
+from solvers.soc.paper import PaperSOC, PaperState
+from solvers.soc.r_step import RStep
+
+ACCURACY = 1e-8
+RHO = st.floats(0.1, 10.0)
+
+
+def drawn(seed: int, n: int, d: int) -> tuple[PGOProblem, Array, Array]:
+    """A problem, penalties of the size of its diagonal, and a shift near its poses."""
+    problem = varied_problem(seed, n, d)
+    rng = np.random.default_rng(seed)
+    rho = float(np.median(problem.M.diagonal())) * np.exp(0.3 * rng.standard_normal(n))
+    V = random_poses(n, d, seed).stacked()
+    return problem, rho, V + 0.1 * rng.standard_normal(V.shape)
+
+
+@settings(max_examples=10)
+@given(seed=SEEDS, n=st.integers(3, 10), d=DIMENSIONS)
+def test_the_joint_program_is_the_factorised_step(seed: int, n: int, d: int) -> None:
+    problem, rho, V = drawn(seed, n, d)
+    team = build_team(problem, None, RStep.FACTORIZED).with_penalty(rho, np.ones(n))
+    X = graph_qp(problem.graph, rho).solve(V)
+    np.testing.assert_allclose(X[n:], team.solve_all(V[n:]), rtol=0, atol=ACCURACY)
+    t = problem.M[:n, :n] @ X[:n] + problem.M[:n, n:] @ X[n:]  # the translations are the best ones for these rotations
+    np.testing.assert_allclose(t, 0.0, rtol=0, atol=ACCURACY * float(problem.M.diagonal().max()))
+
+
+@settings(max_examples=10)
+@given(seed=SEEDS, n=st.integers(3, 10), d=DIMENSIONS)
+def test_the_rotation_program_solves_its_normal_equations(seed: int, n: int, d: int) -> None:
+    problem, rho, V = drawn(seed, n, d)
+    X = graph_qp(problem.graph, rho, Unknowns.ROTATIONS).solve(V[n:])
+    half = 0.5 * np.repeat(rho, d)
+    expected = np.linalg.solve(problem.L.toarray() + np.diag(half), half[:, None] * V[n:])
+    np.testing.assert_allclose(X, expected, rtol=0, atol=ACCURACY)
+
+
+@settings(max_examples=8)
+@given(seed=SEEDS, n=st.integers(4, 10), d=DIMENSIONS)
+def test_with_frozen_neighbours_it_is_the_papers_step(seed: int, n: int, d: int) -> None:
+    problem, _, _ = drawn(seed, n, d)
+    robots = partition(problem.graph, 2)
+    graph = problem.graph.with_robots(robots.robot)
+    soc = PaperSOC(robots=robots)
+    state = soc.init(problem, random_poses(n, d, seed))
+    assert isinstance(state, PaperState)
+    following = soc.step(problem, state)
+    assert isinstance(following, PaperState)
+    X = np.concatenate([np.zeros((n, d)), stack_transposes(state.R)])
+    for robot in range(2):
+        qp = robot_qp(graph, robot, np.full(n, state.rho))
+        own = np.flatnonzero(graph.robots == robot)
+        Y = qp.solve(stack_transposes((state.omega - state.B)[own]), X)
+        np.testing.assert_allclose(Y, stack_transposes(following.R[own]), rtol=0, atol=ACCURACY)
+
+
+@settings(max_examples=8)
+@given(seed=SEEDS, n=st.integers(4, 10), d=DIMENSIONS)
+def test_with_copies_it_is_the_consensus_step(seed: int, n: int, d: int) -> None:
+    problem, rho, V = drawn(seed, n, d)
+    robots = partition(problem.graph, 2)
+    graph = problem.graph.with_robots(robots.robot)
+    separator = np.zeros(n, dtype=bool)
+    separator[robots.separators(graph)] = True
+    rho_t = np.full(n, float(np.median(rho)))
+    team = build_team(problem, robots, RStep.FACTORIZED).with_penalty(rho, rho_t)
+    solution = team.solve_all(V[team.row])
+    for a, (robot, rows) in enumerate(zip(team.robots, team.slices, strict=True)):
+        copies = np.maximum(team.copies, 1)  # translations of separators, and all rotations, are shared out
+        share_t = np.where(separator, rho_t / copies[:n], 0.0)
+        qp = robot_qp(graph, a, rho / copies[n::d], Neighbours.COPIES, Unknowns.POSES, rho_t=share_t)
+        np.testing.assert_array_equal(qp.variables.poses, robot.poses)
+        local = np.concatenate([robot.poses, (n + d * robot.poses[:, None] + np.arange(d)).ravel()])
+        np.testing.assert_allclose(qp.solve(V[local])[robot.held], solution[rows], rtol=0, atol=ACCURACY)
+
+
+def test_a_frozen_translation_needs_a_penalty() -> None:
+    problem, rho, V = drawn(0, 6, 2)
+    graph = problem.graph.with_robots(np.arange(6) // 3)
+    with pytest.raises(SettingError, match="give rho_t"):
+        robot_qp(graph, 0, rho, Neighbours.FROZEN, Unknowns.POSES)
+    qp = robot_qp(graph, 0, rho, Neighbours.FROZEN, Unknowns.POSES, rho_t=rho)
+    mine = np.concatenate([np.arange(3), 6 + np.arange(6)])
+    half = 0.5 * np.concatenate([rho, np.repeat(rho, 2)])[mine]
+    others = np.setdiff1d(np.arange(18), mine)
+    M = problem.M.toarray()
+    expected = np.linalg.solve(
+        M[np.ix_(mine, mine)] + np.diag(half), half[:, None] * V[mine] - M[np.ix_(mine, others)] @ V[others]
+    )
+    np.testing.assert_allclose(qp.solve(V[mine], V), expected, rtol=0, atol=ACCURACY)
+    with pytest.raises(SettingError, match="neighbours are frozen"):
+        qp.solve(V[mine])
+
+
+def test_the_shift_is_the_only_parameter_and_it_is_compiled_once() -> None:
+    problem, rho, V = drawn(1, 6, 3)
+    qp = graph_qp(problem.graph, rho)
+    assert qp.qp.problem.parameters() == [qp.qp.shift]
+    qp.solve(V)
+    compiled = qp.qp.problem._cache.param_prog
+    qp.solve(2.0 * V)
+    assert qp.qp.problem._cache.param_prog is compiled
+
+
+@settings(max_examples=10)
+@given(seed=SEEDS, n=st.integers(3, 8), d=DIMENSIONS)
+def test_the_named_views_are_the_poses_and_residuals(seed: int, n: int, d: int) -> None:
+    problem, rho, _ = drawn(seed, n, d)
+    graph, poses = problem.graph, random_poses(n, d, seed)
+    seen: list[PoseVariables] = []
+
+    def look(unknown: PoseVariables) -> ModelChange:
+        seen.append(unknown)
+        return ModelChange()
+
+    qp = graph_qp(graph, rho, changer=look)
+    cost = qp.cost(poses.stacked())
+    assert cost == pytest.approx(problem.objective(poses), rel=1e-12)
+    total = 0.0
+    for e in range(graph.num_edges):
+        total += graph.kappa[e] * float(np.sum(seen[0].rotation_residual(e).value ** 2))
+        total += graph.tau[e] * float(np.sum(seen[0].translation_residual(e).value ** 2))
+    assert total == pytest.approx(cost, rel=1e-10)
+    np.testing.assert_array_equal(seen[0].R(1).value, poses.R[1])
+    np.testing.assert_array_equal(seen[0].t(n - 1).value, poses.t[n - 1])
+
+
+def test_replaced_edges_leave_the_cost() -> None:
+    problem, rho, _ = drawn(2, 6, 3)
+    poses = random_poses(6, 3, 2)
+    qp = graph_qp(problem.graph, rho, changer=lambda unknown: ModelChange(replaced_edges=[0, 3]))
+    costs = problem.edge_costs(poses)
+    assert qp.cost(poses.stacked()) == pytest.approx(float(costs.sum() - costs[0] - costs[3]), rel=1e-12)
+
+
+def test_what_is_not_there_is_named() -> None:
+    problem, rho, _ = drawn(3, 6, 2)
+    graph = problem.graph.with_robots(np.arange(6) // 3)
+    with pytest.raises(SettingError, match="robot 5 owns no pose"):
+        robot_qp(graph, 5, rho)
+    with pytest.raises(SettingError, match="pose 5 is not among the 3 unknown"):
+        robot_qp(graph, 0, rho, changer=lambda unknown: ModelChange(terms=[cp.sum_squares(unknown.R(5))]))
+    with pytest.raises(SettingError, match=r"use Unknowns\.POSES"):
+        graph_qp(graph, rho, Unknowns.ROTATIONS, lambda unknown: ModelChange(terms=[cp.sum_squares(unknown.t(0))]))
+    with pytest.raises(SettingError, match="not convex"):
+        graph_qp(graph, rho, changer=lambda unknown: ModelChange(terms=[-cp.sum_squares(unknown.t(0))]))

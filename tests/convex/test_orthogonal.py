@@ -1,0 +1,306 @@
+import itertools
+import math
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem, kkt_residuals
+from pgo_models.convex.orthogonality_examples import (
+    one_norm_components,
+    polar_factor,
+    procrustes,
+    rotation_averaging,
+    smallest_eigenvectors,
+    sparse_components,
+    sparse_low_rank,
+)
+from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import Array, orthogonality_error, random_rotations
+from pgo_models.graphs.scenes import MILD_NOISE, grid, random_geometric
+from pgo_models.problem.problem import PGOProblem
+from solvers.convex.orthogonal import OrthogonalSOC, solve_orthogonal
+from solvers.loop import iterate, run
+from solvers.result import Status
+from solvers.riemannian.newton import Newton
+from solvers.soc.soc import SOC
+
+SEEDS = st.integers(0, 2**32 - 1)
+TOLERANCE = OrthogonalSOC.tolerance
+BETTER = 100 * TOLERANCE  # residuals bound the error up to the conditioning of the problem
+
+
+def rng_of(seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def assert_solved(solution) -> None:
+    assert solution.status is Status.CONVERGED
+    assert solution.kkt.feasibility <= BETTER
+    # One convex solve at the answer, independent of the run's own residuals.
+    assert solution.kkt.stationarity <= BETTER * max(1.0, solution.outcome.state.scale)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nearest_orthonormal_matrix(seed: int) -> None:
+    B = rng_of(seed).standard_normal((5, 3))
+    solution = solve_orthogonal(procrustes(np.eye(5), B), rng_of(seed), starts=1)
+    assert_solved(solution)
+    np.testing.assert_allclose(solution.values[0], polar_factor(B), rtol=0, atol=BETTER)
+
+
+@pytest.mark.parametrize("rotation", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_balanced_procrustes_is_the_svd(seed: int, rotation: bool) -> None:
+    rng = rng_of(seed)
+    A, B = rng.standard_normal((8, 3)), rng.standard_normal((8, 3))
+    solution = solve_orthogonal(procrustes(A, B, rotation=rotation), rng, starts=6)
+    assert_solved(solution)
+    X = polar_factor(A.T @ B, rotation=rotation)
+    assert solution.objective == pytest.approx(float(np.sum((A @ X - B) ** 2)), rel=TOLERANCE)
+    np.testing.assert_allclose(solution.values[0], X, rtol=0, atol=BETTER)
+    if rotation:
+        assert orthogonality_error(solution.values[0][None])[0] < 1e-12
+
+
+def test_unbalanced_procrustes_finds_the_planted_answer() -> None:
+    rng = rng_of(0)
+    A, X = rng.standard_normal((10, 5)), np.linalg.qr(rng.standard_normal((5, 2)))[0]
+    solution = solve_orthogonal(procrustes(A, A @ X), rng, starts=4)
+    assert_solved(solution)
+    np.testing.assert_allclose(solution.values[0], X, rtol=0, atol=BETTER)
+
+
+@settings(max_examples=5, deadline=None)
+@given(seed=SEEDS, n=st.integers(3, 7), count=st.integers(1, 3))
+def test_smallest_eigenvectors_from_any_start(seed: int, n: int, count: int) -> None:
+    rng = rng_of(seed)
+    basis = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    values = np.arange(1.0, n + 1)
+    solution = solve_orthogonal(smallest_eigenvectors((basis * values) @ basis.T, count), rng, starts=2)
+    assert_solved(solution)
+    assert solution.objective == pytest.approx(values[:count].sum(), rel=TOLERANCE)
+    X = solution.values[0]
+    np.testing.assert_allclose(X @ X.T, basis[:, :count] @ basis[:, :count].T, rtol=0, atol=2 * BETTER)
+    # The multiplier of tr(X^T A X) is 2 X^T A X.
+    np.testing.assert_allclose(np.linalg.eigvalsh(solution.kkt.multipliers[0]), 2 * values[:count], rtol=0, atol=1e-2)
+
+
+def inliers_and_outliers(rng: np.random.Generator) -> tuple[Array, Array]:
+    normal = np.linalg.qr(rng.standard_normal((4, 1)))[0]
+    inliers = rng.standard_normal((40, 4))
+    inliers -= inliers @ normal @ normal.T
+    return np.vstack([inliers, rng.standard_normal((15, 4)) + 1.0]), normal[:, 0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_norm_component_ignores_outliers(seed: int) -> None:
+    A, normal = inliers_and_outliers(rng_of(seed))
+    solution = solve_orthogonal(one_norm_components(A, 1), rng_of(seed), starts=3)
+    assert_solved(solution)
+    assert abs(solution.values[0][:, 0] @ normal) > 1.0 - TOLERANCE
+    assert solution.objective <= np.abs(A @ normal).sum() * (1.0 + BETTER)
+    last = np.linalg.svd(A)[2][-1]
+    assert abs(last @ normal) < 0.999
+
+
+def test_sparse_components_reach_their_bound() -> None:
+    values = np.arange(1.0, 9.0)
+    solution = solve_orthogonal(sparse_components(np.diag(values), 2, 0.5), rng_of(0), starts=4)
+    assert_solved(solution)
+    bound = values[:2].sum() + 0.5 * 2
+    assert bound * (1.0 - TOLERANCE) <= solution.objective <= bound * (1.0 + TOLERANCE)
+
+
+def test_rotation_averaging_equals_soc_and_newton_on_the_graph() -> None:
+    graph = random_geometric(8, rng_of(0), d=3, noise=MILD_NOISE)
+    solution = solve_orthogonal(rotation_averaging(graph), rng_of(0), starts=2)
+    assert_solved(solution)
+    # With tau far below kappa, F is its rotation part.
+    faint = PGOProblem(type(graph)(**{**vars(graph), "tau": 1e-9 * graph.kappa}))
+    soc = run(SOC(tolerance=1e-8), faint)
+    newton = run(Newton(), faint, soc.poses)
+    assert solution.objective == pytest.approx(newton.objective, rel=BETTER)
+    R = np.array(solution.values)
+    common = R[0] @ newton.poses.R[0].T
+    np.testing.assert_allclose(R, common @ newton.poses.R, rtol=0, atol=10 * BETTER)
+    assert orthogonality_error(R).max() < 1e-12
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_sparse_low_rank_finds_the_planted_support(seed: int) -> None:
+    rng = rng_of(seed)
+    B = np.zeros((20, 3))
+    for column in range(3):
+        B[5 * column : 5 * column + 4, column] = rng.choice([-1.0, 1.0], 4) * rng.uniform(0.5, 1.0, 4)
+    B /= np.linalg.norm(B, axis=0)
+    Y = B @ (np.diag([5.0, 4.0, 3.0]) @ rng.standard_normal((3, 50))) + 0.05 * rng.standard_normal((20, 50))
+    problem = sparse_low_rank(Y, 3, 12)
+    singular = np.linalg.svd(Y)[0][:, :3]
+    c = np.linalg.norm(Y, 2) ** 2
+    outcome = run(OrthogonalSOC(penalty=3 * c), problem, problem.point([singular]))
+    assert outcome.status is Status.CONVERGED
+    orthonormal, sparse = outcome.state.copies
+    np.testing.assert_allclose(orthonormal, sparse, rtol=0, atol=BETTER)
+    np.testing.assert_array_equal(sparse != 0, B != 0)
+    # Better than the planted factor, which does not fit the noise, and no better than dense factors can be.
+    error = np.sum((Y - orthonormal @ orthonormal.T @ Y) ** 2)
+    assert outcome.objective == pytest.approx(error, rel=BETTER)
+    assert np.sum((Y - singular @ singular.T @ Y) ** 2) <= error <= np.sum((Y - B @ B.T @ Y) ** 2)
+
+
+def test_other_variables_and_convex_constraints_take_part() -> None:
+    # Nearest unit vector with a nonnegative second entry, through an epigraph variable.
+    x, t = cp.Variable(2, name="x"), cp.Variable(name="t")
+    distance = cp.norm(x - np.array([3.0, -4.0]))
+    model = OrthogonalProblem(cp.Problem(cp.Minimize(t), [distance <= t, x[1] >= 0]), unit_columns=[x])
+    solution = solve_orthogonal(model, rng_of(0), starts=3)
+    assert solution.status is Status.CONVERGED
+    assert solution.kkt.feasibility <= BETTER
+    np.testing.assert_allclose(solution.values[0], [1.0, 0.0], rtol=0, atol=BETTER)
+    assert solution.objective == pytest.approx(math.hypot(2.0, 4.0), rel=BETTER)
+    np.testing.assert_array_equal(x.value, solution.values[0])
+
+
+def test_unit_rows_solve_a_small_max_cut() -> None:
+    # Every edge of the 4-cycle can be cut: with unit rows tr(X^T L X) is at most 16, where neighbours are opposite.
+    L = 2.0 * np.eye(4) - np.roll(np.eye(4), 1, 0) - np.roll(np.eye(4), -1, 0)
+    X = cp.Variable((4, 3), name="X")
+    root = np.linalg.cholesky(4.1 * np.eye(4) - L).T
+    solution = solve_orthogonal(
+        OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(root @ X))), unit_rows=[X]), rng_of(0), starts=2
+    )
+    assert_solved(solution)
+    rows = solution.values[0]
+    np.testing.assert_allclose(rows @ rows.T, np.outer([1, -1, 1, -1], [1, -1, 1, -1]), rtol=0, atol=BETTER)
+
+
+def test_over_relaxation_and_a_fixed_penalty_have_the_same_answer() -> None:
+    rng = rng_of(0)
+    A, B = rng.standard_normal((8, 3)), rng.standard_normal((8, 3))
+    problem = procrustes(A, B, rotation=True)
+    start = problem.point([polar_factor(A.T @ B, rotation=True)])
+    answers = [
+        run(method, problem, start).state.copies[0]
+        for method in (OrthogonalSOC(), OrthogonalSOC(alpha=1.6), OrthogonalSOC(penalty=60.0))
+    ]
+    for answer in answers[1:]:
+        np.testing.assert_allclose(answer, answers[0], rtol=0, atol=BETTER)
+
+
+def test_fixed_penalty_is_the_papers_recursion() -> None:
+    rng = rng_of(1)
+    A, B = rng.standard_normal((6, 3)), rng.standard_normal((6, 3))
+    rho = 50.0
+    omega, scaled = np.eye(3), np.zeros((3, 3))
+    found = iterate(OrthogonalSOC(penalty=rho), procrustes(A, B, rotation=True))
+    next(found)
+    for state in itertools.islice(found, 10):
+        R = np.linalg.solve(2.0 * A.T @ A + rho * np.eye(3), 2.0 * A.T @ B + rho * (omega - scaled))
+        omega = polar_factor(R + scaled, rotation=True)
+        scaled = scaled + R - omega
+        np.testing.assert_allclose(state.copies[0], omega, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(state.B[0], scaled, rtol=0, atol=1e-9)
+
+
+def test_scaling_the_objective_scales_the_penalty() -> None:
+    rng = rng_of(2)
+    A, B = rng.standard_normal((8, 3)), rng.standard_normal((8, 3))
+    one = run(OrthogonalSOC(), procrustes(A, B))
+    other = run(OrthogonalSOC(), procrustes(100.0 * A, 100.0 * B))
+    assert one.status is other.status is Status.CONVERGED
+    assert other.objective == pytest.approx(1e4 * one.objective, rel=BETTER)
+
+
+# The contract of every solver.
+
+
+def example() -> OrthogonalProblem:
+    rng = rng_of(5)
+    return procrustes(rng.standard_normal((8, 3)), rng.standard_normal((8, 3)))
+
+
+def test_step_leaves_its_input_alone() -> None:
+    problem, method = example(), OrthogonalSOC()
+    state = list(itertools.islice(iterate(method, problem), 4))[-1]
+    X, copies, B, rho = state.X[0].copy(), state.copies[0].copy(), state.B[0].copy(), state.rho
+    first, second = method.step(problem, state), method.step(problem, state)
+    for before, after in ((X, state.X[0]), (copies, state.copies[0]), (B, state.B[0]), (first.B[0], second.B[0])):
+        np.testing.assert_array_equal(before, after)
+    assert (state.rho, state.k, first.k) == (rho, 3, 4)
+
+
+def test_warm_start_at_the_solution_stays() -> None:
+    problem = example()
+    method = OrthogonalSOC(tolerance=1e-9)
+    first = run(method, problem)
+    assert first.status is Status.CONVERGED
+    again = run(OrthogonalSOC(), problem, method.point(problem, first.state))
+    assert again.status is Status.CONVERGED
+    assert again.iterations == 1
+    np.testing.assert_allclose(again.state.copies[0], first.state.copies[0], rtol=0, atol=TOLERANCE)
+
+
+def test_limits_are_reported() -> None:
+    problem = example()
+    outcome = run(OrthogonalSOC(max_iterations=2), problem)
+    assert outcome.status is Status.MAX_ITERATIONS
+    assert (outcome.iterations, len(outcome.history)) == (2, 3)
+    assert run(OrthogonalSOC(), problem, time_limit=1e-9).status is Status.TIME_LIMIT
+
+
+def test_unfinished_starts_are_told_apart() -> None:
+    solution = solve_orthogonal(example(), rng_of(0), OrthogonalSOC(max_iterations=1), starts=2)
+    assert solution.status is Status.MAX_ITERATIONS
+    assert all(math.isnan(objective) for objective in solution.objectives)
+    assert "MAX_ITERATIONS" in repr(solution)
+
+
+def test_same_seed_gives_the_same_bits() -> None:
+    one, other = (solve_orthogonal(example(), rng_of(3), starts=2) for _ in range(2))
+    np.testing.assert_array_equal(one.values[0], other.values[0])
+    assert one.objectives == other.objectives
+
+
+def test_residuals_of_the_run_are_those_of_the_answer() -> None:
+    problem, method = example(), OrthogonalSOC()
+    for state in itertools.islice(iterate(method, problem), 3, 12, 4):
+        kkt = kkt_residuals(problem, method.point(problem, state), state.rho)
+        # Both bound the distance from stationarity, in the units of the gradient, of neighbouring iterates.
+        bound = state.scale * (
+            state.dual_residual + 2.0 * state.rho / state.scale * math.sqrt(3) * state.primal_residual
+        )
+        assert kkt.stationarity <= bound + BETTER
+
+
+@pytest.mark.parametrize(
+    ("settings_given", "message"),
+    [
+        ({"penalty": 0.0}, "penalty must be positive"),
+        ({"penalty": math.nan}, "penalty must be positive"),
+        ({"alpha": 2.0}, r"alpha must be in \(0, 2\)"),
+        ({"safeguard": 1.0}, "safeguard must be above 1"),
+        ({"tolerance": 0.0}, "tolerance must be positive"),
+        ({"max_iterations": -1}, "max_iterations must not be negative"),
+    ],
+)
+def test_settings_are_checked(settings_given, message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        OrthogonalSOC(**settings_given)
+
+
+def test_starts_are_checked() -> None:
+    with pytest.raises(SettingError, match="starts must be at least 1"):
+        solve_orthogonal(example(), rng_of(0), starts=0)
+    with pytest.raises(SettingError, match="shapes"):
+        run(OrthogonalSOC(), example(), OrthogonalPoint((np.eye(2),), (np.zeros((2, 2)),)))
+
+
+def test_rotation_start_of_a_graph_may_be_given() -> None:
+    graph = grid(rng_of(0))
+    problem = rotation_averaging(graph)
+    start = problem.point(list(random_rotations(graph.num_poses, 3, rng_of(1))))
+    problem.check_point(start)
+    assert len(start.copies) == graph.num_poses

@@ -1,0 +1,275 @@
+import cvxpy as cp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pgo_models.convex.constraint_sets import Orthonormal, Rotations, Sparse, UnitColumns, UnitRows
+from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem, kkt_residuals
+from pgo_models.convex.orthogonality_examples import (
+    one_norm_components,
+    polar_factor,
+    procrustes,
+    rotation_averaging,
+    smallest_eigenvectors,
+    sparse_components,
+    sparse_low_rank,
+)
+from pgo_models.errors import PGOError, SettingError
+from pgo_models.geometry.rotations import random_rotations
+from pgo_models.graphs.scenes import grid
+
+EPS = float(np.finfo(float).eps)
+SEEDS = st.integers(0, 2**32 - 1)
+ROUNDING = 1e3 * EPS
+SUBPROBLEM = 1e-6  # square root of Clarabel's tolerance, with a margin
+
+SETS = [
+    (Orthonormal(), (5, 3)),
+    (Orthonormal(), (3, 3)),
+    (Rotations(), (3, 3)),
+    (Rotations(), (2, 2)),
+    (Rotations(), (4, 4)),
+    (UnitColumns(), (4, 3)),
+    (UnitColumns(), (4,)),
+    (UnitRows(), (4, 3)),
+    (UnitRows(), (4,)),
+    (Sparse(4), (4, 3)),
+    (Sparse(2), (5,)),
+]
+SETS_AND_SHAPES = st.sampled_from(SETS)
+
+
+@given(seed=SEEDS, chosen=SETS_AND_SHAPES, scale=st.sampled_from([1e-6, 1.0, 1e6]))
+def test_projection_is_in_the_set_and_nearest(seed: int, chosen, scale: float) -> None:
+    constraint, shape = chosen
+    rng = np.random.default_rng(seed)
+    V = scale * rng.standard_normal(shape)
+    P = constraint.project(V)
+    assert P.shape == shape
+    assert constraint.distance(P) <= ROUNDING
+    for _ in range(20):
+        other = constraint.random(shape, rng)
+        assert np.sum((V - P) ** 2) <= np.sum((V - other) ** 2) + ROUNDING * max(1.0, scale) ** 2
+    np.testing.assert_allclose(constraint.project(P), P, rtol=0, atol=ROUNDING * max(1.0, np.abs(P).max()))
+
+
+@given(seed=SEEDS, chosen=SETS_AND_SHAPES)
+def test_what_a_projection_leaves_is_normal(seed: int, chosen) -> None:
+    constraint, shape = chosen
+    V = np.random.default_rng(seed).standard_normal(shape)
+    P = constraint.project(V)
+    N = V - P
+    np.testing.assert_allclose(constraint.normal_part(P, N), N, rtol=0, atol=ROUNDING)
+    # rho = 1 gave P, so the least penalty is 1 at most.
+    assert constraint.least_penalty(P, N) <= 1.0 + ROUNDING
+
+
+@given(seed=SEEDS, chosen=SETS_AND_SHAPES)
+def test_normal_part_is_an_orthogonal_projection(seed: int, chosen) -> None:
+    constraint, shape = chosen
+    rng = np.random.default_rng(seed)
+    P, G = constraint.random(shape, rng), rng.standard_normal(shape)
+    N = constraint.normal_part(P, G)
+    np.testing.assert_allclose(constraint.normal_part(P, N), N, rtol=0, atol=ROUNDING)
+    assert abs(np.vdot(N, G - N)) <= ROUNDING
+
+
+@given(seed=SEEDS, chosen=st.sampled_from(SETS[:9]))
+def test_least_penalty_is_the_least(seed: int, chosen) -> None:
+    constraint, shape = chosen
+    rng = np.random.default_rng(seed)
+    P = constraint.random(shape, rng)
+    N = constraint.normal_part(P, rng.standard_normal(shape))
+    least = constraint.least_penalty(P, N)
+    for rho in (1.01 * least + 1e-3, 2.0 * least + 1e-3):
+        np.testing.assert_allclose(constraint.project(P + N / rho), P, rtol=0, atol=1e-9)
+    # SO(d) forgives one eigenvalue below the limit.
+    if least > 1e-3 and not isinstance(constraint, Rotations):
+        assert np.linalg.norm(constraint.project(P + N / (0.9 * least)) - P) > 0.1
+
+
+def test_normal_part_of_a_sparse_point_with_room_is_zero() -> None:
+    np.testing.assert_array_equal(Sparse(2).normal_part(np.array([1.0, 0.0, 0.0]), np.ones(3)), np.zeros(3))
+
+
+def test_projection_of_zero_is_in_the_set() -> None:
+    for constraint, shape in SETS:
+        assert constraint.distance(constraint.project(np.zeros(shape))) <= ROUNDING
+
+
+def small(kind: str = "orthogonal", shape: tuple[int, ...] = (3, 2)) -> OrthogonalProblem:
+    X = cp.Variable(shape, name="X")
+    return OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(X - 1.0))), **{kind: [X]})
+
+
+@pytest.mark.parametrize(
+    ("kind", "shape", "message"),
+    [
+        ("orthogonal", (2, 3), r"shape \(2, 3\); X\^T X = I needs at least as many rows as columns"),
+        ("orthogonal", (3,), "needs at least as many rows"),
+        ("rotations", (3, 2), r"shape \(3, 2\); a rotation must be square"),
+        ("unit_columns", (), "give a vector or a matrix"),
+    ],
+)
+def test_wrong_shapes_are_refused(kind: str, shape: tuple[int, ...], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        small(kind, shape)
+
+
+def test_wrong_problems_are_refused() -> None:
+    X = cp.Variable((3, 2), name="X")
+    square = cp.sum_squares(X)
+    for problem, message in [
+        (cp.Problem(cp.Maximize(square)), "maximises .* which is convex"),
+        (cp.Problem(cp.Minimize(-square)), "not convex: cvxpy finds it concave"),
+        (cp.Problem(cp.Minimize(square), [square >= 1]), r"constraints\[0\].* is not convex"),
+        (square, "give a cvxpy Problem"),
+    ]:
+        with pytest.raises(SettingError, match=message):
+            OrthogonalProblem(problem, orthogonal=[X])
+
+
+def test_wrong_variables_are_refused() -> None:
+    X, Z = cp.Variable((3, 2), name="X"), cp.Variable((3, 2), complex=True, name="Z")
+    B = cp.Variable((3, 2), boolean=True, name="B")
+    problem = cp.Problem(cp.Minimize(cp.sum_squares(X)))
+    for named, message in [
+        ([cp.Variable((3, 2), name="stranger")], r"orthogonal\[0\] \(stranger\) is not a variable of the problem"),
+        ([X + 1.0], "give a cvxpy Variable"),
+        ([], "no variable is named"),
+        (X, "give a list of variables"),
+    ]:
+        with pytest.raises(SettingError, match=message):
+            OrthogonalProblem(problem, orthogonal=named)
+    with pytest.raises(SettingError, match="complex"):
+        OrthogonalProblem(cp.Problem(cp.Minimize(cp.norm(Z, "fro"))), orthogonal=[Z])
+    with pytest.raises(SettingError, match="boolean"):
+        OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(X) + cp.sum_squares(B))), orthogonal=[X])
+    with pytest.raises(SettingError, match="nonzeros must be at least 1"):
+        OrthogonalProblem(problem, sparse=[(X, 0)])
+
+
+def test_wrong_points_are_refused() -> None:
+    problem = small()
+    with pytest.raises(SettingError, match="2 values for 1 variables"):
+        problem.point([np.eye(3, 2), np.eye(3, 2)])
+    with pytest.raises(SettingError, match=r"shape \(2, 3\)"):
+        problem.point([np.eye(2, 3)])
+    with pytest.raises(SettingError, match="not finite"):
+        problem.point([np.full((3, 2), np.nan)])
+    with pytest.raises(SettingError, match=r"a copy is 4.* away from Orthonormal\(\)"):
+        problem.check_point(OrthogonalPoint((2.0 * np.eye(3, 2),), (np.zeros((3, 2)),)))
+
+
+def test_maximising_a_concave_function_minimises_its_negative() -> None:
+    x = cp.Variable(3)
+    problem = OrthogonalProblem(cp.Problem(cp.Maximize(x[0] - cp.sum_squares(x))), unit_columns=[x])
+    assert problem.objective([np.array([1.0, 0.0, 0.0])]) == 0.0
+
+
+def test_split_problem_is_compiled_once() -> None:
+    split = small().split()
+    assert split.problem.is_dcp(dpp=True)
+    split.solve([np.eye(3, 2)], 1.0)
+    program = split.problem._cache.param_prog
+    assert program is not None
+    split.solve([np.zeros((3, 2))], 7.0)
+    assert split.problem._cache.param_prog is program
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS, rho=st.sampled_from([0.1, 1.0, 30.0]))
+def test_split_problem_gives_the_gradient(seed: int, rho: float) -> None:
+    rng = np.random.default_rng(seed)
+    A, B, V = rng.standard_normal((6, 3)), rng.standard_normal((6, 2)), rng.standard_normal((3, 2))
+    (X,), _ = procrustes(A, B).split().solve([V], rho)
+    gradient = 2.0 * A.T @ (A @ X - B)
+    np.testing.assert_allclose(rho * (V - X), gradient, rtol=0, atol=SUBPROBLEM * max(1.0, rho))
+
+
+def test_two_sets_of_a_variable_share_its_subproblem() -> None:
+    rng = np.random.default_rng(0)
+    problem = sparse_low_rank(rng.standard_normal((6, 20)), 2, 4)
+    V, W = rng.standard_normal((2, 6, 2))
+    split = problem.split()
+    np.testing.assert_allclose(
+        split.solve([V, W], 2.0)[0][0], split.solve([(V + W) / 2, (V + W) / 2], 2.0)[0][0], rtol=0, atol=SUBPROBLEM
+    )
+
+
+def test_infeasible_constraints_say_so() -> None:
+    X = cp.Variable((2, 2))
+    problem = OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(X)), [X >= 1, X <= 0]), orthogonal=[X])
+    with pytest.raises(PGOError, match="infeasible on the split subproblem"):
+        problem.split().solve([np.eye(2)], 1.0)
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=SEEDS)
+def test_kkt_residuals_know_the_stationary_points(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    C = rng.standard_normal((5, 5))
+    values, vectors = np.linalg.eigh(C @ C.T)
+    problem = smallest_eigenvectors(C @ C.T, 2)
+    X = vectors[:, [1, 3]]  # stationary, not optimal: 2 C X = X Lambda
+    normal = -2.0 * X * values[[1, 3]]
+    kkt = kkt_residuals(problem, OrthogonalPoint((X,), (normal,)), 1.0)
+    assert kkt.feasibility <= ROUNDING
+    assert kkt.stationarity <= SUBPROBLEM * max(1.0, kkt.gradient_norm)
+    np.testing.assert_allclose(kkt.multipliers[0], np.diag(2.0 * values[[1, 3]]), rtol=0, atol=1e-10 * values[-1])
+    elsewhere = problem.random_point(rng)
+    X = elsewhere.copies[0]
+    G = 2.0 * C @ C.T @ X
+    tangential = np.linalg.norm(G - Orthonormal().normal_part(X, G))
+    rho = 1e4 * values[-1]
+    found = kkt_residuals(problem, OrthogonalPoint((X,), (-G,)), rho)
+    # With a large rho the subgradient is taken at X: the residual is the tangential gradient.
+    assert found.stationarity == pytest.approx(tangential, rel=1e-2, abs=SUBPROBLEM * rho)
+
+
+def test_kkt_residuals_count_constraints_and_copies() -> None:
+    x = cp.Variable(2)
+    problem = OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum(x)), [x[0] >= 0.5]), unit_columns=[x])
+    assert problem.infeasibility([np.array([0.0, 1.0])]) == pytest.approx(0.5, rel=1e-14)
+    both = OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum(x))), unit_columns=[x], sparse=[(x, 1)])
+    assert both.infeasibility([np.array([0.6, 0.8]), np.array([0.6, 0.0])]) == pytest.approx(0.8, rel=1e-14)
+
+
+def test_examples_check_their_matrices() -> None:
+    with pytest.raises(SettingError, match="not symmetric"):
+        smallest_eigenvectors(np.array([[1.0, 1.0], [0.0, 1.0]]), 1)
+    with pytest.raises(SettingError, match="has the eigenvalue -1"):
+        sparse_components(np.diag([1.0, -1.0]), 1, 0.1)
+    with pytest.raises(SettingError, match="A has 2 rows and B 3"):
+        procrustes(np.eye(2), np.ones((3, 2)))
+    with pytest.raises(SettingError, match="give a matrix"):
+        one_norm_components(np.ones(3), 1)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS)
+def test_examples_have_the_objectives_they_claim(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    A, X = rng.standard_normal((6, 4)), Orthonormal().random((4, 2), rng)
+    Y = rng.standard_normal((4, 9))
+    C = A.T @ A
+    for problem, value in [
+        (procrustes(A, A[:, :2]), np.sum((A @ X - A[:, :2]) ** 2)),
+        (smallest_eigenvectors(C, 2), np.trace(X.T @ C @ X)),
+        (one_norm_components(A, 2), np.abs(A @ X).sum()),
+        (sparse_components(C, 2, 0.3), np.trace(X.T @ C @ X) + 0.3 * np.abs(X).sum()),
+        (sparse_low_rank(Y, 2, 3), np.sum((Y - X @ X.T @ Y) ** 2)),
+    ]:
+        assert problem.objective([X]) == pytest.approx(value, rel=1e-10)
+    graph = grid(rng)
+    R = random_rotations(graph.num_poses, 3, rng)
+    error = np.sum(graph.kappa[:, None, None] * (R[graph.j] - R[graph.i] @ graph.R_ij) ** 2)
+    assert rotation_averaging(graph).objective(list(R)) == pytest.approx(error, rel=1e-10)
+
+
+@given(seed=SEEDS, d=st.integers(2, 4))
+def test_polar_factor_is_the_projection(seed: int, d: int) -> None:
+    A = np.random.default_rng(seed).standard_normal((d, d))
+    np.testing.assert_allclose(polar_factor(A), Orthonormal().project(A), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(polar_factor(A, rotation=True), Rotations().project(A), rtol=0, atol=1e-12)

@@ -1,0 +1,199 @@
+"""What crosses between robots that hold copies: rows of poses that both hold, and sums; and what is counted of it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robots import PARTITIONERS, Partitioner, Recording, metis, scattered
+
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.partitioning import partition
+from pgo_models.graphs.scenes import NoiseModel, grid
+from solvers.distributed.robots.agent import COPIES
+from solvers.network.ledger import DRIVER
+from solvers.network.messages import Message
+from solvers.pipeline import Pipeline, solve
+from solvers.soc.anderson import Anderson
+from solvers.soc.penalty import MultiplierPenalty
+from solvers.soc.soc import SOC, Coupling
+from solvers.solution import Solution
+
+NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
+STALLED = MultiplierPenalty(stall_window=3, stall_ratio=1e-6)  # anything counts as stalled after three steps
+
+STAR = {  # to and from whoever sums up: settings, figures of all poses in no order, and sums
+    *("passes", "alpha", "memory", "alone", "rule", "is_stationary", "translation_penalty", "separator_penalty"),
+    *(
+        "norms",
+        "travel",
+        "scale",
+        "stiffness",
+        "size",
+        "ratio",
+        "objective",
+        "level",
+        "figures",
+        "share",
+        "sums",
+        "gamma",
+        "is_best",
+        "restart",
+        "factor",
+        "is_back",
+    ),
+}
+ROUNDS = (  # orders that are, or end, a round
+    *(
+        "project",
+        "set_translations",
+        "move",
+        "evaluate_trial",
+        "certificate",
+        "move_certificate",
+        "adopt",
+        "copies.begin",
+        "copies.penalize",
+    ),
+    *("copies.extrapolate", "copies.back_at_best"),
+)
+ENDS, POSES = ("copies.begin", "copies.finish"), ("R", "t", "cover", "schur", "b")  # with the driver, at the cover
+ALL_REDUCES = (
+    "copies.travel",
+    "copies.multiplier_norms",
+    "copies.stiffness",
+    "copies.start",
+    "copies.solve",
+    "copies.agree",
+)
+OFF = ("describe", "set_poses", "cost", "copies.cost", "result")
+
+
+class Watching(Recording):
+    """Writes down, too, what robots find out about poses that another robot does not hold."""
+
+    def ask(self, order: str, messages: Sequence[Message]) -> list[Message]:
+        answers = super().ask(order, messages)
+        if order == "describe":
+            self.secrets: list[list[Array]] = [[] for _ in self.agents]
+        for agent in self.agents:
+            holder, share = agent.copies, agent.share
+            if holder is not None:
+                for other, secrets in zip(self.shares, self.secrets, strict=True):
+                    hidden = ~np.isin(share.poses, other.poses)
+                    rows = np.concatenate([hidden, np.repeat(hidden, share.graph.d)])
+                    secrets += [values[rows].ravel() for values in (holder.X, holder.z, holder.s)]
+        return answers
+
+
+Engine = TypeVar("Engine", bound=Recording)
+
+
+def solved(
+    seed: int, n: int, d: int, partitioner: Partitioner, noise: NoiseModel, engine: Engine, soc: SOC | None = None
+) -> tuple[Solution, Engine]:
+    graph = varied_graph(seed, n, d, noise)
+    parts = partitioner(graph, seed)
+    soc = replace(soc if soc is not None else SOC(tolerance=1e-4), coupling=Coupling.CONSENSUS, robots=parts)
+    pipeline = Pipeline(soc=soc, second_try=False, staircase=None)
+    return solve(graph, pipeline, robots=parts, engine=engine), engine
+
+
+@settings(max_examples=12)
+@given(seed=SEEDS, n=st.integers(3, 16), d=DIMENSIONS, noise=NOISES, partitioner=PARTITIONERS)
+def test_the_ledger_counts_what_was_sent(
+    seed: int, n: int, d: int, noise: NoiseModel, partitioner: Partitioner
+) -> None:
+    solution, engine = solved(seed, n, d, partitioner, noise, Recording())
+    ledger, number = solution.ledger, len(engine.shares)
+    assert ledger is not None
+    sent, received = np.zeros((2, number)), np.zeros((2, number))
+    links: dict[tuple[int, int], int] = {}
+    for order, down, up in engine.log:
+        if order in OFF:
+            continue
+        for robot in range(number):
+            received[:, robot] += sum(8 * np.size(value) for value in down[robot].values())
+            for name, value in up[robot].items():
+                sent[:, robot] += 8 * np.size(value)
+                if ">" in name:
+                    link = robot, int(name.partition(">")[2])
+                    links[link] = links.get(link, 0) + 8 * np.size(value)
+    np.testing.assert_array_equal(ledger.bytes_sent, sent[0])
+    np.testing.assert_array_equal(ledger.bytes_received, received[0])
+    between = {(a, b): size for a, b, _, size in zip(*(x.tolist() for x in ledger.by_link()), strict=True)}
+    assert {link: size for link, size in between.items() if DRIVER not in link} == links
+    assert ledger.rounds == engine.times(*ROUNDS)
+    assert ledger.all_reduces == engine.times(*ALL_REDUCES)
+
+
+def test_rounds_of_a_whole_solve_are_as_documented() -> None:
+    graph, engine = grid(np.random.default_rng(0)), Recording()
+    parts = partition(graph, 3)
+    soc = SOC(robots=parts, tolerance=2e-3)
+    solution = solve(graph, Pipeline(soc=soc), robots=parts, engine=engine)
+    _, stage, _ = solution.stages
+    assert solution.ledger is not None
+    assert engine.times("copies.begin", "copies.back_at_best") == 1  # no refresh, no raise
+    assert [record.measurement.rounds for record in stage.history.records] == [4 + k for k in range(len(stage.history))]
+    # 2 to start, 2 for poses and penalties, 1 a step, 2 for the result of SOC, 2 a move of Newton, 2 for the proof.
+    assert solution.ledger.rounds == 2 + (2 + stage.iterations + 2) + 2 * engine.times("move") + 2
+    assert solution.ledger.all_reduces == 3 + 2 * stage.iterations
+
+
+@pytest.mark.parametrize("per_robot", [False, True])
+@pytest.mark.parametrize("partitioner", [metis, scattered])
+@pytest.mark.parametrize("d", [2, 3])
+def test_neighbours_send_rows_of_common_poses_and_sums_go_to_all(
+    d: int, partitioner: Partitioner, per_robot: bool
+) -> None:
+    soc = SOC(acceleration=Anderson(memory=5, per_robot=per_robot), max_iterations=8, penalty=STALLED)
+    solution, engine = solved(7, 24, d, partitioner, LOUD_NOISE, Recording(), soc)
+    parts = solution.robots
+    assert parts is not None
+    seen = set()
+    for share in engine.shares:
+        common = dict(share.common)
+        for order, down, up in engine.log:
+            if not order.startswith(COPIES):
+                continue
+            for message, mark in ((down[share.robot], "<"), (up[share.robot], ">")):
+                for name, value in message.items():
+                    kind, between, other = name.partition(mark)
+                    if not between:
+                        assert name in (STAR if order not in ENDS else {*STAR, *POSES}), (order, name)
+                        if name in ("sums", "gamma"):
+                            assert np.size(value) <= (11 if not per_robot else 2)
+                        continue
+                    poses = common[int(other)]
+                    owner = share.robot if mark == ">" else int(other)
+                    known = int((share.owner[poses] == owner).sum())
+                    allowed = {
+                        "rows": {((d + 1) * len(poses), d)},
+                        "force": {((d + 1) * len(poses), d)},
+                        "known": {((d + 1) * known, d), (known, 1 + (d + 1) + d * d)},
+                    }
+                    assert np.shape(value) in allowed[kind], (order, name)
+                    seen.add(kind)
+    assert seen == {"rows", "force", "known"}
+    assert engine.times("copies.begin") == 2
+
+
+@settings(max_examples=10)
+@given(seed=SEEDS, n=st.integers(6, 16), d=DIMENSIONS, noise=NOISES, partitioner=PARTITIONERS)
+def test_no_robot_is_sent_a_pose_that_it_does_not_hold_or_an_edge_between_such_poses(
+    seed: int, n: int, d: int, noise: NoiseModel, partitioner: Partitioner
+) -> None:
+    solution, engine = solved(seed, n, d, partitioner, noise, Watching(), SOC(max_iterations=4))
+    graph = solution.problem.graph
+    for share, secrets in zip(engine.shares, engine.secrets, strict=True):
+        theirs = ~np.isin(graph.i, share.poses) & ~np.isin(graph.j, share.poses)
+        edges = [graph.R_ij[theirs], graph.t_ij[theirs], graph.kappa[theirs], graph.tau[theirs]]
+        secret = np.concatenate([*secrets, *(np.ravel(values) for values in edges)])
+        secret = secret[~np.isin(np.abs(secret), [0.0, 1.0])]  # which anything may be
+        told = [np.ravel(value) for _, down, _ in engine.log for value in down[share.robot].values()]
+        assert not np.isin(secret, np.concatenate([np.zeros(0), *told])).any()

@@ -1,0 +1,248 @@
+import tracemalloc
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, EPS, LOUD_NOISE, SEEDS, random_poses, varied_problem
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robots import BACKENDS, PARTITIONERS, Partitioner
+from scipy.sparse import csc_array, diags_array
+
+from pgo_models.errors import NotPositiveDefiniteError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, tangent_dimension
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.problem.cholesky import CholeskyBackend
+from pgo_models.problem.hessian import riemannian_hessian
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.interface import Interface, InterfaceFactor, by_separator
+from solvers.distributed.multifrontal import separator_tree
+from solvers.distributed.robots.elimination import Cut, Elimination, columns_of, eliminate, packed, unpacked
+from solvers.distributed.robots.subgraph import Part, share_out
+
+SIZES = st.integers(2, 30)
+KINDS = st.sampled_from(["translations", "poses", "tangent"])
+
+
+def widths_of(kind: str, d: int) -> tuple[int, ...]:
+    return {"translations": (1,), "poses": (1, d), "tangent": (d, tangent_dimension(d))}[kind]
+
+
+def matrix_of(problem: PGOProblem, poses: Poses, kind: str) -> csc_array:
+    """One of the three matrices that driver and robots work with; positive semidefinite."""
+    if kind == "translations":
+        return problem.M[: problem.num_poses, : problem.num_poses].tocsc()
+    return problem.M.copy() if kind == "poses" else riemannian_hessian(problem, poses, None)
+
+
+@dataclass
+class Split:
+    """A matrix K + diagonal, whole and as robots and driver hold it."""
+
+    whole: Array
+    parts: list[Part]
+    pieces: list[csc_array]
+    cuts: list[Cut]
+    columns: list[IntArray]
+    own: list[tuple[IntArray, Array]]
+    interface: Interface
+    cover_columns: IntArray
+
+    def eliminate(self, backend: CholeskyBackend) -> tuple[list[Elimination], InterfaceFactor]:
+        robots = [eliminate(piece, cut, backend) for piece, cut in zip(self.pieces, self.cuts, strict=True)]
+        return robots, self.interface.factorize([robot.schur for robot in robots], self.own)
+
+    def is_positive_definite(self, backend: CholeskyBackend) -> bool:
+        try:
+            self.eliminate(backend)
+        except NotPositiveDefiniteError:
+            return False
+        return True
+
+
+def split(problem: PGOProblem, parts: Partition, kind: str, seed: int, diagonal: Array) -> Split:
+    """Matrix of a kind plus a diagonal, (side,): each robot adds it in its interior, the driver on the cover."""
+    n, widths, poses = problem.num_poses, widths_of(kind, problem.d), random_poses(problem.num_poses, problem.d, seed)
+    working = [share.part for share in share_out(problem.graph, parts) if share.part is not None]
+    cover = np.unique(np.concatenate([part.poses[part.boundary] for part in working]))
+    pieces, cuts, columns = [], [], []
+    for part in working:
+        p = part.problem.num_poses
+        local = Poses(poses.R[part.poses], poses.t[part.poses])
+        cut = Cut(columns_of(part.interior, p, widths), columns_of(part.boundary, p, widths), None)
+        mine = columns_of(part.poses, n, widths)
+        added = np.zeros(len(mine))
+        added[cut.interior] = diagonal[mine[cut.interior]]
+        pieces.append((matrix_of(part.problem, local, kind) + diags_array(added)).tocsc())
+        cuts.append(cut)
+        columns.append(mine)
+    touched = tuple(part.in_cover[part.boundary] for part in working)
+    at = columns_of(cover, n, widths)
+    return Split(
+        whole=matrix_of(problem, poses, kind).toarray() + np.diag(diagonal),
+        parts=working,
+        pieces=pieces,
+        cuts=cuts,
+        columns=columns,
+        own=[(np.arange(len(at))[:, None], diagonal[at][:, None, None])],
+        interface=Interface(len(cover), widths, touched, separator_tree(touched, len(cover))),
+        cover_columns=at,
+    )
+
+
+def side_of(problem: PGOProblem, kind: str) -> int:
+    return sum(widths_of(kind, problem.d)) * problem.num_poses
+
+
+@settings(max_examples=50)
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS, kind=KINDS, backend=BACKENDS)
+def test_elimination_and_back_substitution_solve_the_whole_system(
+    seed: int, n: int, d: int, partitioner: Partitioner, kind: str, backend: CholeskyBackend
+) -> None:
+    problem = varied_problem(seed, n, d)
+    rng = np.random.default_rng(seed)
+    scale = float(problem.M.diagonal().max())
+    system = split(
+        problem, partitioner(problem.graph, seed), kind, seed, scale * rng.uniform(1e-3, 1.0, side_of(problem, kind))
+    )
+    robots, driver = system.eliminate(backend)
+    b = rng.standard_normal((len(system.whole), 3))
+    shares = []  # every part of b is somebody's: of the robot inside, of the first who touches it on the cover
+    left = b.copy()
+    for mine in system.columns:
+        shares.append(left[mine])
+        left[mine] = 0.0
+    reduced = [robot.reduce(share) for robot, share in zip(robots, shares, strict=True)]
+    b_G = system.interface.gather([vector for vector, _ in reduced])
+    x_G = driver.solve(b_G)
+    x = np.full_like(b, np.nan)
+    for mine, robot, share, part in zip(system.columns, robots, shares, system.interface.scatter(x_G), strict=True):
+        x[mine] = robot.back_substitute(share, part)
+    np.testing.assert_array_equal(x[system.cover_columns], x_G)
+    allowed = 100 * EPS * len(b) * np.linalg.norm(system.whole, 2) * np.linalg.norm(x)
+    assert np.linalg.norm(system.whole @ x - b) <= allowed
+    energy = sum(inside for _, inside in reduced) + np.vdot(b_G, x_G)
+    assert energy == pytest.approx(np.vdot(b, x), rel=1e-9)
+
+
+@settings(max_examples=50)
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS, kind=KINDS, backend=BACKENDS)
+def test_robots_hold_the_matrix_between_them(
+    seed: int, n: int, d: int, partitioner: Partitioner, kind: str, backend: CholeskyBackend
+) -> None:
+    problem = varied_problem(seed, n, d)
+    system = split(problem, partitioner(problem.graph, seed), kind, seed, np.ones(side_of(problem, kind)))
+    total = np.zeros_like(system.whole)
+    for mine, piece in zip(system.columns, system.pieces, strict=True):
+        total[np.ix_(mine, mine)] += piece.toarray()
+    total[system.cover_columns, system.cover_columns] += 1.0
+    scale = np.abs(system.whole).max()
+    np.testing.assert_allclose(total, system.whole, rtol=0, atol=100 * EPS * scale)
+    for robot, piece, cut in zip(system.eliminate(backend)[0], system.pieces, system.cuts, strict=True):
+        K, inside, g = piece.toarray(), cut.interior, cut.boundary
+        expected = K[np.ix_(g, g)]
+        if len(inside):
+            expected = expected - K[np.ix_(g, inside)] @ np.linalg.solve(
+                K[np.ix_(inside, inside)], K[np.ix_(inside, g)]
+            )
+        np.testing.assert_allclose(unpacked(robot.schur, len(g)), expected, rtol=0, atol=1e-9 * scale)
+        np.testing.assert_array_equal(robot.diagonal, K.diagonal()[g])
+
+
+@settings(max_examples=50)
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS, kind=KINDS, backend=BACKENDS)
+def test_the_whole_is_positive_definite_where_all_parts_of_it_are(
+    seed: int, n: int, d: int, partitioner: Partitioner, kind: str, backend: CholeskyBackend
+) -> None:
+    # Inertia is additive: just above and just below its smallest eigenvalue the verdict is that of the whole.
+    problem = varied_problem(seed, n, d, LOUD_NOISE)
+    parts, side = partitioner(problem.graph, seed), side_of(problem, kind)
+    rng = np.random.default_rng(seed)
+    rough = float(problem.M.diagonal().max()) * rng.standard_normal(side)
+    whole = split(problem, parts, kind, seed, rough).whole
+    values = np.linalg.eigvalsh(whole)
+    near = 1e-9 * np.abs(values).max()
+    for sign, expected in ((1.0, True), (-1.0, False)):
+        shifted = split(problem, parts, kind, seed, rough - values[0] + sign * near)
+        assert shifted.is_positive_definite(backend) is expected
+
+
+def test_numbers_that_are_not_finite_are_not_positive_definite() -> None:
+    touched = (np.array([0, 1]),)
+    interface = Interface(2, (1,), touched, separator_tree(touched, 2))
+    for bad in (np.nan, np.inf):
+        with pytest.raises(NotPositiveDefiniteError, match="nan or inf"):
+            interface.factorize([np.array([1.0, bad, 1.0])])
+
+
+def test_without_separators_there_is_nothing_to_solve() -> None:
+    interface = Interface(0, (1, 3), (np.zeros(0, dtype=int),), separator_tree((np.zeros(0, dtype=int),), 0))
+    factor = interface.factorize([np.zeros(0)])
+    assert factor.solve(interface.gather([np.zeros((0, 3))])).shape == (0, 3)
+
+
+# Columns and packing.
+
+
+@given(count=st.integers(0, 6), widths=st.lists(st.integers(1, 4), min_size=1, max_size=3))
+def test_unknowns_by_field_and_by_separator_are_the_same(count: int, widths: list[int]) -> None:
+    order = by_separator(count, tuple(widths))
+    assert sorted(order.tolist()) == list(range(count * sum(widths)))
+    for separator, columns in enumerate(order.reshape(count, sum(widths))):
+        np.testing.assert_array_equal(columns, columns_of(np.array([separator]), count, tuple(widths)))
+
+
+@given(seed=SEEDS, side=st.integers(0, 12))
+def test_a_packed_matrix_is_unpacked_as_it_was(seed: int, side: int) -> None:
+    half = np.random.default_rng(seed).standard_normal((side, side))
+    matrix = half + half.T
+    assert packed(matrix).shape == (side * (side + 1) // 2,)
+    np.testing.assert_array_equal(unpacked(packed(matrix), side), matrix)
+
+
+# The driver's memory.
+
+
+def team(seed: int, number: int, separators: int, each: int) -> tuple[IntArray, ...]:
+    """Robots that each touch some separators: half of them side by side on a ring, half anywhere."""
+    rng = np.random.default_rng(seed)
+    touched = []
+    for robot in range(number):
+        near = (robot * separators // number + np.arange(each // 2)) % separators
+        touched.append(np.union1d(near, rng.choice(separators, each - each // 2, replace=False)))
+    return tuple(touched)
+
+
+@pytest.mark.parametrize(
+    ("number", "separators", "each"), [(1, 90, 90), (2, 120, 80), (5, 160, 70), (32, 260, 24), (64, 90, 40)]
+)
+@pytest.mark.parametrize("widths", [(1,), (1, 3), (3, 3)], ids=str)
+def test_factoring_takes_no_more_memory_than_was_said(
+    number: int, separators: int, each: int, widths: tuple[int, ...]
+) -> None:
+    touched = team(0, number, separators, each)
+    interface = Interface(separators, widths, touched, separator_tree(touched, separators))
+    interface.factorize([packed(np.eye(len(columns))) for columns in interface.columns])  # imports and caches
+    said = interface.num_bytes
+    tracemalloc.start()
+    try:
+        factor = interface.factorize([packed(np.eye(len(columns))) for columns in interface.columns])
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert factor.order.size == interface.side
+    small = 100_000 + 2000 * len(interface.tree)  # objects, and arrays of a few numbers
+    assert most <= said + small
+    assert most >= 0.2 * said  # and it is not said from far above
+
+
+def test_what_would_not_fit_is_refused_with_the_way_out() -> None:
+    touched = team(0, 5, 160, 70)
+    interface = Interface(160, (3, 3), touched, separator_tree(touched, 160))
+    interface.check_memory(interface.num_bytes)
+    with pytest.raises(
+        SettingError, match=r"for 160 separators, more than .* METIS partition or fewer robots, raise driver_memory"
+    ):
+        interface.check_memory(interface.num_bytes - 1)

@@ -1,0 +1,262 @@
+"""Rounding of factorisations, of eliminations by robots, and of the driver's, held against exact arithmetic."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cvxopt
+import numpy as np
+import pytest
+from cvxopt import cholmod
+from exact_arithmetic import (
+    MP,
+    Exact,
+    ExactGraph,
+    exact,
+    is_positive_definite,
+    largest_share,
+    total,
+)
+from graphs import DIMENSIONS, SEEDS, still_ring, varied_graph
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from roads import road
+from scipy.sparse import csc_array
+
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.partitioning import partition
+from pgo_models.problem.cholesky import (
+    CholeskyBackend,
+    CholeskyFactor,
+    SymbolicCholesky,
+    _Cholmod,
+    _CholmodFactor,
+    _SuperLUFactor,
+    analyze,
+)
+from pgo_models.problem.floating_point import gamma
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.interface import Interface, InterfaceFactor
+from solvers.distributed.multifrontal import separator_tree
+from solvers.distributed.robots.elimination import Cut, columns_of, eliminate, packed, unpacked
+from solvers.distributed.robots.proof import verify_interior
+from solvers.distributed.robots.subgraph import Part, share_out
+
+BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
+
+# Factors.
+
+
+def stored_matrix(matrix: Array) -> csc_array:
+    side = len(matrix)
+    rows, columns = np.tile(np.arange(side), side), np.repeat(np.arange(side), side)
+    return csc_array((matrix.T.ravel(), (rows, columns)), shape=matrix.shape)
+
+
+def square_of(factor: CholeskyFactor, analysis: SymbolicCholesky) -> Exact:
+    """R^T R of a factor in the order of its matrix, taken exactly."""
+    if isinstance(factor, _SuperLUFactor):
+        L, order = exact(factor._lu.L.toarray()), factor._rows
+        product = (L * exact(factor._lu.U.diagonal())) @ L.T
+    else:
+        assert isinstance(factor, _CholmodFactor)
+        assert isinstance(analysis, _Cholmod)
+        order = analysis.counts().order
+        columns = cholmod.getfactor(factor._numeric)
+        L = exact(np.array(cvxopt.matrix(columns)))
+        product = L @ L.T
+    found = np.empty_like(product)
+    found[np.ix_(order, order)] = product
+    return found
+
+
+def nearly_singular(seed: int, n: int, d: int) -> Array:
+    """M and a little of its diagonal, symmetric to the last bit."""
+    M = PGOProblem(varied_graph(seed, n, d)).M.toarray()
+    return 0.5 * (M + M.T) + 1e-9 * np.diag(M.diagonal())
+
+
+def well_conditioned(seed: int, n: int, d: int) -> Array:
+    W = np.random.default_rng(seed).standard_normal((d * n + 1, d * n + 1))
+    return np.tril(W @ W.T) + np.tril(W @ W.T, -1).T + np.eye(d * n + 1)
+
+
+@BACKENDS
+@pytest.mark.parametrize("kind", [nearly_singular, well_conditioned])
+@settings(max_examples=10)
+@given(seed=SEEDS, n=st.integers(2, 6), d=DIMENSIONS)
+def test_a_factor_is_within_its_backward_error(
+    kind: Callable[[int, int, int], Array], backend: CholeskyBackend, seed: int, n: int, d: int
+) -> None:
+    A = kind(seed, n, d)
+    stored = stored_matrix(A)
+    analysis = analyze(stored, backend)
+    factor = analysis.factorize(stored)
+    epsilon = factor.backward_error()
+    difference = square_of(factor, analysis) - exact(A)
+    assert (epsilon < 1e-8).all()
+    assert largest_share(difference, A.diagonal()) > 0.0
+    assert largest_share(difference - np.diag(exact(epsilon * A.diagonal())), A.diagonal()) < 0.0
+
+
+def test_counts_of_a_pattern_do_not_depend_on_numbers() -> None:
+    """CVXOPT shows the non-zeros of a numeric factor: zeros in it must count, too."""
+    M = PGOProblem(road(0, 300, 5.0, 3)).M
+    found = []
+    for values in (M.data, np.zeros(M.nnz)):
+        analysis = analyze(M, CholeskyBackend.CHOLMOD)
+        assert isinstance(analysis, _Cholmod)
+        matrix = csc_array((values.copy(), M.indices, M.indptr), shape=M.shape)
+        matrix.setdiag(1.0 + 2.0 * M.diagonal())
+        analysis.factorize(matrix)  # and let go, so that it is the one that is looked into
+        found.append(analysis.counts())
+    untouched = analyze(M, CholeskyBackend.CHOLMOD)
+    assert isinstance(untouched, _Cholmod)
+    for counts in found:
+        np.testing.assert_array_equal(counts.in_column, untouched.counts().in_column)
+        np.testing.assert_array_equal(counts.in_row, untouched.counts().in_row)
+        np.testing.assert_array_equal(counts.order, untouched.counts().order)
+    assert untouched.crude_error() >= untouched.counts().error(0).max() > 0
+    side = float(M.shape[0])
+    assert untouched.crude_error() >= side * gamma(side)
+
+
+def bordered(seed: int, coupling: float) -> tuple[Array, Cut]:
+    """A matrix whose boundary hangs on its interior weakly or not, and the cut between."""
+    rng = np.random.default_rng(seed)
+    i, g = int(rng.integers(3, 12)), int(rng.integers(2, 8))
+    K = well_conditioned(seed, i + g - 1, 1)
+    K[:i, i:] *= coupling
+    K[i:, :i] *= coupling
+    return K, Cut(np.arange(i), np.arange(i, i + g), None)
+
+
+@BACKENDS
+@pytest.mark.parametrize("coupling", [1.0, 1e-8])
+def test_an_elimination_is_below_its_matrix(backend: CholeskyBackend, coupling: float) -> None:
+    needed = []
+    for seed in range(12):
+        K, cut = bordered(seed, coupling)
+        i = len(cut.interior)
+        for is_verified in (True, False):
+            found = eliminate(stored_matrix(K), cut, backend, is_verified)
+            left = exact(K)
+            left[i:, i:] -= exact(unpacked(found.schur, len(K) - i))
+            if is_verified:
+                left[:i, :i] += np.diag(exact(found.interior_error) * exact(K.diagonal()[:i]))
+            is_below = is_positive_definite([dict(enumerate(row)) for row in left])
+            if is_verified:
+                assert is_below
+            else:
+                needed.append(not is_below)
+    assert any(needed)
+
+
+def is_true_of_robot(
+    problem: PGOProblem, part: Part, Lambda: Array, eta: float, share: float, backend: CholeskyBackend
+) -> bool | None:
+    """Whether the exact S of a robot is above its Schur complement and slack; None where it proves nothing."""
+    p, d = problem.num_poses, problem.d
+    cut = Cut(columns_of(part.interior, p, (1, d)), columns_of(part.boundary, p, (1, d)), None)
+    proved = verify_interior(problem, Lambda, eta, cut, np.zeros(0, dtype=np.int64), share, backend)
+    if proved is None:
+        return None
+    _, found, slack = proved
+    rows = ExactGraph.of_doubles(problem.graph).certificate_matrix(Lambda)
+    S = np.array([[row.get(column, MP.mpf(0)) for column in range(len(rows))] for row in rows], dtype=object)
+    inside = cut.interior
+    S[inside, inside] += np.where(inside >= p, exact(eta), MP.mpf(0)) - exact(slack)
+    S[np.ix_(cut.boundary, cut.boundary)] -= exact(unpacked(found.schur, len(cut.boundary)))
+    return is_positive_definite([dict(enumerate(row)) for row in S])
+
+
+@BACKENDS
+@pytest.mark.parametrize("exponent", range(24, 34))
+def test_no_rounding_is_lost_between_multipliers_and_eta_by_a_robot(backend: CholeskyBackend, exponent: int) -> None:
+    graph, d = still_ring(12, 2), 2
+    eta = 0.75 * 2.0**exponent
+    for share in share_out(graph, partition(graph, 2)):
+        assert share.part is not None
+        interior = share.part.interior
+        Lambda = np.zeros((share.part.problem.num_poses, d, d))
+        above = np.where(np.arange(len(interior)) % 4 == 0, np.spacing(eta), 0.0)
+        Lambda[interior] = (eta + above)[:, None, None] * np.eye(d)
+        assert is_true_of_robot(share.part.problem, share.part, Lambda, eta, 1e-11, backend) is not False
+
+
+@BACKENDS
+@settings(max_examples=10)
+@given(seed=SEEDS, n=st.integers(4, 9), d=DIMENSIONS, eta=st.sampled_from([0.0, 1e-3, 1e9]))
+def test_what_a_robot_hands_on_is_below_its_part_of_S(
+    backend: CholeskyBackend, seed: int, n: int, d: int, eta: float
+) -> None:
+    graph, rng = varied_graph(seed, n, d), np.random.default_rng(seed)
+    for share in share_out(graph, partition(graph, 2)):
+        if share.part is None:
+            continue
+        problem, part = share.part.problem, share.part
+        p = problem.num_poses
+        Lambda = np.zeros((p, d, d))
+        Lambda[part.interior] = rng.uniform(0.0, 2.0) * eta * np.eye(d)
+        assert is_true_of_robot(problem, part, Lambda, eta, 1e-15, backend) is not False
+
+
+@pytest.mark.parametrize("cancelling", [0.0, 1e6])
+def test_the_drivers_factor_is_within_its_rounding(cancelling: float) -> None:
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        g, d = int(rng.integers(3, 7)), int(rng.integers(2, 4))
+        touched = tuple(np.arange(g) if a < 2 else np.sort(rng.permutation(g)[:2]) for a in range(4))
+        space = Interface(g, (1, d), touched, separator_tree(touched, g))
+        contributions, K = [], np.full((space.side, space.side), MP.mpf(0), dtype=object)
+        for a, columns in enumerate(space.columns):
+            W = rng.standard_normal((len(columns), len(columns)))
+            C = W @ W.T + (cancelling if a == 0 else -cancelling if a == 1 else 0.0) * np.eye(len(columns))
+            contributions.append(packed(C))
+            K[np.ix_(columns, columns)] += exact(unpacked(contributions[-1], len(columns)))
+        values = np.broadcast_to(np.eye(d + 1), (g, d + 1, d + 1)) * rng.uniform(0.1, 1.0)
+        columns = np.stack([columns_of(np.array([pose]), g, (1, d)) for pose in range(g)])
+        for block in zip(columns, values, strict=True):
+            K[np.ix_(block[0], block[0])] += exact(block[1])
+        diagonal = np.asarray(K.diagonal(), dtype=float) * (1.0 + 1e-12)
+        lost = space.rounding(contributions, [(columns, values)], diagonal)
+        factor = space.factorize(contributions, [(columns, values)])
+        difference = square_of_tree(factor) - K
+        assert largest_share(difference, diagonal) > 0.0
+        assert largest_share(difference - np.diag(exact(lost)), diagonal) < 0.0
+
+
+def square_of_tree(factor: InterfaceFactor) -> Exact:
+    """R^T R of the driver's factor, taken exactly, in the order of its unknowns."""
+    tree, width, side = factor.factor.tree, factor.factor.width, len(factor.order)
+    product = np.full((side, side), MP.mpf(0), dtype=object)
+    for front, (L_EE, L_BE) in zip(tree, factor.factor.blocks, strict=True):
+        if len(front.eliminated):
+            rows = factor.order[(width * front.poses[:, None] + np.arange(width)).ravel()]
+            L = exact(np.concatenate([L_EE, L_BE]))
+            product[np.ix_(rows, rows)] += L @ L.T
+    return product
+
+
+@BACKENDS
+def test_a_long_column_takes_as_many_roundings_as_it_has_entries(backend: CholeskyBackend) -> None:
+    """An arrow: every square that is subtracted from the last pivot is rounded up on its own."""
+    side, corner = 401, 1.5 * 2.0**30
+    k, last = np.arange(side - 1), np.full(side - 1, side - 1)
+    edge = np.full(side - 1, np.sqrt(2.0**-23 + 2.0**-40))
+    values = np.concatenate([np.ones(side - 1), [corner], edge, edge])
+    rows, columns = np.concatenate([np.arange(side), k, last]), np.concatenate([np.arange(side), last, k])
+    A = csc_array((values, (rows, columns)), shape=(side, side))
+    analysis = analyze(A, backend)
+    factor = analysis.factorize(A)
+    allowed = factor.backward_error()[side - 1] * corner
+    if isinstance(factor, _SuperLUFactor):
+        row = int(np.flatnonzero(factor._rows == side - 1)[0])
+        squares = exact(factor._lu.L.toarray()[row]) ** 2 * exact(factor._lu.U.diagonal())
+    else:
+        assert isinstance(factor, _CholmodFactor)
+        assert isinstance(analysis, _Cholmod)
+        row = int(np.flatnonzero(analysis.counts().order == side - 1)[0])
+        squares = exact(np.array(cvxopt.matrix(cholmod.getfactor(factor._numeric)))[row]) ** 2
+    deviation = abs(total(squares) - exact(corner))
+    assert 100 * 2.0**-53 * corner < deviation <= exact(allowed)

@@ -1,0 +1,249 @@
+"""CONSENSUS without waiting: the plain recursion if nothing goes wrong, and the same optimum if something does."""
+
+from collections.abc import Callable
+from functools import cache
+from itertools import islice
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph, varied_problem
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robots import PARTITIONERS, Partitioner, Recording, metis
+
+from pgo_models.certificates.newton_polish import polish
+from pgo_models.errors import SettingError
+from pgo_models.graphs.partitioning import Partition, partition
+from pgo_models.graphs.scenes import NoiseModel, circle, grid
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
+from solvers.distributed.driver import Count, Driver
+from solvers.distributed.stages import open_driver
+from solvers.loop import iterate, run
+from solvers.network.engine import InProcess
+from solvers.network.faults import Faults
+from solvers.network.ledger import Ledger
+from solvers.pipeline import Pipeline, solve
+from solvers.result import Record, Status
+from solvers.soc.paper import PaperSOC
+from solvers.soc.penalty import FixedPenalty, MultiplierPenalty, rotation_scale
+from solvers.soc.soc import SOC, Coupling
+from solvers.soc.state import SOCState
+
+NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
+LEVEL = 1e-6
+MOST = 400
+SILENT_FROM, SILENT_ROUNDS = 2, 50
+FAULTS = {
+    "loss": Faults(loss=0.2, seed=1),
+    "delay": Faults(max_delay=5, seed=1),
+    "silence": Faults(silent_robot=1, silent_from=SILENT_FROM, silent_rounds=SILENT_ROUNDS),
+}
+
+
+@settings(max_examples=25)
+@given(
+    seed=SEEDS,
+    n=st.integers(2, 16),
+    d=DIMENSIONS,
+    noise=NOISES,
+    partitioner=PARTITIONERS,
+    alpha=st.sampled_from([1.0, 1.8]),
+    damping=st.sampled_from([0.5, 1.0]),
+    local_passes=st.sampled_from([1, 10]),
+)
+def test_without_faults_the_states_are_those_of_the_plain_recursion(
+    seed: int,
+    n: int,
+    d: int,
+    noise: NoiseModel,
+    partitioner: Partitioner,
+    alpha: float,
+    damping: float,
+    local_passes: int,
+) -> None:
+    problem = varied_problem(seed, n, d, noise)
+    parts, engine, start = partitioner(problem.graph, seed), Recording(), chordal_start(problem)
+    driver = open_driver(problem, parts, engine)
+    driver.set_poses(start)
+    soc = SOC(
+        coupling=Coupling.CONSENSUS,
+        robots=parts,
+        penalty=MultiplierPenalty(max_refreshes=0),
+        acceleration=None,
+        alpha=alpha,
+        local_passes=local_passes,
+    )
+    method = AsynchronousSOC(soc, alpha=alpha, damping=damping)
+    state = method.init(driver, None)
+    central = soc.init(problem, start)
+    for _ in range(10):
+        before = central
+        assert isinstance(before, SOCState)
+        central = soc.step(problem, before)
+        assert isinstance(central, SOCState)
+        if central.raises:  # the safeguards of the two are not the same
+            return
+        state = method.step(driver, state)
+        size = np.sqrt(central.team.penalty[central.team.row >= n].sum())
+        # s goes the damped way of a plain step; omega is that of the s before.
+        assert state.primal_residual == pytest.approx(central.merits[-1] / size, rel=1e-6, abs=1e-9)
+        for robot, rows, agent in zip(central.team.robots, central.team.slices, engine.agents, strict=True):
+            mine = agent.copies
+            assert mine is not None
+            allowed = 1e-8 * (1 + np.abs(central.s).max())
+            np.testing.assert_allclose(mine.z[robot.held], before.z[rows], rtol=0, atol=allowed)
+            expected = before.s[rows] + damping * (central.s - before.s)[rows]
+            np.testing.assert_allclose(mine.s[robot.held], expected, rtol=0, atol=allowed)
+        if damping != 1.0:
+            return
+
+
+# What goes wrong.
+
+
+@cache
+def scene(name: str) -> PGOProblem:
+    make = {"circle": circle, "grid": grid}[name]
+    return PGOProblem(make(np.random.default_rng(0)))
+
+
+def rounds_to_optimum(problem: PGOProblem, parts: Partition, faults: Faults) -> tuple[int, Ledger]:
+    """Rounds until omega, with the best translations for it, is within LEVEL of the optimum, after any silence."""
+    best = problem.objective(polish(problem, chordal_start(problem)))
+    driver = open_driver(problem, parts, InProcess())
+    driver.start()
+    silence_ends = faults.silent_from + faults.silent_rounds
+    for state in islice(iterate(AsynchronousSOC(SOC(), faults), driver), MOST):
+        if state.k >= silence_ends and gap_at(problem, driver, best) <= LEVEL:
+            return state.k, driver.ledger
+    raise AssertionError(f"not within {LEVEL} after {MOST} rounds")
+
+
+def gap_at(problem: PGOProblem, driver: Driver, best: float) -> float:
+    R = np.empty((problem.num_poses, problem.d, problem.d))
+    for answer in driver.ask_all("own_poses", count=Count.OFF):
+        R[answer["poses"]] = answer["R"]
+    return (problem.objective(problem.with_best_translations(R)) - best) / max(1.0, best)
+
+
+def check_faults(problem: PGOProblem, parts: Partition, faults: Faults) -> None:
+    faultless, _ = rounds_to_optimum(problem, parts, Faults())
+    rounds, _ = rounds_to_optimum(problem, parts, faults)
+    assert rounds - (faults.silent_from + faults.silent_rounds) <= 3 * faultless
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("name", ["circle", "grid"])
+def test_the_optimum_is_reached_in_three_times_the_rounds(name: str, fault: str) -> None:
+    problem = scene(name)
+    check_faults(problem, metis(problem.graph, 3), FAULTS[fault])
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("name", ["tinyGrid3D", "smallGrid3D"])
+def test_the_optimum_of_benchmark_graphs_is_reached_in_three_times_the_rounds(
+    name: str, fault: str, benchmark_problem: Callable[[str], PGOProblem]
+) -> None:
+    problem = benchmark_problem(name)
+    check_faults(problem, partition(problem.graph, 3), FAULTS[fault])
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_run_does_not_end_on_old_rows(fault: str) -> None:
+    # All may stand still while a robot is cut off, or no message came through: that is no convergence.
+    problem, tolerance = scene("grid"), 1e-4
+    parts, faults = metis(problem.graph, 3), FAULTS[fault]
+    driver = open_driver(problem, parts, InProcess())
+    driver.start()
+    method = AsynchronousSOC(SOC(tolerance=tolerance), faults)
+    outcome = run(method, driver)
+    assert outcome.status is Status.CONVERGED
+    if faults.silent_robot is not None:
+        assert outcome.iterations > SILENT_FROM + SILENT_ROUNDS
+    method.finish(driver)
+    best = problem.objective(polish(problem, chordal_start(problem)))
+    assert driver.objective - best <= 100 * tolerance**2 * max(1.0, best)
+    last = outcome.history.records[-1].measurement
+    assert max(last.primal_residual, last.dual_residual) <= tolerance
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_solve_with_faults_is_certified_with_the_central_gap(d: int, fault: str) -> None:
+    graph = varied_graph(3, 20, d)
+    parts, engine = metis(graph, 3), Recording()
+    pipeline = Pipeline(soc=SOC(robots=parts, tolerance=2e-3), faults=FAULTS[fault])
+    solution = solve(graph, pipeline, robots=parts, engine=engine)
+    central = solve(graph, Pipeline())
+    assert solution.is_certified
+    assert solution.status is Status.CONVERGED
+    assert solution.objective == pytest.approx(central.objective, rel=1e-9)
+    assert solution.gap == pytest.approx(central.gap, abs=1e-9)
+    assert engine.times("copies.turn") == solution.stages[1].iterations > 0
+    assert engine.times("copies.extrapolate", "copies.solve") == 0
+    again = solve(graph, pipeline, robots=parts)
+    np.testing.assert_array_equal(again.poses.R, solution.poses.R)  # the same seed, the same faults
+
+
+def test_a_round_is_one_message_a_link_and_no_all_reduce() -> None:
+    problem, engine = scene("grid"), Recording()
+    driver = open_driver(problem, metis(problem.graph, 3), engine)
+    driver.start()
+    method = AsynchronousSOC(SOC(), Faults(loss=0.5, seed=2))
+    state = method.init(driver, None)
+    before = driver.ledger
+    for _ in range(7):
+        state = method.step(driver, state)
+    after = driver.ledger
+    assert after.rounds == before.rounds + 7
+    assert after.all_reduces == before.all_reduces
+    sent = [answer for order, _, up in engine.log[-7:] for answer in up]
+    num_bytes = sum(8 * np.size(value) for answer in sent for value in answer.values())
+    settings_each = 3 * 8
+    assert after.num_bytes - before.num_bytes == num_bytes + len(sent) * settings_each  # what is lost was sent
+
+
+def test_a_state_that_is_not_finite_is_said_to_be() -> None:
+    problem, engine = scene("grid"), Recording()
+    driver = open_driver(problem, metis(problem.graph, 3), engine)
+    driver.start()
+
+    def break_it(state: AsynchronousState, record: Record) -> None:
+        holder = engine.agents[0].copies
+        if record.k == 1 and holder is not None:
+            holder.s = 1e180 * holder.s  # its square is too large
+
+    method = AsynchronousSOC(SOC(penalty=FixedPenalty(float(np.median(rotation_scale(problem))))))
+    with np.errstate(over="ignore"):
+        outcome = run(method, driver, callback=break_it)
+    assert outcome.status is Status.NOT_FINITE
+
+
+# Settings.
+
+
+@pytest.mark.parametrize("alpha", [0.0, 2.0, np.nan])
+def test_alpha_is_checked(alpha: float) -> None:
+    with pytest.raises(SettingError, match=r"alpha must be in \(0, 2\)"):
+        AsynchronousSOC(alpha=alpha)
+
+
+@pytest.mark.parametrize("damping", [0.0, 1.1, np.nan])
+def test_damping_is_checked(damping: float) -> None:
+    with pytest.raises(SettingError, match=r"damping must be in \(0, 1\]"):
+        AsynchronousSOC(damping=damping)
+
+
+def test_faults_are_for_consensus_by_robots() -> None:
+    graph = grid(np.random.default_rng(0))
+    parts = partition(graph, 3)
+    for soc in (None, SOC(), SOC(coupling=Coupling.SUBSTRUCTURED), PaperSOC(robots=parts)):
+        with pytest.raises(SettingError, match="faults are of messages between robots"):
+            Pipeline(soc=soc, faults=Faults())
+    with pytest.raises(SettingError, match="faults are of messages between robots"):
+        solve(graph, Pipeline(soc=SOC(robots=parts), faults=Faults()))
+    nobody = Pipeline(soc=SOC(robots=parts), faults=Faults(silent_robot=3, silent_rounds=5))
+    with pytest.raises(SettingError, match="silent_robot is 3; give 0 to 2"):
+        solve(graph, nobody, robots=parts)

@@ -1,0 +1,358 @@
+import io
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from graphs import varied_graph
+from hypothesis import HealthCheck, given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+import pgo_models as pgo
+import solvers
+from pgo_models.errors import FileFormatError, PGOError, SettingError
+from pgo_models.graphs.partitioning import partition
+from pgo_models.graphs.scenes import NoiseModel
+from solvers.cli_options import BackEnd, Method, chosen_partition, chosen_pipeline
+from solvers.distributed import checkpoint
+from solvers.distributed.checkpoint import Checkpoint, Journal
+from solvers.network.engine import InProcess
+
+MEASURED = ("R_ij", "t_ij", "kappa", "tau")
+PGO = [sys.executable, "-c", "from solvers.cli import main; main()"]
+
+
+class Killed(BaseException):
+    """Ends a solve as a kill does: nothing of ours catches it."""
+
+
+def killed_after(steps):
+    """Callback that ends the run at the given state, counted over all stages."""
+    seen = []
+
+    def callback(state, record):
+        seen.append(record.k)
+        if len(seen) > steps:
+            raise Killed
+
+    return callback
+
+
+def pipeline(coupling, robots, gap=1e-6):
+    chosen = solvers.Pipeline(gap=gap, staircase=None)
+    return replace(chosen, soc=replace(chosen.soc, coupling=coupling, robots=robots, tolerance=1e-6))
+
+
+def assert_same(found, expected):
+    np.testing.assert_array_equal(found.poses.R, expected.poses.R)
+    np.testing.assert_array_equal(found.poses.t, expected.poses.t)
+    assert (found.lower_bound, found.status) == (expected.lower_bound, expected.status)
+    assert found.ledger.rounds == expected.ledger.rounds
+    assert found.ledger.all_reduces == expected.ledger.all_reduces
+    assert [stage.name for stage in found.stages] == [stage.name for stage in expected.stages]
+    for one, other in zip(found.stages, expected.stages, strict=True):
+        assert (one.iterations, one.status, one.objective) == (other.iterations, other.status, other.objective)
+        assert repr(one.method) == repr(other.method)
+        np.testing.assert_array_equal(one.history.objective, other.history.objective)
+        assert (np.diff(one.history.seconds) >= 0).all()
+
+
+@pytest.mark.parametrize("coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS])
+@pytest.mark.parametrize("part", [0.0, 0.3, 0.7, 1.0])
+def test_a_run_that_was_broken_off_goes_on_to_the_same_numbers(coupling, part, tmp_path):
+    graph = varied_graph(int(10 * part), 50, 3)
+    robots = partition(graph, 4)
+    settings = pipeline(coupling, robots)
+    expected = solvers.solve(graph, settings, robots=robots)
+    steps = sum(len(stage.history) for stage in expected.stages)
+    checkpoint = Checkpoint(tmp_path / "run.ckpt", rounds=3)
+    after = round(part * (steps - 1))
+    with pytest.raises(Killed):
+        solvers.solve(graph, settings, robots=robots, checkpoint=checkpoint, callback=killed_after(after))
+    seen = []
+    found = solvers.solve(
+        graph,
+        settings,
+        robots=robots,
+        checkpoint=checkpoint,
+        engine=InProcess(threads=2),
+        callback=lambda state, record: seen.append(record.k),
+    )
+    assert_same(found, expected)
+    assert steps - after <= len(seen) <= steps - after + 3  # three rounds are three steps at most
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("part", [0.3, 0.8])
+def test_a_second_attempt_goes_on_too(part, tmp_path):
+    graph = varied_graph(1, 14, 2, NoiseModel(0.5, 1.2))  # the relaxation is not tight
+    settings = pipeline(solvers.Coupling.SUBSTRUCTURED, None)
+    settings = replace(settings, soc=replace(settings.soc, tolerance=1e-2))
+    expected = solvers.solve(graph, settings, robots=3)
+    assert [stage.name for stage in expected.stages] == 2 * ["chordal start", "SOC", "Newton"]
+    first = sum(len(stage.history) for stage in expected.stages[:3])
+    second = sum(len(stage.history) for stage in expected.stages[3:])
+    checkpoint, after = Checkpoint(tmp_path / "run.ckpt", rounds=1), first + round(part * (second - 1))
+    with pytest.raises(Killed):
+        solvers.solve(graph, settings, robots=3, checkpoint=checkpoint, callback=killed_after(after))
+    seen = []
+    found = solvers.solve(
+        graph, settings, robots=3, checkpoint=checkpoint, callback=lambda state, record: seen.append(record.k)
+    )
+    assert_same(found, expected)
+    assert len(seen) <= first + second - after + 1
+
+
+def test_without_soc_newton_goes_on(tmp_path):
+    graph = varied_graph(7, 60, 3)
+    settings = solvers.Pipeline(soc=None)
+    expected = solvers.solve(graph, settings, robots=3)
+    checkpoint = Checkpoint(tmp_path / "run.ckpt", rounds=1)
+    with pytest.raises(Killed):
+        solvers.solve(graph, settings, robots=3, checkpoint=checkpoint, callback=killed_after(1))
+    assert_same(solvers.solve(graph, settings, robots=3, checkpoint=checkpoint), expected)
+
+
+def test_the_file_stays_when_the_run_was_stopped_and_goes_when_it_converged(tmp_path):
+    graph, path = varied_graph(8, 40, 2), tmp_path / "run.ckpt"
+    stopped = solvers.solve(graph, robots=2, checkpoint=Checkpoint(path), time_limit=1e-9)
+    assert stopped.status is solvers.Status.TIME_LIMIT
+    assert path.exists()
+    found = solvers.solve(graph, robots=2, checkpoint=Checkpoint(path))
+    assert_same(found, solvers.solve(graph, robots=2))
+    assert not path.exists()
+
+
+def test_a_checkpoint_is_due_after_so_many_rounds(tmp_path, monkeypatch):
+    graph, write, written = varied_graph(8, 40, 2), checkpoint._write, []
+
+    def recording(path, fingerprint, saved, snapshots):
+        written.append((saved.method, saved.driver.ledger.rounds))
+        write(path, fingerprint, saved, snapshots)
+
+    def writes(rounds):
+        written.clear()
+        finer = solvers.Pipeline(soc=solvers.SOC(tolerance=2e-3))
+        solvers.solve(graph, finer, robots=2, checkpoint=Checkpoint(tmp_path / "run.ckpt", rounds))
+        return [rounds for method, rounds in written if method == "SubstructuredSOC"]
+
+    monkeypatch.setattr(checkpoint, "_write", recording)
+    every_state = writes(1)
+    assert len(every_state) > 5
+    (rounds_a_step,) = set(np.diff(every_state[1:]))
+    assert writes(int(rounds_a_step)) == every_state
+    assert writes(int(3 * rounds_a_step))[1:] == every_state[3::3]
+
+
+@pytest.fixture
+def broken_off(tmp_path):
+    """Graph, and path of the checkpoint of a solve of it by three robots."""
+    graph, path = varied_graph(9, 30, 2), tmp_path / "run.ckpt"
+    with pytest.raises(Killed):
+        solvers.solve(graph, robots=3, checkpoint=Checkpoint(path), callback=killed_after(2))
+    return graph, path
+
+
+def changed_graph(graph, name):
+    array = getattr(graph, name).copy()
+    array.flat[0] = np.nextafter(array.flat[0], 2.0)
+    return replace(graph, **{name: array})
+
+
+def renamed(robots):
+    return replace(robots, robot=robots.num_robots - 1 - robots.robot)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        *(("graph", lambda graph, part=part: {"problem": changed_graph(graph, part)}) for part in MEASURED),
+        ("graph", lambda graph: {"problem": replace(graph, i=graph.j, j=graph.i)}),
+        ("partition", lambda graph: {"robots": 2}),
+        ("partition", lambda graph: {"robots": renamed(partition(graph, 3))}),
+        ("settings", lambda graph: {"pipeline": solvers.Pipeline(gap=1e-5)}),
+        ("settings", lambda graph: {"pipeline": solvers.Pipeline(second_try=False)}),
+        ("settings", lambda graph: {"pipeline": solvers.Pipeline(newton=solvers.Newton(max_iterations=7))}),
+        ("settings", lambda graph: {"pipeline": solvers.Pipeline(soc=None)}),
+        ("settings", lambda graph: {"start": pgo.spanning_tree_start(graph)}),
+    ],
+)
+def test_another_graph_partition_or_setting_is_refused(name, change, broken_off):
+    graph, path = broken_off
+    arguments = {"problem": graph, "robots": 3, "checkpoint": Checkpoint(path), **change(graph)}
+    with pytest.raises(SettingError, match=rf"run with another {name}; go on with the same"):
+        solvers.solve(**arguments)
+    assert [one.name for one in path.parent.iterdir()] == ["run.ckpt"]
+
+
+def test_all_that_is_another_is_named(broken_off):
+    graph, path = broken_off
+    with pytest.raises(SettingError, match="run with another graph and another settings; go on"):
+        solvers.solve(changed_graph(graph, "t_ij"), solvers.Pipeline(gap=1e-5), robots=3, checkpoint=Checkpoint(path))
+
+
+@pytest.mark.parametrize("damage", ["text", "half", "empty", "array", "npz", "directory"])
+def test_a_file_that_is_no_checkpoint_is_refused_and_left_alone(damage, broken_off):
+    graph, path = broken_off
+    whole = path.read_bytes()
+    if damage == "npz":
+        with path.open("wb") as file:
+            np.savez(file, header=np.array(["another", "a", "b", "c"]))
+    elif damage == "array":
+        with path.open("wb") as file:
+            np.save(file, np.zeros(3))
+    elif damage == "directory":
+        path.unlink()
+        path.mkdir()
+    else:
+        path.write_bytes({"text": b"VERTEX_SE2 0 0 0 0\n", "half": whole[: len(whole) // 2], "empty": b""}[damage])
+    wrong = {"half": "a damaged checkpoint, its checksum", "directory": "cannot be read"}.get(damage, "no checkpoint")
+    with pytest.raises(FileFormatError, match=rf"run\.ckpt: {wrong}"):
+        solvers.solve(graph, robots=3, checkpoint=Checkpoint(path))
+    assert [one.name for one in path.parent.iterdir()] == ["run.ckpt"]  # and no lock
+
+
+@given(
+    place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7), length=st.none() | st.floats(0, 1, exclude_max=True)
+)
+@hypothesis_settings(max_examples=500, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_flipped_bit_or_a_lost_end_is_one_error(broken_off, place, bit, length):
+    path = broken_off[1]
+    whole = path.read_bytes()
+    damaged = bytearray(whole)
+    damaged[int(place * len(whole))] ^= 1 << bit
+    other = path.with_name("damaged.ckpt")
+    other.write_bytes(damaged if length is None else whole[: int(length * len(whole))])
+    with pytest.raises(FileFormatError, match=r"damaged\.ckpt: (no checkpoint of a solve|a damaged checkpoint)"):
+        Journal(Checkpoint(other), {}, [])
+
+
+@pytest.mark.parametrize("arrays", [{}, {"run/tree": np.array("{}")}, {"run/tree": np.array("no JSON")}])
+def test_a_whole_file_of_another_version_is_refused(arrays, broken_off, monkeypatch):
+    path, save = broken_off[1], np.savez
+    kept = {"header": np.array(["graph", "partition", "settings"])}
+    monkeypatch.setattr(np, "savez", lambda file, **options: save(file, **kept, **arrays))
+    checkpoint._write(path, dict.fromkeys(checkpoint._PARTS, ""), None, [])
+    with pytest.raises(FileFormatError, match="a checkpoint of another version of this package; remove it"):
+        Journal(Checkpoint(path), {part: part for part in checkpoint._PARTS}, [])
+
+
+def content(path):
+    """Arrays of a checkpoint, which follow two lines."""
+    return np.load(io.BytesIO(path.read_bytes().split(b"\n", 2)[2]), allow_pickle=False)
+
+
+def test_a_checkpoint_holds_no_pickle(broken_off):
+    with content(broken_off[1]) as file:
+        assert {file[name].dtype.kind for name in file.files} <= set("fiUb")
+
+
+def test_room_on_the_disk_again_means_checkpoints_again(tmp_path, monkeypatch, caplog):
+    graph, path, written = varied_graph(6, 30, 2), tmp_path / "run.ckpt", []
+    write = checkpoint._write
+
+    def failing(*arguments):
+        written.append(path.exists())
+        if len(written) in (2, 3, 5):
+            raise PGOError(f"cannot write {path}: No space left on device; choose a place that can be written")
+        write(*arguments)
+
+    monkeypatch.setattr(checkpoint, "_write", failing)
+    found = solvers.solve(graph, robots=3, checkpoint=Checkpoint(path, rounds=1))
+    assert len(written) > 6
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert_same(found, solvers.solve(graph, robots=3))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_checkpoint_that_cannot_be_written_or_removed_loses_no_result(tmp_path, caplog):
+    graph, path = varied_graph(6, 30, 2), tmp_path / "run.ckpt"
+
+    def block(state, record):
+        if path.is_file():
+            path.unlink()
+            path.mkdir()
+
+    found = solvers.solve(graph, robots=3, checkpoint=Checkpoint(path, rounds=1), callback=block)
+    assert_same(found, solvers.solve(graph, robots=3))
+    first, last = caplog.messages
+    assert first.startswith(
+        f"the solve goes on without a new checkpoint: cannot write {path}: it is not a regular file"
+    )
+    assert last.startswith(f"cannot remove {path}: ")
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+def test_a_second_run_on_a_checkpoint_is_refused(is_there, tmp_path):
+    graph, path = varied_graph(9, 30, 2), tmp_path / "run.ckpt"
+    if is_there:
+        with pytest.raises(Killed):
+            solvers.solve(graph, robots=3, checkpoint=Checkpoint(path), callback=killed_after(2))
+    link = tmp_path / "link.ckpt"
+    link.symlink_to(path)
+    refusals = []
+
+    def second(state, record):
+        for name in (path, link):
+            with pytest.raises(SettingError, match=r"run\.ckpt is in use by another run; wait until") as refused:
+                solvers.solve(graph, robots=3, checkpoint=Checkpoint(name))
+            refusals.append(str(refused.value))
+
+    found = solvers.solve(graph, robots=3, checkpoint=Checkpoint(path), callback=second)
+    assert refusals
+    assert_same(found, solvers.solve(graph, robots=3))
+    assert list(tmp_path.iterdir()) == [link]
+
+
+def test_rounds_are_positive():
+    with pytest.raises(SettingError, match="rounds must be at least 1, got 0"):
+        Checkpoint("run.ckpt", rounds=0)
+
+
+def test_a_killed_process_goes_on_where_it_was(tmp_path):
+    iterations, path = 250, tmp_path / "run.ckpt"
+    options = ["--robots", "3", "--tolerance", "1e-300", "--max-iterations", str(iterations), "--resume", str(path)]
+    environment = {**os.environ, "PYTHONPATH": str(Path(solvers.__file__).parent.parent)}
+    process = subprocess.Popen([*PGO, "solve", "circle", *options], env=environment, stdout=subprocess.DEVNULL)
+    written, deadline = set(), time.monotonic() + 60
+    while len(written) < 3:  # checkpoints, each a new file: the run is in the middle of SOC
+        assert process.poll() is None, "the run ended before it was killed"
+        assert time.monotonic() < deadline, "no checkpoints are written"
+        time.sleep(1e-3)
+        if path.exists():
+            written.add(path.stat().st_mtime_ns)
+    second = subprocess.run(
+        [*PGO, "solve", "circle", *options], env=environment, capture_output=True, text=True, check=False
+    )
+    assert (second.returncode, second.stdout) == (1, "")
+    assert second.stderr == (
+        f"pgo: {path} is in use by another run; wait until that has ended, or choose another name\n"
+    )
+    assert process.poll() is None
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert path.with_name("run.ckpt.lock").exists()  # a dead process's: it holds nobody up
+    graph = pgo.load("circle")
+    robots = chosen_partition(graph, 3, None)
+    settings = chosen_pipeline(Method.SUBSTRUCTURED, robots, BackEnd.FACTORIZED, 1e-6, iterations, 1e-300)
+    expected = solvers.solve(graph, settings, robots=robots)
+    seen = []
+    found = solvers.solve(
+        graph,
+        settings,
+        robots=robots,
+        checkpoint=Checkpoint(path),
+        callback=lambda state, record: seen.append(record.k),
+    )
+    np.testing.assert_allclose(found.objective, expected.objective, rtol=1e-8, atol=0)
+    assert found.is_certified
+    soc = next(stage for stage in found.stages if stage.name == "SOC")
+    assert soc.iterations == iterations
+    assert seen[0] >= 10  # the first state after the resume is not the start
+    assert len(seen) < len(soc.history)

@@ -1,0 +1,291 @@
+"""CONSENSUS by robots that hold copies takes the steps of `solvers.soc.soc`, which has all robots in one place."""
+
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph, varied_problem
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robots import (
+    BACKENDS,
+    PARTITIONERS,
+    Partitioner,
+    Recording,
+    contiguous,
+    corner_cases,
+    metis,
+    one_robot,
+    scattered,
+    singletons,
+)
+
+from pgo_models.errors import SettingError
+from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import NoiseModel, grid
+from pgo_models.problem.cholesky import CholeskyBackend
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.consensus import ConsensusSOC, ConsensusState
+from solvers.distributed.driver import Driver
+from solvers.distributed.stages import collect, open_driver
+from solvers.loop import iterate, run
+from solvers.pipeline import Pipeline, solve
+from solvers.result import Status
+from solvers.soc import penalty as safeguard
+from solvers.soc import separator_stiffness as stiffness
+from solvers.soc.anderson import Anderson, AndersonMemory
+from solvers.soc.paper import PaperSOC
+from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule, rotation_scale
+from solvers.soc.r_step import RStep
+from solvers.soc.soc import SOC, Coupling
+from solvers.soc.state import SOCState
+
+SIZES = st.integers(2, 20)
+NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
+CONVERGED = 1e-8  # only rounding is left
+SAME = 1e-7
+STALLED = MultiplierPenalty(stall_window=3, stall_ratio=1e-6)  # anything counts as stalled after three steps
+
+
+def check_state(one: SOCState, other: ConsensusState, engine: Recording) -> None:
+    """Every robot has its rows of the central iterate, and the penalties."""
+    assert (other.k, other.refreshes, other.raises) == (one.k, one.refreshes, one.raises)
+    np.testing.assert_allclose(other.primal_residual, one.primal_residual, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(other.dual_residual, one.dual_residual, rtol=1e-6, atol=1e-8)
+    assert one.team.penalty is not None
+    for robot, rows, agent in zip(one.team.robots, one.team.slices, engine.agents, strict=True):
+        mine = agent.copies
+        assert mine is not None
+        np.testing.assert_array_equal(agent.share.poses, robot.poses)
+        np.testing.assert_array_equal(np.flatnonzero(mine.held), robot.held)
+        np.testing.assert_allclose(mine.rho, one.rho[robot.poses], rtol=SAME, atol=0)
+        np.testing.assert_allclose(mine.penalty[robot.held], one.team.penalty[rows], rtol=SAME, atol=0)
+        for local, whole in ((mine.x, one.x), (mine.z, one.z), (mine.s, one.s)):
+            np.testing.assert_allclose(local[robot.held], whole[rows], rtol=0, atol=SAME * (1 + np.abs(whole).max()))
+
+
+def check_acceleration(one: SOCState, other: ConsensusState, engine: Recording, soc: SOC) -> None:
+    """Robots remember as much as one place does, and the sums are those of what they remember."""
+    if soc.acceleration is None:
+        return
+    number = len(engine.agents)
+    is_alone = soc.acceleration.per_robot
+    memories = one.memory or (AndersonMemory(),) * (number if is_alone else 1)
+    for robot, agent in enumerate(engine.agents):
+        assert agent.copies is not None
+        memory = memories[robot if is_alone else 0]
+        sums = agent.copies.sums if is_alone else other.sums
+        known = len(memory.residual_differences)
+        assert len(sums.gram) == len(agent.copies.anderson.residual_differences) == known
+        np.testing.assert_allclose(sums.smallest, memory.smallest, rtol=1e-6, atol=1e-8)
+
+
+def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> SOCState:
+    """Compare iterate by iterate until only rounding is left, and what the runs leave behind; the last central one."""
+    engine, start = Recording(), chordal_start(problem)
+    driver = open_driver(problem, parts, engine)
+    driver.set_poses(start)
+    central = islice(iterate(soc, problem, start), steps + 1)
+    for one, other in zip(central, iterate(ConsensusSOC(soc), driver), strict=False):
+        assert isinstance(one, SOCState)
+        check_state(one, other, engine)
+        check_acceleration(one, other, engine, soc)
+        if max(one.primal_residual, one.dual_residual) <= CONVERGED:
+            break
+    ConsensusSOC(soc).finish(driver)
+    check_end(problem, soc, one, driver)
+    return one
+
+
+def check_end(problem: PGOProblem, soc: SOC, last: SOCState, driver: Driver) -> None:
+    poses, _ = collect(driver)
+    expected = soc.poses(problem, last)
+    size = 1 + np.abs(expected.t).max()
+    np.testing.assert_allclose(poses.R, expected.R, rtol=0, atol=SAME)
+    np.testing.assert_allclose(poses.t - poses.t[0], expected.t, rtol=0, atol=SAME * size)
+    assert driver.objective == pytest.approx(problem.objective(expected), rel=1e-6, abs=1e-9)
+
+
+@settings(max_examples=25)
+@given(
+    seed=SEEDS,
+    n=SIZES,
+    d=DIMENSIONS,
+    noise=NOISES,
+    partitioner=PARTITIONERS,
+    backend=BACKENDS,
+    rule=st.sampled_from([MultiplierPenalty(), STALLED, BalancedPenalty(), BalancedPenalty(scale=30.0)]),
+    alpha=st.sampled_from([1.0, 1.6]),
+    acceleration=st.sampled_from([None, Anderson(), Anderson(memory=2, restart_ratio=1.01), Anderson(per_robot=True)]),
+    local_passes=st.sampled_from([1, 10]),
+    penalties=st.sampled_from([(None, None), (0.1, None), (None, 0.5), (0.02, 0.0)]),
+)
+def test_the_iterates_are_those_of_one_place(
+    seed: int,
+    n: int,
+    d: int,
+    noise: NoiseModel,
+    partitioner: Partitioner,
+    backend: CholeskyBackend,
+    rule: PenaltyRule,
+    alpha: float,
+    acceleration: Anderson | None,
+    local_passes: int,
+    penalties: tuple[float | None, float | None],
+) -> None:
+    problem = PGOProblem(varied_graph(seed, n, d, noise), backend)
+    parts = partitioner(problem.graph, seed)
+    translation_penalty, separator_penalty = penalties
+    soc = SOC(
+        robots=parts,
+        coupling=Coupling.CONSENSUS,
+        penalty=rule,
+        alpha=alpha,
+        acceleration=acceleration,
+        local_passes=local_passes,
+        translation_penalty=translation_penalty,
+        separator_penalty=separator_penalty,
+    )
+    check(problem, parts, soc, 8)
+
+
+@pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)
+def test_the_iterates_of_corner_cases(graph: PoseGraph, parts: Partition) -> None:
+    check(PGOProblem(graph), parts, SOC(robots=parts), 8)
+
+
+@pytest.mark.parametrize("partitioner", [contiguous, metis, scattered, singletons, one_robot])
+@pytest.mark.parametrize("d", [2, 3])
+def test_every_change_of_the_penalty_is_the_central_one(
+    d: int, partitioner: Partitioner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = varied_problem(5, 14, d, LOUD_NOISE)
+    parts = partitioner(problem.graph, 5)
+    soc = SOC(coupling=Coupling.CONSENSUS, robots=parts)
+    assert check(problem, parts, replace(soc, penalty=STALLED), 8).refreshes == 1
+    assert check(problem, parts, replace(soc, penalty=BalancedPenalty(scale=100.0)), 8).refreshes >= 1
+    monkeypatch.setattr(safeguard, "_DIVERGED", 1.0)  # any step back counts as divergence
+    weak = FixedPenalty(0.1 * float(np.median(rotation_scale(problem))))
+    assert check(problem, parts, replace(soc, penalty=weak, acceleration=None, alpha=1.9), 14).raises >= 1
+
+
+def test_the_second_look_at_the_translation_penalty_is_the_central_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stiffness, "_SECOND_LOOK", 2)
+    monkeypatch.setattr(stiffness, "_FAR_AWAY", 0.0)
+    monkeypatch.setattr(stiffness, "_LEAST_FACTOR", 0.999)
+    monkeypatch.setattr(stiffness, "_ENOUGH", np.inf)  # any fall is taken
+    problem = varied_problem(5, 14, 3, LOUD_NOISE)
+    parts = metis(problem.graph, 5)
+    assert check(problem, parts, SOC(coupling=Coupling.CONSENSUS, robots=parts, penalty=STALLED), 12).refreshes >= 2
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_robots_forget_when_the_acceleration_restarts(seed: int) -> None:
+    problem = varied_problem(seed, 14, 3, LOUD_NOISE)
+    parts, start = metis(problem.graph, 5), chordal_start(problem)
+    acceleration = Anderson(memory=3, restart_ratio=1.001)
+    soc = SOC(coupling=Coupling.CONSENSUS, robots=parts, penalty=BalancedPenalty(), acceleration=acceleration)
+    engine = Recording()
+    driver = open_driver(problem, parts, engine)
+    driver.set_poses(start)
+    restarts = []
+    for one, other in islice(zip(iterate(soc, problem, start), iterate(ConsensusSOC(soc), driver), strict=False), 16):
+        assert isinstance(one, SOCState)
+        check_state(one, other, engine)
+        check_acceleration(one, other, engine, soc)
+        orders = [down[0]["restart"][0] for order, down, _ in engine.log if order == "copies.extrapolate"]
+        restarts.append(bool(orders) and bool(orders[-1]))
+    assert sum(restarts[:-3]) >= 1  # and steps follow
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_long_accelerated_run_ends_where_one_place_ends(d: int) -> None:
+    problem = varied_problem(1, 30, d)
+    parts = metis(problem.graph, 4)
+    soc = SOC(robots=parts)
+    driver = open_driver(problem, parts, Recording())
+    driver.start()
+    central = run(soc, problem)
+    distributed = run(ConsensusSOC(soc), driver)
+    assert distributed.status is central.status is Status.CONVERGED
+    assert distributed.iterations == central.iterations
+    ConsensusSOC(soc).finish(driver)
+    assert isinstance(central.state, SOCState)
+    check_end(problem, soc, central.state, driver)
+    for figure in ("primal_residual", "dual_residual"):
+        np.testing.assert_allclose(
+            [getattr(record.measurement, figure) for record in distributed.history.records[1:]],
+            [getattr(record.measurement, figure) for record in central.history.records[1:]],
+            rtol=1e-4,
+            atol=1e-9,
+        )
+
+
+def test_a_state_that_is_not_finite_is_said_to_be_and_leaves_the_last_one_behind() -> None:
+    problem, engine = varied_problem(0, 12, 3), Recording()
+    driver = open_driver(problem, metis(problem.graph, 2), engine)
+    driver.start()
+    start = driver.objective
+    for acceleration in (Anderson(), Anderson(per_robot=True), None):
+        method = ConsensusSOC(SOC(acceleration=acceleration))
+        state = method.init(driver, None)
+        holder = engine.agents[0].copies
+        assert holder is not None
+        s = holder.s
+        holder.s = np.full_like(s, np.nan)
+        broken = method.step(driver, state)
+        assert broken.k == 1
+        measurement = method.measure(driver, broken)
+        assert np.isnan([measurement.objective, measurement.primal_residual, measurement.dual_residual]).all()
+        assert method.converged(broken, measurement) is None
+        method.finish(driver)
+        assert driver.objective == pytest.approx(start, rel=1e-9)
+
+
+# solve(.., robots=..)
+
+
+@settings(max_examples=10)
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
+def test_the_solution_is_certified_with_the_central_gap(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
+    problem = varied_problem(seed, n, d)
+    parts = partitioner(problem.graph, seed)
+    # The coupling follows from the robots of SOC; one robot is JOINT's.
+    pipeline = Pipeline(soc=SOC(robots=parts, tolerance=2e-3), second_try=False, staircase=None)
+    solution, central = solve(problem, pipeline, robots=parts), solve(problem, pipeline)
+    rounding = 1e-12 * central.objective + central.certificate.rounding_level
+    assert solution.is_certified
+    assert solution.gap == pytest.approx(central.gap, abs=1e-11)
+    assert solution.objective == pytest.approx(central.objective, rel=1e-12, abs=rounding)
+    assert [stage.name for stage in solution.stages] == [stage.name for stage in central.stages]
+    soc, other = solution.stages[1], central.stages[1]
+    assert soc.iterations == other.iterations
+    assert soc.status is other.status
+
+
+def test_solve_and_soc_have_the_same_robots() -> None:
+    graph = grid(np.random.default_rng(0))
+    three, four = partition(graph, 3, PartitionMethod.METIS), partition(graph, 4)
+    pipeline = Pipeline(soc=SOC(robots=three, tolerance=2e-3))
+    engine = Recording()
+    solution = solve(graph, pipeline, robots=3, engine=engine)  # so many are SOC's
+    assert solution.robots is three
+    assert engine.times("copies.turn", "penalize") == 0
+    assert engine.times("copies.extrapolate") == solution.stages[1].iterations > 0
+    same = Partition(three.robot.copy(), three.method)
+    assert solve(graph, pipeline, robots=same).gap == solution.gap
+    for other in (four, 4, partition(graph, 3, PartitionMethod.CONTIGUOUS)):
+        with pytest.raises(SettingError, match="give both the same robots, or SOC none"):
+            solve(graph, pipeline, robots=other)
+
+
+def test_what_robots_cannot_run_is_refused() -> None:
+    graph = grid(np.random.default_rng(0))
+    parts = partition(graph, 3)
+    with pytest.raises(SettingError, match="PaperSOC is run in one place"):
+        solve(graph, Pipeline(soc=PaperSOC()), robots=parts)
+    with pytest.raises(SettingError, match=r"robots factor their subproblems, got r_step .*FISTA"):
+        solve(graph, Pipeline(soc=SOC(robots=parts, r_step=RStep.FISTA)), robots=parts)

@@ -1,0 +1,190 @@
+"""Newton by driver and robots takes the steps of `pgo_models.certificates.newton_polish`."""
+
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, EPS, LOUD_NOISE, MILD_NOISE, SEEDS, random_poses, varied_graph, varied_problem
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, metis
+
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, ground_pose, retract
+from pgo_models.certificates.rounding_errors import rounding_level
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import tangent_dimension
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.problem.cholesky import CholeskyBackend
+from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.driver import Driver
+from solvers.distributed.newton import SubstructuredNewton, model_at
+from solvers.distributed.stages import collect, open_driver
+from solvers.loop import iterate, run
+from solvers.network.engine import InProcess
+from solvers.result import Status
+from solvers.riemannian.newton import Newton
+
+SIZES = st.integers(2, 20)
+NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
+
+
+def near(problem: PGOProblem, seed: int, spread: float) -> Poses:
+    """The chordal start, moved at random."""
+    rng = np.random.default_rng(seed)
+    moves = [spread * rng.standard_normal((problem.num_poses, k)) for k in (tangent_dimension(problem.d), problem.d)]
+    return retract(chordal_start(problem), *moves)
+
+
+def driver_at(problem: PGOProblem, parts: Partition, poses: Poses) -> Driver:
+    driver = open_driver(problem, parts, InProcess())
+    driver.set_poses(poses)
+    return driver
+
+
+def check(problem: PGOProblem, parts: Partition, start: Poses, newton: Newton, steps: int) -> None:
+    driver = driver_at(problem, parts, start)
+    central = iterate(replace(newton, secants=False), problem, start)
+    distributed = iterate(SubstructuredNewton(newton), driver)
+    for one, other in islice(zip(central, distributed, strict=True), steps + 1):
+        objective = one.polish.objective
+        assert other.k == one.k
+        assert other.objective == pytest.approx(objective, rel=1e-7, abs=1e-12)
+        if objective <= 1e6 * rounding_level(problem, one.polish.poses):  # an optimum of zero: F is rounding, too
+            break
+        assert other.decrement == pytest.approx(one.polish.decrement, rel=1e-5, abs=1e-13)
+        if one.polish.decrement <= 1e-10:  # what is left is rounding
+            break
+        assert other.moved == one.polish.moved
+    poses, _ = collect(driver)
+    assert driver.objective == pytest.approx(problem.objective(poses), rel=1e-10, abs=1e-20)
+
+
+@settings(max_examples=30)
+@given(
+    seed=SEEDS,
+    n=SIZES,
+    d=DIMENSIONS,
+    noise=NOISES,
+    partitioner=PARTITIONERS,
+    backend=BACKENDS,
+    second_order=st.booleans(),
+    spread=st.sampled_from([0.0, 0.05, 0.5]),
+)
+def test_the_steps_are_the_central_ones(
+    seed: int,
+    n: int,
+    d: int,
+    noise: NoiseModel,
+    partitioner: Partitioner,
+    backend: CholeskyBackend,
+    second_order: bool,
+    spread: float,
+) -> None:
+    problem = PGOProblem(varied_graph(seed, n, d, noise), backend)
+    newton = Newton(second_order=second_order)
+    check(problem, partitioner(problem.graph, seed), near(problem, seed, spread), newton, 5)
+
+
+@pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)
+def test_the_steps_of_corner_cases(graph: PoseGraph, parts: Partition) -> None:
+    problem = PGOProblem(graph)
+    check(problem, parts, near(problem, 0, 0.3), Newton(), 8)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_as_many_steps_to_the_same_optimum(d: int) -> None:
+    problem = varied_problem(2, 30, d, LOUD_NOISE)
+    start = chordal_start(problem)
+    central = run(Newton(secants=False), problem, start)
+    driver = driver_at(problem, metis(problem.graph, 4), start)
+    method = SubstructuredNewton()
+    states = []
+    for state in iterate(method, driver):
+        states.append(state)
+        if len(states) > 1 and method.converged(state, method.measure(driver, state)) is not None:
+            break
+    assert central.status is Status.CONVERGED
+    assert states[-1].decrement <= STATIONARY_DECREMENT
+    assert len(states) - 1 == central.iterations
+    assert driver.objective == pytest.approx(central.objective, rel=1e-13)
+
+
+@settings(max_examples=30)
+@given(
+    seed=SEEDS,
+    n=SIZES,
+    d=DIMENSIONS,
+    partitioner=PARTITIONERS,
+    backend=BACKENDS,
+    second_order=st.booleans(),
+    damping=st.sampled_from([0.0, 1e-8, 0.1, 100.0]),
+)
+def test_a_model_is_the_central_matrix_with_its_ground_and_damping(
+    seed: int,
+    n: int,
+    d: int,
+    partitioner: Partitioner,
+    backend: CholeskyBackend,
+    second_order: bool,
+    damping: float,
+) -> None:
+    problem = PGOProblem(varied_graph(seed, n, d), backend)
+    poses = near(problem, seed, 0.01)
+    driver = driver_at(problem, partitioner(problem.graph, seed), poses)
+    H = riemannian_hessian(problem, poses, multipliers(problem, poses) if second_order else None)
+    ground_pose(H, problem)
+    H.setdiag(H.diagonal() * (1.0 + damping))
+    dense = H.toarray()
+    layout = TangentLayout(n, d)
+    gradient = layout.join(*problem.riemannian_gradient(poses))
+    values = np.linalg.eigvalsh(dense)
+    model = model_at(driver, second_order, damping)
+    if abs(values[0]) <= 1e-10 * values[-1]:
+        return  # either answer is right
+    assert (model is not None) == (values[0] > 0)
+    if model is None:
+        return
+    w, v = layout.split(np.linalg.solve(dense, gradient))
+    expected = np.concatenate([v[driver.cover].ravel(), w[driver.cover].ravel()])
+    condition = values[-1] / values[0]
+    allowed = 1e3 * EPS * condition * (1e-9 + np.abs(np.linalg.solve(dense, gradient)).max())
+    np.testing.assert_allclose(model.y[:, 0], expected, rtol=0, atol=allowed)
+    square = float(gradient @ np.linalg.solve(dense, gradient))
+    assert model.square == pytest.approx(square, rel=1e3 * EPS * condition + 1e-9)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_where_the_hessian_is_not_positive_definite_gauss_newton_takes_over(d: int) -> None:
+    problem = varied_problem(4, 20, d, LOUD_NOISE)
+    start = random_poses(20, d, 4)  # far from any minimum
+    parts = metis(problem.graph, 4)
+    driver = driver_at(problem, parts, start)
+    assert model_at(driver, second_order=True, damping=0.0) is None
+    assert model_at(driver, second_order=False, damping=0.0) is not None
+    check(problem, parts, start, Newton(), 4)
+
+
+def test_damping_grows_until_the_matrix_is_positive_definite(monkeypatch: pytest.MonkeyPatch) -> None:
+    # As if rounding spoiled every factorisation with less damping than 1e-3.
+    problem = varied_problem(0, 12, 3)
+    driver = driver_at(problem, metis(problem.graph, 2), near(problem, 0, 0.2))
+    tried = []
+
+    def spoiled(driver: Driver, second_order: bool, damping: float) -> object:
+        tried.append((second_order, damping))
+        return model_at(driver, second_order, damping) if damping >= 1e-3 else None
+
+    monkeypatch.setattr("solvers.distributed.newton.model_at", spoiled)
+    before = driver.objective
+    state = next(islice(iterate(SubstructuredNewton(), driver), 1, None))
+    assert [second_order for second_order, _ in tried] == [True] + [False] * (len(tried) - 1)
+    dampings = [damping for _, damping in tried[1:]]
+    np.testing.assert_allclose(dampings, [0.0, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3], rtol=1e-12, atol=0)
+    assert state.moved
+    assert driver.objective < before

@@ -1,0 +1,251 @@
+"""The driver and its robots: what they find together, what crosses between them, and what is counted of it."""
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, random_poses, varied_graph, varied_problem
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robots import BACKENDS, PARTITIONERS, Partitioner, Recording, corner_cases, metis
+
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.errors import GraphError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import tangent_dimension
+from pgo_models.graphs.partitioning import Partition, partition
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import NoiseModel, grid
+from pgo_models.problem.cholesky import CholeskyBackend
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.driver import Driver
+from solvers.distributed.robots.subgraph import share_out
+from solvers.distributed.stages import collect, open_driver
+from solvers.network.engine import InProcess
+from solvers.pipeline import Pipeline, solve
+from solvers.solution import Solution
+
+SIZES = st.integers(2, 24)
+NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
+OFF = ("describe", "set_poses", "cost", "result")  # orders that are not counted
+
+PROOF = ("certificate", "move_certificate")
+
+
+def check_start(problem: PGOProblem, parts: Partition) -> None:
+    driver = open_driver(problem, parts, InProcess())
+    driver.start()
+    poses, Lambda = collect(driver)
+    expected = chordal_start(problem)
+    size = 1 + np.abs(expected.t).max()
+    np.testing.assert_allclose(poses.R, expected.R, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(poses.t - poses.t[0], expected.t, rtol=0, atol=1e-9 * size)
+    scale = float(problem.M.diagonal().max())
+    np.testing.assert_allclose(Lambda, multipliers(problem, poses), rtol=0, atol=1e-12 * scale * size)
+    assert driver.objective == pytest.approx(problem.objective(poses), rel=1e-12, abs=1e-24 * scale)
+    assert driver.ledger.rounds == 2
+
+
+@settings(max_examples=40)
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, noise=NOISES, partitioner=PARTITIONERS, backend=BACKENDS)
+def test_the_chordal_start_is_the_central_one(
+    seed: int, n: int, d: int, noise: NoiseModel, partitioner: Partitioner, backend: CholeskyBackend
+) -> None:
+    graph = varied_graph(seed, n, d, noise)
+    check_start(PGOProblem(graph, backend), partitioner(graph, seed))
+
+
+@pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)
+def test_the_chordal_start_of_corner_cases(graph: PoseGraph, parts: Partition) -> None:
+    check_start(PGOProblem(graph), parts)
+
+
+@settings(max_examples=30)
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
+def test_poses_from_elsewhere_are_taken_as_they_are(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
+    problem = varied_problem(seed, n, d)
+    given_poses, other = random_poses(n, d, seed), random_poses(n, d, seed + 1)
+    driver = open_driver(problem, partitioner(problem.graph, seed), InProcess())
+    driver.set_poses(given_poses)
+    assert driver.objective == pytest.approx(problem.objective(given_poses), rel=1e-12)
+    driver.save_poses()
+    driver.set_poses(other)
+    driver.restore_poses()
+    poses, Lambda = collect(driver)
+    np.testing.assert_array_equal(poses.R, given_poses.R)
+    np.testing.assert_array_equal(poses.t, given_poses.t)
+    assert driver.objective == pytest.approx(problem.objective(given_poses), rel=1e-12)
+    scale = float(problem.M.diagonal().max())
+    np.testing.assert_allclose(Lambda, multipliers(problem, poses), rtol=0, atol=1e-11 * scale)
+    assert driver.ledger.rounds == 0
+    with pytest.raises(GraphError, match="give one pose for every pose of the graph"):
+        driver.set_poses(Poses(given_poses.R[1:], given_poses.t[1:]))
+
+
+def test_separators_that_would_not_fit_are_refused_before_a_robot_starts() -> None:
+    graph = grid(np.random.default_rng(0))
+    engine = Recording()
+    with pytest.raises(SettingError, match="use a METIS partition or fewer robots"):
+        Driver(share_out(graph, partition(graph, 3)), graph.num_poses, engine, None, memory=1e3)
+    assert engine.shares == ()
+
+
+# What crosses.
+
+
+def solved(seed: int, n: int, d: int, partitioner: Partitioner, noise: NoiseModel) -> tuple[Solution, Recording]:
+    graph, engine = varied_graph(seed, n, d, noise), Recording()
+    solution = solve(graph, Pipeline(staircase=None), robots=partitioner(graph, seed), engine=engine)
+    assert engine.is_closed
+    return solution, engine
+
+
+@settings(max_examples=25)
+@given(seed=SEEDS, n=st.integers(3, 16), d=DIMENSIONS, noise=NOISES, partitioner=PARTITIONERS)
+def test_the_ledger_counts_what_was_sent(
+    seed: int, n: int, d: int, noise: NoiseModel, partitioner: Partitioner
+) -> None:
+    solution, engine = solved(seed, n, d, partitioner, noise)
+    ledger, number = solution.ledger, len(engine.shares)
+    assert ledger is not None
+    sent, received, messages = np.zeros((2, number)), np.zeros((2, number)), 0
+    for order, down, up in engine.log:
+        if order in OFF:
+            continue
+        for robot in range(number):
+            for total, message in ((received, down[robot]), (sent, up[robot])):
+                size = 8 * sum(np.asarray(value).size for value in message.values())
+                total[0, robot] += size
+                messages += size > 0
+    np.testing.assert_array_equal(ledger.bytes_sent, sent[0])
+    np.testing.assert_array_equal(ledger.bytes_received, received[0])
+    assert (ledger.num_robots, ledger.messages, ledger.num_bytes) == (
+        number,
+        messages,
+        sent[0].sum() + received[0].sum(),
+    )
+    # A solve of M x = b, a step (a), a Newton direction, the best translations and a proof take one round each.
+    counted = (
+        "project",
+        "set_translations",
+        "penalize",
+        "rescale",
+        "solve",
+        "finish",
+        "move",
+        "evaluate_trial",
+        *PROOF,
+    )
+    assert ledger.rounds == engine.times(*counted)
+    assert ledger.all_reduces == engine.times("agree")
+    last = solution.stages[-1].history.records[-1].measurement
+    assert last.rounds == ledger.rounds - engine.times(*PROOF)
+
+
+def test_rounds_of_a_whole_solve_are_as_documented() -> None:
+    graph, engine = grid(np.random.default_rng(0)), Recording()
+    solution = solve(graph, robots=partition(graph, 3), engine=engine)
+    assert solution.ledger is not None
+    start, soc, newton = solution.stages
+    moves = engine.times("move")
+    assert (start.name, engine.times("rescale"), engine.times("turn"), engine.times("certificate")) == (
+        "chordal start",
+        0,
+        0,
+        1,
+    )
+    assert engine.times("penalize") == 1  # no refresh
+    # 2 to start, 1 for the penalty and 1 a step and 2 for the result of SOC, 2 a move of Newton, 2 for the proof.
+    assert engine.times("move_certificate") == 1
+    assert solution.ledger.rounds == 2 + (1 + soc.iterations + 2) + 2 * moves + 2
+    assert solution.ledger.all_reduces == soc.iterations
+    assert newton.iterations <= moves
+    rounds = [record.measurement.rounds for record in soc.history.records]
+    assert rounds == list(range(3, 4 + soc.iterations))
+
+
+def lower(g: int, width: int) -> tuple[int]:
+    """Shape of the lower triangle of a matrix with `width` unknowns a separator."""
+    return (width * g * (width * g + 1) // 2,)
+
+
+@pytest.mark.parametrize("noise", [MILD_NOISE, LOUD_NOISE])
+@pytest.mark.parametrize("d", [2, 3])
+def test_what_crosses_has_the_size_of_the_separators(d: int, noise: NoiseModel) -> None:
+    solution, engine = solved(7, 40, d, metis, noise)
+    graph, parts, tangent = solution.problem.graph, solution.robots, d + tangent_dimension(d)
+    assert parts is not None
+    memory = 40
+    seen = set()
+    for share in share_out(graph, parts):
+        part = share.part
+        if part is None:
+            continue
+        g, inside = len(part.boundary), len(part.interior)
+        assert inside not in (0, g)
+        any_side = {(width * g, k) for width, k in ((1, d), (d + 1, d), (tangent, 1))}
+        allowed = {
+            "schur": {lower(g, 1), lower(g, d + 1), lower(g, tangent)},
+            "diagonal": {((d + 1) * g,), (tangent * g,)},
+            "b": any_side,
+            "x": any_side,
+            "t": {(g, d)},
+            "z": {(d * g, d)},
+            "force": {((d + 1) * g, d)},
+            "norms": {(inside,)},
+            "scale": {(inside,)},
+            "rule": {(3,)},
+            "settings": {(2,)},
+            "fixed": {((d + 1) * g,)},
+            "figures": {(5,)},
+            **{name: {((d + 1) * g, d)} for name in ("point", "product", "error")},
+            "gamma": {(k,) for k in range(memory + 1)},
+            "sums": {(k,) for k in range(2 * memory + 2)},
+        }
+        for order, sent, got in engine.log:
+            if order == "result":
+                continue
+            for name, value in (*sent[share.robot].items(), *got[share.robot].items()):
+                assert np.shape(value) in allowed.get(name, {(1,)}), (order, name)
+                seen.add(name)
+    assert {"schur", "b", "x", "t", "force", "sums", "gamma", "norms", "scale"} <= seen
+
+
+@settings(max_examples=15)
+@given(seed=SEEDS, n=st.integers(6, 24), d=DIMENSIONS, noise=NOISES, partitioner=PARTITIONERS)
+def test_no_interior_pose_and_no_private_measurement_crosses(
+    seed: int, n: int, d: int, noise: NoiseModel, partitioner: Partitioner
+) -> None:
+    solution, engine = solved(seed, n, d, partitioner, noise)
+    graph, poses = solution.problem.graph, solution.certificate.poses  # as the robots hold them
+    cover = np.unique(np.concatenate([share.poses[share.in_cover >= 0] for share in engine.shares]))
+    interior = np.setdiff1d(np.arange(n), cover)
+    private = ~np.isin(graph.i, cover) & ~np.isin(graph.j, cover)
+    secrets = np.concatenate(
+        [
+            poses.R[interior].ravel(),
+            poses.t[interior].ravel(),
+            graph.R_ij[private].ravel(),
+            graph.t_ij[private].ravel(),
+            graph.kappa[private],
+            graph.tau[private],
+        ]
+    )
+    secrets = secrets[~np.isin(np.abs(secrets), [0.0, 1.0])]  # which anything may be
+    # ||Lambda_i|| and m_i, for the quantile of the penalty, and the largest diagonal entry of M are told: of a pose
+    # with one edge they are its precision.
+    told = [value for name, value in engine.crossed("result") if name not in ("norms", "scale", "largest")]
+    assert not np.isin(secrets, np.concatenate(told)).any()
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_threads_change_no_bit(d: int) -> None:
+    graph = varied_graph(3, 30, d)
+    first, second = (solve(graph, robots=partition(graph, 4), engine=InProcess(threads)) for threads in (1, 3))
+    np.testing.assert_array_equal(first.poses.R, second.poses.R)
+    np.testing.assert_array_equal(first.poses.t, second.poses.t)
+    assert first.lower_bound == second.lower_bound
+
+
+def test_the_number_of_threads_is_checked() -> None:
+    with pytest.raises(SettingError, match="threads must be at least 1, got 0"):
+        InProcess(0)

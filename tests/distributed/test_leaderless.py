@@ -1,0 +1,141 @@
+"""CONSENSUS without a driver: the optimum to SOC's tolerance, nothing sent to a driver, and nothing claimed."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, SEEDS, varied_graph, varied_problem
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robots import PARTITIONERS, Partitioner, Recording, metis, scattered
+
+from pgo_models.certificates.certificate import Verdict
+from pgo_models.certificates.newton_polish import polish
+from pgo_models.errors import GraphError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.scenes import grid
+from pgo_models.problem.initialization import chordal_start, spanning_tree_start
+from solvers.distributed.checkpoint import Checkpoint
+from solvers.distributed.leaderless import NO_CERTIFICATE, tree_traffic
+from solvers.network.faults import Faults
+from solvers.network.ledger import DRIVER
+from solvers.pipeline import Pipeline, solve
+from solvers.result import Record, Status
+from solvers.soc.paper import PaperSOC
+from solvers.soc.penalty import MultiplierPenalty
+from solvers.soc.soc import SOC, Coupling
+
+TOLERANCE = 1e-6
+ALONE = ("cover", "force", "schur", "b")  # what only a driver is told
+
+
+def alone(soc: SOC, faults: Faults | None = None) -> Pipeline:
+    return Pipeline(soc=soc, faults=faults, driver_memory=0)
+
+
+@settings(max_examples=15)
+@given(seed=SEEDS, n=st.integers(3, 16), d=DIMENSIONS, partitioner=PARTITIONERS)
+def test_robots_alone_find_the_optimum_and_claim_nothing(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
+    graph = varied_graph(seed, n, d)
+    parts, engine = partitioner(graph, seed), Recording()
+    soc = SOC(coupling=Coupling.CONSENSUS, robots=parts, tolerance=TOLERANCE)
+    solution = solve(graph, alone(soc), robots=parts, engine=engine)
+    problem = solution.problem
+    best = problem.objective(polish(problem, chordal_start(problem)))
+    assert [stage.name for stage in solution.stages] == ["spanning tree", "SOC"]
+    assert solution.status is Status.CONVERGED
+    assert solution.objective == pytest.approx(problem.objective(solution.poses), rel=1e-12)
+    assert solution.stages[1].objective == pytest.approx(solution.objective, rel=1e-9)
+    assert solution.objective - best <= 100 * TOLERANCE * max(1.0, best)
+    assert solution.lower_bound == 0.0
+    if solution.objective > 1e-3:  # not of a tree, whose edges all fit
+        assert solution.certificate.verdict is Verdict.TRIVIAL
+    assert solution.note == NO_CERTIFICATE
+    assert f"note         {NO_CERTIFICATE}" in str(solution)
+    for order, _, answers in engine.log:
+        assert order.startswith("copies.") or order in ("describe", "set_poses")
+        if order != "describe":
+            assert not any(name in ALONE for answer in answers for name in answer)
+
+
+def test_the_ledger_has_the_tree_and_sums_but_no_poses_of_a_driver() -> None:
+    problem = varied_problem(4, 24, 3)
+    parts = scattered(problem.graph, 4)
+    soc = SOC(robots=parts, max_iterations=0)
+    solution = solve(problem, alone(soc), robots=parts)
+    ledger, tree = solution.ledger, tree_traffic(problem, parts)
+    assert ledger is not None
+    cut = parts.robot[problem.graph.i] != parts.robot[problem.graph.j]
+    assert 0 < sum(int(traffic.num_bytes.sum()) for traffic in tree) <= 8 * 12 * cut.sum()
+    assert ledger.rounds == len(tree) + 2  # and two for poses, penalties and forces
+    sender, receiver, _, num_bytes = ledger.by_link()
+    with_driver = (sender == DRIVER) | (receiver == DRIVER)
+    assert num_bytes[with_driver].sum() <= 8 * (3 * problem.num_poses + 12 * parts.num_robots)  # norms, scales and sums
+
+
+def test_the_penalties_are_taken_anew_at_the_poses_agreed_on() -> None:
+    problem = varied_problem(5, 20, 3)
+    parts, engine = metis(problem.graph, 5), Recording()
+    soc = SOC(robots=parts, penalty=MultiplierPenalty(stall_window=2, stall_ratio=1e-9), tolerance=TOLERANCE)
+    solution = solve(problem, alone(soc), robots=parts, engine=engine)
+    assert engine.times("copies.begin_here") == engine.times("copies.travel") == 1
+    assert solution.status is Status.CONVERGED
+    best = problem.objective(polish(problem, chordal_start(problem)))
+    assert solution.objective == pytest.approx(best, rel=1e-4)
+
+
+def test_given_poses_are_the_start_and_stay_where_nothing_is_better() -> None:
+    problem = varied_problem(1, 20, 2)
+    parts, best = metis(problem.graph, 3), polish(problem, chordal_start(problem))
+    solution = solve(problem, alone(SOC(robots=parts, max_iterations=2)), best, robots=parts)
+    assert solution.stages[0].name == "given start"
+    assert solution.objective <= problem.objective(best) * (1 + 1e-12)
+    with pytest.raises(GraphError, match="give one pose for every pose"):
+        solve(problem, alone(SOC(robots=parts)), Poses(np.eye(2)[None], np.zeros((1, 2))), robots=parts)
+
+
+def test_lost_messages_need_no_driver_either() -> None:
+    problem = varied_problem(3, 20, 3)
+    parts = metis(problem.graph, 4)
+    soc = SOC(robots=parts, tolerance=TOLERANCE)
+    solution = solve(problem, alone(soc, Faults(loss=0.2, seed=1)), robots=parts)
+    assert solution.status is Status.CONVERGED
+    assert solution.objective == pytest.approx(problem.objective(polish(problem, chordal_start(problem))), rel=1e-4)
+    assert solution.objective < problem.objective(spanning_tree_start(problem.graph))
+
+
+def test_a_run_without_a_driver_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
+    problem = varied_problem(3, 20, 3)
+    parts, file = metis(problem.graph, 4), Checkpoint(tmp_path / "run.ckpt", rounds=3)
+    pipeline = alone(SOC(robots=parts, tolerance=TOLERANCE))
+
+    def stop(state: object, record: Record) -> bool:
+        return record.k == 8
+
+    whole = solve(problem, pipeline, robots=parts)
+    broken = solve(problem, pipeline, robots=parts, checkpoint=file, callback=stop)
+    assert broken.status is Status.STOPPED
+    resumed = solve(problem, pipeline, robots=parts, checkpoint=file)
+    assert resumed.stages[1].iterations == whole.stages[1].iterations
+    assert resumed.ledger is not None
+    assert whole.ledger is not None
+    assert resumed.ledger.rounds == whole.ledger.rounds
+    np.testing.assert_allclose(resumed.poses.R, whole.poses.R, rtol=0, atol=1e-9)
+
+
+def test_the_memory_of_the_driver_is_a_setting_and_the_refusal_says_the_way_out() -> None:
+    graph = grid(np.random.default_rng(0))
+    parts = metis(graph, 3)
+    soc = SOC(robots=parts)
+    too_little = r"start, Newton and the certificate, whatever the coupling; .* set it to 0: CONSENSUS without a driver"
+    with pytest.raises(SettingError, match=too_little):
+        solve(graph, Pipeline(soc=soc, driver_memory=1e3), robots=parts)
+    assert solve(graph, Pipeline(soc=soc, driver_memory=1e9), robots=parts).is_certified
+    for other in (None, SOC(), SOC(coupling=Coupling.SUBSTRUCTURED), PaperSOC(robots=parts)):
+        with pytest.raises(SettingError, match="without a driver there is CONSENSUS alone"):
+            Pipeline(soc=other, driver_memory=0)
+    for value in (-1.0, np.nan):
+        with pytest.raises(SettingError, match="driver_memory must not be negative"):
+            Pipeline(soc=soc, driver_memory=value)
+    with pytest.raises(SettingError, match="driver_memory is for solves by robots"):
+        solve(graph, Pipeline(soc=soc, driver_memory=0))

@@ -1,0 +1,308 @@
+"""A whole solve by driver and robots: the certificate and the solution are those of one computer."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from graphs import (
+    DIMENSIONS,
+    LOUD_NOISE,
+    MILD_NOISE,
+    SEEDS,
+    best_known,
+    rounding_of_objective,
+    varied_graph,
+    varied_problem,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, metis, scattered
+
+from pgo_models.certificates.certificate import DEFAULT_GAP
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.lower_bound import best_bound, prove_bound
+from pgo_models.certificates.newton_polish import polish, relative_decrement
+from pgo_models.errors import GraphError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.g2o import read_g2o
+from pgo_models.graphs.partitioning import Partition, partition
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import NoiseModel, grid
+from pgo_models.problem.cholesky import CholeskyBackend
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.lower_bound import best_bound_distributed, prove_with_eta
+from solvers.distributed.stages import collect, open_driver
+from solvers.network.engine import InProcess
+from solvers.network.faults import Faults
+from solvers.pipeline import Pipeline, solve
+from solvers.result import Record, Status
+from solvers.riemannian.newton import Newton, gauss_newton
+from solvers.soc.anderson import Anderson
+from solvers.soc.soc import SOC, Coupling
+from solvers.solution import Solution
+
+ROOT = Path(__file__).parents[2]
+SIZES = st.integers(2, 20)
+NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
+SHORT = Pipeline(second_try=False, staircase=None)
+
+
+def check_certificate(problem: PGOProblem, parts: Partition, poses: Poses) -> None:
+    driver = open_driver(problem, parts, InProcess())
+    driver.set_poses(poses)
+    Lambda = multipliers(problem, poses)
+    objective = problem.objective(poses)
+    central = best_bound(problem, Lambda, poses, DEFAULT_GAP, objective)
+    found = best_bound_distributed(driver, DEFAULT_GAP)
+    if not math.isnan(central.eta):
+        np.testing.assert_allclose(collect(driver)[1], Lambda, rtol=0, atol=1e-11 * problem.M.diagonal().max())
+    assert found.is_grounded == central.is_grounded
+    assert found.eta == pytest.approx(central.eta, rel=1e-9, nan_ok=True)
+    # Grounded at another pose: off an optimum that is another bound.
+    off = relative_decrement(problem, poses)
+    assert found.value == pytest.approx(central.value, rel=1e-9 + off, abs=found.rounding + central.rounding)
+
+
+@settings(max_examples=40)
+@given(
+    seed=SEEDS, n=SIZES, d=DIMENSIONS, noise=NOISES, partitioner=PARTITIONERS, backend=BACKENDS, polished=st.booleans()
+)
+def test_the_bound_is_the_central_one_at_any_poses(
+    seed: int,
+    n: int,
+    d: int,
+    noise: NoiseModel,
+    partitioner: Partitioner,
+    backend: CholeskyBackend,
+    polished: bool,
+) -> None:
+    problem = PGOProblem(varied_graph(seed, n, d, noise), backend)
+    start = chordal_start(problem)
+    check_certificate(problem, partitioner(problem.graph, seed), polish(problem, start) if polished else start)
+
+
+@pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)
+def test_the_bound_of_corner_cases(graph: PoseGraph, parts: Partition) -> None:
+    problem = PGOProblem(graph)
+    check_certificate(problem, parts, polish(problem, chordal_start(problem)))
+
+
+@settings(max_examples=30)
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS, backend=BACKENDS)
+def test_a_shift_is_proved_by_all_together_where_one_proves_it(
+    seed: int, n: int, d: int, partitioner: Partitioner, backend: CholeskyBackend
+) -> None:
+    # Where S has a negative eigenvalue, just below and just above the shift that makes up for it.
+    problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE), backend)
+    poses = chordal_start(problem)
+    Lambda = multipliers(problem, poses)
+    driver = open_driver(problem, partitioner(problem.graph, seed), InProcess())
+    driver.set_poses(poses)
+    scale = float(problem.M.diagonal().max())
+    S = problem.M.toarray()
+    for i in range(n):
+        rows = slice(n + d * i, n + d * (i + 1))
+        S[rows, rows] -= Lambda[i]
+    S[0, 0] *= 2.0
+    weight = np.concatenate([np.full(n, 1e-7), np.ones(d * n)])  # the shift is on the rotations alone
+    low, high = 0.0, scale
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        rotations = S + middle * np.diag(weight > 0.5)
+        low, high = (low, middle) if np.linalg.eigvalsh(rotations)[0] > 0 else (middle, high)
+    for eta in (0.99 * high, 1.01 * high + 1e-9 * scale):
+        if min(abs(eta - high), eta) <= 1e-11 * scale:
+            continue
+        found, central = prove_with_eta(driver, eta), prove_bound(problem, Lambda, eta)
+        assert (found is not None) == (central is not None) == (eta > high)
+        assert found is None or found.value == pytest.approx(central, rel=1e-12, abs=1e-12 * scale)
+
+
+# solve(.., robots=..)
+
+
+def check_equal(distributed: Solution, central: Solution) -> None:
+    problem = central.problem
+    rounding = rounding_of_objective(problem, central.poses.stacked()) + 1e-12 * central.objective
+    assert abs(distributed.objective - central.objective) <= rounding
+    rounding += (
+        central.certificate.rounding_level + central.certificate.bound.rounding + distributed.certificate.bound.rounding
+    )
+    assert abs(distributed.lower_bound - central.lower_bound) <= rounding
+    assert distributed.gap == pytest.approx(central.gap, abs=2 * rounding / max(central.objective, 1e-300))
+    assert distributed.certificate.verdict is central.certificate.verdict
+    assert distributed.status is central.status
+    assert [stage.name for stage in distributed.stages] == [stage.name for stage in central.stages]
+    certificate = distributed.certificate
+    if not math.isnan(certificate.eta):  # anyone can check it
+        at = certificate.poses if certificate.bound.is_grounded else None
+        bound = prove_bound(problem, certificate.Lambda, certificate.eta, at)
+        assert bound == pytest.approx(distributed.lower_bound, abs=2 * rounding)
+
+
+@settings(max_examples=25)
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS, backend=BACKENDS)
+def test_the_solution_is_the_central_one(
+    seed: int, n: int, d: int, partitioner: Partitioner, backend: CholeskyBackend
+) -> None:
+    problem = PGOProblem(varied_graph(seed, n, d), backend)
+    parts = partitioner(problem.graph, seed)
+    distributed, central = solve(problem, SHORT, robots=parts), solve(problem, SHORT)
+    check_equal(distributed, central)
+    assert distributed.is_certified
+    assert distributed.robots is parts
+    assert distributed.ledger is not None
+    assert distributed.ledger.num_robots == parts.num_robots
+    assert central.ledger is central.robots is None
+
+
+@pytest.mark.parametrize("given_start", [False, True])
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize(
+    "pipeline",
+    [Pipeline(), Pipeline(soc=None), Pipeline(soc=None, newton=gauss_newton()), Pipeline(soc=SOC(tolerance=1e-8))],
+    ids=["SOC", "no SOC", "Gauss-Newton", "SOC to the end"],
+)
+def test_every_pipeline_ends_at_the_central_solution(pipeline: Pipeline, d: int, given_start: bool) -> None:
+    problem = varied_problem(3, 25, d)
+    start = problem.graph.truth if given_start else None
+    central = solve(problem, pipeline, start)
+    for partitioner in (metis, scattered):
+        distributed = solve(problem, pipeline, start, robots=partitioner(problem.graph, 3))
+        check_equal(distributed, central)
+        first, other = distributed.stages[0], central.stages[0]
+        assert first.objective == pytest.approx(other.objective, rel=1e-12)
+
+
+@settings(max_examples=8)
+@given(seed=SEEDS, n=st.integers(4, 10), d=DIMENSIONS, partitioner=PARTITIONERS)
+def test_a_bound_holds_where_nothing_is_certified(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
+    problem = PGOProblem(varied_graph(seed, n, d, NoiseModel(translation_std=1.0, rotation_std=1.5)))
+    solution = solve(problem, SHORT, robots=partitioner(problem.graph, seed))
+    assert 0 <= solution.lower_bound <= best_known(problem, seed)
+    assert solution.objective == pytest.approx(problem.objective(solution.poses), rel=1e-12)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_second_try_and_the_staircase_follow_where_the_gap_stays_wide(d: int) -> None:
+    # The cycle closes with half a turn too much: the chordal start is at a local minimum or the relaxation is loose.
+    problem = PGOProblem(varied_graph(11, 14, d, NoiseModel(translation_std=1.0, rotation_std=1.5)))
+    solution = solve(problem, robots=3)
+    central = solve(problem)
+    assert [stage.name for stage in solution.stages] == [stage.name for stage in central.stages]
+    assert solution.lower_bound <= min(solution.objective, central.objective)
+    assert solution.gap == pytest.approx(central.gap, abs=1e-4)
+
+
+def test_a_number_of_robots_stands_for_the_default_partition() -> None:
+    graph = grid(np.random.default_rng(0))
+    solution = solve(graph, robots=4)
+    assert solution.robots is not None
+    np.testing.assert_array_equal(solution.robots.robot, partition(graph, 4).robot)
+    with pytest.raises(SettingError, match="num_robots is 28; give 1 to 27"):
+        solve(graph, robots=28)
+
+
+def test_a_start_or_a_partition_of_another_graph_is_refused() -> None:
+    graph = grid(np.random.default_rng(0))
+    with pytest.raises(GraphError, match="give one pose for every pose"):
+        solve(graph, start=Poses(np.eye(3)[None], np.zeros((1, 3))), robots=3)
+    with pytest.raises(SettingError, match="give one robot for every pose"):
+        solve(graph, robots=Partition(np.array([0, 1]), partition(graph, 3).method))
+
+
+def stop_at(k: int) -> Callable[[object, Record], bool]:
+    return lambda state, record: record.k == k
+
+
+def interrupt(state: object, record: Record) -> None:
+    if record.k == 2:
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("callback", "time_limit", "expected"),
+    [
+        (stop_at(1), math.inf, [Status.STOPPED, Status.STOPPED]),
+        (stop_at(0), math.inf, [Status.STOPPED, Status.STOPPED]),
+        (interrupt, math.inf, [Status.INTERRUPTED]),
+        (None, 1e-9, [Status.TIME_LIMIT]),
+    ],
+)
+def test_a_run_that_is_cut_short_gives_poses_and_a_bound_that_holds(
+    callback: Callable[[object, Record], bool | None] | None, time_limit: float, expected: list[Status]
+) -> None:
+    problem = varied_problem(6, 25, 3, LOUD_NOISE)
+    parts = metis(problem.graph, 4)
+    solution = solve(problem, SHORT, robots=parts, callback=callback, time_limit=time_limit)
+    statuses = [stage.status for stage in solution.stages[1:]]
+    assert statuses == expected
+    assert solution.status is statuses[-1]
+    assert solution.objective <= problem.objective(chordal_start(problem)) * (1 + 1e-12)
+    assert solution.objective == pytest.approx(problem.objective(solution.poses), rel=1e-12)
+    assert solution.lower_bound <= best_known(problem)
+    assert solution.ledger is not None
+    assert solution.ledger.rounds >= 3
+
+
+STAGES = {
+    "substructured": (SOC(coupling=Coupling.SUBSTRUCTURED, max_iterations=4), None),
+    "consensus": (SOC(max_iterations=4), None),
+    "consensus, each accelerates alone": (SOC(max_iterations=4, acceleration=Anderson(per_robot=True)), None),
+    "consensus, loss": (SOC(max_iterations=9), Faults(loss=0.3, seed=1)),
+    "consensus, delay": (SOC(max_iterations=9), Faults(max_delay=4, seed=2)),
+    "consensus, silence": (SOC(max_iterations=9), Faults(silent_robot=1, silent_from=2, silent_rounds=9)),
+}
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("stage", STAGES)
+def test_every_stage_reports_f_of_its_poses(stage: str, d: int, threads: int) -> None:
+    # Each run ends after one more stage, so that the poses are those of its last one.
+    problem = varied_problem(3, 15, d, LOUD_NOISE)
+    parts = scattered(problem.graph, 3)
+    soc, faults = STAGES[stage]
+    if soc.coupling is None:
+        soc = replace(soc, coupling=Coupling.CONSENSUS, robots=parts)
+    stay = Newton(max_iterations=0)
+    for start in (None, problem.graph.truth):
+        for pipeline in (
+            Pipeline(soc=None, newton=stay),
+            *(Pipeline(soc=soc, newton=newton, faults=faults) for newton in (stay, Newton())),
+        ):
+            short = replace(pipeline, second_try=False, staircase=None)
+            solution = solve(problem, short, start, robots=parts, engine=InProcess(threads))
+            rounding = 1e-12 * solution.objective
+            assert solution.objective == pytest.approx(problem.objective(solution.poses), abs=rounding)
+            assert solution.stages[-1].objective == pytest.approx(solution.objective, abs=rounding)
+            if pipeline.newton is stay:
+                assert solution.stages[-2].objective == pytest.approx(solution.objective, abs=rounding)
+
+
+# Folders with one file a robot.
+
+
+def check_folder(folder: Path) -> None:
+    graph = read_g2o(folder)
+    assert graph.num_robots == len(list(folder.glob("*.g2o")))
+    parts = partition(graph)
+    np.testing.assert_array_equal(parts.robot, graph.robots)
+    solution = solve(graph, robots=parts)
+    assert solution.is_certified
+    assert solution.ledger is not None
+    assert solution.ledger.num_robots == graph.num_robots
+    check_equal(solution, solve(graph))
+
+
+def test_the_folder_of_robots_that_comes_along_solves_and_certifies() -> None:
+    check_folder(ROOT / "data" / "robots")
+
+
+@pytest.mark.parametrize("name", ["example_4robots", "example_16robots"])
+def test_public_folders_of_robots_solve_and_certify(name: str, benchmark_data: Path) -> None:
+    check_folder(benchmark_data / name)

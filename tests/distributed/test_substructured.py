@@ -1,0 +1,154 @@
+"""SOC by driver and robots takes the steps of JOINT, whatever the partition and the penalty rule."""
+
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph, varied_problem
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robots import BACKENDS, PARTITIONERS, Partitioner, contiguous, corner_cases, metis, scattered, singletons
+
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.problem.cholesky import CholeskyBackend
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.driver import Driver
+from solvers.distributed.stages import collect, open_driver
+from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
+from solvers.loop import iterate, run
+from solvers.network.engine import InProcess
+from solvers.result import Status
+from solvers.soc.anderson import Anderson
+from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule, rotation_scale
+from solvers.soc.soc import SOC, Coupling
+from solvers.soc.state import SOCState
+
+SIZES = st.integers(2, 20)
+NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
+CONVERGED = 1e-8
+STALLED = MultiplierPenalty(stall_window=3, stall_ratio=1e-6)  # anything counts as stalled after three steps
+
+
+def pairs(
+    problem: PGOProblem, parts: Partition, soc: SOC, steps: int
+) -> tuple[list[SOCState], list[SubstructuredState], Driver]:
+    """Iterates of the central recursion, until only rounding is left, and as many of the distributed one."""
+    start = chordal_start(problem)
+    driver = open_driver(problem, parts, InProcess())
+    driver.set_poses(start)
+    central = []
+    for state in islice(iterate(soc, problem, start), steps + 1):
+        assert isinstance(state, SOCState)
+        central.append(state)
+        if max(state.primal_residual, state.dual_residual) <= CONVERGED:
+            break
+    distributed = list(islice(iterate(SubstructuredSOC(soc), driver), len(central)))
+    return central, distributed, driver
+
+
+def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> tuple[int, int]:
+    """Compare iterate by iterate; the refreshes and raises that took place."""
+    central, distributed, driver = pairs(problem, parts, soc, steps)
+    for one, other in zip(central, distributed, strict=True):
+        assert (other.k, other.refreshes, other.raises) == (one.k, one.refreshes, one.raises)
+        np.testing.assert_allclose(other.primal_residual, one.primal_residual, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(other.dual_residual, one.dual_residual, rtol=1e-6, atol=1e-8)
+        ratio = one.rho / rotation_scale(problem)
+        np.testing.assert_allclose(np.sort(other.ratio), np.sort(ratio), rtol=1e-6, atol=0)
+    SubstructuredSOC(soc).finish(driver)
+    poses, _ = collect(driver)
+    expected = soc.poses(problem, central[-1])
+    size = 1 + np.abs(expected.t).max()
+    np.testing.assert_allclose(poses.R, expected.R, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(poses.t - poses.t[0], expected.t, rtol=0, atol=1e-7 * size)
+    assert driver.objective == pytest.approx(problem.objective(expected), rel=1e-6, abs=1e-9)
+    return central[-1].refreshes, central[-1].raises
+
+
+def small_penalty(problem: PGOProblem) -> FixedPenalty:
+    return FixedPenalty(1e-3 * float(np.median(rotation_scale(problem))))
+
+
+@settings(max_examples=40)
+@given(
+    seed=SEEDS,
+    n=SIZES,
+    d=DIMENSIONS,
+    noise=NOISES,
+    partitioner=PARTITIONERS,
+    backend=BACKENDS,
+    rule=st.sampled_from([MultiplierPenalty(), STALLED, BalancedPenalty(), BalancedPenalty(scale=30.0)]),
+    alpha=st.sampled_from([1.0, 1.6]),
+    acceleration=st.sampled_from([None, Anderson(), Anderson(memory=2, restart_ratio=1.01)]),
+)
+def test_the_iterates_are_those_of_joint(
+    seed: int,
+    n: int,
+    d: int,
+    noise: NoiseModel,
+    partitioner: Partitioner,
+    backend: CholeskyBackend,
+    rule: PenaltyRule,
+    alpha: float,
+    acceleration: Anderson | None,
+) -> None:
+    problem = PGOProblem(varied_graph(seed, n, d, noise), backend)
+    soc = SOC(coupling=Coupling.JOINT, penalty=rule, alpha=alpha, acceleration=acceleration)
+    check(problem, partitioner(problem.graph, seed), soc, 10)
+
+
+@pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)
+def test_the_iterates_of_corner_cases(graph: PoseGraph, parts: Partition) -> None:
+    check(PGOProblem(graph), parts, SOC(), 10)
+
+
+@pytest.mark.parametrize("partitioner", [contiguous, metis, scattered, singletons])
+@pytest.mark.parametrize("d", [2, 3])
+def test_every_change_of_the_penalty_is_the_central_one(d: int, partitioner: Partitioner) -> None:
+    problem = varied_problem(5, 20, d, LOUD_NOISE)
+    parts = partitioner(problem.graph, 5)
+    assert check(problem, parts, SOC(penalty=STALLED), 12) == (1, 0)
+    assert check(problem, parts, SOC(penalty=BalancedPenalty(scale=100.0)), 12)[0] >= 1
+    raised = check(problem, parts, SOC(penalty=small_penalty(problem), acceleration=None), 40)[1]
+    assert raised >= 1
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_long_accelerated_run_ends_where_joint_ends(d: int) -> None:
+    problem = varied_problem(1, 30, d)
+    parts = metis(problem.graph, 4)
+    driver = open_driver(problem, parts, InProcess())
+    driver.start()
+    central = run(SOC(), problem)
+    distributed = run(SubstructuredSOC(), driver)
+    assert distributed.status is central.status is Status.CONVERGED
+    assert distributed.iterations == central.iterations
+    np.testing.assert_allclose(
+        [r.measurement.primal_residual for r in distributed.history.records[1:]],
+        [r.measurement.primal_residual for r in central.history.records[1:]],
+        rtol=1e-4,
+        atol=1e-9,
+    )
+    # F is measured at the translations of step (a), which are not yet the best ones.
+    excess = distributed.history.objective[1:] - central.history.objective[1:]
+    assert (excess >= -1e-12 * central.objective).all()
+    assert excess[-1] <= 10 * SOC.tolerance * central.objective
+
+
+def test_a_state_that_is_not_finite_is_said_to_be_and_leaves_the_last_one_behind() -> None:
+    problem = varied_problem(0, 12, 3)
+    driver = open_driver(problem, metis(problem.graph, 2), InProcess())
+    driver.start()
+    start, method = driver.objective, SubstructuredSOC()
+    state = method.init(driver, None)
+    broken = method.step(driver, replace(state, block=replace(state.block, s=np.full_like(state.block.s, np.nan))))
+    assert broken.k == 1
+    measurement = method.measure(driver, broken)
+    assert np.isnan([measurement.objective, measurement.primal_residual, measurement.dual_residual]).all()
+    assert method.converged(broken, measurement) is None
+    method.finish(driver)
+    assert driver.objective == pytest.approx(start, rel=1e-12)

@@ -1,0 +1,49 @@
+from functools import partial
+
+import numpy as np
+import pytest
+from graphs import varied_graph
+
+import solvers
+from pgo_models.errors import SettingError
+from pgo_models.graphs.partitioning import partition
+from solvers.distributed.robots.agent import Agent
+from solvers.distributed.robots.subgraph import share_out
+from solvers.network.engine import InProcess
+from solvers.network.messages import RESTORE, SNAPSHOT
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_threads_give_the_same_numbers(seed):
+    graph = varied_graph(seed, 40, 2 + seed % 2)
+    one, many = (solvers.solve(graph, robots=4, engine=InProcess(threads)) for threads in (1, 3))
+    np.testing.assert_array_equal(one.poses.R, many.poses.R)
+    np.testing.assert_array_equal(one.poses.t, many.poses.t)
+    assert repr(one.ledger) == repr(many.ledger)
+    assert one.lower_bound == many.lower_bound
+
+
+def test_there_is_a_thread_at_least():
+    with pytest.raises(SettingError, match="threads must be at least 1, got 0"):
+        InProcess(0)
+
+
+def test_robots_restored_from_snapshots_answer_as_those_that_were_asked():
+    graph = varied_graph(1, 30, 3)
+    shares = share_out(graph, partition(graph, 3))
+    nothing = [{}] * len(shares)
+    make = partial(Agent, backend=None)
+    old, new = InProcess().open(make, shares), InProcess().open(make, shares)
+    chordal = old.ask("chordal", nothing)
+    old.ask("project", [{"x": np.ones_like(answer["b"])} for answer in chordal])
+    new.ask(RESTORE, old.ask(SNAPSHOT, nothing))
+    for order in ("eliminated", "translations", "multiplier_norms", "evaluate", "eliminated_translations"):
+        for before, after in zip(old.ask(order, nothing), new.ask(order, nothing), strict=True):
+            assert before.keys() == after.keys()
+            for name in before:
+                np.testing.assert_array_equal(before[name], after[name])
+
+
+def test_engine_and_checkpoint_need_robots():
+    with pytest.raises(SettingError, match="give robots"):
+        solvers.solve(varied_graph(0, 8, 2), engine=InProcess())

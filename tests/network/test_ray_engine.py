@@ -1,0 +1,325 @@
+import gc
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from graphs import varied_graph
+
+import pgo_models as pgo
+import solvers
+from pgo_models.errors import EngineError, FileFormatError, MissingExtraError, NotPositiveDefiniteError, SettingError
+from pgo_models.graphs.pose_graph import PoseGraph
+from solvers import cli
+from solvers.distributed.robots.agent import Agent
+from solvers.distributed.robots.subgraph import Share, share_out
+from solvers.network import ray_engine
+from solvers.network.ray_engine import RayEngine, connect
+from solvers.network.recovery import Recovery
+
+ray = pytest.importorskip("ray")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def local_ray():
+    """Ray on this machine, started once: an engine uses it and leaves it running."""
+    earlier = signal.getsignal(signal.SIGTERM)
+    assert connect(num_cpus=2)
+    assert signal.getsignal(signal.SIGTERM) is earlier  # Ray's own would end a solve without its best iterate
+    yield
+    ray.shutdown()
+
+
+@pytest.fixture(scope="module")
+def graph():
+    return varied_graph(0, 60, 3)
+
+
+@pytest.fixture(scope="module")
+def robots(graph):
+    return pgo.partition(graph, 3)
+
+
+@pytest.fixture
+def actors(monkeypatch):
+    """Places of the engines that are opened, with their actors."""
+    opened = []
+    start = ray_engine._RayPlace.start
+
+    def watched(place, robots):
+        if place not in opened:
+            opened.append(place)
+        start(place, robots)
+
+    monkeypatch.setattr(ray_engine._RayPlace, "start", watched)
+    return opened
+
+
+def pipeline(coupling, robots):
+    chosen = solvers.Pipeline()
+    return replace(chosen, soc=replace(chosen.soc, coupling=coupling, robots=robots, tolerance=1e-6))
+
+
+def pid_of(actor):
+    return ray.get(actor.__ray_call__.remote(lambda holder: os.getpid()))
+
+
+def assert_same(found, expected):
+    np.testing.assert_array_equal(found.poses.R, expected.poses.R)
+    np.testing.assert_array_equal(found.poses.t, expected.poses.t)
+    assert found.lower_bound == expected.lower_bound
+    assert repr(found.ledger) == repr(expected.ledger)
+
+
+def sent_arrays(value):
+    """All arrays of numbers in what was sent."""
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind in "fiub":
+            yield value
+    elif isinstance(value, dict):
+        for item in value.values():
+            yield from sent_arrays(item)
+    elif isinstance(value, tuple | list):
+        for item in value:
+            yield from sent_arrays(item)
+    elif hasattr(value, "__dict__"):
+        yield from sent_arrays(vars(value))
+
+
+@pytest.fixture
+def sent(monkeypatch):
+    """Arguments of all that crosses to every actor, those of its constructor first."""
+    from ray.actor import ActorClass, ActorMethod
+
+    crossed = {}
+    make, call = ActorClass._remote, ActorMethod._remote
+
+    def recording_make(self, args=None, kwargs=None, **options):
+        handle = make(self, args, kwargs, **options)
+        crossed[handle._actor_id] = [args, kwargs]
+        return handle
+
+    def recording_call(self, args=None, kwargs=None, **options):
+        crossed[self._actor._actor_id].append((args, kwargs))
+        return call(self, args, kwargs, **options)
+
+    monkeypatch.setattr(ActorClass, "_remote", recording_make)
+    monkeypatch.setattr(ActorMethod, "_remote", recording_call)
+    return crossed
+
+
+@pytest.mark.parametrize("coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS])
+def test_killed_actors_change_nothing_and_no_process_receives_anothers_private_edges(
+    coupling, graph, robots, actors, sent
+):
+    settings = pipeline(coupling, robots)
+    expected = solvers.solve(graph, settings, robots=robots)
+    steps = []
+
+    def kill(state, record):
+        steps.append(record.k)
+        (place,) = actors
+        if len(steps) == 3:
+            os.kill(pid_of(place.actors[1]), signal.SIGKILL)
+        if len(steps) == 12:
+            ray.kill(place.actors[0])
+
+    engine = RayEngine(recovery=Recovery(orders_between_snapshots=20))
+    found = solvers.solve(graph, settings, robots=robots, engine=engine, callback=kill)
+    assert len(steps) > 12
+    assert_same(found, expected)
+    assert ray.is_initialized()  # it was not the engine that started it
+    assert len(sent) == 5  # three, and two in place of those that were killed
+    for crossed in sent.values():
+        assert_only_own_edges(crossed, graph, robots)
+
+
+def assert_only_own_edges(crossed, graph, robots):
+    """First what makes the agent is sent, and its share; never an edge between two poses of another robot."""
+    _, share = crossed[0]
+    assert isinstance(share, Share)
+    assert set(vars(share)) == set(Share.__dataclass_fields__)  # nothing that was worked out of it
+    assert isinstance(share.graph, PoseGraph)
+    assert len(crossed) > 10
+    i, j = robots.robot[graph.i], robots.robot[graph.j]
+    others, own = np.flatnonzero((i == j) & (i != share.robot)), np.flatnonzero((i == share.robot) | (j == share.robot))
+    numbers = np.concatenate([array.ravel().astype(float) for array in sent_arrays(crossed)])
+    assert np.isin(graph.t_ij[own], numbers).all()
+    # Weights are drawn from continuous distributions. A pose at the end of a single edge may be that edge.
+    assert not np.isin([graph.kappa[others], graph.tau[others]], numbers).any()
+    for measured in (graph.t_ij[others], graph.R_ij[others].reshape(len(others), -1)):
+        assert not np.isin(measured, numbers).all(axis=1).any()
+
+
+def test_a_robot_that_is_lost_too_often_ends_the_run(graph, actors):
+    def kill(state, record):
+        ray.kill(actors[0].actors[1])
+
+    engine = RayEngine(recovery=Recovery(max_restarts=0))
+    with pytest.raises(EngineError, match=r"robot 1 was lost 1 times \(robot 1's actor is gone"):
+        solvers.solve(graph, robots=2, engine=engine, callback=kill)
+    assert actors[0].actors == {}
+
+
+def test_errors_of_robots_arrive_as_what_they_are(graph):
+    pool = RayEngine().open(partial(Agent, backend=None), share_out(graph, pgo.partition(graph, 1)))
+    try:
+        with pytest.raises(NotPositiveDefiniteError, match=r"^the matrix has nan or inf; check the weights"):
+            pool.ask("penalize", [{"rule": np.full(3, np.nan), "is_stationary": np.zeros(1)}])
+    finally:
+        pool.close()
+
+
+def test_a_slow_answer_is_waited_for_while_the_cluster_lives(graph, actors, monkeypatch):
+    pool = RayEngine().open(partial(Agent, backend=None), share_out(graph, pgo.partition(graph, 1)))
+    monkeypatch.setattr(ray_engine, "_SECONDS_TO_ANSWER", 0.1)
+    try:
+        ticket = actors[0].actors[0].__ray_call__.remote(lambda holder: time.sleep(1) or {"slow": 1})
+        assert actors[0].receive(0, ticket) == {"slow": 1}
+        monkeypatch.setattr(ray_engine, "_SECONDS_TO_COME_BACK", 0.5)
+        monkeypatch.setattr(ray, "nodes", lambda: [{"Alive": False}])
+        ticket = actors[0].actors[0].__ray_call__.remote(lambda holder: time.sleep(5) or {})
+        with pytest.raises(EngineError, match=r"has died \(none of its machines is left\); solve again"):
+            actors[0].receive(0, ticket)
+        assert actors[0].actors == {}
+    finally:
+        pool.close()
+
+
+@pytest.mark.parametrize("error", [MissingExtraError("cvxopt", "fast"), FileFormatError("x.g2o", 3, "bad")])
+def test_errors_can_be_sent(error):
+    import pickle
+
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+@pytest.mark.parametrize(("robots", "share"), [(1, 1.0), (2, 1.0), (3, 0.5), (4, 0.5), (6, 0.3333)])
+def test_every_cpu_has_room_for_as_many_robots(robots, share, graph):
+    shares = share_out(graph, pgo.partition(graph, robots))
+    assert (
+        ray_engine._RayPlace(
+            ray, partial(Agent, backend=None), shares, RayEngine(robots_per_cpu=3), False
+        )._cpus_a_robot
+        == share
+    )
+
+
+def test_too_few_cpus_are_told_at_once(graph):
+    with pytest.raises(EngineError, match="too few CPUs: 5 robots with at most 2 a CPU, on 2; use fewer robots"):
+        solvers.solve(graph, robots=5, engine=RayEngine(robots_per_cpu=2))
+
+
+def test_cpus_that_others_use_are_told_in_time(graph):
+    busy = ray.remote(Agent).options(num_cpus=2)
+    shares = share_out(graph, pgo.partition(graph, 2))
+    held = busy.remote(shares[0], None)
+    ray.get(held.obey.remote("save_poses", {}))
+    try:
+        with pytest.raises(
+            EngineError, match=r"too few CPUs: 2 of 2 robots have not started in 0\.5 s, 0 CPUs are free"
+        ):
+            solvers.solve(graph, robots=2, engine=RayEngine(patience=0.5))
+    finally:
+        ray.kill(held)
+
+
+@pytest.mark.parametrize("address", ["nonsense", "host:port", ":6379", "localhost:0", "ray://localhost:10001"])
+def test_an_address_that_is_none_is_refused(address):
+    with pytest.raises(SettingError, match=r"address is .*; give host:port"):
+        connect(address)
+
+
+def test_an_address_where_no_cluster_answers_is_told_in_one_line(monkeypatch, capfd):
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        free = f"127.0.0.1:{closed.getsockname()[1]}"
+    with pytest.raises(SystemExit) as end:
+        cli.main(["solve", "circle", "--robots", "2", "--engine", "ray", "--address", free])
+    assert end.value.code == 1
+    out, err = capfd.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert err.startswith(f"pgo: no Ray cluster answers at {free} (")
+    monkeypatch.setattr(ray_engine, "_SECONDS_TO_JOIN", 0.5)
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        with pytest.raises(EngineError, match="connected to Ray already"):
+            connect(f"127.0.0.1:{silent.getsockname()[1]}")
+        with pytest.raises(EngineError, match="is no Ray cluster that can be joined from here"):
+            ray_engine._check_cluster(f"127.0.0.1:{silent.getsockname()[1]}")
+
+
+def test_a_ray_that_does_not_keep_to_the_loopback_is_refused(monkeypatch):
+    stopped = []
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(ray, "init", lambda **options: None)
+    monkeypatch.setattr(ray, "shutdown", lambda: stopped.append(True))
+    monkeypatch.setattr(ray.util, "get_node_ip_address", lambda: "192.0.2.2")
+    with pytest.raises(EngineError, match=r"would listen at 192\.0\.2\.2, not on the loopback"):
+        connect()
+    assert stopped == [True]
+
+
+def test_names_of_a_module_are_replaced_for_a_while_where_it_has_them():
+    module = type(sys)("module")
+    module.one = 1
+
+    def fail():
+        with ray_engine._replaced(module, one=2, two=2):
+            assert module.one == 2
+            assert not hasattr(module, "two")
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert module.one == 1
+
+
+def test_without_ray_the_extra_is_named(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'pgo-splitting\[ray\]'"):
+        connect()
+    with pytest.raises(SystemExit) as end:
+        cli.main(["solve", "circle", "--robots", "2", "--engine", "ray"])
+    assert end.value.code == 1
+    assert capsys.readouterr().err == "pgo: ray is not installed; run: pip install 'pgo-splitting[ray]'\n"
+
+
+@pytest.mark.parametrize("wrong", [{"num_cpus": 0}, {"robots_per_cpu": 0}, {"patience": 0.0}])
+def test_settings_are_checked(wrong):
+    with pytest.raises(SettingError, match=f"{next(iter(wrong))} must be positive, got 0"):
+        RayEngine(**wrong)
+
+
+def test_cpus_of_a_cluster_are_its_own():
+    with pytest.raises(SettingError, match="the cluster at host:1 has its own"):
+        RayEngine(address="host:1", num_cpus=2)
+
+
+@pytest.mark.slow
+def test_a_solve_starts_and_stops_ray_and_is_quiet(tmp_path):
+    path = Path(cli.__file__).parent.parent
+    command = [sys.executable, "-W", "error", "-c", "from solvers.cli import main; main()"]
+    options = ["solve", "robots", "--engine", "ray", "--resume", str(tmp_path / "run.ckpt")]
+    finished = subprocess.run(
+        [*command, *options],
+        env={**os.environ, "PYTHONPATH": str(path)},
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+    )
+    assert (finished.returncode, finished.stderr) == (0, "")
+    assert "4, 40 to 40 poses each, as the graph names them" in finished.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_left_open():
+    gc.collect()  # a ResourceWarning is an error here

@@ -1,0 +1,203 @@
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from graphs import varied_graph
+
+import solvers
+from pgo_models.errors import EngineError, NotPositiveDefiniteError, SettingError
+from pgo_models.graphs.partitioning import PartitionMethod, partition
+from solvers.distributed.robots.agent import Agent
+from solvers.distributed.robots.subgraph import share_out
+from solvers.network.messages import RESTORE, SNAPSHOT
+from solvers.network.recovery import RecoveringPool, Recovery, RobotLostError
+
+
+@dataclass(eq=False)
+class Leaky:
+    """A place that loses the robot of every order whose number is in `losses`, before or after it has obeyed."""
+
+    shares: tuple
+    losses: set
+    is_before: bool = True
+    agents: dict = field(default_factory=dict)
+    count: int = 0
+    lost: int = 0
+
+    def start(self, robots):
+        self.agents |= {robot: Agent(replace(self.shares[robot]), None) for robot in robots}
+
+    def send(self, robot, order, message):
+        return order, message
+
+    def receive(self, robot, ticket):
+        self.count += 1
+        if self.count in self.losses and self.is_before:
+            self.lose(robot)
+        answer = self.agents[robot].obey(*ticket)
+        if self.count in self.losses:
+            self.lose(robot)
+        return answer
+
+    def lose(self, robot):
+        del self.agents[robot]
+        self.lost += 1
+        raise RobotLostError("gone")
+
+    def close(self):
+        self.agents = {}
+
+
+@dataclass(frozen=True)
+class LeakyEngine:
+    """Settings of a `Leaky` place; what it has opened is in `opened`."""
+
+    losses: frozenset = frozenset()
+    recovery: Recovery = field(default_factory=lambda: Recovery(max_restarts=1000))
+    is_before: bool = True
+    opened: list = field(default_factory=list)
+
+    def open(self, make, shares):
+        place = Leaky(shares, set(self.losses), self.is_before)
+        place.start(range(len(shares)))
+        self.opened.append(RecoveringPool(place, len(shares), self.recovery))
+        return self.opened[-1]
+
+
+def pipeline(coupling, robots):
+    chosen = solvers.Pipeline()
+    return replace(chosen, soc=replace(chosen.soc, coupling=coupling, robots=robots, tolerance=1e-5))
+
+
+@pytest.mark.parametrize("coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS])
+@pytest.mark.parametrize("orders", [1, 7, 1000])
+@pytest.mark.parametrize("is_before", [True, False])
+def test_lost_robots_change_nothing(coupling, orders, is_before):
+    graph = varied_graph(orders, 60, 2 + orders % 2)
+    robots = partition(graph, 4, PartitionMethod.CONTIGUOUS)
+    expected = solvers.solve(graph, pipeline(coupling, robots), robots=robots)
+    losses = frozenset(np.random.default_rng(orders).integers(1, 300, 12).tolist())
+    engine = LeakyEngine(losses, Recovery(orders, max_restarts=1000), is_before)
+    found = solvers.solve(graph, pipeline(coupling, robots), robots=robots, engine=engine)
+    (pool,) = engine.opened
+    assert pool.place.lost > 3
+    assert sum(pool.restarts) == pool.place.lost
+    np.testing.assert_array_equal(found.poses.R, expected.poses.R)
+    np.testing.assert_array_equal(found.poses.t, expected.poses.t)
+    assert found.lower_bound == expected.lower_bound
+    assert repr(found.ledger) == repr(expected.ledger)
+
+
+@pytest.mark.parametrize("orders", [7, 1000])
+def test_a_run_that_goes_on_from_a_checkpoint_can_lose_robots(orders, tmp_path):
+    class KilledError(BaseException):
+        pass
+
+    def kill(state, record):
+        if record.k == 9:
+            raise KilledError
+
+    graph, checkpoint = varied_graph(6, 60, 3), solvers.Checkpoint(tmp_path / "run.ckpt", rounds=2)
+    settings = pipeline(solvers.Coupling.SUBSTRUCTURED, None)
+    expected = solvers.solve(graph, settings, robots=4)
+    losses = frozenset(np.random.default_rng(orders).integers(5, 100, 8).tolist())
+    first, second = (LeakyEngine(losses, Recovery(orders, max_restarts=1000)) for _ in range(2))
+    with pytest.raises(KilledError):
+        solvers.solve(graph, settings, robots=4, engine=first, checkpoint=checkpoint, callback=kill)
+    found = solvers.solve(graph, settings, robots=4, engine=second, checkpoint=checkpoint)
+    assert second.opened[0].place.lost > 3
+    np.testing.assert_array_equal(found.poses.t, expected.poses.t)
+    assert found.lower_bound == expected.lower_bound
+
+
+def test_a_snapshot_and_a_restore_take_the_place_of_the_orders_before(monkeypatch):
+    obeyed = []
+
+    def obey(agent, order, message):
+        obeyed.append((order, message))
+        return {"of": agent.share.robot}
+
+    monkeypatch.setattr(Agent, "obey", obey)
+    graph = varied_graph(5, 24, 2)
+    place = Leaky(share_out(graph, partition(graph, 2)), set())
+    place.start(range(2))
+    pool = RecoveringPool(place, 2, Recovery())
+    pool.ask("one", [{}] * 2)
+    for order, messages, kept in (
+        (SNAPSHOT, [{}] * 2, {"of": 1}),
+        (RESTORE, [{"earlier": 0}, {"earlier": 1}], {"earlier": 1}),
+    ):
+        pool.ask(order, messages)
+        pool.ask("two", [{}] * 2)
+        obeyed.clear()
+        place.losses = {place.count + 2}  # robot 1, before it obeys
+        pool.ask("three", [{}] * 2)
+        assert obeyed == [("three", {}), (RESTORE, kept), ("two", {}), ("three", {})]
+
+
+def test_what_is_kept_for_a_robot_is_bounded():
+    graph = varied_graph(3, 30, 2)
+    engine = LeakyEngine(recovery=Recovery(orders_between_snapshots=5))
+    solvers.solve(graph, robots=3, engine=engine)
+    assert len(engine.opened[0]._log) < 5
+
+
+def test_a_snapshot_is_taken_after_so_many_orders(monkeypatch):
+    obeyed = []
+    monkeypatch.setattr(Agent, "obey", lambda agent, order, message: obeyed.append(order) or {})
+    place = Leaky(share_out(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 1)), set())
+    place.start([0])
+    pool = RecoveringPool(place, 1, Recovery(orders_between_snapshots=3))
+    for _ in range(7):
+        pool.ask("go", [{}])
+        assert len(pool._log) < 3
+    assert obeyed == [*3 * ["go"], SNAPSHOT, *3 * ["go"], SNAPSHOT, "go"]
+
+
+def test_of_two_refusals_the_first_robots_is_told(monkeypatch):
+    def obey(agent, order, message):
+        raise NotPositiveDefiniteError(f"robot {agent.share.robot}")
+
+    monkeypatch.setattr(Agent, "obey", obey)
+    place = Leaky(share_out(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 2)), set())
+    place.start(range(2))
+    with pytest.raises(NotPositiveDefiniteError, match="robot 0"):
+        RecoveringPool(place, 2, Recovery()).ask("go", [{}] * 2)
+
+
+def test_a_robot_that_is_lost_again_and_again_ends_the_run():
+    graph = varied_graph(4, 30, 2)
+    engine = LeakyEngine(frozenset(range(20, 10_000)), Recovery(max_restarts=2))
+    with pytest.raises(EngineError, match=r"robot \d was lost 3 times \(gone\); look at the memory"):
+        solvers.solve(graph, robots=3, engine=engine)
+
+
+def test_a_robots_own_error_is_told_after_all_have_obeyed_and_is_passed_over_in_the_replay(monkeypatch):
+    graph = varied_graph(5, 24, 2)
+    shares = share_out(graph, partition(graph, 3))
+    obeyed = []
+
+    def obey(agent, order, message):
+        obeyed.append((agent.share.robot, order))
+        if order == "refuse" and agent.share.robot == 0:
+            raise NotPositiveDefiniteError("no")
+        return {"robot": np.array([agent.share.robot])}
+
+    monkeypatch.setattr(Agent, "obey", obey)
+    place = Leaky(shares, losses={4})
+    place.start(range(3))
+    pool = RecoveringPool(place, 3, Recovery())
+    with pytest.raises(NotPositiveDefiniteError, match="no"):
+        pool.ask("refuse", [{}] * 3)
+    assert obeyed == [(0, "refuse"), (1, "refuse"), (2, "refuse")]
+    answers = pool.ask("evaluate", [{}] * 3)  # robot 0 is lost here
+    assert [int(answer["robot"][0]) for answer in answers] == [0, 1, 2]
+    assert obeyed[3:5] == [(0, "refuse"), (0, "evaluate")]
+    pool.close()
+    assert place.agents == {}
+
+
+@pytest.mark.parametrize("wrong", [{"orders_between_snapshots": 0}, {"max_restarts": -1}])
+def test_settings_are_checked(wrong):
+    with pytest.raises(SettingError, match=next(iter(wrong))):
+        Recovery(**wrong)

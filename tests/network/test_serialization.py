@@ -1,0 +1,100 @@
+import json
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from graphs import SEEDS, random_poses
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pgo_models.geometry.poses import Poses
+from solvers.network.serialization import deserialize, serialize
+from solvers.result import Measurement, Record, Status
+from solvers.soc.rotation_block import block_at
+from solvers.soc.shared_anderson import AndersonShare
+
+PLAIN = st.none() | st.booleans() | st.integers() | st.floats() | st.text()
+
+
+def same(one, other):
+    return one == other or (isinstance(one, float) and math.isnan(one) and math.isnan(other))
+
+
+@given(values=st.lists(PLAIN, max_size=6))
+def test_plain_values_come_back_the_same(values):
+    found = deserialize(serialize(values), ())
+    assert isinstance(found, tuple)
+    assert all(map(same, values, found))
+
+
+@given(seed=SEEDS)
+def test_arrays_and_classes_come_back_bit_by_bit_and_apart_from_the_original(seed):
+    poses = random_poses(3, 3, seed)
+    block = block_at(poses.R, np.ones(3), np.ones(9)).after_solve(np.ones((9, 3)), 1.0, 2)[0]
+    found = deserialize(serialize({"block": block, "poses": (poses, None)}), (Poses, AndersonShare, type(block)))
+    assert found["block"].anderson.residual_differences == ()
+    for name in ("rho", "z", "s", "x", "best"):
+        np.testing.assert_array_equal(getattr(found["block"], name), getattr(block, name))
+    np.testing.assert_array_equal(found["block"].anderson.image, block.anderson.image)
+    np.testing.assert_array_equal(found["poses"][0].t, poses.t)
+    found["block"].z[:] = 0.0
+    assert block.z.any()
+
+
+def test_enums_and_nested_classes_come_back():
+    record = Record(3, 0.5, Measurement(2.0, math.inf, 0.1, rounds=7))
+    assert deserialize(serialize((record, Status.STALLED)), (Record, Measurement, Status)) == (record, Status.STALLED)
+
+
+def test_only_arrays_of_plain_numbers_and_one_text_are_made():
+    arrays = serialize({"poses": random_poses(2, 2, 0), "status": Status.CONVERGED})
+    assert {array.dtype.kind for array in arrays.values()} <= set("fiUb")
+
+
+def test_a_class_that_is_not_expected_is_not_made():
+    @dataclass
+    class Other:
+        value: int
+
+    with pytest.raises(ValueError, match="not packed here"):
+        deserialize(serialize(Other(1)), (Poses,))
+    with pytest.raises(ValueError, match="not packed here"):
+        deserialize({"0": np.zeros(2)}, ())
+
+
+def test_what_is_packed_and_what_is_unpacked_are_copies():
+    original = np.arange(3.0)
+    packed = serialize((original,))
+    original[:] = 7.0
+    deserialize(packed, ())[0][:] = 8.0
+    np.testing.assert_array_equal(deserialize(packed, ())[0], [0.0, 1.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        {"class": "Poses", "fields": {}},
+        {"class": "Poses", "fields": {"R": 1, "t": 2, "more": 3}},
+        {"class": "Other", "fields": {}},
+        {"enum": "Status", "member": "GONE"},
+        {"array": 0},
+        {"keys": ["a", "b"], "values": [1]},
+        {},
+    ],
+)
+def test_a_tree_of_another_version_is_a_value_error(tree):
+    with pytest.raises(ValueError, match=r"not packed here|zip"):
+        deserialize({"tree": np.array(json.dumps(tree))}, (Poses, Status))
+
+
+def test_what_is_no_data_is_refused():
+    with pytest.raises(TypeError, match="cannot pack"):
+        serialize({"function": print})
+    with pytest.raises(TypeError, match="cannot pack the key"):
+        serialize({(1, 2): 3})
+
+
+def test_keys_are_strings_or_integers():
+    for mapping in ({1: None, 0: 2.5}, {"1": None, 1: True}, {}):
+        assert deserialize(serialize(mapping), ()) == mapping

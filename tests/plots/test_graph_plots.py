@@ -1,0 +1,143 @@
+import builtins
+
+import numpy as np
+import pytest
+
+import pgo_models as pgo
+import solvers
+from pgo_models.errors import GraphError, MissingExtraError
+from pgo_models.plots.curves import plot_decay, plot_tightness
+from pgo_models.plots.graph_plots import draw_graph, plot_against_truth
+from pgo_models.plots.matrix_plots import plot_sparsity, plot_spectrum
+from pgo_models.plots.style import save_figure
+from solvers.reporting.convergence_plots import Curve, plot_convergence, plot_gaps
+
+pytest.importorskip("matplotlib")
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_every_edge_is_drawn_once_in_the_colour_of_its_robot(d):
+    from matplotlib.figure import Figure
+
+    graph = pgo.grid_world(3, 10, np.random.default_rng(0), d=d)
+    axes = Figure().add_subplot(projection="3d" if d == 3 else None)
+    draw_graph(graph, graph.truth, axes, mark_edges=False)
+    (lines,) = axes.collections
+    colours = lines.get_colors()
+    drawn = [tuple(colour) for colour in np.asarray(colours)]
+    grey = (0.6, 0.6, 0.6, 1.0)
+    owner = np.where(graph.robots[graph.i] == graph.robots[graph.j], graph.robots[graph.i], 3)
+    assert sorted(map(drawn.count, set(drawn) - {grey})) == sorted(np.bincount(owner)[:3])
+    assert drawn.count(grey) == (owner == 3).sum()
+    assert axes.get_xlabel() == "x (m)"
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_doubtful_edges_stand_out(d):
+    from matplotlib.colors import to_rgba
+    from matplotlib.figure import Figure
+
+    graph = pgo.grid_world(2, 12, np.random.default_rng(0), d=d)
+    cost = pgo.edge_residuals(graph, graph.truth).cost
+    wrong, unsure = np.argsort(cost)[:2]  # made to be what they are not
+    kappa, tau = graph.kappa.copy(), graph.tau.copy()
+    tau[unsure], kappa[wrong] = 0.01 * tau[unsure], 1e4 * kappa[wrong]
+    marked = graph.with_weights(kappa, tau)
+    assert pgo.edge_residuals(marked, graph.truth).is_misfit[wrong]
+    axes = Figure().add_subplot(projection="3d" if d == 3 else None)
+    draw_graph(marked, graph.truth, axes)
+    (lines,) = axes.collections
+    misfits = int(pgo.edge_residuals(marked, graph.truth).is_misfit.sum())
+    widths, styles = np.asarray(lines.get_linewidth()), lines.get_linestyle()
+    assert (widths == widths.max()).sum() == misfits
+    assert sum(pattern is not None for _, pattern in styles) == 1
+    colours = [tuple(colour) for colour in np.asarray(lines.get_colors())]
+    assert colours.count(to_rgba("#D55E00")) == misfits
+
+
+def test_the_legend_says_only_what_is_there():
+    graph = pgo.grid_world(3, 10, np.random.default_rng(0))
+    (legend,) = pgo.plot_graph(graph, graph.truth).legends
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert texts[:3] == ["robot 0", "robot 1", "robot 2"]
+    assert "between robots" in texts
+    assert not any("uncertain" in text for text in texts)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_errors_to_the_truth_are_those_after_alignment(d):
+    graph = pgo.grid_world(1, 12, np.random.default_rng(0), d=d)
+    estimate = pgo.spanning_tree_start(graph)
+    figure = plot_against_truth(graph, estimate)
+    metres = figure.axes[1].lines[0].get_ydata()
+    np.testing.assert_allclose(
+        np.sqrt(np.mean(metres**2)), pgo.absolute_trajectory_error(estimate, graph.truth), rtol=1e-12, atol=0
+    )
+
+
+def test_without_a_truth_one_line_says_so():
+    graph = pgo.grid_world(1, 12, np.random.default_rng(0))
+    from dataclasses import replace
+
+    with pytest.raises(GraphError, match="without a ground truth"):
+        plot_against_truth(replace(graph, truth=None), graph.truth)
+
+
+def test_figures_are_a_column_wide_and_readable_there(tmp_path):
+    graph = pgo.circle(np.random.default_rng(0))
+    problem = pgo.PGOProblem(graph)
+    solution = solvers.solve(problem)
+    stages = [(stage.name, stage.history) for stage in solution.stages]
+    figures = [
+        pgo.plot_graph(graph, graph.truth),
+        plot_against_truth(graph, solution.poses),
+        plot_spectrum(problem, solution.certificate),
+        plot_sparsity(problem),
+        plot_decay([("half", 0.5 ** np.arange(5))], "error (m)"),
+        plot_tightness([("circle", np.array([0.5, 1.0]), np.array([1.0, 0.5]))]),
+        plot_convergence(stages, solution.lower_bound),
+        plot_gaps([Curve("SOC", stages[1][1], solution.lower_bound)]),
+    ]
+    from matplotlib.text import Text
+
+    for figure in figures:
+        save_figure(figure, tmp_path / "figure.png")  # the texts are made when it is drawn
+        assert figure.get_figwidth() == 3.4
+        small = [text for text in figure.findobj(Text) if text.get_text() and text.get_fontsize() < 7]
+        assert not small
+
+
+def test_a_figure_shows_itself_in_a_notebook():
+    graph = pgo.circle(np.random.default_rng(0))
+    assert pgo.plot_graph(graph, graph.truth)._repr_png_().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
+def test_a_solution_saves_its_picture(suffix, tmp_path):
+    path = tmp_path / f"picture{suffix}"
+    solvers.solve(pgo.circle(np.random.default_rng(0))).save(path)
+    head = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}[suffix]
+    assert path.read_bytes().startswith(head)
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
+def test_poses_of_another_graph_are_refused():
+    from matplotlib.figure import Figure
+
+    graph = pgo.circle(np.random.default_rng(0))
+    with pytest.raises(GraphError, match="one pose for every pose"):
+        draw_graph(graph, pgo.Poses.identity(3, 3), Figure().add_subplot(projection="3d"))
+
+
+def test_without_matplotlib_one_line_names_the_extra(monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *rest):
+        if name.startswith("matplotlib"):
+            raise ImportError(name)
+        return real(name, *rest)
+
+    solution = solvers.solve(pgo.circle(np.random.default_rng(0)))
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(MissingExtraError, match=r"pgo-splitting\[plot\]"):
+        solution.plot()

@@ -1,0 +1,100 @@
+import builtins
+import re
+
+import numpy as np
+import pytest
+
+import pgo_models as pgo
+from pgo_models.errors import GraphError, MissingExtraError
+from pgo_models.plots.interactive_plots import animate_poses, save_page
+
+pytest.importorskip("plotly")
+
+
+def ends(trace, d):
+    """Start and end of every segment of a trace of edges, (edges, 2, d)."""
+    points = np.stack([np.asarray(trace[letter]) for letter in "xyz"[:d]], axis=1).reshape(-1, 3, d)
+    assert np.isnan(points[:, 2]).all()
+    return points[:, :2]
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_every_edge_and_pose_is_drawn_once(d):
+    graph = pgo.grid_world(3, 10, np.random.default_rng(0), d=d)
+    traces = pgo.explore_graph(graph, graph.truth).data
+    drawn = np.concatenate([ends(trace, d) for trace in traces if trace.mode == "lines"])
+    expected = np.stack([graph.truth.t[graph.i], graph.truth.t[graph.j]], axis=1)
+    weights = np.random.default_rng(1).standard_normal(2 * d)  # tell segments apart in any order
+    found, wanted = (np.sort(segments.reshape(-1, 2 * d) @ weights) for segments in (drawn, expected))
+    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-5)
+    named = [text for trace in traces if trace.mode == "markers" and trace.name != "misfit" for text in trace.text]
+    assert len(named) == len(set(named)) == graph.num_poses
+    assert named[0] == "pose 0, robot 0"
+
+
+def test_positions_are_drawn_to_seven_digits():
+    graph = pgo.circle(np.random.default_rng(0))
+    far = graph.truth.moved(np.eye(3), np.array([1000.0, 0.0, 0.0]))
+    (dots,) = [trace for trace in pgo.explore_graph(graph, far).data if trace.name == "edges and poses"][1:]
+    np.testing.assert_allclose(np.asarray(dots.x), far.t[:, 0], rtol=1e-7, atol=0)
+
+
+def test_a_misfit_says_how_bad_it_is():
+    graph = pgo.circle(np.random.default_rng(0))
+    graph = graph.with_weights(np.where(np.arange(300) == 5, 1e3, 1.0) * graph.kappa, graph.tau)
+    (misfit,) = [trace for trace in pgo.explore_graph(graph, graph.truth).data if trace.name == "misfit"]
+    residuals = pgo.edge_residuals(graph, graph.truth)
+    assert len(misfit.text) == residuals.is_misfit.sum()
+    (text,) = [text for text in misfit.text if text.startswith("edge 5:")]
+    assert f"{np.rad2deg(residuals.rotation[5]):.3g} deg" in text
+
+
+def test_a_film_has_a_frame_and_a_step_of_the_slider_for_every_iterate():
+    graph = pgo.circle(np.random.default_rng(0))
+    iterates = [pgo.spanning_tree_start(graph, root) for root in range(4)]
+    film = animate_poses(graph, iterates)
+    assert [frame.name for frame in film.frames] == ["k = 0", "k = 1", "k = 2", "k = 3"]
+    (slider,) = film.layout.sliders
+    assert [list(step.args[0]) for step in slider.steps] == [[frame.name] for frame in film.frames]
+    np.testing.assert_allclose(ends(film.frames[-1].data[0], 3)[:, 0], iterates[-1].t[graph.i], rtol=1e-6, atol=1e-6)
+
+
+def test_long_films_of_large_graphs_are_thinned_but_keep_their_ends():
+    graph = pgo.random_geometric(2000, np.random.default_rng(0), mean_degree=20.0)
+    film = animate_poses(graph, [graph.truth] * 60)
+    assert (film.frames[0].name, film.frames[-1].name) == ("k = 0", "k = 59")
+    assert 2 < len(film.frames) < 60
+    assert len(film.to_json()) < 9e6
+
+
+@pytest.mark.parametrize(
+    ("iterates", "labels", "message"),
+    [(0, None, "no iterates"), (2, ["one"], "1 labels for 2 iterates")],
+)
+def test_films_of_nothing_are_refused(iterates, labels, message):
+    graph = pgo.circle(np.random.default_rng(0))
+    with pytest.raises(GraphError, match=message):
+        animate_poses(graph, [graph.truth] * iterates, labels)
+
+
+def test_a_page_escapes_its_title_and_has_no_button_that_uploads(tmp_path):
+    graph = pgo.circle(np.random.default_rng(0))
+    save_page(pgo.explore_graph(graph, graph.truth, "<script>alert(1)</script>"), tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "<script>alert" not in text
+    assert re.search(r'"showSendToCloud":\s*false', text)
+    assert [file.name for file in tmp_path.iterdir()] == ["page.html"]
+
+
+def test_without_plotly_one_line_names_the_extra(monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *rest):
+        if name.startswith("plotly"):
+            raise ImportError(name)
+        return real(name, *rest)
+
+    graph = pgo.circle(np.random.default_rng(0))
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(MissingExtraError, match=r"pgo-splitting\[plot\]"):
+        pgo.explore_graph(graph, graph.truth)

@@ -1,0 +1,94 @@
+import numpy as np
+import pytest
+from scipy.sparse import tril
+
+import pgo_models as pgo
+import solvers
+from pgo_models.errors import SettingError
+from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.plots.matrix_plots import factor_pattern, plot_sparsity, plot_spectrum, smallest_eigenvalues
+from pgo_models.problem.matrices import marginalized_matrix
+
+
+def certificate_of(graph):
+    problem = pgo.PGOProblem(graph)
+    return problem, pgo.certify(problem, pgo.polish(problem, pgo.chordal_start(problem)))
+
+
+@pytest.mark.parametrize("num_poses", [6, 120])  # all at once, and by Lanczos
+@pytest.mark.parametrize("d", [2, 3])
+def test_eigenvalues_are_those_of_the_dense_matrix(num_poses, d):
+    graph = pgo.random_geometric(num_poses, np.random.default_rng(num_poses + d), d=d)
+    problem, certificate = certificate_of(graph)
+    dense = marginalized_matrix(graph)
+    for i in range(num_poses):
+        block = slice(d * i, d * (i + 1))
+        dense[block, block] -= certificate.Lambda[i]
+    expected = np.linalg.eigvalsh(dense)
+    found = smallest_eigenvalues(problem, certificate.Lambda, 7)
+    np.testing.assert_allclose(found, expected[:7], rtol=1e-6, atol=1e-9 * expected[-1])
+
+
+def test_a_negative_eigenvalue_is_found_with_its_sign():
+    graph = pgo.circle(np.random.default_rng(0))
+    problem, certificate = certificate_of(graph)
+    Lambda = certificate.Lambda + 3.0 * np.eye(3)
+    shifted = smallest_eigenvalues(problem, Lambda, 5)
+    np.testing.assert_allclose(
+        shifted, smallest_eigenvalues(problem, certificate.Lambda, 5) - 3.0, rtol=1e-9, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("count", [0, 76])
+def test_a_count_out_of_range_is_refused(count):
+    problem, certificate = certificate_of(pgo.circle(np.random.default_rng(0)))
+    with pytest.raises(SettingError, match="75 eigenvalues"):
+        smallest_eigenvalues(problem, certificate.Lambda, count)
+
+
+def test_the_factors_pattern_is_that_of_an_elimination():
+    problem = pgo.PGOProblem(pgo.grid(np.random.default_rng(0)))
+    pattern = factor_pattern(problem)
+    order = pattern.order
+    permuted = problem.M[order][:, order]
+    filled = (permuted.toarray() != 0) | np.eye(problem.side, dtype=bool)
+    filled = np.zeros_like(filled)
+    M = problem.M.tocoo()
+    place = np.argsort(order)
+    filled[place[M.row], place[M.col]] = True
+    for k in range(problem.side):
+        below = np.flatnonzero(filled[:, k] & (np.arange(problem.side) > k))
+        filled[np.ix_(below, below)] = True
+    assert pattern.factor.nnz >= np.tril(filled).sum() > 0
+    stored = pattern.factor.toarray() != 0
+    assert (stored >= np.tril(filled)).all()
+    assert pattern.fill_in == pattern.factor.nnz - tril(problem.M).nnz
+
+
+def test_the_spectrum_is_drawn_by_sign_and_with_the_proofs_eta():
+    pytest.importorskip("matplotlib")
+    problem, certificate = certificate_of(pgo.circle(np.random.default_rng(0)))
+    figure = plot_spectrum(problem, certificate, 9)
+    (axes,) = figure.axes
+    assert sum(len(line.get_xdata()) for line in axes.lines) == 9
+    assert certificate.eta == 0
+    assert not any("eta" in label for label in axes.get_legend_handles_labels()[1])
+
+
+def test_the_spectrum_is_drawn_with_the_shift_of_a_loose_relaxation():
+    pytest.importorskip("matplotlib")
+    graph = pgo.random_geometric(6, np.random.default_rng(3), noise=NoiseModel(0.5, 1.5))
+    certificate = solvers.solve(graph).certificate  # where the staircase solved the relaxation
+    assert certificate.eta > 0
+    (axes,) = plot_spectrum(pgo.PGOProblem(graph), certificate, 9).axes
+    assert f"{certificate.eta:.1e}" in axes.get_legend_handles_labels()[1][2]
+
+
+def test_the_sparsity_counts_entries():
+    pytest.importorskip("matplotlib")
+    problem = pgo.PGOProblem(pgo.sphere(np.random.default_rng(0)))
+    figure = plot_sparsity(problem)
+    pattern = factor_pattern(problem)
+    assert f"{problem.M.nnz:,} entries" in figure.axes[0].get_title()
+    assert f"{pattern.factor.nnz:,} entries" in figure.axes[1].get_title()
+    assert f"{pattern.fill_in:,} entries" in figure.get_supxlabel()

@@ -1,0 +1,225 @@
+import sys
+
+import numpy as np
+import pytest
+from cvxopt import cholmod
+from graphs import DIMENSIONS, EPS, SEEDS, SIZES, varied_problem
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.sparse import csc_array
+
+from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError
+from pgo_models.problem.cholesky import CholeskyBackend, _Cholmod, analyze, default_backend, factorize
+
+BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
+COLUMNS = st.sampled_from([None, 1, 3])
+
+
+def pattern_of(seed: int, side: int) -> csc_array:
+    """Symmetric pattern with a full diagonal."""
+    rng = np.random.default_rng(seed)
+    dense = rng.random((side, side)) < rng.uniform(0.0, 0.4)
+    return csc_array((dense | dense.T | np.eye(side, dtype=bool)).astype(float))
+
+
+def definite(pattern: csc_array, rng: np.random.Generator, scale: float = 1.0) -> csc_array:
+    """Positive definite matrix of the pattern, diagonally dominant."""
+    off = rng.standard_normal(pattern.shape) * pattern.toarray()
+    off = off + off.T
+    np.fill_diagonal(off, 0.0)
+    dense = scale * (off + np.diag(1e-3 + np.abs(off).sum(axis=1)))
+    columns = np.repeat(np.arange(pattern.shape[1]), np.diff(pattern.indptr))
+    return csc_array((dense[pattern.indices, columns], pattern.indices, pattern.indptr), shape=pattern.shape)
+
+
+def is_positive_definite(matrix: csc_array, backend: CholeskyBackend) -> bool:
+    """Whether the factorisation goes through."""
+    try:
+        factorize(matrix, backend)
+    except NotPositiveDefiniteError:
+        return False
+    return True
+
+
+def dense_matrix(dense: np.ndarray) -> csc_array:
+    """Matrix with every entry stored."""
+    side = len(dense)
+    rows, columns = np.tile(np.arange(side), side), np.repeat(np.arange(side), side)
+    return csc_array((dense.T.ravel(), (rows, columns)), shape=dense.shape)
+
+
+def right_hand_side(rng: np.random.Generator, side: int, columns: int | None) -> np.ndarray:
+    return rng.standard_normal(side if columns is None else (side, columns))
+
+
+def assert_solves(matrix: csc_array, x: np.ndarray, b: np.ndarray) -> None:
+    assert x.shape == b.shape
+    allowed = 64 * len(b) * EPS * (abs(matrix) @ np.abs(x) + np.abs(b))
+    assert (np.abs(matrix @ x - b) <= allowed).all()
+
+
+@BACKENDS
+@given(seed=SEEDS, side=st.integers(1, 30), columns=COLUMNS)
+def test_the_factor_solves(backend: CholeskyBackend, seed: int, side: int, columns: int | None) -> None:
+    rng = np.random.default_rng(seed)
+    matrix = definite(pattern_of(seed, side), rng)
+    b = right_hand_side(rng, side, columns)
+    kept = b.copy()
+    assert_solves(matrix, factorize(matrix, backend).solve(b), b)
+    np.testing.assert_array_equal(b, kept)
+
+
+@given(seed=SEEDS, side=st.integers(1, 30), columns=COLUMNS)
+def test_the_backends_agree(seed: int, side: int, columns: int | None) -> None:
+    rng = np.random.default_rng(seed)
+    matrix = definite(pattern_of(seed, side), rng)
+    b = right_hand_side(rng, side, columns)
+    superlu, cholmod = (factorize(matrix, backend).solve(b) for backend in CholeskyBackend)
+    condition = np.linalg.cond(matrix.toarray())
+    assert np.linalg.norm(superlu - cholmod) <= 64 * side * EPS * condition * np.linalg.norm(superlu)
+
+
+@BACKENDS
+@given(seed=SEEDS, side=st.integers(1, 20))
+def test_one_analysis_serves_many_matrices(backend: CholeskyBackend, seed: int, side: int) -> None:
+    rng = np.random.default_rng(seed)
+    pattern = pattern_of(seed, side)
+    first, second = definite(pattern, rng), definite(pattern, rng, scale=1e3)
+    b = rng.standard_normal((side, 2))
+    analysis = analyze(pattern, backend)
+    kept = analysis.factorize(first)
+    before = kept.solve(b)
+    other = analysis.factorize(second)
+    assert_solves(second, other.solve(b), b)
+    np.testing.assert_array_equal(kept.solve(b), before)  # its own memory, as it was not given away
+    again = analysis.factorize(first, overwrite=other)
+    np.testing.assert_array_equal(again.solve(b), before)
+
+
+def test_the_memory_of_a_factor_out_of_use_is_taken_over_without_a_finaliser() -> None:
+    pytest.importorskip("cvxopt")
+    matrix = definite(pattern_of(0, 9), np.random.default_rng(0))
+    analysis = analyze(matrix, CholeskyBackend.CHOLMOD)
+    kept = analysis.factorize(matrix)
+    for _ in range(5):
+        factor = analysis.factorize(matrix)
+        assert not hasattr(factor, "__del__")  # Ctrl-C in one would be printed and lost
+    assert isinstance(analysis, _Cholmod)
+    assert len(analysis._taken) <= 3
+    assert_solves(matrix, kept.solve(np.ones(9)), np.ones(9))
+
+
+@BACKENDS
+@given(seed=SEEDS, side=st.integers(2, 20))
+def test_a_failed_factorisation_leaves_the_analysis_as_it_was(backend: CholeskyBackend, seed: int, side: int) -> None:
+    rng = np.random.default_rng(seed)
+    pattern = pattern_of(seed, side)
+    good = definite(pattern, rng)
+    bad = good.copy()
+    bad.setdiag(-good.diagonal())
+    b = rng.standard_normal(side)
+    analysis = analyze(pattern, backend)
+    kept = analysis.factorize(good)
+    expected = kept.solve(b)
+    with pytest.raises(NotPositiveDefiniteError):
+        analysis.factorize(bad)
+    np.testing.assert_array_equal(kept.solve(b), expected)
+    np.testing.assert_array_equal(analysis.factorize(good).solve(b), expected)
+    with pytest.raises(NotPositiveDefiniteError):
+        analysis.factorize(bad, overwrite=kept)
+    np.testing.assert_array_equal(analysis.factorize(good).solve(b), expected)
+    np.testing.assert_array_equal(analysis.factorize(good).solve(b), expected)
+
+
+@BACKENDS
+@given(seed=SEEDS, side=st.integers(1, 40), margin=st.floats(1e-9, 1.0))
+def test_identity_less_a_short_vector_is_definite(
+    backend: CholeskyBackend, seed: int, side: int, margin: float
+) -> None:
+    x = np.random.default_rng(seed).standard_normal(side)
+    x *= np.sqrt(1.0 - margin) / np.linalg.norm(x)  # the smallest eigenvalue is the margin
+    assert is_positive_definite(dense_matrix(np.eye(side) - np.outer(x, x)), backend)
+
+
+@BACKENDS
+@given(seed=SEEDS, side=st.integers(1, 40), below=st.floats(1e-9, 1.0))
+def test_identity_less_a_long_vector_is_not(backend: CholeskyBackend, seed: int, side: int, below: float) -> None:
+    x = np.random.default_rng(seed).standard_normal(side)
+    x *= np.sqrt(1.0 + below) / np.linalg.norm(x)  # the smallest eigenvalue is -below; 1 is I - 2 x x^T
+    assert not is_positive_definite(dense_matrix(np.eye(side) - np.outer(x, x)), backend)
+
+
+@BACKENDS
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [[0.0]],
+        [[-1.0]],
+        [[1.0, 1.0], [1.0, 1.0]],
+        [[0.0, 1.0], [1.0, 0.0]],
+        [[1.0, 2.0], [2.0, 1.0]],
+        [[0.0, 1.0], [1.0, 5.0]],
+        [[2.0, -1.0, -1.0], [-1.0, 2.0, -1.0], [-1.0, -1.0, 2.0]],
+        [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
+    ],
+)
+def test_singular_and_indefinite_matrices_are_rejected(backend: CholeskyBackend, rows: list[list[float]]) -> None:
+    matrix = dense_matrix(np.array(rows))
+    assert not is_positive_definite(matrix, backend)
+    with pytest.raises(NotPositiveDefiniteError, match=r"singular|pivot"):
+        factorize(matrix, backend)
+
+
+@pytest.mark.parametrize("rows", [[[-1.0]], [[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.0], [0.0, -1.0]]])
+@pytest.mark.parametrize("others", [0, 1])
+def test_an_option_that_others_set_lets_no_indefinite_matrix_pass(
+    others: int, rows: list[list[float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(cholmod.options, "supernodal", others)  # L D L^T, which indefinite matrices have
+    assert not is_positive_definite(dense_matrix(np.array(rows)), CholeskyBackend.CHOLMOD)
+    assert cholmod.options["supernodal"] == others
+
+
+@BACKENDS
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_nan_and_inf_are_rejected(backend: CholeskyBackend, value: float) -> None:
+    dense = np.eye(3)
+    dense[0, 1] = dense[1, 0] = value
+    with pytest.raises(NotPositiveDefiniteError, match="nan or inf"):
+        factorize(dense_matrix(dense), backend)
+    assert not is_positive_definite(dense_matrix(dense), backend)
+
+
+@BACKENDS
+def test_another_pattern_is_rejected(backend: CholeskyBackend) -> None:
+    diagonal = csc_array(np.eye(3))
+    full = dense_matrix(np.eye(3) + 1.0)
+    for pattern, matrix in ((diagonal, full), (full, diagonal), (diagonal, csc_array(np.eye(2)))):
+        with pytest.raises(ValueError, match="another sparsity pattern"):
+            analyze(pattern, backend).factorize(matrix)
+
+
+@BACKENDS
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_the_same_matrix_gives_the_same_bits(backend: CholeskyBackend, seed: int, n: int, d: int) -> None:
+    problem = varied_problem(seed, n, d)
+    matrix = problem.M.copy()
+    matrix.setdiag(1.001 * matrix.diagonal())
+    b = np.random.default_rng(seed).standard_normal((problem.side, d))
+    once, again = (factorize(matrix, backend).solve(b) for _ in range(2))
+    np.testing.assert_array_equal(once, again)
+    assert_solves(matrix, once, b)
+
+
+def test_superlu_is_the_default_without_cvxopt(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert default_backend() is CholeskyBackend.CHOLMOD
+    monkeypatch.setitem(sys.modules, "cvxopt", None)
+    assert default_backend() is CholeskyBackend.SUPERLU
+    np.testing.assert_array_equal(factorize(csc_array(2.0 * np.eye(2))).solve(np.ones(2)), [0.5, 0.5])
+
+
+def test_asking_for_cholmod_without_cvxopt_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cvxopt", None)
+    with pytest.raises(MissingExtraError, match=r"cvxopt is not installed; run: pip install .*\[fast\]") as caught:
+        analyze(csc_array(np.eye(2)), CholeskyBackend.CHOLMOD)
+    assert caught.value.extra == "fast"

@@ -1,0 +1,144 @@
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, LOUD_NOISE, SEEDS, SIZES, median_slope, random_poses, varied_graph, varied_problem
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pgo_models.certificates.dual_variables import certificate_matrix, multipliers
+from pgo_models.certificates.newton_polish import polish
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, exp_map, hat, stack_transposes, tangent_dimension
+from pgo_models.problem.hessian import TangentLayout, double_cross, riemannian_hessian
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+
+
+def move(rng: np.random.Generator, n: int, d: int) -> tuple[Array, Array]:
+    return rng.standard_normal((n, tangent_dimension(d))), rng.standard_normal((n, d))
+
+
+def stacked_move(poses: Poses, w: Array, v: Array) -> Array:
+    """V: rows v_i^T, then -hat(w_i) R_i^T = (R_i hat(w_i))^T."""
+    return np.concatenate([v, stack_transposes(poses.R @ hat(w))])
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, theta=st.sampled_from([None, 0.0, 0.5, 1.0]))
+def test_the_form_is_twice_that_of_S(seed: int, n: int, d: int, theta: float | None) -> None:
+    problem, poses = varied_problem(seed, n, d), random_poses(n, d, seed)
+    rng = np.random.default_rng(seed)
+    w, v = move(rng, n, d)
+    Lambda = None if theta is None else theta * multipliers(problem, poses)
+    S = problem.M if Lambda is None else certificate_matrix(problem, Lambda)
+    V = stacked_move(poses, w, v)
+    step = TangentLayout(n, d).join(w, v)
+    hessian = riemannian_hessian(problem, poses, Lambda)
+    terms = float(np.sum(np.abs(V) * (abs(S) @ np.abs(V))))
+    assert step @ (hessian @ step) == pytest.approx(2.0 * float(np.sum(V * (S @ V))), rel=0, abs=1e-12 * terms)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_gradient_and_hessian_have_taylor_slope_three(seed: int, n: int, d: int) -> None:
+    problem, poses = varied_problem(seed, n, d), random_poses(n, d, seed)
+    layout = TangentLayout(n, d)
+    gradient = layout.join(*problem.riemannian_gradient(poses))
+    hessian = riemannian_hessian(problem, poses, multipliers(problem, poses))
+    rng = np.random.default_rng(seed)
+
+    def error(w: Array, v: Array, h: float) -> float:
+        step = h * layout.join(w, v)
+        there = problem.objective(Poses(poses.R @ exp_map(h * w), poses.t + h * v))
+        return abs(there - problem.objective(poses) - gradient @ step - 0.5 * step @ (hessian @ step))
+
+    # The median over moves, as the third derivative is nearly zero along some.
+    assert median_slope(error, [move(rng, n, d) for _ in range(7)], (-1.5, -3.0)) == pytest.approx(3.0, abs=0.2)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_gauss_newton_is_newton_where_edges_fit(seed: int, n: int, d: int) -> None:
+    # J^T J is the Hessian when the residuals vanish: any other poses, measured exactly by the edges of the graph.
+    graph = varied_graph(seed, n, d)
+    poses = random_poses(n, d, seed)
+    R_i = np.swapaxes(poses.R[graph.i], 1, 2)
+    exact = PGOProblem(
+        type(graph)(
+            n,
+            graph.i,
+            graph.j,
+            R_i @ poses.R[graph.j],
+            np.einsum("mab,mb->ma", R_i, poses.t[graph.j] - poses.t[graph.i]),
+            graph.kappa,
+            graph.tau,
+        )
+    )
+    newton = riemannian_hessian(exact, poses, multipliers(exact, poses)).toarray()
+    gauss_newton = riemannian_hessian(exact, poses, None).toarray()
+    scale = np.abs(gauss_newton).max()
+    np.testing.assert_allclose(newton, gauss_newton, rtol=0, atol=1e-12 * scale)
+    assert np.linalg.eigvalsh(gauss_newton)[0] >= -1e-12 * scale
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_it_is_symmetric_and_its_pattern_is_the_graph_s(seed: int, n: int, d: int) -> None:
+    problem, poses = varied_problem(seed, n, d), random_poses(n, d, seed)
+    hessian = riemannian_hessian(problem, poses, multipliers(problem, poses))
+    dense = hessian.toarray()
+    np.testing.assert_allclose(dense, dense.T, rtol=0, atol=1e-13 * np.abs(dense).max())
+    assert hessian.shape == (TangentLayout(n, d).side,) * 2
+    other = riemannian_hessian(problem, Poses.identity(n, d), None)
+    np.testing.assert_array_equal(hessian.indptr, other.indptr)
+    np.testing.assert_array_equal(hessian.indices, other.indices)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_rigid_motions_are_in_the_null_space_at_stationary_points(seed: int, n: int, d: int) -> None:
+    problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE))
+    poses = polish(problem, chordal_start(problem))
+    hessian = riemannian_hessian(problem, poses, multipliers(problem, poses))
+    layout = TangentLayout(n, d)
+    rotations = tangent_dimension(d)
+    motions = [layout.join(np.zeros((n, rotations)), np.tile(axis, (n, 1))) for axis in np.eye(d)]
+    for axis in np.eye(rotations):
+        world = hat(axis[None])[0]
+        in_body = np.einsum("nba,b->na", poses.R, axis) if d == 3 else np.tile(axis, (n, 1))
+        motions.append(layout.join(in_body, poses.t @ world.T))
+    scale = float(abs(hessian).sum(axis=0).max()) * (1.0 + np.abs(poses.t).max())
+    # The gradient that polish leaves: half the squared decrement is below 1e-13 max(1, F).
+    left = np.sqrt(2e-13 * max(1.0, problem.objective(poses)) / scale)
+    for motion in motions:
+        assert np.abs(hessian @ motion).max() <= scale * (1e-12 + left)
+
+
+@given(seed=SEEDS, n=st.integers(1, 5))
+def test_double_cross_is_its_definition_in_space(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    A, B = rng.standard_normal((2, n, 3, 3))
+    u, v = rng.standard_normal((2, n, 3))
+    expected = np.sum((hat(u) @ A @ np.swapaxes(hat(v), 1, 2)) * B, axis=(1, 2))
+    np.testing.assert_allclose(np.einsum("na,nab,nb->n", u, double_cross(A, B), v), expected, rtol=0, atol=1e-12)
+    cofactors = np.linalg.det(A)[:, None, None] * np.swapaxes(np.linalg.inv(A), 1, 2)
+    np.testing.assert_allclose(double_cross(A, A), 2 * cofactors, rtol=0, atol=1e-9 * (1 + np.abs(cofactors).max()))
+
+
+@given(seed=SEEDS, n=st.integers(1, 5))
+def test_double_cross_is_its_definition_in_the_plane(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    A, B = rng.standard_normal((2, n, 2, 2))
+    turn = hat(np.ones((n, 1)))
+    expected = np.sum((turn @ A @ np.swapaxes(turn, 1, 2)) * B, axis=(1, 2))
+    K = double_cross(A, B)
+    assert K.shape == (n, 1, 1)
+    np.testing.assert_allclose(K[:, 0, 0], expected, rtol=0, atol=1e-13)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_the_layout_joins_and_splits(seed: int, n: int, d: int) -> None:
+    layout = TangentLayout(n, d)
+    w, v = move(np.random.default_rng(seed), n, d)
+    step = layout.join(w, v)
+    assert step.shape == (layout.side,)
+    again_w, again_v = layout.split(step)
+    np.testing.assert_array_equal(again_w, w)
+    np.testing.assert_array_equal(again_v, v)
+    every = np.arange(n)
+    np.testing.assert_array_equal(step[layout.translations(every)], v)
+    np.testing.assert_array_equal(step[layout.rotations(every)], w)

@@ -1,0 +1,178 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, EPS, SEEDS, SIZES, exact_graph, random_poses, varied_graph, varied_problem
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import shortest_path
+
+from pgo_models.errors import GraphError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import log_map, orthogonality_error, random_rotations, unstack_transposes
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, circle, grid, observe
+from pgo_models.problem.cholesky import CholeskyBackend
+from pgo_models.problem.initialization import chordal_start, gps_imu_start, odometry_start, spanning_tree_start
+from pgo_models.problem.matrices import residual_matrix
+from pgo_models.problem.problem import PGOProblem
+
+
+def chain(seed: int, n: int, d: int, noise: NoiseModel = MILD_NOISE) -> PoseGraph:
+    """Odometry i -> i + 1 in a random order, and a few other edges in between."""
+    rng = np.random.default_rng(seed)
+    order = rng.permutation(n - 1)
+    extra = rng.integers(0, n, (3, 2))
+    extra = extra[extra[:, 0] != extra[:, 1]]
+    i, j = np.concatenate([order, extra[:, 0]]), np.concatenate([order + 1, extra[:, 1]])
+    return observe("chain", random_poses(n, d, seed), i, j, noise, 2.0, 3.0, rng)
+
+
+def hops(graph: PoseGraph, root: int, edges: np.ndarray) -> np.ndarray:
+    """Number of the chosen edges from the root to every pose."""
+    adjacency = coo_array((np.ones(edges.sum()), (graph.i[edges], graph.j[edges])), (graph.num_poses,) * 2)
+    return shortest_path(adjacency.tocsr(), directed=False, unweighted=True, indices=root)
+
+
+def assert_costs_nothing(graph: PoseGraph, poses: Poses) -> None:
+    """F is at the rounding level: every residual is below about n eps times the size of the world."""
+    size = 1.0 + np.abs(poses.t).max()
+    w = residual_matrix(graph)[1]
+    assert PGOProblem(graph).objective(poses) <= w.sum() * (1e3 * graph.num_poses * EPS * size) ** 2
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_without_noise_every_start_is_the_truth(seed: int, n: int, d: int) -> None:
+    graph = exact_graph(seed, n, d)
+    assert graph.truth is not None
+    truth = graph.truth.with_gauge_at(0)
+    for start in (spanning_tree_start(graph), chordal_start(PGOProblem(graph))):
+        assert_costs_nothing(graph, start)
+        aligned = start.with_gauge_at(0)
+        np.testing.assert_allclose(aligned.R, truth.R, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(aligned.t, truth.t, rtol=0, atol=1e-9 * (1 + np.abs(truth.t).max()))
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_without_noise_odometry_is_the_truth(seed: int, n: int, d: int) -> None:
+    graph = chain(seed, n, d, NoiseModel(1e-300, 1e-300))
+    assert_costs_nothing(graph, odometry_start(graph))
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_odometry_composes_the_first_link_of_every_pair(seed: int, n: int, d: int) -> None:
+    graph = chain(seed, n, d)
+    poses = odometry_start(graph)
+    R, t = np.eye(d), np.zeros(d)
+    for pose in range(n):
+        np.testing.assert_allclose(poses.R[pose], R, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(poses.t[pose], t, rtol=0, atol=1e-12 * (1 + np.abs(t).max()))
+        if pose < n - 1:
+            e = int(np.flatnonzero((graph.i == pose) & (graph.j == pose + 1))[0])
+            R, t = R @ graph.R_ij[e], t + R @ graph.t_ij[e]
+
+
+def test_odometry_with_a_gap_names_it() -> None:
+    graph = chain(0, 6, 3)
+    keep = ~((graph.i == 2) & (graph.j == 3))
+    parts = {name: getattr(graph, name)[keep] for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")}
+    with pytest.raises(GraphError, match=r"no odometry from pose 12 to 13; use spanning_tree_start\(\)"):
+        odometry_start(replace(graph, ids=np.arange(10, 16), **parts))
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, root=st.integers(0, 11))
+def test_a_spanning_tree_composes_edges_along_shortest_paths(seed: int, n: int, d: int, root: int) -> None:
+    graph = varied_graph(seed, n, d)  # with edges in both directions and repeated ones
+    root %= n
+    poses = spanning_tree_start(graph, root)
+    np.testing.assert_array_equal(poses.R[root], np.eye(d))
+    np.testing.assert_array_equal(poses.t[root], np.zeros(d))
+    costs = PGOProblem(graph).edge_costs(poses)
+    fits = costs <= (graph.kappa + graph.tau) * (1e3 * n * EPS * (1.0 + np.abs(poses.t).max())) ** 2
+    # Noise leaves only the edges of the tree, and their copies, to fit; between them they reach every pose.
+    np.testing.assert_array_equal(hops(graph, root, fits), hops(graph, root, np.ones(graph.num_edges, dtype=bool)))
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_the_chordal_start_is_the_projected_minimiser(seed: int, n: int, d: int) -> None:
+    problem = varied_problem(seed, n, d)
+    start = chordal_start(problem)
+    # Without constraints and with pose 0 at the identity: dense least squares.
+    M = problem.M.toarray()
+    fixed = np.concatenate([[0], n + np.arange(d)])
+    free = np.setdiff1d(np.arange(problem.side), fixed)
+    X_fixed = np.concatenate([np.zeros((1, d)), np.eye(d)])
+    X = np.zeros((problem.side, d))
+    X[fixed] = X_fixed
+    X[free] = np.linalg.solve(M[np.ix_(free, free)], -M[np.ix_(free, fixed)] @ X_fixed)
+    U, _, Vt = np.linalg.svd(unstack_transposes(X[n:]))
+    U[..., -1] *= np.linalg.det(U @ Vt)[:, None]
+    np.testing.assert_allclose(start.R, U @ Vt, rtol=0, atol=1e-8)
+    np.testing.assert_array_equal(start.t, problem.recover_translations(start.R))
+    np.testing.assert_allclose(start.R[0], np.eye(d), rtol=0, atol=1e-14)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_starts_are_rotations(seed: int, n: int, d: int) -> None:
+    graph = varied_graph(seed, n, d, NoiseModel(1.0, 2.0))
+    for start in (spanning_tree_start(graph), chordal_start(PGOProblem(graph))):
+        assert orthogonality_error(start.R).max() <= 32 * EPS
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_the_chordal_start_is_gauge_free(seed: int, n: int, d: int) -> None:
+    # Relative measurements know no world: turning the truth, and with it the estimate of the file, changes nothing.
+    graph = varied_graph(seed, n, d)
+    rng = np.random.default_rng(seed)
+    assert graph.truth is not None
+    turned = replace(graph, truth=graph.truth.moved(random_rotations(1, d, rng)[0], rng.standard_normal(d)))
+    np.testing.assert_array_equal(chordal_start(PGOProblem(turned)).R, chordal_start(PGOProblem(graph)).R)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_turning_the_body_frames_turns_the_chordal_start(seed: int, n: int, d: int) -> None:
+    # x_i -> x_i y_i turns every measurement to y_i^-1 x_ij y_j; the relaxation, with x_0 y_0 = I, follows.
+    problem = varied_problem(seed, n, d)
+    graph = problem.graph
+    G = random_rotations(n, d, np.random.default_rng(seed))
+    G[0] = np.eye(d)
+    R_i = np.swapaxes(G[graph.i], 1, 2)
+    turned = replace(graph, R_ij=R_i @ graph.R_ij @ G[graph.j], t_ij=np.einsum("mab,mb->ma", R_i, graph.t_ij))
+    before, after = chordal_start(problem), chordal_start(PGOProblem(turned))
+    np.testing.assert_allclose(after.R, before.R @ G, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(after.t, before.t, rtol=0, atol=1e-8 * (1 + np.abs(before.t).max()))
+
+
+@pytest.mark.parametrize("scene", [circle, grid])
+def test_both_backends_start_alike(scene: object) -> None:
+    graph = scene(np.random.default_rng(0))
+    starts = [chordal_start(PGOProblem(graph, backend)) for backend in CholeskyBackend]
+    np.testing.assert_allclose(starts[0].R, starts[1].R, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_gps_imu_noise_has_its_standard_deviations(d: int) -> None:
+    n = 4000
+    truth = random_poses(n, d, 0)
+    start = gps_imu_start(truth, 0.2, 0.1, np.random.default_rng(0))
+    t = start.t - truth.t
+    w = log_map(np.swapaxes(truth.R, 1, 2) @ start.R)
+    for values, std in ((t, 0.2), (w, 0.1)):
+        assert values.std() == pytest.approx(std, rel=5 / np.sqrt(2 * values.size))
+        assert abs(values.mean()) < 5 * std / np.sqrt(values.size)
+    again = gps_imu_start(truth, 0.2, 0.1, np.random.default_rng(0))
+    np.testing.assert_array_equal(again.R, start.R)
+    np.testing.assert_array_equal(again.t, start.t)
+
+
+def test_a_spanning_tree_needs_a_connected_graph() -> None:
+    graph = replace(chain(0, 5, 2), num_poses=6, initial=None, truth=None)
+    with pytest.raises(GraphError, match="2 components"):
+        spanning_tree_start(graph)
+
+
+@pytest.mark.parametrize("root", [-1, 5, 100])
+def test_a_root_must_be_a_pose(root: int) -> None:
+    with pytest.raises(SettingError, match=f"root is {root}; give a pose, 0 to 4"):
+        spanning_tree_start(chain(0, 5, 2), root)

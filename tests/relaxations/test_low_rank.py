@@ -1,0 +1,96 @@
+"""The rank-restricted relaxation, its derivatives and its rounding."""
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, SEEDS, random_poses, varied_problem
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.stiefel import append_rank, project_to_tangent, retract
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.relaxations.low_rank import hessian_product, lifted_point
+from pgo_models.relaxations.rounding import round_factor, round_gram
+
+SIZES, EXTRA = st.integers(2, 8), st.integers(0, 3)
+
+
+def drawn(seed: int, n: int, d: int, extra: int) -> tuple[PGOProblem, Array, Array]:
+    """Problem, a point and a unit tangent there."""
+    rng = np.random.default_rng(seed)
+    Y = np.swapaxes(np.linalg.qr(rng.standard_normal((n, d + extra, d)))[0], 1, 2)
+    V = project_to_tangent(Y, rng.standard_normal(Y.shape))
+    return varied_problem(seed, n, d), Y, V / np.linalg.norm(V)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, extra=EXTRA)
+def test_the_value_is_that_of_the_dense_marginalised_matrix(seed: int, n: int, d: int, extra: int) -> None:
+    problem, Y, _ = drawn(seed, n, d, extra)
+    point, rows = lifted_point(problem, Y), Y.reshape(n * d, -1)
+    scale = np.abs(problem.Q).max()
+    assert point.value == pytest.approx(np.sum(rows * (problem.Q @ rows)), abs=1e-11 * n * scale)
+    assert np.einsum("naa->", point.Lambda) == pytest.approx(point.value, abs=1e-11 * n * scale)
+    np.testing.assert_allclose(problem.apply_Q(rows), problem.Q @ rows, rtol=0, atol=1e-11 * n * scale)
+    assert point.rank == d + extra
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_at_rank_d_it_is_F_with_its_multipliers(seed: int, n: int, d: int) -> None:
+    problem = varied_problem(seed, n, d)
+    poses = problem.with_best_translations(random_poses(n, d, seed).R)
+    point = lifted_point(problem, np.swapaxes(poses.R, 1, 2))
+    assert point.value == pytest.approx(problem.objective(poses), rel=1e-12)
+    expected = multipliers(problem, poses)
+    np.testing.assert_allclose(point.Lambda, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, extra=EXTRA)
+def test_the_gradient_and_the_hessian_are_the_derivatives(seed: int, n: int, d: int, extra: int) -> None:
+    problem, Y, V = drawn(seed, n, d, extra)
+    point, h = lifted_point(problem, Y), 1e-4
+    forth, back = (lifted_point(problem, retract(Y, sign * h * V)) for sign in (1, -1))
+    scale = max(1.0, point.value, float(np.abs(problem.Q).sum(axis=0).max()))
+    assert (forth.value - back.value) / (2 * h) == pytest.approx(np.sum(point.gradient * V), abs=1e-6 * scale)
+    curvature = np.sum(V * hessian_product(problem, point, V))
+    assert (forth.value - 2 * point.value + back.value) / h**2 == pytest.approx(curvature, abs=1e-5 * scale)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, extra=EXTRA)
+def test_the_hessian_is_symmetric_and_tangent(seed: int, n: int, d: int, extra: int) -> None:
+    problem, Y, V = drawn(seed, n, d, extra)
+    W = project_to_tangent(Y, np.random.default_rng([seed, 7]).standard_normal(Y.shape))
+    point = lifted_point(problem, Y)
+    HV, HW = hessian_product(problem, point, V), hessian_product(problem, point, W)
+    scale = max(1.0, float(np.abs(problem.Q).sum(axis=0).max()))
+    assert np.sum(W * HV) == pytest.approx(np.sum(V * HW), abs=1e-10 * scale * n)
+    np.testing.assert_allclose(project_to_tangent(Y, HV), HV, rtol=0, atol=1e-11 * scale)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, extra=st.integers(1, 3))
+def test_rotations_that_were_lifted_and_turned_are_rounded_back(seed: int, n: int, d: int, extra: int) -> None:
+    problem, rng = varied_problem(seed, n, d), np.random.default_rng(seed)
+    R = random_poses(n, d, seed).R
+    Y = np.swapaxes(R, 1, 2)
+    for _ in range(extra):
+        Y = append_rank(Y)
+    turn = np.linalg.qr(rng.standard_normal((d + extra, d + extra)))[0]
+    poses, report = round_factor(problem, Y @ turn)
+    np.testing.assert_allclose(poses.with_gauge_at(0).R, R[0].T @ R, rtol=0, atol=1e-9)
+    assert report.is_tight
+    by_gram, _ = round_gram(problem, (Y.reshape(n * d, -1)) @ (Y.reshape(n * d, -1)).T)
+    np.testing.assert_allclose(by_gram.with_gauge_at(0).R, R[0].T @ R, rtol=0, atol=1e-6)
+
+
+def test_rotations_are_their_own_rounding_and_reflections_are_turned_over() -> None:
+    problem, R = varied_problem(0, 5, 3), random_poses(5, 3, 0).R
+    Y = np.swapaxes(R, 1, 2)
+    np.testing.assert_array_equal(round_factor(problem, Y)[0].R, R)
+    over = round_factor(problem, -Y)[0]
+    np.testing.assert_allclose(over.with_gauge_at(0).R, R[0].T @ R, rtol=0, atol=1e-12)
+
+
+def test_a_factor_of_higher_rank_is_reported() -> None:
+    problem, Y, _ = drawn(0, 8, 3, 2)
+    report = round_factor(problem, Y)[1]
+    assert (report.rank, report.is_tight) == (5, False)

@@ -1,0 +1,237 @@
+"""The semidefinite relaxation in its three forms; the optimum by three roads; the bound where it is not tight."""
+
+import math
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, LOUD_NOISE, OPTIMUM, SEEDS, exact_graph, random_poses, varied_problem
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pgo_models.certificates.certificate import Verdict
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.lower_bound import prove_bound
+from pgo_models.certificates.newton_polish import polish
+from pgo_models.errors import SettingError
+from pgo_models.graphs.g2o import read_g2o
+from pgo_models.graphs.scenes import circle, grid, sphere
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.relaxations import solve_sdp as semidefinite
+from pgo_models.relaxations.clique_decomposition import clique_relaxation
+from pgo_models.relaxations.plan import RelaxationForm, SDPSolver, plan_relaxation
+from pgo_models.relaxations.rounding import rank_report, round_gram
+from pgo_models.relaxations.solve_sdp import (
+    DEFAULT_RELAXATION_GAP,
+    RelaxationSolution,
+    RelaxationStatus,
+    solve_relaxation,
+)
+from solvers.pipeline import solve
+from solvers.studies.tightness import SweptScene, noisy_scene
+
+FORMS = st.sampled_from(list(RelaxationForm))
+NOT_TIGHT_DEGREES, NOT_TIGHT_SEED = 70.0, 0
+
+
+def restarts(problem: PGOProblem, count: int, seed: int) -> float:
+    """Lowest F that polishing from random rotations finds."""
+    starts = (random_poses(problem.num_poses, problem.d, seed + k) for k in range(count))
+    return min(problem.objective(polish(problem, problem.with_best_translations(s.R))) for s in starts)
+
+
+@settings(max_examples=9)
+@given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, form=FORMS)
+def test_three_roads_lead_to_one_optimum(seed: int, n: int, d: int, form: RelaxationForm) -> None:
+    problem = varied_problem(seed, n, d)
+    relaxed, solved = solve_relaxation(problem, form, SDPSolver.CLARABEL), solve(problem)
+    F = solved.objective
+    allowed = DEFAULT_RELAXATION_GAP * max(1.0, F)
+    assert solved.is_certified
+    assert restarts(problem, 12, seed) == pytest.approx(F, abs=1e-6 * max(1.0, F))
+    if solved.certificate.verdict is not Verdict.EXACT:  # else the relaxation's poses are exact to its accuracy alone
+        assert relaxed.verdict is Verdict.CERTIFIED
+        assert relaxed.gap_to(solved.poses) <= DEFAULT_RELAXATION_GAP
+    assert relaxed.lower_bound <= F
+    assert relaxed.objective == pytest.approx(F, abs=allowed)
+    if relaxed.status is RelaxationStatus.OPTIMAL:
+        assert relaxed.value == pytest.approx(F, abs=allowed)
+
+
+@settings(max_examples=9)
+@given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, form=FORMS)
+def test_the_duals_are_the_multipliers_with_their_sign(seed: int, n: int, d: int, form: RelaxationForm) -> None:
+    problem = varied_problem(seed, n, d, LOUD_NOISE)
+    solution = solve_relaxation(problem, form, SDPSolver.CLARABEL)
+    Lambda = solution.Lambda
+    trace = float(np.einsum("naa->", Lambda))
+    assert trace == pytest.approx(solution.value, abs=1e-4 * max(1.0, solution.value))
+    if solution.verdict is Verdict.CERTIFIED:
+        expected = multipliers(problem, polish(problem, solution.poses))
+        scale = max(1.0, float(np.abs(expected).max()))
+        np.testing.assert_allclose(Lambda, expected, rtol=0, atol=2e-2 * scale)
+        if np.abs(expected).max() > 0.1:
+            assert np.abs(Lambda + expected).max() > np.abs(Lambda - expected).max()
+
+
+@settings(max_examples=25)
+@given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS)
+def test_weak_duality_for_any_multipliers(seed: int, n: int, d: int) -> None:
+    problem, rng = varied_problem(seed, n, d), np.random.default_rng(seed)
+    Lambda = rng.standard_normal((n, d, d)) * np.exp(rng.uniform(-4, 4))
+    Lambda = 0.5 * (Lambda + np.swapaxes(Lambda, 1, 2))
+    eta = float(np.abs(Lambda).sum(axis=2).max()) * 1.1
+    bound = prove_bound(problem, Lambda, eta)
+    assert bound is not None
+    for k in range(3):
+        assert bound <= problem.objective(random_poses(n, d, seed + k))
+
+
+@pytest.mark.parametrize("form", list(RelaxationForm))
+def test_the_centre_and_the_form_do_not_change_the_value(form: RelaxationForm) -> None:
+    problem = varied_problem(11, 8, 3, LOUD_NOISE)
+    F = solve(problem).objective
+    assert solve_relaxation(problem, form).value == pytest.approx(F, rel=1e-5)
+    if form is RelaxationForm.CLIQUES:
+        for seed in range(2):
+            far = clique_relaxation(problem, centre=problem.with_best_translations(random_poses(8, 3, seed).R))
+            far.model.solve(solver=cp.CLARABEL, max_threads=1)
+            assert far.model.value * far.scale == pytest.approx(F, rel=1e-4)
+
+
+def not_tight() -> PGOProblem:
+    rng = np.random.default_rng(NOT_TIGHT_SEED)
+    return PGOProblem(noisy_scene(SweptScene.CIRCLE, np.deg2rad(NOT_TIGHT_DEGREES), rng))
+
+
+def test_where_it_is_not_tight_the_bound_holds_and_the_verdict_says_so() -> None:
+    problem = not_tight()
+    solution = solve_relaxation(problem)
+    best = min(restarts(problem, 20, 0), solve(problem).objective)
+    assert solution.rank.rank > 3
+    assert not solution.rank.is_tight
+    assert solution.rank.tightness > 0.1
+    assert solution.verdict is Verdict.NOT_CERTIFIED
+    assert solution.gap > 1e-3
+    assert "NOT_CERTIFIED" in str(solution)
+    # Valid, no more than the relaxation's value, and not trivial.
+    assert solution.lower_bound <= min(best, solution.value * (1 + 1e-5))
+    assert solution.lower_bound > 0.9 * solution.value
+    assert (best - solution.lower_bound) / best > 1e-3
+
+
+def test_a_rough_solution_still_gives_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = PGOProblem(circle(np.random.default_rng(1)))
+    monkeypatch.setattr(semidefinite, "_SCS_MAX_ITERATIONS", 25)
+    solution = solve_relaxation(problem, solver=SDPSolver.SCS)
+    assert solution.status is RelaxationStatus.LIMIT
+    assert 0.0 < solution.lower_bound <= solve(problem).objective
+    assert solution.gap > DEFAULT_RELAXATION_GAP
+
+
+def test_time_is_limited() -> None:
+    problem = PGOProblem(grid(np.random.default_rng(1)))
+    solution = solve_relaxation(problem, time_limit=1e-3)
+    assert solution.status is RelaxationStatus.LIMIT
+    assert solution.lower_bound <= solve(problem).objective
+    assert solution.verdict is not Verdict.CERTIFIED
+
+
+@pytest.mark.parametrize("form", list(RelaxationForm))
+def test_measurements_without_noise_cost_nothing(form: RelaxationForm) -> None:
+    solution = solve_relaxation(PGOProblem(exact_graph(3, 6, 3)), form, SDPSolver.CLARABEL)
+    assert solution.verdict in (Verdict.EXACT, Verdict.TRIVIAL)  # of zero nothing better than zero is a bound
+    assert solution.lower_bound == 0.0
+    assert solution.objective <= 1e-6
+    assert abs(solution.value) <= 1e-5
+
+
+def test_the_rank_report() -> None:
+    rng = np.random.default_rng(0)
+    Y = random_poses(5, 3, 0).stacked()[5:]
+    exact = rank_report(Y @ Y.T, 3)
+    assert (exact.rank, exact.is_tight) == (3, True)
+    assert exact.tightness < 1e-12
+    np.testing.assert_allclose(exact.singular_values[:3], 5.0, rtol=1e-12, atol=0)
+    lifted = np.concatenate([Y, 0.5 * rng.standard_normal((15, 1))], axis=1)
+    wide = rank_report(lifted @ lifted.T, 3)
+    assert (wide.rank, wide.is_tight) == (4, False)
+    assert wide.tightness == pytest.approx(wide.singular_values[3] / wide.singular_values[2])
+    assert "rank 4 (d = 3)" in str(wide)
+
+
+@settings(max_examples=20)
+@given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS)
+def test_rounding_the_gram_matrix_of_rotations_gives_them_back(seed: int, n: int, d: int) -> None:
+    problem, R = varied_problem(seed, n, d), random_poses(n, d, seed).R
+    Y = problem.with_best_translations(R).stacked()[n:]
+    poses, report = round_gram(problem, Y @ Y.T)
+    assert report.is_tight
+    relative = np.swapaxes(R[:1], 1, 2) @ R
+    np.testing.assert_allclose(np.swapaxes(poses.R[:1], 1, 2) @ poses.R, relative, rtol=0, atol=1e-9)
+
+
+def choice(problem: PGOProblem) -> tuple[str, str]:
+    plan = plan_relaxation(problem)
+    return plan.form.name, plan.solver.name
+
+
+def test_the_choice_follows_the_cliques() -> None:
+    rng = np.random.default_rng(0)
+    assert choice(PGOProblem(grid(rng))) == ("CLIQUES", "CLARABEL")
+    assert choice(PGOProblem(circle(rng))) == ("PRIMAL", "SCS")
+    assert choice(PGOProblem(sphere(rng))) == ("PRIMAL", "SCS")
+    plan = plan_relaxation(PGOProblem(circle(rng)), RelaxationForm.DUAL)
+    assert (plan.form, plan.solver) == (RelaxationForm.DUAL, SDPSolver.CLARABEL)
+    assert "as asked for" in plan.reason
+
+
+def test_the_reason_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    solution = solve_relaxation(varied_problem(1, 8, 2), verbose=True)
+    printed = capsys.readouterr().out
+    assert solution.plan.reason in printed
+    assert "verdict      CERTIFIED" in printed
+
+
+def test_what_is_beyond_reach_is_refused_with_an_estimate() -> None:
+    problem = PGOProblem(sphere(np.random.default_rng(0)))
+    with pytest.raises(
+        SettingError, match=r"needs about [\d.]+ GB, above the limit of 4 GB .* use certify\("
+    ) as caught:
+        solve_relaxation(problem, RelaxationForm.PRIMAL, SDPSolver.CLARABEL)
+    assert "PRIMAL and CLARABEL as asked for" in str(caught.value)
+    assert "Q" not in vars(problem)  # nothing dense was formed
+    with pytest.raises(SettingError, match="needs about"):
+        solve_relaxation(problem, memory_limit=1e6)
+
+
+def test_settings_are_checked() -> None:
+    problem = varied_problem(0, 3, 2)
+    for name, value in (("gap", 0.0), ("time_limit", -1.0), ("memory_limit", math.nan)):
+        with pytest.raises(SettingError, match=f"{name} is"):
+            solve_relaxation(problem, **{name: value})
+
+
+def certified(problem: PGOProblem) -> RelaxationSolution:
+    solution = solve_relaxation(problem)
+    assert solution.gap_to(solve(problem).poses) <= DEFAULT_RELAXATION_GAP
+    assert solution.verdict is Verdict.CERTIFIED
+    assert solution.rank.is_tight
+    return solution
+
+
+@pytest.mark.parametrize("scene", [circle, grid, sphere])
+def test_the_scenes_are_certified(scene) -> None:
+    certified(PGOProblem(scene(np.random.default_rng(0))))
+
+
+def test_tinyGrid3D_has_its_published_optimum(benchmark_data) -> None:
+    solution = certified(PGOProblem(read_g2o(benchmark_data / "tinyGrid3D.g2o")))
+    assert solution.value == pytest.approx(OPTIMUM["tinyGrid3D"], rel=1e-6)
+
+
+def test_a_long_trajectory_with_few_loops(benchmark_data) -> None:
+    problem = PGOProblem(read_g2o(benchmark_data / "kitti_00.g2o").subgraph(np.arange(2300, 3450)))
+    solution = certified(problem)
+    assert problem.graph.num_edges - problem.num_poses >= 20  # loops
+    assert solution.plan.form is RelaxationForm.CLIQUES

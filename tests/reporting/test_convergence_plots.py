@@ -1,0 +1,110 @@
+import builtins
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pgo_models.certificates.certificate import relative_gap
+from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.graphs.published_results import PublishedRun
+from solvers import History, Measurement, Record
+from solvers.reporting.convergence_plots import Curve, Effort, explore_convergence, plot_convergence, plot_gaps
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("plotly")
+
+PAPER = PublishedRun("some", objective=12.0, optimum=10.0, iterations=20)
+
+
+def history(length, factor=0.5):
+    return History(
+        tuple(Record(k, 0.25 * k, Measurement(10.0 + factor**k, factor**k, 2 * factor**k)) for k in range(length))
+    )
+
+
+def test_the_gap_is_held_against_the_bound():
+    records = history(6)
+    gap = Curve("x", records, 9.5).gap
+    assert gap.tolist() == [relative_gap(value, 9.5) for value in records.objective]
+
+
+@pytest.mark.parametrize("label", ["rounds", "num_bytes"])
+def test_communication_has_an_entry_for_every_record(label):
+    with pytest.raises(SettingError, match=f"{label} of x has 3 entries for 6 records"):
+        Curve("x", history(6), 9.5, **{label: np.arange(3.0)})
+
+
+def test_efforts_are_what_was_counted():
+    curve = Curve("x", history(4), 9.5, rounds=np.arange(4) * 2.0, num_bytes=np.arange(4) * 800.0)
+    assert curve.effort(Effort.ITERATIONS).tolist() == [0, 1, 2, 3]
+    assert curve.effort(Effort.SECONDS).tolist() == [0, 0.25, 0.5, 0.75]
+    assert curve.effort(Effort.ROUNDS).tolist() == [0, 2, 4, 6]
+    assert curve.effort(Effort.BYTES).tolist() == [0, 800, 1600, 2400]
+
+
+@pytest.mark.parametrize("effort", [Effort.ROUNDS, Effort.BYTES])
+def test_an_effort_that_was_not_counted_is_refused(effort):
+    with pytest.raises(SettingError, match=f"no count of {effort.value.split()[0]}"):
+        plot_gaps([Curve("x", history(4), 9.5)], effort)
+
+
+def test_stages_follow_each_other_and_what_has_no_logarithm_is_left_out():
+    first, second = history(5), history(4, 0.1)
+    nothing = Measurement(10.0, 0.0, np.inf)
+    second = replace(second, records=(Record(0, 0.0, nothing), *second.records[1:]))
+    figure = plot_convergence([("start", History()), ("SOC", first), ("Newton", second)], 10.0)
+    above, below = figure.axes
+    assert [line.get_label() for line in below.lines] == ["SOC, gap", "Newton, gap"]
+    assert below.lines[0].get_xdata().tolist() == [0, 1, 2, 3, 4]
+    assert below.lines[1].get_xdata().tolist() == [5, 6, 7]  # F is the bound itself at the first
+    np.testing.assert_allclose(below.lines[0].get_ydata(), Curve("", first, 10.0).gap, rtol=1e-12, atol=0)
+    assert len(above.lines) == 4
+
+
+def test_the_papers_mark_is_a_star_where_it_is_near_and_a_line_where_it_is_far():
+    near = plot_convergence([("SOC", history(12))], 10.0, PAPER).axes[1].lines[-1]
+    assert (near.get_xdata()[0], near.get_ydata()[0]) == (20, PAPER.gap)
+    far = plot_convergence([("SOC", history(3))], 10.0, PAPER).axes[1].lines[-1]
+    assert list(far.get_ydata()) == [PAPER.gap] * 2
+    assert "after 20" in far.get_label()
+
+
+def test_both_pictures_show_the_same_numbers():
+    stages = [("SOC", history(6)), ("Newton", history(3, 0.01))]
+    drawn = plot_convergence(stages, 9.0, PAPER)
+    explored = explore_convergence(stages, 9.0, PAPER)
+    gaps = {trace.name: trace for trace in explored.data if trace.name.endswith(": gap")}
+    for line in drawn.axes[1].lines[:2]:
+        trace = gaps[line.get_label().replace(", ", ": ")]
+        assert list(trace.x) == line.get_xdata().tolist()
+        np.testing.assert_allclose(trace.y, line.get_ydata(), rtol=1e-4, atol=0)
+    assert explored.data[-1].name.startswith("paper's SOC")
+
+
+@pytest.mark.parametrize("picture", [plot_convergence, explore_convergence])
+def test_a_run_without_records_is_refused(picture):
+    with pytest.raises(SettingError, match="no stage has a record"):
+        picture([("start", History())], 1.0)
+
+
+@pytest.mark.parametrize("effort", [Effort.ITERATIONS, Effort.SECONDS])
+def test_methods_are_told_apart_by_more_than_colour(effort):
+    figure = plot_gaps([Curve(name, history(9, factor), 9.5) for name, factor in (("a", 0.5), ("b", 0.3))], effort)
+    one, other = figure.axes[0].lines
+    assert one.get_color() != other.get_color()
+    assert one.get_marker() != other.get_marker()
+    assert one.get_linestyle() != other.get_linestyle()
+    assert effort.value in figure.axes[0].get_xlabel()
+
+
+def test_without_plotly_one_line_names_the_extra(monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *rest):
+        if name.startswith("plotly"):
+            raise ImportError(name)
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(MissingExtraError, match=r"pgo-splitting\[plot\]"):
+        explore_convergence([("SOC", history(4))], 9.0)

@@ -1,0 +1,369 @@
+import builtins
+import re
+import shlex
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from browser import Browser, find_browser
+
+import pgo_models as pgo
+import solvers
+from pgo_models.certificates.certificate import BoundSource
+from pgo_models.certificates.lower_bound import NO_BOUND
+from pgo_models.errors import SettingError
+from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.plots.interactive_plots import animate_poses, save_page
+from solvers import cli
+from solvers.network.ledger import Ledger, Traffic
+from solvers.reporting.report import report_page
+from solvers.reporting.report_text import advice, headline, meaning, percent
+
+plotly = pytest.importorskip("plotly")
+EMPTY = {"meta", "link", "br", "input", "img", "hr"}
+
+
+class Page(HTMLParser):
+    """What a reader finds: texts, tables by id, tags that ask for something; fails on tags that do not match."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.texts, self.tables, self.asked, self.open_tags, self.row, self.table = [], {}, [], [], None, None
+        self.scripts = 0
+        self.feed(text)
+        self.close()
+        assert self.open_tags == []
+
+    def handle_starttag(self, tag, attributes):
+        named = dict(attributes)
+        self.asked += [named[name] for name in ("src", "href", "srcset", "data", "action") if name in named]
+        self.scripts += tag == "script"
+        if tag not in EMPTY:
+            self.open_tags.append(tag)
+        if tag == "table":
+            self.table = self.tables.setdefault(named["id"], [])
+        if tag == "tr":
+            self.row = []
+            self.table.append(self.row)
+        if tag in ("td", "th"):
+            self.row.append("")
+
+    def handle_endtag(self, tag):
+        assert self.open_tags.pop() == tag
+        if tag == "tr":
+            self.row = None
+
+    def handle_data(self, data):
+        if self.open_tags and self.open_tags[-1] not in ("script", "style"):
+            self.texts.append(data)
+            if self.row:
+                self.row[-1] += data
+
+    @property
+    def text(self):
+        return " ".join(" ".join(self.texts).split())
+
+
+def own_part(text):
+    """The page without plotly's script."""
+    return text.replace(plotly.offline.get_plotlyjs(), "")
+
+
+@pytest.fixture(scope="module")
+def solution():
+    return solvers.solve(pgo.load("robots"))
+
+
+@pytest.fixture(scope="module")
+def uncertain():
+    graph = pgo.random_geometric(12, np.random.default_rng(5), noise=NoiseModel(1.0, 2.5))
+    solution = solvers.solve(graph)
+    assert not solution.is_certified
+    return solution
+
+
+@pytest.fixture(scope="module")
+def page(solution):
+    return Page(report_page(solution))
+
+
+def test_the_numbers_are_those_of_the_solution(solution, page):
+    for figure in (solution.objective, solution.lower_bound):
+        assert f"{figure:.10g}" in page.text
+    assert f"{solution.gap:.3g}" in page.text
+    assert "CERTIFIED" in page.text
+    head, *stages = page.tables["stages"]
+    assert head == ["stage", "iterations", "F", "seconds", "ended"]
+    assert [row[0] for row in stages] == [stage.name for stage in solution.stages]
+    assert [row[2] for row in stages] == [f"{stage.objective:.10g}" for stage in solution.stages]
+    assert f"{pgo.absolute_trajectory_error(solution.poses, solution.problem.graph.truth):.4g} m" in page.text
+
+
+def test_the_worst_edges_come_first_with_their_figures(solution, page):
+    graph = solution.problem.graph
+    residuals = pgo.edge_residuals(graph, solution.poses)
+    head, *rows = page.tables["edges"]
+    assert len(rows) == min(100, graph.num_edges)
+    costs = [float(row[head.index("cost")]) for row in rows]
+    assert costs == sorted(costs, reverse=True)
+    for row in rows:
+        e = int(row[0])
+        figures = [residuals.cost[e], residuals.translation[e], np.rad2deg(residuals.rotation[e])]
+        shown = [float(row[head.index(name)]) for name in ("cost", "error (m)", "error (deg)")]
+        np.testing.assert_allclose(shown, figures, rtol=1e-3, atol=0)
+        assert (
+            row[head.index("from pose")]
+            == f"{'abcd'[graph.robots[graph.i[e]]]}{int(graph.pose_ids[graph.i[e]]) % 2**56}"
+        )
+        assert int(row[head.index("to robot")]) == graph.robots[graph.j[e]]
+    assert max(costs) == pytest.approx(residuals.cost.max(), rel=1e-3)
+
+
+def test_the_robots_share_everything(solution, page):
+    graph = solution.problem.graph
+    head, *rows = page.tables["robots"]
+    columns = {name: [float(row[k].rstrip(" %").replace(",", "")) for row in rows] for k, name in enumerate(head)}
+    assert sum(columns["poses"]) == graph.num_poses
+    assert sum(columns["own edges"]) + sum(columns["edges to others"]) / 2 == graph.num_edges
+    assert sum(columns["share of F"]) == pytest.approx(100, abs=0.5 * len(rows))
+    robots = pgo.partition(graph)
+    assert sum(columns["separators"]) == len(robots.separators(graph))
+
+
+def test_a_solve_by_robots_shows_their_communication():
+    graph = pgo.load("sphere")
+    solved = solvers.solve(graph, robots=3)
+    page = Page(report_page(solved))
+    assert [int(row[1]) for row in page.tables["robots"][1:]] == solved.robots.sizes.tolist()
+    assert f"{solved.ledger.rounds} rounds" in page.text
+
+
+def test_robots_of_the_solve_are_shown_where_the_graph_names_none():
+    graph = pgo.load("sphere")
+    soc = solvers.SOC(robots=pgo.partition(graph, 3))
+    page = Page(report_page(solvers.solve(graph, solvers.Pipeline(soc=soc))))
+    assert [row[1] for row in page.tables["robots"][1:]] == ["17", "17", "16"]
+    assert "contiguous in time" in page.text
+
+
+def test_more_robots_than_can_be_read_are_cut_to_the_costliest():
+    graph = pgo.random_geometric(250, np.random.default_rng(0))
+    solution = solvers.solve(graph.with_robots(np.arange(250)))
+    page = Page(report_page(solution))
+    assert len(page.tables["robots"]) == 1 + 200
+    assert "Shown are the 200 with the largest share of F." in page.text
+
+
+def test_communication_is_shown_when_it_was_counted(solution):
+    count = solution.problem.graph.num_robots
+    ring = np.arange(count)
+    traffic = Traffic(ring, (ring + 1) % count, 80 * (1 + ring))
+    ledger = Ledger(count).after_round(traffic).after_round(traffic).after_all_reduce(10)
+    page = Page(report_page(replace(solution, ledger=ledger, robots=pgo.partition(solution.problem.graph))))
+    assert f"2 rounds, {2 * count} messages, {ledger.num_bytes:,} bytes, 1 all-reduces" in page.text
+    head, *rows = page.tables["robots"]
+    for name, expected in (("bytes sent", ledger.bytes_sent), ("bytes received", ledger.bytes_received)):
+        assert [int(row[head.index(name)].replace(",", "")) for row in rows] == expected.tolist()
+    assert "bytes sent" not in Page(report_page(solution)).tables["robots"][0]
+
+
+def test_settings_and_versions_are_on_the_page(solution, page):
+    soc = next(stage.method for stage in solution.stages if isinstance(stage.method, solvers.SOC))
+    assert f"tolerance {soc.tolerance}" in page.text
+    assert f"numpy {np.__version__}" in page.text
+
+
+@pytest.mark.parametrize("name", ["</script><script>alert(1)</script>", "<img src=x onerror=alert(1)>", "a&b\"c'd"])
+def test_names_are_escaped_wherever_they_stand(name, solution):
+    graph = replace(solution.problem.graph, name=name)
+    renamed = replace(solution, problem=pgo.PGOProblem(graph))
+    text = own_part(report_page(renamed))
+    found = Page(text)
+    assert name in found.text
+    assert found.scripts == 2
+    assert found.asked == ["data:,"]
+    assert text.count("</script>") == 2
+
+
+def test_the_page_asks_for_nothing_online(solution):
+    text = report_page(solution)
+    assert text.count("plotly.js v") == 1
+    found = Page(own_part(text))
+    assert found.asked == ["data:,"]  # the icon, which browsers would else ask for
+    assert "default-src 'none'" in text
+    assert "@import" not in own_part(text)
+    assert "url(" not in own_part(text)
+
+
+def test_ten_thousand_poses_take_less_than_five_megabytes_beside_the_library(solution):
+    graph = pgo.random_geometric(10_000, np.random.default_rng(0), d=3, mean_degree=6.0)
+    large = replace(solution, problem=pgo.PGOProblem(graph), poses=graph.truth)
+    assert graph.num_edges > 20_000
+    assert len(own_part(report_page(large)).encode()) < 5e6
+
+
+def test_a_report_is_written_whole_under_a_pages_name_only(solution, tmp_path):
+    solution.report(tmp_path / "out.html")
+    assert [file.name for file in tmp_path.iterdir()] == ["out.html"]
+    with pytest.raises(SettingError, match=r"ends in \.html"):
+        solution.report(tmp_path / "out.pdf")
+    with pytest.raises(pgo.PGOError, match="cannot write"):
+        solution.report(tmp_path / "no" / "out.html")
+
+
+def test_without_plotly_one_line_names_the_extra_before_anything_is_solved(monkeypatch, tmp_path, capsys):
+    real = builtins.__import__
+
+    def without(name, *rest):
+        if name.startswith("plotly"):
+            raise ImportError(name)
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(SystemExit) as end:
+        cli.main(["solve", "no-such-graph", "--report", str(tmp_path / "out.html")])
+    err = capsys.readouterr().err
+    assert (end.value.code, err.count("\n")) == (1, 1)
+    assert "pgo-splitting[plot]" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("unit_weights", [False, True])
+def test_the_command_line_writes_one_whose_commands_can_be_typed(unit_weights, tmp_path, capsys):
+    options = ["--unit-weights"] if unit_weights else []
+    with pytest.raises(SystemExit) as end:
+        cli.main(["solve", "grid", *options, "--report", str(tmp_path / "out.html")])
+    assert end.value.code == 0
+    assert f"written: {tmp_path / 'out.html'}" in capsys.readouterr().out
+    commands = re.findall("<code>(.*?)</code>", own_part((tmp_path / "out.html").read_text(encoding="utf-8")))
+    assert commands[0].split()[:3] == ["pgo", "solve", "grid"]
+    assert all(("--unit-weights" in command) == unit_weights for command in commands)
+
+
+def cases(solution, uncertain):
+    graph, certificate = solution.problem.graph, solution.certificate
+    yield graph, certificate, solvers.Status.CONVERGED
+    yield graph, replace(certificate, wanted_gap=1e-9), solvers.Status.CONVERGED
+    yield graph, replace(certificate, verdict=pgo.Verdict.EXACT, gap=0.0), solvers.Status.CONVERGED
+    for status in solvers.Status:
+        yield uncertain.problem.graph, uncertain.certificate, status
+    wide = replace(certificate, verdict=pgo.Verdict.NOT_CERTIFIED, gap=0.25)
+    yield graph, wide, solvers.Status.CONVERGED
+    yield graph, replace(wide, source=BoundSource.RELAXATION), solvers.Status.CONVERGED
+    yield graph, replace(wide, gap=3e-9, wanted_gap=1e-12), solvers.Status.CONVERGED
+    yield graph, replace(wide, verdict=pgo.Verdict.TRIVIAL, gap=1.0, bound=NO_BOUND), solvers.Status.CONVERGED
+
+
+def test_every_case_has_a_verdict_and_something_to_try(solution, uncertain, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    known = {option for command in ("solve", "certify") for option in options_of(command)}
+    for graph, certificate, status in cases(solution, uncertain):
+        assert certificate.is_certified == headline(certificate).startswith("Certified")
+        assert f"{certificate.objective:.10g}" in meaning(certificate)[0]
+        found = advice(graph, certificate, status, 3)
+        assert any(one.command for one in found)
+        assert any("3 edges" in one.text for one in found)
+        for one in found:
+            words = shlex.split(one.command)
+            assert not words or words[0] == "pgo"
+            assert {word for word in words if word.startswith("--")} <= known
+        assert status.is_success or "run" in found[0].text or "overflowed" in found[0].text
+
+
+def options_of(command):
+    import typer
+
+    return [text for parameter in typer.main.get_command(cli.app).commands[command].params for text in parameter.opts]
+
+
+def test_a_gap_that_was_nearly_reached_is_offered(solution):
+    nearly = replace(solution.certificate, verdict=pgo.Verdict.NOT_CERTIFIED, gap=3e-9, wanted_gap=1e-12)
+    commands = [one.command for one in advice(solution.problem.graph, nearly, solvers.Status.CONVERGED, 0, "x y.g2o")]
+    assert "pgo solve x y.g2o --gap 1e-08" in commands
+
+
+def test_exact_measurements_are_reported_too():
+    graph = pgo.circle(np.random.default_rng(0))
+    exact = replace(
+        graph,
+        R_ij=np.swapaxes(graph.truth.R[graph.i], 1, 2) @ graph.truth.R[graph.j],
+        t_ij=np.einsum("mba,mb->ma", graph.truth.R[graph.i], graph.truth.t[graph.j] - graph.truth.t[graph.i]),
+        information=None,
+    )
+    solution = solvers.solve(exact)
+    assert solution.is_certified
+    page = Page(report_page(solution))
+    assert solution.certificate.verdict is pgo.Verdict.EXACT
+    assert "F cannot be told from zero" in page.text
+    assert "nan" not in page.text
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [(0.0, "0 %"), (1.0, "100 %"), (0.123456, "12 %"), (1e-3, "0.1 %"), (4.6e-3, "0.46 %"), (1.28e-14, "1.3e-12 %")],
+)
+def test_percentages_have_two_digits(share, text):
+    assert percent(share) == text
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    if find_browser() is None:
+        pytest.skip("no chromium or chrome on PATH to open the page in")
+    with Browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+def test_the_browser_hears_what_goes_wrong(browser, tmp_path):
+    page = tmp_path / "wrong.html"
+    page.write_text("<img src='missing.png'><script>console.error('one'); throw Error('two')</script>")
+    browser.open(page)
+    browser.wait_for("true")
+    told = " ".join(browser.errors)
+    assert all(word in told for word in ("one", "two", "missing.png"))
+    assert (tmp_path / "missing.png").as_uri() in browser.requests
+
+
+@pytest.mark.parametrize("which", ["solution", "uncertain", "plane"])
+def test_a_browser_shows_it_without_a_complaint_and_sorts_the_table(which, browser, tmp_path, request):
+    if which == "plane":
+        solved = solvers.solve(pgo.random_geometric(40, np.random.default_rng(0), d=2))
+    else:
+        solved = request.getfixturevalue(which)
+    solved.report(tmp_path / "out.html")
+    browser.open(tmp_path / "out.html")
+    browser.wait_for("document.querySelectorAll('.plot .main-svg').length > 0")
+    place = "graph2d" if which == "plane" else "graph3d"
+    for plot in (place, "convergence"):
+        browser.wait_for(f"document.getElementById('{plot}')._fullData?.length > 0")
+        assert browser.value(f"document.getElementById('{plot}').getBoundingClientRect().height") > 300
+    # WebGL has drawn: no message in its place.
+    assert browser.value(f"document.querySelectorAll('#{place} canvas').length") > 0
+    assert "WebGL is not supported" not in browser.value("document.body.innerText")
+    column = browser.value(
+        "[...document.querySelectorAll('#edges th')].findIndex(head => head.innerText.startsWith('error (m)'))"
+    )
+    cells = f"[...document.querySelectorAll('#edges tbody tr')].map(row => +row.cells[{column}].dataset.value)"
+    before = browser.value(cells)
+    for descending in (True, False):
+        browser.click(f"#edges th:nth-child({column + 1}) button")
+        assert browser.value(cells) == sorted(before, reverse=descending)
+    assert browser.value("document.querySelector('#edges th[aria-sort]').getAttribute('aria-sort')") == "ascending"
+    assert browser.errors == []
+    assert browser.requests == [(tmp_path / "out.html").as_uri()]
+
+
+def test_a_film_steps_through_its_iterates_in_a_browser(browser, tmp_path):
+    graph = pgo.circle(np.random.default_rng(0))
+    film = animate_poses(graph, [pgo.spanning_tree_start(graph), graph.truth], ["tree", "truth"])
+    save_page(film, tmp_path / "film.html")
+    browser.open(tmp_path / "film.html")
+    browser.wait_for("document.querySelectorAll('.slider-group').length > 0")
+    plot = "document.querySelector('.plotly-graph-div')"
+    assert browser.value(f"{plot}._fullLayout.sliders[0].active") == 0
+    browser.value(f"Plotly.animate({plot}, ['truth'], {{mode: 'immediate'}}).then(() => true)")
+    browser.wait_for(f"{plot}._fullLayout.sliders[0].active === 1")
+    shown = browser.value(f"Array.from({plot}._fullData[0].x).slice(0, 1)")[0]
+    np.testing.assert_allclose(shown, graph.truth.t[graph.i[0], 0], rtol=1e-6, atol=1e-6)
+    assert browser.errors == []

@@ -1,0 +1,153 @@
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from graphs import (
+    DIMENSIONS,
+    LOUD_NOISE,
+    OPTIMUM,
+    SEEDS,
+    SIZES,
+    exact_graph,
+    optimum_tolerance,
+    random_poses,
+    varied_graph,
+    varied_problem,
+)
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, polish, relative_decrement
+from pgo_models.errors import GraphError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.loop import run
+from solvers.result import Status
+from solvers.riemannian.newton import Newton, gauss_newton
+
+ROUNDING = 1e-14  # the relative change of F that a step does not tell apart from none
+METHODS = pytest.mark.parametrize("method", [Newton(), gauss_newton()], ids=["newton", "gauss_newton"])
+
+
+@METHODS
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, spread=st.sampled_from([1.0, 1e3, 1e6]))
+def test_F_never_rises_from_hostile_starts(method: Newton, seed: int, n: int, d: int, spread: float) -> None:
+    problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE))
+    start = random_poses(n, d, seed, spread)
+    result = run(Newton(max_iterations=15, second_order=method.second_order), problem, start)
+    F = result.history.objective
+    assert F[0] == problem.objective(start)
+    assert (F[1:] <= F[:-1] * (1 + ROUNDING)).all()
+    assert np.isfinite(F).all()
+    assert result.objective == problem.objective(result.poses)
+    assert result.status is not Status.NOT_FINITE
+
+
+@METHODS
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_it_ends_at_rounding_level(method: Newton, seed: int, n: int, d: int) -> None:
+    problem = varied_problem(seed, n, d)
+    result = run(method, problem)
+    assert result.status is Status.CONVERGED
+    assert result.history.dual_residual[-1] <= method.tolerance
+    assert relative_decrement(problem, result.poses) <= 10 * STATIONARY_DECREMENT
+    expected = problem.objective(polish(problem, chordal_start(problem)))
+    assert result.objective == pytest.approx(expected, rel=1e-10, abs=1e-12)
+
+
+@METHODS
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_graphs_without_noise_end_at_zero(method: Newton, seed: int, n: int, d: int) -> None:
+    problem = PGOProblem(exact_graph(seed, n, d))
+    for start in (None, problem.graph.truth):
+        result = run(method, problem, start)
+        assert result.status is Status.CONVERGED
+        assert result.objective <= 1e-20
+
+
+@pytest.mark.parametrize("name", OPTIMUM)
+def test_the_certified_optimum_is_reached_on_every_benchmark(
+    name: str, benchmark_problem: Callable[[str], PGOProblem]
+) -> None:
+    result = run(Newton(), benchmark_problem(name))
+    assert result.status is Status.CONVERGED
+    assert result.objective == pytest.approx(OPTIMUM[name], rel=0, abs=optimum_tolerance(name))
+    F = result.history.objective
+    assert (F[1:] <= F[:-1] * (1 + ROUNDING)).all()
+
+
+@pytest.mark.parametrize("name", ["tinyGrid3D", "smallGrid3D", "sphere2500", "intel"])
+def test_gauss_newton_reaches_it_too(name: str, benchmark_problem: Callable[[str], PGOProblem]) -> None:
+    result = run(gauss_newton(), benchmark_problem(name))
+    assert result.status is Status.CONVERGED
+    assert result.objective == pytest.approx(OPTIMUM[name], rel=0, abs=optimum_tolerance(name))
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_it_converges_fast_near_the_end(seed: int, n: int, d: int) -> None:
+    problem = varied_problem(seed, n, d)
+    result = run(Newton(), problem)
+    assert result.iterations <= 10
+    decrements = result.history.dual_residual
+    late = np.flatnonzero(decrements < 1e-4)
+    assert all(decrements[k] <= 0.01 * decrements[k - 1] for k in late[1:] if decrements[k] > STATIONARY_DECREMENT)
+
+
+def test_a_tolerance_below_rounding_stalls_and_says_so() -> None:
+    problem = varied_problem(0, 10, 3)
+    result = run(Newton(tolerance=1e-300), problem)
+    assert result.status in (Status.STALLED, Status.CONVERGED)
+    assert result.status.is_success
+    assert result.iterations < Newton.max_iterations
+    assert relative_decrement(problem, result.poses) <= STATIONARY_DECREMENT
+
+
+def test_the_default_start_is_the_chordal_one() -> None:
+    problem = varied_problem(0, 8, 3)
+    state = Newton().init(problem, None)
+    np.testing.assert_array_equal(state.polish.poses.R, chordal_start(problem).R)
+    assert state.k == 0
+
+
+def test_a_state_tells_of_its_poses() -> None:
+    problem = varied_problem(0, 8, 3)
+    newton = Newton()
+    state = newton.step(problem, newton.init(problem, random_poses(8, 3, 0)))
+    measurement = newton.measure(problem, state)
+    poses = newton.poses(problem, state)
+    assert state.k == 1
+    assert measurement.objective == problem.objective(poses)
+    assert measurement.primal_residual == 0.0
+    # The decrement is that of the poses of the state, with the matrix of the step.
+    assert measurement.dual_residual > 0
+
+
+def test_gauss_newton_is_newton_with_another_matrix() -> None:
+    method = gauss_newton(7)
+    assert method == Newton(max_iterations=7, second_order=False, secants=False)
+    problem = varied_problem(0, 8, 3)
+    state = method.init(problem, None)
+    for _ in range(3):
+        state = method.step(problem, state)
+        assert not state.polish.is_newton
+
+
+def test_the_start_must_fit() -> None:
+    with pytest.raises(GraphError, match="give one pose for every pose of the graph"):
+        Newton().init(varied_problem(0, 5, 3), Poses.identity(4, 3))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"tolerance": 0.0}, "tolerance must be positive, got"),
+        ({"tolerance": -1.0}, "tolerance must be positive"),
+        ({"tolerance": np.nan}, "tolerance must be positive"),
+        ({"max_iterations": -1}, "max_iterations must not be negative, got -1"),
+    ],
+)
+def test_settings_are_checked(settings: dict[str, float], message: str) -> None:
+    for kind in (SettingError, ValueError):
+        with pytest.raises(kind, match=message):
+            Newton(**settings)

@@ -1,0 +1,128 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, SEEDS, SIZES, exact_graph, random_poses, varied_graph, varied_problem
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.errors import PGOError, SettingError
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.soc.penalty import (
+    BalancedPenalty,
+    BoydPenalty,
+    FixedPenalty,
+    MultiplierPenalty,
+    rotation_scale,
+    translation_scale,
+)
+
+RESIDUALS = st.floats(1e-12, 1e3)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, factor=st.floats(1.0, 20.0), quantile=st.floats(0.0, 1.0))
+def test_the_multiplier_penalty_is_its_formula(seed: int, n: int, d: int, factor: float, quantile: float) -> None:
+    problem, poses = varied_problem(seed, n, d), random_poses(n, d, seed)
+    M = problem.M.toarray()
+    Lambda = multipliers(problem, poses)
+    norms = np.array([np.linalg.norm(block, 2) for block in Lambda])
+    m = np.array([np.trace(M[n + d * i : n + d * (i + 1), n + d * i : n + d * (i + 1)]) / d for i in range(n)])
+    q = np.quantile(norms / m, quantile)
+    rho = MultiplierPenalty(factor=factor, quantile=quantile).initial(problem, poses)
+    np.testing.assert_allclose(rho, factor * np.maximum(norms, q * m), rtol=1e-9, atol=0)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, exponent=st.integers(-20, 20))
+def test_rules_without_a_unit_scale_with_the_weights(seed: int, n: int, d: int, exponent: int) -> None:
+    graph = varied_graph(seed, n, d)
+    scale = 2.0**exponent
+    problem = PGOProblem(graph)
+    scaled = PGOProblem(replace(graph, kappa=scale * graph.kappa, tau=scale * graph.tau))
+    poses = random_poses(n, d, seed)
+    for rule in (MultiplierPenalty(), BalancedPenalty()):
+        np.testing.assert_allclose(
+            rule.initial(scaled, poses), scale * rule.initial(problem, poses), rtol=1e-12, atol=0
+        )
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, translation=st.floats(0.0, 1e3))
+def test_the_world_does_not_matter(seed: int, n: int, d: int, translation: float) -> None:
+    problem, poses = varied_problem(seed, n, d), random_poses(n, d, seed)
+    world = random_poses(1, d, seed + 1)
+    moved = poses.moved(world.R[0], translation * world.t[0])
+    rule = MultiplierPenalty()
+    np.testing.assert_allclose(
+        rule.initial(problem, moved), rule.initial(problem, poses), rtol=1e-9 * (1 + translation), atol=0
+    )
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_without_noise_the_penalty_stays_above_rounding(seed: int, n: int, d: int) -> None:
+    problem = PGOProblem(exact_graph(seed, n, d))
+    assert problem.graph.truth is not None
+    for poses in (problem.graph.truth, chordal_start(problem)):
+        rho = MultiplierPenalty().initial(problem, poses)
+        assert (rho >= 1e-6 * rotation_scale(problem)).all()
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_scales_are_diagonals_of_M(seed: int, n: int, d: int) -> None:
+    problem = varied_problem(seed, n, d)
+    diagonal = problem.M.toarray().diagonal()
+    np.testing.assert_array_equal(translation_scale(problem), diagonal[:n])
+    np.testing.assert_allclose(rotation_scale(problem), diagonal[n:].reshape(n, d).mean(axis=1), rtol=1e-15, atol=0)
+    np.testing.assert_array_equal(
+        BalancedPenalty(scale=0.5).initial(problem, random_poses(n, d, 0)), 0.5 * rotation_scale(problem)
+    )
+    np.testing.assert_array_equal(FixedPenalty(7.0).initial(problem, random_poses(n, d, 0)), np.full(n, 7.0))
+
+
+@given(primal=RESIDUALS, dual=RESIDUALS)
+def test_balancing_moves_rho_towards_the_larger_residual(primal: float, dual: float) -> None:
+    rule = BalancedPenalty()
+    factor = rule.factor(primal, dual)
+    assert 1 / rule.refactor_ratio <= factor <= rule.refactor_ratio
+    assert factor == pytest.approx(1 / rule.factor(dual, primal))
+    ratio = primal / dual
+    if factor > 1:
+        assert ratio >= rule.refactor_ratio**2 * (1 - 1e-9)
+    if factor < 1:
+        assert 1 / ratio >= rule.refactor_ratio**2 * (1 - 1e-9)
+    if ratio > rule.refactor_ratio**2 * (1 + 1e-9):
+        assert factor > 1
+    # The matrices are factored again only for a change that is worth it.
+    assert factor == 1 or max(factor, 1 / factor) == pytest.approx(rule.refactor_ratio)
+
+
+@pytest.mark.parametrize(("primal", "dual", "direction"), [(1.0, 0.0, 1), (0.0, 1.0, -1), (0.0, 0.0, 0)])
+def test_balancing_bears_residuals_of_zero(primal: float, dual: float, direction: int) -> None:
+    assert np.sign(np.log(BalancedPenalty().factor(primal, dual))) == direction
+
+
+@pytest.mark.parametrize(
+    ("rule", "settings", "message"),
+    [
+        (MultiplierPenalty, {"factor": 0.0}, r"factor must be positive, got 0\.0"),
+        (MultiplierPenalty, {"factor": np.nan}, "factor must be positive"),
+        (MultiplierPenalty, {"quantile": -0.1}, r"quantile must be in \[0, 1\]"),
+        (MultiplierPenalty, {"quantile": 1.1}, r"quantile must be in \[0, 1\]"),
+        (MultiplierPenalty, {"stall_window": 0}, "stall_window must be at least 1"),
+        (MultiplierPenalty, {"stall_ratio": 1.0}, r"stall_ratio in \(0, 1\)"),
+        (MultiplierPenalty, {"stall_ratio": 0.0}, r"stall_ratio in \(0, 1\)"),
+        (MultiplierPenalty, {"max_refreshes": -1}, "max_refreshes must not be negative"),
+        (FixedPenalty, {"rho": 0.0}, "rho must be positive"),
+        (FixedPenalty, {"rho": -1.0}, "rho must be positive"),
+        (FixedPenalty, {"rho": np.nan}, "rho must be positive"),
+        (BalancedPenalty, {"scale": 0.0}, "scale must be positive"),
+        (BalancedPenalty, {"refactor_ratio": 0.5}, "refactor_ratio must be above 1"),
+        (BoydPenalty, {"scale": 0.0}, "scale must be positive"),
+        (BoydPenalty, {"imbalance": 1.0}, "imbalance and growth must be above 1"),
+        (BoydPenalty, {"growth": np.nan}, "imbalance and growth must be above 1"),
+    ],
+)
+def test_settings_are_checked(rule: type, settings: dict[str, float], message: str) -> None:
+    for kind in (SettingError, PGOError, ValueError):
+        with pytest.raises(kind, match=message):
+            rule(**settings)

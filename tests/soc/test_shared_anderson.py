@@ -1,0 +1,96 @@
+import numpy as np
+from graphs import SEEDS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pgo_models.geometry.rotations import Array
+from solvers.soc.anderson import Anderson, AndersonMemory, extrapolate
+from solvers.soc.shared_anderson import AndersonShare, AndersonSums
+
+
+class Parties:
+    """Rows spread over parties at random, and the two sums and one answer by which they accelerate together."""
+
+    def __init__(self, rng: np.random.Generator, rows: int, number: int) -> None:
+        self.owner = rng.integers(0, number, rows)  # some may own none
+        self.shares = [AndersonShare() for _ in range(number)]
+        self.sums = AndersonSums()
+        self.restarts = 0
+
+    def extrapolate(self, settings: Anderson, residual: Array, image: Array) -> Array:
+        told = []
+        for party, share in enumerate(self.shares):
+            rows = self.owner == party
+            sums, self.shares[party] = share.observe(residual[rows], image[rows], settings.memory)
+            told.append(sums)
+        gamma, self.sums = self.sums.coefficients(settings, np.sum(told, axis=0))
+        if gamma is None:
+            self.restarts += 1
+            self.shares = [share.restarted() for share in self.shares]
+            gamma = np.zeros(0)
+        following = np.empty_like(image)
+        for party, share in enumerate(self.shares):
+            following[self.owner == party] = share.combine(gamma)
+        return following
+
+
+@settings(max_examples=40)
+@given(seed=SEEDS, rows=st.integers(1, 40), number=st.integers(1, 6), memory=st.integers(1, 8))
+def test_parties_take_the_steps_that_one_would_take(seed: int, rows: int, number: int, memory: int) -> None:
+    # Residuals without order, so that the memory fills, is emptied again and again, and fills again.
+    rng = np.random.default_rng(seed)
+    rule = Anderson(memory=memory, restart_ratio=3.0, regularization=1e-6)
+    parties, alone, restarts = Parties(rng, rows, number), AndersonMemory(), 0
+    for _ in range(40):
+        residual = np.exp(rng.normal(0.0, 0.7)) * rng.standard_normal((rows, 3)) / np.sqrt(3 * rows)
+        image = rng.standard_normal((rows, 3))
+        before = alone
+        expected, alone = extrapolate(rule, alone, residual, image)
+        restarts += before.residual is not None and not alone.residual_differences
+        found = parties.extrapolate(rule, residual, image)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * (1 + np.abs(expected).max()))
+        assert parties.restarts == restarts
+        for share in parties.shares:
+            assert len(share.residual_differences) == len(share.image_differences) == len(alone.residual_differences)
+    np.testing.assert_allclose(parties.sums.gram, alone.gram, rtol=1e-9, atol=1e-9)
+
+
+def test_restarts_and_a_full_memory_do_occur() -> None:
+    rng = np.random.default_rng(0)
+    rule = Anderson(memory=4, restart_ratio=3.0)
+    parties = Parties(rng, 20, 3)
+    lengths = []
+    for _ in range(60):
+        residual = np.exp(rng.normal(0.0, 0.7)) * rng.standard_normal((20, 3))
+        parties.extrapolate(rule, residual, rng.standard_normal((20, 3)))
+        lengths.append(len(parties.shares[0].residual_differences))
+    assert parties.restarts >= 2
+    assert lengths.count(4) >= 5
+
+
+@settings(max_examples=30)
+@given(seed=SEEDS, side=st.integers(2, 20), number=st.integers(1, 5))
+def test_a_contraction_is_solved_together_as_alone(seed: int, side: int, number: int) -> None:
+    rng = np.random.default_rng(seed)
+    basis = np.linalg.qr(rng.standard_normal((side, side)))[0]
+    T = (basis * rng.uniform(-0.9, 0.9, side)) @ basis.T
+    fixed = rng.standard_normal((side, 1))
+    s = np.zeros((side, 1))
+    parties = Parties(rng, side, number)
+    for _ in range(120):
+        image = fixed + T @ (s - fixed)
+        s = parties.extrapolate(Anderson(memory=5), image - s, image)
+    np.testing.assert_allclose(s, fixed, rtol=0, atol=1e-6 * np.linalg.norm(fixed))
+
+
+def test_what_was_is_left_alone() -> None:
+    rng = np.random.default_rng(0)
+    share = AndersonShare()
+    for _ in range(5):
+        kept = (share.residual_differences, share.image_differences, share.residual, share.image)
+        _, following = share.observe(rng.standard_normal((4, 2)), rng.standard_normal((4, 2)), 3)
+        assert (share.residual_differences, share.image_differences, share.residual, share.image) == kept
+        image = following.image.copy()
+        following.combine(np.ones(len(following.image_differences)))
+        np.testing.assert_array_equal(following.image, image)
+        share = following

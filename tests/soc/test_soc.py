@@ -1,0 +1,281 @@
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+from graphs import (
+    DIMENSIONS,
+    LOUD_NOISE,
+    SEEDS,
+    exact_graph,
+    varied_graph,
+    varied_problem,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.newton_polish import polish, relative_decrement
+from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import orthogonality_error, project_by_svd, stack_transposes, unstack_transposes
+from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
+from pgo_models.graphs.scenes import grid
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.loop import iterate, run
+from solvers.result import Measurement, Status
+from solvers.soc.anderson import Anderson, AndersonMemory, extrapolate
+from solvers.soc.paper import PaperSOC
+from solvers.soc.penalty import FixedPenalty, MultiplierPenalty, rotation_scale, translation_scale
+from solvers.soc.soc import SOC, Coupling
+from solvers.soc.state import SOCState
+
+SIZES = st.integers(3, 12)
+METHODS = st.sampled_from([PartitionMethod.CONTIGUOUS, PartitionMethod.METIS, PartitionMethod.SINGLETONS])
+
+
+def robots_of(problem: PGOProblem, seed: int, method: PartitionMethod) -> Partition:
+    return partition(problem.graph, 2 + seed % (problem.num_poses - 1), method)
+
+
+def fixed_penalty(problem: PGOProblem) -> FixedPenalty:
+    return FixedPenalty(float(np.median(rotation_scale(problem))))
+
+
+# The recursion, literally.
+
+
+@pytest.mark.parametrize("alpha", [0.7, 1.0, 1.6])
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_joint_is_algorithm_one_with_translations(alpha: float, seed: int, n: int, d: int) -> None:
+    problem = varied_problem(seed, n, d)
+    rule = fixed_penalty(problem)
+    soc = SOC(penalty=rule, alpha=alpha, acceleration=None)
+    start = chordal_start(problem)
+    D = np.concatenate([np.zeros(n), np.full(d * n, rule.rho)])
+    K = problem.M.toarray() + 0.5 * np.diag(D)
+    omega, B = stack_transposes(start.R), np.zeros((d * n, d))
+    for state in islice(iterate(soc, problem, start), 1, 12):
+        X = np.linalg.lstsq(K, 0.5 * D[:, None] * np.concatenate([np.zeros((n, d)), omega - B]), rcond=1e-14)[0]
+        x = alpha * X[n:] + (1 - alpha) * omega  # (a)
+        omega = stack_transposes(project_by_svd(unstack_transposes(x + B)))  # (b)
+        B = B + x - omega  # (c)
+        np.testing.assert_allclose(stack_transposes(state.omega), omega, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(state.x, X[n:], rtol=0, atol=1e-8)
+        np.testing.assert_allclose(state.B, B, rtol=0, atol=1e-8)
+
+
+@given(
+    seed=SEEDS,
+    n=SIZES,
+    d=DIMENSIONS,
+    method=METHODS,
+    alpha=st.sampled_from([1.0, 1.5]),
+    local_passes=st.sampled_from([1, 3]),
+)
+def test_consensus_is_its_recursion_robot_by_robot(
+    seed: int, n: int, d: int, method: PartitionMethod, alpha: float, local_passes: int
+) -> None:
+    problem = varied_problem(seed, n, d)
+    rule = fixed_penalty(problem)
+    soc = SOC(
+        robots=robots_of(problem, seed, method),
+        penalty=rule,
+        alpha=alpha,
+        acceleration=None,
+        local_passes=local_passes,
+        translation_penalty=0.1,
+    )
+    states = iterate(soc, problem)
+    first = next(states)
+    team = first.team
+    whole = np.concatenate([0.1 * translation_scale(problem), np.full(d * n, rule.rho)])
+    share = (whole / np.maximum(team.copies, 1))[team.row]
+    z, B = first.z, first.B
+    for state in islice(states, 8):
+        x, z, B = np.empty_like(z), z.copy(), B.copy()
+        for robot, rows in zip(team.robots, team.slices, strict=True):
+            for left in range(local_passes)[::-1]:
+                K, b = robot.M.toarray(), np.zeros((robot.M.shape[0], d))
+                K[robot.held, robot.held] += 0.5 * share[rows]
+                b[robot.held] = 0.5 * share[rows, None] * (z - B)[rows]
+                x[rows] = np.linalg.solve(K, b)[robot.held]
+                for row in range(rows.start, rows.stop if left else rows.start):
+                    if team.row[row] < n or (team.row[row] - n) % d or team.copies[team.row[row]] > 1:
+                        continue
+                    pose = slice(row, row + d)  # no other robot knows it: its omega is its robot's own affair
+                    s = (x + B)[pose]
+                    z[pose] = project_by_svd(s.T[None])[0].T
+                    B[pose] = s - z[pose]
+        relaxed = alpha * x + (1 - alpha) * z
+        mean = np.zeros((problem.side, d))
+        for row in np.unique(team.row):
+            mean[row] = (relaxed + B)[team.row == row].mean(axis=0)
+        mean[n:] = stack_transposes(project_by_svd(unstack_transposes(mean[n:])))
+        z = mean[team.row]
+        B = B + relaxed - z
+        scale = 1 + np.abs(z).max()
+        np.testing.assert_allclose(state.z, z, rtol=0, atol=1e-7 * scale)
+        np.testing.assert_allclose(state.B, B, rtol=0, atol=1e-7 * scale)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, accelerated=st.booleans())
+def test_what_a_state_says_of_itself(seed: int, n: int, d: int, accelerated: bool) -> None:
+    problem = varied_problem(seed, n, d)
+    soc = SOC(penalty=fixed_penalty(problem), acceleration=Anderson() if accelerated else None)
+    states = list(islice(iterate(soc, problem), 8))
+    for k, state in enumerate(states):
+        assert state.k == k
+        assert orthogonality_error(state.omega).max() <= 1e-13
+        np.testing.assert_array_equal(state.z, stack_transposes(state.omega))
+        np.testing.assert_array_equal(state.B, state.s - state.z)
+        poses = soc.poses(problem, state)
+        np.testing.assert_array_equal(poses.R, state.omega)
+        assert soc.measure(problem, state).objective == problem.objective(poses)
+        if k:
+            before = states[k - 1]
+            root = np.sqrt(np.repeat(state.rho, d))[:, None]
+            size = np.linalg.norm(root * state.z)
+            assert state.primal_residual == pytest.approx(np.linalg.norm(root * (state.x - state.z)) / size)
+            stiff = np.maximum(1.0, root**2 / problem.M.diagonal()[n:, None])
+            assert state.dual_residual == pytest.approx(np.linalg.norm(stiff * root * (state.z - before.z)) / size)
+            assert state.merits[-1] == pytest.approx(np.linalg.norm(root * (state.x - before.z)))
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, method=METHODS)
+def test_separator_penalties_follow_from_the_stiffness(seed: int, n: int, d: int, method: PartitionMethod) -> None:
+    problem = varied_problem(seed, n, d)
+    robots = robots_of(problem, seed, method)
+    start = chordal_start(problem)
+    state = SOC(robots=robots).init(problem, start)
+    assert isinstance(state, SOCState)
+    wanted = MultiplierPenalty().initial(problem, start)
+    relative = 0.6 * state.team.stiffness(wanted)
+    np.testing.assert_allclose(state.rho_t, relative * translation_scale(problem), rtol=1e-12, atol=0)
+    shared = robots.separators(problem.graph)
+    wanted[shared] = np.maximum(wanted[shared], min(0.7 * relative**0.5, 0.3) * rotation_scale(problem)[shared])
+    np.testing.assert_allclose(state.rho, wanted, rtol=1e-12, atol=0)
+    given_state = SOC(robots=robots, translation_penalty=0.02, separator_penalty=5.0).init(problem, start)
+    assert isinstance(given_state, SOCState)
+    np.testing.assert_allclose(given_state.rho_t, 0.02 * translation_scale(problem), rtol=1e-12, atol=0)
+    assert (given_state.rho[shared] >= 5.0 * rotation_scale(problem)[shared]).all()
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, method=METHODS)
+def test_anderson_per_robot_sums_nothing_over_the_robots(seed: int, n: int, d: int, method: PartitionMethod) -> None:
+    problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE))
+    robots = robots_of(problem, seed, method)
+    soc = SOC(robots=robots, acceleration=Anderson(per_robot=True), local_passes=1)
+    plain = replace(soc, acceleration=None)
+    state = soc.init(problem, None)
+    memories: list[AndersonMemory] = [AndersonMemory()] * robots.num_robots
+    for _ in range(4):
+        assert isinstance(state, SOCState)
+        image = plain.step(problem, state)
+        following = soc.step(problem, state)
+        assert isinstance(image, SOCState)
+        assert isinstance(following, SOCState)
+        assert state.team.penalty is not None
+        residual = np.sqrt(state.team.penalty)[:, None] * (image.x - state.z)
+        for a, rows in enumerate(state.team.slices):
+            s, memories[a] = extrapolate(Anderson(), memories[a], residual[rows], (image.x + state.B)[rows])
+            np.testing.assert_array_equal(following.s[rows], s)
+        state = following
+
+
+def test_without_noise_state_zero_is_a_fixed_point() -> None:
+    graph = exact_graph(0, 8, 3)
+    problem = PGOProblem(graph)
+    assert graph.truth is not None
+    for robots in (None, partition(graph, 3)):
+        states = list(islice(iterate(SOC(robots=robots), problem, graph.truth), 4))
+        for state in states[1:]:
+            np.testing.assert_allclose(state.omega, states[0].omega, rtol=0, atol=1e-8)
+
+
+@settings(max_examples=40)
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, method=METHODS)
+def test_graphs_without_noise_end_at_zero(seed: int, n: int, d: int, method: PartitionMethod) -> None:
+    problem = PGOProblem(exact_graph(seed, n, d))
+    for robots in (None, robots_of(problem, seed, method)):
+        for start in (None, problem.graph.truth):
+            result = run(SOC(robots=robots), problem, start)
+            assert result.status is Status.CONVERGED
+            assert result.objective <= 1e-12
+
+
+# Endings and settings.
+
+
+@pytest.mark.parametrize("robots", [1, 3])
+def test_an_iterate_that_is_not_finite_is_said_to_be(robots: int) -> None:
+    problem = varied_problem(0, 8, 3)
+    soc = SOC(robots=partition(problem.graph, robots))
+    state = soc.init(problem, None)
+    assert isinstance(state, SOCState)
+    broken = soc.step(problem, replace(state, s=np.full_like(state.s, np.inf)))
+    assert broken.k == 1
+    measurement = soc.measure(problem, broken)
+    assert np.isnan([measurement.objective, measurement.primal_residual, measurement.dual_residual]).all()
+    assert soc.converged(broken, measurement) is None
+
+
+def test_the_refreshed_multiplier_is_the_stationary_one() -> None:
+    # At a stationary point 2 Lambda_i R_i^T + rho_i B_i = 0, which makes it a fixed point of the recursion.
+    problem = PGOProblem(varied_graph(0, 10, 3, LOUD_NOISE))
+    best = polish(problem, chordal_start(problem))
+    soc = SOC(tolerance=1e-10, max_iterations=2000)
+    state = run(soc, problem, best).state
+    poses = soc.poses(problem, state)
+    B = np.swapaxes(unstack_transposes(state.B), 1, 2)
+    expected = -2.0 * multipliers(problem, poses) @ np.swapaxes(poses.R, 1, 2) / state.rho[:, None, None]
+    np.testing.assert_allclose(B, expected, rtol=0, atol=1e-6)
+    assert relative_decrement(problem, poses) <= 1e-12
+
+
+def test_couplings_follow_from_the_robots() -> None:
+    graph = grid(np.random.default_rng(0))
+    assert SOC().effective_coupling is Coupling.JOINT
+    assert SOC(robots=partition(graph, 3)).effective_coupling is Coupling.CONSENSUS
+    assert SOC(coupling=Coupling.JOINT, robots=partition(graph, 1)).effective_coupling is Coupling.JOINT
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"alpha": 0.0}, r"alpha must be in \(0, 2\), got 0\.0"),
+        ({"alpha": 2.0}, r"alpha must be in \(0, 2\)"),
+        ({"alpha": np.nan}, r"alpha must be in \(0, 2\)"),
+        ({"local_passes": 0}, "local_passes must be at least 1, got 0"),
+        ({"translation_penalty": 0.0}, "translation_penalty must be positive"),
+        ({"separator_penalty": -1.0}, "separator_penalty must not be negative"),
+        ({"tolerance": 0.0}, "tolerance must be positive"),
+        ({"tolerance": np.nan}, "tolerance must be positive"),
+        ({"max_iterations": -1}, "max_iterations must not be negative"),
+        ({"coupling": Coupling.CONSENSUS}, r"CONSENSUS needs robots; see pgo_models\.partition"),
+        (
+            {"coupling": Coupling.JOINT, "robots": Partition(np.array([0, 1]), PartitionMethod.CONTIGUOUS)},
+            "JOINT has one robot",
+        ),
+    ],
+)
+def test_settings_are_checked(changes: dict[str, object], message: str) -> None:
+    for kind in (SettingError, ValueError):
+        with pytest.raises(kind, match=message):
+            SOC(**changes)
+
+
+def test_robots_of_another_graph_are_refused() -> None:
+    problem = varied_problem(0, 8, 3)
+    for robots in (partition(varied_graph(0, 9, 3), 3), partition(varied_graph(0, 7, 3), 3)):
+        for method in (SOC(robots=robots), PaperSOC(robots=robots)):
+            with pytest.raises(SettingError, match="give one robot for every pose"):
+                method.init(problem, None)
+
+
+def test_tolerance_is_on_both_residuals() -> None:
+    soc = SOC(tolerance=1e-3)
+    state = soc.init(varied_problem(0, 5, 2), None)
+    assert soc.converged(state, Measurement(1.0, 1e-3, 1e-3)) is Status.CONVERGED
+    assert soc.converged(state, Measurement(1.0, 2e-3, 0.0)) is None
+    assert soc.converged(state, Measurement(1.0, 0.0, 2e-3)) is None

@@ -1,0 +1,197 @@
+import importlib.util
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pgo_models as pgo
+from pgo_models.certificates.certificate import relative_gap
+from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.graphs.published_results import published_rows
+from solvers import Run, Status, solve
+from solvers.reporting.convergence_plots import Effort
+from solvers.studies import benchmark_runs as trial_runs
+from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings, StageRecord
+from solvers.studies.benchmark_runs import run_benchmark
+
+BY_ROBOTS = {
+    BenchmarkMethod.CONSENSUS,
+    BenchmarkMethod.PAPER,
+    BenchmarkMethod.SUBSTRUCTURED,
+    BenchmarkMethod.GAUSS_SEIDEL,
+}
+HERE = [one for one in BenchmarkMethod if one is not BenchmarkMethod.GTSAM or importlib.util.find_spec("gtsam")]
+SCENES = {"circle": pgo.circle, "grid": pgo.grid, "sphere": pgo.sphere}
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return pgo.PGOProblem(pgo.grid(np.random.default_rng(3)))
+
+
+@pytest.fixture(scope="module")
+def bound(problem):
+    return solve(problem).lower_bound
+
+
+@pytest.mark.parametrize("contender", HERE, ids=lambda one: one.value)
+def test_every_contender_has_an_answer_and_counts_what_it_spent(contender, problem, bound):
+    trial = run_benchmark(contender, problem)
+    assert trial.contender is contender
+    assert trial.status is Status.CONVERGED
+    assert trial.is_answer
+    assert trial.remark == ""
+    assert trial.objective == pytest.approx(problem.objective(trial.poses), rel=1e-12)
+    # DGS is chordal and one Gauss-Newton step, GTSAM minimises angles; the others reach the optimum.
+    wanted = 0.1 if contender in (BenchmarkMethod.GAUSS_SEIDEL, BenchmarkMethod.GTSAM) else 1e-5
+    assert 0 <= relative_gap(trial.objective, bound) < wanted
+    assert 0 < trial.seconds_per_robot <= trial.seconds * (1 + 1e-12)
+    assert (trial.rounds is not None) == (contender in BY_ROBOTS)
+    assert (trial.num_bytes is not None) == (contender in BY_ROBOTS)
+    if contender in BY_ROBOTS:
+        assert trial.rounds >= sum(trial.iterations)
+        assert trial.num_bytes > 0
+        assert trial.seconds_per_robot < 0.5 * trial.seconds
+    else:
+        assert trial.seconds_per_robot == trial.seconds
+
+
+@pytest.mark.parametrize("contender", HERE, ids=lambda one: one.value)
+def test_the_curve_of_a_trial_ends_where_the_trial_does(contender, problem, bound):
+    trial = run_benchmark(contender, problem)
+    curve = trial.curve(bound)
+    counted = [Effort.ITERATIONS, Effort.SECONDS]
+    if contender in BY_ROBOTS:
+        counted += [Effort.ROUNDS, Effort.BYTES]
+    ends = {
+        Effort.ITERATIONS: sum(trial.iterations),
+        Effort.SECONDS: trial.seconds,
+        Effort.ROUNDS: trial.rounds,
+        Effort.BYTES: trial.num_bytes,
+    }
+    for effort in counted:
+        spent = curve.effort(effort)
+        assert (np.diff(spent) >= 0).all()
+        assert spent[-1] == pytest.approx(ends[effort], rel=1e-12)
+    assert curve.history.objective[-1] == pytest.approx(trial.objective, rel=1e-9)
+
+
+@given(st.sampled_from(sorted(SCENES)), st.integers(0, 99), st.integers(2, 40))
+@settings(max_examples=6)
+def test_the_papers_method_keeps_to_its_rounds(scene, seed, rounds):
+    problem = pgo.PGOProblem(SCENES[scene](np.random.default_rng(seed)))
+    trial = run_benchmark(BenchmarkMethod.PAPER, problem, BenchmarkSettings(max_rounds=rounds), problem.graph.initial)
+    assert sum(trial.iterations) <= trial.rounds <= rounds
+    if trial.legs[-1].status is not Status.CONVERGED:
+        assert trial.remark == f"stopped within {rounds} rounds"
+    assert trial.objective == pytest.approx(problem.objective(trial.poses), rel=1e-12)
+
+
+@pytest.mark.parametrize("rounds", [4, 12, 17])
+def test_the_papers_method_hands_its_last_iterate_on_even_where_an_earlier_one_is_better(rounds):
+    for seed in range(3):
+        graph = pgo.circle(np.random.default_rng(seed))
+        trial = run_benchmark(
+            BenchmarkMethod.PAPER, pgo.PGOProblem(graph), BenchmarkSettings(max_rounds=rounds), graph.initial
+        )
+        assert trial.iterations[0] == rounds // 2
+        assert trial.first_objective == pytest.approx(trial.legs[0].history.objective[-1], rel=1e-9)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_papers_method_beats_the_papers_gap_within_its_iterations(scene):
+    row = next(row for row in published_rows() if row.name == scene)
+    theirs = relative_gap(row.soc.objective, row.se_sync.objective)
+    for seed in range(2):
+        graph = SCENES[scene](np.random.default_rng(100 + seed))
+        problem = pgo.PGOProblem(graph)
+        trial = run_benchmark(
+            BenchmarkMethod.PAPER, problem, BenchmarkSettings(max_rounds=row.soc.iterations), graph.initial
+        )
+        assert trial.rounds <= row.soc.iterations
+        assert relative_gap(trial.objective, solve(problem).lower_bound) <= theirs
+
+
+def test_dgs_that_is_cut_short_in_its_first_stage_is_no_answer(problem, monkeypatch):
+    monkeypatch.setattr(trial_runs, "_MOST_SWEEPS", 3)
+    trial = run_benchmark(BenchmarkMethod.GAUSS_SEIDEL, problem)
+    assert not trial.is_answer
+    assert trial.remark == "MAX_ITERATIONS in its first stage: no poses after 3 sweeps"
+
+
+def test_a_stage_that_did_not_converge_is_said(problem, monkeypatch):
+    monkeypatch.setattr(trial_runs, "_HANDOVER_ITERATIONS", 2)
+    assert run_benchmark(BenchmarkMethod.JOINT, problem).remark == "SOC: MAX_ITERATIONS"
+
+
+@pytest.mark.parametrize("contender", [BenchmarkMethod.STAIRCASE, BenchmarkMethod.CONSENSUS, BenchmarkMethod.PAPER])
+def test_time_runs_out_for_all_stages_together(contender, problem):
+    trial = run_benchmark(contender, problem, BenchmarkSettings(time_limit=1e-9))
+    assert trial.status is Status.TIME_LIMIT
+    assert "TIME_LIMIT" in trial.remark
+    assert math.isfinite(trial.objective)
+
+
+@pytest.mark.parametrize(
+    "contender", [one for one in HERE if one is not BenchmarkMethod.GTSAM], ids=lambda one: one.value
+)
+def test_ctrl_c_leaves_no_half_trial(contender, problem, monkeypatch):
+    def as_if_interrupted(true):
+        return lambda *arguments, **options: _interrupted(true(*arguments, **options))
+
+    monkeypatch.setattr(trial_runs, "run", as_if_interrupted(trial_runs.run))
+    monkeypatch.setattr(trial_runs, "solve", as_if_interrupted(trial_runs.solve))
+    with pytest.raises(KeyboardInterrupt):
+        run_benchmark(contender, problem)
+
+
+def _interrupted(result):
+    """A run or solution as the loop hands it back after Ctrl-C."""
+    if isinstance(result, Run):
+        return replace(result, status=Status.INTERRUPTED)
+    return replace(result, stages=tuple(replace(stage, status=Status.INTERRUPTED) for stage in result.stages))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"num_robots": 0}, "num_robots is 0"),
+        ({"max_rounds": 1}, "max_rounds is 1; give at least 2"),
+        ({"time_limit": 0.0}, "time_limit is 0.0"),
+    ],
+)
+def test_settings_out_of_range_are_refused(wrong, message):
+    with pytest.raises(SettingError, match=message):
+        BenchmarkSettings(**wrong)
+
+
+def test_robots_that_the_graph_names_keep_their_poses():
+    graph = pgo.load("robots")
+    assert (BenchmarkSettings(num_robots=4).robots(graph).robot == graph.robots).all()
+    assert BenchmarkSettings(num_robots=3).robots(graph).num_robots == 3
+
+
+def test_robots_are_at_most_one_a_pose_and_contiguous_without_metis(monkeypatch):
+    graph = pgo.grid(np.random.default_rng(0))
+    assert BenchmarkSettings(num_robots=99).robots(graph).num_robots <= 27
+
+    def partition(graph, number, method):
+        if method is pgo.PartitionMethod.METIS:
+            raise MissingExtraError("pymetis", "fast")
+        return pgo.partition(graph, number, method)
+
+    monkeypatch.setattr("solvers.studies.benchmark.partition", partition)
+    assert BenchmarkSettings().robots(graph).method is pgo.PartitionMethod.CONTIGUOUS
+
+
+def test_a_leg_that_is_not_counted_leaves_the_sum_open(problem):
+    trial = run_benchmark(BenchmarkMethod.PAPER, problem)
+    first = trial.legs[0]
+    open_leg = StageRecord(first.name, first.status, first.history)
+    mixed = BenchmarkRun(BenchmarkMethod.PAPER, (open_leg, trial.legs[1]), trial.poses, trial.objective, trial.status)
+    assert mixed.rounds is None
+    assert mixed.num_bytes is None
+    assert mixed.curve(0.0).rounds is None

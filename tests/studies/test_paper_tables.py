@@ -1,0 +1,249 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from graphs import OPTIMUM, REFERENCE, optimum_tolerance
+
+import pgo_models as pgo
+from pgo_models.errors import NotPositiveDefiniteError, SettingError
+from pgo_models.graphs.published_results import published_rows
+from solvers import reproduce_tables
+from solvers.studies import paper_tables as reproduction
+from solvers.studies.benchmark import BenchmarkMethod
+from solvers.studies.paper_tables import TABLE_CONTENDERS, Reproduction, ReproductionSettings, graph_of_row
+from solvers.studies.paper_tables_text import findings, tables_as_text
+
+PAPER = {name: row for name, row in REFERENCE["paper_tables"].items() if isinstance(row, dict)}
+
+
+def one_row(name):
+    return next(row for row in published_rows() if row.name == name)
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return reproduce_tables(ReproductionSettings(only=("circle", "grid", "sphere"), num_seeds=2))
+
+
+@pytest.fixture
+def count_runs(monkeypatch):
+    """Every trial that is really run, in order."""
+    runs = []
+    true = reproduction.run_benchmark
+
+    def run_benchmark(contender, problem, *rest):
+        runs.append((problem.graph.name, contender))
+        return true(contender, problem, *rest)
+
+    monkeypatch.setattr(reproduction, "run_benchmark", run_benchmark)
+    return runs
+
+
+def test_rows_and_figures_are_those_of_the_papers_tables():
+    rows = ReproductionSettings().rows
+    assert [row.name for row in rows] == list(PAPER)
+    for row in rows:
+        figures = PAPER[row.name]
+        assert (row.num_poses, row.num_edges) == (figures["poses"], figures["measurements"])
+        assert (row.se_sync.objective, row.soc.objective) == (figures["F_star"], figures["F_soc"])
+        assert row.dgs.objective == figures["F_dgs"]
+        assert row.soc.iterations == figures["iterations_soc"]
+        assert (row.se_sync.seconds, row.soc.seconds) == (figures["seconds_sesync"], figures["seconds_soc"])
+
+
+def test_scenes_show_what_they_should(scenes):
+    assert scenes.is_complete
+    assert [row.published.name for row in scenes.rows] == [n for n in ("circle", "grid", "sphere") for _ in range(4)]
+    assert [row.contender for row in scenes.rows[:4]] == list(TABLE_CONTENDERS)
+    assert all(len(row.cells) == 2 and not row.reasons for row in scenes.rows)
+    found = findings(scenes)
+    assert len(found) == 2  # fewer rounds than the paper, and DGS where it has none: not of scenes
+    assert all(finding.failed == () and finding.held == ("circle", "grid", "sphere") for finding in found)
+    for row in scenes.rows:
+        for optimum, cell in zip(row.optima, row.cells, strict=True):
+            assert 0 < optimum.gap < 1e-6
+            assert cell.objective >= optimum.lower_bound
+            if row.contender in (BenchmarkMethod.STAIRCASE, BenchmarkMethod.CONSENSUS):
+                assert cell.gap < 1e-6
+
+
+def test_findings_fail_where_the_figures_do(scenes):
+    def spoiled(row):
+        cells = tuple(replace(cell, gap=0.5, rounds=10**6) for cell in row.cells)
+        return replace(row, cells=cells) if row.published.name == "grid" else row
+
+    found = findings(Reproduction(scenes.settings, tuple(map(spoiled, scenes.rows)), True))
+    assert all(finding.failed == ("grid",) and finding.held == ("circle", "sphere") for finding in found)
+    assert "NOT on grid" in str(found[0])
+
+
+def test_text_has_a_line_a_method_with_the_papers_figures_beside(scenes):
+    table = tables_as_text(scenes)
+    costs, efforts = table.parts
+    assert len(costs.rows) == len(efforts.rows) == len(table.records) == 12
+    record = next(r for r in table.records if (r["graph"], r["method"]) == ("sphere", BenchmarkMethod.PAPER.label))
+    assert (record["paper_objective"], record["paper_iterations"]) == (PAPER["sphere"]["F_soc"], 38)
+    row = next(row for row in scenes.rows if (row.published.name, row.contender) == ("sphere", BenchmarkMethod.PAPER))
+    objectives = [cell.objective for cell in row.cells]
+    assert record["objective"] == pytest.approx(np.mean(objectives), rel=1e-12)
+    assert record["objective_std"] == pytest.approx(np.std(objectives, ddof=1), rel=1e-12)
+    shown = next(line for line in costs.rows[8:] if line[5] == BenchmarkMethod.PAPER.label)
+    assert shown[6] == f"{np.mean(objectives):.1f} +- {np.std(objectives, ddof=1):.1f}"
+    assert shown[9:11] == ("594.23", "6")
+
+
+def test_what_is_kept_is_not_run_again_and_gives_the_same_table(tmp_path, count_runs):
+    settings, keep = ReproductionSettings(only=("grid",), num_seeds=1), tmp_path / "kept.json"
+    first = reproduce_tables(settings, keep)
+    assert len(count_runs) == 4
+    again = reproduce_tables(settings, keep)
+    assert len(count_runs) == 4
+    assert again == first
+    more = reproduce_tables(replace(settings, num_seeds=2), keep)
+    assert len(count_runs) == 8
+    assert [row.cells[:1] for row in more.rows] == [row.cells for row in first.rows]
+    reproduce_tables(settings, keep, is_fresh=True)
+    assert len(count_runs) == 12
+
+
+def test_other_robots_are_another_figure(tmp_path, count_runs):
+    keep = tmp_path / "kept.json"
+    for robots in (5, 3, 5):
+        reproduce_tables(ReproductionSettings(("grid",), 1, robots), keep)
+    assert len(count_runs) == 8
+
+
+def test_ctrl_c_keeps_what_is_done_and_the_next_run_goes_on(tmp_path, monkeypatch, count_runs):
+    settings, keep = ReproductionSettings(only=("circle", "grid"), num_seeds=2), tmp_path / "kept.json"
+    counting = reproduction.run_benchmark
+
+    def interrupted(contender, *rest):
+        if len(count_runs) == 6:
+            raise KeyboardInterrupt
+        return counting(contender, *rest)
+
+    monkeypatch.setattr(reproduction, "run_benchmark", interrupted)
+    part = reproduce_tables(settings, keep)
+    assert not part.is_complete
+    assert [len(row.cells) for row in part.rows] == [2, 2, 1, 1, 0, 0, 0, 0]
+    text = tables_as_text(part)
+    assert "interrupted: the same command goes on where it was" in text.notes
+    remarks = [row[-1] for row in text.parts[0].rows]
+    assert all(remark.startswith("1 of 2 not run yet") for remark in remarks[2:4])
+    assert remarks[4:] == ["not run yet"] * 4
+    assert len(json.loads(keep.read_text())["results"]) == 6 + 2
+    monkeypatch.setattr(reproduction, "run_benchmark", counting)
+    whole = reproduce_tables(settings, keep)
+    assert whole.is_complete
+    assert len(count_runs) == 16
+    assert all(len(row.cells) == 2 for row in whole.rows)
+
+
+@pytest.mark.parametrize(
+    "error", [NotPositiveDefiniteError("no factor"), np.linalg.LinAlgError("singular"), MemoryError()]
+)
+def test_a_method_that_fails_leaves_its_reason_and_is_tried_again(error, tmp_path, monkeypatch, count_runs):
+    settings, keep, counting = ReproductionSettings(("grid",), 1), tmp_path / "kept.json", reproduction.run_benchmark
+
+    def failing(contender, *rest):
+        if contender is BenchmarkMethod.GAUSS_SEIDEL:
+            raise error
+        return counting(contender, *rest)
+
+    monkeypatch.setattr(reproduction, "run_benchmark", failing)
+    tables = reproduce_tables(settings, keep)
+    assert tables.is_complete
+    reason = str(error) or "MemoryError"
+    assert tables.rows[1].reasons == (reason,)
+    assert [len(row.cells) for row in tables.rows] == [1, 0, 1, 1]
+    table = tables_as_text(tables)
+    assert table.parts[0].rows[1][5:] == ("DGS", "-", "-", "-", "123.244", "30", reason)
+    assert table.records[1]["objective"] is None
+    monkeypatch.setattr(reproduction, "run_benchmark", counting)
+    assert len(reproduce_tables(settings, keep).rows[1].cells) == 1
+
+
+def test_a_mistake_of_ours_is_no_reason(monkeypatch):
+    def broken(*arguments):
+        raise TypeError("ours")
+
+    monkeypatch.setattr(reproduction, "run_benchmark", broken)
+    with pytest.raises(TypeError, match="ours"):
+        reproduce_tables(ReproductionSettings(("grid",), 1))
+
+
+def test_dgs_cut_short_in_its_first_stage_has_no_figures(monkeypatch):
+    monkeypatch.setattr("solvers.studies.benchmark_runs._MOST_SWEEPS", 2)
+    row = reproduce_tables(ReproductionSettings(("grid",), 1)).rows[1]
+    assert row.cells == ()
+    assert row.reasons == ("MAX_ITERATIONS in its first stage: no poses after 2 sweeps",)
+
+
+@pytest.fixture
+def no_data(tmp_path, monkeypatch):
+    """No benchmark graph is here, and none in a cache."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PGO_DATA", raising=False)
+    monkeypatch.setattr("pooch.os_cache", lambda name: tmp_path / "cache")
+    return tmp_path
+
+
+def test_a_graph_that_is_not_here_says_how_to_get_it_and_nothing_is_downloaded(no_data, count_runs):
+    tables = reproduce_tables(ReproductionSettings(only=("rim",)))
+    assert tables.is_complete
+    assert count_runs == []
+    (line,) = tables_as_text(tables).parts[0].rows
+    assert line[:3] == ("rim", "10195", "29743")
+    assert "pgo info rim" in line[-1]
+    assert "PGO_DATA" in line[-1]
+    assert line[9] == "6182.73"
+    assert list(no_data.iterdir()) == []
+
+
+def test_another_graph_is_never_passed_off_as_the_papers(no_data, count_runs):
+    (no_data / "data").mkdir()
+    pgo.write_g2o(pgo.grid(np.random.default_rng(0)), no_data / "data" / "rim.g2o")
+    tables = reproduce_tables(ReproductionSettings(only=("rim",)))
+    assert count_runs == []
+    assert (
+        "has 27 poses and 108 edges, the paper's has 10195 and 29743: it is another graph" in tables.rows[0].reasons[0]
+    )
+
+
+def test_scenes_are_drawn_from_their_seeds():
+    for name in ("circle", "grid", "sphere"):
+        made = graph_of_row(one_row(name), 0, False)
+        assert made.name == name
+        np.testing.assert_allclose(made.t_ij, pgo.load(name).t_ij, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"only": ("torus",)}, "no row 'torus'; they have circle"),
+        ({"num_seeds": 0}, "num_seeds is 0"),
+        ({"num_robots": 0}, "num_robots is 0"),
+    ],
+)
+def test_wrong_settings_are_refused(wrong, message):
+    with pytest.raises(SettingError, match=message):
+        ReproductionSettings(**wrong)
+
+
+def assert_row_shows_what_it_should(name: str) -> None:
+    tables = reproduce_tables(ReproductionSettings(only=(name,)))
+    assert all(finding.failed == () for finding in findings(tables))
+    for row in tables.rows:
+        assert abs(row.optima[0].objective - OPTIMUM[name]) <= optimum_tolerance(name)
+        assert np.isfinite(row.cells[0].objective)
+    by = {row.contender: row.cells[0] for row in tables.rows}
+    assert by[BenchmarkMethod.PAPER].objective <= PAPER[name]["F_soc"]
+    assert by[BenchmarkMethod.PAPER].rounds <= PAPER[name]["iterations_soc"]
+    assert by[BenchmarkMethod.CONSENSUS].gap < 1e-4
+    assert by[BenchmarkMethod.CONSENSUS].rounds < PAPER[name]["iterations_soc"]
+
+
+@pytest.mark.usefixtures("benchmark_data")
+def test_the_garage_shows_what_it_should():
+    assert_row_shows_what_it_should("parking-garage")

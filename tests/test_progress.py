@@ -1,0 +1,173 @@
+import sys
+from types import ModuleType, TracebackType
+
+import pytest
+from rich.progress import Progress
+
+import solvers.progress as table_module
+from solvers.progress import Table
+from solvers.result import Measurement, Record, Status
+
+RECORDS = [Record(k, 0.25 * k, Measurement(100.0 / (k + 1), 10.0**-k, 2 * 10.0**-k)) for k in range(3)]
+
+
+def shown(verbose: bool, progress: bool | None, elapsed: float = 0.0) -> None:
+    with Table("SOC", 100, verbose=verbose, progress=progress) as table:
+        for record in RECORDS:
+            table.row(record, elapsed)
+        table.end(Status.CONVERGED, 2)
+
+
+def test_it_is_silent_by_default(capsys: pytest.CaptureFixture[str]) -> None:
+    shown(verbose=False, progress=False, elapsed=1e6)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_verbose_prints_a_header_a_row_an_iterate_and_the_ending(capsys: pytest.CaptureFixture[str]) -> None:
+    shown(verbose=True, progress=False)
+    out, err = capsys.readouterr()
+    name, header, *rows, ending = out.splitlines()
+    assert err == ""
+    assert name == "SOC"
+    assert header.split() == ["k", "F", "primal", "dual", "seconds"]
+    assert [row.split() for row in rows] == [
+        ["0", "100", "1.00e+00", "2.00e+00", "0.000"],
+        ["1", "50", "1.00e-01", "2.00e-01", "0.250"],
+        ["2", "33.33333333", "1.00e-02", "2.00e-02", "0.500"],
+    ]
+    assert {len(row) for row in rows} == {len(header)}
+    assert ending == f"CONVERGED after 2 iterations: {Status.CONVERGED.value}"
+
+
+def test_a_residual_that_is_not_yet_known_is_a_dash(capsys: pytest.CaptureFixture[str]) -> None:
+    with Table("SOC", 100, verbose=True, progress=False) as table:
+        table.row(Record(0, 0.0, Measurement(1.0, float("inf"), float("inf"))), 0.0)
+        table.row(Record(1, 0.0, Measurement(float("nan"), float("nan"), float("nan"))), 0.0)
+    rows = capsys.readouterr().out.splitlines()[2:]
+    assert rows[0].split() == ["0", "1", "-", "-", "0.000"]
+    assert rows[1].split() == ["1", "nan", "nan", "nan", "0.000"]
+
+
+def test_names_with_brackets_are_printed_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    with Table("SOC[bold]", 100, verbose=True, progress=False) as table:
+        table.row(RECORDS[0], 0.0)
+    assert capsys.readouterr().out.splitlines()[0] == "SOC[bold]"
+
+
+def test_a_long_run_shows_a_bar_on_stderr_alone(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as if somebody watched
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    shown(verbose=False, progress=True, elapsed=10.0)
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "SOC" in err
+    assert "2/100" in err
+
+
+@pytest.mark.parametrize("status", Status)
+def test_lines_are_not_wrapped(status: Status, capsys: pytest.CaptureFixture[str]) -> None:
+    with Table("SOC", 100, verbose=True, progress=False) as table:
+        table.end(status, 123_456)
+    assert capsys.readouterr().out.splitlines()[-1] == f"{status.name} after 123456 iterations: {status.value}"
+
+
+def test_a_short_run_shows_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
+    shown(verbose=False, progress=True, elapsed=0.01)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_the_table_takes_the_place_of_the_bar(capsys: pytest.CaptureFixture[str]) -> None:
+    shown(verbose=True, progress=True, elapsed=10.0)
+    out, err = capsys.readouterr()
+    assert len(out.splitlines()) == 6
+    assert err == ""
+
+
+class Notebook:
+    """Stands for IPython in a notebook: remembers what its outputs show."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.outputs: list[list[str]] = []
+        outputs = self.outputs
+
+        class DisplayHandle:
+            def display(self, shown: str) -> None:
+                self.output = [shown]
+                outputs.append(self.output)
+
+            def update(self, shown: str) -> None:
+                self.output.append(shown)
+
+        display = ModuleType("IPython.display")
+        display.HTML, display.DisplayHandle = str, DisplayHandle
+        monkeypatch.setitem(sys.modules, "IPython", ModuleType("IPython"))
+        monkeypatch.setitem(sys.modules, "IPython.display", display)
+        monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+        monkeypatch.setattr(table_module, "_SECONDS_BETWEEN_UPDATES", 0.0)
+
+
+@pytest.mark.parametrize("progress", [None, True])
+def test_a_long_run_shows_one_bar_in_a_notebook_and_takes_it_away(progress, monkeypatch, capsys) -> None:
+    notebook = Notebook(monkeypatch)
+    shown(verbose=False, progress=progress, elapsed=10.0)
+    (output,) = notebook.outputs
+    assert 'SOC <progress value="2" max="100">' in output[-2]
+    assert "F 33.333333" in output[-2]
+    assert output[-1] == ""
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(("progress", "elapsed"), [(False, 10.0), (None, 0.01)])
+def test_notebooks_show_no_bar_when_told_so_or_on_short_runs(progress, elapsed, monkeypatch) -> None:
+    notebook = Notebook(monkeypatch)
+    shown(verbose=False, progress=progress, elapsed=elapsed)
+    assert notebook.outputs == []
+
+
+def test_the_table_is_lines_in_a_notebook_too(monkeypatch, capsys) -> None:
+    notebook = Notebook(monkeypatch)
+    shown(verbose=True, progress=None, elapsed=10.0)
+    assert len(capsys.readouterr().out.splitlines()) == 6
+    assert notebook.outputs == []
+
+
+def test_no_bar_is_shown_by_default_outside_notebooks(capsys: pytest.CaptureFixture[str]) -> None:
+    shown(verbose=False, progress=None, elapsed=1e6)
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("error", [None, KeyboardInterrupt, ValueError])
+def test_the_bar_is_stopped_whatever_happens(
+    error: type[BaseException] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stopped: list[bool] = []
+
+    class Bar(Progress):
+        def stop(self) -> None:
+            stopped.append(True)
+            super().stop()
+
+    monkeypatch.setattr(table_module, "Progress", Bar)
+
+    def interrupted() -> None:
+        with Table("SOC", 100, verbose=False, progress=True) as table:
+            table.row(RECORDS[1], 10.0)
+            assert not stopped
+            if error is not None:
+                raise error
+
+    if error is None:
+        interrupted()
+    else:
+        with pytest.raises(error):
+            interrupted()
+    assert stopped == [True]
+
+
+def test_it_swallows_no_exception() -> None:
+    table = Table("SOC", 100, verbose=False, progress=False)
+    nothing: tuple[type[BaseException] | None, BaseException | None, TracebackType | None] = (None, None, None)
+    assert table.__exit__(*nothing) is None
