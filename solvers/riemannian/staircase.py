@@ -252,7 +252,8 @@ class Staircase:
     ) -> StaircaseState:
         """State at a point, with the first radius of a rank."""
         squared = inner(point.gradient, _precondition(problem, preconditioner, point.Y, point.gradient))
-        decrement = scaled_decrement(0.5 * squared, point.value, level)
+        # An F below its rounding level is zero, whatever the gradient of its rounding is relative to it.
+        decrement = scaled_decrement(0.5 * squared, point.value, level) if point.value > level else 0.0
         return StaircaseState(
             k=k,
             point=point,

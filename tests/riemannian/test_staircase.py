@@ -15,7 +15,7 @@ from graphs import (
     varied_graph,
     wound_ring,
 )
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, Verdict, certify_at, certify_with
@@ -135,6 +135,7 @@ def test_its_bound_holds_at_any_noise_and_start(seed: int, n: int, d: int) -> No
 
 
 @settings(max_examples=15)
+@example(seed=150, n=8, d=2)  # F of the start is a hundredth of its rounding level
 @given(seed=SEEDS, n=st.integers(2, 10), d=DIMENSIONS)
 def test_graphs_without_noise_end_at_zero(seed: int, n: int, d: int) -> None:
     problem = PGOProblem(exact_graph(seed, n, d))
