@@ -11,20 +11,18 @@ from pgo_models.geometry.rotations import Array
 from solvers.distributed.driver import Count, Driver
 from solvers.result import Measurement, Status
 from solvers.soc.penalty import (
-    MAX_RAISES,
-    BalancedPenalty,
+    Due,
     MultiplierPenalty,
-    has_diverged,
-    has_stalled,
-    is_going_round,
+    Steps,
+    next_penalty,
 )
-from solvers.soc.separator_stiffness import adapted_penalty, fell_most, is_second_look, translation_penalty_for
+from solvers.soc.separator_stiffness import adapted_penalty, fell_most, translation_penalty_for
 from solvers.soc.shared_anderson import AndersonSums
 from solvers.soc.soc import SOC
 
 
 @dataclass(frozen=True, eq=False)
-class ConsensusState:
+class ConsensusState(Steps):
     """Iterate k: the sums that all robots know; the iterates are theirs, and a step replaces them.
 
     Attributes
@@ -44,11 +42,6 @@ class ConsensusState:
     translation_penalty: float
     separator_penalty: float
     sums: AndersonSums = field(default_factory=AndersonSums)
-    primal_residual: float = np.inf
-    dual_residual: float = np.inf
-    merits: tuple[float, ...] = ()
-    refreshes: int = 0
-    raises: int = 0
 
 
 @dataclass(frozen=True)
@@ -167,22 +160,18 @@ class ConsensusSOC:
 
     def _with_penalty_due(self, driver: Driver, state: ConsensusState) -> ConsensusState:
         """As in `solvers.soc.soc`: the penalty that the rule, or the safeguard, wants from now on."""
-        rule, merits = self.soc.penalty, state.merits
-        if state.raises < MAX_RAISES and (has_diverged(merits) or is_going_round(merits, state.ratio)):
-            return replace(self._rescaled(driver, state, 2.0, from_best=True), raises=state.raises + 1)
-        if isinstance(rule, MultiplierPenalty):
-            is_stalled = has_stalled(rule, merits) and state.refreshes < rule.max_refreshes
-            looks_again = is_second_look(state.refreshes, merits, max(state.primal_residual, state.dual_residual))
-            adapted = self._adapted(driver, state) if is_stalled or looks_again else state
-            if is_stalled or fell_most(state.translation_penalty, adapted.translation_penalty):
+        due, factor = next_penalty(self.soc.penalty, state.ratio, state)
+        if due is Due.RAISE:
+            return replace(self._rescaled(driver, state, factor, from_best=True), raises=state.raises + 1)
+        if due in (Due.REFRESH, Due.SECOND_LOOK):
+            adapted = self._adapted(driver, state)
+            if due is Due.REFRESH or fell_most(state.translation_penalty, adapted.translation_penalty):
                 if self.has_driver:
                     self.finish(driver)
                 fresh = self._penalized(driver, adapted)
                 return replace(fresh, k=state.k, refreshes=state.refreshes + 1, raises=state.raises)
-        if isinstance(rule, BalancedPenalty) and state.k > 0:
-            factor = rule.factor(state.primal_residual, state.dual_residual)
-            if factor != 1.0 and (factor > 1.0 or state.raises == 0):
-                return replace(self._rescaled(driver, state, factor, from_best=False), refreshes=state.refreshes + 1)
+        if due is Due.RESCALE:
+            return replace(self._rescaled(driver, state, factor, from_best=False), refreshes=state.refreshes + 1)
         return state
 
     def _adapted(self, driver: Driver, state: ConsensusState) -> ConsensusState:

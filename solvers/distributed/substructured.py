@@ -18,12 +18,9 @@ from solvers.distributed.multifrontal import TreeFactor
 from solvers.network.messages import Message
 from solvers.result import Measurement, Status
 from solvers.soc.penalty import (
-    MAX_RAISES,
-    BalancedPenalty,
-    MultiplierPenalty,
-    has_diverged,
-    has_stalled,
-    is_going_round,
+    Due,
+    Steps,
+    next_penalty,
 )
 from solvers.soc.rotation_block import RotationBlock, block_at, stationary_B
 from solvers.soc.shared_anderson import AndersonSums
@@ -31,7 +28,7 @@ from solvers.soc.soc import SOC
 
 
 @dataclass(frozen=True, eq=False)
-class SubstructuredState:
+class SubstructuredState(Steps):
     """Iterate k: the driver's part of it; the robots keep theirs, which a step replaces.
 
     Attributes
@@ -55,11 +52,6 @@ class SubstructuredState:
     ratio: Array
     size: float
     sums: AndersonSums = field(default_factory=AndersonSums)
-    primal_residual: float = np.inf
-    dual_residual: float = np.inf
-    merits: tuple[float, ...] = ()
-    refreshes: int = 0
-    raises: int = 0
 
     def at_rest(self) -> SubstructuredState:
         """State without the factor and the robots' answers, from which `SubstructuredSOC.init` goes on."""
@@ -172,10 +164,10 @@ class SubstructuredSOC:
 
     def _with_penalty_due(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
         """As in `solvers.soc.soc`: the penalty that the rule, or the safeguard, wants from now on."""
-        rule, merits = self.soc.penalty, state.merits
-        if state.raises < MAX_RAISES and (has_diverged(merits) or is_going_round(merits, state.ratio)):
-            return replace(self._rescaled(driver, state, 2.0, from_best=True), raises=state.raises + 1)
-        if isinstance(rule, MultiplierPenalty) and has_stalled(rule, merits) and state.refreshes < rule.max_refreshes:
+        due, factor = next_penalty(self.soc.penalty, state.ratio, state)
+        if due is Due.RAISE:
+            return replace(self._rescaled(driver, state, factor, from_best=True), raises=state.raises + 1)
+        if due is Due.REFRESH:
             self.finish(driver)
             refreshed = self._penalized(driver, is_stationary=True)
             return replace(
@@ -189,10 +181,8 @@ class SubstructuredSOC:
                 merits=(),
                 refreshes=state.refreshes + 1,
             )
-        if isinstance(rule, BalancedPenalty) and state.k > 0:
-            factor = rule.factor(state.primal_residual, state.dual_residual)
-            if factor != 1.0 and (factor > 1.0 or state.raises == 0):
-                return replace(self._rescaled(driver, state, factor, from_best=False), refreshes=state.refreshes + 1)
+        if due is Due.RESCALE:
+            return replace(self._rescaled(driver, state, factor, from_best=False), refreshes=state.refreshes + 1)
         return state
 
     def _rescaled(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,12 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
+from solvers.soc.separator_stiffness import is_second_look
 
+MAX_RAISES = 20
+_DIVERGED = 10.0  # times the smallest merit: go back and double the penalty
+_PATIENCE = 20  # steps without a new smallest merit: likewise, unless rho is `_ENOUGH` times m_i in the median
+_ENOUGH = 4.0  # 4 ||Lambda_i|| is, and at an optimum that can be certified ||Lambda_i|| is about m_i at most
 _SMALLEST_RATIO = 1e-6  # of ||Lambda_i|| to m_i; M + D/2 keeps ten digits
 
 
@@ -195,13 +201,54 @@ def translation_scale(problem: PGOProblem) -> Array:
     return np.asarray(problem.M.data[problem.diagonal_positions[: problem.num_poses]])
 
 
-# When SOC's penalty is too small, or no longer fits: decisions from the merits of its steps alone.
+class Due(enum.Enum):
+    """What the penalty needs before the next step."""
+
+    NOTHING = "it stays"
+    RAISE = "back to the best iterate with twice the penalty: the recursion diverges or cycles"
+    REFRESH = "the multipliers anew: the recursion has stalled"
+    SECOND_LOOK = "the same, if the translation penalty then falls as far as it can"
+    RESCALE = "another rho, and B with it: the residuals are out of balance"
 
 
-MAX_RAISES = 20
-_DIVERGED = 10.0  # times the smallest merit: go back and double the penalty
-_PATIENCE = 20  # steps without a new smallest merit: likewise, unless rho is `_ENOUGH` times m_i in the median
-_ENOUGH = 4.0  # 4 ||Lambda_i|| is, and at an optimum that can be certified ||Lambda_i|| is about m_i at most
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Steps:
+    """What the steps so far say of the penalty: figures that the states of all couplings have.
+
+    Attributes
+    ----------
+    primal_residual, dual_residual : float
+        ||x - z||_rho and ||c (z - z_before)||_rho, both over ||omega||_rho, with c = max(1, rho / diagonal of M): a
+        penalty far above M makes short steps anywhere.
+    merits : tuple of float
+        Fixed-point residual ||x - z_before||_rho of the steps since rho last changed.
+    refreshes, raises : int
+        How often the penalty rule, and the safeguard against divergence, changed rho.
+    """
+
+    primal_residual: float = np.inf
+    dual_residual: float = np.inf
+    merits: tuple[float, ...] = ()
+    refreshes: int = 0
+    raises: int = 0
+
+
+def next_penalty(rule: PenaltyRule, ratio: Array, steps: Steps) -> tuple[Due, float]:
+    """What is due before the next step, and the factor on rho; `ratio` is rho_i / m_i of all poses."""
+    merits, refreshes, raises = steps.merits, steps.refreshes, steps.raises
+    residuals = steps.primal_residual, steps.dual_residual
+    if raises < MAX_RAISES and (has_diverged(merits) or is_going_round(merits, ratio)):
+        return Due.RAISE, 2.0
+    if isinstance(rule, MultiplierPenalty):
+        if has_stalled(rule, merits) and refreshes < rule.max_refreshes:
+            return Due.REFRESH, 1.0
+        if is_second_look(refreshes, merits, max(residuals)):
+            return Due.SECOND_LOOK, 1.0
+    if isinstance(rule, BalancedPenalty) and np.isfinite(residuals).all():
+        factor = rule.factor(*residuals)
+        if factor != 1.0 and (factor > 1.0 or raises == 0):
+            return Due.RESCALE, factor
+    return Due.NOTHING, 1.0
 
 
 def has_stalled(rule: MultiplierPenalty, merits: tuple[float, ...]) -> bool:

@@ -36,19 +36,16 @@ from solvers.soc.local_copies import (
     stationary_mean,
 )
 from solvers.soc.penalty import (
-    MAX_RAISES,
-    BalancedPenalty,
+    Due,
     FixedPenalty,
     MultiplierPenalty,
     PenaltyRule,
-    has_diverged,
-    has_stalled,
-    is_going_round,
+    next_penalty,
     rotation_scale,
     translation_scale,
 )
 from solvers.soc.r_step import BackEnd, RStep
-from solvers.soc.separator_stiffness import fell_most, is_second_look, translation_penalty_for
+from solvers.soc.separator_stiffness import fell_most, translation_penalty_for
 from solvers.soc.state import SOCState
 
 _SEPARATOR_PENALTY, _MOST_SEPARATOR_PENALTY = 0.7, 0.3  # times the root of the translation penalty, and no more
@@ -260,22 +257,17 @@ class SOC:
 
     def _with_penalty_due(self, problem: PGOProblem, state: SOCState) -> SOCState:
         """State with the penalty that the rule, or the safeguard, wants from now on; mostly the state itself."""
-        is_too_small = has_diverged(state.merits) or is_going_round(state.merits, state.rho / rotation_scale(problem))
-        if is_too_small and state.raises < MAX_RAISES:
+        due, factor = next_penalty(self.penalty, state.rho / rotation_scale(problem), state)
+        if due is Due.RAISE:
             assert state.best is not None
             back = replace(state, s=state.best, z=agree(state.team, state.best, problem)[1])
-            return replace(self._rescaled(problem, back, 2.0), raises=state.raises + 1)
-        rule, merits = self.penalty, state.merits
-        if isinstance(rule, MultiplierPenalty):
-            is_stalled = has_stalled(rule, merits) and state.refreshes < rule.max_refreshes
-            looks_again = is_second_look(state.refreshes, merits, max(state.primal_residual, state.dual_residual))
-            before, after = self._adapted(problem, state) if is_stalled or looks_again else (1.0, 1.0)
-            if is_stalled or fell_most(before, after):
+            return replace(self._rescaled(problem, back, factor), raises=state.raises + 1)
+        if due in (Due.REFRESH, Due.SECOND_LOOK):
+            before, after = self._adapted(problem, state)
+            if due is Due.REFRESH or fell_most(before, after):
                 return self._refreshed(problem, state, after)
-        if isinstance(rule, BalancedPenalty) and state.k > 0:
-            factor = rule.factor(state.primal_residual, state.dual_residual)
-            if factor != 1.0 and (factor > 1.0 or state.raises == 0):
-                return replace(self._rescaled(problem, state, factor), refreshes=state.refreshes + 1)
+        if due is Due.RESCALE:
+            return replace(self._rescaled(problem, state, factor), refreshes=state.refreshes + 1)
         return state
 
     def _rescaled(self, problem: PGOProblem, state: SOCState, factor: float) -> SOCState:

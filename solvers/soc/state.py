@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from pgo_models.geometry.rotations import Array
 from solvers.soc.anderson import AndersonMemory
 from solvers.soc.local_copies import Team
+from solvers.soc.penalty import Steps
 
 
 @dataclass(frozen=True, eq=False)
-class SOCState:
+class SOCState(Steps):
     """Iterate k of JOINT or CONSENSUS. Team vectors are (rows, d): see `solvers.soc.local_copies.Team`.
 
     Attributes
@@ -38,17 +37,10 @@ class SOCState:
         Robots with their prepared subproblems.
     memory : tuple of AndersonMemory
         One for all robots, one for every robot, or none yet.
-    primal_residual, dual_residual : float
-        ||x - z||_rho and ||c (z - z_before)||_rho, both over ||omega||_rho, with c = max(1, rho / diagonal of M): a
-        penalty far above M makes short steps anywhere.
-    merits : tuple of float
-        Fixed-point residual ||x - z_before||_rho of the steps since rho last changed.
     best : (rows, d)
         The s of the smallest merit.
     origin : tuple of two (rows, d), optional
         z and s when the penalty rule last set rho.
-    refreshes, raises : int
-        How often the penalty rule, and the safeguard against divergence, changed rho.
     """
 
     k: int
@@ -61,13 +53,8 @@ class SOCState:
     separator_rho: Array
     team: Team
     memory: tuple[AndersonMemory, ...] = ()
-    primal_residual: float = np.inf
-    dual_residual: float = np.inf
-    merits: tuple[float, ...] = ()
     best: Array | None = None
     origin: tuple[Array, Array] | None = None
-    refreshes: int = 0
-    raises: int = 0
 
     @property
     def B(self) -> Array:
