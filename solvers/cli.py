@@ -34,8 +34,8 @@ from pgo_models.graphs.trajectories import read_kitti, read_tum, write_tum
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.cli_options import (
-    BackEnd,
-    Method,
+    BackEndName,
+    FirstStage,
     Runner,
     Scene,
     Split,
@@ -105,7 +105,7 @@ def solve_command(
         ),
     ] = None,
     method: Annotated[
-        Method | None,
+        FirstStage | None,
         typer.Option(
             help="First stage: joint SOC (one robot), substructured SOC (robots and a driver, the same iterates), "
             "consensus SOC (robots alone), SOC as in the paper, or none before Newton. Joint unless given, or "
@@ -146,7 +146,7 @@ def solve_command(
         Start | None, typer.Option(help="Start: chordal relaxation (tree for the paper's method) unless given.")
     ] = None,
     r_step: Annotated[
-        BackEnd | None, typer.Option("--r-step", help="Back end of SOC's R-subproblem; factorized unless given.")
+        BackEndName | None, typer.Option("--r-step", help="Back end of SOC's R-subproblem; factorized unless given.")
     ] = None,
     gap: GapOption = DEFAULT_GAP,
     max_iterations: Annotated[
@@ -178,13 +178,13 @@ def solve_command(
     about_robots = (robots, split, engine, address, resume, driver_memory)
     is_shared = any(option is not None for option in about_robots)
     chosen = chosen_method(method, robots, is_shared)
-    if chosen is Method.JOINT and split is not None:
+    if chosen is FirstStage.JOINT and split is not None:
         raise SettingError(f"--method joint has one robot, got --split {split.value}; use substructured or consensus")
     runs_on = chosen_engine(chosen, engine, address, resume is not None)
-    is_shared |= chosen in (Method.SUBSTRUCTURED, Method.CONSENSUS)
+    is_shared |= chosen in (FirstStage.SUBSTRUCTURED, FirstStage.CONSENSUS)
     shared = chosen_partition(problem.graph, robots, split) if is_shared else None
     # Robots factor; the other back ends of CONSENSUS have all robots in one place.
-    on_robots = shared is not None and runs_on is not None and r_step in (None, BackEnd.FACTORIZED)
+    on_robots = shared is not None and runs_on is not None and r_step in (None, BackEndName.FACTORIZED)
     of_robots = (engine, address, resume, driver_memory)
     if r_step is not None and not on_robots and any(option is not None for option in of_robots):
         raise SettingError(

@@ -27,7 +27,7 @@ from solvers.soc.r_step import RStep
 from solvers.soc.soc import SOC, Coupling
 
 
-class Method(enum.Enum):
+class FirstStage(enum.Enum):
     """First stage of a solve."""
 
     JOINT = "joint"
@@ -37,7 +37,7 @@ class Method(enum.Enum):
     NEWTON = "newton"
 
 
-ON_ROBOTS = (Method.SUBSTRUCTURED, Method.CONSENSUS, Method.NEWTON)  # methods that driver and robots run
+ON_ROBOTS = (FirstStage.SUBSTRUCTURED, FirstStage.CONSENSUS, FirstStage.NEWTON)  # methods that driver and robots run
 
 
 class Start(enum.Enum):
@@ -49,7 +49,7 @@ class Start(enum.Enum):
     FILE = "file"
 
 
-class BackEnd(enum.Enum):
+class BackEndName(enum.Enum):
     """Names of the R-step's back ends."""
 
     FACTORIZED = "factorized"
@@ -85,9 +85,9 @@ class Scene(enum.Enum):
 
 
 def chosen_pipeline(
-    method: Method,
+    method: FirstStage,
     robots: Partition | None,
-    r_step: BackEnd | None,
+    r_step: BackEndName | None,
     gap: float,
     max_iterations: int | None,
     tolerance: float | None,
@@ -110,21 +110,21 @@ def chosen_pipeline(
     if driver_memory is not None and method not in ON_ROBOTS:
         raise SettingError(f"--driver-memory is for methods that run on robots, got --method {method.value}")
     memory = DEFAULT_MEMORY if driver_memory is None else 1e9 * driver_memory
-    if method is Method.NEWTON:
+    if method is FirstStage.NEWTON:
         of_soc = (("--r-step", r_step), ("--max-iterations", max_iterations), ("--tolerance", tolerance))
         for name, value in of_soc:
             if value is not None:
                 raise SettingError(f"{name} is for SOC, which --method newton leaves out; leave out one of the two")
         return Pipeline(soc=None, gap=gap, driver_memory=memory)
-    r_step = BackEnd.FACTORIZED if r_step is None else r_step
-    if method is Method.SUBSTRUCTURED and r_step is not BackEnd.FACTORIZED:
+    r_step = BackEndName.FACTORIZED if r_step is None else r_step
+    if method is FirstStage.SUBSTRUCTURED and r_step is not BackEndName.FACTORIZED:
         raise SettingError(
             f"--method substructured factors, got --r-step {r_step.value}; use joint, consensus or paper"
         )
-    usual = PaperSOC() if method is Method.PAPER else HANDOVER if memory > 0 else SOC()
+    usual = PaperSOC() if method is FirstStage.PAPER else HANDOVER if memory > 0 else SOC()
     chosen = replace(
         usual,
-        robots=robots if method in (Method.CONSENSUS, Method.PAPER) else None,
+        robots=robots if method in (FirstStage.CONSENSUS, FirstStage.PAPER) else None,
         r_step=RStep[r_step.name],
         tolerance=usual.tolerance if tolerance is None else tolerance,
         max_iterations=usual.max_iterations if max_iterations is None else max_iterations,
@@ -134,7 +134,7 @@ def chosen_pipeline(
     return Pipeline(soc=chosen, newton=gauss_newton(), gap=gap, driver_memory=memory)
 
 
-def chosen_method(method: Method | None, robots: int | None, is_shared: bool) -> Method:
+def chosen_method(method: FirstStage | None, robots: int | None, is_shared: bool) -> FirstStage:
     """Method of a solve: as asked for, or the one that suits one robot or many.
 
     Parameters
@@ -147,10 +147,10 @@ def chosen_method(method: Method | None, robots: int | None, is_shared: bool) ->
     SettingError
         When many robots are to use a method that has one.
     """
-    if method is Method.JOINT and (robots or 1) > 1:
+    if method is FirstStage.JOINT and (robots or 1) > 1:
         raise SettingError(f"--method joint has one robot, got --robots {robots}; use substructured or consensus")
     if method is None:
-        return Method.SUBSTRUCTURED if is_shared else Method.JOINT
+        return FirstStage.SUBSTRUCTURED if is_shared else FirstStage.JOINT
     return method
 
 
@@ -173,7 +173,7 @@ def chosen_partition(graph: PoseGraph, number: int | None, split: Split | None) 
     return partition(graph, number, PartitionMethod.METIS if has_metis else PartitionMethod.CONTIGUOUS)
 
 
-def chosen_engine(method: Method, engine: Runner | None, address: str | None, checkpoint: bool) -> Engine | None:
+def chosen_engine(method: FirstStage, engine: Runner | None, address: str | None, checkpoint: bool) -> Engine | None:
     """Engine of the options; None where the method runs in one place.
 
     Raises

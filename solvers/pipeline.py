@@ -21,7 +21,7 @@ from pgo_models.graphs.partitioning import Partition, partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem, as_problem
-from solvers.distributed.checkpoint import Checkpoint, Journal, fingerprint
+from solvers.distributed.checkpoint import Checkpoint, Journal, run_fingerprint
 from solvers.distributed.driver import DEFAULT_MEMORY
 from solvers.distributed.leaderless import NO_CERTIFICATE, attempt_leaderless
 from solvers.distributed.stages import attempt_distributed, collect, open_driver
@@ -191,7 +191,7 @@ def solve(
         robots = _robots_for(pipeline.soc, robots, problem.graph)
         settings = pipeline.soc, pipeline.newton, pipeline.gap, pipeline.second_try, pipeline.faults
         has_driver = pipeline.driver_memory > 0
-        mark = fingerprint(problem, robots, (*settings, has_driver), start)
+        mark = run_fingerprint(problem, robots, (*settings, has_driver), start)
         engine = engine if engine is not None else InProcess()
         with (
             closing(Journal(checkpoint, mark, stages)) as journal,

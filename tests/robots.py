@@ -13,7 +13,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import observe
 from pgo_models.problem.cholesky import CholeskyBackend
 from solvers.distributed.robots.agent import Agent
-from solvers.distributed.robots.subgraph import Share
+from solvers.distributed.robots.subgraph import Subgraph
 from solvers.network.engine import WorkerPool
 from solvers.network.messages import Message
 
@@ -87,11 +87,11 @@ class Recording:
 
     def __init__(self) -> None:
         self.log: list[tuple[str, list[Message], list[Message]]] = []
-        self.shares: Sequence[Share] = ()
+        self.shares: Sequence[Subgraph] = ()
         self.agents: list[Agent] = []
         self.is_closed = False
 
-    def open(self, make: Callable[[Share], Agent], shares: Sequence[Share]) -> WorkerPool:
+    def open(self, make: Callable[[Subgraph], Agent], shares: Sequence[Subgraph]) -> WorkerPool:
         self.shares = shares
         self.agents = [make(share) for share in shares]
         return self

@@ -100,7 +100,7 @@ def test_every_way_to_solve_ends_at_the_same_optimum(options, pgo_command):
 def test_the_command_and_the_function_have_the_same_defaults():
     joint, paper = (
         choices.chosen_pipeline(method, None, None, 1e-6, None, None)
-        for method in (choices.Method.JOINT, choices.Method.PAPER)
+        for method in (choices.FirstStage.JOINT, choices.FirstStage.PAPER)
     )
     default = solvers.Pipeline().soc
     assert (joint.soc.max_iterations, joint.soc.tolerance) == (default.max_iterations, default.tolerance)

@@ -156,7 +156,7 @@ def relative_decrement(problem: PGOProblem, poses: Poses) -> float:
     return decrement if is_newton else max(decrement, 2.0 * STATIONARY_DECREMENT)
 
 
-def retract(poses: Poses, w: Array, v: Array) -> Poses:
+def move_poses(poses: Poses, w: Array, v: Array) -> Poses:
     """Poses (R_i Exp(hat(w_i)), t_i + v_i), the rotations cleaned of rounding."""
     return Poses(project_to_rotations(poses.R @ exp_map(w)), poses.t + v)
 
@@ -241,7 +241,7 @@ def _backtrack(
     for _ in range(HALVINGS):
         # The translations that are best for the turned rotations lie on the curved path that a straight move of both
         # leaves: on parking-garage this saves two thirds of the factorisations.
-        poses = problem.with_best_translations(retract(state.poses, length * w, length * v).R)
+        poses = problem.with_best_translations(move_poses(state.poses, length * w, length * v).R)
         objective = problem.objective(poses)
         if length == 1.0 and objective <= NEARLY_EXACT * level:
             poses = problem.with_refined_translations(poses)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from pgo_models.certificates.newton_polish import retract
+from pgo_models.certificates.newton_polish import move_poses
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
@@ -303,7 +303,7 @@ def _moved(problem: PGOProblem, state: GaussSeidelState) -> Poses:
     w, v = TangentLayout(n - 1, d).split(state.x[:, 0])
     at_rest = np.zeros((1, w.shape[1])), np.zeros((1, d))
     origin = Poses(state.R, np.broadcast_to(state.t[0], (n, d)))
-    return retract(origin, np.concatenate([at_rest[0], w]), np.concatenate([at_rest[1], v]))
+    return move_poses(origin, np.concatenate([at_rest[0], w]), np.concatenate([at_rest[1], v]))
 
 
 def _change(problem: PGOProblem, state: GaussSeidelState, x: Array) -> tuple[float, int]:

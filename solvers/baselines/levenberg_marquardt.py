@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, ground_pose, retract, scaled_decrement
+from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, ground_pose, move_poses, scaled_decrement
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
 from pgo_models.geometry.poses import Poses
@@ -159,7 +159,7 @@ class LevenbergMarquardt:
         """Ratio of actual to foreseen decrease, and the poses after the step with their F."""
         if not np.isfinite(state.step).all():
             return -math.inf, state.poses, state.objective
-        poses = retract(state.poses, *TangentLayout(problem.num_poses, problem.d).split(state.step))
+        poses = move_poses(state.poses, *TangentLayout(problem.num_poses, problem.d).split(state.step))
         objective = problem.objective(poses)
         damped = state.damping * inner(state.step, state.matrix.diagonal() * state.step)
         foreseen = 0.5 * (damped - inner(state.gradient, state.step))

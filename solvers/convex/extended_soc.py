@@ -14,7 +14,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
 from solvers.result import Measurement, Status
 from solvers.soc.penalty import MultiplierPenalty
-from solvers.soc.r_step import RStep, Subproblem
+from solvers.soc.r_step import RStep, RSubproblem
 from solvers.soc.soc import SOC, Coupling
 from solvers.soc.state import SOCState
 
@@ -29,7 +29,7 @@ class ExtendedStep:
     graph: PoseGraph
     changer: Changer
 
-    def prepare(self, subproblem: Subproblem) -> GraphQP:
+    def prepare(self, subproblem: RSubproblem) -> GraphQP:
         """Compile the changed quadratic program with the subproblem's penalties.
 
         Raises
@@ -123,6 +123,6 @@ class ExtendedSOC:
 
 
 def _model(state: SOCState) -> GraphQP:
-    model = state.team.steps[0]
+    model = state.copies.steps[0]
     assert isinstance(model, GraphQP)
     return model

@@ -32,7 +32,7 @@ from solvers.distributed.interface import Interface, InterfaceFactor
 from solvers.distributed.multifrontal import separator_tree
 from solvers.distributed.robots.agent import COPIES, Agent
 from solvers.distributed.robots.elimination import columns_of
-from solvers.distributed.robots.subgraph import Share
+from solvers.distributed.robots.subgraph import Subgraph
 from solvers.network.engine import Engine
 from solvers.network.faults import LossyChannel
 from solvers.network.ledger import BYTES_PER_NUMBER, DRIVER, Ledger, Traffic
@@ -94,7 +94,7 @@ class Driver:
 
     def __init__(
         self,
-        shares: Sequence[Share],
+        subgraphs: Sequence[Subgraph],
         num_poses: int,
         engine: Engine,
         backend: CholeskyBackend | None,
@@ -110,31 +110,33 @@ class Driver:
         SettingError
             When the separators would take more than `memory` bytes.
         """
-        working = [share for share in shares if share.part is not None]
-        self.num_poses, self.d, self.grounded = num_poses, shares[0].graph.d, grounded
-        cover = np.concatenate([share.poses[share.in_cover >= 0] for share in shares])
-        place = np.concatenate([share.in_cover[share.in_cover >= 0] for share in shares])
+        working = [subgraph for subgraph in subgraphs if subgraph.part is not None]
+        self.num_poses, self.d, self.grounded = num_poses, subgraphs[0].graph.d, grounded
+        cover = np.concatenate([subgraph.poses[subgraph.in_cover >= 0] for subgraph in subgraphs])
+        place = np.concatenate([subgraph.in_cover[subgraph.in_cover >= 0] for subgraph in subgraphs])
         self.cover: IntArray = np.zeros(len(np.unique(place)), dtype=np.int64)
         self.cover[place] = cover
         g, d = len(self.cover), self.d
         self.tangent = (d, tangent_dimension(d))
-        touched = tuple(share.part.in_cover[share.part.boundary] for share in working if share.part is not None)
+        touched = tuple(
+            subgraph.part.in_cover[subgraph.part.boundary] for subgraph in working if subgraph.part is not None
+        )
         tree = separator_tree(touched, g) if memory else ()
         kinds: tuple[tuple[int, ...], ...] = ((1,), (1, d), self.tangent)
         self._interfaces = {widths: Interface(g, widths, touched, tree) for widths in kinds}
         if memory:
             self._interfaces[self.tangent].check_memory(memory)
-        self._held_cover = [share.in_cover[share.in_cover >= 0] for share in shares]
-        self._parts = [share.part.poses for share in working if share.part is not None]
-        self.robots = np.array([share.robot for share in working])
-        self.ledger = Ledger(len(shares))
+        self._held_cover = [subgraph.in_cover[subgraph.in_cover >= 0] for subgraph in subgraphs]
+        self._parts = [subgraph.part.poses for subgraph in working if subgraph.part is not None]
+        self.robots = np.array([subgraph.robot for subgraph in working])
+        self.ledger = Ledger(len(subgraphs))
         self._traffic: dict[bytes, Traffic] = {}
         self.R, self.t = np.broadcast_to(np.eye(d), (g, d, d)).copy(), np.zeros((g, d))
         self.force, self.objective, self.rounding_level = np.zeros(((d + 1) * g, d)), math.nan, 0.0
         self.block: RotationBlock | None = None
         self._kept = (self.R, self.t, self.force, self.objective, self.rounding_level)
         self._laplacian: InterfaceFactor | None = None
-        self._workers = engine.open(partial(Agent, backend=backend), shares)
+        self._workers = engine.open(partial(Agent, backend=backend), subgraphs)
         described = self.ask("describe", count=Count.OFF)
         self.diagonal = self.interface(1, d).gather([answer["diagonal"][:, None] for answer in described])[:, 0]
 

@@ -47,7 +47,7 @@ class Front:
 
 
 def separator_tree(touched: Sequence[IntArray], num_separators: int) -> tuple[Front, ...]:
-    """Fronts in an order in which children come first; the last one is the whole team.
+    """Fronts in an order in which children come first; the last one holds all robots.
 
     Parameters
     ----------

@@ -18,8 +18,8 @@ from pgo_models.certificates.newton_polish import (
     ROUNDING,
     STATIONARY_DECREMENT,
     SUFFICIENT,
+    move_poses,
     reached_rounding,
-    retract,
     scaled_decrement,
 )
 from pgo_models.errors import NotPositiveDefiniteError
@@ -189,7 +189,7 @@ def _backtrack(driver: Driver, model: Model) -> tuple[_Trial, list[Message]] | N
             answers = driver.ask("move", [{"x": part, "length": message} for part in parts])
         else:
             answers = driver.ask("turn", {"length": message}, Count.PIGGYBACKED)
-        R = retract(now, length * w, length * v).R
+        R = move_poses(now, length * w, length * v).R
         t, answers = driver.best_translations(answers, "evaluate_trial")
         objective, level, force = driver.state_of(answers)
         trial = _Trial(R, t, objective, level, force)

@@ -18,7 +18,7 @@ from solvers.distributed.consensus import ConsensusSOC, ConsensusState
 from solvers.distributed.driver import DEFAULT_MEMORY, Count, Driver
 from solvers.distributed.lower_bound import best_bound_distributed
 from solvers.distributed.newton import SubstructuredNewton
-from solvers.distributed.robots.subgraph import middle_separator, share_out
+from solvers.distributed.robots.subgraph import middle_separator, split_graph
 from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
 from solvers.loop import Watch
 from solvers.network.engine import Engine
@@ -30,9 +30,9 @@ from solvers.soc.soc import SOC, Coupling
 
 def open_driver(problem: PGOProblem, robots: Partition, engine: Engine, memory: float = DEFAULT_MEMORY) -> Driver:
     """Driver and robots for a graph."""
-    shares = share_out(problem.graph, robots)
-    grounded = middle_separator(problem.graph, shares)
-    return Driver(shares, problem.num_poses, engine, problem.backend, memory, grounded)
+    subgraphs = split_graph(problem.graph, robots)
+    grounded = middle_separator(problem.graph, subgraphs)
+    return Driver(subgraphs, problem.num_poses, engine, problem.backend, memory, grounded)
 
 
 def attempt_distributed(

@@ -23,7 +23,7 @@ from pgo_models.plots.interactive_plots import PAGE_CONFIG, explore_graph
 from pgo_models.problem.problem import PGOProblem
 from solvers.network.ledger import Ledger
 from solvers.reporting.convergence_plots import explore_convergence
-from solvers.reporting.report_html import Cell, facts, page, paragraph, section, sortable_table
+from solvers.reporting.report_html import PageCell, facts, page, paragraph, section, sortable_table
 from solvers.reporting.report_text import advice, headline, meaning
 from solvers.reporting.versions import versions
 from solvers.result import Stage, Status
@@ -266,7 +266,10 @@ def _robots(solution: Solved, robots: Partition, residuals: EdgeResiduals) -> st
     if count > _MOST_ROBOTS:
         lines.append(f"Shown are the {_MOST_ROBOTS} with the largest share of F.")
     rows = [
-        [*(Cell(f"{values[a]:,}", values[a]) for _, values in columns), Cell(f"{100 * share[a]:.3g} %", share[a])]
+        [
+            *(PageCell(f"{values[a]:,}", values[a]) for _, values in columns),
+            PageCell(f"{100 * share[a]:.3g} %", share[a]),
+        ]
         for a in shown.tolist()
     ]
     heads = [*(head for head, _ in columns), "share of F"]
@@ -281,12 +284,12 @@ def _worst_edges(solution: Solved, robots: Partition, residuals: EdgeResiduals) 
     rows = []
     for e in worst.tolist():
         i, j = int(graph.i[e]), int(graph.j[e])
-        row = [Cell(str(e), e), Cell(names[i]), Cell(names[j])]
+        row = [PageCell(str(e), e), PageCell(names[i]), PageCell(names[j])]
         if robots.num_robots > 1:
             row[1:] = [_number(robots.robot[i], "d"), row[1], _number(robots.robot[j], "d"), row[2]]
         row += [
             _number(residuals.cost[e], ".4g"),
-            Cell(f"{100 * share[e]:.3g} %", share[e]),
+            PageCell(f"{100 * share[e]:.3g} %", share[e]),
             _number(residuals.translation[e], ".4g"),
             _number(degrees[e], ".4g"),
             _number(graph.kappa[e], ".4g"),
@@ -307,11 +310,11 @@ def _worst_edges(solution: Solved, robots: Partition, residuals: EdgeResiduals) 
 def _stages(solution: Solved) -> str:
     rows = [
         [
-            Cell(name),
+            PageCell(name),
             _number(stage.iterations, "d"),
             _number(stage.objective, ".10g"),
             _number(stage.seconds, ".3f"),
-            Cell(stage.status.name),
+            PageCell(stage.status.name),
         ]
         for name, stage in zip(_stage_names(solution), solution.stages, strict=True)
     ]
@@ -345,5 +348,5 @@ def _setting(value: object) -> str:
     return value.name if isinstance(value, enum.Enum) else str(value)
 
 
-def _number(value: float, form: str) -> Cell:
-    return Cell(format(value, form), float(value))
+def _number(value: float, form: str) -> PageCell:
+    return PageCell(format(value, form), float(value))

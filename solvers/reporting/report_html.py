@@ -72,7 +72,7 @@ for (const table of document.querySelectorAll("table.sortable")) {
 
 
 @dataclass(frozen=True)
-class Cell:
+class PageCell:
     """A cell of a table: what is shown, and what it is sorted by (the text itself unless given)."""
 
     text: str
@@ -133,7 +133,7 @@ def facts(rows: Sequence[tuple[str, str]]) -> str:
     return f"<dl>{inside}</dl>"
 
 
-def sortable_table(name: str, heads: Sequence[str], rows: Sequence[Sequence[Cell]], alarms: Sequence[bool]) -> str:
+def sortable_table(name: str, heads: Sequence[str], rows: Sequence[Sequence[PageCell]], alarms: Sequence[bool]) -> str:
     """Table that sorts by the column whose head is clicked, numbers from the largest; all text is escaped.
 
     Parameters
@@ -141,7 +141,7 @@ def sortable_table(name: str, heads: Sequence[str], rows: Sequence[Sequence[Cell
     name : str
         Id of the table.
     heads : sequence of str
-    rows : sequence of sequences of Cell
+    rows : sequence of sequences of PageCell
     alarms : sequence of bool
         Which rows are marked.
     """

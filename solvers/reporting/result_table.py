@@ -24,7 +24,7 @@ _WIDEST = 10_000
 
 
 @dataclass(frozen=True)
-class Part:
+class TablePart:
     """A table of formatted cells.
 
     Attributes
@@ -62,14 +62,14 @@ class ResultTable:
 
     Attributes
     ----------
-    parts : tuple of Part
+    parts : tuple of TablePart
     records : tuple of dict
         The same figures in full, for CSV and JSON: every record has the same names.
     notes : tuple of str
         Sentences below the tables.
     """
 
-    parts: tuple[Part, ...]
+    parts: tuple[TablePart, ...]
     records: tuple[dict[str, Value], ...]
     notes: tuple[str, ...] = ()
 
@@ -137,12 +137,12 @@ def check_table_format(path: Path) -> None:
         raise SettingError(f"cannot write {path}: no table has suffix {path.suffix!r}; use .md, .csv or .json")
 
 
-def percent(gap: float) -> str:
+def gap_percent(gap: float) -> str:
     """Gap in percent, two digits.
 
     Examples
     --------
-    >>> percent(0.0812), percent(5e-7)
+    >>> gap_percent(0.0812), gap_percent(5e-7)
     ('8.1', '5e-05')
     """
     return f"{100.0 * gap:.2g}"

@@ -21,7 +21,7 @@ from pgo_models.problem.cholesky import SymbolicCholesky, analyze
 from pgo_models.problem.matrices import joint_matrix, residual_matrix
 from pgo_models.problem.problem import PGOProblem
 from solvers.soc.penalty import translation_scale
-from solvers.soc.r_step import BackEnd, RotationStep, Subproblem, prepare
+from solvers.soc.r_step import BackEnd, RotationStep, RSubproblem, prepare
 from solvers.soc.rotation_block import stationary_B
 from solvers.soc.separator_stiffness import GROUND, adapted_penalty, separator_stiffness, travel
 
@@ -39,7 +39,7 @@ class Robot:
     held_global : (rows_a,)
         The same rows in the X of the whole graph.
     A, w, M, analysis
-        As in `solvers.soc.r_step.Subproblem`.
+        As in `solvers.soc.r_step.RSubproblem`.
     components : (n_a,)
         Which poses hang together by edges that it knows.
     """
@@ -55,20 +55,20 @@ class Robot:
 
 
 @dataclass(frozen=True, eq=False)
-class Team:
+class LocalCopies:
     """All robots, in this process and in order; deterministic.
 
-    A team vector, (rows, d), stacks the held rows of all robots.
+    A vector over the copies, (rows, d), stacks the held rows of all robots.
 
     Attributes
     ----------
     robots : tuple of Robot
     row : (rows,)
-        Row of the whole graph's X for every row of a team vector.
-    copies : (N,)
+        Row of the whole graph's X for every row of such a vector.
+    multiplicity : (N,)
         How many robots hold a row of X; 0 for translations that only their robot knows.
     slices : tuple of slice
-        Rows of every robot in a team vector.
+        Rows of every robot in such a vector.
     steps : tuple of RotationStep
         Prepared back ends, empty before `with_penalty`.
     penalty : (rows,)
@@ -79,19 +79,19 @@ class Team:
     back_end: BackEnd
     robots: tuple[Robot, ...]
     row: IntArray
-    copies: IntArray
+    multiplicity: IntArray
     slices: tuple[slice, ...]
     steps: tuple[RotationStep, ...] = ()
     penalty: Array | None = None
 
-    def with_penalty(self, rho: Array, rho_t: Array) -> Team:
-        """Return the team ready to solve with penalties rho (rotations) and rho_t (separator translations), (n,).
+    def with_penalty(self, rho: Array, rho_t: Array) -> LocalCopies:
+        """Return the copies ready to solve with penalties rho (rotations) and rho_t (separator translations), (n,).
 
         The penalty of a pose is shared equally among its copies.
         """
         d = self.problem.d
         whole = np.concatenate([rho_t, np.repeat(rho, d)])
-        share = whole[self.row] / self.copies[self.row]
+        share = whole[self.row] / self.multiplicity[self.row]
         steps = []
         for robot, rows in zip(self.robots, self.slices, strict=True):
             penalty = np.zeros(robot.M.shape[0])
@@ -99,8 +99,8 @@ class Team:
             steps.append(prepare(self._subproblem(robot, penalty), self.back_end))
         return replace(self, steps=tuple(steps), penalty=share)
 
-    def _subproblem(self, robot: Robot, penalty: Array) -> Subproblem:
-        return Subproblem(
+    def _subproblem(self, robot: Robot, penalty: Array) -> RSubproblem:
+        return RSubproblem(
             A=robot.A,
             w=robot.w,
             M=robot.M,
@@ -124,12 +124,12 @@ class Team:
     def separators(self) -> IntArray:
         """Poses that more than one robot holds, ascending."""
         n = self.problem.num_poses
-        return np.flatnonzero(self.copies[n :: self.problem.d] > 1)
+        return np.flatnonzero(self.multiplicity[n :: self.problem.d] > 1)
 
     @cached_property
     def private(self) -> BoolArray:
-        """Whether a row of a team vector is known to its robot alone, (rows,)."""
-        return np.asarray(self.copies[self.row] == 1)
+        """Whether a row of a vector over the copies is known to its robot alone, (rows,)."""
+        return np.asarray(self.multiplicity[self.row] == 1)
 
     def stiffness(self, rho: Array) -> float:
         """How hard it is to move a separator while rho, (n,), holds the rotations: the median of the robots' stiffness.
@@ -143,9 +143,9 @@ class Team:
         n, count = problem.num_poses, len(robot.poses)
         held = robot.held[robot.held < count]
         separators = robot.poses[held]
-        half_scale = 0.5 * problem.M.data[problem.diagonal_positions[separators]] / self.copies[separators]
+        half_scale = 0.5 * problem.M.data[problem.diagonal_positions[separators]] / self.multiplicity[separators]
         penalty = np.zeros(robot.M.shape[0])
-        penalty[count:] = np.repeat(rho[robot.poses] / self.copies[n + d * robot.poses], d)
+        penalty[count:] = np.repeat(rho[robot.poses] / self.multiplicity[n + d * robot.poses], d)
         penalty[held] = 2.0 * GROUND * half_scale
         factor = robot.analysis.factorize(self._subproblem(robot, penalty).K)
         return separator_stiffness(factor, robot.M.shape[0], held, half_scale, robot.components[held])
@@ -153,13 +153,13 @@ class Team:
     def average(self, vector: Array) -> Array:
         """Mean over the copies of every row of X, (N, d); rows without copies are zero."""
         if len(self.robots) == 1:
-            mean = np.zeros((len(self.copies), vector.shape[1]))
+            mean = np.zeros((len(self.multiplicity), vector.shape[1]))
             mean[self.row] = vector
             return mean
         total = np.stack(
-            [np.bincount(self.row, weights=column, minlength=len(self.copies)) for column in vector.T], axis=1
+            [np.bincount(self.row, weights=column, minlength=len(self.multiplicity)) for column in vector.T], axis=1
         )
-        return np.asarray(total / np.maximum(self.copies, 1)[:, None])
+        return np.asarray(total / np.maximum(self.multiplicity, 1)[:, None])
 
     def gradients(self, X: Array) -> Array:
         """2 M_a X of every robot on its held rows, (rows, d), at copies that agree with X, (N, d)."""
@@ -170,7 +170,7 @@ class Team:
         return gradient
 
 
-def build_team(problem: PGOProblem, partition: Partition | None, back_end: BackEnd) -> Team:
+def build_copies(problem: PGOProblem, partition: Partition | None, back_end: BackEnd) -> LocalCopies:
     """Split a problem among robots; None is one robot that holds it all."""
     if partition is None or partition.num_robots == 1:
         robots: tuple[Robot, ...] = (_whole(problem),)
@@ -181,7 +181,7 @@ def build_team(problem: PGOProblem, partition: Partition | None, back_end: BackE
     row = np.concatenate([robot.held_global for robot in robots])
     ends = np.cumsum([len(robot.held) for robot in robots])
     slices = tuple(slice(end - len(robot.held), end) for robot, end in zip(robots, ends, strict=True))
-    return Team(problem, back_end, robots, row, np.bincount(row, minlength=problem.side), slices)
+    return LocalCopies(problem, back_end, robots, row, np.bincount(row, minlength=problem.side), slices)
 
 
 def _whole(problem: PGOProblem) -> Robot:
@@ -221,7 +221,7 @@ def _global_rows(poses: IntArray, problem: PGOProblem) -> IntArray:
     return np.concatenate([poses, (n + d * poses[:, None] + np.arange(d)).ravel()])
 
 
-# Team vectors of SOC: agreement of the copies, the norms of the residuals, and multipliers in balance.
+# Vectors over the copies: agreement of the copies, the norms of the residuals, and multipliers in balance.
 
 
 def stationary_mean(problem: PGOProblem, poses: Poses, rho: Array) -> Array:
@@ -230,53 +230,57 @@ def stationary_mean(problem: PGOProblem, poses: Poses, rho: Array) -> Array:
     return np.concatenate([np.zeros((problem.num_poses, problem.d)), rotations])
 
 
-def balanced(team: Team, X: Array, mean: Array) -> Array:
+def balanced(copies: LocalCopies, X: Array, mean: Array) -> Array:
     """Local multipliers B, (rows, d), that make every subproblem stationary at X; `mean`, (N, d), is their mean.
 
     At a stationary point 2 M_a x + rho_a B_a = 0 for every robot a. One robot alone has B = mean.
     """
-    assert team.penalty is not None
-    B = -team.gradients(X) / team.penalty[:, None]
-    return B + (mean - team.average(B))[team.row]
+    assert copies.penalty is not None
+    B = -copies.gradients(X) / copies.penalty[:, None]
+    return B + (mean - copies.average(B))[copies.row]
 
 
-def agree(team: Team, s: Array, problem: PGOProblem) -> tuple[Array, Array]:
+def agree(copies: LocalCopies, s: Array, problem: PGOProblem) -> tuple[Array, Array]:
     """Step (b): omega from the mean of the copies, and omega and the mean separator translations handed out again."""
-    mean = team.average(s)
+    mean = copies.average(s)
     omega = project_to_rotations(unstack_transposes(mean[problem.num_poses :]))
     mean[problem.num_poses :] = stack_transposes(omega)
-    return omega, mean[team.row]
+    return omega, mean[copies.row]
 
 
-def norm_of_omega(team: Team) -> float:
+def norm_of_omega(copies: LocalCopies) -> float:
     """||omega||_rho over all copies: the translations, which depend on the origin of the world, are left out."""
-    assert team.penalty is not None
-    rotations = team.row >= team.problem.num_poses
-    return float(np.sqrt(team.penalty[rotations].sum()))
+    assert copies.penalty is not None
+    rotations = copies.row >= copies.problem.num_poses
+    return float(np.sqrt(copies.penalty[rotations].sum()))
 
 
-def norm_weight(team: Team) -> Array:
+def norm_weight(copies: LocalCopies) -> Array:
     """Square roots of the penalties: ||v||_rho is the norm of weight * v."""
-    assert team.penalty is not None
-    return np.sqrt(team.penalty)[:, None]
+    assert copies.penalty is not None
+    return np.sqrt(copies.penalty)[:, None]
 
 
-def stationarity_weight(team: Team) -> Array:
+def stationarity_weight(copies: LocalCopies) -> Array:
     """Root of the penalty, times penalty over the diagonal of M where it is above that."""
-    assert team.penalty is not None
-    problem = team.problem
-    diagonal = problem.M.data[problem.diagonal_positions][team.row] / team.copies[team.row]
-    return np.asarray(norm_weight(team) * np.maximum(1.0, team.penalty / diagonal)[:, None])
+    assert copies.penalty is not None
+    problem = copies.problem
+    diagonal = problem.M.data[problem.diagonal_positions][copies.row] / copies.multiplicity[copies.row]
+    return np.asarray(norm_weight(copies) * np.maximum(1.0, copies.penalty / diagonal)[:, None])
 
 
 def adapted(
-    problem: PGOProblem, team: Team, penalty: float, origin: tuple[Array, Array] | None, now: tuple[Array, Array]
+    problem: PGOProblem,
+    copies: LocalCopies,
+    penalty: float,
+    origin: tuple[Array, Array] | None,
+    now: tuple[Array, Array],
 ) -> float:
     """Translation penalty, times the diagonal of M, after the way with `penalty` from the first z, s to those now."""
     assert origin is not None
-    assert team.penalty is not None
-    at, scale = team.row < problem.num_poses, translation_scale(problem)
+    assert copies.penalty is not None
+    at, scale = copies.row < problem.num_poses, translation_scale(problem)
     moved, change = now[0] - origin[0], now[1] - origin[1]
-    pulled = team.penalty[at, None] * (change - moved)[at]  # of B = s - z
-    sums = travel(moved[at], pulled, scale[team.row[at]] / team.copies[team.row[at]])
+    pulled = copies.penalty[at, None] * (change - moved)[at]  # of B = s - z
+    sums = travel(moved[at], pulled, scale[copies.row[at]] / copies.multiplicity[copies.row[at]])
     return adapted_penalty(penalty, sums)

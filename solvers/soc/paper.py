@@ -29,7 +29,7 @@ from pgo_models.problem.matrices import assemble, norm, residual_matrix, rotatio
 from pgo_models.problem.problem import PGOProblem
 from solvers.result import Measurement, Status
 from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty
-from solvers.soc.r_step import BackEnd, RotationStep, RStep, Subproblem, prepare
+from solvers.soc.r_step import BackEnd, RotationStep, RStep, RSubproblem, prepare
 
 PaperPenalty = FixedPenalty | BalancedPenalty | BoydPenalty
 _PATIENCE = 20  # steps without a new smallest merit, after which rho goes up
@@ -237,7 +237,7 @@ def _with_adapted_rho(
 def _prepare(problem: PGOProblem, blocks: Blocks, rho: float, back_end: BackEnd) -> RotationStep:
     penalty = np.full(blocks.own.shape[0], rho)
     return prepare(
-        Subproblem(
+        RSubproblem(
             A=blocks.A,
             w=blocks.w,
             M=blocks.own,

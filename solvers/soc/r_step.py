@@ -33,7 +33,7 @@ class RStep(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Subproblem:
+class RSubproblem:
     """The R-subproblem of one robot, or of the whole graph.
 
     Attributes
@@ -89,14 +89,14 @@ class RotationStep(Protocol):
 class CustomRStep(Protocol):
     """A back end of one's own, in place of an RStep."""
 
-    def prepare(self, subproblem: Subproblem) -> RotationStep:
+    def prepare(self, subproblem: RSubproblem) -> RotationStep:
         """Make the subproblem, or a changed one with the same rows, ready for many shifts."""
 
 
 BackEnd = RStep | CustomRStep
 
 
-def prepare(subproblem: Subproblem, back_end: BackEnd) -> RotationStep:
+def prepare(subproblem: RSubproblem, back_end: BackEnd) -> RotationStep:
     """Factor, bound or compile the subproblem once, for many shifts."""
     if not isinstance(back_end, RStep):
         return back_end.prepare(subproblem)
@@ -126,7 +126,7 @@ class _Fista:
     1/2 because Q is positive semidefinite. The Lipschitz constant is a bound on the largest eigenvalue.
     """
 
-    def __init__(self, subproblem: Subproblem) -> None:
+    def __init__(self, subproblem: RSubproblem) -> None:
         K, count = subproblem.K, subproblem.num_translations
         self._subproblem = subproblem
         self._factor_tt = factorize(K[:count, :count].tocsc(), subproblem.backend) if count else None

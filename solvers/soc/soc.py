@@ -25,11 +25,11 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.result import Measurement, Status
 from solvers.soc.anderson import Anderson, extrapolate_parts, over_relax
 from solvers.soc.local_copies import (
-    Team,
+    LocalCopies,
     adapted,
     agree,
     balanced,
-    build_team,
+    build_copies,
     norm_of_omega,
     norm_weight,
     stationarity_weight,
@@ -82,8 +82,8 @@ class SOC:
         last of them. It costs no message. 1 is the plain recursion.
     translation_penalty : float, optional
         Penalty of separator translations in CONSENSUS, times their diagonal in M. Unless given, 0.6 times the stiffness
-        of the separators (`Team.stiffness`), the inverse of their mean compliance; lowered where the penalties are
-        taken anew, if the translations went far for what changed in their multipliers
+        of the separators (`LocalCopies.stiffness`), the inverse of their mean compliance; lowered where the penalties
+        are taken anew, if the translations went far for what changed in their multipliers
         (`solvers.soc.separator_stiffness`).
     separator_penalty : float, optional
         Least penalty of separator rotations in CONSENSUS under a MultiplierPenalty, times their mean diagonal in M: on
@@ -156,37 +156,37 @@ class SOC:
         B = 0, but for many robots under a MultiplierPenalty the stationary one, as after a refresh.
         """
         poses = start if start is not None else chordal_start(problem)
-        team = build_team(problem, self._copies, self.r_step)
+        copies = build_copies(problem, self._copies, self.r_step)
         rho = self.penalty.initial(problem, poses)
         relative = self.translation_penalty
-        if relative is None and len(team.robots) > 1:
-            relative = translation_penalty_for(team.stiffness(rho))
-        rho_t, separator_rho = self._separator_penalties(problem, team, relative)
+        if relative is None and len(copies.robots) > 1:
+            relative = translation_penalty_for(copies.stiffness(rho))
+        rho_t, separator_rho = self._separator_penalties(problem, copies, relative)
         rho = np.maximum(rho, separator_rho)
-        team = team.with_penalty(rho, rho_t)
+        copies = copies.with_penalty(rho, rho_t)
         X = problem.stacked(poses)
-        z = X[team.row]
-        is_stationary = len(team.robots) > 1 and isinstance(self.penalty, MultiplierPenalty)
+        z = X[copies.row]
+        is_stationary = len(copies.robots) > 1 and isinstance(self.penalty, MultiplierPenalty)
         mean = stationary_mean(problem, poses, rho) if is_stationary else np.zeros_like(X)
-        s = z + balanced(team, X, mean)
-        return SOCState(0, z, poses.R, z, s, rho, rho_t, separator_rho, team, origin=(z, s))
+        s = z + balanced(copies, X, mean)
+        return SOCState(0, z, poses.R, z, s, rho, rho_t, separator_rho, copies, origin=(z, s))
 
     def step(self, problem: PGOProblem, state: SOCState) -> SOCState:
         """One iteration: (a), (b), (c)."""
         state = self._with_penalty_due(problem, state)
-        team, weight = state.team, norm_weight(state.team)
-        z, B, drift = self._between_exchanges(team, state)
-        x = team.solve_all(z - B)  # (a)
+        copies, weight = state.copies, norm_weight(state.copies)
+        z, B, drift = self._between_exchanges(copies, state)
+        x = copies.solve_all(z - B)  # (a)
         relaxed = over_relax(x, z, self.alpha)
         s, memory = relaxed + B, state.memory
         residual = weight * (relaxed - z + drift)
         merit = norm(residual)
         if self.acceleration is not None and np.isfinite(merit):
-            s, memory = extrapolate_parts(self.acceleration, memory, residual, s, team.slices)
+            s, memory = extrapolate_parts(self.acceleration, memory, residual, s, copies.slices)
         if not np.isfinite(s).all():
             return replace(state, k=state.k + 1, x=x, primal_residual=np.nan, dual_residual=np.nan)
-        omega, following = agree(team, s, problem)  # (b), and (c): B = s - z = B + x - z
-        size = norm_of_omega(team)
+        omega, following = agree(copies, s, problem)  # (b), and (c): B = s - z = B + x - z
+        size = norm_of_omega(copies)
         return replace(
             state,
             k=state.k + 1,
@@ -196,7 +196,7 @@ class SOC:
             s=s,
             memory=memory,
             primal_residual=norm(weight * (x - following)) / size,
-            dual_residual=norm(stationarity_weight(team) * (following - state.z)) / size,
+            dual_residual=norm(stationarity_weight(copies) * (following - state.z)) / size,
             merits=(*state.merits, merit),
             best=state.s if merit <= min(state.merits, default=np.inf) else state.best,
         )
@@ -227,25 +227,27 @@ class SOC:
             return np.array([0.0, 0.0, rule.rho])
         return np.array([0.0, rule.scale, 0.0])
 
-    def _between_exchanges(self, team: Team, state: SOCState) -> tuple[Array, Array, Array | float]:
+    def _between_exchanges(self, copies: LocalCopies, state: SOCState) -> tuple[Array, Array, Array | float]:
         """Return z and B after all but the last of the local passes, and by how much z + B has moved."""
-        z, B, private = state.z.copy(), state.B.copy(), team.private
-        is_alone = len(team.robots) == 1
+        z, B, private = state.z.copy(), state.B.copy(), copies.private
+        is_alone = len(copies.robots) == 1
         if is_alone or self.local_passes == 1 or not private.any() or not np.isfinite(state.s).all():
             return z, B, 0.0
         for _ in range(self.local_passes - 1):
-            s = (team.solve_all(z - B) + B)[private]  # (a)
+            s = (copies.solve_all(z - B) + B)[private]  # (a)
             z[private] = stack_transposes(project_to_rotations(unstack_transposes(s)))  # (b)
             B[private] = s - z[private]  # (c)
         return z, B, z + B - state.s
 
-    def _separator_penalties(self, problem: PGOProblem, team: Team, relative: float | None) -> tuple[Array, Array]:
+    def _separator_penalties(
+        self, problem: PGOProblem, copies: LocalCopies, relative: float | None
+    ) -> tuple[Array, Array]:
         """Penalty of separator translations and least penalty of separator rotations, (n,) each."""
-        if relative is None or len(team.robots) == 1:
+        if relative is None or len(copies.robots) == 1:
             return translation_scale(problem), np.zeros(problem.num_poses)
         separator_rho = np.zeros(problem.num_poses)
         if isinstance(self.penalty, MultiplierPenalty):
-            separator = team.separators
+            separator = copies.separators
             separator_rho[separator] = self.separator_penalty_for(relative) * rotation_scale(problem)[separator]
         return relative * translation_scale(problem), separator_rho
 
@@ -260,7 +262,7 @@ class SOC:
         due, factor = next_penalty(self.penalty, state.rho / rotation_scale(problem), state)
         if due is Due.RAISE:
             assert state.best is not None
-            back = replace(state, s=state.best, z=agree(state.team, state.best, problem)[1])
+            back = replace(state, s=state.best, z=agree(state.copies, state.best, problem)[1])
             return replace(self._rescaled(problem, back, factor), raises=state.raises + 1)
         if due in (Due.REFRESH, Due.SECOND_LOOK):
             before, after = self._adapted(problem, state)
@@ -273,30 +275,30 @@ class SOC:
     def _rescaled(self, problem: PGOProblem, state: SOCState, factor: float) -> SOCState:
         """State with factor * rho and the same unscaled multiplier rho B."""
         rho = factor * state.rho
-        before = state.team.penalty
-        team = state.team.with_penalty(rho, state.rho_t)
+        before = state.copies.penalty
+        copies = state.copies.with_penalty(rho, state.rho_t)
         assert before is not None
-        assert team.penalty is not None
-        s = state.z + (before / team.penalty)[:, None] * state.B
-        return replace(state, s=s, rho=rho, team=team, memory=(), merits=(), best=None)
+        assert copies.penalty is not None
+        s = state.z + (before / copies.penalty)[:, None] * state.B
+        return replace(state, s=s, rho=rho, copies=copies, memory=(), merits=(), best=None)
 
     def _adapted(self, problem: PGOProblem, state: SOCState) -> tuple[float, float]:
         """Translation penalty, times the diagonal of M, and what the way so far suggests instead."""
-        if self.translation_penalty is not None or len(state.team.robots) == 1:
+        if self.translation_penalty is not None or len(state.copies.robots) == 1:
             given = self.translation_penalty if self.translation_penalty is not None else 1.0
             return given, given
         relative = float(state.rho_t[0] / translation_scale(problem)[0])
-        return relative, adapted(problem, state.team, relative, state.origin, (state.z, state.s))
+        return relative, adapted(problem, state.copies, relative, state.origin, (state.z, state.s))
 
     def _refreshed(self, problem: PGOProblem, state: SOCState, relative: float) -> SOCState:
         """State with rho and B from the multipliers at omega, where the mean B_i is -2 Lambda_i R_i^T / rho_i."""
         poses = problem.with_best_translations(state.omega)
-        rho_t, separator_rho = self._separator_penalties(problem, state.team, relative)
+        rho_t, separator_rho = self._separator_penalties(problem, state.copies, relative)
         rho = np.maximum(self.penalty.initial(problem, poses), separator_rho)
-        team = state.team.with_penalty(rho, rho_t)
+        copies = state.copies.with_penalty(rho, rho_t)
         X = problem.stacked(poses)
-        z = X[team.row]
-        s = z + balanced(team, X, stationary_mean(problem, poses, rho))
+        z = X[copies.row]
+        s = z + balanced(copies, X, stationary_mean(problem, poses, rho))
         return replace(
             state,
             z=z,
@@ -305,7 +307,7 @@ class SOC:
             rho=rho,
             rho_t=rho_t,
             separator_rho=separator_rho,
-            team=team,
+            copies=copies,
             memory=(),
             merits=(),
             best=None,

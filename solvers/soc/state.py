@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 from pgo_models.geometry.rotations import Array
 from solvers.soc.anderson import AndersonMemory
-from solvers.soc.local_copies import Team
+from solvers.soc.local_copies import LocalCopies
 from solvers.soc.penalty import Steps
 
 
 @dataclass(frozen=True, eq=False)
 class SOCState(Steps):
-    """Iterate k of JOINT or CONSENSUS. Team vectors are (rows, d): see `solvers.soc.local_copies.Team`.
+    """Iterate k of JOINT or CONSENSUS; rows are those of vectors over the copies (`solvers.soc.local_copies`).
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class SOCState(Steps):
         Penalty of the translations of separators.
     separator_rho : (n,)
         Least penalty of the rotations of separators under a MultiplierPenalty.
-    team : Team
+    copies : LocalCopies
         Robots with their prepared subproblems.
     memory : tuple of AndersonMemory
         One for all robots, one for every robot, or none yet.
@@ -51,7 +51,7 @@ class SOCState(Steps):
     rho: Array
     rho_t: Array
     separator_rho: Array
-    team: Team
+    copies: LocalCopies
     memory: tuple[AndersonMemory, ...] = ()
     best: Array | None = None
     origin: tuple[Array, Array] | None = None

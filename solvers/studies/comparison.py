@@ -21,7 +21,7 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.pipeline import solve
 from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
 from solvers.reporting.convergence_plots import Curve
-from solvers.reporting.result_table import Part, ResultTable, Value, percent
+from solvers.reporting.result_table import ResultTable, TablePart, Value, gap_percent
 from solvers.result import Status
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings
 from solvers.studies.benchmark_runs import run_benchmark
@@ -101,7 +101,7 @@ class Comparison:
                 (
                     trial.contender.label,
                     f"{trial.objective:.9g}" if trial.is_answer else "-",
-                    percent(gap) if trial.is_answer else "-",
+                    gap_percent(gap) if trial.is_answer else "-",
                     " + ".join(map(str, trial.iterations)),
                     "-" if trial.rounds is None else str(trial.rounds),
                     "-" if trial.all_reduces is None else str(trial.all_reduces),
@@ -123,7 +123,7 @@ class Comparison:
         ]
         if not self.is_complete:
             notes.append("interrupted: the methods left out were not run")
-        return ResultTable((Part(_HEADS, tuple(rows)),), tuple(records), tuple(notes))
+        return ResultTable((TablePart(_HEADS, tuple(rows)),), tuple(records), tuple(notes))
 
     def save_plot(self, path: Path | str) -> None:
         """Write the gap against rounds, bytes and seconds as a picture or, for .html, as a page to explore.

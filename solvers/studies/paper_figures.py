@@ -24,7 +24,7 @@ from pgo_models.plots.style import column_figure, save_figure
 from pgo_models.problem.problem import PGOProblem
 from solvers.pipeline import solve
 from solvers.reporting.convergence_plots import explore_convergence, plot_convergence
-from solvers.reporting.result_table import percent
+from solvers.reporting.result_table import gap_percent
 from solvers.result import History
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings, StageRecord
 from solvers.studies.benchmark_runs import run_benchmark
@@ -79,7 +79,7 @@ class Shown:
     def title(self) -> str:
         """Of the picture of the result."""
         gap = relative_gap(self.trial.objective, self.lower_bound)
-        return f"{self.graph.name}, SOC: F = {self.trial.objective:.6g}, gap {percent(gap)} %"
+        return f"{self.graph.name}, SOC: F = {self.trial.objective:.6g}, gap {gap_percent(gap)} %"
 
     @property
     def panels(self) -> list[tuple[str, PoseGraph, Poses]]:

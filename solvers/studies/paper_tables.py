@@ -24,7 +24,7 @@ from solvers.pipeline import solve
 from solvers.result import Status
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
 from solvers.studies.benchmark_runs import run_benchmark
-from solvers.studies.results_cache import Entry, KeptResults, fingerprint
+from solvers.studies.results_cache import Entry, KeptResults, graph_fingerprint
 
 SCENES: dict[str, Callable[[np.random.Generator], PoseGraph]] = {"circle": circle, "grid": grid, "sphere": sphere}
 TABLE_CONTENDERS = (
@@ -96,7 +96,7 @@ class Optimum:
 
 
 @dataclass(frozen=True)
-class Cell:
+class TableEntry:
     """What one method did on one graph (`solvers.studies.benchmark`); `first_gap` is that after SOC."""
 
     objective: float
@@ -121,7 +121,7 @@ class ReproducedRow:
     num_draws : int
         How many were wanted.
     optima : tuple of Optimum
-    cells : tuple of Cell
+    cells : tuple of TableEntry
         Of the draws that have figures.
     reasons : tuple of str
         Why others have none.
@@ -131,7 +131,7 @@ class ReproducedRow:
     contender: BenchmarkMethod
     num_draws: int
     optima: tuple[Optimum, ...]
-    cells: tuple[Cell, ...]
+    cells: tuple[TableEntry, ...]
     reasons: tuple[str, ...]
 
     @property
@@ -264,7 +264,7 @@ class _RowResults:
 
     def __init__(self) -> None:
         self.optima: list[Optimum] = []
-        self.cells: dict[BenchmarkMethod, list[Cell]] = {contender: [] for contender in TABLE_CONTENDERS}
+        self.cells: dict[BenchmarkMethod, list[TableEntry]] = {contender: [] for contender in TABLE_CONTENDERS}
         self.reasons: dict[BenchmarkMethod, list[str]] = {contender: [] for contender in TABLE_CONTENDERS}
 
     def fail(self, reason: str, bar: _Bar) -> None:
@@ -290,7 +290,7 @@ def _one_graph(
     except _FAILURES as error:
         results.fail(_reason(error), bar)
         return
-    problem, name = PGOProblem(graph), f"{row.name} {seed} {fingerprint(graph)}"
+    problem, name = PGOProblem(graph), f"{row.name} {seed} {graph_fingerprint(graph)}"
     found = _found(kept, f"{name} optimum", partial(_optimum, problem))
     if isinstance(found, str):
         results.fail(found, bar)
@@ -305,7 +305,7 @@ def _one_graph(
         if isinstance(cell, str):
             results.reasons[contender].append(cell)
         else:
-            results.cells[contender].append(Cell(**{**cell, "iterations": tuple(cell["iterations"])}))
+            results.cells[contender].append(TableEntry(**{**cell, "iterations": tuple(cell["iterations"])}))
         bar.advance()
 
 
@@ -339,7 +339,7 @@ def _cell(
         raise PGOError(trial.remark)
     first = trial.first_objective
     return asdict(
-        Cell(
+        TableEntry(
             objective=float(trial.objective),
             gap=float(relative_gap(trial.objective, optimum.lower_bound)),
             first_gap=None if first is None else float(relative_gap(first, optimum.lower_bound)),

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from solvers.reporting.result_table import Part, ResultTable, Value, percent
+from solvers.reporting.result_table import ResultTable, TablePart, Value, gap_percent
 from solvers.studies.benchmark import BenchmarkMethod
-from solvers.studies.paper_tables import Cell, ReproducedRow, Reproduction
+from solvers.studies.paper_tables import ReproducedRow, Reproduction, TableEntry
 
 _COST_HEADS = (
     "graph",
@@ -131,8 +131,8 @@ def tables_as_text(tables: Reproduction) -> ResultTable:
     if not tables.is_complete:
         notes.append("interrupted: the same command goes on where it was")
     parts = (
-        Part(_COST_HEADS, tuple(costs), "Cost (tables 1 and 3 of the paper)"),
-        Part(_EFFORT_HEADS, tuple(efforts), "Effort (tables 2 and 4 of the paper)"),
+        TablePart(_COST_HEADS, tuple(costs), "Cost (tables 1 and 3 of the paper)"),
+        TablePart(_EFFORT_HEADS, tuple(efforts), "Effort (tables 2 and 4 of the paper)"),
     )
     return ResultTable(parts, tuple(map(_record, tables.rows)), tuple(notes))
 
@@ -170,7 +170,7 @@ def _answers_where_the_paper_has_none(row: ReproducedRow) -> bool | None:
 def _graph_cells(row: ReproducedRow) -> tuple[str, ...]:
     published = row.published
     optimum = _spread([optimum.objective for optimum in row.optima], 8)
-    proven = percent(max(optimum.gap for optimum in row.optima)) if row.optima else "-"
+    proven = gap_percent(max(optimum.gap for optimum in row.optima)) if row.optima else "-"
     return published.name, str(published.num_poses), str(published.num_edges), optimum, proven
 
 
@@ -188,7 +188,7 @@ def _paper_cost_cells(row: ReproducedRow) -> tuple[str, ...]:
     figures, gap = row.figures, row.published_gap
     return (
         "-" if figures is None or figures.objective is None else f"{figures.objective:.8g}",
-        "-" if gap is None or row.contender is BenchmarkMethod.STAIRCASE else percent(gap),
+        "-" if gap is None or row.contender is BenchmarkMethod.STAIRCASE else gap_percent(gap),
     )
 
 
@@ -228,10 +228,10 @@ def _gaps(gaps: Sequence[float]) -> str:
     if not gaps:
         return "-"
     mean, spread = float(np.mean(gaps)), _deviation(gaps)
-    return percent(mean) if spread <= 0.05 * mean else f"{percent(mean)} +- {percent(spread)}"
+    return gap_percent(mean) if spread <= 0.05 * mean else f"{gap_percent(mean)} +- {gap_percent(spread)}"
 
 
-def _iterations(cells: Sequence[Cell]) -> str:
+def _iterations(cells: Sequence[TableEntry]) -> str:
     if not cells:
         return "-"
     means = np.mean([cell.iterations for cell in cells], axis=0)

@@ -78,14 +78,14 @@ class KeptResults:
         return results
 
 
-def fingerprint(graph: PoseGraph) -> str:
+def graph_fingerprint(graph: PoseGraph) -> str:
     """Short text that differs between graphs with different measurements or estimates.
 
     Examples
     --------
     >>> from pgo_models.graphs.scenes import grid
     >>> one, other = (grid(np.random.default_rng(seed)) for seed in (0, 1))
-    >>> fingerprint(one) == fingerprint(one), fingerprint(one) == fingerprint(other)
+    >>> graph_fingerprint(one) == graph_fingerprint(one), graph_fingerprint(one) == graph_fingerprint(other)
     (True, False)
     """
     digest = hashlib.sha256()

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.sparse.linalg import spsolve
 from test_sweep_order import scattered
 
-from pgo_models.certificates.newton_polish import polish, retract
+from pgo_models.certificates.newton_polish import move_poses, polish
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import project_to_rotations, random_rotations, unstack_transposes
@@ -76,7 +76,7 @@ def centralized(problem: PGOProblem) -> Poses:
     n, d = problem.num_poses, problem.d
     projected = project_to_rotations(unstack_transposes(relaxed_rotations(problem, np.eye(d))))
     w, v = TangentLayout(n - 1, d).split(gauss_newton_move(problem, np.concatenate([np.eye(d)[None], projected]))[:, 0])
-    moved = retract(Poses(projected, np.zeros((n - 1, d))), w, v)
+    moved = move_poses(Poses(projected, np.zeros((n - 1, d))), w, v)
     return Poses(np.concatenate([np.eye(d)[None], moved.R]), np.concatenate([np.zeros((1, d)), moved.t]))
 
 

@@ -23,10 +23,10 @@ from pgo_models.certificates.newton_polish import (
     STATIONARY_DECREMENT,
     _apply_inverse,
     _Secant,
+    move_poses,
     polish,
     polish_step,
     relative_decrement,
-    retract,
     start_polish,
 )
 from pgo_models.geometry.poses import Poses
@@ -96,7 +96,7 @@ def test_the_decrement_predicts_what_is_left(seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)
     best = polish(problem, chordal_start(problem))
     rng = np.random.default_rng(seed)
-    near = retract(best, 1e-4 * rng.standard_normal((n, tangent_dimension(d))), 1e-4 * rng.standard_normal((n, d)))
+    near = move_poses(best, 1e-4 * rng.standard_normal((n, tangent_dimension(d))), 1e-4 * rng.standard_normal((n, d)))
     left = (problem.objective(near) - problem.objective(best)) / problem.objective(near)
     # To first order in the distance, 1e-4, times the condition of the random weights.
     assert relative_decrement(problem, near) == pytest.approx(left, rel=0.05, abs=1e-12)
@@ -126,7 +126,7 @@ def test_without_noise_nothing_is_left(seed: int, n: int, d: int) -> None:
     problem = PGOProblem(exact_graph(seed, n, d))
     near = chordal_start(problem)
     rng = np.random.default_rng(seed)
-    shaken = retract(near, 0.05 * rng.standard_normal((n, tangent_dimension(d))), 0.05 * rng.standard_normal((n, d)))
+    shaken = move_poses(near, 0.05 * rng.standard_normal((n, tangent_dimension(d))), 0.05 * rng.standard_normal((n, d)))
     # The decrement tells to first order what is left.
     assert problem.objective(polish(problem, shaken)) <= 2 * STATIONARY_DECREMENT
 
@@ -206,10 +206,10 @@ def test_retract_moves_along_the_exponential(seed: int, n: int, d: int) -> None:
     poses = random_poses(n, d, seed)
     rng = np.random.default_rng(seed)
     w, v = rng.standard_normal((n, tangent_dimension(d))), rng.standard_normal((n, d))
-    there = retract(poses, w, v)
+    there = move_poses(poses, w, v)
     np.testing.assert_allclose(there.R, poses.R @ exp_map(w), rtol=0, atol=16 * EPS)
     np.testing.assert_array_equal(there.t, poses.t + v)
-    back = retract(there, -w, -v)
+    back = move_poses(there, -w, -v)
     np.testing.assert_allclose(back.R, poses.R, rtol=0, atol=32 * EPS)
 
 

@@ -10,7 +10,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, stack_transposes
 from pgo_models.graphs.partitioning import partition
 from pgo_models.problem.problem import PGOProblem
-from solvers.soc.local_copies import build_team
+from solvers.soc.local_copies import build_copies
 from solvers.soc.paper import PaperSOC, PaperState
 from solvers.soc.r_step import RStep
 
@@ -31,9 +31,9 @@ def drawn(seed: int, n: int, d: int) -> tuple[PGOProblem, Array, Array]:
 @given(seed=SEEDS, n=st.integers(3, 10), d=DIMENSIONS)
 def test_the_joint_program_is_the_factorised_step(seed: int, n: int, d: int) -> None:
     problem, rho, V = drawn(seed, n, d)
-    team = build_team(problem, None, RStep.FACTORIZED).with_penalty(rho, np.ones(n))
+    copies = build_copies(problem, None, RStep.FACTORIZED).with_penalty(rho, np.ones(n))
     X = graph_qp(problem.graph, rho).solve(V)
-    np.testing.assert_allclose(X[n:], team.solve_all(V[n:]), rtol=0, atol=ACCURACY)
+    np.testing.assert_allclose(X[n:], copies.solve_all(V[n:]), rtol=0, atol=ACCURACY)
     t = problem.M[:n, :n] @ X[:n] + problem.M[:n, n:] @ X[n:]  # the translations are the best ones for these rotations
     np.testing.assert_allclose(t, 0.0, rtol=0, atol=ACCURACY * float(problem.M.diagonal().max()))
 
@@ -76,12 +76,12 @@ def test_with_copies_it_is_the_consensus_step(seed: int, n: int, d: int) -> None
     separator = np.zeros(n, dtype=bool)
     separator[robots.separators(graph)] = True
     rho_t = np.full(n, float(np.median(rho)))
-    team = build_team(problem, robots, RStep.FACTORIZED).with_penalty(rho, rho_t)
-    solution = team.solve_all(V[team.row])
-    for a, (robot, rows) in enumerate(zip(team.robots, team.slices, strict=True)):
-        copies = np.maximum(team.copies, 1)  # translations of separators, and all rotations, are shared out
-        share_t = np.where(separator, rho_t / copies[:n], 0.0)
-        qp = robot_qp(graph, a, rho / copies[n::d], Neighbours.COPIES, Unknowns.POSES, rho_t=share_t)
+    copies = build_copies(problem, robots, RStep.FACTORIZED).with_penalty(rho, rho_t)
+    solution = copies.solve_all(V[copies.row])
+    for a, (robot, rows) in enumerate(zip(copies.robots, copies.slices, strict=True)):
+        held = np.maximum(copies.multiplicity, 1)  # translations of separators, and all rotations, are shared out
+        share_t = np.where(separator, rho_t / held[:n], 0.0)
+        qp = robot_qp(graph, a, rho / held[n::d], Neighbours.COPIES, Unknowns.POSES, rho_t=share_t)
         np.testing.assert_array_equal(qp.variables.poses, robot.poses)
         local = np.concatenate([robot.poses, (n + d * robot.poses[:, None] + np.arange(d)).ravel()])
         np.testing.assert_allclose(qp.solve(V[local])[robot.held], solution[rows], rtol=0, atol=ACCURACY)

@@ -86,10 +86,10 @@ def test_without_faults_the_states_are_those_of_the_plain_recursion(
         if central.raises:  # the safeguards of the two are not the same
             return
         state = method.step(driver, state)
-        size = np.sqrt(central.team.penalty[central.team.row >= n].sum())
+        size = np.sqrt(central.copies.penalty[central.copies.row >= n].sum())
         # s goes the damped way of a plain step; omega is that of the s before.
         assert state.primal_residual == pytest.approx(central.merits[-1] / size, rel=1e-6, abs=1e-9)
-        for robot, rows, agent in zip(central.team.robots, central.team.slices, engine.agents, strict=True):
+        for robot, rows, agent in zip(central.copies.robots, central.copies.slices, engine.agents, strict=True):
             mine = agent.copies
             assert mine is not None
             allowed = 1e-8 * (1 + np.abs(central.s).max())

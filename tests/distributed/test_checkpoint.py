@@ -132,9 +132,9 @@ def test_the_file_stays_when_the_run_was_stopped_and_goes_when_it_converged(tmp_
 def test_a_checkpoint_is_due_after_so_many_rounds(tmp_path, monkeypatch):
     graph, write, written = varied_graph(8, 40, 2), checkpoint._write, []
 
-    def recording(path, fingerprint, saved, snapshots):
+    def recording(path, run_fingerprint, saved, snapshots):
         written.append((saved.method, saved.driver.ledger.rounds))
-        write(path, fingerprint, saved, snapshots)
+        write(path, run_fingerprint, saved, snapshots)
 
     def writes(rounds):
         written.clear()

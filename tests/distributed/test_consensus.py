@@ -55,14 +55,14 @@ def check_state(one: SOCState, other: ConsensusState, engine: Recording) -> None
     assert (other.k, other.refreshes, other.raises) == (one.k, one.refreshes, one.raises)
     np.testing.assert_allclose(other.primal_residual, one.primal_residual, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(other.dual_residual, one.dual_residual, rtol=1e-6, atol=1e-8)
-    assert one.team.penalty is not None
-    for robot, rows, agent in zip(one.team.robots, one.team.slices, engine.agents, strict=True):
+    assert one.copies.penalty is not None
+    for robot, rows, agent in zip(one.copies.robots, one.copies.slices, engine.agents, strict=True):
         mine = agent.copies
         assert mine is not None
-        np.testing.assert_array_equal(agent.share.poses, robot.poses)
+        np.testing.assert_array_equal(agent.subgraph.poses, robot.poses)
         np.testing.assert_array_equal(np.flatnonzero(mine.held), robot.held)
         np.testing.assert_allclose(mine.rho, one.rho[robot.poses], rtol=SAME, atol=0)
-        np.testing.assert_allclose(mine.penalty[robot.held], one.team.penalty[rows], rtol=SAME, atol=0)
+        np.testing.assert_allclose(mine.penalty[robot.held], one.copies.penalty[rows], rtol=SAME, atol=0)
         for local, whole in ((mine.x, one.x), (mine.z, one.z), (mine.s, one.s)):
             np.testing.assert_allclose(local[robot.held], whole[rows], rtol=0, atol=SAME * (1 + np.abs(whole).max()))
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, metis
 
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, ground_pose, retract
+from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, ground_pose, move_poses
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import tangent_dimension
@@ -38,7 +38,7 @@ def near(problem: PGOProblem, seed: int, spread: float) -> Poses:
     """The chordal start, moved at random."""
     rng = np.random.default_rng(seed)
     moves = [spread * rng.standard_normal((problem.num_poses, k)) for k in (tangent_dimension(problem.d), problem.d)]
-    return retract(chordal_start(problem), *moves)
+    return move_poses(chordal_start(problem), *moves)
 
 
 def driver_at(problem: PGOProblem, parts: Partition, poses: Poses) -> Driver:

@@ -18,7 +18,7 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import Driver
-from solvers.distributed.robots.subgraph import share_out
+from solvers.distributed.robots.subgraph import split_graph
 from solvers.distributed.stages import collect, open_driver
 from solvers.network.engine import InProcess
 from solvers.pipeline import Pipeline, solve
@@ -85,7 +85,7 @@ def test_separators_that_would_not_fit_are_refused_before_a_robot_starts() -> No
     graph = grid(np.random.default_rng(0))
     engine = Recording()
     with pytest.raises(SettingError, match="use a METIS partition or fewer robots"):
-        Driver(share_out(graph, partition(graph, 3)), graph.num_poses, engine, None, memory=1e3)
+        Driver(split_graph(graph, partition(graph, 3)), graph.num_poses, engine, None, memory=1e3)
     assert engine.shares == ()
 
 
@@ -176,7 +176,7 @@ def test_what_crosses_has_the_size_of_the_separators(d: int, noise: NoiseModel) 
     assert parts is not None
     memory = 40
     seen = set()
-    for share in share_out(graph, parts):
+    for share in split_graph(graph, parts):
         part = share.part
         if part is None:
             continue

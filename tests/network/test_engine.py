@@ -8,7 +8,7 @@ import solvers
 from pgo_models.errors import SettingError
 from pgo_models.graphs.partitioning import partition
 from solvers.distributed.robots.agent import Agent
-from solvers.distributed.robots.subgraph import share_out
+from solvers.distributed.robots.subgraph import split_graph
 from solvers.network.engine import InProcess
 from solvers.network.messages import RESTORE, SNAPSHOT
 
@@ -30,7 +30,7 @@ def test_there_is_a_thread_at_least():
 
 def test_robots_restored_from_snapshots_answer_as_those_that_were_asked():
     graph = varied_graph(1, 30, 3)
-    shares = share_out(graph, partition(graph, 3))
+    shares = split_graph(graph, partition(graph, 3))
     nothing = [{}] * len(shares)
     make = partial(Agent, backend=None)
     old, new = InProcess().open(make, shares), InProcess().open(make, shares)

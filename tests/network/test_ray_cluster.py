@@ -15,7 +15,7 @@ import pgo_models as pgo
 from pgo_models.errors import EngineError
 from solvers import cli
 from solvers.distributed.robots.agent import Agent
-from solvers.distributed.robots.subgraph import share_out
+from solvers.distributed.robots.subgraph import split_graph
 from solvers.network import ray_engine
 from solvers.network.ray_engine import RayEngine
 
@@ -48,7 +48,7 @@ def listening(pids):
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc is Linux's")
 def test_without_an_address_all_listen_on_the_loopback_alone():
     graph = varied_graph(0, 60, 3)
-    pool = RayEngine(num_cpus=2).open(partial(Agent, backend=None), share_out(graph, pgo.partition(graph, 2)))
+    pool = RayEngine(num_cpus=2).open(partial(Agent, backend=None), split_graph(graph, pgo.partition(graph, 2)))
     try:
         found = listening(processes(os.getpid()))
     finally:

@@ -19,7 +19,7 @@ from pgo_models.errors import EngineError, FileFormatError, MissingExtraError, N
 from pgo_models.graphs.pose_graph import PoseGraph
 from solvers import cli
 from solvers.distributed.robots.agent import Agent
-from solvers.distributed.robots.subgraph import Share, share_out
+from solvers.distributed.robots.subgraph import Subgraph, split_graph
 from solvers.network import ray_engine
 from solvers.network.ray_engine import RayEngine, connect
 from solvers.network.recovery import Recovery
@@ -144,8 +144,8 @@ def test_killed_actors_change_nothing_and_no_process_receives_anothers_private_e
 def assert_only_own_edges(crossed, graph, robots):
     """First what makes the agent is sent, and its share; never an edge between two poses of another robot."""
     _, share = crossed[0]
-    assert isinstance(share, Share)
-    assert set(vars(share)) == set(Share.__dataclass_fields__)  # nothing that was worked out of it
+    assert isinstance(share, Subgraph)
+    assert set(vars(share)) == set(Subgraph.__dataclass_fields__)  # nothing that was worked out of it
     assert isinstance(share.graph, PoseGraph)
     assert len(crossed) > 10
     i, j = robots.robot[graph.i], robots.robot[graph.j]
@@ -169,7 +169,7 @@ def test_a_robot_that_is_lost_too_often_ends_the_run(graph, actors):
 
 
 def test_errors_of_robots_arrive_as_what_they_are(graph):
-    pool = RayEngine().open(partial(Agent, backend=None), share_out(graph, pgo.partition(graph, 1)))
+    pool = RayEngine().open(partial(Agent, backend=None), split_graph(graph, pgo.partition(graph, 1)))
     try:
         with pytest.raises(NotPositiveDefiniteError, match=r"^the matrix has nan or inf; check the weights"):
             pool.ask("penalize", [{"rule": np.full(3, np.nan), "is_stationary": np.zeros(1)}])
@@ -178,7 +178,7 @@ def test_errors_of_robots_arrive_as_what_they_are(graph):
 
 
 def test_a_slow_answer_is_waited_for_while_the_cluster_lives(graph, actors, monkeypatch):
-    pool = RayEngine().open(partial(Agent, backend=None), share_out(graph, pgo.partition(graph, 1)))
+    pool = RayEngine().open(partial(Agent, backend=None), split_graph(graph, pgo.partition(graph, 1)))
     monkeypatch.setattr(ray_engine, "_SECONDS_TO_ANSWER", 0.1)
     try:
         ticket = actors[0].actors[0].__ray_call__.remote(lambda holder: time.sleep(1) or {"slow": 1})
@@ -202,7 +202,7 @@ def test_errors_can_be_sent(error):
 
 @pytest.mark.parametrize(("robots", "share"), [(1, 1.0), (2, 1.0), (3, 0.5), (4, 0.5), (6, 0.3333)])
 def test_every_cpu_has_room_for_as_many_robots(robots, share, graph):
-    shares = share_out(graph, pgo.partition(graph, robots))
+    shares = split_graph(graph, pgo.partition(graph, robots))
     assert (
         ray_engine._RayPlace(
             ray, partial(Agent, backend=None), shares, RayEngine(robots_per_cpu=3), False
@@ -218,7 +218,7 @@ def test_too_few_cpus_are_told_at_once(graph):
 
 def test_cpus_that_others_use_are_told_in_time(graph):
     busy = ray.remote(Agent).options(num_cpus=2)
-    shares = share_out(graph, pgo.partition(graph, 2))
+    shares = split_graph(graph, pgo.partition(graph, 2))
     held = busy.remote(shares[0], None)
     ray.get(held.obey.remote("save_poses", {}))
     try:

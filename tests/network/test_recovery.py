@@ -8,7 +8,7 @@ import solvers
 from pgo_models.errors import EngineError, NotPositiveDefiniteError, SettingError
 from pgo_models.graphs.partitioning import PartitionMethod, partition
 from solvers.distributed.robots.agent import Agent
-from solvers.distributed.robots.subgraph import share_out
+from solvers.distributed.robots.subgraph import split_graph
 from solvers.network.messages import RESTORE, SNAPSHOT
 from solvers.network.recovery import RecoveringPool, Recovery, RobotLostError
 
@@ -115,11 +115,11 @@ def test_a_snapshot_and_a_restore_take_the_place_of_the_orders_before(monkeypatc
 
     def obey(agent, order, message):
         obeyed.append((order, message))
-        return {"of": agent.share.robot}
+        return {"of": agent.subgraph.robot}
 
     monkeypatch.setattr(Agent, "obey", obey)
     graph = varied_graph(5, 24, 2)
-    place = Leaky(share_out(graph, partition(graph, 2)), set())
+    place = Leaky(split_graph(graph, partition(graph, 2)), set())
     place.start(range(2))
     pool = RecoveringPool(place, 2, Recovery())
     pool.ask("one", [{}] * 2)
@@ -145,7 +145,7 @@ def test_what_is_kept_for_a_robot_is_bounded():
 def test_a_snapshot_is_taken_after_so_many_orders(monkeypatch):
     obeyed = []
     monkeypatch.setattr(Agent, "obey", lambda agent, order, message: obeyed.append(order) or {})
-    place = Leaky(share_out(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 1)), set())
+    place = Leaky(split_graph(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 1)), set())
     place.start([0])
     pool = RecoveringPool(place, 1, Recovery(orders_between_snapshots=3))
     for _ in range(7):
@@ -156,10 +156,10 @@ def test_a_snapshot_is_taken_after_so_many_orders(monkeypatch):
 
 def test_of_two_refusals_the_first_robots_is_told(monkeypatch):
     def obey(agent, order, message):
-        raise NotPositiveDefiniteError(f"robot {agent.share.robot}")
+        raise NotPositiveDefiniteError(f"robot {agent.subgraph.robot}")
 
     monkeypatch.setattr(Agent, "obey", obey)
-    place = Leaky(share_out(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 2)), set())
+    place = Leaky(split_graph(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 2)), set())
     place.start(range(2))
     with pytest.raises(NotPositiveDefiniteError, match="robot 0"):
         RecoveringPool(place, 2, Recovery()).ask("go", [{}] * 2)
@@ -174,14 +174,14 @@ def test_a_robot_that_is_lost_again_and_again_ends_the_run():
 
 def test_a_robots_own_error_is_told_after_all_have_obeyed_and_is_passed_over_in_the_replay(monkeypatch):
     graph = varied_graph(5, 24, 2)
-    shares = share_out(graph, partition(graph, 3))
+    shares = split_graph(graph, partition(graph, 3))
     obeyed = []
 
     def obey(agent, order, message):
-        obeyed.append((agent.share.robot, order))
-        if order == "refuse" and agent.share.robot == 0:
+        obeyed.append((agent.subgraph.robot, order))
+        if order == "refuse" and agent.subgraph.robot == 0:
             raise NotPositiveDefiniteError("no")
-        return {"robot": np.array([agent.share.robot])}
+        return {"robot": np.array([agent.subgraph.robot])}
 
     monkeypatch.setattr(Agent, "obey", obey)
     place = Leaky(shares, losses={4})

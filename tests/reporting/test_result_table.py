@@ -8,7 +8,7 @@ from rich.console import Console
 
 from pgo_models import PGOError
 from pgo_models.errors import SettingError
-from solvers.reporting.result_table import Part, ResultTable, check_table_format, percent
+from solvers.reporting.result_table import ResultTable, TablePart, check_table_format, gap_percent
 
 HEADS = ("graph", "F", "remark")
 ROWS = (("grid", "97.01", "a | b [bold]"), ("rim", "-", "not here; " + "get it " * 40))
@@ -16,7 +16,7 @@ RECORDS = (
     {"graph": "grid", "objective": 97.01402085123456, "rounds": 32},
     {"graph": "rim", "objective": math.nan, "rounds": None},
 )
-TABLE = ResultTable((Part(HEADS, ROWS, "Cost"), Part(HEADS[:2], (("x", "1"),))), RECORDS, ("a note",))
+TABLE = ResultTable((TablePart(HEADS, ROWS, "Cost"), TablePart(HEADS[:2], (("x", "1"),))), RECORDS, ("a note",))
 
 
 def test_markdown_has_every_part_with_figures_to_the_right_and_bars_escaped():
@@ -77,9 +77,9 @@ def test_a_place_that_cannot_be_written_is_said(tmp_path):
 
 def test_a_row_has_a_cell_for_every_head():
     with pytest.raises(SettingError, match="has 2 cells for 3 heads"):
-        Part(HEADS, (("a", "b"),))
+        TablePart(HEADS, (("a", "b"),))
 
 
 @pytest.mark.parametrize(("gap", "text"), [(0.0, "0"), (0.5, "50"), (0.123456, "12"), (3.2e-9, "3.2e-07")])
 def test_gaps_are_in_percent(gap, text):
-    assert percent(gap) == text
+    assert gap_percent(gap) == text

@@ -14,18 +14,18 @@ from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from solvers.soc.local_copies import build_team
+from solvers.soc.local_copies import build_copies
 from solvers.soc.paper import PaperSOC
 from solvers.soc.penalty import FixedPenalty, MultiplierPenalty, rotation_scale, translation_scale
-from solvers.soc.r_step import RStep, Subproblem, _largest_eigenvalue_bound, prepare
+from solvers.soc.r_step import RStep, RSubproblem, _largest_eigenvalue_bound, prepare
 
 AGREEMENT = 1e-8  # the contract of the back ends
 SCENES = {"circle": circle, "grid": grid, "sphere": sphere}
 
 
-def subproblem_of(problem: PGOProblem, penalty: Array) -> Subproblem:
+def subproblem_of(problem: PGOProblem, penalty: Array) -> RSubproblem:
     A, w = problem.residual_matrix
-    return Subproblem(A, w, problem.M, problem.d, problem.num_poses, penalty, problem.analysis, problem.backend)
+    return RSubproblem(A, w, problem.M, problem.d, problem.num_poses, penalty, problem.analysis, problem.backend)
 
 
 def random_penalty(problem: PGOProblem, rng: np.random.Generator, translations: bool) -> Array:
@@ -193,6 +193,6 @@ def problem_named(name: str, request: pytest.FixtureRequest) -> PGOProblem:
 def assert_teams_agree(problem: PGOProblem, robots: Partition) -> None:
     rho = MultiplierPenalty().initial(problem, chordal_start(problem))
     rho_t = 0.1 * translation_scale(problem)
-    teams = [build_team(problem, robots, back_end).with_penalty(rho, rho_t) for back_end in RStep]
+    teams = [build_copies(problem, robots, back_end).with_penalty(rho, rho_t) for back_end in RStep]
     shift = np.random.default_rng(0).standard_normal((len(teams[0].row), problem.d))
-    assert largest_difference([team.solve_all(shift) for team in teams]) <= AGREEMENT
+    assert largest_difference([copies.solve_all(shift) for copies in teams]) <= AGREEMENT

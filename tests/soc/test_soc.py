@@ -88,20 +88,20 @@ def test_consensus_is_its_recursion_robot_by_robot(
     )
     states = iterate(soc, problem)
     first = next(states)
-    team = first.team
+    copies = first.copies
     whole = np.concatenate([0.1 * translation_scale(problem), np.full(d * n, rule.rho)])
-    share = (whole / np.maximum(team.copies, 1))[team.row]
+    share = (whole / np.maximum(copies.multiplicity, 1))[copies.row]
     z, B = first.z, first.B
     for state in islice(states, 8):
         x, z, B = np.empty_like(z), z.copy(), B.copy()
-        for robot, rows in zip(team.robots, team.slices, strict=True):
+        for robot, rows in zip(copies.robots, copies.slices, strict=True):
             for left in range(local_passes)[::-1]:
                 K, b = robot.M.toarray(), np.zeros((robot.M.shape[0], d))
                 K[robot.held, robot.held] += 0.5 * share[rows]
                 b[robot.held] = 0.5 * share[rows, None] * (z - B)[rows]
                 x[rows] = np.linalg.solve(K, b)[robot.held]
                 for row in range(rows.start, rows.stop if left else rows.start):
-                    if team.row[row] < n or (team.row[row] - n) % d or team.copies[team.row[row]] > 1:
+                    if copies.row[row] < n or (copies.row[row] - n) % d or copies.multiplicity[copies.row[row]] > 1:
                         continue
                     pose = slice(row, row + d)  # no other robot knows it: its omega is its robot's own affair
                     s = (x + B)[pose]
@@ -109,10 +109,10 @@ def test_consensus_is_its_recursion_robot_by_robot(
                     B[pose] = s - z[pose]
         relaxed = alpha * x + (1 - alpha) * z
         mean = np.zeros((problem.side, d))
-        for row in np.unique(team.row):
-            mean[row] = (relaxed + B)[team.row == row].mean(axis=0)
+        for row in np.unique(copies.row):
+            mean[row] = (relaxed + B)[copies.row == row].mean(axis=0)
         mean[n:] = stack_transposes(project_by_svd(unstack_transposes(mean[n:])))
-        z = mean[team.row]
+        z = mean[copies.row]
         B = B + relaxed - z
         scale = 1 + np.abs(z).max()
         np.testing.assert_allclose(state.z, z, rtol=0, atol=1e-7 * scale)
@@ -150,7 +150,7 @@ def test_separator_penalties_follow_from_the_stiffness(seed: int, n: int, d: int
     state = SOC(robots=robots).init(problem, start)
     assert isinstance(state, SOCState)
     wanted = MultiplierPenalty().initial(problem, start)
-    relative = 0.6 * state.team.stiffness(wanted)
+    relative = 0.6 * state.copies.stiffness(wanted)
     np.testing.assert_allclose(state.rho_t, relative * translation_scale(problem), rtol=1e-12, atol=0)
     shared = robots.separators(problem.graph)
     wanted[shared] = np.maximum(wanted[shared], min(0.7 * relative**0.5, 0.3) * rotation_scale(problem)[shared])
@@ -175,9 +175,9 @@ def test_anderson_per_robot_sums_nothing_over_the_robots(seed: int, n: int, d: i
         following = soc.step(problem, state)
         assert isinstance(image, SOCState)
         assert isinstance(following, SOCState)
-        assert state.team.penalty is not None
-        residual = np.sqrt(state.team.penalty)[:, None] * (image.x - state.z)
-        for a, rows in enumerate(state.team.slices):
+        assert state.copies.penalty is not None
+        residual = np.sqrt(state.copies.penalty)[:, None] * (image.x - state.z)
+        for a, rows in enumerate(state.copies.slices):
             s, memories[a] = extrapolate(Anderson(), memories[a], residual[rows], (image.x + state.B)[rows])
             np.testing.assert_array_equal(following.s[rows], s)
         state = following

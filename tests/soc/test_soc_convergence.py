@@ -263,8 +263,8 @@ def test_rescaling_keeps_the_unscaled_multiplier(benchmark_problem: Callable[[st
             if before.rho[0] != after.rho[0]:
                 changes += 1
                 # The step that follows a change starts from B rescaled: s - x is that B, when it is not accelerated.
-                lam = before.team.penalty[:, None] * before.B
-                np.testing.assert_allclose(after.team.penalty[:, None] * (after.s - after.x), lam, rtol=0, atol=1e-9)
+                lam = before.copies.penalty[:, None] * before.B
+                np.testing.assert_allclose(after.copies.penalty[:, None] * (after.s - after.x), lam, rtol=0, atol=1e-9)
     assert changes > 0
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 
 from pgo_models.errors import FileFormatError
 from solvers.studies import results_cache as kept_results
-from solvers.studies.results_cache import KeptResults, fingerprint
+from solvers.studies.results_cache import KeptResults, graph_fingerprint
 
 
 def test_what_is_added_is_there_for_the_next_one(tmp_path):
@@ -61,8 +61,8 @@ def test_a_file_of_something_else_is_never_written_over(text, tmp_path):
 @given(SEEDS)
 def test_the_fingerprint_is_that_of_the_measurements(seed):
     graph = varied_graph(seed, 6, 3)
-    before = fingerprint(graph)
-    assert before == fingerprint(varied_graph(seed, 6, 3))
+    before = graph_fingerprint(graph)
+    assert before == graph_fingerprint(varied_graph(seed, 6, 3))
     t_ij = graph.t_ij.copy()
     t_ij[0, 0] = np.nextafter(t_ij[0, 0], np.inf)
-    assert before != fingerprint(replace(graph, t_ij=t_ij))
+    assert before != graph_fingerprint(replace(graph, t_ij=t_ij))

@@ -9,7 +9,7 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from solvers.distributed.robots.consensus_robot import ConsensusRobot
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.proof import RobotProof
-from solvers.distributed.robots.subgraph import Share
+from solvers.distributed.robots.subgraph import Subgraph
 from solvers.network.messages import RESTORE, SNAPSHOT, Message
 from solvers.network.serialization import deserialize, serialize
 from solvers.soc.rotation_block import RotationBlock
@@ -24,16 +24,16 @@ class Agent:
 
     Attributes
     ----------
-    share : Share
+    subgraph : Subgraph
     interior : Interior, optional
         None when the robot counts no edge: orders about the interior then have an empty answer.
     copies : ConsensusRobot, optional
         None before CONSENSUS begins.
     """
 
-    def __init__(self, share: Share, backend: CholeskyBackend | None) -> None:
-        self.share, self.backend = share, backend
-        self.interior = Interior(share, backend) if share.part is not None else None
+    def __init__(self, subgraph: Subgraph, backend: CholeskyBackend | None) -> None:
+        self.subgraph, self.backend = subgraph, backend
+        self.interior = Interior(subgraph, backend) if subgraph.part is not None else None
         self.copies: ConsensusRobot | None = None
 
     def obey(self, order: str, message: Message) -> Message:
@@ -69,31 +69,31 @@ class Agent:
             self.interior.remember(remembered["interior"])
         self.copies = None
         if remembered["copies"] is not None:
-            self.copies = ConsensusRobot(self.share, self.backend)
+            self.copies = ConsensusRobot(self.subgraph, self.backend)
             self.copies.remember(remembered["copies"])
         return {}
 
     def _begin(self, message: Message) -> Message:
         """Give the poses at hand to the copies: interior ones, and those of the cover, which the driver sends."""
-        share, d = self.share, self.share.graph.d
-        n = len(share.poses)
+        subgraph, d = self.subgraph, self.subgraph.graph.d
+        n = len(subgraph.poses)
         R, t = np.broadcast_to(np.eye(d), (n, d, d)).copy(), np.zeros((n, d))
-        in_cover = share.in_cover >= 0
+        in_cover = subgraph.in_cover >= 0
         R[in_cover], t[in_cover] = message["R"], message["t"]
         if self.interior is not None:
             part = self.interior.part
-            place = np.searchsorted(share.poses, part.poses[part.interior])
+            place = np.searchsorted(subgraph.poses, part.poses[part.interior])
             R[place], t[place] = self.interior.poses.R[part.interior], self.interior.poses.t[part.interior]
         if self.copies is None:
-            self.copies = ConsensusRobot(share, self.backend)
+            self.copies = ConsensusRobot(subgraph, self.backend)
         return self.copies.begin(Poses(R, t))
 
     def _finish(self) -> Message:
         """Take omega for the interior; the own rotations of the cover."""
         assert self.copies is not None
-        share, omega = self.share, self.copies.omega
+        subgraph, omega = self.subgraph, self.copies.omega
         if self.interior is not None:
-            place = np.searchsorted(share.poses, self.interior.part.poses)
+            place = np.searchsorted(subgraph.poses, self.interior.part.poses)
             self.interior.poses = Poses(omega[place], self.interior.poses.t)
-        own = np.flatnonzero(share.is_own & (share.in_cover >= 0))
-        return {"cover": share.in_cover[own], "R": omega[own]}
+        own = np.flatnonzero(subgraph.is_own & (subgraph.in_cover >= 0))
+        return {"cover": subgraph.in_cover[own], "R": omega[own]}

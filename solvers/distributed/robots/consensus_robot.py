@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pgo_models.certificates.dual_variables import multipliers
@@ -22,15 +21,15 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor
 from pgo_models.problem.matrices import inner
 from solvers.distributed.robots.elimination import columns_of
-from solvers.distributed.robots.subgraph import PartProblem, Share
+from solvers.distributed.robots.subgraph import PartProblem, Subgraph
 from solvers.network.messages import Message
 from solvers.soc.anderson import Anderson, over_relax
 from solvers.soc.rotation_block import stationary_B
 from solvers.soc.separator_stiffness import GROUND, separator_stiffness, travel
 from solvers.soc.shared_anderson import AndersonShare, AndersonSums
 
-# What follows from the share, and the factor: all other attributes are remembered.
-_FIXED = {"share", "d", "problem", "is_own", "own", "neighbours", "held", "copies", "_factor"}
+# What follows from the subgraph, and the factor: all other attributes are remembered.
+_FIXED = {"subgraph", "d", "problem", "is_own", "own", "neighbours", "held", "copies", "_factor"}
 _FIXED |= {"_common", "_mine", "_theirs", "_common_rows"}
 _NOTHING: Message = {}  # what a robot without neighbours is sent
 
@@ -44,22 +43,22 @@ class ConsensusRobot:
     that no other robot holds have no penalty and no part in the iterates; they are zero there.
     """
 
-    def __init__(self, share: Share, backend: CholeskyBackend | None) -> None:
-        graph, d = share.graph, share.graph.d
-        self.share, self.d = share, d
-        halved = np.where(share.is_own[graph.i] & share.is_own[graph.j], 1.0, 0.5)
+    def __init__(self, subgraph: Subgraph, backend: CholeskyBackend | None) -> None:
+        graph, d = subgraph.graph, subgraph.graph.d
+        self.subgraph, self.d = subgraph, d
+        halved = np.where(subgraph.is_own[graph.i] & subgraph.is_own[graph.j], 1.0, 0.5)
         self.problem = PartProblem(_weighted(graph, halved), backend)
-        self.is_own = share.is_own
+        self.is_own = subgraph.is_own
         self.own = np.flatnonzero(self.is_own)
         n = graph.num_poses
-        self.neighbours = tuple(robot for robot, _ in share.common)
-        self._common = tuple(poses for _, poses in share.common)
-        self._mine = tuple(poses[share.owner[poses] == share.robot] for _, poses in share.common)
-        self._theirs = tuple(poses[share.owner[poses] == robot] for robot, poses in share.common)
+        self.neighbours = tuple(robot for robot, _ in subgraph.common)
+        self._common = tuple(poses for _, poses in subgraph.common)
+        self._mine = tuple(poses[subgraph.owner[poses] == subgraph.robot] for _, poses in subgraph.common)
+        self._theirs = tuple(poses[subgraph.owner[poses] == robot] for robot, poses in subgraph.common)
         self._common_rows = tuple(columns_of(poses, n, (1, d)) for poses in self._common)
-        is_shared = share.copies > 1
+        is_shared = subgraph.copies > 1
         self.held = np.concatenate([is_shared, np.ones(d * n, dtype=bool)])[:, None]
-        self.copies = np.concatenate([share.copies, np.repeat(share.copies, d)])[:, None]
+        self.copies = np.concatenate([subgraph.copies, np.repeat(subgraph.copies, d)])[:, None]
         self.X = np.zeros(((d + 1) * n, d))
         self.rho, self.diagonal, self.pull = np.ones(n), np.ones((n, d + 1)), np.zeros((n, d * d))
         self.penalty = np.zeros((d + 1) * n)
@@ -88,7 +87,7 @@ class ConsensusRobot:
         """Take the owners' poses: ||Lambda_i||_2 and m_i of the robot's own."""
         self._from_owners(message, lambda theirs, rows: self._set_rows(self.X, theirs, rows))
         n, d = len(self.is_own), self.d
-        whole = PartProblem(self.share.graph, self.problem.backend)  # own poses have all their edges here
+        whole = PartProblem(self.subgraph.graph, self.problem.backend)  # own poses have all their edges here
         R = unstack_transposes(self.X[n:])
         self._Lambda = multipliers(whole, Poses(R, self.X[:n]))
         diagonal = whole.M.data[whole.diagonal_positions]
@@ -125,15 +124,12 @@ class ConsensusRobot:
         self._total_force = self._force.copy()
         for robot, rows in zip(self.neighbours, self._common_rows, strict=True):
             self._total_force[rows] += message[f"force<{robot}"]
-        separators = np.flatnonzero(self.share.copies > 1)
-        half_scale = 0.5 * self.diagonal[separators, 0] / self.share.copies[separators]
+        separators = np.flatnonzero(self.subgraph.copies > 1)
+        half_scale = 0.5 * self.diagonal[separators, 0] / self.subgraph.copies[separators]
         penalty = np.zeros((d + 1) * n)
-        penalty[n:] = np.repeat(self.rho / self.share.copies, d)
+        penalty[n:] = np.repeat(self.rho / self.subgraph.copies, d)
         penalty[separators] = 2.0 * GROUND * half_scale
-        components = connected_components(
-            coo_array((np.ones(self.share.graph.num_edges), (self.share.graph.i, self.share.graph.j)), shape=(n, n)),
-            directed=False,
-        )[1]
+        components = connected_components(self.subgraph.graph.adjacency, directed=False)[1]
         factor = self._factored(penalty)
         stiffness = separator_stiffness(factor, (d + 1) * n, separators, half_scale, components[separators])
         return {"stiffness": np.array([stiffness])}
@@ -142,7 +138,7 @@ class ConsensusRobot:
         """Factor, with omega at the poses and B in balance; ||omega||_rho^2 and rho_i / m_i of the own poses."""
         n, d = len(self.is_own), self.d
         floor = message["separator_penalty"][0] * self._scale
-        self.rho = np.where(self.share.copies > 1, np.maximum(self.rho, floor), self.rho)
+        self.rho = np.where(self.subgraph.copies > 1, np.maximum(self.rho, floor), self.rho)
         self._factorize(float(message["translation_penalty"][0]))
         # B makes every subproblem stationary; its mean over the copies is the multiplier of the constraint.
         rotations = (self.pull / self.rho[:, None]).reshape(d * n, d)
@@ -245,9 +241,9 @@ class ConsensusRobot:
 
     def travel(self) -> Message:
         """How far separator translations, and their multipliers, went: see `solvers.soc.separator_stiffness`."""
-        at, (z, s) = np.flatnonzero(self.share.copies > 1), self._origin
+        at, (z, s) = np.flatnonzero(self.subgraph.copies > 1), self._origin
         pulled = self.penalty[at, None] * (self.s - self.z - s + z)[at]
-        return {"travel": travel((self.z - z)[at], pulled, self.diagonal[at, 0] / self.share.copies[at])}
+        return {"travel": travel((self.z - z)[at], pulled, self.diagonal[at, 0] / self.subgraph.copies[at])}
 
     def back_at_best(self) -> Message:
         """Return to the s of the smallest merit; its rows for every neighbour."""
@@ -281,16 +277,16 @@ class ConsensusRobot:
     def own_poses(self) -> Message:
         """Omega and the translations at hand of the own poses, for whoever may see them."""
         mine = self._poses[self.own]
-        return {"poses": self.share.poses[self.own], "R": mine.R, "t": mine.t}
+        return {"poses": self.subgraph.poses[self.own], "R": mine.R, "t": mine.t}
 
     def cost(self) -> Message:
         """Part of F at omega, the translations agreed on, and inside those of step (a)."""
         n = len(self.is_own)
-        counted = self.share.is_counted
+        counted = self.subgraph.is_counted
         if not counted.any():
             return {"objective": np.zeros(1)}
         X = np.where(self.held, self.z, self.X)
-        graph = self.share.graph
+        graph = self.subgraph.graph
         i, j, R, t = graph.i[counted], graph.j[counted], self.omega, X[:n]
         rotation = R[j] - R[i] @ graph.R_ij[counted]
         translation = t[j] - t[i] - np.einsum("eab,eb->ea", R[i], graph.t_ij[counted])
@@ -327,7 +323,7 @@ class ConsensusRobot:
         problem = self.problem
         data = problem.M.data.copy()
         data[problem.diagonal_positions] += 0.5 * penalty
-        if not (self.share.copies > 1).any():
+        if not (self.subgraph.copies > 1).any():
             data[problem.diagonal_positions[0]] *= 2.0  # one robot alone: a common shift costs nothing
         return problem.analysis.factorize(problem.with_pattern_of_M(data), overwrite=self._factor)
 
@@ -340,7 +336,7 @@ class ConsensusRobot:
         n = len(self.is_own)
         total, is_added = np.zeros_like(self.s), False
         for robot, rows in zip(self.neighbours, self._common_rows, strict=True):
-            if robot > self.share.robot and not is_added:
+            if robot > self.subgraph.robot and not is_added:
                 total, is_added = total + self.s, True
             total[rows] += message[f"rows<{robot}"]
         mean = (total if is_added else total + self.s) / self.copies

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.newton_polish import retract
+from pgo_models.certificates.newton_polish import move_poses
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
@@ -30,11 +30,11 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from solvers.distributed.robots.elimination import Cut, Elimination, columns_of, eliminate
 from solvers.distributed.robots.proof import RobotProof, begin_proof, verify_interior
-from solvers.distributed.robots.subgraph import Part, Share
+from solvers.distributed.robots.subgraph import Part, Subgraph
 from solvers.network.messages import Message
 from solvers.soc.rotation_block import RotationBlock, block_at, stationary_B
 
-# What follows from the share, and factors: all other attributes are remembered.
+# What follows from the subgraph, and factors: all other attributes are remembered.
 _FIXED = {"part", "problem", "backend", "robot", "_cuts", "_holds_zero", "_grounds", "_interior_rows"}
 _FIXED |= {"_laplacian", "_elimination", "_eliminated"}
 
@@ -42,13 +42,13 @@ _FIXED |= {"_laplacian", "_elimination", "_eliminated"}
 class Interior:
     """A robot and what it remembers between orders."""
 
-    def __init__(self, share: Share, backend: CholeskyBackend | None) -> None:
-        part = share.part
+    def __init__(self, subgraph: Subgraph, backend: CholeskyBackend | None) -> None:
+        part = subgraph.part
         assert part is not None, "a robot that counts no edge has nothing to answer"
         self.part: Part = part
         self.problem = part.problem
         self.backend = backend
-        self.robot = share.robot
+        self.robot = subgraph.robot
         d, p = self.problem.d, self.problem.num_poses
         self.poses = Poses(np.broadcast_to(np.eye(d), (p, d, d)).copy(), np.zeros((p, d)))
         self.block: RotationBlock | None = None
@@ -218,7 +218,7 @@ class Interior:
         assert self._step is not None
         w, v = self._step
         length = message["length"][0]
-        self._trial = Poses(retract(self.poses, length * w, length * v).R, self.poses.t)
+        self._trial = Poses(move_poses(self.poses, length * w, length * v).R, self.poses.t)
         return self._reduced_translations(self._trial.R)
 
     def evaluate_trial(self, message: Message) -> Message:
@@ -241,8 +241,8 @@ class Interior:
         self._proof = None
         fixed = self._cuts[(1, d)].boundary[message["fixed"] > 0]
         fixed = np.append(fixed, 0) if "point" not in message and self._grounds else fixed
-        eta, share, cut = message["eta"][0], message["share"][0], self._cuts[(1, d)]
-        found = verify_interior(self.problem, Lambda, eta, cut, fixed, share, self.backend)
+        eta, least, cut = message["eta"][0], message["share"][0], self._cuts[(1, d)]
+        found = verify_interior(self.problem, Lambda, eta, cut, fixed, least, self.backend)
         if found is None:
             return {"definite": np.zeros(1), "trace": trace}
         matrix, self._elimination, slack = found

@@ -23,8 +23,8 @@ class PartProblem(PGOProblem):
 
 
 @dataclass(frozen=True, eq=False)
-class Share:
-    """A robot's share of a graph: all that it ever learns of it before the first round.
+class Subgraph:
+    """A robot's part of a graph: all that it ever learns of it before the first round.
 
     Attributes
     ----------
@@ -103,8 +103,8 @@ class Part:
         return found[np.argsort(self.in_cover[found])]
 
 
-def share_out(graph: PoseGraph, partition: Partition) -> tuple[Share, ...]:
-    """Give every robot its share.
+def split_graph(graph: PoseGraph, partition: Partition) -> tuple[Subgraph, ...]:
+    """Give every robot its subgraph.
 
     Raises
     ------
@@ -116,8 +116,8 @@ def share_out(graph: PoseGraph, partition: Partition) -> tuple[Share, ...]:
     >>> import numpy as np
     >>> from pgo_models import grid, partition
     >>> graph = grid(np.random.default_rng(0))
-    >>> shares = share_out(graph, partition(graph, 3))
-    >>> sum(int(share.is_counted.sum()) for share in shares) == graph.num_edges
+    >>> subgraphs = split_graph(graph, partition(graph, 3))
+    >>> sum(int(subgraph.is_counted.sum()) for subgraph in subgraphs) == graph.num_edges
     True
     """
     cover = np.full(graph.num_poses, -1)
@@ -129,14 +129,14 @@ def share_out(graph: PoseGraph, partition: Partition) -> tuple[Share, ...]:
     # An end outside the cover decides: such ends of one edge have one owner. Else the owner of the first end counts it.
     counts = np.where(cover[graph.j] < 0, owner[graph.j], owner[graph.i])
     holds = _holders(graph, owner, partition.num_robots)
-    return tuple(_share(graph, owner, cover, counts, holds, robot) for robot in range(partition.num_robots))
+    return tuple(_subgraph_of(graph, owner, cover, counts, holds, robot) for robot in range(partition.num_robots))
 
 
-def middle_separator(graph: PoseGraph, shares: tuple[Share, ...]) -> int:
+def middle_separator(graph: PoseGraph, subgraphs: tuple[Subgraph, ...]) -> int:
     """Which of the poses that the driver solves for is nearest to the middle of the graph."""
     in_cover = np.full(graph.num_poses, -1)
-    for share in shares:
-        in_cover[share.poses] = np.maximum(in_cover[share.poses], share.in_cover)
+    for subgraph in subgraphs:
+        in_cover[subgraph.poses] = np.maximum(in_cover[subgraph.poses], subgraph.in_cover)
     order = poses_by_distance(graph, middle_pose(graph))
     return int(in_cover[order[np.argmax(in_cover[order] >= 0)]])
 
@@ -150,7 +150,9 @@ def _holders(graph: PoseGraph, owner: IntArray, num_robots: int) -> csr_array:
     return csr_array((np.ones(len(once)), (pose, robot)), shape=(graph.num_poses, num_robots))
 
 
-def _share(graph: PoseGraph, owner: IntArray, cover: IntArray, counts: IntArray, holds: csr_array, robot: int) -> Share:
+def _subgraph_of(
+    graph: PoseGraph, owner: IntArray, cover: IntArray, counts: IntArray, holds: csr_array, robot: int
+) -> Subgraph:
     edges = np.flatnonzero((owner[graph.i] == robot) | (owner[graph.j] == robot))
     poses = np.unique(np.concatenate([np.flatnonzero(owner == robot), graph.i[edges], graph.j[edges]]))
     local = PoseGraph(
@@ -168,4 +170,4 @@ def _share(graph: PoseGraph, owner: IntArray, cover: IntArray, counts: IntArray,
     others = [other for other in np.flatnonzero(np.diff(held.indptr)).tolist() if other != robot]
     common = tuple((other, np.sort(held.indices[held.indptr[other] : held.indptr[other + 1]])) for other in others)
     copies = np.diff(holds[poses].indptr)
-    return Share(robot, local, poses, owner[poses], cover[poses], counts[edges] == robot, copies, common)
+    return Subgraph(robot, local, poses, owner[poses], cover[poses], counts[edges] == robot, copies, common)

@@ -81,7 +81,7 @@ class Watching(Recording):
         if order == "describe":
             self.secrets: list[list[Array]] = [[] for _ in self.agents]
         for agent in self.agents:
-            holder, share = agent.copies, agent.share
+            holder, share = agent.copies, agent.subgraph
             if holder is not None:
                 for other, secrets in zip(self.shares, self.secrets, strict=True):
                     hidden = ~np.isin(share.poses, other.poses)

@@ -20,7 +20,7 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.interface import Interface, InterfaceFactor, by_separator
 from solvers.distributed.multifrontal import separator_tree
 from solvers.distributed.robots.elimination import Cut, Elimination, columns_of, eliminate, packed, unpacked
-from solvers.distributed.robots.subgraph import Part, share_out
+from solvers.distributed.robots.subgraph import Part, split_graph
 
 SIZES = st.integers(2, 30)
 KINDS = st.sampled_from(["translations", "poses", "tangent"])
@@ -65,7 +65,7 @@ class Split:
 def split(problem: PGOProblem, parts: Partition, kind: str, seed: int, diagonal: Array) -> Split:
     """Matrix of a kind plus a diagonal, (side,): each robot adds it in its interior, the driver on the cover."""
     n, widths, poses = problem.num_poses, widths_of(kind, problem.d), random_poses(problem.num_poses, problem.d, seed)
-    working = [share.part for share in share_out(problem.graph, parts) if share.part is not None]
+    working = [share.part for share in split_graph(problem.graph, parts) if share.part is not None]
     cover = np.unique(np.concatenate([part.poses[part.boundary] for part in working]))
     pieces, cuts, columns = [], [], []
     for part in working:
@@ -205,7 +205,7 @@ def test_a_packed_matrix_is_unpacked_as_it_was(seed: int, side: int) -> None:
 # The driver's memory.
 
 
-def team(seed: int, number: int, separators: int, each: int) -> tuple[IntArray, ...]:
+def copies(seed: int, number: int, separators: int, each: int) -> tuple[IntArray, ...]:
     """Robots that each touch some separators: half of them side by side on a ring, half anywhere."""
     rng = np.random.default_rng(seed)
     touched = []
@@ -222,7 +222,7 @@ def team(seed: int, number: int, separators: int, each: int) -> tuple[IntArray, 
 def test_factoring_takes_no_more_memory_than_was_said(
     number: int, separators: int, each: int, widths: tuple[int, ...]
 ) -> None:
-    touched = team(0, number, separators, each)
+    touched = copies(0, number, separators, each)
     interface = Interface(separators, widths, touched, separator_tree(touched, separators))
     interface.factorize([packed(np.eye(len(columns))) for columns in interface.columns])  # imports and caches
     said = interface.num_bytes
@@ -239,7 +239,7 @@ def test_factoring_takes_no_more_memory_than_was_said(
 
 
 def test_what_would_not_fit_is_refused_with_the_way_out() -> None:
-    touched = team(0, 5, 160, 70)
+    touched = copies(0, 5, 160, 70)
     interface = Interface(160, (3, 3), touched, separator_tree(touched, 160))
     interface.check_memory(interface.num_bytes)
     with pytest.raises(

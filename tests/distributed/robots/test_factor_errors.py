@@ -40,7 +40,7 @@ from solvers.distributed.interface import Interface, InterfaceFactor
 from solvers.distributed.multifrontal import separator_tree
 from solvers.distributed.robots.elimination import Cut, columns_of, eliminate, packed, unpacked
 from solvers.distributed.robots.proof import verify_interior
-from solvers.distributed.robots.subgraph import Part, share_out
+from solvers.distributed.robots.subgraph import Part, split_graph
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
 
@@ -175,7 +175,7 @@ def is_true_of_robot(
 def test_no_rounding_is_lost_between_multipliers_and_eta_by_a_robot(backend: CholeskyBackend, exponent: int) -> None:
     graph, d = still_ring(12, 2), 2
     eta = 0.75 * 2.0**exponent
-    for share in share_out(graph, partition(graph, 2)):
+    for share in split_graph(graph, partition(graph, 2)):
         assert share.part is not None
         interior = share.part.interior
         Lambda = np.zeros((share.part.problem.num_poses, d, d))
@@ -191,7 +191,7 @@ def test_what_a_robot_hands_on_is_below_its_part_of_S(
     backend: CholeskyBackend, seed: int, n: int, d: int, eta: float
 ) -> None:
     graph, rng = varied_graph(seed, n, d), np.random.default_rng(seed)
-    for share in share_out(graph, partition(graph, 2)):
+    for share in split_graph(graph, partition(graph, 2)):
         if share.part is None:
             continue
         problem, part = share.part.problem, share.part

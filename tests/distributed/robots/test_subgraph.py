@@ -9,50 +9,50 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph, middle_pose
 from pgo_models.graphs.separators import vertex_cover
-from solvers.distributed.robots.subgraph import Share, share_out
+from solvers.distributed.robots.subgraph import Subgraph, split_graph
 
 SIZES = st.integers(2, 40)
 
 
-def edges_of(share: Share, graph: PoseGraph) -> list[int]:
+def edges_of(subgraph: Subgraph, graph: PoseGraph) -> list[int]:
     """Which edges of the whole graph a share holds, in its order."""
-    own = set(share.poses[share.is_own].tolist())
+    own = set(subgraph.poses[subgraph.is_own].tolist())
     return [e for e in range(graph.num_edges) if {int(graph.i[e]), int(graph.j[e])} & own]
 
 
 def check_shares(graph: PoseGraph, parts: Partition) -> None:
-    shares = share_out(graph, parts)
+    subgraphs = split_graph(graph, parts)
     cover = vertex_cover(parts, graph)
     if not len(cover):
         cover = np.array([middle_pose(graph)])
-    assert [share.robot for share in shares] == list(range(parts.num_robots))
+    assert [subgraph.robot for subgraph in subgraphs] == list(range(parts.num_robots))
     counted = np.zeros(graph.num_edges, dtype=int)
     interiors: list[int] = []
-    for share in shares:
-        edges = edges_of(share, graph)
-        local = share.graph
+    for subgraph in subgraphs:
+        edges = edges_of(subgraph, graph)
+        local = subgraph.graph
         # It holds the edges of its own poses and no other, and of others' poses only the far ends.
-        np.testing.assert_array_equal(share.poses[local.i], graph.i[edges])
-        np.testing.assert_array_equal(share.poses[local.j], graph.j[edges])
+        np.testing.assert_array_equal(subgraph.poses[local.i], graph.i[edges])
+        np.testing.assert_array_equal(subgraph.poses[local.j], graph.j[edges])
         for name in ("R_ij", "t_ij", "kappa", "tau"):
             np.testing.assert_array_equal(getattr(local, name), getattr(graph, name)[edges])
-        own = np.flatnonzero(parts.robot == share.robot)
-        assert share.poses.tolist() == sorted({*own.tolist(), *graph.i[edges].tolist(), *graph.j[edges].tolist()})
-        np.testing.assert_array_equal(share.owner, parts.robot[share.poses])
-        np.testing.assert_array_equal(local.pose_ids, graph.pose_ids[share.poses])
-        inside = share.in_cover >= 0
-        np.testing.assert_array_equal(cover[share.in_cover[inside]], share.poses[inside])
-        assert not np.isin(share.poses[~inside], cover).any()
-        np.add.at(counted, np.array(edges, dtype=int)[share.is_counted], 1)
-        if share.part is None:
-            assert not share.is_counted.any()
+        own = np.flatnonzero(parts.robot == subgraph.robot)
+        assert subgraph.poses.tolist() == sorted({*own.tolist(), *graph.i[edges].tolist(), *graph.j[edges].tolist()})
+        np.testing.assert_array_equal(subgraph.owner, parts.robot[subgraph.poses])
+        np.testing.assert_array_equal(local.pose_ids, graph.pose_ids[subgraph.poses])
+        inside = subgraph.in_cover >= 0
+        np.testing.assert_array_equal(cover[subgraph.in_cover[inside]], subgraph.poses[inside])
+        assert not np.isin(subgraph.poses[~inside], cover).any()
+        np.add.at(counted, np.array(edges, dtype=int)[subgraph.is_counted], 1)
+        if subgraph.part is None:
+            assert not subgraph.is_counted.any()
             continue
-        part = share.part
+        part = subgraph.part
         np.testing.assert_array_equal(part.in_cover >= 0, np.isin(part.poses, cover))
         assert sorted([*part.interior, *part.boundary]) == list(range(len(part.poses)))
         assert (np.diff(part.in_cover[part.boundary]) > 0).all()
         # Its interior is its own alone: no other robot's part has a pose of it.
-        assert (parts.robot[part.poses[part.interior]] == share.robot).all()
+        assert (parts.robot[part.poses[part.interior]] == subgraph.robot).all()
         interiors += part.poses[part.interior].tolist()
     assert (counted == 1).all()
     assert sorted(interiors) == sorted(set(range(graph.num_poses)) - set(cover.tolist()))
@@ -76,28 +76,30 @@ def test_the_costs_of_the_parts_add_up(seed: int, n: int, d: int, partitioner: P
     problem = varied_problem(seed, n, d)
     poses = random_poses(n, d, seed)
     total = 0.0
-    for share in share_out(problem.graph, partitioner(problem.graph, seed)):
-        if share.part is not None:
-            at = share.part.poses
-            total += share.part.problem.objective(Poses(poses.R[at], poses.t[at]))
+    for subgraph in split_graph(problem.graph, partitioner(problem.graph, seed)):
+        if subgraph.part is not None:
+            at = subgraph.part.poses
+            total += subgraph.part.problem.objective(Poses(poses.R[at], poses.t[at]))
     assert total == pytest.approx(problem.objective(poses), rel=1e-12)
 
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_a_pose_that_covers_all_its_edges_leaves_its_robot_nothing_to_count(d: int) -> None:
     for center in (0, 6):
-        shares = share_out(*star(center, d))
-        assert [share.part is None for share in shares] == [a == center for a in range(7)]
+        subgraphs = split_graph(*star(center, d))
+        assert [subgraph.part is None for subgraph in subgraphs] == [a == center for a in range(7)]
 
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_between_two_poses_of_the_cover_the_owner_of_the_first_end_counts(d: int) -> None:
     graph, parts = complete(d)
     without_interior = [
-        share for share in share_out(graph, parts) if share.part is not None and not share.part.interior.size
+        subgraph
+        for subgraph in split_graph(graph, parts)
+        if subgraph.part is not None and not subgraph.part.interior.size
     ]
     assert without_interior
-    for share in without_interior:
-        assert share.part is not None
-        first = share.part.poses[share.part.problem.graph.i]
-        np.testing.assert_array_equal(first, share.robot)
+    for subgraph in without_interior:
+        assert subgraph.part is not None
+        first = subgraph.part.poses[subgraph.part.problem.graph.i]
+        np.testing.assert_array_equal(first, subgraph.robot)
