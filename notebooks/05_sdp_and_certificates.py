@@ -224,7 +224,8 @@ _ = axes.legend(fontsize=8)
 # %%
 degrees = np.array([30.0, 40.0, 45.0, 50.0, 55.0, 60.0, 70.0])
 sweeps = {
-    scene.value: solvers.noise_sweep(scene, np.deg2rad(degrees), 4, np.random.default_rng(0)) for scene in SweptScene
+    scene.value: solvers.noise_sweep(scene, np.deg2rad(degrees), 4, np.random.default_rng(0))
+    for scene in SweptScene
 }
 plot_tightness([(name, sweep.rotation_std, sweep.fraction) for name, sweep in sweeps.items()])
 

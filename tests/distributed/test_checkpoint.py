@@ -19,7 +19,7 @@ import solvers
 from pgo_models.errors import FileFormatError, PGOError, SettingError
 from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.scenes import NoiseModel
-from solvers.cli_options import BackEnd, Method, chosen_partition, chosen_pipeline
+from solvers.cli_options import BackEndName, FirstStage, chosen_partition, chosen_pipeline
 from solvers.distributed import checkpoint
 from solvers.distributed.checkpoint import Checkpoint, Journal
 from solvers.network.engine import InProcess
@@ -340,7 +340,7 @@ def test_a_killed_process_goes_on_where_it_was(tmp_path):
     assert path.with_name("run.ckpt.lock").exists()  # a dead process's: it holds nobody up
     graph = pgo.load("circle")
     robots = chosen_partition(graph, 3, None)
-    settings = chosen_pipeline(Method.SUBSTRUCTURED, robots, BackEnd.FACTORIZED, 1e-6, iterations, 1e-300)
+    settings = chosen_pipeline(FirstStage.SUBSTRUCTURED, robots, BackEndName.FACTORIZED, 1e-6, iterations, 1e-300)
     expected = solvers.solve(graph, settings, robots=robots)
     seen = []
     found = solvers.solve(
