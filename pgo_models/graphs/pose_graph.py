@@ -294,3 +294,9 @@ def middle_pose(graph: PoseGraph) -> int:
 def poses_by_distance(graph: PoseGraph, pose: int) -> IntArray:
     """Poses of a connected graph, (n,), by their number of edges to a pose, which is the first."""
     return np.asarray(breadth_first_order(graph.adjacency, pose, directed=False, return_predecessors=False))
+
+
+def edge_counts(i: IntArray, j: IntArray, size: int) -> csr_array:
+    """Symmetric matrix with the number of edges (i, j) between every two."""
+    ends = np.concatenate([i, j]), np.concatenate([j, i])
+    return csr_array(coo_array((np.ones(2 * len(i)), ends), shape=(size, size)))

@@ -6,11 +6,9 @@ import heapq
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
 
-from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 from pgo_models.html_tables import facts_table
 
 
@@ -31,7 +29,7 @@ def vertex_cover(partition: Partition, graph: PoseGraph) -> IntArray:
     (9, 27)
     """
     cut = partition.cut_edges(graph)
-    adjacency = _adjacency(graph, cut)
+    adjacency = edge_counts(graph.i[cut], graph.j[cut], graph.num_poses)
     degree = np.diff(adjacency.indptr)
     chosen = np.zeros(graph.num_poses, dtype=bool)
     queue = [(-int(degree[pose]), int(pose)) for pose in np.flatnonzero(degree)]
@@ -141,10 +139,3 @@ def report_partition(partition: Partition, graph: PoseGraph) -> PartitionReport:
         cover=len(vertex_cover(partition, graph)),
         copies=len(held),
     )
-
-
-def _adjacency(graph: PoseGraph, chosen: BoolArray) -> csr_array:
-    """Neighbours of every pose by the chosen edges, each once."""
-    i, j = graph.i[chosen], graph.j[chosen]
-    ends = (np.concatenate([i, j]), np.concatenate([j, i]))
-    return csr_array(coo_array((np.ones(2 * len(i)), ends), shape=(graph.num_poses, graph.num_poses)))

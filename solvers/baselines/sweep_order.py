@@ -11,11 +11,11 @@ import heapq
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 from solvers.network.ledger import BYTES_PER_NUMBER, Traffic
 
 
@@ -90,10 +90,10 @@ def schedule(graph: PoseGraph, robots: Partition, sweep: Sweep) -> Schedule:
     """
     cut = robots.cut_edges(graph)
     robot, num_robots = robots.robot, robots.num_robots
-    inner = _adjacency(graph.i[~cut], graph.j[~cut], graph.num_poses)
+    inner = edge_counts(graph.i[~cut], graph.j[~cut], graph.num_poses)
     num_pieces, piece = connected_components(inner, directed=False)
     piece = piece.astype(np.int64)
-    between = _adjacency(piece[graph.i[cut]], piece[graph.j[cut]], num_pieces)
+    between = edge_counts(piece[graph.i[cut]], piece[graph.j[cut]], num_pieces)
     order = _most_anchored_first(between, int(piece[0]))
     owner = np.empty(num_pieces, dtype=np.int64)
     owner[piece] = robot
@@ -102,7 +102,7 @@ def schedule(graph: PoseGraph, robots: Partition, sweep: Sweep) -> Schedule:
     if sweep is Sweep.JACOBI:
         group = np.zeros(num_robots, dtype=np.int64)
     elif sweep is Sweep.COLORS:
-        group = _greedy_colors(_adjacency(robot[graph.i[cut]], robot[graph.j[cut]], num_robots), robot_order)
+        group = _greedy_colors(edge_counts(robot[graph.i[cut]], robot[graph.j[cut]], num_robots), robot_order)
     else:
         group = _ranks(robot_order)
     if sweep is Sweep.ROBOTS:
@@ -119,12 +119,6 @@ def _separators(graph: PoseGraph, robots: Partition) -> tuple[IntArray, IntArray
     pose, other = np.concatenate([i, j]), np.concatenate([j, i])
     pair = np.unique(pose * num_robots + robots.robot[other])
     return pair // num_robots, pair % num_robots
-
-
-def _adjacency(i: IntArray, j: IntArray, size: int) -> csr_array:
-    """Symmetric matrix with the number of edges between every two."""
-    ends = (np.concatenate([i, j]), np.concatenate([j, i]))
-    return csr_array(coo_array((np.ones(2 * len(i)), ends), shape=(size, size)))
 
 
 def _most_anchored_first(adjacency: csr_array, root: int) -> IntArray:

@@ -136,7 +136,7 @@ class Journal:
         Finished stages of the solve, those of the checkpoint to begin with.
     """
 
-    def __init__(self, checkpoint: Checkpoint | None, run_fingerprint: Mapping[str, str], stages: list[Stage]) -> None:
+    def __init__(self, checkpoint: Checkpoint | None, mark: Mapping[str, str], stages: list[Stage]) -> None:
         """Read the checkpoint, if there is one.
 
         Raises
@@ -147,7 +147,7 @@ class Journal:
             When it is one of another graph, partition or settings, or another run uses it.
         """
         self.stages = stages
-        self._checkpoint, self._fingerprint = checkpoint, run_fingerprint
+        self._checkpoint, self._mark = checkpoint, mark
         self._finished: list[Attempt] = []
         self._saved: Saved | None = None
         self._snapshots: list[dict[str, NDArray[Any]]] = []
@@ -155,7 +155,7 @@ class Journal:
         self._lock = RunLock(Path(checkpoint.path)) if checkpoint is not None else None
         try:
             if checkpoint is not None and Path(checkpoint.path).exists():
-                self._saved, self._snapshots = _read(Path(checkpoint.path), run_fingerprint)
+                self._saved, self._snapshots = _read(Path(checkpoint.path), mark)
                 stages[:] = self._saved.stages
         except PGOError:
             self.close()
@@ -219,7 +219,7 @@ class Journal:
                 saved = Saved(*done, name, at_rest, tuple(records), driver.remembered())
                 snapshots = driver.snapshots()
                 try:
-                    _write(Path(self._checkpoint.path), self._fingerprint, saved, snapshots)
+                    _write(Path(self._checkpoint.path), self._mark, saved, snapshots)
                 except PGOError as error:  # the disk's, which may have room again by the next time
                     if not self._has_warned:
                         _LOG.warning("the solve goes on without a new checkpoint: %s", error)
@@ -262,12 +262,10 @@ def _digest_of_rest(stream: BufferedReader | BufferedRandom) -> bytes:
     return hashlib.file_digest(stream, "sha256").hexdigest().encode() + b"\n"
 
 
-def _write(
-    path: Path, run_fingerprint: Mapping[str, str], saved: Saved, snapshots: Sequence[Mapping[str, NDArray[Any]]]
-) -> None:
+def _write(path: Path, mark: Mapping[str, str], saved: Saved, snapshots: Sequence[Mapping[str, NDArray[Any]]]) -> None:
     parts = {"run": serialize(saved)} | {f"robot {robot}": dict(snapshot) for robot, snapshot in enumerate(snapshots)}
     arrays = {f"{part}/{name}": array for part, found in parts.items() for name, array in found.items()}
-    header = np.array([run_fingerprint[part] for part in _PARTS])
+    header = np.array([mark[part] for part in _PARTS])
     with replace_when_done(path) as temporary, temporary.open("w+b") as file:
         file.write(_FORMAT + b"0" * _DIGEST_SIZE)
         np.savez(file, allow_pickle=False, **{"header": header, **arrays})
@@ -277,7 +275,7 @@ def _write(
         file.write(digest)
 
 
-def _read(path: Path, run_fingerprint: Mapping[str, str]) -> tuple[Saved, list[dict[str, NDArray[Any]]]]:
+def _read(path: Path, mark: Mapping[str, str]) -> tuple[Saved, list[dict[str, NDArray[Any]]]]:
     parts: dict[str, dict[str, NDArray[Any]]] = {}
     try:
         with path.open("rb") as stream:
@@ -291,7 +289,7 @@ def _read(path: Path, run_fingerprint: Mapping[str, str]) -> tuple[Saved, list[d
                 part, _, name = key.partition("/")
                 parts.setdefault(part, {})[name] = file[key]
         header = [str(text) for text in parts["header"][""]]
-        other = [part for part, found in zip(_PARTS, header, strict=True) if found != run_fingerprint[part]]
+        other = [part for part, found in zip(_PARTS, header, strict=True) if found != mark[part]]
         if not other:
             saved: Saved = deserialize(parts["run"], _CLASSES)
             return saved, [parts[f"robot {robot}"] for robot in range(saved.driver.ledger.num_robots)]

@@ -10,12 +10,7 @@ import numpy as np
 from pgo_models.geometry.rotations import Array
 from solvers.distributed.driver import Count, Driver
 from solvers.result import Measurement, Status
-from solvers.soc.penalty import (
-    Due,
-    MultiplierPenalty,
-    Steps,
-    next_penalty,
-)
+from solvers.soc.penalty import Due, MultiplierPenalty, Steps, next_penalty
 from solvers.soc.separator_stiffness import adapted_penalty, fell_most, translation_penalty_for
 from solvers.soc.shared_anderson import AndersonSums
 from solvers.soc.soc import SOC

@@ -17,11 +17,7 @@ from solvers.distributed.interface import InterfaceFactor
 from solvers.distributed.multifrontal import TreeFactor
 from solvers.network.messages import Message
 from solvers.result import Measurement, Status
-from solvers.soc.penalty import (
-    Due,
-    Steps,
-    next_penalty,
-)
+from solvers.soc.penalty import Due, Steps, next_penalty
 from solvers.soc.rotation_block import RotationBlock, block_at, stationary_B
 from solvers.soc.shared_anderson import AndersonSums
 from solvers.soc.soc import SOC

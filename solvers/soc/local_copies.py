@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array
+from scipy.sparse.csgraph import connected_components
 
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.geometry.poses import Poses
@@ -209,9 +210,7 @@ def _share(problem: PGOProblem, owner: IntArray, a: int, separator: Array) -> Ro
     M = joint_matrix(local)
     A, w = residual_matrix(local)
     held = np.concatenate([np.flatnonzero(separator[poses]), np.arange(len(poses), M.shape[0])])
-    components = np.empty(len(poses), dtype=np.int64)
-    for number, together in enumerate(local.components()):
-        components[together] = number
+    components = connected_components(local.adjacency, directed=False)[1]
     return Robot(poses, held, _global_rows(poses, problem)[held], A, w, M, analyze(M, problem.backend), components)
 
 
