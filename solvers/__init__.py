@@ -22,7 +22,8 @@ from solvers.soc.anderson import Anderson
 from solvers.soc.paper import PaperSOC
 from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty, MultiplierPenalty
 from solvers.soc.r_step import RStep
-from solvers.soc.soc import SOC, Coupling
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC
 from solvers.solution import Solution
 from solvers.studies.comparison import compare_methods
 from solvers.studies.paper_figures import draw_paper_figures

@@ -24,7 +24,8 @@ from solvers.pipeline import HANDOVER, Pipeline
 from solvers.riemannian.newton import gauss_newton
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
-from solvers.soc.soc import SOC, Coupling
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC
 
 
 class FirstStage(enum.Enum):

@@ -33,7 +33,8 @@ from solvers.riemannian.newton import Newton
 from solvers.riemannian.staircase import DualBound, Staircase
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
-from solvers.soc.soc import SOC, Coupling
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC
 from solvers.solution import Solution
 
 HANDOVER_TOLERANCE = 5e-3  # relative residual at which Newton needs one or two factorisations on all graphs tried
@@ -213,7 +214,7 @@ def solve(
                 poses, certificate = _broken_off(problem, pipeline, watch, stages)
             if stages[-1].status.is_success:
                 journal.end()
-        ledger = driver.ledger
+        ledger = driver.network.ledger
     if pipeline.staircase is not None and certificate.can_improve and stages[-1].status not in OUT_OF_TIME:
         try:
             poses, certificate = _climb(problem, pipeline, poses, certificate, stages, watch)

@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from budget import EXAMPLES, PROFILE
 from hypothesis import settings
 
 from pgo_models.certificates.newton_polish import polish
@@ -14,10 +15,9 @@ from pgo_models.graphs.g2o import read_g2o
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 
-# Speed is measured in benchmarks. HYPOTHESIS_PROFILE=thorough draws four times as many examples.
-settings.register_profile("light", max_examples=25, deadline=None)
-settings.register_profile("thorough", max_examples=100, deadline=None)
-settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "light"))
+# Speed is measured in benchmarks.
+settings.register_profile(PROFILE, max_examples=EXAMPLES, deadline=None)
+settings.load_profile(PROFILE)
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,9 @@
 """Partitions of every kind, and robots whose messages are written down, that several test files share."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from graphs import MILD_NOISE
@@ -12,10 +15,12 @@ from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import observe
 from pgo_models.problem.cholesky import CholeskyBackend
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.driver import Driver
 from solvers.distributed.robots.agent import Agent
-from solvers.distributed.robots.subgraph import Subgraph
-from solvers.network.engine import WorkerPool
-from solvers.network.messages import Message
+from solvers.distributed.stages import open_driver
+from solvers.network.engine import Engine, InProcess, WorkerPool
+from solvers.soc.subgraph import Subgraph
 
 Partitioner = Callable[[PoseGraph, int], Partition]
 
@@ -82,11 +87,50 @@ def corner_cases() -> list[tuple[PoseGraph, Partition]]:
     return found
 
 
+def driver_at(problem: PGOProblem, parts: Partition, poses: Poses | None, engine: Engine | None = None) -> Driver:
+    """Driver and robots, in this process, at poses, or at their own chordal start."""
+    driver = open_driver(problem, parts, engine if engine is not None else InProcess())
+    if poses is None:
+        driver.start()
+    else:
+        driver.set_poses(poses)
+    return driver
+
+
+def spoil(agent: Agent, factor: float) -> None:
+    """Multiply what a robot's copies are at."""
+    assert agent.copies is not None
+    block = agent.copies.block
+    state = replace(agent.copies.state, block=replace(block, s=factor * block.s))
+    agent.copies = replace(agent.copies, state=state)
+
+
+def name_of(order: object) -> str:
+    """Class and method of an order, or the function that it is."""
+    inner = order.args[0] if isinstance(order, partial) else order
+    return str(getattr(inner, "__qualname__", inner))
+
+
+def arrays_in(record: object, name: str = "value") -> Iterator[tuple[str, Array]]:
+    """Numbers and arrays of a request or an answer, each with the name of its field; between robots with `>`."""
+    if isinstance(record, Mapping):
+        for robot, value in record.items():
+            yield from ((f"{field}>{robot}", array) for field, array in arrays_in(value, name))
+    elif is_dataclass(record):
+        for field in fields(record):
+            yield from arrays_in(getattr(record, field.name), field.name)
+    elif isinstance(record, tuple):
+        for value in record:
+            yield from arrays_in(value, name)
+    elif record is not None:
+        yield name, np.asarray(record)
+
+
 class Recording:
-    """Robots of this process, and all that was said: an engine that is its own crew."""
+    """Robots of this process, and all that was said: an engine that is its own pool."""
 
     def __init__(self) -> None:
-        self.log: list[tuple[str, list[Message], list[Message]]] = []
+        self.log: list[tuple[str, list[Any], list[Any]]] = []
         self.shares: Sequence[Subgraph] = ()
         self.agents: list[Agent] = []
         self.is_closed = False
@@ -96,19 +140,19 @@ class Recording:
         self.agents = [make(share) for share in shares]
         return self
 
-    def ask(self, order: str, messages: Sequence[Message]) -> list[Message]:
-        answers = [agent.obey(order, message) for agent, message in zip(self.agents, messages, strict=True)]
-        self.log.append((order, list(messages), answers))
+    def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
+        answers = [order(agent, request) for agent, request in zip(self.agents, requests, strict=True)]
+        self.log.append((name_of(order), list(requests), answers))
         return answers
 
     def close(self) -> None:
         self.is_closed = True
 
-    def times(self, *orders: str) -> int:
+    def times(self, *orders: object) -> int:
         """How often one of these orders was given."""
-        return sum(order in orders for order, _, _ in self.log)
+        return sum(name in map(name_of, orders) for name, _, _ in self.log)
 
-    def crossed(self, *orders: str) -> list[tuple[str, Array]]:
+    def crossed(self, *orders: object) -> list[tuple[str, Array]]:
         """Names and numbers of all arrays that crossed in orders other than these."""
-        both = [m for order, sent, got in self.log if order not in orders for m in (*sent, *got)]
-        return [(name, np.ravel(value).astype(float)) for message in both for name, value in message.items()]
+        both = [m for name, sent, got in self.log if name not in map(name_of, orders) for m in (*sent, *got)]
+        return [(name, np.ravel(value).astype(float)) for record in both for name, value in arrays_in(record)]

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import OPTIMUM, wound_ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -34,7 +35,7 @@ def test_folders_of_robots_are_solved_as_they_are(name, benchmark_data):
     assert solution.is_certified
 
 
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=examples(15))
 @given(seed=st.integers(0, 10**6), d=st.sampled_from([2, 3]), rotation_std=st.floats(0.01, 2.0))
 def test_the_bound_holds_and_the_solution_is_no_worse_than_the_start_at_any_noise(seed, d, rotation_std):
     rng = np.random.default_rng(seed)
@@ -187,7 +188,7 @@ def test_a_gap_beyond_doubles_is_not_looked_for_in_other_poses(robots):
     assert solution.gap < 1e-13
 
 
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(
     seed=st.integers(0, 2**32 - 1),
     weights=st.sampled_from([1e-9, 1e-3, 1e3, 1e9]),

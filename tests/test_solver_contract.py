@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, SEEDS, random_poses, varied_graph, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -100,7 +101,7 @@ def assert_same(one: Any, other: Any, where: str = "state") -> None:
 
 
 @EVERY
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_a_step_leaves_its_state_alone(make: Make, seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)
@@ -117,7 +118,7 @@ def test_a_step_leaves_its_state_alone(make: Make, seed: int, n: int, d: int) ->
 
 
 @EVERY
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, backend=st.sampled_from(CholeskyBackend))
 def test_a_list_of_states_is_a_film(make: Make, seed: int, n: int, d: int, backend: CholeskyBackend) -> None:
     # Stepping again from an old state gives the frame that followed it, whatever was done meanwhile.
@@ -132,7 +133,7 @@ def test_a_list_of_states_is_a_film(make: Make, seed: int, n: int, d: int, backe
 
 
 @EVERY
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_a_start_is_left_alone_and_is_state_zero(make: Make, seed: int, n: int, d: int) -> None:
     problem, start = varied_problem(seed, n, d), random_poses(n, d, seed)
@@ -146,7 +147,7 @@ def test_a_start_is_left_alone_and_is_state_zero(make: Make, seed: int, n: int, 
 
 
 @EVERY
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_every_state_stands_for_feasible_poses_whose_F_is_measured(make: Make, seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)

@@ -29,6 +29,11 @@ def multipliers(problem: PGOProblem, poses: Poses) -> Array:
     return 0.5 * (product + np.swapaxes(product, 1, 2))
 
 
+def multiplier_norms(Lambda: Array) -> Array:
+    """||Lambda_i||_2, (n,), of symmetric (n, d, d)."""
+    return np.asarray(np.abs(np.linalg.eigvalsh(Lambda)).max(axis=1, initial=0.0))
+
+
 def certificate_matrix(problem: PGOProblem, Lambda: Array, eta: float = 0.0) -> csc_array:
     """S + eta blockdiag(0, I), (N, N), with S = M - blockdiag(0, Lambda); the pattern is that of M.
 

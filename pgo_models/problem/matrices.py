@@ -151,6 +151,21 @@ def rotation_columns(pose: IntArray, first: int, d: int) -> IntArray:
     return np.asarray(first + d * pose[:, None] + np.arange(d))
 
 
+def columns_of(poses: IntArray, num_poses: int, widths: tuple[int, ...]) -> IntArray:
+    """Unknowns of some poses when those of all poses are stacked field by field, `widths[f]` numbers a pose.
+
+    Examples
+    --------
+    >>> columns_of(np.array([1]), 3, (1, 2))
+    array([1, 5, 6])
+    """
+    found, first = [], 0
+    for width in widths:
+        found.append((first + width * poses[:, None] + np.arange(width)).ravel())
+        first += width * num_poses
+    return np.concatenate(found)
+
+
 def inner(A: Array, B: Array) -> float:
     """Frobenius inner product sum_ab A_ab B_ab of two arrays of one shape.
 

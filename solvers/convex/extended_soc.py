@@ -11,12 +11,13 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, stack_transposes
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.result import Measurement, Status
 from solvers.soc.penalty import MultiplierPenalty
 from solvers.soc.r_step import RStep, RSubproblem
-from solvers.soc.soc import SOC, Coupling
-from solvers.soc.state import SOCState
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC, Joint, SOCState
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,13 +94,14 @@ class ExtendedSOC:
 
     def init(self, problem: PGOProblem, start: Poses | None) -> SOCState:
         """State 0 of SOC; the changed program is compiled here, and again when rho changes."""
-        state = replace(self.soc, r_step=ExtendedStep(problem.graph, self.changer)).init(problem, start)
-        return state
+        return self._recursion(problem).init(problem, start if start is not None else chordal_start(problem))
 
     def step(self, problem: PGOProblem, state: SOCState) -> SOCState:
         """One iteration of SOC."""
-        following = self.soc.step(problem, state)
-        return following
+        return self._recursion(problem).step(problem, state)
+
+    def _recursion(self, problem: PGOProblem) -> Joint:
+        return Joint(replace(self.soc, r_step=ExtendedStep(problem.graph, self.changer)))
 
     def measure(self, problem: PGOProblem, state: SOCState) -> Measurement:
         """Objective of the changed problem at the poses, and the residuals of SOC."""
@@ -109,7 +111,7 @@ class ExtendedSOC:
 
     def poses(self, problem: PGOProblem, state: SOCState) -> Poses:
         """Omega with the translations of step (a)."""
-        V = np.concatenate([np.zeros((problem.num_poses, problem.d)), state.z - state.B])
+        V = np.concatenate([np.zeros((problem.num_poses, problem.d)), state.block.shift])
         return Poses(state.omega, _model(state).solve(V)[: problem.num_poses])
 
     def cost(self, state: SOCState, poses: Poses) -> float:
@@ -123,6 +125,6 @@ class ExtendedSOC:
 
 
 def _model(state: SOCState) -> GraphQP:
-    model = state.copies.steps[0]
+    model = state.r_step
     assert isinstance(model, GraphQP)
     return model

@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pgo_models.errors import SettingError
-from solvers.distributed.consensus import ConsensusSOC
-from solvers.distributed.driver import Count, Driver
+from pgo_models.geometry.rotations import Array
+from solvers.distributed.consensus import RobotsOfDriver
+from solvers.distributed.driver import Driver
+from solvers.network.counted_pool import Count
 from solvers.network.faults import Faults, LossyChannel
-from solvers.network.messages import Message
 from solvers.result import Measurement, Status
+from solvers.soc.consensus import Consensus, ask_all
+from solvers.soc.consensus_robot import ConsensusRobot
+from solvers.soc.copies import Rows, TurnSettings
 from solvers.soc.soc import SOC
 
 
@@ -32,8 +34,8 @@ class AsynchronousState:
     size : float
         ||omega||_rho.
     channel : LossyChannel
-    messages : list of Message
-        What has arrived for the next turn.
+    rows : list of mapping of int to rows
+        What has arrived for the next turn, by its sender.
     quiet : int
         Rounds in a row with residuals within tolerance.
     waited : int
@@ -42,8 +44,8 @@ class AsynchronousState:
 
     k: int
     size: float
-    channel: LossyChannel[NDArray[Any]]
-    messages: list[Message]
+    channel: LossyChannel[Array]
+    rows: list[Rows]
     primal_residual: float = np.inf
     dual_residual: float = np.inf
     quiet: int = 0
@@ -97,49 +99,36 @@ class AsynchronousSOC:
         SettingError
             When there is no such robot as the one that is to be silent.
         """
-        number, silent = driver.ledger.num_robots, self.faults.silent_robot
-        if silent is not None and silent >= number:
-            raise SettingError(f"silent_robot is {silent}; give 0 to {number - 1}")
-        state = ConsensusSOC(self.soc, self.has_driver).init(driver, None)
-        messages = driver.hand_on(driver.ask_all("announce", count=Count.PIGGYBACKED), self._settings)
-        return AsynchronousState(0, state.size, LossyChannel(self.faults), messages)
+        robots, silent = RobotsOfDriver(driver, self.has_driver), self.faults.silent_robot
+        if silent is not None and silent >= robots.num_robots:
+            raise SettingError(f"silent_robot is {silent}; give 0 to {robots.num_robots - 1}")
+        state = Consensus(self.soc).init(robots)
+        settings = TurnSettings(self.alpha, self.damping)
+        rows = robots.hand_on(ask_all(robots, ConsensusRobot.announce, settings, Count.PIGGYBACKED))
+        return AsynchronousState(0, state.size, LossyChannel(self.faults), rows)
 
     def step(self, driver: Driver, state: AsynchronousState) -> AsynchronousState:
         """One turn of every robot, with what has arrived."""
-        answers = driver.ask_all("turn", state.messages, Count.PIGGYBACKED)
-        squares = np.sum([answer["sums"] for answer in answers], axis=0)
+        robots = RobotsOfDriver(driver)
+        turns = robots.ask(ConsensusRobot.turn, state.rows, Count.PIGGYBACKED)
+        squares = np.sum([turn.sums for turn in turns], axis=0)
         if not np.isfinite(squares).all():
             return replace(state, k=state.k + 1, primal_residual=np.nan, dual_residual=np.nan)
         primal, dual = math.sqrt(squares[0]) / state.size, math.sqrt(squares[1]) / state.size
         return replace(
             state,
             k=state.k + 1,
-            messages=driver.hand_on(answers, self._settings, state.channel),
+            rows=robots.hand_on([turn.rows for turn in turns], state.channel),
             primal_residual=primal,
             dual_residual=dual,
             quiet=state.quiet + 1 if max(primal, dual) <= self.soc.tolerance else 0,
-            waited=max(int(answer["waited"][0]) for answer in answers),
+            waited=max(turn.waited for turn in turns),
         )
 
     def measure(self, driver: Driver, state: AsynchronousState) -> Measurement:
         """F of the owners' omega with translations that are at hand, and the residuals."""
-        if math.isnan(state.primal_residual):
-            return driver.measured(np.nan, np.nan, np.nan)
-        parts = [float(answer["objective"][0]) for answer in driver.ask_all("cost", count=Count.OFF)]
-        return driver.measured(math.fsum(parts), state.primal_residual, state.dual_residual)
+        return RobotsOfDriver(driver).measured(Measurement(math.nan, state.primal_residual, state.dual_residual))
 
     def converged(self, state: AsynchronousState, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals have been within tolerance since before the oldest rows in use were sent."""
         return Status.CONVERGED if state.quiet > state.waited + self.faults.max_delay else None
-
-    def finish(self, driver: Driver) -> None:
-        """Leave omega and the best translations for it with driver and robots: two rounds."""
-        ConsensusSOC(self.soc).finish(driver)
-
-    @property
-    def _settings(self) -> Message:
-        return {
-            "passes": np.array([self.soc.local_passes]),
-            "alpha": np.array([self.alpha]),
-            "damping": np.array([self.damping]),
-        }

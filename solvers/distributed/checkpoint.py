@@ -25,8 +25,7 @@ from pgo_models.files import replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed.consensus import ConsensusState
-from solvers.distributed.driver import Driver, DriverMemory
+from solvers.distributed.driver import CoverPoses, Driver, DriverState
 from solvers.distributed.interface import InterfaceFactor
 from solvers.distributed.multifrontal import TreeFactor
 from solvers.distributed.newton import SubstructuredNewtonState
@@ -37,16 +36,18 @@ from solvers.network.ledger import Ledger, Traffic
 from solvers.network.serialization import deserialize, serialize
 from solvers.result import History, Measurement, Outcome, Record, Stage, Status
 from solvers.riemannian.newton import Newton
-from solvers.soc.anderson import Anderson
+from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
+from solvers.soc.consensus import ConsensusState
+from solvers.soc.copies import SeparatorPenalty
 from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty
 from solvers.soc.r_step import RStep
-from solvers.soc.rotation_block import RotationBlock
-from solvers.soc.shared_anderson import AndersonShare, AndersonSums
-from solvers.soc.soc import SOC, Coupling
+from solvers.soc.recursion_block import RecursionBlock, StepSettings
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC
 
 S = TypeVar("S")
 Attempt = tuple[Poses, Certificate]
-_FORMAT = b"pgo-splitting checkpoint 2\n"  # first line of a file; the second is the SHA-256 of all that follows
+_FORMAT = b"pgo-splitting checkpoint 3\n"  # first line of a file; the second is the SHA-256 of all that follows
 _DIGEST_SIZE = 65
 _LOG = logging.getLogger(__name__)
 _PARTS = ("graph", "partition", "settings")
@@ -96,7 +97,7 @@ class Saved:
         Its state.
     records : tuple of Record
         Of the states before.
-    driver : DriverMemory
+    driver : DriverState
     """
 
     attempts: tuple[Attempt, ...]
@@ -104,26 +105,15 @@ class Saved:
     method: str
     state: object
     records: tuple[Record, ...]
-    driver: DriverMemory
+    driver: DriverState
 
 
 _CLASSES = (
-    *(
-        Saved,
-        DriverMemory,
-        Poses,
-        Certificate,
-        LowerBound,
-        BoundSource,
-        Verdict,
-        Ledger,
-        Traffic,
-        RotationBlock,
-        AndersonShare,
-    ),
-    *(Stage, Status, History, Record, Measurement, AndersonSums, InterfaceFactor, TreeFactor),
-    *(SubstructuredState, ConsensusState, SubstructuredNewtonState, Partition, PartitionMethod),
+    *(Saved, DriverState, CoverPoses, Poses, Certificate, LowerBound, BoundSource, Verdict, Ledger, Traffic),
+    *(Stage, Status, History, Record, Measurement, RecursionBlock, StepSettings, AndersonShare, AndersonSums),
+    *(SubstructuredState, ConsensusState, SubstructuredNewtonState, InterfaceFactor, TreeFactor, SeparatorPenalty),
     *(SOC, Newton, Anderson, Coupling, RStep, MultiplierPenalty, FixedPenalty, BalancedPenalty),
+    *(Partition, PartitionMethod),
 )
 
 
@@ -187,7 +177,7 @@ class Journal:
         start: S | None = None
         earlier: tuple[Record, ...] = ()
         if self._saved is not None:
-            driver.remember(self._saved.driver, self._snapshots)
+            driver.resume(self._saved.driver, self._snapshots)
             start, earlier = self._saved.state, self._saved.records  # type: ignore[assignment] # by its method's name
             self._saved, self._snapshots = None, []
         if self._checkpoint is None:
@@ -207,16 +197,16 @@ class Journal:
         self, name: str, driver: Driver, watch: Watch, records: list[Record], is_due: bool
     ) -> Callable[[Any, Record], bool | None]:
         """Callback that writes a checkpoint when one is due, and then calls the one of `watch`."""
-        last = -math.inf if is_due else driver.ledger.rounds
+        last = -math.inf if is_due else driver.network.ledger.rounds
 
         def write(state: Any, record: Record) -> bool | None:  # noqa: ANN401 - of whatever method runs
             nonlocal last
             assert self._checkpoint is not None
-            if driver.ledger.rounds - last >= self._checkpoint.rounds:
-                last = driver.ledger.rounds
+            if driver.network.ledger.rounds - last >= self._checkpoint.rounds:
+                last = driver.network.ledger.rounds
                 at_rest = state.at_rest() if isinstance(state, SubstructuredState) else state
                 done = tuple(self._finished), tuple(self.stages)
-                saved = Saved(*done, name, at_rest, tuple(records), driver.remembered())
+                saved = Saved(*done, name, at_rest, tuple(records), driver.state)
                 snapshots = driver.snapshots()
                 try:
                     _write(Path(self._checkpoint.path), self._mark, saved, snapshots)

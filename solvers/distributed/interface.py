@@ -12,8 +12,9 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.floating_point import OUTWARD, column_error, gamma
+from pgo_models.problem.matrices import columns_of
 from solvers.distributed.multifrontal import Front, TreeFactor, factorize_tree, tree_bytes, tree_counts
-from solvers.distributed.robots.elimination import columns_of, row_sums, unpacked
+from solvers.distributed.robots.elimination import row_sums, unpacked
 
 
 @dataclass(frozen=True, eq=False)

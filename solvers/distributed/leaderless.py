@@ -21,12 +21,15 @@ from pgo_models.problem.initialization import spanning_tree, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
-from solvers.distributed.consensus import ConsensusSOC, ConsensusState
-from solvers.distributed.driver import Count, Driver
+from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
+from solvers.distributed.driver import Driver
 from solvers.loop import Watch
+from solvers.network.counted_pool import Count
 from solvers.network.faults import Faults
 from solvers.network.ledger import BYTES_PER_NUMBER, Traffic
 from solvers.result import History, Outcome, Stage, Status
+from solvers.soc.consensus import ConsensusState, ask_all
+from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.soc import SOC
 
 NO_CERTIFICATE = "no driver: Newton and the certificate were left out, and F >= 0 is all that is known of the optimum"
@@ -54,7 +57,7 @@ def attempt_leaderless(
         driver.hand_out(before)
         if start is None:
             for traffic in tree_traffic(problem, robots):
-                driver.ledger = driver.ledger.after_round(traffic)
+                driver.network.ledger = driver.network.ledger.after_round(traffic)
         name = "spanning tree" if start is None else "given start"
         seconds = time.perf_counter() - began
         journal.stages.append(Stage(name, Status.CONVERGED, 0, problem.objective(before), seconds, History()))
@@ -77,8 +80,8 @@ def collect_copies(driver: Driver) -> Poses:
     """Poses that the robots agreed on, for whoever asked for the solution; off the ledger."""
     n, d = driver.num_poses, driver.d
     R, t = np.empty((n, d, d)), np.empty((n, d))
-    for answer in driver.ask_all("own_poses", count=Count.OFF):
-        R[answer["poses"]], t[answer["poses"]] = answer["R"], answer["t"]
+    for own in ask_all(RobotsOfDriver(driver), ConsensusRobot.own_poses, None, Count.OFF):
+        R[own.poses], t[own.poses] = own.R, own.t
     return Poses(R, t)
 
 

@@ -32,10 +32,11 @@ from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array, stack_transposes
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, gamma
+from pgo_models.problem.matrices import columns_of
 from solvers.distributed.driver import Driver
 from solvers.distributed.interface import InterfaceFactor
-from solvers.distributed.robots.elimination import columns_of
-from solvers.network.messages import Message
+from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,33 +45,29 @@ class InterfaceProof:
 
     factor: InterfaceFactor
     slack: Array
-    answers: list[Message]
+    answers: list[ProofAnswer]
     Lambda: Array
     traces: list[float]
 
 
 def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
     """Grounded without eta where that goes through, else the better form with the smallest eta found; at the poses."""
-    if driver.objective <= driver.rounding_level:
+    if driver.at.objective <= driver.at.rounding_level:
         return NO_BOUND
     found = prove_grounded(driver, 0.0)
     if found is not None and found.value > 0.0:
         return found
     count = driver.num_poses * driver.d
-    smallest = smallest_shift(gap, driver.objective, count)
+    smallest = smallest_shift(gap, driver.at.objective, count)
     # At stationary poses tr(Lambda) is F; it only says where the search ends.
     forms = prove_with_eta, prove_grounded
-    bounds = [search_bound(partial(form, driver), smallest, driver.objective, count) for form in forms]
+    bounds = [search_bound(partial(form, driver), smallest, driver.at.objective, count) for form in forms]
     return max([NO_BOUND, *bounds], key=lambda bound: bound.value)
 
 
 def prove_with_eta(driver: Driver, eta: float) -> LowerBound | None:
     """Bound tr(Lambda) - eta n d if S + eta blockdiag(0, I) without a translation is positive definite: one round."""
-    none = np.zeros(0, dtype=np.int64)
-    message = {"fixed": _is_fixed(driver, none), "eta": np.array([eta])}
-    fixed = driver.ground(1).ravel()
-    message["fixed"][fixed] = True
-    proof = _eliminate(driver, message, fixed, eta, UNGROUNDED_SHIFT)
+    proof = _eliminate(driver, driver.ground(1).ravel(), eta, UNGROUNDED_SHIFT)
     if proof is None:
         return None
     lost = eta * driver.num_poses * driver.d
@@ -82,31 +79,31 @@ def prove_grounded(driver: Driver, eta: float) -> LowerBound | None:
     """Bound grounded at the driver's pose, if S_r + eta blockdiag(0, I) is positive definite, else None."""
     g, d, r = len(driver.cover), driver.d, driver.grounded
     fixed = columns_of(np.array([r]), g, (1, d))
-    R, t = driver.R[r], driver.t[r]
-    X = np.concatenate([(driver.t - t) @ R, stack_transposes(R.T @ driver.R)])
+    R, t = driver.at.R[r], driver.at.t[r]
+    X = np.concatenate([(driver.at.t - t) @ R, stack_transposes(R.T @ driver.at.R)])
     X[fixed] = np.concatenate([np.zeros((1, d)), np.eye(d)])
-    message = {"fixed": _is_fixed(driver, fixed), "eta": np.array([eta])}
     share, proof = FIRST_SHIFT, None
     while proof is None:
         if share < LEAST_SHIFT:
             return None
-        proof = _eliminate(driver, message, fixed, eta, share, X)
+        proof = _eliminate(driver, fixed, eta, share, X)
         share *= SHRINK
     start = X
     space, free = driver.interface(1, d), np.ones(len(X), dtype=bool)
     free[fixed] = False
-    at = _sum_up(driver, proof, X, proof.answers, free)
+    steps = [answer.step for answer in proof.answers if answer.step is not None]
+    at = _sum_up(driver, proof, X, steps, free)
     for _ in range(MOST_MOVES):
         if at.left <= SETTLED * abs(at.value):
             break
-        b = space.gather([answer["b"] for answer in at.answers]) + at.own
+        b = space.gather([one.right.b for one in at.steps]) + at.own
         b[fixed] = 0.0
         step = proof.factor.solve(b)
         step[fixed] = 0.0
-        answers = driver.ask("move_certificate", [{"x": part} for part in space.scatter(step)])
+        steps = driver.ask_each(Interior.move_certificate, space.scatter(step))
         X = X.copy()
         X[g:] -= step[g:]  # the translations matter in the residuals alone, which the robots have
-        moved = _sum_up(driver, proof, X, answers, free)
+        moved = _sum_up(driver, proof, X, steps, free)
         if not moved.left < at.left:
             break
         at = moved
@@ -125,56 +122,52 @@ class _Sums:
     squared_distances: float  # of the interiors
     X: Array
     own: Array  # the driver's part of S X
-    answers: Sequence[Message]
+    steps: Sequence[ProofStep]
 
 
-def _sum_up(driver: Driver, proof: InterfaceProof, X: Array, answers: Sequence[Message], free: Array) -> _Sums:
+def _sum_up(driver: Driver, proof: InterfaceProof, X: Array, steps: Sequence[ProofStep], free: Array) -> _Sums:
     g, d = len(driver.cover), driver.d
     space = driver.interface(1, d)
     blocks = evaluate_multipliers(proof.Lambda, X[g:].reshape(g, d, d))
     own, error = np.zeros_like(X), np.zeros_like(X)
     own[g:], error[g:] = blocks.product, blocks.product_error
-    parts = [answer["product"] for answer in answers]
+    found = [step.sums for step in steps]
+    parts = [one.product for one in found]
     sizes = space.gather([np.abs(part) for part in parts]) + np.abs(own)
-    error += space.gather([answer["error"] for answer in answers]) + gamma(len(parts) + 2.0) * sizes
+    error += space.gather([one.error for one in found]) + gamma(len(parts) + 2.0) * sizes
     product = space.gather(parts) + own
     slack = proof.slack[free]
-    figures = np.array([answer["figures"] for answer in answers])
-    values = [*figures[:, 0].tolist(), blocks.value]
-    value_error = float(figures[:, 1].sum()) + blocks.value_error + UNIT_ROUNDOFF * abs(math.fsum(values))
+    values = [*(one.value for one in found), blocks.value]
+    value_error = (
+        math.fsum(one.value_error for one in found) + blocks.value_error + UNIT_ROUNDOFF * abs(math.fsum(values))
+    )
     return _Sums(
         value=math.fsum(values),
         value_error=OUTWARD * value_error,
-        left=float(figures[:, 2].sum()) + quadratic_loss(product[free], 0.0, slack),
-        quadratic=OUTWARD * (float(figures[:, 3].sum()) + quadratic_loss(product[free], error[free], slack)),
-        squared_distances=float(figures[:, 4].sum()),
+        left=math.fsum(one.left for one in found) + quadratic_loss(product[free], 0.0, slack),
+        quadratic=OUTWARD
+        * (math.fsum(one.quadratic for one in found) + quadratic_loss(product[free], error[free], slack)),
+        squared_distances=math.fsum(one.squared_distances for one in found),
         X=X,
         own=own,
-        answers=answers,
+        steps=steps,
     )
 
 
-def _is_fixed(driver: Driver, fixed: IntArray) -> Array:
-    marked = np.zeros((driver.d + 1) * len(driver.cover))
-    marked[fixed] = 1.0
-    return marked
-
-
 def _eliminate(
-    driver: Driver, message: dict[str, Array], fixed: IntArray, eta: float, share: float, X: Array | None = None
+    driver: Driver, fixed: IntArray, eta: float, share: float, X: Array | None = None
 ) -> InterfaceProof | None:
     """One elimination of S + eta blockdiag(0, I) less a share of its diagonal; None when it is not shown definite."""
     g, d = len(driver.cover), driver.d
-    space = driver.interface(1, d)
-    messages: list[Message] = [
-        {**message, "share": np.array([share]), "fixed": part} for part in space.scatter(message["fixed"])
-    ]
-    if X is not None:
-        messages = [{**one, "point": part} for one, part in zip(messages, space.scatter(X), strict=True)]
-    answers = driver.ask("certificate", messages)
-    Lambda = driver.multipliers
-    traces = [*np.einsum("naa->na", Lambda).ravel().tolist(), *(float(answer["trace"][0]) for answer in answers)]
-    if not all(answer["definite"][0] for answer in answers):
+    space, marked = driver.interface(1, d), np.zeros((d + 1) * g)
+    marked[fixed] = 1.0
+    points: Sequence[Array | None] = space.scatter(X) if X is not None else [None] * len(driver.robots)
+    orders = [ProofOrder(eta, share, part, at) for part, at in zip(space.scatter(marked), points, strict=True)]
+    answers = driver.ask_each(Interior.certificate, orders)
+    Lambda = driver.at.multipliers
+    traces = [*np.einsum("naa->na", Lambda).ravel().tolist(), *(answer.trace for answer in answers)]
+    contributions = [answer.schur for answer in answers if answer.schur is not None]
+    if len(contributions) < len(answers):
         return None
     added = eta * np.eye(d) - Lambda
     columns = driver.rotation_rows.reshape(g, d)
@@ -183,7 +176,6 @@ def _eliminate(
     is_fixed = np.zeros(len(diagonal), dtype=bool)
     is_fixed[fixed] = True
     added[is_fixed[columns].any(axis=1)] = 0.0
-    contributions = [answer["schur"] for answer in answers]
     lost = space.rounding(contributions, [(columns, added)], diagonal) + 8.0 * UNIT_ROUNDOFF * diagonal
     shift = np.maximum(share * diagonal, MARGIN * lost)
     shifted = np.where(is_fixed, diagonal, -shift)

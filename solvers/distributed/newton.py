@@ -28,9 +28,11 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.hessian import TangentLayout
 from pgo_models.problem.matrices import inner
-from solvers.distributed.driver import Count, Driver
+from solvers.distributed.driver import CoverPoses, Driver
 from solvers.distributed.interface import InterfaceFactor
-from solvers.network.messages import Message
+from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots.records import ModelOrder, Move, Reduced, RightHandSide, TrialEvaluation
+from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Status
 from solvers.riemannian.newton import Newton
 
@@ -69,13 +71,13 @@ class SubstructuredNewton:
 
     def init(self, driver: Driver, start: SubstructuredNewtonState | None) -> SubstructuredNewtonState:
         """State 0, at the poses that driver and robots hold."""
-        return start if start is not None else SubstructuredNewtonState(0, driver.objective)
+        return start if start is not None else SubstructuredNewtonState(0, driver.at.objective)
 
     def step(self, driver: Driver, state: SubstructuredNewtonState) -> SubstructuredNewtonState:
         """One factorisation and the moves it serves, two rounds each."""
         model = self._factorize(driver)
         at_rounding = False
-        decrement = scaled_decrement(model.square, driver.objective, driver.rounding_level)
+        decrement = scaled_decrement(model.square, driver.at.objective, driver.at.rounding_level)
         moved = False
         for _ in range(1 + CHORD_STEPS):
             if decrement <= STATIONARY_DECREMENT:
@@ -84,23 +86,23 @@ class SubstructuredNewton:
             if found is None:
                 break
             trial, answers = found
-            following = _solved(driver, model.is_newton, model.factor, answers)
+            gradients = [answer.gradient for answer in answers]
+            following = _solved(driver, model.is_newton, model.factor, gradients)
             after = scaled_decrement(following.square, trial.objective, trial.rounding_level)
             at_rounding = reached_rounding(decrement, after, model.is_newton and not moved)
-            if trial.objective >= driver.objective and after > 0.5 * decrement:
+            if trial.objective >= driver.at.objective and after > 0.5 * decrement:
                 break
-            driver.ask("accept", count=Count.PIGGYBACKED)
-            driver.R, driver.t, driver.force = trial.R, trial.t, trial.force
-            driver.objective, driver.rounding_level = trial.objective, trial.rounding_level
+            driver.ask(Interior.accept, None, Count.PIGGYBACKED)
+            driver.at = trial
             enough = after <= PROGRESS * decrement
             model, decrement, moved = following, after, True
             if not enough:
                 break
-        return SubstructuredNewtonState(state.k + 1, driver.objective, decrement, moved, at_rounding)
+        return SubstructuredNewtonState(state.k + 1, driver.at.objective, decrement, moved, at_rounding)
 
     def measure(self, driver: Driver, state: SubstructuredNewtonState) -> Measurement:
         """F and the relative decrement."""
-        return driver.measured(state.objective, 0.0, state.decrement)
+        return driver.measured(Measurement(state.objective, 0.0, state.decrement))
 
     def converged(self, state: SubstructuredNewtonState, measurement: Measurement) -> Status | None:
         """CONVERGED within tolerance or where the gradient is rounding; STALLED when the last step could not move."""
@@ -124,40 +126,32 @@ class SubstructuredNewton:
                 raise NotPositiveDefiniteError("the damped Gauss-Newton matrix is not positive definite")
 
 
-@dataclass(frozen=True, eq=False)
-class _Trial:
-    R: Array
-    t: Array
-    objective: float
-    rounding_level: float
-    force: Array
-
-
 def model_at(driver: Driver, second_order: bool, damping: float) -> Model | None:
     """Model at the poses at hand; None when a robot's interior, or the sum, is not positive definite."""
-    settings = np.array([float(second_order), damping])
-    answers = driver.ask("model", {"settings": settings}, Count.PIGGYBACKED)
-    if not all(answer["definite"][0] for answer in answers):
+    answers = driver.ask(Interior.model, ModelOrder(second_order, damping), Count.PIGGYBACKED)
+    reduced = [answer for answer in answers if answer is not None]
+    if len(reduced) < len(answers):
         return None
     interface = driver.interface(*driver.tangent)
     try:
-        factor = interface.factorize([a["schur"] for a in answers], _own(driver, answers, second_order, damping))
+        own = _own(driver, reduced, second_order, damping)
+        factor = interface.factorize([answer.schur for answer in reduced], own)
     except NotPositiveDefiniteError:
         return None
-    return _solved(driver, second_order, factor, answers)
+    return _solved(driver, second_order, factor, [answer.right for answer in reduced])
 
 
 def _own(
-    driver: Driver, answers: Sequence[Message], second_order: bool, damping: float
+    driver: Driver, reduced: Sequence[Reduced], second_order: bool, damping: float
 ) -> list[tuple[IntArray, Array]]:
     """What the driver adds: the multipliers of the cover, the ground, the damping."""
     g, d = len(driver.cover), driver.d
     interface, layout = driver.interface(*driver.tangent), TangentLayout(g, d)
     own: list[tuple[IntArray, Array]] = []
-    diagonal = interface.gather([answer["diagonal"][:, None] for answer in answers])[:, 0]
+    diagonal = interface.gather([answer.diagonal[:, None] for answer in reduced])[:, 0]
     columns = layout.rotations(np.arange(g))
     if second_order:
-        Lambda = driver.multipliers
+        Lambda = driver.at.multipliers
         trace = np.einsum("naa->n", Lambda)[:, None, None]
         curvature = -2.0 * trace if d == 2 else -2.0 * (trace * np.eye(3) - Lambda)
         own.append((columns, curvature))
@@ -170,32 +164,32 @@ def _own(
     return own
 
 
-def _solved(driver: Driver, is_newton: bool, factor: InterfaceFactor, answers: Sequence[Message]) -> Model:
+def _solved(driver: Driver, is_newton: bool, factor: InterfaceFactor, right: Sequence[RightHandSide]) -> Model:
     """Solution y = H^-1 g on the cover, and g^T H^-1 g."""
-    b = driver.interface(*driver.tangent).gather([answer["b"] for answer in answers])
+    b = driver.interface(*driver.tangent).gather([part.b for part in right])
     y = factor.solve(b)
-    return Model(is_newton, factor, y, math.fsum(float(answer["energy"][0]) for answer in answers) + inner(b, y))
+    return Model(is_newton, factor, y, math.fsum(part.energy for part in right) + inner(b, y))
 
 
-def _backtrack(driver: Driver, model: Model) -> tuple[_Trial, list[Message]] | None:
+def _backtrack(driver: Driver, model: Model) -> tuple[CoverPoses, list[TrialEvaluation]] | None:
     """First of the moves -y, -y/2, .. that lowers F enough, and the robots' answers there; None when none does."""
-    now, layout = Poses(driver.R, driver.t), TangentLayout(len(driver.cover), driver.d)
+    now, layout = Poses(driver.at.R, driver.at.t), TangentLayout(len(driver.cover), driver.d)
     w, v = layout.split(-model.y[:, 0])
     length = 1.0
     for _ in range(HALVINGS):
-        message = np.array([length])
         if length == 1.0:
-            parts = driver.interface(*driver.tangent).scatter(model.y)
-            answers = driver.ask("move", [{"x": part, "length": message} for part in parts])
+            moves = [Move(part, length) for part in driver.interface(*driver.tangent).scatter(model.y)]
+            translations = driver.ask_each(Interior.move, moves)
         else:
-            answers = driver.ask("turn", {"length": message}, Count.PIGGYBACKED)
+            translations = driver.ask(Interior.turn, length, Count.PIGGYBACKED)
         R = move_poses(now, length * w, length * v).R
-        t, answers = driver.best_translations(answers, "evaluate_trial")
-        objective, level, force = driver.state_of(answers)
-        trial = _Trial(R, t, objective, level, force)
-        if objective <= driver.objective - SUFFICIENT * length * model.square:
+        t, parts = driver.best_translations(translations)
+        answers = driver.ask_each(Interior.evaluate_trial, parts)
+        trial = driver.with_sums(CoverPoses(R, t, driver.at.force), [answer.at for answer in answers])
+        objective, before = trial.objective, driver.at.objective
+        if objective <= before - SUFFICIENT * length * model.square:
             return trial, answers
-        if length == 1.0 and objective <= driver.objective * (1.0 + ROUNDING):
+        if length == 1.0 and objective <= before * (1.0 + ROUNDING):
             return trial, answers
         length *= 0.5
     return None

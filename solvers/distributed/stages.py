@@ -14,18 +14,22 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
-from solvers.distributed.consensus import ConsensusSOC, ConsensusState
-from solvers.distributed.driver import DEFAULT_MEMORY, Count, Driver
+from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
+from solvers.distributed.driver import DEFAULT_MEMORY, Driver
 from solvers.distributed.lower_bound import best_bound_distributed
 from solvers.distributed.newton import SubstructuredNewton
-from solvers.distributed.robots.subgraph import middle_separator, split_graph
+from solvers.distributed.robots.interior import Interior
 from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
 from solvers.loop import Watch
+from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine
 from solvers.network.faults import Faults
 from solvers.result import OUT_OF_TIME, History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
-from solvers.soc.soc import SOC, Coupling
+from solvers.soc.consensus import ConsensusState
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC
+from solvers.soc.subgraph import middle_separator, split_graph
 
 
 def open_driver(problem: PGOProblem, robots: Partition, engine: Engine, memory: float = DEFAULT_MEMORY) -> Driver:
@@ -61,7 +65,7 @@ def attempt_distributed(
     if stages[-1].status not in OUT_OF_TIME:
         second = journal.run(SubstructuredNewton(newton), driver, watch)
         decrement = second.state.decrement
-        figures = second.status, second.iterations, driver.objective, second.seconds, second.history, newton
+        figures = second.status, second.iterations, driver.at.objective, second.seconds, second.history, newton
         stages.append(Stage("Newton", *figures))
     bound = best_bound_distributed(driver, gap)
     poses, Lambda = collect(driver)
@@ -77,7 +81,7 @@ def _start(driver: Driver, start: Poses | None) -> Stage:
     else:
         driver.set_poses(start)
     name = "chordal start" if start is None else "given start"
-    return Stage(name, Status.CONVERGED, 0, driver.objective, time.perf_counter() - began, History())
+    return Stage(name, Status.CONVERGED, 0, driver.at.objective, time.perf_counter() - began, History())
 
 
 def _run_soc(driver: Driver, soc: SOC, faults: Faults | None, journal: Journal, watch: Watch) -> Stage:
@@ -87,29 +91,26 @@ def _run_soc(driver: Driver, soc: SOC, faults: Faults | None, journal: Journal, 
         driver.save_poses()
     first: Outcome[AsynchronousState] | Outcome[ConsensusState] | Outcome[SubstructuredState]
     if soc.effective_coupling is Coupling.CONSENSUS and faults is not None:
-        asynchronous = AsynchronousSOC(soc, faults)
-        first = watch.run(asynchronous, driver)  # messages under way are in no checkpoint
-        asynchronous.finish(driver)
+        first = watch.run(AsynchronousSOC(soc, faults), driver)  # messages under way are in no checkpoint
+        RobotsOfDriver(driver).finish()
     elif soc.effective_coupling is Coupling.CONSENSUS:
-        consensus = ConsensusSOC(soc)
-        first = journal.run(consensus, driver, watch)
-        consensus.finish(driver)
+        first = journal.run(ConsensusSOC(soc), driver, watch)
+        RobotsOfDriver(driver).finish()
     else:
         substructured = SubstructuredSOC(soc)
         first = journal.run(substructured, driver, watch)
         substructured.finish(driver)
-    if not driver.objective <= driver.kept_objective:
+    if not driver.at.objective <= driver.kept.objective:
         driver.restore_poses()
     seconds = time.perf_counter() - began
-    return Stage("SOC", first.status, first.iterations, driver.objective, seconds, first.history, soc)
+    return Stage("SOC", first.status, first.iterations, driver.at.objective, seconds, first.history, soc)
 
 
 def collect(driver: Driver) -> tuple[Poses, Array]:
     """All poses and multipliers, for whoever asked for the solution; off the ledger."""
     n, d = driver.num_poses, driver.d
     R, t, Lambda = np.empty((n, d, d)), np.empty((n, d)), np.empty((n, d, d))
-    R[driver.cover], t[driver.cover], Lambda[driver.cover] = driver.R, driver.t, driver.multipliers
-    for answer in driver.ask("result", count=Count.OFF):
-        poses = answer["poses"]
-        R[poses], t[poses], Lambda[poses] = answer["R"], answer["t"], answer["Lambda"]
+    R[driver.cover], t[driver.cover], Lambda[driver.cover] = driver.at.R, driver.at.t, driver.at.multipliers
+    for own in driver.ask(Interior.result, None, Count.OFF):
+        R[own.poses], t[own.poses], Lambda[own.poses] = own.R, own.t, own.Lambda
     return Poses(R, t), Lambda

@@ -11,15 +11,18 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pgo_models.geometry.rotations import Array, unstack_transposes
-from solvers.distributed.driver import Count, Driver
+from pgo_models.certificates.dual_variables import multiplier_norms
+from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
+from solvers.distributed.driver import Driver
 from solvers.distributed.interface import InterfaceFactor
 from solvers.distributed.multifrontal import TreeFactor
-from solvers.network.messages import Message
+from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots.records import Reduced, RescaleInterior, RightHandSide
+from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Status
+from solvers.soc.anderson import AndersonSums
 from solvers.soc.penalty import Due, Steps, next_penalty
-from solvers.soc.rotation_block import RotationBlock, block_at, stationary_B
-from solvers.soc.shared_anderson import AndersonSums
+from solvers.soc.recursion_block import Agreement, RecursionBlock, block_at, stationary_B
 from solvers.soc.soc import SOC
 
 
@@ -30,11 +33,11 @@ class SubstructuredState(Steps):
     Attributes
     ----------
     k : int
-    block : RotationBlock
+    block : RecursionBlock
         Rotations of the cover.
     factor : InterfaceFactor
-    answers : sequence of Message
-        The robots' right-hand sides for the next step (a).
+    right : sequence of RightHandSide
+        The robots', for the next step (a).
     ratio : (n,)
         rho_i / m_i of all poses, in no order.
     size : float
@@ -42,16 +45,16 @@ class SubstructuredState(Steps):
     """
 
     k: int
-    block: RotationBlock
+    block: RecursionBlock
     factor: InterfaceFactor
-    answers: Sequence[Message]
+    right: Sequence[RightHandSide]
     ratio: Array
     size: float
     sums: AndersonSums = field(default_factory=AndersonSums)
 
     def at_rest(self) -> SubstructuredState:
         """State without the factor and the robots' answers, from which `SubstructuredSOC.init` goes on."""
-        return replace(self, factor=InterfaceFactor(TreeFactor((), 0, ()), np.zeros(0, dtype=np.int64)), answers=())
+        return replace(self, factor=InterfaceFactor(TreeFactor((), 0, ()), np.zeros(0, dtype=np.int64)), right=())
 
 
 @dataclass(frozen=True)
@@ -74,89 +77,66 @@ class SubstructuredSOC:
     def init(self, driver: Driver, start: SubstructuredState | None) -> SubstructuredState:
         """State 0: omega = the rotations that driver and robots hold, B = 0; or a state that was `at_rest`."""
         if start is not None:
-            answers = driver.ask("eliminated", count=Count.PIGGYBACKED)
-            return replace(start, factor=_factor(driver, start.block, answers), answers=answers)
+            answers = driver.ask(Interior.eliminated, None, Count.PIGGYBACKED)
+            return replace(start, factor=_factor(driver, start.block, answers), right=_right(answers))
         return self._penalized(driver, is_stationary=False)
 
     def step(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
         """One round: (a) by elimination; and one all-reduce: (b), (c)."""
         state = self._with_penalty_due(driver, state)
         space, rows, block = driver.interface(1, driver.d), driver.rotation_rows, state.block
-        b = space.gather([answer["b"] for answer in state.answers])
+        b = space.gather([part.b for part in state.right])
         b[rows] += (0.5 * block.penalty)[:, None] * block.shift
         x = state.factor.solve(b)
-        alpha, memory = np.array([self.soc.alpha]), np.array([self._memory])
-        messages: list[Message] = [{"x": part, "alpha": alpha, "memory": memory} for part in space.scatter(x)]
-        block, own = block.after_solve(x[rows], self.soc.alpha, self._memory)  # (a)
-        sums = own + np.sum([answer["sums"] for answer in driver.ask("solve", messages)], axis=0)
+        block, own = block.after_solve(x[rows])  # (a)
+        sums = own + np.sum(driver.ask_each(Interior.solve, space.scatter(x)), axis=0)
         merit = math.sqrt(sums[0])
         if not math.isfinite(merit):
             return replace(state, k=state.k + 1, primal_residual=np.nan, dual_residual=np.nan)
-        gamma: Array | None = np.zeros(0)
-        anderson = state.sums
-        if self.soc.acceleration is not None:
-            gamma, anderson = state.sums.coefficients(self.soc.acceleration, sums)
-        is_best = merit <= min(state.merits, default=np.inf)
-        message = {
-            "gamma": gamma if gamma is not None else np.zeros(0),
-            "restart": np.array([float(gamma is None)]),
-            "is_best": np.array([float(is_best)]),
-        }
-        block, own = block.after_agreement(gamma, is_best)  # (b) and (c)
+        gamma, anderson = state.sums.coefficients(self.soc.acceleration, sums)
+        agreement = Agreement(gamma, state.is_best(merit))
+        block, own = block.extrapolated(agreement).projected()  # (b), (c)
         driver.block = block
-        answers = driver.ask("agree", message, Count.ALL_REDUCE)
-        squares = own + np.sum([answer["sums"] for answer in answers], axis=0)
-        return replace(
-            state,
-            k=state.k + 1,
-            block=block,
-            answers=answers,
-            sums=anderson,
-            primal_residual=math.sqrt(squares[0]) / state.size,
-            dual_residual=math.sqrt(squares[1]) / state.size,
-            merits=(*state.merits, merit),
-        )
+        answers = driver.ask(Interior.agree, agreement, Count.ALL_REDUCE)
+        squares = own + np.sum([answer.sums for answer in answers], axis=0)
+        right = [answer.right for answer in answers]
+        after = state.after(merit, squares, state.size)
+        return replace(after, k=state.k + 1, block=block, right=right, sums=anderson)
 
     def measure(self, driver: Driver, state: SubstructuredState) -> Measurement:
         """F at omega and the translations of step (a), and the residuals."""
         if math.isnan(state.primal_residual):
-            return driver.measured(np.nan, np.nan, np.nan)
-        answers = driver.ask("cost", driver.scattered_rotations(state.block.z), Count.OFF)
-        objective = math.fsum(float(answer["objective"][0]) for answer in answers)
-        return driver.measured(objective, state.primal_residual, state.dual_residual)
+            return driver.measured(Measurement(np.nan, np.nan, np.nan))
+        parts = driver.ask_each(Interior.cost, driver.scattered_rotations(state.block.z), Count.OFF)
+        return driver.measured(state.measurement(math.fsum(parts)))
 
     def converged(self, state: SubstructuredState, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals are within tolerance."""
-        worst = max(measurement.primal_residual, measurement.dual_residual)
-        return Status.CONVERGED if worst <= self.soc.tolerance else None
+        return self.soc.status_at(measurement)
 
     def finish(self, driver: Driver) -> None:
         """Leave omega and the best translations for it with driver and robots: two rounds."""
         assert driver.block is not None
-        driver.R = unstack_transposes(driver.block.z)
-        driver.set_translations(driver.ask("finish", driver.scattered_rotations(driver.block.z)))
-
-    @property
-    def _memory(self) -> int:
-        return self.soc.acceleration.memory if self.soc.acceleration is not None else 1
+        driver.at = replace(driver.at, R=unstack_transposes(driver.block.z))
+        driver.set_translations(driver.ask_each(Interior.finish, driver.scattered_rotations(driver.block.z)))
 
     def _penalized(self, driver: Driver, is_stationary: bool) -> SubstructuredState:
         """State 0 at the poses that driver and robots hold; one round, in which the quantile is found."""
-        answers = driver.ask("multiplier_norms", count=Count.PIGGYBACKED)
-        Lambda, scale = driver.multipliers, driver.scale
-        norms = np.abs(np.linalg.eigvalsh(Lambda)).max(axis=1, initial=0.0)
-        all_norms = np.concatenate([norms, *(answer["norms"] for answer in answers)])
-        all_scales = np.concatenate([scale, *(answer["scale"] for answer in answers)])
-        rule = self.soc.penalty_rule(all_norms, all_scales)
-        rho = _apply(rule, norms, scale)
-        ratio = _apply(rule, all_norms, all_scales) / all_scales
-        B = stationary_B(driver.R, Lambda, rho) if is_stationary else None
-        block = block_at(driver.R, rho, driver.diagonal[driver.rotation_rows], B)
-        message = {"rule": rule, "is_stationary": np.array([float(is_stationary)])}
-        answers = driver.ask("penalize", message)
-        driver.block = block
-        factor, size = _factor(driver, block, answers), math.sqrt(driver.d * float(ratio @ all_scales))
-        return SubstructuredState(0, block, factor, answers, ratio, size)
+        answers = driver.ask(Interior.multiplier_norms, None, Count.PIGGYBACKED)
+        Lambda, scale = driver.at.multipliers, driver.scale
+        norms = multiplier_norms(Lambda)
+        all_norms = np.concatenate([norms, *(answer.norms for answer in answers)])
+        all_scales = np.concatenate([scale, *(answer.scale for answer in answers)])
+        order = self.soc.penalty_order(all_norms / all_scales, is_stationary)
+        order = replace(order, settings=replace(order.settings, alone=None))
+        rho, ratio = order.rho(norms, scale), order.rho(all_norms, all_scales) / all_scales
+        B = stationary_B(driver.at.R, Lambda, rho) if is_stationary else 0.0
+        diagonal, rows = driver.diagonal[driver.rotation_rows], stack_transposes(driver.at.R)
+        driver.block = block_at(rows, np.repeat(rho, driver.d), diagonal, order.settings, B)
+        reduced = driver.ask(Interior.penalize, order)
+        size = math.sqrt(driver.d * float(ratio @ all_scales))
+        factor = _factor(driver, driver.block, reduced)
+        return SubstructuredState(0, driver.block, factor, _right(reduced), ratio, size)
 
     def _with_penalty_due(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
         """As in `solvers.soc.soc`: the penalty that the rule, or the safeguard, wants from now on."""
@@ -165,18 +145,8 @@ class SubstructuredSOC:
             return replace(self._rescaled(driver, state, factor, from_best=True), raises=state.raises + 1)
         if due is Due.REFRESH:
             self.finish(driver)
-            refreshed = self._penalized(driver, is_stationary=True)
-            return replace(
-                state,
-                block=refreshed.block,
-                factor=refreshed.factor,
-                answers=refreshed.answers,
-                ratio=refreshed.ratio,
-                size=refreshed.size,
-                sums=AndersonSums(),
-                merits=(),
-                refreshes=state.refreshes + 1,
-            )
+            fresh = self._penalized(driver, is_stationary=True)
+            return replace(fresh, k=state.k, refreshes=state.refreshes + 1, raises=state.raises)
         if due is Due.RESCALE:
             return replace(self._rescaled(driver, state, factor, from_best=False), refreshes=state.refreshes + 1)
         return state
@@ -185,15 +155,14 @@ class SubstructuredSOC:
         self, driver: Driver, state: SubstructuredState, factor: float, from_best: bool
     ) -> SubstructuredState:
         """State with factor * rho and the same unscaled multiplier rho B."""
-        block = (state.block.back_at_best() if from_best else state.block).rescaled(factor)
-        driver.block = block
-        message = {"factor": np.array([factor]), "from_best": np.array([float(from_best)])}
-        answers = driver.ask("rescale", message)
+        block = state.block.back_at_best() if from_best else state.block
+        driver.block = block = block.rescaled(factor * block.penalty)
+        reduced = driver.ask(Interior.rescale, RescaleInterior(factor, from_best))
         return replace(
             state,
             block=block,
-            factor=_factor(driver, block, answers),
-            answers=answers,
+            factor=_factor(driver, block, reduced),
+            right=_right(reduced),
             ratio=factor * state.ratio,
             size=math.sqrt(factor) * state.size,
             sums=AndersonSums(),
@@ -201,11 +170,11 @@ class SubstructuredSOC:
         )
 
 
-def _apply(rule: Array, norms: Array, scales: Array) -> Array:
-    return np.asarray(np.maximum(np.maximum(rule[0] * norms, rule[1] * scales), rule[2]))
+def _right(reduced: Sequence[Reduced]) -> list[RightHandSide]:
+    return [answer.right for answer in reduced]
 
 
-def _factor(driver: Driver, block: RotationBlock, answers: Sequence[Message]) -> InterfaceFactor:
+def _factor(driver: Driver, block: RecursionBlock, reduced: Sequence[Reduced]) -> InterfaceFactor:
     """Factor of the driver's matrix of step (a)."""
     own = [(driver.rotation_rows[:, None], (0.5 * block.penalty)[:, None, None]), *driver.grounded_translation()]
-    return driver.interface(1, driver.d).factorize([answer["schur"] for answer in answers], own)
+    return driver.interface(1, driver.d).factorize([answer.schur for answer in reduced], own)

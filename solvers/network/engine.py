@@ -5,19 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from pgo_models.errors import SettingError
-from solvers.network.messages import Message, Worker
+from solvers.network.messages import Worker
 
 T = TypeVar("T")
+Q = TypeVar("Q")
+A = TypeVar("A")
 
 
 class WorkerPool(Protocol):
     """Robots that wait for orders."""
 
-    def ask(self, order: str, messages: Sequence[Message]) -> list[Message]:
-        """Give every robot an order, each with its message, and wait for all answers."""
+    def ask(self, order: Callable[[Any, Q], A], requests: Sequence[Q]) -> list[A]:
+        """Give every robot an order, each with its request, and wait for all answers."""
 
     def close(self) -> None:
         """Let the robots go."""
@@ -65,11 +67,10 @@ class _LocalPool:
         self._workers = workers
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
-    def ask(self, order: str, messages: Sequence[Message]) -> list[Message]:
-        pairs = zip(self._workers, messages, strict=True)
+    def ask(self, order: Callable[[Any, Q], A], requests: Sequence[Q]) -> list[A]:
         if self._pool is None:
-            return [worker.obey(order, message) for worker, message in pairs]
-        return list(self._pool.map(lambda pair: pair[0].obey(order, pair[1]), pairs))
+            return [order(worker, request) for worker, request in zip(self._workers, requests, strict=True)]
+        return list(self._pool.map(order, self._workers, requests))
 
     def close(self) -> None:
         if self._pool is not None:

@@ -1,18 +1,49 @@
-"""What crosses between driver and agents: arrays by name, the agent that answers, and orders that every agent knows."""
+"""Orders to workers: functions of a worker and a request. Requests and answers are numbers, arrays and records."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
-Message = Mapping[str, NDArray[Any]]
-SNAPSHOT, RESTORE = "snapshot", "restore"  # orders that concern all that an agent remembers
+Snapshot = Mapping[str, NDArray[Any]]
 
 
 class Worker(Protocol):
     """One robot as an engine runs it."""
 
-    def obey(self, order: str, message: Message) -> Message:
-        """Answer to an order."""
+    def snapshot(self) -> Snapshot:
+        """All that earlier orders left here."""
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go on from a snapshot."""
+
+
+def take_snapshot(worker: Worker, _: None) -> Snapshot:
+    """Order: all that earlier orders left with the worker."""
+    return worker.snapshot()
+
+
+def restore(worker: Worker, snapshot: Snapshot) -> None:
+    """Order: go on from a snapshot."""
+    worker.restore(snapshot)
+
+
+def count_numbers(record: object) -> int:
+    """Numbers in a request or an answer; a mapping is between workers, and counted where it is handed on.
+
+    Examples
+    --------
+    >>> count_numbers((np.zeros((3, 2)), True, None, {1: np.zeros(5)}))
+    7
+    """
+    if record is None or isinstance(record, Mapping):
+        return 0
+    if dataclasses.is_dataclass(record):
+        return sum(count_numbers(getattr(record, field.name)) for field in dataclasses.fields(record))
+    if isinstance(record, tuple):
+        return sum(map(count_numbers, record))
+    return int(np.size(record))  # type: ignore[arg-type] # a number or an array

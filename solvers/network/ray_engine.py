@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pgo_models.errors import EngineError, MissingExtraError, SettingError
 from solvers.network.engine import WorkerPool
-from solvers.network.messages import Message, Worker
-from solvers.network.recovery import RecoveringPool, Recovery, RobotLostError
+from solvers.network.messages import Worker
+from solvers.network.recovery import Order, RecoveringPool, Recovery, RobotLostError
 
 T = TypeVar("T")
 
@@ -181,17 +181,17 @@ class _RayPlace:
             self.actors[robot] = made.remote(self.make, replace(self.shares[robot]))
         self._wait({robot: self.actors[robot].ready.remote() for robot in robots})
 
-    def send(self, robot: int, order: str, message: Message) -> ObjectRef[Message]:
-        ticket: ObjectRef[Message] = self.actors[robot].obey.remote(order, dict(message))
+    def send(self, robot: int, order: Order, request: object) -> ObjectRef[Any]:
+        ticket: ObjectRef[Any] = self.actors[robot].obey.remote(order, request)
         return ticket
 
-    def receive(self, robot: int, ticket: ObjectRef[Message]) -> Message:
+    def receive(self, robot: int, ticket: ObjectRef[Any]) -> Any:  # noqa: ANN401 - what the order answers
         errors = self.ray.exceptions
         while True:
             if time.monotonic() > self._seen + _SECONDS_TO_ANSWER:
                 self._look()
             try:
-                answer: Message = self.ray.get(ticket, timeout=_SECONDS_TO_ANSWER)
+                answer = self.ray.get(ticket, timeout=_SECONDS_TO_ANSWER)
             except errors.GetTimeoutError:
                 continue
             except errors.RayTaskError as error:
@@ -221,7 +221,7 @@ class _RayPlace:
             )
         return math.floor(1e4 / a_cpu) / 1e4  # Ray counts in steps of 1e-4
 
-    def _wait(self, tickets: Mapping[int, ObjectRef[Message]]) -> None:
+    def _wait(self, tickets: Mapping[int, ObjectRef[Any]]) -> None:
         """Wait until robots are there."""
         deadline = time.monotonic() + self.engine.patience
         missing = list(tickets.values())
@@ -273,11 +273,11 @@ class _Actor:
     def __init__(self, make: Callable[[T], Worker], share: T) -> None:
         self._worker = make(share)
 
-    def ready(self) -> Message:
-        return {}
+    def ready(self) -> None:
+        return None
 
-    def obey(self, order: str, message: Message) -> Message:
-        return self._worker.obey(order, message)
+    def obey(self, order: Order, request: object) -> object:
+        return order(self._worker, request)
 
 
 def _ray() -> ModuleType:

@@ -6,14 +6,17 @@ is not in the ledger.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from pgo_models.errors import EngineError, PGOError, SettingError
-from solvers.network.messages import RESTORE, SNAPSHOT, Message
+from solvers.network.messages import Snapshot, restore, take_snapshot
 
 T = TypeVar("T")
+Q = TypeVar("Q")
+A = TypeVar("A")
+Order = Callable[[Any, Any], Any]
 
 
 class RobotLostError(EngineError):
@@ -32,10 +35,10 @@ class Place(Protocol[T]):
             When one was lost while it started.
         """
 
-    def send(self, robot: int, order: str, message: Message) -> T:
+    def send(self, robot: int, order: Order, request: object) -> T:
         """Give a robot an order."""
 
-    def receive(self, robot: int, ticket: T) -> Message:
+    def receive(self, robot: int, ticket: T) -> Any:  # noqa: ANN401 - what the order answers
         """Wait for its answer.
 
         Raises
@@ -88,14 +91,14 @@ class RecoveringPool(Generic[T]):
     num_robots: int
     recovery: Recovery
     restarts: list[int] = field(init=False)
-    _log: list[tuple[str, tuple[Message, ...]]] = field(init=False, default_factory=list)
-    _snapshots: list[Message] = field(init=False, default_factory=list)
+    _log: list[tuple[Order, tuple[Any, ...]]] = field(init=False, default_factory=list)
+    _snapshots: list[Snapshot] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
         self.restarts = [0] * self.num_robots
 
-    def ask(self, order: str, messages: Sequence[Message]) -> list[Message]:
-        """Give every robot an order, each with its message, and wait for all answers.
+    def ask(self, order: Callable[[Any, Q], A], requests: Sequence[Q]) -> list[A]:
+        """Give every robot an order, each with its request, and wait for all answers.
 
         Raises
         ------
@@ -103,31 +106,31 @@ class RecoveringPool(Generic[T]):
             When a robot was lost more often than it may be.
         """
         try:
-            answers = self._asked(order, messages)
+            answers: list[Any] = self._asked(order, requests)
         finally:  # an order that failed on one robot was obeyed by the others
-            self._log.append((order, tuple(messages)))
-        if order == SNAPSHOT:
+            self._log.append((order, tuple(requests)))
+        if order is take_snapshot:
             self._snapshots, self._log = answers, []
-        elif order == RESTORE:
-            self._snapshots, self._log = list(messages), []
+        elif order is restore:
+            self._snapshots, self._log = [*self._log[-1][1]], []
         elif len(self._log) >= self.recovery.orders_between_snapshots:
-            self.ask(SNAPSHOT, [{}] * self.num_robots)
+            self.ask(take_snapshot, [None] * self.num_robots)
         return answers
 
     def close(self) -> None:
         """Let the robots go."""
         self.place.close()
 
-    def _asked(self, order: str, messages: Sequence[Message]) -> list[Message]:
-        tickets = [self.place.send(robot, order, message) for robot, message in enumerate(messages)]
-        answers: list[Message] = []
+    def _asked(self, order: Order, requests: Sequence[object]) -> list[Any]:
+        tickets = [self.place.send(robot, order, request) for robot, request in enumerate(requests)]
+        answers = []
         refusal: PGOError | None = None
         for robot, ticket in enumerate(tickets):
             try:
                 try:
                     answers.append(self.place.receive(robot, ticket))
                 except RobotLostError as lost:
-                    answers.append(self._recovered(robot, order, messages[robot], lost))
+                    answers.append(self._recovered(robot, order, requests[robot], lost))
             except EngineError:
                 raise
             except PGOError as error:  # the robot's own; the others' answers are waited for all the same
@@ -136,17 +139,17 @@ class RecoveringPool(Generic[T]):
             raise refusal
         return answers
 
-    def _recovered(self, robot: int, order: str, message: Message, lost: RobotLostError) -> Message:
+    def _recovered(self, robot: int, order: Order, request: object, lost: RobotLostError) -> object:
         """Answer of a robot that was lost before it gave one."""
         while self.restarts[robot] < self.recovery.max_restarts:
             self.restarts[robot] += 1
             try:
                 self.place.start([robot])
                 if self._snapshots:
-                    self._order(robot, RESTORE, self._snapshots[robot])
-                for earlier, messages in self._log:
-                    self._again(robot, earlier, messages[robot])
-                return self._order(robot, order, message)
+                    self._order(robot, restore, self._snapshots[robot])
+                for earlier, requests in self._log:
+                    self._again(robot, earlier, requests[robot])
+                return self._order(robot, order, request)
             except RobotLostError as error:
                 lost = error
         raise EngineError(
@@ -154,12 +157,12 @@ class RecoveringPool(Generic[T]):
             "run in this process"
         ) from lost
 
-    def _order(self, robot: int, order: str, message: Message) -> Message:
-        return self.place.receive(robot, self.place.send(robot, order, message))
+    def _order(self, robot: int, order: Order, request: object) -> object:
+        return self.place.receive(robot, self.place.send(robot, order, request))
 
-    def _again(self, robot: int, order: str, message: Message) -> None:
+    def _again(self, robot: int, order: Order, request: object) -> None:
         try:
-            self._order(robot, order, message)
+            self._order(robot, order, request)
         except EngineError:
             raise
         except PGOError:  # as it was the first time, when the driver was told

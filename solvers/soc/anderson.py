@@ -1,4 +1,10 @@
-"""Over-relaxation and safeguarded Anderson acceleration of a fixed-point map (Walker & Ni 2011; Zhang et al. 2020)."""
+"""Over-relaxation and safeguarded Anderson acceleration of a fixed-point map (Walker & Ni 2011; Zhang et al. 2020).
+
+    s' = g(s) - sum_k gamma_k dg_k,   gamma = argmin || f - sum_k gamma_k df_k ||,   f = g(s) - s
+
+over the last differences df_k of residuals and dg_k of images. The vectors may be spread over parties: each has its
+rows (`AndersonShare`), and sums over the parties give everybody the coefficients (`AndersonSums`).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +14,7 @@ import numpy as np
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
-from pgo_models.problem.matrices import inner, norm
+from pgo_models.problem.matrices import inner
 
 
 def over_relax(new: Array, old: Array, alpha: float) -> Array:
@@ -53,70 +59,74 @@ class Anderson:
 
 
 @dataclass(frozen=True, eq=False)
-class AndersonMemory:
-    """What the acceleration remembers: past differences of residuals and of images, and their Gram matrix."""
+class AndersonShare:
+    """One party's rows of what the acceleration remembers: past differences of residuals and of images."""
 
     residual_differences: tuple[Array, ...] = ()
     image_differences: tuple[Array, ...] = ()
-    gram: Array = field(default_factory=lambda: np.zeros((0, 0)))
     residual: Array | None = None
     image: Array | None = None
+
+    def observe(self, residual: Array, image: Array, keep: int) -> tuple[Array, AndersonShare]:
+        """Part of the sums, and the share with the newest of at most `keep` differences.
+
+        Parameters
+        ----------
+        residual, image : (rows, d)
+            `residual` may carry weights; `image` not.
+
+        Returns
+        -------
+        sums : (1 + 2 q,)
+            ||residual||^2; newest . difference for the q differences, the newest last; difference . residual for them.
+        """
+        size = inner(residual, residual)
+        if self.residual is None or self.image is None or not keep:
+            return np.array([size]), AndersonShare(residual=residual, image=image)
+        newest = residual - self.residual
+        residuals = (*(self.residual_differences[-(keep - 1) :] if keep > 1 else ()), newest)
+        images = (*(self.image_differences[-(keep - 1) :] if keep > 1 else ()), image - self.image)
+        sums = [size, *(inner(newest, other) for other in residuals), *(inner(other, residual) for other in residuals)]
+        return np.array(sums), AndersonShare(residuals, images, residual, image)
+
+    def combine(self, gamma: Array) -> Array:
+        """Rows of image - sum_k gamma_k dg_k; no coefficient is a plain step."""
+        assert self.image is not None
+        following = self.image.copy()
+        latest = self.image_differences[len(self.image_differences) - len(gamma) :]
+        for coefficient, difference in zip(gamma, latest, strict=True):
+            following -= coefficient * difference
+        return following
+
+    def restarted(self) -> AndersonShare:
+        """Return the share with the differences forgotten."""
+        return AndersonShare(residual=self.residual, image=self.image)
+
+
+@dataclass(frozen=True, eq=False)
+class AndersonSums:
+    """What all parties know: the Gram matrix of the differences, and the smallest residual since the last restart."""
+
+    gram: Array = field(default_factory=lambda: np.zeros((0, 0)))
     smallest: float = np.inf
 
+    def coefficients(self, settings: Anderson | None, sums: Array) -> tuple[Array | None, AndersonSums]:
+        """Coefficients gamma of the differences; None is a restart, after which the parties forget theirs.
 
-def extrapolate(
-    settings: Anderson, memory: AndersonMemory, residual: Array, image: Array
-) -> tuple[Array, AndersonMemory]:
-    """Next point s' from the image g(s) and the residual (g(s) - s), scaled to the norm that counts.
-
-    s' = g(s) - sum_k gamma_k dg_k with gamma = argmin || residual - sum_k gamma_k df_k ||, over the last `memory`
-    differences df_k of residuals and dg_k of images.
-
-    Parameters
-    ----------
-    residual, image : (rows, d)
-        `residual` may carry weights; `image` not.
-    """
-    size = norm(residual)
-    if size > settings.restart_ratio * memory.smallest:
-        memory = AndersonMemory()
-    smallest = min(memory.smallest, size)
-    if memory.residual is None or memory.image is None:
-        return image, AndersonMemory(residual=residual, image=image, smallest=smallest)
-    keep = settings.memory - 1
-    older = memory.residual_differences[-keep:] if keep else ()
-    older_images = memory.image_differences[-keep:] if keep else ()
-    newest = residual - memory.residual
-    gram = np.empty((len(older) + 1, len(older) + 1))
-    gram[:-1, :-1] = memory.gram[len(memory.gram) - len(older) :, len(memory.gram) - len(older) :]
-    gram[-1, :] = [inner(newest, other) for other in (*older, newest)]
-    gram[:, -1] = gram[-1]
-    residuals = (*older, newest)
-    images = (*older_images, image - memory.image)
-    right_hand_side = np.array([inner(other, residual) for other in residuals])
-    damped = gram + settings.regularization * np.trace(gram) * np.eye(len(gram))
-    gamma = np.linalg.lstsq(damped, right_hand_side, rcond=None)[0]
-    following = image.copy()
-    for coefficient, difference in zip(gamma, images, strict=True):
-        following -= coefficient * difference
-    return following, AndersonMemory(residuals, images, gram, residual, image, smallest)
-
-
-def extrapolate_parts(
-    settings: Anderson, memories: tuple[AndersonMemory, ...], residual: Array, image: Array, slices: tuple[slice, ...]
-) -> tuple[Array, tuple[AndersonMemory, ...]]:
-    """Extrapolate all rows together or, with `per_robot`, the rows of every robot on their own.
-
-    Parameters
-    ----------
-    memories : tuple of AndersonMemory
-        As returned by the step before; empty at first.
-    slices : tuple of slice
-        Rows of the robots.
-    """
-    parts = slices if settings.per_robot else (slice(None),)
-    following, kept = np.empty_like(image), []
-    for rows, memory in zip(parts, memories or (AndersonMemory(),) * len(parts), strict=True):
-        following[rows], remembered = extrapolate(settings, memory, residual[rows], image[rows])
-        kept.append(remembered)
-    return following, tuple(kept)
+        Without settings, or with every party on its own, there are none.
+        """
+        if settings is None or settings.per_robot:
+            return np.zeros(0), self
+        size = float(np.sqrt(sums[0]))
+        if size > settings.restart_ratio * self.smallest:
+            return None, AndersonSums(smallest=size)
+        count = len(sums) // 2
+        smallest = min(self.smallest, size)
+        if not count:
+            return np.zeros(0), AndersonSums(smallest=smallest)
+        gram = np.empty((count, count))
+        gram[:-1, :-1] = self.gram[len(self.gram) - count + 1 :, len(self.gram) - count + 1 :]
+        gram[-1, :] = gram[:, -1] = sums[1 : 1 + count]
+        damped = gram + settings.regularization * np.trace(gram) * np.eye(count)
+        gamma = np.linalg.lstsq(damped, sums[1 + count :], rcond=None)[0]
+        return gamma, AndersonSums(gram, smallest)

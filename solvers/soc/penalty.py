@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
-from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.dual_variables import multiplier_norms, multipliers
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
+from solvers.result import Measurement
+from solvers.soc.recursion_block import StepSettings
 from solvers.soc.separator_stiffness import is_second_look
 
 MAX_RAISES = 20
@@ -22,7 +25,43 @@ _SMALLEST_RATIO = 1e-6  # of ||Lambda_i|| to m_i; M + D/2 keeps ten digits
 
 
 @dataclass(frozen=True)
-class MultiplierPenalty:
+class PenaltyOrder:
+    """rho_i = max(per_norm ||Lambda_i||_2, per_scale m_i, least): what a party must know to set its penalties.
+
+    Attributes
+    ----------
+    per_norm, per_scale, least : float
+    is_stationary : bool
+        B starts at its value at a stationary point, -2 Lambda_i R_i^T / rho_i; else at zero.
+    settings : StepSettings
+    """
+
+    per_norm: float
+    per_scale: float
+    least: float
+    is_stationary: bool = False
+    settings: StepSettings = field(default_factory=StepSettings)
+
+    def rho(self, norms: Array, scale: Array) -> Array:
+        """rho, (n,), from ||Lambda_i||_2 and m_i."""
+        return np.asarray(np.maximum(np.maximum(self.per_norm * norms, self.per_scale * scale), self.least))
+
+
+class _Rule:
+    """A rule that says the three numbers of a `PenaltyOrder`."""
+
+    def bounds(self, ratio: Array) -> tuple[float, float, float]:
+        """(per_norm, per_scale, least), from ||Lambda_i||_2 / m_i of all poses, (n,)."""
+        raise NotImplementedError
+
+    def initial(self, problem: PGOProblem, poses: Poses) -> Array:
+        """rho, (n,), at poses."""
+        norms, scale = multiplier_norms(multipliers(problem, poses)), rotation_scale(problem)
+        return PenaltyOrder(*self.bounds(norms / scale)).rho(norms, scale)
+
+
+@dataclass(frozen=True)
+class MultiplierPenalty(_Rule):
     """rho_i = factor max(||Lambda_i||_2, q m_i), one for every pose.
 
     m_i is the mean diagonal of M over the rotation rows of pose i and q a quantile of ||Lambda_i||_2 / m_i over all
@@ -66,21 +105,16 @@ class MultiplierPenalty:
         if self.max_refreshes < 0:
             raise SettingError(f"max_refreshes must not be negative, got {self.max_refreshes}")
 
-    def initial(self, problem: PGOProblem, poses: Poses) -> Array:
-        """rho, (n,), at poses."""
-        norms = np.abs(np.linalg.eigvalsh(multipliers(problem, poses))).max(axis=1)
-        scale = rotation_scale(problem)
-        return np.asarray(self.factor * np.maximum(norms, self.floor(norms / scale) * scale))
-
-    def floor(self, ratio: Array) -> float:
-        """Quantile q of ||Lambda_i||_2 / m_i over all poses, (n,)."""
+    def bounds(self, ratio: Array) -> tuple[float, float, float]:
+        """(per_norm, per_scale, least), from ||Lambda_i||_2 / m_i of all poses, (n,)."""
         # Where the multipliers are zero but for rounding (measurements without noise) any penalty works that M + D/2
         # does not lose to rounding.
-        return max(float(np.quantile(ratio, self.quantile)), _SMALLEST_RATIO)
+        floor = max(float(np.quantile(ratio, self.quantile)), _SMALLEST_RATIO)
+        return self.factor, self.factor * floor, 0.0
 
 
 @dataclass(frozen=True)
-class FixedPenalty:
+class FixedPenalty(_Rule):
     """rho_i = rho for all poses, unless the safeguard of `solvers.soc.soc` raises it.
 
     Examples
@@ -97,13 +131,13 @@ class FixedPenalty:
         if not self.rho > 0:
             raise SettingError(f"rho must be positive, got {self.rho}")
 
-    def initial(self, problem: PGOProblem, poses: Poses) -> Array:
-        """rho, (n,)."""
-        return np.full(problem.num_poses, self.rho)
+    def bounds(self, ratio: Array) -> tuple[float, float, float]:
+        """(0, 0, rho)."""
+        return 0.0, 0.0, self.rho
 
 
 @dataclass(frozen=True)
-class BalancedPenalty:
+class BalancedPenalty(_Rule):
     """rho that balances relative residuals (after OSQP, Stellato et al. 2020, section 5.2).
 
     It starts at `scale` times m_i, the mean diagonal of M over the rotation rows of the pose. The balance asks for rho
@@ -130,9 +164,9 @@ class BalancedPenalty:
         if not self.refactor_ratio > 1:
             raise SettingError(f"refactor_ratio must be above 1, got {self.refactor_ratio}")
 
-    def initial(self, problem: PGOProblem, poses: Poses) -> Array:
-        """rho, (n,)."""
-        return self.scale * rotation_scale(problem)
+    def bounds(self, ratio: Array) -> tuple[float, float, float]:
+        """(0, scale, 0)."""
+        return 0.0, self.scale, 0.0
 
     def factor(self, primal_residual: float, dual_residual: float) -> float:
         """Factor by which rho moves now; 1 for not at all."""
@@ -145,7 +179,7 @@ class BalancedPenalty:
 
 
 @dataclass(frozen=True)
-class BoydPenalty:
+class BoydPenalty(_Rule):
     """One rho for all poses that balances residuals as in Boyd et al. 2011, section 3.4.1, (3.13); for PaperSOC.
 
     rho <- growth rho where ||r|| > imbalance ||s||, rho / growth where ||s|| > imbalance ||r||, with r = R - omega and
@@ -176,9 +210,9 @@ class BoydPenalty:
         if not self.imbalance > 1 or not self.growth > 1:
             raise SettingError(f"imbalance and growth must be above 1, got {self.imbalance} and {self.growth}")
 
-    def initial(self, problem: PGOProblem, poses: Poses) -> Array:
-        """rho, (n,)."""
-        return self.scale * rotation_scale(problem)
+    def bounds(self, ratio: Array) -> tuple[float, float, float]:
+        """(0, scale, 0)."""
+        return 0.0, self.scale, 0.0
 
     def factor(self, primal_residual: float, dual_residual: float) -> float:
         """Factor by which rho moves now, from ||r|| and ||s||; 1 for not at all."""
@@ -231,6 +265,19 @@ class Steps:
     merits: tuple[float, ...] = ()
     refreshes: int = 0
     raises: int = 0
+
+    def is_best(self, merit: float) -> bool:
+        """Whether no merit has been smaller since rho last changed."""
+        return merit <= min(self.merits, default=np.inf)
+
+    def after(self, merit: float, squares: Array, size: float) -> Self:
+        """Figures after a step with this merit, squared residuals (2,) and ||omega||_rho."""
+        primal, dual = np.sqrt(squares) / size
+        return replace(self, primal_residual=float(primal), dual_residual=float(dual), merits=(*self.merits, merit))
+
+    def measurement(self, objective: float) -> Measurement:
+        """F and the residuals."""
+        return Measurement(objective, self.primal_residual, self.dual_residual)
 
 
 def next_penalty(rule: PenaltyRule, ratio: Array, steps: Steps) -> tuple[Due, float]:

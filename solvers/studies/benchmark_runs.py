@@ -26,7 +26,8 @@ from solvers.riemannian.newton import Newton, gauss_newton
 from solvers.riemannian.staircase import Staircase
 from solvers.soc.paper import PaperSOC, PaperState
 from solvers.soc.penalty import BalancedPenalty
-from solvers.soc.soc import SOC, Coupling
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC
 from solvers.solution import Solution
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings, StageRecord
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, OPTIMUM, REFERENCE, SEEDS, exact_graph, random_poses, varied_graph, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -106,7 +107,7 @@ def assert_converges(
 # The two linear problems.
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(seed=SEEDS, n=st.integers(2, 12), d=DIMENSIONS)
 def test_least_squares_are_F_without_orthogonality_and_F_linearized(seed: int, n: int, d: int) -> None:
     problem, rng = varied_problem(seed, n, d), np.random.default_rng(seed)
@@ -134,7 +135,7 @@ def test_least_squares_are_F_without_orthogonality_and_F_linearized(seed: int, n
 
 
 @EVERY_METHOD
-@settings(max_examples=6)
+@settings(max_examples=examples(6))
 @given(seed=SEEDS, n=st.integers(2, 10), d=DIMENSIONS)
 def test_sweeps_settle_at_the_exact_solutions(sweep: Sweep, alpha: float, seed: int, n: int, d: int) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, weights=0.3))
@@ -202,7 +203,7 @@ def test_too_much_over_relaxation_of_jacobi_diverges_and_says_so() -> None:
 
 
 @pytest.mark.parametrize("sweep", Sweep)
-@settings(max_examples=15)
+@settings(max_examples=examples(15))
 @given(seed=SEEDS, n=st.integers(2, 25), d=DIMENSIONS)
 def test_a_flagged_sweep_ignores_where_it_begins(sweep: Sweep, seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)
@@ -245,7 +246,7 @@ def test_without_flags_the_first_sweep_listens_to_everybody() -> None:
     assert one.objective == pytest.approx(other.objective, rel=1e-7)
 
 
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=st.integers(3, 12), d=DIMENSIONS)
 def test_pose_0_of_the_start_stays_and_the_gauge_does_not_matter(seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, OPTIMUM, SEEDS, exact_graph, random_poses, varied_graph, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -41,7 +42,7 @@ def test_settings_out_of_range_are_refused() -> None:
 
 
 @needs_gtsam
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 @given(seed=SEEDS, n=st.integers(2, 10), d=DIMENSIONS)
 def test_its_cost_is_F_to_leading_order(seed: int, n: int, d: int) -> None:
     # A turn and move of size h away from where all residuals are zero costs h^2; what differs is of higher order.

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, LOUD_NOISE, OPTIMUM, SEEDS, optimum_tolerance, random_poses, varied_graph, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -39,7 +40,7 @@ def test_the_four_starts_lead_to_the_optimum(
     assert result.objective == pytest.approx(OPTIMUM[name], rel=0, abs=optimum_tolerance(name))
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(seed=SEEDS, n=st.integers(2, 12), d=DIMENSIONS, spread=st.sampled_from([1.0, 1e3]))
 def test_F_never_rises_from_hostile_starts(seed: int, n: int, d: int, spread: float) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE))
@@ -49,7 +50,7 @@ def test_F_never_rises_from_hostile_starts(seed: int, n: int, d: int, spread: fl
     assert result.objective == problem.objective(result.poses)
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(seed=SEEDS, n=st.integers(2, 12), d=DIMENSIONS)
 def test_it_ends_where_newton_does(seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)

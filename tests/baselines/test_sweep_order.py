@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, SEEDS, varied_graph
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -27,7 +28,7 @@ def drawn(seed: int, n: int, d: int, sweep: Sweep) -> tuple[PoseGraph, Partition
     return graph, robots, schedule(graph, robots, sweep)
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(seed=SEEDS, n=NUM_POSES, d=DIMENSIONS, sweep=st.sampled_from(Sweep))
 def test_robots_of_one_turn_are_no_neighbours(seed: int, n: int, d: int, sweep: Sweep) -> None:
     graph, robots, turns = drawn(seed, n, d, sweep)
@@ -45,7 +46,7 @@ def test_robots_of_one_turn_are_no_neighbours(seed: int, n: int, d: int, sweep: 
     assert turns.group.max() <= max(degree.max(), robots.num_robots * (sweep is Sweep.ROBOTS))
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(seed=SEEDS, n=NUM_POSES, d=DIMENSIONS, sweep=st.sampled_from(Sweep))
 def test_every_first_estimate_has_one_before_it_to_lean_on(seed: int, n: int, d: int, sweep: Sweep) -> None:
     graph, robots, turns = drawn(seed, n, d, sweep)
@@ -84,7 +85,7 @@ def pieces(graph: PoseGraph, mine: np.ndarray) -> list[set[int]]:
     return found
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(seed=SEEDS, n=NUM_POSES, d=DIMENSIONS, numbers=st.integers(1, 9))
 def test_separators_are_sent_once_to_every_robot_that_needs_them(seed: int, n: int, d: int, numbers: int) -> None:
     graph, robots, turns = drawn(seed, n, d, Sweep.JACOBI)

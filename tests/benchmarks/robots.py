@@ -28,11 +28,14 @@ import pgo_models as pgo
 import solvers
 from pgo_models.graphs.separators import vertex_cover
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
-from solvers.distributed.driver import Count
+from solvers.distributed.consensus import RobotsOfDriver
 from solvers.distributed.stages import open_driver
 from solvers.loop import run
+from solvers.network.counted_pool import Count
 from solvers.network.engine import InProcess
 from solvers.network.faults import Faults
+from solvers.soc.consensus import ask_all
+from solvers.soc.consensus_robot import ConsensusRobot
 
 REFERENCE = json.loads((Path(__file__).parents[2] / "data" / "reference.json").read_text())
 OPTIMUM = REFERENCE["certified_optimum"]
@@ -93,8 +96,8 @@ def faults_job(name: str, fault: str) -> dict[str, object]:
 
     def is_done(state: AsynchronousState, record: solvers.Record) -> bool:
         R = np.empty((graph.num_poses, graph.d, graph.d))
-        for answer in driver.ask_all("own_poses", count=Count.OFF):
-            R[answer["poses"]] = answer["R"]
+        for own in ask_all(RobotsOfDriver(driver), ConsensusRobot.own_poses, None, Count.OFF):
+            R[own.poses] = own.R
         gaps.append(gap_of(problem.objective(problem.with_best_translations(R)), OPTIMUM[name]))
         return (
             gaps[-1] <= LEVELS[-1] and not FAULTS[fault].is_silent(2, state.k) and state.k > FAULTS[fault].silent_from

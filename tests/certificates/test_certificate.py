@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import (
     DIMENSIONS,
     LOUD_NOISE,
@@ -89,7 +90,7 @@ def assert_holds_together(problem: PGOProblem, poses: Poses, certificate: Certif
 # Anybody's poses.
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, noise=NOISES, spread=st.sampled_from([1.0, 1e3, 1e6]))
 def test_certificates_of_any_poses_hold(seed: int, n: int, d: int, noise: NoiseModel, spread: float) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, noise))
@@ -101,7 +102,7 @@ def test_certificates_of_any_poses_hold(seed: int, n: int, d: int, noise: NoiseM
         assert_holds_together(problem, poses, certify(problem, poses), known)
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(seed=SEEDS, n=st.integers(3, 12), d=DIMENSIONS, noise=NOISES)
 def test_certificates_on_a_loop_hold(seed: int, n: int, d: int, noise: NoiseModel) -> None:
     problem = PGOProblem(ring(seed, n, d, noise))
@@ -111,7 +112,7 @@ def test_certificates_on_a_loop_hold(seed: int, n: int, d: int, noise: NoiseMode
 
 
 @pytest.mark.parametrize("name", ["tinyGrid3D", "smallGrid3D"])
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, spread=st.sampled_from([1.0, 1e6]))
 def test_certificates_of_hostile_poses_hold_on_benchmarks(
     name: str, seed: int, spread: float, benchmark_problem: Callable[[str], PGOProblem]
@@ -154,7 +155,7 @@ def test_the_paper_s_networks_are_certified(
     assert_holds_together(problem, poses, certificate, best_known(problem))
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_graphs_without_noise_are_certified(seed: int, n: int, d: int) -> None:
     graph = exact_graph(seed, n, d)
@@ -227,7 +228,7 @@ def test_beside_a_saddle_the_chordal_start_gives_better_poses() -> None:
 # Measurements that are plain wrong, and noise beyond what the relaxation bears.
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_a_measurement_turned_by_half_a_turn_does_not_break_the_bound(seed: int, n: int, d: int) -> None:
     graph = varied_graph(seed, n, d)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from budget import examples
 from exact_arithmetic import (
     Exact,
     ExactGraph,
@@ -85,7 +86,7 @@ ROADS = {
 
 
 @BACKENDS
-@settings(max_examples=15)
+@settings(max_examples=examples(15))
 @given(**ROADS)
 def test_no_bound_is_above_F_on_roads(
     backend: CholeskyBackend, seed: int, n: int, spacing: float, d: int, shape: Shape, sigma: float, turn: float
@@ -115,7 +116,7 @@ def test_roads_of_twenty_kilometres(d: int, shape: Shape, spacing: float, robots
     check(road(0, 2000, spacing, d, shape), None, 1e-8, robots)
 
 
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(
     seed=SEEDS,
     n=ROADS["n"],
@@ -158,7 +159,7 @@ def test_a_chain_without_noise_has_a_bound_at_rounding_level(backend: CholeskyBa
     assert raw_bound(solution.problem, solution.poses).value <= F
 
 
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(
     seed=SEEDS,
     d=DIMENSIONS,
@@ -194,7 +195,7 @@ LOOSE = st.sampled_from([NoiseModel(0.5, 1.0), NoiseModel(0.1, 2.0), NoiseModel(
 
 
 @BACKENDS
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @given(
     seed=SEEDS,
     n=st.integers(3, 12),
@@ -219,7 +220,7 @@ def test_no_bound_is_above_F_where_eta_is_needed(
 
 
 @BACKENDS
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=st.integers(3, 10), d=DIMENSIONS, steps=st.integers(0, 4))
 def test_no_bound_is_above_F_at_poses_that_are_not_stationary(
     backend: CholeskyBackend, seed: int, n: int, d: int, steps: int
@@ -269,7 +270,7 @@ def test_large_benchmarks_are_proven_to_ten_digits(
 
 
 @BACKENDS
-@settings(max_examples=8)
+@settings(max_examples=examples(8))
 @given(seed=SEEDS, d=DIMENSIONS, shape=st.sampled_from(Shape))
 def test_any_numbering_gives_about_the_same_bound(backend: CholeskyBackend, seed: int, d: int, shape: Shape) -> None:
     graph = road(seed, 150, 30.0, d, shape, loops=5)
@@ -324,7 +325,7 @@ def largest_share_of(problem: PGOProblem, Lambda: np.ndarray, fixed: np.ndarray,
 
 
 @BACKENDS
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, exponent=st.integers(-15, -9))
 def test_what_is_barely_said_to_be_definite_is(
     backend: CholeskyBackend, seed: int, n: int, d: int, exponent: int

@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import (
     DIMENSIONS,
     LOUD_NOISE,
@@ -30,7 +31,7 @@ BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
 
 
 @BACKENDS
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, noise=NOISES, size=st.floats(1e-6, 1e3), eta=st.floats(0, 10))
 def test_any_multipliers_prove_nothing_or_a_true_bound(
     backend: CholeskyBackend, seed: int, n: int, d: int, noise: NoiseModel, size: float, eta: float
@@ -48,7 +49,7 @@ def test_any_multipliers_prove_nothing_or_a_true_bound(
             assert bound is None or 0.0 <= bound <= known
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, share=st.floats(0.0, 1.0))
 def test_a_share_of_the_multipliers_of_a_tight_graph_proves_that_share(seed: int, n: int, d: int, share: float) -> None:
     problem = varied_problem(seed, n, d)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from budget import examples
 from exact_arithmetic import (
     MP,
     Exact,
@@ -83,7 +84,7 @@ KINDS = ["random", "rotations that fit", "high parts cancel", "low parts cancel"
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS)
 def test_edges_are_evaluated_within_their_errors(kind: str, seed: int, n: int, d: int) -> None:
     graph, rng = varied_graph(seed, n, d), np.random.default_rng(seed)
@@ -99,7 +100,7 @@ def test_edges_are_evaluated_within_their_errors(kind: str, seed: int, n: int, d
 
 
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, size=st.floats(-8.0, 8.0))
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 def test_multipliers_are_evaluated_within_their_errors(seed: int, n: int, d: int, size: float) -> None:
     rng = np.random.default_rng(seed)
     Lambda = rng.standard_normal((n, d, d))
@@ -115,7 +116,7 @@ def test_multipliers_are_evaluated_within_their_errors(seed: int, n: int, d: int
 
 
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, kind=st.sampled_from(KINDS), size=st.sampled_from([1.0, 1e8]))
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 def test_the_certificate_is_evaluated_within_its_errors(seed: int, n: int, d: int, kind: str, size: float) -> None:
     graph, rng = varied_graph(seed, n, d), np.random.default_rng(seed)
     problem = PGOProblem(graph)
@@ -164,7 +165,7 @@ def slanted(graph: PoseGraph) -> PoseGraph:
 
 
 @pytest.mark.parametrize("kind", ["plain", "slanted", "hub"])
-@settings(max_examples=15)
+@settings(max_examples=examples(15))
 @given(seed=SEEDS, n=st.integers(2, 6), d=DIMENSIONS)
 def test_entries_of_S_are_within_their_share_of_the_diagonal(kind: str, seed: int, n: int, d: int) -> None:
     graph = varied_graph(seed, n, d)
@@ -182,7 +183,7 @@ def test_entries_of_S_are_within_their_share_of_the_diagonal(kind: str, seed: in
 # The bounds.
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(seed=SEEDS, n=st.integers(3, 8), d=DIMENSIONS)
 def test_the_bound_with_eta_alone_is_below_its_two_terms(seed: int, n: int, d: int) -> None:
     """tr(Lambda) and eta n d nearly cancel, so that their rounding is in plain sight."""
@@ -226,7 +227,7 @@ def test_what_eta_adds_is_taken_off(d: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["noise", "none", "far"])
-@settings(max_examples=15)
+@settings(max_examples=examples(15))
 @given(seed=SEEDS, n=st.integers(3, 8), d=DIMENSIONS)
 def test_F_of_poses_is_known_to_its_error(kind: str, seed: int, n: int, d: int) -> None:
     graph = exact_graph(seed, n, d) if kind == "none" else varied_graph(seed, n, d)

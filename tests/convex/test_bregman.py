@@ -4,6 +4,7 @@ import math
 import cvxpy as cp
 import numpy as np
 import pytest
+from budget import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from signals import sparse_signal
@@ -59,7 +60,7 @@ def soft(x: Array, threshold: float) -> Array:
     return np.sign(x) * np.maximum(np.abs(x) - threshold, 0.0)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=examples(8), deadline=None)
 @given(seed=SEEDS, alpha=ALPHAS)
 def test_three_forms_have_the_same_states(seed: int, alpha: float) -> None:
     problem = lasso(seed)
@@ -71,7 +72,7 @@ def test_three_forms_have_the_same_states(seed: int, alpha: float) -> None:
         np.testing.assert_allclose(multipliers.lam, -alpha * two_line.b, rtol=0, atol=EQUIVALENCE)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=examples(8), deadline=None)
 @given(seed=SEEDS, alpha=ALPHAS)
 def test_p_is_a_subgradient_of_J(seed: int, alpha: float) -> None:
     problem = lasso(seed)
@@ -83,7 +84,7 @@ def test_p_is_a_subgradient_of_J(seed: int, alpha: float) -> None:
             assert problem.objective(other) >= J + state.p @ (other - state.x) - EQUIVALENCE
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=examples(8), deadline=None)
 @given(seed=SEEDS, alpha=ALPHAS)
 def test_one_pass_is_admm(seed: int, alpha: float) -> None:
     problem, A, c = split_lasso(seed)
@@ -104,7 +105,7 @@ def test_many_passes_are_the_method_of_multipliers() -> None:
         np.testing.assert_allclose(state.lam, exact.lam, rtol=0, atol=EQUIVALENCE)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=examples(8), deadline=None)
 @given(seed=SEEDS, alpha=ALPHAS)
 def test_residual_falls_and_keeps_its_bound(seed: int, alpha: float) -> None:
     problem, solution = sparse_signal(seed, m=20, s=8, nonzeros=3)

@@ -1,6 +1,7 @@
 import cvxpy as cp
 import numpy as np
 import pytest
+from budget import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
@@ -154,7 +155,7 @@ def test_differences_need_a_signal_or_an_image(shape: tuple[int, ...]) -> None:
         differences(shape)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(seed=SEEDS)
 def test_total_variation_models_have_the_right_objectives(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -180,7 +181,7 @@ def test_examples_check_their_settings() -> None:
         shared_rotation_step(graph, robots, V[1:], 1.0)
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=examples(5), deadline=None)
 @given(seed=SEEDS, num_robots=st.integers(1, 3))
 def test_shared_rotation_step_adds_up_to_the_whole_graph(seed: int, num_robots: int) -> None:
     rng = np.random.default_rng(seed)

@@ -20,8 +20,8 @@ from solvers.loop import run
 from solvers.result import Run, Status
 from solvers.soc.penalty import MultiplierPenalty
 from solvers.soc.r_step import RStep
-from solvers.soc.soc import SOC, Coupling
-from solvers.soc.state import SOCState
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC, SOCState
 
 N, D = 7, 2
 TOLERANCE = 1e-8
@@ -140,9 +140,9 @@ def test_without_a_change_it_is_SOC() -> None:
 def test_a_step_leaves_its_state_alone() -> None:
     solver = ExtendedSOC(lambda unknown: ModelChange(), SETTINGS)
     state = solver.init(problem(), None)
-    before = state.s.copy()
+    before = state.block.s.copy()
     solver.step(problem(), state)
-    np.testing.assert_array_equal(state.s, before)
+    np.testing.assert_array_equal(state.block.s, before)
 
 
 def test_what_does_not_go_together_is_refused() -> None:

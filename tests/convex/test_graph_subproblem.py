@@ -1,6 +1,7 @@
 import cvxpy as cp
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, SEEDS, random_poses, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,9 +11,12 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, stack_transposes
 from pgo_models.graphs.partitioning import partition
 from pgo_models.problem.problem import PGOProblem
-from solvers.soc.local_copies import build_copies
+from solvers.soc.consensus import LocalConsensus
 from solvers.soc.paper import PaperSOC, PaperState
-from solvers.soc.r_step import RStep
+from solvers.soc.penalty import FixedPenalty, translation_scale
+from solvers.soc.r_step import RStep, RSubproblem, prepare
+from solvers.soc.soc import SOC
+from solvers.soc.subgraph import split_graph
 
 ACCURACY = 1e-8
 RHO = st.floats(0.1, 10.0)
@@ -27,18 +31,20 @@ def drawn(seed: int, n: int, d: int) -> tuple[PGOProblem, Array, Array]:
     return problem, rho, V + 0.1 * rng.standard_normal(V.shape)
 
 
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=st.integers(3, 10), d=DIMENSIONS)
 def test_the_joint_program_is_the_factorised_step(seed: int, n: int, d: int) -> None:
     problem, rho, V = drawn(seed, n, d)
-    copies = build_copies(problem, None, RStep.FACTORIZED).with_penalty(rho, np.ones(n))
+    A, w = problem.residual_matrix
+    D = np.concatenate([np.zeros(n), np.repeat(rho, d)])
+    step = prepare(RSubproblem(A, w, problem.M, d, n, D, problem.analysis, problem.backend), RStep.FACTORIZED)
     X = graph_qp(problem.graph, rho).solve(V)
-    np.testing.assert_allclose(X[n:], copies.solve_all(V[n:]), rtol=0, atol=ACCURACY)
+    np.testing.assert_allclose(X[n:], step.solve(V)[n:], rtol=0, atol=ACCURACY)
     t = problem.M[:n, :n] @ X[:n] + problem.M[:n, n:] @ X[n:]  # the translations are the best ones for these rotations
     np.testing.assert_allclose(t, 0.0, rtol=0, atol=ACCURACY * float(problem.M.diagonal().max()))
 
 
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=st.integers(3, 10), d=DIMENSIONS)
 def test_the_rotation_program_solves_its_normal_equations(seed: int, n: int, d: int) -> None:
     problem, rho, V = drawn(seed, n, d)
@@ -48,7 +54,7 @@ def test_the_rotation_program_solves_its_normal_equations(seed: int, n: int, d: 
     np.testing.assert_allclose(X, expected, rtol=0, atol=ACCURACY)
 
 
-@settings(max_examples=8)
+@settings(max_examples=examples(8))
 @given(seed=SEEDS, n=st.integers(4, 10), d=DIMENSIONS)
 def test_with_frozen_neighbours_it_is_the_papers_step(seed: int, n: int, d: int) -> None:
     problem, _, _ = drawn(seed, n, d)
@@ -67,7 +73,7 @@ def test_with_frozen_neighbours_it_is_the_papers_step(seed: int, n: int, d: int)
         np.testing.assert_allclose(Y, stack_transposes(following.R[own]), rtol=0, atol=ACCURACY)
 
 
-@settings(max_examples=8)
+@settings(max_examples=examples(8))
 @given(seed=SEEDS, n=st.integers(4, 10), d=DIMENSIONS)
 def test_with_copies_it_is_the_consensus_step(seed: int, n: int, d: int) -> None:
     problem, rho, V = drawn(seed, n, d)
@@ -75,16 +81,18 @@ def test_with_copies_it_is_the_consensus_step(seed: int, n: int, d: int) -> None
     graph = problem.graph.with_robots(robots.robot)
     separator = np.zeros(n, dtype=bool)
     separator[robots.separators(graph)] = True
-    rho_t = np.full(n, float(np.median(rho)))
-    copies = build_copies(problem, robots, RStep.FACTORIZED).with_penalty(rho, rho_t)
-    solution = copies.solve_all(V[copies.row])
-    for a, (robot, rows) in enumerate(zip(copies.robots, copies.slices, strict=True)):
-        held = np.maximum(copies.multiplicity, 1)  # translations of separators, and all rotations, are shared out
-        share_t = np.where(separator, rho_t / held[:n], 0.0)
-        qp = robot_qp(graph, a, rho / held[n::d], Neighbours.COPIES, Unknowns.POSES, rho_t=share_t)
-        np.testing.assert_array_equal(qp.variables.poses, robot.poses)
-        local = np.concatenate([robot.poses, (n + d * robot.poses[:, None] + np.arange(d)).ravel()])
-        np.testing.assert_allclose(qp.solve(V[local])[robot.held], solution[rows], rtol=0, atol=ACCURACY)
+    rule = FixedPenalty(float(np.median(rho)))
+    soc = SOC(robots=robots, penalty=rule, translation_penalty=0.5)
+    count = np.bincount(np.concatenate([s.poses for s in split_graph(graph, robots)]), minlength=n)
+    share_t = np.where(separator, 0.5 * translation_scale(problem) / count, 0.0)
+    for a, robot in enumerate(LocalConsensus(soc).init(problem, random_poses(n, d, seed)).robots):
+        assert robot.step_a is not None
+        poses, held = robot.layout.subgraph.poses, robot.layout.held[:, 0]
+        qp = robot_qp(graph, a, rule.rho / count, Neighbours.COPIES, Unknowns.POSES, rho_t=share_t)
+        np.testing.assert_array_equal(qp.variables.poses, poses)
+        at = V[np.concatenate([poses, (n + d * poses[:, None] + np.arange(d)).ravel()])]
+        found = robot.step_a.solve(np.where(held[:, None], at, 0.0))
+        np.testing.assert_allclose(qp.solve(at)[held], found[held], rtol=0, atol=ACCURACY)
 
 
 def test_a_frozen_translation_needs_a_penalty() -> None:
@@ -115,7 +123,7 @@ def test_the_shift_is_the_only_parameter_and_it_is_compiled_once() -> None:
     assert qp.qp.problem._cache.param_prog is compiled
 
 
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=st.integers(3, 8), d=DIMENSIONS)
 def test_the_named_views_are_the_poses_and_residuals(seed: int, n: int, d: int) -> None:
     problem, rho, _ = drawn(seed, n, d)

@@ -4,6 +4,7 @@ import math
 import cvxpy as cp
 import numpy as np
 import pytest
+from budget import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -73,7 +74,7 @@ def test_unbalanced_procrustes_finds_the_planted_answer() -> None:
     np.testing.assert_allclose(solution.values[0], X, rtol=0, atol=BETTER)
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=examples(5), deadline=None)
 @given(seed=SEEDS, n=st.integers(3, 7), count=st.integers(1, 3))
 def test_smallest_eigenvectors_from_any_start(seed: int, n: int, count: int) -> None:
     rng = rng_of(seed)

@@ -1,6 +1,7 @@
 import cvxpy as cp
 import numpy as np
 import pytest
+from budget import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -178,7 +179,7 @@ def test_split_problem_is_compiled_once() -> None:
     assert split.problem._cache.param_prog is program
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 @given(seed=SEEDS, rho=st.sampled_from([0.1, 1.0, 30.0]))
 def test_split_problem_gives_the_gradient(seed: int, rho: float) -> None:
     rng = np.random.default_rng(seed)
@@ -205,7 +206,7 @@ def test_infeasible_constraints_say_so() -> None:
         problem.split().solve([np.eye(2)], 1.0)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(seed=SEEDS)
 def test_kkt_residuals_know_the_stationary_points(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -247,7 +248,7 @@ def test_examples_check_their_matrices() -> None:
         one_norm_components(np.ones(3), 1)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 @given(seed=SEEDS)
 def test_examples_have_the_objectives_they_claim(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -1,6 +1,7 @@
 import cvxpy as cp
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, SEEDS, SIZES, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -22,7 +23,7 @@ def posed(seed: int, n: int, d: int, with_translations: bool) -> tuple[RotationQ
     return rotation_qp(A, w, penalty, d), problem.M.toarray() + 0.5 * np.diag(penalty), rng
 
 
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, with_translations=PENALISE_TRANSLATIONS)
 def test_the_solution_satisfies_the_normal_equations(seed: int, n: int, d: int, with_translations: bool) -> None:
     qp, K, rng = posed(seed, n, d, with_translations)
@@ -34,7 +35,7 @@ def test_the_solution_satisfies_the_normal_equations(seed: int, n: int, d: int, 
         assert np.abs(K @ X - b).max() <= 1e-8 * np.abs(K).max() * (1.0 + np.abs(X).max())
 
 
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_rows_without_a_penalty_do_not_matter(seed: int, n: int, d: int) -> None:
     qp, K, rng = posed(seed, n, d, with_translations=False)
@@ -45,7 +46,7 @@ def test_rows_without_a_penalty_do_not_matter(seed: int, n: int, d: int) -> None
     np.testing.assert_array_equal(qp.solve(V), X)
 
 
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, with_translations=PENALISE_TRANSLATIONS)
 def test_it_is_a_parametrised_quadratic_program(seed: int, n: int, d: int, with_translations: bool) -> None:
     qp, K, _ = posed(seed, n, d, with_translations)
@@ -57,7 +58,7 @@ def test_it_is_a_parametrised_quadratic_program(seed: int, n: int, d: int, with_
     assert qp.shift.shape == (int((qp.penalty > 0).sum()), d)
 
 
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_the_objective_is_the_R_subproblem(seed: int, n: int, d: int) -> None:
     qp, K, rng = posed(seed, n, d, with_translations=True)

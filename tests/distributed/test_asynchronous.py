@@ -6,10 +6,11 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from robots import PARTITIONERS, Partitioner, Recording, metis
+from robots import PARTITIONERS, Partitioner, Recording, arrays_in, driver_at, metis, spoil
 
 from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import SettingError
@@ -18,18 +19,20 @@ from pgo_models.graphs.scenes import NoiseModel, circle, grid
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
-from solvers.distributed.driver import Count, Driver
-from solvers.distributed.stages import open_driver
+from solvers.distributed.consensus import RobotsOfDriver
+from solvers.distributed.driver import Driver
 from solvers.loop import iterate, run
-from solvers.network.engine import InProcess
+from solvers.network.counted_pool import Count
 from solvers.network.faults import Faults
 from solvers.network.ledger import Ledger
 from solvers.pipeline import Pipeline, solve
 from solvers.result import Record, Status
+from solvers.soc.consensus import LocalConsensus, ask_all
+from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.paper import PaperSOC
 from solvers.soc.penalty import FixedPenalty, MultiplierPenalty, rotation_scale
-from solvers.soc.soc import SOC, Coupling
-from solvers.soc.state import SOCState
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC
 
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
 LEVEL = 1e-6
@@ -42,7 +45,7 @@ FAULTS = {
 }
 
 
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @given(
     seed=SEEDS,
     n=st.integers(2, 16),
@@ -65,8 +68,7 @@ def test_without_faults_the_states_are_those_of_the_plain_recursion(
 ) -> None:
     problem = varied_problem(seed, n, d, noise)
     parts, engine, start = partitioner(problem.graph, seed), Recording(), chordal_start(problem)
-    driver = open_driver(problem, parts, engine)
-    driver.set_poses(start)
+    driver = driver_at(problem, parts, start, engine)
     soc = SOC(
         coupling=Coupling.CONSENSUS,
         robots=parts,
@@ -77,25 +79,24 @@ def test_without_faults_the_states_are_those_of_the_plain_recursion(
     )
     method = AsynchronousSOC(soc, alpha=alpha, damping=damping)
     state = method.init(driver, None)
-    central = soc.init(problem, start)
+    here = LocalConsensus(soc)
+    central = here.init(problem, start)
     for _ in range(10):
         before = central
-        assert isinstance(before, SOCState)
-        central = soc.step(problem, before)
-        assert isinstance(central, SOCState)
-        if central.raises:  # the safeguards of the two are not the same
+        central = here.step(problem, before)
+        if central.shared.raises:  # the safeguards of the two are not the same
             return
         state = method.step(driver, state)
-        size = np.sqrt(central.copies.penalty[central.copies.row >= n].sum())
         # s goes the damped way of a plain step; omega is that of the s before.
-        assert state.primal_residual == pytest.approx(central.merits[-1] / size, rel=1e-6, abs=1e-9)
-        for robot, rows, agent in zip(central.copies.robots, central.copies.slices, engine.agents, strict=True):
+        expected = central.shared.merits[-1] / central.shared.size
+        assert state.primal_residual == pytest.approx(expected, rel=1e-6, abs=1e-9)
+        for old, new, agent in zip(before.robots, central.robots, engine.agents, strict=True):
             mine = agent.copies
             assert mine is not None
-            allowed = 1e-8 * (1 + np.abs(central.s).max())
-            np.testing.assert_allclose(mine.z[robot.held], before.z[rows], rtol=0, atol=allowed)
-            expected = before.s[rows] + damping * (central.s - before.s)[rows]
-            np.testing.assert_allclose(mine.s[robot.held], expected, rtol=0, atol=allowed)
+            allowed = 1e-8 * (1 + np.abs(new.block.s).max())
+            np.testing.assert_allclose(mine.block.z, old.block.z, rtol=0, atol=allowed)
+            way = old.block.s + damping * (new.block.s - old.block.s)
+            np.testing.assert_allclose(mine.block.s, way, rtol=0, atol=allowed)
         if damping != 1.0:
             return
 
@@ -112,19 +113,18 @@ def scene(name: str) -> PGOProblem:
 def rounds_to_optimum(problem: PGOProblem, parts: Partition, faults: Faults) -> tuple[int, Ledger]:
     """Rounds until omega, with the best translations for it, is within LEVEL of the optimum, after any silence."""
     best = problem.objective(polish(problem, chordal_start(problem)))
-    driver = open_driver(problem, parts, InProcess())
-    driver.start()
+    driver = driver_at(problem, parts, None)
     silence_ends = faults.silent_from + faults.silent_rounds
     for state in islice(iterate(AsynchronousSOC(SOC(), faults), driver), MOST):
         if state.k >= silence_ends and gap_at(problem, driver, best) <= LEVEL:
-            return state.k, driver.ledger
+            return state.k, driver.network.ledger
     raise AssertionError(f"not within {LEVEL} after {MOST} rounds")
 
 
 def gap_at(problem: PGOProblem, driver: Driver, best: float) -> float:
     R = np.empty((problem.num_poses, problem.d, problem.d))
-    for answer in driver.ask_all("own_poses", count=Count.OFF):
-        R[answer["poses"]] = answer["R"]
+    for own in ask_all(RobotsOfDriver(driver), ConsensusRobot.own_poses, None, Count.OFF):
+        R[own.poses] = own.R
     return (problem.objective(problem.with_best_translations(R)) - best) / max(1.0, best)
 
 
@@ -155,16 +155,15 @@ def test_a_run_does_not_end_on_old_rows(fault: str) -> None:
     # All may stand still while a robot is cut off, or no message came through: that is no convergence.
     problem, tolerance = scene("grid"), 1e-4
     parts, faults = metis(problem.graph, 3), FAULTS[fault]
-    driver = open_driver(problem, parts, InProcess())
-    driver.start()
+    driver = driver_at(problem, parts, None)
     method = AsynchronousSOC(SOC(tolerance=tolerance), faults)
     outcome = run(method, driver)
     assert outcome.status is Status.CONVERGED
     if faults.silent_robot is not None:
         assert outcome.iterations > SILENT_FROM + SILENT_ROUNDS
-    method.finish(driver)
+    RobotsOfDriver(driver).finish()
     best = problem.objective(polish(problem, chordal_start(problem)))
-    assert driver.objective - best <= 100 * tolerance**2 * max(1.0, best)
+    assert driver.at.objective - best <= 100 * tolerance**2 * max(1.0, best)
     last = outcome.history.records[-1].measurement
     assert max(last.primal_residual, last.dual_residual) <= tolerance
 
@@ -181,39 +180,35 @@ def test_a_solve_with_faults_is_certified_with_the_central_gap(d: int, fault: st
     assert solution.status is Status.CONVERGED
     assert solution.objective == pytest.approx(central.objective, rel=1e-9)
     assert solution.gap == pytest.approx(central.gap, abs=1e-9)
-    assert engine.times("copies.turn") == solution.stages[1].iterations > 0
-    assert engine.times("copies.extrapolate", "copies.solve") == 0
+    assert engine.times(ConsensusRobot.turn) == solution.stages[1].iterations > 0
+    assert engine.times(ConsensusRobot.extrapolate, ConsensusRobot.solve) == 0
     again = solve(graph, pipeline, robots=parts)
     np.testing.assert_array_equal(again.poses.R, solution.poses.R)  # the same seed, the same faults
 
 
 def test_a_round_is_one_message_a_link_and_no_all_reduce() -> None:
     problem, engine = scene("grid"), Recording()
-    driver = open_driver(problem, metis(problem.graph, 3), engine)
-    driver.start()
+    driver = driver_at(problem, metis(problem.graph, 3), None, engine)
     method = AsynchronousSOC(SOC(), Faults(loss=0.5, seed=2))
     state = method.init(driver, None)
-    before = driver.ledger
+    before = driver.network.ledger
     for _ in range(7):
         state = method.step(driver, state)
-    after = driver.ledger
+    after = driver.network.ledger
     assert after.rounds == before.rounds + 7
     assert after.all_reduces == before.all_reduces
     sent = [answer for order, _, up in engine.log[-7:] for answer in up]
-    num_bytes = sum(8 * np.size(value) for answer in sent for value in answer.values())
-    settings_each = 3 * 8
-    assert after.num_bytes - before.num_bytes == num_bytes + len(sent) * settings_each  # what is lost was sent
+    num_bytes = sum(8 * np.size(value) for answer in sent for _, value in arrays_in(answer))
+    assert after.num_bytes - before.num_bytes == num_bytes  # what is lost was sent
 
 
 def test_a_state_that_is_not_finite_is_said_to_be() -> None:
     problem, engine = scene("grid"), Recording()
-    driver = open_driver(problem, metis(problem.graph, 3), engine)
-    driver.start()
+    driver = driver_at(problem, metis(problem.graph, 3), None, engine)
 
     def break_it(state: AsynchronousState, record: Record) -> None:
-        holder = engine.agents[0].copies
-        if record.k == 1 and holder is not None:
-            holder.s = 1e180 * holder.s  # its square is too large
+        if record.k == 1:
+            spoil(engine.agents[0], 1e180)  # its square is too large
 
     method = AsynchronousSOC(SOC(penalty=FixedPenalty(float(np.median(rotation_scale(problem))))))
     with np.errstate(over="ignore"):

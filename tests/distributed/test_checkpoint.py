@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import varied_graph
 from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
@@ -221,7 +222,7 @@ def test_a_file_that_is_no_checkpoint_is_refused_and_left_alone(damage, broken_o
 @given(
     place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7), length=st.none() | st.floats(0, 1, exclude_max=True)
 )
-@hypothesis_settings(max_examples=500, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@hypothesis_settings(max_examples=examples(500), suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_flipped_bit_or_a_lost_end_is_one_error(broken_off, place, bit, length):
     path = broken_off[1]
     whole = path.read_bytes()

@@ -5,6 +5,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,33 +16,40 @@ from robots import (
     Recording,
     contiguous,
     corner_cases,
+    driver_at,
     metis,
     one_robot,
     scattered,
     singletons,
+    spoil,
 )
 
 from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, grid
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed.consensus import ConsensusSOC, ConsensusState
+from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.distributed.driver import Driver
-from solvers.distributed.stages import collect, open_driver
+from solvers.distributed.robots.interior import Interior
+from solvers.distributed.stages import collect
 from solvers.loop import iterate, run
 from solvers.pipeline import Pipeline, solve
 from solvers.result import Status
 from solvers.soc import penalty as safeguard
 from solvers.soc import separator_stiffness as stiffness
-from solvers.soc.anderson import Anderson, AndersonMemory
+from solvers.soc.anderson import Anderson
+from solvers.soc.consensus import ConsensusIterate, ConsensusState, LocalConsensus
+from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.paper import PaperSOC
 from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule, rotation_scale
 from solvers.soc.r_step import RStep
-from solvers.soc.soc import SOC, Coupling
-from solvers.soc.state import SOCState
+from solvers.soc.recursion_block import RecursionBlock
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC
 
 SIZES = st.integers(2, 20)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
@@ -50,66 +58,53 @@ SAME = 1e-7
 STALLED = MultiplierPenalty(stall_window=3, stall_ratio=1e-6)  # anything counts as stalled after three steps
 
 
-def check_state(one: SOCState, other: ConsensusState, engine: Recording) -> None:
-    """Every robot has its rows of the central iterate, and the penalties."""
-    assert (other.k, other.refreshes, other.raises) == (one.k, one.refreshes, one.raises)
-    np.testing.assert_allclose(other.primal_residual, one.primal_residual, rtol=1e-6, atol=1e-8)
-    np.testing.assert_allclose(other.dual_residual, one.dual_residual, rtol=1e-6, atol=1e-8)
-    assert one.copies.penalty is not None
-    for robot, rows, agent in zip(one.copies.robots, one.copies.slices, engine.agents, strict=True):
+def check_state(one: ConsensusIterate, other: ConsensusState, engine: Recording) -> None:
+    """Every robot has what it has in one place, and so has whoever sums up."""
+    steps = one.shared
+    assert (other.k, other.refreshes, other.raises) == (steps.k, steps.refreshes, steps.raises)
+    np.testing.assert_allclose(other.primal_residual, steps.primal_residual, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(other.dual_residual, steps.dual_residual, rtol=1e-6, atol=1e-8)
+    assert len(other.sums.gram) == len(steps.sums.gram)
+    np.testing.assert_allclose(other.sums.smallest, steps.sums.smallest, rtol=1e-6, atol=1e-8)
+    for robot, agent in zip(one.robots, engine.agents, strict=True):
         mine = agent.copies
         assert mine is not None
-        np.testing.assert_array_equal(agent.subgraph.poses, robot.poses)
-        np.testing.assert_array_equal(np.flatnonzero(mine.held), robot.held)
-        np.testing.assert_allclose(mine.rho, one.rho[robot.poses], rtol=SAME, atol=0)
-        np.testing.assert_allclose(mine.penalty[robot.held], one.copies.penalty[rows], rtol=SAME, atol=0)
-        for local, whole in ((mine.x, one.x), (mine.z, one.z), (mine.s, one.s)):
-            np.testing.assert_allclose(local[robot.held], whole[rows], rtol=0, atol=SAME * (1 + np.abs(whole).max()))
+        np.testing.assert_allclose(mine.state.rho, robot.state.rho, rtol=SAME, atol=0)
+        np.testing.assert_allclose(mine.block.penalty, robot.block.penalty, rtol=SAME, atol=0)
+        known = mine.block.anderson, robot.block.anderson
+        assert len(known[0].residual_differences) == len(known[1].residual_differences)
+        for local, whole in zip(rows_in(mine.block), rows_in(robot.block), strict=True):
+            np.testing.assert_allclose(local, whole, rtol=0, atol=SAME * (1 + np.abs(whole).max()))
 
 
-def check_acceleration(one: SOCState, other: ConsensusState, engine: Recording, soc: SOC) -> None:
-    """Robots remember as much as one place does, and the sums are those of what they remember."""
-    if soc.acceleration is None:
-        return
-    number = len(engine.agents)
-    is_alone = soc.acceleration.per_robot
-    memories = one.memory or (AndersonMemory(),) * (number if is_alone else 1)
-    for robot, agent in enumerate(engine.agents):
-        assert agent.copies is not None
-        memory = memories[robot if is_alone else 0]
-        sums = agent.copies.sums if is_alone else other.sums
-        known = len(memory.residual_differences)
-        assert len(sums.gram) == len(agent.copies.anderson.residual_differences) == known
-        np.testing.assert_allclose(sums.smallest, memory.smallest, rtol=1e-6, atol=1e-8)
+def rows_in(block: RecursionBlock) -> tuple[Array, Array, Array]:
+    return block.x, block.z, block.s
 
 
-def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> SOCState:
+def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> ConsensusState:
     """Compare iterate by iterate until only rounding is left, and what the runs leave behind; the last central one."""
     engine, start = Recording(), chordal_start(problem)
-    driver = open_driver(problem, parts, engine)
-    driver.set_poses(start)
-    central = islice(iterate(soc, problem, start), steps + 1)
+    driver = driver_at(problem, parts, start, engine)
+    central = islice(iterate(LocalConsensus(replace(soc, robots=parts)), problem, start), steps + 1)
     for one, other in zip(central, iterate(ConsensusSOC(soc), driver), strict=False):
-        assert isinstance(one, SOCState)
         check_state(one, other, engine)
-        check_acceleration(one, other, engine, soc)
-        if max(one.primal_residual, one.dual_residual) <= CONVERGED:
+        if max(one.shared.primal_residual, one.shared.dual_residual) <= CONVERGED:
             break
-    ConsensusSOC(soc).finish(driver)
-    check_end(problem, soc, one, driver)
-    return one
+    RobotsOfDriver(driver).finish()
+    check_end(problem, one, driver)
+    return one.shared
 
 
-def check_end(problem: PGOProblem, soc: SOC, last: SOCState, driver: Driver) -> None:
+def check_end(problem: PGOProblem, last: ConsensusIterate, driver: Driver) -> None:
     poses, _ = collect(driver)
-    expected = soc.poses(problem, last)
+    expected = problem.with_best_translations(last.omega)
     size = 1 + np.abs(expected.t).max()
     np.testing.assert_allclose(poses.R, expected.R, rtol=0, atol=SAME)
     np.testing.assert_allclose(poses.t - poses.t[0], expected.t, rtol=0, atol=SAME * size)
-    assert driver.objective == pytest.approx(problem.objective(expected), rel=1e-6, abs=1e-9)
+    assert driver.at.objective == pytest.approx(problem.objective(expected), rel=1e-6, abs=1e-9)
 
 
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @given(
     seed=SEEDS,
     n=SIZES,
@@ -189,14 +184,11 @@ def test_robots_forget_when_the_acceleration_restarts(seed: int) -> None:
     acceleration = Anderson(memory=3, restart_ratio=1.001)
     soc = SOC(coupling=Coupling.CONSENSUS, robots=parts, penalty=BalancedPenalty(), acceleration=acceleration)
     engine = Recording()
-    driver = open_driver(problem, parts, engine)
-    driver.set_poses(start)
+    driver = driver_at(problem, parts, start, engine)
     restarts = []
     for one, other in islice(zip(iterate(soc, problem, start), iterate(ConsensusSOC(soc), driver), strict=False), 16):
-        assert isinstance(one, SOCState)
         check_state(one, other, engine)
-        check_acceleration(one, other, engine, soc)
-        orders = [down[0]["restart"][0] for order, down, _ in engine.log if order == "copies.extrapolate"]
+        orders = [down[0].gamma is None for order, down, _ in engine.log if order == "ConsensusRobot.extrapolate"]
         restarts.append(bool(orders) and bool(orders[-1]))
     assert sum(restarts[:-3]) >= 1  # and steps follow
 
@@ -206,15 +198,13 @@ def test_a_long_accelerated_run_ends_where_one_place_ends(d: int) -> None:
     problem = varied_problem(1, 30, d)
     parts = metis(problem.graph, 4)
     soc = SOC(robots=parts)
-    driver = open_driver(problem, parts, Recording())
-    driver.start()
+    driver = driver_at(problem, parts, None, Recording())
     central = run(soc, problem)
     distributed = run(ConsensusSOC(soc), driver)
     assert distributed.status is central.status is Status.CONVERGED
     assert distributed.iterations == central.iterations
-    ConsensusSOC(soc).finish(driver)
-    assert isinstance(central.state, SOCState)
-    check_end(problem, soc, central.state, driver)
+    RobotsOfDriver(driver).finish()
+    check_end(problem, central.state, driver)
     for figure in ("primal_residual", "dual_residual"):
         np.testing.assert_allclose(
             [getattr(record.measurement, figure) for record in distributed.history.records[1:]],
@@ -226,29 +216,25 @@ def test_a_long_accelerated_run_ends_where_one_place_ends(d: int) -> None:
 
 def test_a_state_that_is_not_finite_is_said_to_be_and_leaves_the_last_one_behind() -> None:
     problem, engine = varied_problem(0, 12, 3), Recording()
-    driver = open_driver(problem, metis(problem.graph, 2), engine)
-    driver.start()
-    start = driver.objective
+    driver = driver_at(problem, metis(problem.graph, 2), None, engine)
+    start = driver.at.objective
     for acceleration in (Anderson(), Anderson(per_robot=True), None):
         method = ConsensusSOC(SOC(acceleration=acceleration))
         state = method.init(driver, None)
-        holder = engine.agents[0].copies
-        assert holder is not None
-        s = holder.s
-        holder.s = np.full_like(s, np.nan)
+        spoil(engine.agents[0], np.nan)
         broken = method.step(driver, state)
         assert broken.k == 1
         measurement = method.measure(driver, broken)
         assert np.isnan([measurement.objective, measurement.primal_residual, measurement.dual_residual]).all()
         assert method.converged(broken, measurement) is None
-        method.finish(driver)
-        assert driver.objective == pytest.approx(start, rel=1e-9)
+        RobotsOfDriver(driver).finish()
+        assert driver.at.objective == pytest.approx(start, rel=1e-9)
 
 
 # solve(.., robots=..)
 
 
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
 def test_the_solution_is_certified_with_the_central_gap(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
     problem = varied_problem(seed, n, d)
@@ -273,8 +259,8 @@ def test_solve_and_soc_have_the_same_robots() -> None:
     engine = Recording()
     solution = solve(graph, pipeline, robots=3, engine=engine)  # so many are SOC's
     assert solution.robots is three
-    assert engine.times("copies.turn", "penalize") == 0
-    assert engine.times("copies.extrapolate") == solution.stages[1].iterations > 0
+    assert engine.times(ConsensusRobot.turn, Interior.penalize) == 0
+    assert engine.times(ConsensusRobot.extrapolate) == solution.stages[1].iterations > 0
     same = Partition(three.robot.copy(), three.method)
     assert solve(graph, pipeline, robots=same).gap == solution.gap
     for other in (four, 4, partition(graph, 3, PartitionMethod.CONTIGUOUS)):

@@ -5,10 +5,11 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, EPS, LOUD_NOISE, MILD_NOISE, SEEDS, random_poses, varied_graph, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, metis
+from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, driver_at, metis
 
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, ground_pose, move_poses
@@ -24,9 +25,8 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import Driver
 from solvers.distributed.newton import SubstructuredNewton, model_at
-from solvers.distributed.stages import collect, open_driver
+from solvers.distributed.stages import collect
 from solvers.loop import iterate, run
-from solvers.network.engine import InProcess
 from solvers.result import Status
 from solvers.riemannian.newton import Newton
 
@@ -39,12 +39,6 @@ def near(problem: PGOProblem, seed: int, spread: float) -> Poses:
     rng = np.random.default_rng(seed)
     moves = [spread * rng.standard_normal((problem.num_poses, k)) for k in (tangent_dimension(problem.d), problem.d)]
     return move_poses(chordal_start(problem), *moves)
-
-
-def driver_at(problem: PGOProblem, parts: Partition, poses: Poses) -> Driver:
-    driver = open_driver(problem, parts, InProcess())
-    driver.set_poses(poses)
-    return driver
 
 
 def check(problem: PGOProblem, parts: Partition, start: Poses, newton: Newton, steps: int) -> None:
@@ -62,10 +56,10 @@ def check(problem: PGOProblem, parts: Partition, start: Poses, newton: Newton, s
             break
         assert other.moved == one.polish.moved
     poses, _ = collect(driver)
-    assert driver.objective == pytest.approx(problem.objective(poses), rel=1e-10, abs=1e-20)
+    assert driver.at.objective == pytest.approx(problem.objective(poses), rel=1e-10, abs=1e-20)
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(
     seed=SEEDS,
     n=SIZES,
@@ -112,10 +106,10 @@ def test_as_many_steps_to_the_same_optimum(d: int) -> None:
     assert central.status is Status.CONVERGED
     assert states[-1].decrement <= STATIONARY_DECREMENT
     assert len(states) - 1 == central.iterations
-    assert driver.objective == pytest.approx(central.objective, rel=1e-13)
+    assert driver.at.objective == pytest.approx(central.objective, rel=1e-13)
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(
     seed=SEEDS,
     n=SIZES,
@@ -181,10 +175,10 @@ def test_damping_grows_until_the_matrix_is_positive_definite(monkeypatch: pytest
         return model_at(driver, second_order, damping) if damping >= 1e-3 else None
 
     monkeypatch.setattr("solvers.distributed.newton.model_at", spoiled)
-    before = driver.objective
+    before = driver.at.objective
     state = next(islice(iterate(SubstructuredNewton(), driver), 1, None))
     assert [second_order for second_order, _ in tried] == [True] + [False] * (len(tried) - 1)
     dampings = [damping for _, damping in tried[1:]]
     np.testing.assert_allclose(dampings, [0.0, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3], rtol=1e-12, atol=0)
     assert state.moved
-    assert driver.objective < before
+    assert driver.at.objective < before

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, random_poses, varied_graph, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from robots import BACKENDS, PARTITIONERS, Partitioner, Recording, corner_cases, metis
+from robots import BACKENDS, PARTITIONERS, Partitioner, Recording, arrays_in, corner_cases, driver_at, metis
 
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.errors import GraphError, SettingError
@@ -18,22 +19,22 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import Driver
-from solvers.distributed.robots.subgraph import split_graph
-from solvers.distributed.stages import collect, open_driver
+from solvers.distributed.robots.interior import Interior
+from solvers.distributed.stages import collect
 from solvers.network.engine import InProcess
 from solvers.pipeline import Pipeline, solve
+from solvers.soc.subgraph import split_graph
 from solvers.solution import Solution
 
 SIZES = st.integers(2, 24)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
-OFF = ("describe", "set_poses", "cost", "result")  # orders that are not counted
+OFF = ("Interior.describe", "Interior.set_poses", "Interior.cost", "Interior.result")  # orders that are not counted
 
-PROOF = ("certificate", "move_certificate")
+PROOF = (Interior.certificate, Interior.move_certificate)
 
 
 def check_start(problem: PGOProblem, parts: Partition) -> None:
-    driver = open_driver(problem, parts, InProcess())
-    driver.start()
+    driver = driver_at(problem, parts, None)
     poses, Lambda = collect(driver)
     expected = chordal_start(problem)
     size = 1 + np.abs(expected.t).max()
@@ -41,11 +42,11 @@ def check_start(problem: PGOProblem, parts: Partition) -> None:
     np.testing.assert_allclose(poses.t - poses.t[0], expected.t, rtol=0, atol=1e-9 * size)
     scale = float(problem.M.diagonal().max())
     np.testing.assert_allclose(Lambda, multipliers(problem, poses), rtol=0, atol=1e-12 * scale * size)
-    assert driver.objective == pytest.approx(problem.objective(poses), rel=1e-12, abs=1e-24 * scale)
-    assert driver.ledger.rounds == 2
+    assert driver.at.objective == pytest.approx(problem.objective(poses), rel=1e-12, abs=1e-24 * scale)
+    assert driver.network.ledger.rounds == 2
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, noise=NOISES, partitioner=PARTITIONERS, backend=BACKENDS)
 def test_the_chordal_start_is_the_central_one(
     seed: int, n: int, d: int, noise: NoiseModel, partitioner: Partitioner, backend: CholeskyBackend
@@ -59,24 +60,23 @@ def test_the_chordal_start_of_corner_cases(graph: PoseGraph, parts: Partition) -
     check_start(PGOProblem(graph), parts)
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
 def test_poses_from_elsewhere_are_taken_as_they_are(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
     problem = varied_problem(seed, n, d)
     given_poses, other = random_poses(n, d, seed), random_poses(n, d, seed + 1)
-    driver = open_driver(problem, partitioner(problem.graph, seed), InProcess())
-    driver.set_poses(given_poses)
-    assert driver.objective == pytest.approx(problem.objective(given_poses), rel=1e-12)
+    driver = driver_at(problem, partitioner(problem.graph, seed), given_poses)
+    assert driver.at.objective == pytest.approx(problem.objective(given_poses), rel=1e-12)
     driver.save_poses()
     driver.set_poses(other)
     driver.restore_poses()
     poses, Lambda = collect(driver)
     np.testing.assert_array_equal(poses.R, given_poses.R)
     np.testing.assert_array_equal(poses.t, given_poses.t)
-    assert driver.objective == pytest.approx(problem.objective(given_poses), rel=1e-12)
+    assert driver.at.objective == pytest.approx(problem.objective(given_poses), rel=1e-12)
     scale = float(problem.M.diagonal().max())
     np.testing.assert_allclose(Lambda, multipliers(problem, poses), rtol=0, atol=1e-11 * scale)
-    assert driver.ledger.rounds == 0
+    assert driver.network.ledger.rounds == 0
     with pytest.raises(GraphError, match="give one pose for every pose of the graph"):
         driver.set_poses(Poses(given_poses.R[1:], given_poses.t[1:]))
 
@@ -99,7 +99,7 @@ def solved(seed: int, n: int, d: int, partitioner: Partitioner, noise: NoiseMode
     return solution, engine
 
 
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @given(seed=SEEDS, n=st.integers(3, 16), d=DIMENSIONS, noise=NOISES, partitioner=PARTITIONERS)
 def test_the_ledger_counts_what_was_sent(
     seed: int, n: int, d: int, noise: NoiseModel, partitioner: Partitioner
@@ -113,7 +113,7 @@ def test_the_ledger_counts_what_was_sent(
             continue
         for robot in range(number):
             for total, message in ((received, down[robot]), (sent, up[robot])):
-                size = 8 * sum(np.asarray(value).size for value in message.values())
+                size = 8 * sum(np.size(value) for _, value in arrays_in(message))
                 total[0, robot] += size
                 messages += size > 0
     np.testing.assert_array_equal(ledger.bytes_sent, sent[0])
@@ -125,18 +125,11 @@ def test_the_ledger_counts_what_was_sent(
     )
     # A solve of M x = b, a step (a), a Newton direction, the best translations and a proof take one round each.
     counted = (
-        "project",
-        "set_translations",
-        "penalize",
-        "rescale",
-        "solve",
-        "finish",
-        "move",
-        "evaluate_trial",
-        *PROOF,
+        *(Interior.project, Interior.set_translations, Interior.penalize, Interior.rescale, Interior.solve),
+        *(Interior.finish, Interior.move, Interior.evaluate_trial, *PROOF),
     )
     assert ledger.rounds == engine.times(*counted)
-    assert ledger.all_reduces == engine.times("agree")
+    assert ledger.all_reduces == engine.times(Interior.agree)
     last = solution.stages[-1].history.records[-1].measurement
     assert last.rounds == ledger.rounds - engine.times(*PROOF)
 
@@ -146,16 +139,13 @@ def test_rounds_of_a_whole_solve_are_as_documented() -> None:
     solution = solve(graph, robots=partition(graph, 3), engine=engine)
     assert solution.ledger is not None
     start, soc, newton = solution.stages
-    moves = engine.times("move")
-    assert (start.name, engine.times("rescale"), engine.times("turn"), engine.times("certificate")) == (
-        "chordal start",
-        0,
-        0,
-        1,
-    )
-    assert engine.times("penalize") == 1  # no refresh
+    moves = engine.times(Interior.move)
+    assert start.name == "chordal start"
+    assert engine.times(Interior.rescale, Interior.turn) == 0
+    assert engine.times(Interior.certificate) == 1
+    assert engine.times(Interior.penalize) == 1  # no refresh
     # 2 to start, 1 for the penalty and 1 a step and 2 for the result of SOC, 2 a move of Newton, 2 for the proof.
-    assert engine.times("move_certificate") == 1
+    assert engine.times(Interior.move_certificate) == 1
     assert solution.ledger.rounds == 2 + (1 + soc.iterations + 2) + 2 * moves + 2
     assert solution.ledger.all_reduces == soc.iterations
     assert newton.iterations <= moves
@@ -188,29 +178,37 @@ def test_what_crosses_has_the_size_of_the_separators(d: int, noise: NoiseModel) 
             "diagonal": {((d + 1) * g,), (tangent * g,)},
             "b": any_side,
             "x": any_side,
-            "t": {(g, d)},
-            "z": {(d * g, d)},
             "force": {((d + 1) * g, d)},
             "norms": {(inside,)},
             "scale": {(inside,)},
-            "rule": {(3,)},
-            "settings": {(2,)},
             "fixed": {((d + 1) * g,)},
-            "figures": {(5,)},
             **{name: {((d + 1) * g, d)} for name in ("point", "product", "error")},
             "gamma": {(k,) for k in range(memory + 1)},
             "sums": {(k,) for k in range(2 * memory + 2)},
         }
+        sums = allowed["sums"]
+        values = {  # of orders that take or give one array
+            "Interior.describe": {((d + 1) * g,)},
+            "Interior.project": any_side,
+            "Interior.set_translations": {(g, d)},
+            "Interior.evaluate_trial": {(g, d)},
+            "Interior.solve": any_side | sums,
+            "Interior.cost": {(d * g, d), ()},
+            "Interior.finish": {(d * g, d)},
+            "Interior.move_certificate": any_side | {()},
+        }
         for order, sent, got in engine.log:
-            if order == "result":
+            if order == "Interior.result":
                 continue
-            for name, value in (*sent[share.robot].items(), *got[share.robot].items()):
-                assert np.shape(value) in allowed.get(name, {(1,)}), (order, name)
-                seen.add(name)
-    assert {"schur", "b", "x", "t", "force", "sums", "gamma", "norms", "scale"} <= seen
+            for record in (sent[share.robot], got[share.robot]):
+                for name, value in arrays_in(record):
+                    plain = values.get(order, {()}) if name == "value" else {()}
+                    assert np.shape(value) in allowed.get(name, plain), (order, name)
+                    seen.add(name)
+    assert {"schur", "b", "x", "value", "force", "sums", "gamma", "norms", "scale"} <= seen
 
 
-@settings(max_examples=15)
+@settings(max_examples=examples(15))
 @given(seed=SEEDS, n=st.integers(6, 24), d=DIMENSIONS, noise=NOISES, partitioner=PARTITIONERS)
 def test_no_interior_pose_and_no_private_measurement_crosses(
     seed: int, n: int, d: int, noise: NoiseModel, partitioner: Partitioner
@@ -233,7 +231,7 @@ def test_no_interior_pose_and_no_private_measurement_crosses(
     secrets = secrets[~np.isin(np.abs(secrets), [0.0, 1.0])]  # which anything may be
     # ||Lambda_i|| and m_i, for the quantile of the penalty, and the largest diagonal entry of M are told: of a pose
     # with one edge they are its precision.
-    told = [value for name, value in engine.crossed("result") if name not in ("norms", "scale", "largest")]
+    told = [value for name, value in engine.crossed(Interior.result) if name not in ("norms", "scale")]
     assert not np.isin(secrets, np.concatenate(told)).any()
 
 

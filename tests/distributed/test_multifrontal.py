@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import SEEDS
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -61,7 +62,7 @@ def check_tree(tree: tuple[Front, ...], touched: tuple[IntArray, ...], separator
         assert set(front.poses.tolist()) == set(front.eliminated.tolist()) | set(front.boundary.tolist())
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(seed=SEEDS, robots=st.integers(1, 12), separators=st.integers(1, 15), width=st.sampled_from([1, 3, 4]))
 def test_factor_and_solve_are_those_of_the_dense_sum(seed: int, robots: int, separators: int, width: int) -> None:
     touched = random_team(seed, robots, separators)

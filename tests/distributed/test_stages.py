@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import (
     DIMENSIONS,
     LOUD_NOISE,
@@ -19,7 +20,7 @@ from graphs import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, metis, scattered
+from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, driver_at, metis, scattered
 
 from pgo_models.certificates.certificate import DEFAULT_GAP
 from pgo_models.certificates.dual_variables import multipliers
@@ -35,14 +36,15 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.lower_bound import best_bound_distributed, prove_with_eta
-from solvers.distributed.stages import collect, open_driver
+from solvers.distributed.stages import collect
 from solvers.network.engine import InProcess
 from solvers.network.faults import Faults
 from solvers.pipeline import Pipeline, solve
 from solvers.result import Record, Status
 from solvers.riemannian.newton import Newton, gauss_newton
 from solvers.soc.anderson import Anderson
-from solvers.soc.soc import SOC, Coupling
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC
 from solvers.solution import Solution
 
 ROOT = Path(__file__).parents[2]
@@ -52,8 +54,7 @@ SHORT = Pipeline(second_try=False, staircase=None)
 
 
 def check_certificate(problem: PGOProblem, parts: Partition, poses: Poses) -> None:
-    driver = open_driver(problem, parts, InProcess())
-    driver.set_poses(poses)
+    driver = driver_at(problem, parts, poses)
     Lambda = multipliers(problem, poses)
     objective = problem.objective(poses)
     central = best_bound(problem, Lambda, poses, DEFAULT_GAP, objective)
@@ -67,7 +68,7 @@ def check_certificate(problem: PGOProblem, parts: Partition, poses: Poses) -> No
     assert found.value == pytest.approx(central.value, rel=1e-9 + off, abs=found.rounding + central.rounding)
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(
     seed=SEEDS, n=SIZES, d=DIMENSIONS, noise=NOISES, partitioner=PARTITIONERS, backend=BACKENDS, polished=st.booleans()
 )
@@ -91,7 +92,7 @@ def test_the_bound_of_corner_cases(graph: PoseGraph, parts: Partition) -> None:
     check_certificate(problem, parts, polish(problem, chordal_start(problem)))
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS, backend=BACKENDS)
 def test_a_shift_is_proved_by_all_together_where_one_proves_it(
     seed: int, n: int, d: int, partitioner: Partitioner, backend: CholeskyBackend
@@ -100,8 +101,7 @@ def test_a_shift_is_proved_by_all_together_where_one_proves_it(
     problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE), backend)
     poses = chordal_start(problem)
     Lambda = multipliers(problem, poses)
-    driver = open_driver(problem, partitioner(problem.graph, seed), InProcess())
-    driver.set_poses(poses)
+    driver = driver_at(problem, partitioner(problem.graph, seed), poses)
     scale = float(problem.M.diagonal().max())
     S = problem.M.toarray()
     for i in range(n):
@@ -144,7 +144,7 @@ def check_equal(distributed: Solution, central: Solution) -> None:
         assert bound == pytest.approx(distributed.lower_bound, abs=2 * rounding)
 
 
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS, backend=BACKENDS)
 def test_the_solution_is_the_central_one(
     seed: int, n: int, d: int, partitioner: Partitioner, backend: CholeskyBackend
@@ -178,7 +178,7 @@ def test_every_pipeline_ends_at_the_central_solution(pipeline: Pipeline, d: int,
         assert first.objective == pytest.approx(other.objective, rel=1e-12)
 
 
-@settings(max_examples=8)
+@settings(max_examples=examples(8))
 @given(seed=SEEDS, n=st.integers(4, 10), d=DIMENSIONS, partitioner=PARTITIONERS)
 def test_a_bound_holds_where_nothing_is_certified(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, NoiseModel(translation_std=1.0, rotation_std=1.5)))

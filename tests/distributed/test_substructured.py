@@ -5,10 +5,21 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from robots import BACKENDS, PARTITIONERS, Partitioner, contiguous, corner_cases, metis, scattered, singletons
+from robots import (
+    BACKENDS,
+    PARTITIONERS,
+    Partitioner,
+    contiguous,
+    corner_cases,
+    driver_at,
+    metis,
+    scattered,
+    singletons,
+)
 
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -17,15 +28,14 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import Driver
-from solvers.distributed.stages import collect, open_driver
+from solvers.distributed.stages import collect
 from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
 from solvers.loop import iterate, run
-from solvers.network.engine import InProcess
 from solvers.result import Status
 from solvers.soc.anderson import Anderson
 from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule, rotation_scale
-from solvers.soc.soc import SOC, Coupling
-from solvers.soc.state import SOCState
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC, SOCState
 
 SIZES = st.integers(2, 20)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
@@ -38,8 +48,7 @@ def pairs(
 ) -> tuple[list[SOCState], list[SubstructuredState], Driver]:
     """Iterates of the central recursion, until only rounding is left, and as many of the distributed one."""
     start = chordal_start(problem)
-    driver = open_driver(problem, parts, InProcess())
-    driver.set_poses(start)
+    driver = driver_at(problem, parts, start)
     central = []
     for state in islice(iterate(soc, problem, start), steps + 1):
         assert isinstance(state, SOCState)
@@ -65,7 +74,7 @@ def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> tuple[
     size = 1 + np.abs(expected.t).max()
     np.testing.assert_allclose(poses.R, expected.R, rtol=0, atol=1e-7)
     np.testing.assert_allclose(poses.t - poses.t[0], expected.t, rtol=0, atol=1e-7 * size)
-    assert driver.objective == pytest.approx(problem.objective(expected), rel=1e-6, abs=1e-9)
+    assert driver.at.objective == pytest.approx(problem.objective(expected), rel=1e-6, abs=1e-9)
     return central[-1].refreshes, central[-1].raises
 
 
@@ -73,7 +82,7 @@ def small_penalty(problem: PGOProblem) -> FixedPenalty:
     return FixedPenalty(1e-3 * float(np.median(rotation_scale(problem))))
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(
     seed=SEEDS,
     n=SIZES,
@@ -121,8 +130,7 @@ def test_every_change_of_the_penalty_is_the_central_one(d: int, partitioner: Par
 def test_a_long_accelerated_run_ends_where_joint_ends(d: int) -> None:
     problem = varied_problem(1, 30, d)
     parts = metis(problem.graph, 4)
-    driver = open_driver(problem, parts, InProcess())
-    driver.start()
+    driver = driver_at(problem, parts, None)
     central = run(SOC(), problem)
     distributed = run(SubstructuredSOC(), driver)
     assert distributed.status is central.status is Status.CONVERGED
@@ -141,9 +149,8 @@ def test_a_long_accelerated_run_ends_where_joint_ends(d: int) -> None:
 
 def test_a_state_that_is_not_finite_is_said_to_be_and_leaves_the_last_one_behind() -> None:
     problem = varied_problem(0, 12, 3)
-    driver = open_driver(problem, metis(problem.graph, 2), InProcess())
-    driver.start()
-    start, method = driver.objective, SubstructuredSOC()
+    driver = driver_at(problem, metis(problem.graph, 2), None)
+    start, method = driver.at.objective, SubstructuredSOC()
     state = method.init(driver, None)
     broken = method.step(driver, replace(state, block=replace(state.block, s=np.full_like(state.block.s, np.nan))))
     assert broken.k == 1
@@ -151,4 +158,4 @@ def test_a_state_that_is_not_finite_is_said_to_be_and_leaves_the_last_one_behind
     assert np.isnan([measurement.objective, measurement.primal_residual, measurement.dual_residual]).all()
     assert method.converged(broken, measurement) is None
     method.finish(driver)
-    assert driver.objective == pytest.approx(start, rel=1e-12)
+    assert driver.at.objective == pytest.approx(start, rel=1e-12)

@@ -15,9 +15,9 @@ import pgo_models as pgo
 from pgo_models.errors import EngineError
 from solvers import cli
 from solvers.distributed.robots.agent import Agent
-from solvers.distributed.robots.subgraph import split_graph
 from solvers.network import ray_engine
 from solvers.network.ray_engine import RayEngine
+from solvers.soc.subgraph import split_graph
 
 pytest.importorskip("ray")
 

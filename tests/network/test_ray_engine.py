@@ -18,11 +18,13 @@ import solvers
 from pgo_models.errors import EngineError, FileFormatError, MissingExtraError, NotPositiveDefiniteError, SettingError
 from pgo_models.graphs.pose_graph import PoseGraph
 from solvers import cli
-from solvers.distributed.robots.agent import Agent
-from solvers.distributed.robots.subgraph import Subgraph, split_graph
+from solvers.distributed.robots.agent import Agent, order_interior
+from solvers.distributed.robots.interior import Interior
 from solvers.network import ray_engine
 from solvers.network.ray_engine import RayEngine, connect
 from solvers.network.recovery import Recovery
+from solvers.soc.penalty import PenaltyOrder
+from solvers.soc.subgraph import Subgraph, split_graph
 
 ray = pytest.importorskip("ray")
 
@@ -172,7 +174,7 @@ def test_errors_of_robots_arrive_as_what_they_are(graph):
     pool = RayEngine().open(partial(Agent, backend=None), split_graph(graph, pgo.partition(graph, 1)))
     try:
         with pytest.raises(NotPositiveDefiniteError, match=r"^the matrix has nan or inf; check the weights"):
-            pool.ask("penalize", [{"rule": np.full(3, np.nan), "is_stationary": np.zeros(1)}])
+            pool.ask(partial(order_interior, Interior.penalize), [PenaltyOrder(np.nan, np.nan, np.nan)])
     finally:
         pool.close()
 
@@ -181,8 +183,8 @@ def test_a_slow_answer_is_waited_for_while_the_cluster_lives(graph, actors, monk
     pool = RayEngine().open(partial(Agent, backend=None), split_graph(graph, pgo.partition(graph, 1)))
     monkeypatch.setattr(ray_engine, "_SECONDS_TO_ANSWER", 0.1)
     try:
-        ticket = actors[0].actors[0].__ray_call__.remote(lambda holder: time.sleep(1) or {"slow": 1})
-        assert actors[0].receive(0, ticket) == {"slow": 1}
+        ticket = actors[0].actors[0].__ray_call__.remote(lambda holder: time.sleep(1) or "slow")
+        assert actors[0].receive(0, ticket) == "slow"
         monkeypatch.setattr(ray_engine, "_SECONDS_TO_COME_BACK", 0.5)
         monkeypatch.setattr(ray, "nodes", lambda: [{"Alive": False}])
         ticket = actors[0].actors[0].__ray_call__.remote(lambda holder: time.sleep(5) or {})
@@ -220,7 +222,7 @@ def test_cpus_that_others_use_are_told_in_time(graph):
     busy = ray.remote(Agent).options(num_cpus=2)
     shares = split_graph(graph, pgo.partition(graph, 2))
     held = busy.remote(shares[0], None)
-    ray.get(held.obey.remote("save_poses", {}))
+    ray.get(held.snapshot.remote())
     try:
         with pytest.raises(
             EngineError, match=r"too few CPUs: 2 of 2 robots have not started in 0\.5 s, 0 CPUs are free"

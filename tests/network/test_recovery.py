@@ -1,4 +1,5 @@
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -8,9 +9,9 @@ import solvers
 from pgo_models.errors import EngineError, NotPositiveDefiniteError, SettingError
 from pgo_models.graphs.partitioning import PartitionMethod, partition
 from solvers.distributed.robots.agent import Agent
-from solvers.distributed.robots.subgraph import split_graph
-from solvers.network.messages import RESTORE, SNAPSHOT
+from solvers.network.messages import restore, take_snapshot
 from solvers.network.recovery import RecoveringPool, Recovery, RobotLostError
+from solvers.soc.subgraph import split_graph
 
 
 @dataclass(eq=False)
@@ -27,14 +28,15 @@ class Leaky:
     def start(self, robots):
         self.agents |= {robot: Agent(replace(self.shares[robot]), None) for robot in robots}
 
-    def send(self, robot, order, message):
-        return order, message
+    def send(self, robot, order, request):
+        return order, request
 
     def receive(self, robot, ticket):
         self.count += 1
         if self.count in self.losses and self.is_before:
             self.lose(robot)
-        answer = self.agents[robot].obey(*ticket)
+        order, request = ticket
+        answer = order(self.agents[robot], request)
         if self.count in self.losses:
             self.lose(robot)
         return answer
@@ -110,29 +112,39 @@ def test_a_run_that_goes_on_from_a_checkpoint_can_lose_robots(orders, tmp_path):
     assert found.lower_bound == expected.lower_bound
 
 
-def test_a_snapshot_and_a_restore_take_the_place_of_the_orders_before(monkeypatch):
-    obeyed = []
+class Obeyed:
+    """Orders that write down what they are and answer with the number of the robot."""
 
-    def obey(agent, order, message):
-        obeyed.append((order, message))
+    def __init__(self, monkeypatch):
+        self.log = []
+        monkeypatch.setattr(Agent, "snapshot", lambda agent: self.note("snapshot", agent, None))
+        monkeypatch.setattr(Agent, "restore", lambda agent, snapshot: self.note("restore", agent, snapshot) and None)
+
+    def note(self, name, agent, request):
+        self.log.append((name, request))
         return {"of": agent.subgraph.robot}
 
-    monkeypatch.setattr(Agent, "obey", obey)
+    def order(self, name):
+        return partial(self.note, name)
+
+
+def test_a_snapshot_and_a_restore_take_the_place_of_the_orders_before(monkeypatch):
+    obeyed = Obeyed(monkeypatch)
     graph = varied_graph(5, 24, 2)
     place = Leaky(split_graph(graph, partition(graph, 2)), set())
     place.start(range(2))
     pool = RecoveringPool(place, 2, Recovery())
-    pool.ask("one", [{}] * 2)
-    for order, messages, kept in (
-        (SNAPSHOT, [{}] * 2, {"of": 1}),
-        (RESTORE, [{"earlier": 0}, {"earlier": 1}], {"earlier": 1}),
+    pool.ask(obeyed.order("one"), [0] * 2)
+    for order, requests, kept in (
+        (take_snapshot, [None] * 2, {"of": 1}),
+        (restore, [{"earlier": 0}, {"earlier": 1}], {"earlier": 1}),
     ):
-        pool.ask(order, messages)
-        pool.ask("two", [{}] * 2)
-        obeyed.clear()
+        pool.ask(order, requests)
+        pool.ask(obeyed.order("two"), [0] * 2)
+        obeyed.log.clear()
         place.losses = {place.count + 2}  # robot 1, before it obeys
-        pool.ask("three", [{}] * 2)
-        assert obeyed == [("three", {}), (RESTORE, kept), ("two", {}), ("three", {})]
+        pool.ask(obeyed.order("three"), [0] * 2)
+        assert obeyed.log == [("three", 0), ("restore", kept), ("two", 0), ("three", 0)]
 
 
 def test_what_is_kept_for_a_robot_is_bounded():
@@ -143,26 +155,24 @@ def test_what_is_kept_for_a_robot_is_bounded():
 
 
 def test_a_snapshot_is_taken_after_so_many_orders(monkeypatch):
-    obeyed = []
-    monkeypatch.setattr(Agent, "obey", lambda agent, order, message: obeyed.append(order) or {})
+    obeyed = Obeyed(monkeypatch)
     place = Leaky(split_graph(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 1)), set())
     place.start([0])
     pool = RecoveringPool(place, 1, Recovery(orders_between_snapshots=3))
     for _ in range(7):
-        pool.ask("go", [{}])
+        pool.ask(obeyed.order("go"), [None])
         assert len(pool._log) < 3
-    assert obeyed == [*3 * ["go"], SNAPSHOT, *3 * ["go"], SNAPSHOT, "go"]
+    assert [name for name, _ in obeyed.log] == [*3 * ["go"], "snapshot", *3 * ["go"], "snapshot", "go"]
 
 
-def test_of_two_refusals_the_first_robots_is_told(monkeypatch):
-    def obey(agent, order, message):
+def test_of_two_refusals_the_first_robots_is_told():
+    def refuse(agent, request):
         raise NotPositiveDefiniteError(f"robot {agent.subgraph.robot}")
 
-    monkeypatch.setattr(Agent, "obey", obey)
     place = Leaky(split_graph(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 2)), set())
     place.start(range(2))
     with pytest.raises(NotPositiveDefiniteError, match="robot 0"):
-        RecoveringPool(place, 2, Recovery()).ask("go", [{}] * 2)
+        RecoveringPool(place, 2, Recovery()).ask(refuse, [None] * 2)
 
 
 def test_a_robot_that_is_lost_again_and_again_ends_the_run():
@@ -172,26 +182,28 @@ def test_a_robot_that_is_lost_again_and_again_ends_the_run():
         solvers.solve(graph, robots=3, engine=engine)
 
 
-def test_a_robots_own_error_is_told_after_all_have_obeyed_and_is_passed_over_in_the_replay(monkeypatch):
+def test_a_robots_own_error_is_told_after_all_have_obeyed_and_is_passed_over_in_the_replay():
     graph = varied_graph(5, 24, 2)
     shares = split_graph(graph, partition(graph, 3))
     obeyed = []
 
-    def obey(agent, order, message):
-        obeyed.append((agent.subgraph.robot, order))
-        if order == "refuse" and agent.subgraph.robot == 0:
+    def refuse(agent, request):
+        obeyed.append((agent.subgraph.robot, "refuse"))
+        if agent.subgraph.robot == 0:
             raise NotPositiveDefiniteError("no")
-        return {"robot": np.array([agent.subgraph.robot])}
 
-    monkeypatch.setattr(Agent, "obey", obey)
+    def evaluate(agent, request):
+        obeyed.append((agent.subgraph.robot, "evaluate"))
+        return agent.subgraph.robot
+
     place = Leaky(shares, losses={4})
     place.start(range(3))
     pool = RecoveringPool(place, 3, Recovery())
     with pytest.raises(NotPositiveDefiniteError, match="no"):
-        pool.ask("refuse", [{}] * 3)
+        pool.ask(refuse, [None] * 3)
     assert obeyed == [(0, "refuse"), (1, "refuse"), (2, "refuse")]
-    answers = pool.ask("evaluate", [{}] * 3)  # robot 0 is lost here
-    assert [int(answer["robot"][0]) for answer in answers] == [0, 1, 2]
+    answers = pool.ask(evaluate, [None] * 3)  # robot 0 is lost here
+    assert answers == [0, 1, 2]
     assert obeyed[3:5] == [(0, "refuse"), (0, "evaluate")]
     pool.close()
     assert place.agents == {}

@@ -9,10 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import stack_transposes
 from solvers.network.serialization import deserialize, serialize
 from solvers.result import Measurement, Record, Status
-from solvers.soc.rotation_block import block_at
-from solvers.soc.shared_anderson import AndersonShare
+from solvers.soc.anderson import AndersonShare
+from solvers.soc.recursion_block import StepSettings, block_at
 
 PLAIN = st.none() | st.booleans() | st.integers() | st.floats() | st.text()
 
@@ -31,10 +32,12 @@ def test_plain_values_come_back_the_same(values):
 @given(seed=SEEDS)
 def test_arrays_and_classes_come_back_bit_by_bit_and_apart_from_the_original(seed):
     poses = random_poses(3, 3, seed)
-    block = block_at(poses.R, np.ones(3), np.ones(9)).after_solve(np.ones((9, 3)), 1.0, 2)[0]
-    found = deserialize(serialize({"block": block, "poses": (poses, None)}), (Poses, AndersonShare, type(block)))
+    start = block_at(stack_transposes(poses.R), np.ones(9), np.ones(9), StepSettings(memory=2))
+    block, _ = start.after_solve(np.ones((9, 3)))
+    classes = (Poses, AndersonShare, StepSettings, type(block))
+    found = deserialize(serialize({"block": block, "poses": (poses, None)}), classes)
     assert found["block"].anderson.residual_differences == ()
-    for name in ("rho", "z", "s", "x", "best"):
+    for name in ("penalty", "z", "s", "x", "best"):
         np.testing.assert_array_equal(getattr(found["block"], name), getattr(block, name))
     np.testing.assert_array_equal(found["block"].anderson.image, block.anderson.image)
     np.testing.assert_array_equal(found["poses"][0].t, poses.t)

@@ -5,6 +5,7 @@ import math
 import cvxpy as cp
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, LOUD_NOISE, OPTIMUM, SEEDS, exact_graph, random_poses, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -40,7 +41,7 @@ def restarts(problem: PGOProblem, count: int, seed: int) -> float:
     return min(problem.objective(polish(problem, problem.with_best_translations(s.R))) for s in starts)
 
 
-@settings(max_examples=9)
+@settings(max_examples=examples(9))
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, form=FORMS)
 def test_three_roads_lead_to_one_optimum(seed: int, n: int, d: int, form: RelaxationForm) -> None:
     problem = varied_problem(seed, n, d)
@@ -58,7 +59,7 @@ def test_three_roads_lead_to_one_optimum(seed: int, n: int, d: int, form: Relaxa
         assert relaxed.value == pytest.approx(F, abs=allowed)
 
 
-@settings(max_examples=9)
+@settings(max_examples=examples(9))
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, form=FORMS)
 def test_the_duals_are_the_multipliers_with_their_sign(seed: int, n: int, d: int, form: RelaxationForm) -> None:
     problem = varied_problem(seed, n, d, LOUD_NOISE)
@@ -74,7 +75,7 @@ def test_the_duals_are_the_multipliers_with_their_sign(seed: int, n: int, d: int
             assert np.abs(Lambda + expected).max() > np.abs(Lambda - expected).max()
 
 
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS)
 def test_weak_duality_for_any_multipliers(seed: int, n: int, d: int) -> None:
     problem, rng = varied_problem(seed, n, d), np.random.default_rng(seed)
@@ -160,7 +161,7 @@ def test_the_rank_report() -> None:
     assert "rank 4 (d = 3)" in str(wide)
 
 
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS)
 def test_rounding_the_gram_matrix_of_rotations_gives_them_back(seed: int, n: int, d: int) -> None:
     problem, R = varied_problem(seed, n, d), random_poses(n, d, seed).R

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import (
     DIMENSIONS,
     LOUD_NOISE,
@@ -119,7 +120,7 @@ def test_where_the_relaxation_is_not_tight_its_optimum_is_that_of_the_semidefini
     assert "semidefinite relaxation" in str(relaxed)
 
 
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @given(seed=SEEDS, n=st.integers(2, 10), d=DIMENSIONS)
 def test_its_bound_holds_at_any_noise_and_start(seed: int, n: int, d: int) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE))
@@ -134,7 +135,7 @@ def test_its_bound_holds_at_any_noise_and_start(seed: int, n: int, d: int) -> No
         assert bound.lower_bound <= rounded_up(problem, best)
 
 
-@settings(max_examples=15)
+@settings(max_examples=examples(15))
 @example(seed=150, n=8, d=2)  # F of the start is a hundredth of its rounding level
 @given(seed=SEEDS, n=st.integers(2, 10), d=DIMENSIONS)
 def test_graphs_without_noise_end_at_zero(seed: int, n: int, d: int) -> None:

@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -8,7 +9,25 @@ from hypothesis import strategies as st
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
-from solvers.soc.anderson import Anderson, AndersonMemory, extrapolate, over_relax
+from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums, over_relax
+
+
+@dataclass(frozen=True, eq=False)
+class AndersonMemory:
+    """What one party that has all rows remembers."""
+
+    share: AndersonShare = field(default_factory=AndersonShare)
+    sums: AndersonSums = field(default_factory=AndersonSums)
+
+
+def extrapolate(
+    settings: Anderson, memory: AndersonMemory, residual: Array, image: Array
+) -> tuple[Array, AndersonMemory]:
+    sums, share = memory.share.observe(residual, image, settings.memory)
+    gamma, known = memory.sums.coefficients(settings, sums)
+    if gamma is None:
+        gamma, share = np.zeros(0), share.restarted()
+    return share.combine(gamma), AndersonMemory(share, known)
 
 
 def contraction(seed: int, side: int, rate: float = 0.95) -> tuple[Callable[[Array], Array], Array]:
@@ -65,8 +84,8 @@ def test_the_first_step_is_the_plain_one(seed: int, side: int) -> None:
     residual, image = np.random.default_rng(seed).standard_normal((2, side, 2))
     s, memory = extrapolate(Anderson(), AndersonMemory(), residual, image)
     np.testing.assert_array_equal(s, image)
-    assert memory.residual_differences == ()
-    assert memory.smallest == pytest.approx(np.linalg.norm(residual), rel=1e-14)
+    assert memory.share.residual_differences == ()
+    assert memory.sums.smallest == pytest.approx(np.linalg.norm(residual), rel=1e-14)
 
 
 @given(seed=SEEDS, side=st.integers(2, 10), size=st.integers(1, 6), steps=st.integers(2, 12))
@@ -76,18 +95,21 @@ def test_the_memory_holds_the_last_differences(seed: int, side: int, size: int, 
     memory = AndersonMemory()
     for residual, image in zip(residuals, images, strict=True):
         before = memory
-        kept = [part.copy() for part in (*before.residual_differences, *before.image_differences, before.gram)]
+        kept = [
+            part.copy()
+            for part in (*before.share.residual_differences, *before.share.image_differences, before.sums.gram)
+        ]
         _, memory = extrapolate(Anderson(memory=size, restart_ratio=1e9), memory, residual, image)
-        after = (*before.residual_differences, *before.image_differences, before.gram)
+        after = (*before.share.residual_differences, *before.share.image_differences, before.sums.gram)
         for one, other in zip(kept, after, strict=True):
             np.testing.assert_array_equal(one, other)
     count = min(size, steps - 1)
-    assert len(memory.residual_differences) == len(memory.image_differences) == count
+    assert len(memory.share.residual_differences) == len(memory.share.image_differences) == count
     for k in range(count):
-        np.testing.assert_array_equal(memory.residual_differences[-1 - k], residuals[-1 - k] - residuals[-2 - k])
-        np.testing.assert_array_equal(memory.image_differences[-1 - k], images[-1 - k] - images[-2 - k])
-    gram = [[np.vdot(a, b) for b in memory.residual_differences] for a in memory.residual_differences]
-    np.testing.assert_allclose(memory.gram, gram, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(memory.share.residual_differences[-1 - k], residuals[-1 - k] - residuals[-2 - k])
+        np.testing.assert_array_equal(memory.share.image_differences[-1 - k], images[-1 - k] - images[-2 - k])
+    gram = [[np.vdot(a, b) for b in memory.share.residual_differences] for a in memory.share.residual_differences]
+    np.testing.assert_allclose(memory.sums.gram, gram, rtol=0, atol=1e-12)
 
 
 @given(seed=SEEDS, side=st.integers(5, 20), steps=st.integers(2, 5))
@@ -97,8 +119,8 @@ def test_the_combination_is_the_least_squares_one(seed: int, side: int, steps: i
     memory = AndersonMemory()
     for residual, image in zip(residuals, images, strict=True):
         s, memory = extrapolate(Anderson(restart_ratio=1e9), memory, residual, image)
-    df = np.concatenate(memory.residual_differences, axis=1)
-    dg = np.concatenate(memory.image_differences, axis=1)
+    df = np.concatenate(memory.share.residual_differences, axis=1)
+    dg = np.concatenate(memory.share.image_differences, axis=1)
     gamma = np.linalg.lstsq(df, residuals[-1], rcond=None)[0]
     np.testing.assert_allclose(s, images[-1] - dg @ gamma, rtol=0, atol=1e-6 * (1 + np.abs(gamma).max()))
 
@@ -111,9 +133,9 @@ def test_a_residual_that_grows_empties_the_memory() -> None:
     memory = AndersonMemory()
     for size, image, length in zip((1.0, 0.5, 0.99, 1.01), images, (0, 1, 2, 0), strict=True):
         s, memory = extrapolate(settings, memory, size * direction, image)
-        assert len(memory.residual_differences) == length
+        assert len(memory.share.residual_differences) == length
     np.testing.assert_array_equal(s, images[-1])
-    assert memory.smallest == pytest.approx(1.01)
+    assert memory.sums.smallest == pytest.approx(1.01)
 
 
 def test_differences_that_vanish_do_no_harm() -> None:

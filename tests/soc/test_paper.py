@@ -4,6 +4,7 @@ from itertools import islice, pairwise
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, REFERENCE, SEEDS, exact_graph, random_poses, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -27,7 +28,8 @@ from solvers.riemannian.newton import gauss_newton
 from solvers.soc.paper import PaperSOC
 from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty, MultiplierPenalty
 from solvers.soc.r_step import RStep
-from solvers.soc.soc import SOC, Coupling
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC
 
 SIZES = st.integers(2, 12)
 PAPER_TABLES = REFERENCE["paper_tables"]
@@ -207,7 +209,7 @@ def test_rho_adapts_in_the_right_direction(rule: type, scale: float, direction: 
     assert np.sign(np.log(states[-1].rho / states[0].rho)) == direction
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_graphs_without_noise_end_at_zero(seed: int, n: int, d: int) -> None:
     problem = PGOProblem(exact_graph(seed, n, d))
@@ -216,7 +218,7 @@ def test_graphs_without_noise_end_at_zero(seed: int, n: int, d: int) -> None:
     assert result.objective <= 1e-12
 
 
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_where_it_converges_the_split_does_not_matter(seed: int, n: int, d: int) -> None:
     # It minimises the rotations' part of F alone. With frozen neighbours it need not converge in time.

@@ -8,16 +8,16 @@ import pytest
 from graphs import varied_problem
 from hypothesis import given
 from hypothesis import strategies as st
+from robots import driver_at
 
 from pgo_models.graphs.partitioning import partition
 from pgo_models.problem.initialization import chordal_start
 from solvers.distributed.consensus import ConsensusSOC
-from solvers.distributed.stages import open_driver
 from solvers.distributed.substructured import SubstructuredSOC
 from solvers.loop import iterate
-from solvers.network.engine import InProcess
 from solvers.soc.penalty import FixedPenalty, MultiplierPenalty, has_diverged, has_stalled, is_going_round
-from solvers.soc.soc import SOC, Coupling
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC
 
 MERITS = st.lists(st.floats(1e-12, 1e12), max_size=40).map(tuple)
 UNITS = st.integers(-20, 20).map(lambda exponent: 2.0**exponent)
@@ -88,8 +88,7 @@ def test_the_twentieth_raise_is_the_last_whoever_runs_it(coupling: Coupling) -> 
         method, problem = SOC(), given
     else:
         robots = partition(given.graph, 2)
-        problem = open_driver(given, robots, InProcess())
-        problem.set_poses(chordal_start(given))
+        problem = driver_at(given, robots, chordal_start(given))
         soc = SOC(coupling=coupling, robots=robots)
         method = ConsensusSOC(soc) if coupling is Coupling.CONSENSUS else SubstructuredSOC(soc)
     *_, state = islice(iterate(method, problem), 4)

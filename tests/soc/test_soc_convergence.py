@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import (
     DIMENSIONS,
     LOUD_NOISE,
@@ -26,9 +27,12 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.loop import iterate, run
 from solvers.result import Record, Status
 from solvers.soc.anderson import Anderson
+from solvers.soc.consensus import ConsensusIterate
 from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule
 from solvers.soc.r_step import RStep
-from solvers.soc.soc import SOC, Coupling
+from solvers.soc.recursion_block import RecursionBlock
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC, SOCState
 
 SIZES = st.integers(3, 12)
 METHODS = st.sampled_from([PartitionMethod.CONTIGUOUS, PartitionMethod.METIS, PartitionMethod.SINGLETONS])
@@ -70,7 +74,7 @@ def robots_of(problem: PGOProblem, seed: int, method: PartitionMethod) -> Partit
 # Fixed points.
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, noise=st.sampled_from([MILD_NOISE, LOUD_NOISE]))
 def test_the_fixed_point_does_not_depend_on_the_split(seed: int, n: int, d: int, noise: NoiseModel) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, noise))
@@ -78,7 +82,7 @@ def test_the_fixed_point_does_not_depend_on_the_split(seed: int, n: int, d: int,
     assert_same_end(problem, [SOC(robots=robots, **TIGHT) for robots in splits])
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_the_fixed_point_does_not_depend_on_the_acceleration(seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)
@@ -119,7 +123,7 @@ def test_one_robot_is_joint_state_by_state(seed: int, n: int, d: int, accelerate
             assert (one.primal_residual, one.dual_residual) == (other.primal_residual, other.dual_residual)
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, noise=st.sampled_from([MILD_NOISE, LOUD_NOISE]))
 def test_it_ends_where_newton_does(seed: int, n: int, d: int, noise: NoiseModel) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, noise))
@@ -252,6 +256,10 @@ def test_a_penalty_far_too_large_is_not_taken_for_convergence(
     assert result.objective > (1 + GAP) * OPTIMUM["smallGrid3D"]
 
 
+def blocks_of(state: SOCState | ConsensusIterate) -> list[RecursionBlock]:
+    return [state.block] if isinstance(state, SOCState) else [robot.block for robot in state.robots]
+
+
 def test_rescaling_keeps_the_unscaled_multiplier(benchmark_problem: Callable[[str], PGOProblem]) -> None:
     problem = benchmark_problem("tinyGrid3D")
     robots = partition(problem.graph, 3)
@@ -263,12 +271,13 @@ def test_rescaling_keeps_the_unscaled_multiplier(benchmark_problem: Callable[[st
             if before.rho[0] != after.rho[0]:
                 changes += 1
                 # The step that follows a change starts from B rescaled: s - x is that B, when it is not accelerated.
-                lam = before.copies.penalty[:, None] * before.B
-                np.testing.assert_allclose(after.copies.penalty[:, None] * (after.s - after.x), lam, rtol=0, atol=1e-9)
+                for one, other in zip(blocks_of(before), blocks_of(after), strict=True):
+                    lam, following = one.penalty[:, None] * one.B, other.penalty[:, None] * (other.s - other.x)
+                    np.testing.assert_allclose(following, lam, rtol=0, atol=1e-9)
     assert changes > 0
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(
     seed=SEEDS,
     n=SIZES,
@@ -295,7 +304,7 @@ def test_it_never_diverges(seed: int, n: int, d: int, rotation_std: float, metho
             assert result.objective <= at_start * (1 + SOC.tolerance) + SOC.tolerance
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, rotation_std=st.sampled_from([0.3, 1.0, 2.0]))
 def test_the_plain_recursion_never_ends_above_its_start(seed: int, n: int, d: int, rotation_std: float) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, NoiseModel(0.1, rotation_std)))
@@ -304,7 +313,7 @@ def test_the_plain_recursion_never_ends_above_its_start(seed: int, n: int, d: in
     assert result.objective <= problem.objective(start) * (1 + SOC.tolerance) + SOC.tolerance
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, rotation_std=st.sampled_from([0.05, 1.0, 2.0]))
 def test_what_converges_is_stationary(seed: int, n: int, d: int, rotation_std: float) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, NoiseModel(0.1, rotation_std)))

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from budget import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -80,7 +81,7 @@ def test_the_curve_of_a_trial_ends_where_the_trial_does(contender, problem, boun
 
 
 @given(st.sampled_from(sorted(SCENES)), st.integers(0, 99), st.integers(2, 40))
-@settings(max_examples=6)
+@settings(max_examples=examples(6))
 def test_the_papers_method_keeps_to_its_rounds(scene, seed, rounds):
     problem = pgo.PGOProblem(SCENES[scene](np.random.default_rng(seed)))
     trial = run_benchmark(BenchmarkMethod.PAPER, problem, BenchmarkSettings(max_rounds=rounds), problem.graph.initial)

@@ -2,98 +2,128 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
 import numpy as np
 
 from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
-from solvers.distributed.robots.consensus_robot import ConsensusRobot
-from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots.factors import Eliminated, Factors
+from solvers.distributed.robots.interior import Interior, InteriorState, interior_of
 from solvers.distributed.robots.proof import RobotProof
-from solvers.distributed.robots.subgraph import Subgraph
-from solvers.network.messages import RESTORE, SNAPSHOT, Message
+from solvers.network.messages import Snapshot
 from solvers.network.serialization import deserialize, serialize
-from solvers.soc.rotation_block import RotationBlock
-from solvers.soc.shared_anderson import AndersonShare, AndersonSums
+from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
+from solvers.soc.consensus_robot import ConsensusRobot
+from solvers.soc.copies import CopiesState, CopyLayout, Rows, TurnSettings, Waiting
+from solvers.soc.recursion_block import RecursionBlock, StepSettings
+from solvers.soc.subgraph import Subgraph
 
-COPIES = "copies."  # prefix of the orders that concern copies; the others concern the interior
-_CLASSES = (AndersonShare, AndersonSums, Poses, RobotProof, RotationBlock)
+Q = TypeVar("Q")
+A = TypeVar("A")
+
+
+@dataclass(frozen=True, eq=False)
+class AgentRecord:
+    """All that orders left with an agent: what a checkpoint holds of it."""
+
+    interior: InteriorState | None
+    copies: CopiesState | None
+
+
+@dataclass(frozen=True, eq=False)
+class CoverRotations:
+    """Omega of own poses that the driver solves for, and where they are among its poses."""
+
+    in_cover: IntArray
+    R: np.ndarray
+
+
+CLASSES = (
+    *(AgentRecord, InteriorState, CopiesState, Poses, RecursionBlock, StepSettings, Anderson, AndersonShare),
+    *(AndersonSums, RobotProof, Eliminated, Waiting, TurnSettings),
+)
 
 
 class Agent:
-    """A robot that obeys every order of the driver.
+    """A robot that obeys orders: each replaces what it has by what the order makes of it.
 
     Attributes
     ----------
     subgraph : Subgraph
     interior : Interior, optional
-        None when the robot counts no edge: orders about the interior then have an empty answer.
+        None when the robot counts no edge.
     copies : ConsensusRobot, optional
         None before CONSENSUS begins.
     """
 
     def __init__(self, subgraph: Subgraph, backend: CholeskyBackend | None) -> None:
         self.subgraph, self.backend = subgraph, backend
-        self.interior = Interior(subgraph, backend) if subgraph.part is not None else None
+        self.interior = interior_of(subgraph, backend)
         self.copies: ConsensusRobot | None = None
 
-    def obey(self, order: str, message: Message) -> Message:
-        """Answer to an order."""
-        if order == f"{COPIES}begin":
-            return self._begin(message)
-        if order == f"{COPIES}finish":
-            return self._finish()
-        if order == SNAPSHOT:
-            return self.snapshot()
-        if order == RESTORE:
-            return self.restore(message)
-        target: Interior | ConsensusRobot | None = self.interior
-        if order.startswith(COPIES):
-            target = self.copies
-            order = order.removeprefix(COPIES)
-        if target is None:
-            return {}
-        method = getattr(target, order)
-        answer: Message = method(message) if message else method()
-        return answer
-
-    def snapshot(self) -> Message:
+    def snapshot(self) -> Snapshot:
         """All that earlier orders left here, as arrays; matrices instead of their factors."""
-        interior = self.interior.remembered() if self.interior is not None else None
-        copies = self.copies.remembered() if self.copies is not None else None
-        return serialize({"interior": interior, "copies": copies})
+        interior = self.interior.state if self.interior is not None else None
+        return serialize(AgentRecord(interior, self.copies.state if self.copies is not None else None))
 
-    def restore(self, message: Message) -> Message:
+    def restore(self, snapshot: Snapshot) -> None:
         """Go on from a snapshot of this robot."""
-        remembered = deserialize(message, _CLASSES)
-        if self.interior is not None:
-            self.interior.remember(remembered["interior"])
-        self.copies = None
-        if remembered["copies"] is not None:
-            self.copies = ConsensusRobot(self.subgraph, self.backend)
-            self.copies.remember(remembered["copies"])
-        return {}
+        record: AgentRecord = deserialize(snapshot, CLASSES)
+        if self.interior is not None and record.interior is not None:
+            factors = Factors(self.interior.part, self.backend)
+            self.interior = replace(self.interior, factors=factors, state=record.interior)
+        self.copies = self._no_copies.restored(record.copies) if record.copies is not None else None
 
-    def _begin(self, message: Message) -> Message:
-        """Give the poses at hand to the copies: interior ones, and those of the cover, which the driver sends."""
-        subgraph, d = self.subgraph, self.subgraph.graph.d
-        n = len(subgraph.poses)
-        R, t = np.broadcast_to(np.eye(d), (n, d, d)).copy(), np.zeros((n, d))
-        in_cover = subgraph.in_cover >= 0
-        R[in_cover], t[in_cover] = message["R"], message["t"]
-        if self.interior is not None:
-            part = self.interior.part
-            place = np.searchsorted(subgraph.poses, part.poses[part.interior])
-            R[place], t[place] = self.interior.poses.R[part.interior], self.interior.poses.t[part.interior]
-        if self.copies is None:
-            self.copies = ConsensusRobot(subgraph, self.backend)
-        return self.copies.begin(Poses(R, t))
+    @property
+    def _no_copies(self) -> ConsensusRobot:
+        nowhere = CopiesState(np.zeros((0, self.subgraph.graph.d)))
+        return ConsensusRobot(CopyLayout(self.subgraph, self.backend), nowhere)
 
-    def _finish(self) -> Message:
-        """Take omega for the interior; the own rotations of the cover."""
-        assert self.copies is not None
-        subgraph, omega = self.subgraph, self.copies.omega
-        if self.interior is not None:
-            place = np.searchsorted(subgraph.poses, self.interior.part.poses)
-            self.interior.poses = Poses(omega[place], self.interior.poses.t)
-        own = np.flatnonzero(subgraph.is_own & (subgraph.in_cover >= 0))
-        return {"cover": subgraph.in_cover[own], "R": omega[own]}
+
+# Orders: with the first argument given, functions of an agent and a request.
+
+
+def order_interior(order: Callable[[Interior, Q], tuple[Interior, A]], agent: Agent, request: Q) -> A | None:
+    """Give the interior an order; None where a robot counts no edge."""
+    if agent.interior is None:
+        return None
+    agent.interior, answer = order(agent.interior, request)
+    return answer
+
+
+def order_copies(order: Callable[[ConsensusRobot, Q], tuple[ConsensusRobot, A]], agent: Agent, request: Q) -> A:
+    """Give the copies an order."""
+    assert agent.copies is not None
+    agent.copies, answer = order(agent.copies, request)
+    return answer
+
+
+def begin_copies(agent: Agent, cover: Poses) -> Rows:
+    """Give the poses at hand to the copies: interior ones, and those of the cover, which the driver sends."""
+    subgraph, d = agent.subgraph, agent.subgraph.graph.d
+    n, in_cover = len(subgraph.poses), subgraph.in_cover >= 0
+    R, t = np.broadcast_to(np.eye(d), (n, d, d)).copy(), np.zeros((n, d))
+    R[in_cover], t[in_cover] = cover.R, cover.t
+    if agent.interior is not None:
+        part, poses = agent.interior.part, agent.interior.state.poses
+        place = np.searchsorted(subgraph.poses, part.poses[part.interior])
+        R[place], t[place] = poses.R[part.interior], poses.t[part.interior]
+    if agent.copies is None:
+        agent.copies = agent._no_copies
+    return order_copies(ConsensusRobot.begin, agent, Poses(R, t))
+
+
+def finish_copies(agent: Agent, _: None) -> CoverRotations:
+    """Take omega for the interior; the own rotations of the cover."""
+    assert agent.copies is not None
+    subgraph, omega = agent.subgraph, agent.copies.omega
+    if agent.interior is not None:
+        interior, state = agent.interior, agent.interior.state
+        place = np.searchsorted(subgraph.poses, interior.part.poses)
+        agent.interior = replace(interior, state=replace(state, poses=Poses(omega[place], state.poses.t)))
+    own = np.flatnonzero(subgraph.is_own & (subgraph.in_cover >= 0))
+    return CoverRotations(subgraph.in_cover[own], omega[own])

@@ -23,21 +23,6 @@ from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, column_err
 from pgo_models.problem.matrices import inner
 
 
-def columns_of(poses: IntArray, num_poses: int, widths: tuple[int, ...]) -> IntArray:
-    """Unknowns of some poses when those of all poses are stacked field by field, `widths[f]` numbers a pose.
-
-    Examples
-    --------
-    >>> columns_of(np.array([1]), 3, (1, 2))
-    array([1, 5, 6])
-    """
-    found, first = [], 0
-    for width in widths:
-        found.append((first + width * poses[:, None] + np.arange(width)).ravel())
-        first += width * num_poses
-    return np.concatenate(found)
-
-
 @dataclass(frozen=True, eq=False)
 class Cut:
     """Where a robot's unknowns are cut: columns of its interior and of its boundary, and the interior's analysis."""

@@ -18,9 +18,34 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.floating_point import OUTWARD
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.robots.elimination import Cut, Elimination, eliminate
-from solvers.distributed.robots.subgraph import Part
+from solvers.soc.subgraph import Part
 
 _ATTEMPTS = 3  # the error of a factor is known when it is there, and hardly changes with the shift
+
+
+@dataclass(frozen=True, eq=False)
+class ProofSums:
+    """Parts of the bound at one X.
+
+    Attributes
+    ----------
+    value, value_error : float
+        Of `evaluate_certificate`.
+    left, quadratic : float
+        Of the interior alone: sums of |G|^2 and (|G| + its error)^2 over slack, G the rows of S X.
+    squared_distances : float
+        Which an eta costs.
+    product, error : ((d+1) g, d)
+        Rows of S X on the boundary, and their errors.
+    """
+
+    value: float
+    value_error: float
+    left: float
+    quadratic: float
+    squared_distances: float
+    product: Array
+    error: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,21 +80,15 @@ class RobotProof:
         X[p:] -= step[p:]
         return replace(self, X=X, low=self.low - step[:p])
 
-    def evaluated(self, problem: PGOProblem, boundary: IntArray) -> tuple[dict[str, Array], Array]:
-        """Parts of the bound at X, and S X.
-
-        `figures` are the value of `evaluate_certificate` with its error and, of the interior alone, sums of |G|^2 and
-        (|G| + its error)^2 over slack, G the rows of S X, and the squared distances that an eta costs. `product` and
-        `error` are the rows of S X on the boundary.
-        """
+    def evaluated(self, problem: PGOProblem, boundary: IntArray) -> tuple[ProofSums, Array]:
+        """Parts of the bound at X, and S X."""
         found = evaluate_certificate(problem, self.Lambda, self.X, self.low)
         G, error = found.product[self.interior], found.product_error[self.interior]
         left, quadratic = quadratic_loss(G, 0.0, self.slack), quadratic_loss(G, error, self.slack)
         rotations = self.interior[self.interior >= len(self.low)]
         apart = squared_distances(self.X[rotations], self.start[rotations])
-        figures = np.array([found.value, found.value_error, left, quadratic, apart])
-        sums = {"figures": figures, "product": found.product[boundary], "error": found.product_error[boundary]}
-        return sums, found.product
+        sums = found.value, found.value_error, left, quadratic, apart
+        return ProofSums(*sums, found.product[boundary], found.product_error[boundary]), found.product
 
 
 def begin_proof(part: Part, poses: Poses, Lambda: Array, slack: Array, cut: Cut, point: Array) -> RobotProof:

@@ -1,78 +1,49 @@
 """What crosses between robots that hold copies: rows of poses that both hold, and sums; and what is counted of it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from robots import PARTITIONERS, Partitioner, Recording, contiguous, metis, scattered
+from robots import PARTITIONERS, Partitioner, Recording, arrays_in, contiguous, metis, name_of, scattered
 
 from pgo_models.geometry.rotations import Array, exp_map, tangent_dimension
 from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, grid
-from solvers.distributed.robots.agent import COPIES
-from solvers.distributed.robots.subgraph import middle_separator
+from solvers.distributed.robots.agent import begin_copies
+from solvers.distributed.robots.interior import Interior
 from solvers.network.ledger import DRIVER
-from solvers.network.messages import Message
 from solvers.pipeline import Pipeline, solve
 from solvers.soc.anderson import Anderson
+from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.penalty import MultiplierPenalty
-from solvers.soc.soc import SOC, Coupling
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC
+from solvers.soc.subgraph import middle_separator
 from solvers.solution import Solution
 
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
 STALLED = MultiplierPenalty(stall_window=3, stall_ratio=1e-6)  # anything counts as stalled after three steps
 
 STAR = {  # to and from whoever sums up: settings, figures of all poses in no order, and sums
-    *("passes", "alpha", "memory", "alone", "rule", "is_stationary", "translation_penalty", "separator_penalty"),
-    *(
-        "norms",
-        "travel",
-        "scale",
-        "stiffness",
-        "size",
-        "ratio",
-        "objective",
-        "level",
-        "figures",
-        "share",
-        "sums",
-        "gamma",
-        "is_best",
-        "restart",
-        "factor",
-        "is_back",
-    ),
+    *("per_norm", "per_scale", "least", "is_stationary", "alpha", "memory", "local_passes", "per_robot"),
+    *("regularization", "restart_ratio", "norms", "scale", "translation", "rotation", "factor", "size", "ratio"),
+    *("gamma", "is_best", "value"),
 }
+Copies, Inner = ConsensusRobot, Interior
 ROUNDS = (  # orders that are, or end, a round
-    *(
-        "project",
-        "set_translations",
-        "move",
-        "evaluate_trial",
-        "certificate",
-        "move_certificate",
-        "adopt",
-        "copies.begin",
-        "copies.penalize",
-    ),
-    *("copies.extrapolate", "copies.back_at_best"),
+    *(Inner.project, Inner.set_translations, Inner.move, Inner.evaluate_trial, Inner.certificate),
+    *(Inner.move_certificate, Inner.adopt, begin_copies, Copies.penalize, Copies.extrapolate, Copies.back_at_best),
 )
-ENDS, POSES = ("copies.begin", "copies.finish"), ("R", "t", "cover", "schur", "b")  # with the driver, at the cover
-ALL_REDUCES = (
-    "copies.travel",
-    "copies.multiplier_norms",
-    "copies.stiffness",
-    "copies.start",
-    "copies.solve",
-    "copies.agree",
-)
-OFF = ("describe", "set_poses", "cost", "copies.cost", "result")
+ENDS, POSES = ("begin_copies", "finish_copies"), ("R", "t", "in_cover")  # with the driver, at the cover
+ALL_REDUCES = (*(Copies.travel, Copies.multiplier_norms, Copies.stiffness, Copies.start, Copies.solve, Copies.agree),)
+OFF = ("Interior.describe", "Interior.set_poses", "Interior.cost", "ConsensusRobot.cost", "Interior.result")
 
 
 class Watching(Recording):
@@ -85,10 +56,10 @@ class Watching(Recording):
         super().__init__()
         self.graph = graph
 
-    def ask(self, order: str, messages: Sequence[Message]) -> list[Message]:
-        answers = super().ask(order, messages)
+    def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
+        answers = super().ask(order, requests)
         grounded = middle_separator(self.graph, tuple(self.shares))
-        if order == "describe":
+        if name_of(order) == "Interior.describe":
             self.secrets: list[list[Array]] = [[] for _ in self.agents]
         for agent in self.agents:
             holder, share = agent.copies, agent.subgraph
@@ -96,7 +67,9 @@ class Watching(Recording):
                 for other, secrets in zip(self.shares, self.secrets, strict=True):
                     hidden = ~np.isin(share.poses, other.poses) & (share.in_cover != grounded)
                     rows = np.concatenate([hidden, np.repeat(hidden, share.graph.d)])
-                    secrets += [values[rows].ravel() for values in (holder.X, holder.z, holder.s)]
+                    block = holder.state.block
+                    known = (holder.state.X, *((block.z, block.s) if block is not None else ()))
+                    secrets += [values[rows].ravel() for values in known]
         return answers
 
 
@@ -118,7 +91,7 @@ def solved_graph(
     return solve(graph, pipeline, robots=parts, engine=engine), engine
 
 
-@settings(max_examples=12)
+@settings(max_examples=examples(12))
 @given(seed=SEEDS, n=st.integers(3, 16), d=DIMENSIONS, noise=NOISES, partitioner=PARTITIONERS)
 def test_the_ledger_counts_what_was_sent(
     seed: int, n: int, d: int, noise: NoiseModel, partitioner: Partitioner
@@ -132,8 +105,9 @@ def test_the_ledger_counts_what_was_sent(
         if order in OFF:
             continue
         for robot in range(number):
-            received[:, robot] += sum(8 * np.size(value) for value in down[robot].values())
-            for name, value in up[robot].items():
+            for _, value in arrays_in(down[robot]):
+                received[:, robot] += 8 * np.size(value)
+            for name, value in arrays_in(up[robot]):
                 sent[:, robot] += 8 * np.size(value)
                 if ">" in name:
                     link = robot, int(name.partition(">")[2])
@@ -153,10 +127,10 @@ def test_rounds_of_a_whole_solve_are_as_documented() -> None:
     solution = solve(graph, Pipeline(soc=soc), robots=parts, engine=engine)
     _, stage, _ = solution.stages
     assert solution.ledger is not None
-    assert engine.times("copies.begin", "copies.back_at_best") == 1  # no refresh, no raise
+    assert engine.times(begin_copies, Copies.back_at_best) == 1  # no refresh, no raise
     assert [record.measurement.rounds for record in stage.history.records] == [4 + k for k in range(len(stage.history))]
     # 2 to start, 2 for poses and penalties, 1 a step, 2 for the result of SOC, 2 a move of Newton, 2 for the proof.
-    assert solution.ledger.rounds == 2 + (2 + stage.iterations + 2) + 2 * engine.times("move") + 2
+    assert solution.ledger.rounds == 2 + (2 + stage.iterations + 2) + 2 * engine.times(Interior.move) + 2
     assert solution.ledger.all_reduces == 3 + 2 * stage.iterations
 
 
@@ -174,28 +148,25 @@ def test_neighbours_send_rows_of_common_poses_and_sums_go_to_all(
     for share in engine.shares:
         common = dict(share.common)
         for order, down, up in engine.log:
-            if not order.startswith(COPIES):
+            if not order.startswith("ConsensusRobot.") and order not in ENDS:
                 continue
-            for message, mark in ((down[share.robot], "<"), (up[share.robot], ">")):
-                for name, value in message.items():
-                    kind, between, other = name.partition(mark)
+            for message, is_sent in ((down[share.robot], False), (up[share.robot], True)):
+                for name, value in arrays_in(message):
+                    kind, between, other = name.partition(">")
                     if not between:
-                        assert name in (STAR if order not in ENDS else {*STAR, *POSES}), (order, name)
-                        if name in ("sums", "gamma"):
-                            assert np.size(value) <= (11 if not per_robot else 2)
+                        assert name in (STAR if order not in ENDS else POSES), (order, name)
+                        if name in ("value", "gamma"):
+                            assert np.size(value) <= (3 + d if order.endswith("travel") else 2 if per_robot else 11)
                         continue
                     poses = common[int(other)]
-                    owner = share.robot if mark == ">" else int(other)
+                    owner = share.robot if is_sent else int(other)
                     known = int((share.owner[poses] == owner).sum())
-                    allowed = {
-                        "rows": {((d + 1) * len(poses), d)},
-                        "force": {((d + 1) * len(poses), d)},
-                        "known": {((d + 1) * known, d), (known, 1 + (d + 1) + d * d)},
-                    }
+                    rows = {((d + 1) * len(poses), d), ((d + 1) * known, d)}
+                    allowed = {"force": rows, "rows": rows, "value": rows, "of_own": {(known, 1 + (d + 1) + d * d)}}
                     assert np.shape(value) in allowed[kind], (order, name)
                     seen.add(kind)
-    assert seen == {"rows", "force", "known"}
-    assert engine.times("copies.begin") == 2
+    assert seen == {"value", "force", "of_own"}
+    assert engine.times(begin_copies) == 2
 
 
 def measured_twice(graph: PoseGraph, rng: np.random.Generator) -> PoseGraph:
@@ -208,7 +179,7 @@ def measured_twice(graph: PoseGraph, rng: np.random.Generator) -> PoseGraph:
 
 
 @example(seed=6431187, n=6, d=2, noise=MILD_NOISE, partitioner=contiguous)
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=st.integers(6, 16), d=DIMENSIONS, noise=NOISES, partitioner=PARTITIONERS)
 def test_no_robot_is_sent_a_pose_that_it_does_not_hold_or_an_edge_between_such_poses(
     seed: int, n: int, d: int, noise: NoiseModel, partitioner: Partitioner
@@ -220,5 +191,5 @@ def test_no_robot_is_sent_a_pose_that_it_does_not_hold_or_an_edge_between_such_p
         edges = [graph.R_ij[theirs], graph.t_ij[theirs], graph.kappa[theirs], graph.tau[theirs]]
         secret = np.concatenate([*secrets, *(np.ravel(values) for values in edges)])
         secret = secret[~np.isin(np.abs(secret), [0.0, 1.0])]  # which anything may be
-        told = [np.ravel(value) for _, down, _ in engine.log for value in down[share.robot].values()]
+        told = [np.ravel(value) for _, down, _ in engine.log for _, value in arrays_in(down[share.robot])]
         assert not np.isin(secret, np.concatenate([np.zeros(0), *told])).any()

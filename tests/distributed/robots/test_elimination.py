@@ -3,6 +3,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, EPS, LOUD_NOISE, SEEDS, random_poses, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,11 +17,12 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import riemannian_hessian
+from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.interface import Interface, InterfaceFactor, by_separator
 from solvers.distributed.multifrontal import separator_tree
-from solvers.distributed.robots.elimination import Cut, Elimination, columns_of, eliminate, packed, unpacked
-from solvers.distributed.robots.subgraph import Part, split_graph
+from solvers.distributed.robots.elimination import Cut, Elimination, eliminate, packed, unpacked
+from solvers.soc.subgraph import Part, split_graph
 
 SIZES = st.integers(2, 30)
 KINDS = st.sampled_from(["translations", "poses", "tangent"])
@@ -96,7 +98,7 @@ def side_of(problem: PGOProblem, kind: str) -> int:
     return sum(widths_of(kind, problem.d)) * problem.num_poses
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS, kind=KINDS, backend=BACKENDS)
 def test_elimination_and_back_substitution_solve_the_whole_system(
     seed: int, n: int, d: int, partitioner: Partitioner, kind: str, backend: CholeskyBackend
@@ -127,7 +129,7 @@ def test_elimination_and_back_substitution_solve_the_whole_system(
     assert energy == pytest.approx(np.vdot(b, x), rel=1e-9)
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS, kind=KINDS, backend=BACKENDS)
 def test_robots_hold_the_matrix_between_them(
     seed: int, n: int, d: int, partitioner: Partitioner, kind: str, backend: CholeskyBackend
@@ -151,7 +153,7 @@ def test_robots_hold_the_matrix_between_them(
         np.testing.assert_array_equal(robot.diagonal, K.diagonal()[g])
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS, kind=KINDS, backend=BACKENDS)
 def test_the_whole_is_positive_definite_where_all_parts_of_it_are(
     seed: int, n: int, d: int, partitioner: Partitioner, kind: str, backend: CholeskyBackend

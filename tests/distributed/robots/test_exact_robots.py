@@ -1,50 +1,38 @@
 """Bounds by a driver and robots, as they were proved, held against F in exact arithmetic."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from budget import examples
 from exact_arithmetic import ExactGraph, exact, is_positive_definite, less_diagonal, without
 from graphs import DIMENSIONS, SEEDS, random_poses, turned_away, varied_graph, wound_ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from roads import Shape, road
-from robots import BACKENDS, PARTITIONERS, Partitioner, contiguous, metis
+from robots import BACKENDS, PARTITIONERS, Partitioner, contiguous, driver_at, metis
 
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import pose_rows, prove_bound
 from pgo_models.certificates.newton_polish import polish
 from pgo_models.certificates.rounding_errors import evaluate_multipliers
 from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.floating_point import gamma
 from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed import lower_bound as distributed_bound
-from solvers.distributed.driver import Driver
 from solvers.distributed.interface import Interface
 from solvers.distributed.lower_bound import InterfaceProof, best_bound_distributed, prove_grounded, prove_with_eta
-from solvers.distributed.robots.elimination import columns_of
-from solvers.distributed.stages import collect, open_driver
-from solvers.network.engine import InProcess
+from solvers.distributed.robots.proof import ProofSums
+from solvers.distributed.robots.records import ProofStep, RightHandSide
+from solvers.distributed.stages import collect
 
 
-@contextmanager
-def team_at(problem: PGOProblem, parts: Partition, poses: Poses) -> Iterator[Driver]:
-    """Driver and robots at poses."""
-    driver = open_driver(problem, parts, InProcess())
-    try:
-        driver.set_poses(poses)
-        yield driver
-    finally:
-        driver.close()
-
-
-@settings(max_examples=12)
+@settings(max_examples=examples(12))
 @given(seed=SEEDS, n=st.integers(4, 14), d=DIMENSIONS, cut=PARTITIONERS, backend=BACKENDS, noise=st.floats(0.01, 2.0))
 def test_no_bound_of_robots_is_above_F(
     seed: int, n: int, d: int, cut: Partitioner, backend: CholeskyBackend, noise: float
@@ -55,7 +43,7 @@ def test_no_bound_of_robots_is_above_F(
     best = min((polish(problem, start) for start in starts), key=problem.objective)
     F = graph.objective_of(best)
     for poses in (best, starts[0], polish(problem, starts[1])):
-        with team_at(problem, cut(problem.graph, seed), poses) as driver:
+        with closing(driver_at(problem, cut(problem.graph, seed), poses)) as driver:
             assert best_bound_distributed(driver, 1e-6).value <= F
             for eta in (1e-3, 1.0):
                 bound = prove_with_eta(driver, eta)
@@ -63,7 +51,7 @@ def test_no_bound_of_robots_is_above_F(
 
 
 @pytest.mark.parametrize("cut", [contiguous, metis])
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=st.integers(30, 150), spacing=st.floats(1.0, 100.0), d=DIMENSIONS, shape=st.sampled_from(Shape))
 def test_no_bound_of_robots_is_above_F_on_long_roads(
     cut: Partitioner, seed: int, n: int, spacing: float, d: int, shape: Shape
@@ -71,7 +59,7 @@ def test_no_bound_of_robots_is_above_F_on_long_roads(
     problem = PGOProblem(road(seed, n, spacing, d, shape, loops=5))
     poses = polish(problem, chordal_start(problem))
     F = ExactGraph.of_doubles(problem.graph).objective_of(poses)
-    with team_at(problem, cut(problem.graph, 3), poses) as driver:
+    with closing(driver_at(problem, cut(problem.graph, 3), poses)) as driver:
         bound = best_bound_distributed(driver, 1e-6)
     assert (1.0 - 1e-6) * F <= bound.value <= F
 
@@ -85,7 +73,7 @@ def test_the_bound_of_robots_holds_wherever_it_is_grounded(d: int, monkeypatch: 
     F = ExactGraph.of_doubles(problem.graph).objective_of(best)
     for size in (1e-3, 1e-5, 1e-7):
         away = turned_away(problem, best, size, 0)
-        with team_at(problem, contiguous(problem.graph, 2), away) as driver:
+        with closing(driver_at(problem, contiguous(problem.graph, 2), away)) as driver:
             bound = prove_grounded(driver, 1e-9)
         assert bound is not None
         assert bound.value <= F < ExactGraph.of_doubles(problem.graph).objective_of(away)
@@ -96,13 +84,13 @@ def test_what_eta_adds_is_taken_off_by_robots(d: int) -> None:
     problem, start = wound_ring(12, d)
     local, best = polish(problem, start), polish(problem, chordal_start(problem))
     F = ExactGraph.of_doubles(problem.graph).objective_of(best)
-    with team_at(problem, contiguous(problem.graph, 2), local) as driver:
+    with closing(driver_at(problem, contiguous(problem.graph, 2), local)) as driver:
         found = [prove_with_eta(driver, float(eta)) for eta in 2.0 ** np.arange(-20, 10)]
     assert any(bound is not None for bound in found)
     assert all(bound is None or bound.value <= F for bound in found)
 
 
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=st.integers(4, 10), d=DIMENSIONS, cut=PARTITIONERS, backend=BACKENDS)
 def test_what_a_driver_says_to_be_definite_is(
     seed: int, n: int, d: int, cut: Partitioner, backend: CholeskyBackend
@@ -110,12 +98,11 @@ def test_what_a_driver_says_to_be_definite_is(
     """S_r, less what the driver has left over on the separators, is positive definite."""
     problem = PGOProblem(varied_graph(seed, n, d), backend)
     poses = polish(problem, chordal_start(problem))
-    with team_at(problem, cut(problem.graph, seed), poses) as driver:
+    with closing(driver_at(problem, cut(problem.graph, seed), poses)) as driver:
         g, r = len(driver.cover), driver.grounded
         fixed = columns_of(np.array([r]), g, (1, d))
-        message = {"fixed": distributed_bound._is_fixed(driver, fixed), "eta": np.zeros(1)}
-        X = Poses(driver.R, driver.t).stacked()
-        proof = distributed_bound._eliminate(driver, message, fixed, 0.0, 1e-9, X)
+        X = Poses(driver.at.R, driver.at.t).stacked()
+        proof = distributed_bound._eliminate(driver, fixed, 0.0, 1e-9, X)
         _, Lambda = collect(driver)
         rows = columns_of(driver.cover, n, (1, d))
         left_out = pose_rows(int(driver.cover[r]), n, d)
@@ -130,7 +117,7 @@ def test_weights_that_could_underflow_prove_nothing_by_robots_either() -> None:
     graph = varied_graph(0, 8, 2)
     problem = PGOProblem(replace(graph, kappa=1e-120 * graph.kappa, tau=1e-120 * graph.tau))
     poses = chordal_start(problem)
-    with team_at(problem, contiguous(problem.graph, 2), poses) as driver:
+    with closing(driver_at(problem, contiguous(problem.graph, 2), poses)) as driver:
         assert distributed_bound.prove_grounded(driver, 0.0) is None
     assert prove_bound(problem, multipliers(problem, poses), poses=poses) is None
 
@@ -139,11 +126,11 @@ def test_every_term_of_a_driver_s_errors_is_there(monkeypatch: pytest.MonkeyPatc
     u, enough = 2.0**-53, 1.0 - 1e-12
     problem = PGOProblem(varied_graph(3, 16, 3))
     poses = polish(problem, chordal_start(problem))
-    with team_at(problem, contiguous(problem.graph, 3), poses) as driver:
+    with closing(driver_at(problem, contiguous(problem.graph, 3), poses)) as driver:
         g, d, rng = len(driver.cover), driver.d, np.random.default_rng(0)
         space = driver.interface(1, d)
-        X = Poses(driver.R, driver.t).stacked()
-        Lambda, slack = driver.multipliers, rng.uniform(1.0, 2.0, len(X))
+        X = Poses(driver.at.R, driver.at.t).stacked()
+        Lambda, slack = driver.at.multipliers, rng.uniform(1.0, 2.0, len(X))
         blocks = evaluate_multipliers(Lambda, X[g:].reshape(g, d, d))
         own, error = np.zeros_like(X), np.zeros_like(X)
         own[g:], error[g:] = blocks.product, blocks.product_error
@@ -152,18 +139,17 @@ def test_every_term_of_a_driver_s_errors_is_there(monkeypatch: pytest.MonkeyPatc
         for columns in space.columns:
             parts.append(-left[columns])
             left[columns] = 0.0
-        figures = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
-        answers = [{"product": part, "error": 1e-15 * abs(part), "figures": figures} for part in parts]
-        proof = InterfaceProof(None, slack, answers, Lambda, [])  # type: ignore[arg-type]
-        sums = distributed_bound._sum_up(driver, proof, X, answers, np.ones(len(X), dtype=bool))
+        nothing = RightHandSide(np.zeros(0), 0.0)
+        steps = [ProofStep(ProofSums(1.0, 0.0, 0.0, 0.0, 0.0, p, 1e-15 * abs(p)), nothing) for p in parts]
+        proof = InterfaceProof(None, slack, [], Lambda, [])  # type: ignore[arg-type]
+        sums = distributed_bound._sum_up(driver, proof, X, steps, np.ones(len(X), dtype=bool))
         assert (left == 0.0).all()
         error += 1e-15 * abs(own) + gamma(len(parts) + 2.0) * 2.0 * abs(own)
         assert sums.quadratic >= enough * np.sum(error**2 / slack[:, None]) > 0.0
         assert sums.value_error >= enough * (blocks.value_error + u * abs(sums.value)) > 0.0
         monkeypatch.setattr(Interface, "rounding", lambda self, contributions, own, diagonal: 0.0 * diagonal)
         fixed = driver.ground(1).ravel()
-        message = {"fixed": distributed_bound._is_fixed(driver, fixed), "eta": np.array([1.0])}
-        found = distributed_bound._eliminate(driver, message, fixed, 1.0, 1e-13, None)
+        found = distributed_bound._eliminate(driver, fixed, 1.0, 1e-13, None)
         assert found is not None
         diagonal = driver.diagonal.copy()
         rows = driver.rotation_rows

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import cvxopt
 import numpy as np
 import pytest
+from budget import examples
 from cvxopt import cholmod
 from exact_arithmetic import (
     MP,
@@ -35,12 +36,13 @@ from pgo_models.problem.cholesky import (
     analyze,
 )
 from pgo_models.problem.floating_point import gamma
+from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.interface import Interface, InterfaceFactor
 from solvers.distributed.multifrontal import separator_tree
-from solvers.distributed.robots.elimination import Cut, columns_of, eliminate, packed, unpacked
+from solvers.distributed.robots.elimination import Cut, eliminate, packed, unpacked
 from solvers.distributed.robots.proof import verify_interior
-from solvers.distributed.robots.subgraph import Part, split_graph
+from solvers.soc.subgraph import Part, split_graph
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
 
@@ -83,7 +85,7 @@ def well_conditioned(seed: int, n: int, d: int) -> Array:
 
 @BACKENDS
 @pytest.mark.parametrize("kind", [nearly_singular, well_conditioned])
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=st.integers(2, 6), d=DIMENSIONS)
 def test_a_factor_is_within_its_backward_error(
     kind: Callable[[int, int, int], Array], backend: CholeskyBackend, seed: int, n: int, d: int
@@ -185,7 +187,7 @@ def test_no_rounding_is_lost_between_multipliers_and_eta_by_a_robot(backend: Cho
 
 
 @BACKENDS
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=st.integers(4, 9), d=DIMENSIONS, eta=st.sampled_from([0.0, 1e-3, 1e9]))
 def test_what_a_robot_hands_on_is_below_its_part_of_S(
     backend: CholeskyBackend, seed: int, n: int, d: int, eta: float

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, SEEDS, random_poses, varied_graph, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -9,7 +10,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph, middle_pose
 from pgo_models.graphs.separators import vertex_cover
-from solvers.distributed.robots.subgraph import Subgraph, split_graph
+from solvers.soc.subgraph import Subgraph, split_graph
 
 SIZES = st.integers(2, 40)
 
@@ -58,7 +59,7 @@ def check_shares(graph: PoseGraph, parts: Partition) -> None:
     assert sorted(interiors) == sorted(set(range(graph.num_poses)) - set(cover.tolist()))
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
 def test_edges_are_counted_once_and_interiors_are_private(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
     graph = varied_graph(seed, n, d)
@@ -70,7 +71,7 @@ def test_corner_cases_are_shared_out_alike(graph: PoseGraph, parts: Partition) -
     check_shares(graph, parts)
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
 def test_the_costs_of_the_parts_add_up(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
     problem = varied_problem(seed, n, d)

@@ -1,0 +1,140 @@
+"""What the driver asks a robot's interior, and what it answers; g boundary poses, vectors of w unknowns a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import IntArray
+from solvers.distributed.robots.proof import ProofSums
+
+
+@dataclass(frozen=True, eq=False)
+class RightHandSide:
+    """b on the boundary with the interior eliminated, (w g, k), and b_I . K_II^-1 b_I."""
+
+    b: Array
+    energy: float
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """A robot's matrix and right-hand side with the interior eliminated.
+
+    Attributes
+    ----------
+    schur : (w g (w g + 1) / 2,)
+        Lower triangle, packed.
+    diagonal : (w g,)
+        Of the matrix before the elimination.
+    right : RightHandSide
+    """
+
+    schur: Array
+    diagonal: Array
+    right: RightHandSide
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedTranslations:
+    """Right-hand side of the best translations, (g, d), and the first time their matrix."""
+
+    b: Array
+    schur: Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Part of F and of its rounding level, and the rows of M X on the boundary, ((d+1) g, d)."""
+
+    objective: float
+    level: float
+    force: Array
+
+
+@dataclass(frozen=True, eq=False)
+class TrialEvaluation:
+    """The same at a trial, and the reduced gradient there."""
+
+    at: Evaluation
+    gradient: RightHandSide
+
+
+@dataclass(frozen=True)
+class RescaleInterior:
+    """Factor on rho, and whether all go back to their best iterate."""
+
+    factor: float
+    from_best: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Agreed:
+    """Squared residuals, (2,), and the right-hand side of the next step (a)."""
+
+    sums: Array
+    right: RightHandSide
+
+
+@dataclass(frozen=True)
+class ModelOrder:
+    """Newton's matrix, or the Gauss-Newton matrix, with a share of its diagonal added."""
+
+    second_order: bool
+    damping: float
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """H^-1 g on the boundary, (w g, 1), and how far to go along minus it."""
+
+    x: Array
+    length: float
+
+
+@dataclass(frozen=True, eq=False)
+class ProofOrder:
+    """How S is eliminated for a proof.
+
+    Attributes
+    ----------
+    eta : float
+    share : float
+        At least so much of the diagonal is subtracted.
+    fixed : ((d+1) g,)
+        1 for rows on the boundary that are left out.
+    point : ((d+1) g, d), optional
+        X there, where a proof begins.
+    """
+
+    eta: float
+    share: float
+    fixed: Array
+    point: Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class ProofStep:
+    """Parts of the bound, and the right-hand side of the next move."""
+
+    sums: ProofSums
+    right: RightHandSide
+
+
+@dataclass(frozen=True, eq=False)
+class ProofAnswer:
+    """S with the interior eliminated, None where it is not definite; part of tr(Lambda); the first step of a proof."""
+
+    schur: Array | None
+    trace: float
+    step: ProofStep | None
+
+
+@dataclass(frozen=True, eq=False)
+class InteriorPoses:
+    """Interior poses, their numbers in the whole graph, and multipliers."""
+
+    poses: IntArray
+    R: Array
+    t: Array
+    Lambda: Array

@@ -1,0 +1,94 @@
+"""Workers whose messages are counted: what the driver asks of them, and what they send each other."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+
+from pgo_models.graphs.pose_graph import IntArray
+from solvers.network.engine import WorkerPool
+from solvers.network.faults import LossyChannel
+from solvers.network.ledger import BYTES_PER_NUMBER, DRIVER, Ledger, Traffic
+from solvers.network.messages import count_numbers
+
+Q = TypeVar("Q")
+A = TypeVar("A")
+
+
+class Count(enum.Enum):
+    """What an order costs on the network."""
+
+    ROUND = "robots wait for values at the separators"
+    ALL_REDUCE = "sums of a few numbers, and what follows from them"
+    PIGGYBACKED = "counted with the next round"
+    OFF = "measuring, setting up, and collecting the answer are off the ledger"
+
+
+class CountedPool:
+    """A worker pool and its ledger.
+
+    Attributes
+    ----------
+    workers : WorkerPool
+    ledger : Ledger
+    """
+
+    def __init__(self, workers: WorkerPool, num_robots: int) -> None:
+        self.workers, self.ledger = workers, Ledger(num_robots)
+        self._traffic: dict[bytes, Traffic] = {}
+
+    def ask(
+        self, order: Callable[[Any, Q], A], requests: Sequence[Q], count: Count, robots: IntArray | None = None
+    ) -> list[A]:
+        """Answers of all workers to an order; of them `robots`, all unless given, exchange something with the driver.
+
+        What goes to other workers is counted when it is handed on.
+        """
+        answers = self.workers.ask(order, requests)
+        if count is Count.OFF:
+            return answers
+        if robots is None:
+            robots = np.arange(len(requests))
+        sizes = [count_numbers(requests[robot]) for robot in robots.tolist()]
+        sizes += [count_numbers(answers[robot]) for robot in robots.tolist()]
+        driver = np.full(len(robots), DRIVER)
+        sender, receiver = np.concatenate([driver, robots]), np.concatenate([robots, driver])
+        self._count(sender, receiver, sizes, is_round=count is Count.ROUND)
+        if count is Count.ALL_REDUCE:
+            self.ledger = self.ledger.after_all_reduce(0)
+        return answers
+
+    def hand_on(self, sent: Sequence[Mapping[int, A]], channel: LossyChannel[A] | None = None) -> list[Mapping[int, A]]:
+        """What every worker receives, by its sender, of what each sent, by its receiver: one round.
+
+        What a faulty `channel` loses is counted, and not handed on.
+        """
+        messages = {(robot, to): value for robot, addressed in enumerate(sent) for to, value in addressed.items()}
+        links = np.array(list(messages), dtype=np.int64).reshape(-1, 2)
+        self._count(links[:, 0], links[:, 1], [count_numbers(value) for value in messages.values()], is_round=True)
+        return delivered(messages if channel is None else channel.carry(messages), len(sent))
+
+    def _count(self, sender: IntArray, receiver: IntArray, numbers: Sequence[int], is_round: bool) -> None:
+        """Count an exchange; equal ones are one object, which the ledger counts."""
+        num_bytes = BYTES_PER_NUMBER * np.array(numbers, dtype=np.int64)
+        used = num_bytes > 0
+        exchange = sender[used], receiver[used], num_bytes[used]
+        traffic = self._traffic.setdefault(np.concatenate(exchange).tobytes(), Traffic(*exchange))
+        self.ledger = self.ledger.after_exchange(traffic, is_round)
+
+
+def delivered(messages: Mapping[tuple[int, int], A], num_robots: int) -> list[Mapping[int, A]]:
+    """Messages of every link (sender, receiver) for each of the receivers, by their senders.
+
+    Examples
+    --------
+    >>> delivered({(0, 1): "to one", (2, 1): "to one, too"}, 3)
+    [{}, {0: 'to one', 2: 'to one, too'}, {}]
+    """
+    received: list[dict[int, A]] = [{} for _ in range(num_robots)]
+    for (sender, receiver), value in messages.items():
+        received[receiver][sender] = value
+    return list(received)
