@@ -53,13 +53,7 @@ def _ratios(graph: PoseGraph) -> dict[str, Array]:
 
 
 def extreme_weight(graph: str) -> str:
-    """Sentence on the precision farthest from the median of its kind: file and line, edge, value, and the way out.
-
-    Examples
-    --------
-    >>> extreme_weight("grid")[-84:]
-    'are too far apart for doubles; correct the information matrix, or use --unit-weights'
-    """
+    """Sentence on the precision farthest from the median of its kind: file and line, edge, value, and the way out."""
     path = locate(graph)
     if not (path.is_file() or path.is_dir()):
         return f"{graph}: weights too far apart for doubles; give it as a file to be told which"

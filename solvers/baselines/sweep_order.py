@@ -77,16 +77,6 @@ def schedule(graph: PoseGraph, robots: Partition, sweep: Sweep) -> Schedule:
     ------
     SettingError
         When the partition is of another number of poses.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.partitioning import partition
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> turns = schedule(graph, partition(graph, 3), Sweep.COLORS)
-    >>> turns.group[[0, 9, 18]], turns.first[[0, 9, 18]]
-    (array([0, 1, 0]), array([0, 1, 2]))
     """
     cut = robots.cut_edges(graph)
     robot, num_robots = robots.robot, robots.num_robots

@@ -32,15 +32,6 @@ def plot_efforts(curves: Sequence[Curve]) -> Figure:
         When there is no curve with a gap above zero.
     MissingExtraError
         Without matplotlib.
-
-    Examples
-    --------
-    >>> from solvers.result import History, Measurement, Record
-    >>> records = tuple(Record(k, 0.1 * k, Measurement(2.0 + 0.5**k, 0.5**k, 0.5**k)) for k in range(9))
-    >>> one = Curve("in one place", History(records), 2.0)
-    >>> many = Curve("by robots", History(records), 2.0, rounds=np.arange(9.0))
-    >>> [axes.get_xlabel() for axes in plot_efforts([one, many]).axes]
-    ['communication rounds', 'time in steps (s)']
     """
     panels = _panels(curves)
     styles = _styles(curves, _LINES)
@@ -70,13 +61,6 @@ def explore_efforts(curves: Sequence[Curve], title: str = "") -> PlotlyFigure:
         When there is no curve with a gap above zero.
     MissingExtraError
         Without plotly.
-
-    Examples
-    --------
-    >>> from solvers.result import History, Measurement, Record
-    >>> records = tuple(Record(k, 0.1 * k, Measurement(2.0 + 0.5**k, 0.5**k, 0.5**k)) for k in range(9))
-    >>> [trace.name for trace in explore_efforts([Curve("halving", History(records), 2.0)]).data]
-    ['halving']
     """
     try:
         from plotly.subplots import make_subplots

@@ -109,15 +109,6 @@ def plot_convergence(
         When no stage has a record.
     MissingExtraError
         Without matplotlib.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers.pipeline import solve
-    >>> solution = solve(grid(np.random.default_rng(0)))
-    >>> stages = [(stage.name, stage.history) for stage in solution.stages]
-    >>> [axes.get_ylabel() for axes in plot_convergence(stages, solution.lower_bound).axes]
-    ['relative residual', 'relative gap']
     """
     run = _with_records(stages)
     with column_figure(height=1.3) as figure:
@@ -155,14 +146,6 @@ def plot_gaps(curves: Sequence[Curve], effort: Effort = Effort.ITERATIONS) -> Fi
         When a curve does not know this effort.
     MissingExtraError
         Without matplotlib.
-
-    Examples
-    --------
-    >>> from solvers.result import Measurement, Record
-    >>> records = tuple(Record(k, 0.1 * k, Measurement(2.0 + 0.5**k, 0.5**k, 0.5**k)) for k in range(9))
-    >>> figure = plot_gaps([Curve("halving", History(records), 2.0)], Effort.SECONDS)
-    >>> figure.axes[0].get_xlabel()
-    'time in steps (s)'
     """
     with column_figure(height=0.85) as figure:
         axes = figure.add_subplot()
@@ -189,13 +172,6 @@ def explore_convergence(
         When no stage has a record.
     MissingExtraError
         Without plotly.
-
-    Examples
-    --------
-    >>> from solvers.result import Measurement, Record
-    >>> records = tuple(Record(k, 0.1 * k, Measurement(2.0 + 0.5**k, 0.5**k, 0.5**k)) for k in range(9))
-    >>> [trace.name for trace in explore_convergence([("halving", History(records))], 2.0).data]
-    ['halving: gap', 'halving: primal residual', 'halving: dual residual']
     """
     run = _with_records(stages)
     try:

@@ -125,13 +125,7 @@ def advice(
 
 
 def percent(share: float) -> str:
-    """Return a share as a percentage for people.
-
-    Examples
-    --------
-    >>> percent(5e-7), percent(0.25)
-    ('0.00005 %', '25 %')
-    """
+    """Return a share as a percentage for people."""
     value = 100.0 * share
     if value <= 0:
         return "0 %"

@@ -138,13 +138,7 @@ def check_table_format(path: Path) -> None:
 
 
 def gap_percent(gap: float) -> str:
-    """Gap in percent, two digits.
-
-    Examples
-    --------
-    >>> gap_percent(0.0812), gap_percent(5e-7)
-    ('8.1', '5e-05')
-    """
+    """Gap in percent, two digits."""
     return f"{100.0 * gap:.2g}"
 
 

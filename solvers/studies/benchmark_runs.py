@@ -69,13 +69,6 @@ def run_benchmark(
         When the method cannot be run on this graph.
     KeyboardInterrupt
         After Ctrl-C: half a trial is none.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> run_benchmark(BenchmarkMethod.NEWTON, problem).rounds is None
-    True
     """
     settings = settings if settings is not None else BenchmarkSettings()
     trial = _RUNS[contender](problem, _Allowance(settings, problem.graph), start)

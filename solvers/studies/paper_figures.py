@@ -154,14 +154,6 @@ def plot_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> Figure:
     ------
     MissingExtraError
         Without matplotlib.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> [axes.get_title() for axes in plot_panels([[("truth", graph, graph.truth)]]).axes]
-    ['truth']
     """
     columns = max(len(row) for row in panels)
     with column_figure(height=1.0 * len(panels), width=columns) as figure:
@@ -181,15 +173,6 @@ def explore_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> PlotlyFi
     ------
     MissingExtraError
         Without plotly.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> figure = explore_panels([[("truth", graph, graph.truth), ("again", graph, graph.truth)]])
-    >>> sorted({trace.scene for trace in figure.data})
-    ['scene', 'scene2']
     """
     from plotly.graph_objects import Figure
 

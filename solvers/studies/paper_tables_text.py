@@ -95,13 +95,6 @@ def tables_as_text(tables: Reproduction) -> ResultTable:
     """Return the reproduced tables, a line for each method on each graph, and the findings below.
 
     The first part has what the paper's tables 1 and 3 have, the second what 2 and 4 have.
-
-    Examples
-    --------
-    >>> from solvers.studies.paper_tables import ReproductionSettings, reproduce_tables
-    >>> table = tables_as_text(reproduce_tables(ReproductionSettings(only=("grid",), num_seeds=2)))
-    >>> [row[1] for row in table.parts[1].rows]
-    ['SE-Sync (staircase)', 'DGS', 'SOC as in the paper', 'SOC consensus + Newton']
     """
     costs, efforts, before = [], [], ""
     for row in tables.rows:
