@@ -1,15 +1,15 @@
-"""The one printed table of a run, and its progress bar, in a terminal or in a notebook."""
+"""The one printed table of a run and its progress bar, in a terminal or in a notebook; the bar of a job of runs."""
 
 from __future__ import annotations
 
 import html
 import math
+import sys
 import time
 from types import TracebackType
-from typing import Protocol
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from solvers.result import Measurement, Record, Status
 
@@ -32,7 +32,7 @@ class Table:
         self._verbose, self._progress = verbose, self._in_notebook if progress is None else progress
         # In a notebook, too, lines are lines: rich would make an output of its own of each.
         self._console = Console(highlight=False, force_jupyter=False)
-        self._bar: _Bar | None = None
+        self._bar: _TerminalBar | _NotebookBar | None = None
 
     def __enter__(self) -> Table:
         return self
@@ -73,12 +73,22 @@ class Table:
             self._bar.stop()
 
 
-class _Bar(Protocol):
-    def show(self, k: int, text: str) -> None:
-        """Show iterate k and its figures."""
+class JobBar(Progress):
+    """Progress over the parts of a job, on stderr; with `progress` None, where that is a terminal."""
 
-    def stop(self) -> None:
-        """Go away."""
+    def __init__(self, parts: int, progress: bool | None) -> None:
+        is_shown = sys.stderr.isatty() if progress is None else progress
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        super().__init__(*columns, console=Console(stderr=True), transient=True, disable=not is_shown)
+        self._task = self.add_task("", total=parts)
+
+    def name_part(self, text: str) -> None:
+        """Say which part is being done."""
+        self.update(self._task, description=text)
+
+    def end_part(self) -> None:
+        """Count the part as done."""
+        self.advance(self._task)
 
 
 class _TerminalBar:

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import math
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pgo_models.certificates.certificate import relative_gap
 from pgo_models.errors import PGOError, SettingError
@@ -19,6 +16,7 @@ from pgo_models.plots.interactive_plots import save_page
 from pgo_models.plots.style import is_picture, save_figure
 from pgo_models.problem.problem import PGOProblem
 from solvers.pipeline import solve
+from solvers.progress import JobBar
 from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
 from solvers.reporting.convergence_plots import Curve
 from solvers.reporting.result_table import ResultTable, TablePart, Value, gap_percent
@@ -185,18 +183,15 @@ def compare_methods(
     trials: list[BenchmarkRun] = []
     reasons: list[tuple[BenchmarkMethod, str]] = []
     is_complete = True
-    is_shown = sys.stderr.isatty() if progress is None else progress
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not is_shown) as bar:
-        task = bar.add_task("", total=len(settings.chosen))
+    with JobBar(len(settings.chosen), progress) as bar:
         try:
             for contender in settings.chosen:
-                bar.update(task, description=contender.label)
+                bar.name_part(contender.label)
                 try:
                     trials.append(run_benchmark(contender, problem, settings.trial))
                 except (PGOError, np.linalg.LinAlgError, MemoryError) as error:
                     reasons.append((contender, str(error) or type(error).__name__))
-                bar.advance(task)
+                bar.end_part()
         except KeyboardInterrupt:
             is_complete = False
     known = [solution.objective, solution.certificate.poses_objective]

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import enum
 import html
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pgo_models.certificates.certificate import relative_gap
 from pgo_models.errors import MissingExtraError, PGOError
@@ -23,6 +19,7 @@ from pgo_models.plots.interactive_plots import explore_graph, save_page
 from pgo_models.plots.style import column_figure, save_figure
 from pgo_models.problem.problem import PGOProblem
 from solvers.pipeline import solve
+from solvers.progress import JobBar
 from solvers.reporting.convergence_plots import explore_convergence, plot_convergence
 from solvers.reporting.result_table import gap_percent
 from solvers.result import History
@@ -138,7 +135,7 @@ def draw_paper_figures(
     except OSError as error:
         raise PGOError(f"cannot make the folder {folder}: {error.strerror}; choose another") from error
     wanted = tuple(dict.fromkeys(name for one in sets for name in one.graphs))
-    shown, reasons = _run_all(wanted, download, sys.stderr.isatty() if progress is None else progress)
+    shown, reasons = _run_all(wanted, download, progress)
     written: list[Path] = []
     for one in sets:
         here = [shown[name] for name in one.graphs if name in shown]
@@ -213,20 +210,18 @@ def explore_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> PlotlyFi
     return figure
 
 
-def _run_all(names: tuple[str, ...], download: bool, is_shown: bool) -> tuple[dict[str, Shown], list[str]]:
+def _run_all(names: tuple[str, ...], download: bool, progress: bool | None) -> tuple[dict[str, Shown], list[str]]:
     shown: dict[str, Shown] = {}
     reasons: list[str] = []
     rows = {row.name: row for row in published_rows()}
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not is_shown) as bar:
-        task = bar.add_task("", total=len(names))
+    with JobBar(len(names), progress) as bar:
         for name in names:
-            bar.update(task, description=name)
+            bar.name_part(name)
             try:
                 shown[name] = _run(rows[name], download)
             except PGOError as error:
                 reasons.append(str(error))
-            bar.advance(task)
+            bar.end_part()
     return shown, reasons
 
 

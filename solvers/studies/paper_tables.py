@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pgo_models.certificates.certificate import relative_gap
 from pgo_models.errors import PGOError, SettingError
@@ -21,6 +17,7 @@ from pgo_models.graphs.published_results import PublishedFigures, PublishedRow, 
 from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.problem.problem import PGOProblem
 from solvers.pipeline import solve
+from solvers.progress import JobBar
 from solvers.result import Status
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
 from solvers.studies.benchmark_runs import run_benchmark
@@ -229,7 +226,8 @@ def reproduce_tables(
     kept = KeptResults(keep, is_fresh)
     results = {row.name: _RowResults() for row in settings.rows}
     is_complete = True
-    with _Bar(settings, progress) as bar:
+    draws = sum(len(settings.seeds(row.name)) for row in settings.rows)
+    with JobBar(draws * len(TABLE_CONTENDERS), progress) as bar:
         try:
             for row in settings.rows:
                 for seed in settings.seeds(row.name):
@@ -267,11 +265,11 @@ class _RowResults:
         self.cells: dict[BenchmarkMethod, list[TableEntry]] = {contender: [] for contender in TABLE_CONTENDERS}
         self.reasons: dict[BenchmarkMethod, list[str]] = {contender: [] for contender in TABLE_CONTENDERS}
 
-    def fail(self, reason: str, bar: _Bar) -> None:
+    def fail(self, reason: str, bar: JobBar) -> None:
         """Note why a draw has no figures at all."""
         for contender in TABLE_CONTENDERS:
             self.reasons[contender].append(reason)
-            bar.advance()
+            bar.end_part()
 
     def rows(self, published: PublishedRow, settings: ReproductionSettings) -> Iterator[ReproducedRow]:
         draws = len(settings.seeds(published.name))
@@ -281,10 +279,10 @@ class _RowResults:
 
 
 def _one_graph(
-    row: PublishedRow, seed: int, settings: ReproductionSettings, kept: KeptResults, results: _RowResults, bar: _Bar
+    row: PublishedRow, seed: int, settings: ReproductionSettings, kept: KeptResults, results: _RowResults, bar: JobBar
 ) -> None:
     """Optimum and all cells of one draw of a row; what was kept is taken, what fails leaves its reason."""
-    bar.show(row.name, "certified optimum")
+    bar.name_part(f"{row.name}: certified optimum")
     try:
         graph = graph_of_row(row, seed, settings.download)
     except _FAILURES as error:
@@ -299,14 +297,14 @@ def _one_graph(
     results.optima.append(optimum)
     robots = BenchmarkSettings(settings.num_robots).robots(graph)
     for contender in TABLE_CONTENDERS:
-        bar.show(row.name, contender.label)
+        bar.name_part(f"{row.name}: {contender.label}")
         key = f"{name} {contender.value}, {robots.num_robots} robots {robots.method.name}"
         cell = _found(kept, key, partial(_cell, contender, problem, row, settings, optimum))
         if isinstance(cell, str):
             results.reasons[contender].append(cell)
         else:
             results.cells[contender].append(TableEntry(**{**cell, "iterations": tuple(cell["iterations"])}))
-        bar.advance()
+        bar.end_part()
 
 
 def _found(kept: KeptResults, key: str, find: Callable[[], Entry]) -> Entry | str:
@@ -355,27 +353,3 @@ def _cell(
 
 def _reason(error: BaseException) -> str:
     return str(error) or type(error).__name__
-
-
-class _Bar:
-    """Progress over all cells, on stderr."""
-
-    def __init__(self, settings: ReproductionSettings, progress: bool | None) -> None:
-        is_shown = sys.stderr.isatty() if progress is None else progress
-        total = sum(len(settings.seeds(row.name)) for row in settings.rows) * len(TABLE_CONTENDERS)
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        self._progress = Progress(*columns, console=Console(stderr=True), transient=True, disable=not is_shown)
-        self._task = self._progress.add_task("", total=total)
-
-    def show(self, graph: str, what: str) -> None:
-        self._progress.update(self._task, description=f"{graph}: {what}")
-
-    def advance(self) -> None:
-        self._progress.advance(self._task)
-
-    def __enter__(self) -> _Bar:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: Any) -> None:  # noqa: ANN401
-        self._progress.stop()
