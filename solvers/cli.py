@@ -6,7 +6,6 @@ Exit codes: 0 done; 1 bad input, one line on stderr; 2 not converged, the result
 
 from __future__ import annotations
 
-import json
 import math
 import shlex
 import sys
@@ -24,7 +23,7 @@ from rich.table import Table
 
 from pgo_models.certificates.certificate import DEFAULT_GAP, certify
 from pgo_models.errors import FileFormatError, SettingError
-from pgo_models.files import check_writable, replace_when_done
+from pgo_models.files import check_writable
 from pgo_models.geometry.poses import Poses, absolute_trajectory_error
 from pgo_models.graphs.datasets import known_datasets, load
 from pgo_models.graphs.g2o import MOST_SYMBOLS, read_g2o_poses, symbol_ids, write_g2o, write_g2o_folder
@@ -54,7 +53,7 @@ from solvers.reporting.report import check_report, write_report
 from solvers.reporting.versions import versions
 from solvers.shell import DONE, Commands, run_command, save_then_show
 from solvers.soc.soc import SOC
-from solvers.solution import certificate_json, check_format, check_target
+from solvers.solution import certificate_json, check_format, check_target, write_json
 from solvers.studies.commands import compare_command, figures_command, tables_command
 
 NOT_CONVERGED, NOT_CERTIFIED = 2, 3
@@ -243,12 +242,8 @@ def certify_command(
         "best_known_objective": certificate.poses_objective,
         "versions": versions(problem.backend),
     }
-
-    def save(path: Path) -> None:
-        with replace_when_done(path) as temporary:
-            temporary.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-    save_then_show([(out, save)] if out is not None else [], lambda: typer.echo(str(certificate)))
+    targets = [(out, partial(write_json, record))] if out is not None else []
+    save_then_show(targets, lambda: typer.echo(str(certificate)))
     warn_of_weights(graph, problem, certificate)
     raise typer.Exit(DONE if certificate.is_certified else NOT_CERTIFIED)
 

@@ -12,26 +12,21 @@ from typing import TYPE_CHECKING
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, gap_text
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.files import check_writable, replace_when_done
-from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.g2o import check_g2o_folder, write_g2o, write_g2o_folder
-from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.trajectories import write_kitti, write_tum
 from pgo_models.html_tables import facts_table, rows_table
 from pgo_models.plots.graph_plots import compare_poses
 from pgo_models.plots.style import is_picture, save_figure
 from pgo_models.problem.initialization import spanning_tree_start
-from pgo_models.problem.problem import PGOProblem
-from solvers.network.ledger import Ledger
-from solvers.reporting.report import write_report
+from solvers.reporting.report import Solved, write_report
 from solvers.reporting.versions import versions
-from solvers.result import Stage, Status
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class Solution(Solved):
     """The answer to a pose graph.
 
     Attributes
@@ -65,17 +60,6 @@ class Solution:
     >>> solution.is_certified, bool(solution.lower_bound <= solution.objective)
     (True, True)
     """
-
-    problem: PGOProblem
-    poses: Poses
-    objective: float
-    certificate: Certificate
-    status: Status
-    stages: tuple[Stage, ...]
-    seconds: float
-    ledger: Ledger | None = None
-    robots: Partition | None = None
-    note: str = ""
 
     @property
     def lower_bound(self) -> float:
@@ -139,8 +123,7 @@ class Solution:
         elif suffix == ".kitti":
             write_kitti(self.poses, path)
         elif suffix == ".json":
-            with replace_when_done(path) as temporary:
-                temporary.write_text(json.dumps(self.as_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+            write_json(self.as_json(), path)
         else:
             save_figure(self.plot(), path)
 
@@ -266,6 +249,12 @@ def check_target(path: Path, num_robots: int) -> None:
         check_g2o_folder(path, num_robots)
     else:
         check_writable(path)
+
+
+def write_json(record: dict[str, object], path: Path) -> None:
+    """Write a record, whole or not at all."""
+    with replace_when_done(path) as temporary:
+        temporary.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def certificate_json(certificate: Certificate) -> dict[str, object]:

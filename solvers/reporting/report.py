@@ -5,9 +5,8 @@ from __future__ import annotations
 import enum
 import html
 from collections.abc import Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -34,44 +33,20 @@ _MOST_ROBOTS = 200
 _PAGE_SUFFIXES = (".html", ".htm")
 
 
-class Solved(Protocol):
-    """What a report needs of a solution; `solvers.solution.Solution` has it."""
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """What a report is of: the fields of `solvers.solution.Solution`, which says what they are."""
 
-    @property
-    def problem(self) -> PGOProblem:
-        """The problem."""
-
-    @property
-    def poses(self) -> Poses:
-        """The answer."""
-
-    @property
-    def objective(self) -> float:
-        """F of the answer."""
-
-    @property
-    def certificate(self) -> Certificate:
-        """Bound, gap and verdict."""
-
-    @property
-    def status(self) -> Status:
-        """How the last stage ended."""
-
-    @property
-    def stages(self) -> tuple[Stage, ...]:
-        """What was done."""
-
-    @property
-    def seconds(self) -> float:
-        """Wall time of it all."""
-
-    @property
-    def ledger(self) -> Ledger | None:
-        """What crossed the network, where robots solved it."""
-
-    @property
-    def robots(self) -> Partition | None:
-        """Who owned which pose then."""
+    problem: PGOProblem
+    poses: Poses
+    objective: float
+    certificate: Certificate
+    status: Status
+    stages: tuple[Stage, ...]
+    seconds: float
+    ledger: Ledger | None = None
+    robots: Partition | None = None
+    note: str = ""
 
 
 def write_report(solution: Solved, path: Path | str, *, source: str | None = None) -> None:
