@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar, cast, overload
 
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
@@ -163,82 +163,26 @@ def run(
     >>> run(Newton(), problem, callback=lambda state, record: record.k == 2).status.name
     'STOPPED'
     """
-    if hasattr(method, "poses"):
-        problem = as_problem(problem)
-    if not time_limit > 0:
-        raise SettingError(f"time_limit is {time_limit}; give positive seconds")
-    name = type(method).__name__
-    began = time.perf_counter()
-    state = method.init(problem, start)
-    in_steps = time.perf_counter() - began + (earlier[-1].seconds if earlier else 0.0)
-    best: tuple[Measurement, S] | None = None
-    records = list(earlier)
-    k = len(earlier)
-    with Table(name, method.max_iterations, verbose, progress) as table:
-        try:
-            while True:
-                measurement = method.measure(problem, state)
-                record = Record(k, in_steps, measurement)
-                records.append(record)
-                if math.isfinite(measurement.objective) and (best is None or _is_better(measurement, best[0])):
-                    best = (measurement, state)
-                elapsed = time.perf_counter() - began
-                table.row(record, elapsed)
-                status = _ending(method, state, record, elapsed > time_limit, callback)
-                if status is not None:
-                    break
-                before = time.perf_counter()
-                state = method.step(problem, state)
-                in_steps += time.perf_counter() - before
-                k += 1
-        except KeyboardInterrupt:
-            status = Status.INTERRUPTED
-        except NotPositiveDefiniteError:
-            # Its matrices were positive definite at state 0: an iterate has overflowed.
-            if best is None:
-                raise
-            status = Status.NOT_FINITE
-        table.end(status, k)
-    objective = records[-1].measurement.objective if records else math.nan
-    if best is not None and not status.is_success:
-        objective, state = best[0].objective, best[1]
-    outcome = Outcome(
-        name=name,
-        objective=objective,
-        state=state,
-        status=status,
-        iterations=k,
-        history=History(tuple(records)),
-        seconds=time.perf_counter() - began,
-        method=method,
-    )
-    return _with_poses(outcome, problem, began) if hasattr(method, "poses") else outcome
-
-
-def _with_poses(outcome: Outcome[S], problem: PGOProblem, began: float) -> Run[S]:
-    poses = cast(Solver[S], outcome.method).poses(problem, outcome.state)
-    known = {item.name: getattr(outcome, item.name) for item in fields(outcome)}
-    seconds = time.perf_counter() - began
-    return Run(**{**known, "objective": problem.objective(poses), "seconds": seconds}, poses=poses)
+    return Watch(time_limit, verbose, progress, callback).run(method, problem, start, earlier)
 
 
 @dataclass(frozen=True)
 class Watch:
-    """How the runs of a longer job are watched: until when, and who is shown what; see `run`. Their poses are kept."""
+    """How runs are watched: for how long together, and who is shown what; see `run`. Their poses are kept."""
 
-    deadline: float
+    time_limit: float = math.inf
     verbose: bool = False
     progress: bool | None = None
     callback: Callable[[Any, Record], bool | None] | None = None
+    began: float = field(default_factory=time.perf_counter)
     found: list[Poses] = field(default_factory=list)
 
-    @property
-    def seconds_left(self) -> float:
-        """Time until the deadline, positive."""
-        return max(self.deadline - time.perf_counter(), 1e-3)
+    def __post_init__(self) -> None:
+        if not self.time_limit > 0:
+            raise SettingError(f"time_limit is {self.time_limit}; give positive seconds")
 
     @overload
-    def run(self, method: Solver[S], problem: PGOProblem, start: Poses | None = None) -> Run[S]: ...
+    def run(self, method: Solver[S], problem: PGOProblem | PoseGraph, start: Poses | None = None) -> Run[S]: ...
     @overload
     def run(
         self, method: Method[P, X, S], problem: P, start: X | None = None, earlier: tuple[Record, ...] = ()
@@ -246,41 +190,67 @@ class Watch:
     def run(
         self, method: Method[Any, Any, S], problem: Any, start: Any = None, earlier: tuple[Record, ...] = ()
     ) -> Outcome[S]:
-        """Run a method on a problem of its kind."""
-        found = run(
-            method,
-            problem,
-            start,
-            earlier=earlier,
-            callback=self.callback,
-            time_limit=self.seconds_left,
-            verbose=self.verbose,
-            progress=self.progress,
-        )
-        if isinstance(found, Run):
-            self.found.append(found.poses)
-        return found
+        """Run a method on a problem of its kind: the loop."""
+        solver = cast(Solver[S], method) if hasattr(method, "poses") else None
+        if solver is not None:
+            problem = as_problem(problem)
+        name = type(method).__name__
+        began = time.perf_counter()
+        state = method.init(problem, start)
+        in_steps = time.perf_counter() - began + (earlier[-1].seconds if earlier else 0.0)
+        best: tuple[Measurement, S] | None = None
+        records = list(earlier)
+        k = len(earlier)
+        with Table(name, method.max_iterations, self.verbose, self.progress) as table:
+            try:
+                while True:
+                    measurement = method.measure(problem, state)
+                    record = Record(k, in_steps, measurement)
+                    records.append(record)
+                    if math.isfinite(measurement.objective) and (best is None or _is_better(measurement, best[0])):
+                        best = (measurement, state)
+                    table.row(record, time.perf_counter() - began)
+                    status = self._ending(method, state, record)
+                    if status is not None:
+                        break
+                    before = time.perf_counter()
+                    state = method.step(problem, state)
+                    in_steps += time.perf_counter() - before
+                    k += 1
+            except KeyboardInterrupt:
+                status = Status.INTERRUPTED
+            except NotPositiveDefiniteError:
+                # Its matrices were positive definite at state 0: an iterate has overflowed.
+                if best is None:
+                    raise
+                status = Status.NOT_FINITE
+            table.end(status, k)
+        objective = records[-1].measurement.objective if records else math.nan
+        if best is not None and not status.is_success:
+            objective, state = best[0].objective, best[1]
+        history = History(tuple(records))
+        if solver is None:
+            seconds = time.perf_counter() - began
+            return Outcome(name, objective, state, status, k, history, seconds, method=method)
+        poses = solver.poses(problem, state)
+        self.found.append(poses)
+        objective, seconds = problem.objective(poses), time.perf_counter() - began
+        return Run(name, objective, state, status, k, history, seconds, poses, method=method)
+
+    def _ending(self, method: Method[P, X, S], state: S, record: Record) -> Status | None:
+        """Status when the run ends at this state, else None."""
+        is_late = time.perf_counter() - self.began > self.time_limit
+        if self.callback is not None and self.callback(state, record):
+            return Status.STOPPED
+        if not math.isfinite(record.measurement.objective):
+            return Status.NOT_FINITE
+        status = method.converged(state, record.measurement)
+        if status is not None:
+            return status
+        if is_late:
+            return Status.TIME_LIMIT
+        return Status.MAX_ITERATIONS if record.k >= method.max_iterations else None
 
 
 def _is_better(one: Measurement, other: Measurement) -> bool:
     return (one.infeasibility, one.objective) < (other.infeasibility, other.objective)
-
-
-def _ending(
-    method: Method[P, X, S],
-    state: S,
-    record: Record,
-    out_of_time: bool,
-    callback: Callable[[S, Record], bool | None] | None,
-) -> Status | None:
-    """Status when the run ends at this state, else None."""
-    if callback is not None and callback(state, record):
-        return Status.STOPPED
-    if math.isnan(record.measurement.objective) or math.isinf(record.measurement.objective):
-        return Status.NOT_FINITE
-    status = method.converged(state, record.measurement)
-    if status is not None:
-        return status
-    if out_of_time:
-        return Status.TIME_LIMIT
-    return Status.MAX_ITERATIONS if record.k >= method.max_iterations else None

@@ -158,9 +158,7 @@ def solve(
     >>> solution.status.name, solution.is_certified
     ('CONVERGED', True)
     """
-    began = time.perf_counter()
-    if not time_limit > 0:
-        raise SettingError(f"time_limit is {time_limit}; give positive seconds")
+    watch = Watch(time_limit, verbose, progress, callback)
     problem = as_problem(problem)
     if robots is None and (engine is not None or checkpoint is not None):
         raise SettingError("engine and checkpoint are for solves by robots; give robots, a number or a Partition")
@@ -176,18 +174,15 @@ def solve(
         raise SettingError("driver_memory is for solves by robots; give solve() the robots, too")
     if pipeline.driver_memory == 0:
         pipeline = replace(pipeline, second_try=False, staircase=None)
-    stages: list[Stage] = []
-    watch = Watch(began + time_limit, verbose, progress, callback)
+    job = _Job(problem, pipeline, watch)
+    ledger = None
     if robots is None:
         try:
-            poses, certificate = _tries(
-                partial(_attempt, problem, pipeline, stages, watch), problem, pipeline, start, stages
-            )
+            poses, certificate = job.tries(job.attempt, start)
         except KeyboardInterrupt:  # between the loops, which answer it themselves
             if not watch.found:
                 raise
-            poses, certificate = _broken_off(problem, pipeline, watch, stages)
-        ledger = None
+            poses, certificate = job.broken_off()
     else:
         robots = _robots_for(pipeline.soc, robots, problem.graph)
         settings = pipeline.soc, pipeline.newton, pipeline.gap, pipeline.second_try, pipeline.faults
@@ -195,31 +190,28 @@ def solve(
         mark = run_fingerprint(problem, robots, (*settings, has_driver), start)
         engine = engine if engine is not None else InProcess()
         with (
-            closing(Journal(checkpoint, mark, stages)) as journal,
+            closing(Journal(checkpoint, mark, job.stages)) as journal,
             closing(open_driver(problem, robots, engine, pipeline.driver_memory)) as driver,
         ):
-            attempt = partial(
-                attempt_distributed, driver, problem, pipeline.newton, pipeline.gap, pipeline.faults, journal, watch
-            )
+            common = pipeline.gap, pipeline.faults, journal, watch
+            attempt = partial(attempt_distributed, driver, problem, pipeline.newton, *common)
             if not has_driver:
-                attempt = partial(
-                    attempt_leaderless, driver, problem, robots, pipeline.gap, pipeline.faults, journal, watch
-                )
+                attempt = partial(attempt_leaderless, driver, problem, robots, *common)
             try:
-                poses, certificate = _tries(attempt, problem, pipeline, start, stages)
+                poses, certificate = job.tries(attempt, start)
             except KeyboardInterrupt:
-                if not stages:
+                if not job.stages:
                     raise
                 watch.found.append(collect(driver)[0])
-                poses, certificate = _broken_off(problem, pipeline, watch, stages)
-            if stages[-1].status.is_success:
+                poses, certificate = job.broken_off()
+            if job.stages[-1].status.is_success:
                 journal.end()
         ledger = driver.network.ledger
-    if pipeline.staircase is not None and certificate.can_improve and stages[-1].status not in OUT_OF_TIME:
+    if pipeline.staircase is not None and certificate.can_improve and job.stages[-1].status not in OUT_OF_TIME:
         try:
-            poses, certificate = _climb(problem, pipeline, poses, certificate, stages, watch)
+            poses, certificate = job.climb(pipeline.staircase, poses, certificate)
         except KeyboardInterrupt:
-            stages.append(_interruption(problem.objective(poses)))
+            job.interrupt(problem.objective(poses))
     reference = problem.graph.initial
     poses = poses.aligned_to(reference) if reference is not None else poses.with_gauge_at(0)
     return Solution(
@@ -227,9 +219,9 @@ def solve(
         poses=poses,
         objective=problem.objective(poses),
         certificate=certificate,
-        status=stages[-1].status,
-        stages=tuple(stages),
-        seconds=time.perf_counter() - began,
+        status=job.stages[-1].status,
+        stages=tuple(job.stages),
+        seconds=time.perf_counter() - watch.began,
         ledger=ledger,
         robots=robots,
         note=NO_CERTIFICATE if pipeline.driver_memory == 0 else "",
@@ -257,103 +249,86 @@ def _robots_for(soc: SOC | PaperSOC | None, robots: Partition | int, graph: Pose
     return robots
 
 
-def _tries(
-    attempt: Callable[[SOC | PaperSOC | None, Poses | None], tuple[Poses, Certificate]],
-    problem: PGOProblem,
-    pipeline: Pipeline,
-    start: Poses | None,
-    stages: list[Stage],
-) -> tuple[Poses, Certificate]:
-    """One attempt, and where its certificate is wider than asked for a second one with a finer SOC."""
-    poses, certificate = attempt(pipeline.soc, start)
-    if pipeline.second_try and certificate.can_improve and stages[-1].status.is_success:
-        soc = pipeline.soc if pipeline.soc is not None else SOC()
-        fine = replace(soc, tolerance=min(soc.tolerance, _SECOND_TRY_TOLERANCE), max_iterations=SOC.max_iterations)
-        poses, certificate = _better(problem, poses, certificate, attempt(fine, None)[1])
-    return poses, certificate
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """What all parts of a solve share: its problem and settings, how it is watched, and what was done so far."""
 
+    problem: PGOProblem
+    pipeline: Pipeline
+    watch: Watch
+    stages: list[Stage] = field(default_factory=list)
 
-def _attempt(
-    problem: PGOProblem,
-    pipeline: Pipeline,
-    stages: list[Stage],
-    watch: Watch,
-    soc: SOC | PaperSOC | None,
-    start: Poses | None,
-) -> tuple[Poses, Certificate]:
-    """SOC, Newton and certificate from a start; appends what was done to `stages`."""
-    began = time.perf_counter()
-    poses, name = (start, "given start") if start is not None else _own_start(problem, soc)
-    seconds = time.perf_counter() - began
-    stages.append(Stage(name, Status.CONVERGED, 0, problem.objective(poses), seconds, History()))
-    watch.found.append(poses)
-    if soc is not None:
-        first: Run[Any] = watch.run(soc, problem, poses)
-        stages.append(Stage.of(first))
-        # A start that is better than SOC's best iterate is kept: CSAIL's chordal start is within 1e-4.
-        poses = first.poses if first.objective <= problem.objective(poses) else poses
-        del first  # its factor is the next one's to take over
-    return _polished(problem, pipeline, stages, watch, poses)
+    def tries(
+        self,
+        attempt: Callable[[SOC | PaperSOC | None, Poses | None], tuple[Poses, Certificate]],
+        start: Poses | None,
+    ) -> tuple[Poses, Certificate]:
+        """One attempt, and where its certificate is wider than asked for a second one with a finer SOC."""
+        poses, certificate = attempt(self.pipeline.soc, start)
+        if self.pipeline.second_try and certificate.can_improve and self.stages[-1].status.is_success:
+            soc = self.pipeline.soc if self.pipeline.soc is not None else SOC()
+            fine = replace(soc, tolerance=min(soc.tolerance, _SECOND_TRY_TOLERANCE), max_iterations=SOC.max_iterations)
+            poses, certificate = _better(self.problem, poses, certificate, attempt(fine, None)[1])
+        return poses, certificate
 
+    def attempt(self, soc: SOC | PaperSOC | None, start: Poses | None) -> tuple[Poses, Certificate]:
+        """SOC, Newton and certificate from a start."""
+        began = time.perf_counter()
+        poses, name = (start, "given start") if start is not None else _own_start(self.problem, soc)
+        seconds = time.perf_counter() - began
+        self.stages.append(Stage(name, Status.CONVERGED, 0, self.problem.objective(poses), seconds, History()))
+        self.watch.found.append(poses)
+        if soc is not None:
+            first: Run[Any] = self.watch.run(soc, self.problem, poses)
+            self.stages.append(Stage.of(first))
+            # A start that is better than SOC's best iterate is kept: CSAIL's chordal start is within 1e-4.
+            poses = first.poses if first.objective <= self.problem.objective(poses) else poses
+            del first  # its factor is the next one's to take over
+        return self.polish(poses)
 
-def _polished(
-    problem: PGOProblem, pipeline: Pipeline, stages: list[Stage], watch: Watch, poses: Poses
-) -> tuple[Poses, Certificate]:
-    """Newton, unless the stage before was cut short, and certificate."""
-    decrement = math.inf
-    if stages[-1].status not in OUT_OF_TIME:
-        second = watch.run(pipeline.newton, problem, poses)
-        stages.append(Stage.of(second))
-        poses, decrement = second.poses, second.state.polish.decrement
-        del second
-    return poses, certify_at(problem, poses, pipeline.gap, decrement)
+    def polish(self, poses: Poses) -> tuple[Poses, Certificate]:
+        """Newton, unless the stage before was cut short, and certificate."""
+        decrement = math.inf
+        if self.stages[-1].status not in OUT_OF_TIME:
+            second = self.watch.run(self.pipeline.newton, self.problem, poses)
+            self.stages.append(Stage.of(second))
+            poses, decrement = second.poses, second.state.polish.decrement
+            del second
+        return poses, certify_at(self.problem, poses, self.pipeline.gap, decrement)
 
+    def climb(self, staircase: Staircase, poses: Poses, certificate: Certificate) -> tuple[Poses, Certificate]:
+        """Staircase from the best poses, Newton from what it rounds to, and the relaxation's bound if still needed."""
+        problem, gap = self.problem, self.pipeline.gap
+        bounds: list[DualBound | None] = []
+        # Of a run that was cut short the state with the best poses is kept, not the one with the best bound.
+        watching = replace(self.watch, callback=lambda state, record: bounds.append(state.bound))
+        climb = watching.run(replace(staircase, gap=gap), problem, poses)
+        self.stages.append(Stage.of(climb))
+        poses, certificate = _better(problem, poses, certificate, self.polish(climb.poses)[1])
+        bound = bounds[-1] if bounds else None
+        if bound is not None and not certificate.is_certified:
+            relaxed = certify_with(
+                problem, poses, bound.Lambda, gap, certificate.stationarity, BoundSource.RELAXATION, bound.bound
+            )
+            certificate = max(certificate, relaxed, key=lambda found: found.lower_bound)
+        return poses, certificate
 
-def _broken_off(
-    problem: PGOProblem, pipeline: Pipeline, watch: Watch, stages: list[Stage]
-) -> tuple[Poses, Certificate]:
-    """Best poses found before an interruption, with the bound 0, which needs no proof."""
-    poses = min(watch.found, key=problem.objective)
-    stages.append(_interruption(problem.objective(poses)))
-    nothing = np.zeros_like(poses.R)
-    return poses, certify_with(problem, poses, nothing, pipeline.gap, math.inf, BoundSource.GIVEN, NO_BOUND)
+    def broken_off(self) -> tuple[Poses, Certificate]:
+        """Best poses found before an interruption, with the bound 0, which needs no proof."""
+        poses = min(self.watch.found, key=self.problem.objective)
+        self.interrupt(self.problem.objective(poses))
+        nothing, source = np.zeros_like(poses.R), BoundSource.GIVEN
+        return poses, certify_with(self.problem, poses, nothing, self.pipeline.gap, math.inf, source, NO_BOUND)
 
-
-def _interruption(objective: float) -> Stage:
-    return Stage("interruption", Status.INTERRUPTED, 0, objective, 0.0, History())
+    def interrupt(self, objective: float) -> None:
+        """Note that what was under way was broken off."""
+        self.stages.append(Stage("interruption", Status.INTERRUPTED, 0, objective, 0.0, History()))
 
 
 def _own_start(problem: PGOProblem, soc: SOC | PaperSOC | None) -> tuple[Poses, str]:
     if isinstance(soc, PaperSOC):
         return spanning_tree_start(problem.graph), "spanning tree"
     return chordal_start(problem), "chordal start"
-
-
-def _climb(
-    problem: PGOProblem,
-    pipeline: Pipeline,
-    poses: Poses,
-    certificate: Certificate,
-    stages: list[Stage],
-    watch: Watch,
-) -> tuple[Poses, Certificate]:
-    """Staircase from the best poses, Newton from what it rounds to, and the relaxation's bound if still needed."""
-    assert pipeline.staircase is not None
-    bounds: list[DualBound | None] = []
-    # Of a run that was cut short the state with the best poses is kept, not the one with the best bound.
-    watching = replace(watch, callback=lambda state, record: bounds.append(state.bound))
-    climb = watching.run(replace(pipeline.staircase, gap=pipeline.gap), problem, poses)
-    stages.append(Stage.of(climb))
-    rounded = _polished(problem, pipeline, stages, watch, climb.poses)[1]
-    poses, certificate = _better(problem, poses, certificate, rounded)
-    bound = bounds[-1] if bounds else None
-    if bound is not None and not certificate.is_certified:
-        stationarity = certificate.stationarity
-        relaxed = certify_with(
-            problem, poses, bound.Lambda, pipeline.gap, stationarity, BoundSource.RELAXATION, bound.bound
-        )
-        certificate = max(certificate, relaxed, key=lambda found: found.lower_bound)
-    return poses, certificate
 
 
 def _better(
