@@ -31,31 +31,38 @@ from solvers.result import Measurement, Status
 
 
 @dataclass(frozen=True, eq=False)
-class BregmanState:
-    """Iterate k of `Bregman`: x, (m,), the subgradient p, (m,), of J at x, and the compiled subproblem."""
+class _ExactState:
+    """Iterate k of a form that minimises over the whole of x: every one after the first step is stationary."""
 
     k: int
     x: Array
+
+    @property
+    def stationarity(self) -> float:
+        """Distance of 0 from the subdifferential of the Lagrangian; inf before the first step."""
+        return 0.0 if self.k > 0 else math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class BregmanState(_ExactState):
+    """Iterate k of `Bregman`: x, (m,), the subgradient p, (m,), of J at x, and the compiled subproblem."""
+
     p: Array
     subproblem: Subproblem
 
 
 @dataclass(frozen=True, eq=False)
-class TwoLineState:
+class TwoLineState(_ExactState):
     """Iterate k of `TwoLineBregman`: x, (m,), the residuals added up, b, (s,), and the compiled subproblem."""
 
-    k: int
-    x: Array
     b: Array
     subproblem: Subproblem
 
 
 @dataclass(frozen=True, eq=False)
-class MultiplierState:
+class MultiplierState(_ExactState):
     """Iterate k of `MethodOfMultipliers`: x, (m,), the multiplier lam, (s,), and the compiled subproblem."""
 
-    k: int
-    x: Array
     lam: Array
     subproblem: Subproblem
 
@@ -108,44 +115,27 @@ class BregmanSettings:
     subproblem_tolerance: float = TOLERANCE
 
     def __post_init__(self) -> None:
-        positive = {
-            "alpha": self.alpha,
-            "tolerance": self.tolerance,
-            "subproblem_tolerance": self.subproblem_tolerance,
-        }
-        for name, value in positive.items():
+        for name in ("alpha", "tolerance", "subproblem_tolerance"):
+            value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise SettingError(f"{name} must be positive and finite, got {value}")
         if self.max_iterations < 0:
             raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
 
-    def _figures(self, problem: BregmanProblem, x: Array, stationarity: float) -> Measurement:
-        infeasibility = float(np.linalg.norm(problem.residual(x)))
+    def measure(self, problem: BregmanProblem, state: _ExactState | AlternatingState) -> Measurement:
+        """J(x), ||K x - f||, relative, and the distance from stationarity, relative."""
+        infeasibility = float(np.linalg.norm(problem.residual(state.x)))
         primal = infeasibility / max(1.0, float(np.linalg.norm(problem.f)))
-        return Measurement(problem.objective(x), primal, stationarity, infeasibility)
+        return Measurement(problem.objective(state.x), primal, state.stationarity, infeasibility)
 
-    def _ending(self, measurement: Measurement) -> Status | None:
+    def converged(self, state: _ExactState | AlternatingState, measurement: Measurement) -> Status | None:
+        """CONVERGED when both residuals are within tolerance, after at least one step."""
         worst = max(measurement.primal_residual, measurement.dual_residual)
         return Status.CONVERGED if worst <= self.tolerance else None
 
 
 @dataclass(frozen=True)
-class _ExactForm(BregmanSettings):
-    """A form that minimises over the whole of x: every iterate after the first step is stationary."""
-
-    def measure(self, problem: BregmanProblem, state: BregmanState | TwoLineState | MultiplierState) -> Measurement:
-        """J(x) and ||K x - f||, relative; the dual residual is 0, or inf before the first step."""
-        return self._figures(problem, state.x, 0.0 if state.k > 0 else math.inf)
-
-    def converged(
-        self, state: BregmanState | TwoLineState | MultiplierState, measurement: Measurement
-    ) -> Status | None:
-        """CONVERGED when K x = f within tolerance, after at least one step."""
-        return self._ending(measurement)
-
-
-@dataclass(frozen=True)
-class Bregman(_ExactForm):
+class Bregman(BregmanSettings):
     """Bregman iteration with subgradients (paper: `update B`; Osher et al. 2005). Settings: `BregmanSettings`.
 
         x^{k+1} = argmin J(x) - J(x^k) - <p^k, x - x^k> + alpha/2 ||K x - f||^2
@@ -179,7 +169,7 @@ class Bregman(_ExactForm):
 
 
 @dataclass(frozen=True)
-class TwoLineBregman(_ExactForm):
+class TwoLineBregman(BregmanSettings):
     """Bregman iteration in two lines (paper: `bregman update`; Yin et al. 2008). Settings: `BregmanSettings`.
 
     x^{k+1} = argmin J(x) + alpha/2 ||K x - f + b^k||^2,    b^{k+1} = b^k + K x^{k+1} - f
@@ -212,7 +202,7 @@ class TwoLineBregman(_ExactForm):
 
 
 @dataclass(frozen=True)
-class MethodOfMultipliers(_ExactForm):
+class MethodOfMultipliers(BregmanSettings):
     """Method of multipliers (paper: `minbregman`). Settings: `BregmanSettings`.
 
         x^{k+1} = argmin L_alpha(x, lam^k),    lam^{k+1} = lam^k + alpha (f - K x^{k+1})
@@ -303,14 +293,6 @@ class AlternatingBregman(BregmanSettings):
         stationarity = self._stationarity(problem, x - before)
         stationarity /= max(1.0, float(np.linalg.norm(problem.K.T @ lam)))
         return AlternatingState(state.k + 1, x, lam, state.subproblems, stationarity)
-
-    def measure(self, problem: BregmanProblem, state: AlternatingState) -> Measurement:
-        """J(x), ||K x - f||, relative, and the distance from stationarity, relative."""
-        return self._figures(problem, state.x, state.stationarity)
-
-    def converged(self, state: AlternatingState, measurement: Measurement) -> Status | None:
-        """CONVERGED when both residuals are within tolerance."""
-        return self._ending(measurement)
 
     def point(self, problem: BregmanProblem, state: AlternatingState) -> BregmanPoint:
         """The state's x and lam."""
