@@ -23,8 +23,14 @@ _MARKER_DISTANCE = 0.08  # of the diagonal of a panel
 _MOST_POINTS = 400  # of a curve in a page: sweeps by the thousand would make it slow
 
 
-def plot_efforts(curves: Sequence[Curve]) -> Figure:
+def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -> Figure:
     """Figure of the gap of several methods over what they spent; a panel holds those whose effort is counted.
+
+    Parameters
+    ----------
+    curves : sequence of Curve
+    efforts : sequence of Effort
+        A panel for each, all but that of iterations with a logarithmic axis.
 
     Raises
     ------
@@ -33,7 +39,7 @@ def plot_efforts(curves: Sequence[Curve]) -> Figure:
     MissingExtraError
         Without matplotlib.
     """
-    panels = _panels(curves)
+    panels = _panels(curves, efforts)
     styles = _styles(curves, _LINES)
     with column_figure(height=0.95, width=max(1.0, 0.9 * len(panels))) as figure:
         handles = {}
@@ -42,8 +48,8 @@ def plot_efforts(curves: Sequence[Curve]) -> Figure:
             for curve in shown:
                 colour, marker, line = styles[curve.name]
                 x, y = _points(curve, effort)
-                form = f"{marker}{line}"
-                (handles[curve.name],) = axes.loglog(x, y, form, color=colour, markevery=_MARKER_DISTANCE)
+                draw = axes.semilogy if effort is Effort.ITERATIONS else axes.loglog
+                (handles[curve.name],) = draw(x, y, f"{marker}{line}", color=colour, markevery=_MARKER_DISTANCE)
             axes.set_xlabel(effort.value)
         grid[0].set_ylabel("relative gap")
         names = [curve.name for curve in curves if curve.name in handles]
@@ -66,7 +72,7 @@ def explore_efforts(curves: Sequence[Curve], title: str = "") -> PlotlyFigure:
         from plotly.subplots import make_subplots
     except ImportError as error:
         raise MissingExtraError("plotly", "plot") from error
-    panels = _panels(curves)
+    panels = _panels(curves, _PANELS)
     styles = _styles(curves, _DASHES)
     figure = make_subplots(1, len(panels), shared_yaxes=True, horizontal_spacing=0.03)
     named: set[str] = set()
@@ -102,10 +108,10 @@ def explore_efforts(curves: Sequence[Curve], title: str = "") -> PlotlyFigure:
     return figure
 
 
-def _panels(curves: Sequence[Curve]) -> list[tuple[Effort, list[Curve]]]:
+def _panels(curves: Sequence[Curve], efforts: Sequence[Effort]) -> list[tuple[Effort, list[Curve]]]:
     panels = []
-    for effort in _PANELS:
-        shown = [curve for curve in curves if _is_counted(curve, effort) and len(_points(curve, effort)[0])]
+    for effort in efforts:
+        shown = [curve for curve in curves if curve.counts(effort) and len(_points(curve, effort)[0])]
         if shown:
             panels.append((effort, shown))
     if not panels:
@@ -113,15 +119,10 @@ def _panels(curves: Sequence[Curve]) -> list[tuple[Effort, list[Curve]]]:
     return panels
 
 
-def _is_counted(curve: Curve, effort: Effort) -> bool:
-    known = {Effort.ROUNDS: curve.rounds, Effort.BYTES: curve.num_bytes}
-    return effort not in known or known[effort] is not None
-
-
 def _points(curve: Curve, effort: Effort) -> tuple[Array, Array]:
-    """What logarithmic axes can show of a curve."""
+    """What the axes can show of a curve."""
     x, y = curve.effort(effort), curve.gap
-    shown = (x > 0) & np.isfinite(y) & (y > 0)
+    shown = ((x > 0) | (effort is Effort.ITERATIONS)) & np.isfinite(y) & (y > 0)
     return x[shown], y[shown]
 
 

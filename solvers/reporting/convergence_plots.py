@@ -1,4 +1,4 @@
-"""Pictures of runs: residuals and gap over the iterations with the paper's mark, and methods beside each other."""
+"""Pictures of runs: residuals and gap over the iterations with the paper's mark; what methods spent."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pgo_models.certificates.certificate import relative_gap
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.published_results import PublishedRun
-from pgo_models.plots.style import ALARM_COLOUR, COLOURS, MARKERS, column_figure
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, column_figure
 from solvers.result import History
 
 if TYPE_CHECKING:
@@ -69,6 +69,10 @@ class Curve:
         """(objective - lower_bound) / objective of every record."""
         return np.array([relative_gap(objective, self.lower_bound) for objective in self.history.objective])
 
+    def counts(self, effort: Effort) -> bool:
+        """Whether it is known what was spent."""
+        return self._efforts[effort] is not None
+
     def effort(self, effort: Effort) -> Array:
         """What was spent up to every record.
 
@@ -77,15 +81,18 @@ class Curve:
         SettingError
             When the curve does not know its communication.
         """
-        known = {
+        if not self.counts(effort):
+            raise SettingError(f"{self.name} has no count of {effort.value}; give it to the Curve, or leave it out")
+        return np.asarray(self._efforts[effort], dtype=float)
+
+    @property
+    def _efforts(self) -> dict[Effort, Array | None]:
+        return {
             Effort.ITERATIONS: self.history.k,
             Effort.SECONDS: self.history.seconds,
             Effort.ROUNDS: self.rounds,
             Effort.BYTES: self.num_bytes,
-        }[effort]
-        if known is None:
-            raise SettingError(f"{self.name} has no count of {effort.value}; give it to the Curve, or leave it out")
-        return np.asarray(known, dtype=float)
+        }
 
 
 def plot_convergence(
@@ -128,36 +135,6 @@ def plot_convergence(
         if published is not None:
             _mark(below, published, begin)
         figure.legend(loc="outside lower center", ncols=2)
-    return figure
-
-
-def plot_gaps(curves: Sequence[Curve], effort: Effort = Effort.ITERATIONS) -> Figure:
-    """Figure of the gap of several methods against what they spent; what starts at zero starts at the left edge.
-
-    Parameters
-    ----------
-    curves : sequence of Curve
-    effort : Effort
-        Iterations, rounds, bytes or seconds; all but iterations on a logarithmic axis.
-
-    Raises
-    ------
-    SettingError
-        When a curve does not know this effort.
-    MissingExtraError
-        Without matplotlib.
-    """
-    with column_figure(height=0.85) as figure:
-        axes = figure.add_subplot()
-        styles = zip(cycle(COLOURS), cycle(MARKERS), cycle(_LINES), strict=True)
-        for curve, (colour, marker, line) in zip(curves, styles, strict=False):
-            style = {"color": colour, "markevery": max(1, len(curve.history) // _MOST_MARKERS)}
-            _semilogy(axes, curve.effort(effort), curve.gap, curve.name, f"{marker}{line}", style)
-        if effort is not Effort.ITERATIONS:
-            _logarithmic(axes)
-        axes.set_xlabel(effort.value)
-        axes.set_ylabel("relative gap")
-        figure.legend(loc="outside upper center", ncols=2)
     return figure
 
 
@@ -232,17 +209,6 @@ def _semilogy(axes: Axes, k: Array, values: Array, label: str, form: str, style:
     shown = np.isfinite(values) & (values > 0)
     if shown.any():
         axes.semilogy(k[shown], values[shown], form, label=label, **style)
-
-
-def _logarithmic(axes: Axes) -> None:
-    """Logarithmic axis below, with few labels: 1, 2, 5, 10 over a short range, powers of ten over a long one."""
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
-    axes.set_xscale("log")
-    lowest, highest = axes.get_xlim()
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if highest > 100 * lowest else (1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _mark(axes: Axes, published: PublishedRun, last: float) -> None:

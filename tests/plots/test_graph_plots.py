@@ -10,7 +10,8 @@ from pgo_models.plots.curves import plot_decay, plot_tightness
 from pgo_models.plots.graph_plots import draw_graph, plot_against_truth
 from pgo_models.plots.matrix_plots import plot_sparsity, plot_spectrum
 from pgo_models.plots.style import save_figure
-from solvers.reporting.convergence_plots import Curve, plot_convergence, plot_gaps
+from solvers.reporting.comparison_plots import plot_efforts
+from solvers.reporting.convergence_plots import Curve, plot_convergence
 
 pytest.importorskip("matplotlib")
 
@@ -96,7 +97,7 @@ def test_figures_are_a_column_wide_and_readable_there(tmp_path):
         plot_decay([("half", 0.5 ** np.arange(5))], "error (m)"),
         plot_tightness([("circle", np.array([0.5, 1.0]), np.array([1.0, 0.5]))]),
         plot_convergence(stages, solution.lower_bound),
-        plot_gaps([Curve("SOC", stages[1][1], solution.lower_bound)]),
+        plot_efforts([Curve("SOC", stages[1][1], solution.lower_bound)]),
     ]
     from matplotlib.text import Text
 

@@ -8,7 +8,8 @@ from pgo_models.certificates.certificate import relative_gap
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.graphs.published_results import PublishedRun
 from solvers import History, Measurement, Record
-from solvers.reporting.convergence_plots import Curve, Effort, explore_convergence, plot_convergence, plot_gaps
+from solvers.reporting.comparison_plots import plot_efforts
+from solvers.reporting.convergence_plots import Curve, Effort, explore_convergence, plot_convergence
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("plotly")
@@ -45,7 +46,7 @@ def test_efforts_are_what_was_counted():
 @pytest.mark.parametrize("effort", [Effort.ROUNDS, Effort.BYTES])
 def test_an_effort_that_was_not_counted_is_refused(effort):
     with pytest.raises(SettingError, match=f"no count of {effort.value.split()[0]}"):
-        plot_gaps([Curve("x", history(4), 9.5)], effort)
+        Curve("x", history(4), 9.5).effort(effort)
 
 
 def test_stages_follow_each_other_and_what_has_no_logarithm_is_left_out():
@@ -89,11 +90,11 @@ def test_a_run_without_records_is_refused(picture):
 
 @pytest.mark.parametrize("effort", [Effort.ITERATIONS, Effort.SECONDS])
 def test_methods_are_told_apart_by_more_than_colour(effort):
-    figure = plot_gaps([Curve(name, history(9, factor), 9.5) for name, factor in (("a", 0.5), ("b", 0.3))], effort)
+    figure = plot_efforts([Curve(name, history(9, factor), 9.5) for name, factor in (("a", 0.5), ("b", 0.3))], [effort])
     one, other = figure.axes[0].lines
     assert one.get_color() != other.get_color()
     assert one.get_marker() != other.get_marker()
-    assert one.get_linestyle() != other.get_linestyle()
+    assert (figure.axes[0].get_xscale() == "linear") == (effort is Effort.ITERATIONS) == (0 in one.get_xdata())
     assert effort.value in figure.axes[0].get_xlabel()
 
 
