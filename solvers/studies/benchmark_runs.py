@@ -172,24 +172,21 @@ def _paper(problem: PGOProblem, allowed: _Allowance, start: Poses | None) -> Ben
     k = first.history.k
     leg = StageRecord("SOC", first.status, first.history, alone.num_robots, k, k * float(exchange.num_bytes.sum()))
     newton = replace(gauss_newton(), tolerance=_SECOND_STAGE_TOLERANCE)
-    solution, last = _with_translations(*allowed.solve(problem, None, newton, handed_over))
-    remark = ""
+    solution, last = allowed.solve(problem, None, newton, handed_over)
+    rounds, remark = _with_translations(last), ""
     if total is not None:
-        rounds = last[0].rounds
-        assert rounds is not None
         within = int(np.flatnonzero(k[-1] + rounds <= total).max(initial=0))
         if within < len(rounds) - 1:
             shorter = replace(newton, max_iterations=within)
-            solution, last = _with_translations(*allowed.solve(problem, None, shorter, handed_over))
-            remark = f"stopped within {total} rounds"
-    return replace(_finished(solution, (leg, *last)), remark=remark)
+            solution, last = allowed.solve(problem, None, shorter, handed_over)
+            rounds, remark = _with_translations(last), f"stopped within {total} rounds"
+    return replace(_finished(solution, (leg, replace(last[0], rounds=rounds), *last[1:])), remark=remark)
 
 
-def _with_translations(solution: Solution, legs: tuple[StageRecord, ...]) -> tuple[Solution, tuple[StageRecord, ...]]:
-    """Legs with the round, but not its bytes, in which robots that know rotations alone get their translations."""
-    rounds = legs[0].rounds
-    assert rounds is not None
-    return solution, (replace(legs[0], rounds=rounds + 1.0), *legs[1:])
+def _with_translations(legs: tuple[StageRecord, ...]) -> Array:
+    """Rounds of the first leg and the one, without its bytes, in which robots that know rotations get translations."""
+    assert legs[0].rounds is not None
+    return legs[0].rounds + 1.0
 
 
 def _gauss_seidel(problem: PGOProblem, allowed: _Allowance, start: Poses | None) -> BenchmarkRun:
@@ -226,7 +223,8 @@ def _legs_of(solution: Solution) -> tuple[StageRecord, ...]:
     for stage in solution.stages[1:]:
         records = tuple(replace(record, seconds=start + record.seconds) for record in stage.history.records)
         history, start = History(records), 0.0
-        rounds, num_bytes = _rounds_of(history), _bytes_of(history)
+        rounds = _counted([record.measurement.rounds for record in records])
+        num_bytes = _counted([record.measurement.num_bytes for record in records])
         if rounds is not None and num_bytes is not None:
             last = rounds[-1], num_bytes[-1]
             rounds, num_bytes = rounds - rounds_before, num_bytes - bytes_before
@@ -239,15 +237,8 @@ def _finished(solution: Solution, legs: tuple[StageRecord, ...]) -> BenchmarkRun
     return BenchmarkRun(BenchmarkMethod.JOINT, legs, solution.poses, solution.objective, solution.status)
 
 
-def _rounds_of(history: History) -> Array | None:
-    return _counted([record.measurement.rounds for record in history.records])
-
-
-def _bytes_of(history: History) -> Array | None:
-    return _counted([record.measurement.num_bytes for record in history.records])
-
-
 def _counted(values: list[int | None]) -> Array | None:
+    """Counts of every record; None where one is not known."""
     known = [value for value in values if value is not None]
     return np.array(known, dtype=float) if len(known) == len(values) else None
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import enum
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
@@ -21,6 +22,7 @@ from solvers.studies.paper_figures import FigureSet, draw_paper_figures
 from solvers.studies.paper_tables import ReproductionSettings, reproduce_tables
 from solvers.studies.paper_tables_text import tables_as_text
 
+Choice = TypeVar("Choice", bound=enum.Enum)
 KEPT_FILE = Path("pgo-tables.json")
 DownloadOption = Annotated[
     bool, typer.Option("--download", help="Download the benchmark graphs that are not here; each is checked.")
@@ -88,7 +90,9 @@ def compare_command(
     for path in plot or []:
         check_plot_format(path)
         check_writable(path)
-    settings = ComparisonSettings(_contenders(methods), BenchmarkSettings(robots, time_limit=time_limit))
+    settings = ComparisonSettings(
+        _chosen(BenchmarkMethod, methods, "method"), BenchmarkSettings(robots, time_limit=time_limit)
+    )
     loaded = load(graph)
     comparison = compare_methods(PGOProblem(loaded.unit_weights() if unit_weights else loaded), settings)
     table = comparison.table()
@@ -106,11 +110,7 @@ def figures_command(
     download: DownloadOption = False,
 ) -> None:
     """Draw the paper's figures anew, as PNG and as pages to explore."""
-    known = {one.value: one for one in FigureSet}
-    for name in _split(only):
-        if name not in known:
-            raise SettingError(f"there is no figure {name!r}; there are {', '.join(known)}")
-    written, reasons = draw_paper_figures(out, tuple(known[name] for name in _split(only)), download=download)
+    written, reasons = draw_paper_figures(out, _chosen(FigureSet, only, "figure"), download=download)
     for path in written:
         typer.echo(f"written: {path}")
     for reason in reasons:
@@ -119,12 +119,12 @@ def figures_command(
         raise PGOError("no figure could be drawn: no graph is here")
 
 
-def _contenders(methods: str) -> tuple[BenchmarkMethod, ...]:
-    known = {one.value: one for one in BenchmarkMethod}
-    for name in _split(methods):
+def _chosen(choices: type[Choice], names: str, kind: str) -> tuple[Choice, ...]:
+    known = {one.value: one for one in choices}
+    for name in _split(names):
         if name not in known:
-            raise SettingError(f"there is no method {name!r}; there are {', '.join(known)}")
-    return tuple(known[name] for name in _split(methods))
+            raise SettingError(f"there is no {kind} {name!r}; there are {', '.join(known)}")
+    return tuple(known[name] for name in _split(names))
 
 
 def _split(names: str) -> tuple[str, ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import enum
 import html
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -66,24 +65,15 @@ class Shown:
     lower_bound: float
 
     @property
-    def result(self) -> Poses:
-        """Its poses, aligned with the truth or the estimate that the graph came with."""
-        reference = self.graph.truth if self.graph.truth is not None else self.graph.initial
-        poses = self.trial.poses
-        return poses if reference is None else poses.aligned_to(reference)
-
-    @property
-    def title(self) -> str:
-        """Of the picture of the result."""
-        gap = relative_gap(self.trial.objective, self.lower_bound)
-        return f"{self.graph.name}, SOC: F = {self.trial.objective:.6g}, gap {gap_percent(gap)} %"
-
-    @property
     def panels(self) -> list[tuple[str, PoseGraph, Poses]]:
-        """Truth, if known, and result."""
-        shown = [(self.title, self.graph, self.result)]
-        if self.graph.truth is not None:
-            shown.insert(0, (f"{self.graph.name}, ground truth", self.graph, self.graph.truth))
+        """Truth, if known, and result, aligned with it or with the estimate that the graph came with."""
+        graph, poses = self.graph, self.trial.poses
+        reference = graph.truth if graph.truth is not None else graph.initial
+        gap = gap_percent(relative_gap(self.trial.objective, self.lower_bound))
+        title = f"{graph.name}, SOC: F = {self.trial.objective:.6g}, gap {gap} %"
+        shown = [(title, graph, poses if reference is None else poses.aligned_to(reference))]
+        if graph.truth is not None:
+            shown.insert(0, (f"{graph.name}, ground truth", graph, graph.truth))
         return shown
 
 
@@ -240,35 +230,29 @@ def _run(row: PublishedRow, download: bool) -> Shown:
 def _write_grid(one: FigureSet, here: list[Shown], folder: Path) -> list[Path]:
     columns = [shown.panels for shown in here]
     panels = [[column[r] for column in columns if r < len(column)] for r in range(max(map(len, columns)))]
-    return [
-        _written(folder / f"{one.value}.png", lambda path: save_figure(plot_panels(panels), path)),
-        _written(folder / f"{one.value}.html", lambda path: save_page(explore_panels(panels), path)),
-    ]
+    return _write_both(folder, one.value, plot_panels(panels), explore_panels(panels))
 
 
 def _write_convergence(one: FigureSet, here: list[Shown], folder: Path) -> list[Path]:
     written = []
     for shown in here:
         stages = [(name, _from_step_one(leg)) for name, leg in zip(_STAGES, shown.trial.legs, strict=True)]
-        published = published_run(shown.graph)
-        picture = plot_convergence(stages, shown.lower_bound, published)
-        page = explore_convergence(stages, shown.lower_bound, published)
+        curves = stages, shown.lower_bound, published_run(shown.graph)
         name = f"{one.value}-{shown.graph.name}"
-        save_figure(picture, folder / f"{name}.png")
-        save_page(page, folder / f"{name}.html")
-        written += [folder / f"{name}.png", folder / f"{name}.html"]
+        written += _write_both(folder, name, plot_convergence(*curves), explore_convergence(*curves))
     return written
+
+
+def _write_both(folder: Path, name: str, picture: Figure, page: PlotlyFigure) -> list[Path]:
+    save_figure(picture, folder / f"{name}.png")
+    save_page(page, folder / f"{name}.html")
+    return [folder / f"{name}.png", folder / f"{name}.html"]
 
 
 def _from_step_one(leg: StageRecord) -> History:
     """History in which state 0 of SOC, where R and omega are the same start, has no primal residual but zero."""
     first, *others = leg.history.records
     return History((replace(first, measurement=replace(first.measurement, primal_residual=0.0)), *others))
-
-
-def _written(path: Path, write: Callable[[Path], None]) -> Path:
-    write(path)
-    return path
 
 
 def _check_extras() -> None:
