@@ -54,7 +54,7 @@ from solvers.reporting.versions import versions
 from solvers.shell import DONE, Commands, run_command, save_then_show
 from solvers.soc.soc import SOC
 from solvers.solution import certificate_json, check_format, check_target, write_json
-from solvers.studies.commands import compare_command, figures_command, tables_command
+from solvers.studies.commands import UnitWeightsOption, compare_command, figures_command, tables_command
 
 NOT_CONVERGED, NOT_CERTIFIED = 2, 3
 
@@ -86,9 +86,6 @@ SplitOption = Annotated[
     ),
 ]
 GapOption = Annotated[float, typer.Option(callback=_finite_gap, help="Relative gap to certify.")]
-UnitWeightsOption = Annotated[
-    bool, typer.Option("--unit-weights", help="Set kappa = tau = 1, the weights of the paper's equation.")
-]
 
 
 @app.command("solve")

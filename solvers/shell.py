@@ -49,10 +49,7 @@ def run_command(app: typer.Typer, arguments: list[str]) -> int:
             code, message = _run(app, arguments)
         out.flush()
         if out.error is not None and out.error.errno != errno.EPIPE:  # who closes a pipe has read enough
-            code, message = (
-                BAD_INPUT,
-                f"cannot print: {out.error.strerror}; --out is written all the same",
-            )
+            code, message = BAD_INPUT, f"cannot print: {out.error.strerror}; --out is written all the same"
         if code == BROKEN_OFF:
             code, message = broken.code, f"{broken.word} before it was done"
         elif broken.signal is not None and code != BAD_INPUT:

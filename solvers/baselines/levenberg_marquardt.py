@@ -7,7 +7,7 @@ Least Squares Problems, algorithm 3.16) and the scaling of Marquardt (1963): rot
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.sparse import csc_array
@@ -64,8 +64,8 @@ class LevenbergMarquardtState:
     analysis: SymbolicCholesky
     damping: float
     growth: float
-    step: Array
-    decrement: float
+    step: Array = field(default_factory=lambda: np.empty(0))
+    decrement: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -107,39 +107,17 @@ class LevenbergMarquardt:
     def init(self, problem: PGOProblem, start: Poses | None) -> LevenbergMarquardtState:
         """State 0: `start`, or the chordal relaxation."""
         poses = start if start is not None else chordal_start(problem)
-        objective = problem.objective(poses)
-        matrix, gradient = _linearized(problem, poses)
-        analysis = analyze(matrix, problem.backend)
-        level = rounding_level(problem, poses)
-        step, decrement = _damped_step(matrix, gradient, analysis, self.damping, objective, level)
-        return LevenbergMarquardtState(
-            0, poses, objective, level, matrix, gradient, analysis, self.damping, _GROWTH, step, decrement
-        )
+        return _linearized(problem, 0, poses, problem.objective(poses), self.damping)
 
     def step(self, problem: PGOProblem, state: LevenbergMarquardtState) -> LevenbergMarquardtState:
         """Take the step if F falls, and set the damping by how well the model foresaw it."""
         ratio, candidate, objective = self._tried(problem, state)
         if not ratio > 0:
             damping = min(state.growth * state.damping, _DAMPING_LIMITS[1])
-            again = replace(state, k=state.k + 1, damping=damping, growth=_GROWTH * state.growth)
-        else:
-            factor = max(_SMALLEST_FACTOR, 1.0 - (2.0 * min(ratio, 1.0) - 1.0) ** 3)
-            matrix, gradient = _linearized(problem, candidate)
-            again = replace(
-                state,
-                k=state.k + 1,
-                poses=candidate,
-                objective=objective,
-                level=rounding_level(problem, candidate),
-                matrix=matrix,
-                gradient=gradient,
-                damping=max(factor * state.damping, _DAMPING_LIMITS[0]),
-                growth=_GROWTH,
-            )
-        step, decrement = _damped_step(
-            again.matrix, again.gradient, again.analysis, again.damping, again.objective, again.level
-        )
-        return replace(again, step=step, decrement=decrement)
+            return _with_step(replace(state, k=state.k + 1, damping=damping, growth=_GROWTH * state.growth))
+        factor = max(_SMALLEST_FACTOR, 1.0 - (2.0 * min(ratio, 1.0) - 1.0) ** 3)
+        damping = max(factor * state.damping, _DAMPING_LIMITS[0])
+        return _linearized(problem, state.k + 1, candidate, objective, damping, state.analysis)
 
     def measure(self, problem: PGOProblem, state: LevenbergMarquardtState) -> Measurement:
         """F and the relative decrement."""
@@ -168,20 +146,30 @@ class LevenbergMarquardt:
         return (state.objective - objective + rounding) / (foreseen + rounding), poses, objective
 
 
-def _linearized(problem: PGOProblem, poses: Poses) -> tuple[csc_array, Array]:
+def _linearized(
+    problem: PGOProblem,
+    k: int,
+    poses: Poses,
+    objective: float,
+    damping: float,
+    analysis: SymbolicCholesky | None = None,
+) -> LevenbergMarquardtState:
+    """State at new poses."""
     matrix = riemannian_hessian(problem, poses, None)
     ground_pose(matrix, problem)
     gradient = TangentLayout(problem.num_poses, problem.d).join(*problem.riemannian_gradient(poses))
-    return matrix, gradient
+    analysis = analysis if analysis is not None else analyze(matrix, problem.backend)
+    level = rounding_level(problem, poses)
+    return _with_step(LevenbergMarquardtState(k, poses, objective, level, matrix, gradient, analysis, damping, _GROWTH))
 
 
-def _damped_step(
-    matrix: csc_array, gradient: Array, analysis: SymbolicCholesky, damping: float, objective: float, level: float
-) -> tuple[Array, float]:
-    damped = matrix.copy()
-    damped.setdiag((1.0 + damping) * matrix.diagonal())
+def _with_step(state: LevenbergMarquardtState) -> LevenbergMarquardtState:
+    """State with the step of its damping."""
+    damped = state.matrix.copy()
+    damped.setdiag((1.0 + state.damping) * state.matrix.diagonal())
     try:
-        step = -analysis.factorize(damped).solve(gradient)
+        step = -state.analysis.factorize(damped).solve(state.gradient)
     except NotPositiveDefiniteError:
-        return np.full_like(gradient, np.nan), math.inf
-    return step, scaled_decrement(-inner(gradient, step), objective, level)
+        return replace(state, step=np.full_like(state.gradient, np.nan), decrement=math.inf)
+    foreseen = -inner(state.gradient, step)
+    return replace(state, step=step, decrement=scaled_decrement(foreseen, state.objective, state.level))

@@ -79,11 +79,12 @@ def schedule(graph: PoseGraph, robots: Partition, sweep: Sweep) -> Schedule:
         When the partition is of another number of poses.
     """
     cut = robots.cut_edges(graph)
+    i, j = graph.i[cut], graph.j[cut]  # of the edges between robots
     robot, num_robots = robots.robot, robots.num_robots
     inner = edge_counts(graph.i[~cut], graph.j[~cut], graph.num_poses)
     num_pieces, piece = connected_components(inner, directed=False)
     piece = piece.astype(np.int64)
-    between = edge_counts(piece[graph.i[cut]], piece[graph.j[cut]], num_pieces)
+    between = edge_counts(piece[i], piece[j], num_pieces)
     order = _most_anchored_first(between, int(piece[0]))
     owner = np.empty(num_pieces, dtype=np.int64)
     owner[piece] = robot
@@ -92,23 +93,16 @@ def schedule(graph: PoseGraph, robots: Partition, sweep: Sweep) -> Schedule:
     if sweep is Sweep.JACOBI:
         group = np.zeros(num_robots, dtype=np.int64)
     elif sweep is Sweep.COLORS:
-        group = _greedy_colors(edge_counts(robot[graph.i[cut]], robot[graph.j[cut]], num_robots), robot_order)
+        group = _greedy_colors(edge_counts(robot[i], robot[j], num_robots), robot_order)
     else:
-        group = _ranks(robot_order)
+        group = np.argsort(robot_order)  # the inverse permutation
     if sweep is Sweep.ROBOTS:
-        first = _ranks(order)
+        first = np.argsort(order)
     else:
         first = dijkstra(between, unweighted=True, indices=int(piece[0])).astype(np.int64)
-    sent, receiver = _separators(graph, robots)
-    return Schedule(robot=robot, group=group[robot], first=first[piece], sent=sent, receiver=receiver)
-
-
-def _separators(graph: PoseGraph, robots: Partition) -> tuple[IntArray, IntArray]:
-    cut, num_robots = robots.cut_edges(graph), robots.num_robots
-    i, j = graph.i[cut], graph.j[cut]
     pose, other = np.concatenate([i, j]), np.concatenate([j, i])
-    pair = np.unique(pose * num_robots + robots.robot[other])
-    return pair // num_robots, pair % num_robots
+    sent, receiver = np.divmod(np.unique(pose * num_robots + robot[other]), num_robots)
+    return Schedule(robot=robot, group=group[robot], first=first[piece], sent=sent, receiver=receiver)
 
 
 def _most_anchored_first(adjacency: csr_array, root: int) -> IntArray:
@@ -136,9 +130,3 @@ def _greedy_colors(adjacency: csr_array, order: IntArray) -> IntArray:
         taken = set(color[adjacency.indices[adjacency.indptr[member] : adjacency.indptr[member + 1]]].tolist())
         color[member] = next(c for c in range(len(taken) + 1) if c not in taken)
     return color
-
-
-def _ranks(order: IntArray) -> IntArray:
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order))
-    return rank

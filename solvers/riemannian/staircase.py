@@ -168,12 +168,10 @@ class Staircase:
     def measure(self, problem: PGOProblem, state: StaircaseState) -> Measurement:
         """F of the rounded poses, what rounding loses, and the decrement."""
         objective = problem.objective(self.poses(problem, state))
-        lost = (
-            0.0
-            if state.point.rank == problem.d
-            else (objective - state.point.value) / max(objective, state.rounding_level)
-        )
-        return Measurement(objective, max(lost, 0.0), state.decrement)
+        lost = 0.0
+        if state.point.rank > problem.d:
+            lost = max(objective - state.point.value, 0.0) / max(objective, state.rounding_level)
+        return Measurement(objective, lost, state.decrement)
 
     def poses(self, problem: PGOProblem, state: StaircaseState) -> Poses:
         """Y rounded to rotations, and the best translations for them."""

@@ -20,33 +20,23 @@ from solvers.result import History, Status
 class BenchmarkMethod(enum.Enum):
     """Methods that can be held against each other, by the name that `pgo compare` knows."""
 
-    JOINT = "joint"
-    CONSENSUS = "consensus"
-    PAPER = "paper"
-    SUBSTRUCTURED = "substructured"
-    STAIRCASE = "staircase"
-    GAUSS_SEIDEL = "gauss-seidel"
-    NEWTON = "newton"
-    LEVENBERG_MARQUARDT = "levenberg-marquardt"
-    GTSAM = "gtsam"
+    JOINT = "joint", "SOC joint + Newton"
+    CONSENSUS = "consensus", "SOC consensus + Newton"
+    PAPER = "paper", "SOC as in the paper"
+    SUBSTRUCTURED = "substructured", "SOC substructured + Newton"
+    STAIRCASE = "staircase", "SE-Sync (staircase)"
+    GAUSS_SEIDEL = "gauss-seidel", "DGS"
+    NEWTON = "newton", "Newton"
+    LEVENBERG_MARQUARDT = "levenberg-marquardt", "Levenberg-Marquardt"
+    GTSAM = "gtsam", "GTSAM"
 
-    @property
-    def label(self) -> str:
-        """Name in tables and pictures."""
-        return _LABELS[self]
+    label: str
 
-
-_LABELS = {
-    BenchmarkMethod.JOINT: "SOC joint + Newton",
-    BenchmarkMethod.CONSENSUS: "SOC consensus + Newton",
-    BenchmarkMethod.PAPER: "SOC as in the paper",
-    BenchmarkMethod.SUBSTRUCTURED: "SOC substructured + Newton",
-    BenchmarkMethod.STAIRCASE: "SE-Sync (staircase)",
-    BenchmarkMethod.GAUSS_SEIDEL: "DGS",
-    BenchmarkMethod.NEWTON: "Newton",
-    BenchmarkMethod.LEVENBERG_MARQUARDT: "Levenberg-Marquardt",
-    BenchmarkMethod.GTSAM: "GTSAM",
-}
+    def __new__(cls, name: str, label: str) -> BenchmarkMethod:
+        """Member whose value is its name alone; `label` is what tables and pictures call it."""
+        one = object.__new__(cls)
+        one._value_, one.label = name, label
+        return one
 
 
 @dataclass(frozen=True)

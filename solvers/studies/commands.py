@@ -27,6 +27,9 @@ KEPT_FILE = Path("pgo-tables.json")
 DownloadOption = Annotated[
     bool, typer.Option("--download", help="Download the benchmark graphs that are not here; each is checked.")
 ]
+UnitWeightsOption = Annotated[
+    bool, typer.Option("--unit-weights", help="Set kappa = tau = 1, the weights of the paper's equation.")
+]
 TableOption = Annotated[
     list[Path] | None,
     typer.Option("--out", "-o", help="Write the table: .md, .csv or .json; may be given several times."),
@@ -81,9 +84,7 @@ def compare_command(
         typer.Option(help="Write the gap against rounds, bytes and seconds: .png, .svg, .pdf or .html."),
     ] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for every method.")] = math.inf,
-    unit_weights: Annotated[
-        bool, typer.Option("--unit-weights", help="Set kappa = tau = 1, the weights of the paper's equation.")
-    ] = False,
+    unit_weights: UnitWeightsOption = False,
 ) -> None:
     """Run several methods on a graph and hold them against each other and a proven bound."""
     _check_tables(out)
