@@ -24,6 +24,8 @@ from solvers.reporting.versions import versions
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_STAGE_HEADS = ("stage", "iterations", "F", "seconds", "ended")
+
 
 @dataclass(frozen=True, eq=False)
 class Solution(Solved):
@@ -83,19 +85,17 @@ class Solution(Solved):
 
     def __str__(self) -> str:
         rows = [f"{label:<12} {text}" for label, text in self._summary()]
-        rows += ["", f"{'stage':<14} {'iterations':>10} {'F':>16} {'seconds':>9}  ended"]
-        for stage in self.stages:
-            rows.append(
-                f"{stage.name:<14} {stage.iterations:>10} {stage.objective:>16.10g} {stage.seconds:>9.3f}  "
-                f"{stage.status.name}"
-            )
+        lines = [_STAGE_HEADS, *self._stage_rows()]
+        rows += ["", *(f"{name:<14} {k:>10} {F:>16} {seconds:>9}  {ended}" for name, k, F, seconds, ended in lines)]
         return "\n".join(rows)
 
     def _repr_html_(self) -> str:
-        stages = [
+        return facts_table(self._summary()) + rows_table(_STAGE_HEADS, self._stage_rows())
+
+    def _stage_rows(self) -> list[tuple[str, str, str, str, str]]:
+        return [
             (s.name, str(s.iterations), f"{s.objective:.10g}", f"{s.seconds:.3f}", s.status.name) for s in self.stages
         ]
-        return facts_table(self._summary()) + rows_table(("stage", "iterations", "F", "seconds", "ended"), stages)
 
     def save(self, path: Path | str) -> None:
         """Write the solution in the format that the suffix of `path` names.

@@ -241,22 +241,13 @@ def pose_problem(problem: PGOProblem, R: Array) -> LeastSquares:
     every = np.arange(n)
     rows = np.repeat(rotation_columns(every, n, d)[:, :, None], tangent_dimension(d), axis=2)
     columns = np.repeat(layout.rotations(every)[:, None, :], d, axis=1)
+    rows = np.concatenate([every, rows.ravel()])
     parts = []
     for c in range(d):
         turned = np.einsum("nb,kba->nak", R[:, c], hat(np.eye(tangent_dimension(d))))  # d (R_i hat(w))_ca / d w_k
-        parts.append(
-            A
-            @ csr_array(
-                (
-                    np.concatenate([np.ones(n), turned.ravel()]),
-                    (
-                        np.concatenate([every, rows.ravel()]),
-                        np.concatenate([layout.translations(every)[:, c], columns.ravel()]),
-                    ),
-                ),
-                shape=(problem.side, layout.side),
-            )
-        )
+        entries = np.concatenate([np.ones(n), turned.ravel()])
+        places = rows, np.concatenate([layout.translations(every)[:, c], columns.ravel()])
+        parts.append(A @ csr_array((entries, places), shape=(problem.side, layout.side)))
     residuals = A @ Poses(R, np.zeros((n, d))).stacked()
     edge = np.concatenate([np.arange(m), np.repeat(np.arange(m), d)])
     pose = np.concatenate([np.repeat(every, d), np.repeat(every, tangent_dimension(d))])
@@ -301,9 +292,8 @@ def _moved(problem: PGOProblem, state: GaussSeidelState) -> Poses:
     """Poses (R_i Exp(hat(w_i)), t_0 + v_i) of the second stage, pose 0 at rest."""
     n, d = problem.num_poses, problem.d
     w, v = TangentLayout(n - 1, d).split(state.x[:, 0])
-    at_rest = np.zeros((1, w.shape[1])), np.zeros((1, d))
-    origin = Poses(state.R, np.broadcast_to(state.t[0], (n, d)))
-    return move_poses(origin, np.concatenate([at_rest[0], w]), np.concatenate([at_rest[1], v]))
+    origin, before = Poses(state.R, np.broadcast_to(state.t[0], (n, d))), ((1, 0), (0, 0))
+    return move_poses(origin, np.pad(w, before), np.pad(v, before))
 
 
 def _change(problem: PGOProblem, state: GaussSeidelState, x: Array) -> tuple[float, int]:

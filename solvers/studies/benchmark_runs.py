@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -124,13 +125,11 @@ class _Allowance:
         return solution, _legs_of(solution)
 
 
-def _one_run(solver: Solver[Any], name: str) -> Callable[[PGOProblem, _Allowance, Poses | None], BenchmarkRun]:
+def _one_run(
+    solver: Solver[Any], name: str, problem: PGOProblem, allowed: _Allowance, start: Poses | None
+) -> BenchmarkRun:
     """A run of one method in one place."""
-
-    def trial(problem: PGOProblem, allowed: _Allowance, start: Poses | None) -> BenchmarkRun:
-        return _run_of(allowed.run(solver, problem, start), name)
-
-    return trial
+    return _run_of(allowed.run(solver, problem, start), name)
 
 
 def _run_of(finished: Run[Any], name: str) -> BenchmarkRun:
@@ -138,20 +137,16 @@ def _run_of(finished: Run[Any], name: str) -> BenchmarkRun:
     return BenchmarkRun(BenchmarkMethod.NEWTON, (leg,), finished.poses, finished.objective, finished.status)
 
 
-def _soc_and_newton(coupling: Coupling) -> Callable[[PGOProblem, _Allowance, Poses | None], BenchmarkRun]:
+def _soc_and_newton(coupling: Coupling, problem: PGOProblem, allowed: _Allowance, start: Poses | None) -> BenchmarkRun:
     """A run of a coupling as `solve` runs it: JOINT in one place, the others by robots and their driver."""
     is_joint = coupling is Coupling.JOINT
-
-    def trial(problem: PGOProblem, allowed: _Allowance, start: Poses | None) -> BenchmarkRun:
-        soc = SOC(
-            coupling=coupling,
-            robots=None if is_joint else allowed.robots,
-            tolerance=HANDOVER_TOLERANCE,
-            max_iterations=_HANDOVER_ITERATIONS,
-        )
-        return _finished(*allowed.solve(problem, soc, Newton(), start, by_robots=not is_joint))
-
-    return trial
+    soc = SOC(
+        coupling=coupling,
+        robots=None if is_joint else allowed.robots,
+        tolerance=HANDOVER_TOLERANCE,
+        max_iterations=_HANDOVER_ITERATIONS,
+    )
+    return _finished(*allowed.solve(problem, soc, Newton(), start, by_robots=not is_joint))
 
 
 def _paper(problem: PGOProblem, allowed: _Allowance, start: Poses | None) -> BenchmarkRun:
@@ -244,13 +239,13 @@ def _counted(values: list[int | None]) -> Array | None:
 
 
 _RUNS: dict[BenchmarkMethod, Callable[[PGOProblem, _Allowance, Poses | None], BenchmarkRun]] = {
-    BenchmarkMethod.JOINT: _soc_and_newton(Coupling.JOINT),
-    BenchmarkMethod.CONSENSUS: _soc_and_newton(Coupling.CONSENSUS),
+    BenchmarkMethod.JOINT: partial(_soc_and_newton, Coupling.JOINT),
+    BenchmarkMethod.CONSENSUS: partial(_soc_and_newton, Coupling.CONSENSUS),
     BenchmarkMethod.PAPER: _paper,
-    BenchmarkMethod.SUBSTRUCTURED: _soc_and_newton(Coupling.SUBSTRUCTURED),
-    BenchmarkMethod.STAIRCASE: _one_run(Staircase(), "staircase"),
+    BenchmarkMethod.SUBSTRUCTURED: partial(_soc_and_newton, Coupling.SUBSTRUCTURED),
+    BenchmarkMethod.STAIRCASE: partial(_one_run, Staircase(), "staircase"),
     BenchmarkMethod.GAUSS_SEIDEL: _gauss_seidel,
-    BenchmarkMethod.NEWTON: _one_run(Newton(), "Newton"),
-    BenchmarkMethod.LEVENBERG_MARQUARDT: _one_run(LevenbergMarquardt(), "Levenberg-Marquardt"),
+    BenchmarkMethod.NEWTON: partial(_one_run, Newton(), "Newton"),
+    BenchmarkMethod.LEVENBERG_MARQUARDT: partial(_one_run, LevenbergMarquardt(), "Levenberg-Marquardt"),
     BenchmarkMethod.GTSAM: _gtsam,
 }
