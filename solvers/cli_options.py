@@ -94,14 +94,7 @@ def chosen_pipeline(
     tolerance: float | None,
     driver_memory: float | None = None,
 ) -> Pipeline:
-    """Pipeline of the options of `pgo solve`.
-
-    Parameters
-    ----------
-    robots : Partition, optional
-        For CONSENSUS and PAPER.
-    driver_memory : float, optional
-        GB.
+    """Pipeline of the options of `pgo solve`; robots are for CONSENSUS and PAPER, the driver's memory is in GB.
 
     Raises
     ------
@@ -136,12 +129,7 @@ def chosen_pipeline(
 
 
 def chosen_method(method: FirstStage | None, robots: int | None, is_shared: bool) -> FirstStage:
-    """Method of a solve: as asked for, or the one that suits one robot or many.
-
-    Parameters
-    ----------
-    is_shared : bool
-        Whether another option than the method is about robots.
+    """Method of a solve: as asked for, or the one that suits one robot or, if another option is about robots, many.
 
     Raises
     ------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +18,7 @@ from pgo_models.plots.graph_plots import compare_poses
 from pgo_models.plots.style import is_picture, save_figure
 from pgo_models.problem.initialization import spanning_tree_start
 from solvers.reporting.report import Solved, write_report
+from solvers.reporting.result_table import finite_or_none
 from solvers.reporting.versions import versions
 
 if TYPE_CHECKING:
@@ -263,15 +263,10 @@ def certificate_json(certificate: Certificate) -> dict[str, object]:
         "lower_bound": certificate.lower_bound,
         "gap": certificate.gap,
         "wanted_gap": certificate.wanted_gap,
-        "eta": finite_or_none(certificate.eta),
+        "eta": finite_or_none(certificate.eta),  # nan where none was proved
         "grounded": certificate.bound.is_grounded,
         "rounding": certificate.bound.rounding,
         "digits": certificate.digits,
-        "stationarity": finite_or_none(certificate.stationarity),
+        "stationarity": finite_or_none(certificate.stationarity),  # inf where it was not measured
         "verdict": certificate.verdict.name,
     }
-
-
-def finite_or_none(value: float) -> float | None:
-    """Value for JSON, which knows neither nan (no eta was proved) nor inf (stationarity was not measured)."""
-    return value if math.isfinite(value) else None

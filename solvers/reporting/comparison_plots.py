@@ -10,14 +10,13 @@ import numpy as np
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.plots.style import COLOURS, MARKERS, column_figure
-from solvers.reporting.convergence_plots import Curve, Effort
+from solvers.reporting.convergence_plots import LINES, LOGARITHMIC, Curve, Effort
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from plotly.graph_objects import Figure as PlotlyFigure
 
 _PANELS = (Effort.ROUNDS, Effort.BYTES, Effort.SECONDS)
-_LINES = ("-", "--", ":", "-.")
 _DASHES = ("solid", "dash", "dot", "dashdot")
 _MARKER_DISTANCE = 0.08  # of the diagonal of a panel
 _MOST_POINTS = 400  # of a curve in a page: sweeps by the thousand would make it slow
@@ -40,7 +39,7 @@ def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -
         Without matplotlib.
     """
     panels = _panels(curves, efforts)
-    styles = _styles(curves, _LINES)
+    styles = _styles(curves, LINES)
     with column_figure(height=0.95, width=max(1.0, 0.9 * len(panels))) as figure:
         handles = {}
         grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
@@ -94,7 +93,7 @@ def explore_efforts(curves: Sequence[Curve], title: str = "") -> PlotlyFigure:
             )
             named.add(curve.name)
         figure.update_xaxes(title_text=effort.value, row=1, col=column)
-    axis = {"type": "log", "dtick": 1, "exponentformat": "power", "gridcolor": "#eeeeee", "zeroline": False}
+    axis = {**LOGARITHMIC, "dtick": 1}
     figure.update_xaxes(**axis)
     figure.update_yaxes(**axis)
     figure.update_yaxes(title_text="relative gap", row=1, col=1)

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 _MOST_MARKERS = 12
 _STAR_WITHIN = 3.0  # times our own iterations; a mark farther out is a line with its figures, lest it squeeze the rest
-_LINES = ("-", "--", ":", "-.")
+LINES = ("-", "--", ":", "-.")
+LOGARITHMIC = {"type": "log", "exponentformat": "power", "gridcolor": "#eeeeee", "zeroline": False}  # plotly's axis
 
 
 class Effort(enum.Enum):
@@ -121,7 +122,7 @@ def plot_convergence(
     with column_figure(height=1.3) as figure:
         above, below = figure.subplots(2, 1, sharex=True)
         begin = 0.0
-        for (name, history), colour, line in zip(run, cycle(COLOURS), cycle(_LINES), strict=False):
+        for (name, history), colour, line in zip(run, cycle(COLOURS), cycle(LINES), strict=False):
             curve = Curve(name, history, lower_bound)
             k, every = begin + history.k, max(1, len(history) // _MOST_MARKERS)
             style = {"color": colour, "markevery": every}
@@ -185,14 +186,13 @@ def explore_convergence(
             mode="lines",
             line={"color": ALARM_COLOUR, "dash": "dot"},
         )
-    logarithmic = {"type": "log", "exponentformat": "power", "gridcolor": "#eeeeee", "zeroline": False}
     figure.update_layout(
         template="none",
         margin={"l": 80, "r": 10, "t": 10, "b": 50},
         legend={"orientation": "h", "y": -0.14},
         xaxis={"title": {"text": "iteration"}, "anchor": "y2", "gridcolor": "#eeeeee", "zeroline": False},
-        yaxis={**logarithmic, "title": {"text": "relative gap"}, "domain": [0.54, 1.0]},
-        yaxis2={**logarithmic, "title": {"text": "relative residual"}, "domain": [0.0, 0.46]},
+        yaxis={**LOGARITHMIC, "title": {"text": "relative gap"}, "domain": [0.54, 1.0]},
+        yaxis2={**LOGARITHMIC, "title": {"text": "relative residual"}, "domain": [0.0, 0.46]},
     )
     return figure
 

@@ -82,21 +82,7 @@ class PageCell:
 def page(
     title: str, sections: Sequence[str], figures: dict[str, str], settings: dict[str, object], plotly_script: str
 ) -> str:
-    """Whole page.
-
-    Parameters
-    ----------
-    title : str
-        Escaped here.
-    sections : sequence of str
-        HTML.
-    figures : dict of str to str
-        JSON of a plotly figure for the id of the element that shows it.
-    settings : dict of str to object
-        Plotly's settings, the same for all figures.
-    plotly_script : str
-        The library, once.
-    """
+    """Whole page: sections of HTML, and the JSON of a plotly figure for the id of every element that shows one."""
     specifications = ",".join(f"{json.dumps(name)}:{_in_script(figure)}" for name, figure in figures.items())
     return "\n".join(
         [
@@ -134,16 +120,9 @@ def facts(rows: Sequence[tuple[str, str]]) -> str:
 
 
 def sortable_table(name: str, heads: Sequence[str], rows: Sequence[Sequence[PageCell]], alarms: Sequence[bool]) -> str:
-    """Table that sorts by the column whose head is clicked, numbers from the largest; all text is escaped.
+    """Table of id `name` that sorts by the column whose head is clicked, numbers from the largest; text is escaped.
 
-    Parameters
-    ----------
-    name : str
-        Id of the table.
-    heads : sequence of str
-    rows : sequence of sequences of PageCell
-    alarms : sequence of bool
-        Which rows are marked.
+    Rows with an alarm are marked.
     """
     head = "".join(f'<th scope="col"><button type="button">{html.escape(text)}</button></th>' for text in heads)
     body = []

@@ -18,14 +18,7 @@ _SMALL_GAP = 1e-8
 
 @dataclass(frozen=True)
 class Advice:
-    """Something to try next.
-
-    Attributes
-    ----------
-    text : str
-    command : str, optional
-        What to type; empty where there is nothing to type.
-    """
+    """Something to try next, and the command to type for it; empty where there is nothing to type."""
 
     text: str
     command: str = ""
@@ -91,18 +84,10 @@ def advice(
 ) -> list[Advice]:
     """Return what to try next, most promising first.
 
-    Parameters
-    ----------
-    graph : PoseGraph
-    certificate : Certificate
-    status : Status
-        How the solve ended.
-    misfits : int
-        Number of edges that stand out.
-    source : str, optional
-        What stands for the graph in commands, as typed; its name unless given.
+    `misfits` edges stand out; `source` stands for the graph in commands, as typed, its name unless given.
     """
-    name = source if source is not None else shlex.quote(_source(graph))
+    file = graph.name if graph.name in known_datasets() else f"{graph.name}.g2o"
+    name = source if source is not None else shlex.quote(file)
     solve = f"pgo solve {name}"
     found = []
     if not status.is_success:
@@ -139,10 +124,6 @@ def percent(share: float) -> str:
 def _excess(certificate: Certificate) -> str:
     """How much of F there is above the bound, as a share of it."""
     return f"{percent(certificate.gap)} of it"
-
-
-def _source(graph: PoseGraph) -> str:
-    return graph.name if graph.name in known_datasets() else f"{graph.name}.g2o"
 
 
 def _unfinished(status: Status, solve: str) -> Advice:

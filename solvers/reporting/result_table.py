@@ -106,12 +106,12 @@ class ResultTable:
         text = io.StringIO()
         writer = csv.DictWriter(text, list(self.records[0]) if self.records else [], lineterminator="\n")
         writer.writeheader()
-        writer.writerows({name: _known(value) for name, value in record.items()} for record in self.records)
+        writer.writerows({name: finite_or_none(value) for name, value in record.items()} for record in self.records)
         return text.getvalue()
 
     def json(self) -> str:
         """Return records and notes as JSON; what is unknown or not finite is null."""
-        rows = [{name: _known(value) for name, value in record.items()} for record in self.records]
+        rows = [{name: finite_or_none(value) for name, value in record.items()} for record in self.records]
         return json.dumps({"rows": rows, "notes": list(self.notes)}, indent=1, allow_nan=False) + "\n"
 
     def save(self, path: Path | str) -> None:
@@ -142,7 +142,8 @@ def gap_percent(gap: float) -> str:
     return f"{100.0 * gap:.2g}"
 
 
-def _known(value: Value) -> Value:
+def finite_or_none(value: Value) -> Value:
+    """Value for a file, where what is unknown or not finite is nothing: JSON knows neither nan nor inf."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

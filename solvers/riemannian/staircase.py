@@ -44,13 +44,7 @@ _SUFFICIENT, _HALVINGS = 0.25, 40
 
 @dataclass(frozen=True, eq=False)
 class DualBound:
-    """A proven lower bound on F (`pgo_models.certificates.lower_bound`), and the multipliers it was proved with.
-
-    Attributes
-    ----------
-    bound : LowerBound
-    Lambda : (n, d, d)
-    """
+    """A proven lower bound on F (`pgo_models.certificates.lower_bound`), and its multipliers Lambda, (n, d, d)."""
 
     bound: LowerBound
     Lambda: Array

@@ -51,14 +51,7 @@ class FigureSet(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A graph with what the paper's method made of it.
-
-    Attributes
-    ----------
-    graph : PoseGraph
-    trial : BenchmarkRun
-    lower_bound : float
-    """
+    """A graph with what the paper's method made of it, and the bound that is proven."""
 
     graph: PoseGraph
     trial: BenchmarkRun

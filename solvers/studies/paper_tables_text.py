@@ -211,7 +211,7 @@ def _spread(values: Sequence[float], digits: int) -> str:
     """Mean +- standard deviation; one value to so many digits."""
     if not values:
         return "-"
-    mean, spread = float(np.mean(values)), _deviation(values)
+    mean, spread = float(np.mean(values)), _deviation(values) or 0.0
     if spread <= _SAME * abs(mean):
         return f"{mean:.{digits}g}" if len(values) == 1 else f"{mean:.4g}"
     return f"{mean:.1f} +- {spread:.1f}"
@@ -220,7 +220,7 @@ def _spread(values: Sequence[float], digits: int) -> str:
 def _gaps(gaps: Sequence[float]) -> str:
     if not gaps:
         return "-"
-    mean, spread = float(np.mean(gaps)), _deviation(gaps)
+    mean, spread = float(np.mean(gaps)), _deviation(gaps) or 0.0
     return gap_percent(mean) if spread <= 0.05 * mean else f"{gap_percent(mean)} +- {gap_percent(spread)}"
 
 
@@ -235,8 +235,12 @@ def _seconds(seconds: Sequence[float]) -> str:
     return f"{float(np.mean(seconds)):.2g}" if seconds else "-"
 
 
-def _deviation(values: Sequence[float]) -> float:
-    return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None
+
+
+def _deviation(values: Sequence[float]) -> float | None:
+    return float(np.std(values, ddof=1)) if len(values) > 1 else None
 
 
 def _counted(sentences: Sequence[str], total: int) -> list[str]:
@@ -252,12 +256,6 @@ def _record(row: ReproducedRow) -> dict[str, Value]:
     figures, published, cells = row.figures, row.published, row.cells
     optimum = published.se_sync.objective
 
-    def mean(values: Sequence[float]) -> float | None:
-        return float(np.mean(values)) if len(values) else None
-
-    def spread(values: Sequence[float]) -> float | None:
-        return float(np.std(values, ddof=1)) if len(values) > 1 else None
-
     objectives, gaps = [cell.objective for cell in cells], [cell.gap for cell in cells]
     stages = np.mean([cell.iterations for cell in cells], axis=0).tolist() if cells else []
     return {
@@ -265,25 +263,25 @@ def _record(row: ReproducedRow) -> dict[str, Value]:
         "poses": published.num_poses,
         "edges": published.num_edges,
         "draws": row.num_draws,
-        "optimum": mean([one.objective for one in row.optima]),
-        "optimum_std": spread([one.objective for one in row.optima]),
-        "lower_bound": mean([one.lower_bound for one in row.optima]),
+        "optimum": _mean([one.objective for one in row.optima]),
+        "optimum_std": _deviation([one.objective for one in row.optima]),
+        "lower_bound": _mean([one.lower_bound for one in row.optima]),
         "proven_gap": max((one.gap for one in row.optima), default=None),
         "method": row.contender.label,
         "draws_done": len(cells),
-        "objective": mean(objectives),
-        "objective_std": spread(objectives),
-        "gap": mean(gaps),
-        "gap_std": spread(gaps),
+        "objective": _mean(objectives),
+        "objective_std": _deviation(objectives),
+        "gap": _mean(gaps),
+        "gap_std": _deviation(gaps),
         "gap_largest": max(gaps, default=None),
-        "gap_after_first_stage": mean([cell.first_gap for cell in cells if cell.first_gap is not None]),
+        "gap_after_first_stage": _mean([cell.first_gap for cell in cells if cell.first_gap is not None]),
         "iterations_first_stage": stages[0] if stages else None,
         "iterations_second_stage": stages[1] if len(stages) > 1 else None,
-        "rounds": mean([cell.rounds for cell in cells if cell.rounds is not None]),
+        "rounds": _mean([cell.rounds for cell in cells if cell.rounds is not None]),
         "rounds_largest": max((cell.rounds for cell in cells if cell.rounds is not None), default=None),
-        "bytes": mean([cell.num_bytes for cell in cells if cell.num_bytes is not None]),
-        "seconds": mean([cell.seconds for cell in cells]),
-        "seconds_per_robot": mean([cell.seconds_per_robot for cell in cells]),
+        "bytes": _mean([cell.num_bytes for cell in cells if cell.num_bytes is not None]),
+        "seconds": _mean([cell.seconds for cell in cells]),
+        "seconds_per_robot": _mean([cell.seconds_per_robot for cell in cells]),
         "paper_objective": None if figures is None else figures.objective,
         "paper_optimum": optimum,
         "paper_gap": row.published_gap,
