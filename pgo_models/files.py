@@ -112,15 +112,6 @@ def replace_when_done(path: Path | str) -> Iterator[Path]:
     ------
     PGOError
         When the folder or the file cannot be written, or `path` is there and is no regular file.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> with replace_when_done(folder / "one.txt") as temporary:
-    ...     _ = temporary.write_text("1")
-    >>> [file.name for file in folder.iterdir()]
-    ['one.txt']
     """
     with _temporary_beside(path) as (temporary, target):
         yield temporary
@@ -134,14 +125,6 @@ def check_writable(path: Path | str) -> None:
     ------
     PGOError
         See `replace_when_done`.
-
-    Examples
-    --------
-    >>> try:
-    ...     check_writable("no/such/folder/a.txt")
-    ... except PGOError as error:
-    ...     print(error)
-    cannot write no/such/folder/a.txt: No such file or directory; choose a place that can be written
     """
     with _temporary_beside(path) as (temporary, _):
         temporary.touch()

@@ -7,25 +7,13 @@ from collections.abc import Sequence
 
 
 def facts_table(facts: Sequence[tuple[str, str]]) -> str:
-    """HTML table with a row for every (label, text); both are escaped.
-
-    Examples
-    --------
-    >>> facts_table([("graph", "a<b")])
-    '<table><tr><th>graph</th><td>a&lt;b</td></tr></table>'
-    """
+    """HTML table with a row for every (label, text); both are escaped."""
     rows = "".join(f"<tr><th>{html.escape(label)}</th><td>{html.escape(text)}</td></tr>" for label, text in facts)
     return f"<table>{rows}</table>"
 
 
 def rows_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """HTML table with a head and rows of cells; all are escaped.
-
-    Examples
-    --------
-    >>> rows_table(["k", "F"], [["0", "1.5"]])
-    '<table><tr><th>k</th><th>F</th></tr><tr><td>0</td><td>1.5</td></tr></table>'
-    """
+    """HTML table with a head and rows of cells; all are escaped."""
     head = "".join(f"<th>{html.escape(text)}</th>" for text in heads)
     body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table><tr>{head}</tr>{body}</table>"

@@ -163,24 +163,12 @@ class Certificate(ReadOnly):
 
 
 def proven_digits(gap: float) -> int:
-    """Digits of F that a relative gap leaves no doubt of; none where it is 0, as F is rounding then.
-
-    Examples
-    --------
-    >>> proven_digits(3e-13), proven_digits(0.2), proven_digits(0.0)
-    (12, 0, 0)
-    """
+    """Digits of F that a relative gap leaves no doubt of; none where it is 0, as F is rounding then."""
     return max(0, math.floor(-math.log10(gap))) if gap > 0 else 0
 
 
 def gap_text(gap: float) -> str:
-    """A relative gap for tables, with the digits that it proves.
-
-    Examples
-    --------
-    >>> gap_text(3.2e-13), gap_text(0.2), gap_text(0.0)
-    ('3.2e-13, proven to 12 digits', '0.2', '0: F is at its rounding level')
-    """
+    """A relative gap for tables, with the digits that it proves."""
     if gap == 0.0:
         return "0: F is at its rounding level"
     digits = proven_digits(gap)

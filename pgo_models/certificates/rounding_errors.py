@@ -170,14 +170,6 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     in the Euclidean norm of its d, or d^2, numbers; the error is sum tau (2 ||r_t|| e_t + e_t^2) + kappa (2 ||r_R|| e_R
     + e_R^2) and the rounding of the sum. The level is sum tau e_t^2 + kappa e_R^2 with ||t_i|| + ||t_j||, seen from the
     first pose, for ||t_j - t_i||: no poses can do better than the last bits of their coordinates.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> rounding = objective_rounding(problem, problem.graph.truth)
-    >>> bool(0 < rounding.level < rounding.error < 1e-10)
-    True
     """
     graph, d, m = problem.graph, problem.d, problem.graph.num_edges
     e_t, e_R = _residual_errors(problem, poses, np.linalg.norm(poses.t[graph.j] - poses.t[graph.i], axis=1))

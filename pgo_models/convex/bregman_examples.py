@@ -138,15 +138,6 @@ def shared_rotation_step(graph: PoseGraph, robots: Partition, V: Array, rho: flo
     ------
     SettingError
         When rho is not positive or V has another shape.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.partitioning import partition
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> step = shared_rotation_step(graph, partition(graph, 2), graph.truth.R, rho=1.0)
-    >>> [len(poses) for poses in step.held], step.problem
-    ([23, 22], BregmanProblem(m=405, s=162, blocks=2))
     """
     n, d = graph.num_poses, graph.d
     V = finite_array(V, "V")

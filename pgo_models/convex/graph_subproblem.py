@@ -218,14 +218,6 @@ def robot_qp(
     ------
     SettingError
         When the robot owns no pose, or frozen neighbours pull on translations that have no penalty.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> robots = graph.with_robots(np.arange(27) // 9)
-    >>> robot_qp(robots, 1, np.ones(27)).variables.poses
-    array([ 9, 10, 11, 12, 13, 14, 15, 16, 17])
     """
     owned = graph.robots == robot
     if not owned.any():

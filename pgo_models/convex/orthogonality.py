@@ -297,13 +297,6 @@ def kkt_residuals(problem: OrthogonalProblem, point: OrthogonalPoint, rho: float
     point : OrthogonalPoint
     rho : float
         Of the order of the curvature of J.
-
-    Examples
-    --------
-    >>> from pgo_models.convex.orthogonality_examples import procrustes
-    >>> problem = procrustes(np.eye(3), np.eye(3))
-    >>> bool(kkt_residuals(problem, problem.point([np.eye(3)]), rho=1.0).stationarity < 1e-9)
-    True
     """
     normals = [
         term.constraint.normal_part(copy, normal)

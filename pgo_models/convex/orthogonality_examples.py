@@ -47,11 +47,6 @@ def smallest_eigenvectors(A: Array, count: int) -> OrthogonalProblem:
     ------
     SettingError
         When A is not symmetric positive semidefinite.
-
-    Examples
-    --------
-    >>> smallest_eigenvectors(np.diag([1.0, 2.0, 3.0]), 2)
-    OrthogonalProblem((3, 2) Orthonormal)
     """
     A = _matrix(A, "A")
     X = cp.Variable((len(A), count), name="X")
@@ -63,11 +58,6 @@ def one_norm_components(A: Array, count: int) -> OrthogonalProblem:
 
     The 1-norm form of the last principal components. When most rows lie in a hyperplane, its normal is the answer for
     count = 1 whatever the other rows are, where the eigenvector of A^T A is turned by them (Tsakiris & Vidal 2018).
-
-    Examples
-    --------
-    >>> one_norm_components(np.eye(4), 2)
-    OrthogonalProblem((4, 2) Orthonormal)
     """
     A = _matrix(A, "A")
     X = cp.Variable((A.shape[1], count), name="X")
@@ -82,11 +72,6 @@ def sparse_components(A: Array, count: int, weight: float) -> OrthogonalProblem:
     References
     ----------
     Ozolins, Lai, Caflisch, Osher 2013.
-
-    Examples
-    --------
-    >>> sparse_components(np.eye(4), 2, weight=0.1)
-    OrthogonalProblem((4, 2) Orthonormal)
     """
     A = _matrix(A, "A")
     X = cp.Variable((len(A), count), name="X")
@@ -98,13 +83,6 @@ def rotation_averaging(graph: PoseGraph) -> OrthogonalProblem:
     """Minimise sum_e kappa ||R_j - R_i R_ij||_F^2 over rotations R_0 .. R_{n-1} (paper: `rotation`).
 
     The rotation part of F, one (d, d) variable a pose. A common rotation of all is free.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> len(rotation_averaging(graph).rotations)
-    27
     """
     R = [cp.Variable((graph.d, graph.d), name=f"R_{pose}") for pose in range(graph.num_poses)]
     root = np.sqrt(graph.kappa)
@@ -129,11 +107,6 @@ def sparse_low_rank(Y: Array, rank: int, nonzeros: int) -> OrthogonalProblem:
     References
     ----------
     Hou, Chau, Magnenat-Thalmann, He 2017 (SLRMA).
-
-    Examples
-    --------
-    >>> sparse_low_rank(np.outer(np.ones(4), np.ones(3)), rank=1, nonzeros=2)
-    OrthogonalProblem((4, 1) Orthonormal, (4, 1) Sparse(nonzeros=2))
     """
     Y = _matrix(Y, "Y")
     c = float(np.linalg.norm(Y, 2)) ** 2

@@ -97,13 +97,7 @@ def load(
 
 
 def locate(name_or_path: str | Path, registry: Registry = SE_SYNC, *, download: bool = True) -> Path:
-    """File or folder that `load` reads; parameters and errors as there.
-
-    Examples
-    --------
-    >>> locate("sphere").name
-    'sphere.g2o'
-    """
+    """File or folder that `load` reads; parameters and errors as there."""
     path = Path(name_or_path)
     name = str(name_or_path)
     if not name:

@@ -101,17 +101,7 @@ def read_g2o(path: Path | str, weights: RotationWeight = RotationWeight.SE_SYNC)
 
 
 def edge_place(path: Path | str, ids: tuple[int, int]) -> str:
-    """`file:line` of the first edge between two pose ids in a g2o file or folder that has been read.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from pgo_models.graphs.scenes import grid
-    >>> path = Path(tempfile.mkdtemp()) / "grid.g2o"
-    >>> write_g2o(grid(np.random.default_rng(0)), path)
-    >>> edge_place(path, (0, 1)).endswith("grid.g2o:28")
-    True
-    """
+    """`file:line` of the first edge between two pose ids in a g2o file or folder that has been read."""
     for file in map(read_lines, _files_of(Path(path))):
         at = np.flatnonzero((file.edge_ids == ids).all(axis=1))
         if at.size:
@@ -191,13 +181,7 @@ def write_g2o_folder(graph: PoseGraph, folder: Path | str, poses: Poses | None =
 
 
 def check_g2o_folder(folder: Path | str, num_robots: int) -> None:
-    """Raise what `write_g2o_folder` would for this folder, before there is anything to write.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> check_g2o_folder(Path(tempfile.mkdtemp()) / "new" / "folder", num_robots=4)
-    """
+    """Raise what `write_g2o_folder` would for this folder, before there is anything to write."""
     folder = Path(folder)
     present, inside = folder.absolute(), folder.absolute() / "0.g2o"
     while not os.path.lexists(present):
@@ -230,16 +214,7 @@ def symbol_ids(robots: IntArray) -> IntArray:
 
 
 def pose_names(graph: PoseGraph) -> list[str]:
-    """Names of the poses for people: a GTSAM symbol as its letter and index, another id as it is.
-
-    Examples
-    --------
-    >>> from dataclasses import replace
-    >>> from pgo_models.graphs.scenes import circle
-    >>> graph = circle(np.random.default_rng(0))
-    >>> pose_names(replace(graph, ids=symbol_ids(np.arange(25) // 13)))[11:15]
-    ['a11', 'a12', 'b0', 'b1']
-    """
+    """Names of the poses for people: a GTSAM symbol as its letter and index, another id as it is."""
     ids = graph.pose_ids.tolist()
     if not all(id_ >> _LETTER_SHIFT in map(ord, _LETTERS) for id_ in ids):
         return [str(id_) for id_ in ids]

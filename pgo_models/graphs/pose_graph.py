@@ -273,16 +273,7 @@ def has_no_gap(robot: IntArray) -> bool:
 
 
 def middle_pose(graph: PoseGraph) -> int:
-    """A pose half-way along a long shortest path of a connected graph, found by two breadth-first searches.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> chain = np.arange(4)
-    >>> turn = np.eye(2)[None].repeat(4, axis=0)
-    >>> middle_pose(PoseGraph(5, chain, chain + 1, turn, np.ones((4, 2)), np.ones(4), np.ones(4)))
-    2
-    """
+    """A pose half-way along a long shortest path of a connected graph, found by two breadth-first searches."""
     end = poses_by_distance(graph, 0)[-1]
     order, parent = breadth_first_order(graph.adjacency, end, directed=False)
     path = [int(order[-1])]

@@ -32,11 +32,6 @@ def precisions(information: Array, weights: RotationWeight = RotationWeight.SE_S
     ------
     SettingError
         When weights is no RotationWeight.
-
-    Examples
-    --------
-    >>> precisions(np.diag([4.0, 4.0, 4.0, 6.0, 6.0, 6.0])[None])
-    (array([3.]), array([4.]))
     """
     if not isinstance(weights, RotationWeight):
         raise SettingError(f"weights is {weights!r}; give RotationWeight.SE_SYNC or RotationWeight.GAUSSIAN")

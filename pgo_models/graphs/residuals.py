@@ -73,17 +73,7 @@ def edge_residuals(graph: PoseGraph, poses: Poses) -> EdgeResiduals:
 
 
 def uncertain_edges(graph: PoseGraph) -> BoolArray:
-    """Whether kappa or tau of an edge is under `UNCERTAIN_RATIO` of its median over the graph, (m,).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import circle
-    >>> graph = circle(np.random.default_rng(0))
-    >>> weak = np.where(np.arange(graph.num_edges) == 7, 0.01, 1.0)
-    >>> np.flatnonzero(uncertain_edges(graph.with_weights(graph.kappa, weak * graph.tau)))
-    array([7])
-    """
+    """Whether kappa or tau of an edge is under `UNCERTAIN_RATIO` of its median over the graph, (m,)."""
     low_kappa = graph.kappa < UNCERTAIN_RATIO * np.median(graph.kappa)
     low_tau = graph.tau < UNCERTAIN_RATIO * np.median(graph.tau)
     return np.asarray(low_kappa | low_tau)

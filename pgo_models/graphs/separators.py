@@ -17,16 +17,6 @@ def vertex_cover(partition: Partition, graph: PoseGraph) -> IntArray:
 
     Greedy: the pose with most uncovered edges is taken until none is left, then poses that the later ones made
     superfluous are dropped. The smallest cover is NP-hard to find; this one leaves out no pose that could be.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from pgo_models.graphs.partitioning import partition
-    >>> graph = grid(np.random.default_rng(0))
-    >>> robots = partition(graph, 3)
-    >>> len(vertex_cover(robots, graph)), len(robots.separators(graph))
-    (9, 27)
     """
     cut = partition.cut_edges(graph)
     adjacency = edge_counts(graph.i[cut], graph.j[cut], graph.num_poses)

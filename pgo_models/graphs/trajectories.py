@@ -91,14 +91,6 @@ def write_kitti(poses: Poses, path: Path | str) -> None:
     ------
     PGOError
         When the file cannot be written; what stood there stays.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> path = Path(tempfile.mkdtemp()) / "poses.kitti"
-    >>> write_kitti(Poses.identity(2, 3), path)
-    >>> len(path.read_text().split())
-    24
     """
     R, t = _lifted(poses)
     _write_rows(np.concatenate([R, t[:, :, None]], axis=2).reshape(-1, 12), path)

@@ -59,16 +59,6 @@ def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = Tr
     ------
     GraphError
         When the poses are not those of the graph.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> axes = Figure().add_subplot(projection="3d")
-    >>> draw_graph(graph, graph.truth, axes)
-    >>> axes.get_xlabel()
-    'x (m)'
     """
     from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgb

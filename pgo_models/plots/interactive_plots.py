@@ -114,15 +114,6 @@ def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[
         When there are no iterates, their labels are not as many, or they are not poses of the graph.
     MissingExtraError
         Without plotly.
-
-    Examples
-    --------
-    >>> from pgo_models.problem.initialization import spanning_tree_start
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> film = animate_poses(graph, [spanning_tree_start(graph), graph.truth], ["tree", "truth"])
-    >>> [frame.name for frame in film.frames]
-    ['tree', 'truth']
     """
     go = _plotly()
     if not iterates:
@@ -163,16 +154,6 @@ def save_page(figure: Figure, path: Path | str) -> None:
     ------
     PGOError
         When the file cannot be written.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> page = Path(tempfile.mkdtemp()) / "graph.html"
-    >>> save_page(explore_graph(graph, graph.truth), page)
-    >>> "Plotly.newPlot" in page.read_text(encoding="utf-8")
-    True
     """
     page = figure.to_html(
         include_plotlyjs=True, full_html=True, config=PAGE_CONFIG, auto_play=False, default_height="96vh"

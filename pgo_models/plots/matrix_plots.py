@@ -135,16 +135,7 @@ class FactorPattern:
 
 
 def factor_pattern(problem: PGOProblem) -> FactorPattern:
-    """Pattern of the Cholesky factor of M, in SuperLU's minimum degree order of M + M^T.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> pattern = factor_pattern(problem)
-    >>> pattern.factor.nnz == tril(problem.M).nnz + pattern.fill_in
-    True
-    """
+    """Pattern of the Cholesky factor of M, in SuperLU's minimum degree order of M + M^T."""
     ones = csc_array((np.ones(problem.M.nnz), problem.M.indices, problem.M.indptr), shape=problem.M.shape)
     # Diagonally dominant with off-diagonal entries of one sign: nothing cancels, so the numbers show the pattern.
     dominant = csc_array((2.0 * float(ones.sum(axis=0).max())) * eye_array(problem.side) - ones)
@@ -161,13 +152,6 @@ def plot_sparsity(problem: PGOProblem) -> Figure:
     ------
     MissingExtraError
         Without matplotlib.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> figure = plot_sparsity(PGOProblem(grid(np.random.default_rng(0))))
-    >>> figure.axes[0].get_title().splitlines()[0]
-    'M, 108 x 108'
     """
     pattern = factor_pattern(problem)
     with column_figure(height=0.6) as figure:

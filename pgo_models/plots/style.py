@@ -76,14 +76,6 @@ def save_figure(figure: Figure, path: Path | str) -> None:
     ------
     PGOError
         When the file cannot be written.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import numpy as np
-    >>> from pgo_models.plots.curves import plot_decay
-    >>> figure = plot_decay([("half", 0.5 ** np.arange(5))], "error (m)")
-    >>> save_figure(figure, Path(tempfile.mkdtemp()) / "decay.svg")
     """
     path = Path(path)
     with replace_when_done(path) as temporary:

@@ -36,13 +36,7 @@ class CholeskyBackend(enum.Enum):
 
 
 def default_backend() -> CholeskyBackend:
-    """CHOLMOD when CVXOPT is installed, SuperLU otherwise.
-
-    Examples
-    --------
-    >>> default_backend() in CholeskyBackend
-    True
-    """
+    """CHOLMOD when CVXOPT is installed, SuperLU otherwise."""
     installed = importlib.util.find_spec("cvxopt") is not None
     return CholeskyBackend.CHOLMOD if installed else CholeskyBackend.SUPERLU
 
@@ -153,15 +147,7 @@ def analyze(pattern: csc_array, backend: CholeskyBackend | None = None) -> Symbo
 
 
 def factorize(matrix: csc_array, backend: CholeskyBackend | None = None) -> CholeskyFactor:
-    """Factor one symmetric positive definite matrix; see `SymbolicCholesky.factorize`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from scipy.sparse import csc_array
-    >>> factorize(csc_array([[4.0, 0.0], [0.0, 2.0]])).solve(np.array([4.0, 4.0]))
-    array([1., 2.])
-    """
+    """Factor one symmetric positive definite matrix; see `SymbolicCholesky.factorize`."""
     return analyze(matrix, backend).factorize(matrix)
 
 

@@ -28,11 +28,6 @@ def gps_imu_start(truth: Poses, translation_std: float, rotation_std: float, rng
     translation_std, rotation_std : float
         Standard deviations, metres and radians.
     rng : np.random.Generator
-
-    Examples
-    --------
-    >>> gps_imu_start(Poses.identity(5, 3), 0.5, 0.1, np.random.default_rng(0))
-    Poses(n=5, d=3)
     """
     n, d = truth.num_poses, truth.d
     t = truth.t + rng.normal(0.0, translation_std, (n, d))

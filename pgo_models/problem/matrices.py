@@ -23,14 +23,6 @@ def residual_matrix(graph: PoseGraph) -> tuple[csr_array, Array]:
 
     Its first m rows give t_j^T - t_i^T - t_ij^T R_i^T with weight tau; then d rows an edge give
     R_j^T - R_ij^T R_i^T with weight kappa (equations `translation` and `rotation` of the paper).
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> A, w = residual_matrix(graph)
-    >>> A.shape == (4 * graph.num_edges, 4 * graph.num_poses), w.shape
-    (True, (432,))
     """
     n, m, d = graph.num_poses, graph.num_edges, graph.d
     edge = np.arange(m)
@@ -62,14 +54,6 @@ def joint_matrix(graph: PoseGraph) -> csc_array:
         R_j:  kappa I
 
     The pattern holds every diagonal d x d block in full, so that multipliers can be subtracted in place.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> A, w = residual_matrix(graph)
-    >>> bool(abs(joint_matrix(graph) - A.T @ (w[:, None] * A)).max() < 1e-12)
-    True
     """
     n, d = graph.num_poses, graph.d
     i, j, kappa, tau, t_ij = graph.i, graph.j, graph.kappa, graph.tau, graph.t_ij
@@ -96,15 +80,7 @@ def joint_matrix(graph: PoseGraph) -> csc_array:
 
 
 def connection_laplacian(graph: PoseGraph) -> csc_array:
-    """L, (dn, dn), the rotation-only part of M: sum_e kappa ||R_j - R_i R_ij||_F^2 = tr(Y^T L Y), Y the rows R_i^T.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> connection_laplacian(graph).shape
-    (81, 81)
-    """
+    """L, (dn, dn), the rotation-only part of M: sum_e kappa ||R_j - R_i R_ij||_F^2 = tr(Y^T L Y), Y the rows R_i^T."""
     n, d = graph.num_poses, graph.d
     block_i, block_j = rotation_columns(graph.i, 0, d), rotation_columns(graph.j, 0, d)
     eye = graph.kappa[:, None, None] * np.eye(d)
@@ -127,13 +103,6 @@ def marginalized_matrix(graph: PoseGraph) -> Array:
     ------
     SettingError
         When its side would exceed `MAX_DENSE_SIDE`; `PGOProblem.apply_Q` multiplies with it at any size.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> bool(np.linalg.eigvalsh(marginalized_matrix(graph)).min() > -1e-9)
-    True
     """
     n, d = graph.num_poses, graph.d
     if d * n > MAX_DENSE_SIDE:
@@ -152,13 +121,7 @@ def rotation_columns(pose: IntArray, first: int, d: int) -> IntArray:
 
 
 def columns_of(poses: IntArray, num_poses: int, widths: tuple[int, ...]) -> IntArray:
-    """Unknowns of some poses when those of all poses are stacked field by field, `widths[f]` numbers a pose.
-
-    Examples
-    --------
-    >>> columns_of(np.array([1]), 3, (1, 2))
-    array([1, 5, 6])
-    """
+    """Unknowns of some poses when those of all poses are stacked field by field, `widths[f]` numbers a pose."""
     found, first = [], 0
     for width in widths:
         found.append((first + width * poses[:, None] + np.arange(width)).ravel())

@@ -118,15 +118,6 @@ def clique_relaxation(
     ----------
     Fukuda, Kojima, Murota & Nakata, Exploiting sparsity in semidefinite programming via matrix completion, 2001;
     Vandenberghe & Andersen 2015, chapter 14.
-
-    Examples
-    --------
-    >>> from pgo_models.problem.problem import PGOProblem
-    >>> from pgo_models.graphs.scenes import random_geometric
-    >>> problem = PGOProblem(random_geometric(4, np.random.default_rng(0)))
-    >>> relaxation = clique_relaxation(problem)
-    >>> len(relaxation.semidefinite) == len(relaxation.tree.cliques)
-    True
     """
     tree = tree if tree is not None else clique_tree(problem.graph)
     centre = centre if centre is not None else polish(problem, chordal_start(problem))

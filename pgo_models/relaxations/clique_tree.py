@@ -52,13 +52,6 @@ def clique_tree(graph: PoseGraph) -> CliqueTree:
     ----------
     Vandenberghe & Andersen, Chordal graphs and semidefinite optimization, 2015, chapters 4 and 6; the merging is that
     of Garstka, Cannon & Goulart, A clique graph based merging strategy, 2020, on the edges of the tree.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> max(len(clique) for clique in clique_tree(graph).cliques) < graph.num_poses
-    True
     """
     members, parent = _eliminate(graph)
     d = graph.d

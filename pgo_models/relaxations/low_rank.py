@@ -44,18 +44,7 @@ class LiftedPoint:
 
 
 def lifted_point(problem: PGOProblem, Y: Array) -> LiftedPoint:
-    """Point at Y, (n, d, r), with blocks of orthonormal rows.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> R = problem.graph.truth.R
-    >>> point = lifted_point(problem, np.swapaxes(R, 1, 2))
-    >>> bool(np.isclose(point.value, problem.objective(problem.with_best_translations(R))))
-    True
-    """
+    """Point at Y, (n, d, r), with blocks of orthonormal rows."""
     Y = real_array(Y, "Y")
     n, d, r = Y.shape
     rows = Y.reshape(n * d, r)
@@ -69,17 +58,7 @@ def lifted_point(problem: PGOProblem, Y: Array) -> LiftedPoint:
 
 
 def hessian_product(problem: PGOProblem, point: LiftedPoint, V: Array) -> Array:
-    """Riemannian Hessian of f at a point on a tangent V, (n, d, r): P(2 Q V - 2 Lambda V), P the projection.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> point = lifted_point(problem, np.swapaxes(problem.graph.truth.R, 1, 2))
-    >>> hessian_product(problem, point, np.zeros_like(point.Y)).shape
-    (27, 3, 3)
-    """
+    """Riemannian Hessian of f at a point on a tangent V, (n, d, r): P(2 Q V - 2 Lambda V), P the projection."""
     n, d, r = V.shape
     QV = problem.apply_Q(V.reshape(n * d, r)).reshape(n, d, r)
     return 2.0 * project_to_tangent(point.Y, QV - point.Lambda @ V)

@@ -82,13 +82,6 @@ def plan_relaxation(
     ------
     SettingError
         When the estimate exceeds `memory_limit`, in bytes, or the limit is not positive.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import circle
-    >>> plan = plan_relaxation(PGOProblem(circle(np.random.default_rng(0))))
-    >>> plan.form.name, plan.solver.name
-    ('PRIMAL', 'SCS')
     """
     if not memory_limit > 0:
         raise SettingError(f"memory_limit is {memory_limit}; give positive bytes")

@@ -60,14 +60,6 @@ def primal_relaxation(problem: PGOProblem) -> PrimalRelaxation:
     ------
     SettingError
         When Q would be larger than `pgo_models.problem.matrices.MAX_DENSE_SIDE`.
-
-    Examples
-    --------
-    >>> from pgo_models.problem.problem import PGOProblem
-    >>> from pgo_models.graphs.scenes import random_geometric
-    >>> problem = PGOProblem(random_geometric(4, np.random.default_rng(0)))
-    >>> len(primal_relaxation(problem).orthogonality)
-    4
     """
     n, d = problem.num_poses, problem.d
     scale = float(np.abs(problem.Q).max())
@@ -119,16 +111,7 @@ class DualRelaxation:
 
 
 def dual_relaxation(problem: PGOProblem) -> DualRelaxation:
-    """Pose the dual as one linear matrix inequality with the sparsity of M, on which Clarabel's decomposition acts.
-
-    Examples
-    --------
-    >>> from pgo_models.problem.problem import PGOProblem
-    >>> from pgo_models.graphs.scenes import random_geometric
-    >>> problem = PGOProblem(random_geometric(4, np.random.default_rng(0)))
-    >>> bool(dual_relaxation(problem).scale > 0)
-    True
-    """
+    """Pose the dual as one linear matrix inequality with the sparsity of M, on which Clarabel's decomposition acts."""
     n, d = problem.num_poses, problem.d
     grounded = problem.M[1:, 1:].tocsc()
     side, scale = grounded.shape[0], float(grounded.diagonal().max())

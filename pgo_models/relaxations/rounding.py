@@ -56,17 +56,6 @@ def round_gram(problem: PGOProblem, Z: Array) -> tuple[Poses, RankReport]:
 
     Z = Y Y^T with the rows R_i^T of every pose in Y, up to one orthogonal matrix on the right; if it has determinant
     -1 on most blocks, a column changes its sign (Rosen et al. 2019, algorithm 2).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.problem.problem import PGOProblem
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> Y = problem.graph.truth.R.reshape(-1, 3)
-    >>> poses, report = round_gram(problem, Y @ Y.T)
-    >>> report.rank
-    3
     """
     d = problem.d
     symmetric = 0.5 * (Z + Z.T)
@@ -79,16 +68,6 @@ def round_factor(problem: PGOProblem, Y: Array) -> tuple[Poses, RankReport]:
     """Poses of a low-rank factor, (n, d, r): what `round_gram` makes of Z = Y Y^T, without forming it.
 
     Rotations, which r = d gives as long as no block reflects, are returned as they are.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.problem.problem import PGOProblem
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> poses, report = round_factor(problem, np.swapaxes(problem.graph.truth.R, 1, 2))
-    >>> report.rank, bool(np.allclose(poses.R, problem.graph.truth.R))
-    (3, True)
     """
     n, d, r = Y.shape
     stacked = Y.reshape(n * d, r)

@@ -29,7 +29,9 @@ from pgo_models.certificates.certificate import (
     Verdict,
     certify,
     certify_at,
+    gap_text,
     judge,
+    proven_digits,
 )
 from pgo_models.certificates.lower_bound import prove_bound
 from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, polish, relative_decrement
@@ -354,3 +356,9 @@ def test_multipliers_of_a_certificate_cannot_be_changed() -> None:
     certificate = certify_at(problem, polish(problem, chordal_start(problem)))
     with pytest.raises(ValueError, match="read-only"):
         certificate.Lambda[:] = 0.0
+
+
+def test_a_gap_is_written_with_the_digits_that_it_proves() -> None:
+    assert [proven_digits(gap) for gap in (3e-13, 0.2, 0.0)] == [12, 0, 0]
+    assert gap_text(3.2e-13) == "3.2e-13, proven to 12 digits"
+    assert (gap_text(0.2), gap_text(0.0)) == ("0.2", "0: F is at its rounding level")
