@@ -1,7 +1,8 @@
-"""How the compiled cvxpy models of Bregman iteration and SOC are checked and solved: convex, by Clarabel, tightly."""
+"""How cvxpy models are given to Clarabel, and those of Bregman iteration and SOC checked: convex, solved tightly."""
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import cvxpy as cp
@@ -74,7 +75,11 @@ def solve_compiled(problem: cp.Problem, name: str, tolerance: float = TOLERANCE)
         When Clarabel ends without a solution; the message has its status and what it means.
     """
     while True:
-        status = _status(problem, tolerance)
+        try:
+            run_clarabel(problem, tolerance, warm_start=False)
+            status = str(problem.status)
+        except cp.SolverError:
+            status = cp.SOLVER_ERROR
         if status == cp.OPTIMAL:
             return
         if status in _MEANING or tolerance >= LOOSEST_TOLERANCE:
@@ -83,22 +88,34 @@ def solve_compiled(problem: cp.Problem, name: str, tolerance: float = TOLERANCE)
         tolerance = min(100.0 * tolerance, LOOSEST_TOLERANCE)
 
 
-def _status(problem: cp.Problem, tolerance: float) -> str:
-    """How Clarabel ended on a problem."""
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
-            problem.solve(
-                solver=cp.CLARABEL,
-                warm_start=False,
-                max_threads=1,
-                tol_gap_abs=tolerance,
-                tol_gap_rel=tolerance,
-                tol_feas=tolerance,
-            )
-    except cp.SolverError:
-        return str(cp.SOLVER_ERROR)
-    return str(problem.status)
+def run_clarabel(
+    problem: cp.Problem,
+    tolerance: float,
+    *,
+    warm_start: bool = True,
+    time_limit: float = math.inf,
+    verbose: bool = False,
+) -> None:
+    """Run Clarabel on one thread to a tolerance on the gap and on feasibility; `problem.status` says how it ended.
+
+    Raises
+    ------
+    cp.SolverError
+        When it ends without an iterate.
+    """
+    with warnings.catch_warnings():
+        # The status says so too, and every caller minds it.
+        warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
+        problem.solve(
+            solver=cp.CLARABEL,
+            warm_start=warm_start,
+            verbose=verbose,
+            max_threads=1,
+            time_limit=time_limit,
+            tol_gap_abs=tolerance,
+            tol_gap_rel=tolerance,
+            tol_feas=tolerance,
+        )
 
 
 def finite_array(values: object, name: str) -> Array:

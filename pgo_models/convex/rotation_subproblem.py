@@ -8,7 +8,6 @@ only Parameter (DPP), so that the problem is compiled once and solved again for 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,6 +15,7 @@ import cvxpy as cp
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
+from pgo_models.convex.clarabel import run_clarabel
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.rotations import Array
 
@@ -54,7 +54,10 @@ class RotationQP:
         self.shift.value = np.sqrt(self.penalty[held])[:, None] * V[held]
         # The quadratic program reaches the first tolerance; added cones may not, and stop where rounding lets them.
         for tolerance in TOLERANCES:
-            self._run_clarabel(tolerance)
+            try:
+                run_clarabel(self.problem, tolerance)
+            except cp.SolverError as error:
+                raise PGOError(f"Clarabel could not solve the R-subproblem: {error}") from error
             if self.problem.status == cp.OPTIMAL:
                 break
         if self.problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or self.X.value is None:
@@ -63,20 +66,6 @@ class RotationQP:
                 "check its scaling, and that constraints do not contradict each other"
             )
         return np.asarray(self.X.value)
-
-    def _run_clarabel(self, tolerance: float) -> None:
-        try:
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
-                self.problem.solve(
-                    solver=cp.CLARABEL,
-                    tol_gap_abs=tolerance,
-                    tol_gap_rel=tolerance,
-                    tol_feas=tolerance,
-                    max_threads=1,
-                )
-        except cp.SolverError as error:
-            raise PGOError(f"Clarabel could not solve the R-subproblem: {error}") from error
 
 
 def rotation_qp(

@@ -13,6 +13,7 @@ import cvxpy as cp
 from pgo_models.certificates.certificate import Verdict, gap_text, relative_gap, verdict_of
 from pgo_models.certificates.lower_bound import LowerBound, best_bound
 from pgo_models.certificates.rounding_errors import objective_rounding
+from pgo_models.convex.clarabel import run_clarabel
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -61,11 +62,7 @@ class RelaxationSolution:
     rank : RankReport
     objective, rounding_level : float
         F of the poses, and below what it could not be told from zero.
-    gap : float
-        (objective - lower_bound) / objective.
     wanted_gap : float
-    verdict : Verdict
-        On the poses.
     iterations : int
     seconds : float
         From posing to proof.
@@ -208,29 +205,20 @@ def _posed(problem: PGOProblem, plan: RelaxationPlan) -> Relaxation:
 
 
 def _solve(model: cp.Problem, solver: SDPSolver, time_limit: float, verbose: bool) -> RelaxationStatus:
-    limited = math.isfinite(time_limit)
     try:
-        with warnings.catch_warnings():
-            # Said by the status, and made good by the proof of the bound.
-            warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
-            if solver is SDPSolver.CLARABEL:
-                model.solve(
-                    solver=cp.CLARABEL,
-                    verbose=verbose,
-                    max_threads=1,
-                    tol_gap_abs=CLARABEL_TOLERANCE,
-                    tol_gap_rel=CLARABEL_TOLERANCE,
-                    tol_feas=CLARABEL_TOLERANCE,
-                    time_limit=time_limit,
-                )
-            else:
+        if solver is SDPSolver.CLARABEL:
+            run_clarabel(model, CLARABEL_TOLERANCE, time_limit=time_limit, verbose=verbose)
+        else:
+            with warnings.catch_warnings():
+                # Said by the status, and made good by the proof of the bound.
+                warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
                 model.solve(
                     solver=cp.SCS,
                     verbose=verbose,
                     eps_abs=SCS_TOLERANCE,
                     eps_rel=SCS_TOLERANCE,
                     max_iters=_SCS_MAX_ITERATIONS,
-                    time_limit_secs=time_limit if limited else 0.0,
+                    time_limit_secs=time_limit if math.isfinite(time_limit) else 0.0,
                 )
     except cp.SolverError as error:
         raise PGOError(f"{solver.name} failed on the relaxation: {error}; try the other solver or form") from error
