@@ -167,7 +167,7 @@ def bregman_subproblem(problem: BregmanProblem, alpha: float, tolerance: float =
     p = cp.Parameter(problem.K.shape[1], name="p")
     x = _stack(problem.variables)
     penalty = cp.sum_squares(np.sqrt(alpha / 2) * (problem.K @ x - problem.f))
-    return _compiled(problem.J - p @ x + penalty, problem.variables, p, 1.0, tolerance)
+    return Subproblem(cp.Problem(cp.Minimize(problem.J - p @ x + penalty)), problem.variables, p, 1.0, tolerance)
 
 
 def two_line_subproblem(problem: BregmanProblem, alpha: float, tolerance: float = TOLERANCE) -> Subproblem:
@@ -175,7 +175,7 @@ def two_line_subproblem(problem: BregmanProblem, alpha: float, tolerance: float 
     root = float(np.sqrt(alpha / 2))
     shift = cp.Parameter(problem.K.shape[0], name="shift")
     penalty = cp.sum_squares((root * problem.K) @ _stack(problem.variables) - shift)
-    return _compiled(problem.J + penalty, problem.variables, shift, root, tolerance)
+    return Subproblem(cp.Problem(cp.Minimize(problem.J + penalty)), problem.variables, shift, root, tolerance)
 
 
 def augmented_lagrangian_subproblem(problem: BregmanProblem, alpha: float, tolerance: float = TOLERANCE) -> Subproblem:
@@ -183,7 +183,9 @@ def augmented_lagrangian_subproblem(problem: BregmanProblem, alpha: float, toler
     lam = cp.Parameter(problem.K.shape[0], name="lam")
     residual = problem.f - problem.K @ _stack(problem.variables)
     penalty = cp.sum_squares(np.sqrt(alpha / 2) * residual)
-    return _compiled(problem.J + lam @ residual + penalty, problem.variables, lam, 1.0, tolerance)
+    return Subproblem(
+        cp.Problem(cp.Minimize(problem.J + lam @ residual + penalty)), problem.variables, lam, 1.0, tolerance
+    )
 
 
 def block_subproblems(problem: BregmanProblem, alpha: float, tolerance: float = TOLERANCE) -> tuple[Subproblem, ...]:
@@ -202,7 +204,7 @@ def block_subproblems(problem: BregmanProblem, alpha: float, tolerance: float = 
     for variable, block, J_i in zip(problem.variables, problem.blocks, separated, strict=True):
         c = cp.Parameter(problem.K.shape[0], name="c")
         penalty = cp.sum_squares((root * problem.K[:, block]) @ _stack((variable,)) - c)
-        compiled.append(_compiled(J_i + penalty, (variable,), c, root, tolerance))
+        compiled.append(Subproblem(cp.Problem(cp.Minimize(J_i + penalty)), (variable,), c, root, tolerance))
     return tuple(compiled)
 
 
@@ -226,13 +228,3 @@ def _terms_by_variable(problem: BregmanProblem) -> list[cp.Expression]:
 
 def _stack(variables: Sequence[cp.Variable]) -> cp.Expression:
     return cp.hstack([cp.vec(variable, order="C") for variable in variables])
-
-
-def _compiled(
-    objective: cp.Expression,
-    variables: tuple[cp.Variable, ...],
-    parameter: cp.Parameter,
-    scale: float,
-    tolerance: float,
-) -> Subproblem:
-    return Subproblem(cp.Problem(cp.Minimize(objective)), variables, parameter, scale, tolerance)

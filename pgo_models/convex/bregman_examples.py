@@ -14,6 +14,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.problem.matrices import residual_matrix, rotation_columns
 
 
 def basis_pursuit(K: Array, f: Array) -> BregmanProblem:
@@ -147,6 +148,7 @@ def shared_rotation_step(graph: PoseGraph, robots: Partition, V: Array, rho: flo
         raise SettingError(f"rho must be positive, got {rho}")
     shift = stack_transposes(V)
     owner_i, owner_j = robots.robot[graph.i], robots.robot[graph.j]
+    A, _ = residual_matrix(graph)
     variables, held, terms = [], [], []
     for robot in range(robots.num_robots):
         mine = (owner_i == robot) | (owner_j == robot)
@@ -154,11 +156,11 @@ def shared_rotation_step(graph: PoseGraph, robots: Partition, V: Array, rho: flo
         poses = np.union1d(own, np.concatenate([graph.i[mine], graph.j[mine]]))
         x = cp.Variable((d * len(poses), d), name=f"x_{robot}")
         weight = np.where(owner_i == owner_j, 1.0, 0.5)[mine] * graph.kappa[mine]
-        at_i, at_j = np.searchsorted(poses, graph.i[mine]), np.searchsorted(poses, graph.j[mine])
-        residuals = _rotation_residuals(at_i, at_j, graph.R_ij[mine], len(poses))
-        own_rows = _rows_of(np.searchsorted(poses, own), d)
+        rows = rotation_columns(np.flatnonzero(mine), graph.num_edges, d).ravel()
+        residuals = A[rows][:, rotation_columns(poses, n, d).ravel()]
+        own_rows = rotation_columns(np.searchsorted(poses, own), 0, d).ravel()
         edges = cp.sum_squares(diags_array(np.sqrt(np.repeat(weight, d))) @ residuals @ x)
-        terms.append(edges + 0.5 * rho * cp.sum_squares(x[own_rows] - shift[_rows_of(own, d)]))
+        terms.append(edges + 0.5 * rho * cp.sum_squares(x[own_rows] - shift[rotation_columns(own, 0, d).ravel()]))
         variables.append(x)
         held.append(poses)
     K = _agreement(held, robots.robot, d)
@@ -169,20 +171,6 @@ def shared_rotation_step(graph: PoseGraph, robots: Partition, V: Array, rho: flo
 def _forward(length: int) -> csr_array:
     ones = np.ones(max(length - 1, 0))
     return csr_array(diags_array([-ones, ones], offsets=[0, 1], shape=(len(ones), length)))
-
-
-def _rows_of(poses: IntArray, d: int) -> IntArray:
-    return (d * poses[:, None] + np.arange(d)).ravel()
-
-
-def _rotation_residuals(i: IntArray, j: IntArray, R_ij: Array, count: int) -> csr_array:
-    """A, (d m, d count): rows of A Y are R_j^T - R_ij^T R_i^T."""
-    m, d = len(i), R_ij.shape[-1]
-    rows = np.repeat(np.arange(d * m), d)
-    columns = np.repeat(d * i[:, None] + np.arange(d), d, axis=0).ravel()
-    from_i = coo_array((-np.swapaxes(R_ij, 1, 2).ravel(), (rows, columns)), shape=(d * m, d * count))
-    to_j = coo_array((np.ones(d * m), (np.arange(d * m), _rows_of(j, d))), shape=(d * m, d * count))
-    return csr_array(from_i + to_j)
 
 
 def _agreement(held: list[IntArray], robot: IntArray, d: int) -> csr_array:
