@@ -50,7 +50,7 @@ from solvers.distributed.checkpoint import Checkpoint
 from solvers.explanations import explained_by_its_graph, warn_of_weights
 from solvers.pipeline import HANDOVER, solve
 from solvers.reporting.report import check_report, write_report
-from solvers.reporting.versions import versions
+from solvers.reporting.versions import installed_versions
 from solvers.shell import DONE, Commands, run_command, save_then_show
 from solvers.soc.soc import SOC
 from solvers.solution import certificate_json, check_format, check_target, write_json
@@ -237,7 +237,7 @@ def certify_command(
         **certificate_json(certificate),
         "source": certificate.source.name,
         "best_known_objective": certificate.poses_objective,
-        "versions": versions(problem.backend),
+        "versions": installed_versions(problem.backend),
     }
     targets = [(out, partial(write_json, record))] if out is not None else []
     save_then_show(targets, lambda: typer.echo(str(certificate)))
@@ -259,7 +259,7 @@ def info_command(
     if graph is None:
         if robots is not None or split is not None:
             raise SettingError("--robots and --split describe a graph; give one")
-        for name, version in versions(None).items():
+        for name, version in installed_versions(None).items():
             table.add_row(name, version)
         table.add_row("data sets", ", ".join(known_datasets()))
     else:
@@ -374,5 +374,5 @@ def _describe(graph: PoseGraph) -> list[tuple[str, str]]:
             rows.append(("F, estimate", f"{problem.objective(graph.initial):.8g}"))
         rows.append(("F, tree", f"{problem.objective(spanning_tree_start(graph)):.8g}"))
         rows.append(("F, chordal", f"{problem.objective(chordal_start(problem)):.8g}"))
-    rows.append(("Cholesky", versions(None)["cholesky"]))
+    rows.append(("Cholesky", installed_versions(None)["cholesky"]))
     return rows

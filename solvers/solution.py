@@ -19,7 +19,7 @@ from pgo_models.plots.style import is_picture, save_figure
 from pgo_models.problem.initialization import spanning_tree_start
 from solvers.reporting.report import Solved, write_report
 from solvers.reporting.result_table import finite_or_none
-from solvers.reporting.versions import versions
+from solvers.reporting.versions import installed_versions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -179,7 +179,7 @@ class Solution(Solved):
                 for stage in self.stages
             ],
             **self._network_json(),
-            "versions": versions(self.problem.backend),
+            "versions": installed_versions(self.problem.backend),
             "ids": graph.pose_ids.tolist(),
             "R": self.poses.R.tolist(),
             "t": self.poses.t.tolist(),

@@ -21,7 +21,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, log_map, quaternions_from_rotations
 from pgo_models.graphs.g2o_parser import G2OLines, IntArray, information_of, poses_of, read_lines
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import RotationWeight, isotropic_information, precisions
+from pgo_models.graphs.precisions import RotationWeight, edge_precisions, isotropic_information
 
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
 MOST_SYMBOLS = len(_LETTERS)  # robots whose poses can be named by GTSAM symbols
@@ -81,7 +81,7 @@ def read_g2o(path: Path | str, weights: RotationWeight = RotationWeight.SE_SYNC)
     robot = _robots(ids, files)
     R_ij, t_ij = poses_of(d, rows)
     information = information_of(d, rows)
-    kappa, tau = precisions(information, weights)
+    kappa, tau = edge_precisions(information, weights)
     both = np.searchsorted(ids, edge_ids)
     return PoseGraph(
         num_poses=len(ids),

@@ -29,7 +29,7 @@ from pgo_models.geometry.rotations import Array, project_to_rotations
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.relaxations.clique_tree import CliqueTree, clique_side, clique_tree
+from pgo_models.relaxations.clique_tree import CliqueTree, build_clique_tree, clique_side
 from pgo_models.relaxations.rounding import RankReport, rank_report
 
 _LEAST_SCALE = 1e-6  # of the mean diagonal of L: noise-free graphs have F near zero
@@ -112,14 +112,14 @@ def clique_relaxation(
     centre : Poses, optional
         The stationary point that the chordal start polishes to, unless given. Far from the optimum it costs digits.
     tree : CliqueTree, optional
-        `clique_tree(problem.graph)` unless given.
+        `build_clique_tree(problem.graph)` unless given.
 
     References
     ----------
     Fukuda, Kojima, Murota & Nakata, Exploiting sparsity in semidefinite programming via matrix completion, 2001;
     Vandenberghe & Andersen 2015, chapter 14.
     """
-    tree = tree if tree is not None else clique_tree(problem.graph)
+    tree = tree if tree is not None else build_clique_tree(problem.graph)
     centre = centre if centre is not None else polish(problem, chordal_start(problem))
     layout = _Layout.of(problem, tree, centre)
     scale = max(problem.objective(centre), _LEAST_SCALE * float(problem.L.diagonal().mean()))

@@ -42,7 +42,7 @@ class CliqueTree:
         return np.intersect1d(self.cliques[k], self.cliques[self.parent[k]], assume_unique=True)
 
 
-def clique_tree(graph: PoseGraph) -> CliqueTree:
+def build_clique_tree(graph: PoseGraph) -> CliqueTree:
     """Eliminate poses in the order of least degree, and merge cliques of the elimination where that saves work.
 
     A child and its parent are merged when the cube of the union's side is at most the sum of their cubes and an

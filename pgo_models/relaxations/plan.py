@@ -10,7 +10,7 @@ import numpy as np
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.relaxations.clique_tree import CliqueTree, clique_side, clique_tree
+from pgo_models.relaxations.clique_tree import CliqueTree, build_clique_tree, clique_side
 
 DEFAULT_MEMORY_LIMIT = 4e9  # bytes
 
@@ -85,7 +85,7 @@ def plan_relaxation(
     """
     if not memory_limit > 0:
         raise SettingError(f"memory_limit is {memory_limit}; give positive bytes")
-    tree = clique_tree(problem.graph)
+    tree = build_clique_tree(problem.graph)
     largest = int(clique_side(int(tree.sizes.max()), problem.d))
     shape = (
         f"the largest of {len(tree.cliques)} cliques has side {largest}, the dense cone {problem.d * problem.num_poses}"

@@ -31,7 +31,7 @@ from solvers.distributed.interface import Interface, InterfaceFactor
 from solvers.distributed.multifrontal import separator_tree
 from solvers.distributed.robots.agent import Agent, order_interior
 from solvers.distributed.robots.interior import Interior
-from solvers.distributed.robots.records import Evaluation, ReducedTranslations
+from solvers.distributed.robots.records import CostParts, ReducedTranslations
 from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import Engine
 from solvers.network.ledger import Ledger
@@ -285,7 +285,7 @@ class Driver:
         t = self._laplacian.solve(line.gather([answer.b for answer in answers]))
         return t, line.scatter(t)
 
-    def with_sums(self, poses: CoverPoses, answers: Sequence[Evaluation]) -> CoverPoses:
+    def with_sums(self, poses: CoverPoses, answers: Sequence[CostParts]) -> CoverPoses:
         """Poses of the cover with F, its rounding level, and the rows of M X there."""
         force = self.interface(1, self.d).gather([answer.force for answer in answers])
         objective = math.fsum(answer.objective for answer in answers)

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pgo_models.errors import EngineError, MissingExtraError, SettingError
 from solvers.network.engine import WorkerPool
 from solvers.network.messages import Worker
-from solvers.network.recovery import Order, RecoveringPool, Recovery, RobotLostError
+from solvers.network.recovery import AnyOrder, RecoveringPool, Recovery, RobotLostError
 
 T = TypeVar("T")
 
@@ -181,7 +181,7 @@ class _RayPlace:
             self.actors[robot] = made.remote(self.make, replace(self.shares[robot]))
         self._wait({robot: self.actors[robot].ready.remote() for robot in robots})
 
-    def send(self, robot: int, order: Order, request: object) -> ObjectRef[Any]:
+    def send(self, robot: int, order: AnyOrder, request: object) -> ObjectRef[Any]:
         ticket: ObjectRef[Any] = self.actors[robot].obey.remote(order, request)
         return ticket
 
@@ -276,7 +276,7 @@ class _Actor:
     def ready(self) -> None:
         return None
 
-    def obey(self, order: Order, request: object) -> object:
+    def obey(self, order: AnyOrder, request: object) -> object:
         return order(self._worker, request)
 
 

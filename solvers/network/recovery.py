@@ -16,7 +16,7 @@ from solvers.network.messages import Snapshot, restore, take_snapshot
 T = TypeVar("T")
 Q = TypeVar("Q")
 A = TypeVar("A")
-Order = Callable[[Any, Any], Any]
+AnyOrder = Callable[[Any, Any], Any]
 
 
 class RobotLostError(EngineError):
@@ -35,7 +35,7 @@ class Place(Protocol[T]):
             When one was lost while it started.
         """
 
-    def send(self, robot: int, order: Order, request: object) -> T:
+    def send(self, robot: int, order: AnyOrder, request: object) -> T:
         """Give a robot an order."""
 
     def receive(self, robot: int, ticket: T) -> Any:  # noqa: ANN401 - what the order answers
@@ -91,7 +91,7 @@ class RecoveringPool(Generic[T]):
     num_robots: int
     recovery: Recovery
     restarts: list[int] = field(init=False)
-    _log: list[tuple[Order, tuple[Any, ...]]] = field(init=False, default_factory=list)
+    _log: list[tuple[AnyOrder, tuple[Any, ...]]] = field(init=False, default_factory=list)
     _snapshots: list[Snapshot] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
@@ -121,7 +121,7 @@ class RecoveringPool(Generic[T]):
         """Let the robots go."""
         self.place.close()
 
-    def _asked(self, order: Order, requests: Sequence[object]) -> list[Any]:
+    def _asked(self, order: AnyOrder, requests: Sequence[object]) -> list[Any]:
         tickets = [self.place.send(robot, order, request) for robot, request in enumerate(requests)]
         answers = []
         refusal: PGOError | None = None
@@ -139,7 +139,7 @@ class RecoveringPool(Generic[T]):
             raise refusal
         return answers
 
-    def _recovered(self, robot: int, order: Order, request: object, lost: RobotLostError) -> object:
+    def _recovered(self, robot: int, order: AnyOrder, request: object, lost: RobotLostError) -> object:
         """Answer of a robot that was lost before it gave one."""
         while self.restarts[robot] < self.recovery.max_restarts:
             self.restarts[robot] += 1
@@ -157,10 +157,10 @@ class RecoveringPool(Generic[T]):
             "run in this process"
         ) from lost
 
-    def _order(self, robot: int, order: Order, request: object) -> object:
+    def _order(self, robot: int, order: AnyOrder, request: object) -> object:
         return self.place.receive(robot, self.place.send(robot, order, request))
 
-    def _again(self, robot: int, order: Order, request: object) -> None:
+    def _again(self, robot: int, order: AnyOrder, request: object) -> None:
         try:
             self._order(robot, order, request)
         except EngineError:

@@ -24,7 +24,7 @@ from solvers.network.ledger import Ledger
 from solvers.reporting.convergence_plots import explore_convergence
 from solvers.reporting.report_html import PageCell, facts, page, paragraph, section, sortable_table
 from solvers.reporting.report_text import advice, headline, meaning
-from solvers.reporting.versions import versions
+from solvers.reporting.versions import installed_versions
 from solvers.result import Stage, Status
 from solvers.soc.soc import SOC
 
@@ -123,7 +123,7 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
         _worst_edges(solution, robots, residuals),
         _stages(solution),
         _settings(solution),
-        section("Versions", facts(list(versions(solution.problem.backend).items()))),
+        section("Versions", facts(list(installed_versions(solution.problem.backend).items()))),
         section("How to read this", facts(_GLOSSARY)),
     ]
     return page(f"{graph.name}: report", sections, figures, PAGE_CONFIG, script)

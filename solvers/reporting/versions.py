@@ -9,7 +9,7 @@ from importlib import metadata
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
 
 
-def versions(backend: CholeskyBackend | None) -> dict[str, str]:
+def installed_versions(backend: CholeskyBackend | None) -> dict[str, str]:
     """Versions of what computed a result, for records."""
     found = {"python": platform.python_version()}
     for name in ("pgo-splitting", "numpy", "scipy", "cvxpy", "clarabel"):

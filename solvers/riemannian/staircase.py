@@ -29,7 +29,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.low_rank import LiftedPoint, hessian_product, lifted_point
 from pgo_models.relaxations.rounding import round_factor
 from solvers.result import Measurement, Status
-from solvers.riemannian.truncated_cg import truncated_cg
+from solvers.riemannian.truncated_cg import truncated_conjugate_gradients
 
 _SHIFT = 1e-6  # of the mean diagonal entry of M over the rotations: makes Q, which is singular, definite
 _FIRST_RADIUS = 100.0  # times the preconditioned gradient, which soft directions outgrow
@@ -180,7 +180,7 @@ class Staircase:
     def _descend(self, problem: PGOProblem, state: StaircaseState) -> StaircaseState:
         """One iteration of the trust region (Absil, Mahony & Sepulchre, algorithm 10)."""
         point, scale = state.point, max(state.point.value, state.rounding_level)
-        trial = truncated_cg(
+        trial = truncated_conjugate_gradients(
             point.gradient,
             partial(hessian_product, problem, point),
             partial(_precondition, problem, state.preconditioner, point.Y),

@@ -37,7 +37,7 @@ class TruncatedStep:
     is_at_boundary: bool
 
 
-def truncated_cg(
+def truncated_conjugate_gradients(
     gradient: Array,
     hessian: Callable[[Array], Array],
     precondition: Callable[[Array], Array],

@@ -29,14 +29,14 @@ from solvers.soc.copies import (
     Rows,
     SeparatorPenalty,
     Started,
-    Turn,
+    TurnAnswer,
     TurnSettings,
     Waiting,
 )
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.r_step import RotationStep, prepare
 from solvers.soc.recursion_block import Agreement, RecursionBlock, block_at, nearest_rotations, stationary_B
-from solvers.soc.separator_stiffness import GROUND, separator_stiffness, travel
+from solvers.soc.separator_stiffness import GROUND, stiffness_of_separators, travel
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ class ConsensusRobot:
         penalty[separators] = 2.0 * GROUND * half_scale
         components = connected_components(layout.subgraph.graph.adjacency, directed=False)[1]
         factor = layout.problem.analysis.factorize(layout.subproblem(penalty).K)
-        stiffness = separator_stiffness(factor, (d + 1) * n, separators, half_scale, components[separators])
+        stiffness = stiffness_of_separators(factor, (d + 1) * n, separators, half_scale, components[separators])
         return self._with(rho=rho, diagonal=diagonal, pull=pull, total_force=total), stiffness
 
     def start(self, separators: SeparatorPenalty) -> tuple[ConsensusRobot, Started]:
@@ -151,7 +151,7 @@ class ConsensusRobot:
         waiting = Waiting(settings, {}, dict.fromkeys(self.layout.common, 0))
         return self._with(waiting=waiting)._sending(self.block)
 
-    def turn(self, rows: Rows) -> tuple[ConsensusRobot, Turn]:
+    def turn(self, rows: Rows) -> tuple[ConsensusRobot, TurnAnswer]:
         """One turn with the newest rows that have arrived: (b), (c) and (a), damped; rows for every neighbour.
 
         s <- s + damping (T(s) - s) with T the map of the synchronous recursion, the neighbours' rows being old ones: an
@@ -172,7 +172,7 @@ class ConsensusRobot:
         block = replace(block, s=block.s + waiting.settings.damping * moved)
         following = self._with(X=X, waiting=waiting.after(math.sqrt(sums[0])))
         robot, sent = following._sending(block)
-        return robot, Turn(sent, sums, max(waited.values(), default=0))
+        return robot, TurnAnswer(sent, sums, max(waited.values(), default=0))
 
     def travel(self, _: None) -> tuple[ConsensusRobot, Array]:
         """How far separator translations, and their multipliers, went: see `solvers.soc.separator_stiffness`."""

@@ -80,7 +80,7 @@ class TurnSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Turn:
+class TurnAnswer:
     """Rows for every neighbour, squared residuals, and how many turns the oldest rows in use are old."""
 
     rows: Rows

@@ -15,7 +15,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 
 
-def fista(
+def minimize_with_fista(
     apply_H: Callable[[Array], Array],
     b: Array,
     start: Array,

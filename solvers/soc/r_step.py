@@ -16,7 +16,7 @@ from scipy.sparse import csc_array, csr_array, diags_array
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, factorize
 from pgo_models.problem.matrices import entry_positions
-from solvers.soc.fista import fista
+from solvers.soc.fista import minimize_with_fista
 
 if TYPE_CHECKING:
     from pgo_models.convex.rotation_subproblem import RotationQP
@@ -142,7 +142,7 @@ class _Fista:
         b_t = b[:count]
         reduced = self._scale * (b[count:] - self._K_tR.T @ self._solve_tt(b_t))
         start = V[count:] / self._scale
-        R = self._scale * fista(self._apply, reduced, start, self._lipschitz, strong_convexity=0.5)
+        R = self._scale * minimize_with_fista(self._apply, reduced, start, self._lipschitz, strong_convexity=0.5)
         return np.concatenate([self._solve_tt(b_t - self._K_tR @ R), R])
 
     def _apply(self, Y: Array) -> Array:

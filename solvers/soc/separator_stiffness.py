@@ -17,7 +17,7 @@ _LEAST_FACTOR, _ENOUGH = 0.1, 1.0 / 3.0  # by which the translation penalty is l
 _SECOND_LOOK, _FAR_AWAY = 20, 1e-3  # iterations after penalties were taken anew, and residual that is still large then
 
 
-def separator_stiffness(
+def stiffness_of_separators(
     factor: CholeskyFactor, side: int, held: IntArray, half_scale: Array, component: IntArray
 ) -> float:
     """Stiffness of one robot's separators, relative to the diagonal of M.

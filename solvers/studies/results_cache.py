@@ -12,7 +12,7 @@ import numpy as np
 from pgo_models.errors import FileFormatError
 from pgo_models.files import read_text, replace_when_done
 from pgo_models.graphs.pose_graph import PoseGraph
-from solvers.reporting.versions import versions
+from solvers.reporting.versions import installed_versions
 
 Entry = dict[str, Any]
 
@@ -37,7 +37,7 @@ class KeptResults:
 
     def __init__(self, path: Path | None, is_fresh: bool = False) -> None:
         self._path = path
-        self._header = {"kind": "results of pgo, by key", "versions": versions(None)}
+        self._header = {"kind": "results of pgo, by key", "versions": installed_versions(None)}
         self._entries: dict[str, Entry] = {}
         if path is not None and path.exists():
             found = self._read(path)  # in any case: a file of something else is not to be written over

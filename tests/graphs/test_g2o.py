@@ -14,7 +14,7 @@ from pgo_models.graphs.datasets import load
 from pgo_models.graphs.g2o import read_g2o, read_g2o_poses, symbol_ids, write_g2o, write_g2o_folder
 from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import RotationWeight, isotropic_information, precisions
+from pgo_models.graphs.precisions import RotationWeight, edge_precisions, isotropic_information
 from pgo_models.graphs.scenes import random_geometric
 from pgo_models.problem.problem import PGOProblem
 
@@ -44,7 +44,7 @@ def random_graph(seed: int, num_poses: int, d: int) -> PoseGraph:
     k = 3 if d == 2 else 6
     root = rng.standard_normal((graph.num_edges, k, k))
     information = root @ np.swapaxes(root, 1, 2) + np.eye(k)
-    kappa, tau = precisions(information)
+    kappa, tau = edge_precisions(information)
     ids = np.sort(rng.choice(2**62, num_poses, replace=False) - 2**40)
     fixed = rng.choice(num_poses, 2, replace=False)
     return dataclasses.replace(
@@ -104,14 +104,14 @@ def test_precisions_follow_their_formulas(seed: int, d: int) -> None:
     k = 3 if d == 2 else 6
     root = rng.standard_normal((4, k, k))
     information = root @ np.swapaxes(root, 1, 2) + np.eye(k)
-    kappa, tau = precisions(information)
+    kappa, tau = edge_precisions(information)
     for e, matrix in enumerate(information):
         # tr(A^-1) = sum of the inverse eigenvalues
         assert tau[e] == pytest.approx(d / np.sum(1 / np.linalg.eigvalsh(matrix[:d, :d])), rel=1e-9)
         rotation = np.linalg.eigvalsh(matrix[d:, d:])
         expected = rotation[0] if d == 2 else 3 / (2 * np.sum(1 / rotation))
         assert kappa[e] == pytest.approx(expected, rel=1e-9)
-    again = precisions(isotropic_information(kappa, tau, d))
+    again = edge_precisions(isotropic_information(kappa, tau, d))
     np.testing.assert_allclose(again, [kappa, tau], rtol=8 * EPS, atol=0)
 
 
@@ -124,7 +124,7 @@ def test_gaussian_weights_give_the_chi_square_of_a_small_error(
     rng = np.random.default_rng(seed)
     I_t, I_theta = np.exp(rng.uniform(-5, 5, 2))
     information = np.diag([I_t] * d + [I_theta] * (d * (d - 1) // 2))[None]
-    kappa, tau = precisions(information, weights)
+    kappa, tau = edge_precisions(information, weights)
     one = np.array([0])
     graph = PoseGraph(2, one, one + 1, np.eye(d)[None], np.zeros((1, d)), kappa, tau)
     turn, step = 1e-4 * rng.standard_normal(d * (d - 1) // 2), rng.standard_normal(d)

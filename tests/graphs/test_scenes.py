@@ -11,7 +11,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import log_map
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import isotropic_information, precisions
+from pgo_models.graphs.precisions import edge_precisions, isotropic_information
 from pgo_models.graphs.scenes import NoiseModel, circle, grid, observe, random_geometric, sphere
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -100,7 +100,7 @@ def test_noise_has_its_standard_deviations(d: int) -> None:
 def test_precisions_are_those_of_the_information_matrix(d: int) -> None:
     noise = NoiseModel(translation_std=0.2, rotation_std=0.1)
     variance = [0.2**2] * d + [0.1**2] * (1 if d == 2 else 3)
-    kappa, tau = precisions(np.diag(1 / np.array(variance))[None])
+    kappa, tau = edge_precisions(np.diag(1 / np.array(variance))[None])
     assert kappa[0] == pytest.approx(noise.kappa(d))
     assert tau[0] == pytest.approx(noise.tau)
     np.testing.assert_allclose(

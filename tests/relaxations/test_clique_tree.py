@@ -6,13 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pgo_models.graphs.scenes import grid
-from pgo_models.relaxations.clique_tree import clique_side, clique_tree
+from pgo_models.relaxations.clique_tree import build_clique_tree, clique_side
 
 
 @given(seed=SEEDS, n=st.integers(2, 40), d=DIMENSIONS)
 def test_every_edge_is_in_a_clique_and_the_intersections_run_along_the_tree(seed: int, n: int, d: int) -> None:
     graph = varied_graph(seed, n, d)
-    tree = clique_tree(graph)
+    tree = build_clique_tree(graph)
     agents = [set(clique.tolist()) for clique in tree.cliques]
     assert set().union(*agents) == set(range(n))
     for i, j in zip(graph.i.tolist(), graph.j.tolist(), strict=True):
@@ -32,7 +32,7 @@ def test_every_edge_is_in_a_clique_and_the_intersections_run_along_the_tree(seed
 
 @given(seed=SEEDS, n=st.integers(2, 40))
 def test_no_clique_is_within_its_parent(seed: int, n: int) -> None:
-    tree = clique_tree(varied_graph(seed, n, 2))
+    tree = build_clique_tree(varied_graph(seed, n, 2))
     for k in range(1, len(tree.cliques)):
         assert len(tree.separator(k)) < len(tree.cliques[k])
         assert len(tree.separator(k)) < len(tree.cliques[tree.parent[k]])
@@ -50,11 +50,11 @@ def test_a_complete_graph_is_one_clique() -> None:
         kappa=np.ones(len(i)),
         tau=np.ones(len(i)),
     )
-    (clique,) = clique_tree(graph).cliques
+    (clique,) = build_clique_tree(graph).cliques
     np.testing.assert_array_equal(clique, np.arange(n))
 
 
 def test_the_lattice_has_cliques_of_half_its_poses() -> None:
-    tree = clique_tree(grid(np.random.default_rng(0)))
+    tree = build_clique_tree(grid(np.random.default_rng(0)))
     assert tree.sizes.max() == 13
     assert clique_side(13, 3) == 51

@@ -6,7 +6,7 @@ from graphs import SEEDS
 from hypothesis import given
 from hypothesis import strategies as st
 
-from solvers.riemannian.truncated_cg import TruncatedStep, truncated_cg
+from solvers.riemannian.truncated_cg import TruncatedStep, truncated_conjugate_gradients
 
 SIDE = 12
 
@@ -19,7 +19,7 @@ def spectrum(seed: int, low: float, high: float) -> tuple[np.ndarray, np.ndarray
 
 
 def solve(H: np.ndarray, P: np.ndarray, g: np.ndarray, radius: float, forcing: float = 1e-10) -> TruncatedStep:
-    return truncated_cg(g, lambda v: H @ v, lambda v: np.linalg.solve(P, v), radius, forcing, 0.0, 200)
+    return truncated_conjugate_gradients(g, lambda v: H @ v, lambda v: np.linalg.solve(P, v), radius, forcing, 0.0, 200)
 
 
 @given(seed=SEEDS)
@@ -65,5 +65,5 @@ def test_it_ends_as_roughly_as_it_may(seed: int) -> None:
     rough, fine = solve(H, np.eye(SIDE), g, 1e6, 0.3), solve(H, np.eye(SIDE), g, 1e6, 1e-8)
     assert rough.iterations <= fine.iterations
     assert np.linalg.norm(H @ rough.step + g) <= 0.3 * np.linalg.norm(g) * (1 + 1e-9)
-    assert truncated_cg(g, lambda v: H @ v, lambda v: v, 1e6, 1e-8, 0.0, 2).iterations == 2
-    assert truncated_cg(g, lambda v: H @ v, lambda v: v, 1e6, 1e-8, 1e9, 9).iterations == 0
+    assert truncated_conjugate_gradients(g, lambda v: H @ v, lambda v: v, 1e6, 1e-8, 0.0, 2).iterations == 2
+    assert truncated_conjugate_gradients(g, lambda v: H @ v, lambda v: v, 1e6, 1e-8, 1e9, 9).iterations == 0

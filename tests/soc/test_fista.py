@@ -12,7 +12,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.scenes import circle
 from pgo_models.problem.problem import PGOProblem
 from solvers.loop import run
-from solvers.soc.fista import fista
+from solvers.soc.fista import minimize_with_fista
 from solvers.soc.penalty import FixedPenalty
 from solvers.soc.r_step import RStep
 from solvers.soc.soc import SOC
@@ -32,7 +32,7 @@ def test_it_solves_to_its_tolerance(seed: int, side: int, columns: int, conditio
     H, lipschitz, convexity = quadratic(seed, side, condition)
     b, start = np.random.default_rng(seed).standard_normal((2, side, columns))
     for tolerance in (1e-3, 1e-9):
-        x = fista(lambda x: H @ x, b, start, lipschitz, convexity, tolerance)
+        x = minimize_with_fista(lambda x: H @ x, b, start, lipschitz, convexity, tolerance)
         # The residual as the iteration computed it, and what its rounding may hide.
         assert np.linalg.norm(H @ x - b) <= (tolerance + 64 * EPS * condition) * np.linalg.norm(b)
 
@@ -42,7 +42,7 @@ def test_it_stays_at_the_solution(seed: int, side: int, condition: float) -> Non
     H, lipschitz, convexity = quadratic(seed, side, condition)
     solution = np.random.default_rng(seed).standard_normal((side, 2))
     b = H @ solution
-    np.testing.assert_array_equal(fista(lambda x: H @ x, b, solution, lipschitz, convexity), solution)
+    np.testing.assert_array_equal(minimize_with_fista(lambda x: H @ x, b, solution, lipschitz, convexity), solution)
 
 
 @given(seed=SEEDS, side=st.integers(2, 20))
@@ -58,7 +58,7 @@ def test_it_takes_about_the_root_of_the_condition_in_steps(seed: int, side: int)
         count += 1
         return H @ x
 
-    fista(counted, b, np.zeros_like(b), lipschitz, convexity, tolerance)
+    minimize_with_fista(counted, b, np.zeros_like(b), lipschitz, convexity, tolerance)
     # (1 - 1 / sqrt(condition))^(k/2) in the residual, which starts at most condition too high.
     assert count <= 2 * np.sqrt(condition) * np.log(condition / tolerance) + 10
 
@@ -76,7 +76,7 @@ def test_the_limit_is_kept(seed: int, side: int, limit: int) -> None:
 
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        x = fista(counted, b, start, lipschitz, convexity, max_iterations=limit)
+        x = minimize_with_fista(counted, b, start, lipschitz, convexity, max_iterations=limit)
     assert count <= limit + 1  # the last one is for what is said
     assert np.isfinite(x).all()
     reached = np.linalg.norm(H @ x - b) / np.linalg.norm(b)
@@ -98,7 +98,7 @@ def test_inputs_are_left_alone() -> None:
     H, lipschitz, convexity = quadratic(0, 5, 10.0)
     b, start = np.random.default_rng(0).standard_normal((2, 5, 2))
     kept = b.copy(), start.copy()
-    fista(lambda x: H @ x, b, start, lipschitz, convexity)
+    minimize_with_fista(lambda x: H @ x, b, start, lipschitz, convexity)
     np.testing.assert_array_equal(b, kept[0])
     np.testing.assert_array_equal(start, kept[1])
 
@@ -106,7 +106,7 @@ def test_inputs_are_left_alone() -> None:
 def test_nothing_on_the_right_hand_side() -> None:
     H, lipschitz, convexity = quadratic(0, 5, 10.0)
     b = np.zeros((5, 1))
-    np.testing.assert_array_equal(fista(lambda x: H @ x, b, b, lipschitz, convexity), b)
+    np.testing.assert_array_equal(minimize_with_fista(lambda x: H @ x, b, b, lipschitz, convexity), b)
 
 
 @pytest.mark.parametrize(
@@ -115,4 +115,4 @@ def test_nothing_on_the_right_hand_side() -> None:
 def test_the_constants_are_checked(lipschitz: float, convexity: float) -> None:
     b = np.ones((2, 1))
     with pytest.raises(SettingError, match="need lipschitz >= strong_convexity > 0"):
-        fista(lambda x: x, b, b, lipschitz, convexity)
+        minimize_with_fista(lambda x: x, b, b, lipschitz, convexity)

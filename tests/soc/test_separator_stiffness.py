@@ -12,7 +12,7 @@ from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyFactor
 from pgo_models.problem.problem import PGOProblem
 from solvers.soc.penalty import rotation_scale, translation_scale
-from solvers.soc.separator_stiffness import GROUND, adapted_penalty, separator_stiffness, travel
+from solvers.soc.separator_stiffness import GROUND, adapted_penalty, stiffness_of_separators, travel
 
 PROBES = 32
 SIZES = st.integers(2, 20)
@@ -54,7 +54,7 @@ def test_the_estimate_is_within_its_statistical_error(
     held = np.sort(rng.choice(n, rng.integers(2, n + 1), replace=False))
     half_scale, factor = system(problem, held, weight)
     C = exact(half_scale, factor, problem.side, held)
-    stiffness = separator_stiffness(factor, problem.side, held, half_scale, np.zeros(len(held), dtype=int))
+    stiffness = stiffness_of_separators(factor, problem.side, held, half_scale, np.zeros(len(held), dtype=int))
     trace, degrees = float(np.trace(C)), len(held) - 1
     # z^T C z for signs z has the variance 2 sum_(i != j) C_ij^2 (Hutchinson 1990).
     deviation = np.sqrt(2.0 * (np.sum(C**2) - np.sum(np.diag(C) ** 2)) / PROBES)
@@ -68,7 +68,7 @@ def test_a_factor_on_all_weights_changes_nothing(seed: int, n: int, d: int, expo
     found = []
     for unit in (1.0, 2.0**exponent):
         half_scale, factor = system(problem, held, 1.0, unit)
-        found.append(separator_stiffness(factor, problem.side, held, half_scale, together))
+        found.append(stiffness_of_separators(factor, problem.side, held, half_scale, together))
     assert found[1] == pytest.approx(found[0], rel=1e-6)
 
 
@@ -79,8 +79,8 @@ def test_four_times_the_weights_beside_the_same_scale_are_four_times_as_stiff(se
     held, together = np.arange(n), np.zeros(n, dtype=int)
     half_scale, factor = system(problem, held, 1.0)
     _, stronger = system(problem, held, 1.0, 4.0)
-    soft = separator_stiffness(factor, problem.side, held, half_scale, together)
-    stiff = separator_stiffness(stronger, problem.side, held, half_scale, together)
+    soft = stiffness_of_separators(factor, problem.side, held, half_scale, together)
+    stiff = stiffness_of_separators(stronger, problem.side, held, half_scale, together)
     assert stiff == pytest.approx(4.0 * soft, rel=1e-6)
 
 
@@ -88,9 +88,9 @@ def test_separators_that_nothing_joins_feel_nothing_but_shifts() -> None:
     problem = varied_problem(0, 6, 3)
     held = np.array([0, 2, 5])
     half_scale, factor = system(problem, held, 1.0)
-    assert separator_stiffness(factor, problem.side, held, half_scale, np.arange(3)) == 1.0
+    assert stiffness_of_separators(factor, problem.side, held, half_scale, np.arange(3)) == 1.0
     none = np.zeros(0, dtype=int)
-    assert separator_stiffness(factor, problem.side, none, np.zeros(0), none) == 1.0
+    assert stiffness_of_separators(factor, problem.side, none, np.zeros(0), none) == 1.0
 
 
 @given(seed=SEEDS, q=st.integers(2, 12), d=DIMENSIONS, penalty=st.sampled_from([1e-3, 0.1, 2.0]))

@@ -34,7 +34,7 @@ from solvers.distributed.robots.factors import Eliminated, Factors, Widths
 from solvers.distributed.robots.proof import RobotProof, begin_proof, verify_interior
 from solvers.distributed.robots.records import (
     Agreed,
-    Evaluation,
+    CostParts,
     InteriorPoses,
     ModelOrder,
     Move,
@@ -124,7 +124,7 @@ class Interior:
         """Take poses from elsewhere, (p,), as they are."""
         return self._with(poses=poses), None
 
-    def evaluate(self, _: None) -> tuple[Interior, Evaluation]:
+    def evaluate(self, _: None) -> tuple[Interior, CostParts]:
         """Parts of F and of M X on the boundary, at the poses at hand."""
         return self, self._evaluation(self.state.poses)
 
@@ -146,7 +146,7 @@ class Interior:
         """Right-hand side of the best translations, and once their matrix."""
         return self._reduced_translations(self.state.poses.R)
 
-    def set_translations(self, t: Array) -> tuple[Interior, Evaluation]:
+    def set_translations(self, t: Array) -> tuple[Interior, CostParts]:
         """Take the best translations, from (g, d) on the boundary: parts of F and of M X on the boundary."""
         R = self.state.poses.R
         return self._with(poses=Poses(R, self._translations(R, t))).evaluate(None)
@@ -370,10 +370,10 @@ class Interior:
         p = self.part.problem.num_poses
         return np.asarray(-(self.part.problem.M[:p, p:] @ stack_transposes(R)))
 
-    def _evaluation(self, poses: Poses) -> Evaluation:
+    def _evaluation(self, poses: Poses) -> CostParts:
         problem = self.part.problem
         force = problem.apply_M(problem.stacked(poses))[self._boundary_rows]
-        return Evaluation(problem.objective(poses), rounding_level(problem, poses), force)
+        return CostParts(problem.objective(poses), rounding_level(problem, poses), force)
 
     def _proof_step(self) -> tuple[Interior, ProofStep]:
         assert self.state.proof is not None

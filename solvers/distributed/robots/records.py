@@ -44,7 +44,7 @@ class ReducedTranslations:
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluation:
+class CostParts:
     """Part of F and of its rounding level, and the rows of M X on the boundary, ((d+1) g, d)."""
 
     objective: float
@@ -56,7 +56,7 @@ class Evaluation:
 class TrialEvaluation:
     """The same at a trial, and the reduced gradient there."""
 
-    at: Evaluation
+    at: CostParts
     gradient: RightHandSide
 
 
