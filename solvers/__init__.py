@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from solvers.convex.bregman import AlternatingBregman, Bregman, MethodOfMultipliers, TwoLineBregman
     from solvers.convex.extended_soc import ExtendedSOC
     from solvers.convex.orthogonal import OrthogonalSOC, solve_orthogonal
-    from solvers.studies.error_forgetting import error_forgetting
+    from solvers.studies.forgetting import error_forgetting
 
 # These import cvxpy, which takes half of the time of an import: loaded when one of their names is first used.
 _LATER = {
@@ -45,7 +45,7 @@ _LATER = {
     "ExtendedSOC": "solvers.convex.extended_soc",
     "OrthogonalSOC": "solvers.convex.orthogonal",
     "solve_orthogonal": "solvers.convex.orthogonal",
-    "error_forgetting": "solvers.studies.error_forgetting",
+    "error_forgetting": "solvers.studies.forgetting",
 }
 
 __all__ = [

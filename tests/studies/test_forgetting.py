@@ -4,7 +4,7 @@ from signals import sparse_signal
 
 from pgo_models.errors import SettingError
 from pgo_models.plots.curves import plot_decay
-from solvers.studies.error_forgetting import error_forgetting
+from solvers.studies.forgetting import error_forgetting
 
 
 def test_errors_of_the_first_steps_are_forgotten_and_the_penalty_alone_keeps_its_own():
