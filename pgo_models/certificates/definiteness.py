@@ -9,8 +9,10 @@ definite (Rump 2006, *Verification of positive definiteness*; Jansson, Chaykin &
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from scipy.sparse import csc_array
@@ -25,10 +27,13 @@ from pgo_models.problem.cholesky import CholeskyFactor
 from pgo_models.problem.floating_point import OUTWARD
 from pgo_models.problem.problem import PGOProblem
 
+T = TypeVar("T")
+
 FIRST_SHIFT = 1e-9  # of the diagonal; what is not needed for rounding makes the bound sharper
 SHRINK = 1.0 / 32.0
 LEAST_SHIFT = 1e-15  # below the rounding of any matrix with a few non-zeros in a row
 MARGIN = 2.125  # twice the rounding, and what the estimate of it may be off by
+ETA_GROWTH, ETA_BISECTIONS = 10.0, 3
 _CG_TOLERANCE, _CG_ITERATIONS = 1e-4, 50
 _SMALLEST, _LARGEST = 1e-150, 1e150  # of diagonal entries: nothing that counts underflows
 
@@ -202,3 +207,30 @@ def search_shift(
             return factor, shift, is_marginal
         expected = np.maximum(expected, error)
     return None
+
+
+def smallest_eta(
+    attempt: Callable[[float], T | None], eta: float, below: float = math.inf, too_small: float | None = None
+) -> tuple[float, T] | None:
+    """Smallest shift eta found for which `attempt` does not give None, and what it gives; None when none is `below`.
+
+    It grows from the eta given, and the last step is bisected: to within a third of the smallest that would do.
+    `too_small` is an eta below the first for which there is known to be none.
+    """
+    found = None
+    while found is None:
+        if not eta < below:
+            return None
+        found = attempt(eta)
+        if found is None:
+            too_small, eta = eta, ETA_GROWTH * eta
+    for _ in range(ETA_BISECTIONS):
+        if too_small is None:
+            break
+        middle = math.sqrt(too_small * eta)
+        better = attempt(middle)
+        if better is None:
+            too_small = middle
+        else:
+            eta, found = middle, better
+    return eta, found

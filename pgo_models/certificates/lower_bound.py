@@ -28,7 +28,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.certificates.definiteness import DefiniteProof, prove_definite
+from pgo_models.certificates.definiteness import DefiniteProof, prove_definite, smallest_eta
 from pgo_models.certificates.rounding_errors import Evaluation, evaluate_certificate, has_safe_scale
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
@@ -39,7 +39,6 @@ from pgo_models.problem.matrices import rotation_columns
 from pgo_models.problem.problem import PGOProblem
 
 _ETA_SHARE = 0.5  # of the wanted gap is spent on eta; the rest is for poses a little off the optimum
-_ETA_GROWTH, _ETA_BISECTIONS = 10.0, 3
 UNGROUNDED_SHIFT = 1e-11  # of the diagonal: with eta, what is subtracted for rounding has to be made up for
 MOST_MOVES = 3
 SETTLED = 1e-13  # of the value: G adds less, and moving again would gain nothing
@@ -148,26 +147,13 @@ def search_bound(prove: Callable[[float], LowerBound | None], smallest: float, t
     prove : callable
         Bound for eta, or None where none was proved.
     smallest : float
-        First eta; from there on it grows until there is a bound, then the last step is bisected.
+        First eta (`smallest_eta`).
     trace, count : float, int
         tr(Lambda) and n d.
     """
-    eta, too_small = max(smallest, UNIT_ROUNDOFF * trace / count), math.nan  # at F = 0 the smallest would never grow
-    bound = None
-    while bound is None:
-        if not trace - eta * count > 0.0:
-            return NO_BOUND
-        bound = prove(eta)
-        if bound is None:
-            too_small, eta = eta, _ETA_GROWTH * eta
-    for _ in range(0 if math.isnan(too_small) else _ETA_BISECTIONS):
-        middle = math.sqrt(too_small * eta)
-        tighter = prove(middle)
-        if tighter is None:
-            too_small = middle
-        else:
-            eta, bound = middle, tighter
-    return bound if bound.value > 0.0 else NO_BOUND
+    first = max(smallest, UNIT_ROUNDOFF * trace / count)  # at F = 0 the smallest would never grow
+    found = smallest_eta(prove, first, below=trace / count)
+    return found[1] if found is not None and found[1].value > 0.0 else NO_BOUND
 
 
 def smallest_shift(gap: float, objective: float, count: int) -> float:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, eigsh
 
+from pgo_models.certificates.definiteness import ETA_GROWTH, smallest_eta
 from pgo_models.certificates.dual_variables import factorize_certificate
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array
@@ -15,7 +15,6 @@ from pgo_models.problem.cholesky import CholeskyFactor
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
 
-_GROWTH, _BISECTIONS = 10.0, 3
 _ACCURACY = 1e-3  # relative, of the eigenvalue: any direction that goes down will do, a steep one is better
 
 
@@ -44,9 +43,8 @@ class NegativeCurvature:
 def negative_curvature(problem: PGOProblem, Lambda: Array, eta: float, rng: np.random.Generator) -> NegativeCurvature:
     """Smallest eigenvalue of Q - blockdiag(Lambda), where it is below -eta < 0, with its eigenvector.
 
-    The shift eta grows until S + eta blockdiag(0, I) has a Cholesky factor, and is bisected to within a third of the
-    smallest that has. Its solves are those with Q - Lambda + eta I (`factorize_certificate`), whose inverse has the
-    wanted eigenvalue far above all others, so that Lanczos needs a handful of them.
+    With eta about the smallest for which S + eta blockdiag(0, I) has a Cholesky factor, the inverse of Q - Lambda +
+    eta I has the wanted eigenvalue far above all others, so that Lanczos needs a handful of solves.
 
     Parameters
     ----------
@@ -58,16 +56,9 @@ def negative_curvature(problem: PGOProblem, Lambda: Array, eta: float, rng: np.r
         Draws the first Lanczos vector.
     """
     n, d = problem.num_poses, problem.d
-    shift, factor = _smallest_definite_shift(problem, Lambda, eta)
-    right_hand_side = np.zeros(problem.side)
-
-    def inverse(y: Array) -> Array:
-        right_hand_side[n:] = y.ravel()
-        return factor.solve(right_hand_side)[n:]
-
-    operator = LinearOperator((n * d, n * d), matvec=inverse, dtype=float)
+    shift, factor = smallest_definite_shift(problem, Lambda, ETA_GROWTH * eta, too_small=eta)
     first = rng.standard_normal(n * d)
-    _, vectors = eigsh(operator, k=1, which="LA", v0=first, tol=_ACCURACY)
+    _, vectors = eigsh(rotation_inverse(problem, factor), k=1, which="LA", v0=first, tol=_ACCURACY)
     v = vectors[:, 0] / np.linalg.norm(vectors[:, 0])
     blocks = v.reshape(n, d)
     curvature = inner(v, problem.apply_Q(v[:, None])[:, 0])
@@ -75,24 +66,30 @@ def negative_curvature(problem: PGOProblem, Lambda: Array, eta: float, rng: np.r
     return NegativeCurvature(curvature, blocks, shift, factor)
 
 
-def _smallest_definite_shift(problem: PGOProblem, Lambda: Array, eta: float) -> tuple[float, CholeskyFactor]:
-    too_small, factor = eta, None
-    while factor is None:
-        eta *= _GROWTH
-        factor = _factor_or_none(problem, Lambda, eta)
-        too_small = eta if factor is None else too_small
-    for _ in range(_BISECTIONS):
-        middle = math.sqrt(too_small * eta)
-        better = _factor_or_none(problem, Lambda, middle)
-        if better is None:
-            too_small = middle
-        else:
-            eta, factor = middle, better
-    return eta, factor
+def smallest_definite_shift(
+    problem: PGOProblem, Lambda: Array, eta: float, too_small: float | None = None
+) -> tuple[float, CholeskyFactor]:
+    """About the smallest shift from eta on for which `factorize_certificate` has a factor, and the factor."""
+
+    def attempt(shift: float) -> CholeskyFactor | None:
+        try:
+            return factorize_certificate(problem, Lambda, shift)
+        except NotPositiveDefiniteError:
+            return None
+
+    found = smallest_eta(attempt, eta, too_small=too_small)
+    if found is None:
+        raise NotPositiveDefiniteError("no shift makes the certificate matrix positive definite; check Lambda for nan")
+    return found
 
 
-def _factor_or_none(problem: PGOProblem, Lambda: Array, eta: float) -> CholeskyFactor | None:
-    try:
-        return factorize_certificate(problem, Lambda, eta)
-    except NotPositiveDefiniteError:
-        return None
+def rotation_inverse(problem: PGOProblem, factor: CholeskyFactor) -> LinearOperator:
+    """(Q - blockdiag(Lambda) + eta I)^-1, (dn, dn), by solves with a factor of `factorize_certificate`."""
+    n, side = problem.num_poses, problem.num_poses * problem.d
+
+    def invert(vectors: Array) -> Array:
+        whole = np.zeros((problem.side, *vectors.shape[1:]))
+        whole[n:] = vectors
+        return factor.solve(whole)[n:]
+
+    return LinearOperator((side, side), matvec=invert, matmat=invert, dtype=float)

@@ -7,22 +7,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import csc_array, eye_array, tril
-from scipy.sparse.linalg import LinearOperator, eigsh, splu
+from scipy.sparse.linalg import eigsh, splu
 
 from pgo_models.certificates.certificate import Certificate
-from pgo_models.certificates.dual_variables import factorize_certificate
-from pgo_models.errors import NotPositiveDefiniteError, SettingError
+from pgo_models.certificates.spectrum import rotation_inverse, smallest_definite_shift
+from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, SMALL_POINTS, column_figure
-from pgo_models.problem.cholesky import CholeskyFactor
 from pgo_models.problem.problem import PGOProblem
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_FIRST_SHIFT, _SHIFT_GROWTH = 1e-6, 10.0  # of the mean diagonal entry of M
+_FIRST_SHIFT = 1e-6  # of the mean diagonal entry of M
 _DENSE_SIDE = 200  # below it all eigenvalues are had at once
 _CELLS = 300  # a side of the picture of a pattern
 
@@ -53,18 +52,11 @@ def smallest_eigenvalues(problem: PGOProblem, Lambda: Array, count: int = 12) ->
     side = problem.num_poses * problem.d
     if not 1 <= count <= side:
         raise SettingError(f"count is {count}; S has {side} eigenvalues, give 1 to {side}")
-    eta, factor = _factor_below_spectrum(problem, Lambda)
-    n = problem.num_poses
-
-    def invert(vectors: Array) -> Array:
-        whole = np.zeros((problem.side, vectors.shape[1] if vectors.ndim == 2 else 1))
-        whole[n:] = vectors.reshape(side, -1)
-        return factor.solve(whole)[n:].reshape(vectors.shape)
-
+    eta, factor = smallest_definite_shift(problem, Lambda, _FIRST_SHIFT * float(problem.M.diagonal().mean()))
+    operator = rotation_inverse(problem, factor)
     if side <= _DENSE_SIDE or count >= side - 1:
-        inverse = np.linalg.eigvalsh(invert(np.eye(side)))
+        inverse = np.linalg.eigvalsh(operator @ np.eye(side))
     else:
-        operator = LinearOperator((side, side), matvec=invert, matmat=invert, dtype=float)
         start = np.random.default_rng(0).standard_normal(side)  # only so that the same question has the same answer
         inverse = eigsh(operator, k=count, which="LA", v0=start, return_eigenvectors=False)
     return np.sort(1.0 / np.sort(inverse)[::-1][:count] - eta)
@@ -163,16 +155,6 @@ def plot_sparsity(problem: PGOProblem) -> Figure:
         share = 100.0 * pattern.fill_in / pattern.factor.nnz
         figure.supxlabel(f"fill-in: {pattern.fill_in:,} entries, {share:.0f} % of the factor", fontsize=SMALL_POINTS)
     return figure
-
-
-def _factor_below_spectrum(problem: PGOProblem, Lambda: Array) -> tuple[float, CholeskyFactor]:
-    """Smallest tried eta for which S + eta blockdiag(0, I), one translation grounded, has a factor; and the factor."""
-    eta = _FIRST_SHIFT * float(problem.M.diagonal().mean())
-    while True:
-        try:
-            return eta, factorize_certificate(problem, Lambda, eta)
-        except NotPositiveDefiniteError:
-            eta *= _SHIFT_GROWTH
 
 
 def _draw_pattern(axes: Axes, matrix: csc_array) -> None:
