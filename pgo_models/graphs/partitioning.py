@@ -6,12 +6,11 @@ import enum
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
 
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.geometry.arrays import ReadOnly, whole_array, whole_number
 from pgo_models.geometry.rotations import BoolArray
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph, has_no_gap
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts, has_no_gap
 
 
 class PartitionMethod(enum.Enum):
@@ -137,14 +136,11 @@ def _metis(graph: PoseGraph, num_robots: int) -> IntArray:
         import pymetis
     except ImportError as error:
         raise MissingExtraError("pymetis", "fast") from error
-    ones = np.ones(graph.num_edges, dtype=np.int64)
-    adjacency = coo_array((ones, (graph.i, graph.j)), shape=(graph.num_poses, graph.num_poses)).tocsr()
-    adjacency = (adjacency + adjacency.T).tocsr()
-    adjacency.sort_indices()
+    adjacency = edge_counts(graph.i, graph.j, graph.num_poses)
     _, part = pymetis.part_graph(
         num_robots,
         adjacency=pymetis.CSRAdjacency(adjacency.indptr.tolist(), adjacency.indices.tolist()),
-        eweights=adjacency.data.tolist(),
+        eweights=adjacency.data.astype(np.int64).tolist(),
         options=pymetis.Options(contig=True, seed=0),
     )
     return np.asarray(np.unique(np.asarray(part), return_inverse=True)[1], dtype=np.int64)

@@ -15,7 +15,7 @@ from scipy.sparse import csc_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, hat, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.matrices import assemble, rotation_columns
+from pgo_models.problem.matrices import assemble, block_entries, rotation_columns
 from pgo_models.problem.problem import PGOProblem
 
 
@@ -73,13 +73,13 @@ def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) 
         (v_j, v_j, tau),
         (v_i, v_j, -tau),
         (v_j, v_i, -tau),
-        (*_grid(v_i, w_i), -lever),
-        (*_grid(w_i, v_i), -np.swapaxes(lever, 1, 2)),
-        (*_grid(v_j, w_i), lever),
-        (*_grid(w_i, v_j), np.swapaxes(lever, 1, 2)),
-        (*_grid(w_i, w_j), coupling),
-        (*_grid(w_j, w_i), np.swapaxes(coupling, 1, 2)),
-        (*_grid(poses_w, poses_w), own),
+        (*block_entries(v_i, w_i), -lever),
+        (*block_entries(w_i, v_i), -np.swapaxes(lever, 1, 2)),
+        (*block_entries(v_j, w_i), lever),
+        (*block_entries(w_i, v_j), np.swapaxes(lever, 1, 2)),
+        (*block_entries(w_i, w_j), coupling),
+        (*block_entries(w_j, w_i), np.swapaxes(coupling, 1, 2)),
+        (*block_entries(poses_w, poses_w), own),
     ]
     return assemble(blocks, layout.side)
 
@@ -117,10 +117,3 @@ def _lever(t_ij: Array) -> Array:
 
 def _trace(A: Array) -> Array:
     return np.asarray(np.einsum("naa->n", A))[:, None, None]
-
-
-def _grid(rows: IntArray, columns: IntArray) -> tuple[IntArray, IntArray]:
-    return (
-        np.repeat(rows[:, :, None], columns.shape[1], axis=2),
-        np.repeat(columns[:, None, :], rows.shape[1], axis=1),
-    )

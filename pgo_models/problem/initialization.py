@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order
 
 from pgo_models.errors import GraphError, SettingError
@@ -15,7 +14,7 @@ from pgo_models.geometry.rotations import (
     tangent_dimension,
     unstack_transposes,
 )
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 from pgo_models.problem.problem import PGOProblem
 
 
@@ -90,19 +89,11 @@ def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
 def spanning_tree(graph: PoseGraph, root: int) -> tuple[IntArray, IntArray, IntArray]:
     """Breadth-first tree: poses in its order, the parent of every pose, and the edges to order[1:]."""
     n = graph.num_poses
-    # The stored number of an adjacency entry is 1 + the first edge between the two poses.
-    pair = np.minimum(graph.i, graph.j) * n + np.maximum(graph.i, graph.j)
-    first = np.unique(pair, return_index=True)[1]
-    rows, columns, number = graph.i[first], graph.j[first], first + 1.0
-    adjacency = csr_array(
-        coo_array(
-            (np.concatenate([number, number]), (np.concatenate([rows, columns]), np.concatenate([columns, rows]))),
-            shape=(n, n),
-        )
-    )
-    order, parent = breadth_first_order(adjacency, root, directed=False)
-    child = order[1:]
-    return order, parent, np.asarray(adjacency[child, parent[child]]).astype(np.int64).ravel() - 1
+    order, parent = breadth_first_order(edge_counts(graph.i, graph.j, n), root, directed=False)
+    ends, child = np.stack([graph.i, graph.j]), order[1:]
+    pairs, first = np.unique(ends.min(axis=0) * n + ends.max(axis=0), return_index=True)
+    branches = np.minimum(child, parent[child]) * np.int64(n) + np.maximum(child, parent[child])
+    return order, parent, first[np.searchsorted(pairs, branches)]
 
 
 def chordal_start(problem: PGOProblem) -> Poses:
@@ -124,13 +115,8 @@ def chordal_start(problem: PGOProblem) -> Poses:
     X_fixed[fixed[1:]] = np.eye(d)
     right_hand_side = -(problem.M @ X_fixed)
     right_hand_side[fixed] = X_fixed[fixed]
-    is_fixed = np.zeros(problem.side, dtype=bool)
-    is_fixed[fixed] = True
     data = problem.M.data.copy()
-    data[is_fixed[problem.M.indices]] = 0.0
-    for column in fixed:
-        data[problem.M.indptr[column] : problem.M.indptr[column + 1]] = 0.0
-    data[problem.diagonal_positions[fixed]] = 1.0
+    problem.leave_out(data, fixed, 1.0)
     X = problem.analysis.factorize(problem.with_pattern_of_M(data)).solve(right_hand_side)
     return problem.with_best_translations(project_to_rotations(unstack_transposes(X[n:])))
 

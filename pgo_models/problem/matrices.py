@@ -71,10 +71,10 @@ def joint_matrix(graph: PoseGraph) -> csc_array:
         (block_i, t_i, tau_t),
         (t_j, block_i, -tau_t),
         (block_i, t_j, -tau_t),
-        (*_square(block_i, block_i), eye + tau_t[:, :, None] * t_ij[:, None, :]),
-        (*_square(block_j, block_j), eye),
-        (*_square(block_i, block_j), -kappa[:, None, None] * graph.R_ij),
-        (*_square(block_j, block_i), -kappa[:, None, None] * np.swapaxes(graph.R_ij, 1, 2)),
+        (*block_entries(block_i, block_i), eye + tau_t[:, :, None] * t_ij[:, None, :]),
+        (*block_entries(block_j, block_j), eye),
+        (*block_entries(block_i, block_j), -kappa[:, None, None] * graph.R_ij),
+        (*block_entries(block_j, block_i), -kappa[:, None, None] * np.swapaxes(graph.R_ij, 1, 2)),
     ]
     return assemble(blocks, (d + 1) * n)
 
@@ -86,10 +86,10 @@ def connection_laplacian(graph: PoseGraph) -> csc_array:
     eye = graph.kappa[:, None, None] * np.eye(d)
     coupling = -graph.kappa[:, None, None] * graph.R_ij
     blocks = [
-        (*_square(block_i, block_i), eye),
-        (*_square(block_j, block_j), eye),
-        (*_square(block_i, block_j), coupling),
-        (*_square(block_j, block_i), np.swapaxes(coupling, 1, 2)),
+        (*block_entries(block_i, block_i), eye),
+        (*block_entries(block_j, block_j), eye),
+        (*block_entries(block_i, block_j), coupling),
+        (*block_entries(block_j, block_i), np.swapaxes(coupling, 1, 2)),
     ]
     return assemble(blocks, d * n)
 
@@ -157,8 +157,9 @@ def entry_positions(matrix: csc_array, rows: IntArray, columns: IntArray) -> Int
     return np.searchsorted(stored, columns.astype(np.int64) * side + rows)
 
 
-def _square(block_rows: IntArray, block_columns: IntArray) -> tuple[IntArray, IntArray]:
-    """Rows and columns (m, d, d) of d x d blocks."""
-    d = block_rows.shape[1]
-    rows = np.repeat(block_rows[:, :, None], d, axis=2)
-    return rows, np.repeat(block_columns[:, None, :], d, axis=1)
+def block_entries(rows: IntArray, columns: IntArray) -> tuple[IntArray, IntArray]:
+    """Rows and columns, (m, a, b) each, of the entries of blocks with these rows, (m, a), and columns, (m, b)."""
+    return (
+        np.repeat(rows[:, :, None], columns.shape[1], axis=2),
+        np.repeat(columns[:, None, :], rows.shape[1], axis=1),
+    )

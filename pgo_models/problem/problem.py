@@ -15,6 +15,7 @@ from pgo_models.geometry.rotations import Array, stack_transposes, vee
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, analyze, factorize
 from pgo_models.problem.matrices import (
+    block_entries,
     connection_laplacian,
     entry_positions,
     joint_matrix,
@@ -113,9 +114,8 @@ class PGOProblem:
     def block_positions(self) -> IntArray:
         """Positions in `M.data` of the diagonal d x d rotation blocks of M, (n, d, d)."""
         n, d = self.num_poses, self.d
-        columns = rotation_columns(np.arange(n), n, d)
-        rows = np.repeat(columns[:, :, None], d, axis=2)
-        return read_only(entry_positions(self.M, rows.ravel(), np.swapaxes(rows, 1, 2).ravel()).reshape(n, d, d))
+        block = rotation_columns(np.arange(n), n, d)
+        return read_only(entry_positions(self.M, *block_entries(block, block)))
 
     def with_pattern_of_M(self, data: Array) -> csc_array:
         """Return the matrix that has the pattern of M and the given stored values."""

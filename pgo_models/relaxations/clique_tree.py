@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 
 _CLIQUE_OVERHEAD = 300.0
 
@@ -53,13 +53,7 @@ def build_clique_tree(graph: PoseGraph) -> CliqueTree:
     Vandenberghe & Andersen, Chordal graphs and semidefinite optimization, 2015, chapters 4 and 6; the merging is that
     of Garstka, Cannon & Goulart, A clique graph based merging strategy, 2020, on the edges of the tree.
     """
-    members, parent = _eliminate(graph)
-    d = graph.d
-
-    def work(size: int) -> float:
-        return float(clique_side(size, d) ** 3) + _CLIQUE_OVERHEAD
-
-    return _merge(members, parent, work)
+    return _merge(*_eliminate(graph), lambda size: clique_side(size, graph.d) ** 3 + _CLIQUE_OVERHEAD)
 
 
 def clique_side(num_poses: int, d: int) -> int:
@@ -69,10 +63,8 @@ def clique_side(num_poses: int, d: int) -> int:
 
 def _eliminate(graph: PoseGraph) -> tuple[list[set[int]], list[int]]:
     """Cliques of the elimination of every pose, in order, and the place of every clique's parent."""
-    neighbours: list[set[int]] = [set() for _ in range(graph.num_poses)]
-    for a, b in zip(graph.i.tolist(), graph.j.tolist(), strict=True):
-        neighbours[a].add(b)
-        neighbours[b].add(a)
+    adjacency = edge_counts(graph.i, graph.j, graph.num_poses)
+    neighbours = [set(row.tolist()) for row in np.split(adjacency.indices, adjacency.indptr[1:-1])]
     heap = [(len(adjacent), pose) for pose, adjacent in enumerate(neighbours)]
     heapq.heapify(heap)
     place: dict[int, int] = {}
