@@ -5,8 +5,8 @@ The projection onto orthonormal columns is Theorem 1 of Lai & Osher 2014 and ste
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -14,30 +14,36 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, project_by_svd
 
 
-class ConstraintSet(Protocol):
+class ConstraintSet(ABC):
     """A closed set of matrices with a closed-form projection."""
 
+    @abstractmethod
     def check_shape(self, shape: tuple[int, ...], name: str) -> None:
         """Raise SettingError unless the set has matrices of this shape; `name` is for the message."""
 
+    @abstractmethod
     def project(self, V: Array) -> Array:
         """One nearest point of the set to V."""
 
+    @abstractmethod
     def normal_part(self, P: Array, G: Array) -> Array:
         """Projection of G onto the normal space of the set at its point P."""
 
+    @abstractmethod
     def least_penalty(self, P: Array, N: Array) -> float:
         """Smallest rho at which P is still the projection of P + N / rho, for N normal at P."""
 
+    @abstractmethod
     def distance(self, P: Array) -> float:
         """How far P is from satisfying the equations of the set."""
 
     def random(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-        """Random point of the set."""
+        """Random point of the set: the projection of normal entries, for norms and determinants the uniform one."""
+        return self.project(rng.standard_normal(shape))
 
 
 @dataclass(frozen=True)
-class Orthonormal:
+class Orthonormal(ConstraintSet):
     """X^T X = I, columns at most as many as rows: the Stiefel manifold; O(p) when X is square."""
 
     def check_shape(self, shape: tuple[int, ...], name: str) -> None:
@@ -64,14 +70,10 @@ class Orthonormal:
         """||P^T P - I||_F."""
         return float(np.linalg.norm(P.T @ P - np.eye(P.shape[1])))
 
-    def random(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-        """Uniform (Haar) point."""
-        return self.project(rng.standard_normal(shape))
-
 
 @dataclass(frozen=True)
-class Rotations:
-    """X^T X = I and det X = 1: SO(d), for square X of any side."""
+class Rotations(Orthonormal):
+    """X^T X = I and det X = 1: SO(d), for square X of any side; a part of O(d), with its normal spaces."""
 
     def check_shape(self, shape: tuple[int, ...], name: str) -> None:
         """Square."""
@@ -82,10 +84,6 @@ class Rotations:
         """U diag(1, .., 1, det(U V^T)) V^T of the SVD."""
         return project_by_svd(V)
 
-    def normal_part(self, P: Array, G: Array) -> Array:
-        """P Lambda, with Lambda = sym(P^T G): SO(d) is a part of O(d)."""
-        return np.asarray(P @ _symmetric(P.T @ G))
-
     def least_penalty(self, P: Array, N: Array) -> float:
         """Minus half the sum of Lambda's two smallest eigenvalues: one may be negative in a nearest rotation."""
         return max(0.0, float(-np.mean(np.linalg.eigvalsh(_symmetric(P.T @ N))[:2])))
@@ -94,13 +92,9 @@ class Rotations:
         """max(||P^T P - I||_F, 1 - det P)."""
         return max(float(np.linalg.norm(P.T @ P - np.eye(len(P)))), 1.0 - float(np.linalg.det(P)))
 
-    def random(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-        """Uniform (Haar) point."""
-        return self.project(rng.standard_normal(shape))
-
 
 @dataclass(frozen=True)
-class UnitColumns:
+class UnitColumns(ConstraintSet):
     """||x_j|| = 1 for every column x_j; a vector is one column."""
 
     def check_shape(self, shape: tuple[int, ...], name: str) -> None:
@@ -126,13 +120,9 @@ class UnitColumns:
         """Norm of the vector of ||p_j||^2 - 1."""
         return float(np.linalg.norm(np.sum(P**2, axis=0) - 1.0))
 
-    def random(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-        """Uniform point."""
-        return self.project(rng.standard_normal(shape))
-
 
 @dataclass(frozen=True)
-class UnitRows:
+class UnitRows(ConstraintSet):
     """||x_i|| = 1 for every row x_i; of a vector, every entry is -1 or 1."""
 
     def check_shape(self, shape: tuple[int, ...], name: str) -> None:
@@ -155,13 +145,9 @@ class UnitRows:
         """Norm of the vector of ||p_i||^2 - 1."""
         return UnitColumns().distance(_rows_as_columns(P))
 
-    def random(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-        """Uniform point."""
-        return self.project(rng.standard_normal(shape))
-
 
 @dataclass(frozen=True)
-class Sparse:
+class Sparse(ConstraintSet):
     """At most `nonzeros` entries are not zero: ||X||_0 <= nonzeros."""
 
     nonzeros: int
@@ -196,10 +182,6 @@ class Sparse:
     def distance(self, P: Array) -> float:
         """Norm of the entries that hard thresholding would drop."""
         return float(np.linalg.norm(P - self.project(P)))
-
-    def random(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-        """Projection of normal entries."""
-        return self.project(rng.standard_normal(shape))
 
 
 def _symmetric(A: Array) -> Array:

@@ -310,7 +310,7 @@ def kkt_residuals(problem: OrthogonalProblem, point: OrthogonalPoint, rho: float
     for term, normal in zip(problem.terms, normals, strict=True):
         gradients[term.variable] -= normal
     multipliers = tuple(
-        -copy.T @ normal if isinstance(term.constraint, Orthonormal | Rotations) else -normal
+        -copy.T @ normal if isinstance(term.constraint, Orthonormal) else -normal
         for term, copy, normal in zip(problem.terms, point.copies, normals, strict=True)
     )
     return KKTResiduals(
