@@ -91,7 +91,7 @@ def polish_step(
     layout = TangentLayout(problem.num_poses, problem.d)
     now = replace(state, analysis=analysis, factor=factor, is_newton=is_newton, moved=False)
     level = rounding_level(problem, state.poses)  # hardly moves with them
-    gradient, learned = layout.join(*problem.riemannian_gradient(state.poses)), list[_Secant]()
+    gradient, learned = layout.join(*problem.riemannian_gradient(state.poses)), list[tuple[Array, Array]]()
     direction = -factor.solve(gradient)
     now = replace(now, decrement=scaled_decrement(-inner(gradient, direction), now.objective, level))
     for _ in range(1 + (SECANT_STEPS if secants else CHORD_STEPS)):
@@ -102,7 +102,8 @@ def polish_step(
             break
         before, gradient = gradient, layout.join(*problem.riemannian_gradient(candidate.poses))
         if secants:
-            learned.append(_Secant(_move_between(layout, now.poses, candidate.poses), gradient - before))
+            turn = vee(np.swapaxes(now.poses.R, 1, 2) @ candidate.poses.R)
+            learned.append((layout.join(turn, candidate.poses.t - now.poses.t), gradient - before))
         direction = -_apply_inverse(factor, learned, gradient)
         decrement = scaled_decrement(-inner(gradient, direction), candidate.objective, level)
         at_rounding = reached_rounding(now.decrement, decrement, is_newton and not now.moved)
@@ -200,28 +201,19 @@ def ground_pose(matrix: csc_array, problem: PGOProblem) -> None:
         matrix.data[position] += abs(matrix.data[position])
 
 
-@dataclass(frozen=True, eq=False)
-class _Secant:
-    """A move and the change of the gradient along it."""
+def _apply_inverse(factor: CholeskyFactor, secants: list[tuple[Array, Array]], gradient: Array) -> Array:
+    """H^-1 g by the two loops of L-BFGS (Nocedal & Wright 2006, algorithm 7.4), from H the factored matrix.
 
-    move: Array
-    change: Array
-
-
-def _move_between(layout: TangentLayout, start: Poses, end: Poses) -> Array:
-    return layout.join(vee(np.swapaxes(start.R, 1, 2) @ end.R), end.t - start.t)
-
-
-def _apply_inverse(factor: CholeskyFactor, secants: list[_Secant], gradient: Array) -> Array:
-    """H^-1 g by the two loops of L-BFGS (Nocedal & Wright 2006, algorithm 7.4), from H the factored matrix."""
-    curved = [one for one in secants if inner(one.move, one.change) > 0.0]
+    A secant is a move and the change of the gradient along it.
+    """
+    curved = [(move, change) for move, change in secants if inner(move, change) > 0.0]
     g, shares = gradient.copy(), []
-    for one in reversed(curved):
-        shares.append(inner(one.move, g) / inner(one.move, one.change))
-        g -= shares[-1] * one.change
+    for move, change in reversed(curved):
+        shares.append(inner(move, g) / inner(move, change))
+        g -= shares[-1] * change
     step = factor.solve(g)
-    for one, share in zip(curved, reversed(shares), strict=True):
-        step += (share - inner(one.change, step) / inner(one.move, one.change)) * one.move
+    for (move, change), share in zip(curved, reversed(shares), strict=True):
+        step += (share - inner(change, step) / inner(move, change)) * move
     return step
 
 

@@ -22,7 +22,6 @@ from hypothesis import strategies as st
 from pgo_models.certificates.newton_polish import (
     STATIONARY_DECREMENT,
     _apply_inverse,
-    _Secant,
     move_poses,
     polish,
     polish_step,
@@ -182,9 +181,9 @@ def test_a_move_is_learned_from(seed: int, n: int, d: int) -> None:
     matrix.setdiag(2.0 * matrix.diagonal())
     factor, rng = factorize(matrix), np.random.default_rng(seed)
     moves = rng.standard_normal((3, layout.side))
-    curved = [_Secant(move, matrix @ move + 0.1 * rng.uniform() * move) for move in moves]
-    level = _Secant(moves[0], -moves[0])  # of negative curvature: left out
-    g = curved[-1].change
+    curved = [(move, matrix @ move + 0.1 * rng.uniform() * move) for move in moves]
+    level = (moves[0], -moves[0])  # of negative curvature: left out
+    _, g = curved[-1]
     np.testing.assert_allclose(_apply_inverse(factor, curved, g), moves[-1], rtol=0, atol=1e-6)
     np.testing.assert_array_equal(_apply_inverse(factor, [level], g), factor.solve(g))
 
