@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from pgo_models.errors import FileFormatError, PGOError
 
 LARGEST = 1e100  # beyond it squares and determinants would overflow; no measured number is near
 FARTHEST = 1e15  # metres: beyond it neighbouring doubles are more than 0.1 m apart
+_ZERO_QUATERNION = 1e-9  # a norm below this gives no direction: files hold about six digits
 LONGEST_LINE = 10_000  # characters; an edge in space with all its digits has 750
 
 
@@ -51,10 +52,22 @@ def check_length(path: Path | str, line: int, text: str) -> None:
         raise FileFormatError(path, line, problem)
 
 
-def too_far(path: Path | str, line: int, distance: float) -> FileFormatError:
-    """Error of a position or translation beyond `FARTHEST`."""
-    problem = f"{distance:.3g} m is beyond {FARTHEST:g} m, where doubles cannot tell metres apart; correct the line"
-    return FileFormatError(path, line, problem)
+def check_distances(path: Path | str, lines: Sequence[int] | NDArray[np.int64], t: NDArray[np.float64]) -> None:
+    """Raise a FileFormatError when a position or translation, (n, d), of these lines is beyond `FARTHEST`."""
+    far = np.abs(t).max(axis=1, initial=0.0)
+    if (far > FARTHEST).any():
+        problem = (
+            f"{far.max():.3g} m is beyond {FARTHEST:g} m, where doubles cannot tell metres apart; correct the line"
+        )
+        raise FileFormatError(path, int(lines[int(np.argmax(far))]), problem)
+
+
+def check_quaternions(path: Path | str, lines: Sequence[int] | NDArray[np.int64], q: NDArray[np.float64]) -> None:
+    """Raise a FileFormatError when a quaternion, (n, 4), of these lines is zero."""
+    zero = np.linalg.norm(q, axis=1) < _ZERO_QUATERNION
+    if zero.any():
+        problem = "zero quaternion; it is no rotation: 0 0 0 1 is the unrotated one"
+        raise FileFormatError(path, int(lines[int(np.argmax(zero))]), problem)
 
 
 def finite_number(path: Path | str, line: int, word: str) -> float:

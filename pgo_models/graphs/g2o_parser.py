@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgo_models.errors import FileFormatError
-from pgo_models.files import FARTHEST, LARGEST, LONGEST_LINE, check_length, finite_number, read_text, too_far
+from pgo_models.files import LARGEST, check_distances, check_length, check_quaternions, finite_number, read_text
 from pgo_models.geometry.rotations import Array, exp_map, rotations_from_quaternions
 
 IntArray = NDArray[np.int64]
 
-_ZERO_QUATERNION = 1e-9  # a norm below this gives no direction: files hold about six digits
 _SINGULAR = 1e-15  # a pivot below this part of its diagonal entry is rounding
 
 
@@ -99,8 +98,7 @@ def read_lines(path: Path | str) -> G2OLines:
             continue
         tag = parts[0]
         if tag in _TAGS:
-            if len(line) > LONGEST_LINE:
-                check_length(path, number, line)
+            check_length(path, number, line)
             gathered[tag].append(number)
             if tag[0] == "E":
                 ids[tag] += parts[1:3]
@@ -132,9 +130,9 @@ def read_lines(path: Path | str) -> G2OLines:
         np.array([number for number, _ in fix], dtype=np.int64),
     )
     for rows, at in ((vertices, found.vertex_lines), (edges, found.edge_lines)):
-        far = np.abs(rows[:, :d]).max(axis=1, initial=0.0)
-        if (far > FARTHEST).any():
-            raise too_far(path, int(at[np.argmax(far)]), float(far.max()))
+        check_distances(path, at, rows[:, :d])
+        if d == 3:
+            check_quaternions(path, at, rows[:, 3:7])
     for number, problem in _faults(found):
         raise FileFormatError(path, number, problem)
     return found
@@ -227,11 +225,6 @@ def _dimension(path: Path, gathered: dict[str, list[int]]) -> int:
 
 def _faults(found: G2OLines) -> Iterator[tuple[int, str]]:
     """Line and description of what the numbers of a file cannot be."""
-    if found.d == 3:
-        for rows, lines in ((found.vertices, found.vertex_lines), (found.edges, found.edge_lines)):
-            zero = np.linalg.norm(rows[:, 3:7], axis=1) < _ZERO_QUATERNION
-            if zero.any():
-                yield int(lines[np.argmax(zero)]), "zero quaternion; it is no rotation: 0 0 0 1 is the unrotated one"
     order = np.argsort(found.vertex_ids, kind="stable")
     again = np.flatnonzero(np.diff(found.vertex_ids[order]) == 0)
     if again.size:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pgo_models.errors import FileFormatError, GraphError
-from pgo_models.files import FARTHEST, read_table, replace_when_done, too_far
+from pgo_models.files import check_distances, check_quaternions, read_table, replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
@@ -22,7 +22,6 @@ from pgo_models.geometry.rotations import (
     rotations_from_quaternions,
 )
 
-_ZERO_QUATERNION = 1e-9
 _PLANE_TOLERANCE = 1e-6  # metres, and of the entries of R that vanish when a pose lies in the plane
 _MATRIX_TOLERANCE = 1e-3  # KITTI's own files have about seven digits; this tells digits from a wrong matrix
 
@@ -77,10 +76,7 @@ def read_tum(path: Path | str, d: int = 3) -> Poses:
     Poses(n=2, d=3)
     """
     rows, lines = read_table(path, 8)
-    zero = np.linalg.norm(rows[:, 4:], axis=1) < _ZERO_QUATERNION
-    if zero.any():
-        problem = "zero quaternion; it is no rotation: 0 0 0 1 is the unrotated one"
-        raise FileFormatError(path, lines[int(np.argmax(zero))], problem)
+    check_quaternions(path, lines, rows[:, 4:])
     return _in_dimension(rotations_from_quaternions(rows[:, 4:]), rows[:, 1:4], d, path, lines)
 
 
@@ -134,9 +130,7 @@ def _lifted(poses: Poses) -> tuple[Array, Array]:
 
 
 def _in_dimension(R: Array, t: Array, d: int, path: Path | str, lines: Sequence[int]) -> Poses:
-    far = np.abs(t).max(axis=1)
-    if (far > FARTHEST).any():
-        raise too_far(path, lines[int(np.argmax(far))], float(far.max()))
+    check_distances(path, lines, t)
     if d == 3:
         return Poses(R, t)
     out = np.maximum(np.abs(t[:, 2]), np.abs(R[:, 2, :] - [0.0, 0.0, 1.0]).max(axis=1))
