@@ -21,7 +21,7 @@ from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
-from pgo_models.graphs.residuals import edge_residuals
+from pgo_models.graphs.residuals import Chi2Convention, chi2, edge_residuals
 from pgo_models.graphs.scenes import circle, grid, random_geometric, sphere
 from pgo_models.graphs.trajectories import read_tum, write_tum
 from pgo_models.plots.graph_plots import compare_poses, plot_graph
@@ -49,6 +49,7 @@ _LATER = {
 __all__ = [
     "BregmanProblem",
     "Certificate",
+    "Chi2Convention",
     "CholeskyBackend",
     "OrthogonalProblem",
     "PGOError",
@@ -63,6 +64,7 @@ __all__ = [
     "certificate_matrix",
     "certify",
     "certify_at",
+    "chi2",
     "chordal_start",
     "circle",
     "compare_poses",

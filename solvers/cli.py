@@ -28,6 +28,8 @@ from pgo_models.geometry.poses import Poses, absolute_trajectory_error
 from pgo_models.graphs.datasets import known_datasets, load
 from pgo_models.graphs.g2o import MOST_SYMBOLS, read_g2o_poses, symbol_ids, write_g2o, write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.precisions import condition
+from pgo_models.graphs.residuals import Chi2Convention, chi2
 from pgo_models.graphs.separators import report_partition
 from pgo_models.graphs.trajectories import read_kitti, read_tum, write_tum
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
@@ -53,7 +55,7 @@ from solvers.reporting.report import check_report, write_report
 from solvers.reporting.versions import installed_versions
 from solvers.shell import DONE, Commands, run_command, save_then_show
 from solvers.soc.soc import SOC
-from solvers.solution import certificate_json, check_format, check_target, write_json
+from solvers.solution import certificate_json, check_format, check_target, chi2_of_file, chi2_rows, write_json
 from solvers.studies.commands import UnitWeightsOption, compare_command, figures_command, tables_command
 
 NOT_CONVERGED, NOT_CERTIFIED = 2, 3
@@ -231,16 +233,19 @@ def certify_command(
             raise SettingError(f"cannot write {out}: a certificate is written as .json")
         check_writable(out)
     problem = PGOProblem(_load(graph, unit_weights))
-    certificate = certify(problem, _estimate(problem.graph, estimate), gap)
+    poses = _estimate(problem.graph, estimate)
+    certificate = certify(problem, poses, gap)
     record = {
         "objective": certificate.objective,
+        "chi2": chi2_of_file(problem.graph, poses),
         **certificate_json(certificate),
         "source": certificate.source.name,
         "best_known_objective": certificate.poses_objective,
         "versions": installed_versions(problem.backend),
     }
     targets = [(out, partial(write_json, record))] if out is not None else []
-    save_then_show(targets, lambda: typer.echo(str(certificate)))
+    rows = [f"{label:<12} {text}" for label, text in chi2_rows(problem.graph, poses, certificate.objective)]
+    save_then_show(targets, lambda: typer.echo("\n".join([str(certificate), *rows])))
     warn_of_weights(graph, problem, certificate)
     raise typer.Exit(DONE if certificate.is_certified else NOT_CERTIFIED)
 
@@ -365,6 +370,7 @@ def _describe(graph: PoseGraph) -> list[tuple[str, str]]:
         ("degree", f"{degree.min()} to {degree.max()}, mean {degree.mean():.2f}"),
         ("kappa", f"{graph.kappa.min():.4g} to {graph.kappa.max():.4g} per rad^2"),
         ("tau", f"{graph.tau.min():.4g} to {graph.tau.max():.4g} per m^2"),
+        *_describe_information(graph),
         ("estimate", "with the graph" if graph.initial is not None else "none"),
         ("truth", "with the graph" if graph.truth is not None else "none"),
     ]
@@ -372,7 +378,22 @@ def _describe(graph: PoseGraph) -> list[tuple[str, str]]:
         problem = PGOProblem(graph)
         if graph.initial is not None:
             rows.append(("F, estimate", f"{problem.objective(graph.initial):.8g}"))
+            if graph.information is not None:
+                rows += [
+                    (f"chi2, {one.name.lower()}", f"{chi2(graph, graph.initial, one):.8g}") for one in Chi2Convention
+                ]
         rows.append(("F, tree", f"{problem.objective(spanning_tree_start(graph)):.8g}"))
         rows.append(("F, chordal", f"{problem.objective(chordal_start(problem)):.8g}"))
     rows.append(("Cholesky", installed_versions(None)["cholesky"]))
     return rows
+
+
+def _describe_information(graph: PoseGraph) -> list[tuple[str, str]]:
+    if graph.information is None:
+        return []
+    d, rows = graph.d, []
+    for name, block in (("I_tt", slice(0, d)), ("I_rr", slice(d, None))):
+        ratio = condition(graph.information[:, block, block])
+        rows.append((name, f"condition {np.median(ratio):.3g} in the median, at most {ratio.max():.3g}"))
+    coupled = int(graph.information[:, :d, d:].any(axis=(1, 2)).sum())
+    return [*rows, ("I_tr", f"not zero in {coupled} of {graph.num_edges} edges")]

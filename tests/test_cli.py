@@ -220,6 +220,11 @@ def test_info_describes_graphs_and_the_installation(pgo_command):
     assert code == 0
     assert re.search(r"poses +160", out)
     assert re.search(r"robots +4", out)
+    for part in (
+        "I_tt            condition 1 in the median, at most 1",
+        "I_tr            not zero in 0 of",
+    ):
+        assert part in out
     code, out, _ = pgo_command("info")
     assert code == 0
     assert re.search(r"cholesky +(CHOLMOD|SuperLU)", out)

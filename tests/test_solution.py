@@ -6,6 +6,7 @@ import pytest
 import pgo_models as pgo
 import solvers
 from pgo_models.errors import SettingError
+from pgo_models.graphs.precisions import isotropic_information
 from pgo_models.graphs.trajectories import read_kitti
 
 
@@ -20,6 +21,22 @@ def test_it_prints_cost_bound_gap_and_verdict(solution):
         assert part in text
     assert "CERTIFIED: globally optimal within the gap asked for" in text
     assert repr(solution).startswith("Solution('circle', F=")
+
+
+def test_it_says_what_the_information_of_the_file_would_cost(solution):
+    from dataclasses import replace
+
+    graph = solution.problem.graph
+    assert "chi2" not in str(solution)
+    assert solution.as_json()["chi2"] is None
+    isotropic = replace(graph, information=isotropic_information(graph.kappa, graph.tau, 3))
+    same = replace(solution, problem=pgo.PGOProblem(isotropic))
+    assert "chi2" not in str(same)  # it is F
+    assert same.as_json()["chi2"] == pytest.approx(solution.objective, rel=1e-12)
+    twice = replace(solution, problem=pgo.PGOProblem(replace(graph, information=2.0 * isotropic.information)))
+    expected = f"chi2         {pgo.chi2(twice.problem.graph, solution.poses):.10g} with the file's information matrices"
+    assert f"{expected}; the bound is on F alone" in str(twice)
+    assert twice.as_json()["chi2"] == pytest.approx(2 * solution.objective, rel=1e-12)
 
 
 def test_its_html_is_well_formed_and_escapes_names(solution):

@@ -48,5 +48,11 @@ def isotropic_information(kappa: Array, tau: Array, d: int) -> Array:
     return np.asarray(np.stack(diagonal, axis=1)[:, :, None] * np.eye(len(diagonal)))
 
 
+def condition(blocks: Array) -> Array:
+    """Largest over smallest eigenvalue, (m,), of positive definite blocks (m, k, k)."""
+    values = np.linalg.eigvalsh(blocks)
+    return np.asarray(values[:, -1] / values[:, 0])
+
+
 def _trace_of_inverse(A: Array) -> Array:
     return np.asarray(np.trace(np.linalg.inv(A), axis1=1, axis2=2))

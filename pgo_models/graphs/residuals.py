@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.errors import GraphError
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, BoolArray, log_map
+from pgo_models.geometry.rotations import Array, BoolArray, hat, log_map
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.precisions import isotropic_information
 
 MISFIT_SHARE = 6.0  # times the mean share of F: a well modelled edge is there less than once in ten thousand
 UNCERTAIN_RATIO = 0.1  # of the median precision
@@ -77,3 +79,78 @@ def uncertain_edges(graph: PoseGraph) -> BoolArray:
     low_kappa = graph.kappa < UNCERTAIN_RATIO * np.median(graph.kappa)
     low_tau = graph.tau < UNCERTAIN_RATIO * np.median(graph.tau)
     return np.asarray(low_kappa | low_tau)
+
+
+class Chi2Convention(enum.Enum):
+    """How the residual of an edge is read: all of E = R_ij^T R_i^T R_j, a turn by theta about a, and r_t; see `chi2`.
+
+    Small residuals cost the same, but for G2O in space: the vector part of a quaternion is half as long as the rotation
+    vector, and the rotation block of a g2o file is meant for one or for the other.
+    """
+
+    CHORDAL = "2 (1 - cos theta) a^T I_rr a, smooth everywhere and never more than the geodesic; coupled by a sin theta"
+    GEODESIC = "the rotation vector theta a"
+    G2O = "the program g2o: in space the vector part of E's quaternion, a sin(theta / 2); in the plane theta"
+    GTSAM = "the program GTSAM: the logarithm in SE(d), which turns r_t too"
+
+
+def chi2(graph: PoseGraph, poses: Poses, convention: Chi2Convention = Chi2Convention.CHORDAL) -> float:
+    """Cost with the whole information matrices of the graph, as in its file; no factor 1/2, which GTSAM's error has.
+
+    chi2 = sum over edges of r^T I r, r = (r_t, r_r), with the error E_ij = (measurement)^-1 x_i^-1 x_j in the frame of
+    the measured end pose: r_t = R_ij^T (R_i^T (t_j - t_i) - t_ij), and r_r as `convention` reads its rotation. The
+    rotation block is taken to be of the rotation vector, in radians, also where g2o takes it to be of the quaternion.
+
+    Without information matrices they are `isotropic_information` of kappa and tau.
+
+    Raises
+    ------
+    GraphError
+        When the poses are not those of the graph.
+    SettingError
+        When convention is none.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.scenes import circle
+    >>> graph = circle(np.random.default_rng(0))
+    >>> chordal, geodesic = (chi2(graph, graph.truth, c) for c in (Chi2Convention.CHORDAL, Chi2Convention.GEODESIC))
+    >>> 0 < chordal < geodesic
+    True
+    """
+    if not isinstance(convention, Chi2Convention):
+        raise SettingError(f"convention is {convention!r}; give one of {', '.join(map(str, Chi2Convention))}")
+    if poses.t.shape != (graph.num_poses, graph.d):
+        raise GraphError(f"{poses} are not the poses of {graph}; give one pose for every pose of the graph")
+    i, j, d = graph.i, graph.j, graph.d
+    back = np.swapaxes(graph.R_ij, 1, 2)
+    E = back @ np.swapaxes(poses.R[i], 1, 2) @ poses.R[j]
+    moved = np.einsum("mba,mb->ma", poses.R[i], poses.t[j] - poses.t[i])
+    r_t = np.einsum("mab,mb->ma", back, moved - graph.t_ij)
+    w = log_map(E)
+    half = 0.5 * np.linalg.norm(w, axis=1)[:, None]
+    chord = w * np.sinc(half / np.pi)  # 2 a sin(theta / 2)
+    r_r = chord if convention is Chi2Convention.CHORDAL else w
+    if d == 3 and convention is Chi2Convention.G2O:
+        r_r = 0.5 * chord
+    if convention is Chi2Convention.GTSAM:
+        r_t = _logarithm_translation(w, r_t)
+    information = graph.information
+    if information is None:
+        information = isotropic_information(graph.kappa, graph.tau, d)
+    I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
+    coupled = np.cos(half) * chord if convention is Chi2Convention.CHORDAL else r_r
+    terms = ((r_t, I_tt, r_t), (2.0 * r_t, I_tr, coupled), (r_r, I_rr, r_r))
+    return sum(float(np.einsum("ma,mab,mb->", *term, optimize=True)) for term in terms)
+
+
+def _logarithm_translation(w: Array, t: Array) -> Array:
+    """U of the logarithm (w, u) in SE(d), (m, d): V(w) u = t, so that u = t - W t / 2 + c W^2 t with W = hat(w)."""
+    theta = np.linalg.norm(w, axis=1)
+    safe = np.where(theta > 1e-4, theta, 1.0)
+    half = 0.5 * safe
+    c = np.where(theta > 1e-4, (1.0 - half * np.cos(half) / np.sin(half)) / safe**2, 1.0 / 12.0 + theta**2 / 720.0)
+    W = hat(w)
+    turned = np.einsum("mab,mb->ma", W, t)
+    return np.asarray(t - 0.5 * turned + c[:, None] * np.einsum("mab,mb->ma", W, turned))

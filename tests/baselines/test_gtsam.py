@@ -2,7 +2,9 @@
 
 import importlib.util
 import sys
+import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +18,8 @@ from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import GraphError, MissingExtraError, NotPositiveDefiniteError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map
+from pgo_models.graphs.g2o import write_g2o
+from pgo_models.graphs.residuals import Chi2Convention, chi2
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.problem import PGOProblem
 from solvers.baselines.gtsam import Gtsam, GtsamMethod, factor_graph, run_gtsam
@@ -124,3 +128,21 @@ def test_what_was_measured_exactly_is_recovered() -> None:
         result = run_gtsam(PGOProblem(exact_graph(0, 10, d)))
         assert result.status is Status.CONVERGED
         assert result.objective <= 1e-12
+
+
+@needs_gtsam
+@settings(max_examples=examples(20), deadline=None)
+@given(seed=SEEDS, n=st.integers(2, 10), d=DIMENSIONS)
+def test_chi2_in_its_convention_is_twice_its_error(seed: int, n: int, d: int) -> None:
+    import gtsam
+
+    graph, rng = varied_graph(seed, n, d), np.random.default_rng(seed)
+    A = rng.standard_normal((graph.num_edges, 3 * d - 3, 3 * d - 3))
+    graph = replace(graph, information=A @ np.swapaxes(A, 1, 2) + np.eye(3 * d - 3))
+    near = graph.truth.R @ exp_map(0.3 * rng.standard_normal((n, 2 * d - 3)))
+    poses = Poses(near, graph.truth.t + 0.3 * rng.standard_normal((n, d)))
+    with tempfile.TemporaryDirectory() as folder:
+        path = f"{folder}/graph.g2o"
+        write_g2o(graph, path, poses)
+        factors, values = gtsam.readG2o(path, d == 3)
+        assert chi2(graph, poses, Chi2Convention.GTSAM) == pytest.approx(2 * factors.error(values), rel=1e-9)

@@ -1,12 +1,18 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from graphs import random_poses
+from graphs import REFERENCE, random_poses
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.linalg import logm
+from scipy.spatial.transform import Rotation
 
 import pgo_models as pgo
-from pgo_models.errors import GraphError
-from pgo_models.graphs.residuals import EdgeResiduals, uncertain_edges
+from pgo_models.errors import GraphError, SettingError
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.precisions import isotropic_information
+from pgo_models.graphs.residuals import Chi2Convention, EdgeResiduals, chi2, uncertain_edges
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([2, 3]))
@@ -88,3 +94,102 @@ def test_an_uncertain_precision_is_under_a_tenth_of_the_median(weak):
 def test_poses_of_another_graph_are_refused():
     with pytest.raises(GraphError, match="one pose for every pose"):
         pgo.edge_residuals(pgo.circle(np.random.default_rng(0)), pgo.Poses.identity(3, 3))
+
+
+# chi2 with the file's information.
+
+
+def one_edge(d: int, turn: Array, shift: Array, information: Array) -> tuple[pgo.PoseGraph, pgo.Poses]:
+    """An edge that the second pose misses by a turn and a shift, both in the frame of the measured end pose."""
+    pose = random_poses(2, d, 1)
+    E = pgo.exp_map(turn[None])[0]
+    R_ij = pose.R[0].T @ pose.R[1] @ E.T
+    t_ij = pose.R[0].T @ (pose.t[1] - pose.t[0]) - R_ij @ shift
+    graph = pgo.PoseGraph(2, [0], [1], R_ij[None], t_ij[None], [1.0], [1.0], information=information[None])
+    return graph, pose
+
+
+def random_information(k: int, rng: np.random.Generator) -> Array:
+    A = rng.standard_normal((k, k))
+    return A @ A.T + np.eye(k)
+
+
+def test_chi2_in_the_plane_by_hand():
+    rng = np.random.default_rng(0)
+    info, r, theta = random_information(3, rng), np.array([0.3, -0.2]), 0.7
+    graph, pose = one_edge(2, np.array([theta]), r, info)
+    residual = np.append(r, theta)
+    for convention in (Chi2Convention.GEODESIC, Chi2Convention.G2O):
+        assert chi2(graph, pose, convention) == pytest.approx(residual @ info @ residual, rel=1e-12)
+    chordal = r @ info[:2, :2] @ r + 2 * (r @ info[:2, 2]) * np.sin(theta) + 2 * (1 - np.cos(theta)) * info[2, 2]
+    assert chi2(graph, pose) == pytest.approx(chordal, rel=1e-12)
+    V = np.array([[np.sin(theta), np.cos(theta) - 1], [1 - np.cos(theta), np.sin(theta)]]) / theta
+    logarithm = np.append(np.linalg.solve(V, r), theta)
+    assert chi2(graph, pose, Chi2Convention.GTSAM) == pytest.approx(logarithm @ info @ logarithm, rel=1e-12)
+
+
+def test_chi2_in_space_by_hand():
+    rng = np.random.default_rng(1)
+    info, r, w = random_information(6, rng), rng.standard_normal(3), np.array([0.4, -0.8, 0.5])
+    graph, pose = one_edge(3, w, r, info)
+    theta = np.linalg.norm(w)
+    a = w / theta
+    for convention, turned in (
+        (Chi2Convention.GEODESIC, w),
+        (Chi2Convention.G2O, Rotation.from_rotvec(w).as_quat(canonical=True)[:3]),
+    ):
+        residual = np.concatenate([r, turned])
+        assert chi2(graph, pose, convention) == pytest.approx(residual @ info @ residual, rel=1e-12)
+    twice = 2 * (1 - np.cos(theta)) * (a @ info[3:, 3:] @ a)
+    chordal = r @ info[:3, :3] @ r + 2 * r @ info[:3, 3:] @ a * np.sin(theta) + twice
+    assert chi2(graph, pose) == pytest.approx(chordal, rel=1e-12)
+    # 2 (1 - cos theta) a^T I_rr a is tr(W (2 I - E - E^T)), quadratic in the rotations, with W = tr(I_rr) / 2 I - I_rr.
+    W, E = 0.5 * np.trace(info[3:, 3:]) * np.eye(3) - info[3:, 3:], pgo.exp_map(w[None])[0]
+    assert twice == pytest.approx(np.trace(W @ (2 * np.eye(3) - E - E.T)), rel=1e-12)
+    twist = np.zeros((4, 4))
+    twist[:3, :3], twist[:3, 3] = pgo.exp_map(w[None])[0], r
+    twist[3, 3] = 1.0
+    logarithm = np.real(logm(twist))
+    residual = np.concatenate([logarithm[:3, 3], w])
+    assert chi2(graph, pose, Chi2Convention.GTSAM) == pytest.approx(residual @ info @ residual, rel=1e-10)
+
+
+@given(seed=st.integers(0, 2**32 - 1), d=st.sampled_from([2, 3]))
+def test_the_chordal_chi2_is_below_the_geodesic_one_and_next_to_it_for_small_residuals(seed, d):
+    rng = np.random.default_rng(seed)
+    graph = pgo.random_geometric(6, rng, d=d)
+    k = 3 * d - 3
+    information = np.array([random_information(k, rng) for _ in range(graph.num_edges)])
+    information[:, :d, d:] = 0.0
+    information[:, d:, :d] = 0.0
+    graph = replace(graph, information=information)
+    far = random_poses(6, d, seed)
+    assert chi2(graph, far) <= chi2(graph, far, Chi2Convention.GEODESIC) * (1 + 1e-12)
+    values = [chi2(graph, graph.truth, convention) for convention in Chi2Convention]
+    if d == 2:
+        np.testing.assert_allclose(values, values[1], rtol=0.2)
+
+
+def test_without_information_chi2_is_of_the_isotropic_one():
+    for d in (2, 3):
+        graph = pgo.random_geometric(6, np.random.default_rng(0), d=d)
+        isotropic = replace(graph, information=isotropic_information(graph.kappa, graph.tau, d))
+        for convention in Chi2Convention:
+            assert chi2(graph, graph.truth, convention) == chi2(isotropic, graph.truth, convention)
+
+
+@pytest.mark.parametrize("name", ["intel", "CSAIL", "MIT", "FR079"])
+def test_chi2_at_the_optimum_of_F_is_the_measured_one(name, benchmark_data, benchmark_optimum):
+    graph = pgo.read_g2o(benchmark_data / f"{name}.g2o")
+    information = graph.information.copy()
+    information[:, :2, 2], information[:, 2, :2] = 0.0, 0.0  # the reference leaves out what couples the blocks
+    found = chi2(replace(graph, information=information), benchmark_optimum(name))
+    assert found == pytest.approx(REFERENCE["full_information_optimum"][name][0], rel=1e-5)
+
+
+def test_chi2_refuses_other_poses_and_conventions():
+    graph = pgo.circle(np.random.default_rng(0))
+    with pytest.raises(GraphError, match="give one pose for every pose of the graph"):
+        chi2(graph, random_poses(3, 3, 0))
+    with pytest.raises(SettingError, match=r"convention is 'g2o'; give one of Chi2Convention\.CHORDAL, "):
+        chi2(graph, graph.truth, "g2o")
