@@ -15,12 +15,13 @@ from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, column_f
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
 OWN, BETWEEN, UNCERTAIN, MISFIT = range(4)
 _WIDTHS = np.array([0.6, 0.5, 0.5, 1.8])
-_NAMES = {
+KIND_LABELS = {
     BETWEEN: "between robots",
     UNCERTAIN: "uncertain: precision under a tenth of the median",
     MISFIT: "misfit: over six times the mean share of F",
@@ -60,9 +61,7 @@ def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = Tr
     GraphError
         When the poses are not those of the graph.
     """
-    from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgb
-    from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
     kind = edge_kinds(graph, poses)
     if not mark_edges:
@@ -72,8 +71,7 @@ def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = Tr
     palette = np.array([to_rgb(name) for name in (*COLOURS, QUIET_COLOUR, ALARM_COLOUR)])
     colour = np.where(graph.robots[i] == graph.robots[j], graph.robots[i] % len(COLOURS), len(COLOURS))
     colour[kind == MISFIT] = len(COLOURS) + 1
-    collection = LineCollection if graph.d == 2 else Line3DCollection
-    lines = collection(
+    lines = _line_collection(graph.d)(
         list(np.stack([poses.t[i], poses.t[j]], axis=1)),
         colors=palette[colour],
         linewidths=_WIDTHS[kind],
@@ -176,7 +174,8 @@ def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = Non
         axes = figure.add_subplot(grid[0], projection="3d" if graph.d == 3 else None)
         axes.plot(*truth.t.T, color="black", linewidth=0.8, label="truth")
         axes.plot(*aligned.t.T, color=COLOURS[0], linewidth=0.8, label="estimate, aligned")
-        _draw_errors(axes, aligned.t, truth.t)
+        errors = list(np.stack([aligned.t, truth.t], axis=1))
+        axes.add_collection(_line_collection(graph.d)(errors, colors=ALARM_COLOUR, linewidths=0.5, label="error"))
         _frame(axes, np.concatenate([aligned.t, truth.t]))
         ate = absolute_trajectory_error(poses, truth)
         axes.set_title(f"{graph.name}: ATE {ate:.3g} m, rotation {np.sqrt(np.mean(degrees**2)):.3g} deg (rms)")
@@ -208,13 +207,11 @@ def _frame(axes: Axes, points: Array) -> None:
         axes.set_aspect("equal")
 
 
-def _draw_errors(axes: Axes, estimate: Array, truth: Array) -> None:
+def _line_collection(d: int) -> type[LineCollection]:
     from matplotlib.collections import LineCollection
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-    collection = LineCollection if truth.shape[1] == 2 else Line3DCollection
-    segments = list(np.stack([estimate, truth], axis=1))
-    axes.add_collection(collection(segments, colors=ALARM_COLOUR, linewidths=0.5, label="error"))
+    return LineCollection if d == 2 else Line3DCollection
 
 
 def _legend(graph: PoseGraph, kind: IntArray) -> list[Line2D]:
@@ -224,7 +221,7 @@ def _legend(graph: PoseGraph, kind: IntArray) -> list[Line2D]:
     if 1 < graph.num_robots <= _MOST_NAMED_ROBOTS:
         handles = [Line2D([], [], color=COLOURS[a], label=f"robot {a}") for a in range(graph.num_robots)]
     style = {BETWEEN: (QUIET_COLOUR, "solid"), UNCERTAIN: (COLOURS[0], "dotted"), MISFIT: (ALARM_COLOUR, "solid")}
-    for one, label in _NAMES.items():
+    for one, label in KIND_LABELS.items():
         if (kind == one).any():
             colour, line = style[one]
             handles.append(Line2D([], [], color=colour, linestyle=line, linewidth=2 * _WIDTHS[one], label=label))

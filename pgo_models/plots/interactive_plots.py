@@ -17,7 +17,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import pose_names
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.residuals import EdgeResiduals, edge_residuals
-from pgo_models.plots.graph_plots import BETWEEN, MISFIT, OWN, UNCERTAIN, edge_kinds
+from pgo_models.plots.graph_plots import BETWEEN, KIND_LABELS, MISFIT, OWN, UNCERTAIN, edge_kinds
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR
 
 if TYPE_CHECKING:
@@ -76,18 +76,17 @@ def explore_graph(graph: PoseGraph, poses: Poses, title: str = "") -> Figure:
         # One entry of the legend shows and hides both; a robot may have no edge of its own, but has poses.
         for trace, shown in ((own_lines, False), (_dots(poses.t[mine], text, name, colour, 4.0), in_legend)):
             traces.append({**trace, "legendgroup": name, "showlegend": shown})
-    for one, name, colour, width, dash in (
-        (BETWEEN, "between robots", QUIET_COLOUR, 1.0, "solid"),
-        (UNCERTAIN, "uncertain: precision under a tenth of the median", QUIET_COLOUR, 1.5, "dot"),
-        (MISFIT, "misfit: over six times the mean share of F", ALARM_COLOUR, 5.0, "solid"),
+    for one, colour, width, dash in (
+        (BETWEEN, QUIET_COLOUR, 1.0, "solid"),
+        (UNCERTAIN, QUIET_COLOUR, 1.5, "dot"),
+        (MISFIT, ALARM_COLOUR, 5.0, "solid"),
     ):
         edges = np.flatnonzero(kind == one)
         if len(edges):
-            traces.append(_lines(graph, poses.t, edges, name, colour, width, dash, True))
+            traces.append(_lines(graph, poses.t, edges, KIND_LABELS[one], colour, width, dash, True))
     misfits = np.flatnonzero(kind == MISFIT)
     middles = 0.5 * (poses.t[graph.i[misfits]] + poses.t[graph.j[misfits]])
-    text = _misfit_text(graph, misfits, residuals)
-    traces.append(_dots(middles, text, "misfit", ALARM_COLOUR, 6.0))
+    traces.append(_dots(middles, _misfit_text(graph, misfits, residuals), "misfit", ALARM_COLOUR, 6.0))
     figure = go.Figure(traces)
     _arrange(figure, poses.t, title)
     return figure
