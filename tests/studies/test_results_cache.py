@@ -36,7 +36,7 @@ def test_a_fresh_job_leaves_the_old_results_aside_and_then_replaces_them(tmp_pat
 def test_results_of_other_versions_are_not_taken_up(tmp_path, monkeypatch):
     path = tmp_path / "kept.json"
     KeptResults(path).add("a", {"x": 1})
-    monkeypatch.setattr(kept_results, "versions", lambda backend: {"numpy": "0.1"})
+    monkeypatch.setattr(kept_results, "installed_versions", lambda backend: {"numpy": "0.1"})
     assert KeptResults(path).get("a") is None
 
 
