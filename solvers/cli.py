@@ -28,11 +28,8 @@ from pgo_models.geometry.poses import Poses, absolute_trajectory_error
 from pgo_models.graphs.datasets import known_datasets, load
 from pgo_models.graphs.g2o import MOST_SYMBOLS, read_g2o_poses, symbol_ids, write_g2o, write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import condition
-from pgo_models.graphs.residuals import Chi2Convention, chi2
 from pgo_models.graphs.separators import report_partition
-from pgo_models.graphs.trajectories import read_kitti, read_tum, write_tum
-from pgo_models.problem.initialization import chordal_start, spanning_tree_start
+from pgo_models.graphs.trajectories import read_kitti, read_times, read_tum, write_tum
 from pgo_models.problem.problem import PGOProblem
 from solvers.cli_options import (
     BackEndName,
@@ -51,6 +48,7 @@ from solvers.cli_options import (
 from solvers.distributed.checkpoint import Checkpoint
 from solvers.explanations import explained_by_its_graph, warn_of_weights
 from solvers.pipeline import HANDOVER, solve
+from solvers.reporting.graph_facts import graph_facts
 from solvers.reporting.report import check_report, write_report
 from solvers.reporting.versions import installed_versions
 from solvers.shell import DONE, Commands, run_command, save_then_show
@@ -156,6 +154,17 @@ def solve_command(
     tolerance: Annotated[float | None, typer.Option(help="Residual at which Newton takes over from SOC.")] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for the iterations.")] = math.inf,
     unit_weights: UnitWeightsOption = False,
+    anchor: Annotated[
+        int | None,
+        typer.Option(
+            metavar="ID",
+            help="Pose that stays where the file has it, as by a FIX line; else the answer is aligned with the file's.",
+        ),
+    ] = None,
+    times: Annotated[
+        Path | None,
+        typer.Option(help="Seconds of the poses, for .tum: a TUM file, or one number a line, in the order of the ids."),
+    ] = None,
     report: Annotated[
         Path | None,
         typer.Option(help="Write a report as .html: one page that opens offline, with pictures, tables and advice."),
@@ -167,7 +176,7 @@ def solve_command(
         check_format(path)  # before a long solve, not after it
     if report is not None:
         check_report(report)
-    problem = PGOProblem(_load(graph, unit_weights))
+    problem = PGOProblem(_timed(_load(graph, unit_weights), times))
     for path in out or []:
         check_target(path, problem.graph.num_robots)
     for other in (report, resume):
@@ -195,6 +204,7 @@ def solve_command(
         robots=shared if on_robots else None,
         engine=runs_on if on_robots else None,
         checkpoint=Checkpoint(resume) if resume is not None else None,
+        anchor=_pose_named(problem.graph, anchor) if anchor is not None else None,
         time_limit=time_limit,
         verbose=verbose,
         progress=sys.stderr.isatty(),
@@ -269,7 +279,7 @@ def info_command(
         table.add_row("data sets", ", ".join(known_datasets()))
     else:
         loaded = load(graph)
-        for label, text in _describe(loaded):
+        for label, text in graph_facts(loaded):
             table.add_row(label, text)
         if robots is not None or split is not None:
             shared = chosen_partition(loaded, robots, split)
@@ -339,6 +349,25 @@ def _load(graph: str, unit_weights: bool) -> PoseGraph:
     return loaded.unit_weights() if unit_weights else loaded
 
 
+def _timed(graph: PoseGraph, path: Path | None) -> PoseGraph:
+    if path is None:
+        return graph
+    times = read_times(path)
+    if len(times) != graph.num_poses:
+        raise FileFormatError(
+            path, None, f"{len(times)} times, {graph.name} has {graph.num_poses} poses; give one each"
+        )
+    return replace(graph, times=times)
+
+
+def _pose_named(graph: PoseGraph, name: int) -> int:
+    found = np.flatnonzero(graph.pose_ids == name)
+    if not len(found):
+        ids = graph.pose_ids
+        raise SettingError(f"{graph.name} has no pose {name} to anchor; its ids are from {ids.min()} to {ids.max()}")
+    return int(found[0])
+
+
 def _estimate(graph: PoseGraph, path: Path | None) -> Poses:
     if path is None:
         if graph.initial is None:
@@ -356,44 +385,3 @@ def _estimate(graph: PoseGraph, path: Path | None) -> Poses:
     if found.num_poses != graph.num_poses:
         raise FileFormatError(path, None, f"{found.num_poses} poses, {graph.name} has {graph.num_poses}; give one each")
     return found
-
-
-def _describe(graph: PoseGraph) -> list[tuple[str, str]]:
-    components = graph.components()
-    degree = np.bincount(np.concatenate([graph.i, graph.j]), minlength=graph.num_poses)
-    rows = [
-        ("graph", f"{graph.name}, {graph.d}D"),
-        ("poses", str(graph.num_poses)),
-        ("edges", str(graph.num_edges)),
-        ("robots", str(graph.num_robots)),
-        ("components", f"{len(components)} (sizes {', '.join(str(len(part)) for part in components[:5])})"),
-        ("degree", f"{degree.min()} to {degree.max()}, mean {degree.mean():.2f}"),
-        ("kappa", f"{graph.kappa.min():.4g} to {graph.kappa.max():.4g} per rad^2"),
-        ("tau", f"{graph.tau.min():.4g} to {graph.tau.max():.4g} per m^2"),
-        *_describe_information(graph),
-        ("estimate", "with the graph" if graph.initial is not None else "none"),
-        ("truth", "with the graph" if graph.truth is not None else "none"),
-    ]
-    if len(components) == 1:
-        problem = PGOProblem(graph)
-        if graph.initial is not None:
-            rows.append(("F, estimate", f"{problem.objective(graph.initial):.8g}"))
-            if graph.information is not None:
-                rows += [
-                    (f"chi2, {one.name.lower()}", f"{chi2(graph, graph.initial, one):.8g}") for one in Chi2Convention
-                ]
-        rows.append(("F, tree", f"{problem.objective(spanning_tree_start(graph)):.8g}"))
-        rows.append(("F, chordal", f"{problem.objective(chordal_start(problem)):.8g}"))
-    rows.append(("Cholesky", installed_versions(None)["cholesky"]))
-    return rows
-
-
-def _describe_information(graph: PoseGraph) -> list[tuple[str, str]]:
-    if graph.information is None:
-        return []
-    d, rows = graph.d, []
-    for name, block in (("I_tt", slice(0, d)), ("I_rr", slice(d, None))):
-        ratio = condition(graph.information[:, block, block])
-        rows.append((name, f"condition {np.median(ratio):.3g} in the median, at most {ratio.max():.3g}"))
-    coupled = int(graph.information[:, :d, d:].any(axis=(1, 2)).sum())
-    return [*rows, ("I_tr", f"not zero in {coupled} of {graph.num_edges} edges")]

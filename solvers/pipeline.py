@@ -105,6 +105,7 @@ def solve(
     robots: Partition | int | None = None,
     engine: Engine | None = None,
     checkpoint: Checkpoint | None = None,
+    anchor: int | None = None,
     callback: Callable[[Any, Record], bool | None] | None = None,
     time_limit: float = math.inf,
     verbose: bool = False,
@@ -131,6 +132,9 @@ def solve(
         Where the robots run; in this process unless given.
     checkpoint : Checkpoint, optional
         File from which a solve by robots that was broken off goes on, and to which it writes what that takes.
+    anchor : int, optional
+        Pose that stays where the graph's estimate has it, or at the identity if it has none. Unless given, the first of
+        `graph.fixed`; without one the poses are aligned with the estimate, or pose 0 is at the identity.
     callback : callable, optional
         Called with every state of SOC and Newton and its record; a true answer ends that stage.
     time_limit : float
@@ -160,6 +164,8 @@ def solve(
     """
     watch = Watch(time_limit, verbose, progress, callback)
     problem = as_problem(problem)
+    if anchor is not None and not 0 <= anchor < problem.num_poses:
+        raise SettingError(f"anchor is {anchor}; give a pose, 0 to {problem.num_poses - 1}")
     if robots is None and (engine is not None or checkpoint is not None):
         raise SettingError("engine and checkpoint are for solves by robots; give robots, a number or a Partition")
     pipeline = pipeline if pipeline is not None else Pipeline()
@@ -212,8 +218,7 @@ def solve(
             poses, certificate = job.climb(pipeline.staircase, poses, certificate)
         except KeyboardInterrupt:
             job.interrupt(problem.objective(poses))
-    reference = problem.graph.initial
-    poses = poses.aligned_to(reference) if reference is not None else poses.with_gauge_at(0)
+    poses, frame = framed(poses, problem.graph, anchor)
     return Solution(
         problem=problem,
         poses=poses,
@@ -225,7 +230,24 @@ def solve(
         ledger=ledger,
         robots=robots,
         note=NO_CERTIFICATE if pipeline.driver_memory == 0 else "",
+        frame=frame,
     )
+
+
+def framed(poses: Poses, graph: PoseGraph, anchor: int | None) -> tuple[Poses, str]:
+    """Poses in the frame of the anchor, of the first FIX line, of the graph's estimate or of pose 0; which it is."""
+    ids, reference = graph.pose_ids, graph.initial
+    held = anchor if anchor is not None else int(graph.fixed[0]) if len(graph.fixed) else None
+    if held is None and reference is not None:
+        return poses.aligned_to(reference), "aligned with the estimate that came with the graph"
+    why = "as asked for" if anchor is not None else "by its FIX line"
+    if anchor is None and len(graph.fixed) > 1:
+        why += f"; those of {len(graph.fixed) - 1} other poses are not minded, F leaves one frame open"
+    if held is not None and reference is not None:
+        return poses.anchored_to(reference, held), f"pose {ids[held]} where the estimate has it, {why}"
+    if held is not None:
+        return poses.with_gauge_at(held), f"pose {ids[held]} at the identity, {why}"
+    return poses.with_gauge_at(0), f"pose {ids[0]} at the identity"
 
 
 def _robots_for(soc: SOC | PaperSOC | None, robots: Partition | int, graph: PoseGraph) -> Partition:

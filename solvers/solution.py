@@ -38,7 +38,7 @@ class Solution(Solved):
     ----------
     problem : PGOProblem
     poses : Poses
-        Aligned with the estimate that came with the graph, if one did, else with pose 0 at the identity.
+        In the frame that `frame` names.
     objective : float
         F of the poses.
     certificate : Certificate
@@ -55,6 +55,8 @@ class Solution(Solved):
         Who owned which pose in such a solve.
     note : str
         What the certificate lacks, and why; empty where it lacks nothing.
+    frame : str
+        Which frame the poses are in, which F leaves open.
 
     Examples
     --------
@@ -122,7 +124,7 @@ class Solution(Solved):
         elif suffix == "":
             write_g2o_folder(self.problem.graph, path, self.poses)
         elif suffix in (".tum", ".txt"):
-            write_tum(self.poses, path)
+            write_tum(self.poses, path, self.problem.graph.times)
         elif suffix == ".kitti":
             write_kitti(self.poses, path)
         elif suffix == ".json":
@@ -170,6 +172,7 @@ class Solution(Solved):
             "chi2": chi2_of_file(graph, self.poses),
             **certificate_json(certificate),
             "note": self.note,
+            "frame": self.frame,
             "status": self.status.name,
             "seconds": self.seconds,
             "stages": [
@@ -219,6 +222,7 @@ class Solution(Solved):
             ("verdict", f"{certificate.verdict.name}: {certificate.verdict.value}"),
             *chi2_rows(graph, self.poses, self.objective),
             *([("note", self.note)] if self.note else []),
+            *([("frame", self.frame)] if self.frame else []),
             ("seconds", f"{self.seconds:.3g}"),
             *self._network(),
         ]

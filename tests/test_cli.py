@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import pgo_models as pgo
 import solvers
 from pgo_models.graphs.separators import report_partition
+from pgo_models.graphs.trajectories import read_times
 from solvers import cli
 from solvers import cli_options as choices
 
@@ -353,3 +355,24 @@ def test_robots_of_an_engine_factor(pgo_command):
     )
     assert code == 1
     assert "--r-step clarabel" in error
+
+
+def test_an_anchor_stays_where_the_file_has_it_and_times_are_written(pgo_command, tmp_path):
+    graph = pgo.grid(np.random.default_rng(0))
+    ids = 10 * np.arange(graph.num_poses)
+    pgo.write_g2o(replace(graph, ids=ids), tmp_path / "grid.g2o", graph.truth)
+    times = 5.0 + np.arange(graph.num_poses)
+    (tmp_path / "times.txt").write_text("\n".join(map(str, times)))
+    options = ("--anchor", 30, "--times", tmp_path / "times.txt")
+    code, out, _ = pgo_command("solve", tmp_path / "grid.g2o", *options, "--out", tmp_path / "grid.tum")
+    assert code == 0
+    assert "frame        pose 30 where the estimate has it, as asked for" in out
+    np.testing.assert_array_equal(read_times(tmp_path / "grid.tum"), times)
+    np.testing.assert_array_equal(pgo.read_tum(tmp_path / "grid.tum").t[3], graph.truth.t[3])
+    code, _, err = pgo_command("solve", tmp_path / "grid.g2o", "--anchor", 31)
+    assert code == 1
+    assert "has no pose 31 to anchor; its ids are from 0 to 260" in err
+    (tmp_path / "times.txt").write_text("1\n2\n")
+    code, _, err = pgo_command("solve", tmp_path / "grid.g2o", "--times", tmp_path / "times.txt")
+    assert code == 1
+    assert "times.txt: 2 times, grid has 27 poses; give one each" in err

@@ -12,6 +12,7 @@ import solvers
 from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, Verdict
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.graphs.trajectories import read_times
 from solvers.pipeline import HANDOVER_TOLERANCE
 from solvers.studies.tightness import SweptScene, noisy_scene
 
@@ -209,3 +210,50 @@ def test_units_change_neither_verdict_nor_iterations_nor_digits(seed, weights, m
         moved = pgo.certify(other.problem, pgo.Poses(poses.R, metres * poses.t))
         assert moved.verdict is theirs.verdict
         assert moved.gap == pytest.approx(theirs.gap, rel=1e-6)
+
+
+def test_a_solution_says_in_which_frame_it_is():
+    graph = pgo.grid(np.random.default_rng(0))
+    bare = replace(graph, initial=None)
+    near = graph.truth.moved(pgo.random_rotations(1, 3, np.random.default_rng(1))[0], np.array([1.0, 2.0, 3.0]))
+    known = replace(graph, initial=near)
+    for start, anchor, frame, held in (
+        (bare, None, "pose 0 at the identity", 0),
+        (bare, 5, "pose 5 at the identity, as asked for", 5),
+        (replace(bare, fixed=np.array([7])), None, "pose 7 at the identity, by its FIX line", 7),
+        (known, None, "aligned with the estimate that came with the graph", None),
+        (known, 5, "pose 5 where the estimate has it, as asked for", 5),
+        (replace(known, fixed=np.array([7])), 5, "pose 5 where the estimate has it, as asked for", 5),
+        (
+            replace(known, fixed=np.array([7, 3])),
+            None,
+            "pose 7 where the estimate has it, by its FIX line; those of 1 other poses are not minded, F leaves one "
+            "frame open",
+            7,
+        ),
+    ):
+        solution = solvers.solve(start, anchor=anchor)
+        assert solution.frame == frame
+        assert f"frame        {frame}" in str(solution)
+        assert solution.as_json()["frame"] == frame
+        assert solution.objective == pytest.approx(solution.certificate.objective, rel=1e-12)
+        if held is not None:
+            pose = start.initial[np.array([held])] if start.initial is not None else pgo.Poses.identity(1, 3)
+            np.testing.assert_allclose(solution.poses.R[held], pose.R[0], rtol=0, atol=1e-14)
+            np.testing.assert_allclose(solution.poses.t[held], pose.t[0], rtol=0, atol=1e-14)
+    for anchor in (-1, 27):
+        with pytest.raises(SettingError, match=f"anchor is {anchor}; give a pose, 0 to 26"):
+            solvers.solve(graph, anchor=anchor)
+
+
+def test_times_go_along_and_are_written(tmp_path):
+    graph = pgo.circle(np.random.default_rng(0))
+    times = 100.0 + 0.1 * np.arange(graph.num_poses)
+    solution = solvers.solve(replace(graph, times=times))
+    solution.save(tmp_path / "poses.tum")
+    np.testing.assert_array_equal(read_times(tmp_path / "poses.tum"), times)
+    np.testing.assert_array_equal(replace(graph, times=times).subgraph(np.array([3, 1])).times, times[[1, 3]])
+    with pytest.raises(GraphError, match="times do not ascend"):
+        replace(graph, times=times[::-1])
+    with pytest.raises(GraphError, match="times has shape"):
+        replace(graph, times=times[1:])

@@ -111,6 +111,21 @@ class Poses(ReadOnly):
         R = self.R[index].T
         return self.moved(R, -R @ self.t[index])
 
+    def anchored_to(self, other: Poses, index: int) -> Poses:
+        """Move the world so that pose `index` is where `other` has it, to the last bit.
+
+        Raises
+        ------
+        GraphError
+            When the two have not the same number of poses and dimension.
+        """
+        _check_same_size(self, other)
+        turn = other.R[index] @ self.R[index].T
+        moved = self.moved(turn, other.t[index] - turn @ self.t[index])
+        R, t = moved.R.copy(), moved.t.copy()
+        R[index], t[index] = other.R[index], other.t[index]
+        return Poses(R, t)
+
     def aligned_to(self, other: Poses) -> Poses:
         """Move the world so that positions, then rotations where they leave it open, fit `other` best.
 

@@ -43,7 +43,10 @@ class PoseGraph(ReadOnly):
     initial, truth : Poses, optional
         The estimate that came with the file, and the ground truth of a generated scene.
     fixed : (f,)
-        Poses that the file says are fixed. F does not depend on the gauge: this is kept for writing, not used.
+        Poses that the file says are fixed. F does not depend on the gauge: the solution is moved so that the first of
+        them is where the file has it, and all are kept for writing.
+    times : (n,), optional
+        Seconds of the poses, ascending, for the trajectories that are written.
     name : str
 
     All arrays are read-only copies: `dataclasses.replace` makes a graph with others.
@@ -75,6 +78,7 @@ class PoseGraph(ReadOnly):
     initial: Poses | None = None
     truth: Poses | None = None
     fixed: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    times: Array | None = None
     name: str = "graph"
 
     def __post_init__(self) -> None:
@@ -83,7 +87,7 @@ class PoseGraph(ReadOnly):
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, whole_array(value, name))
-        for name in ("R_ij", "t_ij", "kappa", "tau", "information"):
+        for name in ("R_ij", "t_ij", "kappa", "tau", "information", "times"):
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, real_array(value, name))
@@ -189,6 +193,7 @@ class PoseGraph(ReadOnly):
             initial=None if self.initial is None else self.initial[chosen],
             truth=None if self.truth is None else self.truth[chosen],
             fixed=number[self.fixed][number[self.fixed] >= 0],
+            times=None if self.times is None else self.times[chosen],
         )
 
     def unit_weights(self) -> PoseGraph:
@@ -229,6 +234,7 @@ class PoseGraph(ReadOnly):
             "ids": (self.num_poses,),
             "robot": (self.num_poses,),
             "fixed": (len(self.fixed),),
+            "times": (self.num_poses,),
         }
         for name, shape in expected.items():
             value = getattr(self, name)
@@ -251,6 +257,8 @@ class PoseGraph(ReadOnly):
             raise GraphError(f"{self.edge_label(int(np.argmax(loops)))} leads from a pose to itself; remove it")
         if ((self.fixed < 0) | (self.fixed >= self.num_poses)).any():
             raise GraphError(f"fixed names a pose outside 0 .. {self.num_poses - 1}")
+        if self.times is not None and not (np.isfinite(self.times).all() and (np.diff(self.times) > 0).all()):
+            raise GraphError("times do not ascend; give one for every pose, in the order of their ids")
         for name in ("R_ij", "t_ij", "kappa", "tau", "information"):
             value = getattr(self, name)
             if value is not None and not np.isfinite(value).all():

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pgo_models.errors import FileFormatError, GraphError
-from pgo_models.files import check_distances, check_quaternions, read_table, replace_when_done
+from pgo_models.files import check_distances, check_quaternions, read_table, read_text, replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
@@ -59,7 +59,7 @@ def write_tum(poses: Poses, path: Path | str, timestamps: Array | None = None) -
 
 
 def read_tum(path: Path | str, d: int = 3) -> Poses:
-    """Poses of a TUM file, in the order of its lines; the timestamps are not kept.
+    """Poses of a TUM file, in the order of its lines; `read_times` reads the timestamps.
 
     Raises
     ------
@@ -78,6 +78,25 @@ def read_tum(path: Path | str, d: int = 3) -> Poses:
     rows, lines = read_table(path, 8)
     check_quaternions(path, lines, rows[:, 4:])
     return _in_dimension(rotations_from_quaternions(rows[:, 4:]), rows[:, 1:4], d, path, lines)
+
+
+def read_times(path: Path | str) -> Array:
+    """Seconds, (n,), of a TUM file or of one with a number a line, ascending.
+
+    Raises
+    ------
+    FileFormatError
+        With file:line, for a row that is not 8 finite numbers, or one, like the first; for a time that is not after the
+        one before.
+    """
+    words = (line.split() for line in read_text(path).split("\n"))
+    first = next((row for row in words if row and not row[0].startswith("#")), [])
+    rows, lines = read_table(path, 8 if len(first) == 8 else 1)
+    late = np.flatnonzero(np.diff(rows[:, 0]) <= 0)
+    if len(late):
+        before, after = rows[late[0] : late[0] + 2, 0].tolist()
+        raise FileFormatError(path, lines[late[0] + 1], f"time {after!r} is not after {before!r}; sort the lines")
+    return rows[:, 0]
 
 
 def write_kitti(poses: Poses, path: Path | str) -> None:

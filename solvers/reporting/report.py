@@ -47,6 +47,7 @@ class Solved:
     ledger: Ledger | None = None
     robots: Partition | None = None
     note: str = ""
+    frame: str = ""
 
 
 def write_report(solution: Solved, path: Path | str, *, source: str | None = None) -> None:

@@ -212,3 +212,14 @@ def test_indexing() -> None:
     poses = random_poses(5, 3, np.random.default_rng(0))
     np.testing.assert_array_equal(poses[1:3].t, poses.t[1:3])
     np.testing.assert_array_equal(poses[np.array([4, 0])].R, poses.R[[4, 0]])
+
+
+@given(seed=SEEDS, n=st.integers(1, 6), d=DIMENSIONS)
+def test_an_anchored_pose_is_where_the_other_has_it_to_the_last_bit(seed: int, n: int, d: int) -> None:
+    rng = np.random.default_rng(seed)
+    poses, other, at = random_poses(n, d, rng), random_poses(n, d, rng), seed % n
+    found = poses.anchored_to(other, at)
+    np.testing.assert_array_equal(found.R[at], other.R[at])
+    np.testing.assert_array_equal(found.t[at], other.t[at])
+    assert_same(found.with_gauge_at(at), poses.with_gauge_at(at))
+    assert_same(poses.moved(*random_motion(d, rng)).anchored_to(other, at), found)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from pgo_models.errors import FileFormatError, GraphError, PGOError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, random_rotations
-from pgo_models.graphs.trajectories import read_kitti, read_tum, write_kitti, write_tum
+from pgo_models.graphs.trajectories import read_kitti, read_times, read_tum, write_kitti, write_tum
 
 EPS = np.finfo(float).eps
 SEEDS = st.integers(0, 2**32 - 1)
@@ -118,3 +118,26 @@ def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
     for write in (write_tum, write_kitti):
         with pytest.raises(PGOError, match="cannot write"):
             write(Poses.identity(2, 3), tmp_path / "missing" / "a")
+
+
+def test_times_are_read_from_tum_and_from_one_column(tmp_path):
+    times = np.array([0.5, 1.25, 1e9])
+    write_tum(Poses.identity(3, 3), tmp_path / "poses.tum", times)
+    (tmp_path / "times.txt").write_text("# seconds\n0.5\n1.25\n\n1e9\n")
+    for name in ("poses.tum", "times.txt"):
+        np.testing.assert_array_equal(read_times(tmp_path / name), times)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1\n2\n2\n", r"times\.txt:3: time 2\.0 is not after 2\.0; sort the lines"),
+        ("1\nlate\n", r"times\.txt:2: "),
+        ("1\n2 3\n", r"times\.txt:2: 2 numbers where 1 belong"),
+        ("# nothing\n", r"times\.txt: no rows"),
+    ],
+)
+def test_times_that_are_none_are_named(text, message, tmp_path):
+    (tmp_path / "times.txt").write_text(text)
+    with pytest.raises(FileFormatError, match=message):
+        read_times(tmp_path / "times.txt")
