@@ -26,8 +26,6 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import CoverPoses, Driver, DriverState
-from solvers.distributed.interface import InterfaceFactor
-from solvers.distributed.multifrontal import TreeFactor
 from solvers.distributed.newton import SubstructuredNewtonState
 from solvers.distributed.run_lock import RunLock
 from solvers.distributed.substructured import SubstructuredState
@@ -111,7 +109,7 @@ class Saved:
 _CLASSES = (
     *(Saved, DriverState, CoverPoses, Poses, Certificate, LowerBound, BoundSource, Verdict, Ledger, Traffic),
     *(Stage, Status, History, Record, Measurement, RecursionBlock, StepSettings, AndersonShare, AndersonSums),
-    *(SubstructuredState, ConsensusState, SubstructuredNewtonState, InterfaceFactor, TreeFactor, SeparatorPenalty),
+    *(SubstructuredState, ConsensusState, SubstructuredNewtonState, SeparatorPenalty),
     *(SOC, Newton, Anderson, Coupling, RStep, MultiplierPenalty, FixedPenalty, BalancedPenalty),
     *(Partition, PartitionMethod),
 )
@@ -204,9 +202,8 @@ class Journal:
             assert self._checkpoint is not None
             if driver.network.ledger.rounds - last >= self._checkpoint.rounds:
                 last = driver.network.ledger.rounds
-                at_rest = state.at_rest() if isinstance(state, SubstructuredState) else state
                 done = tuple(self._finished), tuple(self.stages)
-                saved = Saved(*done, name, at_rest, tuple(records), driver.state)
+                saved = Saved(*done, name, state, tuple(records), driver.state)
                 snapshots = driver.snapshots()
                 try:
                     _write(Path(self._checkpoint.path), self._mark, saved, snapshots)

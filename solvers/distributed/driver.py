@@ -31,7 +31,7 @@ from solvers.distributed.interface import Interface, InterfaceFactor
 from solvers.distributed.multifrontal import separator_tree
 from solvers.distributed.robots.agent import Agent, order_interior
 from solvers.distributed.robots.interior import Interior
-from solvers.distributed.robots.records import CostParts, ReducedTranslations
+from solvers.distributed.robots.records import CostParts, ReducedTranslations, RightHandSide
 from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import Engine
 from solvers.network.ledger import Ledger
@@ -98,6 +98,8 @@ class Driver:
         Which of the cover is left out when a bound is proved.
     block : RecursionBlock, optional
         Rotations of the cover in SOC's recursion.
+    step_a : InterfaceFactor, optional
+        Of its step (a), with the robots' right-hand sides for the next one in `right`.
     """
 
     def __init__(
@@ -138,6 +140,8 @@ class Driver:
         R = np.broadcast_to(np.eye(d), (g, d, d)).copy()
         self.at = self.kept = CoverPoses(R, np.zeros((g, d)), np.zeros(((d + 1) * g, d)))
         self.block: RecursionBlock | None = None
+        self.step_a: InterfaceFactor | None = None
+        self.right: list[RightHandSide] = []
         self._laplacian: InterfaceFactor | None = None
         self.network = CountedPool(engine.open(partial(Agent, backend=backend), subgraphs), len(subgraphs))
         described = self.ask(Interior.describe, None, Count.OFF)

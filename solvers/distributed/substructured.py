@@ -14,10 +14,8 @@ import numpy as np
 from pgo_models.certificates.dual_variables import multiplier_norms
 from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
 from solvers.distributed.driver import Driver
-from solvers.distributed.interface import InterfaceFactor
-from solvers.distributed.multifrontal import TreeFactor
 from solvers.distributed.robots.interior import Interior
-from solvers.distributed.robots.records import Reduced, RescaleInterior, RightHandSide
+from solvers.distributed.robots.records import Reduced, RescaleInterior
 from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Status
 from solvers.soc.anderson import AndersonSums
@@ -28,16 +26,11 @@ from solvers.soc.soc import SOC
 
 @dataclass(frozen=True, eq=False)
 class SubstructuredState(Steps):
-    """Iterate k: the driver's part of it; the robots keep theirs, which a step replaces.
+    """Figures of iterate k; its rows are with driver and robots, and a step replaces them.
 
     Attributes
     ----------
     k : int
-    block : RecursionBlock
-        Rotations of the cover.
-    factor : InterfaceFactor
-    right : sequence of RightHandSide
-        The robots', for the next step (a).
     ratio : (n,)
         rho_i / m_i of all poses, in no order.
     size : float
@@ -45,16 +38,9 @@ class SubstructuredState(Steps):
     """
 
     k: int
-    block: RecursionBlock
-    factor: InterfaceFactor
-    right: Sequence[RightHandSide]
     ratio: Array
     size: float
     sums: AndersonSums = field(default_factory=AndersonSums)
-
-    def at_rest(self) -> SubstructuredState:
-        """State without the factor and the robots' answers, from which `SubstructuredSOC.init` goes on."""
-        return replace(self, factor=InterfaceFactor(TreeFactor((), 0, ()), np.zeros(0, dtype=np.int64)), right=())
 
 
 @dataclass(frozen=True)
@@ -75,19 +61,20 @@ class SubstructuredSOC:
         return self.soc.max_iterations
 
     def init(self, driver: Driver, start: SubstructuredState | None) -> SubstructuredState:
-        """State 0: omega = the rotations that driver and robots hold, B = 0; or a state that was `at_rest`."""
+        """State 0: omega = the rotations that driver and robots hold, B = 0; or the state that they were resumed at."""
         if start is not None:
-            answers = driver.ask(Interior.eliminated, None, Count.PIGGYBACKED)
-            return replace(start, factor=_factor(driver, start.block, answers), right=_right(answers))
+            _take(driver, _block(driver), driver.ask(Interior.eliminated, None, Count.PIGGYBACKED))
+            return start
         return self._penalized(driver, is_stationary=False)
 
     def step(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
         """One round: (a) by elimination; and one all-reduce: (b), (c)."""
         state = self._with_penalty_due(driver, state)
-        space, rows, block = driver.interface(1, driver.d), driver.rotation_rows, state.block
-        b = space.gather([part.b for part in state.right])
+        space, rows, block = driver.interface(1, driver.d), driver.rotation_rows, _block(driver)
+        assert driver.step_a is not None
+        b = space.gather([part.b for part in driver.right])
         b[rows] += (0.5 * block.penalty)[:, None] * block.shift
-        x = state.factor.solve(b)
+        x = driver.step_a.solve(b)
         block, own = block.after_solve(x[rows])  # (a)
         sums = own + np.sum(driver.ask_each(Interior.solve, space.scatter(x)), axis=0)
         merit = math.sqrt(sums[0])
@@ -96,18 +83,16 @@ class SubstructuredSOC:
         gamma, anderson = state.sums.coefficients(self.soc.acceleration, sums)
         agreement = Agreement(gamma, state.is_best(merit))
         block, own = block.extrapolated(agreement).projected()  # (b), (c)
-        driver.block = block
         answers = driver.ask(Interior.agree, agreement, Count.ALL_REDUCE)
+        driver.block, driver.right = block, [answer.right for answer in answers]
         squares = own + np.sum([answer.sums for answer in answers], axis=0)
-        right = [answer.right for answer in answers]
-        after = state.after(merit, squares, state.size)
-        return replace(after, k=state.k + 1, block=block, right=right, sums=anderson)
+        return replace(state.after(merit, squares, state.size), k=state.k + 1, sums=anderson)
 
     def measure(self, driver: Driver, state: SubstructuredState) -> Measurement:
         """F at omega and the translations of step (a), and the residuals."""
         if math.isnan(state.primal_residual):
             return driver.measured(Measurement(np.nan, np.nan, np.nan))
-        parts = driver.ask_each(Interior.cost, driver.scattered_rotations(state.block.z), Count.OFF)
+        parts = driver.ask_each(Interior.cost, driver.scattered_rotations(_block(driver).z), Count.OFF)
         return driver.measured(state.measurement(math.fsum(parts)))
 
     def converged(self, state: SubstructuredState, measurement: Measurement) -> Status | None:
@@ -116,9 +101,10 @@ class SubstructuredSOC:
 
     def finish(self, driver: Driver) -> None:
         """Leave omega and the best translations for it with driver and robots: two rounds."""
-        assert driver.block is not None
-        driver.at = replace(driver.at, R=unstack_transposes(driver.block.z))
-        driver.set_translations(driver.ask_each(Interior.finish, driver.scattered_rotations(driver.block.z)))
+        z = _block(driver).z
+        driver.step_a, driver.right = None, []
+        driver.at = replace(driver.at, R=unstack_transposes(z))
+        driver.set_translations(driver.ask_each(Interior.finish, driver.scattered_rotations(z)))
 
     def _penalized(self, driver: Driver, is_stationary: bool) -> SubstructuredState:
         """State 0 at the poses that driver and robots hold; one round, in which the quantile is found."""
@@ -132,11 +118,9 @@ class SubstructuredSOC:
         rho, ratio = order.rho(norms, scale), order.rho(all_norms, all_scales) / all_scales
         B = stationary_B(driver.at.R, Lambda, rho) if is_stationary else 0.0
         diagonal, rows = driver.diagonal[driver.rotation_rows], stack_transposes(driver.at.R)
-        driver.block = block_at(rows, np.repeat(rho, driver.d), diagonal, order.settings, B)
-        reduced = driver.ask(Interior.penalize, order)
-        size = math.sqrt(driver.d * float(ratio @ all_scales))
-        factor = _factor(driver, driver.block, reduced)
-        return SubstructuredState(0, driver.block, factor, _right(reduced), ratio, size)
+        block = block_at(rows, np.repeat(rho, driver.d), diagonal, order.settings, B)
+        _take(driver, block, driver.ask(Interior.penalize, order))
+        return SubstructuredState(0, ratio, math.sqrt(driver.d * float(ratio @ all_scales)))
 
     def _with_penalty_due(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
         """As in `solvers.soc.soc`: the penalty that the rule, or the safeguard, wants from now on."""
@@ -155,26 +139,22 @@ class SubstructuredSOC:
         self, driver: Driver, state: SubstructuredState, factor: float, from_best: bool
     ) -> SubstructuredState:
         """State with factor * rho and the same unscaled multiplier rho B."""
-        block = state.block.back_at_best() if from_best else state.block
-        driver.block = block = block.rescaled(factor * block.penalty)
-        reduced = driver.ask(Interior.rescale, RescaleInterior(factor, from_best))
+        block = _block(driver).back_at_best() if from_best else _block(driver)
+        block = block.rescaled(factor * block.penalty)
+        _take(driver, block, driver.ask(Interior.rescale, RescaleInterior(factor, from_best)))
         return replace(
-            state,
-            block=block,
-            factor=_factor(driver, block, reduced),
-            right=_right(reduced),
-            ratio=factor * state.ratio,
-            size=math.sqrt(factor) * state.size,
-            sums=AndersonSums(),
-            merits=(),
+            state, ratio=factor * state.ratio, size=math.sqrt(factor) * state.size, sums=AndersonSums(), merits=()
         )
 
 
-def _right(reduced: Sequence[Reduced]) -> list[RightHandSide]:
-    return [answer.right for answer in reduced]
+def _block(driver: Driver) -> RecursionBlock:
+    assert driver.block is not None
+    return driver.block
 
 
-def _factor(driver: Driver, block: RecursionBlock, reduced: Sequence[Reduced]) -> InterfaceFactor:
-    """Factor of the driver's matrix of step (a)."""
+def _take(driver: Driver, block: RecursionBlock, reduced: Sequence[Reduced]) -> None:
+    """Go on from a block, with the robots' eliminations for its penalty: factor the driver's matrix of step (a)."""
     own = [(driver.rotation_rows[:, None], (0.5 * block.penalty)[:, None, None]), *driver.grounded_translation()]
-    return driver.interface(1, driver.d).factorize([answer.schur for answer in reduced], own)
+    matrices = [answer.schur for answer in reduced]
+    driver.step_a = driver.interface(1, driver.d).factorize(matrices, own)
+    driver.block, driver.right = block, [answer.right for answer in reduced]

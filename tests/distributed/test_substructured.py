@@ -152,7 +152,9 @@ def test_a_state_that_is_not_finite_is_said_to_be_and_leaves_the_last_one_behind
     driver = driver_at(problem, metis(problem.graph, 2), None)
     start, method = driver.at.objective, SubstructuredSOC()
     state = method.init(driver, None)
-    broken = method.step(driver, replace(state, block=replace(state.block, s=np.full_like(state.block.s, np.nan))))
+    assert driver.block is not None
+    driver.block = replace(driver.block, s=np.full_like(driver.block.s, np.nan))
+    broken = method.step(driver, state)
     assert broken.k == 1
     measurement = method.measure(driver, broken)
     assert np.isnan([measurement.objective, measurement.primal_residual, measurement.dual_residual]).all()
