@@ -48,7 +48,7 @@ from solvers.cli_options import (
 from solvers.distributed.checkpoint import Checkpoint
 from solvers.explanations import explained_by_its_graph, warn_of_weights
 from solvers.pipeline import HANDOVER, solve
-from solvers.reporting.graph_facts import graph_facts
+from solvers.reporting.graph_facts import describe_graph
 from solvers.reporting.report import check_report, write_report
 from solvers.reporting.versions import installed_versions
 from solvers.shell import DONE, Commands, run_command, save_then_show
@@ -279,7 +279,7 @@ def info_command(
         table.add_row("data sets", ", ".join(known_datasets()))
     else:
         loaded = load(graph)
-        for label, text in graph_facts(loaded):
+        for label, text in describe_graph(loaded):
             table.add_row(label, text)
         if robots is not None or split is not None:
             shared = chosen_partition(loaded, robots, split)

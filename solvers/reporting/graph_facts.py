@@ -12,7 +12,7 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.reporting.versions import installed_versions
 
 
-def graph_facts(graph: PoseGraph) -> list[tuple[str, str]]:
+def describe_graph(graph: PoseGraph) -> list[tuple[str, str]]:
     """What `pgo info` says of a graph: label and text of every row."""
     components = graph.components()
     degree = np.bincount(np.concatenate([graph.i, graph.j]), minlength=graph.num_poses)
