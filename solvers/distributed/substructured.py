@@ -114,7 +114,6 @@ class SubstructuredSOC:
         all_norms = np.concatenate([norms, *(answer.norms for answer in answers)])
         all_scales = np.concatenate([scale, *(answer.scale for answer in answers)])
         order = self.soc.penalty_order(all_norms / all_scales, is_stationary)
-        order = replace(order, settings=replace(order.settings, alone=None))
         rho, ratio = order.rho(norms, scale), order.rho(all_norms, all_scales) / all_scales
         B = stationary_B(driver.at.R, Lambda, rho) if is_stationary else 0.0
         diagonal, rows = driver.diagonal[driver.rotation_rows], stack_transposes(driver.at.R)

@@ -113,9 +113,9 @@ class AndersonSums:
     def coefficients(self, settings: Anderson | None, sums: Array) -> tuple[Array | None, AndersonSums]:
         """Coefficients gamma of the differences; None is a restart, after which the parties forget theirs.
 
-        Without settings, or with every party on its own, there are none.
+        Without settings there are none.
         """
-        if settings is None or settings.per_robot:
+        if settings is None:
             return np.zeros(0), self
         size = float(np.sqrt(sums[0]))
         if size > settings.restart_ratio * self.smallest:

@@ -120,7 +120,8 @@ class Consensus:
         merit = math.sqrt(sums[0])
         if not math.isfinite(merit):
             return replace(state, k=state.k + 1, primal_residual=np.nan, dual_residual=np.nan)
-        gamma, anderson = state.sums.coefficients(self.soc.acceleration, sums)
+        together = self.soc.acceleration if self.soc.step_settings.alone is None else None
+        gamma, anderson = state.sums.coefficients(together, sums)
         agreement = Agreement(gamma, state.is_best(merit))
         rows = robots.hand_on(ask_all(robots, ConsensusRobot.extrapolate, agreement, Count.PIGGYBACKED))
         squares = np.sum(robots.ask(ConsensusRobot.agree, rows, Count.ALL_REDUCE), axis=0)  # (b), (c)

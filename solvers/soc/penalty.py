@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -47,12 +48,12 @@ class PenaltyOrder:
         return np.asarray(np.maximum(np.maximum(self.per_norm * norms, self.per_scale * scale), self.least))
 
 
-class _Rule:
+class _Rule(ABC):
     """A rule that says the three numbers of a `PenaltyOrder`."""
 
+    @abstractmethod
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
         """(per_norm, per_scale, least), from ||Lambda_i||_2 / m_i of all poses, (n,)."""
-        raise NotImplementedError
 
     def initial(self, problem: PGOProblem, poses: Poses) -> Array:
         """rho, (n,), at poses."""

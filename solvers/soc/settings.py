@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
@@ -83,7 +83,7 @@ class SOCSettings:
     def step_settings(self) -> StepSettings:
         """What a robot must know of them."""
         found = self.acceleration
-        alone = replace(found, per_robot=False) if found is not None and found.per_robot else None
+        alone = found if found is not None and found.per_robot else None
         return StepSettings(self.alpha, found.memory if found is not None else 0, self.local_passes, alone)
 
     def penalty_order(self, ratio: Array, is_stationary: bool) -> PenaltyOrder:

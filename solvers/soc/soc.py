@@ -106,8 +106,7 @@ class Joint:
         rho = order.rho(norms, scale)
         B = stationary_B(poses.R, Lambda, rho) if is_stationary else 0.0
         diagonal = problem.M.data[problem.diagonal_positions[problem.num_poses :]]
-        settings = replace(order.settings, alone=None)
-        block = block_at(stack_transposes(poses.R), np.repeat(rho, problem.d), diagonal, settings, B)
+        block = block_at(stack_transposes(poses.R), np.repeat(rho, problem.d), diagonal, order.settings, B)
         return SOCState(0, block, rho, self._prepared(problem, block))
 
     def _with_penalty_due(self, problem: PGOProblem, state: SOCState) -> SOCState:

@@ -92,7 +92,7 @@ def small_penalty(problem: PGOProblem) -> FixedPenalty:
     backend=BACKENDS,
     rule=st.sampled_from([MultiplierPenalty(), STALLED, BalancedPenalty(), BalancedPenalty(scale=30.0)]),
     alpha=st.sampled_from([1.0, 1.6]),
-    acceleration=st.sampled_from([None, Anderson(), Anderson(memory=2, restart_ratio=1.01)]),
+    acceleration=st.sampled_from([None, Anderson(), Anderson(memory=2, restart_ratio=1.01), Anderson(per_robot=True)]),
 )
 def test_the_iterates_are_those_of_joint(
     seed: int,

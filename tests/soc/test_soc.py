@@ -195,6 +195,19 @@ def test_anderson_per_robot_sums_nothing_over_the_robots(seed: int, n: int, d: i
         state = following
 
 
+@pytest.mark.parametrize("alone", [True, False])
+def test_one_robot_accelerates_the_same_whether_alone_or_together(alone: bool) -> None:
+    problem = varied_problem(3, 12, 3, LOUD_NOISE)
+    states, plain = (
+        list(islice(iterate(SOC(acceleration=acceleration), problem), 12))
+        for acceleration in (Anderson(per_robot=alone), None)
+    )
+    expected = list(islice(iterate(SOC(), problem), 12))
+    for one, other in zip(states, expected, strict=True):
+        np.testing.assert_array_equal(one.omega, other.omega)
+    assert np.abs(states[-1].omega - plain[-1].omega).max() > 1e-9
+
+
 def with_settings(soc: SOC, state: ConsensusIterate) -> ConsensusIterate:
     """State whose robots have other settings."""
     robots = [
