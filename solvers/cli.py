@@ -244,17 +244,17 @@ def certify_command(
         check_writable(out)
     problem = PGOProblem(_load(graph, unit_weights))
     poses = _estimate(problem.graph, estimate)
-    certificate = certify(problem, poses, gap)
+    certificate, found = certify(problem, poses, gap), chi2_of_file(problem.graph, poses)
     record = {
         "objective": certificate.objective,
-        "chi2": chi2_of_file(problem.graph, poses),
+        "chi2": found,
         **certificate_json(certificate),
         "source": certificate.source.name,
         "best_known_objective": certificate.poses_objective,
         "versions": installed_versions(problem.backend),
     }
     targets = [(out, partial(write_json, record))] if out is not None else []
-    rows = [f"{label:<12} {text}" for label, text in chi2_rows(problem.graph, poses, certificate.objective)]
+    rows = [f"{label:<12} {text}" for label, text in chi2_rows(found, certificate.objective)]
     save_then_show(targets, lambda: typer.echo("\n".join([str(certificate), *rows])))
     warn_of_weights(graph, problem, certificate)
     raise typer.Exit(DONE if certificate.is_certified else NOT_CERTIFIED)

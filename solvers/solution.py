@@ -220,7 +220,7 @@ class Solution(Solved):
             ("lower bound", f"{certificate.lower_bound:.10g}{relaxed}"),
             ("gap", gap_text(certificate.gap)),
             ("verdict", f"{certificate.verdict.name}: {certificate.verdict.value}"),
-            *chi2_rows(graph, self.poses, self.objective),
+            *chi2_rows(chi2_of_file(graph, self.poses), self.objective),
             *([("note", self.note)] if self.note else []),
             *([("frame", self.frame)] if self.frame else []),
             ("seconds", f"{self.seconds:.3g}"),
@@ -245,9 +245,8 @@ def chi2_of_file(graph: PoseGraph, poses: Poses) -> float | None:
     return None if graph.information is None else chi2(graph, poses)
 
 
-def chi2_rows(graph: PoseGraph, poses: Poses, objective: float) -> list[tuple[str, str]]:
-    """What a summary says of the cost with the file's information matrices, where it is not F, which is certified."""
-    found = chi2_of_file(graph, poses)
+def chi2_rows(found: float | None, objective: float) -> list[tuple[str, str]]:
+    """What a summary says of `chi2_of_file`, where it is not F, which is certified."""
     if found is None or abs(found - objective) <= 1e-9 * objective:
         return []
     return [("chi2", f"{found:.10g} with the file's information matrices; the bound is on F alone")]

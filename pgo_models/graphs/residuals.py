@@ -63,8 +63,7 @@ def edge_residuals(graph: PoseGraph, poses: Poses) -> EdgeResiduals:
     >>> residuals.translation.shape, bool(residuals.rotation.max() < np.pi)
     ((300,), True)
     """
-    if poses.t.shape != (graph.num_poses, graph.d):
-        raise GraphError(f"{poses} beside {graph!r}; give one pose for every pose of the graph")
+    _check_poses(graph, poses)
     R_i, R_j = poses.R[graph.i], poses.R[graph.j]
     predicted = R_i @ graph.R_ij
     shift = poses.t[graph.j] - poses.t[graph.i] - np.einsum("mab,mb->ma", R_i, graph.t_ij)
@@ -121,8 +120,7 @@ def chi2(graph: PoseGraph, poses: Poses, convention: Chi2Convention = Chi2Conven
     """
     if not isinstance(convention, Chi2Convention):
         raise SettingError(f"convention is {convention!r}; give one of {', '.join(map(str, Chi2Convention))}")
-    if poses.t.shape != (graph.num_poses, graph.d):
-        raise GraphError(f"{poses} are not the poses of {graph}; give one pose for every pose of the graph")
+    _check_poses(graph, poses)
     i, j, d = graph.i, graph.j, graph.d
     back = np.swapaxes(graph.R_ij, 1, 2)
     E = back @ np.swapaxes(poses.R[i], 1, 2) @ poses.R[j]
@@ -143,6 +141,11 @@ def chi2(graph: PoseGraph, poses: Poses, convention: Chi2Convention = Chi2Conven
     coupled = np.cos(half) * chord if convention is Chi2Convention.CHORDAL else r_r
     terms = ((r_t, I_tt, r_t), (2.0 * r_t, I_tr, coupled), (r_r, I_rr, r_r))
     return sum(float(np.einsum("ma,mab,mb->", *term, optimize=True)) for term in terms)
+
+
+def _check_poses(graph: PoseGraph, poses: Poses) -> None:
+    if poses.t.shape != (graph.num_poses, graph.d):
+        raise GraphError(f"{poses} beside {graph!r}; give one pose for every pose of the graph")
 
 
 def _logarithm_translation(w: Array, t: Array) -> Array:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pgo_models.certificates.dual_variables import multiplier_norms
-from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
+from pgo_models.geometry.rotations import Array, unstack_transposes
 from solvers.distributed.driver import Driver
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import Reduced, RescaleInterior
@@ -20,7 +20,7 @@ from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Status
 from solvers.soc.anderson import AndersonSums
 from solvers.soc.penalty import Due, Steps, next_penalty
-from solvers.soc.recursion_block import Agreement, RecursionBlock, block_at, stationary_B
+from solvers.soc.recursion_block import Agreement, RecursionBlock
 from solvers.soc.soc import SOC
 
 
@@ -109,15 +109,12 @@ class SubstructuredSOC:
     def _penalized(self, driver: Driver, is_stationary: bool) -> SubstructuredState:
         """State 0 at the poses that driver and robots hold; one round, in which the quantile is found."""
         answers = driver.ask(Interior.multiplier_norms, None, Count.PIGGYBACKED)
-        Lambda, scale = driver.at.multipliers, driver.scale
-        norms = multiplier_norms(Lambda)
-        all_norms = np.concatenate([norms, *(answer.norms for answer in answers)])
-        all_scales = np.concatenate([scale, *(answer.scale for answer in answers)])
+        Lambda = driver.at.multipliers
+        all_norms = np.concatenate([multiplier_norms(Lambda), *(answer.norms for answer in answers)])
+        all_scales = np.concatenate([driver.scale, *(answer.scale for answer in answers)])
         order = self.soc.penalty_order(all_norms / all_scales, is_stationary)
-        rho, ratio = order.rho(norms, scale), order.rho(all_norms, all_scales) / all_scales
-        B = stationary_B(driver.at.R, Lambda, rho) if is_stationary else 0.0
-        diagonal, rows = driver.diagonal[driver.rotation_rows], stack_transposes(driver.at.R)
-        block = block_at(rows, np.repeat(rho, driver.d), diagonal, order.settings, B)
+        ratio = order.rho(all_norms, all_scales) / all_scales
+        block = order.block(driver.at.R, Lambda, driver.diagonal[driver.rotation_rows])
         _take(driver, block, driver.ask(Interior.penalize, order))
         return SubstructuredState(0, ratio, math.sqrt(driver.d * float(ratio @ all_scales)))
 

@@ -66,7 +66,7 @@ class CountedPool:
 
         What a faulty `channel` loses is counted, and not handed on.
         """
-        messages = {(robot, to): value for robot, addressed in enumerate(sent) for to, value in addressed.items()}
+        messages = by_link(sent)
         links = np.array(list(messages), dtype=np.int64).reshape(-1, 2)
         self._count(links[:, 0], links[:, 1], [count_numbers(value) for value in messages.values()], is_round=True)
         return delivered(messages if channel is None else channel.carry(messages), len(sent))
@@ -78,6 +78,11 @@ class CountedPool:
         exchange = sender[used], receiver[used], num_bytes[used]
         traffic = self._traffic.setdefault(np.concatenate(exchange).tobytes(), Traffic(*exchange))
         self.ledger = self.ledger.after_exchange(traffic, is_round)
+
+
+def by_link(sent: Sequence[Mapping[int, A]]) -> dict[tuple[int, int], A]:
+    """Messages by (sender, receiver), of what every sender sent by its receiver."""
+    return {(robot, to): value for robot, addressed in enumerate(sent) for to, value in addressed.items()}
 
 
 def delivered(messages: Mapping[tuple[int, int], A], num_robots: int) -> list[Mapping[int, A]]:

@@ -16,7 +16,7 @@ import numpy as np
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
-from solvers.network.counted_pool import Count, delivered
+from solvers.network.counted_pool import Count, by_link, delivered
 from solvers.soc.anderson import AndersonSums
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.copies import CopiesState, CopyLayout, RescaleCopies, Rows, SeparatorPenalty
@@ -204,8 +204,7 @@ class LocalRobots:
 
     def hand_on(self, sent: Sequence[Mapping[int, A]]) -> list[Mapping[int, A]]:
         """What every robot receives, by its sender, of what each sent, by its receiver."""
-        messages = {(robot, to): value for robot, addressed in enumerate(sent) for to, value in addressed.items()}
-        return delivered(messages, self.num_robots)
+        return delivered(by_link(sent), self.num_robots)
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,9 +252,9 @@ class LocalConsensus:
     def init(self, problem: PGOProblem, start: Poses) -> ConsensusIterate:
         """State 0: omega = the rotations of `start`."""
         assert self.soc.robots is not None
-        nothing = CopiesState(problem.stacked(start)[:0])  # raises unless the poses fit
+        problem.stacked(start)  # raises unless the poses fit
         layouts = [CopyLayout(s, problem.backend, self.soc.r_step) for s in split_graph(problem.graph, self.soc.robots)]
-        here = LocalRobots(problem, tuple(ConsensusRobot(layout, nothing) for layout in layouts), start)
+        here = LocalRobots(problem, tuple(ConsensusRobot(layout, CopiesState()) for layout in layouts), start)
         shared = Consensus(self.soc).init(here)
         return ConsensusIterate(shared, here.robots)
 

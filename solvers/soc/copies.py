@@ -232,7 +232,7 @@ class CopiesState:
     waiting : Waiting, optional
     """
 
-    X: Array
+    X: Array = field(default_factory=lambda: np.zeros((0, 0)))
     rho: Array = field(default_factory=lambda: np.zeros(0))
     diagonal: Array = field(default_factory=lambda: np.zeros((0, 0)))
     Lambda: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))

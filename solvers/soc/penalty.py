@@ -12,10 +12,10 @@ import numpy as np
 from pgo_models.certificates.dual_variables import multiplier_norms, multipliers
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.rotations import Array, stack_transposes
 from pgo_models.problem.problem import PGOProblem
 from solvers.result import Measurement
-from solvers.soc.recursion_block import StepSettings
+from solvers.soc.recursion_block import RecursionBlock, StepSettings, block_at, stationary_B
 from solvers.soc.separator_stiffness import is_second_look
 
 MAX_RAISES = 20
@@ -46,6 +46,13 @@ class PenaltyOrder:
     def rho(self, norms: Array, scale: Array) -> Array:
         """rho, (n,), from ||Lambda_i||_2 and m_i."""
         return np.asarray(np.maximum(np.maximum(self.per_norm * norms, self.per_scale * scale), self.least))
+
+    def block(self, R: Array, Lambda: Array, diagonal: Array) -> RecursionBlock:
+        """Rows of a party at its rotations R, (k, d, d), with this penalty; `diagonal`, (dk,), is that of M there."""
+        d = R.shape[-1]
+        rho = self.rho(multiplier_norms(Lambda), diagonal.reshape(-1, d).mean(axis=1))
+        B = stationary_B(R, Lambda, rho) if self.is_stationary else 0.0
+        return block_at(stack_transposes(R), np.repeat(rho, d), diagonal, self.settings, B)
 
 
 class _Rule(ABC):

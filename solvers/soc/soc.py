@@ -26,7 +26,7 @@ from solvers.soc.anderson import AndersonSums
 from solvers.soc.consensus import LocalConsensus
 from solvers.soc.penalty import Due, Steps, next_penalty, rotation_scale
 from solvers.soc.r_step import RotationStep, RSubproblem, prepare
-from solvers.soc.recursion_block import Agreement, RecursionBlock, block_at, stationary_B
+from solvers.soc.recursion_block import Agreement, RecursionBlock
 from solvers.soc.settings import SOCSettings
 
 
@@ -100,14 +100,10 @@ class Joint:
 
     def _penalized(self, problem: PGOProblem, poses: Poses, is_stationary: bool) -> SOCState:
         """State 0 at poses, B zero or stationary."""
-        Lambda, scale = multipliers(problem, poses), rotation_scale(problem)
-        norms = multiplier_norms(Lambda)
-        order = self.soc.penalty_order(norms / scale, is_stationary)
-        rho = order.rho(norms, scale)
-        B = stationary_B(poses.R, Lambda, rho) if is_stationary else 0.0
-        diagonal = problem.M.data[problem.diagonal_positions[problem.num_poses :]]
-        block = block_at(stack_transposes(poses.R), np.repeat(rho, problem.d), diagonal, order.settings, B)
-        return SOCState(0, block, rho, self._prepared(problem, block))
+        Lambda = multipliers(problem, poses)
+        order = self.soc.penalty_order(multiplier_norms(Lambda) / rotation_scale(problem), is_stationary)
+        block = order.block(poses.R, Lambda, problem.M.data[problem.diagonal_positions[problem.num_poses :]])
+        return SOCState(0, block, block.penalty[:: problem.d], self._prepared(problem, block))
 
     def _with_penalty_due(self, problem: PGOProblem, state: SOCState) -> SOCState:
         """State with the penalty that the rule, or the safeguard, wants from now on; mostly the state itself."""

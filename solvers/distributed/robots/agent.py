@@ -80,8 +80,7 @@ class Agent:
 
     @property
     def _no_copies(self) -> ConsensusRobot:
-        nowhere = CopiesState(np.zeros((0, self.subgraph.graph.d)))
-        return ConsensusRobot(CopyLayout(self.subgraph, self.backend), nowhere)
+        return ConsensusRobot(CopyLayout(self.subgraph, self.backend), CopiesState())
 
 
 # Orders: with the first argument given, functions of an agent and a request.

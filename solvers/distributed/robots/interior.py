@@ -49,7 +49,7 @@ from solvers.distributed.robots.records import (
 )
 from solvers.soc.copies import Norms
 from solvers.soc.penalty import PenaltyOrder
-from solvers.soc.recursion_block import Agreement, RecursionBlock, block_at, stationary_B
+from solvers.soc.recursion_block import Agreement, RecursionBlock
 from solvers.soc.subgraph import Part, Subgraph
 
 
@@ -160,12 +160,8 @@ class Interior:
     def penalize(self, order: PenaltyOrder) -> tuple[Interior, Reduced]:
         """Set rho_i, factor M + D/2; omega is at the poses, B zero or stationary."""
         interior, problem = self.part.interior, self.part.problem
-        Lambda, R = self._multipliers()[interior], self.state.poses.R[interior]
-        rho = order.rho(multiplier_norms(Lambda), self._scale)
-        B = stationary_B(R, Lambda, rho) if order.is_stationary else 0.0
         diagonal = problem.M.data[problem.diagonal_positions][self._interior_rows]
-        block = block_at(stack_transposes(R), np.repeat(rho, problem.d), diagonal, order.settings, B)
-        return self._penalized(block)
+        return self._penalized(order.block(self.state.poses.R[interior], self._multipliers()[interior], diagonal))
 
     def rescale(self, order: RescaleInterior) -> tuple[Interior, Reduced]:
         """Multiply rho, from the best iterate on if asked to, and factor again."""
