@@ -12,35 +12,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pgo_models.certificates.dual_variables import multiplier_norms
-from pgo_models.geometry.rotations import Array, unstack_transposes
+from pgo_models.geometry.rotations import unstack_transposes
 from solvers.distributed.driver import Driver
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import Reduced, RescaleInterior
 from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Status
-from solvers.soc.anderson import AndersonSums
-from solvers.soc.penalty import Due, Steps, next_penalty
+from solvers.soc.penalty import Due, SharedSteps, next_penalty
 from solvers.soc.recursion_block import Agreement, RecursionBlock
 from solvers.soc.soc import SOC
 
 
 @dataclass(frozen=True, eq=False)
-class SubstructuredState(Steps):
-    """Figures of iterate k; its rows are with driver and robots, and a step replaces them.
-
-    Attributes
-    ----------
-    k : int
-    ratio : (n,)
-        rho_i / m_i of all poses, in no order.
-    size : float
-        ||omega||_rho.
-    """
-
-    k: int
-    ratio: Array
-    size: float
-    sums: AndersonSums = field(default_factory=AndersonSums)
+class SubstructuredState(SharedSteps):
+    """Figures of iterate k; its rows are with driver and robots, and a step replaces them."""
 
 
 @dataclass(frozen=True)
@@ -79,14 +64,14 @@ class SubstructuredSOC:
         sums = own + np.sum(driver.ask_each(Interior.solve, space.scatter(x)), axis=0)
         merit = math.sqrt(sums[0])
         if not math.isfinite(merit):
-            return replace(state, k=state.k + 1, primal_residual=np.nan, dual_residual=np.nan)
+            return state.broken()
         gamma, anderson = state.sums.coefficients(self.soc.acceleration, sums)
         agreement = Agreement(gamma, state.is_best(merit))
         block, own = block.extrapolated(agreement).projected()  # (b), (c)
         answers = driver.ask(Interior.agree, agreement, Count.ALL_REDUCE)
         driver.block, driver.right = block, [answer.right for answer in answers]
         squares = own + np.sum([answer.sums for answer in answers], axis=0)
-        return replace(state.after(merit, squares, state.size), k=state.k + 1, sums=anderson)
+        return state.after(merit, squares, state.size, anderson)
 
     def measure(self, driver: Driver, state: SubstructuredState) -> Measurement:
         """F at omega and the translations of step (a), and the residuals."""
@@ -116,7 +101,7 @@ class SubstructuredSOC:
         ratio = order.rho(all_norms, all_scales) / all_scales
         block = order.block(driver.at.R, Lambda, driver.diagonal[driver.rotation_rows])
         _take(driver, block, driver.ask(Interior.penalize, order))
-        return SubstructuredState(0, ratio, math.sqrt(driver.d * float(ratio @ all_scales)))
+        return SubstructuredState(ratio=ratio, size=math.sqrt(driver.d * float(ratio @ all_scales)))
 
     def _with_penalty_due(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
         """As in `solvers.soc.soc`: the penalty that the rule, or the safeguard, wants from now on."""
@@ -126,7 +111,7 @@ class SubstructuredSOC:
         if due is Due.REFRESH:
             self.finish(driver)
             fresh = self._penalized(driver, is_stationary=True)
-            return replace(fresh, k=state.k, refreshes=state.refreshes + 1, raises=state.raises)
+            return fresh.in_place_of(state)
         if due is Due.RESCALE:
             return replace(self._rescaled(driver, state, factor, from_best=False), refreshes=state.refreshes + 1)
         return state
@@ -138,9 +123,7 @@ class SubstructuredSOC:
         block = _block(driver).back_at_best() if from_best else _block(driver)
         block = block.rescaled(factor * block.penalty)
         _take(driver, block, driver.ask(Interior.rescale, RescaleInterior(factor, from_best)))
-        return replace(
-            state, ratio=factor * state.ratio, size=math.sqrt(factor) * state.size, sums=AndersonSums(), merits=()
-        )
+        return state.rescaled(factor)
 
 
 def _block(driver: Driver) -> RecursionBlock:

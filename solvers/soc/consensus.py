@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -17,10 +17,9 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from solvers.network.counted_pool import Count, by_link, delivered
-from solvers.soc.anderson import AndersonSums
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.copies import CopiesState, CopyLayout, RescaleCopies, Rows, SeparatorPenalty
-from solvers.soc.penalty import Due, MultiplierPenalty, Steps, next_penalty
+from solvers.soc.penalty import Due, MultiplierPenalty, SharedSteps, next_penalty
 from solvers.soc.recursion_block import Agreement
 from solvers.soc.separator_stiffness import adapted_penalty, fell_most, translation_penalty_for
 from solvers.soc.settings import SOCSettings
@@ -54,25 +53,15 @@ def ask_all(robots: Robots, order: Order[Q, A], request: Q, count: Count) -> lis
 
 
 @dataclass(frozen=True, eq=False)
-class ConsensusState(Steps):
+class ConsensusState(SharedSteps):
     """Iterate k: the sums that all robots know; the iterates are theirs.
 
     Attributes
     ----------
-    k : int
-    ratio : (n,)
-        rho_i / m_i of all poses, in no order.
-    size : float
-        ||omega||_rho.
     separators : SeparatorPenalty
-    sums : AndersonSums
     """
 
-    k: int
-    ratio: Array
-    size: float
     separators: SeparatorPenalty
-    sums: AndersonSums = field(default_factory=AndersonSums)
 
 
 @dataclass(frozen=True)
@@ -111,7 +100,8 @@ class Consensus:
             separators = self._separators(given if given is not None else translation_penalty_for(stiffness))
         started = ask_all(robots, ConsensusRobot.start, separators, Count.ALL_REDUCE)
         size = math.sqrt(math.fsum(answer.size for answer in started))
-        return ConsensusState(0, np.concatenate([answer.ratio for answer in started]), size, separators)
+        ratio = np.concatenate([answer.ratio for answer in started])
+        return ConsensusState(ratio=ratio, size=size, separators=separators)
 
     def step(self, robots: Robots, state: ConsensusState) -> ConsensusState:
         """One round: (a) on every robot, its rows to the neighbours, (b) and (c)."""
@@ -119,13 +109,13 @@ class Consensus:
         sums = np.sum(ask_all(robots, ConsensusRobot.solve, None, Count.ALL_REDUCE), axis=0)  # (a)
         merit = math.sqrt(sums[0])
         if not math.isfinite(merit):
-            return replace(state, k=state.k + 1, primal_residual=np.nan, dual_residual=np.nan)
+            return state.broken()
         together = self.soc.acceleration if self.soc.step_settings.alone is None else None
         gamma, anderson = state.sums.coefficients(together, sums)
         agreement = Agreement(gamma, state.is_best(merit))
         rows = robots.hand_on(ask_all(robots, ConsensusRobot.extrapolate, agreement, Count.PIGGYBACKED))
         squares = np.sum(robots.ask(ConsensusRobot.agree, rows, Count.ALL_REDUCE), axis=0)  # (b), (c)
-        return replace(state.after(merit, squares, state.size), k=state.k + 1, sums=anderson)
+        return state.after(merit, squares, state.size, anderson)
 
     def _with_penalty_due(self, robots: Robots, state: ConsensusState) -> ConsensusState:
         """State with the penalty that the rule, or the safeguard, wants from now on; mostly the state itself."""
@@ -136,7 +126,7 @@ class Consensus:
             adapted = self._adapted(robots, state)
             if due is Due.REFRESH or fell_most(state.separators.translation, adapted.separators.translation):
                 fresh = self.init(robots, adapted)
-                return replace(fresh, k=state.k, refreshes=state.refreshes + 1, raises=state.raises)
+                return fresh.in_place_of(state)
         if due is Due.RESCALE:
             return replace(self._rescaled(robots, state, factor, from_best=False), refreshes=state.refreshes + 1)
         return state
@@ -160,9 +150,7 @@ class Consensus:
             sent = ask_all(robots, ConsensusRobot.back_at_best, None, Count.PIGGYBACKED)
             orders = [replace(order, rows=rows) for rows in robots.hand_on(sent)]
         robots.ask(ConsensusRobot.rescale, orders, Count.PIGGYBACKED)
-        return replace(
-            state, ratio=factor * state.ratio, size=math.sqrt(factor) * state.size, sums=AndersonSums(), merits=()
-        )
+        return state.rescaled(factor)
 
 
 # In one place.

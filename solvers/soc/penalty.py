@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Self
@@ -15,6 +16,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, stack_transposes
 from pgo_models.problem.problem import PGOProblem
 from solvers.result import Measurement
+from solvers.soc.anderson import AndersonSums
 from solvers.soc.recursion_block import RecursionBlock, StepSettings, block_at, stationary_B
 from solvers.soc.separator_stiffness import is_second_look
 
@@ -255,10 +257,13 @@ class Due(enum.Enum):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Steps:
-    """What the steps so far say of the penalty: figures that the states of all couplings have.
+    """Iterate k, and what the steps so far say of the penalty: what the states of all couplings have.
 
     Attributes
     ----------
+    k : int
+    sums : AndersonSums
+        What all parties know of the acceleration.
     primal_residual, dual_residual : float
         ||x - z||_rho and ||c (z - z_before)||_rho, both over ||omega||_rho, with c = max(1, rho / diagonal of M): a
         penalty far above M makes short steps anywhere.
@@ -268,6 +273,8 @@ class Steps:
         How often the penalty rule, and the safeguard against divergence, changed rho.
     """
 
+    k: int = 0
+    sums: AndersonSums = field(default_factory=AndersonSums)
     primal_residual: float = np.inf
     dual_residual: float = np.inf
     merits: tuple[float, ...] = ()
@@ -278,14 +285,44 @@ class Steps:
         """Whether no merit has been smaller since rho last changed."""
         return merit <= min(self.merits, default=np.inf)
 
-    def after(self, merit: float, squares: Array, size: float) -> Self:
-        """Figures after a step with this merit, squared residuals (2,) and ||omega||_rho."""
-        primal, dual = np.sqrt(squares) / size
-        return replace(self, primal_residual=float(primal), dual_residual=float(dual), merits=(*self.merits, merit))
+    def after(self, merit: float, squares: Array, size: float, sums: AndersonSums) -> Self:
+        """State after a step with this merit, squared residuals (2,) and ||omega||_rho."""
+        primal, dual = (np.sqrt(squares) / size).tolist()
+        merits = (*self.merits, merit)
+        return replace(self, k=self.k + 1, sums=sums, primal_residual=primal, dual_residual=dual, merits=merits)
+
+    def broken(self) -> Self:
+        """State after a step that is not finite."""
+        return replace(self, k=self.k + 1, primal_residual=np.nan, dual_residual=np.nan)
+
+    def in_place_of(self, before: Self) -> Self:
+        """State that follows `before` without a step: its penalties are taken anew."""
+        return replace(self, k=before.k, refreshes=before.refreshes + 1, raises=before.raises)
 
     def measurement(self, objective: float) -> Measurement:
         """F and the residuals."""
         return Measurement(objective, self.primal_residual, self.dual_residual)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SharedSteps(Steps):
+    """What is known of all robots' rows, which are theirs.
+
+    Attributes
+    ----------
+    ratio : (n,)
+        rho_i / m_i of all poses, in no order.
+    size : float
+        ||omega||_rho.
+    """
+
+    ratio: Array
+    size: float
+
+    def rescaled(self, factor: float) -> Self:
+        """State after all have multiplied rho, and forgotten what was accelerated."""
+        ratio, size = factor * self.ratio, math.sqrt(factor) * self.size
+        return replace(self, ratio=ratio, size=size, sums=AndersonSums(), merits=())
 
 
 def next_penalty(rule: PenaltyRule, ratio: Array, steps: Steps) -> tuple[Due, float]:

@@ -11,7 +11,7 @@ Ebrahimi & Deghat, Algorithm 1 (`algo1: SOC`); Lai & Osher 2014.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -36,21 +36,14 @@ class SOCState(Steps):
 
     Attributes
     ----------
-    k : int
     block : RecursionBlock
         Rows of every R_i^T: x, z, s, B.
-    rho : (n,)
-        Penalty of every rotation.
     r_step : RotationStep
         Back end of step (a), prepared for the present rho.
-    sums : AndersonSums
     """
 
-    k: int
     block: RecursionBlock
-    rho: Array
     r_step: RotationStep
-    sums: AndersonSums = field(default_factory=AndersonSums)
 
     @property
     def steps(self) -> SOCState:
@@ -61,6 +54,11 @@ class SOCState(Steps):
     def omega(self) -> Array:
         """Rotations, (n, d, d)."""
         return unstack_transposes(self.block.z)
+
+    @property
+    def rho(self) -> Array:
+        """Penalty of every rotation, (n,)."""
+        return self.block.penalty[:: self.block.z.shape[1]]
 
     @property
     def x(self) -> Array:
@@ -92,18 +90,18 @@ class Joint:
         block, sums = state.block.after_solve(state.r_step.solve(V)[n:])  # (a)
         merit = math.sqrt(sums[0])
         if not math.isfinite(merit):
-            return replace(state, k=state.k + 1, block=block, primal_residual=np.nan, dual_residual=np.nan)
+            return replace(state.broken(), block=block)
         gamma, anderson = state.sums.coefficients(self.soc.acceleration, sums)
         block, squares = block.extrapolated(Agreement(gamma, state.is_best(merit))).projected()  # (b), (c)
         size = math.sqrt(block.penalty.sum())
-        return replace(state.after(merit, squares, size), k=state.k + 1, block=block, sums=anderson)
+        return replace(state.after(merit, squares, size, anderson), block=block)
 
     def _penalized(self, problem: PGOProblem, poses: Poses, is_stationary: bool) -> SOCState:
         """State 0 at poses, B zero or stationary."""
         Lambda = multipliers(problem, poses)
         order = self.soc.penalty_order(multiplier_norms(Lambda) / rotation_scale(problem), is_stationary)
         block = order.block(poses.R, Lambda, problem.M.data[problem.diagonal_positions[problem.num_poses :]])
-        return SOCState(0, block, block.penalty[:: problem.d], self._prepared(problem, block))
+        return SOCState(block, self._prepared(problem, block))
 
     def _with_penalty_due(self, problem: PGOProblem, state: SOCState) -> SOCState:
         """State with the penalty that the rule, or the safeguard, wants from now on; mostly the state itself."""
@@ -113,7 +111,7 @@ class Joint:
             return replace(self._rescaled(problem, back, factor), raises=state.raises + 1)
         if due is Due.REFRESH:
             fresh = self._penalized(problem, problem.with_best_translations(state.omega), is_stationary=True)
-            return replace(fresh, k=state.k, refreshes=state.refreshes + 1, raises=state.raises)
+            return fresh.in_place_of(state)
         if due is Due.RESCALE:
             return replace(self._rescaled(problem, state, factor), refreshes=state.refreshes + 1)
         return state
@@ -121,8 +119,7 @@ class Joint:
     def _rescaled(self, problem: PGOProblem, state: SOCState, factor: float) -> SOCState:
         """State with factor * rho and the same unscaled multiplier rho B."""
         block = state.block.rescaled(factor * state.block.penalty)
-        r_step = self._prepared(problem, block)
-        return replace(state, block=block, rho=factor * state.rho, r_step=r_step, sums=AndersonSums(), merits=())
+        return replace(state, block=block, r_step=self._prepared(problem, block), sums=AndersonSums(), merits=())
 
     def _prepared(self, problem: PGOProblem, block: RecursionBlock) -> RotationStep:
         (A, w), n = problem.residual_matrix, problem.num_poses
