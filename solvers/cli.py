@@ -22,15 +22,14 @@ from rich.console import Console
 from rich.table import Table
 
 from pgo_models.certificates.certificate import DEFAULT_GAP, certify
-from pgo_models.errors import FileFormatError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.files import check_writable
-from pgo_models.geometry.poses import Poses, absolute_trajectory_error
+from pgo_models.geometry.poses import absolute_trajectory_error
 from pgo_models.graphs.datasets import known_datasets, load
-from pgo_models.graphs.g2o import MOST_SYMBOLS, read_g2o_poses, symbol_ids, write_g2o, write_g2o_folder
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.g2o import MOST_SYMBOLS, symbol_ids, write_g2o, write_g2o_folder
 from pgo_models.graphs.separators import report_partition
-from pgo_models.graphs.trajectories import read_kitti, read_times, read_tum, write_tum
-from pgo_models.problem.problem import PGOProblem
+from pgo_models.graphs.trajectories import write_tum
+from solvers.cli_inputs import estimated_poses, load_graph, pose_named, pose_problem, with_times
 from solvers.cli_options import (
     BackEndName,
     FirstStage,
@@ -46,14 +45,14 @@ from solvers.cli_options import (
     chosen_start,
 )
 from solvers.distributed.checkpoint import Checkpoint
-from solvers.explanations import explained_by_its_graph, warn_of_weights
+from solvers.explanations import explained_by_its_graph, hint_of_chi2, warn_of_weights
 from solvers.pipeline import HANDOVER, solve
 from solvers.reporting.graph_facts import describe_graph
 from solvers.reporting.report import check_report, write_report
 from solvers.reporting.versions import installed_versions
 from solvers.shell import DONE, Commands, run_command, save_then_show
 from solvers.soc.soc import SOC
-from solvers.solution import certificate_json, check_format, check_target, chi2_of_file, chi2_rows, write_json
+from solvers.solution import both_costs, certificate_json, check_format, check_target, other_cost, write_json
 from solvers.studies.commands import UnitWeightsOption, compare_command, figures_command, tables_command
 
 NOT_CONVERGED, NOT_CERTIFIED = 2, 3
@@ -83,6 +82,13 @@ SplitOption = Annotated[
     typer.Option(
         help="How poses go to robots: as the file names them if it does, else with few cut edges where METIS is there, "
         "else contiguous."
+    ),
+]
+InformationOption = Annotated[
+    bool,
+    typer.Option(
+        "--information",
+        help="The cost is chi2 of the file's information matrices, not F of two precisions an edge.",
     ),
 ]
 GapOption = Annotated[float, typer.Option(callback=_finite_gap, help="Relative gap to certify.")]
@@ -154,6 +160,7 @@ def solve_command(
     tolerance: Annotated[float | None, typer.Option(help="Residual at which Newton takes over from SOC.")] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for the iterations.")] = math.inf,
     unit_weights: UnitWeightsOption = False,
+    information: InformationOption = False,
     anchor: Annotated[
         int | None,
         typer.Option(
@@ -171,12 +178,12 @@ def solve_command(
     ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print a line an iteration.")] = False,
 ) -> None:
-    """Solve a pose graph: poses, their cost F, a proven lower bound on the global optimum, and the gap."""
+    """Solve a pose graph: poses, their cost, a proven lower bound on the global optimum, and the gap."""
     for path in out or []:
         check_format(path)  # before a long solve, not after it
     if report is not None:
         check_report(report)
-    problem = PGOProblem(_timed(_load(graph, unit_weights), times))
+    problem = pose_problem(with_times(load_graph(graph, unit_weights), times), unit_weights, information)
     for path in out or []:
         check_target(path, problem.graph.num_robots)
     for other in (report, resume):
@@ -204,7 +211,7 @@ def solve_command(
         robots=shared if on_robots else None,
         engine=runs_on if on_robots else None,
         checkpoint=Checkpoint(resume) if resume is not None else None,
-        anchor=_pose_named(problem.graph, anchor) if anchor is not None else None,
+        anchor=pose_named(problem.graph, anchor) if anchor is not None else None,
         time_limit=time_limit,
         verbose=verbose,
         progress=sys.stderr.isatty(),
@@ -216,7 +223,7 @@ def solve_command(
     if report is not None:
         source = shlex.join([graph, *(["--unit-weights"] if unit_weights else [])])
         targets.append((report, partial(write_report, solution, source=source)))
-    save_then_show(targets, lambda: typer.echo(text))
+    save_then_show(targets, lambda: typer.echo("\n\n".join([text, *hint_of_chi2(problem, solution.poses)])))
     warn_of_weights(graph, problem, solution.certificate)
     if not solution.status.is_success:
         raise typer.Exit(NOT_CONVERGED)
@@ -236,26 +243,27 @@ def certify_command(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the certificate as .json.")] = None,
     gap: GapOption = DEFAULT_GAP,
     unit_weights: UnitWeightsOption = False,
+    information: InformationOption = False,
 ) -> None:
     """Judge anybody's poses: how far their cost can be above the global optimum."""
     if out is not None:
         if out.suffix.lower() != ".json":
             raise SettingError(f"cannot write {out}: a certificate is written as .json")
         check_writable(out)
-    problem = PGOProblem(_load(graph, unit_weights))
-    poses = _estimate(problem.graph, estimate)
-    certificate, found = certify(problem, poses, gap), chi2_of_file(problem.graph, poses)
+    problem = pose_problem(load_graph(graph, unit_weights), unit_weights, information)
+    poses = estimated_poses(problem.graph, estimate)
+    certificate = certify(problem, poses, gap)
     record = {
         "objective": certificate.objective,
-        "chi2": found,
+        **both_costs(problem, poses),
         **certificate_json(certificate),
         "source": certificate.source.name,
         "best_known_objective": certificate.poses_objective,
         "versions": installed_versions(problem.backend),
     }
     targets = [(out, partial(write_json, record))] if out is not None else []
-    rows = [f"{label:<12} {text}" for label, text in chi2_rows(found, certificate.objective)]
-    save_then_show(targets, lambda: typer.echo("\n".join([str(certificate), *rows])))
+    rows = [f"{label:<12} {text}" for label, text in other_cost(problem, poses)]
+    save_then_show(targets, lambda: typer.echo("\n".join([str(certificate), *rows, *hint_of_chi2(problem, poses)])))
     warn_of_weights(graph, problem, certificate)
     raise typer.Exit(DONE if certificate.is_certified else NOT_CERTIFIED)
 
@@ -342,46 +350,3 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _say(message: Warning | str, *_: object, **__: object) -> None:
     print(f"pgo: warning: {message}", file=sys.stderr)
-
-
-def _load(graph: str, unit_weights: bool) -> PoseGraph:
-    loaded = load(graph)
-    return loaded.unit_weights() if unit_weights else loaded
-
-
-def _timed(graph: PoseGraph, path: Path | None) -> PoseGraph:
-    if path is None:
-        return graph
-    times = read_times(path)
-    if len(times) != graph.num_poses:
-        raise FileFormatError(
-            path, None, f"{len(times)} times, {graph.name} has {graph.num_poses} poses; give one each"
-        )
-    return replace(graph, times=times)
-
-
-def _pose_named(graph: PoseGraph, name: int) -> int:
-    found = np.flatnonzero(graph.pose_ids == name)
-    if not len(found):
-        ids = graph.pose_ids
-        raise SettingError(f"{graph.name} has no pose {name} to anchor; its ids are from {ids.min()} to {ids.max()}")
-    return int(found[0])
-
-
-def _estimate(graph: PoseGraph, path: Path | None) -> Poses:
-    if path is None:
-        if graph.initial is None:
-            raise SettingError(f"{graph.name} has no VERTEX line for every pose; give --estimate FILE")
-        return graph.initial
-    suffix = path.suffix.lower()
-    if suffix == ".g2o":
-        return read_g2o_poses(path, graph)
-    if suffix in (".tum", ".txt"):
-        found = read_tum(path, graph.d)
-    elif suffix == ".kitti":
-        found = read_kitti(path, graph.d)
-    else:
-        raise SettingError(f"cannot read {path}: no format has suffix {suffix!r}; use .g2o, .tum or .kitti")
-    if found.num_poses != graph.num_poses:
-        raise FileFormatError(path, None, f"{found.num_poses} poses, {graph.name} has {graph.num_poses}; give one each")
-    return found

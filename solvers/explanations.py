@@ -10,14 +10,18 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 
 from pgo_models.certificates.certificate import Certificate
+from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import GraphWarning, NotPositiveDefiniteError, PGOError
+from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.datasets import load, locate
 from pgo_models.graphs.g2o import edge_place
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 
+WORTH_SAYING = 1.01  # times its minimum: what chi2 has to be for a hint
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -46,6 +50,21 @@ def warn_of_weights(graph: str, problem: PGOProblem, certificate: Certificate) -
     heaviest = max(float(ratio.max()) for ratio in _ratios(problem.graph).values())
     if not certificate.is_certified and heaviest * UNIT_ROUNDOFF > certificate.wanted_gap:
         warnings.warn(extreme_weight(graph), GraphWarning, stacklevel=2)
+
+
+def hint_of_chi2(problem: PGOProblem, poses: Poses) -> list[str]:
+    """A line that names `--information` where F was asked for, and chi2 can be lowered by more than it is worth.
+
+    Two Newton steps give a bound from above on its minimum.
+    """
+    graph = problem.graph
+    if problem.weighting is not Weighting.ISOTROPIC or graph.information is None:
+        return []
+    whole = PGOProblem(graph, problem.backend, Weighting.INFORMATION)
+    here, below = whole.objective(poses), whole.objective(polish(whole, poses, max_steps=2))
+    if not here > WORTH_SAYING * below:
+        return []
+    return [f"the file's own cost: chi2 {here:.4g} here; its minimum is at most {below:.4g}: --information"]
 
 
 def _ratios(graph: PoseGraph) -> dict[str, Array]:

@@ -12,7 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, Certificate, certify_at, certify_with, judge
+from pgo_models.certificates.certificate import (
+    DEFAULT_GAP,
+    BoundSource,
+    Certificate,
+    certify_at,
+    certify_with,
+    judge,
+    soften,
+)
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import whole_number
@@ -215,7 +223,9 @@ def solve(
         ledger = driver.network.ledger
     if pipeline.staircase is not None and certificate.can_improve and job.stages[-1].status not in OUT_OF_TIME:
         try:
-            poses, certificate = job.climb(pipeline.staircase, poses, certificate)
+            if problem.is_quadratic:
+                poses, certificate = job.climb(pipeline.staircase, poses, certificate)
+            certificate = soften(problem, certificate)
         except KeyboardInterrupt:
             job.interrupt(problem.objective(poses))
     poses, frame = framed(poses, problem.graph, anchor)
@@ -294,17 +304,20 @@ class _Job:
         return poses, certificate
 
     def attempt(self, soc: SOC | PaperSOC | None, start: Poses | None) -> tuple[Poses, Certificate]:
-        """SOC, Newton and certificate from a start."""
-        began = time.perf_counter()
-        poses, name = (start, "given start") if start is not None else _own_start(self.problem, soc)
+        """SOC, Newton and certificate from a start; the first on the convex part of chi2 where that is not convex."""
+        began, first_problem = time.perf_counter(), self.problem.convex_part
+        poses, name = (start, "given start") if start is not None else _own_start(first_problem, soc)
         seconds = time.perf_counter() - began
         self.stages.append(Stage(name, Status.CONVERGED, 0, self.problem.objective(poses), seconds, History()))
         self.watch.found.append(poses)
         if soc is not None:
-            first: Run[Any] = self.watch.run(soc, self.problem, poses)
-            self.stages.append(Stage.of(first))
+            first: Run[Any] = self.watch.run(soc, first_problem, poses)
             # A start that is better than SOC's best iterate is kept: CSAIL's chordal start is within 1e-4.
-            poses = first.poses if first.objective <= self.problem.objective(poses) else poses
+            poses = first.poses if first.objective <= first_problem.objective(poses) else poses
+            stage = Stage.of(first)
+            if first_problem is not self.problem:
+                stage = replace(stage, name=f"{stage.name}, convex", objective=self.problem.objective(poses))
+            self.stages.append(stage)
             del first  # its factor is the next one's to take over
         return self.polish(poses)
 

@@ -13,13 +13,14 @@ from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.files import check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.g2o import check_g2o_folder, write_g2o, write_g2o_folder
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import chi2
 from pgo_models.graphs.trajectories import write_kitti, write_tum
 from pgo_models.html_tables import facts_table, rows_table
 from pgo_models.plots.graph_plots import compare_poses
 from pgo_models.plots.style import is_picture, save_figure
 from pgo_models.problem.initialization import spanning_tree_start
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.reporting.report import Solved, write_report
 from solvers.reporting.result_table import finite_or_none
 from solvers.reporting.versions import installed_versions
@@ -27,7 +28,8 @@ from solvers.reporting.versions import installed_versions
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_STAGE_HEADS = ("stage", "iterations", "F", "seconds", "ended")
+
+INFORMATION = "the file's information matrices"
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +42,7 @@ class Solution(Solved):
     poses : Poses
         In the frame that `frame` names.
     objective : float
-        F of the poses.
+        Cost of the poses: F, or chi2 with `Weighting.INFORMATION`.
     certificate : Certificate
         Lower bound on the global optimum, gap and verdict.
     status : Status
@@ -70,7 +72,7 @@ class Solution(Solved):
 
     @property
     def lower_bound(self) -> float:
-        """Proven lower bound on F over all poses."""
+        """Proven lower bound on the cost of all poses."""
         return self.certificate.lower_bound
 
     @property
@@ -85,17 +87,22 @@ class Solution(Solved):
 
     def __repr__(self) -> str:
         return (
-            f"Solution({self.problem.graph.name!r}, F={self.objective:.10g}, gap={self.gap:.3g}, {self._verdict.name})"
+            f"Solution({self.problem.graph.name!r}, {self.certificate.cost}={self.objective:.10g}, gap={self.gap:.3g}, "
+            f"{self._verdict.name})"
         )
 
     def __str__(self) -> str:
         rows = [f"{label:<12} {text}" for label, text in self._summary()]
-        lines = [_STAGE_HEADS, *self._stage_rows()]
+        lines = [self._stage_heads, *self._stage_rows()]
         rows += ["", *(f"{name:<14} {k:>10} {F:>16} {seconds:>9}  {ended}" for name, k, F, seconds, ended in lines)]
         return "\n".join(rows)
 
     def _repr_html_(self) -> str:
-        return facts_table(self._summary()) + rows_table(_STAGE_HEADS, self._stage_rows())
+        return facts_table(self._summary()) + rows_table(self._stage_heads, self._stage_rows())
+
+    @property
+    def _stage_heads(self) -> tuple[str, str, str, str, str]:
+        return "stage", "iterations", self.certificate.cost, "seconds", "ended"
 
     def _stage_rows(self) -> list[tuple[str, str, str, str, str]]:
         return [
@@ -158,9 +165,10 @@ class Solution(Solved):
         before, name = graph.initial, "estimate that came with the graph"
         if before is None:
             before, name = spanning_tree_start(graph), "spanning tree"
-        solved = f"{self._verdict.name.lower().replace('_', ' ')}: F = {self.objective:.6g}, gap {self.gap:.1e}"
+        verdict, cost = self._verdict.name.lower().replace("_", " "), self.certificate.cost
+        solved = f"{verdict}: {cost} = {self.objective:.6g}, gap {self.gap:.1e}"
         return compare_poses(
-            graph, [(f"{name}: F = {self.problem.objective(before):.4g}", before), (solved, self.poses)]
+            graph, [(f"{name}: {cost} = {self.problem.objective(before):.4g}", before), (solved, self.poses)]
         )
 
     def as_json(self) -> dict[str, object]:
@@ -169,7 +177,7 @@ class Solution(Solved):
         return {
             "graph": {"name": graph.name, "d": graph.d, "poses": graph.num_poses, "edges": graph.num_edges},
             "objective": self.objective,
-            "chi2": chi2_of_file(graph, self.poses),
+            **both_costs(self.problem, self.poses),
             **certificate_json(certificate),
             "note": self.note,
             "frame": self.frame,
@@ -216,11 +224,11 @@ class Solution(Solved):
         return [
             ("graph", f"{graph.name}: {graph.num_poses} poses, {graph.num_edges} edges, {graph.d}D"),
             ("status", f"{self.status.name}: {self.status.value}"),
-            ("F", f"{self.objective:.10g}"),
+            (certificate.cost, f"{self.objective:.10g}"),
             ("lower bound", f"{certificate.lower_bound:.10g}{relaxed}"),
             ("gap", gap_text(certificate.gap)),
             ("verdict", f"{certificate.verdict.name}: {certificate.verdict.value}"),
-            *chi2_rows(chi2_of_file(graph, self.poses), self.objective),
+            *other_cost(self.problem, self.poses),
             *([("note", self.note)] if self.note else []),
             *([("frame", self.frame)] if self.frame else []),
             ("seconds", f"{self.seconds:.3g}"),
@@ -240,16 +248,25 @@ class Solution(Solved):
         ]
 
 
-def chi2_of_file(graph: PoseGraph, poses: Poses) -> float | None:
-    """chi2, chordal, with the information matrices that came with the graph; None where none did."""
-    return None if graph.information is None else chi2(graph, poses)
+def both_costs(problem: PGOProblem, poses: Poses) -> dict[str, float | str | None]:
+    """What `.json` files hold of the costs of poses: F, chi2 (chordal; None without a file's matrices), which is it."""
+    graph = problem.graph
+    isotropic = problem if problem.weighting is Weighting.ISOTROPIC else PGOProblem(graph, problem.backend)
+    return {
+        "weighting": problem.weighting.name if isinstance(problem.weighting, Weighting) else "GIVEN",
+        "F": isotropic.objective(poses),
+        "chi2": None if graph.information is None else chi2(graph, poses),
+    }
 
 
-def chi2_rows(found: float | None, objective: float) -> list[tuple[str, str]]:
-    """What a summary says of `chi2_of_file`, where it is not F, which is certified."""
-    if found is None or abs(found - objective) <= 1e-9 * objective:
+def other_cost(problem: PGOProblem, poses: Poses) -> list[tuple[str, str]]:
+    """What a summary says of the cost that is not bounded, where it is another."""
+    costs, objective = both_costs(problem, poses), problem.objective(poses)
+    name, what = ("F", "two precisions an edge") if costs["weighting"] == "INFORMATION" else ("chi2", INFORMATION)
+    found = costs[name]
+    if not isinstance(found, float) or abs(found - objective) <= 1e-9 * objective:
         return []
-    return [("chi2", f"{found:.10g} with the file's information matrices; the bound is on F alone")]
+    return [(name, f"{found:.10g} with {what}; the bound is on {'chi2' if name == 'F' else 'F'} alone")]
 
 
 def check_format(path: Path) -> None:

@@ -53,6 +53,21 @@ def varied_graph(seed: int, n: int, d: int, noise: NoiseModel = MILD_NOISE, weig
     )
 
 
+def informed(
+    seed: int, n: int, d: int, coupled: bool, spread: float = 1.0, noise: NoiseModel = MILD_NOISE
+) -> PoseGraph:
+    """A graph with random information matrices, of conditions up to about exp(4 spread)."""
+    graph, rng = varied_graph(seed, n, d, noise), np.random.default_rng(seed)
+    k = d + tangent_dimension(d)
+    axes = np.linalg.qr(rng.standard_normal((graph.num_edges, k, k)))[0]
+    values = np.exp(spread * rng.uniform(-2.0, 2.0, (graph.num_edges, 1, k)))
+    information = (axes * values) @ np.swapaxes(axes, 1, 2)
+    information = 0.5 * (information + np.swapaxes(information, 1, 2))
+    if not coupled:
+        information[:, :d, d:] = information[:, d:, :d] = 0.0
+    return replace(graph, information=information)
+
+
 def varied_problem(seed: int, n: int, d: int, noise: NoiseModel = MILD_NOISE) -> PGOProblem:
     """Problem of `varied_graph`."""
     return PGOProblem(varied_graph(seed, n, d, noise))

@@ -40,6 +40,7 @@ ORDER = {
         "shell",
         "explanations",
         "studies",
+        "cli_inputs",
         "cli_options",
         "cli",
     ),

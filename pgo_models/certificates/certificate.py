@@ -14,6 +14,7 @@ from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, best_bound
 from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, polish, relative_decrement
 from pgo_models.certificates.rounding_errors import ObjectiveRounding, objective_rounding
+from pgo_models.certificates.tangent import softened_bound
 from pgo_models.errors import ProofError, SettingError
 from pgo_models.geometry.arrays import ReadOnly, real_array
 from pgo_models.geometry.poses import Poses
@@ -22,6 +23,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.html_tables import facts_table
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem, as_problem
+from pgo_models.problem.weighting import Weighting
 
 DEFAULT_GAP = 1e-6
 
@@ -44,6 +46,7 @@ class BoundSource(enum.Enum):
     RELAXATION = (
         "where the staircase solved the semidefinite relaxation, whose optimum is below F of all poses if not tight"
     )
+    SOFTENED = "where smaller information matrices, whose cost is below chi2 at all poses, have their minimum"
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +75,8 @@ class Certificate(ReadOnly):
         Multipliers, which with eta and the poses are the proof: anyone can check it with `prove_bound`.
     wanted_gap : float
     verdict : Verdict
+    weighting : Weighting
+        Which cost `objective` and the bound are of: F, or chi2.
 
     Examples
     --------
@@ -96,6 +101,7 @@ class Certificate(ReadOnly):
     Lambda: Array
     wanted_gap: float
     verdict: Verdict
+    weighting: Weighting = Weighting.ISOTROPIC
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "Lambda", real_array(self.Lambda, "Lambda", SettingError))
@@ -131,7 +137,7 @@ class Certificate(ReadOnly):
         return self.verdict in (Verdict.CERTIFIED, Verdict.EXACT)
 
     def __repr__(self) -> str:
-        return f"Certificate(F={self.objective:.10g}, gap={self.gap:.3g}, {self.verdict.name})"
+        return f"Certificate({self.cost}={self.objective:.10g}, gap={self.gap:.3g}, {self.verdict.name})"
 
     def __str__(self) -> str:
         return "\n".join(f"{label:<12} {text}" for label, text in self._facts())
@@ -143,23 +149,29 @@ class Certificate(ReadOnly):
         measured = not math.isnan(self.stationarity)
         stationary = f"   (stationary to {self.stationarity:.2g})" if measured else ""
         facts = [
-            ("F", f"{self.objective:.10g}{stationary}"),
+            (self.cost, f"{self.objective:.10g}{stationary}"),
             ("lower bound", f"{self.lower_bound:.10g}   ({self.proof}; {self.source.value})"),
             ("gap", f"{gap_text(self.gap)}   (asked for: {self.wanted_gap:.3g})"),
             ("verdict", f"{self.verdict.name}: {self.verdict.value}"),
         ]
         if self.source is not BoundSource.GIVEN:
-            facts.insert(1, ("best known F", f"{self.poses_objective:.10g}"))
+            facts.insert(1, (f"best known {self.cost}", f"{self.poses_objective:.10g}"))
         return facts
+
+    @property
+    def cost(self) -> str:
+        """Name of the cost, as it is printed."""
+        return "chi2" if self.weighting is Weighting.INFORMATION else "F"
 
     @property
     def proof(self) -> str:
         """How the bound was proved, in a few words."""
         if math.isnan(self.eta):
-            return "F is a sum of squares"
+            return f"{self.cost} is never negative"
         form = "grounded at a pose" if self.bound.is_grounded else "with a shift"
         shift = f", eta = {self.eta:.3g}" if self.eta > 0 else ""
-        return f"proved {form}{shift}, less {self.bound.rounding:.2g} for rounding"
+        cap = f", conditions cut to {self.bound.cap:.3g}" if self.bound.cap < math.inf else ""
+        return f"proved {form}{shift}{cap}, less {self.bound.rounding:.2g} for rounding"
 
 
 def proven_digits(gap: float) -> int:
@@ -212,16 +224,18 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     """
     problem = as_problem(problem)
     stationarity = relative_decrement(problem, poses)
-    if stationarity <= STATIONARY_DECREMENT:
+    if stationarity <= STATIONARY_DECREMENT and problem.is_quadratic:
         certificate = certify_at(problem, poses, gap, stationarity)
     else:
         polished = certify_at(problem, polish(problem, poses), gap, stationarity)
         certificate = judge(problem, poses, replace(polished, source=BoundSource.POLISHED))
     if not _bound_is_tight(certificate):
-        other = certify_at(problem, polish(problem, chordal_start(problem)), gap, stationarity)
+        start = polish(problem.convex_part, chordal_start(problem.convex_part))
+        other = certify_at(problem, polish(problem, start), gap, stationarity)
         # Of equal bounds, as two zeros, the one with the better poses.
         if (other.lower_bound, -other.poses_objective) > (certificate.lower_bound, -certificate.poses_objective):
             certificate = judge(problem, poses, replace(other, source=BoundSource.CHORDAL))
+        certificate = soften(problem, certificate)
     return certificate
 
 
@@ -254,8 +268,19 @@ def certify_at(
     >>> bool(0.9 * certificate.objective < certificate.lower_bound <= certificate.objective)
     True
     """
-    best = problem.with_best_translations(poses.R)
+    best = problem.at_best_translations(poses)
     return certify_with(problem, poses, multipliers(problem, best), gap, stationarity, BoundSource.GIVEN, ground=best)
+
+
+def soften(problem: PGOProblem, certificate: Certificate) -> Certificate:
+    """The certificate, or where it grants but a loose bound on chi2 the better one of `softened_bound`."""
+    if problem.weighting is not Weighting.INFORMATION or _bound_is_tight(certificate):
+        return certificate
+    bound, _, Lambda = softened_bound(problem, certificate.poses)
+    if bound.value <= certificate.lower_bound:
+        return certificate
+    softer = replace(certificate, bound=bound, Lambda=Lambda, source=BoundSource.SOFTENED)
+    return _judged(problem, softer, certificate.objective, objective_rounding(problem, certificate.poses))
 
 
 def certify_with(
@@ -287,8 +312,9 @@ def certify_with(
     objective, rounding = problem.objective(poses), objective_rounding(problem, poses)
     if bound is None:
         is_exact = objective <= rounding.level
-        ground = ground if ground is not None else problem.with_best_translations(poses.R)
-        bound = NO_BOUND if is_exact else best_bound(problem, Lambda, ground, gap, objective)
+        ground = ground if ground is not None else problem.at_best_translations(poses)
+        tangent = problem.tangent_at(ground)
+        bound = NO_BOUND if is_exact else best_bound(tangent, Lambda, ground, gap, objective)
     unjudged = Certificate(
         objective=objective,
         bound=bound,
@@ -301,6 +327,7 @@ def certify_with(
         Lambda=Lambda,
         wanted_gap=gap,
         verdict=Verdict.TRIVIAL,
+        weighting=problem.weighting if isinstance(problem.weighting, Weighting) else Weighting.ISOTROPIC,
     )
     return _judged(problem, unjudged, objective, rounding)
 

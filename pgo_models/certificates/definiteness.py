@@ -19,7 +19,7 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import LinearOperator, cg
 
 from pgo_models.certificates.dual_variables import certificate_matrix
-from pgo_models.certificates.rounding_errors import matrix_error
+from pgo_models.certificates.rounding_errors import matrix_errors
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
@@ -144,7 +144,7 @@ def prove_definite(
     free = diagonal.copy()
     free[fixed] = 0.0
     expected, crude = problem.analysis.expected_error(), problem.analysis.crude_error()
-    entries = np.full(problem.side, matrix_error(problem.graph))
+    entries = matrix_errors(problem, diagonal)
     if expected is None and turned is not None and crude < np.inf:
         enough = np.maximum(first_shift, MARGIN * (entries + crude))
         if enough.max() <= SHRINK * _softest(stored, free, turned):

@@ -14,7 +14,7 @@ from pgo_models.problem.problem import PGOProblem
 def multipliers(problem: PGOProblem, poses: Poses) -> Array:
     """Lambda_i = sym((M X)_i R_i), (n, d, d): the multipliers of R_i R_i^T = I at poses.
 
-    At a stationary point (M X)_i = Lambda_i R_i^T exactly, and tr(Lambda) = F.
+    At a stationary point (M X)_i = Lambda_i R_i^T exactly, and tr(Lambda) = F. M is that of the tangent for chi2.
 
     Examples
     --------
@@ -25,7 +25,7 @@ def multipliers(problem: PGOProblem, poses: Poses) -> Array:
     (27, 3, 3)
     """
     n, d = problem.num_poses, problem.d
-    product = problem.apply_M(problem.stacked(poses))[n:].reshape(n, d, d) @ poses.R
+    product = problem.tangent_at(poses).apply_M(problem.stacked(poses))[n:].reshape(n, d, d) @ poses.R
     return 0.5 * (product + np.swapaxes(product, 1, 2))
 
 

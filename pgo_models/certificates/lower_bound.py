@@ -14,6 +14,9 @@ slack with S_r >= diag(slack) proved by one factorisation (`prove_definite`). X'
 without the rotation of pose r the matrix could be definite only by a shift. (Kin: Carlone, Calafiore, Tommolillo &
 Dellaert 2016, on when the dual is tight.)
 
+**chi2.** What is bounded here is a quadratic cost tr(X^T M X) + constant; that of a tangent (`PGOProblem.tangent_at`)
+is at most chi2 at all poses, and so is its bound. At the minimum of chi2 both have one value and one gradient.
+
 **With a shift.** Where S_r is not positive definite, S_r + eta blockdiag(0, I) may be; the bound then loses
 eta sum_i ||X_i - X'_i Q||_F^2 <= eta sum_i (sqrt(8) + ||X'_i - R_i^T||)^2, as rotations are at most sqrt(8) apart. Or,
 asking nothing of poses: if S + eta blockdiag(0, I) is positive definite without the row of one translation,
@@ -58,12 +61,15 @@ class LowerBound:
         Whether the proof leaves out one whole pose; else it is one with eta alone.
     rounding : float
         Sum of all that was subtracted because of rounding.
+    cap : float
+        Condition that the information matrices were cut down to for it (`pgo_models.certificates.tangent`).
     """
 
     value: float
     eta: float
     is_grounded: bool
     rounding: float
+    cap: float = math.inf
 
 
 NO_BOUND = LowerBound(0.0, math.nan, False, 0.0)
@@ -110,9 +116,17 @@ def prove_bound(problem: PGOProblem, Lambda: Array, eta: float = 0.0, poses: Pos
     >>> bool(prove_bound(problem, Lambda, eta=1e-6) < bound), prove_bound(problem, Lambda, eta=0.0)
     (True, None)
     """
-    point = _grounded_at(problem, problem.with_best_translations(poses.R)) if poses is not None else None
+    if poses is not None:
+        poses = problem.at_best_translations(poses)
+        problem = problem.tangent_at(poses)
+    point = _grounded_at(problem, poses) if poses is not None else None
     found = _prove(problem, _symmetric(problem, Lambda), eta, point)
     return found.value if found is not None else None
+
+
+def prove_at(problem: PGOProblem, Lambda: Array, poses: Poses) -> LowerBound | None:
+    """Bound grounded at poses without a shift, or None."""
+    return _prove(problem, _symmetric(problem, Lambda), 0.0, _grounded_at(problem, poses))
 
 
 def best_bound(problem: PGOProblem, Lambda: Array, poses: Poses | None, gap: float, objective: float) -> LowerBound:
@@ -211,7 +225,7 @@ def pose_rows(pose: int, n: int, d: int) -> IntArray:
 def _prove(problem: PGOProblem, Lambda: Array, eta: float, ground: _Ground | None) -> LowerBound | None:
     if not 0.0 <= eta < math.inf:
         raise SettingError(f"eta is {eta}; a shift must not be negative, and finite")
-    if not (np.isfinite(Lambda).all() and has_safe_scale(problem.graph)):
+    if not (np.isfinite(Lambda).all() and has_safe_scale(problem)):
         return None
     return _prove_with_eta(problem, Lambda, eta) if ground is None else _prove_grounded(problem, Lambda, eta, ground)
 
@@ -225,7 +239,8 @@ def _prove_with_eta(problem: PGOProblem, Lambda: Array, eta: float) -> LowerBoun
         return None
     trace, lost = _trace(Lambda), eta * problem.num_poses * problem.d
     rounding = OUTWARD * 4.0 * UNIT_ROUNDOFF * (abs(trace) + lost)
-    return bound_from([trace, -lost], rounding, eta, is_grounded=False)
+    constant, constant_error = problem.weights.constant
+    return bound_from([trace, constant, -lost], rounding + constant_error, eta, is_grounded=False)
 
 
 def _prove_grounded(problem: PGOProblem, Lambda: Array, eta: float, ground: _Ground) -> LowerBound | None:

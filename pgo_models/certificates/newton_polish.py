@@ -26,8 +26,10 @@ from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
 
 STATIONARY_DECREMENT = 1e-13
+STATIONARY_FOR_TANGENTS = 1e-19  # what is left of chi2 weighs more in the bound: its tangent is softer than chi2 itself
 SMALL_DECREMENT = 1e-9
 ROUNDING = 1e-14  # relative change of F that is not told apart from none
+NEARLY_STRAIGHT = 1e-9  # decrement below which the path of the best translations of chi2 is a line
 SUFFICIENT = 1e-4  # Armijo's constant
 HALVINGS = 40
 NEARLY_EXACT = 1e4  # times its rounding level: then F is what the solve for the translations leaves
@@ -51,6 +53,8 @@ class PolishState:
         Whether the last factored matrix was the Hessian, not its damped Gauss-Newton part.
     moved : bool
         Whether the last step changed the poses.
+    tolerance : float
+        On the decrement.
     is_at_rounding : bool
         Whether a Newton step, which squares a small decrement, hardly changed it: the gradient is rounding.
     analysis, factor
@@ -63,18 +67,20 @@ class PolishState:
     is_newton: bool = False
     moved: bool = True
     is_at_rounding: bool = False
+    tolerance: float = STATIONARY_DECREMENT
     analysis: SymbolicCholesky | None = None
     factor: CholeskyFactor | None = None
 
     @property
     def is_stationary(self) -> bool:
         """Whether nothing is left to gain above the rounding level."""
-        return self.decrement <= STATIONARY_DECREMENT or self.is_at_rounding
+        return self.decrement <= self.tolerance or self.is_at_rounding
 
 
 def start_polish(problem: PGOProblem, poses: Poses) -> PolishState:
     """State before the first step."""
-    return PolishState(poses=poses, objective=problem.objective(poses))
+    tolerance = STATIONARY_DECREMENT if problem.is_quadratic else STATIONARY_FOR_TANGENTS
+    return PolishState(poses=poses, objective=problem.objective(poses), tolerance=tolerance)
 
 
 def polish_step(
@@ -233,9 +239,11 @@ def _backtrack(
     for _ in range(HALVINGS):
         # The translations that are best for the turned rotations lie on the curved path that a straight move of both
         # leaves: on parking-garage this saves two thirds of the factorisations.
-        poses = problem.with_best_translations(move_poses(state.poses, length * w, length * v).R)
+        poses = move_poses(state.poses, length * w, length * v)
+        if problem.is_quadratic or state.decrement > NEARLY_STRAIGHT:
+            poses = problem.at_best_translations(poses)
         objective = problem.objective(poses)
-        if length == 1.0 and objective <= NEARLY_EXACT * level:
+        if problem.is_quadratic and length == 1.0 and objective <= NEARLY_EXACT * level:
             poses = problem.with_refined_translations(poses)
             objective = problem.objective(poses)
         if objective <= state.objective + SUFFICIENT * length * slope:

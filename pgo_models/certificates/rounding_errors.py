@@ -17,17 +17,26 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, orthogonality_error
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, gamma
+from pgo_models.problem.incidence import blocks_of_rows, rows_of_blocks
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Tangent
 
 _SUMMED = 80  # roundings of a weighted square and of numpy's sum in pairs: blocks of 128, then halves of 2^60 at most
 _SMALLEST, _LARGEST = 1e-100, 1e100  # of weights: products of four stay far from underflow and overflow
 
 
-def has_safe_scale(graph: PoseGraph) -> bool:
-    """Whether weights, and tau ||t_ij||^2, are between 1e-100 and 1e100, where no product underflows or overflows."""
-    longest = np.maximum(1.0, np.sum(graph.t_ij**2, axis=1))
-    smallest = min(graph.kappa.min(), graph.tau.min())
-    return bool(smallest >= _SMALLEST and max(graph.kappa.max(), (graph.tau * longest).max()) <= _LARGEST)
+def has_safe_scale(problem: PGOProblem) -> bool:
+    """Whether weights, and tau ||t_ij||^2, are between 1e-100 and 1e100, where no product underflows or overflows.
+
+    In size; a weight of zero does no harm.
+    """
+    weights = problem.weights
+    longest = np.maximum(1.0, np.sum(problem.graph.t_ij**2, axis=1))
+    used = [np.abs(weights.kappa).ravel(), weights.tau, weights.tau * longest]
+    if weights.tangent is not None:
+        used.append(np.abs(weights.tangent.C).max(axis=(1, 2)) * longest)
+    sizes = np.concatenate(used)
+    return bool(sizes[sizes > 0.0].min() >= _SMALLEST and sizes.max() <= _LARGEST)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,34 +73,70 @@ def evaluate_edges(problem: PGOProblem, X: Array, low: Array) -> Evaluation:
     low : (n, d)
         To be added to the translations of X, exactly.
     """
-    graph, n, d = problem.graph, problem.num_poses, problem.d
+    graph, n, d, weights = problem.graph, problem.num_poses, problem.d, problem.weights
     t, P = X[:n], X[n:].reshape(n, d, d)
     P_i, transposed = P[graph.i], np.swapaxes(graph.R_ij, 1, 2)
     high_difference, low_difference = t[graph.j] - t[graph.i], low[graph.j] - low[graph.i]
     difference = high_difference + low_difference
     moved, turned = graph.t_ij[:, None, :] @ P_i, transposed @ P_i
-    residuals = np.concatenate([difference - moved[:, 0], (P[graph.j] - turned).reshape(-1, d)])
+    rho = np.concatenate([difference[:, None] - moved, P[graph.j] - turned], axis=1)
     absolute = np.abs(P_i)
-    product_sizes = np.concatenate(
-        [(np.abs(graph.t_ij)[:, None, :] @ absolute)[:, 0], (np.abs(transposed) @ absolute).reshape(-1, d)]
-    )
-    errors = gamma(d) * product_sizes + UNIT_ROUNDOFF * np.abs(residuals)
-    errors[: graph.num_edges] += UNIT_ROUNDOFF * (np.abs(high_difference) + np.abs(low_difference) + np.abs(difference))
-    A, w = problem.residual_matrix
-    weighted = w[:, None] * residuals
-    costs = weighted * residuals
-    of_edges = np.concatenate(
-        [costs[: graph.num_edges].sum(axis=1), costs[graph.num_edges :].reshape(-1, d * d).sum(axis=1)]
-    )
-    value = math.fsum(of_edges)
-    value_error = 2.0 * float(np.sum(np.abs(weighted) * errors)) + gamma(d * d + 4) * value
-    most = int(np.bincount(A.indices, minlength=1).max()) + 2
-    sizes = w[:, None] * (errors + gamma(most) * np.abs(residuals))
+    product_sizes = np.concatenate([np.abs(graph.t_ij)[:, None, :] @ absolute, np.abs(transposed) @ absolute], axis=1)
+    errors = gamma(d) * product_sizes + UNIT_ROUNDOFF * np.abs(rho)
+    errors[:, 0] += UNIT_ROUNDOFF * (np.abs(high_difference) + np.abs(low_difference) + np.abs(difference))
+    G, sizes, off = weights.weigh(rho), weights.weigh(np.abs(rho), sizes=True), weights.weigh(errors, sizes=True)
+    of_edges = np.sum(G * rho, axis=(1, 2))
+    value_error = float(np.sum((2.0 * sizes + off) * errors))
+    value_error += gamma(d * d + d + 4) * float(np.sum(sizes * np.abs(rho)))
+    if weights.W_error is not None:
+        turning = np.linalg.norm(rho[:, 1:], axis=(1, 2))
+        value_error += OUTWARD * float(np.sum(weights.W_error * turning**2))
+        off[:, 1:] += OUTWARD * (weights.W_error * turning)[:, None, None]
+    A = problem.plain_residual_matrix
+    most = int(np.bincount(A.indices, minlength=1).max()) + d + 2
+    bent = None
+    if weights.tangent is not None:
+        bent = _evaluate_tangents(weights.tangent, rho, errors, P_i)
+        of_edges, value_error = of_edges + bent.value, value_error + bent.value_error
+        G, off, sizes = G + bent.G, off + bent.G_error, sizes + np.abs(bent.G)
+    off += gamma(most) * sizes
+    product, product_error = A.T @ rows_of_blocks(G), abs(A).T @ rows_of_blocks(off)
+    if bent is not None:
+        product[n:] += problem.incidence.at_beginning(bent.own)
+        product_error[n:] += problem.incidence.at_beginning(bent.own_error + gamma(most) * np.abs(bent.own))
+        product_error += UNIT_ROUNDOFF * np.abs(product)
     return Evaluation(
-        value=value,
-        value_error=OUTWARD * value_error,
-        product=np.asarray(A.T @ weighted),
-        product_error=OUTWARD * np.asarray(abs(A).T @ sizes),
+        math.fsum(of_edges), OUTWARD * value_error, np.asarray(product), OUTWARD * np.asarray(product_error)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Bent:
+    """What tangents add to the cost of every edge, to its gradient in rho, (m, d + 1, d), and in P_i, (m, d, d)."""
+
+    value: Array
+    value_error: float
+    G: Array
+    G_error: Array
+    own: Array
+    own_error: Array
+
+
+def _evaluate_tangents(tangent: Tangent, rho: Array, errors: Array, P_i: Array) -> _Bent:
+    """Tangents, value + 2 <C, rho P_i^T - Z*> - loss, C P_i and C^T rho, for rho known to errors."""
+    C, d = tangent.C, rho.shape[2]
+    C_size, rho_size, P_size = np.abs(C), np.abs(rho), np.abs(np.swapaxes(P_i, 1, 2))
+    apart = rho @ np.swapaxes(P_i, 1, 2) - tangent.Z
+    apart_error = (errors + gamma(d + 1) * rho_size) @ P_size + gamma(d * d + d + 3) * np.abs(apart)
+    constant = tangent.value - tangent.loss
+    return _Bent(
+        value=2.0 * np.sum(C * apart, axis=(1, 2)) + constant,
+        value_error=float(np.sum(2.0 * C_size * apart_error))
+        + float(np.sum(tangent.value_error + 4.0 * UNIT_ROUNDOFF * (np.abs(constant) + np.abs(tangent.loss)))),
+        G=C @ P_i,
+        G_error=gamma(d) * C_size @ np.swapaxes(P_size, 1, 2),
+        own=np.swapaxes(C, 1, 2) @ rho,
+        own_error=np.swapaxes(C_size, 1, 2) @ (errors + gamma(d + 1) * rho_size),
     )
 
 
@@ -143,6 +188,35 @@ def matrix_error(graph: PoseGraph) -> float:
     return float(OUTWARD * ((d + 2) * gamma(most + 4.0) * (1.0 + slant) + slant + 4 * d * UNIT_ROUNDOFF))
 
 
+def matrix_errors(problem: PGOProblem, diagonal: Array) -> Array:
+    """Shares of a diagonal, (N,), by which the stored S is off: |Z^T (S_stored - S) Z| <= Z^T diag(shares diagonal) Z.
+
+    That of `matrix_error` for F. With information matrices the terms of an entry can be larger than the diagonal is:
+    E = gamma_k (|A|^T |W| |A| + ..), entry by entry, k the factors of a term and the terms of an entry, and
+    v^T E v <= sum_a v_a^2 (E u)_a / u_a for any positive u; here u = diagonal^-1/2. Subtracting Lambda and what follows
+    is as in `matrix_error`.
+    """
+    graph, weights, n, m, d = problem.graph, problem.weights, problem.num_poses, problem.graph.num_edges, problem.d
+    if weights.W_error is None and weights.tangent is None:
+        return np.full(problem.side, matrix_error(graph))
+    A = abs(problem.plain_residual_matrix)
+    u = 1.0 / np.sqrt(diagonal)
+    rho = blocks_of_rows((A @ u)[:, None], m)
+    G = weights.weigh(rho, sizes=True)
+    W_error = np.zeros(m) if weights.W_error is None else weights.W_error
+    most = int(np.bincount(np.concatenate([graph.i, graph.j])).max())
+    count = gamma(most + 3.0 * d + 6.0) + float(orthogonality_error(graph.R_ij).max()) + d * gamma(d + 2)
+    E = count * (A.T @ rows_of_blocks(G))[:, 0]
+    G = np.zeros_like(G)
+    G[:, 1:] = (W_error * rho[:, 1:, 0].sum(axis=1))[:, None, None]
+    E += (A.T @ rows_of_blocks(G))[:, 0]
+    if weights.tangent is not None:
+        C = np.abs(weights.tangent.C)
+        E += count * (A.T @ rows_of_blocks(C @ u[n:].reshape(n, d, 1)[graph.i]))[:, 0]
+        E[n:] += count * problem.incidence.at_beginning(np.swapaxes(C, 1, 2) @ rho)[:, 0]
+    return np.asarray(OUTWARD * (E * u + 4 * d * UNIT_ROUNDOFF))
+
+
 @dataclass(frozen=True)
 class ObjectiveRounding:
     """How well F of given poses is known.
@@ -169,22 +243,38 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
 
     in the Euclidean norm of its d, or d^2, numbers; the error is sum tau (2 ||r_t|| e_t + e_t^2) + kappa (2 ||r_R|| e_R
     + e_R^2) and the rounding of the sum. The level is sum tau e_t^2 + kappa e_R^2 with ||t_i|| + ||t_j||, seen from the
-    first pose, for ||t_j - t_i||: no poses can do better than the last bits of their coordinates.
+    first pose, for ||t_j - t_i||: no poses can do better than the last bits of their coordinates. In chi2, kappa r_R is
+    W r_R, and its excess, whose half gradient is C, adds 2 <|C|, errors> + size ||errors||^2.
     """
-    graph, d, m = problem.graph, problem.d, problem.graph.num_edges
+    graph, d, m, weights = problem.graph, problem.d, problem.graph.num_edges, problem.weights
     e_t, e_R = _residual_errors(problem, poses, np.linalg.norm(poses.t[graph.j] - poses.t[graph.i], axis=1))
-    squares = np.sum(problem.residuals(problem.stacked(poses)) ** 2, axis=1)
-    r_t, r_R = squares[:m], squares[m:].reshape(m, d).sum(axis=1)
-    cross = float(np.sum(graph.tau * np.sqrt(r_t) * e_t)) + e_R * float(np.sum(graph.kappa * np.sqrt(r_R)))
-    F = float(graph.tau @ r_t + graph.kappa @ r_R)
-    error = _sum_of_squares(graph, e_t, e_R) + 2.0 * cross + _SUMMED * UNIT_ROUNDOFF * F
+    X = problem.stacked(poses)
+    residuals, (_, w) = problem.residuals(X), problem.residual_matrix
+    # Along the axes of W, which turn no norm, kappa weighs row by row.
+    weighted = np.sum((w[:, None] * residuals) ** 2, axis=1)
+    cross = float(np.sum(np.sqrt(weighted[:m]) * e_t))
+    cross += e_R * float(np.sum(np.sqrt(weighted[m:].reshape(m, d).sum(axis=1))))
+    F = float(np.sum(np.abs(w) * np.sum(residuals**2, axis=1)))
+    error = _sum_of_squares(problem, e_t, e_R) + 2.0 * cross + _SUMMED * UNIT_ROUNDOFF * F
+    if weights.W_error is not None:
+        turning = np.sum(residuals[m:] ** 2, axis=1).reshape(m, d).sum(axis=1)
+        error += float(np.sum((weights.W_error + gamma(4.0 * d) * np.abs(weights.kappa).max()) * turning))
+    if weights.excess is not None:
+        touched = weights.excess.tangent(problem.edge_products(residuals, X))
+        moved = np.linalg.norm(touched.Z, axis=2)
+        slant = poses.orthogonality_error + d * gamma(d + 2)
+        error += 2.0 * float(np.sum(np.linalg.norm(touched.C[:, 0], axis=1) * (e_t + slant * moved[:, 0])))
+        error += 2.0 * float(
+            np.sum(np.linalg.norm(touched.C[:, 1:], axis=(1, 2)) * (e_R + slant * moved[:, 1:].sum(axis=1)))
+        )
+        error += float(np.sum(touched.value_error))
     return ObjectiveRounding(rounding_level(problem, poses), OUTWARD * error)
 
 
 def rounding_level(problem: PGOProblem, poses: Poses) -> float:
     """Level of `objective_rounding`."""
     graph, size = problem.graph, np.linalg.norm(poses.t - poses.t[:1], axis=1)
-    return _sum_of_squares(graph, *_residual_errors(problem, poses, size[graph.i] + size[graph.j]))
+    return _sum_of_squares(problem, *_residual_errors(problem, poses, size[graph.i] + size[graph.j]))
 
 
 def _residual_errors(problem: PGOProblem, poses: Poses, distance: Array) -> tuple[Array, float]:
@@ -195,5 +285,8 @@ def _residual_errors(problem: PGOProblem, poses: Poses, distance: Array) -> tupl
     return share * (distance + length) + omega * length, 2.0 * math.sqrt(d) * share + 2.0 * omega
 
 
-def _sum_of_squares(graph: PoseGraph, e_t: Array, e_R: float) -> float:
-    return OUTWARD * (float(np.sum(graph.tau * e_t**2)) + float(np.sum(graph.kappa)) * e_R**2)
+def _sum_of_squares(problem: PGOProblem, e_t: Array, e_R: float) -> float:
+    weights, kappa = problem.weights, np.abs(problem.weights.kappa)
+    more = 0.0 if weights.excess is None else weights.excess.size
+    of_rotation = float(np.sum((kappa if weights.axes is None else kappa.max(axis=1)) + more))
+    return OUTWARD * (float(np.sum((weights.tau + more) * e_t**2)) + of_rotation * e_R**2)

@@ -8,6 +8,9 @@ import numpy as np
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import PoseGraph
+
+_LEAST_SCALED = 1e-12  # smallest eigenvalue of a matrix scaled to ones on its diagonal that counts as positive
 
 
 class RotationWeight(enum.Enum):
@@ -46,6 +49,24 @@ def isotropic_information(kappa: Array, tau: Array, d: int) -> Array:
     """Diagonal information matrices, (m, 3, 3) or (m, 6, 6), whose `precisions` are kappa and tau."""
     diagonal = [tau, tau, kappa] if d == 2 else [tau, tau, tau, 2 * kappa, 2 * kappa, 2 * kappa]
     return np.asarray(np.stack(diagonal, axis=1)[:, :, None] * np.eye(len(diagonal)))
+
+
+def proper_information(graph: PoseGraph) -> Array:
+    """Information matrices that chi2 is of, (m, k, k): the graph's, without coupling blocks that make one indefinite.
+
+    Those of kappa and tau (`isotropic_information`) where the graph has none. The file's reader asks but for definite
+    blocks I_tt and I_rr: 5,021 whole matrices of the public cubicle graph are indefinite.
+    """
+    if graph.information is None:
+        return isotropic_information(graph.kappa, graph.tau, graph.d)
+    scale = 1.0 / np.sqrt(np.einsum("mkk->mk", graph.information))
+    bad = ~(np.linalg.eigvalsh(graph.information * scale[:, :, None] * scale[:, None, :])[:, 0] > _LEAST_SCALED)
+    if not bad.any():
+        return graph.information
+    information = graph.information.copy()
+    information[bad, : graph.d, graph.d :] = 0.0
+    information[bad, graph.d :, : graph.d] = 0.0
+    return information
 
 
 def condition(blocks: Array) -> Array:

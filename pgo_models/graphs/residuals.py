@@ -11,7 +11,7 @@ from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, hat, log_map
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import isotropic_information
+from pgo_models.graphs.precisions import proper_information
 
 MISFIT_SHARE = 6.0  # times the mean share of F: a well modelled edge is there less than once in ten thousand
 UNCERTAIN_RATIO = 0.1  # of the median precision
@@ -100,7 +100,7 @@ def chi2(graph: PoseGraph, poses: Poses, convention: Chi2Convention = Chi2Conven
     the measured end pose: r_t = R_ij^T (R_i^T (t_j - t_i) - t_ij), and r_r as `convention` reads its rotation. The
     rotation block is taken to be of the rotation vector, in radians, also where g2o takes it to be of the quaternion.
 
-    Without information matrices they are `isotropic_information` of kappa and tau.
+    Which matrices count is said by `pgo_models.graphs.precisions.proper_information`.
 
     Raises
     ------
@@ -134,9 +134,7 @@ def chi2(graph: PoseGraph, poses: Poses, convention: Chi2Convention = Chi2Conven
         r_r = 0.5 * chord
     if convention is Chi2Convention.GTSAM:
         r_t = _logarithm_translation(w, r_t)
-    information = graph.information
-    if information is None:
-        information = isotropic_information(graph.kappa, graph.tau, d)
+    information = proper_information(graph)
     I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
     coupled = np.cos(half) * chord if convention is Chi2Convention.CHORDAL else r_r
     terms = ((r_t, I_tt, r_t), (2.0 * r_t, I_tr, coupled), (r_r, I_rr, r_r))

@@ -15,7 +15,7 @@ from scipy.sparse import csc_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, hat, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.matrices import assemble, block_entries, rotation_columns
+from pgo_models.problem.matrices import assemble, block_entries, edge_blocks, rotation_columns
 from pgo_models.problem.problem import PGOProblem
 
 
@@ -62,11 +62,14 @@ def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) 
     layout = TangentLayout(problem.num_poses, d)
     i, j, R = graph.i, graph.j, poses.R
     v_i, v_j, w_i, w_j = layout.translations(i), layout.translations(j), layout.rotations(i), layout.rotations(j)
-    tau = np.repeat(2.0 * graph.tau[:, None], d, axis=1)
-    lever = 2.0 * graph.tau[:, None, None] * (R[i] @ _lever(graph.t_ij))
+    weights = problem.weights if Lambda is None else problem.tangent_at(poses).weights
+    tau = np.repeat(2.0 * weights.tau[:, None], d, axis=1)
+    arm, own_i, between, own_j = edge_blocks(graph.R_ij, graph.t_ij, weights)
+    lever = 2.0 * R[i] @ _lever(arm)
     relative = np.swapaxes(R[i], 1, 2) @ R[j]
-    coupling = -2.0 * graph.kappa[:, None, None] * double_cross(relative, graph.R_ij)
-    own = _diagonal_blocks(problem, Lambda)
+    coupling = -2.0 * double_cross(relative, between)
+    S_ii = problem.incidence.at_both(own_i, own_j)
+    own = _of_turns(S_ii if Lambda is None else S_ii - Lambda)
     poses_w = layout.rotations(np.arange(problem.num_poses))
     blocks = [
         (v_i, v_i, tau),
@@ -81,6 +84,16 @@ def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) 
         (*block_entries(w_j, w_i), np.swapaxes(coupling, 1, 2)),
         (*block_entries(poses_w, poses_w), own),
     ]
+    excess = problem.weights.excess
+    if excess is not None:
+        apart = np.einsum("mba,mb->ma", R[i], poses.t[j] - poses.t[i])
+        unknowns = np.concatenate([v_i, v_j, w_i, w_j][: None if excess.K is not None else 3], axis=1)
+        curvature = excess.curvature(relative, apart)[:, : unknowns.shape[1], : unknowns.shape[1]]
+        for first in (0, d):  # from R_i^T v to v
+            curvature[:, first : first + d] = R[i] @ curvature[:, first : first + d]
+        for first in (0, d):
+            curvature[:, :, first : first + d] = curvature[:, :, first : first + d] @ np.swapaxes(R[i], 1, 2)
+        blocks.append((*block_entries(unknowns, unknowns), curvature))
     return assemble(blocks, layout.side)
 
 
@@ -99,13 +112,10 @@ def double_cross(A: Array, B: Array) -> Array:
     return np.asarray((trace_A * trace_B - _trace(AB)) * np.eye(3) + symmetric_part)
 
 
-def _diagonal_blocks(problem: PGOProblem, Lambda: Array | None) -> Array:
+def _of_turns(S_ii: Array) -> Array:
     """2 (tr(S_ii) I - S_ii) in space, 2 tr(S_ii) in the plane, with S_ii the diagonal rotation blocks of S."""
-    S_ii = problem.M.data[problem.block_positions]
-    if Lambda is not None:
-        S_ii = S_ii - Lambda
     trace = _trace(S_ii)
-    return 2.0 * trace if problem.d == 2 else 2.0 * (trace * np.eye(3) - S_ii)
+    return 2.0 * trace if S_ii.shape[1] == 2 else 2.0 * (trace * np.eye(3) - S_ii)
 
 
 def _lever(t_ij: Array) -> Array:

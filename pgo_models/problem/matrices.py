@@ -14,36 +14,65 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import factorize
+from pgo_models.problem.weighting import EdgeWeights
 
 MAX_DENSE_SIDE = 6000  # a dense Q of this side takes 288 MB
 
 
-def residual_matrix(graph: PoseGraph) -> tuple[csr_array, Array]:
+def residual_matrix(graph: PoseGraph, weights: EdgeWeights | None = None) -> tuple[csr_array, Array]:
     """A, ((d+1) m, N), and weights w, ((d+1) m,), with F = sum_rows w ||A X||^2.
 
     Its first m rows give t_j^T - t_i^T - t_ij^T R_i^T with weight tau; then d rows an edge give
-    R_j^T - R_ij^T R_i^T with weight kappa (equations `translation` and `rotation` of the paper).
+    R_j^T - R_ij^T R_i^T with weight kappa (equations `translation` and `rotation` of the paper), or U^T times them with
+    weights kappa of their own where the weights are W = U diag(kappa) U^T; F's unless given.
     """
     n, m, d = graph.num_poses, graph.num_edges, graph.d
+    weights = weights if weights is not None else isotropic_weights(graph)
     edge = np.arange(m)
     rotation_row = m + d * edge[:, None] + np.arange(d)
     block_i, block_j = rotation_columns(graph.i, n, d), rotation_columns(graph.j, n, d)
     rows = [edge, edge, np.repeat(edge, d), rotation_row.ravel(), np.repeat(rotation_row, d)]
     columns = [graph.j, graph.i, block_i.ravel(), block_j.ravel(), np.repeat(block_i[:, None], d, axis=1).ravel()]
-    values = [
-        np.ones(m),
-        -np.ones(m),
-        -graph.t_ij.ravel(),
-        np.ones(m * d),
-        -np.swapaxes(graph.R_ij, 1, 2).ravel(),
-    ]
+    at_j, at_i = np.ones(m * d), graph.R_ij
+    if weights.axes is not None:
+        rows[3], columns[3] = rows[4], np.repeat(block_j[:, None], d, axis=1).ravel()
+        at_j, at_i = np.swapaxes(weights.axes, 1, 2).ravel(), graph.R_ij @ weights.axes
+    values = [np.ones(m), -np.ones(m), -graph.t_ij.ravel(), at_j, -np.swapaxes(at_i, 1, 2).ravel()]
     A = csr_array(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=((d + 1) * m, (d + 1) * n)
     )
-    return A, np.concatenate([graph.tau, np.repeat(graph.kappa, d)])
+    return A, weights.of_rows(d)
 
 
-def joint_matrix(graph: PoseGraph) -> csc_array:
+def isotropic_weights(graph: PoseGraph) -> EdgeWeights:
+    """The weights of F."""
+    return EdgeWeights(graph.tau, graph.kappa)
+
+
+def edge_blocks(R_ij: Array, t_ij: Array, weights: EdgeWeights) -> tuple[Array, Array, Array, Array]:
+    """Blocks of M that edges (i, j) add to, beside tau: (t_i, R_i), (R_i, R_i), -(R_i, R_j) and (R_j, R_j).
+
+    W = kappa I gives tau t_ij, kappa I + tau t_ij t_ij^T, kappa R_ij, kappa I; else R_i has R_ij W R_ij^T, and so on.
+    A tangent adds 2 <C, rho R_i> to the cost of an edge, rho its residual rows.
+    """
+    W = weights.W(t_ij.shape[1])
+    lever = weights.tau[:, None] * t_ij
+    own_i = lever[:, :, None] * t_ij[:, None, :]
+    if weights.axes is None:
+        own_i += W
+        between = weights.kappa[:, None, None] * R_ij
+    else:
+        between = R_ij @ W
+        own_i += between @ np.swapaxes(R_ij, 1, 2)
+    if weights.tangent is not None:
+        C = weights.tangent.C
+        half = t_ij[:, :, None] * C[:, :1] + R_ij @ C[:, 1:]
+        own_i -= half + np.swapaxes(half, 1, 2)
+        lever, between = lever - C[:, 0], between - np.swapaxes(C[:, 1:], 1, 2)
+    return lever, own_i, between, W
+
+
+def joint_matrix(graph: PoseGraph, weights: EdgeWeights | None = None) -> csc_array:
     """M, (N, N), symmetric, with F = tr(X^T M X) = tr(X^T A^T diag(w) A X).
 
     Edge (i, j) adds, in the rows and columns of t_i, t_j, R_i, R_j:
@@ -53,13 +82,15 @@ def joint_matrix(graph: PoseGraph) -> csc_array:
         R_i:  kappa I + tau t_ij t_ij^T           R_j: -kappa R_ij
         R_j:  kappa I
 
+    for W = kappa I; see `edge_blocks`.
+
     The pattern holds every diagonal d x d block in full, so that multipliers can be subtracted in place.
     """
     n, d = graph.num_poses, graph.d
-    i, j, kappa, tau, t_ij = graph.i, graph.j, graph.kappa, graph.tau, graph.t_ij
+    weights = weights if weights is not None else isotropic_weights(graph)
+    i, j, tau = graph.i, graph.j, weights.tau
     block_i, block_j = rotation_columns(i, n, d), rotation_columns(j, n, d)
-    tau_t = tau[:, None] * t_ij
-    eye = kappa[:, None, None] * np.eye(d)
+    lever, own_i, between, own_j = edge_blocks(graph.R_ij, graph.t_ij, weights)
     t_i = np.repeat(i[:, None], d, axis=1)
     t_j = np.repeat(j[:, None], d, axis=1)
     blocks = [
@@ -67,34 +98,35 @@ def joint_matrix(graph: PoseGraph) -> csc_array:
         (j, j, tau),
         (i, j, -tau),
         (j, i, -tau),
-        (t_i, block_i, tau_t),
-        (block_i, t_i, tau_t),
-        (t_j, block_i, -tau_t),
-        (block_i, t_j, -tau_t),
-        (*block_entries(block_i, block_i), eye + tau_t[:, :, None] * t_ij[:, None, :]),
-        (*block_entries(block_j, block_j), eye),
-        (*block_entries(block_i, block_j), -kappa[:, None, None] * graph.R_ij),
-        (*block_entries(block_j, block_i), -kappa[:, None, None] * np.swapaxes(graph.R_ij, 1, 2)),
+        (t_i, block_i, lever),
+        (block_i, t_i, lever),
+        (t_j, block_i, -lever),
+        (block_i, t_j, -lever),
+        (*block_entries(block_i, block_i), own_i),
+        (*block_entries(block_j, block_j), own_j),
+        (*block_entries(block_i, block_j), -between),
+        (*block_entries(block_j, block_i), -np.swapaxes(between, 1, 2)),
     ]
     return assemble(blocks, (d + 1) * n)
 
 
-def connection_laplacian(graph: PoseGraph) -> csc_array:
+def connection_laplacian(graph: PoseGraph, weights: EdgeWeights | None = None) -> csc_array:
     """L, (dn, dn), the rotation-only part of M: sum_e kappa ||R_j - R_i R_ij||_F^2 = tr(Y^T L Y), Y the rows R_i^T."""
+    weights = weights if weights is not None else isotropic_weights(graph)
     n, d = graph.num_poses, graph.d
     block_i, block_j = rotation_columns(graph.i, 0, d), rotation_columns(graph.j, 0, d)
-    eye = graph.kappa[:, None, None] * np.eye(d)
-    coupling = -graph.kappa[:, None, None] * graph.R_ij
+    _, own_i, between, own_j = edge_blocks(graph.R_ij, np.zeros_like(graph.t_ij), weights)
+    coupling = -between
     blocks = [
-        (*block_entries(block_i, block_i), eye),
-        (*block_entries(block_j, block_j), eye),
+        (*block_entries(block_i, block_i), own_i),
+        (*block_entries(block_j, block_j), own_j),
         (*block_entries(block_i, block_j), coupling),
         (*block_entries(block_j, block_i), np.swapaxes(coupling, 1, 2)),
     ]
     return assemble(blocks, d * n)
 
 
-def marginalized_matrix(graph: PoseGraph) -> Array:
+def marginalized_matrix(graph: PoseGraph, weights: EdgeWeights | None = None) -> Array:
     """Q, (dn, dn) and dense: min over t of F = tr(Y^T Q Y), Y the rows R_i^T.
 
     Q = M_RR - M_Rt (M_tt)^+ M_tR, the Schur complement of the translations (SE-Sync: Rosen et al. 2019, equation 22).
@@ -109,7 +141,7 @@ def marginalized_matrix(graph: PoseGraph) -> Array:
         raise SettingError(
             f"Q is dense with side {d * n}, {8e-9 * (d * n) ** 2:.1f} GB; use PGOProblem.apply_Q, which forms no Q"
         )
-    M = joint_matrix(graph)
+    M = joint_matrix(graph, weights)
     M_Rt, M_RR = M[n:, :n], M[n:, n:].toarray()
     grounded = factorize(M[1:n, 1:n].tocsc())  # columns of M_tR sum to zero, so t_0 = 0 loses nothing
     return np.asarray(M_RR - M_Rt[:, 1:] @ grounded.solve(M_Rt[:, 1:].toarray().T))

@@ -1,8 +1,8 @@
-"""PGOProblem: the cost F of a pose graph, its gradients, its matrices and exact translations (paper: `min overall`)."""
+"""PGOProblem: the cost of a pose graph, its gradients, its matrices and exact translations (paper: `min overall`)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,9 +11,10 @@ from scipy.sparse import csc_array, csr_array
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.arrays import read_only
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, stack_transposes, vee
+from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes, vee
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, analyze, factorize
+from pgo_models.problem.incidence import Incidence, block_laplacian, blocks_of_rows, rows_of_blocks
 from pgo_models.problem.matrices import (
     block_entries,
     connection_laplacian,
@@ -23,6 +24,7 @@ from pgo_models.problem.matrices import (
     residual_matrix,
     rotation_columns,
 )
+from pgo_models.problem.weighting import EdgeWeights, Weighting, convex_weights, edge_weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,17 +33,25 @@ class PGOProblem:
 
     With X, (N, d), N = (d+1) n, the rows t_i and then the rows of every R_i^T, F = tr(X^T M X).
 
+    With `Weighting.INFORMATION` the cost is chi2 of the graph's information matrices. It is quadratic in X, too, where
+    all matrices of translations are multiples of the identity and nothing couples them with rotations; else M is the
+    quadratic part, and `tangent_at` gives quadratic problems that touch chi2 from below (`problem.weighting`).
+
     Attributes
     ----------
     graph : PoseGraph
         Connected; its weights kappa, tau are the problem's. `graph.unit_weights()` gives the paper's equation.
     backend : CholeskyBackend, optional
         Which sparse Cholesky to use; `default_backend()` unless given.
+    weighting : Weighting or EdgeWeights
+        Which cost, F or chi2, or its weights themselves.
 
     Raises
     ------
     GraphError
         When the graph is not connected.
+    SettingError
+        When weighting is none.
 
     Examples
     --------
@@ -54,12 +64,17 @@ class PGOProblem:
 
     graph: PoseGraph
     backend: CholeskyBackend | None = None
+    weighting: Weighting | EdgeWeights = Weighting.ISOTROPIC
 
     def __post_init__(self) -> None:
+        if not isinstance(self.weighting, Weighting | EdgeWeights):
+            raise SettingError(f"weighting is {self.weighting!r}; give one of {', '.join(map(str, Weighting))}")
         self.graph.check_connected()
 
     def __repr__(self) -> str:
-        return f"PGOProblem({self.graph.name!r}, d={self.d}, poses={self.num_poses}, edges={self.graph.num_edges})"
+        cost = ", chi2" if self.weighting is Weighting.INFORMATION else ""
+        size = f"d={self.d}, poses={self.num_poses}, edges={self.graph.num_edges}"
+        return f"PGOProblem({self.graph.name!r}, {size}{cost})"
 
     @property
     def num_poses(self) -> int:
@@ -76,33 +91,73 @@ class PGOProblem:
         """N = (d + 1) n, the rows of X."""
         return (self.d + 1) * self.num_poses
 
+    @cached_property
+    def weights(self) -> EdgeWeights:
+        """Weights of the edges."""
+        return edge_weights(self.graph, self.weighting) if isinstance(self.weighting, Weighting) else self.weighting
+
+    @property
+    def is_quadratic(self) -> bool:
+        """Whether the cost is tr(X^T M X) of X alone."""
+        return self.weights.excess is None
+
+    @cached_property
+    def convex_part(self) -> PGOProblem:
+        """The problem itself if its cost is quadratic and convex in (R, t), else one near it: what SOC is run on."""
+        if self.is_quadratic and self.weights.is_convex:
+            return self
+        return replace(self, weighting=convex_weights(self.graph))
+
+    def tangent_at(self, poses: Poses) -> PGOProblem:
+        """Quadratic problem with F(X) <= chi2(X) for all poses, and equal value and gradient at the given ones."""
+        excess = self.weights.excess
+        if excess is None:
+            return self
+        if self._touched and self._touched[0][0] is poses:  # multipliers, gradient and Hessian ask for the same one
+            return self._touched[0][1]
+        X = self.stacked(poses)
+        tangent = excess.tangent(self.edge_products(self.residuals(X), X))
+        found = replace(self, weighting=replace(self.weights, excess=None, tangent=tangent))
+        found.__dict__.update({name: value for name, value in self.__dict__.items() if name in _OF_THE_PATTERN})
+        self._touched[:] = [(poses, found)]
+        return found
+
+    @cached_property
+    def _touched(self) -> list[tuple[Poses, PGOProblem]]:
+        return []
+
     # Matrices, each built when first asked for, read-only: what follows from them is kept, too.
 
     @cached_property
     def M(self) -> csc_array:
         """M, (N, N): F = tr(X^T M X)."""
-        return read_only(joint_matrix(self.graph))
+        return read_only(joint_matrix(self.graph, self.weights))
 
     @cached_property
     def L(self) -> csc_array:
         """L, (dn, dn): the rotation part of F is tr(Y^T L Y) for Y the rows R_i^T."""
-        return read_only(connection_laplacian(self.graph))
+        return read_only(connection_laplacian(self.graph, self.weights))
 
     @cached_property
     def Q(self) -> Array:
         """Q, (dn, dn), dense: min over t of F is tr(Y^T Q Y) for Y the rows R_i^T; for small graphs."""
-        return read_only(marginalized_matrix(self.graph))
+        return read_only(marginalized_matrix(self.graph, self.weights))
 
     @cached_property
     def residual_matrix(self) -> tuple[csr_array, Array]:
         """A, ((d+1) m, N), and w: F = sum_rows w ||A X||^2."""
-        A, w = residual_matrix(self.graph)
+        A, w = residual_matrix(self.graph, self.weights)
         return read_only(A), read_only(w)
+
+    @property
+    def plain_residual_matrix(self) -> csr_array:
+        """A with the rotation residuals as they are, not along the axes of W."""
+        return self.residual_matrix[0] if self.weights.axes is None else self._unturned_residual_matrix
 
     @cached_property
     def analysis(self) -> SymbolicCholesky:
         """Symbolic factorisation of the pattern of M, shared by every matrix that has it."""
-        return analyze(self.M, self.backend)
+        return analyze(self.M, self.backend) if self.convex_part is self else self.convex_part.analysis
 
     @cached_property
     def diagonal_positions(self) -> IntArray:
@@ -141,7 +196,9 @@ class PGOProblem:
         """F = tr(X^T M X) as a weighted sum of squared residuals, which does not cancel; X need not be feasible."""
         residuals = self.residuals(X)
         _, w = self.residual_matrix
-        return float(np.sum(w[:, None] * residuals**2))  # in pairs: off by a few dozen roundings, not by one an edge
+        F = float(np.sum(w[:, None] * residuals**2))  # in pairs: off by a few dozen roundings, not by one an edge
+        beyond = self.weights.excess or self.weights.tangent
+        return F if beyond is None else F + float(np.sum(beyond.values(self.edge_products(residuals, X))))
 
     def objective(self, poses: Poses) -> float:
         """F at poses (paper: `min overall`, weighted)."""
@@ -149,15 +206,26 @@ class PGOProblem:
 
     def edge_costs(self, poses: Poses) -> Array:
         """Share of every edge in F, (m,)."""
-        m, d = self.graph.num_edges, self.d
-        squares = np.sum(self.residuals(self.stacked(poses)) ** 2, axis=1)
-        rotation = squares[m:].reshape(m, d).sum(axis=1)
-        return np.asarray(self.graph.tau * squares[:m] + self.graph.kappa * rotation)
+        m, X = self.graph.num_edges, self.stacked(poses)
+        residuals, (_, w) = self.residuals(X), self.residual_matrix
+        squares = w * np.sum(residuals**2, axis=1)
+        costs = squares[:m] + squares[m:].reshape(m, self.d).sum(axis=1)
+        beyond = self.weights.excess or self.weights.tangent
+        return np.asarray(costs if beyond is None else costs + beyond.values(self.edge_products(residuals, X)))
 
     def apply_M(self, X: Array) -> Array:
         """M X = A^T (w A X), (N, d), through the residuals: accurate where edges fit well and coordinates are large."""
         A, w = self.residual_matrix
-        return np.asarray(A.T @ (w[:, None] * (A @ X)))
+        residuals, tangent, n = A @ X, self.weights.tangent, self.num_poses
+        if tangent is None:
+            return np.asarray(A.T @ (w[:, None] * residuals))
+        C, axes = tangent.C, self.weights.axes
+        pull = rows_of_blocks(C @ X[n:].reshape(n, self.d, self.d)[self.graph.i], axes)
+        product = A.T @ (w[:, None] * residuals + pull)
+        product[n:] += self.incidence.at_beginning(
+            np.swapaxes(C, 1, 2) @ blocks_of_rows(residuals, self.graph.num_edges, axes)
+        )
+        return np.asarray(product)
 
     def apply_Q(self, Y: Array) -> Array:
         """Q Y, (dn, k), for Y of shape (dn, k), without forming Q: M applied to Y and its best translations."""
@@ -169,7 +237,7 @@ class PGOProblem:
         With G = 2 M X it is (-2 vee(G_i R_i), G_{t_i}).
         """
         n, d = self.num_poses, self.d
-        G = 2.0 * self.apply_M(self.stacked(poses))
+        G = 2.0 * self.tangent_at(poses).apply_M(self.stacked(poses))
         return -2.0 * vee(G[n:].reshape(n, d, d) @ poses.R), G[:n]
 
     # Exact translations for given rotations.
@@ -187,6 +255,19 @@ class PGOProblem:
     def with_best_translations(self, R: Array) -> Poses:
         """Poses (R, t) with the translations of `recover_translations`."""
         return Poses(R, self.recover_translations(R))
+
+    def at_best_translations(self, poses: Poses) -> Poses:
+        """Poses with the translations that are best for their rotations, t_0 where it is if chi2 is not quadratic."""
+        excess, (n, d), graph = self.weights.excess, poses.t.shape, self.graph
+        if excess is None:
+            return self.with_best_translations(poses.R)
+        R_i = poses.R[graph.i]
+        half = R_i @ (excess.J[:, :d, :d] + self.weights.tau[:, None, None] * np.eye(d)) @ np.swapaxes(R_i, 1, 2)
+        factor = self._chi2_translations.factorize(block_laplacian(graph, half))
+        step = factor.solve(self.tangent_at(poses).apply_M(poses.stacked())[1:n].ravel())
+        t = poses.t.copy()
+        t[1:] -= step.reshape(n - 1, d)
+        return Poses(poses.R, t)
 
     def with_refined_translations(self, poses: Poses) -> Poses:
         """Poses after steps of iterative refinement of the translations, as many as lower F, with t_0 where it is.
@@ -219,9 +300,30 @@ class PGOProblem:
         return poses.stacked()
 
     @cached_property
+    def _unturned_residual_matrix(self) -> csr_array:
+        return read_only(residual_matrix(self.graph)[0])
+
+    @cached_property
+    def incidence(self) -> Incidence:
+        """Which edges begin and end at a pose."""
+        return Incidence.of(self.graph)
+
+    def edge_products(self, residuals: Array, X: Array) -> Array:
+        """Z, (m, d + 1, d): the residual rows of every edge, times R_i."""
+        rho = blocks_of_rows(residuals, self.graph.num_edges, self.weights.axes)
+        return np.asarray(rho @ unstack_transposes(X[self.num_poses :])[self.graph.i])
+
+    @cached_property
     def _translation_factor(self) -> CholeskyFactor:
         n = self.num_poses
         return factorize(self.M[1:n, 1:n].tocsc(), self.backend)
+
+    @cached_property
+    def _chi2_translations(self) -> SymbolicCholesky:
+        """Of the matrix of `at_best_translations`, whose pattern the graph alone gives."""
+        return analyze(
+            block_laplacian(self.graph, np.broadcast_to(np.eye(self.d), self.graph.R_ij.shape)), self.backend
+        )
 
     @cached_property
     def _M_tR(self) -> csr_array:
@@ -231,6 +333,16 @@ class PGOProblem:
     @cached_property
     def _M_rotation_rows(self) -> csr_array:
         return self.M[self.num_poses :].tocsr()
+
+
+_OF_THE_PATTERN = (
+    "residual_matrix",
+    "analysis",
+    "diagonal_positions",
+    "block_positions",
+    "incidence",
+    "_unturned_residual_matrix",
+)
 
 
 def as_problem(given: object) -> PGOProblem:

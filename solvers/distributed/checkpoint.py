@@ -25,6 +25,7 @@ from pgo_models.files import replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.distributed.driver import CoverPoses, Driver, DriverState
 from solvers.distributed.newton import SubstructuredNewtonState
 from solvers.distributed.run_lock import RunLock
@@ -107,7 +108,7 @@ class Saved:
 
 
 _CLASSES = (
-    *(Saved, DriverState, CoverPoses, Poses, Certificate, LowerBound, BoundSource, Verdict, Ledger, Traffic),
+    *(Saved, DriverState, CoverPoses, Poses, Certificate, LowerBound, BoundSource, Verdict, Weighting, Ledger, Traffic),
     *(Stage, Status, History, Record, Measurement, RecursionBlock, StepSettings, AndersonShare, AndersonSums),
     *(SubstructuredState, ConsensusState, SubstructuredNewtonState, SeparatorPenalty),
     *(SOC, Newton, Anderson, Coupling, RStep, MultiplierPenalty, FixedPenalty, BalancedPenalty),

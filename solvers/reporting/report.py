@@ -140,6 +140,7 @@ _CURVE_HINT = (
 )
 _GLOSSARY = [
     ("F", "cost: sum over edges of kappa ||R_j - R_i R_ij||^2 + tau ||t_j - t_i - R_i t_ij||^2"),
+    ("chi2", "cost: sum over edges of squared errors weighed with the information matrices of the file"),
     ("lower bound", "proven: no poses cost less"),
     ("gap", "(F - lower bound) / F"),
     ("kappa", "precision of an edge's rotation, per rad^2: the larger, the surer"),
@@ -181,7 +182,7 @@ def _header(solution: Solved) -> str:
 def _verdict(solution: Solved) -> str:
     certificate = solution.certificate
     figures = [
-        ("cost F", f"{solution.objective:.10g}"),
+        (f"cost {certificate.cost}", f"{solution.objective:.10g}"),
         ("lower bound", f"{certificate.lower_bound:.10g}"),
         ("gap", gap_text(certificate.gap)),
         ("gap asked for", f"{certificate.wanted_gap:.3g}"),
@@ -294,7 +295,7 @@ def _stages(solution: Solved) -> str:
         ]
         for name, stage in zip(_stage_names(solution), solution.stages, strict=True)
     ]
-    heads = ["stage", "iterations", "F", "seconds", "ended"]
+    heads = ["stage", "iterations", solution.certificate.cost, "seconds", "ended"]
     explained = sorted({(stage.status.name, stage.status.value) for stage in solution.stages})
     return section("Stages", sortable_table("stages", heads, rows, [False] * len(rows)), facts(explained))
 

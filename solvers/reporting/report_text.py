@@ -31,7 +31,10 @@ def headline(certificate: Certificate) -> str:
     if certificate.verdict is Verdict.CERTIFIED:
         return f"Certified: the cost of these poses is the least possible, to within {_excess(certificate)}."
     if certificate.verdict is Verdict.TRIVIAL:
-        return "Not certified: nothing better than F >= 0 is proven, so these poses may be far from the best ones."
+        return (
+            f"Not certified: nothing better than {certificate.cost} >= 0 is proven, so these poses may be far from the "
+            "best ones."
+        )
     return (
         f"Not certified: the cost of these poses may be too high by up to {_excess(certificate)}; less was asked for."
     )
@@ -39,12 +42,12 @@ def headline(certificate: Certificate) -> str:
 
 def meaning(certificate: Certificate) -> list[str]:
     """Return what the figures mean, in a few sentences that need no further reading."""
-    F, bound = certificate.objective, certificate.lower_bound
-    sentences = [f"The poses cost F = {F:.10g}: the sum, over all measurements, of squared errors times precisions."]
+    bound, cost = certificate.lower_bound, f"{certificate.cost} = {certificate.objective:.10g}"
+    sentences = [f"The poses cost {cost}: the sum, over all measurements, of squared errors times precisions."]
     if certificate.verdict is Verdict.EXACT:
         sentences.append(
-            f"F cannot be told from zero: rounding alone makes up to {certificate.rounding_level:.2g} of it, and as a "
-            "sum of squares it is never below zero."
+            f"{certificate.cost} cannot be told from zero: rounding alone makes up to "
+            f"{certificate.rounding_level:.2g} of it, and as a sum of squares it is never below zero."
         )
         return sentences
     if certificate.verdict is Verdict.TRIVIAL:

@@ -25,7 +25,7 @@ from pgo_models.geometry.rotations import Array, project_to_rotations, stack_tra
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.problem.cholesky import SymbolicCholesky, analyze
 from pgo_models.problem.initialization import spanning_tree_start
-from pgo_models.problem.matrices import assemble, norm, residual_matrix, rotation_columns
+from pgo_models.problem.matrices import assemble, norm, rotation_columns
 from pgo_models.problem.problem import PGOProblem
 from solvers.result import Measurement, Status
 from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty
@@ -254,14 +254,15 @@ def _prepare(problem: PGOProblem, blocks: Blocks, rho: float, back_end: BackEnd)
 def _split(problem: PGOProblem, robots: Partition) -> Blocks:
     graph, n, d = problem.graph, problem.num_poses, problem.d
     cut = robots.cut_edges(graph)
-    A, w = residual_matrix(graph)
-    rotation_rows = (graph.num_edges + d * np.flatnonzero(~cut)[:, None] + np.arange(d)).ravel()
-    inner = A[:, n:].tocsr()[rotation_rows]
-    ends = np.concatenate([graph.i[cut], graph.j[cut]])
-    columns = rotation_columns(ends, 0, d).ravel()
-    alone = csr_array((np.ones(len(columns)), columns, np.arange(len(columns) + 1)), shape=(len(columns), n * d))
-    A_own = vstack([inner, alone], format="csr")
-    w_own = np.concatenate([w[rotation_rows], np.repeat(np.tile(graph.kappa[cut], 2), d)])
+    A, w = problem.residual_matrix
+    rows = graph.num_edges + d * np.arange(graph.num_edges)[:, None] + np.arange(d)
+    inner, between = rows[~cut].ravel(), rows[cut].ravel()
+    rotations = A[:, n:].tocsr()
+    across = rotations[between].tocoo()
+    of_i = across.col // d == np.repeat(graph.i[cut], d)[across.row]
+    alone = [csr_array((across.data[at], (across.row[at], across.col[at])), shape=across.shape) for at in (of_i, ~of_i)]
+    A_own = vstack([rotations[inner], *alone], format="csr")
+    w_own = np.concatenate([w[inner], w[between], w[between]])
     every = np.arange(n)
     full_blocks = rotation_columns(every, 0, d)
     zero = (

@@ -130,7 +130,7 @@ def verify_interior(
     share : float
         At least so much of the diagonal is subtracted, more where rounding needs it.
     """
-    if not has_safe_scale(problem.graph):
+    if not has_safe_scale(problem):
         return None
     inside = cut.interior
     shifts = np.zeros(problem.side)

@@ -1,0 +1,316 @@
+"""What an edge costs: the two precisions of F, or the information matrix of the file, as chi2.
+
+With rho_t = t_j^T - t_i^T - t_ij^T R_i^T, rho_R = R_j^T - R_ij^T R_i^T the rows of an edge's residual, (d + 1, d),
+
+    cost = tau ||rho_t||^2 + tr(W rho_R rho_R^T) + excess(Z),    Z = (rho_t; rho_R) R_i.
+
+**F**: W = kappa I, no excess. **chi2** (`pgo_models.graphs.residuals.chi2`, CHORDAL): for a turn E by theta about a,
+2 (1 - cos theta) a^T I_rr a = tr(W (2 I - E - E^T)) with W = tr(I_rr) / 2 I - I_rr in space and I_theta / 2 I in the
+plane: quadratic in the rotations, convex where no eigenvalue of I_rr is above the sum of the others. What is left of
+the translations, r^T (I_tt - tau I) r for a tau below the smallest eigenvalue, is a convex function of Z, as is what
+couples them with the rotation: see `Excess`.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pgo_models.errors import GraphError
+from pgo_models.geometry.rotations import Array, hat, tangent_dimension, vee
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.precisions import proper_information
+from pgo_models.problem.floating_point import OUTWARD, gamma
+
+_MARGIN = 2.0**-24  # of the smallest eigenvalue: stays between tau and it, so that the excess is strictly convex
+_ROUNDED = 2.0**-42  # of the trace: far above the rounding of a block, which so cannot make it indefinite
+_LEAST_CONVEX = 0.1
+_COUPLED_SHARE = 0.5  # of the smallest eigenvalue of I_tt stays in tau; the other half bears the coupling
+
+
+class Weighting(enum.Enum):
+    """Which cost of the graph's measurements a problem is."""
+
+    ISOTROPIC = "F: two precisions an edge, kappa and tau, as in the paper and SE-Sync"
+    INFORMATION = "chi2: the information matrices of the file"
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeWeights:
+    """Weights of the residuals of every edge.
+
+    Attributes
+    ----------
+    tau : (m,)
+    kappa : (m,), or (m, d) with `axes`
+        W = kappa I, or U diag(kappa) U^T: negative where the cost is not convex.
+    axes : (m, d, d), optional
+        U, orthogonal to rounding.
+    W_given : (m, d, d), optional
+        W itself, with `axes`.
+    W_error : (m,), optional
+        Bound on the Frobenius norm of what W is off from that of the information matrices.
+    excess : Excess, optional
+        What of the cost is not quadratic in the poses.
+    tangent : Tangent, optional
+        A minorant of it, which is; in its place.
+    """
+
+    tau: Array
+    kappa: Array
+    axes: Array | None = None
+    W_given: Array | None = None
+    W_error: Array | None = None
+    excess: Excess | None = None
+    tangent: Tangent | None = None
+
+    @property
+    def is_convex(self) -> bool:
+        """Whether the quadratic part of the cost is strictly convex in the residuals."""
+        return bool((self.kappa > 0.0).all())
+
+    def W(self, d: int) -> Array:
+        """Weights of the rotation residuals, (m, d, d)."""
+        return np.asarray(self.kappa[:, None, None] * np.eye(d)) if self.W_given is None else self.W_given
+
+    def weigh(self, rho: Array, sizes: bool = False) -> Array:
+        """(tau rho_t; W rho_R) of edges, (m, d + 1, d); with `sizes`, with the absolute values of W."""
+        found = np.empty_like(rho)
+        found[:, 0] = self.tau[:, None] * rho[:, 0]
+        if self.W_given is None:
+            found[:, 1:] = (np.abs(self.kappa) if sizes else self.kappa)[:, None, None] * rho[:, 1:]
+        else:
+            found[:, 1:] = (np.abs(self.W_given) if sizes else self.W_given) @ rho[:, 1:]
+        return found
+
+    @property
+    def constant(self) -> tuple[float, float]:
+        """What a quadratic cost has beside tr(X^T M X), and a bound on its rounding error."""
+        return (0.0, 0.0) if self.tangent is None else self.tangent.constant
+
+    def of_rows(self, d: int) -> Array:
+        """Weights w, ((d + 1) m,), of the rows of A: the translation residuals, then d rows an edge along U."""
+        return np.concatenate([self.tau, np.repeat(self.kappa, d) if self.axes is None else self.kappa.ravel()])
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """A quadratic minorant of the excess, equal to it at Z*: sum_e value + 2 <C, Z - Z*> - loss.
+
+    It holds for whatever numbers C has: `loss` is what those that are stored can be off by, so that the minorant is
+    below the convex function that the exact ones touch.
+
+    Attributes
+    ----------
+    C, Z : (m, d + 1, d)
+    value, value_error, loss : (m,)
+    """
+
+    C: Array
+    Z: Array
+    value: Array
+    value_error: Array
+    loss: Array
+
+    def values(self, Z: Array) -> Array:
+        """The minorant of every edge, (m,)."""
+        return np.asarray(self.value - self.loss + 2.0 * np.sum(self.C * (Z - self.Z), axis=(1, 2)))
+
+    @property
+    def constant(self) -> tuple[float, float]:
+        """The sum of value - loss - 2 <C, Z*>, and a bound on its rounding error."""
+        terms = 2.0 * self.C * self.Z
+        sizes = np.abs(self.value) + self.loss + np.sum(np.abs(terms), axis=(1, 2))
+        error = float(np.sum(self.value_error + gamma(terms[0].size + 8.0) * sizes))
+        return math.fsum(self.value - self.loss - np.sum(terms, axis=(1, 2))), OUTWARD * error
+
+
+@dataclass(frozen=True, eq=False)
+class Excess:
+    """Convex part of chi2 beyond the quadratic one: u^T J u + tr(H K H) of every edge.
+
+    In the frame of pose i, r = R_i^T (t_j - t_i) - t_ij and E = R_i^T R_j R_ij^T, a turn by theta about a, with
+    s = a sin theta and H = (1 - cos theta) a a^T, all linear in Z, as Z = (r^T; R_ij^T (E^T - I)):
+
+        r^T I_tt r + 2 r^T I_tr s + tr(W (2 I - E - E^T))
+          = tau ||r||^2 + tr(W' (2 I - E - E^T)) + u^T J u + tr(H K H),  u = (r, s), J = [I_tt - tau I, I_tr; ., K]
+
+    for W' that of I_rr - K, since 2 (1 - cos theta) a^T K a = s^T K s + (1 - cos theta)^2 a^T K a. K makes J positive
+    definite. Without coupling blocks u = r and there is no K. A tangent of this function is quadratic in the poses,
+    with the pattern of M: what a relaxation with matrix weights gains only by many redundant constraints (Holmes,
+    Duembgen & Barfoot 2024).
+
+    Attributes
+    ----------
+    R_ij : (m, d, d)
+    J : (m, q, q)
+        q = d, or d + 1 or d + 3 with coupling blocks.
+    K : (m, p, p) or None
+        p = 1 in the plane, 3 in space.
+    size : (m,)
+        Bound on the norms of the absolute values that J and K are computed from.
+    least : (m,)
+        A number that no eigenvalue of J, nor of K, is below.
+    """
+
+    R_ij: Array
+    J: Array
+    K: Array | None
+    size: Array
+    least: Array
+
+    def arguments(self, Z: Array) -> tuple[Array, Array | None]:
+        """(u, H) of edges, (m, q) and (m, p, p) or None: linear in Z, (m, d + 1, d)."""
+        if self.K is None:
+            return Z[:, 0], None
+        D = np.swapaxes(self.R_ij @ Z[:, 1:], 1, 2)
+        return np.concatenate([Z[:, 0], vee(D)], axis=1), _bend(D)
+
+    def values(self, Z: Array) -> Array:
+        """The excess of every edge, (m,)."""
+        u, H = self.arguments(Z)
+        found = np.sum(u * (self.J @ u[:, :, None])[:, :, 0], axis=1)
+        return np.asarray(found if H is None or self.K is None else found + np.sum(H * (self.K @ H), axis=(1, 2)))
+
+    def tangent(self, Z: Array) -> Tangent:
+        """Tangent at Z: C is half the gradient of the excess there."""
+        d = Z.shape[2]
+        u, H = self.arguments(Z)
+        y = np.einsum("mab,mb->ma", self.J, u)
+        C = np.zeros_like(Z)
+        C[:, 0] = y[:, :d]
+        if H is not None and self.K is not None:
+            N = self.K @ H
+            C[:, 1:] = 0.5 * np.swapaxes((hat(y[:, d:]) + _bend_adjoint(N + np.swapaxes(N, 1, 2), d)) @ self.R_ij, 1, 2)
+        # Every number of C is a sum of products whose absolute values sum to at most `size` ||Z||, as is the value's.
+        length = np.linalg.norm(Z.reshape(len(Z), -1), axis=1)
+        off = gamma(16.0 * d) * self.size * length
+        return Tangent(C, Z, self.values(Z), OUTWARD * off * length, OUTWARD * 32.0 * off**2 / self.least)
+
+    def derivatives(self, relative: Array, apart: Array) -> tuple[Array, Array | None]:
+        """Derivatives of u and H, (m, q, 2 d + 2 p) and (m, p, p, 2 p), in (R_i^T v_i, R_i^T v_j, w_i, w_j), at poses.
+
+        Parameters
+        ----------
+        relative, apart : (m, d, d), (m, d)
+            R_i^T R_j and R_i^T (t_j - t_i).
+        """
+        m, d = apart.shape
+        p = tangent_dimension(d)
+        eye = np.broadcast_to(np.eye(d), (m, d, d))
+        turns = np.broadcast_to(hat(np.eye(p)), (m, p, d, d))
+        J_w = -np.einsum("mkab,mb->mak", turns, apart)
+        J_r = np.concatenate([-eye, eye, J_w, np.zeros((m, d, p))], axis=2)
+        if self.K is None:
+            return J_r, None
+        E = (relative @ np.swapaxes(self.R_ij, 1, 2))[:, None]
+        back = np.swapaxes(self.R_ij, 1, 2)[:, None]
+        D = np.concatenate([-turns @ E, relative[:, None] @ turns @ back], axis=1).reshape(-1, d, d)
+        J_s = np.concatenate([np.zeros((m, p, 2 * d)), np.swapaxes(vee(D).reshape(m, 2 * p, p), 1, 2)], axis=2)
+        return np.concatenate([J_r, J_s], axis=1), np.moveaxis(_bend(D).reshape(m, 2 * p, p, p), 1, 3)
+
+    def curvature(self, relative: Array, apart: Array) -> Array:
+        """The Gauss-Newton matrix of the excess, (m, 2 d + 2 p, 2 d + 2 p), in the unknowns of `derivatives`."""
+        J_u, J_H = self.derivatives(relative, apart)
+        found = 2.0 * np.swapaxes(J_u, 1, 2) @ self.J @ J_u
+        if J_H is not None and self.K is not None:
+            first = 2 * apart.shape[1]
+            K_H = np.einsum("mab,mbck->mack", self.K, J_H)
+            found[:, first:, first:] += 2.0 * np.einsum("mabk,mabl->mkl", J_H, K_H)
+        return np.asarray(found)
+
+
+def edge_weights(graph: PoseGraph, weighting: Weighting) -> EdgeWeights:
+    """Weights of a graph's edges in one of the two costs.
+
+    Coupling blocks count where the whole information matrix is positive definite (`proper_information`).
+
+    Raises
+    ------
+    GraphError
+        When an information matrix is too far from isotropic for double precision; it names the edge.
+    """
+    if weighting is Weighting.ISOTROPIC:
+        return EdgeWeights(graph.tau, graph.kappa)
+    information, d, p = proper_information(graph), graph.d, tangent_dimension(graph.d)
+    I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
+    smallest, trace = np.linalg.eigvalsh(I_tt)[:, 0], np.einsum("mkk->m", I_tt)
+    is_coupled = I_tr.any(axis=(1, 2))
+    if (I_tt == I_tt[:, :1, :1] * np.eye(d)).all() and not is_coupled.any():
+        return EdgeWeights(I_tt[:, 0, 0].copy(), *_rotation_weights(I_rr))
+    margin = np.repeat((_MARGIN * smallest + _ROUNDED * trace)[:, None], d, axis=1)
+    tau = np.where(is_coupled, _COUPLED_SHARE * smallest, smallest - 2.0 * margin[:, 0])
+    J, K, turn = I_tt - tau[:, None, None] * np.eye(d), None, graph.R_ij
+    growth = 1.0
+    if is_coupled.any():
+        bearing = np.swapaxes(I_tr, 1, 2) @ np.linalg.solve(J, I_tr)
+        spare = _MARGIN * np.linalg.eigvalsh(I_rr)[:, 0] + _ROUNDED * np.einsum("mkk->m", I_rr)
+        share = 0.5 + 4.0 * margin[:, 0] / smallest + _MARGIN
+        K = share[:, None, None] * (bearing + np.swapaxes(bearing, 1, 2)) + 2.0 * spare[:, None, None] * np.eye(p)
+        J = np.concatenate([np.concatenate([J, I_tr], 2), np.concatenate([np.swapaxes(I_tr, 1, 2), K], 2)], 1)
+        turn = np.zeros_like(J)
+        turn[:, :d, :d], turn[:, d:, d:] = graph.R_ij, graph.R_ij if d == 3 else 1.0
+        margin = np.concatenate([margin, np.repeat(spare[:, None], p, axis=1)], axis=1)
+        growth = 4.0 * d  # of absolute values in the sums of `Excess.arguments` and `Excess.tangent`
+    weights = _rotation_weights(I_rr, K)
+    sizes = np.abs(J) + 2.0 * tau[:, None, None] * np.eye(J.shape[1])
+    J = turn @ J @ np.swapaxes(turn, 1, 2)
+    size = growth * np.linalg.norm(np.abs(turn) @ sizes @ np.abs(np.swapaxes(turn, 1, 2)), axis=(1, 2))
+    _check_definite(graph, J - margin[:, :, None] * np.eye(J.shape[1]), tau)
+    K = None if K is None else J[:, d:, d:]
+    return EdgeWeights(tau, *weights, Excess(graph.R_ij, J, K, OUTWARD * size, 0.5 * margin.min(axis=1)))
+
+
+def convex_weights(graph: PoseGraph) -> EdgeWeights:
+    """Weights of a strictly convex quadratic cost near chi2: tau as in F, and of W what is well above zero."""
+    I_rr = proper_information(graph)[:, graph.d :, graph.d :]
+    kappa, axes, W, _ = _rotation_weights(I_rr)
+    if axes is not None:
+        least = _LEAST_CONVEX * 1.5 / np.trace(np.linalg.inv(I_rr), axis1=1, axis2=2)  # of the kappa of F
+        kappa = np.maximum(kappa, least[:, None])
+        W = (axes * kappa[:, None, :]) @ np.swapaxes(axes, 1, 2)
+    return EdgeWeights(graph.tau, kappa, axes, W)
+
+
+def _rotation_weights(I_rr: Array, K: Array | None = None) -> tuple[Array, Array | None, Array | None, Array]:
+    """(kappa, axes, W, W_error) of the W that belongs to I_rr - K."""
+    rest, p = I_rr if K is None else I_rr - K, I_rr.shape[1]
+    sizes = np.linalg.norm(I_rr, axis=(1, 2)) + (0.0 if K is None else np.linalg.norm(K, axis=(1, 2)))
+    rounded = OUTWARD * gamma(4.0 * p) * p * sizes
+    if p == 1 or (rest == rest[:, :1, :1] * np.eye(p)).all():
+        return 0.5 * rest[:, 0, 0], None, None, rounded
+    W = 0.5 * np.einsum("mkk->m", rest)[:, None, None] * np.eye(p) - rest
+    return (*np.linalg.eigh(W), W, rounded)
+
+
+def _check_definite(graph: PoseGraph, J: Array, tau: Array) -> None:
+    """Raise unless tau is positive and Cholesky factorisations of J go through (Rump 2006)."""
+    try:
+        np.linalg.cholesky(J)
+        definite = tau > 0.0
+    except np.linalg.LinAlgError:
+        definite = (tau > 0.0) & (np.linalg.eigvalsh(J)[:, 0] > 0.0)
+    if not definite.all():
+        edge = graph.edge_label(int(np.argmin(definite)))
+        raise GraphError(
+            f"the information matrix of {edge} spans more orders of magnitude than double precision carries; give it a "
+            "larger smallest eigenvalue, or solve without the information matrices"
+        )
+
+
+def _bend(D: Array) -> Array:
+    """H of D = E - I, (m, p, p): sym(D) - tr(D) / 2 I in space, -tr(D) / 2 in the plane."""
+    half_trace = 0.5 * np.einsum("maa->m", D)[:, None, None]
+    if D.shape[1] == 2:
+        return np.asarray(-half_trace)
+    return np.asarray(0.5 * (D + np.swapaxes(D, 1, 2)) - half_trace * np.eye(3))
+
+
+def _bend_adjoint(N: Array, d: int) -> Array:
+    """B, (m, d, d), with <B, D> = <N, _bend(D)> for symmetric N, (m, p, p)."""
+    if d == 2:
+        return np.asarray(-0.5 * N * np.eye(2))
+    return np.asarray(N - 0.5 * np.einsum("maa->m", N)[:, None, None] * np.eye(3))

@@ -1,0 +1,72 @@
+"""What the arguments of `pgo` name: graphs, problems, poses and their times."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pgo_models.errors import FileFormatError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.datasets import load
+from pgo_models.graphs.g2o import read_g2o_poses
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.trajectories import read_kitti, read_times, read_tum
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
+
+
+def load_graph(graph: str, unit_weights: bool) -> PoseGraph:
+    """Graph of a file, folder or data set, with its own weights or those of the paper."""
+    loaded = load(graph)
+    return loaded.unit_weights() if unit_weights else loaded
+
+
+def pose_problem(graph: PoseGraph, unit_weights: bool, information: bool) -> PGOProblem:
+    """Problem with the cost that was asked for; a SettingError where there are no information matrices."""
+    if information and (unit_weights or graph.information is None):
+        why = "--unit-weights takes them away" if unit_weights else f"{graph.name} has none"
+        raise SettingError(f"--information asks for information matrices, and {why}; leave it out")
+    return PGOProblem(graph, weighting=Weighting.INFORMATION if information else Weighting.ISOTROPIC)
+
+
+def with_times(graph: PoseGraph, path: Path | None) -> PoseGraph:
+    """Graph with the times in a file, one for every pose."""
+    if path is None:
+        return graph
+    times = read_times(path)
+    if len(times) != graph.num_poses:
+        raise FileFormatError(
+            path, None, f"{len(times)} times, {graph.name} has {graph.num_poses} poses; give one each"
+        )
+    return replace(graph, times=times)
+
+
+def pose_named(graph: PoseGraph, name: int) -> int:
+    """Pose with an id; a SettingError where there is none."""
+    found = np.flatnonzero(graph.pose_ids == name)
+    if not len(found):
+        ids = graph.pose_ids
+        raise SettingError(f"{graph.name} has no pose {name} to anchor; its ids are from {ids.min()} to {ids.max()}")
+    return int(found[0])
+
+
+def estimated_poses(graph: PoseGraph, path: Path | None) -> Poses:
+    """Poses in a file, else those that came with the graph."""
+    if path is None:
+        if graph.initial is None:
+            raise SettingError(f"{graph.name} has no VERTEX line for every pose; give --estimate FILE")
+        return graph.initial
+    suffix = path.suffix.lower()
+    if suffix == ".g2o":
+        return read_g2o_poses(path, graph)
+    if suffix in (".tum", ".txt"):
+        found = read_tum(path, graph.d)
+    elif suffix == ".kitti":
+        found = read_kitti(path, graph.d)
+    else:
+        raise SettingError(f"cannot read {path}: no format has suffix {suffix!r}; use .g2o, .tum or .kitti")
+    if found.num_poses != graph.num_poses:
+        raise FileFormatError(path, None, f"{found.num_poses} poses, {graph.name} has {graph.num_poses}; give one each")
+    return found

@@ -1,0 +1,160 @@
+"""chi2 as a problem: its decomposition, its derivatives, and tangents that lie below it everywhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, SEEDS, informed, random_poses, varied_graph
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.newton_polish import move_poses, polish
+from pgo_models.errors import GraphError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import tangent_dimension
+from pgo_models.graphs.precisions import isotropic_information, proper_information
+from pgo_models.graphs.residuals import chi2
+from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import EdgeWeights, Weighting
+
+COUPLED = st.booleans()
+
+
+def moved(poses: Poses, size: float, seed: int) -> Poses:
+    rng, (n, d) = np.random.default_rng(seed), poses.t.shape
+    return move_poses(poses, size * rng.standard_normal((n, tangent_dimension(d))), size * rng.standard_normal((n, d)))
+
+
+@given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, coupled=COUPLED)
+def test_the_cost_is_chi2(seed: int, n: int, d: int, coupled: bool) -> None:
+    graph, poses = informed(seed, n, d, coupled), random_poses(n, d, seed)
+    problem = PGOProblem(graph, weighting=Weighting.INFORMATION)
+    assert problem.objective(poses) == pytest.approx(chi2(graph, poses), rel=1e-10)
+    assert problem.edge_costs(poses).sum() == pytest.approx(problem.objective(poses), rel=1e-12)
+    assert (problem.edge_costs(poses) >= 0.0).all()
+
+
+@given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, coupled=COUPLED)
+def test_a_tangent_touches_chi2_and_is_below_it(seed: int, n: int, d: int, coupled: bool) -> None:
+    graph, poses = informed(seed, n, d, coupled), random_poses(n, d, seed)
+    problem = PGOProblem(graph, weighting=Weighting.INFORMATION)
+    tangent = problem.tangent_at(poses)
+    assert tangent.weights.tangent is not None
+    assert tangent.is_quadratic
+    scale = problem.objective(poses)
+    assert tangent.objective(poses) == pytest.approx(scale, rel=1e-10)
+    for other in (random_poses(n, d, seed + 1), moved(poses, 0.1, seed), moved(poses, 1e-3, seed)):
+        assert tangent.objective(other) <= problem.objective(other) + 1e-10 * scale
+        X = other.stacked()
+        quadratic = float(np.sum(X * (tangent.M @ X)))
+        assert quadratic + tangent.weights.constant[0] == pytest.approx(tangent.objective(other), abs=1e-9 * scale)
+        size = float(abs(tangent.M).sum(axis=0).max()) * np.abs(X).max()
+        np.testing.assert_allclose(tangent.apply_M(X), tangent.M @ X, rtol=0, atol=1e-13 * size)
+
+
+@given(seed=SEEDS, n=st.integers(2, 6), d=DIMENSIONS, coupled=COUPLED)
+def test_gradient_and_hessian_of_chi2(seed: int, n: int, d: int, coupled: bool) -> None:
+    graph, poses = informed(seed, n, d, coupled, spread=0.5), random_poses(n, d, seed)
+    problem = PGOProblem(graph, weighting=Weighting.INFORMATION)
+    rng, layout = np.random.default_rng(seed), TangentLayout(n, d)
+    w, v = rng.standard_normal((n, tangent_dimension(d))), rng.standard_normal((n, d))
+    step, F = layout.join(w, v), problem.objective(poses)
+    slope = float(layout.join(*problem.riemannian_gradient(poses)) @ step)
+    curvature = float(step @ (riemannian_hessian(problem, poses, multipliers(problem, poses)) @ step))
+    errors = []
+    for h in (1e-2, 5e-3):
+        ahead, behind = (problem.objective(move_poses(poses, s * w, s * v)) for s in (h, -h))
+        errors.append((abs((ahead - behind) / (2 * h) - slope), abs((ahead + behind - 2 * F) / h**2 - curvature)))
+    scale = F + abs(slope) + abs(curvature)
+    for coarse, fine in zip(*errors, strict=True):
+        assert fine <= 0.3 * coarse + 1e-9 * scale / 5e-3**2 * 1e-3
+
+
+@given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, coupled=COUPLED)
+def test_best_translations_of_chi2(seed: int, n: int, d: int, coupled: bool) -> None:
+    problem = PGOProblem(informed(seed, n, d, coupled), weighting=Weighting.INFORMATION)
+    poses = random_poses(n, d, seed)
+    best = problem.at_best_translations(poses)
+    np.testing.assert_array_equal(best.R, poses.R)
+    _, before = problem.riemannian_gradient(poses)
+    _, after = problem.riemannian_gradient(best)
+    assert np.abs(after).max() <= 1e-9 * (np.abs(before).max() + problem.objective(poses))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_isotropic_information_is_f_in_space_and_quadratic(d: int) -> None:
+    graph = varied_graph(0, 7, d)
+    kappa = graph.kappa if d == 3 else 2.0 * graph.kappa  # in the plane a Gaussian counts rotations half of SE-Sync's
+    whole = replace(graph, information=isotropic_information(kappa, graph.tau, d))
+    problem, F = PGOProblem(whole, weighting=Weighting.INFORMATION), PGOProblem(graph)
+    assert problem.is_quadratic
+    assert problem.convex_part is problem
+    np.testing.assert_allclose(problem.M.toarray(), F.M.toarray(), rtol=1e-13, atol=1e-13 * abs(F.M).max())
+    np.testing.assert_array_equal(F.tangent_at(random_poses(7, d, 0)).M.toarray(), F.M.toarray())
+
+
+def test_rotation_information_is_in_every_matrix() -> None:
+    graph = informed(3, 6, 3, coupled=False)
+    information = graph.information.copy()  # type: ignore[union-attr]
+    information[:, :3, :3] = graph.tau[:, None, None] * np.eye(3)
+    graph = replace(graph, information=information)
+    problem, poses = PGOProblem(graph, weighting=Weighting.INFORMATION), random_poses(6, 3, 1)
+    assert problem.is_quadratic
+    assert not problem.weights.is_convex
+    assert problem.convex_part.weights.is_convex
+    X, n = poses.stacked(), 6
+    A, w = problem.residual_matrix
+    assert np.sum(w[:, None] * (A @ X) ** 2) == pytest.approx(chi2(graph, poses), rel=1e-11)
+    assert np.sum(X * (problem.M @ X)) == pytest.approx(chi2(graph, poses), rel=1e-11)
+    still = replace(graph, t_ij=np.zeros_like(graph.t_ij))
+    at_one_place = chi2(still, Poses(poses.R, np.zeros_like(poses.t)))
+    assert np.sum(X[n:] * (problem.L @ X[n:])) == pytest.approx(at_one_place, rel=1e-11)
+    best = problem.objective(problem.with_best_translations(poses.R))
+    assert np.sum(X[n:] * (problem.Q @ X[n:])) == pytest.approx(best, rel=1e-9)
+
+
+def test_coupling_blocks_of_indefinite_matrices_do_not_count() -> None:
+    graph = informed(0, 6, 3, coupled=True)
+    information = graph.information.copy()  # type: ignore[union-attr]
+    information[0, :3, 3:] *= 100.0
+    information[0, 3:, :3] *= 100.0
+    proper = proper_information(replace(graph, information=information))
+    assert not proper[0, :3, 3:].any()
+    np.testing.assert_array_equal(proper[1:], information[1:])
+    np.testing.assert_array_equal(proper[0, :3, :3], information[0, :3, :3])
+
+
+def test_matrices_beyond_double_precision_are_refused_by_name() -> None:
+    graph = informed(0, 6, 2, coupled=False)
+    information = graph.information.copy()  # type: ignore[union-attr]
+    information[2, :2, :2] = np.diag([1.0, 1e14])
+    problem = PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION)
+    with pytest.raises(GraphError, match=r"edge 2 .* spans more orders of magnitude"):
+        problem.objective(random_poses(6, 2, 0))
+
+
+def test_a_weighting_is_asked_for() -> None:
+    with pytest.raises(SettingError, match=r"give one of Weighting\.ISOTROPIC"):
+        PGOProblem(varied_graph(0, 3, 2), weighting="information")  # type: ignore[arg-type]
+
+
+def test_given_weights_are_taken() -> None:
+    graph = varied_graph(0, 5, 3)
+    twice = PGOProblem(graph, weighting=EdgeWeights(2.0 * graph.tau, 2.0 * graph.kappa))
+    poses = random_poses(5, 3, 0)
+    assert twice.objective(poses) == pytest.approx(2.0 * PGOProblem(graph).objective(poses), rel=1e-14)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("coupled", [False, True])
+def test_polish_finds_stationary_points_of_chi2(d: int, coupled: bool) -> None:
+    graph = informed(1, 12, d, coupled)
+    problem = PGOProblem(graph, weighting=Weighting.INFORMATION)
+    poses = polish(problem, chordal_start(problem.convex_part))
+    w, v = problem.riemannian_gradient(poses)
+    assert max(np.abs(w).max(), np.abs(v).max()) <= 1e-6 * problem.objective(poses)
