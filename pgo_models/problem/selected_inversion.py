@@ -51,7 +51,7 @@ def selected_inverse(L: csc_array) -> Array:
             G_T = inverse @ L_T[:, w:]
             rows_above, Z_above = fronts[parent]
             place = np.searchsorted(rows_above, rows[w:])
-            Z_II = Z_above[place[:, None], place]
+            Z_II = Z_above.take(place, axis=0).take(place, axis=1)
             front[:w, w:] = -(G_T @ Z_II)
             front[:w, :w] -= front[:w, w:] @ G_T.T
             if waiting[k]:
