@@ -26,8 +26,7 @@ def selected_inverse(L: csc_array) -> Array:
     L is as of `CholeskyFactor.take_apart`: lower triangular, rows sorted, all of its pattern stored, zeros included.
     """
     data, indices, indptr, side = L.data, L.indices, L.indptr.astype(np.int64), L.shape[0]
-    count = np.diff(indptr)
-    above = np.full(side, -1)  # parents of columns
+    count, above = np.diff(indptr), np.full(side, -1)  # of columns: their rows and their parents
     above[count > 1] = indices[indptr[:-1][count > 1] + 1]
     # A supernode is a run of columns, each of which has the rows of the next one, and that.
     is_first = np.append(True, (above[:-1] != np.arange(1, side)) | (count[:-1] != count[1:] + 1))
@@ -50,10 +49,11 @@ def selected_inverse(L: csc_array) -> Array:
         if size > w:
             G_T = inverse @ L_T[:, w:]
             rows_above, Z_above = fronts[parent]
-            place = np.searchsorted(rows_above, rows[w:])
+            place = rows_above.searchsorted(rows[w:])
             Z_II = Z_above.take(place, axis=0).take(place, axis=1)
-            front[:w, w:] = -(G_T @ Z_II)
-            front[:w, :w] -= front[:w, w:] @ G_T.T
+            less = G_T @ Z_II
+            front[:w, w:] = -less
+            front[:w, :w] += less @ G_T.T
             if waiting[k]:
                 front[w:, :w], front[w:, w:] = front[:w, w:].T, Z_II
             waiting[parent] -= 1
@@ -61,5 +61,5 @@ def selected_inverse(L: csc_array) -> Array:
                 del fronts[parent]
         if waiting[k]:
             fronts[k] = rows, front
-        Z[mine] = front[:w].ravel()[stored]
+        Z[mine] = front[:w].ravel().take(stored)
     return np.asarray(Z)
