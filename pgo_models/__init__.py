@@ -28,6 +28,7 @@ from pgo_models.plots.graph_plots import compare_poses, plot_graph
 from pgo_models.plots.interactive_plots import explore_graph
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
+from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ __all__ = [
     "Certificate",
     "Chi2Convention",
     "CholeskyBackend",
+    "Marginals",
     "OrthogonalProblem",
     "PGOError",
     "PGOProblem",

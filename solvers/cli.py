@@ -11,6 +11,7 @@ import shlex
 import sys
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,13 +23,14 @@ from rich.console import Console
 from rich.table import Table
 
 from pgo_models.certificates.certificate import DEFAULT_GAP, certify
-from pgo_models.errors import SettingError
+from pgo_models.errors import NotPositiveDefiniteError, SettingError
 from pgo_models.files import check_writable
 from pgo_models.geometry.poses import absolute_trajectory_error
 from pgo_models.graphs.datasets import known_datasets, load
 from pgo_models.graphs.g2o import MOST_SYMBOLS, symbol_ids, write_g2o, write_g2o_folder
 from pgo_models.graphs.separators import report_partition
 from pgo_models.graphs.trajectories import write_tum
+from pgo_models.problem.marginals import write_covariances
 from solvers.cli_inputs import estimated_poses, load_graph, pose_named, pose_problem, with_times
 from solvers.cli_options import (
     BackEndName,
@@ -176,6 +178,12 @@ def solve_command(
         Path | None,
         typer.Option(help="Write a report as .html: one page that opens offline, with pictures, tables and advice."),
     ] = None,
+    covariances: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write poses' covariances as .csv: id, upper triangle; x y (z) in world axes, m, then turn, rad."
+        ),
+    ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print a line an iteration.")] = False,
 ) -> None:
     """Solve a pose graph: poses, their cost, a proven lower bound on the global optimum, and the gap."""
@@ -183,12 +191,13 @@ def solve_command(
         check_format(path)  # before a long solve, not after it
     if report is not None:
         check_report(report)
+    if covariances is not None and covariances.suffix.lower() != ".csv":
+        raise SettingError(f"cannot write {covariances}: covariances are written as .csv")
     problem = pose_problem(with_times(load_graph(graph, unit_weights), times), unit_weights, information)
     for path in out or []:
         check_target(path, problem.graph.num_robots)
-    for other in (report, resume):
-        if other is not None:
-            check_writable(other)
+    for other in filter(None, (report, resume, covariances)):
+        check_writable(other)
     about_robots = (robots, split, engine, address, resume, driver_memory)
     is_shared = any(option is not None for option in about_robots)
     chosen = chosen_method(method, robots, is_shared)
@@ -220,6 +229,10 @@ def solve_command(
     if truth is not None:
         text += f"\n\nerror to the truth (ATE): {absolute_trajectory_error(solution.poses, truth):.4g} m"
     targets: list[tuple[Path, Callable[[Path], None]]] = [(path, solution.save) for path in out or []]
+    if covariances is not None:
+        targets.append((covariances, lambda to: write_covariances(solution.marginals(), problem.graph.pose_ids, to)))
+        with suppress(NotPositiveDefiniteError):  # writing will say so
+            solution = replace(solution, covariances=solution.marginals() if report is not None else None)
     if report is not None:
         source = shlex.join([graph, *(["--unit-weights"] if unit_weights else [])])
         targets.append((report, partial(write_report, solution, source=source)))

@@ -228,7 +228,7 @@ def solve(
             certificate = soften(problem, certificate)
         except KeyboardInterrupt:
             job.interrupt(problem.objective(poses))
-    poses, frame = framed(poses, problem.graph, anchor)
+    poses, frame, held = framed(poses, problem.graph, anchor)
     return Solution(
         problem=problem,
         poses=poses,
@@ -241,23 +241,24 @@ def solve(
         robots=robots,
         note=NO_CERTIFICATE if pipeline.driver_memory == 0 else "",
         frame=frame,
+        anchor=held,
     )
 
 
-def framed(poses: Poses, graph: PoseGraph, anchor: int | None) -> tuple[Poses, str]:
-    """Poses in the frame of the anchor, of the first FIX line, of the graph's estimate or of pose 0; which it is."""
+def framed(poses: Poses, graph: PoseGraph, anchor: int | None) -> tuple[Poses, str, int]:
+    """Poses in the frame of the anchor, first FIX line, estimate or pose 0; which it is; the pose held, or 0."""
     ids, reference = graph.pose_ids, graph.initial
     held = anchor if anchor is not None else int(graph.fixed[0]) if len(graph.fixed) else None
     if held is None and reference is not None:
-        return poses.aligned_to(reference), "aligned with the estimate that came with the graph"
+        return poses.aligned_to(reference), "aligned with the estimate that came with the graph", 0
     why = "as asked for" if anchor is not None else "by its FIX line"
     if anchor is None and len(graph.fixed) > 1:
         why += f"; those of {len(graph.fixed) - 1} other poses are not minded, F leaves one frame open"
     if held is not None and reference is not None:
-        return poses.anchored_to(reference, held), f"pose {ids[held]} where the estimate has it, {why}"
+        return poses.anchored_to(reference, held), f"pose {ids[held]} where the estimate has it, {why}", held
     if held is not None:
-        return poses.with_gauge_at(held), f"pose {ids[held]} at the identity, {why}"
-    return poses.with_gauge_at(0), f"pose {ids[0]} at the identity"
+        return poses.with_gauge_at(held), f"pose {ids[held]} at the identity, {why}", held
+    return poses.with_gauge_at(0), f"pose {ids[0]} at the identity", 0
 
 
 def _robots_for(soc: SOC | PaperSOC | None, robots: Partition | int, graph: PoseGraph) -> Partition:

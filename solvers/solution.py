@@ -9,16 +9,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, gap_text
+from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.files import check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import check_g2o_folder, write_g2o, write_g2o_folder
 from pgo_models.graphs.residuals import chi2
 from pgo_models.graphs.trajectories import write_kitti, write_tum
 from pgo_models.html_tables import facts_table, rows_table
 from pgo_models.plots.graph_plots import compare_poses
 from pgo_models.plots.style import is_picture, save_figure
+from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.initialization import spanning_tree_start
+from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.reporting.report import Solved, write_report
@@ -59,6 +63,10 @@ class Solution(Solved):
         What the certificate lacks, and why; empty where it lacks nothing.
     frame : str
         Which frame the poses are in, which F leaves open.
+    anchor : int
+        Pose that it is held by, or 0: what `marginals` are relative to.
+    covariances : (n, p, p), optional
+        All `marginals()`, for ellipses in the report: `dataclasses.replace` puts them in.
 
     Examples
     --------
@@ -108,6 +116,17 @@ class Solution(Solved):
         return [
             (s.name, str(s.iterations), f"{s.objective:.10g}", f"{s.seconds:.3f}", s.status.name) for s in self.stages
         ]
+
+    def marginals(self, *poses: int, anchor: int | None = None) -> Array:
+        """Joint covariance of some poses, (k p, k p), or of every pose on its own, (n, p, p), when none is named.
+
+        Blocks of (Hess F / 2)^-1 relative to an anchor, the solution's unless given; `Marginals`, which answers many
+        such questions with one factorisation, has units, axes and errors.
+        """
+        hessian = riemannian_hessian(self.problem, self.poses, multipliers(self.problem, self.poses))
+        layout = TangentLayout(self.problem.num_poses, self.problem.d)
+        found = Marginals(hessian, layout, self.anchor if anchor is None else anchor, self.problem.backend)
+        return found.joint(*poses) if poses else found.diagonal
 
     def save(self, path: Path | str) -> None:
         """Write the solution in the format that the suffix of `path` names.

@@ -297,6 +297,8 @@ def test_info_names_the_components(pgo_command, tmp_path):
         ("solve", "sphere", "--out", "/dev/null"),
         ("solve", "sphere", "--out", "good.tum", "--out", "no/such/folder/x.g2o"),
         ("solve", "sphere", "--report", "no/such/folder/x.html"),
+        ("solve", "sphere", "--covariances", "no/such/folder/x.csv"),
+        ("solve", "sphere", "--covariances", "x.json"),
         ("certify", "sphere", "--out", "no/such/folder/x.json"),
         ("compare", "sphere", "--out", "no/such/folder/x.md"),
         ("solve", "x" * 5000),
@@ -376,3 +378,23 @@ def test_an_anchor_stays_where_the_file_has_it_and_times_are_written(pgo_command
     code, _, err = pgo_command("solve", tmp_path / "grid.g2o", "--times", tmp_path / "times.txt")
     assert code == 1
     assert "times.txt: 2 times, grid has 27 poses; give one each" in err
+
+
+def test_covariances_are_written_beside_the_anchor_and_shown_in_the_report(pgo_command, tmp_path):
+    table, report = tmp_path / "poses.csv", tmp_path / "report.html"
+    code, out, _ = pgo_command("solve", "circle", "--anchor", 7, "--covariances", table, "--report", report)
+    assert code == 0
+    assert f"written: {table}" in out
+    head, *rows = [line.split(",") for line in table.read_text().splitlines()]
+    assert (len(rows), len(head), head[1]) == (25, 22, "x*x (m m)")
+    still = [row[0] for row in rows if not any(map(float, row[1:]))]
+    assert still == ["7"]
+    assert "95 % of x, y" in report.read_text(encoding="utf-8")
+
+
+def test_without_a_minimum_all_but_the_covariances_is_written(pgo_command, tmp_path):
+    options = ("--out", tmp_path / "x.tum", "--report", tmp_path / "x.html", "--covariances", tmp_path / "x.csv")
+    code, _, err = pgo_command("solve", "circle", "--start", "tree", "--time-limit", "1e-9", *options)
+    assert (code, err.count("\n")) == (1, 1)
+    assert err.startswith("pgo: no covariances, the poses are at no strict minimum")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["x.html", "x.tum"]

@@ -94,3 +94,16 @@ def test_the_uncertified_solution_of_an_impossible_graph_saves_too(tmp_path):
     record = json.loads((tmp_path / "solution.json").read_text())
     assert record["verdict"] in ("NOT_CERTIFIED", "TRIVIAL")
     assert record["lower_bound"] <= record["objective"]
+
+
+def test_its_marginals_are_of_poses_it_names_beside_its_anchor(solution):
+    blocks, joint = solution.marginals(), solution.marginals(3, 19)
+    assert (blocks.shape, joint.shape) == ((25, 6, 6), (12, 12))
+    for one, place in ((3, 0), (19, 6)):
+        own = joint[place : place + 6, place : place + 6]
+        np.testing.assert_allclose(own, blocks[one], rtol=0, atol=1e-10 * np.abs(blocks).max())
+    assert np.flatnonzero(~blocks.any(axis=(1, 2))).tolist() == [solution.anchor] == [0]
+    assert np.flatnonzero(~solution.marginals(anchor=4).any(axis=(1, 2))).tolist() == [4]
+    assert solvers.solve(solution.problem, anchor=9).anchor == 9
+    with pytest.raises(SettingError, match="there is no pose 25; give one of 0 to 24"):
+        solution.marginals(25)

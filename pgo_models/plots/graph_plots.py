@@ -14,6 +14,7 @@ from pgo_models.graphs.residuals import edge_residuals, uncertain_edges
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, column_figure
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
@@ -42,6 +43,20 @@ def edge_kinds(graph: PoseGraph, poses: Poses) -> IntArray:
     kind[uncertain_edges(graph)] = UNCERTAIN
     kind[edge_residuals(graph, poses).is_misfit] = MISFIT
     return kind
+
+
+def confidence_ellipses(poses: Poses, covariances: Array) -> Array:
+    """Outlines, (k, 49, d) points, that hold the true x and y with 95 %, in space at the height of the pose.
+
+    Of covariances (n, p, p) of moves along the axes of the world first (`Marginals`), at most 100 poses, evenly chosen.
+    """
+    chosen = np.linspace(0, poses.num_poses - 1, min(poses.num_poses, 100)).astype(int)
+    angle = np.linspace(0.0, 2.0 * np.pi, 49)
+    variances, axes = np.linalg.eigh(covariances[chosen, :2, :2])
+    radii = np.sqrt(-2.0 * np.log(0.05) * np.maximum(variances, 0.0))
+    outlines = np.repeat(poses.t[chosen, None], len(angle), axis=1)
+    outlines[:, :, :2] += np.stack([np.cos(angle), np.sin(angle)], axis=1) @ np.swapaxes(axes * radii[:, None], 1, 2)
+    return outlines
 
 
 def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = True) -> None:
@@ -81,8 +96,8 @@ def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = Tr
     _frame(axes, poses.t)
 
 
-def plot_graph(graph: PoseGraph, poses: Poses, title: str = "") -> Figure:
-    """Figure of a graph by robot, with a legend; see `draw_graph`.
+def plot_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: Array | None = None) -> Figure:
+    """Figure of a graph by robot, with a legend (`draw_graph`); of covariances (n, p, p), `confidence_ellipses`.
 
     Raises
     ------
@@ -102,7 +117,11 @@ def plot_graph(graph: PoseGraph, poses: Poses, title: str = "") -> Figure:
         axes = figure.add_subplot(projection="3d" if graph.d == 3 else None)
         draw_graph(graph, poses, axes)
         axes.set_title(title or graph.name)
-        handles = _legend(graph, edge_kinds(graph, poses))
+        handles: list[Artist] = list(_legend(graph, edge_kinds(graph, poses)))
+        if covariances is not None:
+            outlines, style = list(confidence_ellipses(poses, covariances)), {"colors": QUIET_COLOUR, "linewidths": 0.3}
+            ellipses = _line_collection(graph.d)(outlines, **style, zorder=1, label="95 % of x, y")
+            handles.append(axes.add_collection(ellipses))
         if handles:
             figure.legend(handles=handles, loc="outside lower center", ncols=3 if graph.num_robots > 1 else 1)
     return figure

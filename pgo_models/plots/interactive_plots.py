@@ -17,7 +17,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import pose_names
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.residuals import EdgeResiduals, edge_residuals
-from pgo_models.plots.graph_plots import BETWEEN, KIND_LABELS, MISFIT, OWN, UNCERTAIN, edge_kinds
+from pgo_models.plots.graph_plots import BETWEEN, KIND_LABELS, MISFIT, OWN, UNCERTAIN, confidence_ellipses, edge_kinds
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ PAGE_CONFIG: dict[str, object] = {
 }
 
 
-def explore_graph(graph: PoseGraph, poses: Poses, title: str = "") -> Figure:
+def explore_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: Array | None = None) -> Figure:
     """Plotly figure of a graph by robot; poses and misfitting edges say who they are under the pointer.
 
     Parameters
@@ -48,6 +48,8 @@ def explore_graph(graph: PoseGraph, poses: Poses, title: str = "") -> Figure:
     poses : Poses
         Drawn to seven digits (float32).
     title : str
+    covariances : (n, p, p), optional
+        Of every pose, drawn as `confidence_ellipses`.
 
     Raises
     ------
@@ -87,6 +89,10 @@ def explore_graph(graph: PoseGraph, poses: Poses, title: str = "") -> Figure:
     misfits = np.flatnonzero(kind == MISFIT)
     middles = 0.5 * (poses.t[graph.i[misfits]] + poses.t[graph.j[misfits]])
     traces.append(_dots(middles, _misfit_text(graph, misfits, residuals), "misfit", ALARM_COLOUR, 6.0))
+    if covariances is not None:
+        outlines = np.pad(confidence_ellipses(poses, covariances), ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+        gaps, line = outlines.reshape(-1, graph.d), {"color": QUIET_COLOUR, "width": 1.0}
+        traces.append({**_points(gaps), "mode": "lines", "line": line, "name": "95 % of x, y", "hoverinfo": "skip"})
     figure = go.Figure(traces)
     _arrange(figure, poses.t, title)
     return figure

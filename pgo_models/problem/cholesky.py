@@ -67,6 +67,10 @@ class CholeskyFactor(ABC):
             larger matrix, and their own columns' share of E is counted apart (`column_error`).
         """
 
+    @abstractmethod
+    def take_apart(self) -> tuple[csc_array, np.ndarray]:
+        """L and the order with A[order][:, order] = L L^T, rows sorted, all of its pattern stored; uses it up."""
+
     def known_error(self) -> Array | None:
         """`backward_error` where it costs nothing but a look at the factor."""
         return self.backward_error()
@@ -152,11 +156,15 @@ def factorize(matrix: csc_array, backend: CholeskyBackend | None = None) -> Chol
 
 
 class _SuperLUFactor(CholeskyFactor):
-    def __init__(self, lu: SuperLU, order: np.ndarray, diagonal: Array) -> None:
+    def __init__(self, lu: SuperLU, analysis: _SuperLU, diagonal: Array) -> None:
         self._lu = lu
-        self._order = order
-        self._rows = order[np.argsort(lu.perm_c)]  # in the order of elimination
+        self._analysis = analysis
+        self._rows = analysis.order[np.argsort(lu.perm_c)]  # in the order of elimination
         self._diagonal = diagonal[self._rows]
+
+    def take_apart(self) -> tuple[csc_array, np.ndarray]:
+        L = self._lu.L @ diags_array(np.sqrt(self._lu.U.diagonal()))
+        return (L + self._analysis.tiny_factor()).tocsr().tocsc(), self._rows  # to and fro, which sorts rows
 
     def half_solve(self, right_hand_side: Array) -> Array:
         L = self._lu.L.tocsr()
@@ -195,7 +203,8 @@ class _SuperLUFactor(CholeskyFactor):
 
     def solve(self, right_hand_side: Array) -> Array:
         solution = np.empty_like(right_hand_side, dtype=float)
-        solution[self._order] = self._lu.solve(np.asfortranarray(right_hand_side[self._order], dtype=float))
+        order = self._analysis.order
+        solution[order] = self._lu.solve(np.asfortranarray(right_hand_side[order], dtype=float))
         return solution
 
 
@@ -209,35 +218,42 @@ class _SuperLU(SymbolicCholesky):
         dominant = csc_array((np.zeros(pattern.nnz), pattern.indices, pattern.indptr), shape=pattern.shape)
         dominant.setdiag(np.ones(n))
         lu = splu(dominant, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        self._order = np.argsort(lu.perm_c)
+        self.order = np.argsort(lu.perm_c)
+
+    def tiny_factor(self) -> csc_array:
+        """1e-300 wherever a factor may have an entry: scipy leaves out zeros, of which that of a Laplacian has none."""
+        laplacian = csc_array((np.full(len(self._indices), -1.0), self._indices, self._indptr), shape=self._shape)
+        laplacian.setdiag((1.0 + 1e-6) * np.diff(self._indptr))  # with more, entries far down a chain would vanish
+        L = self._lu(laplacian).L
+        return csc_array((np.full(L.nnz, 1e-300), L.indices, L.indptr), shape=L.shape)
 
     def factorize(self, matrix: csc_array, overwrite: CholeskyFactor | None = None) -> CholeskyFactor:
         self._check(matrix)
-        permuted = matrix[self._order][:, self._order].tocsc()
         try:
-            lu = splu(permuted, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+            lu = self._lu(matrix)
         except RuntimeError as error:  # SuperLU's word for an exactly singular matrix
             if "singular" not in str(error):
                 raise MemoryError(str(error)) from error  # its only other one
             raise NotPositiveDefiniteError("the matrix is singular") from error
         if not (np.array_equal(lu.perm_r, lu.perm_c) and (lu.U.diagonal() > 0).all()):
             raise NotPositiveDefiniteError("the matrix has a pivot that is not positive")
-        return _SuperLUFactor(lu, self._order, matrix.diagonal())
+        return _SuperLUFactor(lu, self, matrix.diagonal())
+
+    def _lu(self, matrix: csc_array) -> SuperLU:
+        permuted = matrix[self.order][:, self.order].tocsc()
+        return splu(permuted, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 class _CholmodFactor(CholeskyFactor):
     """CVXOPT factors in place, symbolic part included: that of a factor out of use is taken over by the next one."""
 
     def __init__(self, numeric: _Capsule, analysis: _Cholmod) -> None:
-        self._numeric: _Capsule | None = numeric
+        self._numeric: _Capsule | None = numeric  # None: used up
         self._analysis = analysis
 
-    @property
-    def is_overwritten(self) -> bool:
-        return self._numeric is None
-
-    def overwrite(self) -> None:
-        self._numeric = None
+    def overwrite(self) -> _Capsule | None:
+        numeric, self._numeric = self._numeric, None
+        return numeric
 
     def half_solve(self, right_hand_side: Array) -> Array:
         cvxopt, cholmod = _import_cvxopt()
@@ -246,13 +262,17 @@ class _CholmodFactor(CholeskyFactor):
             cholmod.solve(self._numeric, half, sys=system)
         return np.array(half).reshape(right_hand_side.shape)
 
+    def take_apart(self) -> tuple[csc_array, np.ndarray]:
+        parts, order = self._analysis.take_apart(self.overwrite())
+        pointers, rows, values = (np.array(part).ravel() for part in parts)
+        return csc_array((values, rows, pointers), shape=(len(order), len(order))), order
+
     def known_error(self) -> Array | None:
         return self._analysis.expected_error()
 
     def last_error(self) -> Array:
         if self._numeric is not None and self.known_error() is None:
-            self._analysis.count(self._numeric)
-            self._numeric = None
+            self._analysis.count(self.overwrite())
         return self.backward_error()
 
     def most_in_row(self, beside: Array | int = 0) -> float:
@@ -301,20 +321,23 @@ class _Cholmod(SymbolicCholesky):
         return self._counts if self._counts is not None else self.count(self._spare())
 
     def count(self, capsule: _Capsule) -> FactorCounts:
-        """Find the counts of a numeric factor, which CVXOPT takes apart for it: the next one would be L D L^T in it."""
+        """Find the counts of a numeric factor, which is used up for it."""
+        try:
+            (pointers, rows, _), order = self.take_apart(capsule)
+        except (ValueError, ArithmeticError):  # it is symbolic, or of a matrix that was not positive definite
+            (pointers, rows, _), order = self.take_apart(self._numeric(np.where(self._is_diagonal, 1.0, 0.0), capsule))
+        in_row = np.diff(np.array(pointers).ravel()).astype(float)
+        in_column = np.bincount(np.array(rows).ravel(), minlength=len(in_row)).astype(float)
+        self._counts = FactorCounts(in_column, in_row, order)
+        return self._counts
+
+    def take_apart(self, capsule: _Capsule) -> tuple[tuple[object, object, object], np.ndarray]:
+        """Pointers, rows and values of L, and its order; CVXOPT uses the factor up: the next would be L D L^T in it."""
         self._taken = [(user, other) for user, other in self._taken if other is not capsule]
         cvxopt, cholmod = _import_cvxopt()
         order = cvxopt.matrix(np.arange(self._shape[0], dtype=float))
-        try:
-            cholmod.solve(capsule, order, sys=_PERMUTE)
-        except (ValueError, ArithmeticError):  # it is symbolic, or of a matrix that was not positive definite
-            capsule = self._numeric(np.where(self._is_diagonal, 1.0, 0.0), capsule)
-            cholmod.solve(capsule, order, sys=_PERMUTE)
-        pointers, rows, _ = cholmod.getfactor(capsule).CCS
-        in_row = np.diff(np.array(pointers).ravel()).astype(float)
-        in_column = np.bincount(np.array(rows).ravel(), minlength=len(in_row)).astype(float)
-        self._counts = FactorCounts(in_column, in_row, np.array(order).ravel().astype(np.int64))
-        return self._counts
+        cholmod.solve(capsule, order, sys=_PERMUTE)
+        return cholmod.getfactor(capsule).CCS, np.array(order).ravel().astype(np.int64)
 
     def _analyze(self) -> _Capsule:
         with _supernodal() as cholmod:
@@ -339,7 +362,7 @@ class _Cholmod(SymbolicCholesky):
         used, idle = [], []
         for user, numeric in self._taken:
             factor = None if user is None else user()
-            if factor is None or factor.is_overwritten:
+            if factor is None or factor._numeric is None:
                 idle.append(numeric)
             else:
                 used.append((user, numeric))

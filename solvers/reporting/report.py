@@ -14,6 +14,7 @@ from pgo_models.certificates.certificate import Certificate, gap_text
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.poses import Poses, absolute_trajectory_error
+from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import pose_names
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.graphs.published_results import published_run
@@ -48,6 +49,8 @@ class Solved:
     robots: Partition | None = None
     note: str = ""
     frame: str = ""
+    anchor: int = 0
+    covariances: Array | None = None
 
 
 def write_report(solution: Solved, path: Path | str, *, source: str | None = None) -> None:
@@ -105,7 +108,7 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
     graph = solution.problem.graph.with_robots(robots.robot)
     residuals = edge_residuals(graph, solution.poses)
     place = "graph3d" if graph.d == 3 else "graph2d"
-    figures = {place: explore_graph(graph, solution.poses).to_json()}
+    figures = {place: explore_graph(graph, solution.poses, covariances=solution.covariances).to_json()}
     sections = [
         _header(solution),
         _verdict(solution),

@@ -7,7 +7,7 @@ import pgo_models as pgo
 import solvers
 from pgo_models.errors import GraphError, MissingExtraError
 from pgo_models.plots.curves import plot_decay, plot_tightness
-from pgo_models.plots.graph_plots import draw_graph, plot_against_truth
+from pgo_models.plots.graph_plots import confidence_ellipses, draw_graph, plot_against_truth
 from pgo_models.plots.matrix_plots import plot_sparsity, plot_spectrum
 from pgo_models.plots.style import save_figure
 from solvers.reporting.comparison_plots import plot_efforts
@@ -142,3 +142,26 @@ def test_without_matplotlib_one_line_names_the_extra(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(MissingExtraError, match=r"pgo-splitting\[plot\]"):
         solution.plot()
+
+
+@pytest.mark.parametrize(("d", "poses"), [(2, 30), (3, 240)])
+def test_ellipses_hold_what_their_covariance_says(d, poses):
+    graph = pgo.random_geometric(poses, np.random.default_rng(0), d=d)
+    A = np.random.default_rng(1).standard_normal((poses, 3 * d - 3, 3 * d - 3))
+    covariances = A @ np.swapaxes(A, 1, 2)
+    covariances[0] = 0.0
+    outlines = confidence_ellipses(graph.truth, covariances)
+    assert outlines.shape == (min(poses, 100), 49, d)
+    chosen = [int(np.argmin(np.abs(graph.truth.t - middle).sum(axis=1))) for middle in outlines[:, :-1].mean(axis=1)]
+    assert chosen == sorted(set(chosen))
+    assert (chosen[0], chosen[-1]) == (0, poses - 1)
+    np.testing.assert_array_equal(outlines[0], np.tile(graph.truth.t[0], (49, 1)))
+    for one, outline in zip(chosen[1:], outlines[1:], strict=True):
+        away = outline - graph.truth.t[one]
+        assert not away[:, 2:].any()
+        square = np.sum(away[:, :2] * np.linalg.solve(covariances[one, :2, :2], away[:, :2].T).T, axis=1)
+        np.testing.assert_allclose(square, 5.991464547107979, rtol=1e-9, atol=0)  # 95 % of chi2 with 2 degrees
+    figure = pgo.plot_graph(graph, graph.truth, covariances=covariances)
+    (axes,) = figure.axes
+    assert len(axes.collections) == 2
+    assert [text.get_text() for text in figure.legends[0].get_texts()][-1] == "95 % of x, y"

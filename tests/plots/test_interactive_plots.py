@@ -98,3 +98,14 @@ def test_without_plotly_one_line_names_the_extra(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(MissingExtraError, match=r"pgo-splitting\[plot\]"):
         pgo.explore_graph(graph, graph.truth)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_ellipses_of_covariances_are_one_trace(d):
+    graph = pgo.random_geometric(150, np.random.default_rng(0), d=d)
+    covariances = np.tile(np.diag(np.arange(1.0, 3 * d - 2)), (150, 1, 1))
+    (*_, trace) = pgo.explore_graph(graph, graph.truth, covariances=covariances).data
+    assert (trace.name, len(trace.x)) == ("95 % of x, y", 100 * 50)
+    outlines = np.asarray(trace.x).reshape(100, 50)
+    assert np.isnan(outlines[:, -1]).all()
+    np.testing.assert_allclose(np.ptp(outlines[:, :-1], axis=1), 2 * np.sqrt(5.991464547107979), rtol=1e-5, atol=0)
