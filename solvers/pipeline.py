@@ -186,6 +186,8 @@ def solve(
         raise SettingError("faults are of messages between robots; give solve() the robots of SOC, too")
     if robots is None and pipeline.driver_memory != DEFAULT_MEMORY:
         raise SettingError("driver_memory is for solves by robots; give solve() the robots, too")
+    if pipeline.driver_memory == 0 and problem.convex_part is not problem:
+        raise SettingError("without a driver robots run SOC alone, which needs a convex quadratic cost: F, not chi2")
     if pipeline.driver_memory == 0:
         pipeline = replace(pipeline, second_try=False, staircase=None)
     job = _Job(problem, pipeline, watch)

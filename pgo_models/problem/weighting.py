@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pgo_models.errors import GraphError
-from pgo_models.geometry.rotations import Array, hat, tangent_dimension, vee
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.geometry.rotations import Array, BoolArray, hat, tangent_dimension, vee
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.precisions import proper_information
 from pgo_models.problem.floating_point import OUTWARD, gamma
 
@@ -66,6 +66,25 @@ class EdgeWeights:
     W_error: Array | None = None
     excess: Excess | None = None
     tangent: Tangent | None = None
+
+    def of_edges(self, chosen: IntArray | BoolArray) -> EdgeWeights:
+        """Weights of some of the edges; of a cost, not of a tangent."""
+        axes, W_given, W_error = (
+            None if one is None else one[chosen] for one in (self.axes, self.W_given, self.W_error)
+        )
+        excess = None if self.excess is None else self.excess.of_edges(chosen)
+        return EdgeWeights(self.tau[chosen], self.kappa[chosen], axes, W_given, W_error, excess)
+
+    def scaled(self, share: Array) -> EdgeWeights:
+        """Weights times shares, (m,), of a quadratic cost."""
+        wide = share[:, None, None]
+        return EdgeWeights(
+            share * self.tau,
+            share * self.kappa if self.axes is None else share[:, None] * self.kappa,
+            self.axes,
+            None if self.W_given is None else wide * self.W_given,
+            None if self.W_error is None else share * self.W_error,
+        )
 
     @property
     def is_convex(self) -> bool:
@@ -161,6 +180,11 @@ class Excess:
     K: Array | None
     size: Array
     least: Array
+
+    def of_edges(self, chosen: IntArray | BoolArray) -> Excess:
+        """The excess of some of the edges."""
+        K = None if self.K is None else self.K[chosen]
+        return Excess(self.R_ij[chosen], self.J[chosen], K, self.size[chosen], self.least[chosen])
 
     def arguments(self, Z: Array) -> tuple[Array, Array | None]:
         """(u, H) of edges, (m, q) and (m, p, p) or None: linear in Z, (m, d + 1, d)."""

@@ -231,7 +231,10 @@ def run_fingerprint(problem: PGOProblem, robots: Partition, settings: object, st
     ['partition']
     """
     graph = problem.graph
-    edges = (graph.i, graph.j, graph.R_ij, graph.t_ij, graph.kappa, graph.tau)
+    weights = problem.weights
+    edges = [graph.i, graph.j, graph.R_ij, graph.t_ij, weights.W(graph.d), weights.tau]
+    if weights.excess is not None:
+        edges.append(weights.excess.J)
     poses = () if start is None else (start.R, start.t)
     text = np.frombuffer(repr(settings).encode(), dtype=np.uint8)
     return dict(zip(_PARTS, (_digest(*edges), _digest(robots.robot), _digest(text, *poses)), strict=True))

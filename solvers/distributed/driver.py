@@ -81,6 +81,7 @@ class DriverState:
     kept: CoverPoses
     block: RecursionBlock | None
     ledger: Ledger
+    is_final: bool = False
 
 
 class Driver:
@@ -98,6 +99,8 @@ class Driver:
         Which of the cover is left out when a bound is proved.
     block : RecursionBlock, optional
         Rotations of the cover in SOC's recursion.
+    is_final : bool
+        Whether the cost at hand is the one that is solved, and not the one near it that SOC is run on.
     step_a : InterfaceFactor, optional
         Of its step (a), with the robots' right-hand sides for the next one in `right`.
     """
@@ -142,10 +145,11 @@ class Driver:
         self.block: RecursionBlock | None = None
         self.step_a: InterfaceFactor | None = None
         self.right: list[RightHandSide] = []
+        self._has_two_costs = any(subgraph.final is not None for subgraph in subgraphs)
+        self.is_final = False
         self._laplacian: InterfaceFactor | None = None
         self.network = CountedPool(engine.open(partial(Agent, backend=backend), subgraphs), len(subgraphs))
-        described = self.ask(Interior.describe, None, Count.OFF)
-        self.diagonal = self.interface(1, d).gather([diagonal[:, None] for diagonal in described])[:, 0]
+        self.describe(Count.OFF)
 
     def ask(
         self, order: Callable[[Interior, Q], tuple[Interior, A]], request: Q, count: Count = Count.ROUND
@@ -162,6 +166,17 @@ class Driver:
             to_all[robot] = request
         answers = self.network.ask(partial(order_interior, order), to_all, count, self.robots)
         return [cast(A, answers[robot]) for robot in self.robots.tolist()]
+
+    def describe(self, count: Count) -> None:
+        """Ask for the diagonal of M at the poses at hand."""
+        described = self.ask(Interior.describe, None, count)
+        self.diagonal = self.interface(1, self.d).gather([diagonal[:, None] for diagonal in described])[:, 0]
+
+    def choose_cost(self, final: bool) -> None:
+        """Go over to the cost that is solved, or back to the one that SOC is run on, where those are two."""
+        if self._has_two_costs and final != self.is_final:
+            self.is_final = final
+            self.at = self.with_sums(self.at, self.ask(Interior.choose_cost, final, Count.PIGGYBACKED))
 
     def close(self) -> None:
         """Let the robots go."""
@@ -204,7 +219,7 @@ class Driver:
     @property
     def state(self) -> DriverState:
         """What `resume` needs; the factors are found again."""
-        return DriverState(self.at, self.kept, self.block, self.network.ledger)
+        return DriverState(self.at, self.kept, self.block, self.network.ledger, self.is_final)
 
     def snapshots(self) -> list[Snapshot]:
         """What every robot needs to go on from here; nobody else looks into it, and it is off the ledger."""
@@ -214,6 +229,7 @@ class Driver:
         """Go on from a state, and robots from their snapshots; they send the matrix of the translations again."""
         self.network.ask(restore, snapshots, Count.OFF)
         self.at, self.kept, self.block, self.network.ledger = state.at, state.kept, state.block, state.ledger
+        self.is_final = state.is_final
         matrices = self.ask(Interior.eliminated_translations, None, Count.PIGGYBACKED)
         known = [matrix for matrix in matrices if matrix is not None]
         if known and len(known) == len(matrices):

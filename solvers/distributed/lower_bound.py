@@ -35,8 +35,9 @@ from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, gamma
 from pgo_models.problem.matrices import columns_of
 from solvers.distributed.driver import Driver
 from solvers.distributed.interface import InterfaceFactor
-from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots.proof_orders import move_proof, prove_interior
 from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep
+from solvers.network.counted_pool import Count
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +55,10 @@ def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
     """Grounded without eta where that goes through, else the better form with the smallest eta found; at the poses."""
     if driver.at.objective <= driver.at.rounding_level:
         return NO_BOUND
+    if driver.is_final:
+        driver.describe(Count.PIGGYBACKED)
+        if not (driver.diagonal > 0.0).all():
+            return NO_BOUND
     found = prove_grounded(driver, 0.0)
     if found is not None and found.value > 0.0:
         return found
@@ -100,7 +105,7 @@ def prove_grounded(driver: Driver, eta: float) -> LowerBound | None:
         b[fixed] = 0.0
         step = proof.factor.solve(b)
         step[fixed] = 0.0
-        steps = driver.ask_each(Interior.move_certificate, space.scatter(step))
+        steps = driver.ask_each(move_proof, space.scatter(step))
         X = X.copy()
         X[g:] -= step[g:]  # the translations matter in the residuals alone, which the robots have
         moved = _sum_up(driver, proof, X, steps, free)
@@ -163,7 +168,7 @@ def _eliminate(
     marked[fixed] = 1.0
     points: Sequence[Array | None] = space.scatter(X) if X is not None else [None] * len(driver.robots)
     orders = [ProofOrder(eta, share, part, at) for part, at in zip(space.scatter(marked), points, strict=True)]
-    answers = driver.ask_each(Interior.certificate, orders)
+    answers = driver.ask_each(prove_interior, orders)
     Lambda = driver.at.multipliers
     traces = [*np.einsum("naa->na", Lambda).ravel().tolist(), *(answer.trace for answer in answers)]
     contributions = [answer.schur for answer in answers if answer.schur is not None]

@@ -17,6 +17,7 @@ from pgo_models.certificates.newton_polish import (
     PROGRESS,
     ROUNDING,
     STATIONARY_DECREMENT,
+    STATIONARY_FOR_TANGENTS,
     SUFFICIENT,
     move_poses,
     reached_rounding,
@@ -80,7 +81,7 @@ class SubstructuredNewton:
         decrement = scaled_decrement(model.square, driver.at.objective, driver.at.rounding_level)
         moved = False
         for _ in range(1 + CHORD_STEPS):
-            if decrement <= STATIONARY_DECREMENT:
+            if decrement <= (STATIONARY_FOR_TANGENTS if driver.is_final else STATIONARY_DECREMENT):
                 break
             found = _backtrack(driver, model)
             if found is None:
@@ -176,15 +177,18 @@ def _backtrack(driver: Driver, model: Model) -> tuple[CoverPoses, list[TrialEval
     now, layout = Poses(driver.at.R, driver.at.t), TangentLayout(len(driver.cover), driver.d)
     w, v = layout.split(-model.y[:, 0])
     length = 1.0
+    moves = [Move(part, length) for part in driver.interface(*driver.tangent).scatter(model.y)]
     for _ in range(HALVINGS):
-        if length == 1.0:
-            moves = [Move(part, length) for part in driver.interface(*driver.tangent).scatter(model.y)]
-            translations = driver.ask_each(Interior.move, moves)
+        there = move_poses(now, length * w, length * v)
+        R, t, is_first = there.R, there.t, length == 1.0
+        if driver.is_final:  # chi2, whose best translations have another matrix at all rotations
+            straight, further = Interior.move_straight, Interior.go_straight
+            answers = driver.ask_each(straight, moves) if is_first else driver.ask(further, length, Count.PIGGYBACKED)
         else:
-            translations = driver.ask(Interior.turn, length, Count.PIGGYBACKED)
-        R = move_poses(now, length * w, length * v).R
-        t, parts = driver.best_translations(translations)
-        answers = driver.ask_each(Interior.evaluate_trial, parts)
+            turn = Interior.turn
+            turned = driver.ask_each(Interior.move, moves) if is_first else driver.ask(turn, length, Count.PIGGYBACKED)
+            t, parts = driver.best_translations(turned)
+            answers = driver.ask_each(Interior.evaluate_trial, parts)
         trial = driver.with_sums(CoverPoses(R, t, driver.at.force), [answer.at for answer in answers])
         objective, before = trial.objective, driver.at.objective
         if objective <= before - SUFFICIENT * length * model.square:

@@ -33,8 +33,8 @@ from solvers.soc.subgraph import middle_separator, split_graph
 
 
 def open_driver(problem: PGOProblem, robots: Partition, engine: Engine, memory: float = DEFAULT_MEMORY) -> Driver:
-    """Driver and robots for a graph."""
-    subgraphs = split_graph(problem.graph, robots)
+    """Driver and robots for a problem."""
+    subgraphs = split_graph(problem, robots)
     grounded = middle_separator(problem.graph, subgraphs)
     return Driver(subgraphs, problem.num_poses, engine, problem.backend, memory, grounded)
 
@@ -58,10 +58,12 @@ def attempt_distributed(
     if outcome is not None:
         return outcome
     if not journal.goes_on_with():
+        driver.choose_cost(final=False)
         stages.append(_start(driver, start))
     if soc is not None and not journal.goes_on_with(SubstructuredNewton):
         stages.append(_run_soc(driver, soc, faults, journal, watch))
     decrement = math.inf
+    driver.choose_cost(final=True)  # again, where a checkpoint is from before
     if stages[-1].status not in OUT_OF_TIME:
         second = journal.run(SubstructuredNewton(newton), driver, watch)
         decrement = second.state.decrement
@@ -81,7 +83,15 @@ def _start(driver: Driver, start: Poses | None) -> Stage:
     else:
         driver.set_poses(start)
     name = "chordal start" if start is None else "given start"
-    return Stage(name, Status.CONVERGED, 0, driver.at.objective, time.perf_counter() - began, History())
+    objective = _of_the_problem(driver)
+    driver.choose_cost(final=False)
+    return Stage(name, Status.CONVERGED, 0, objective, time.perf_counter() - began, History())
+
+
+def _of_the_problem(driver: Driver) -> float:
+    """The cost that is solved, at the poses at hand."""
+    driver.choose_cost(final=True)
+    return driver.at.objective
 
 
 def _run_soc(driver: Driver, soc: SOC, faults: Faults | None, journal: Journal, watch: Watch) -> Stage:
@@ -102,8 +112,9 @@ def _run_soc(driver: Driver, soc: SOC, faults: Faults | None, journal: Journal, 
         substructured.finish(driver)
     if not driver.at.objective <= driver.kept.objective:
         driver.restore_poses()
-    seconds = time.perf_counter() - began
-    return Stage("SOC", first.status, first.iterations, driver.at.objective, seconds, first.history, soc)
+    objective, seconds = _of_the_problem(driver), time.perf_counter() - began
+    name = "SOC, convex" if driver.is_final else "SOC"
+    return Stage(name, first.status, first.iterations, objective, seconds, first.history, soc)
 
 
 def collect(driver: Driver) -> tuple[Poses, Array]:

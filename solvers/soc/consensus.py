@@ -241,7 +241,7 @@ class LocalConsensus:
         """State 0: omega = the rotations of `start`."""
         assert self.soc.robots is not None
         problem.stacked(start)  # raises unless the poses fit
-        layouts = [CopyLayout(s, problem.backend, self.soc.r_step) for s in split_graph(problem.graph, self.soc.robots)]
+        layouts = [CopyLayout(s, problem.backend, self.soc.r_step) for s in split_graph(problem, self.soc.robots)]
         here = LocalRobots(problem, tuple(ConsensusRobot(layout, CopiesState()) for layout in layouts), start)
         shared = Consensus(self.soc).init(here)
         return ConsensusIterate(shared, here.robots)

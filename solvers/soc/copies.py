@@ -114,12 +114,12 @@ class CopyLayout:
         """The cost of the robot's edges, those to other robots half."""
         graph, is_own = self.subgraph.graph, self.subgraph.is_own
         halved = np.where(is_own[graph.i] & is_own[graph.j], 1.0, 0.5)
-        return PartProblem(replace(graph, kappa=halved * graph.kappa, tau=halved * graph.tau), self.backend)
+        return PartProblem(graph, self.backend, self.subgraph.weights.scaled(halved))
 
     @cached_property
     def whole(self) -> PartProblem:
         """The cost of the robot's edges: all edges of its own poses are here."""
-        return PartProblem(self.subgraph.graph, self.backend)
+        return PartProblem(self.subgraph.graph, self.backend, self.subgraph.weights)
 
     @cached_property
     def own(self) -> IntArray:

@@ -12,7 +12,8 @@ from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, middle_pose, poses_by_distance
 from pgo_models.graphs.separators import vertex_cover
-from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.problem import PGOProblem, as_problem
+from pgo_models.problem.weighting import EdgeWeights
 
 
 class PartProblem(PGOProblem):
@@ -44,6 +45,10 @@ class Subgraph:
         How many robots hold each pose.
     common : tuple of (int, (q,))
         For every other robot that holds some of the same poses: which of `poses` they are, ascending.
+    weights : EdgeWeights
+        Of its edges, in the cost that SOC is run on.
+    final : EdgeWeights, optional
+        In the cost that is solved, where that is another (`PGOProblem.convex_part`).
     """
 
     robot: int
@@ -54,6 +59,8 @@ class Subgraph:
     is_counted: BoolArray
     copies: IntArray
     common: tuple[tuple[int, IntArray], ...]
+    weights: EdgeWeights
+    final: EdgeWeights | None = None
 
     @cached_property
     def is_own(self) -> BoolArray:
@@ -71,7 +78,9 @@ class Subgraph:
         counted = PoseGraph(
             len(poses), i, j, graph.R_ij[kept], graph.t_ij[kept], graph.kappa[kept], graph.tau[kept], name=graph.name
         )
-        return Part(PartProblem(counted), self.poses[poses], self.in_cover[poses])
+        problem = PartProblem(counted, None, self.weights.of_edges(kept))
+        final = None if self.final is None else PartProblem(counted, None, self.final.of_edges(kept))
+        return Part(problem, self.poses[poses], self.in_cover[poses], final)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +94,14 @@ class Part:
         Numbers of its poses in the whole graph.
     in_cover : (p,)
         Position of each among the poses that the driver solves for, or -1 for the robot's interior.
+    final : PartProblem, optional
+        The cost that is solved, where SOC is run on another.
     """
 
     problem: PartProblem
     poses: IntArray
     in_cover: IntArray
+    final: PartProblem | None = None
 
     @cached_property
     def interior(self) -> IntArray:
@@ -103,7 +115,7 @@ class Part:
         return found[np.argsort(self.in_cover[found])]
 
 
-def split_graph(graph: PoseGraph, partition: Partition) -> tuple[Subgraph, ...]:
+def split_graph(given: PGOProblem | PoseGraph, partition: Partition) -> tuple[Subgraph, ...]:
     """Give every robot its subgraph.
 
     Raises
@@ -120,6 +132,9 @@ def split_graph(graph: PoseGraph, partition: Partition) -> tuple[Subgraph, ...]:
     >>> sum(int(subgraph.is_counted.sum()) for subgraph in subgraphs) == graph.num_edges
     True
     """
+    problem = as_problem(given)
+    graph, first = problem.graph, problem.convex_part
+    costs = first.weights, None if first is problem else problem.weights
     cover = np.full(graph.num_poses, -1)
     solved_for = vertex_cover(partition, graph)
     if not len(solved_for):  # the bound is grounded at a pose that the driver has
@@ -129,7 +144,8 @@ def split_graph(graph: PoseGraph, partition: Partition) -> tuple[Subgraph, ...]:
     # An end outside the cover decides: such ends of one edge have one owner. Else the owner of the first end counts it.
     counts = np.where(cover[graph.j] < 0, owner[graph.j], owner[graph.i])
     holds = _holders(graph, owner, partition.num_robots)
-    return tuple(_subgraph_of(graph, owner, cover, counts, holds, robot) for robot in range(partition.num_robots))
+    robots = range(partition.num_robots)
+    return tuple(_subgraph_of(graph, costs, owner, cover, counts, holds, robot) for robot in robots)
 
 
 def middle_separator(graph: PoseGraph, subgraphs: tuple[Subgraph, ...]) -> int:
@@ -151,7 +167,13 @@ def _holders(graph: PoseGraph, owner: IntArray, num_robots: int) -> csr_array:
 
 
 def _subgraph_of(
-    graph: PoseGraph, owner: IntArray, cover: IntArray, counts: IntArray, holds: csr_array, robot: int
+    graph: PoseGraph,
+    costs: tuple[EdgeWeights, EdgeWeights | None],
+    owner: IntArray,
+    cover: IntArray,
+    counts: IntArray,
+    holds: csr_array,
+    robot: int,
 ) -> Subgraph:
     edges = np.flatnonzero((owner[graph.i] == robot) | (owner[graph.j] == robot))
     poses = np.unique(np.concatenate([np.flatnonzero(owner == robot), graph.i[edges], graph.j[edges]]))
@@ -170,4 +192,6 @@ def _subgraph_of(
     others = [other for other in np.flatnonzero(np.diff(held.indptr)).tolist() if other != robot]
     common = tuple((other, np.sort(held.indices[held.indptr[other] : held.indptr[other + 1]])) for other in others)
     copies = np.diff(holds[poses].indptr)
-    return Subgraph(robot, local, poses, owner[poses], cover[poses], counts[edges] == robot, copies, common)
+    counted, first = counts[edges] == robot, costs[0].of_edges(edges)
+    final = None if costs[1] is None else costs[1].of_edges(edges)
+    return Subgraph(robot, local, poses, owner[poses], cover[poses], counted, copies, common, first, final)

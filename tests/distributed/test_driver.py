@@ -20,6 +20,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import Driver
 from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots.proof_orders import move_proof, prove_interior
 from solvers.distributed.stages import collect
 from solvers.network.engine import InProcess
 from solvers.pipeline import Pipeline, solve
@@ -30,7 +31,7 @@ SIZES = st.integers(2, 24)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
 OFF = ("Interior.describe", "Interior.set_poses", "Interior.cost", "Interior.result")  # orders that are not counted
 
-PROOF = (Interior.certificate, Interior.move_certificate)
+PROOF = (prove_interior, move_proof)
 
 
 def check_start(problem: PGOProblem, parts: Partition) -> None:
@@ -142,10 +143,10 @@ def test_rounds_of_a_whole_solve_are_as_documented() -> None:
     moves = engine.times(Interior.move)
     assert start.name == "chordal start"
     assert engine.times(Interior.rescale, Interior.turn) == 0
-    assert engine.times(Interior.certificate) == 1
+    assert engine.times(prove_interior) == 1
     assert engine.times(Interior.penalize) == 1  # no refresh
     # 2 to start, 1 for the penalty and 1 a step and 2 for the result of SOC, 2 a move of Newton, 2 for the proof.
-    assert engine.times(Interior.move_certificate) == 1
+    assert engine.times(move_proof) == 1
     assert solution.ledger.rounds == 2 + (1 + soc.iterations + 2) + 2 * moves + 2
     assert solution.ledger.all_reduces == soc.iterations
     assert newton.iterations <= moves
@@ -195,7 +196,7 @@ def test_what_crosses_has_the_size_of_the_separators(d: int, noise: NoiseModel) 
             "Interior.solve": any_side | sums,
             "Interior.cost": {(d * g, d), ()},
             "Interior.finish": {(d * g, d)},
-            "Interior.move_certificate": any_side | {()},
+            "move_proof": any_side | {()},
         }
         for order, sent, got in engine.log:
             if order == "Interior.result":

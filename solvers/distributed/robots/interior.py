@@ -8,7 +8,6 @@ penalty's quantile is taken; interior poses and edges stay. The whole story of a
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,17 +29,15 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.matrices import columns_of
+from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.robots.factors import Eliminated, Factors, Widths
-from solvers.distributed.robots.proof import RobotProof, begin_proof, verify_interior
+from solvers.distributed.robots.proof import RobotProof
 from solvers.distributed.robots.records import (
     Agreed,
     CostParts,
     InteriorPoses,
     ModelOrder,
     Move,
-    ProofAnswer,
-    ProofOrder,
-    ProofStep,
     Reduced,
     ReducedTranslations,
     RescaleInterior,
@@ -70,6 +67,8 @@ class InteriorState:
     step : tuple of (p, .), (p, d), optional
         Newton's direction: rotations, translations.
     proof : RobotProof, optional
+    is_final : bool
+        Whether the cost at hand is the one that is solved, and not the one near it that SOC is run on.
     """
 
     poses: Poses
@@ -82,6 +81,7 @@ class InteriorState:
     x: Array = field(default_factory=lambda: np.zeros((0, 0)))
     step: tuple[Array, Array] | None = None
     proof: RobotProof | None = None
+    is_final: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +95,10 @@ class Interior:
     # The start: chordal relaxation, translations, multipliers.
 
     def describe(self, _: None) -> tuple[Interior, Array]:
-        """Diagonal of M on the boundary."""
-        diagonal = self.part.problem.M.data[self.part.problem.diagonal_positions]
-        return self, diagonal[self._boundary_rows]
+        """Diagonal of M on the boundary, of the tangent at the poses at hand where the cost is not quadratic."""
+        problem = self.tangent_problem
+        diagonal = problem.M.data[problem.diagonal_positions]
+        return self, diagonal[self.boundary_rows]
 
     def chordal(self, _: None) -> tuple[Interior, Reduced]:
         """M without the constraints, pose 0 at the identity."""
@@ -116,13 +117,17 @@ class Interior:
 
     def project(self, x: Array) -> tuple[Interior, ReducedTranslations]:
         """Back-substitute the relaxation and project its rotations; then `translations`."""
-        X = self._back_substitute(x)
+        X = self.back_substitute(x)
         R = project_to_rotations(unstack_transposes(X[self.part.problem.num_poses :]))
         return self._at(R).translations(None)
 
+    def choose_cost(self, final: bool) -> tuple[Interior, CostParts]:
+        """Go over to the cost that is solved, or back: its parts at the poses at hand."""
+        return self.with_changes(is_final=final).evaluate(None)
+
     def set_poses(self, poses: Poses) -> tuple[Interior, None]:
         """Take poses from elsewhere, (p,), as they are."""
-        return self._with(poses=poses), None
+        return self.with_changes(poses=poses), None
 
     def evaluate(self, _: None) -> tuple[Interior, CostParts]:
         """Parts of F and of M X on the boundary, at the poses at hand."""
@@ -136,11 +141,11 @@ class Interior:
 
     def save_poses(self, _: None) -> tuple[Interior, None]:
         """Remember the poses at hand."""
-        return self._with(kept=self.state.poses), None
+        return self.with_changes(kept=self.state.poses), None
 
     def restore_poses(self, _: None) -> tuple[Interior, None]:
         """Return to the poses that were kept."""
-        return self._with(poses=self.state.kept), None
+        return self.with_changes(poses=self.state.kept), None
 
     def translations(self, _: None) -> tuple[Interior, ReducedTranslations]:
         """Right-hand side of the best translations, and once their matrix."""
@@ -149,11 +154,11 @@ class Interior:
     def set_translations(self, t: Array) -> tuple[Interior, CostParts]:
         """Take the best translations, from (g, d) on the boundary: parts of F and of M X on the boundary."""
         R = self.state.poses.R
-        return self._with(poses=Poses(R, self._translations(R, t))).evaluate(None)
+        return self.with_changes(poses=Poses(R, self._translations(R, t))).evaluate(None)
 
     def multiplier_norms(self, _: None) -> tuple[Interior, Norms]:
         """||Lambda_i||_2 and m_i of the interior poses."""
-        return self, Norms(multiplier_norms(self._multipliers()[self.part.interior]), self._scale)
+        return self, Norms(multiplier_norms(self.multipliers()[self.part.interior]), self._scale)
 
     # SOC.
 
@@ -161,7 +166,7 @@ class Interior:
         """Set rho_i, factor M + D/2; omega is at the poses, B zero or stationary."""
         interior, problem = self.part.interior, self.part.problem
         diagonal = problem.M.data[problem.diagonal_positions][self._interior_rows]
-        return self._penalized(order.block(self.state.poses.R[interior], self._multipliers()[interior], diagonal))
+        return self._penalized(order.block(self.state.poses.R[interior], self.multipliers()[interior], diagonal))
 
     def rescale(self, order: RescaleInterior) -> tuple[Interior, Reduced]:
         """Multiply rho, from the best iterate on if asked to, and factor again."""
@@ -170,14 +175,14 @@ class Interior:
 
     def solve(self, x: Array) -> tuple[Interior, Array]:
         """Step (a) in the interior, from x on the boundary; this robot's sums for the acceleration."""
-        X = self._back_substitute(x)
+        X = self.back_substitute(x)
         block, sums = self.block.after_solve(X[self._interior_rows])
-        return self._with(x=X, block=block), sums
+        return self.with_changes(x=X, block=block), sums
 
     def agree(self, agreement: Agreement) -> tuple[Interior, Agreed]:
         """Steps (b) and (c): sums of the residuals, and the right-hand side of the next step (a)."""
         block, sums = self.block.extrapolated(agreement).projected()
-        following, right = self._with(block=block)._reduced(self._pull(block))
+        following, right = self.with_changes(block=block).reduced(self._pull(block))
         return following, Agreed(sums, right)
 
     def cost(self, z: Array) -> tuple[Interior, float]:
@@ -197,9 +202,9 @@ class Interior:
         """Hessian (Gauss-Newton where asked for), and the reduced gradient; None where K_II is not definite."""
         Lambda = None
         if order.second_order:
-            Lambda = self._multipliers()
+            Lambda = self.multipliers()
             Lambda[self.part.boundary] = 0.0  # the driver knows the whole force there
-        H, layout = riemannian_hessian(self.part.problem, self.state.poses, Lambda), self._layout
+        H, layout = riemannian_hessian(self.problem, self.state.poses, Lambda), self._layout
         scale = np.ones(layout.side)
         if self.factors.grounds:
             zero = np.zeros(1, dtype=np.int64)
@@ -216,58 +221,46 @@ class Interior:
 
     def move(self, order: Move) -> tuple[Interior, ReducedTranslations]:
         """Direction -H^-1 g from H^-1 g on the boundary; then `turn`."""
-        step = self._layout.split(-self._back_substitute(order.x)[:, 0])
-        return self._with(step=step).turn(order.length)
+        step = self._layout.split(-self.back_substitute(order.x)[:, 0])
+        return self.with_changes(step=step).turn(order.length)
+
+    def move_straight(self, order: Move) -> tuple[Interior, TrialEvaluation]:
+        """Direction -H^-1 g from H^-1 g on the boundary; then `go_straight`."""
+        step = self._layout.split(-self.back_substitute(order.x)[:, 0])
+        return self.with_changes(step=step).go_straight(order.length)
+
+    def go_straight(self, length: float) -> tuple[Interior, TrialEvaluation]:
+        """Trial a length along the direction, its translations as they come: F, force and reduced gradient there."""
+        assert self.state.step is not None
+        w, v = self.state.step
+        trial = move_poses(self.state.poses, length * w, length * v)
+        following, gradient = self.with_changes(trial=trial).reduced(self._gradient(trial))
+        return following, TrialEvaluation(self._evaluation(trial), gradient)
 
     def turn(self, length: float) -> tuple[Interior, ReducedTranslations]:
         """Trial rotations a length along the direction, and the right-hand side of their best translations."""
         assert self.state.step is not None
         poses, (w, v) = self.state.poses, self.state.step
         trial = Poses(move_poses(poses, length * w, length * v).R, poses.t)
-        return self._with(trial=trial)._reduced_translations(trial.R)
+        return self.with_changes(trial=trial)._reduced_translations(trial.R)
 
     def evaluate_trial(self, t: Array) -> tuple[Interior, TrialEvaluation]:
         """Take the trial's best translations: F, force and reduced gradient there, by the factor at hand."""
         R = self.state.trial.R
         trial = Poses(R, self._translations(R, t))
-        following, gradient = self._with(trial=trial)._reduced(self._gradient(trial))
+        following, gradient = self.with_changes(trial=trial).reduced(self._gradient(trial))
         return following, TrialEvaluation(self._evaluation(trial), gradient)
 
     def accept(self, _: None) -> tuple[Interior, None]:
         """Go to the trial."""
-        return self._with(poses=self.state.trial), None
+        return self.with_changes(poses=self.state.trial), None
 
-    # Certificate and answer.
-
-    def certificate(self, order: ProofOrder) -> tuple[Interior, ProofAnswer]:
-        """Eliminate S for a proof, and at a point begin one (`solvers.distributed.robots.proof`)."""
-        problem, Lambda = self.part.problem, self._multipliers()
-        Lambda[self.part.boundary] = 0.0
-        trace = math.fsum(np.einsum("naa->na", Lambda).ravel())
-        widths = (1, problem.d)
-        cut = self.factors.cuts[widths]
-        fixed = cut.boundary[order.fixed > 0]
-        fixed = np.append(fixed, 0) if order.point is None and self.factors.grounds else fixed
-        found = verify_interior(problem, Lambda, order.eta, cut, fixed, order.share, self.factors.backend)
-        if found is None:
-            return self._with(proof=None), ProofAnswer(None, trace, None)
-        matrix, elimination, slack = found
-        following = self._with(proof=None, eliminated=self.factors.keep(matrix, widths, elimination))
-        if order.point is None:
-            return following, ProofAnswer(elimination.schur, trace, None)
-        proof = begin_proof(self.part, self.state.poses, Lambda, slack, elimination.cut, order.point)
-        following, step = following._with(proof=proof)._proof_step()
-        return following, ProofAnswer(elimination.schur, trace, step)
-
-    def move_certificate(self, x: Array) -> tuple[Interior, ProofStep]:
-        """Move X by -S_r^-1 G, from its rows on the boundary: parts of the bound there."""
-        assert self.state.proof is not None
-        return self._with(proof=self.state.proof.moved(self._back_substitute(x)))._proof_step()
+    # The answer.
 
     def result(self, _: None) -> tuple[Interior, InteriorPoses]:
         """Interior poses and multipliers, for whoever may see them."""
         interior, poses = self.part.interior, self.state.poses
-        Lambda = self._multipliers()[interior]
+        Lambda = self.multipliers()[interior]
         return self, InteriorPoses(self.part.poses[interior], poses.R[interior], poses.t[interior], Lambda)
 
     # What is told again, to a driver that was started again.
@@ -284,16 +277,27 @@ class Interior:
     # What the orders share.
 
     @property
+    def problem(self) -> PGOProblem:
+        """The cost at hand."""
+        return self.part.final if self.state.is_final and self.part.final is not None else self.part.problem
+
+    @property
+    def tangent_problem(self) -> PGOProblem:
+        """A quadratic cost that touches the one at hand at the poses at hand, or is it."""
+        return self.problem.tangent_at(self.state.poses)
+
+    @property
     def block(self) -> RecursionBlock:
         """Rotations of the interior in SOC's recursion."""
         assert self.state.block is not None
         return self.state.block
 
-    def _with(self, **changes: object) -> Interior:
+    def with_changes(self, **changes: object) -> Interior:
+        """The robot with some fields of its state replaced."""
         return replace(self, state=replace(self.state, **changes))  # type: ignore[arg-type] # checked by the class
 
     def _at(self, R: Array) -> Interior:
-        return self._with(poses=Poses(R, self.state.poses.t))
+        return self.with_changes(poses=Poses(R, self.state.poses.t))
 
     @property
     def _layout(self) -> TangentLayout:
@@ -304,7 +308,8 @@ class Interior:
         return (self.part.problem.d, tangent_dimension(self.part.problem.d))
 
     @property
-    def _boundary_rows(self) -> IntArray:
+    def boundary_rows(self) -> IntArray:
+        """Rows of X of the boundary."""
         return self.factors.cuts[(1, self.part.problem.d)].boundary
 
     @property
@@ -321,14 +326,15 @@ class Interior:
     def _eliminate(self, K: csc_array, widths: Widths, b: Array) -> tuple[Interior, Reduced]:
         """Eliminate the interior of K x = b: what the driver needs of it."""
         eliminated, found = self.factors.eliminate(K, widths)
-        following, right = self._with(eliminated=eliminated)._reduced(b)
+        following, right = self.with_changes(eliminated=eliminated).reduced(b)
         return following, Reduced(found.schur, found.diagonal, right)
 
-    def _reduced(self, b: Array) -> tuple[Interior, RightHandSide]:
+    def reduced(self, b: Array) -> tuple[Interior, RightHandSide]:
         """Right-hand side on the boundary, and b_I . K_II^-1 b_I, by the elimination at hand."""
-        return self._with(b=b), RightHandSide(*self.factors.of(self.state.eliminated).reduce(b))
+        return self.with_changes(b=b), RightHandSide(*self.factors.of(self.state.eliminated).reduce(b))
 
-    def _back_substitute(self, x: Array) -> Array:
+    def back_substitute(self, x: Array) -> Array:
+        """Solution of the last elimination from its rows on the boundary."""
         return self.factors.of(self.state.eliminated).back_substitute(self.state.b, x)
 
     def _penalized(self, block: RecursionBlock) -> tuple[Interior, Reduced]:
@@ -338,7 +344,7 @@ class Interior:
         if self.factors.grounds:
             data[problem.diagonal_positions[0]] *= 2.0
         K = problem.with_pattern_of_M(data)
-        return self._with(block=block)._eliminate(K, (1, problem.d), self._pull(block))
+        return self.with_changes(block=block)._eliminate(K, (1, problem.d), self._pull(block))
 
     def _pull(self, block: RecursionBlock) -> Array:
         """D/2 (omega - B), (side, d)."""
@@ -356,7 +362,9 @@ class Interior:
     def _reduced_translations(self, R: Array) -> tuple[Interior, ReducedTranslations]:
         found = self.factors.laplacian
         b = found.reduce(self._lever(R))[0]
-        return self._with(has_laplacian=True), ReducedTranslations(b, None if self.state.has_laplacian else found.schur)
+        return self.with_changes(has_laplacian=True), ReducedTranslations(
+            b, None if self.state.has_laplacian else found.schur
+        )
 
     def _translations(self, R: Array, t: Array) -> Array:
         return self.factors.laplacian.back_substitute(self._lever(R), t)
@@ -367,22 +375,16 @@ class Interior:
         return np.asarray(-(self.part.problem.M[:p, p:] @ stack_transposes(R)))
 
     def _evaluation(self, poses: Poses) -> CostParts:
-        problem = self.part.problem
-        force = problem.apply_M(problem.stacked(poses))[self._boundary_rows]
+        problem = self.problem
+        force = problem.tangent_at(poses).apply_M(problem.stacked(poses))[self.boundary_rows]
         return CostParts(problem.objective(poses), rounding_level(problem, poses), force)
 
-    def _proof_step(self) -> tuple[Interior, ProofStep]:
-        assert self.state.proof is not None
-        sums, product = self.state.proof.evaluated(self.part.problem, self._boundary_rows)
-        following, right = self._reduced(product)
-        return following, ProofStep(sums, right)
-
-    def _multipliers(self) -> Array:
+    def multipliers(self) -> Array:
         """Lambda_i, right in the interior alone, where the robot has every edge."""
-        return multipliers(self.part.problem, self.state.poses)
+        return multipliers(self.problem, self.state.poses)
 
     def _gradient(self, poses: Poses) -> Array:
-        return self._layout.join(*self.part.problem.riemannian_gradient(poses))[:, None]
+        return self._layout.join(*self.problem.riemannian_gradient(poses))[:, None]
 
 
 def interior_of(subgraph: Subgraph, backend: CholeskyBackend | None) -> Interior | None:

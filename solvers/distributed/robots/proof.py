@@ -9,7 +9,7 @@ from scipy.sparse import csc_array
 
 from pgo_models.certificates.definiteness import MARGIN, shifted_certificate
 from pgo_models.certificates.lower_bound import quadratic_loss, squared_distances
-from pgo_models.certificates.rounding_errors import evaluate_certificate, has_safe_scale, matrix_error
+from pgo_models.certificates.rounding_errors import evaluate_certificate, has_safe_scale, matrix_errors
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -139,12 +139,16 @@ def verify_interior(
     is_fixed = np.isin(inside, fixed)
     problem.leave_out(S.data, fixed, 0.0)
     S.data[problem.diagonal_positions[inside[is_fixed]]] = 2.0 * diagonal[inside[is_fixed]]
-    entries = matrix_error(problem.graph)
+    positive = np.maximum(diagonal, np.abs(problem.M.data[problem.diagonal_positions]))
+    if not (positive > 0.0).all() or not (diagonal[inside] > 0.0).all():
+        return None
+    of_separators = matrix_errors(problem, positive) * positive
+    entries, of_separators = of_separators[inside] / diagonal[inside], of_separators[cut.boundary]
     expected = cut.analysis.expected_error(len(cut.boundary)) if cut.analysis is not None else None
     error = entries + (expected if expected is not None else np.zeros(len(inside)))
     data = S.data.copy()
     # The entries of the separators are rounded, too.
-    data[problem.diagonal_positions[cut.boundary]] -= OUTWARD * entries * diagonal[cut.boundary]
+    data[problem.diagonal_positions[cut.boundary]] -= OUTWARD * of_separators
     for _ in range(_ATTEMPTS):
         shift = np.maximum(share, MARGIN * error)
         data[problem.diagonal_positions[inside]] = S.data[problem.diagonal_positions[inside]] - shift * diagonal[inside]

@@ -18,6 +18,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, grid
 from solvers.distributed.robots.agent import begin_copies
 from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots.proof_orders import move_proof, prove_interior
 from solvers.network.ledger import DRIVER
 from solvers.pipeline import Pipeline, solve
 from solvers.soc.anderson import Anderson
@@ -38,8 +39,8 @@ STAR = {  # to and from whoever sums up: settings, figures of all poses in no or
 }
 Copies, Inner = ConsensusRobot, Interior
 ROUNDS = (  # orders that are, or end, a round
-    *(Inner.project, Inner.set_translations, Inner.move, Inner.evaluate_trial, Inner.certificate),
-    *(Inner.move_certificate, Inner.adopt, begin_copies, Copies.penalize, Copies.extrapolate, Copies.back_at_best),
+    *(Inner.project, Inner.set_translations, Inner.move, Inner.evaluate_trial, prove_interior),
+    *(move_proof, Inner.adopt, begin_copies, Copies.penalize, Copies.extrapolate, Copies.back_at_best),
 )
 ENDS, POSES = ("begin_copies", "finish_copies"), ("R", "t", "in_cover")  # with the driver, at the cover
 ALL_REDUCES = (*(Copies.travel, Copies.multiplier_norms, Copies.stiffness, Copies.start, Copies.solve, Copies.agree),)
