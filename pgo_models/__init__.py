@@ -30,6 +30,7 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
 from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 
 if TYPE_CHECKING:
     from pgo_models.convex.bregman import BregmanProblem
@@ -62,6 +63,7 @@ __all__ = [
     "Poses",
     "RotationWeight",
     "Verdict",
+    "Weighting",
     "absolute_trajectory_error",
     "certificate_matrix",
     "certify",

@@ -108,6 +108,12 @@ class PGOProblem:
             return self
         return replace(self, weighting=convex_weights(self.graph))
 
+    def check_quadratic(self, method: str, convex: bool = False) -> None:
+        """Raise a SettingError where a method needs a cost that is quadratic in the poses, or convex, and it is not."""
+        if not self.is_quadratic or (convex and not self.weights.is_convex):
+            kind = "convex and quadratic in (R, t)" if convex else "quadratic in (R, t)"
+            raise SettingError(f"{method} needs a cost that is {kind}, as F is, and chi2 here is not; use convex_part")
+
     def tangent_at(self, poses: Poses) -> PGOProblem:
         """Quadratic problem with F(X) <= chi2(X) for all poses, and equal value and gradient at the given ones."""
         excess = self.weights.excess

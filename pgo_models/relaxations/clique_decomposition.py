@@ -332,6 +332,7 @@ def _costs(layout: _Layout) -> Array:
     residual t_j - t_i - P_i R^_i t_ij.
     """
     graph, R, t, d = layout.problem.graph, layout.centre.R, layout.centre.t, layout.problem.d
+    weights, W = layout.problem.weights, layout.problem.weights.W(layout.problem.d)
     H = [np.zeros((side, side)) for side in layout.sides]
     for e in range(graph.num_edges):
         i, j = int(graph.i[e]), int(graph.j[e])
@@ -342,7 +343,7 @@ def _costs(layout: _Layout) -> Array:
         translation = layout.reference_rotation(k, (t[j] - t[i])[:, None] - step)
         translation += layout.translation_deviation(k, j) - layout.translation_deviation(k, i)
         translation -= layout.rotation_deviation(k, i, step)
-        H[k] += graph.kappa[e] * rotation @ rotation.T + graph.tau[e] * translation @ translation.T
+        H[k] += rotation @ (R[j] @ W[e] @ R[j].T) @ rotation.T + weights.tau[e] * translation @ translation.T
     costs = []
     for matrix in H:
         rows, columns = np.triu_indices(len(matrix))

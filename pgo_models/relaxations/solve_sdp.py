@@ -165,6 +165,7 @@ def solve_relaxation(
     for name, value in (("gap", gap), ("time_limit", time_limit)):
         if not value > 0:
             raise SettingError(f"{name} is {value}; it must be positive")
+    problem.check_quadratic("the relaxation")
     began = time.perf_counter()
     plan = plan_relaxation(problem, form, solver, memory_limit)
     if verbose:

@@ -1,8 +1,9 @@
 """GTSAM as a rival: the same graph as its factors, solved by its optimiser, the poses judged by our F.
 
-GTSAM minimises sum_e 1/2 ||Log(z_e^-1 x_i^-1 x_j)||^2 in units of standard deviations. A rotation residual of angle
-theta adds kappa ||R_j - R_i R_ij||_F^2 = 4 kappa (1 - cos theta) = 2 kappa theta^2 + O(theta^4) to F, in the plane as
-in space, so that
+With `Weighting.INFORMATION` its noise models are the information matrices: its cost is chi2, with the logarithm in
+SE(d) for the residual. For F it minimises sum_e 1/2 ||Log(z_e^-1 x_i^-1 x_j)||^2 in units of standard deviations. A
+rotation residual of angle theta adds kappa ||R_j - R_i R_ij||_F^2 = 4 kappa (1 - cos theta) = 2 kappa theta^2 +
+O(theta^4) to F, in the plane as in space, so that
 
     sigma_R = 1 / (2 sqrt(kappa)),        sigma_t = 1 / sqrt(2 tau)
 
@@ -24,7 +25,9 @@ import numpy as np
 from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, log_map, project_to_rotations
+from pgo_models.graphs.precisions import isotropic_information, proper_information
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.result import History, Measurement, Record, Run, Status
 
 
@@ -157,18 +160,23 @@ def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noq
         Without GTSAM.
     """
     gtsam, graph, d = _import_gtsam(), problem.graph, problem.d
-    sigma_R, sigma_t = 0.5 / np.sqrt(graph.kappa), 1.0 / np.sqrt(2.0 * graph.tau)
-    # A tangent vector of Pose3 begins with the rotation, one of Pose2 with the translation.
-    turns, moves = np.repeat(sigma_R[:, None], 2 * d - 3, axis=1), np.repeat(sigma_t[:, None], d, axis=1)
-    sigmas = np.concatenate([turns, moves] if d == 3 else [moves, turns], axis=1)
+    if problem.weighting is Weighting.INFORMATION:
+        information = 2.0 * proper_information(graph)  # GTSAM halves
+    else:
+        kappa = graph.kappa if d == 3 else 2.0 * graph.kappa  # an angle's information is twice kappa, in space as here
+        information = 2.0 * isotropic_information(kappa, graph.tau, d)
+    if d == 3:  # a tangent vector of Pose3 begins with the rotation, one of Pose2 with the translation
+        information = np.roll(information, 3, axis=(1, 2))
     between = gtsam.BetweenFactorPose3 if d == 3 else gtsam.BetweenFactorPose2
     factors = gtsam.NonlinearFactorGraph()
     measured = _gtsam_poses(gtsam, Poses(graph.R_ij, graph.t_ij))
-    for i, j, pose, sigma in zip(graph.i.tolist(), graph.j.tolist(), measured, sigmas, strict=True):
-        factors.add(between(i, j, pose, gtsam.noiseModel.Diagonal.Sigmas(sigma)))
+    for i, j, pose, weight in zip(graph.i.tolist(), graph.j.tolist(), measured, information, strict=True):
+        factors.add(between(i, j, pose, gtsam.noiseModel.Gaussian.Information(weight)))
     prior = gtsam.PriorFactorPose3 if d == 3 else gtsam.PriorFactorPose2
     at = _gtsam_poses(gtsam, Poses.identity(1, d) if start is None else start[:1])[0]
-    factors.add(prior(0, at, gtsam.noiseModel.Diagonal.Sigmas(sigmas.min(axis=0))))
+    factors.add(
+        prior(0, at, gtsam.noiseModel.Gaussian.Information(np.diag(np.einsum("mkk->mk", information).max(axis=0))))
+    )
     return factors
 
 

@@ -139,6 +139,7 @@ class PaperSOC:
 
     def init(self, problem: PGOProblem, start: Poses | None) -> PaperState:
         """State 0: R = omega = start, a spanning tree unless given; B = 0."""
+        problem.check_quadratic("SOC", convex=True)
         start = start if start is not None else spanning_tree_start(problem.graph)
         problem.stacked(start)  # raises unless the poses fit
         robots = self.robots

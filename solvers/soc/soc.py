@@ -183,6 +183,7 @@ class SOC(SOCSettings):
 
         B = 0, but for many robots under a MultiplierPenalty the stationary one, as after a refresh.
         """
+        problem.check_quadratic("SOC", convex=True)
         return self._recursion.init(problem, start if start is not None else chordal_start(problem))
 
     def step(self, problem: PGOProblem, state: Any) -> Any:  # noqa: ANN401

@@ -1,0 +1,68 @@
+"""chi2 from one file: our certified minimum beside GTSAM's answer, CPU seconds with reading (extra `peers`).
+
+    python tests/benchmarks/information.py [FILE ..]
+
+GTSAM goes by Levenberg-Marquardt from the file's estimate, and once more from its own initialisation (LAGO, chordal).
+Its cost is the residual's logarithm in SE(d), which is not chi2 to the last digit.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+import pgo_models as pgo
+import solvers
+
+NAMES = (
+    "intel MIT CSAIL FR079 FRH manhattan M3500 city10000 kitti_00 kitti_07 sphere2500 parking-garage torus3D cubicle"
+)
+ROW = "| {} | {} | {} | {} | {} | {} |"
+
+
+def ours(path: Path) -> tuple[float, float, float]:
+    """Minimum, gap, seconds."""
+    began = time.process_time()
+    problem = pgo.PGOProblem(pgo.read_g2o(path), weighting=pgo.Weighting.INFORMATION)
+    solution = solvers.solve(problem, progress=False)
+    return solution.objective, solution.gap, time.process_time() - began
+
+
+def theirs(path: Path, own_start: bool) -> tuple[float, float]:
+    """Twice GTSAM's error at its answer, and seconds."""
+    import gtsam
+
+    began = time.process_time()
+    is_3d = any(line.startswith("EDGE_SE3") for line in path.open())
+    graph, start = gtsam.readG2o(str(path), is_3d)
+    first = sorted(start.keys())[0]
+    tight = gtsam.noiseModel.Isotropic.Sigma(6 if is_3d else 3, 1e-3)
+    prior, pose = (gtsam.PriorFactorPose3, start.atPose3) if is_3d else (gtsam.PriorFactorPose2, start.atPose2)
+    graph.add(prior(first, pose(first), tight))
+    try:
+        if own_start:
+            start = gtsam.InitializePose3.initialize(graph) if is_3d else gtsam.lago.initialize(graph, False)
+        answer = gtsam.LevenbergMarquardtOptimizer(graph, start, gtsam.LevenbergMarquardtParams()).optimize()
+    except (RuntimeError, ValueError):  # LAGO takes diagonal matrices alone
+        return np.nan, time.process_time() - began
+    return 2.0 * graph.error(answer), time.process_time() - began
+
+
+def main() -> None:
+    folder = Path(os.environ["PGO_DATA"])
+    paths = [Path(name) for name in sys.argv[1:]] or [folder / f"{name}.g2o" for name in NAMES.split()]
+    print(ROW.format("graph", "chi2", "proven gap", "CPU s", "GTSAM from the file", "GTSAM from its own start"))
+    print("|---|---|---|---|---|---|")
+    for path in paths:
+        value, gap, seconds = ours(path)
+        runs = [theirs(path, own) for own in (False, True)]
+        cells = [f"{cost:.6g}, {spent:.2f} s" if np.isfinite(cost) else "fails" for cost, spent in runs]
+        print(ROW.format(path.stem, f"{value:.9g}", f"{gap:.1e}", f"{seconds:.2f}", *cells), flush=True)
+
+
+if __name__ == "__main__":
+    main()
