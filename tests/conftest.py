@@ -14,6 +14,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.g2o import read_g2o
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from solvers import cli
 
 # Speed is measured in benchmarks.
 settings.register_profile(PROFILE, max_examples=EXAMPLES, deadline=None)
@@ -39,3 +40,16 @@ def benchmark_problem(benchmark_data: Path) -> Callable[[str], PGOProblem]:
 def benchmark_optimum(benchmark_problem: Callable[[str], PGOProblem]) -> Callable[[str], Poses]:
     """Stationary poses that the chordal start of a benchmark graph polishes to, found once."""
     return cache(lambda name: polish(benchmark_problem(name), chordal_start(benchmark_problem(name))))
+
+
+@pytest.fixture
+def pgo_command(capsys):
+    """Runs `pgo` in this process: exit code, standard output, standard error."""
+
+    def call(*arguments):
+        with pytest.raises(SystemExit) as end:
+            cli.main([str(argument) for argument in arguments])
+        streams = capsys.readouterr()
+        return end.value.code, streams.out, streams.err
+
+    return call

@@ -21,19 +21,6 @@ ROOT = Path(__file__).parent.parent
 PGO = [sys.executable, "-c", "from solvers.cli import main; main()"]
 
 
-@pytest.fixture
-def pgo_command(capsys):
-    """Runs `pgo` in this process: exit code, standard output, standard error."""
-
-    def call(*arguments):
-        with pytest.raises(SystemExit) as end:
-            cli.main([str(argument) for argument in arguments])
-        streams = capsys.readouterr()
-        return end.value.code, streams.out, streams.err
-
-    return call
-
-
 def test_consensus_goes_without_a_driver_and_says_so(pgo_command):
     code, out, err = pgo_command("solve", "robots", "--method", "consensus", "--driver-memory", "0")
     assert (code, err) == (3, "")

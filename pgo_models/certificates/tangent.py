@@ -22,7 +22,7 @@ from pgo_models.certificates.newton_polish import polish
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import proper_information
+from pgo_models.graphs.precisions import proper_information, uncoupled_share
 from pgo_models.problem.problem import PGOProblem
 
 BISECTIONS = 5
@@ -37,9 +37,8 @@ def soften(graph: PoseGraph, cap: float) -> PoseGraph:
     """
     information, d = proper_information(graph), graph.d
     I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
-    coupled = np.linalg.solve(I_tt, I_tr) @ np.linalg.solve(I_rr, np.swapaxes(I_tr, 1, 2))
-    share = 1.0 - np.sqrt(np.abs(np.linalg.eigvals(coupled)).max(axis=1)) if I_tr.any() else np.ones(len(I_tt))
-    share = np.where(I_tr.any(axis=(1, 2)), share - 2.0**-20, share)
+    share = uncoupled_share(information, d)
+    share = np.where(I_tr.any(axis=(1, 2)), share - 2.0**-20, 1.0)
     smaller = np.zeros_like(information)
     limit = np.array([0.5, 1.0]) if d == 3 else np.ones(1)
     smaller[:, :d, :d] = _clipped(share[:, None, None] * I_tt, lambda values: cap * values[:, 0])

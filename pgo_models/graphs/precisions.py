@@ -69,6 +69,13 @@ def proper_information(graph: PoseGraph) -> Array:
     return information
 
 
+def uncoupled_share(information: Array, d: int) -> Array:
+    """Largest share, (m,), for which I >= share blockdiag(I_tt, I_rr): 1 - ||I_tt^-1/2 I_tr I_rr^-1/2||_2."""
+    I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
+    squared = np.linalg.solve(I_tt, I_tr) @ np.linalg.solve(I_rr, np.swapaxes(I_tr, 1, 2))
+    return np.asarray(1.0 - np.sqrt(np.abs(np.linalg.eigvals(squared)).max(axis=1)))
+
+
 def condition(blocks: Array) -> Array:
     """Largest over smallest eigenvalue, (m,), of positive definite blocks (m, k, k)."""
     values = np.linalg.eigvalsh(blocks)

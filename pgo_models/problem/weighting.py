@@ -22,13 +22,13 @@ import numpy as np
 from pgo_models.errors import GraphError
 from pgo_models.geometry.rotations import Array, BoolArray, hat, tangent_dimension, vee
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.graphs.precisions import proper_information
+from pgo_models.graphs.precisions import proper_information, uncoupled_share
 from pgo_models.problem.floating_point import OUTWARD, gamma
 
 _MARGIN = 2.0**-24  # of the smallest eigenvalue: stays between tau and it, so that the excess is strictly convex
 _ROUNDED = 2.0**-42  # of the trace: far above the rounding of a block, which so cannot make it indefinite
 _LEAST_CONVEX = 0.1
-_COUPLED_SHARE = 0.5  # of the smallest eigenvalue of I_tt stays in tau; the other half bears the coupling
+_COUPLED_SHARE = 0.5  # of what the coupling leaves of the smallest eigenvalue of I_tt stays in tau
 
 
 class Weighting(enum.Enum):
@@ -266,7 +266,9 @@ def edge_weights(graph: PoseGraph, weighting: Weighting) -> EdgeWeights:
     if (I_tt == I_tt[:, :1, :1] * np.eye(d)).all() and not is_coupled.any():
         return EdgeWeights(I_tt[:, 0, 0].copy(), *_rotation_weights(I_rr))
     margin = np.repeat((_MARGIN * smallest + _ROUNDED * trace)[:, None], d, axis=1)
-    tau = np.where(is_coupled, _COUPLED_SHARE * smallest, smallest - 2.0 * margin[:, 0])
+    tau = np.where(
+        is_coupled, _COUPLED_SHARE * uncoupled_share(information, d) * smallest, smallest - 2.0 * margin[:, 0]
+    )
     J, K, turn = I_tt - tau[:, None, None] * np.eye(d), None, graph.R_ij
     growth = 1.0
     if is_coupled.any():
