@@ -1,6 +1,7 @@
 """The one seam to sparse Cholesky: analyse a pattern, factor, solve many right-hand sides, factor again.
 
-SuperLU (scipy) is always there; CHOLMOD comes through CVXOPT with the extra `fast` and is found at run time.
+SuperLU (scipy) is always there; CHOLMOD comes through CVXOPT with the extra `fast` and is found at run time, on the
+BLAS kernels of `pgo_models.problem.kernels`.
 
 Every factor knows how far it can be from exact (`pgo_models.problem.floating_point`), so that one that went through
 proves something in exact arithmetic.
@@ -23,6 +24,7 @@ from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, FactorCounts, error_of_counts, gamma
+from pgo_models.problem.kernels import kernels_of_the_cpu
 
 _PERMUTE, _FORWARD = 7, 4  # CVXOPT's codes of x = P b and L x = b
 _Capsule = object  # a factorisation, which CVXOPT keeps to itself
@@ -370,8 +372,9 @@ def _supernodal() -> Iterator[ModuleType]:
 
 def _import_cvxopt() -> tuple[ModuleType, ModuleType]:
     try:
-        import cvxopt
-        from cvxopt import cholmod
+        with kernels_of_the_cpu():
+            import cvxopt
+            from cvxopt import cholmod
     except ImportError as error:
         raise MissingExtraError("cvxopt", "fast") from error
     return cvxopt, cholmod
