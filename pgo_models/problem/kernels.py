@@ -15,8 +15,7 @@ from contextlib import contextmanager
 import numpy as np
 
 VARIABLE = "OPENBLAS_CORETYPE"
-_KERNELS = "Haswell"  # AVX2 and FMA; those for AVX-512 are as fast here
-_NEEDED = {"AVX2", "X86_V3"}  # by numpy's version: either says AVX2, and there is no CPU with it and without FMA
+_KERNELS, _NEEDED = "Haswell", {"AVX2", "X86_V3"}  # those for AVX-512 are as fast; numpy says AVX2 by either name
 
 
 def chosen_kernels() -> str | None:
@@ -30,11 +29,10 @@ def chosen_kernels() -> str | None:
 def kernels_of_the_cpu() -> Iterator[None]:
     """Have an OpenBLAS that CVXOPT loads meanwhile run `chosen_kernels`; the environment is as before afterwards."""
     kernels = None if "cvxopt" in sys.modules or VARIABLE in os.environ else chosen_kernels()
-    if kernels is None:
-        yield
-        return
-    os.environ[VARIABLE] = kernels
+    if kernels:
+        os.environ[VARIABLE] = kernels
     try:
         yield
     finally:
-        del os.environ[VARIABLE]
+        if kernels:
+            del os.environ[VARIABLE]
