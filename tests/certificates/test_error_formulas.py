@@ -255,6 +255,14 @@ def test_the_error_of_S_X_is_taken_off(d: int, monkeypatch: pytest.MonkeyPatch) 
     assert known.rounding < 1e-3 * least < least <= found.rounding
 
 
+def test_rounding_of_the_bound_with_eta_alone() -> None:
+    problem = PGOProblem(varied_graph(6, 6, 3))
+    Lambda = np.tile(0.5 * np.eye(3), (6, 1, 1))
+    found = lower_bound._prove(problem, Lambda, 1.0, None)
+    assert found is not None
+    assert found.rounding >= ENOUGH * 4 * u * (0.5 + 1.0) * 6 * 3  # tr(Lambda) and eta n d
+
+
 def test_errors_of_a_robot_s_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = PGOProblem(varied_graph(5, 7, 3))
     rng, n = np.random.default_rng(2), 7
