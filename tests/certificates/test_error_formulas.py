@@ -12,6 +12,7 @@ from graphs import varied_graph
 from scipy.sparse import csc_array
 
 from pgo_models.certificates import lower_bound
+from pgo_models.certificates.definiteness import shifted_certificate
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import bound_from, squared_distances
 from pgo_models.certificates.newton_polish import polish
@@ -283,3 +284,20 @@ def test_errors_of_a_robot_s_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found.quadratic >= ENOUGH * np.sum(size**2 / slack[:, None]) > 3.0 * found.left
     away = np.linalg.norm((X - start)[n + 6 :].reshape(-1, 9), axis=1)
     assert found.squared_distances >= ENOUGH * np.sum((np.sqrt(8.0) + away) ** 2)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_robot_counts_the_rounding_of_its_separators_entries(d: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, share = PGOProblem(varied_graph(7, 8, d)), 1e-6
+    is_inside = np.concatenate([np.arange(8) >= 2, np.repeat(np.arange(8) >= 2, d)])
+    cut = Cut(np.flatnonzero(is_inside), np.flatnonzero(~is_inside), None)
+    Lambda = np.zeros((8, d, d))
+    S, diagonal = shifted_certificate(problem, Lambda, np.zeros(problem.side))
+    S_before = S.diagonal()
+    monkeypatch.setattr(robot_proof, "matrix_error", lambda graph: share)
+    found = robot_proof.verify_interior(problem, Lambda, 0.0, cut, np.zeros(0, dtype=np.int64), 1e-12, None)
+    assert found is not None
+    lost = S_before - found[0].diagonal()
+    assert (lost[cut.boundary] >= (1.0 - 1e-9) * share * diagonal[cut.boundary]).all()
+    assert (lost[cut.interior] >= (2.0 - 1e-9) * share * diagonal[cut.interior]).all()
+    assert (found[2] <= lost[cut.interior] - (1.0 - 1e-9) * share * diagonal[cut.interior]).all()
