@@ -301,3 +301,8 @@ def test_a_robot_counts_the_rounding_of_its_separators_entries(d: int, monkeypat
     assert (lost[cut.boundary] >= (1.0 - 1e-9) * share * diagonal[cut.boundary]).all()
     assert (lost[cut.interior] >= (2.0 - 1e-9) * share * diagonal[cut.interior]).all()
     assert (found[2] <= lost[cut.interior] - (1.0 - 1e-9) * share * diagonal[cut.interior]).all()
+    monkeypatch.setattr(robot_proof, "matrix_error", lambda graph: 0.0)
+    found = robot_proof.verify_interior(problem, Lambda, 0.0, cut, np.zeros(0, dtype=np.int64), 1e-12, None)
+    assert found is not None
+    assert (found[1].interior_error > 0.0).all()
+    assert (found[2] <= (1e-12 - ENOUGH * found[1].interior_error) * diagonal[cut.interior]).all()
