@@ -69,3 +69,12 @@ class MissingExtraError(PGOError):
 
     def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str]]:
         return type(self), (self._package, self.extra)
+
+
+def check_signs(settings: object, positive: tuple[str, ...] = (), not_negative: tuple[str, ...] = ()) -> None:
+    """Raise a SettingError for the first of these settings that has the wrong sign; None is none."""
+    for name in positive + not_negative:
+        value = getattr(settings, name)
+        if value is not None and not (value > 0 or (value == 0 and name in not_negative)):
+            sign = "not be negative" if name in not_negative else "be positive"
+            raise SettingError(f"{name} must {sign}, got {value}")

@@ -1,4 +1,4 @@
-"""Errors of a command explained by its graph: which weight cannot be factored, what took the memory."""
+"""Endings explained by the graph: which weight cannot be factored or leaves no bound, what took the memory."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from pgo_models.certificates.certificate import Certificate
+from pgo_models.certificates.certificate import Certificate, Verdict
 from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import GraphWarning, NotPositiveDefiniteError, PGOError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.datasets import load, locate
 from pgo_models.graphs.g2o import edge_place
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.precisions import extreme_weight
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
@@ -35,7 +35,7 @@ def explained_by_its_graph(command: Callable[P, T]) -> Callable[P, T]:
         try:
             return command(*args, **kwargs)
         except NotPositiveDefiniteError as error:
-            raise NotPositiveDefiniteError(f"{extreme_weight(graph)} ({error})") from error
+            raise NotPositiveDefiniteError(f"{place_of_weight(graph)} ({error})") from error
         except MemoryError as error:
             raise PGOError(
                 f"{graph} takes more memory than there is; raise the limit, or share it among machines: "
@@ -45,11 +45,17 @@ def explained_by_its_graph(command: Callable[P, T]) -> Callable[P, T]:
     return explained
 
 
+def note_of_weights(graph: PoseGraph, certificate: Certificate) -> str:
+    """Sentence on the weight beside which rounding hides more than the gap asked for, where no bound was found."""
+    spread, _, text = extreme_weight(graph) if certificate.verdict is Verdict.TRIVIAL else (0.0, 0, "")
+    is_cause = spread * UNIT_ROUNDOFF > certificate.wanted_gap
+    return f"{text}, too far from others for a proof; correct it, or solve graph.unit_weights()" if is_cause else ""
+
+
 def warn_of_weights(graph: str, problem: PGOProblem, certificate: Certificate) -> None:
-    """Name the weight beside which rounding hides more of the others than the gap asked for, if there is no proof."""
-    heaviest = max(float(ratio.max()) for ratio in _ratios(problem.graph).values())
-    if not certificate.is_certified and heaviest * UNIT_ROUNDOFF > certificate.wanted_gap:
-        warnings.warn(extreme_weight(graph), GraphWarning, stacklevel=2)
+    """Say where the weight of `note_of_weights` is, if there is one."""
+    if note_of_weights(problem.graph, certificate):
+        warnings.warn(place_of_weight(graph), GraphWarning, stacklevel=2)
 
 
 def hint_of_chi2(problem: PGOProblem, poses: Poses) -> list[str]:
@@ -67,24 +73,15 @@ def hint_of_chi2(problem: PGOProblem, poses: Poses) -> list[str]:
     return [f"the file's own cost: chi2 {here:.4g} here; its minimum is at most {below:.4g}: --information"]
 
 
-def _ratios(graph: PoseGraph) -> dict[str, Array]:
-    return {name: getattr(graph, name) / np.median(getattr(graph, name)) for name in ("kappa", "tau")}
-
-
-def extreme_weight(graph: str) -> str:
-    """Sentence on the precision farthest from the median of its kind: file and line, edge, value, and the way out."""
+def place_of_weight(graph: str) -> str:
+    """Sentence on the weight that is too far from the others: file and line, edge, value, and the way out."""
     path = locate(graph)
     if not (path.is_file() or path.is_dir()):
         return f"{graph}: weights too far apart for doubles; give it as a file to be told which"
     loaded = load(path)
-    ratios = _ratios(loaded)
-    name = max(ratios, key=lambda one: float(np.abs(np.log(ratios[one])).max()))
-    e = int(np.argmax(np.abs(np.log(ratios[name]))))
-    i, j = int(loaded.pose_ids[loaded.i[e]]), int(loaded.pose_ids[loaded.j[e]])
-    value = float(getattr(loaded, name)[e])
+    _, edge, text = extreme_weight(loaded)
     return (
-        f"{edge_place(path, (i, j))}: {name} of edge {i} -> {j} is {value:.3g}, {ratios[name][e]:.3g} "
-        f"times the median; weights from {min(loaded.kappa.min(), loaded.tau.min()):.3g} to "
+        f"{edge_place(path, edge)}: {text}; weights from {min(loaded.kappa.min(), loaded.tau.min()):.3g} to "
         f"{max(loaded.kappa.max(), loaded.tau.max()):.3g} and lengths up to {np.abs(loaded.t_ij).max():.3g} m "
         "are too far apart for doubles; correct the information matrix, or use --unit-weights"
     )

@@ -33,6 +33,7 @@ from solvers.distributed.checkpoint import Checkpoint, Journal, run_fingerprint
 from solvers.distributed.driver import DEFAULT_MEMORY
 from solvers.distributed.leaderless import NO_CERTIFICATE, attempt_leaderless
 from solvers.distributed.stages import attempt_distributed, collect, open_driver
+from solvers.explanations import note_of_weights
 from solvers.loop import Watch
 from solvers.network.engine import Engine, InProcess
 from solvers.network.faults import Faults
@@ -241,7 +242,7 @@ def solve(
         seconds=time.perf_counter() - watch.began,
         ledger=ledger,
         robots=robots,
-        note=NO_CERTIFICATE if pipeline.driver_memory == 0 else "",
+        note=NO_CERTIFICATE if pipeline.driver_memory == 0 else note_of_weights(problem.graph, certificate),
         frame=frame,
         anchor=held,
     )

@@ -210,6 +210,22 @@ def test_a_weight_that_hides_the_others_is_named_where_there_is_no_proof(tmp_pat
             assert ("CERTIFIED" in out, err) == (True, "")
 
 
+def test_a_light_weight_is_named_where_it_alone_joins_poses_and_a_heavy_one_not_where_noise_is_the_cause(tmp_path):
+    lines = (Path(__file__).parent.parent / "data" / "grid.g2o").read_text().splitlines()
+    edges = [line.split() for line in lines if line.startswith("EDGE")]
+    again = [" ".join([edge[0], *(str(int(pose) + 27) for pose in edge[1:3]), *edge[3:]]) for edge in edges]
+    bridge = " ".join([edges[0][0], "0", "27", *edges[0][3:10], *(repr(1e-12 * float(x)) for x in edges[0][10:])])
+    (tmp_path / "light.g2o").write_text("\n".join([*(" ".join(edge) for edge in edges), *again, bridge]) + "\n")
+    found, _, err = ended(started("solve", tmp_path / "light.g2o"))
+    assert (found, one_line(err)) == (3, True), err
+    assert f"light.g2o:{2 * len(edges) + 1}: kappa of edge 0 -> 27 is 5.24e-13, 1e-12 times the median" in err
+    noisy = scenes.random_geometric(40, np.random.default_rng(0), noise=scenes.NoiseModel(0.5, 1.0))
+    factor = np.where(np.arange(noisy.num_edges) == 3, 2e10, 1.0)
+    write_g2o(noisy.with_weights(factor * noisy.kappa, factor * noisy.tau), tmp_path / "noisy.g2o")
+    found, out, err = ended(started("solve", tmp_path / "noisy.g2o"))
+    assert (found, "NOT_CERTIFIED" in out, err) == (3, True, "")
+
+
 def test_the_same_graph_is_read_whatever_ends_its_lines(tmp_path):
     graph = scenes.grid(np.random.default_rng(0))
     write_g2o(graph, tmp_path / "lf.g2o")

@@ -100,13 +100,11 @@ def read_g2o(path: Path | str, weights: RotationWeight = RotationWeight.SE_SYNC)
     )
 
 
-def edge_place(path: Path | str, ids: tuple[int, int]) -> str:
-    """`file:line` of the first edge between two pose ids in a g2o file or folder that has been read."""
-    for file in map(read_lines, _files_of(Path(path))):
-        at = np.flatnonzero((file.edge_ids == ids).all(axis=1))
-        if at.size:
-            return f"{file.path}:{file.edge_lines[at[0]]}"
-    return str(path)
+def edge_place(path: Path | str, edge: int) -> str:
+    """`file:line` of an edge of the graph that `read_g2o` has read from a file or folder."""
+    files = _robots_files([read_lines(file) for file in _files_of(Path(path))])
+    kept = zip(files, _join_edges(files), strict=True)
+    return [f"{file.path}:{line}" for file, rows in kept for line in file.edge_lines[rows]][edge]
 
 
 def read_g2o_poses(path: Path | str, graph: PoseGraph) -> Poses:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import enum
+from bisect import bisect_left
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 
 _LEAST_SCALED = 1e-12  # smallest eigenvalue of a matrix scaled to ones on its diagonal that counts as positive
 
@@ -84,3 +86,26 @@ def condition(blocks: Array) -> Array:
 
 def _trace_of_inverse(A: Array) -> Array:
     return np.asarray(np.trace(np.linalg.inv(A), axis1=1, axis2=2))
+
+
+def extreme_weight(graph: PoseGraph) -> tuple[float, int, str]:
+    """How far weights of a connected graph are apart where it counts, the edge to blame, and a sentence on its weight.
+
+    Rounding beside the heaviest edge hides what lighter ones hold alone. The lightest such edge is that of a maximum
+    spanning tree; of the two the one farther from the median is to blame.
+    """
+    found = []
+    for kind in ("kappa", "tau"):
+        weight = getattr(graph, kind)
+        order, ratio = np.argsort(-weight), weight / np.median(weight)
+        tree = bisect_left(range(graph.num_edges), -1, key=lambda count: -_num_components(graph, order[:count]))
+        e = int(max(order[0], order[tree - 1], key=lambda end: abs(np.log(ratio[end]))))
+        i, j = graph.pose_ids[[graph.i[e], graph.j[e]]]
+        text = f"{kind} of edge {i} -> {j} is {weight[e]:.3g}, {ratio[e]:.3g} times the median"
+        found.append((float(weight[order[0]] / weight[order[tree - 1]]), e, text))
+    return max(found, key=lambda one: round(float(np.log(one[0])), 9))  # kappa where both are equal but for rounding
+
+
+def _num_components(graph: PoseGraph, edges: IntArray) -> int:
+    adjacency = edge_counts(graph.i[edges], graph.j[edges], graph.num_poses)
+    return int(connected_components(adjacency, directed=False)[0])

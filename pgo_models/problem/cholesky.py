@@ -1,9 +1,8 @@
 """The one seam to sparse Cholesky: analyse a pattern, factor, solve many right-hand sides, factor again.
 
-SuperLU (scipy) is always there; CHOLMOD comes through CVXOPT with the extra `fast` and is found at run time.
-
-Every factor knows how far it can be from exact (`pgo_models.problem.floating_point`), so that one that went through
-proves something in exact arithmetic.
+SuperLU (scipy) is always there; CHOLMOD comes through CVXOPT with the extra `fast` and is found at run time, on the
+BLAS kernels of `pgo_models.problem.kernels`. Every factor knows how far it can be from exact
+(`pgo_models.problem.floating_point`), so that one that went through proves something in exact arithmetic.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, FactorCounts, error_of_counts, gamma
+from pgo_models.problem.kernels import kernels_of_the_cpu
 
 _PERMUTE, _FORWARD = 7, 4  # CVXOPT's codes of x = P b and L x = b
 _Capsule = object  # a factorisation, which CVXOPT keeps to itself
@@ -313,8 +313,7 @@ class _Cholmod(SymbolicCholesky):
 
     def crude_error(self) -> float:
         """Bound from rows and columns of N non-zeros."""
-        side = float(self._shape[0])
-        return float(error_of_counts(np.array(side), side))
+        return float(error_of_counts(np.array(float(self._shape[0])), self._shape[0]))
 
     def counts(self) -> FactorCounts:
         """Counts of every factor with this pattern, if need be of one that is out of use."""
@@ -341,8 +340,7 @@ class _Cholmod(SymbolicCholesky):
 
     def _analyze(self) -> _Capsule:
         with _supernodal() as cholmod:
-            capsule: _Capsule = cholmod.symbolic(self._matrix)
-        return capsule
+            return cholmod.symbolic(self._matrix)
 
     def factorize(self, matrix: csc_array, overwrite: CholeskyFactor | None = None) -> CholeskyFactor:
         self._check(matrix)
@@ -393,8 +391,9 @@ def _supernodal() -> Iterator[ModuleType]:
 
 def _import_cvxopt() -> tuple[ModuleType, ModuleType]:
     try:
-        import cvxopt
-        from cvxopt import cholmod
+        with kernels_of_the_cpu():
+            import cvxopt
+            from cvxopt import cholmod
     except ImportError as error:
         raise MissingExtraError("cvxopt", "fast") from error
     return cvxopt, cholmod

@@ -1,9 +1,9 @@
 """IEEE double arithmetic: gamma_k, and how far the computed Cholesky factor of a sparse matrix can be from exact.
 
 A factorisation that goes through proves something in exact arithmetic (Rump 2006, *Verification of positive
-definiteness*; Demmel 1989; Higham 2002, theorem 10.3). The product R^T R of the
-computed factor, taken exactly, is A + E with |E_ij| <= gamma sum_k |R_ki| |R_kj|, gamma counting the non-zeros of
-column i or j of R, whichever has fewer, in any order of summation; the squares in column j of R sum to at most
+definiteness*; Demmel 1989; Higham 2002, theorem 10.3). The product R^T R of the computed factor, taken exactly, is
+A + E with |E_ij| <= gamma sum_k |R_ki| |R_kj|, gamma counting the non-zeros of column i or j of R, whichever has fewer,
+in any order of summation and with or without fused multiply-adds; the squares in column j of R sum to at most
 a_jj / (1 - gamma). With c_j non-zeros in column j of R and at most p in a row, Cauchy-Schwarz bounds
 
     v^T |E| v <= sum_k (sum_j sqrt(gamma_(c_j)) |R_kj| |v_j|)^2 <= sum_j epsilon_j a_jj v_j^2,

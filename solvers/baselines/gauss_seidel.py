@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from pgo_models.certificates.newton_polish import move_poses
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_signs
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
@@ -148,10 +148,7 @@ class GaussSeidel:
             raise SettingError(f"alpha must be in (0, 2), got {self.alpha}; 1 is no over-relaxation")
         if self.gauss_newton_steps < 1:
             raise SettingError(f"gauss_newton_steps must be at least 1, got {self.gauss_newton_steps}")
-        if not self.tolerance > 0:
-            raise SettingError(f"tolerance must be positive, got {self.tolerance}")
-        if self.max_iterations < 0:
-            raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
+        check_signs(self, positive=("tolerance",), not_negative=("max_iterations",))
 
     def init(self, problem: PGOProblem, start: Poses | None) -> GaussSeidelState:
         """State 0: at `start`, whose pose 0 stays where it is, or at the identity."""

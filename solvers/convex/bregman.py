@@ -25,7 +25,7 @@ from pgo_models.convex.bregman import (
     two_line_subproblem,
 )
 from pgo_models.convex.clarabel import TOLERANCE, finite_array
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_signs
 from pgo_models.geometry.rotations import Array
 from solvers.result import Measurement, Status
 
@@ -119,8 +119,7 @@ class BregmanSettings:
             value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise SettingError(f"{name} must be positive and finite, got {value}")
-        if self.max_iterations < 0:
-            raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
+        check_signs(self, not_negative=("max_iterations",))
 
     def measure(self, problem: BregmanProblem, state: _ExactState | AlternatingState) -> Measurement:
         """J(x), ||K x - f||, relative, and the distance from stationarity, relative."""

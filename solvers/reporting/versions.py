@@ -7,6 +7,7 @@ from contextlib import suppress
 from importlib import metadata
 
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
+from pgo_models.problem.kernels import chosen_kernels
 
 
 def installed_versions(backend: CholeskyBackend | None) -> dict[str, str]:
@@ -15,4 +16,6 @@ def installed_versions(backend: CholeskyBackend | None) -> dict[str, str]:
     for name in ("pgo-splitting", "numpy", "scipy", "cvxpy", "clarabel"):
         with suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
-    return {**found, "cholesky": (backend or default_backend()).value}
+    chosen, kernels = backend or default_backend(), chosen_kernels()
+    has_kernels = chosen is CholeskyBackend.CHOLMOD and kernels
+    return {**found, "cholesky": f"{chosen.value}, {kernels} kernels" if has_kernels else chosen.value}

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.sparse import csc_array, csr_array, vstack
 
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_signs
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
@@ -132,10 +132,7 @@ class PaperSOC:
                 f"the paper has one rho for all poses, got {self.penalty}; give a FixedPenalty, BalancedPenalty or "
                 "BoydPenalty"
             )
-        if not self.tolerance > 0:
-            raise SettingError(f"tolerance must be positive, got {self.tolerance}")
-        if self.max_iterations < 0:
-            raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
+        check_signs(self, positive=("tolerance",), not_negative=("max_iterations",))
 
     def init(self, problem: PGOProblem, start: Poses | None) -> PaperState:
         """State 0: R = omega = start, a spanning tree unless given; B = 0."""

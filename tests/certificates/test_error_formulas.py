@@ -4,12 +4,18 @@ That the formulas are bounds is held against exact arithmetic elsewhere (test_ro
 there one term often covers another, and to leave one out would be seen by nobody.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from graphs import varied_graph
 from scipy.sparse import csc_array
 
+from pgo_models.certificates import lower_bound
+from pgo_models.certificates.definiteness import shifted_certificate
+from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import bound_from, squared_distances
+from pgo_models.certificates.newton_polish import polish
 from pgo_models.certificates.rounding_errors import (
     evaluate_certificate,
     evaluate_edges,
@@ -22,10 +28,12 @@ from pgo_models.geometry.rotations import Array, orthogonality_error, random_rot
 from pgo_models.problem.cholesky import CholeskyBackend, analyze
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF as u
 from pgo_models.problem.floating_point import column_error, error_of_counts, gamma
+from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.interface import Interface
 from solvers.distributed.multifrontal import separator_tree
 from solvers.distributed.robots import elimination as substructure
+from solvers.distributed.robots import proof as robot_proof
 from solvers.distributed.robots.elimination import Cut, eliminate, packed, row_sums
 
 ENOUGH = 1.0 - 1e-12  # the formulas here are rounded, too; the bounds are rounded up by 2^-30
@@ -214,3 +222,87 @@ def test_what_an_eta_costs_and_the_last_rounding() -> None:
         assert squared_distances(stretched, stretched) >= np.sum((stretched - opposite) ** 2)
     assert bound_from([1.0, 2.0**-60], 0.0, 0.0, is_grounded=True).value < 1.0
     assert bound_from([1.0], 0.25, 0.0, is_grounded=True).value < 0.75
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_how_far_stored_rotations_are_from_exact_ones_is_counted_beside_a_half_turn(d: int) -> None:
+    rng = np.random.default_rng(1)
+    for off in (1e-7, 1e-5):
+        stored = random_rotations(5, d, rng) + off * rng.standard_normal((5, d, d))
+        moved = stored + off * rng.standard_normal((5, d, d))
+        apart = np.sqrt(8.0) + orthogonality_error(stored) + np.linalg.norm((moved - stored).reshape(5, -1), axis=1)
+        found = squared_distances(moved.reshape(-1, d), stored.reshape(-1, d))
+        assert ENOUGH * np.sum(apart**2) <= found <= (1.0 + 1e-8) * np.sum(apart**2)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_error_of_S_X_is_taken_off(d: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = PGOProblem(varied_graph(4, 8, d))
+    poses, size = polish(problem, chordal_start(problem)), 1e-3
+    Lambda, evaluate = multipliers(problem, poses), lower_bound.evaluate_certificate
+
+    def less_known(*args: object) -> lower_bound.Evaluation:
+        found = evaluate(*args)  # type: ignore[arg-type]
+        return replace(found, product_error=found.product_error + size)
+
+    point = lower_bound._grounded_at(problem, problem.with_best_translations(poses.R))
+    known = lower_bound._prove(problem, Lambda, 0.0, point)
+    monkeypatch.setattr(lower_bound, "evaluate_certificate", less_known)
+    found = lower_bound._prove(problem, Lambda, 0.0, point)
+    assert known is not None
+    assert found is not None
+    diagonal = np.delete(problem.M.diagonal(), point.rows) + np.abs(Lambda).max()  # the slack is a share of less
+    least = d * np.sum(size**2 / diagonal)
+    assert known.rounding < 1e-3 * least < least <= found.rounding
+
+
+def test_rounding_of_the_bound_with_eta_alone() -> None:
+    problem = PGOProblem(varied_graph(6, 6, 3))
+    Lambda = np.tile(0.5 * np.eye(3), (6, 1, 1))
+    found = lower_bound._prove(problem, Lambda, 1.0, None)
+    assert found is not None
+    assert found.rounding >= ENOUGH * 4 * u * (0.5 + 1.0) * 6 * 3  # tr(Lambda) and eta n d
+
+
+def test_errors_of_a_robot_s_proof(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = PGOProblem(varied_graph(5, 7, 3))
+    rng, n = np.random.default_rng(2), 7
+    start = np.concatenate([rng.standard_normal((n, 3)), random_rotations(n, 3, rng).reshape(-1, 3)])
+    X, Lambda = start + 1e-2 * rng.standard_normal(start.shape), rng.standard_normal((n, 3, 3))
+    Lambda, low = 0.5 * (Lambda + np.swapaxes(Lambda, 1, 2)), np.zeros((n, 3))
+    is_inside = np.concatenate([np.arange(n) >= 2, np.repeat(np.arange(n) >= 2, 3)])
+    inside, boundary = np.flatnonzero(is_inside), np.flatnonzero(~is_inside)
+    slack = rng.uniform(1.0, 2.0, len(inside))
+    whole = evaluate_certificate(problem, Lambda, X, low)
+    whole = replace(whole, product_error=whole.product_error + np.abs(whole.product))  # large enough to be seen
+    monkeypatch.setattr(robot_proof, "evaluate_certificate", lambda *_: whole)
+    found, product = robot_proof.RobotProof(Lambda, start, X, low, slack, inside).evaluated(problem, boundary)
+    np.testing.assert_array_equal(product, whole.product)
+    np.testing.assert_array_equal(found.error, whole.product_error[boundary])
+    assert (found.value, found.value_error) == (whole.value, whole.value_error)
+    size = np.abs(whole.product[inside]) + whole.product_error[inside]
+    assert found.quadratic >= ENOUGH * np.sum(size**2 / slack[:, None]) > 3.0 * found.left
+    away = np.linalg.norm((X - start)[n + 6 :].reshape(-1, 9), axis=1)
+    assert found.squared_distances >= ENOUGH * np.sum((np.sqrt(8.0) + away) ** 2)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_robot_counts_the_rounding_of_its_separators_entries(d: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, share = PGOProblem(varied_graph(7, 8, d)), 1e-6
+    is_inside = np.concatenate([np.arange(8) >= 2, np.repeat(np.arange(8) >= 2, d)])
+    cut = Cut(np.flatnonzero(is_inside), np.flatnonzero(~is_inside), None)
+    Lambda = np.zeros((8, d, d))
+    S, diagonal = shifted_certificate(problem, Lambda, np.zeros(problem.side))
+    S_before = S.diagonal()
+    monkeypatch.setattr(robot_proof, "matrix_error", lambda graph: share)
+    found = robot_proof.verify_interior(problem, Lambda, 0.0, cut, np.zeros(0, dtype=np.int64), 1e-12, None)
+    assert found is not None
+    lost = S_before - found[0].diagonal()
+    assert (lost[cut.boundary] >= (1.0 - 1e-9) * share * diagonal[cut.boundary]).all()
+    assert (lost[cut.interior] >= (2.0 - 1e-9) * share * diagonal[cut.interior]).all()
+    assert (found[2] <= lost[cut.interior] - (1.0 - 1e-9) * share * diagonal[cut.interior]).all()
+    monkeypatch.setattr(robot_proof, "matrix_error", lambda graph: 0.0)
+    found = robot_proof.verify_interior(problem, Lambda, 0.0, cut, np.zeros(0, dtype=np.int64), 1e-12, None)
+    assert found is not None
+    assert (found[1].interior_error > 0.0).all()
+    assert (found[2] <= (1e-12 - ENOUGH * found[1].interior_error) * diagonal[cut.interior]).all()

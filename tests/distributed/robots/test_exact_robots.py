@@ -113,6 +113,18 @@ def test_what_a_driver_says_to_be_definite_is(
     assert is_positive_definite(less_diagonal(without(S, left_out), exact(np.delete(slack, left_out))))
 
 
+def test_an_eta_costs_for_the_poses_of_driver_and_robots_alike() -> None:
+    problem, eta = PGOProblem(varied_graph(3, 16, 3)), 1e-5
+    with closing(driver_at(problem, contiguous(problem.graph, 3), polish(problem, chordal_start(problem)))) as driver:
+        without_eta, with_eta = (distributed_bound.prove_grounded(driver, shift) for shift in (0.0, eta))
+        assert 0 < len(driver.cover) < 16
+    assert without_eta is not None
+    assert with_eta is not None
+    lost = eta * 8.0 * 16
+    assert with_eta.value > 0.0
+    assert without_eta.value - with_eta.value >= (1.0 - 1e-3) * lost
+
+
 def test_weights_that_could_underflow_prove_nothing_by_robots_either() -> None:
     graph = varied_graph(0, 8, 2)
     problem = PGOProblem(replace(graph, kappa=1e-120 * graph.kappa, tau=1e-120 * graph.tau))
