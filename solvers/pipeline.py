@@ -22,6 +22,7 @@ from pgo_models.certificates.certificate import (
     soften,
 )
 from pgo_models.certificates.lower_bound import NO_BOUND
+from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import whole_number
 from pgo_models.geometry.poses import Poses
@@ -299,9 +300,16 @@ class _Job:
         attempt: Callable[[SOC | PaperSOC | None, Poses | None], tuple[Poses, Certificate]],
         start: Poses | None,
     ) -> tuple[Poses, Certificate]:
-        """One attempt, and where its certificate is wider than asked for a second one with a finer SOC."""
+        """One attempt, and where its certificate is wider than asked for a second one.
+
+        That is with a finer SOC, or, of a cost that is not quadratic, from the optimum of F.
+        """
         poses, certificate = attempt(self.pipeline.soc, start)
         if self.pipeline.second_try and certificate.can_improve and self.stages[-1].status.is_success:
+            if not self.problem.is_quadratic:
+                F = PGOProblem(self.problem.graph, self.problem.backend)
+                other = attempt(None, polish(F, chordal_start(F)))[1]
+                return _better(self.problem, poses, certificate, other)
             soc = self.pipeline.soc if self.pipeline.soc is not None else SOC()
             fine = replace(soc, tolerance=min(soc.tolerance, _SECOND_TRY_TOLERANCE), max_iterations=SOC.max_iterations)
             poses, certificate = _better(self.problem, poses, certificate, attempt(fine, None)[1])

@@ -26,10 +26,10 @@ from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
 
 STATIONARY_DECREMENT = 1e-13
-STATIONARY_FOR_TANGENTS = 1e-19  # what is left of chi2 weighs more in the bound: its tangent is softer than chi2 itself
+STATIONARY_FOR_TANGENTS = 1e-17  # what is left of chi2 weighs more in the bound: its tangent is softer than chi2 itself
 SMALL_DECREMENT = 1e-9
 ROUNDING = 1e-14  # relative change of F that is not told apart from none
-NEARLY_STRAIGHT = 1e-9  # decrement below which the path of the best translations of chi2 is a line
+NEARLY_STRAIGHT = 1e-7  # decrement below which the path of the best translations of chi2 is a line
 SUFFICIENT = 1e-4  # Armijo's constant
 HALVINGS = 40
 NEARLY_EXACT = 1e4  # times its rounding level: then F is what the solve for the translations leaves
