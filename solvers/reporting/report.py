@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 import html
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -106,7 +106,7 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
     script = _plotly_script()
     robots = _partition(solution)
     graph = solution.problem.graph.with_robots(robots.robot)
-    residuals = edge_residuals(graph, solution.poses)
+    residuals = replace(edge_residuals(graph, solution.poses), cost=solution.problem.edge_costs(solution.poses))
     place = "graph3d" if graph.d == 3 else "graph2d"
     figures = {place: explore_graph(graph, solution.poses, covariances=solution.covariances).to_json()}
     sections = [
@@ -149,7 +149,7 @@ _GLOSSARY = [
     ("kappa", "precision of an edge's rotation, per rad^2: the larger, the surer"),
     ("tau", "precision of an edge's translation, per m^2"),
     ("separator", "pose with an edge to another robot: what robots have to tell each other"),
-    ("share of F", "of an edge: its summand; of a robot: its own edges and half of those to other robots"),
+    ("share of F, chi2", "of an edge: its summand; of a robot: its own edges and half of those to other robots"),
     (
         "error",
         "of an edge: what the poses say beside what was measured: metres between positions, degrees between rotations",
@@ -244,7 +244,7 @@ def _robots(solution: Solved, robots: Partition, residuals: EdgeResiduals) -> st
             columns.append(("bytes received", ledger.bytes_received.tolist()))
     shown = np.argsort(-share, kind="stable")[:_MOST_ROBOTS] if count > _MOST_ROBOTS else np.arange(count)
     if count > _MOST_ROBOTS:
-        lines.append(f"Shown are the {_MOST_ROBOTS} with the largest share of F.")
+        lines.append(f"Shown are the {_MOST_ROBOTS} with the largest share of {solution.certificate.cost}.")
     rows = [
         [
             *(PageCell(f"{values[a]:,}", values[a]) for _, values in columns),
@@ -252,7 +252,7 @@ def _robots(solution: Solved, robots: Partition, residuals: EdgeResiduals) -> st
         ]
         for a in shown.tolist()
     ]
-    heads = [*(head for head, _ in columns), "share of F"]
+    heads = [*(head for head, _ in columns), f"share of {solution.certificate.cost}"]
     return section("Robots", *map(paragraph, lines), sortable_table("robots", heads, rows, [False] * len(rows)))
 
 
@@ -277,10 +277,11 @@ def _worst_edges(solution: Solved, robots: Partition, residuals: EdgeResiduals) 
         ]
         rows.append(row)
     ends = ["from robot", "from pose", "to robot", "to pose"] if robots.num_robots > 1 else ["from pose", "to pose"]
-    heads = ["edge", *ends, "cost", "share of F", "error (m)", "error (deg)", "kappa (1/rad^2)", "tau (1/m^2)"]
+    share_of = f"share of {solution.certificate.cost}"
+    heads = ["edge", *ends, "cost", share_of, "error (m)", "error (deg)", "kappa (1/rad^2)", "tau (1/m^2)"]
     text = (
         f"The {len(rows)} of {graph.num_edges} edges that cost most, {100 * share[worst].sum():.3g} % "
-        f"of F together; marked are those over six times the mean. Half of all edges fit to "
+        f"of {solution.certificate.cost} together; marked are those over six times the mean. Half of all edges fit to "
         f"{np.median(residuals.translation):.3g} m and {np.median(degrees):.3g} degrees. Click on a head to sort."
     )
     table = sortable_table("edges", heads, rows, residuals.is_misfit[worst].tolist())
