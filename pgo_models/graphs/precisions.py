@@ -61,6 +61,8 @@ def proper_information(graph: PoseGraph) -> Array:
     """
     if graph.information is None:
         return isotropic_information(graph.kappa, graph.tau, graph.d)
+    if not graph.information[:, : graph.d, graph.d :].any():
+        return graph.information
     scale = 1.0 / np.sqrt(np.einsum("mkk->mk", graph.information))
     bad = ~(np.linalg.eigvalsh(graph.information * scale[:, :, None] * scale[:, None, :])[:, 0] > _LEAST_SCALED)
     if not bad.any():
@@ -74,7 +76,7 @@ def proper_information(graph: PoseGraph) -> Array:
 def uncoupled_share(information: Array, d: int) -> Array:
     """Largest share, (m,), for which I >= share blockdiag(I_tt, I_rr): 1 - ||I_tt^-1/2 I_tr I_rr^-1/2||_2."""
     I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
-    squared = np.linalg.solve(I_tt, I_tr) @ np.linalg.solve(I_rr, np.swapaxes(I_tr, 1, 2))
+    squared = np.linalg.solve(I_rr, np.swapaxes(I_tr, 1, 2)) @ np.linalg.solve(I_tt, I_tr)
     return np.asarray(1.0 - np.sqrt(np.abs(np.linalg.eigvals(squared)).max(axis=1)))
 
 
