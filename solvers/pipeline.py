@@ -127,6 +127,9 @@ def solve(
     rounding level, then the dual certificate at the result. Where it is wider than asked for, a second try and then
     the Riemannian staircase, whose optimum is the best bound that the relaxation has.
 
+    chi2 of information matrices that is not quadratic and convex: SOC on its `convex_part`, Newton on chi2 itself; the
+    second try starts at the optimum of F, and smaller information matrices take the place of the staircase.
+
     Parameters
     ----------
     problem : PGOProblem or PoseGraph

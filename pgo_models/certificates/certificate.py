@@ -193,7 +193,8 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     The bound is found at a stationary point. Poses that are not stationary are polished first (damped Newton,
     `polish`); where that point does not give the gap, the one that the chordal start polishes to is tried, and the
     better bound is taken. `source` says what was done; the gap is always that of the poses given. `certify_at` bounds
-    at the poses as they are.
+    at the poses as they are. Of a problem with `Weighting.INFORMATION` all of this is chi2 instead of F, bounded by its
+    tangent at the stationary point, and where that fails by smaller information matrices (`softened_bound`).
 
     Parameters
     ----------
