@@ -61,13 +61,13 @@ def warn_of_weights(graph: str, problem: PGOProblem, certificate: Certificate) -
 def hint_of_chi2(problem: PGOProblem, poses: Poses) -> list[str]:
     """A line that names `--information` where F was asked for, and chi2 can be lowered by more than it is worth.
 
-    Two Newton steps give a bound from above on its minimum.
+    A Newton step gives a bound from above on its minimum.
     """
     graph = problem.graph
     if problem.weighting is not Weighting.ISOTROPIC or graph.information is None:
         return []
     whole = PGOProblem(graph, problem.backend, Weighting.INFORMATION)
-    here, below = whole.objective(poses), whole.objective(polish(whole, poses, max_steps=2))
+    here, below = whole.objective(poses), whole.objective(polish(whole, poses, max_steps=1))
     if not here > WORTH_SAYING * below:
         return []
     return [f"the file's own cost: chi2 {here:.4g} here; its minimum is at most {below:.4g}: --information"]
