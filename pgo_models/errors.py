@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 
@@ -24,7 +25,7 @@ class GraphWarning(UserWarning):
 
 
 class SettingError(PGOError, ValueError):
-    """A setting of a solver, a model or a scene that is out of its range."""
+    """A setting of a solver, a model or a scene that is out of its range: raised where the settings are made."""
 
 
 class FileFormatError(PGOError):
@@ -69,3 +70,25 @@ class MissingExtraError(PGOError):
 
     def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str]]:
         return type(self), (self._package, self.extra)
+
+
+def check_settings(
+    settings: object,
+    *,
+    positive: Sequence[str] = (),
+    not_negative: Sequence[str] = (),
+    at_least_one: Sequence[str] = (),
+    above_one: Sequence[str] = (),
+) -> None:
+    """Raise a SettingError for the first of the named fields that is out of its range; one that is None passes."""
+    rules: tuple[tuple[Sequence[str], str, Callable[[float], bool]], ...] = (
+        (positive, "be positive", lambda value: value > 0),
+        (not_negative, "not be negative", lambda value: value >= 0),
+        (at_least_one, "be at least 1", lambda value: value >= 1),
+        (above_one, "be above 1", lambda value: value > 1),
+    )
+    for names, rule, holds in rules:
+        for name in names:
+            value = getattr(settings, name)
+            if value is not None and not holds(value):
+                raise SettingError(f"{name} must {rule}, got {value}")

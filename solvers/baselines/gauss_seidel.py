@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from pgo_models.certificates.newton_polish import move_poses
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
@@ -120,11 +120,6 @@ class GaussSeidel:
     max_iterations : int
         Sweeps of all stages together.
 
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
-
     Examples
     --------
     >>> from pgo_models.graphs.scenes import grid
@@ -146,12 +141,8 @@ class GaussSeidel:
     def __post_init__(self) -> None:
         if not 0 < self.alpha < 2:
             raise SettingError(f"alpha must be in (0, 2), got {self.alpha}; 1 is no over-relaxation")
-        if self.gauss_newton_steps < 1:
-            raise SettingError(f"gauss_newton_steps must be at least 1, got {self.gauss_newton_steps}")
-        if not self.tolerance > 0:
-            raise SettingError(f"tolerance must be positive, got {self.tolerance}")
-        if self.max_iterations < 0:
-            raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
+        check_settings(self, positive=["tolerance"])
+        check_settings(self, not_negative=["max_iterations"], at_least_one=["gauss_newton_steps"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> GaussSeidelState:
         """State 0: at `start`, whose pose 0 stays where it is, or at the identity."""

@@ -14,7 +14,7 @@ from scipy.sparse import csc_array
 
 from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, ground_pose, move_poses, scaled_decrement
 from pgo_models.certificates.rounding_errors import rounding_level
-from pgo_models.errors import NotPositiveDefiniteError, SettingError
+from pgo_models.errors import NotPositiveDefiniteError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.cholesky import SymbolicCholesky, analyze
@@ -98,11 +98,7 @@ class LevenbergMarquardt:
     damping: float = 1e-3
 
     def __post_init__(self) -> None:
-        for name, value in (("tolerance", self.tolerance), ("damping", self.damping)):
-            if not value > 0:
-                raise SettingError(f"{name} must be positive, got {value}")
-        if self.max_iterations < 0:
-            raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
+        check_settings(self, positive=["tolerance", "damping"], not_negative=["max_iterations"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> LevenbergMarquardtState:
         """State 0: `start`, or the chordal relaxation."""

@@ -25,7 +25,7 @@ from pgo_models.convex.bregman import (
     two_line_subproblem,
 )
 from pgo_models.convex.clarabel import TOLERANCE, finite_array
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
 from solvers.result import Measurement, Status
 
@@ -102,11 +102,6 @@ class BregmanSettings:
     max_iterations : int
     subproblem_tolerance : float
         Clarabel's. Loosen it to see that Bregman iteration forgets the errors of its subproblems (Yin & Osher 2013).
-
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
     """
 
     alpha: float = 1.0
@@ -119,8 +114,7 @@ class BregmanSettings:
             value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise SettingError(f"{name} must be positive and finite, got {value}")
-        if self.max_iterations < 0:
-            raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
+        check_settings(self, not_negative=["max_iterations"])
 
     def measure(self, problem: BregmanProblem, state: _ExactState | AlternatingState) -> Measurement:
         """J(x), ||K x - f||, relative, and the distance from stationarity, relative."""
@@ -265,8 +259,7 @@ class AlternatingBregman(BregmanSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.passes < 1:
-            raise SettingError(f"passes must be at least 1, got {self.passes}")
+        check_settings(self, at_least_one=["passes"])
 
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> AlternatingState:
         """State 0 at `start`, else at x = 0 and lam = 0.

@@ -22,7 +22,7 @@ from pgo_models.convex.orthogonality import (
     SplitProblem,
     kkt_residuals,
 )
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
 from solvers.loop import run
 from solvers.result import Measurement, Outcome, Status
@@ -94,11 +94,6 @@ class OrthogonalSOC:
         On the primal and the dual residual, both relative.
     max_iterations : int
 
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
-
     Examples
     --------
     >>> from pgo_models.convex.orthogonality_examples import procrustes
@@ -121,10 +116,7 @@ class OrthogonalSOC:
             raise SettingError(f"alpha must be in (0, 2), got {self.alpha}")
         if not 1 < self.safeguard < math.inf:
             raise SettingError(f"safeguard must be above 1, got {self.safeguard}")
-        if not self.tolerance > 0:
-            raise SettingError(f"tolerance must be positive, got {self.tolerance}")
-        if self.max_iterations < 0:
-            raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
+        check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
 
     def init(self, problem: OrthogonalProblem, start: OrthogonalPoint | None) -> OrthogonalState:
         """State 0: X = P = start; at the first columns of the identity unless a start is given.

@@ -67,11 +67,6 @@ class AsynchronousSOC:
         Share of a step that is taken, in (0, 1].
     has_driver : bool
         As in `ConsensusSOC`.
-
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
     """
 
     soc: SOC = field(default_factory=SOC)

@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_settings
 
 T = TypeVar("T")
 
@@ -30,11 +30,6 @@ class Faults:
     silent_from, silent_rounds : int
         .. from this round on, for so many rounds.
     seed : int
-
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
 
     Examples
     --------
@@ -59,9 +54,7 @@ class Faults:
     def __post_init__(self) -> None:
         if not 0 <= self.loss < 1:
             raise SettingError(f"loss must be in [0, 1), got {self.loss}")
-        for name in ("max_delay", "silent_robot", "silent_from", "silent_rounds"):
-            if (getattr(self, name) or 0) < 0:
-                raise SettingError(f"{name} must not be negative, got {getattr(self, name)}")
+        check_settings(self, not_negative=["max_delay", "silent_robot", "silent_from", "silent_rounds"])
 
     def is_silent(self, robot: int, number: int) -> bool:
         """Whether a robot is cut off in a round."""

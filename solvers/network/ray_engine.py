@@ -23,7 +23,7 @@ from ipaddress import ip_address
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from pgo_models.errors import EngineError, MissingExtraError, SettingError
+from pgo_models.errors import EngineError, MissingExtraError, SettingError, check_settings
 from solvers.network.engine import WorkerPool
 from solvers.network.messages import Worker
 from solvers.network.recovery import AnyOrder, RecoveringPool, Recovery, RobotLostError
@@ -83,10 +83,7 @@ class RayEngine:
     recovery: Recovery = field(default_factory=Recovery)
 
     def __post_init__(self) -> None:
-        for name in ("num_cpus", "robots_per_cpu", "patience"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise SettingError(f"{name} must be positive, got {value}")
+        check_settings(self, positive=["num_cpus", "robots_per_cpu", "patience"])
         if self.address is not None and self.num_cpus is not None:
             raise SettingError(f"num_cpus is for Ray on this machine; the cluster at {self.address} has its own")
 

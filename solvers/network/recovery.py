@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
-from pgo_models.errors import EngineError, PGOError, SettingError
+from pgo_models.errors import EngineError, PGOError, check_settings
 from solvers.network.messages import Snapshot, restore, take_snapshot
 
 T = TypeVar("T")
@@ -67,10 +67,7 @@ class Recovery:
     max_restarts: int = 3
 
     def __post_init__(self) -> None:
-        if self.orders_between_snapshots < 1:
-            raise SettingError(f"orders_between_snapshots must be at least 1, got {self.orders_between_snapshots}")
-        if self.max_restarts < 0:
-            raise SettingError(f"max_restarts must not be negative, got {self.max_restarts}")
+        check_settings(self, not_negative=["max_restarts"], at_least_one=["orders_between_snapshots"])
 
 
 @dataclass(eq=False)

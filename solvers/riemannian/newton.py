@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, PolishState, polish_step, start_polish
-from pgo_models.errors import SettingError
+from pgo_models.errors import check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
@@ -52,10 +52,7 @@ class Newton:
     secants: bool = True
 
     def __post_init__(self) -> None:
-        if not self.tolerance > 0:
-            raise SettingError(f"tolerance must be positive, got {self.tolerance}")
-        if self.max_iterations < 0:
-            raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
+        check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> NewtonState:
         """State 0: `start`, or the chordal relaxation."""

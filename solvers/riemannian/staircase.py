@@ -18,7 +18,7 @@ from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, best_bound
 from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, scaled_decrement
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.certificates.spectrum import NegativeCurvature, negative_curvature
-from pgo_models.errors import SettingError
+from pgo_models.errors import check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.geometry.stiefel import append_rank, project_to_tangent, retract
@@ -134,13 +134,8 @@ class Staircase:
     max_inner_iterations: int = 1000
 
     def __post_init__(self) -> None:
-        for name, value in (("tolerance", self.tolerance), ("gap", self.gap)):
-            if not value > 0:
-                raise SettingError(f"{name} must be positive, got {value}")
-        if self.max_iterations < 0:
-            raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
-        if self.max_inner_iterations < 1:
-            raise SettingError(f"max_inner_iterations must be at least 1, got {self.max_inner_iterations}")
+        check_settings(self, positive=["tolerance", "gap"])
+        check_settings(self, not_negative=["max_iterations"], at_least_one=["max_inner_iterations"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> StaircaseState:
         """State 0: rank d, at the rotations of `start`, or of the chordal relaxation."""

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.sparse import csc_array, csr_array, vstack
 
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
@@ -107,11 +107,6 @@ class PaperSOC:
         ||omega_i - R_i||^2, and on the gradient of the Lagrangian, over the scale of L.
     max_iterations : int
 
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
-
     Examples
     --------
     >>> from pgo_models.graphs.scenes import grid
@@ -132,10 +127,7 @@ class PaperSOC:
                 f"the paper has one rho for all poses, got {self.penalty}; give a FixedPenalty, BalancedPenalty or "
                 "BoydPenalty"
             )
-        if not self.tolerance > 0:
-            raise SettingError(f"tolerance must be positive, got {self.tolerance}")
-        if self.max_iterations < 0:
-            raise SettingError(f"max_iterations must not be negative, got {self.max_iterations}")
+        check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> PaperState:
         """State 0: R = omega = start, a spanning tree unless given; B = 0."""

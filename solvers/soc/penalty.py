@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from pgo_models.certificates.dual_variables import multiplier_norms, multipliers
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, stack_transposes
 from pgo_models.problem.problem import PGOProblem
@@ -103,8 +103,7 @@ class MultiplierPenalty(_Rule):
     max_refreshes: int = 1
 
     def __post_init__(self) -> None:
-        if not self.factor > 0:
-            raise SettingError(f"factor must be positive, got {self.factor}")
+        check_settings(self, positive=["factor"], not_negative=["max_refreshes"])
         if not 0 <= self.quantile <= 1:
             raise SettingError(f"quantile must be in [0, 1], got {self.quantile}")
         if self.stall_window < 1 or not 0 < self.stall_ratio < 1:
@@ -112,8 +111,6 @@ class MultiplierPenalty(_Rule):
                 "stall_window must be at least 1 and stall_ratio in (0, 1), "
                 f"got {self.stall_window} and {self.stall_ratio}"
             )
-        if self.max_refreshes < 0:
-            raise SettingError(f"max_refreshes must not be negative, got {self.max_refreshes}")
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
         """(per_norm, per_scale, least), from ||Lambda_i||_2 / m_i of all poses, (n,)."""
@@ -138,8 +135,7 @@ class FixedPenalty(_Rule):
     rho: float
 
     def __post_init__(self) -> None:
-        if not self.rho > 0:
-            raise SettingError(f"rho must be positive, got {self.rho}")
+        check_settings(self, positive=["rho"])
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
         """(0, 0, rho)."""
@@ -169,10 +165,7 @@ class BalancedPenalty(_Rule):
     refactor_ratio: float = 5.0
 
     def __post_init__(self) -> None:
-        if not self.scale > 0:
-            raise SettingError(f"scale must be positive, got {self.scale}")
-        if not self.refactor_ratio > 1:
-            raise SettingError(f"refactor_ratio must be above 1, got {self.refactor_ratio}")
+        check_settings(self, positive=["scale"], above_one=["refactor_ratio"])
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
         """(0, scale, 0)."""
@@ -215,8 +208,7 @@ class BoydPenalty(_Rule):
     growth: float = 2.0
 
     def __post_init__(self) -> None:
-        if not self.scale > 0:
-            raise SettingError(f"scale must be positive, got {self.scale}")
+        check_settings(self, positive=["scale"])
         if not self.imbalance > 1 or not self.growth > 1:
             raise SettingError(f"imbalance and growth must be above 1, got {self.imbalance} and {self.growth}")
 

@@ -53,11 +53,6 @@ class BenchmarkSettings:
         Of PAPER, both stages together.
     time_limit : float
         Seconds for each contender.
-
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
     """
 
     num_robots: int = 5
