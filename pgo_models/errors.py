@@ -60,7 +60,10 @@ class EngineError(PGOError):
 
 
 class MissingExtraError(PGOError):
-    """An optional dependency is not installed; the message names the extra."""
+    """An optional dependency is not installed; the message names the extra.
+
+    Whatever draws raises it without matplotlib or plotly, which the extra `plot` brings.
+    """
 
     def __init__(self, package: str, extra: str) -> None:
         """Name the missing `package` and the `extra` that brings it."""

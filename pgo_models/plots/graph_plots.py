@@ -103,8 +103,6 @@ def plot_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: Arr
     ------
     GraphError
         When the poses are not those of the graph.
-    MissingExtraError
-        Without matplotlib.
 
     Examples
     --------
@@ -130,11 +128,6 @@ def plot_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: Arr
 def compare_poses(graph: PoseGraph, panels: list[tuple[str, Poses]]) -> Figure:
     """Figure with one panel for every (title, poses), side by side.
 
-    Raises
-    ------
-    MissingExtraError
-        Without matplotlib.
-
     Examples
     --------
     >>> from pgo_models.problem.initialization import spanning_tree_start
@@ -144,11 +137,18 @@ def compare_poses(graph: PoseGraph, panels: list[tuple[str, Poses]]) -> Figure:
     >>> [axes.get_title() for axes in figure.axes]
     ['truth', 'tree']
     """
-    with column_figure(height=1.0, width=len(panels)) as figure:
-        for place, (title, poses) in enumerate(panels, 1):
-            axes = figure.add_subplot(1, len(panels), place, projection="3d" if graph.d == 3 else None)
-            draw_graph(graph, poses, axes, mark_edges=False)
-            axes.set_title(title)
+    return plot_panels([[(title, graph, poses) for title, poses in panels]])
+
+
+def plot_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> Figure:
+    """Figure with a row of pictures for every list of (title, graph, poses)."""
+    columns = max(len(row) for row in panels)
+    with column_figure(height=1.0 * len(panels), width=columns) as figure:
+        for r, row in enumerate(panels):
+            for place, (title, graph, poses) in enumerate(row, r * columns + 1):
+                axes = figure.add_subplot(len(panels), columns, place, projection="3d" if graph.d == 3 else None)
+                draw_graph(graph, poses, axes, mark_edges=False)
+                axes.set_title(title)
     return figure
 
 
@@ -167,8 +167,6 @@ def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = Non
     ------
     GraphError
         When there is no truth, or the sizes differ.
-    MissingExtraError
-        Without matplotlib.
 
     Examples
     --------

@@ -5,12 +5,11 @@ from __future__ import annotations
 import html
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pgo_models.errors import GraphError, MissingExtraError
+from pgo_models.errors import GraphError
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -18,7 +17,7 @@ from pgo_models.graphs.g2o import pose_names
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.residuals import EdgeResiduals, edge_residuals
 from pgo_models.plots.graph_plots import BETWEEN, KIND_LABELS, MISFIT, OWN, UNCERTAIN, confidence_ellipses, edge_kinds
-from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, plotly
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -55,8 +54,6 @@ def explore_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: 
     ------
     GraphError
         When the poses are not those of the graph.
-    MissingExtraError
-        Without plotly.
 
     Examples
     --------
@@ -65,7 +62,7 @@ def explore_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: 
     >>> [trace.name for trace in explore_graph(graph, graph.truth).data]
     ['edges and poses', 'edges and poses', 'misfit']
     """
-    go = _plotly()
+    go = plotly("graph_objects")
     kind, residuals = edge_kinds(graph, poses), edge_residuals(graph, poses)
     names, several = np.array(pose_names(graph)), graph.num_robots > 1
     traces = []
@@ -117,10 +114,8 @@ def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[
     ------
     GraphError
         When there are no iterates, their labels are not as many, or they are not poses of the graph.
-    MissingExtraError
-        Without plotly.
     """
-    go = _plotly()
+    go = plotly("graph_objects")
     if not iterates:
         raise GraphError("there are no iterates; give at least one set of poses")
     names = [f"k = {k}" for k in range(len(iterates))] if labels is None else list(labels)
@@ -155,25 +150,13 @@ def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[
 def save_page(figure: Figure, path: Path | str) -> None:
     """Write a plotly figure as one HTML page that opens offline, plotly's own script inside (about 5 MB).
 
-    Raises
-    ------
-    PGOError
-        When the file cannot be written.
+    Errors as `replace_when_done`.
     """
     page = figure.to_html(
         include_plotlyjs=True, full_html=True, config=PAGE_CONFIG, auto_play=False, default_height="96vh"
     )
     with replace_when_done(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
-
-
-def _plotly() -> ModuleType:
-    try:
-        from plotly import graph_objects
-    except ImportError as error:
-        raise MissingExtraError("plotly", "plot") from error
-    module: ModuleType = graph_objects
-    return module
 
 
 def _points(points: Array) -> Trace:

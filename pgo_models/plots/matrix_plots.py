@@ -72,8 +72,6 @@ def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12
     ------
     SettingError
         When count is not 1 to d n.
-    MissingExtraError
-        Without matplotlib.
 
     Examples
     --------
@@ -138,13 +136,7 @@ def factor_pattern(problem: PGOProblem) -> FactorPattern:
 
 
 def plot_sparsity(problem: PGOProblem) -> Figure:
-    """Figure of the patterns of M, in the order of the poses, and of its Cholesky factor, with the fill-in counted.
-
-    Raises
-    ------
-    MissingExtraError
-        Without matplotlib.
-    """
+    """Figure of the patterns of M, in the order of the poses, and of its Cholesky factor, with the fill-in counted."""
     pattern = factor_pattern(problem)
     with column_figure(height=0.6) as figure:
         left, right = figure.subplots(1, 2)

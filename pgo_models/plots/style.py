@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from io import BytesIO
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from pgo_models.errors import MissingExtraError
@@ -30,13 +32,7 @@ MARKERS = ("o", "s", "D", "^", "v", "P")
 
 @contextmanager
 def column_figure(height: float, width: float = 1.0) -> Iterator[Figure]:
-    """Context manager yielding a figure in the project's style, `width` columns wide, `height` of them high.
-
-    Raises
-    ------
-    MissingExtraError
-        Without matplotlib.
-    """
+    """Context manager yielding a figure in the project's style, `width` columns wide, `height` of them high."""
     try:
         import matplotlib
     except ImportError as error:
@@ -64,19 +60,22 @@ def keep_letters(axes: Axes) -> None:
     axes.tick_params(which="both", labelsize=SMALL_POINTS)
 
 
+def plotly(name: str) -> ModuleType:
+    """Module of plotly, whose import waits until something is drawn."""
+    try:
+        importlib.import_module("plotly")
+        return importlib.import_module(f"plotly.{name}")
+    except ImportError as error:
+        raise MissingExtraError("plotly", "plot") from error
+
+
 def is_picture(path: Path) -> bool:
     """Whether the suffix names a picture format that `save_figure` writes."""
     return path.suffix.lower() in PICTURE_SUFFIXES
 
 
 def save_figure(figure: Figure, path: Path | str) -> None:
-    """Write a figure as .png, .svg or .pdf, whole or not at all.
-
-    Raises
-    ------
-    PGOError
-        When the file cannot be written.
-    """
+    """Write a figure as .png, .svg or .pdf, whole or not at all; errors as `replace_when_done`."""
     path = Path(path)
     with replace_when_done(path) as temporary:
         figure.savefig(temporary, format=path.suffix.lower().lstrip("."), dpi=DOTS_PER_INCH)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
-from pgo_models.plots.style import COLOURS, MARKERS, column_figure
+from pgo_models.plots.style import COLOURS, MARKERS, column_figure, plotly
 from solvers.reporting.convergence_plots import LINES, LOGARITHMIC, Curve, Effort
 
 if TYPE_CHECKING:
@@ -35,8 +35,6 @@ def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -
     ------
     SettingError
         When there is no curve with a gap above zero.
-    MissingExtraError
-        Without matplotlib.
     """
     panels = _panels(curves, efforts)
     styles = _styles(curves, LINES)
@@ -64,16 +62,10 @@ def explore_efforts(curves: Sequence[Curve], title: str = "") -> PlotlyFigure:
     ------
     SettingError
         When there is no curve with a gap above zero.
-    MissingExtraError
-        Without plotly.
     """
-    try:
-        from plotly.subplots import make_subplots
-    except ImportError as error:
-        raise MissingExtraError("plotly", "plot") from error
     panels = _panels(curves, _PANELS)
     styles = _styles(curves, _DASHES)
-    figure = make_subplots(1, len(panels), shared_yaxes=True, horizontal_spacing=0.03)
+    figure = plotly("subplots").make_subplots(1, len(panels), shared_yaxes=True, horizontal_spacing=0.03)
     named: set[str] = set()
     for column, (effort, shown) in enumerate(panels, 1):
         for curve in shown:

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.published_results import PublishedRun
-from pgo_models.plots.style import ALARM_COLOUR, COLOURS, column_figure
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, column_figure, plotly
 from solvers.result import History
 
 if TYPE_CHECKING:
@@ -115,8 +115,6 @@ def plot_convergence(
     ------
     SettingError
         When no stage has a record.
-    MissingExtraError
-        Without matplotlib.
     """
     run = _with_records(stages)
     with column_figure(height=1.3) as figure:
@@ -148,15 +146,9 @@ def explore_convergence(
     ------
     SettingError
         When no stage has a record.
-    MissingExtraError
-        Without plotly.
     """
     run = _with_records(stages)
-    try:
-        from plotly import graph_objects as go
-    except ImportError as error:
-        raise MissingExtraError("plotly", "plot") from error
-    figure = go.Figure()
+    figure = plotly("graph_objects").Figure()
     begin = 0.0
     for (name, history), colour in zip(run, cycle(COLOURS), strict=False):
         k = begin + history.k

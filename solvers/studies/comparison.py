@@ -130,8 +130,6 @@ class Comparison:
         ------
         SettingError
             On another suffix, or when there is nothing to draw.
-        MissingExtraError
-            Without matplotlib or plotly.
         PGOError
             When the file cannot be written.
         """
