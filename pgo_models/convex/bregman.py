@@ -129,25 +129,13 @@ class BregmanProblem:
 
 @dataclass(frozen=True, eq=False)
 class Subproblem:
-    """A compiled minimisation over x, or over one block of it.
-
-    Attributes
-    ----------
-    problem : cp.Problem
-    variables : tuple of cp.Variable
-    parameter : cp.Parameter
-        p, (m,), or lam, (s,), or the scaled shift, (s,).
-    scale : float
-        The parameter's value is `scale` times what `solve` is given.
-    tolerance : float
-        Clarabel's.
-    """
+    """A compiled minimisation over x, or over one block of it."""
 
     problem: cp.Problem
     variables: tuple[cp.Variable, ...]
-    parameter: cp.Parameter
-    scale: float
-    tolerance: float
+    parameter: cp.Parameter  # p, (m,), or lam, (s,), or the scaled shift, (s,)
+    scale: float  # the parameter's value is `scale` times what `solve` is given
+    tolerance: float  # Clarabel's
 
     def solve(self, value: Array) -> Array:
         """Minimiser, stacked.

@@ -93,22 +93,12 @@ def total_variation_scale_space(noisy: Array) -> BregmanProblem:
 
 @dataclass(frozen=True, eq=False)
 class SharedRotationStep:
-    """The R-subproblem of several robots that agree on the rotations they share.
+    """The R-subproblem of several robots that agree on the rotations they share."""
 
-    Attributes
-    ----------
-    problem : BregmanProblem
-        One variable a robot: the rows R_p^T of the poses it holds.
-    held : tuple of (poses,) arrays
-        Poses that each robot holds, its own and copies of their neighbours, ascending.
-    robot : (n,)
-        Owner of every pose.
-    d : int
-    """
-
-    problem: BregmanProblem
+    problem: BregmanProblem  # one variable a robot: the rows R_p^T of the poses it holds
+    # (poses,) each: poses that a robot holds, its own and copies of their neighbours, ascending.
     held: tuple[IntArray, ...]
-    robot: IntArray
+    robot: IntArray  # (n,): owner of every pose
     d: int
 
     def rotations(self, x: Array) -> Array:

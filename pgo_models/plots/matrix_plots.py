@@ -107,21 +107,11 @@ def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12
 
 @dataclass(frozen=True, eq=False)
 class FactorPattern:
-    """Where the Cholesky factor of M is not zero.
+    """Where the Cholesky factor of M is not zero."""
 
-    Attributes
-    ----------
-    order : (N,)
-        Fill-reducing order of the rows and columns of M.
-    factor : csc_array, (N, N)
-        L, lower triangular, of M in that order; ones where it is stored.
-    fill_in : int
-        Entries of L where the lower triangle of M in that order has none.
-    """
-
-    order: IntArray
-    factor: csc_array
-    fill_in: int
+    order: IntArray  # (N,): fill-reducing order of the rows and columns of M
+    factor: csc_array  # (N, N): L, lower triangular, of M in that order; ones where it is stored
+    fill_in: int  # entries of L where the lower triangle of M in that order has none
 
 
 def factor_pattern(problem: PGOProblem) -> FactorPattern:

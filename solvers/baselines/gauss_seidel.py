@@ -46,43 +46,23 @@ class DGSStage(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class GaussSeidelState:
-    """State after k sweeps.
-
-    Attributes
-    ----------
-    k : int
-    stage : DGSStage
-    R, t : (n, d, d), (n, d)
-        Poses at which the stage began: the start, then the point of linearisation. Of its translations all but that of
-        pose 0 are a first guess only.
-    x : (unknowns, columns)
-        Iterate of the linear problem, without pose 0: the rows of every R_i^T; or v, then w.
-    turns : tuple of Turn
-        A sweep, factorisations included.
-    first : tuple of Turn
-        The flagged sweep that has to come first; empty when every robot has an estimate.
-    schedule : Schedule
-    is_flagged : bool
-        Whether the first linearised problem begins with a flagged sweep too.
-    ledger : Ledger
-    gauss_newton_step : int
-        Linearisations so far.
-    change : float
-        Of the last sweep, relative; inf before the first of a stage.
-    """
+    """State after k sweeps."""
 
     k: int
     stage: DGSStage
+    # R, t: (n, d, d), (n, d); poses at which the stage began: the start, then the point of linearisation. Of its
+    # translations all but that of pose 0 are a first guess only.
     R: Array
     t: Array
+    # (unknowns, columns): iterate of the linear problem, without pose 0: the rows of every R_i^T; or v, then w.
     x: Array
-    turns: tuple[Turn, ...]
-    first: tuple[Turn, ...]
+    turns: tuple[Turn, ...]  # a sweep, factorisations included
+    first: tuple[Turn, ...]  # the flagged sweep that has to come first; empty when every robot has an estimate
     schedule: Schedule
-    is_flagged: bool
+    is_flagged: bool  # whether the first linearised problem begins with a flagged sweep too
     ledger: Ledger
-    gauss_newton_step: int = 0
-    change: float = np.inf
+    gauss_newton_step: int = 0  # linearisations so far
+    change: float = np.inf  # of the last sweep, relative; inf before the first of a stage
 
 
 @dataclass(frozen=True)

@@ -33,39 +33,20 @@ _ROUNDING = 1e-14  # relative change of F that is not told apart from none
 
 @dataclass(frozen=True, eq=False)
 class LevenbergMarquardtState:
-    """State k.
-
-    Attributes
-    ----------
-    k : int
-    poses : Poses
-    objective, level : float
-        F, and its rounding level.
-    matrix : csc_array
-        A, the Gauss-Newton matrix at the poses, pose 0 grounded.
-    gradient : Array
-    analysis : SymbolicCholesky
-    damping : float
-        mu, of the next step: it solves (A + mu diag(A)) h = -g.
-    growth : float
-        Factor on mu if that step is refused.
-    step : Array
-        h; nan where the matrix with this damping has no Cholesky factor.
-    decrement : float
-        -<g, h> / 2, less the rounding level of F, over F.
-    """
+    """State k."""
 
     k: int
     poses: Poses
-    objective: float
-    level: float
-    matrix: csc_array
+    objective: float  # F
+    level: float  # its rounding level
+    matrix: csc_array  # A, the Gauss-Newton matrix at the poses, pose 0 grounded
     gradient: Array
     analysis: SymbolicCholesky
-    damping: float
-    growth: float
+    damping: float  # mu, of the next step: it solves (A + mu diag(A)) h = -g
+    growth: float  # factor on mu if that step is refused
+    # h, nan where the matrix with this damping has no Cholesky factor.
     step: Array = field(default_factory=lambda: np.empty(0))
-    decrement: float = math.inf
+    decrement: float = math.inf  # -<g, h> / 2, less the rounding level of F, over F
 
 
 @dataclass(frozen=True)

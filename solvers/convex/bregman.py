@@ -69,23 +69,13 @@ class MultiplierState(_ExactState):
 
 @dataclass(frozen=True, eq=False)
 class AlternatingState:
-    """Iterate k of `AlternatingBregman`.
-
-    Attributes
-    ----------
-    x : (m,)
-    lam : (s,)
-        Multiplier of K x = f.
-    subproblems : tuple of Subproblem
-        One for every block.
-    stationarity : float
-        Distance of 0 from the subdifferential of the Lagrangian at x and lam; inf before the first step.
-    """
+    """Iterate k of `AlternatingBregman`."""
 
     k: int
-    x: Array
-    lam: Array
-    subproblems: tuple[Subproblem, ...]
+    x: Array  # (m,)
+    lam: Array  # (s,): multiplier of K x = f
+    subproblems: tuple[Subproblem, ...]  # one for every block
+    # Distance of 0 from the subdifferential of the Lagrangian at x and lam; inf before the first step.
     stationarity: float = math.inf
 
 

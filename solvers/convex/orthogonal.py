@@ -38,39 +38,20 @@ _BALANCE_RATIO = 10.0
 
 @dataclass(frozen=True, eq=False)
 class OrthogonalState:
-    """Iterate k.
-
-    Attributes
-    ----------
-    k : int
-    X, others : tuple of arrays
-        Minimisers of step (a): the constrained variables, and the other variables of the problem.
-    copies : tuple of arrays
-        P, one for every term of the problem (a variable in two sets has two).
-    B : tuple of arrays
-        Scaled multipliers, one for every term.
-    rho : float
-        Penalty.
-    split : SplitProblem
-        The compiled step (a).
-    primal_residual : float
-        ||X - P|| / ||P||.
-    scale : float
-        Largest norm of a subgradient of J so far.
-    dual_residual : float
-        ||G + rho B|| / scale, G the subgradient of J at X that step (a) gives: since rho B is normal to the set at P,
-        this is the stationarity residual of the KKT conditions. For one set a variable it is rho ||P - P_before||.
-    """
+    """Iterate k."""
 
     k: int
+    # X, others: minimisers of step (a): the constrained variables, and the other variables of the problem.
     X: tuple[Array, ...]
     others: tuple[Array, ...]
-    copies: tuple[Array, ...]
-    B: tuple[Array, ...]
-    rho: float
-    split: SplitProblem
-    scale: float = 0.0
-    primal_residual: float = math.inf
+    copies: tuple[Array, ...]  # P, one for every term of the problem (a variable in two sets has two)
+    B: tuple[Array, ...]  # scaled multipliers, one for every term
+    rho: float  # penalty
+    split: SplitProblem  # the compiled step (a)
+    scale: float = 0.0  # largest norm of a subgradient of J so far
+    primal_residual: float = math.inf  # ||X - P|| / ||P||
+    # ||G + rho B|| / scale, G the subgradient of J at X that step (a) gives: since rho B is normal to the set at P,
+    # this is the stationarity residual of the KKT conditions. For one set a variable it is rho ||P - P_before||.
     dual_residual: float = math.inf
 
 

@@ -82,28 +82,13 @@ class Checkpoint:
 
 @dataclass(frozen=True, eq=False)
 class Saved:
-    """What a checkpoint holds beside the robots' snapshots.
+    """What a checkpoint holds beside the robots' snapshots."""
 
-    Attributes
-    ----------
-    attempts : tuple of (Poses, Certificate)
-        Outcome of the attempts before the one under way.
-    stages : tuple of Stage
-        Finished stages of all attempts.
-    method : str
-        Name of the method that runs.
-    state : object
-        Its state.
-    records : tuple of Record
-        Of the states before.
-    driver : DriverState
-    """
-
-    attempts: tuple[Attempt, ...]
-    stages: tuple[Stage, ...]
-    method: str
-    state: object
-    records: tuple[Record, ...]
+    attempts: tuple[Attempt, ...]  # outcome of the attempts before the one under way
+    stages: tuple[Stage, ...]  # finished stages of all attempts
+    method: str  # name of the method that runs
+    state: object  # its state
+    records: tuple[Record, ...]  # of the states before
     driver: DriverState
 
 

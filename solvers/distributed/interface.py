@@ -19,21 +19,11 @@ from solvers.distributed.robots.elimination import row_sums, unpacked
 
 @dataclass(frozen=True, eq=False)
 class Interface:
-    """The driver's matrix for one kind of unknowns: how they are stacked, and who touches which separators.
-
-    Attributes
-    ----------
-    num_separators : int
-    widths : tuple of int
-        Numbers a separator in every field.
-    touched : tuple of (g_a,)
-        Separators that every robot touches, ascending.
-    tree : tuple of Front
-    """
+    """The driver's matrix for one kind of unknowns: how they are stacked, and who touches which separators."""
 
     num_separators: int
-    widths: tuple[int, ...]
-    touched: tuple[IntArray, ...]
+    widths: tuple[int, ...]  # numbers a separator in every field
+    touched: tuple[IntArray, ...]  # (g_a,) each: separators that every robot touches, ascending
     tree: tuple[Front, ...]
 
     @property

@@ -23,20 +23,12 @@ _AT_WORK = 4.25  # times a front: itself, and copies of what is added to it or s
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """One group of robots.
+    """One group of robots."""
 
-    Attributes
-    ----------
-    robots : tuple of int
-        Whose contributions are added here: one robot at a leaf, none above.
-    children : tuple of int
-        Earlier fronts, whose Schur complements are added here.
-    eliminated, boundary : (e,), (b,)
-        Separators that only this group touches and that no child has eliminated; those left to groups above.
-    """
-
-    robots: tuple[int, ...]
-    children: tuple[int, ...]
+    robots: tuple[int, ...]  # whose contributions are added here: one robot at a leaf, none above
+    children: tuple[int, ...]  # earlier fronts, whose Schur complements are added here
+    # eliminated, boundary: (e,), (b,); separators that only this group touches and that no child has eliminated; those
+    # left to groups above.
     eliminated: IntArray
     boundary: IntArray
 

@@ -57,46 +57,23 @@ class DualBound:
 
 @dataclass(frozen=True, eq=False)
 class StaircaseState:
-    """State k.
-
-    Attributes
-    ----------
-    k : int
-    point : LiftedPoint
-        Y, its rank, the relaxation's value, multipliers and gradient.
-    preconditioner : CholeskyFactor
-        Of M + eps blockdiag(0, I), whose solves on the rotations are those with Q + eps I; after a climb, of S with a
-        shift.
-    decrement : float
-        <g, P g> / 4, less the rounding level of f, over f, g the gradient and P the preconditioner projected to the
-        tangent space: half the squared Newton decrement if the Hessian were twice the preconditioner's matrix.
-    radius : float
-        Of the trust region, in the preconditioner's norm.
-    rounding_level : float
-        f below it cannot be told from zero; that of the start.
-    inner_iterations : int
-        Products with the Hessian so far.
-    bound : DualBound, optional
-        The best that was proven at a stationary point so far.
-    is_stationary : bool
-        Whether the next step proves a bound or climbs.
-    is_solved : bool
-        Whether the value is proven to be the relaxation's optimum, within the gap.
-    stalled : bool
-        Whether the last step could neither prove nor climb.
-    """
+    """State k."""
 
     k: int
-    point: LiftedPoint
+    point: LiftedPoint  # Y, its rank, the relaxation's value, multipliers and gradient
+    # Of M + eps blockdiag(0, I), whose solves on the rotations are those with Q + eps I; after a climb, of S with a
+    # shift.
     preconditioner: CholeskyFactor
+    # <g, P g> / 4, less the rounding level of f, over f, g the gradient and P the preconditioner projected to the
+    # tangent space: half the squared Newton decrement if the Hessian were twice the preconditioner's matrix.
     decrement: float
-    radius: float
-    rounding_level: float
-    inner_iterations: int = 0
-    bound: DualBound | None = None
-    is_stationary: bool = False
-    is_solved: bool = False
-    stalled: bool = False
+    radius: float  # of the trust region, in the preconditioner's norm
+    rounding_level: float  # f below it cannot be told from zero; that of the start
+    inner_iterations: int = 0  # products with the Hessian so far
+    bound: DualBound | None = None  # the best that was proven at a stationary point so far
+    is_stationary: bool = False  # whether the next step proves a bound or climbs
+    is_solved: bool = False  # whether the value is proven to be the relaxation's optimum, within the gap
+    stalled: bool = False  # whether the last step could neither prove nor climb
 
 
 @dataclass(frozen=True)

@@ -14,27 +14,13 @@ from pgo_models.problem.matrices import inner
 
 @dataclass(frozen=True, eq=False)
 class TruncatedStep:
-    """What `truncated_cg` found.
+    """What `truncated_cg` found."""
 
-    Attributes
-    ----------
-    step : Array
-        Of the shape of the gradient.
-    decrease : float
-        What the model promises: -<g, s> - <s, H s> / 2, positive.
-    length : float
-        Norm of the step in the preconditioner's metric, the one that measures the trust region.
-    iterations : int
-        Products with H.
-    is_at_boundary : bool
-        Whether the region, or negative curvature, ended it.
-    """
-
-    step: Array
-    decrease: float
-    length: float
-    iterations: int
-    is_at_boundary: bool
+    step: Array  # of the shape of the gradient
+    decrease: float  # what the model promises: -<g, s> - <s, H s> / 2, positive
+    length: float  # norm of the step in the preconditioner's metric, the one that measures the trust region
+    iterations: int  # products with H
+    is_at_boundary: bool  # whether the region, or negative curvature, ended it
 
 
 def truncated_conjugate_gradients(

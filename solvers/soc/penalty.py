@@ -29,20 +29,12 @@ _SMALLEST_RATIO = 1e-6  # of ||Lambda_i|| to m_i; M + D/2 keeps ten digits
 
 @dataclass(frozen=True)
 class PenaltyOrder:
-    """rho_i = max(per_norm ||Lambda_i||_2, per_scale m_i, least): what a party must know to set its penalties.
-
-    Attributes
-    ----------
-    per_norm, per_scale, least : float
-    is_stationary : bool
-        B starts at its value at a stationary point, -2 Lambda_i R_i^T / rho_i; else at zero.
-    settings : StepSettings
-    """
+    """rho_i = max(per_norm ||Lambda_i||_2, per_scale m_i, least): what a party must know to set its penalties."""
 
     per_norm: float
     per_scale: float
     least: float
-    is_stationary: bool = False
+    is_stationary: bool = False  # B starts at its value at a stationary point, -2 Lambda_i R_i^T / rho_i; else at zero
     settings: StepSettings = field(default_factory=StepSettings)
 
     def rho(self, norms: Array, scale: Array) -> Array:
@@ -249,27 +241,16 @@ class Due(enum.Enum):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Steps:
-    """Iterate k, and what the steps so far say of the penalty: what the states of all couplings have.
-
-    Attributes
-    ----------
-    k : int
-    sums : AndersonSums
-        What all parties know of the acceleration.
-    primal_residual, dual_residual : float
-        ||x - z||_rho and ||c (z - z_before)||_rho, both over ||omega||_rho, with c = max(1, rho / diagonal of M): a
-        penalty far above M makes short steps anywhere.
-    merits : tuple of float
-        Fixed-point residual ||x - z_before||_rho of the steps since rho last changed.
-    refreshes, raises : int
-        How often the penalty rule, and the safeguard against divergence, changed rho.
-    """
+    """Iterate k, and what the steps so far say of the penalty: what the states of all couplings have."""
 
     k: int = 0
-    sums: AndersonSums = field(default_factory=AndersonSums)
+    sums: AndersonSums = field(default_factory=AndersonSums)  # what all parties know of the acceleration
+    # primal_residual, dual_residual: ||x - z||_rho and ||c (z - z_before)||_rho, both over ||omega||_rho, with c =
+    # max(1, rho / diagonal of M): a penalty far above M makes short steps anywhere.
     primal_residual: float = np.inf
     dual_residual: float = np.inf
-    merits: tuple[float, ...] = ()
+    merits: tuple[float, ...] = ()  # fixed-point residual ||x - z_before||_rho of the steps since rho last changed
+    # refreshes, raises: how often the penalty rule, and the safeguard against divergence, changed rho.
     refreshes: int = 0
     raises: int = 0
 
@@ -298,18 +279,10 @@ class Steps:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SharedSteps(Steps):
-    """What is known of all robots' rows, which are theirs.
+    """What is known of all robots' rows, which are theirs."""
 
-    Attributes
-    ----------
-    ratio : (n,)
-        rho_i / m_i of all poses, in no order.
-    size : float
-        ||omega||_rho.
-    """
-
-    ratio: Array
-    size: float
+    ratio: Array  # (n,): rho_i / m_i of all poses, in no order
+    size: float  # ||omega||_rho
 
     def rescaled(self, factor: float) -> Self:
         """State after all have multiplied rho, and forgotten what was accelerated."""

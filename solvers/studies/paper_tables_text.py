@@ -42,17 +42,10 @@ _SAME = 1e-3  # a spread below this part of the mean is not shown
 
 @dataclass(frozen=True)
 class Finding:
-    """Whether something that the tables should show is there, row by row.
-
-    Attributes
-    ----------
-    claim : str
-    held, failed : tuple of str
-        Names of the graphs.
-    """
+    """Whether something that the tables should show is there, row by row."""
 
     claim: str
-    held: tuple[str, ...]
+    held: tuple[str, ...]  # names of the graphs
     failed: tuple[str, ...]
 
     def __str__(self) -> str:
