@@ -2,7 +2,7 @@
 
 Equations of the paper by label: `problem bregman` is the problem; `update B`, `bregman update` and `minbregman` are the
 three forms of the iteration whose subproblems are compiled here, each with one Parameter (DPP); `bregman ADMM`
-alternates over the blocks of x. The iterations themselves are in solvers/bregman.py.
+alternates over the blocks of x. The iterations themselves are in solvers/convex/bregman.py.
 """
 
 from __future__ import annotations

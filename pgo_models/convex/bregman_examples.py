@@ -1,4 +1,4 @@
-"""Worked models of the form min J(x) s.t. K x = f, for the Bregman iterations of solvers/bregman.py."""
+"""Worked models of the form min J(x) s.t. K x = f, for the Bregman iterations of solvers/convex/bregman.py."""
 
 from __future__ import annotations
 

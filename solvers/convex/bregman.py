@@ -35,7 +35,8 @@ class _ExactState:
     """Iterate k of a form that minimises over the whole of x: every one after the first step is stationary."""
 
     k: int
-    x: Array
+    x: Array  # (m,)
+    subproblem: Subproblem  # compiled
 
     @property
     def stationarity(self) -> float:
@@ -45,26 +46,23 @@ class _ExactState:
 
 @dataclass(frozen=True, eq=False)
 class BregmanState(_ExactState):
-    """Iterate k of `Bregman`: x, (m,), the subgradient p, (m,), of J at x, and the compiled subproblem."""
+    """Iterate k of `Bregman`."""
 
-    p: Array
-    subproblem: Subproblem
+    p: Array  # (m,): a subgradient of J at x
 
 
 @dataclass(frozen=True, eq=False)
 class TwoLineState(_ExactState):
-    """Iterate k of `TwoLineBregman`: x, (m,), the residuals added up, b, (s,), and the compiled subproblem."""
+    """Iterate k of `TwoLineBregman`."""
 
-    b: Array
-    subproblem: Subproblem
+    b: Array  # (s,): the residuals added up
 
 
 @dataclass(frozen=True, eq=False)
 class MultiplierState(_ExactState):
-    """Iterate k of `MethodOfMultipliers`: x, (m,), the multiplier lam, (s,), and the compiled subproblem."""
+    """Iterate k of `MethodOfMultipliers`."""
 
-    lam: Array
-    subproblem: Subproblem
+    lam: Array  # (s,): multiplier of K x = f
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,11 +125,9 @@ class Bregman(BregmanSettings):
 
     Examples
     --------
-    >>> import cvxpy as cp, numpy as np
+    >>> from pgo_models.convex.bregman_examples import basis_pursuit
     >>> from solvers.loop import run
-    >>> x = cp.Variable(2)
-    >>> problem = BregmanProblem(cp.norm1(x), x, np.array([[1.0, 2.0]]), [2.0])
-    >>> run(Bregman(alpha=1.0), problem).state.x.round(6).tolist()
+    >>> run(Bregman(), basis_pursuit(np.array([[1.0, 2.0]]), np.array([2.0]))).state.x.round(6).tolist()
     [0.0, 1.0]
     """
 
@@ -139,13 +135,13 @@ class Bregman(BregmanSettings):
         """State 0 at `start`, else at x = 0 and p = 0."""
         point = _checked_start(problem, start)
         subproblem = bregman_subproblem(problem, self.alpha, self.subproblem_tolerance)
-        return BregmanState(0, point.x, np.asarray(problem.K.T @ point.lam), subproblem)
+        return BregmanState(0, point.x, subproblem, np.asarray(problem.K.T @ point.lam))
 
     def step(self, problem: BregmanProblem, state: BregmanState) -> BregmanState:
         """One iteration."""
         x = state.subproblem.solve(state.p)
         p = state.p - self.alpha * (problem.K.T @ problem.residual(x))
-        return BregmanState(state.k + 1, x, p, state.subproblem)
+        return BregmanState(state.k + 1, x, state.subproblem, p)
 
     def point(self, problem: BregmanProblem, state: BregmanState) -> BregmanPoint:
         """x, and the least-squares lam of p = K^T lam."""
@@ -160,11 +156,9 @@ class TwoLineBregman(BregmanSettings):
 
     Examples
     --------
+    >>> from pgo_models.convex.bregman_examples import basis_pursuit
     >>> from solvers.loop import run
-    >>> import cvxpy as cp, numpy as np
-    >>> x = cp.Variable(2)
-    >>> problem = BregmanProblem(cp.norm1(x), x, np.array([[1.0, 2.0]]), [2.0])
-    >>> run(TwoLineBregman(), problem).state.x.round(6).tolist()
+    >>> run(TwoLineBregman(), basis_pursuit(np.array([[1.0, 2.0]]), np.array([2.0]))).state.x.round(6).tolist()
     [0.0, 1.0]
     """
 
@@ -172,13 +166,13 @@ class TwoLineBregman(BregmanSettings):
         """State 0 at `start`, else at x = 0 and b = 0."""
         point = _checked_start(problem, start)
         subproblem = two_line_subproblem(problem, self.alpha, self.subproblem_tolerance)
-        return TwoLineState(0, point.x, -point.lam / self.alpha, subproblem)
+        return TwoLineState(0, point.x, subproblem, -point.lam / self.alpha)
 
     def step(self, problem: BregmanProblem, state: TwoLineState) -> TwoLineState:
         """One iteration."""
         x = state.subproblem.solve(problem.f - state.b)
         b = state.b + problem.residual(x)
-        return TwoLineState(state.k + 1, x, b, state.subproblem)
+        return TwoLineState(state.k + 1, x, state.subproblem, b)
 
     def point(self, problem: BregmanProblem, state: TwoLineState) -> BregmanPoint:
         """x, and lam = -alpha b."""
@@ -195,11 +189,9 @@ class MethodOfMultipliers(BregmanSettings):
 
     Examples
     --------
+    >>> from pgo_models.convex.bregman_examples import basis_pursuit
     >>> from solvers.loop import run
-    >>> import cvxpy as cp, numpy as np
-    >>> x = cp.Variable(2)
-    >>> problem = BregmanProblem(cp.norm1(x), x, np.array([[1.0, 2.0]]), [2.0])
-    >>> run(MethodOfMultipliers(), problem).state.x.round(6).tolist()
+    >>> run(MethodOfMultipliers(), basis_pursuit(np.array([[1.0, 2.0]]), np.array([2.0]))).state.x.round(6).tolist()
     [0.0, 1.0]
     """
 
@@ -207,13 +199,13 @@ class MethodOfMultipliers(BregmanSettings):
         """State 0 at `start`, else at x = 0 and lam = 0."""
         point = _checked_start(problem, start)
         subproblem = augmented_lagrangian_subproblem(problem, self.alpha, self.subproblem_tolerance)
-        return MultiplierState(0, point.x, point.lam, subproblem)
+        return MultiplierState(0, point.x, subproblem, point.lam)
 
     def step(self, problem: BregmanProblem, state: MultiplierState) -> MultiplierState:
         """One iteration."""
         x = state.subproblem.solve(state.lam)
         lam = state.lam - self.alpha * problem.residual(x)
-        return MultiplierState(state.k + 1, x, lam, state.subproblem)
+        return MultiplierState(state.k + 1, x, state.subproblem, lam)
 
     def point(self, problem: BregmanProblem, state: MultiplierState) -> BregmanPoint:
         """The state's x and lam."""

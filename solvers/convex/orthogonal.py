@@ -21,6 +21,7 @@ from pgo_models.convex.orthogonality import (
     OrthogonalProblem,
     SplitProblem,
     kkt_residuals,
+    norm_of_all,
 )
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
@@ -133,7 +134,7 @@ class OrthogonalSOC:
         B = tuple(s - P for s, P in zip(S, following, strict=True))  # (c)
         G = _summed(problem, [rho * (v - x) for v, x in zip(V, spread, strict=True)])
         N = _summed(problem, [rho * b for b in B])
-        scale = max(state.scale, _norm(G), np.finfo(float).tiny)
+        scale = max(state.scale, norm_of_all(G), np.finfo(float).tiny)
         return replace(
             state,
             k=state.k + 1,
@@ -142,8 +143,9 @@ class OrthogonalSOC:
             copies=following,
             B=B,
             scale=scale,
-            primal_residual=_norm([x - P for x, P in zip(spread, following, strict=True)]) / _norm(following),
-            dual_residual=_norm([g + n for g, n in zip(G, N, strict=True)]) / scale,
+            primal_residual=norm_of_all([x - P for x, P in zip(spread, following, strict=True)])
+            / norm_of_all(following),
+            dual_residual=norm_of_all([g + n for g, n in zip(G, N, strict=True)]) / scale,
         )
 
     def measure(self, problem: OrthogonalProblem, state: OrthogonalState) -> Measurement:
@@ -180,7 +182,7 @@ class OrthogonalSOC:
         for _ in range(_PROBES):
             X, others = split.solve(point.copies, rho)
             moves = [P - X[term.variable] for P, term in zip(point.copies, split.terms, strict=True)]
-            before, distance = distance, _norm(moves) / _norm(point.copies)
+            before, distance = distance, norm_of_all(moves) / norm_of_all(point.copies)
             if was_far and distance > 0.5 * before:
                 break  # held away, by convex constraints or by J itself: start low, and let the rule raise rho
             gradient = rho * max(_spectral(move) for move in moves)
@@ -321,7 +323,3 @@ def _summed(problem: OrthogonalProblem, of_terms: Sequence[Array]) -> list[Array
 
 def _spectral(array: Array) -> float:
     return float(np.linalg.norm(array.reshape(len(array), -1), 2))
-
-
-def _norm(arrays: Sequence[Array]) -> float:
-    return float(np.sqrt(sum(float(np.sum(array**2)) for array in arrays)))

@@ -219,10 +219,11 @@ def run_fingerprint(problem: PGOProblem, robots: Partition, settings: object, st
     edges = (graph.i, graph.j, graph.R_ij, graph.t_ij, graph.kappa, graph.tau)
     poses = () if start is None else (start.R, start.t)
     text = np.frombuffer(repr(settings).encode(), dtype=np.uint8)
-    return dict(zip(_PARTS, (_digest(*edges), _digest(robots.robot), _digest(text, *poses)), strict=True))
+    return dict(zip(_PARTS, (digest(*edges), digest(robots.robot), digest(text, *poses)), strict=True))
 
 
-def _digest(*arrays: NDArray[Any]) -> str:
+def digest(*arrays: NDArray[Any]) -> str:
+    """SHA-256 of arrays with their shapes and types."""
     found = hashlib.sha256()
     for array in arrays:
         found.update(f"{array.shape}{array.dtype}".encode())

@@ -75,14 +75,10 @@ class Ledger:
 
     def after_round(self, *exchanged: Traffic) -> Ledger:
         """Return the ledger after one more round with these exchanges."""
-        counted = self.counted
+        counted = dict(self.counted)  # by the object: one of equal content is another
         for traffic in exchanged:
-            known = next((p for p, (other, _) in enumerate(counted) if other is traffic), None)
-            if known is None:
-                counted = (*counted, (traffic, 1))
-            else:
-                counted = (*counted[:known], (traffic, counted[known][1] + 1), *counted[known + 1 :])
-        return replace(self, rounds=self.rounds + 1, counted=counted)
+            counted[traffic] = counted.get(traffic, 0) + 1
+        return replace(self, rounds=self.rounds + 1, counted=tuple(counted.items()))
 
     def after_exchange(self, traffic: Traffic, is_round: bool) -> Ledger:
         """Return the ledger after an exchange; one that is no round is part of the next round or of an all-reduce."""

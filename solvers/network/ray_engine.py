@@ -369,22 +369,17 @@ def _replaced(module: ModuleType, **values: object) -> Iterator[None]:
 @contextmanager
 def _hushed(name: str) -> Iterator[None]:
     """Keep a library's log away from the terminal."""
-    loggers = [logging.getLogger(name), *_loggers_below(name)]
-    before = [logger.disabled for logger in loggers]
-    for logger in loggers:
+    known = [
+        logging.getLogger(key) for key in (name, *logging.Logger.manager.loggerDict) if f"{key}.".startswith(f"{name}.")
+    ]
+    heard = [logger for logger in known if not logger.disabled]
+    for logger in heard:
         logger.disabled = True
     try:
         yield
     finally:
-        for logger, was_disabled in zip(loggers, before, strict=True):
-            logger.disabled = was_disabled
-
-
-def _loggers_below(name: str) -> list[logging.Logger]:
-    known = logging.Logger.manager.loggerDict
-    return [
-        logger for key, logger in known.items() if key.startswith(f"{name}.") and isinstance(logger, logging.Logger)
-    ]
+        for logger in heard:
+            logger.disabled = False
 
 
 def _reason(error: BaseException) -> str:
