@@ -120,10 +120,7 @@ def shared_rotation_step(graph: PoseGraph, robots: Partition, V: Array, rho: flo
 
     Parameters
     ----------
-    graph : PoseGraph
-    robots : Partition
     V : (n, d, d)
-    rho : float
 
     Raises
     ------

@@ -293,8 +293,6 @@ def kkt_residuals(problem: OrthogonalProblem, point: OrthogonalPoint, rho: float
 
     Parameters
     ----------
-    problem : OrthogonalProblem
-    point : OrthogonalPoint
     rho : float
         Of the order of the curvature of J.
     """

@@ -64,17 +64,10 @@ def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = Tr
 
     Parameters
     ----------
-    graph : PoseGraph
-    poses : Poses
     axes : matplotlib Axes
         Of projection "3d" for graphs in space.
     mark_edges : bool
         Draw edges with a low precision dotted, and those with a large share of F thick and vermilion.
-
-    Raises
-    ------
-    GraphError
-        When the poses are not those of the graph.
     """
     from matplotlib.colors import to_rgb
 
@@ -98,11 +91,6 @@ def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = Tr
 
 def plot_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: Array | None = None) -> Figure:
     """Figure of a graph by robot, with a legend (`draw_graph`); of covariances (n, p, p), `confidence_ellipses`.
-
-    Raises
-    ------
-    GraphError
-        When the poses are not those of the graph.
 
     Examples
     --------
@@ -157,7 +145,6 @@ def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = Non
 
     Parameters
     ----------
-    graph : PoseGraph
     poses : Poses
         The estimate; it is aligned to the truth first.
     truth : Poses, optional

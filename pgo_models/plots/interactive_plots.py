@@ -43,17 +43,10 @@ def explore_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: 
 
     Parameters
     ----------
-    graph : PoseGraph
     poses : Poses
         Drawn to seven digits (float32).
-    title : str
     covariances : (n, p, p), optional
         Of every pose, drawn as `confidence_ellipses`.
-
-    Raises
-    ------
-    GraphError
-        When the poses are not those of the graph.
 
     Examples
     --------
@@ -103,7 +96,6 @@ def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[
 
     Parameters
     ----------
-    graph : PoseGraph
     iterates : sequence of Poses
         For example `[soc.poses(problem, state) for state in itertools.islice(iterate(soc, problem), 30)]`. Each is
         aligned with the last one, so that only what changes moves.

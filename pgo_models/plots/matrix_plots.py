@@ -68,11 +68,6 @@ def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12
     Eigenvalues stand on a logarithmic axis, negative ones as vermilion triangles. The shaded band, where the
     proof needs an eta, is what that leaves open, |lambda| <= eta.
 
-    Raises
-    ------
-    SettingError
-        When count is not 1 to d n.
-
     Examples
     --------
     >>> from pgo_models.certificates.certificate import certify

@@ -41,9 +41,6 @@ class CliqueRelaxation:
 
     Attributes
     ----------
-    problem : PGOProblem
-    tree : CliqueTree
-    centre : Poses
     model : cp.Problem
         Its value times `scale` is that of the relaxation.
     upper : tuple of cp.Variable
@@ -108,7 +105,6 @@ def clique_relaxation(
 
     Parameters
     ----------
-    problem : PGOProblem
     centre : Poses, optional
         The stationary point that the chordal start polishes to, unless given. Far from the optimum it costs digits.
     tree : CliqueTree, optional

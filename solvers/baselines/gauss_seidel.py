@@ -87,7 +87,6 @@ class GaussSeidel:
     ----------
     robots : Partition, optional
         Who owns which pose; one pose a robot unless given.
-    sweep : Sweep
     alpha : float
         Over-relaxation, in (0, 2). Up to 1 every sweep converges; above, `Sweep.JACOBI` may not.
     is_flagged : bool

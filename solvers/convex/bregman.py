@@ -87,7 +87,6 @@ class BregmanSettings:
         The penalty parameter of the paper's section 2; lam has the unit of alpha K x.
     tolerance : float
         On ||K x - f|| / max(1, ||f||) and on the distance from stationarity over max(1, ||K^T lam||).
-    max_iterations : int
     subproblem_tolerance : float
         Clarabel's. Loosen it to see that Bregman iteration forgets the errors of its subproblems (Yin & Osher 2013).
     """
@@ -244,13 +243,7 @@ class AlternatingBregman(BregmanSettings):
         check_settings(self, at_least_one=["passes"])
 
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> AlternatingState:
-        """State 0 at `start`, else at x = 0 and lam = 0.
-
-        Raises
-        ------
-        SettingError
-            When J is not a sum of terms of one variable each.
-        """
+        """State 0 at `start`, else at x = 0 and lam = 0."""
         point = _checked_start(problem, start)
         subproblems = block_subproblems(problem, self.alpha, self.subproblem_tolerance)
         return AlternatingState(0, point.x, point.lam, subproblems)

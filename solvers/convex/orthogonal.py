@@ -74,7 +74,6 @@ class OrthogonalSOC:
         projection: the largest eigenvalue of the multiplier Lambda. Near 1 the recursion may cycle.
     tolerance : float
         On the primal and the dual residual, both relative.
-    max_iterations : int
 
     Examples
     --------
@@ -267,9 +266,6 @@ def solve_orthogonal(
 
     Parameters
     ----------
-    problem : OrthogonalProblem
-    rng : np.random.Generator
-    soc : OrthogonalSOC, optional
     starts : int
         How many.
     verbose : bool

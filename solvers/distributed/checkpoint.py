@@ -204,17 +204,7 @@ class Journal:
 
 
 def run_fingerprint(problem: PGOProblem, robots: Partition, settings: object, start: Poses | None) -> dict[str, str]:
-    """What a checkpoint must have in common with the run that goes on from it.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from pgo_models.graphs.partitioning import partition
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> two, three = (run_fingerprint(problem, partition(problem.graph, k), SOC(), None) for k in (2, 3))
-    >>> [name for name in two if two[name] != three[name]]
-    ['partition']
-    """
+    """What a checkpoint must have in common with the run that goes on from it."""
     graph = problem.graph
     edges = (graph.i, graph.j, graph.R_ij, graph.t_ij, graph.kappa, graph.tau)
     poses = () if start is None else (start.R, start.t)

@@ -62,7 +62,7 @@ class Interface:
             )
 
     def factorize(self, contributions: Sequence[Array], own: Sequence[tuple[IntArray, Array]] = ()) -> InterfaceFactor:
-        """Sum the robots' Schur complements and the driver's own blocks, and factor.
+        """Sum the robots' Schur complements and the driver's own blocks, and factor: `factorize_tree`.
 
         Parameters
         ----------
@@ -70,11 +70,6 @@ class Interface:
             As `Elimination.schur`; g columns a robot.
         own : sequence of (columns (q, w), values (q, w, w))
             Blocks that the driver adds, each on unknowns of one separator.
-
-        Raises
-        ------
-        NotPositiveDefiniteError
-            When the sum is not positive definite.
         """
         width = sum(self.widths)
         order = by_separator(self.num_separators, self.widths)

@@ -45,13 +45,6 @@ def separator_tree(touched: Sequence[IntArray], num_separators: int) -> tuple[Fr
     ----------
     touched : sequence of (g_a,)
         Separators, 0 .. num_separators - 1, that every robot touches.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> tree = separator_tree([np.array([0, 1]), np.array([1, 2]), np.array([2, 3])], 4)
-    >>> sorted(int(pose) for front in tree for pose in front.eliminated)
-    [0, 1, 2, 3]
     """
     robot = np.repeat(np.arange(len(touched)), [len(poses) for poses in touched])
     pose = np.concatenate([*touched, np.zeros(0, dtype=np.int64)])

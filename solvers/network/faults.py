@@ -29,7 +29,6 @@ class Faults:
         A robot that neither sends nor receives ..
     silent_from, silent_rounds : int
         .. from this round on, for so many rounds.
-    seed : int
 
     Examples
     --------

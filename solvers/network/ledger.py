@@ -18,19 +18,12 @@ BYTES_PER_NUMBER = 8
 
 @dataclass(frozen=True, eq=False)
 class Traffic:
-    """Messages of one exchange; the same object may be counted many times.
+    """Messages of one exchange; the same object may be counted many times."""
 
-    Attributes
-    ----------
-    sender, receiver : (q,)
-        Robots, or `DRIVER`.
-    num_bytes : (q,)
-        Payload of every message: eight bytes a number.
-    """
-
+    # sender, receiver: (q,); robots, or `DRIVER`.
     sender: IntArray
     receiver: IntArray
-    num_bytes: IntArray
+    num_bytes: IntArray  # (q,): payload of every message: eight bytes a number
 
     def __post_init__(self) -> None:
         if not self.sender.shape == self.receiver.shape == self.num_bytes.shape:
@@ -49,8 +42,6 @@ class Ledger:
 
     Attributes
     ----------
-    num_robots : int
-    rounds, all_reduces : int
     all_reduce_bytes : int
         Payload of all all-reduces, once up and once down for every robot.
     counted : tuple of (Traffic, int)

@@ -68,7 +68,6 @@ class RayEngine:
         Most robots that share a CPU; as few as the CPUs allow do. Every robot is a process of 100 MB and more.
     patience : float
         Seconds to wait for robots to start.
-    recovery : Recovery
 
     Examples
     --------

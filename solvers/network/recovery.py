@@ -72,22 +72,12 @@ class Recovery:
 
 @dataclass(eq=False)
 class RecoveringPool(Generic[T]):
-    """Robots in a place where they can be lost; answers are those of robots that never are.
+    """Robots in a place where they can be lost; answers are those of robots that never are."""
 
-    Attributes
-    ----------
-    place : Place
-        With all robots started.
-    num_robots : int
-    recovery : Recovery
-    restarts : list of int
-        How often every robot was started again.
-    """
-
-    place: Place[T]
+    place: Place[T]  # with all robots started
     num_robots: int
     recovery: Recovery
-    restarts: list[int] = field(init=False)
+    restarts: list[int] = field(init=False)  # how often every robot was started again
     _log: list[tuple[AnyOrder, tuple[Any, ...]]] = field(init=False, default_factory=list)
     _snapshots: list[Snapshot] = field(init=False, default_factory=list)
 

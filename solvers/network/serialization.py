@@ -50,7 +50,6 @@ def deserialize(arrays: Mapping[str, NDArray[Any]], classes: Sequence[type]) -> 
 
     Parameters
     ----------
-    arrays : mapping
     classes : sequence of type
         Dataclasses and enums that may be in it; nothing else is ever made.
 

@@ -27,7 +27,6 @@ def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -
 
     Parameters
     ----------
-    curves : sequence of Curve
     efforts : sequence of Effort
         A panel for each, all but that of iterations with a logarithmic axis.
 
@@ -56,13 +55,7 @@ def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -
 
 
 def explore_efforts(curves: Sequence[Curve], title: str = "") -> PlotlyFigure:
-    """Plotly figure of what `plot_efforts` shows; an entry of the legend shows and hides a method in all panels.
-
-    Raises
-    ------
-    SettingError
-        When there is no curve with a gap above zero.
-    """
+    """Plotly figure of what `plot_efforts` shows; an entry of the legend shows and hides a method in all panels."""
     panels = _panels(curves, _PANELS)
     styles = _styles(curves, _DASHES)
     figure = plotly("subplots").make_subplots(1, len(panels), shared_yaxes=True, horizontal_spacing=0.03)

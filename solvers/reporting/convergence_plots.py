@@ -43,8 +43,6 @@ class Curve:
 
     Attributes
     ----------
-    name : str
-    history : History
     lower_bound : float
         Proven for the graph, or the best value known.
     rounds, num_bytes : (len(history),), optional
@@ -140,13 +138,7 @@ def plot_convergence(
 def explore_convergence(
     stages: Sequence[tuple[str, History]], lower_bound: float, published: PublishedRun | None = None
 ) -> PlotlyFigure:
-    """Plotly figure of what `plot_convergence` shows: gap above, residuals below, figures under the pointer.
-
-    Raises
-    ------
-    SettingError
-        When no stage has a record.
-    """
+    """Plotly figure of what `plot_convergence` shows: gap above, residuals below, figures under the pointer."""
     run = _with_records(stages)
     figure = plotly("graph_objects").Figure()
     begin = 0.0

@@ -62,19 +62,13 @@ def write_report(solution: Solved, path: Path | str, *, source: str | None = Non
 
     Parameters
     ----------
-    solution : Solved
     path : Path or str
         Ends in .html or .htm.
     source : str, optional
         What stands for the graph in commands: a file, folder or name, quoted where a shell needs it, and options that
         change the problem; the graph's name unless given.
 
-    Raises
-    ------
-    SettingError
-        On another suffix.
-    PGOError
-        When the file cannot be written.
+    Errors as `check_report` and `replace_when_done`.
 
     Examples
     --------

@@ -30,7 +30,6 @@ class Newton:
     ----------
     tolerance : float
         On the relative decrement: about the relative decrease of F that is left.
-    max_iterations : int
     second_order : bool
         False is Gauss-Newton, the second layer of the paper's method.
     secants : bool

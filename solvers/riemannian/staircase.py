@@ -91,7 +91,6 @@ class Staircase:
         On the decrement, at which a point counts as stationary.
     gap : float
         Relative gap between f and the bound that is proven at the end.
-    max_iterations : int
     max_inner_iterations : int
         Conjugate-gradient iterations of one trust-region step.
 

@@ -39,7 +39,6 @@ def truncated_conjugate_gradients(
 
     Parameters
     ----------
-    gradient : Array
     hessian : callable
         H, symmetric on the tangent space.
     precondition : callable
@@ -50,7 +49,6 @@ def truncated_conjugate_gradients(
         Relative residual, in the norm of P^-1, that is enough.
     floor : float
         Squared residual <r, P^-1 r> that is enough.
-    max_iterations : int
 
     References
     ----------

@@ -85,7 +85,6 @@ class PaperSOC:
     tolerance : float
         On the paper's KKT residual, the root mean square over poses of ||omega_i^T omega_i - I||^2 +
         ||omega_i - R_i||^2, and on the gradient of the Lagrangian, over the scale of L.
-    max_iterations : int
 
     Examples
     --------

@@ -72,11 +72,8 @@ class MultiplierPenalty(_Rule):
 
     Attributes
     ----------
-    factor : float
-    quantile : float
     stall_window, stall_ratio : int, float
         Stalled: the residual of the last `stall_window` iterations has not fallen below `stall_ratio` of what it was.
-    max_refreshes : int
 
     Examples
     --------

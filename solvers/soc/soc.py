@@ -151,7 +151,6 @@ class SOC(SOCSettings):
         times the root of the translation penalty, at most 0.3.
     tolerance : float
         On the primal and the dual residual, both relative.
-    max_iterations : int
 
     Raises
     ------

@@ -86,15 +86,6 @@ def split_graph(graph: PoseGraph, partition: Partition) -> tuple[Subgraph, ...]:
     ------
     SettingError
         When the partition is of another number of poses.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models import grid, partition
-    >>> graph = grid(np.random.default_rng(0))
-    >>> subgraphs = split_graph(graph, partition(graph, 3))
-    >>> sum(int(subgraph.is_counted.sum()) for subgraph in subgraphs) == graph.num_edges
-    True
     """
     cover = np.full(graph.num_poses, -1)
     solved_for = vertex_cover(partition, graph)

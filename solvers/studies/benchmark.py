@@ -80,24 +80,13 @@ class BenchmarkSettings:
 
 @dataclass(frozen=True, eq=False)
 class StageRecord:
-    """One stage of a trial.
-
-    Attributes
-    ----------
-    name : str
-    status : Status
-    history : History
-        Seconds and communication count from the beginning of the leg.
-    num_robots : int
-        Among which its seconds are divided; 1 when all is done in one place.
-    rounds, num_bytes : (len(history),), optional
-        Communication up to every record, where it is counted.
-    """
+    """One stage of a trial."""
 
     name: str
     status: Status
-    history: History
-    num_robots: int = 1
+    history: History  # seconds and communication count from the beginning of the leg
+    num_robots: int = 1  # among which its seconds are divided; 1 when all is done in one place
+    # rounds, num_bytes: (len(history),); communication up to every record, where it is counted.
     rounds: Array | None = None
     num_bytes: Array | None = None
 
@@ -113,8 +102,6 @@ class BenchmarkRun:
 
     Attributes
     ----------
-    contender : BenchmarkMethod
-    legs : tuple of StageRecord
     poses : Poses
         Where it ended.
     objective : float

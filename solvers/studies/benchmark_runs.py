@@ -57,8 +57,6 @@ def run_benchmark(
 
     Parameters
     ----------
-    contender : BenchmarkMethod
-    problem : PGOProblem
     settings : BenchmarkSettings, optional
         `BenchmarkSettings()` unless given.
     start : Poses, optional

@@ -46,7 +46,6 @@ class ComparisonSettings:
     ----------
     contenders : tuple of BenchmarkMethod
         All that can be run here unless given: GTSAM only where it is installed.
-    trial : BenchmarkSettings
     """
 
     contenders: tuple[BenchmarkMethod, ...] = ()
@@ -67,10 +66,8 @@ class Comparison:
 
     Attributes
     ----------
-    problem : PGOProblem
     optimum, lower_bound : float
         The best F known, from `solve` or one of the methods, and the bound that is proven.
-    trials : tuple of BenchmarkRun
     reasons : tuple of (BenchmarkMethod, str)
         Methods without figures, and why.
     is_complete : bool

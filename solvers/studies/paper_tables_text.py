@@ -55,15 +55,7 @@ class Finding:
 
 
 def findings(tables: Reproduction) -> tuple[Finding, ...]:
-    """Return what the tables should show, and on which of their rows they do; rows without figures are left out.
-
-    Examples
-    --------
-    >>> from solvers.studies.paper_tables import ReproductionSettings, reproduce_tables
-    >>> tables = reproduce_tables(ReproductionSettings(only=("grid",), num_seeds=1))
-    >>> [finding.failed for finding in findings(tables)]
-    [(), ()]
-    """
+    """Return what the tables should show, and on which of their rows they do; rows without figures are left out."""
     claims: list[tuple[str, Callable[[ReproducedRow], bool | None]]] = [
         (
             "SOC as in the paper is at or below the paper's F (on random scenes: its gap, every draw) within the "

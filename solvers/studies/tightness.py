@@ -27,7 +27,6 @@ class NoiseSweep:
 
     Attributes
     ----------
-    scene : SweptScene
     rotation_std : (levels,)
         Radians.
     certified : (levels, graphs)
@@ -79,12 +78,10 @@ def noise_sweep(scene: SweptScene, rotation_std: Array, graphs: int, rng: np.ran
 
     Parameters
     ----------
-    scene : SweptScene
     rotation_std : (levels,)
         Standard deviations, radians, ascending.
     graphs : int
         At every level.
-    rng : np.random.Generator
 
     Raises
     ------
