@@ -15,7 +15,6 @@ from pgo_models.errors import MissingExtraError
 from pgo_models.files import replace_when_done
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 COLUMN_INCHES = 3.4  # a column of a two-column paper
@@ -52,12 +51,8 @@ def column_figure(height: float, width: float = 1.0) -> Iterator[Figure]:
         figure = _shown_figure()(figsize=(COLUMN_INCHES * width, COLUMN_INCHES * height), layout="constrained")
         yield figure
         for axes in figure.axes:
-            keep_letters(axes)
-
-
-def keep_letters(axes: Axes) -> None:
-    """Fix the size of the tick labels, which matplotlib would else choose when the figure is shown."""
-    axes.tick_params(which="both", labelsize=SMALL_POINTS)
+            # matplotlib would else choose the size of the tick labels when the figure is shown
+            axes.tick_params(which="both", labelsize=SMALL_POINTS)
 
 
 def plotly(name: str) -> ModuleType:

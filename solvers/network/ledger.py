@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
 from pgo_models.errors import SettingError
 from pgo_models.graphs.pose_graph import IntArray
-
-T = TypeVar("T")
 
 DRIVER = -1  # the number that stands for the driver among senders and receivers
 BYTES_PER_NUMBER = 8
