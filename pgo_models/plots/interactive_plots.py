@@ -139,6 +139,17 @@ def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[
     return figure
 
 
+def lay_out(figure: Figure, title: str, legend_y: float) -> None:
+    """White ground, narrow margins, the legend in a row at a height in figure heights, 0 at the foot of the axes."""
+    figure.update_layout(
+        template="none",
+        title={"text": html.escape(title), "font": {"size": 14}},
+        margin={"l": 80, "r": 10, "t": 40 if title else 10, "b": 50},
+        legend={"itemsizing": "constant", "orientation": "h", "y": legend_y},
+        hovermode="closest",
+    )
+
+
 def save_page(figure: Figure, path: Path | str) -> None:
     """Write a plotly figure as one HTML page that opens offline, plotly's own script inside (about 5 MB).
 
@@ -195,14 +206,8 @@ def _misfit_text(graph: PoseGraph, edges: IntArray, residuals: EdgeResiduals) ->
 
 
 def _arrange(figure: Figure, points: Array, title: str) -> None:
-    """Equal scales, labels with the unit, a white ground."""
-    figure.update_layout(
-        template="none",
-        title={"text": html.escape(title), "font": {"size": 14}},
-        margin={"l": 60, "r": 10, "t": 40 if title else 10, "b": 50},
-        legend={"itemsizing": "constant", "orientation": "h", "y": -0.12 if points.shape[1] == 2 else 0.0},
-        hovermode="closest",
-    )
+    """Equal scales, labels with the unit."""
+    lay_out(figure, title, legend_y=-0.12 if points.shape[1] == 2 else 0.0)
     if points.shape[1] == 2:
         figure.update_xaxes(title_text="x (m)", zeroline=False, gridcolor="#eeeeee")
         figure.update_yaxes(title_text="y (m)", zeroline=False, gridcolor="#eeeeee", scaleanchor="x")

@@ -9,6 +9,7 @@ import numpy as np
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
+from pgo_models.plots.interactive_plots import lay_out
 from pgo_models.plots.style import COLOURS, MARKERS, column_figure, plotly
 from solvers.reporting.convergence_plots import LINES, LOGARITHMIC, Curve, Effort
 
@@ -82,13 +83,7 @@ def explore_efforts(curves: Sequence[Curve], title: str = "") -> PlotlyFigure:
     figure.update_xaxes(**axis)
     figure.update_yaxes(**axis)
     figure.update_yaxes(title_text="relative gap", row=1, col=1)
-    figure.update_layout(
-        template="none",
-        title={"text": title, "font": {"size": 14}},
-        margin={"l": 80, "r": 10, "t": 40 if title else 10, "b": 50},
-        legend={"orientation": "h", "y": -0.16},
-        hovermode="closest",
-    )
+    lay_out(figure, title, legend_y=-0.16)
     return figure
 
 

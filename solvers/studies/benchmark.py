@@ -98,28 +98,15 @@ class StageRecord:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BenchmarkRun:
-    """What a contender did on a graph.
-
-    Attributes
-    ----------
-    poses : Poses
-        Where it ended.
-    objective : float
-        F of them.
-    status : Status
-        How the last leg ended, or an earlier one that ran out of time.
-    remark : str
-        What has to be said beside the figures; empty when all went as it should.
-    is_answer : bool
-        Whether the figures are the contender's: not those of a method that was cut short in a stage without an answer.
-    """
+    """What a contender did on a graph."""
 
     contender: BenchmarkMethod
     legs: tuple[StageRecord, ...]
-    poses: Poses
-    objective: float
-    status: Status
-    remark: str = ""
+    poses: Poses  # where it ended
+    objective: float  # F of them
+    status: Status  # how the last leg ended, or an earlier one that ran out of time
+    remark: str = ""  # what has to be said beside the figures; empty when all went as it should
+    # Whether the figures are the contender's: not those of a method that was cut short in a stage without an answer.
     is_answer: bool = True
 
     @property
