@@ -22,11 +22,6 @@ def basis_pursuit(K: Array, f: Array) -> BregmanProblem:
 
     Bregman iteration ends after finitely many steps, and forgets errors made on the way (Yin et al. 2008; Yin & Osher
     2013).
-
-    Examples
-    --------
-    >>> basis_pursuit(np.ones((2, 5)), np.ones(2))
-    BregmanProblem(m=5, s=2, blocks=1)
     """
     x = cp.Variable(np.shape(K)[-1], name="x")
     return BregmanProblem(cp.norm1(x), x, K, f)
@@ -58,12 +53,6 @@ def total_variation_denoising(noisy: Array, weight: float) -> BregmanProblem:
     References
     ----------
     Rudin, Osher, Fatemi 1992; Goldstein & Osher 2009.
-
-    Examples
-    --------
-    >>> problem = total_variation_denoising(np.array([0.1, -0.1, 1.1, 0.9]), weight=0.2)
-    >>> problem
-    BregmanProblem(m=7, s=3, blocks=2)
     """
     noisy = finite_array(noisy, "noisy")
     if not 0 <= weight < np.inf:

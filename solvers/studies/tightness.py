@@ -60,13 +60,7 @@ class NoiseSweep:
 
 
 def noisy_scene(scene: SweptScene, rotation_std: float, rng: np.random.Generator) -> PoseGraph:
-    """The paper's network with its geometry, weights and translation noise, and another rotation noise, in radians.
-
-    Examples
-    --------
-    >>> noisy_scene(SweptScene.CIRCLE, 0.1, np.random.default_rng(0))
-    PoseGraph('circle', d=3, poses=25, edges=300, robots=1)
-    """
+    """The paper's network with its geometry, weights and translation noise, and another rotation noise, in radians."""
     network = circle(rng) if scene is SweptScene.CIRCLE else grid(rng)
     assert network.truth is not None
     noise = NoiseModel(rotation_std=rotation_std)
