@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 
@@ -24,7 +25,7 @@ class GraphWarning(UserWarning):
 
 
 class SettingError(PGOError, ValueError):
-    """A setting of a solver, a model or a scene that is out of its range."""
+    """A setting of a solver, a model or a scene that is out of its range: raised where the settings are made."""
 
 
 class FileFormatError(PGOError):
@@ -59,7 +60,10 @@ class EngineError(PGOError):
 
 
 class MissingExtraError(PGOError):
-    """An optional dependency is not installed; the message names the extra."""
+    """An optional dependency is not installed; the message names the extra.
+
+    Whatever draws raises it without matplotlib or plotly, which the extra `plot` brings.
+    """
 
     def __init__(self, package: str, extra: str) -> None:
         """Name the missing `package` and the `extra` that brings it."""
@@ -71,10 +75,23 @@ class MissingExtraError(PGOError):
         return type(self), (self._package, self.extra)
 
 
-def check_signs(settings: object, positive: tuple[str, ...] = (), not_negative: tuple[str, ...] = ()) -> None:
-    """Raise a SettingError for the first of these settings that has the wrong sign; None is none."""
-    for name in positive + not_negative:
-        value = getattr(settings, name)
-        if value is not None and not (value > 0 or (value == 0 and name in not_negative)):
-            sign = "not be negative" if name in not_negative else "be positive"
-            raise SettingError(f"{name} must {sign}, got {value}")
+def check_settings(
+    settings: object,
+    *,
+    positive: Sequence[str] = (),
+    not_negative: Sequence[str] = (),
+    at_least_one: Sequence[str] = (),
+    above_one: Sequence[str] = (),
+) -> None:
+    """Raise a SettingError for the first of the named fields that is out of its range; one that is None passes."""
+    rules: tuple[tuple[Sequence[str], str, Callable[[float], bool]], ...] = (
+        (positive, "be positive", lambda value: value > 0),
+        (not_negative, "not be negative", lambda value: value >= 0),
+        (at_least_one, "be at least 1", lambda value: value >= 1),
+        (above_one, "be above 1", lambda value: value > 1),
+    )
+    for names, rule, holds in rules:
+        for name in names:
+            value = getattr(settings, name)
+            if value is not None and not holds(value):
+                raise SettingError(f"{name} must {rule}, got {value}")

@@ -2,7 +2,7 @@
 
 Equations of the paper by label: `problem bregman` is the problem; `update B`, `bregman update` and `minbregman` are the
 three forms of the iteration whose subproblems are compiled here, each with one Parameter (DPP); `bregman ADMM`
-alternates over the blocks of x. The iterations themselves are in solvers/bregman.py.
+alternates over the blocks of x. The iterations themselves are in solvers/convex/bregman.py.
 """
 
 from __future__ import annotations
@@ -129,25 +129,13 @@ class BregmanProblem:
 
 @dataclass(frozen=True, eq=False)
 class Subproblem:
-    """A compiled minimisation over x, or over one block of it.
-
-    Attributes
-    ----------
-    problem : cp.Problem
-    variables : tuple of cp.Variable
-    parameter : cp.Parameter
-        p, (m,), or lam, (s,), or the scaled shift, (s,).
-    scale : float
-        The parameter's value is `scale` times what `solve` is given.
-    tolerance : float
-        Clarabel's.
-    """
+    """A compiled minimisation over x, or over one block of it."""
 
     problem: cp.Problem
     variables: tuple[cp.Variable, ...]
-    parameter: cp.Parameter
-    scale: float
-    tolerance: float
+    parameter: cp.Parameter  # p, (m,), or lam, (s,), or the scaled shift, (s,)
+    scale: float  # the parameter's value is `scale` times what `solve` is given
+    tolerance: float  # Clarabel's
 
     def solve(self, value: Array) -> Array:
         """Minimiser, stacked.

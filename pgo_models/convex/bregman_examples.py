@@ -1,4 +1,4 @@
-"""Worked models of the form min J(x) s.t. K x = f, for the Bregman iterations of solvers/bregman.py."""
+"""Worked models of the form min J(x) s.t. K x = f, for the Bregman iterations of solvers/convex/bregman.py."""
 
 from __future__ import annotations
 
@@ -22,11 +22,6 @@ def basis_pursuit(K: Array, f: Array) -> BregmanProblem:
 
     Bregman iteration ends after finitely many steps, and forgets errors made on the way (Yin et al. 2008; Yin & Osher
     2013).
-
-    Examples
-    --------
-    >>> basis_pursuit(np.ones((2, 5)), np.ones(2))
-    BregmanProblem(m=5, s=2, blocks=1)
     """
     x = cp.Variable(np.shape(K)[-1], name="x")
     return BregmanProblem(cp.norm1(x), x, K, f)
@@ -58,12 +53,6 @@ def total_variation_denoising(noisy: Array, weight: float) -> BregmanProblem:
     References
     ----------
     Rudin, Osher, Fatemi 1992; Goldstein & Osher 2009.
-
-    Examples
-    --------
-    >>> problem = total_variation_denoising(np.array([0.1, -0.1, 1.1, 0.9]), weight=0.2)
-    >>> problem
-    BregmanProblem(m=7, s=3, blocks=2)
     """
     noisy = finite_array(noisy, "noisy")
     if not 0 <= weight < np.inf:
@@ -93,22 +82,12 @@ def total_variation_scale_space(noisy: Array) -> BregmanProblem:
 
 @dataclass(frozen=True, eq=False)
 class SharedRotationStep:
-    """The R-subproblem of several robots that agree on the rotations they share.
+    """The R-subproblem of several robots that agree on the rotations they share."""
 
-    Attributes
-    ----------
-    problem : BregmanProblem
-        One variable a robot: the rows R_p^T of the poses it holds.
-    held : tuple of (poses,) arrays
-        Poses that each robot holds, its own and copies of their neighbours, ascending.
-    robot : (n,)
-        Owner of every pose.
-    d : int
-    """
-
-    problem: BregmanProblem
+    problem: BregmanProblem  # one variable a robot: the rows R_p^T of the poses it holds
+    # (poses,) each: poses that a robot holds, its own and copies of their neighbours, ascending.
     held: tuple[IntArray, ...]
-    robot: IntArray
+    robot: IntArray  # (n,): owner of every pose
     d: int
 
     def rotations(self, x: Array) -> Array:
@@ -130,10 +109,7 @@ def shared_rotation_step(graph: PoseGraph, robots: Partition, V: Array, rho: flo
 
     Parameters
     ----------
-    graph : PoseGraph
-    robots : Partition
     V : (n, d, d)
-    rho : float
 
     Raises
     ------

@@ -42,12 +42,7 @@ def check_convex(expression: cp.Expression, name: str) -> None:
 
 
 def check_variable(variable: cp.Variable, name: str) -> None:
-    """Raise unless `variable` is a continuous real cvxpy Variable.
-
-    Raises
-    ------
-    SettingError
-    """
+    """Raise a SettingError unless `variable` is a continuous real cvxpy Variable."""
     if not isinstance(variable, cp.Variable):
         raise SettingError(f"{name} is a {type(variable).__name__}; give a cvxpy Variable")
     if not variable.is_real():

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array, project_by_svd
 
 
@@ -153,8 +153,7 @@ class Sparse(ConstraintSet):
     nonzeros: int
 
     def __post_init__(self) -> None:
-        if self.nonzeros < 1:
-            raise SettingError(f"nonzeros must be at least 1, got {self.nonzeros}")
+        check_settings(self, at_least_one=["nonzeros"])
 
     def check_shape(self, shape: tuple[int, ...], name: str) -> None:
         """One or two dimensions."""

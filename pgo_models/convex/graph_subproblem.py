@@ -42,8 +42,6 @@ class PoseVariables:
 
     Attributes
     ----------
-    graph : PoseGraph
-    unknowns : Unknowns
     poses : (n_a,)
         Poses of the graph that are unknown, ascending.
     X : cp.Variable
@@ -116,10 +114,8 @@ class GraphQP:
 
     Attributes
     ----------
-    variables : PoseVariables
     qp : RotationQP
         The cvxpy problem and its Parameter.
-    change : ModelChange
     A, w
         Residuals and weights of the edges that count, in the rows of X.
     between : sparse (N_a, N)
@@ -177,10 +173,8 @@ def graph_qp(
 
     Parameters
     ----------
-    graph : PoseGraph
     rho : (n,)
         Penalty of every rotation.
-    unknowns : Unknowns
     changer : callable, optional
         Given the variables, returns the ModelChange: terms, constraints, and edges whose loss they replace.
     rho_t : (n,), optional

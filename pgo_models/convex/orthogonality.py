@@ -3,7 +3,7 @@
     minimise J(X, y) over the convex constraints, with X in a set of orthonormal columns, rotations, unit columns, ..
 
 The split form is step (a) of the paper's Algorithm 1 for any J: the same cvxpy problem with the sets taken out and
-rho/2 ||X - V||^2 added, compiled once. The iteration is in solvers/orthogonal_soc.py.
+rho/2 ||X - V||^2 added, compiled once. The iteration is in solvers/convex/orthogonal.py.
 """
 
 from __future__ import annotations
@@ -293,8 +293,6 @@ def kkt_residuals(problem: OrthogonalProblem, point: OrthogonalPoint, rho: float
 
     Parameters
     ----------
-    problem : OrthogonalProblem
-    point : OrthogonalPoint
     rho : float
         Of the order of the curvature of J.
     """
@@ -315,13 +313,14 @@ def kkt_residuals(problem: OrthogonalProblem, point: OrthogonalPoint, rho: float
     )
     return KKTResiduals(
         feasibility=problem.infeasibility(point.copies, others),
-        stationarity=_norm(gaps),
-        gradient_norm=_norm(gradients),
+        stationarity=norm_of_all(gaps),
+        gradient_norm=norm_of_all(gradients),
         multipliers=multipliers,
     )
 
 
-def _norm(arrays: Sequence[Array]) -> float:
+def norm_of_all(arrays: Sequence[Array]) -> float:
+    """Norm of all entries of several arrays."""
     return float(np.sqrt(sum(float(np.sum(array**2)) for array in arrays)))
 
 

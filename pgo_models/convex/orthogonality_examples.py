@@ -24,11 +24,6 @@ def procrustes(A: Array, B: Array, *, rotation: bool = False) -> OrthogonalProbl
     References
     ----------
     Schoenemann 1966; Lai & Osher 2014, section 4.
-
-    Examples
-    --------
-    >>> procrustes(np.eye(3), np.eye(3), rotation=True)
-    OrthogonalProblem((3, 3) Rotations)
     """
     A, B = _matrix(A, "A"), _matrix(B, "B")
     if len(A) != len(B):

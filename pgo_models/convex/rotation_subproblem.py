@@ -28,7 +28,6 @@ class RotationQP:
 
     Attributes
     ----------
-    problem : cp.Problem
     X : cp.Variable, (N, d)
         Rows t_i, then the rows of every R_i^T, of the poses concerned.
     shift : cp.Parameter, (N_D, d)
@@ -93,7 +92,6 @@ def rotation_qp(
         The variable, where terms or constraints are already written in it.
     terms : sequence of cp.Expression
         Convex terms to add to the objective; `pgo_models.convex.graph_subproblem` writes them on poses and edges.
-    constraints : sequence of cp.Constraint
 
     Raises
     ------

@@ -124,8 +124,7 @@ def tangent_dimension(d: int) -> int:
 def hat(w: Array) -> Array:
     """Skew matrices of (n, 1) or (n, 3) tangent vectors: hat(w) v = w x v in space, the turn by w in the plane."""
     if w.shape[-1] == 1:
-        zero = np.zeros_like(w[..., 0])
-        return np.stack([np.stack([zero, -w[..., 0]], -1), np.stack([w[..., 0], zero], -1)], -2)
+        return _from_cosine_sine(np.zeros_like(w[..., 0]), w[..., 0])
     W = np.zeros((*w.shape, 3))
     W[..., 2, 1], W[..., 0, 2], W[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
     W[..., 1, 2], W[..., 2, 0], W[..., 0, 1] = -w[..., 0], -w[..., 1], -w[..., 2]

@@ -25,11 +25,6 @@ def plot_tightness(curves: list[tuple[str, Array, Array]]) -> Figure:
     curves : list of (label, rotation_std, fraction)
         Noise in radians, (levels,), and the certified share there, (levels,), in [0, 1].
 
-    Raises
-    ------
-    MissingExtraError
-        Without matplotlib.
-
     Examples
     --------
     >>> figure = plot_tightness([("grid", np.deg2rad([30, 50, 60]), np.array([1.0, 0.2, 0.0]))])
@@ -57,11 +52,6 @@ def plot_decay(curves: list[tuple[str, Array]], quantity: str) -> Figure:
         Values from iterate 0 on.
     quantity : str
         What they are, with the unit, for the axis.
-
-    Raises
-    ------
-    MissingExtraError
-        Without matplotlib.
 
     Examples
     --------

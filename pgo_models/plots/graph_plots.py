@@ -64,17 +64,10 @@ def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = Tr
 
     Parameters
     ----------
-    graph : PoseGraph
-    poses : Poses
     axes : matplotlib Axes
         Of projection "3d" for graphs in space.
     mark_edges : bool
         Draw edges with a low precision dotted, and those with a large share of F thick and vermilion.
-
-    Raises
-    ------
-    GraphError
-        When the poses are not those of the graph.
     """
     from matplotlib.colors import to_rgb
 
@@ -98,13 +91,6 @@ def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = Tr
 
 def plot_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: Array | None = None) -> Figure:
     """Figure of a graph by robot, with a legend (`draw_graph`); of covariances (n, p, p), `confidence_ellipses`.
-
-    Raises
-    ------
-    GraphError
-        When the poses are not those of the graph.
-    MissingExtraError
-        Without matplotlib.
 
     Examples
     --------
@@ -130,11 +116,6 @@ def plot_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: Arr
 def compare_poses(graph: PoseGraph, panels: list[tuple[str, Poses]]) -> Figure:
     """Figure with one panel for every (title, poses), side by side.
 
-    Raises
-    ------
-    MissingExtraError
-        Without matplotlib.
-
     Examples
     --------
     >>> from pgo_models.problem.initialization import spanning_tree_start
@@ -144,11 +125,18 @@ def compare_poses(graph: PoseGraph, panels: list[tuple[str, Poses]]) -> Figure:
     >>> [axes.get_title() for axes in figure.axes]
     ['truth', 'tree']
     """
-    with column_figure(height=1.0, width=len(panels)) as figure:
-        for place, (title, poses) in enumerate(panels, 1):
-            axes = figure.add_subplot(1, len(panels), place, projection="3d" if graph.d == 3 else None)
-            draw_graph(graph, poses, axes, mark_edges=False)
-            axes.set_title(title)
+    return plot_panels([[(title, graph, poses) for title, poses in panels]])
+
+
+def plot_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> Figure:
+    """Figure with a row of pictures for every list of (title, graph, poses)."""
+    columns = max(len(row) for row in panels)
+    with column_figure(height=1.0 * len(panels), width=columns) as figure:
+        for r, row in enumerate(panels):
+            for place, (title, graph, poses) in enumerate(row, r * columns + 1):
+                axes = figure.add_subplot(len(panels), columns, place, projection="3d" if graph.d == 3 else None)
+                draw_graph(graph, poses, axes, mark_edges=False)
+                axes.set_title(title)
     return figure
 
 
@@ -157,7 +145,6 @@ def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = Non
 
     Parameters
     ----------
-    graph : PoseGraph
     poses : Poses
         The estimate; it is aligned to the truth first.
     truth : Poses, optional
@@ -167,8 +154,6 @@ def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = Non
     ------
     GraphError
         When there is no truth, or the sizes differ.
-    MissingExtraError
-        Without matplotlib.
 
     Examples
     --------

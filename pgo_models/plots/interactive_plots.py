@@ -5,12 +5,11 @@ from __future__ import annotations
 import html
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pgo_models.errors import GraphError, MissingExtraError
+from pgo_models.errors import GraphError
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -18,7 +17,7 @@ from pgo_models.graphs.g2o import pose_names
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.residuals import EdgeResiduals, edge_residuals
 from pgo_models.plots.graph_plots import BETWEEN, KIND_LABELS, MISFIT, OWN, UNCERTAIN, confidence_ellipses, edge_kinds
-from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, plotly
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -44,19 +43,10 @@ def explore_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: 
 
     Parameters
     ----------
-    graph : PoseGraph
     poses : Poses
         Drawn to seven digits (float32).
-    title : str
     covariances : (n, p, p), optional
         Of every pose, drawn as `confidence_ellipses`.
-
-    Raises
-    ------
-    GraphError
-        When the poses are not those of the graph.
-    MissingExtraError
-        Without plotly.
 
     Examples
     --------
@@ -65,7 +55,7 @@ def explore_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: 
     >>> [trace.name for trace in explore_graph(graph, graph.truth).data]
     ['edges and poses', 'edges and poses', 'misfit']
     """
-    go = _plotly()
+    go = plotly("graph_objects")
     kind, residuals = edge_kinds(graph, poses), edge_residuals(graph, poses)
     names, several = np.array(pose_names(graph)), graph.num_robots > 1
     traces = []
@@ -106,7 +96,6 @@ def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[
 
     Parameters
     ----------
-    graph : PoseGraph
     iterates : sequence of Poses
         For example `[soc.poses(problem, state) for state in itertools.islice(iterate(soc, problem), 30)]`. Each is
         aligned with the last one, so that only what changes moves.
@@ -117,10 +106,8 @@ def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[
     ------
     GraphError
         When there are no iterates, their labels are not as many, or they are not poses of the graph.
-    MissingExtraError
-        Without plotly.
     """
-    go = _plotly()
+    go = plotly("graph_objects")
     if not iterates:
         raise GraphError("there are no iterates; give at least one set of poses")
     names = [f"k = {k}" for k in range(len(iterates))] if labels is None else list(labels)
@@ -152,28 +139,27 @@ def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[
     return figure
 
 
+def lay_out(figure: Figure, title: str, legend_y: float) -> None:
+    """White ground, narrow margins, the legend in a row at a height in figure heights, 0 at the foot of the axes."""
+    figure.update_layout(
+        template="none",
+        title={"text": html.escape(title), "font": {"size": 14}},
+        margin={"l": 80, "r": 10, "t": 40 if title else 10, "b": 50},
+        legend={"itemsizing": "constant", "orientation": "h", "y": legend_y},
+        hovermode="closest",
+    )
+
+
 def save_page(figure: Figure, path: Path | str) -> None:
     """Write a plotly figure as one HTML page that opens offline, plotly's own script inside (about 5 MB).
 
-    Raises
-    ------
-    PGOError
-        When the file cannot be written.
+    Errors as `replace_when_done`.
     """
     page = figure.to_html(
         include_plotlyjs=True, full_html=True, config=PAGE_CONFIG, auto_play=False, default_height="96vh"
     )
     with replace_when_done(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
-
-
-def _plotly() -> ModuleType:
-    try:
-        from plotly import graph_objects
-    except ImportError as error:
-        raise MissingExtraError("plotly", "plot") from error
-    module: ModuleType = graph_objects
-    return module
 
 
 def _points(points: Array) -> Trace:
@@ -220,14 +206,8 @@ def _misfit_text(graph: PoseGraph, edges: IntArray, residuals: EdgeResiduals) ->
 
 
 def _arrange(figure: Figure, points: Array, title: str) -> None:
-    """Equal scales, labels with the unit, a white ground."""
-    figure.update_layout(
-        template="none",
-        title={"text": html.escape(title), "font": {"size": 14}},
-        margin={"l": 60, "r": 10, "t": 40 if title else 10, "b": 50},
-        legend={"itemsizing": "constant", "orientation": "h", "y": -0.12 if points.shape[1] == 2 else 0.0},
-        hovermode="closest",
-    )
+    """Equal scales, labels with the unit."""
+    lay_out(figure, title, legend_y=-0.12 if points.shape[1] == 2 else 0.0)
     if points.shape[1] == 2:
         figure.update_xaxes(title_text="x (m)", zeroline=False, gridcolor="#eeeeee")
         figure.update_yaxes(title_text="y (m)", zeroline=False, gridcolor="#eeeeee", scaleanchor="x")

@@ -68,13 +68,6 @@ def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12
     Eigenvalues stand on a logarithmic axis, negative ones as vermilion triangles. The shaded band, where the
     proof needs an eta, is what that leaves open, |lambda| <= eta.
 
-    Raises
-    ------
-    SettingError
-        When count is not 1 to d n.
-    MissingExtraError
-        Without matplotlib.
-
     Examples
     --------
     >>> from pgo_models.certificates.certificate import certify
@@ -109,21 +102,11 @@ def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12
 
 @dataclass(frozen=True, eq=False)
 class FactorPattern:
-    """Where the Cholesky factor of M is not zero.
+    """Where the Cholesky factor of M is not zero."""
 
-    Attributes
-    ----------
-    order : (N,)
-        Fill-reducing order of the rows and columns of M.
-    factor : csc_array, (N, N)
-        L, lower triangular, of M in that order; ones where it is stored.
-    fill_in : int
-        Entries of L where the lower triangle of M in that order has none.
-    """
-
-    order: IntArray
-    factor: csc_array
-    fill_in: int
+    order: IntArray  # (N,): fill-reducing order of the rows and columns of M
+    factor: csc_array  # (N, N): L, lower triangular, of M in that order; ones where it is stored
+    fill_in: int  # entries of L where the lower triangle of M in that order has none
 
 
 def factor_pattern(problem: PGOProblem) -> FactorPattern:
@@ -138,13 +121,7 @@ def factor_pattern(problem: PGOProblem) -> FactorPattern:
 
 
 def plot_sparsity(problem: PGOProblem) -> Figure:
-    """Figure of the patterns of M, in the order of the poses, and of its Cholesky factor, with the fill-in counted.
-
-    Raises
-    ------
-    MissingExtraError
-        Without matplotlib.
-    """
+    """Figure of the patterns of M, in the order of the poses, and of its Cholesky factor, with the fill-in counted."""
     pattern = factor_pattern(problem)
     with column_figure(height=0.6) as figure:
         left, right = figure.subplots(1, 2)

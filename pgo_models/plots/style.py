@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from io import BytesIO
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from pgo_models.errors import MissingExtraError
 from pgo_models.files import replace_when_done
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 COLUMN_INCHES = 3.4  # a column of a two-column paper
@@ -30,13 +31,7 @@ MARKERS = ("o", "s", "D", "^", "v", "P")
 
 @contextmanager
 def column_figure(height: float, width: float = 1.0) -> Iterator[Figure]:
-    """Context manager yielding a figure in the project's style, `width` columns wide, `height` of them high.
-
-    Raises
-    ------
-    MissingExtraError
-        Without matplotlib.
-    """
+    """Context manager yielding a figure in the project's style, `width` columns wide, `height` of them high."""
     try:
         import matplotlib
     except ImportError as error:
@@ -56,12 +51,17 @@ def column_figure(height: float, width: float = 1.0) -> Iterator[Figure]:
         figure = _shown_figure()(figsize=(COLUMN_INCHES * width, COLUMN_INCHES * height), layout="constrained")
         yield figure
         for axes in figure.axes:
-            keep_letters(axes)
+            # matplotlib would else choose the size of the tick labels when the figure is shown
+            axes.tick_params(which="both", labelsize=SMALL_POINTS)
 
 
-def keep_letters(axes: Axes) -> None:
-    """Fix the size of the tick labels, which matplotlib would else choose when the figure is shown."""
-    axes.tick_params(which="both", labelsize=SMALL_POINTS)
+def plotly(name: str) -> ModuleType:
+    """Module of plotly, whose import waits until something is drawn."""
+    try:
+        importlib.import_module("plotly")
+        return importlib.import_module(f"plotly.{name}")
+    except ImportError as error:
+        raise MissingExtraError("plotly", "plot") from error
 
 
 def is_picture(path: Path) -> bool:
@@ -70,13 +70,7 @@ def is_picture(path: Path) -> bool:
 
 
 def save_figure(figure: Figure, path: Path | str) -> None:
-    """Write a figure as .png, .svg or .pdf, whole or not at all.
-
-    Raises
-    ------
-    PGOError
-        When the file cannot be written.
-    """
+    """Write a figure as .png, .svg or .pdf, whole or not at all; errors as `replace_when_done`."""
     path = Path(path)
     with replace_when_done(path) as temporary:
         figure.savefig(temporary, format=path.suffix.lower().lstrip("."), dpi=DOTS_PER_INCH)

@@ -46,6 +46,16 @@ class Marginals:
         When the anchor, or a pose asked for, is none.
     NotPositiveDefiniteError
         When a covariance is asked for where the Hessian is that of no strict minimum.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> from pgo_models.problem.hessian import riemannian_hessian
+    >>> from pgo_models.problem.problem import PGOProblem
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> marginals = Marginals(riemannian_hessian(problem, problem.graph.truth, None), TangentLayout(27, 3))
+    >>> marginals.diagonal.shape, marginals.joint(3, 7).shape
+    ((27, 6, 6), (12, 12))
     """
 
     hessian: csc_array

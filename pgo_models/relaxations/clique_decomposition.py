@@ -41,9 +41,6 @@ class CliqueRelaxation:
 
     Attributes
     ----------
-    problem : PGOProblem
-    tree : CliqueTree
-    centre : Poses
     model : cp.Problem
         Its value times `scale` is that of the relaxation.
     upper : tuple of cp.Variable
@@ -108,7 +105,6 @@ def clique_relaxation(
 
     Parameters
     ----------
-    problem : PGOProblem
     centre : Poses, optional
         The stationary point that the chordal start polishes to, unless given. Far from the optimum it costs digits.
     tree : CliqueTree, optional
@@ -145,32 +141,21 @@ class _Layout:
     """Where the lifted vectors of every clique stand.
 
     A coefficient array, (side, k), says how k lifted vectors are combined from those of a clique.
-
-    Attributes
-    ----------
-    sigma, sigma_t : float
-        Scales of rotation and translation deviations: roots of the median precisions.
-    reference : list of int
-        r of every clique.
-    columns : list of dict
-        First column of every other pose.
-    sides, offsets : list of int
-        Side of W_C, and where its upper triangle begins in w.
-    home : (n,)
-        The clique nearest to the root that holds a pose.
     """
 
     problem: PGOProblem
     tree: CliqueTree
     centre: Poses
+    # sigma, sigma_t: scales of rotation and translation deviations: roots of the median precisions.
     sigma: float
     sigma_t: float
-    reference: list[int]
-    columns: list[dict[int, int]]
+    reference: list[int]  # r of every clique
+    columns: list[dict[int, int]]  # first column of every other pose
+    # sides, offsets: side of W_C, and where its upper triangle begins in w.
     sides: list[int]
     offsets: list[int]
     num_entries: int
-    home: IntArray
+    home: IntArray  # (n,): the clique nearest to the root that holds a pose
 
     @classmethod
     def of(cls, problem: PGOProblem, tree: CliqueTree, centre: Poses) -> _Layout:

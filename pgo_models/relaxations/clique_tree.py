@@ -18,17 +18,10 @@ class CliqueTree:
     """Cliques of poses that cover every edge, joined in a tree with the running intersection property.
 
     The poses that a clique shares with all cliques before it in the order are all in its parent.
-
-    Attributes
-    ----------
-    cliques : tuple of (c_k,) arrays
-        Poses of every clique, ascending; parents before children.
-    parent : (K,)
-        Parent of every clique, -1 for the root.
     """
 
-    cliques: tuple[IntArray, ...]
-    parent: IntArray
+    cliques: tuple[IntArray, ...]  # (c_k,) each: poses of every clique, ascending; parents before children
+    parent: IntArray  # (K,): parent of every clique, -1 for the root
 
     @property
     def sizes(self) -> IntArray:

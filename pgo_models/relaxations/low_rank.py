@@ -19,23 +19,12 @@ from pgo_models.problem.problem import PGOProblem
 
 @dataclass(frozen=True, eq=False)
 class LiftedPoint:
-    """A point of St(d, r)^n and what is known there to first order.
+    """A point of St(d, r)^n and what is known there to first order."""
 
-    Attributes
-    ----------
-    Y : (n, d, r)
-    value : float
-        f(Y) = tr(Y^T Q Y); for r = d, and Y of rotations, F with the best translations.
-    Lambda : (n, d, d)
-        sym((Q Y)_i Y_i^T), the multipliers of Y_i Y_i^T = I; their trace is f(Y).
-    gradient : (n, d, r)
-        Riemannian: 2 ((Q Y)_i - Lambda_i Y_i).
-    """
-
-    Y: Array
-    value: float
-    Lambda: Array
-    gradient: Array
+    Y: Array  # (n, d, r)
+    value: float  # f(Y) = tr(Y^T Q Y); for r = d, and Y of rotations, F with the best translations
+    Lambda: Array  # (n, d, d): sym((Q Y)_i Y_i^T), the multipliers of Y_i Y_i^T = I; their trace is f(Y)
+    gradient: Array  # (n, d, r): Riemannian: 2 ((Q Y)_i - Lambda_i Y_i)
 
     @property
     def rank(self) -> int:

@@ -43,25 +43,13 @@ class SDPSolver(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class RelaxationPlan:
-    """A form and a solver, what they will take, and why they were chosen.
-
-    Attributes
-    ----------
-    form : RelaxationForm
-    solver : SDPSolver
-    tree : CliqueTree
-    seconds : float
-        Rough estimate.
-    memory : float
-        Estimate in bytes.
-    reason : str
-    """
+    """A form and a solver, what they will take, and why they were chosen."""
 
     form: RelaxationForm
     solver: SDPSolver
     tree: CliqueTree
-    seconds: float
-    memory: float
+    seconds: float  # rough estimate
+    memory: float  # estimate in bytes
     reason: str
 
     def __str__(self) -> str:

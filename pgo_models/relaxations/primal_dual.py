@@ -28,7 +28,6 @@ class PrimalRelaxation:
 
     Attributes
     ----------
-    problem : PGOProblem
     model : cp.Problem
         Its value times `scale` is that of the relaxation.
     Z : cp.Variable, (dn, dn)
@@ -76,7 +75,6 @@ class DualRelaxation:
 
     Attributes
     ----------
-    problem : PGOProblem
     model : cp.Problem
         Its value times `scale` is that of the relaxation.
     upper : cp.Variable, (n d (d + 1) / 2,)

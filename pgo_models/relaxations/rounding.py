@@ -21,7 +21,6 @@ class RankReport:
     ----------
     singular_values : (side,)
         Descending.
-    d : int
     rank : int
         How many are above `RANK_TOLERANCE` of the largest.
     tightness : float

@@ -49,8 +49,6 @@ class RelaxationSolution:
     ----------
     relaxation : PrimalRelaxation, DualRelaxation or CliqueRelaxation
         The model with its variables and duals as solved.
-    plan : RelaxationPlan
-    status : RelaxationStatus
     value : float
         Optimal value as the solver reports it: evidence, not a bound.
     Lambda : (n, d, d)
@@ -59,11 +57,8 @@ class RelaxationSolution:
         Proven bound on F (`pgo_models.certificates.lower_bound`): it holds whatever the solver did.
     poses : Poses
         Rounded.
-    rank : RankReport
     objective, rounding_level : float
         F of the poses, and below what it could not be told from zero.
-    wanted_gap : float
-    iterations : int
     seconds : float
         From posing to proof.
     """
@@ -134,8 +129,6 @@ def solve_relaxation(
 
     Parameters
     ----------
-    problem : PGOProblem
-    form : RelaxationForm, optional
     solver : SDPSolver, optional
         Both are chosen by `plan_relaxation` unless given.
     gap : float

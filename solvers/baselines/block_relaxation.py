@@ -28,45 +28,24 @@ from solvers.network.ledger import Ledger, Traffic
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """Minimise sum_rows w ||J x + r||^2, every row of one edge and every unknown of one pose.
+    """Minimise sum_rows w ||J x + r||^2, every row of one edge and every unknown of one pose."""
 
-    Attributes
-    ----------
-    J : sparse (rows, unknowns)
-    w : (rows,)
-    r : (rows, columns)
-    edge : (rows,)
-    pose : (unknowns,)
-    """
-
-    J: csr_array
-    w: Array
-    r: Array
-    edge: IntArray
-    pose: IntArray
+    J: csr_array  # sparse (rows, unknowns)
+    w: Array  # (rows,)
+    r: Array  # (rows, columns)
+    edge: IntArray  # (rows,)
+    pose: IntArray  # (unknowns,)
 
 
 @dataclass(frozen=True, eq=False)
 class Turn:
-    """Robots that update at once.
+    """Robots that update at once."""
 
-    Attributes
-    ----------
-    rows : (rows,)
-        Their unknowns.
-    H : sparse (rows, unknowns)
-    b : (rows, columns)
-    factor : CholeskyFactor
-        Of the robots' diagonal blocks, all of the turn in one block-diagonal matrix.
-    traffic : Traffic
-        What they send to their neighbours afterwards.
-    """
-
-    rows: IntArray
-    H: csr_array
-    b: Array
-    factor: CholeskyFactor | None
-    traffic: Traffic
+    rows: IntArray  # (rows,): their unknowns
+    H: csr_array  # sparse (rows, unknowns)
+    b: Array  # (rows, columns)
+    factor: CholeskyFactor | None  # of the robots' diagonal blocks, all of the turn in one block-diagonal matrix
+    traffic: Traffic  # what they send to their neighbours afterwards
 
 
 def take_turns(turns: tuple[Turn, ...], x: Array, alpha: float, ledger: Ledger) -> tuple[Array, Ledger]:

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from pgo_models.certificates.newton_polish import move_poses
-from pgo_models.errors import SettingError, check_signs
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
@@ -46,43 +46,23 @@ class DGSStage(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class GaussSeidelState:
-    """State after k sweeps.
-
-    Attributes
-    ----------
-    k : int
-    stage : DGSStage
-    R, t : (n, d, d), (n, d)
-        Poses at which the stage began: the start, then the point of linearisation. Of its translations all but that of
-        pose 0 are a first guess only.
-    x : (unknowns, columns)
-        Iterate of the linear problem, without pose 0: the rows of every R_i^T; or v, then w.
-    turns : tuple of Turn
-        A sweep, factorisations included.
-    first : tuple of Turn
-        The flagged sweep that has to come first; empty when every robot has an estimate.
-    schedule : Schedule
-    is_flagged : bool
-        Whether the first linearised problem begins with a flagged sweep too.
-    ledger : Ledger
-    gauss_newton_step : int
-        Linearisations so far.
-    change : float
-        Of the last sweep, relative; inf before the first of a stage.
-    """
+    """State after k sweeps."""
 
     k: int
     stage: DGSStage
+    # R, t: (n, d, d), (n, d); poses at which the stage began: the start, then the point of linearisation. Of its
+    # translations all but that of pose 0 are a first guess only.
     R: Array
     t: Array
+    # (unknowns, columns): iterate of the linear problem, without pose 0: the rows of every R_i^T; or v, then w.
     x: Array
-    turns: tuple[Turn, ...]
-    first: tuple[Turn, ...]
+    turns: tuple[Turn, ...]  # a sweep, factorisations included
+    first: tuple[Turn, ...]  # the flagged sweep that has to come first; empty when every robot has an estimate
     schedule: Schedule
-    is_flagged: bool
+    is_flagged: bool  # whether the first linearised problem begins with a flagged sweep too
     ledger: Ledger
-    gauss_newton_step: int = 0
-    change: float = np.inf
+    gauss_newton_step: int = 0  # linearisations so far
+    change: float = np.inf  # of the last sweep, relative; inf before the first of a stage
 
 
 @dataclass(frozen=True)
@@ -107,7 +87,6 @@ class GaussSeidel:
     ----------
     robots : Partition, optional
         Who owns which pose; one pose a robot unless given.
-    sweep : Sweep
     alpha : float
         Over-relaxation, in (0, 2). Up to 1 every sweep converges; above, `Sweep.JACOBI` may not.
     is_flagged : bool
@@ -119,11 +98,6 @@ class GaussSeidel:
         On the change of a sweep; it ends a stage.
     max_iterations : int
         Sweeps of all stages together.
-
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
 
     Examples
     --------
@@ -146,9 +120,8 @@ class GaussSeidel:
     def __post_init__(self) -> None:
         if not 0 < self.alpha < 2:
             raise SettingError(f"alpha must be in (0, 2), got {self.alpha}; 1 is no over-relaxation")
-        if self.gauss_newton_steps < 1:
-            raise SettingError(f"gauss_newton_steps must be at least 1, got {self.gauss_newton_steps}")
-        check_signs(self, positive=("tolerance",), not_negative=("max_iterations",))
+        check_settings(self, positive=["tolerance"])
+        check_settings(self, not_negative=["max_iterations"], at_least_one=["gauss_newton_steps"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> GaussSeidelState:
         """State 0: at `start`, whose pose 0 stays where it is, or at the identity."""

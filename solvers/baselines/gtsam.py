@@ -22,7 +22,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError, check_signs
+from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, log_map, project_to_rotations
 from pgo_models.graphs.precisions import isotropic_information, proper_information
@@ -60,7 +60,7 @@ class Gtsam:
     max_iterations: int = 100
 
     def __post_init__(self) -> None:
-        check_signs(self, positive=("tolerance",), not_negative=("max_iterations",))
+        check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
 
 
 def run_gtsam(problem: PGOProblem, settings: Gtsam | None = None, start: Poses | None = None) -> Run[Poses]:

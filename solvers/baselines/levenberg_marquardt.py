@@ -14,7 +14,7 @@ from scipy.sparse import csc_array
 
 from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, ground_pose, move_poses, scaled_decrement
 from pgo_models.certificates.rounding_errors import rounding_level
-from pgo_models.errors import NotPositiveDefiniteError, check_signs
+from pgo_models.errors import NotPositiveDefiniteError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.cholesky import SymbolicCholesky, analyze
@@ -33,39 +33,20 @@ _ROUNDING = 1e-14  # relative change of F that is not told apart from none
 
 @dataclass(frozen=True, eq=False)
 class LevenbergMarquardtState:
-    """State k.
-
-    Attributes
-    ----------
-    k : int
-    poses : Poses
-    objective, level : float
-        F, and its rounding level.
-    matrix : csc_array
-        A, the Gauss-Newton matrix at the poses, pose 0 grounded.
-    gradient : Array
-    analysis : SymbolicCholesky
-    damping : float
-        mu, of the next step: it solves (A + mu diag(A)) h = -g.
-    growth : float
-        Factor on mu if that step is refused.
-    step : Array
-        h; nan where the matrix with this damping has no Cholesky factor.
-    decrement : float
-        -<g, h> / 2, less the rounding level of F, over F.
-    """
+    """State k."""
 
     k: int
     poses: Poses
-    objective: float
-    level: float
-    matrix: csc_array
+    objective: float  # F
+    level: float  # its rounding level
+    matrix: csc_array  # A, the Gauss-Newton matrix at the poses, pose 0 grounded
     gradient: Array
     analysis: SymbolicCholesky
-    damping: float
-    growth: float
+    damping: float  # mu, of the next step: it solves (A + mu diag(A)) h = -g
+    growth: float  # factor on mu if that step is refused
+    # h, nan where the matrix with this damping has no Cholesky factor.
     step: Array = field(default_factory=lambda: np.empty(0))
-    decrement: float = math.inf
+    decrement: float = math.inf  # -<g, h> / 2, less the rounding level of F, over F
 
 
 @dataclass(frozen=True)
@@ -98,7 +79,7 @@ class LevenbergMarquardt:
     damping: float = 1e-3
 
     def __post_init__(self) -> None:
-        check_signs(self, positive=("tolerance", "damping"), not_negative=("max_iterations",))
+        check_settings(self, positive=["tolerance", "damping"], not_negative=["max_iterations"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> LevenbergMarquardtState:
         """State 0: `start`, or the chordal relaxation."""

@@ -29,24 +29,14 @@ class Sweep(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """Turns of a sweep.
+    """Turns of a sweep."""
 
-    Attributes
-    ----------
-    robot : (n,)
-        Owner of every pose.
-    group : (n,)
-        In which turn of a sweep the pose is updated. Robots of one turn are no neighbours, except in `Sweep.JACOBI`,
-        which has one turn.
-    first : (n,)
-        In which turn of the flagged first sweep the pose gets its first estimate.
-    sent, receiver : (q,)
-        Separator poses, and a robot that has an edge to them.
-    """
-
-    robot: IntArray
+    robot: IntArray  # (n,): owner of every pose
+    # (n,): in which turn of a sweep the pose is updated. Robots of one turn are no neighbours, except in
+    # `Sweep.JACOBI`, which has one turn.
     group: IntArray
-    first: IntArray
+    first: IntArray  # (n,): in which turn of the flagged first sweep the pose gets its first estimate
+    # sent, receiver: (q,); separator poses, and a robot that has an edge to them.
     sent: IntArray
     receiver: IntArray
 

@@ -25,7 +25,7 @@ from pgo_models.convex.bregman import (
     two_line_subproblem,
 )
 from pgo_models.convex.clarabel import TOLERANCE, finite_array
-from pgo_models.errors import SettingError, check_signs
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
 from solvers.result import Measurement, Status
 
@@ -35,7 +35,8 @@ class _ExactState:
     """Iterate k of a form that minimises over the whole of x: every one after the first step is stationary."""
 
     k: int
-    x: Array
+    x: Array  # (m,)
+    subproblem: Subproblem  # compiled
 
     @property
     def stationarity(self) -> float:
@@ -45,47 +46,34 @@ class _ExactState:
 
 @dataclass(frozen=True, eq=False)
 class BregmanState(_ExactState):
-    """Iterate k of `Bregman`: x, (m,), the subgradient p, (m,), of J at x, and the compiled subproblem."""
+    """Iterate k of `Bregman`."""
 
-    p: Array
-    subproblem: Subproblem
+    p: Array  # (m,): a subgradient of J at x
 
 
 @dataclass(frozen=True, eq=False)
 class TwoLineState(_ExactState):
-    """Iterate k of `TwoLineBregman`: x, (m,), the residuals added up, b, (s,), and the compiled subproblem."""
+    """Iterate k of `TwoLineBregman`."""
 
-    b: Array
-    subproblem: Subproblem
+    b: Array  # (s,): the residuals added up
 
 
 @dataclass(frozen=True, eq=False)
 class MultiplierState(_ExactState):
-    """Iterate k of `MethodOfMultipliers`: x, (m,), the multiplier lam, (s,), and the compiled subproblem."""
+    """Iterate k of `MethodOfMultipliers`."""
 
-    lam: Array
-    subproblem: Subproblem
+    lam: Array  # (s,): multiplier of K x = f
 
 
 @dataclass(frozen=True, eq=False)
 class AlternatingState:
-    """Iterate k of `AlternatingBregman`.
-
-    Attributes
-    ----------
-    x : (m,)
-    lam : (s,)
-        Multiplier of K x = f.
-    subproblems : tuple of Subproblem
-        One for every block.
-    stationarity : float
-        Distance of 0 from the subdifferential of the Lagrangian at x and lam; inf before the first step.
-    """
+    """Iterate k of `AlternatingBregman`."""
 
     k: int
-    x: Array
-    lam: Array
-    subproblems: tuple[Subproblem, ...]
+    x: Array  # (m,)
+    lam: Array  # (s,): multiplier of K x = f
+    subproblems: tuple[Subproblem, ...]  # one for every block
+    # Distance of 0 from the subdifferential of the Lagrangian at x and lam; inf before the first step.
     stationarity: float = math.inf
 
 
@@ -99,14 +87,8 @@ class BregmanSettings:
         The penalty parameter of the paper's section 2; lam has the unit of alpha K x.
     tolerance : float
         On ||K x - f|| / max(1, ||f||) and on the distance from stationarity over max(1, ||K^T lam||).
-    max_iterations : int
     subproblem_tolerance : float
         Clarabel's. Loosen it to see that Bregman iteration forgets the errors of its subproblems (Yin & Osher 2013).
-
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
     """
 
     alpha: float = 1.0
@@ -119,7 +101,7 @@ class BregmanSettings:
             value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise SettingError(f"{name} must be positive and finite, got {value}")
-        check_signs(self, not_negative=("max_iterations",))
+        check_settings(self, not_negative=["max_iterations"])
 
     def measure(self, problem: BregmanProblem, state: _ExactState | AlternatingState) -> Measurement:
         """J(x), ||K x - f||, relative, and the distance from stationarity, relative."""
@@ -142,11 +124,9 @@ class Bregman(BregmanSettings):
 
     Examples
     --------
-    >>> import cvxpy as cp, numpy as np
+    >>> from pgo_models.convex.bregman_examples import basis_pursuit
     >>> from solvers.loop import run
-    >>> x = cp.Variable(2)
-    >>> problem = BregmanProblem(cp.norm1(x), x, np.array([[1.0, 2.0]]), [2.0])
-    >>> run(Bregman(alpha=1.0), problem).state.x.round(6).tolist()
+    >>> run(Bregman(), basis_pursuit(np.array([[1.0, 2.0]]), np.array([2.0]))).state.x.round(6).tolist()
     [0.0, 1.0]
     """
 
@@ -154,13 +134,13 @@ class Bregman(BregmanSettings):
         """State 0 at `start`, else at x = 0 and p = 0."""
         point = _checked_start(problem, start)
         subproblem = bregman_subproblem(problem, self.alpha, self.subproblem_tolerance)
-        return BregmanState(0, point.x, np.asarray(problem.K.T @ point.lam), subproblem)
+        return BregmanState(0, point.x, subproblem, np.asarray(problem.K.T @ point.lam))
 
     def step(self, problem: BregmanProblem, state: BregmanState) -> BregmanState:
         """One iteration."""
         x = state.subproblem.solve(state.p)
         p = state.p - self.alpha * (problem.K.T @ problem.residual(x))
-        return BregmanState(state.k + 1, x, p, state.subproblem)
+        return BregmanState(state.k + 1, x, state.subproblem, p)
 
     def point(self, problem: BregmanProblem, state: BregmanState) -> BregmanPoint:
         """x, and the least-squares lam of p = K^T lam."""
@@ -175,11 +155,9 @@ class TwoLineBregman(BregmanSettings):
 
     Examples
     --------
+    >>> from pgo_models.convex.bregman_examples import basis_pursuit
     >>> from solvers.loop import run
-    >>> import cvxpy as cp, numpy as np
-    >>> x = cp.Variable(2)
-    >>> problem = BregmanProblem(cp.norm1(x), x, np.array([[1.0, 2.0]]), [2.0])
-    >>> run(TwoLineBregman(), problem).state.x.round(6).tolist()
+    >>> run(TwoLineBregman(), basis_pursuit(np.array([[1.0, 2.0]]), np.array([2.0]))).state.x.round(6).tolist()
     [0.0, 1.0]
     """
 
@@ -187,13 +165,13 @@ class TwoLineBregman(BregmanSettings):
         """State 0 at `start`, else at x = 0 and b = 0."""
         point = _checked_start(problem, start)
         subproblem = two_line_subproblem(problem, self.alpha, self.subproblem_tolerance)
-        return TwoLineState(0, point.x, -point.lam / self.alpha, subproblem)
+        return TwoLineState(0, point.x, subproblem, -point.lam / self.alpha)
 
     def step(self, problem: BregmanProblem, state: TwoLineState) -> TwoLineState:
         """One iteration."""
         x = state.subproblem.solve(problem.f - state.b)
         b = state.b + problem.residual(x)
-        return TwoLineState(state.k + 1, x, b, state.subproblem)
+        return TwoLineState(state.k + 1, x, state.subproblem, b)
 
     def point(self, problem: BregmanProblem, state: TwoLineState) -> BregmanPoint:
         """x, and lam = -alpha b."""
@@ -210,11 +188,9 @@ class MethodOfMultipliers(BregmanSettings):
 
     Examples
     --------
+    >>> from pgo_models.convex.bregman_examples import basis_pursuit
     >>> from solvers.loop import run
-    >>> import cvxpy as cp, numpy as np
-    >>> x = cp.Variable(2)
-    >>> problem = BregmanProblem(cp.norm1(x), x, np.array([[1.0, 2.0]]), [2.0])
-    >>> run(MethodOfMultipliers(), problem).state.x.round(6).tolist()
+    >>> run(MethodOfMultipliers(), basis_pursuit(np.array([[1.0, 2.0]]), np.array([2.0]))).state.x.round(6).tolist()
     [0.0, 1.0]
     """
 
@@ -222,13 +198,13 @@ class MethodOfMultipliers(BregmanSettings):
         """State 0 at `start`, else at x = 0 and lam = 0."""
         point = _checked_start(problem, start)
         subproblem = augmented_lagrangian_subproblem(problem, self.alpha, self.subproblem_tolerance)
-        return MultiplierState(0, point.x, point.lam, subproblem)
+        return MultiplierState(0, point.x, subproblem, point.lam)
 
     def step(self, problem: BregmanProblem, state: MultiplierState) -> MultiplierState:
         """One iteration."""
         x = state.subproblem.solve(state.lam)
         lam = state.lam - self.alpha * problem.residual(x)
-        return MultiplierState(state.k + 1, x, lam, state.subproblem)
+        return MultiplierState(state.k + 1, x, state.subproblem, lam)
 
     def point(self, problem: BregmanProblem, state: MultiplierState) -> BregmanPoint:
         """The state's x and lam."""
@@ -264,17 +240,10 @@ class AlternatingBregman(BregmanSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.passes < 1:
-            raise SettingError(f"passes must be at least 1, got {self.passes}")
+        check_settings(self, at_least_one=["passes"])
 
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> AlternatingState:
-        """State 0 at `start`, else at x = 0 and lam = 0.
-
-        Raises
-        ------
-        SettingError
-            When J is not a sum of terms of one variable each.
-        """
+        """State 0 at `start`, else at x = 0 and lam = 0."""
         point = _checked_start(problem, start)
         subproblems = block_subproblems(problem, self.alpha, self.subproblem_tolerance)
         return AlternatingState(0, point.x, point.lam, subproblems)

@@ -21,8 +21,9 @@ from pgo_models.convex.orthogonality import (
     OrthogonalProblem,
     SplitProblem,
     kkt_residuals,
+    norm_of_all,
 )
-from pgo_models.errors import SettingError, check_signs
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
 from solvers.loop import run
 from solvers.result import Measurement, Outcome, Status
@@ -38,39 +39,20 @@ _BALANCE_RATIO = 10.0
 
 @dataclass(frozen=True, eq=False)
 class OrthogonalState:
-    """Iterate k.
-
-    Attributes
-    ----------
-    k : int
-    X, others : tuple of arrays
-        Minimisers of step (a): the constrained variables, and the other variables of the problem.
-    copies : tuple of arrays
-        P, one for every term of the problem (a variable in two sets has two).
-    B : tuple of arrays
-        Scaled multipliers, one for every term.
-    rho : float
-        Penalty.
-    split : SplitProblem
-        The compiled step (a).
-    primal_residual : float
-        ||X - P|| / ||P||.
-    scale : float
-        Largest norm of a subgradient of J so far.
-    dual_residual : float
-        ||G + rho B|| / scale, G the subgradient of J at X that step (a) gives: since rho B is normal to the set at P,
-        this is the stationarity residual of the KKT conditions. For one set a variable it is rho ||P - P_before||.
-    """
+    """Iterate k."""
 
     k: int
+    # X, others: minimisers of step (a): the constrained variables, and the other variables of the problem.
     X: tuple[Array, ...]
     others: tuple[Array, ...]
-    copies: tuple[Array, ...]
-    B: tuple[Array, ...]
-    rho: float
-    split: SplitProblem
-    scale: float = 0.0
-    primal_residual: float = math.inf
+    copies: tuple[Array, ...]  # P, one for every term of the problem (a variable in two sets has two)
+    B: tuple[Array, ...]  # scaled multipliers, one for every term
+    rho: float  # penalty
+    split: SplitProblem  # the compiled step (a)
+    scale: float = 0.0  # largest norm of a subgradient of J so far
+    primal_residual: float = math.inf  # ||X - P|| / ||P||
+    # ||G + rho B|| / scale, G the subgradient of J at X that step (a) gives: since rho B is normal to the set at P,
+    # this is the stationarity residual of the KKT conditions. For one set a variable it is rho ||P - P_before||.
     dual_residual: float = math.inf
 
 
@@ -92,12 +74,6 @@ class OrthogonalSOC:
         projection: the largest eigenvalue of the multiplier Lambda. Near 1 the recursion may cycle.
     tolerance : float
         On the primal and the dual residual, both relative.
-    max_iterations : int
-
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
 
     Examples
     --------
@@ -121,7 +97,7 @@ class OrthogonalSOC:
             raise SettingError(f"alpha must be in (0, 2), got {self.alpha}")
         if not 1 < self.safeguard < math.inf:
             raise SettingError(f"safeguard must be above 1, got {self.safeguard}")
-        check_signs(self, positive=("tolerance",), not_negative=("max_iterations",))
+        check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
 
     def init(self, problem: OrthogonalProblem, start: OrthogonalPoint | None) -> OrthogonalState:
         """State 0: X = P = start; at the first columns of the identity unless a start is given.
@@ -157,7 +133,7 @@ class OrthogonalSOC:
         B = tuple(s - P for s, P in zip(S, following, strict=True))  # (c)
         G = _summed(problem, [rho * (v - x) for v, x in zip(V, spread, strict=True)])
         N = _summed(problem, [rho * b for b in B])
-        scale = max(state.scale, _norm(G), np.finfo(float).tiny)
+        scale = max(state.scale, norm_of_all(G), np.finfo(float).tiny)
         return replace(
             state,
             k=state.k + 1,
@@ -166,8 +142,9 @@ class OrthogonalSOC:
             copies=following,
             B=B,
             scale=scale,
-            primal_residual=_norm([x - P for x, P in zip(spread, following, strict=True)]) / _norm(following),
-            dual_residual=_norm([g + n for g, n in zip(G, N, strict=True)]) / scale,
+            primal_residual=norm_of_all([x - P for x, P in zip(spread, following, strict=True)])
+            / norm_of_all(following),
+            dual_residual=norm_of_all([g + n for g, n in zip(G, N, strict=True)]) / scale,
         )
 
     def measure(self, problem: OrthogonalProblem, state: OrthogonalState) -> Measurement:
@@ -204,7 +181,7 @@ class OrthogonalSOC:
         for _ in range(_PROBES):
             X, others = split.solve(point.copies, rho)
             moves = [P - X[term.variable] for P, term in zip(point.copies, split.terms, strict=True)]
-            before, distance = distance, _norm(moves) / _norm(point.copies)
+            before, distance = distance, norm_of_all(moves) / norm_of_all(point.copies)
             if was_far and distance > 0.5 * before:
                 break  # held away, by convex constraints or by J itself: start low, and let the rule raise rho
             gradient = rho * max(_spectral(move) for move in moves)
@@ -289,9 +266,6 @@ def solve_orthogonal(
 
     Parameters
     ----------
-    problem : OrthogonalProblem
-    rng : np.random.Generator
-    soc : OrthogonalSOC, optional
     starts : int
         How many.
     verbose : bool
@@ -345,7 +319,3 @@ def _summed(problem: OrthogonalProblem, of_terms: Sequence[Array]) -> list[Array
 
 def _spectral(array: Array) -> float:
     return float(np.linalg.norm(array.reshape(len(array), -1), 2))
-
-
-def _norm(arrays: Sequence[Array]) -> float:
-    return float(np.sqrt(sum(float(np.sum(array**2)) for array in arrays)))

@@ -26,59 +26,28 @@ from solvers.soc.soc import SOC
 
 @dataclass(frozen=True, eq=False)
 class AsynchronousState:
-    """Round k: what the robots reported, and the channel with messages under way.
-
-    Attributes
-    ----------
-    k : int
-    size : float
-        ||omega||_rho.
-    channel : LossyChannel
-    rows : list of mapping of int to rows
-        What has arrived for the next turn, by its sender.
-    quiet : int
-        Rounds in a row with residuals within tolerance.
-    waited : int
-        The longest that a robot has not heard of a neighbour, in rounds.
-    """
+    """Round k: what the robots reported, and the channel with messages under way."""
 
     k: int
-    size: float
+    size: float  # ||omega||_rho
     channel: LossyChannel[Array]
-    rows: list[Rows]
+    rows: list[Rows]  # what has arrived for the next turn, by its sender
     primal_residual: float = np.inf
     dual_residual: float = np.inf
-    quiet: int = 0
-    waited: int = 0
+    quiet: int = 0  # rounds in a row with residuals within tolerance
+    waited: int = 0  # the longest that a robot has not heard of a neighbour, in rounds
 
 
 @dataclass(frozen=True)
 class AsynchronousSOC:
-    """SOC by robots that do not wait for each other; a round is one turn of every robot.
+    """SOC by robots that do not wait for each other; a round is one turn of every robot."""
 
-    Attributes
-    ----------
-    soc : SOC
-        Its penalties, local passes, tolerance and limit are used; acceleration, which needs sums over robots, is not.
-    faults : Faults
-    alpha : float
-        Over-relaxation, in (0, 2).
-    damping : float
-        Share of a step that is taken, in (0, 1].
-    has_driver : bool
-        As in `ConsensusSOC`.
-
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
-    """
-
+    # Its penalties, local passes, tolerance and limit are used; acceleration, which needs sums over robots, is not.
     soc: SOC = field(default_factory=SOC)
     faults: Faults = field(default_factory=Faults)
-    alpha: float = 1.8
-    damping: float = 1.0
-    has_driver: bool = True
+    alpha: float = 1.8  # over-relaxation, in (0, 2)
+    damping: float = 1.0  # share of a step that is taken, in (0, 1]
+    has_driver: bool = True  # as in `ConsensusSOC`
 
     def __post_init__(self) -> None:
         if not 0 < self.alpha < 2:

@@ -82,28 +82,13 @@ class Checkpoint:
 
 @dataclass(frozen=True, eq=False)
 class Saved:
-    """What a checkpoint holds beside the robots' snapshots.
+    """What a checkpoint holds beside the robots' snapshots."""
 
-    Attributes
-    ----------
-    attempts : tuple of (Poses, Certificate)
-        Outcome of the attempts before the one under way.
-    stages : tuple of Stage
-        Finished stages of all attempts.
-    method : str
-        Name of the method that runs.
-    state : object
-        Its state.
-    records : tuple of Record
-        Of the states before.
-    driver : DriverState
-    """
-
-    attempts: tuple[Attempt, ...]
-    stages: tuple[Stage, ...]
-    method: str
-    state: object
-    records: tuple[Record, ...]
+    attempts: tuple[Attempt, ...]  # outcome of the attempts before the one under way
+    stages: tuple[Stage, ...]  # finished stages of all attempts
+    method: str  # name of the method that runs
+    state: object  # its state
+    records: tuple[Record, ...]  # of the states before
     driver: DriverState
 
 
@@ -219,17 +204,7 @@ class Journal:
 
 
 def run_fingerprint(problem: PGOProblem, robots: Partition, settings: object, start: Poses | None) -> dict[str, str]:
-    """What a checkpoint must have in common with the run that goes on from it.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from pgo_models.graphs.partitioning import partition
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> two, three = (run_fingerprint(problem, partition(problem.graph, k), SOC(), None) for k in (2, 3))
-    >>> [name for name in two if two[name] != three[name]]
-    ['partition']
-    """
+    """What a checkpoint must have in common with the run that goes on from it."""
     graph = problem.graph
     weights = problem.weights
     edges = [graph.i, graph.j, graph.R_ij, graph.t_ij, weights.W(graph.d), weights.tau]
@@ -237,10 +212,11 @@ def run_fingerprint(problem: PGOProblem, robots: Partition, settings: object, st
         edges.append(weights.excess.J)
     poses = () if start is None else (start.R, start.t)
     text = np.frombuffer(repr(settings).encode(), dtype=np.uint8)
-    return dict(zip(_PARTS, (_digest(*edges), _digest(robots.robot), _digest(text, *poses)), strict=True))
+    return dict(zip(_PARTS, (digest(*edges), digest(robots.robot), digest(text, *poses)), strict=True))
 
 
-def _digest(*arrays: NDArray[Any]) -> str:
+def digest(*arrays: NDArray[Any]) -> str:
+    """SHA-256 of arrays with their shapes and types."""
     found = hashlib.sha256()
     for array in arrays:
         found.update(f"{array.shape}{array.dtype}".encode())

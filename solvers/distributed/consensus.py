@@ -26,17 +26,11 @@ A = TypeVar("A")
 
 @dataclass(frozen=True)
 class RobotsOfDriver:
-    """All robots, reached by the network.
-
-    Attributes
-    ----------
-    driver : Driver
-    has_driver : bool
-        Whether a driver sends the cover's poses at the start, and finds the best translations where penalties are taken
-        anew. Else robots begin at poses that they know, and go on from the translations that they agreed on.
-    """
+    """All robots, reached by the network."""
 
     driver: Driver
+    # Whether a driver sends the cover's poses at the start, and finds the best translations where penalties are taken
+    # anew. Else robots begin at poses that they know, and go on from the translations that they agreed on.
     has_driver: bool = True
 
     @property
@@ -78,18 +72,10 @@ class RobotsOfDriver:
 
 @dataclass(frozen=True)
 class ConsensusSOC:
-    """SOC by robots, from the poses that they and the driver hold; a step replaces what they have.
+    """SOC by robots, from the poses that they and the driver hold; a step replaces what they have."""
 
-    Attributes
-    ----------
-    soc : SOC
-        Settings; its coupling and robots are not looked at.
-    has_driver : bool
-        As in `RobotsOfDriver`.
-    """
-
-    soc: SOC = field(default_factory=SOC)
-    has_driver: bool = True
+    soc: SOC = field(default_factory=SOC)  # settings; its coupling and robots are not looked at
+    has_driver: bool = True  # as in `RobotsOfDriver`
 
     @property
     def max_iterations(self) -> int:

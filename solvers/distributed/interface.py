@@ -19,21 +19,11 @@ from solvers.distributed.robots.elimination import row_sums, unpacked
 
 @dataclass(frozen=True, eq=False)
 class Interface:
-    """The driver's matrix for one kind of unknowns: how they are stacked, and who touches which separators.
-
-    Attributes
-    ----------
-    num_separators : int
-    widths : tuple of int
-        Numbers a separator in every field.
-    touched : tuple of (g_a,)
-        Separators that every robot touches, ascending.
-    tree : tuple of Front
-    """
+    """The driver's matrix for one kind of unknowns: how they are stacked, and who touches which separators."""
 
     num_separators: int
-    widths: tuple[int, ...]
-    touched: tuple[IntArray, ...]
+    widths: tuple[int, ...]  # numbers a separator in every field
+    touched: tuple[IntArray, ...]  # (g_a,) each: separators that every robot touches, ascending
     tree: tuple[Front, ...]
 
     @property
@@ -72,7 +62,7 @@ class Interface:
             )
 
     def factorize(self, contributions: Sequence[Array], own: Sequence[tuple[IntArray, Array]] = ()) -> InterfaceFactor:
-        """Sum the robots' Schur complements and the driver's own blocks, and factor.
+        """Sum the robots' Schur complements and the driver's own blocks, and factor: `factorize_tree`.
 
         Parameters
         ----------
@@ -80,11 +70,6 @@ class Interface:
             As `Elimination.schur`; g columns a robot.
         own : sequence of (columns (q, w), values (q, w, w))
             Blocks that the driver adds, each on unknowns of one separator.
-
-        Raises
-        ------
-        NotPositiveDefiniteError
-            When the sum is not positive definite.
         """
         width = sum(self.widths)
         order = by_separator(self.num_separators, self.widths)

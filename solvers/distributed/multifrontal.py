@@ -23,20 +23,12 @@ _AT_WORK = 4.25  # times a front: itself, and copies of what is added to it or s
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """One group of robots.
+    """One group of robots."""
 
-    Attributes
-    ----------
-    robots : tuple of int
-        Whose contributions are added here: one robot at a leaf, none above.
-    children : tuple of int
-        Earlier fronts, whose Schur complements are added here.
-    eliminated, boundary : (e,), (b,)
-        Separators that only this group touches and that no child has eliminated; those left to groups above.
-    """
-
-    robots: tuple[int, ...]
-    children: tuple[int, ...]
+    robots: tuple[int, ...]  # whose contributions are added here: one robot at a leaf, none above
+    children: tuple[int, ...]  # earlier fronts, whose Schur complements are added here
+    # eliminated, boundary: (e,), (b,); separators that only this group touches and that no child has eliminated; those
+    # left to groups above.
     eliminated: IntArray
     boundary: IntArray
 
@@ -53,13 +45,6 @@ def separator_tree(touched: Sequence[IntArray], num_separators: int) -> tuple[Fr
     ----------
     touched : sequence of (g_a,)
         Separators, 0 .. num_separators - 1, that every robot touches.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> tree = separator_tree([np.array([0, 1]), np.array([1, 2]), np.array([2, 3])], 4)
-    >>> sorted(int(pose) for front in tree for pose in front.eliminated)
-    [0, 1, 2, 3]
     """
     robot = np.repeat(np.arange(len(touched)), [len(poses) for poses in touched])
     pose = np.concatenate([*touched, np.zeros(0, dtype=np.int64)])

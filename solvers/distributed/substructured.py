@@ -30,15 +30,9 @@ class SubstructuredState(SharedSteps):
 
 @dataclass(frozen=True)
 class SubstructuredSOC:
-    """SOC by a driver and its robots, from the poses that they hold.
+    """SOC by a driver and its robots, from the poses that they hold."""
 
-    Attributes
-    ----------
-    soc : SOC
-        Settings; its coupling and robots are not looked at.
-    """
-
-    soc: SOC = field(default_factory=SOC)
+    soc: SOC = field(default_factory=SOC)  # settings; its coupling and robots are not looked at
 
     @property
     def max_iterations(self) -> int:

@@ -28,13 +28,7 @@ class Count(enum.Enum):
 
 
 class CountedPool:
-    """A worker pool and its ledger.
-
-    Attributes
-    ----------
-    workers : WorkerPool
-    ledger : Ledger
-    """
+    """A worker pool and its ledger."""
 
     def __init__(self, workers: WorkerPool, num_robots: int) -> None:
         self.workers, self.ledger = workers, Ledger(num_robots)

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
-from pgo_models.errors import SettingError
+from pgo_models.errors import check_settings
 from solvers.network.messages import Worker
 
 T = TypeVar("T")
@@ -54,8 +54,7 @@ class InProcess:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        if self.threads < 1:
-            raise SettingError(f"threads must be at least 1, got {self.threads}")
+        check_settings(self, at_least_one=["threads"])
 
     def open(self, make: Callable[[T], Worker], shares: Sequence[T]) -> WorkerPool:
         """Agents as objects of this process."""

@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from pgo_models.errors import SettingError, check_signs
+from pgo_models.errors import SettingError, check_settings
 
 T = TypeVar("T")
 
@@ -29,12 +29,6 @@ class Faults:
         A robot that neither sends nor receives ..
     silent_from, silent_rounds : int
         .. from this round on, for so many rounds.
-    seed : int
-
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
 
     Examples
     --------
@@ -59,7 +53,7 @@ class Faults:
     def __post_init__(self) -> None:
         if not 0 <= self.loss < 1:
             raise SettingError(f"loss must be in [0, 1), got {self.loss}")
-        check_signs(self, not_negative=("max_delay", "silent_robot", "silent_from", "silent_rounds"))
+        check_settings(self, not_negative=["max_delay", "silent_robot", "silent_from", "silent_rounds"])
 
     def is_silent(self, robot: int, number: int) -> bool:
         """Whether a robot is cut off in a round."""

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
 from pgo_models.errors import SettingError
 from pgo_models.graphs.pose_graph import IntArray
-
-T = TypeVar("T")
 
 DRIVER = -1  # the number that stands for the driver among senders and receivers
 BYTES_PER_NUMBER = 8
@@ -18,19 +15,12 @@ BYTES_PER_NUMBER = 8
 
 @dataclass(frozen=True, eq=False)
 class Traffic:
-    """Messages of one exchange; the same object may be counted many times.
+    """Messages of one exchange; the same object may be counted many times."""
 
-    Attributes
-    ----------
-    sender, receiver : (q,)
-        Robots, or `DRIVER`.
-    num_bytes : (q,)
-        Payload of every message: eight bytes a number.
-    """
-
+    # sender, receiver: (q,); robots, or `DRIVER`.
     sender: IntArray
     receiver: IntArray
-    num_bytes: IntArray
+    num_bytes: IntArray  # (q,): payload of every message: eight bytes a number
 
     def __post_init__(self) -> None:
         if not self.sender.shape == self.receiver.shape == self.num_bytes.shape:
@@ -49,8 +39,6 @@ class Ledger:
 
     Attributes
     ----------
-    num_robots : int
-    rounds, all_reduces : int
     all_reduce_bytes : int
         Payload of all all-reduces, once up and once down for every robot.
     counted : tuple of (Traffic, int)
@@ -75,14 +63,10 @@ class Ledger:
 
     def after_round(self, *exchanged: Traffic) -> Ledger:
         """Return the ledger after one more round with these exchanges."""
-        counted = self.counted
+        counted = dict(self.counted)  # by the object: one of equal content is another
         for traffic in exchanged:
-            known = next((p for p, (other, _) in enumerate(counted) if other is traffic), None)
-            if known is None:
-                counted = (*counted, (traffic, 1))
-            else:
-                counted = (*counted[:known], (traffic, counted[known][1] + 1), *counted[known + 1 :])
-        return replace(self, rounds=self.rounds + 1, counted=counted)
+            counted[traffic] = counted.get(traffic, 0) + 1
+        return replace(self, rounds=self.rounds + 1, counted=tuple(counted.items()))
 
     def after_exchange(self, traffic: Traffic, is_round: bool) -> Ledger:
         """Return the ledger after an exchange; one that is no round is part of the next round or of an all-reduce."""

@@ -23,7 +23,7 @@ from ipaddress import ip_address
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from pgo_models.errors import EngineError, MissingExtraError, SettingError, check_signs
+from pgo_models.errors import EngineError, MissingExtraError, SettingError, check_settings
 from solvers.network.engine import WorkerPool
 from solvers.network.messages import Worker
 from solvers.network.recovery import AnyOrder, RecoveringPool, Recovery, RobotLostError
@@ -68,7 +68,6 @@ class RayEngine:
         Most robots that share a CPU; as few as the CPUs allow do. Every robot is a process of 100 MB and more.
     patience : float
         Seconds to wait for robots to start.
-    recovery : Recovery
 
     Examples
     --------
@@ -83,7 +82,7 @@ class RayEngine:
     recovery: Recovery = field(default_factory=Recovery)
 
     def __post_init__(self) -> None:
-        check_signs(self, positive=("num_cpus", "robots_per_cpu", "patience"))
+        check_settings(self, positive=["num_cpus", "robots_per_cpu", "patience"])
         if self.address is not None and self.num_cpus is not None:
             raise SettingError(f"num_cpus is for Ray on this machine; the cluster at {self.address} has its own")
 
@@ -369,22 +368,17 @@ def _replaced(module: ModuleType, **values: object) -> Iterator[None]:
 @contextmanager
 def _hushed(name: str) -> Iterator[None]:
     """Keep a library's log away from the terminal."""
-    loggers = [logging.getLogger(name), *_loggers_below(name)]
-    before = [logger.disabled for logger in loggers]
-    for logger in loggers:
+    known = [
+        logging.getLogger(key) for key in (name, *logging.Logger.manager.loggerDict) if f"{key}.".startswith(f"{name}.")
+    ]
+    heard = [logger for logger in known if not logger.disabled]
+    for logger in heard:
         logger.disabled = True
     try:
         yield
     finally:
-        for logger, was_disabled in zip(loggers, before, strict=True):
-            logger.disabled = was_disabled
-
-
-def _loggers_below(name: str) -> list[logging.Logger]:
-    known = logging.Logger.manager.loggerDict
-    return [
-        logger for key, logger in known.items() if key.startswith(f"{name}.") and isinstance(logger, logging.Logger)
-    ]
+        for logger in heard:
+            logger.disabled = False
 
 
 def _reason(error: BaseException) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
-from pgo_models.errors import EngineError, PGOError, SettingError, check_signs
+from pgo_models.errors import EngineError, PGOError, check_settings
 from solvers.network.messages import Snapshot, restore, take_snapshot
 
 T = TypeVar("T")
@@ -67,29 +67,17 @@ class Recovery:
     max_restarts: int = 3
 
     def __post_init__(self) -> None:
-        if self.orders_between_snapshots < 1:
-            raise SettingError(f"orders_between_snapshots must be at least 1, got {self.orders_between_snapshots}")
-        check_signs(self, not_negative=("max_restarts",))
+        check_settings(self, not_negative=["max_restarts"], at_least_one=["orders_between_snapshots"])
 
 
 @dataclass(eq=False)
 class RecoveringPool(Generic[T]):
-    """Robots in a place where they can be lost; answers are those of robots that never are.
+    """Robots in a place where they can be lost; answers are those of robots that never are."""
 
-    Attributes
-    ----------
-    place : Place
-        With all robots started.
-    num_robots : int
-    recovery : Recovery
-    restarts : list of int
-        How often every robot was started again.
-    """
-
-    place: Place[T]
+    place: Place[T]  # with all robots started
     num_robots: int
     recovery: Recovery
-    restarts: list[int] = field(init=False)
+    restarts: list[int] = field(init=False)  # how often every robot was started again
     _log: list[tuple[AnyOrder, tuple[Any, ...]]] = field(init=False, default_factory=list)
     _snapshots: list[Snapshot] = field(init=False, default_factory=list)
 

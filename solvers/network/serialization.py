@@ -30,15 +30,6 @@ def serialize(value: object) -> dict[str, NDArray[Any]]:
     ------
     TypeError
         When there is something else in it.
-
-    Examples
-    --------
-    >>> from pgo_models.geometry.poses import Poses
-    >>> arrays = serialize((3, Poses.identity(2, 3)))
-    >>> sorted(arrays)
-    ['0', '1', 'tree']
-    >>> deserialize(arrays, (Poses,))
-    (3, Poses(n=2, d=3))
     """
     arrays: list[NDArray[Any]] = []
     tree = json.dumps(_tree(value, arrays))
@@ -50,7 +41,6 @@ def deserialize(arrays: Mapping[str, NDArray[Any]], classes: Sequence[type]) -> 
 
     Parameters
     ----------
-    arrays : mapping
     classes : sequence of type
         Dataclasses and enums that may be in it; nothing else is ever made.
 
@@ -80,16 +70,12 @@ def _tree(value: object, arrays: list[NDArray[Any]]) -> object:
         fields = {one.name: _tree(getattr(value, one.name), arrays) for one in dataclasses.fields(value)}
         return {"class": type(value).__name__, "fields": fields}
     if isinstance(value, Mapping):
-        return {"keys": [_plain(key) for key in value], "values": [_tree(item, arrays) for item in value.values()]}
+        if not all(isinstance(key, str | int) for key in value):
+            raise TypeError(f"cannot pack the keys {list(value)!r}")
+        return {"keys": list(value), "values": [_tree(item, arrays) for item in value.values()]}
     if isinstance(value, Sequence):
         return {"items": [_tree(item, arrays) for item in value]}
     raise TypeError(f"cannot pack {value!r}")
-
-
-def _plain(key: object) -> str | int:
-    if isinstance(key, str | int):
-        return key
-    raise TypeError(f"cannot pack the key {key!r}")
 
 
 def _value(tree: Any, arrays: Mapping[str, NDArray[Any]], known: Mapping[str, type]) -> Any:  # noqa: ANN401

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
-from pgo_models.plots.style import COLOURS, MARKERS, column_figure
+from pgo_models.plots.interactive_plots import lay_out
+from pgo_models.plots.style import COLOURS, MARKERS, column_figure, plotly
 from solvers.reporting.convergence_plots import LINES, LOGARITHMIC, Curve, Effort
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -
 
     Parameters
     ----------
-    curves : sequence of Curve
     efforts : sequence of Effort
         A panel for each, all but that of iterations with a logarithmic axis.
 
@@ -35,8 +35,6 @@ def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -
     ------
     SettingError
         When there is no curve with a gap above zero.
-    MissingExtraError
-        Without matplotlib.
     """
     panels = _panels(curves, efforts)
     styles = _styles(curves, LINES)
@@ -58,22 +56,10 @@ def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -
 
 
 def explore_efforts(curves: Sequence[Curve], title: str = "") -> PlotlyFigure:
-    """Plotly figure of what `plot_efforts` shows; an entry of the legend shows and hides a method in all panels.
-
-    Raises
-    ------
-    SettingError
-        When there is no curve with a gap above zero.
-    MissingExtraError
-        Without plotly.
-    """
-    try:
-        from plotly.subplots import make_subplots
-    except ImportError as error:
-        raise MissingExtraError("plotly", "plot") from error
+    """Plotly figure of what `plot_efforts` shows; an entry of the legend shows and hides a method in all panels."""
     panels = _panels(curves, _PANELS)
     styles = _styles(curves, _DASHES)
-    figure = make_subplots(1, len(panels), shared_yaxes=True, horizontal_spacing=0.03)
+    figure = plotly("subplots").make_subplots(1, len(panels), shared_yaxes=True, horizontal_spacing=0.03)
     named: set[str] = set()
     for column, (effort, shown) in enumerate(panels, 1):
         for curve in shown:
@@ -97,13 +83,7 @@ def explore_efforts(curves: Sequence[Curve], title: str = "") -> PlotlyFigure:
     figure.update_xaxes(**axis)
     figure.update_yaxes(**axis)
     figure.update_yaxes(title_text="relative gap", row=1, col=1)
-    figure.update_layout(
-        template="none",
-        title={"text": title, "font": {"size": 14}},
-        margin={"l": 80, "r": 10, "t": 40 if title else 10, "b": 50},
-        legend={"orientation": "h", "y": -0.16},
-        hovermode="closest",
-    )
+    lay_out(figure, title, legend_y=-0.16)
     return figure
 
 

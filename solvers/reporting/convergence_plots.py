@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.published_results import PublishedRun
-from pgo_models.plots.style import ALARM_COLOUR, COLOURS, column_figure
+from pgo_models.plots.interactive_plots import lay_out
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, column_figure, plotly
 from solvers.result import History
 
 if TYPE_CHECKING:
@@ -39,21 +40,12 @@ class Effort(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A run to be compared: its history, the bound it is held against, and what it cost.
-
-    Attributes
-    ----------
-    name : str
-    history : History
-    lower_bound : float
-        Proven for the graph, or the best value known.
-    rounds, num_bytes : (len(history),), optional
-        Communication up to every record.
-    """
+    """A run to be compared: its history, the bound it is held against, and what it cost."""
 
     name: str
     history: History
-    lower_bound: float
+    lower_bound: float  # proven for the graph, or the best value known
+    # rounds, num_bytes: (len(history),); communication up to every record.
     rounds: Array | None = None
     num_bytes: Array | None = None
 
@@ -115,8 +107,6 @@ def plot_convergence(
     ------
     SettingError
         When no stage has a record.
-    MissingExtraError
-        Without matplotlib.
     """
     run = _with_records(stages)
     with column_figure(height=1.3) as figure:
@@ -142,21 +132,9 @@ def plot_convergence(
 def explore_convergence(
     stages: Sequence[tuple[str, History]], lower_bound: float, published: PublishedRun | None = None
 ) -> PlotlyFigure:
-    """Plotly figure of what `plot_convergence` shows: gap above, residuals below, figures under the pointer.
-
-    Raises
-    ------
-    SettingError
-        When no stage has a record.
-    MissingExtraError
-        Without plotly.
-    """
+    """Plotly figure of what `plot_convergence` shows: gap above, residuals below, figures under the pointer."""
     run = _with_records(stages)
-    try:
-        from plotly import graph_objects as go
-    except ImportError as error:
-        raise MissingExtraError("plotly", "plot") from error
-    figure = go.Figure()
+    figure = plotly("graph_objects").Figure()
     begin = 0.0
     for (name, history), colour in zip(run, cycle(COLOURS), strict=False):
         k = begin + history.k
@@ -186,10 +164,8 @@ def explore_convergence(
             mode="lines",
             line={"color": ALARM_COLOUR, "dash": "dot"},
         )
+    lay_out(figure, "", legend_y=-0.14)
     figure.update_layout(
-        template="none",
-        margin={"l": 80, "r": 10, "t": 10, "b": 50},
-        legend={"orientation": "h", "y": -0.14},
         xaxis={"title": {"text": "iteration"}, "anchor": "y2", "gridcolor": "#eeeeee", "zeroline": False},
         yaxis={**LOGARITHMIC, "title": {"text": "relative gap"}, "domain": [0.54, 1.0]},
         yaxis2={**LOGARITHMIC, "title": {"text": "relative residual"}, "domain": [0.0, 0.46]},

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pgo_models.certificates.certificate import Certificate, gap_text
-from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.poses import Poses, absolute_trajectory_error
 from pgo_models.geometry.rotations import Array
@@ -20,6 +20,7 @@ from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.graphs.published_results import published_run
 from pgo_models.graphs.residuals import EdgeResiduals, edge_residuals
 from pgo_models.plots.interactive_plots import PAGE_CONFIG, explore_graph
+from pgo_models.plots.style import plotly
 from pgo_models.problem.problem import PGOProblem
 from solvers.network.ledger import Ledger
 from solvers.reporting.convergence_plots import explore_convergence
@@ -61,21 +62,13 @@ def write_report(solution: Solved, path: Path | str, *, source: str | None = Non
 
     Parameters
     ----------
-    solution : Solved
     path : Path or str
         Ends in .html or .htm.
     source : str, optional
         What stands for the graph in commands: a file, folder or name, quoted where a shell needs it, and options that
         change the problem; the graph's name unless given.
 
-    Raises
-    ------
-    MissingExtraError
-        Without plotly.
-    SettingError
-        On another suffix.
-    PGOError
-        When the file cannot be written.
+    Errors as `check_report` and `replace_when_done`.
 
     Examples
     --------
@@ -98,12 +91,12 @@ def check_report(path: Path) -> None:
     """Raise what `write_report` would before it writes: a SettingError on another suffix, else if plotly is missing."""
     if path.suffix.lower() not in _PAGE_SUFFIXES:
         raise SettingError(f"cannot write {path}: a report is a page; give a name that ends in .html")
-    _plotly_script()
+    plotly("offline")
 
 
 def report_page(solution: Solved, *, source: str | None = None) -> str:
     """HTML of the report; parameters and errors as for `write_report`."""
-    script = _plotly_script()
+    script = plotly("offline").get_plotlyjs()
     robots = _partition(solution)
     graph = solution.problem.graph.with_robots(robots.robot)
     residuals = replace(edge_residuals(graph, solution.poses), cost=solution.problem.edge_costs(solution.poses))
@@ -155,15 +148,6 @@ _GLOSSARY = [
         "of an edge: what the poses say beside what was measured: metres between positions, degrees between rotations",
     ),
 ]
-
-
-def _plotly_script() -> str:
-    try:
-        from plotly.offline import get_plotlyjs
-    except ImportError as error:
-        raise MissingExtraError("plotly", "plot") from error
-    script: str = get_plotlyjs()
-    return script
 
 
 def _partition(solution: Solved) -> Partition:

@@ -25,23 +25,12 @@ _WIDEST = 10_000
 
 @dataclass(frozen=True)
 class TablePart:
-    """A table of formatted cells.
-
-    Attributes
-    ----------
-    heads : tuple of str
-    rows : tuple of tuple of str
-        A cell for every head.
-    caption : str
-        Above the table.
-    texts : tuple of str
-        Heads of the columns that are text and not figures.
-    """
+    """A table of formatted cells."""
 
     heads: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    caption: str = ""
-    texts: tuple[str, ...] = ("graph", "method", "remark")
+    rows: tuple[tuple[str, ...], ...]  # a cell for every head
+    caption: str = ""  # above the table
+    texts: tuple[str, ...] = ("graph", "method", "remark")  # heads of the columns that are text and not figures
 
     def __post_init__(self) -> None:
         for row in self.rows:
@@ -62,7 +51,6 @@ class ResultTable:
 
     Attributes
     ----------
-    parts : tuple of TablePart
     records : tuple of dict
         The same figures in full, for CSV and JSON: every record has the same names.
     notes : tuple of str
@@ -117,12 +105,7 @@ class ResultTable:
     def save(self, path: Path | str) -> None:
         """Write the table in the format that the suffix of `path` names: .md, .csv or .json; whole or not at all.
 
-        Raises
-        ------
-        SettingError
-            On another suffix.
-        PGOError
-            When the file cannot be written.
+        Errors as `check_table_format` and `replace_when_done`.
         """
         path = Path(path)
         check_table_format(path)

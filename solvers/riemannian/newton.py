@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, PolishState, polish_step, start_polish
-from pgo_models.errors import check_signs
+from pgo_models.errors import check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
@@ -30,7 +30,6 @@ class Newton:
     ----------
     tolerance : float
         On the relative decrement: about the relative decrease of F that is left.
-    max_iterations : int
     second_order : bool
         False is Gauss-Newton, the second layer of the paper's method.
     secants : bool
@@ -52,7 +51,7 @@ class Newton:
     secants: bool = True
 
     def __post_init__(self) -> None:
-        check_signs(self, positive=("tolerance",), not_negative=("max_iterations",))
+        check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> NewtonState:
         """State 0: `start`, or the chordal relaxation."""

@@ -18,7 +18,7 @@ from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, best_bound
 from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, scaled_decrement
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.certificates.spectrum import NegativeCurvature, negative_curvature
-from pgo_models.errors import SettingError, check_signs
+from pgo_models.errors import check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.geometry.stiefel import append_rank, project_to_tangent, retract
@@ -57,46 +57,23 @@ class DualBound:
 
 @dataclass(frozen=True, eq=False)
 class StaircaseState:
-    """State k.
-
-    Attributes
-    ----------
-    k : int
-    point : LiftedPoint
-        Y, its rank, the relaxation's value, multipliers and gradient.
-    preconditioner : CholeskyFactor
-        Of M + eps blockdiag(0, I), whose solves on the rotations are those with Q + eps I; after a climb, of S with a
-        shift.
-    decrement : float
-        <g, P g> / 4, less the rounding level of f, over f, g the gradient and P the preconditioner projected to the
-        tangent space: half the squared Newton decrement if the Hessian were twice the preconditioner's matrix.
-    radius : float
-        Of the trust region, in the preconditioner's norm.
-    rounding_level : float
-        f below it cannot be told from zero; that of the start.
-    inner_iterations : int
-        Products with the Hessian so far.
-    bound : DualBound, optional
-        The best that was proven at a stationary point so far.
-    is_stationary : bool
-        Whether the next step proves a bound or climbs.
-    is_solved : bool
-        Whether the value is proven to be the relaxation's optimum, within the gap.
-    stalled : bool
-        Whether the last step could neither prove nor climb.
-    """
+    """State k."""
 
     k: int
-    point: LiftedPoint
+    point: LiftedPoint  # Y, its rank, the relaxation's value, multipliers and gradient
+    # Of M + eps blockdiag(0, I), whose solves on the rotations are those with Q + eps I; after a climb, of S with a
+    # shift.
     preconditioner: CholeskyFactor
+    # <g, P g> / 4, less the rounding level of f, over f, g the gradient and P the preconditioner projected to the
+    # tangent space: half the squared Newton decrement if the Hessian were twice the preconditioner's matrix.
     decrement: float
-    radius: float
-    rounding_level: float
-    inner_iterations: int = 0
-    bound: DualBound | None = None
-    is_stationary: bool = False
-    is_solved: bool = False
-    stalled: bool = False
+    radius: float  # of the trust region, in the preconditioner's norm
+    rounding_level: float  # f below it cannot be told from zero; that of the start
+    inner_iterations: int = 0  # products with the Hessian so far
+    bound: DualBound | None = None  # the best that was proven at a stationary point so far
+    is_stationary: bool = False  # whether the next step proves a bound or climbs
+    is_solved: bool = False  # whether the value is proven to be the relaxation's optimum, within the gap
+    stalled: bool = False  # whether the last step could neither prove nor climb
 
 
 @dataclass(frozen=True)
@@ -114,7 +91,6 @@ class Staircase:
         On the decrement, at which a point counts as stationary.
     gap : float
         Relative gap between f and the bound that is proven at the end.
-    max_iterations : int
     max_inner_iterations : int
         Conjugate-gradient iterations of one trust-region step.
 
@@ -134,9 +110,8 @@ class Staircase:
     max_inner_iterations: int = 1000
 
     def __post_init__(self) -> None:
-        check_signs(self, positive=("tolerance", "gap"), not_negative=("max_iterations",))
-        if self.max_inner_iterations < 1:
-            raise SettingError(f"max_inner_iterations must be at least 1, got {self.max_inner_iterations}")
+        check_settings(self, positive=["tolerance", "gap"])
+        check_settings(self, not_negative=["max_iterations"], at_least_one=["max_inner_iterations"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> StaircaseState:
         """State 0: rank d, at the rotations of `start`, or of the chordal relaxation."""

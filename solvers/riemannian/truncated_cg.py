@@ -14,27 +14,13 @@ from pgo_models.problem.matrices import inner
 
 @dataclass(frozen=True, eq=False)
 class TruncatedStep:
-    """What `truncated_cg` found.
+    """What `truncated_cg` found."""
 
-    Attributes
-    ----------
-    step : Array
-        Of the shape of the gradient.
-    decrease : float
-        What the model promises: -<g, s> - <s, H s> / 2, positive.
-    length : float
-        Norm of the step in the preconditioner's metric, the one that measures the trust region.
-    iterations : int
-        Products with H.
-    is_at_boundary : bool
-        Whether the region, or negative curvature, ended it.
-    """
-
-    step: Array
-    decrease: float
-    length: float
-    iterations: int
-    is_at_boundary: bool
+    step: Array  # of the shape of the gradient
+    decrease: float  # what the model promises: -<g, s> - <s, H s> / 2, positive
+    length: float  # norm of the step in the preconditioner's metric, the one that measures the trust region
+    iterations: int  # products with H
+    is_at_boundary: bool  # whether the region, or negative curvature, ended it
 
 
 def truncated_conjugate_gradients(
@@ -53,7 +39,6 @@ def truncated_conjugate_gradients(
 
     Parameters
     ----------
-    gradient : Array
     hessian : callable
         H, symmetric on the tangent space.
     precondition : callable
@@ -64,7 +49,6 @@ def truncated_conjugate_gradients(
         Relative residual, in the norm of P^-1, that is enough.
     floor : float
         Squared residual <r, P^-1 r> that is enough.
-    max_iterations : int
 
     References
     ----------

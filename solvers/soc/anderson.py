@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pgo_models.errors import SettingError, check_signs
+from pgo_models.errors import check_settings
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.matrices import inner
 
@@ -50,11 +50,7 @@ class Anderson:
     per_robot: bool = False
 
     def __post_init__(self) -> None:
-        if self.memory < 1:
-            raise SettingError(f"memory must be at least 1, got {self.memory}")
-        check_signs(self, not_negative=("regularization",))
-        if not self.restart_ratio > 1:
-            raise SettingError(f"restart_ratio must be above 1, got {self.restart_ratio}")
+        check_settings(self, not_negative=["regularization"], at_least_one=["memory"], above_one=["restart_ratio"])
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,12 +54,7 @@ def ask_all(robots: Robots, order: Order[Q, A], request: Q, count: Count) -> lis
 
 @dataclass(frozen=True, eq=False)
 class ConsensusState(SharedSteps):
-    """Iterate k: the sums that all robots know; the iterates are theirs.
-
-    Attributes
-    ----------
-    separators : SeparatorPenalty
-    """
+    """Iterate k: the sums that all robots know; the iterates are theirs."""
 
     separators: SeparatorPenalty
 
@@ -70,14 +65,9 @@ class Consensus:
 
     An iteration is one round between neighbours and two all-reduces: the sums of the acceleration, of which only the
     merit is left where every robot accelerates alone, and the residuals.
-
-    Attributes
-    ----------
-    soc : SOC
-        Settings; its coupling and robots are not looked at.
     """
 
-    soc: SOCSettings
+    soc: SOCSettings  # settings; its coupling and robots are not looked at
 
     def init(self, robots: Robots, before: ConsensusState | None = None) -> ConsensusState:
         """State 0: omega = the rotations at hand, B in balance; two rounds for poses, penalties and forces.
@@ -158,19 +148,11 @@ class Consensus:
 
 @dataclass(eq=False)
 class LocalRobots:
-    """Robots in one place, for one step: an order replaces them, and leaves those of the step before alone.
-
-    Attributes
-    ----------
-    problem : PGOProblem
-    robots : tuple of ConsensusRobot
-    start : Poses, optional
-        Where they begin; they go on from omega with the best translations for it.
-    """
+    """Robots in one place, for one step: an order replaces them, and leaves those of the step before alone."""
 
     problem: PGOProblem
     robots: tuple[ConsensusRobot, ...]
-    start: Poses | None = None
+    start: Poses | None = None  # where they begin; they go on from omega with the best translations for it
 
     @property
     def num_robots(self) -> int:
@@ -197,18 +179,10 @@ class LocalRobots:
 
 @dataclass(frozen=True, eq=False)
 class ConsensusIterate:
-    """Iterate k of CONSENSUS in one place.
+    """Iterate k of CONSENSUS in one place."""
 
-    Attributes
-    ----------
-    shared : ConsensusState
-        What all robots know.
-    robots : tuple of ConsensusRobot
-        Their copies: `robots[a].block` has x, z, s and B.
-    """
-
-    shared: ConsensusState
-    robots: tuple[ConsensusRobot, ...]
+    shared: ConsensusState  # what all robots know
+    robots: tuple[ConsensusRobot, ...]  # their copies: `robots[a].block` has x, z, s and B
 
     @property
     def k(self) -> int:

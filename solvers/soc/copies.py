@@ -32,18 +32,11 @@ class Norms:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What one robot tells another of the poses that both hold.
+    """What one robot tells another of the poses that both hold."""
 
-    Attributes
-    ----------
-    of_own : (q, 1 + (d + 1) + d^2)
-        rho_i, the diagonal of M and the unscaled multiplier of the poses that the sender owns.
-    force : ((d + 1) q, d)
-        -2 M_a X on the rows of all.
-    """
-
+    # (q, 1 + (d + 1) + d^2): rho_i, the diagonal of M and the unscaled multiplier of the poses that the sender owns.
     of_own: Array
-    force: Array
+    force: Array  # ((d + 1) q, d): -2 M_a X on the rows of all
 
 
 @dataclass(frozen=True)
@@ -177,25 +170,13 @@ class CopyLayout:
 
 @dataclass(frozen=True, eq=False)
 class Waiting:
-    """What a robot of an asynchronous run has heard, and how far it relaxes.
-
-    Attributes
-    ----------
-    settings : TurnSettings
-    newest : mapping of int to rows
-        The newest that has arrived from every neighbour.
-    waited : mapping of int to int
-        How many turns ago.
-    excess : float
-        Share of the over-relaxation that is left.
-    least, turns_since : float, int
-        The smallest merit since that changed, and how long ago it was.
-    """
+    """What a robot of an asynchronous run has heard, and how far it relaxes."""
 
     settings: TurnSettings
-    newest: Rows
-    waited: Mapping[int, int]
-    excess: float = 1.0
+    newest: Rows  # the newest that has arrived from every neighbour
+    waited: Mapping[int, int]  # how many turns ago
+    excess: float = 1.0  # share of the over-relaxation that is left
+    # least, turns_since: the smallest merit since that changed, and how long ago it was.
     least: float = math.inf
     turns_since: int = 0
 
@@ -210,38 +191,22 @@ class Waiting:
 
 @dataclass(frozen=True, eq=False)
 class CopiesState:
-    """What orders leave with a robot; rows as in `CopyLayout`.
+    """What orders leave with a robot; rows as in `CopyLayout`."""
 
-    Attributes
-    ----------
-    X : (rows, d)
-        Poses at the start, then x of the last step (a) with all translations.
-    rho : (n_a,)
-    diagonal : (n_a, d + 1)
-        Diagonal of M of every pose.
-    Lambda, pull : (n_a, d, d), (n_a, d^2)
-        Multipliers, right for own poses, and rho_i B_i of a stationary point.
-    force, total_force : (rows, d)
-        -2 M_a X, and the same summed over robots.
-    settings : StepSettings
-    block : RecursionBlock, optional
-    origin : tuple of two (rows, d)
-        z and s when the penalties were set.
-    sums : AndersonSums
-        Of a robot that accelerates alone, with `gamma` from them.
-    waiting : Waiting, optional
-    """
-
+    # (rows, d): poses at the start, then x of the last step (a) with all translations.
     X: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    rho: Array = field(default_factory=lambda: np.zeros(0))
-    diagonal: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    rho: Array = field(default_factory=lambda: np.zeros(0))  # (n_a,)
+    diagonal: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (n_a, d + 1): diagonal of M of every pose
+    # Lambda, pull: (n_a, d, d), (n_a, d^2); multipliers, right for own poses, and rho_i B_i of a stationary point.
     Lambda: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     pull: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    # force, total_force: (rows, d); -2 M_a X, and the same summed over robots.
     force: Array = field(default_factory=lambda: np.zeros((0, 0)))
     total_force: Array = field(default_factory=lambda: np.zeros((0, 0)))
     settings: StepSettings = field(default_factory=StepSettings)
     block: RecursionBlock | None = None
-    origin: tuple[Array, Array] | None = None
+    origin: tuple[Array, Array] | None = None  # (rows, d) each: z and s when the penalties were set
+    # Of a robot that accelerates alone, with `gamma` from them.
     sums: AndersonSums = field(default_factory=AndersonSums)
     gamma: Array | None = None
     waiting: Waiting | None = None

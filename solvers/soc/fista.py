@@ -35,7 +35,6 @@ def minimize_with_fista(
         lipschitz >= strong_convexity > 0; a lipschitz that is too small diverges.
     tolerance : float
         On ||H x - b|| / ||b||.
-    max_iterations : int
 
     Returns
     -------

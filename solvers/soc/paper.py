@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.sparse import csc_array, csr_array, vstack
 
-from pgo_models.errors import SettingError, check_signs
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
@@ -37,54 +37,34 @@ _PATIENCE = 20  # steps without a new smallest merit, after which rho goes up
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """L split by robots: what a robot knows of its own rotations, and what ties them to frozen neighbours.
+    """L split by robots: what a robot knows of its own rotations, and what ties them to frozen neighbours."""
 
-    Attributes
-    ----------
-    A, w, own : sparse (rows, dn), (rows,), sparse (dn, dn)
-        own = A^T diag(w) A: edges within a robot, and kappa I for both ends of an edge between robots.
-    between : sparse (dn, dn)
-        L - own.
-    analysis : SymbolicCholesky
-    """
-
+    # A, w, own: sparse (rows, dn), (rows,), sparse (dn, dn); own = A^T diag(w) A: edges within a robot, and kappa I for
+    # both ends of an edge between robots.
     A: csr_array
     w: Array
     own: csc_array
-    between: csr_array
+    between: csr_array  # sparse (dn, dn): L - own
     analysis: SymbolicCholesky
 
 
 @dataclass(frozen=True, eq=False)
 class PaperState:
-    """Iterate k of the paper's recursion; names as in Algorithm 1.
-
-    Attributes
-    ----------
-    k : int
-    R, omega, B : (n, d, d)
-    rho : float
-        One penalty for all poses, as in the paper.
-    blocks, r_step
-        The split matrix, and the prepared back end for the present rho.
-    scale : float
-        Mean diagonal of L, the unit in which the stationarity residual is measured.
-    dual_residual : float
-        Stationarity, ||2 L R + rho B||_F / scale over the root of n d, rows of R and B stacked as L has them.
-    smallest_merit, steps_since_smallest, may_fall
-        Safeguard of the adaptive rho: the smallest ||R - omega|| and ||omega - omega_last|| together since rho changed,
-        how long ago, and whether rho may still be lowered.
-    """
+    """Iterate k of the paper's recursion; names as in Algorithm 1."""
 
     k: int
+    # R, omega, B: (n, d, d)
     R: Array
     omega: Array
     B: Array
-    rho: float
-    blocks: Blocks
-    r_step: RotationStep
-    scale: float
+    rho: float  # one penalty for all poses, as in the paper
+    blocks: Blocks  # the split matrix
+    r_step: RotationStep  # the prepared back end for the present rho
+    scale: float  # mean diagonal of L, the unit in which the stationarity residual is measured
+    # Stationarity, ||2 L R + rho B||_F / scale over the root of n d, rows of R and B stacked as L has them.
     dual_residual: float = np.inf
+    # smallest_merit, steps_since_smallest, may_fall: safeguard of the adaptive rho: the smallest ||R - omega|| and
+    # ||omega - omega_last|| together since rho changed, how long ago, and whether rho may still be lowered.
     smallest_merit: float = np.inf
     steps_since_smallest: int = 0
     may_fall: bool = True
@@ -105,12 +85,6 @@ class PaperSOC:
     tolerance : float
         On the paper's KKT residual, the root mean square over poses of ||omega_i^T omega_i - I||^2 +
         ||omega_i - R_i||^2, and on the gradient of the Lagrangian, over the scale of L.
-    max_iterations : int
-
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
 
     Examples
     --------
@@ -132,7 +106,7 @@ class PaperSOC:
                 f"the paper has one rho for all poses, got {self.penalty}; give a FixedPenalty, BalancedPenalty or "
                 "BoydPenalty"
             )
-        check_signs(self, positive=("tolerance",), not_negative=("max_iterations",))
+        check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> PaperState:
         """State 0: R = omega = start, a spanning tree unless given; B = 0."""

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from pgo_models.certificates.dual_variables import multiplier_norms, multipliers
-from pgo_models.errors import SettingError, check_signs
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, stack_transposes
 from pgo_models.problem.problem import PGOProblem
@@ -29,20 +29,12 @@ _SMALLEST_RATIO = 1e-6  # of ||Lambda_i|| to m_i; M + D/2 keeps ten digits
 
 @dataclass(frozen=True)
 class PenaltyOrder:
-    """rho_i = max(per_norm ||Lambda_i||_2, per_scale m_i, least): what a party must know to set its penalties.
-
-    Attributes
-    ----------
-    per_norm, per_scale, least : float
-    is_stationary : bool
-        B starts at its value at a stationary point, -2 Lambda_i R_i^T / rho_i; else at zero.
-    settings : StepSettings
-    """
+    """rho_i = max(per_norm ||Lambda_i||_2, per_scale m_i, least): what a party must know to set its penalties."""
 
     per_norm: float
     per_scale: float
     least: float
-    is_stationary: bool = False
+    is_stationary: bool = False  # B starts at its value at a stationary point, -2 Lambda_i R_i^T / rho_i; else at zero
     settings: StepSettings = field(default_factory=StepSettings)
 
     def rho(self, norms: Array, scale: Array) -> Array:
@@ -80,11 +72,8 @@ class MultiplierPenalty(_Rule):
 
     Attributes
     ----------
-    factor : float
-    quantile : float
     stall_window, stall_ratio : int, float
         Stalled: the residual of the last `stall_window` iterations has not fallen below `stall_ratio` of what it was.
-    max_refreshes : int
 
     Examples
     --------
@@ -103,7 +92,7 @@ class MultiplierPenalty(_Rule):
     max_refreshes: int = 1
 
     def __post_init__(self) -> None:
-        check_signs(self, positive=("factor",), not_negative=("max_refreshes",))
+        check_settings(self, positive=["factor"], not_negative=["max_refreshes"])
         if not 0 <= self.quantile <= 1:
             raise SettingError(f"quantile must be in [0, 1], got {self.quantile}")
         if self.stall_window < 1 or not 0 < self.stall_ratio < 1:
@@ -135,7 +124,7 @@ class FixedPenalty(_Rule):
     rho: float
 
     def __post_init__(self) -> None:
-        check_signs(self, positive=("rho",))
+        check_settings(self, positive=["rho"])
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
         """(0, 0, rho)."""
@@ -165,9 +154,7 @@ class BalancedPenalty(_Rule):
     refactor_ratio: float = 5.0
 
     def __post_init__(self) -> None:
-        check_signs(self, positive=("scale",))
-        if not self.refactor_ratio > 1:
-            raise SettingError(f"refactor_ratio must be above 1, got {self.refactor_ratio}")
+        check_settings(self, positive=["scale"], above_one=["refactor_ratio"])
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
         """(0, scale, 0)."""
@@ -210,7 +197,7 @@ class BoydPenalty(_Rule):
     growth: float = 2.0
 
     def __post_init__(self) -> None:
-        check_signs(self, positive=("scale",))
+        check_settings(self, positive=["scale"])
         if not self.imbalance > 1 or not self.growth > 1:
             raise SettingError(f"imbalance and growth must be above 1, got {self.imbalance} and {self.growth}")
 
@@ -251,27 +238,16 @@ class Due(enum.Enum):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Steps:
-    """Iterate k, and what the steps so far say of the penalty: what the states of all couplings have.
-
-    Attributes
-    ----------
-    k : int
-    sums : AndersonSums
-        What all parties know of the acceleration.
-    primal_residual, dual_residual : float
-        ||x - z||_rho and ||c (z - z_before)||_rho, both over ||omega||_rho, with c = max(1, rho / diagonal of M): a
-        penalty far above M makes short steps anywhere.
-    merits : tuple of float
-        Fixed-point residual ||x - z_before||_rho of the steps since rho last changed.
-    refreshes, raises : int
-        How often the penalty rule, and the safeguard against divergence, changed rho.
-    """
+    """Iterate k, and what the steps so far say of the penalty: what the states of all couplings have."""
 
     k: int = 0
-    sums: AndersonSums = field(default_factory=AndersonSums)
+    sums: AndersonSums = field(default_factory=AndersonSums)  # what all parties know of the acceleration
+    # primal_residual, dual_residual: ||x - z||_rho and ||c (z - z_before)||_rho, both over ||omega||_rho, with c =
+    # max(1, rho / diagonal of M): a penalty far above M makes short steps anywhere.
     primal_residual: float = np.inf
     dual_residual: float = np.inf
-    merits: tuple[float, ...] = ()
+    merits: tuple[float, ...] = ()  # fixed-point residual ||x - z_before||_rho of the steps since rho last changed
+    # refreshes, raises: how often the penalty rule, and the safeguard against divergence, changed rho.
     refreshes: int = 0
     raises: int = 0
 
@@ -300,18 +276,10 @@ class Steps:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SharedSteps(Steps):
-    """What is known of all robots' rows, which are theirs.
+    """What is known of all robots' rows, which are theirs."""
 
-    Attributes
-    ----------
-    ratio : (n,)
-        rho_i / m_i of all poses, in no order.
-    size : float
-        ||omega||_rho.
-    """
-
-    ratio: Array
-    size: float
+    ratio: Array  # (n,): rho_i / m_i of all poses, in no order
+    size: float  # ||omega||_rho
 
     def rescaled(self, factor: float) -> Self:
         """State after all have multiplied rho, and forgotten what was accelerated."""

@@ -34,28 +34,15 @@ class RStep(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class RSubproblem:
-    """The R-subproblem of one robot, or of the whole graph.
+    """The R-subproblem of one robot, or of the whole graph."""
 
-    Attributes
-    ----------
-    A, w : sparse (rows, N), (rows,)
-        Residuals and weights of the edges concerned.
-    M : (N, N)
-        A^T diag(w) A, in the pattern of `analysis`.
-    d : int
-    num_translations : int
-        The first rows of X, 0 for rotations only; the others are rows of R_i^T.
-    penalty : (N,)
-        Diagonal of D. When no translation has one, row 0 is grounded: the minimiser with t_0 = 0 is taken.
-    analysis : SymbolicCholesky
-    backend : CholeskyBackend or None
-    """
-
+    # A, w: sparse (rows, N), (rows,); residuals and weights of the edges concerned.
     A: csr_array
     w: Array
-    M: csc_array
+    M: csc_array  # (N, N): A^T diag(w) A, in the pattern of `analysis`
     d: int
-    num_translations: int
+    num_translations: int  # the first rows of X, 0 for rotations only; the others are rows of R_i^T
+    # (N,): diagonal of D. When no translation has one, row 0 is grounded: the minimiser with t_0 = 0 is taken.
     penalty: Array
     analysis: SymbolicCholesky
     backend: CholeskyBackend | None

@@ -18,69 +18,32 @@ from solvers.soc.anderson import Anderson, AndersonShare, over_relax
 
 @dataclass(frozen=True)
 class StepSettings:
-    """What a robot must know of SOC's settings, sent once.
+    """What a robot must know of SOC's settings, sent once."""
 
-    Attributes
-    ----------
-    alpha : float
-        Over-relaxation.
-    memory : int
-        Of the acceleration; 0 for none.
-    local_passes : int
-    alone : Anderson, optional
-        Given where every robot extrapolates its own rows.
-    """
-
-    alpha: float = 1.0
-    memory: int = 0
+    alpha: float = 1.0  # over-relaxation
+    memory: int = 0  # of the acceleration; 0 for none
     local_passes: int = 1
-    alone: Anderson | None = None
+    alone: Anderson | None = None  # given where every robot extrapolates its own rows
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """What all parties learn from the sums of step (a).
+    """What all parties learn from the sums of step (a)."""
 
-    Attributes
-    ----------
-    gamma : (q,), optional
-        Coefficients of the acceleration; None restarts it.
-    is_best : bool
-        Whether the s before this step has the smallest merit.
-    """
-
-    gamma: Array | None
-    is_best: bool
+    gamma: Array | None  # (q,): coefficients of the acceleration; None restarts it
+    is_best: bool  # whether the s before this step has the smallest merit
 
 
 @dataclass(frozen=True, eq=False)
 class RecursionBlock:
-    """Rows of the recursion: of every R_i^T, and of separator translations; arrays are (rows, d).
+    """Rows of the recursion: of every R_i^T, and of separator translations; arrays are (rows, d)."""
 
-    Attributes
-    ----------
-    penalty : (rows,)
-        rho of every row; zero for rows that have no part in the iterates.
-    diagonal : (rows,)
-        Diagonal of M on these rows.
-    z : (rows, d)
-        What is agreed on: omega, and the translations of separators.
-    s : (rows, d)
-        x + B before the projection, extrapolated: the variable of the fixed-point map.
-    x : (rows, d)
-        Of the last step (a).
-    best : (rows, d)
-        The s of the smallest merit.
-    settings : StepSettings
-    anderson : AndersonShare
-    """
-
-    penalty: Array
-    diagonal: Array
-    z: Array
-    s: Array
-    x: Array
-    best: Array
+    penalty: Array  # (rows,): rho of every row; zero for rows that have no part in the iterates
+    diagonal: Array  # (rows,): diagonal of M on these rows
+    z: Array  # (rows, d): what is agreed on: omega, and the translations of separators
+    s: Array  # (rows, d): x + B before the projection, extrapolated: the variable of the fixed-point map
+    x: Array  # (rows, d): of the last step (a)
+    best: Array  # (rows, d): the s of the smallest merit
     settings: StepSettings = field(default_factory=StepSettings)
     anderson: AndersonShare = field(default_factory=AndersonShare)
 

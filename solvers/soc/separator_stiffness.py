@@ -32,7 +32,6 @@ def stiffness_of_separators(
     ----------
     factor : CholeskyFactor
         Of M_a + rho/2, with `GROUND` times D on the separator translations.
-    side : int
     held : (s,)
         Rows of the separator translations.
     half_scale : (s,)

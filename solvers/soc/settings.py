@@ -6,7 +6,7 @@ import enum
 import math
 from dataclasses import dataclass, field
 
-from pgo_models.errors import SettingError, check_signs
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition
 from solvers.result import Measurement, Status
@@ -45,9 +45,12 @@ class SOCSettings:
     def __post_init__(self) -> None:
         if not 0 < self.alpha < 2:
             raise SettingError(f"alpha must be in (0, 2), got {self.alpha}")
-        if self.local_passes < 1:
-            raise SettingError(f"local_passes must be at least 1, got {self.local_passes}")
-        check_signs(self, ("translation_penalty", "tolerance"), ("separator_penalty", "max_iterations"))
+        check_settings(
+            self,
+            positive=["translation_penalty", "tolerance"],
+            not_negative=["separator_penalty", "max_iterations"],
+            at_least_one=["local_passes"],
+        )
         if self.coupling is Coupling.JOINT and self.robots is not None and self.robots.num_robots > 1:
             raise SettingError(f"JOINT has one robot, got {self.robots}; use Coupling.CONSENSUS")
         if self.coupling is Coupling.CONSENSUS and self.robots is None:

@@ -32,18 +32,10 @@ from solvers.soc.settings import SOCSettings
 
 @dataclass(frozen=True, eq=False)
 class SOCState(Steps):
-    """Iterate k of JOINT.
+    """Iterate k of JOINT."""
 
-    Attributes
-    ----------
-    block : RecursionBlock
-        Rows of every R_i^T: x, z, s, B.
-    r_step : RotationStep
-        Back end of step (a), prepared for the present rho.
-    """
-
-    block: RecursionBlock
-    r_step: RotationStep
+    block: RecursionBlock  # rows of every R_i^T: x, z, s, B
+    r_step: RotationStep  # back end of step (a), prepared for the present rho
 
     @property
     def steps(self) -> SOCState:
@@ -159,7 +151,6 @@ class SOC(SOCSettings):
         times the root of the translation penalty, at most 0.3.
     tolerance : float
         On the primal and the dual residual, both relative.
-    max_iterations : int
 
     Raises
     ------

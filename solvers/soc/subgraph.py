@@ -25,42 +25,22 @@ class PartProblem(PGOProblem):
 
 @dataclass(frozen=True, eq=False)
 class Subgraph:
-    """A robot's part of a graph: all that it ever learns of it before the first round.
-
-    Attributes
-    ----------
-    robot : int
-    graph : PoseGraph
-        Its poses and edges, renumbered: its own poses, and the poses of others at the far end of its edges.
-    poses : (n_a,)
-        Their numbers in the whole graph, ascending.
-    owner : (n_a,)
-        Which robot owns each.
-    in_cover : (n_a,)
-        Position of each among the poses that the driver solves for, or -1.
-    is_counted : (m_a,)
-        Whether an edge is this robot's in sums over robots; every edge of the whole graph is counted once. An edge to a
-        pose that the driver does not solve for is counted by the owner of that pose.
-    copies : (n_a,)
-        How many robots hold each pose.
-    common : tuple of (int, (q,))
-        For every other robot that holds some of the same poses: which of `poses` they are, ascending.
-    weights : EdgeWeights
-        Of its edges, in the cost that SOC is run on.
-    final : EdgeWeights, optional
-        In the cost that is solved, where that is another (`PGOProblem.convex_part`).
-    """
+    """A robot's part of a graph: all that it ever learns of it before the first round."""
 
     robot: int
+    # Its poses and edges, renumbered: its own poses, and the poses of others at the far end of its edges.
     graph: PoseGraph
-    poses: IntArray
-    owner: IntArray
-    in_cover: IntArray
+    poses: IntArray  # (n_a,): their numbers in the whole graph, ascending
+    owner: IntArray  # (n_a,): which robot owns each
+    in_cover: IntArray  # (n_a,): position of each among the poses that the driver solves for, or -1
+    # (m_a,): whether an edge is this robot's in sums over robots; every edge of the whole graph is counted once. An
+    # edge to a pose that the driver does not solve for is counted by the owner of that pose.
     is_counted: BoolArray
-    copies: IntArray
+    copies: IntArray  # (n_a,): how many robots hold each pose
+    # For every other robot that holds some of the same poses: which of `poses` they are, (q,), ascending.
     common: tuple[tuple[int, IntArray], ...]
-    weights: EdgeWeights
-    final: EdgeWeights | None = None
+    weights: EdgeWeights  # of its edges, in the cost that SOC is run on
+    final: EdgeWeights | None = None  # in the cost that is solved, where that is another (`PGOProblem.convex_part`)
 
     @cached_property
     def is_own(self) -> BoolArray:
@@ -85,23 +65,13 @@ class Subgraph:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """The cost of the edges that one robot counts.
-
-    Attributes
-    ----------
-    problem : PartProblem
-    poses : (p,)
-        Numbers of its poses in the whole graph.
-    in_cover : (p,)
-        Position of each among the poses that the driver solves for, or -1 for the robot's interior.
-    final : PartProblem, optional
-        The cost that is solved, where SOC is run on another.
-    """
+    """The cost of the edges that one robot counts."""
 
     problem: PartProblem
-    poses: IntArray
+    poses: IntArray  # (p,): numbers of its poses in the whole graph
+    # (p,): position of each among the poses that the driver solves for, or -1 for the robot's interior.
     in_cover: IntArray
-    final: PartProblem | None = None
+    final: PartProblem | None = None  # the cost that is solved, where SOC is run on another
 
     @cached_property
     def interior(self) -> IntArray:
@@ -122,15 +92,6 @@ def split_graph(given: PGOProblem | PoseGraph, partition: Partition) -> tuple[Su
     ------
     SettingError
         When the partition is of another number of poses.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models import grid, partition
-    >>> graph = grid(np.random.default_rng(0))
-    >>> subgraphs = split_graph(graph, partition(graph, 3))
-    >>> sum(int(subgraph.is_counted.sum()) for subgraph in subgraphs) == graph.num_edges
-    True
     """
     problem = as_problem(given)
     graph, first = problem.graph, problem.convex_part

@@ -53,11 +53,6 @@ class BenchmarkSettings:
         Of PAPER, both stages together.
     time_limit : float
         Seconds for each contender.
-
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
     """
 
     num_robots: int = 5
@@ -85,24 +80,13 @@ class BenchmarkSettings:
 
 @dataclass(frozen=True, eq=False)
 class StageRecord:
-    """One stage of a trial.
-
-    Attributes
-    ----------
-    name : str
-    status : Status
-    history : History
-        Seconds and communication count from the beginning of the leg.
-    num_robots : int
-        Among which its seconds are divided; 1 when all is done in one place.
-    rounds, num_bytes : (len(history),), optional
-        Communication up to every record, where it is counted.
-    """
+    """One stage of a trial."""
 
     name: str
     status: Status
-    history: History
-    num_robots: int = 1
+    history: History  # seconds and communication count from the beginning of the leg
+    num_robots: int = 1  # among which its seconds are divided; 1 when all is done in one place
+    # rounds, num_bytes: (len(history),); communication up to every record, where it is counted.
     rounds: Array | None = None
     num_bytes: Array | None = None
 
@@ -114,30 +98,15 @@ class StageRecord:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BenchmarkRun:
-    """What a contender did on a graph.
-
-    Attributes
-    ----------
-    contender : BenchmarkMethod
-    legs : tuple of StageRecord
-    poses : Poses
-        Where it ended.
-    objective : float
-        F of them.
-    status : Status
-        How the last leg ended, or an earlier one that ran out of time.
-    remark : str
-        What has to be said beside the figures; empty when all went as it should.
-    is_answer : bool
-        Whether the figures are the contender's: not those of a method that was cut short in a stage without an answer.
-    """
+    """What a contender did on a graph."""
 
     contender: BenchmarkMethod
     legs: tuple[StageRecord, ...]
-    poses: Poses
-    objective: float
-    status: Status
-    remark: str = ""
+    poses: Poses  # where it ended
+    objective: float  # F of them
+    status: Status  # how the last leg ended, or an earlier one that ran out of time
+    remark: str = ""  # what has to be said beside the figures; empty when all went as it should
+    # Whether the figures are the contender's: not those of a method that was cut short in a stage without an answer.
     is_answer: bool = True
 
     @property

@@ -57,8 +57,6 @@ def run_benchmark(
 
     Parameters
     ----------
-    contender : BenchmarkMethod
-    problem : PGOProblem
     settings : BenchmarkSettings, optional
         `BenchmarkSettings()` unless given.
     start : Poses, optional
@@ -129,12 +127,13 @@ def _one_run(
     solver: Solver[Any], name: str, problem: PGOProblem, allowed: _Allowance, start: Poses | None
 ) -> BenchmarkRun:
     """A run of one method in one place."""
-    return _run_of(allowed.run(solver, problem, start), name)
+    finished = allowed.run(solver, problem, start)
+    return _run_of(finished, StageRecord(name, finished.status, finished.history))
 
 
-def _run_of(finished: Run[Any], name: str) -> BenchmarkRun:
-    leg = StageRecord(name, finished.status, finished.history)
-    return BenchmarkRun(BenchmarkMethod.NEWTON, (leg,), finished.poses, finished.objective, finished.status)
+def _run_of(found: Run[Any] | Solution, *legs: StageRecord, remark: str = "", is_answer: bool = True) -> BenchmarkRun:
+    """A run with these legs; `run_benchmark` says whose it is."""
+    return BenchmarkRun(BenchmarkMethod.JOINT, legs, found.poses, found.objective, found.status, remark, is_answer)
 
 
 def _soc_and_newton(coupling: Coupling, problem: PGOProblem, allowed: _Allowance, start: Poses | None) -> BenchmarkRun:
@@ -146,7 +145,8 @@ def _soc_and_newton(coupling: Coupling, problem: PGOProblem, allowed: _Allowance
         tolerance=HANDOVER_TOLERANCE,
         max_iterations=_HANDOVER_ITERATIONS,
     )
-    return _finished(*allowed.solve(problem, soc, Newton(), start, by_robots=not is_joint))
+    solution, legs = allowed.solve(problem, soc, Newton(), start, by_robots=not is_joint)
+    return _run_of(solution, *legs)
 
 
 def _paper(problem: PGOProblem, allowed: _Allowance, start: Poses | None) -> BenchmarkRun:
@@ -175,7 +175,7 @@ def _paper(problem: PGOProblem, allowed: _Allowance, start: Poses | None) -> Ben
             shorter = replace(newton, max_iterations=within)
             solution, last = allowed.solve(problem, None, shorter, handed_over)
             rounds, remark = _with_translations(last), f"stopped within {total} rounds"
-    return replace(_finished(solution, (leg, replace(last[0], rounds=rounds), *last[1:])), remark=remark)
+    return _run_of(solution, leg, replace(last[0], rounds=rounds), *last[1:], remark=remark)
 
 
 def _with_translations(legs: tuple[StageRecord, ...]) -> Array:
@@ -200,13 +200,12 @@ def _gauss_seidel(problem: PGOProblem, allowed: _Allowance, start: Poses | None)
     remark = ""
     if not is_answer:
         remark = f"{finished.status.name} in its first stage: no poses after {finished.iterations} sweeps"
-    return BenchmarkRun(
-        BenchmarkMethod.GAUSS_SEIDEL, (leg,), finished.poses, finished.objective, finished.status, remark, is_answer
-    )
+    return _run_of(finished, leg, remark=remark, is_answer=is_answer)
 
 
 def _gtsam(problem: PGOProblem, allowed: _Allowance, start: Poses | None) -> BenchmarkRun:
-    return _run_of(run_gtsam(problem, start=start), "GTSAM")
+    finished = run_gtsam(problem, start=start)
+    return _run_of(finished, StageRecord("GTSAM", finished.status, finished.history))
 
 
 def _legs_of(solution: Solution) -> tuple[StageRecord, ...]:
@@ -226,10 +225,6 @@ def _legs_of(solution: Solution) -> tuple[StageRecord, ...]:
             rounds_before, bytes_before = last
         legs.append(StageRecord(stage.name, stage.status, history, num_robots, rounds, num_bytes))
     return tuple(legs)
-
-
-def _finished(solution: Solution, legs: tuple[StageRecord, ...]) -> BenchmarkRun:
-    return BenchmarkRun(BenchmarkMethod.JOINT, legs, solution.poses, solution.objective, solution.status)
 
 
 def _counted(values: list[int | None]) -> Array | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -55,7 +56,7 @@ def tables_command(
     download: DownloadOption = False,
 ) -> None:
     """Run the paper's tables 1 to 4, row for row: its figures beside ours, held against proven bounds."""
-    _check_tables(out)
+    _check(out, check_table_format)
     check_writable(keep)
     settings = ReproductionSettings(_split(only), seeds, robots, download)
     tables = reproduce_tables(settings, keep, is_fresh=fresh)
@@ -87,10 +88,8 @@ def compare_command(
     unit_weights: UnitWeightsOption = False,
 ) -> None:
     """Run several methods on a graph and hold them against each other and a proven bound."""
-    _check_tables(out)
-    for path in plot or []:
-        check_plot_format(path)
-        check_writable(path)
+    _check(out, check_table_format)
+    _check(plot, check_plot_format)
     settings = ComparisonSettings(
         _chosen(BenchmarkMethod, methods, "method"), BenchmarkSettings(robots, time_limit=time_limit)
     )
@@ -133,7 +132,8 @@ def _split(names: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
 
 
-def _check_tables(out: list[Path] | None) -> None:
-    for path in out or []:
-        check_table_format(path)  # before a long run, not after it
+def _check(paths: list[Path] | None, check_format: Callable[[Path], None]) -> None:
+    """Refuse files that could not be written: before a long run, not after it."""
+    for path in paths or []:
+        check_format(path)
         check_writable(path)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,17 +26,15 @@ from solvers.result import Status
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings
 from solvers.studies.benchmark_runs import run_benchmark
 
-_HEADS = (
-    "method",
-    "F",
-    "gap (%)",
-    "iterations",
-    "rounds",
-    "all-reduces",
-    "MB sent",
-    "seconds",
-    "seconds a robot",
-    "remark",
+_COLUMNS: tuple[tuple[str, str, Callable[[Any], str]], ...] = (  # head, name in the record, how it is written
+    ("F", "objective", "{:.9g}".format),
+    ("gap (%)", "gap", gap_percent),
+    ("iterations", "iterations", str),
+    ("rounds", "rounds", str),
+    ("all-reduces", "all_reduces", str),
+    ("MB sent", "bytes", lambda sent: f"{1e-6 * sent:.3g}"),
+    ("seconds", "seconds", "{:.3g}".format),
+    ("seconds a robot", "seconds_per_robot", "{:.3g}".format),
 )
 
 
@@ -46,7 +46,6 @@ class ComparisonSettings:
     ----------
     contenders : tuple of BenchmarkMethod
         All that can be run here unless given: GTSAM only where it is installed.
-    trial : BenchmarkSettings
     """
 
     contenders: tuple[BenchmarkMethod, ...] = ()
@@ -67,10 +66,8 @@ class Comparison:
 
     Attributes
     ----------
-    problem : PGOProblem
     optimum, lower_bound : float
         The best F known, from `solve` or one of the methods, and the bound that is proven.
-    trials : tuple of BenchmarkRun
     reasons : tuple of (BenchmarkMethod, str)
         Methods without figures, and why.
     is_complete : bool
@@ -91,28 +88,17 @@ class Comparison:
 
     def table(self) -> ResultTable:
         """Return a row for every method, those without figures last, with their reasons."""
-        rows: list[tuple[str, ...]] = []
-        records = []
-        for trial in self.trials:
-            gap = relative_gap(trial.objective, self.lower_bound)
-            rows.append(
-                (
-                    trial.contender.label,
-                    f"{trial.objective:.9g}" if trial.is_answer else "-",
-                    gap_percent(gap) if trial.is_answer else "-",
-                    " + ".join(map(str, trial.iterations)),
-                    "-" if trial.rounds is None else str(trial.rounds),
-                    "-" if trial.all_reduces is None else str(trial.all_reduces),
-                    "-" if trial.num_bytes is None else f"{1e-6 * trial.num_bytes:.3g}",
-                    f"{trial.seconds:.3g}",
-                    f"{trial.seconds_per_robot:.3g}",
-                    trial.remark,
-                )
-            )
-            records.append(_record(trial.contender, trial, gap, trial.remark))
-        for contender, reason in self.reasons:
-            rows.append((contender.label, *("-",) * (len(_HEADS) - 2), reason))
-            records.append(_record(contender, None, math.nan, reason))
+        found: list[tuple[BenchmarkMethod, BenchmarkRun | None, str]] = [
+            *((trial.contender, trial, trial.remark) for trial in self.trials),
+            *((contender, None, reason) for contender, reason in self.reasons),
+        ]
+        rows, records = [], []
+        for contender, trial, remark in found:
+            records.append(_record(contender, trial, self.lower_bound, remark))
+            iterations = None if trial is None else " + ".join(map(str, trial.iterations))
+            shown = {**records[-1], "iterations": iterations}
+            figures = ("-" if shown[name] is None else write(shown[name]) for _, name, write in _COLUMNS)
+            rows.append((contender.label, *figures, remark))
         graph = self.problem.graph
         notes = [
             f"{graph.name}: {graph.num_poses} poses, {graph.num_edges} edges; best F {self.optimum:.10g}, proven lower "
@@ -121,7 +107,8 @@ class Comparison:
         ]
         if not self.is_complete:
             notes.append("interrupted: the methods left out were not run")
-        return ResultTable((TablePart(_HEADS, tuple(rows)),), tuple(records), tuple(notes))
+        heads = ("method", *(head for head, _, _ in _COLUMNS), "remark")
+        return ResultTable((TablePart(heads, tuple(rows)),), tuple(records), tuple(notes))
 
     def save_plot(self, path: Path | str) -> None:
         """Write the gap against rounds, bytes and seconds as a picture or, for .html, as a page to explore.
@@ -130,8 +117,6 @@ class Comparison:
         ------
         SettingError
             On another suffix, or when there is nothing to draw.
-        MissingExtraError
-            Without matplotlib or plotly.
         PGOError
             When the file cannot be written.
         """
@@ -205,13 +190,13 @@ def check_plot_format(path: Path) -> None:
         raise SettingError(f"cannot write {path}: no plot has suffix {path.suffix!r}; use .html, .png, .svg or .pdf")
 
 
-def _record(contender: BenchmarkMethod, trial: BenchmarkRun | None, gap: float, remark: str) -> dict[str, Value]:
-    has_answer = trial is not None and trial.is_answer
+def _record(contender: BenchmarkMethod, trial: BenchmarkRun | None, bound: float, remark: str) -> dict[str, Value]:
+    answer = trial if trial is not None and trial.is_answer else None
     iterations = trial.iterations if trial is not None else ()
     return {
         "method": contender.value,
-        "objective": trial.objective if trial is not None and has_answer else None,
-        "gap": gap if has_answer else None,
+        "objective": answer.objective if answer is not None else None,
+        "gap": relative_gap(answer.objective, bound) if answer is not None else None,
         "iterations_first_stage": iterations[0] if iterations else None,
         "iterations_second_stage": iterations[1] if len(iterations) > 1 else None,
         "rounds": trial.rounds if trial is not None else None,

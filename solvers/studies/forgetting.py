@@ -25,7 +25,6 @@ class ErrorForgetting:
         Without and with an error added to x in the first steps.
     not_added_back : (iterations + 1,)
         What plain quadratic penalties give, with b held at 0: the error of the model itself, which stays.
-    disturbed_steps : int
     """
 
     undisturbed: Array
@@ -58,10 +57,8 @@ def error_forgetting(
 
     Parameters
     ----------
-    problem : BregmanProblem
     solution : (m,)
         x*, which the distances are measured to.
-    rng : np.random.Generator
     method : TwoLineBregman, optional
         Its alpha and its subproblem's tolerance are used.
 

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.errors import MissingExtraError, PGOError
+from pgo_models.errors import PGOError
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.published_results import PublishedRow, published_rows, published_run
-from pgo_models.plots.graph_plots import draw_graph
+from pgo_models.plots.graph_plots import plot_panels
 from pgo_models.plots.interactive_plots import explore_graph, save_page
-from pgo_models.plots.style import column_figure, save_figure
+from pgo_models.plots.style import column_figure, plotly, save_figure
 from pgo_models.problem.problem import PGOProblem
 from solvers.pipeline import solve
 from solvers.progress import JobBar
@@ -98,8 +98,6 @@ def draw_paper_figures(
 
     Raises
     ------
-    MissingExtraError
-        Without matplotlib or plotly.
     PGOError
         When a file cannot be written.
 
@@ -112,7 +110,8 @@ def draw_paper_figures(
     """
     sets = only or tuple(FigureSet)
     folder = Path(folder)
-    _check_extras()
+    with column_figure(height=1.0):  # both kinds of pictures can be drawn: asked before the runs, not after
+        plotly("graph_objects")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -127,63 +126,29 @@ def draw_paper_figures(
     return written, reasons
 
 
-def plot_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> Figure:
-    """Figure with a row of pictures for every list of (title, graph, poses).
-
-    Raises
-    ------
-    MissingExtraError
-        Without matplotlib.
-    """
-    columns = max(len(row) for row in panels)
-    with column_figure(height=1.0 * len(panels), width=columns) as figure:
-        for r, row in enumerate(panels):
-            for c, (title, graph, poses) in enumerate(row):
-                place = r * columns + c + 1
-                axes = figure.add_subplot(len(panels), columns, place, projection="3d" if graph.d == 3 else None)
-                draw_graph(graph, poses, axes, mark_edges=False)
-                axes.set_title(title)
-    return figure
-
-
 def explore_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> PlotlyFigure:
-    """Plotly figure of the same pictures of graphs in space, each to turn on its own.
-
-    Raises
-    ------
-    MissingExtraError
-        Without plotly.
-    """
-    from plotly.graph_objects import Figure
-
-    columns, figure, number = max(len(row) for row in panels), Figure(), 0
+    """Plotly figure of what `plot_panels` shows of graphs in space, each picture to turn on its own."""
+    columns = max(len(row) for row in panels)
+    figure = plotly("subplots").make_subplots(
+        len(panels),
+        columns,
+        specs=[[{"type": "scene"} if c < len(row) else None for c in range(columns)] for row in panels],
+        subplot_titles=[html.escape(title).replace(": ", "<br>") for row in panels for title, _, _ in row],
+        horizontal_spacing=0.02,
+        vertical_spacing=0.1,
+    )
     named: set[str] = set()
-    for r, row in enumerate(panels):
-        for c, (title, graph, poses) in enumerate(row):
-            number += 1
-            scene = "scene" if number == 1 else f"scene{number}"
+    for r, row in enumerate(panels, 1):
+        for c, (_, graph, poses) in enumerate(row, 1):
             picture = explore_graph(graph, poses)
-            left, right = c / columns + 0.01, (c + 1) / columns - 0.01
-            top, bottom = 1.0 - r / len(panels), 1.0 - (r + 1) / len(panels)
             for trace in picture.data:
                 # Of edges that stand out the legend says once why; it shows and hides them everywhere.
                 is_named = trace.showlegend and trace.name not in named and trace.name != _PLAIN
                 named |= {trace.name} if is_named else set()
-                trace.update(scene=scene, showlegend=is_named, legendgroup=trace.name)
-                figure.add_trace(trace)
-            place = {"x": [left, right], "y": [bottom + 0.01, top - 0.08]}
-            layout = {**picture.layout.scene.to_plotly_json(), "domain": place, "camera": {"eye": _EYE}}
-            figure.update_layout({scene: layout})
-            figure.add_annotation(
-                text=html.escape(title).replace(": ", "<br>"),
-                x=(left + right) / 2,
-                y=top,
-                xanchor="center",
-                yanchor="top",
-                showarrow=False,
-                xref="paper",
-                yref="paper",
-            )
+                figure.add_trace(trace.update(showlegend=is_named, legendgroup=trace.name), r, c)
+            figure.update_scenes(picture.layout.scene.to_plotly_json(), row=r, col=c)
+    figure.update_scenes(camera={"eye": _EYE})
+    figure.update_annotations(font_size=12)
     figure.update_layout(
         template="none",
         margin={"l": 10, "r": 10, "t": 40, "b": 10},
@@ -246,13 +211,3 @@ def _from_step_one(leg: StageRecord) -> History:
     """History in which state 0 of SOC, where R and omega are the same start, has no primal residual but zero."""
     first, *others = leg.history.records
     return History((replace(first, measurement=replace(first.measurement, primal_residual=0.0)), *others))
-
-
-def _check_extras() -> None:
-    """Both kinds of pictures can be drawn: asked before the runs, not after."""
-    with column_figure(height=1.0):
-        pass
-    try:
-        import plotly  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError("plotly", "plot") from error

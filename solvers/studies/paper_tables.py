@@ -109,27 +109,14 @@ class TableEntry:
 
 @dataclass(frozen=True)
 class ReproducedRow:
-    """One method on one of the paper's graphs, over all its draws.
-
-    Attributes
-    ----------
-    published : PublishedRow
-    contender : BenchmarkMethod
-    num_draws : int
-        How many were wanted.
-    optima : tuple of Optimum
-    cells : tuple of TableEntry
-        Of the draws that have figures.
-    reasons : tuple of str
-        Why others have none.
-    """
+    """One method on one of the paper's graphs, over all its draws."""
 
     published: PublishedRow
     contender: BenchmarkMethod
-    num_draws: int
+    num_draws: int  # how many were wanted
     optima: tuple[Optimum, ...]
-    cells: tuple[TableEntry, ...]
-    reasons: tuple[str, ...]
+    cells: tuple[TableEntry, ...]  # of the draws that have figures
+    reasons: tuple[str, ...]  # why others have none
 
     @property
     def is_scene(self) -> bool:
@@ -166,7 +153,6 @@ class Reproduction:
 
     Attributes
     ----------
-    settings : ReproductionSettings
     rows : tuple of ReproducedRow
         Graph by graph, and for each SE-Sync, DGS, SOC as in the paper, SOC consensus.
     is_complete : bool

@@ -42,17 +42,10 @@ _SAME = 1e-3  # a spread below this part of the mean is not shown
 
 @dataclass(frozen=True)
 class Finding:
-    """Whether something that the tables should show is there, row by row.
-
-    Attributes
-    ----------
-    claim : str
-    held, failed : tuple of str
-        Names of the graphs.
-    """
+    """Whether something that the tables should show is there, row by row."""
 
     claim: str
-    held: tuple[str, ...]
+    held: tuple[str, ...]  # names of the graphs
     failed: tuple[str, ...]
 
     def __str__(self) -> str:
@@ -62,15 +55,7 @@ class Finding:
 
 
 def findings(tables: Reproduction) -> tuple[Finding, ...]:
-    """Return what the tables should show, and on which of their rows they do; rows without figures are left out.
-
-    Examples
-    --------
-    >>> from solvers.studies.paper_tables import ReproductionSettings, reproduce_tables
-    >>> tables = reproduce_tables(ReproductionSettings(only=("grid",), num_seeds=1))
-    >>> [finding.failed for finding in findings(tables)]
-    [(), ()]
-    """
+    """Return what the tables should show, and on which of their rows they do; rows without figures are left out."""
     claims: list[tuple[str, Callable[[ReproducedRow], bool | None]]] = [
         (
             "SOC as in the paper is at or below the paper's F (on random scenes: its gap, every draw) within the "

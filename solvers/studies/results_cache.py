@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pgo_models.errors import FileFormatError
 from pgo_models.files import read_text, replace_when_done
 from pgo_models.graphs.pose_graph import PoseGraph
+from solvers.distributed.checkpoint import digest
 from solvers.reporting.versions import installed_versions
 
 Entry = dict[str, Any]
@@ -80,10 +78,7 @@ class KeptResults:
 
 def graph_fingerprint(graph: PoseGraph) -> str:
     """Short text that differs between graphs with different measurements or estimates."""
-    digest = hashlib.sha256()
     arrays = [graph.i, graph.j, graph.R_ij, graph.t_ij, graph.kappa, graph.tau]
     if graph.initial is not None:
         arrays += [graph.initial.R, graph.initial.t]
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()[:12]
+    return digest(*arrays)[:12]

@@ -27,7 +27,6 @@ class NoiseSweep:
 
     Attributes
     ----------
-    scene : SweptScene
     rotation_std : (levels,)
         Radians.
     certified : (levels, graphs)
@@ -61,13 +60,7 @@ class NoiseSweep:
 
 
 def noisy_scene(scene: SweptScene, rotation_std: float, rng: np.random.Generator) -> PoseGraph:
-    """The paper's network with its geometry, weights and translation noise, and another rotation noise, in radians.
-
-    Examples
-    --------
-    >>> noisy_scene(SweptScene.CIRCLE, 0.1, np.random.default_rng(0))
-    PoseGraph('circle', d=3, poses=25, edges=300, robots=1)
-    """
+    """The paper's network with its geometry, weights and translation noise, and another rotation noise, in radians."""
     network = circle(rng) if scene is SweptScene.CIRCLE else grid(rng)
     assert network.truth is not None
     noise = NoiseModel(rotation_std=rotation_std)
@@ -79,12 +72,10 @@ def noise_sweep(scene: SweptScene, rotation_std: Array, graphs: int, rng: np.ran
 
     Parameters
     ----------
-    scene : SweptScene
     rotation_std : (levels,)
         Standard deviations, radians, ascending.
     graphs : int
         At every level.
-    rng : np.random.Generator
 
     Raises
     ------

@@ -1,5 +1,6 @@
 import itertools
 import math
+from dataclasses import replace
 
 import cvxpy as cp
 import numpy as np
@@ -140,7 +141,7 @@ def test_errors_on_the_way_are_forgotten() -> None:
         state = method.step(problem, state)
         if k < 3:
             error = 0.1 * rng.standard_normal(state.x.shape)
-            state = type(state)(state.k, state.x + error, state.b + problem.K @ error, state.subproblem)
+            state = replace(state, x=state.x + error, b=state.b + problem.K @ error)
         errors.append(np.linalg.norm(state.x - solution))
     assert min(errors[:3]) > 0.1
     assert errors[-1] < INTERIOR

@@ -1,5 +1,5 @@
-import builtins
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -87,15 +87,8 @@ def test_a_page_escapes_its_title_and_has_no_button_that_uploads(tmp_path):
 
 
 def test_without_plotly_one_line_names_the_extra(monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *rest):
-        if name.startswith("plotly"):
-            raise ImportError(name)
-        return real(name, *rest)
-
     graph = pgo.circle(np.random.default_rng(0))
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "plotly", None)
     with pytest.raises(MissingExtraError, match=r"pgo-splitting\[plot\]"):
         pgo.explore_graph(graph, graph.truth)
 

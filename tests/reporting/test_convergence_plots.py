@@ -1,4 +1,4 @@
-import builtins
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -99,13 +99,6 @@ def test_methods_are_told_apart_by_more_than_colour(effort):
 
 
 def test_without_plotly_one_line_names_the_extra(monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *rest):
-        if name.startswith("plotly"):
-            raise ImportError(name)
-        return real(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "plotly", None)
     with pytest.raises(MissingExtraError, match=r"pgo-splitting\[plot\]"):
         explore_convergence([("SOC", history(4))], 9.0)

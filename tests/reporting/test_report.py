@@ -1,6 +1,6 @@
-import builtins
 import re
 import shlex
+import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -213,14 +213,7 @@ def test_a_report_is_written_whole_under_a_pages_name_only(solution, tmp_path):
 
 
 def test_without_plotly_one_line_names_the_extra_before_anything_is_solved(monkeypatch, tmp_path, capsys):
-    real = builtins.__import__
-
-    def without(name, *rest):
-        if name.startswith("plotly"):
-            raise ImportError(name)
-        return real(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "plotly", None)
     with pytest.raises(SystemExit) as end:
         cli.main(["solve", "no-such-graph", "--report", str(tmp_path / "out.html")])
     err = capsys.readouterr().err

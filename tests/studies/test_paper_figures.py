@@ -1,4 +1,4 @@
-import builtins
+import sys
 
 import pytest
 
@@ -60,14 +60,7 @@ def test_truth_stands_above_the_result():
 
 
 def test_without_plotly_nothing_is_run(monkeypatch, tmp_path):
-    true = builtins.__import__
-
-    def without(name, *rest):
-        if name.startswith("plotly"):
-            raise ImportError(name)
-        return true(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "plotly", None)
     monkeypatch.setattr(paper_figures, "_run_all", lambda *_: pytest.fail("ran all the same"))
     with pytest.raises(MissingExtraError, match=r"plotly is not installed"):
         draw_paper_figures(tmp_path)

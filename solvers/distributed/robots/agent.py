@@ -53,7 +53,6 @@ class Agent:
 
     Attributes
     ----------
-    subgraph : Subgraph
     interior : Interior, optional
         None when the robot counts no edge.
     copies : ConsensusRobot, optional

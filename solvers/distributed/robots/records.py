@@ -19,19 +19,10 @@ class RightHandSide:
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
-    """A robot's matrix and right-hand side with the interior eliminated.
+    """A robot's matrix and right-hand side with the interior eliminated."""
 
-    Attributes
-    ----------
-    schur : (w g (w g + 1) / 2,)
-        Lower triangle, packed.
-    diagonal : (w g,)
-        Of the matrix before the elimination.
-    right : RightHandSide
-    """
-
-    schur: Array
-    diagonal: Array
+    schur: Array  # (w g (w g + 1) / 2,): lower triangle, packed
+    diagonal: Array  # (w g,): of the matrix before the elimination
     right: RightHandSide
 
 
@@ -94,23 +85,12 @@ class Move:
 
 @dataclass(frozen=True, eq=False)
 class ProofOrder:
-    """How S is eliminated for a proof.
-
-    Attributes
-    ----------
-    eta : float
-    share : float
-        At least so much of the diagonal is subtracted.
-    fixed : ((d+1) g,)
-        1 for rows on the boundary that are left out.
-    point : ((d+1) g, d), optional
-        X there, where a proof begins.
-    """
+    """How S is eliminated for a proof."""
 
     eta: float
-    share: float
-    fixed: Array
-    point: Array | None
+    share: float  # at least so much of the diagonal is subtracted
+    fixed: Array  # ((d+1) g,): 1 for rows on the boundary that are left out
+    point: Array | None  # ((d+1) g, d): X there, where a proof begins
 
 
 @dataclass(frozen=True, eq=False)
