@@ -68,7 +68,9 @@ def hint_of_chi2(problem: PGOProblem, poses: Poses) -> list[str]:
 
 
 def _ratios(graph: PoseGraph) -> dict[str, Array]:
-    return {name: getattr(graph, name) / np.median(getattr(graph, name)) for name in ("kappa", "tau")}
+    """Precisions over their medians; 1 where there is none."""
+    values = {name: getattr(graph, name) for name in ("kappa", "tau")}
+    return {name: np.where(one > 0, one / np.median(one[one > 0]), 1.0) for name, one in values.items()}
 
 
 def extreme_weight(graph: str) -> str:
@@ -76,7 +78,8 @@ def extreme_weight(graph: str) -> str:
     path = locate(graph)
     if not (path.is_file() or path.is_dir()):
         return f"{graph}: weights too far apart for doubles; give it as a file to be told which"
-    loaded = load(path)
+    with warnings.catch_warnings(action="ignore"):
+        loaded = load(path, skip_unknown=True)
     ratios = _ratios(loaded)
     name = max(ratios, key=lambda one: float(np.abs(np.log(ratios[one])).max()))
     e = int(np.argmax(np.abs(np.log(ratios[name]))))

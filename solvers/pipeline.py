@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -22,7 +23,7 @@ from pgo_models.certificates.certificate import (
     soften,
 )
 from pgo_models.certificates.lower_bound import NO_BOUND
-from pgo_models.errors import SettingError
+from pgo_models.errors import GraphWarning, SettingError
 from pgo_models.geometry.arrays import whole_number
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition, partition
@@ -174,6 +175,13 @@ def solve(
     problem = as_problem(problem)
     if anchor is not None and not 0 <= anchor < problem.num_poses:
         raise SettingError(f"anchor is {anchor}; give a pose, 0 to {problem.num_poses - 1}")
+    if anchor is not None and problem.graph.world is not None:
+        raise SettingError("the priors of the graph say where its poses are; leave out the anchor")
+    seen_once = problem.graph.seen_once
+    if len(seen_once):
+        named = ", ".join(map(problem.graph.pose_name, seen_once[:5])) + ", .." * (len(seen_once) > 5)
+        message = f"seen once, and of no use to the poses: {len(seen_once)} landmarks ({named}); look at them again"
+        warnings.warn(f"{problem.graph.name}: {message}", GraphWarning, stacklevel=2)
     if robots is None and (engine is not None or checkpoint is not None):
         raise SettingError("engine and checkpoint are for solves by robots; give robots, a number or a Partition")
     pipeline = pipeline if pipeline is not None else Pipeline()
@@ -246,8 +254,11 @@ def solve(
 
 
 def framed(poses: Poses, graph: PoseGraph, anchor: int | None) -> tuple[Poses, str, int]:
-    """Poses in the frame of the anchor, first FIX line, estimate or pose 0; which it is; the pose held, or 0."""
+    """Poses in the frame of priors, anchor, first FIX line, estimate or pose 0; which it is; the pose held, or 0."""
     ids, reference = graph.pose_ids, graph.initial
+    if graph.world is not None:
+        unheeded = "; FIX lines are not minded beside them" if len(graph.fixed) else ""
+        return poses.with_gauge_at(graph.world), f"that of the priors{unheeded}", graph.world
     held = anchor if anchor is not None else int(graph.fixed[0]) if len(graph.fixed) else None
     if held is None and reference is not None:
         return poses.aligned_to(reference), "aligned with the estimate that came with the graph", 0

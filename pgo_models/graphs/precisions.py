@@ -8,6 +8,7 @@ import numpy as np
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.measurements import isotropic_information
 from pgo_models.graphs.pose_graph import PoseGraph
 
 _LEAST_SCALED = 1e-12  # smallest eigenvalue of a matrix scaled to ones on its diagonal that counts as positive
@@ -29,7 +30,7 @@ def edge_precisions(information: Array, weights: RotationWeight = RotationWeight
     """(kappa, tau), each (m,), of information matrices (m, 3, 3) in the plane or (m, 6, 6) in space.
 
     d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I_tt^-1), kappa as `weights` say.
-    The blocks themselves are inverted, not the marginal information. Per radian^2 and per metre^2.
+    The blocks themselves are inverted, not the marginal information; those of zeros give 0. Per radian^2 and metre^2.
 
     Raises
     ------
@@ -45,12 +46,6 @@ def edge_precisions(information: Array, weights: RotationWeight = RotationWeight
     return 1.5 / _trace_of_inverse(information[:, 3:, 3:]), tau
 
 
-def isotropic_information(kappa: Array, tau: Array, d: int) -> Array:
-    """Diagonal information matrices, (m, 3, 3) or (m, 6, 6), whose `precisions` are kappa and tau."""
-    diagonal = [tau, tau, kappa] if d == 2 else [tau, tau, tau, 2 * kappa, 2 * kappa, 2 * kappa]
-    return np.asarray(np.stack(diagonal, axis=1)[:, :, None] * np.eye(len(diagonal)))
-
-
 def proper_information(graph: PoseGraph) -> Array:
     """Information matrices that chi2 is of, (m, k, k): the graph's, without coupling blocks that make one indefinite.
 
@@ -59,7 +54,8 @@ def proper_information(graph: PoseGraph) -> Array:
     """
     if graph.information is None:
         return isotropic_information(graph.kappa, graph.tau, graph.d)
-    scale = 1.0 / np.sqrt(np.einsum("mkk->mk", graph.information))
+    diagonal = np.einsum("mkk->mk", graph.information)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     bad = ~(np.linalg.eigvalsh(graph.information * scale[:, :, None] * scale[:, None, :])[:, 0] > _LEAST_SCALED)
     if not bad.any():
         return graph.information
@@ -70,10 +66,13 @@ def proper_information(graph: PoseGraph) -> Array:
 
 
 def condition(blocks: Array) -> Array:
-    """Largest over smallest eigenvalue, (m,), of positive definite blocks (m, k, k)."""
-    values = np.linalg.eigvalsh(blocks)
+    """Largest over smallest eigenvalue, (m,), of positive definite blocks (m, k, k), without those that are zero."""
+    values = np.linalg.eigvalsh(blocks[blocks.any(axis=(1, 2))])
     return np.asarray(values[:, -1] / values[:, 0])
 
 
 def _trace_of_inverse(A: Array) -> Array:
-    return np.asarray(np.trace(np.linalg.inv(A), axis1=1, axis2=2))
+    zero = np.asarray(~A.any(axis=(1, 2)))
+    return np.where(
+        zero, np.inf, np.trace(np.linalg.inv(A + zero[:, None, None] * np.eye(A.shape[1])), axis1=1, axis2=2)
+    )
