@@ -177,11 +177,11 @@ def solve(
         raise SettingError(f"anchor is {anchor}; give a pose, 0 to {problem.num_poses - 1}")
     if anchor is not None and problem.graph.world is not None:
         raise SettingError("the priors of the graph say where its poses are; leave out the anchor")
-    seen_once = problem.graph.seen_once
-    if len(seen_once):
-        named = ", ".join(map(problem.graph.pose_name, seen_once[:5])) + ", .." * (len(seen_once) > 5)
-        message = f"seen once, and of no use to the poses: {len(seen_once)} landmarks ({named}); look at them again"
-        warnings.warn(f"{problem.graph.name}: {message}", GraphWarning, stacklevel=2)
+    graph, sights = problem.graph, np.bincount(problem.graph.j, minlength=problem.num_poses)
+    if (seen_once := graph.landmarks[sights[graph.landmarks] == 1]).size:
+        named = ", ".join(map(graph.pose_name, seen_once[:5])) + ", .." * (len(seen_once) > 5)
+        message = f"{len(seen_once)} landmarks seen once, of no use to the poses ({named}); look at them again"
+        warnings.warn(f"{graph.name}: {message}", GraphWarning, stacklevel=2)
     if robots is None and (engine is not None or checkpoint is not None):
         raise SettingError("engine and checkpoint are for solves by robots; give robots, a number or a Partition")
     pipeline = pipeline if pipeline is not None else Pipeline()

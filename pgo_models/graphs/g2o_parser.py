@@ -116,13 +116,11 @@ def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
     vertex_ids, vertices, vertex_lines, is_point = source.joined(d, is_edge=False)
     edge_ids, edges, edge_lines, to_point = source.joined(d, is_edge=True)
     landmarks = np.unique(np.concatenate([vertex_ids[is_point, 1], edge_ids[to_point, 1]]))
-    for at, wrong in (
-        (vertex_lines, np.isin(vertex_ids[:, 1], landmarks) & ~is_point),
-        (edge_lines, np.isin(edge_ids[:, 0], landmarks) | (np.isin(edge_ids[:, 1], landmarks) & ~to_point)),
-    ):
-        if wrong.any():
-            problem = "a pose, or an edge of poses, with the id of a landmark, which is a point; renumber one of them"
-            raise FileFormatError(path, int(at[np.argmax(wrong)]), problem)
+    is_posed = np.isin(edge_ids, landmarks) & ~np.stack([np.zeros_like(to_point), to_point], axis=1)
+    posed = [*vertex_lines[np.isin(vertex_ids[:, 1], landmarks) & ~is_point], *edge_lines[is_posed.any(axis=1)]]
+    if posed:
+        problem = "a pose, or an edge of poses, with the id of a landmark, which is a point; renumber one of them"
+        raise FileFormatError(path, int(min(posed)), problem)
     found = G2OLines(
         path,
         d,

@@ -89,8 +89,7 @@ class Measurements(ReadOnly):
     @cached_property
     def bodies(self) -> IntArray:
         """Poses that are neither the world's nor a landmark's, (b,)."""
-        other = self.landmarks if self.world is None else np.append(self.landmarks, self.world)
-        return read_only(np.setdiff1d(np.arange(self.num_poses), other))
+        return read_only(np.setdiff1d(self.in_files, self.landmarks))
 
     @property
     def in_files(self) -> IntArray:
@@ -101,11 +100,6 @@ class Measurements(ReadOnly):
     def is_prior(self) -> BoolArray:
         """Whether an edge begins at the world pose, (m,)."""
         return np.asarray(self.i == self.world)
-
-    @property
-    def seen_once(self) -> IntArray:
-        """Landmarks with one edge, which fixes them and says nothing of the poses."""
-        return np.asarray(self.landmarks[np.bincount(self.j, minlength=self.num_poses)[self.landmarks] == 1])
 
     def completed(self, poses: Poses) -> Poses:
         """Poses with the world's, if it is left out, and with landmarks turned like the poses that saw them first."""
@@ -137,12 +131,11 @@ class Measurements(ReadOnly):
 
     def _settled_landmarks(self) -> dict[str, Array]:
         """The fields kappa and information of a graph with what it says of edges to landmarks."""
-        if not len(self.landmarks):
-            return {}
         to_points, first, d = np.isin(self.j, self.landmarks), self.first_sights, self.d
-        kappa, others = self.kappa.copy(), self.kappa[~to_points & (self.kappa > 0)]
-        kappa[to_points] = 0.0
-        usual = float(np.median(others)) if len(others) else 1.0
+        if not len(first):
+            return {}
+        kappa = np.where(to_points, 0.0, self.kappa)
+        usual = np.median(kappa[kappa > 0]) if kappa.any() else 1.0
         kappa[first] = np.where(self.kappa[first] > 0, self.kappa[first], usual)
         if self.information is None:
             return {"kappa": read_only(kappa)}
@@ -195,11 +188,8 @@ class Measurements(ReadOnly):
             raise GraphError(f"fixed names a pose outside 0 .. {self.num_poses - 1}")
         if self.times is not None and not (np.isfinite(self.times).all() and (np.diff(self.times) > 0).all()):
             raise GraphError("times do not ascend; give one for every pose, in the order of their ids")
-        special = [*self.landmarks.tolist(), *([] if self.world is None else [self.world])]
-        if len(set(special)) < len(special) or not all(0 <= pose < self.num_poses for pose in special):
-            raise GraphError(
-                f"world and landmarks are not different poses of 0 .. {self.num_poses - 1}; name each once"
-            )
+        if len(self.bodies) + len(self.landmarks) + (self.world is not None) != self.num_poses:
+            raise GraphError(f"world and landmarks are not different poses, 0 to {self.num_poses - 1}; name each once")
         turned = np.isin(self.j, self.landmarks) & (self.R_ij != np.eye(self.d)).any(axis=(1, 2))
         wrong = turned | np.isin(self.i, self.landmarks) | (self.j == self.world)
         if wrong.any():

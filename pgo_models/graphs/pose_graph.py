@@ -183,10 +183,7 @@ class PoseGraph(Measurements):
         )
 
     def unit_weights(self) -> PoseGraph:
-        """Return the same measurements with kappa = tau = 1, the weights of the paper's equation (`min overall`).
-
-        What is zero stays zero.
-        """
+        """Return the graph with kappa = tau = 1, as in the paper (`min overall`), but where they are zero."""
         return self.with_weights((self.kappa > 0).astype(float), (self.tau > 0).astype(float))
 
     def with_weights(self, kappa: Array, tau: Array) -> PoseGraph:
@@ -212,36 +209,24 @@ class PoseGraph(Measurements):
 
     def with_prior(self, poses: IntArray, measured: Poses, kappa: Weights, tau: Weights) -> PoseGraph:
         """Return the graph with poses (k,) measured in the frame of the world, in which the solution is then."""
+        graph = self
         if self.world is None:
             graph = self._with_node(poses[0], WORLD_ID, {"world": self.num_poses})
-            return graph.with_prior(poses, measured, kappa, tau)
-        return self.with_edges(np.full(len(poses), self.world), poses, measured, kappa, tau)
+        return graph.with_edges(np.full(len(poses), graph.world), poses, measured, kappa, tau)
 
     def with_position_prior(self, poses: IntArray, positions: Array, tau: Weights) -> PoseGraph:
-        """Return the graph with positions (k, d) of poses (k,) measured in the frame of the world, as by GPS.
-
-        Examples
-        --------
-        >>> from pgo_models.graphs.scenes import grid
-        >>> graph = grid(np.random.default_rng(0))
-        >>> graph.with_position_prior(np.arange(9), graph.truth.t[:9], 4.0)
-        PoseGraph('grid', d=3, poses=27, edges=117, priors=9, robots=1)
-        """
+        """Return the graph with positions (k, d) of poses (k,) measured in the frame of the world, as by GPS."""
         return self.with_prior(poses, Poses.of_points(positions), 0.0, tau)
 
     def with_landmark(self, seen_from: IntArray, positions: Array, tau: Weights, name: int | None = None) -> PoseGraph:
-        """Return the graph with one more landmark, seen at (k, d) in the frames of poses (k,); its truth is unknown.
-
-        Its id is `name`, or the one after the largest.
-        """
+        """Return the graph, without truth, with one more landmark, seen at (k, d) in the frames of poses (k,)."""
         points, n, first, initial = Poses.of_points(positions), self.num_poses, seen_from[0], self.initial
         name = int(self.pose_ids[self.in_files].max()) + 1 if name is None else name
         if initial is not None:
             there = initial.t[first] + initial.R[first] @ points.t[0]
             initial = Poses(initial.R[[*range(n), first]], np.append(initial.t, there[None], axis=0))
         others = {"landmarks": np.append(self.landmarks, n), "initial": initial, "truth": None}
-        graph = self._with_node(first, name, others)
-        return graph.with_edges(seen_from, np.full(len(points.t), n), points, 0.0, tau)
+        return self._with_node(first, name, others).with_edges(seen_from, np.full(len(seen_from), n), points, 0.0, tau)
 
     def _rows(self, edges: BoolArray) -> dict[str, Any]:
         return {name: getattr(self, name)[edges] for name in _OF_EDGES if getattr(self, name) is not None}

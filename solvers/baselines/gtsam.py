@@ -157,6 +157,8 @@ def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noq
         Without GTSAM.
     """
     gtsam, graph, d = _import_gtsam(), problem.graph, problem.d
+    if not ((graph.kappa > 0) & (graph.tau > 0)).all():
+        raise SettingError(f"{graph.name} has edges without a rotation or position, which GTSAM is not given; solve()")
     sigma_R, sigma_t = 0.5 / np.sqrt(graph.kappa), 1.0 / np.sqrt(2.0 * graph.tau)
     # A tangent vector of Pose3 begins with the rotation, one of Pose2 with the translation.
     turns, moves = np.repeat(sigma_R[:, None], 2 * d - 3, axis=1), np.repeat(sigma_t[:, None], d, axis=1)

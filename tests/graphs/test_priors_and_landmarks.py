@@ -70,7 +70,7 @@ def test_the_first_sight_of_a_landmark_carries_its_rotation_whatever_is_taken_aw
         assert left[0] > 0
         assert not left[1:].any()
         less.check_connected()
-    assert less.seen_once.tolist() == [landmark]
+    assert np.sum(less.j == landmark) == 1
 
 
 def test_edits_keep_what_they_do_not_touch():
@@ -111,7 +111,7 @@ def test_new_edges_have_information_where_the_others_have():
     ("changes", "message"),
     [
         ({"world": 0}, "begins at a landmark|ends at the world"),
-        ({"world": 9}, "not different poses of 0 .. 3"),
+        ({"world": 9}, "not different poses, 0 to 3"),
         ({"landmarks": [3, 3]}, "name each once"),
         ({"landmarks": [1]}, r"edge 1 \(1 -> 2\) begins at a landmark"),
         ({"landmarks": [3], "R_ij": np.tile(np.diag([-1.0, -1, 1]), (3, 1, 1))}, "measures its rotation"),
@@ -164,6 +164,6 @@ def test_victoria_park_is_the_same_for_the_same_seed_and_sees_every_landmark_twi
     assert graph.d == 2
     assert len(graph.bodies) == 40
     assert len(graph.landmarks) > 3
-    assert not len(graph.seen_once)
+    assert np.bincount(graph.j)[graph.landmarks].min() >= 2
     graph.check_connected()
     np.testing.assert_array_equal(graph.initial.R[graph.landmarks[0]], graph.initial.R[graph.i[graph.first_sights[0]]])
