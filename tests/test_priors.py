@@ -11,10 +11,11 @@ from scipy.optimize import least_squares
 
 import pgo_models as pgo
 import solvers
-from pgo_models.errors import GraphWarning, SettingError
+from pgo_models.errors import GraphError, GraphWarning, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, log_map, tangent_dimension
 from pgo_models.graphs.g2o import read_g2o, write_g2o
+from pgo_models.graphs.measurements import isotropic_information
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import chi2
 from pgo_models.graphs.scenes import victoria_park
@@ -172,6 +173,33 @@ def test_chi2_with_positions_and_landmarks_is_certified(anisotropic, tmp_path):
     assert solution.is_certified
     np.testing.assert_allclose(solution.objective, chi2(graph, solution.poses), rtol=1e-9, atol=0)
     assert solution.frame == "that of the priors"
+
+
+def test_chi2_takes_no_prior_of_a_rotation_alone_beside_matrices_that_are_not_isotropic():
+    graph = varied_graph(5, 8, 3)
+    graph = graph.with_position_prior(np.arange(8), graph.truth.t, 2.0)
+    graph = graph.with_prior(np.array([2]), graph.truth[np.array([2])], 5.0, 0.0)
+    assert solvers.solve(graph).is_certified
+    information = isotropic_information(graph.kappa, graph.tau, 3)
+    whole = pgo.PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION)
+    np.testing.assert_allclose(solvers.solve(whole).objective, solvers.solve(graph).objective, rtol=1e-9, atol=0)
+    information[0, 0, 0] *= 3
+    with pytest.raises(GraphError, match=r"\(the world -> 2\), of a rotation alone"):
+        solvers.solve(pgo.PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_bound_on_chi2_with_landmarks_and_long_information_matrices_holds(d):
+    """The tangent fails there, and smaller matrices are tried, with blocks of zeros among them."""
+    graph, rng = varied_graph(4, 12, d), np.random.default_rng(0)
+    graph = with_gps(graph, 5)
+    for _ in range(3):
+        graph = graph.with_landmark(rng.choice(12, 3, replace=False), rng.standard_normal((3, d)), 20.0)
+    information = isotropic_information(graph.kappa, graph.tau, d)
+    information[:, 0, 0] *= 1e3
+    graph = replace(graph, information=information)
+    solution = solvers.solve(pgo.PGOProblem(graph, weighting=Weighting.INFORMATION))
+    assert 0 <= solution.lower_bound <= chi2(graph, solution.poses) * (1 + 1e-12)
 
 
 def test_an_anchor_beside_priors_is_refused_and_fix_lines_are_not_minded():

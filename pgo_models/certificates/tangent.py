@@ -22,7 +22,7 @@ from pgo_models.certificates.newton_polish import polish
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import proper_information
+from pgo_models.graphs.precisions import filled, proper_information
 from pgo_models.problem.problem import PGOProblem
 
 BISECTIONS = 5
@@ -37,7 +37,7 @@ def soften(graph: PoseGraph, cap: float) -> PoseGraph:
     """
     information, d = proper_information(graph), graph.d
     I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
-    coupled = np.linalg.solve(I_tt, I_tr) @ np.linalg.solve(I_rr, np.swapaxes(I_tr, 1, 2))
+    coupled = np.linalg.solve(filled(I_tt), I_tr) @ np.linalg.solve(filled(I_rr), np.swapaxes(I_tr, 1, 2))
     share = 1.0 - np.sqrt(np.abs(np.linalg.eigvals(coupled)).max(axis=1)) if I_tr.any() else np.ones(len(I_tt))
     share = np.where(I_tr.any(axis=(1, 2)), share - 2.0**-20, share)
     smaller = np.zeros_like(information)
@@ -72,7 +72,7 @@ def softened_bound(problem: PGOProblem, poses: Poses) -> tuple[LowerBound, Poses
         return True
 
     d = problem.d
-    low, high = 0.0, math.log(1.0 + float(np.linalg.cond(proper_information(problem.graph)[:, :d, :d]).max()))
+    low, high = 0.0, math.log(1.0 + float(np.linalg.cond(filled(proper_information(problem.graph)[:, :d, :d])).max()))
     if attempt(low):
         for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)

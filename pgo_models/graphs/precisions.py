@@ -71,8 +71,10 @@ def condition(blocks: Array) -> Array:
     return np.asarray(values[:, -1] / values[:, 0])
 
 
+def filled(A: Array) -> Array:
+    """Blocks (m, k, k) with the identity in place of those that are zero."""
+    return np.asarray(A + ~A.any(axis=(1, 2), keepdims=True) * np.eye(A.shape[1]))
+
+
 def _trace_of_inverse(A: Array) -> Array:
-    zero = np.asarray(~A.any(axis=(1, 2)))
-    return np.where(
-        zero, np.inf, np.trace(np.linalg.inv(A + zero[:, None, None] * np.eye(A.shape[1])), axis1=1, axis2=2)
-    )
+    return np.where(A.any(axis=(1, 2)), np.trace(np.linalg.inv(filled(A)), axis1=1, axis2=2), np.inf)

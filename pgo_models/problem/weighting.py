@@ -232,7 +232,8 @@ def edge_weights(graph: PoseGraph, weighting: Weighting) -> EdgeWeights:
     Raises
     ------
     GraphError
-        When an information matrix is too far from isotropic for double precision; it names the edge.
+        When an information matrix is too far from isotropic for double precision, or an edge without a position is
+        beside one that is not isotropic; it names the edge.
     """
     if weighting is Weighting.ISOTROPIC:
         return EdgeWeights(graph.tau, graph.kappa)
@@ -242,6 +243,11 @@ def edge_weights(graph: PoseGraph, weighting: Weighting) -> EdgeWeights:
     is_coupled = I_tr.any(axis=(1, 2))
     if (I_tt == I_tt[:, :1, :1] * np.eye(d)).all() and not is_coupled.any():
         return EdgeWeights(I_tt[:, 0, 0].copy(), *_rotation_weights(I_rr))
+    if (silent := ~I_tt.any(axis=(1, 2))).any():
+        edge = graph.edge_label(int(np.argmax(silent)))
+        raise GraphError(
+            f"chi2 of {edge}, of a rotation alone, is not known beside others' matrices; leave out one kind"
+        )
     margin = np.repeat((_MARGIN * smallest + _ROUNDED * trace)[:, None], d, axis=1)
     tau = np.where(is_coupled, _COUPLED_SHARE * smallest, smallest - 2.0 * margin[:, 0])
     J, K, turn = I_tt - tau[:, None, None] * np.eye(d), None, graph.R_ij
