@@ -22,7 +22,7 @@ from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.graphs.residuals import Chi2Convention, chi2, edge_residuals
-from pgo_models.graphs.scenes import circle, grid, random_geometric, sphere
+from pgo_models.graphs.scenes import circle, grid, random_geometric, sphere, victoria_park
 from pgo_models.graphs.trajectories import read_tum, write_tum
 from pgo_models.plots.graph_plots import compare_poses, plot_graph
 from pgo_models.plots.interactive_plots import explore_graph
@@ -97,6 +97,7 @@ __all__ = [
     "solve_relaxation",
     "spanning_tree_start",
     "sphere",
+    "victoria_park",
     "write_g2o",
     "write_tum",
 ]

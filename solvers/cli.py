@@ -26,7 +26,7 @@ from pgo_models.certificates.certificate import DEFAULT_GAP, certify
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
 from pgo_models.files import check_writable
 from pgo_models.geometry.poses import absolute_trajectory_error
-from pgo_models.graphs.datasets import known_datasets, load
+from pgo_models.graphs.datasets import known_datasets
 from pgo_models.graphs.g2o import MOST_SYMBOLS, symbol_ids, write_g2o, write_g2o_folder
 from pgo_models.graphs.separators import report_partition
 from pgo_models.graphs.trajectories import write_tum
@@ -92,6 +92,9 @@ InformationOption = Annotated[
         "--information",
         help="The cost is chi2 of the file's information matrices, not F of two precisions an edge.",
     ),
+]
+SkipUnknownOption = Annotated[
+    bool, typer.Option("--skip-unknown", help="Skip lines of a g2o file with unknown tags, and say which.")
 ]
 GapOption = Annotated[float, typer.Option(callback=_finite_gap, help="Relative gap to certify.")]
 
@@ -163,6 +166,7 @@ def solve_command(
     time_limit: Annotated[float, typer.Option(help="Seconds for the iterations.")] = math.inf,
     unit_weights: UnitWeightsOption = False,
     information: InformationOption = False,
+    skip_unknown: SkipUnknownOption = False,
     anchor: Annotated[
         int | None,
         typer.Option(
@@ -193,7 +197,8 @@ def solve_command(
         check_report(report)
     if covariances is not None and covariances.suffix.lower() != ".csv":
         raise SettingError(f"cannot write {covariances}: covariances are written as .csv")
-    problem = pose_problem(with_times(load_graph(graph, unit_weights), times), unit_weights, information)
+    loaded = with_times(load_graph(graph, unit_weights, skip_unknown), times)
+    problem = pose_problem(loaded, unit_weights, information)
     for path in out or []:
         check_target(path, problem.graph.num_robots)
     for other in filter(None, (report, resume, covariances)):
@@ -227,14 +232,19 @@ def solve_command(
     )
     text, truth = str(solution), problem.graph.truth
     if truth is not None:
-        text += f"\n\nerror to the truth (ATE): {absolute_trajectory_error(solution.poses, truth):.4g} m"
+        bodies = problem.graph.bodies
+        ate = absolute_trajectory_error(solution.poses[bodies], truth[bodies])
+        text += f"\n\nerror to the truth (ATE): {ate:.4g} m"
     targets: list[tuple[Path, Callable[[Path], None]]] = [(path, solution.save) for path in out or []]
     if covariances is not None:
-        targets.append((covariances, lambda to: write_covariances(solution.marginals(), problem.graph.pose_ids, to)))
+        named = problem.graph.in_files
+        ids = problem.graph.pose_ids[named]
+        targets.append((covariances, lambda to: write_covariances(solution.marginals()[named], ids, to)))
         with suppress(NotPositiveDefiniteError):  # writing will say so
             solution = replace(solution, covariances=solution.marginals() if report is not None else None)
     if report is not None:
-        source = shlex.join([graph, *(["--unit-weights"] if unit_weights else [])])
+        options = {"--unit-weights": unit_weights, "--skip-unknown": skip_unknown}
+        source = shlex.join([graph, *(name for name, given in options.items() if given)])
         targets.append((report, partial(write_report, solution, source=source)))
     save_then_show(targets, lambda: typer.echo("\n\n".join([text, *hint_of_chi2(problem, solution.poses)])))
     warn_of_weights(graph, problem, solution.certificate)
@@ -257,13 +267,14 @@ def certify_command(
     gap: GapOption = DEFAULT_GAP,
     unit_weights: UnitWeightsOption = False,
     information: InformationOption = False,
+    skip_unknown: SkipUnknownOption = False,
 ) -> None:
     """Judge anybody's poses: how far their cost can be above the global optimum."""
     if out is not None:
         if out.suffix.lower() != ".json":
             raise SettingError(f"cannot write {out}: a certificate is written as .json")
         check_writable(out)
-    problem = pose_problem(load_graph(graph, unit_weights), unit_weights, information)
+    problem = pose_problem(load_graph(graph, unit_weights, skip_unknown), unit_weights, information)
     poses = estimated_poses(problem.graph, estimate)
     certificate = certify(problem, poses, gap)
     record = {
@@ -289,6 +300,7 @@ def info_command(
     ] = None,
     robots: Annotated[int | None, typer.Option(min=1, help="Show what sharing the poses among so many costs.")] = None,
     split: SplitOption = None,
+    skip_unknown: SkipUnknownOption = False,
 ) -> None:
     """Show what a pose graph is made of, or what this installation has."""
     table = Table(show_header=False, box=None)
@@ -299,7 +311,7 @@ def info_command(
             table.add_row(name, version)
         table.add_row("data sets", ", ".join(known_datasets()))
     else:
-        loaded = load(graph)
+        loaded = load_graph(graph, False, skip_unknown)
         for label, text in describe_graph(loaded):
             table.add_row(label, text)
         if robots is not None or split is not None:
@@ -320,7 +332,9 @@ def generate_command(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random generator.")] = 0,
     poses: Annotated[
         int | None,
-        typer.Option(min=2, help="Poses: in all (random), or of every robot (grid-world); 100 unless given."),
+        typer.Option(
+            min=2, help="Poses: in all (random; victoria-park: 300), or of every robot (grid-world); 100 unless given."
+        ),
     ] = None,
     robots: Annotated[int | None, typer.Option(min=1, help="Robots (grid-world); 4 unless given.")] = None,
     dimension: Annotated[
@@ -328,10 +342,10 @@ def generate_command(
         typer.Option("--dimension", "-d", min=2, max=3, help="Of space (random, grid-world); 3 unless given."),
     ] = None,
     translation_noise: Annotated[
-        float | None, typer.Option(help="Standard deviation, metres (random, grid-world).")
+        float | None, typer.Option(help="Standard deviation, metres (random, grid-world, victoria-park).")
     ] = None,
     rotation_noise: Annotated[
-        float | None, typer.Option(help="Standard deviation, degrees (random, grid-world).")
+        float | None, typer.Option(help="Standard deviation, degrees (random, grid-world, victoria-park).")
     ] = None,
 ) -> None:
     """Generate a scene with known truth, written beside it as NAME.truth.tum."""

@@ -17,9 +17,9 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 
 
-def load_graph(graph: str, unit_weights: bool) -> PoseGraph:
+def load_graph(graph: str, unit_weights: bool, skip_unknown: bool = False) -> PoseGraph:
     """Graph of a file, folder or data set, with its own weights or those of the paper."""
-    loaded = load(graph)
+    loaded = load(graph, skip_unknown=skip_unknown)
     return loaded.unit_weights() if unit_weights else loaded
 
 
@@ -36,9 +36,9 @@ def with_times(graph: PoseGraph, path: Path | None) -> PoseGraph:
     if path is None:
         return graph
     times = read_times(path)
-    if len(times) != graph.num_poses:
+    if len(times) != len(graph.bodies):
         raise FileFormatError(
-            path, None, f"{len(times)} times, {graph.name} has {graph.num_poses} poses; give one each"
+            path, None, f"{len(times)} times, {graph.name} has {len(graph.bodies)} poses; give one each"
         )
     return replace(graph, times=times)
 
@@ -67,6 +67,7 @@ def estimated_poses(graph: PoseGraph, path: Path | None) -> Poses:
         found = read_kitti(path, graph.d)
     else:
         raise SettingError(f"cannot read {path}: no format has suffix {suffix!r}; use .g2o, .tum or .kitti")
-    if found.num_poses != graph.num_poses:
-        raise FileFormatError(path, None, f"{found.num_poses} poses, {graph.name} has {graph.num_poses}; give one each")
-    return found
+    if found.num_poses != len(graph.in_files):
+        known = f"{graph.name} has {len(graph.in_files)}, with its landmarks"
+        raise FileFormatError(path, None, f"{found.num_poses} poses, {known}; give one each, or a .g2o file")
+    return graph.completed(found)

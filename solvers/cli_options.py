@@ -14,7 +14,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, circle, grid, random_geometric, sphere
+from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, circle, grid, random_geometric, sphere, victoria_park
 from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import DEFAULT_MEMORY
@@ -83,6 +83,7 @@ class Scene(enum.Enum):
     SPHERE = "sphere"
     RANDOM = "random"
     GRID_WORLD = "grid-world"
+    VICTORIA_PARK = "victoria-park"
 
 
 def chosen_pipeline(
@@ -223,16 +224,20 @@ def chosen_scene(
     if scene in paper:
         noises = {"--translation-noise": translation_noise, "--rotation-noise": rotation_noise}
         settled |= {"--poses": poses, "--dimension": d, **noises}
+    if scene is Scene.VICTORIA_PARK:
+        settled["--dimension"] = d
     for name, value in settled.items():
         if value is not None:
             raise SettingError(f"{name} does nothing for {scene.value}, of which it is a part; leave it out")
     if scene in paper:
         return paper[scene](rng)
-    poses, d = poses if poses is not None else 100, d if d is not None else 3
+    poses, d = poses if poses is not None else 300 if scene is Scene.VICTORIA_PARK else 100, d if d is not None else 3
     noise = NoiseModel(
         MILD_NOISE.translation_std if translation_noise is None else translation_noise,
         MILD_NOISE.rotation_std if rotation_noise is None else float(np.deg2rad(rotation_noise)),
     )
+    if scene is Scene.VICTORIA_PARK:
+        return victoria_park(rng, num_poses=poses, noise=noise)
     if scene is Scene.RANDOM:
         return random_geometric(poses, rng, d=d, noise=noise)
     return grid_world(robots if robots is not None else 4, poses, rng, d=d, noise=noise)

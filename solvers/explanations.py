@@ -78,7 +78,8 @@ def place_of_weight(graph: str) -> str:
     path = locate(graph)
     if not (path.is_file() or path.is_dir()):
         return f"{graph}: weights too far apart for doubles; give it as a file to be told which"
-    loaded = load(path)
+    with warnings.catch_warnings(action="ignore"):
+        loaded = load(path, skip_unknown=True)
     _, edge, text = extreme_weight(loaded)
     return (
         f"{edge_place(path, edge)}: {text}; weights from {min(loaded.kappa.min(), loaded.tau.min()):.3g} to "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -23,7 +24,7 @@ from pgo_models.certificates.certificate import (
 )
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.certificates.newton_polish import polish
-from pgo_models.errors import SettingError
+from pgo_models.errors import GraphWarning, SettingError
 from pgo_models.geometry.arrays import whole_number
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition, partition
@@ -35,6 +36,7 @@ from solvers.distributed.driver import DEFAULT_MEMORY
 from solvers.distributed.leaderless import NO_CERTIFICATE, attempt_leaderless
 from solvers.distributed.stages import attempt_distributed, collect, open_driver
 from solvers.explanations import note_of_weights
+from solvers.frames import framed
 from solvers.loop import Watch
 from solvers.network.engine import Engine, InProcess
 from solvers.network.faults import Faults
@@ -179,6 +181,13 @@ def solve(
     problem = as_problem(problem)
     if anchor is not None and not 0 <= anchor < problem.num_poses:
         raise SettingError(f"anchor is {anchor}; give a pose, 0 to {problem.num_poses - 1}")
+    if anchor is not None and problem.graph.world is not None:
+        raise SettingError("the priors of the graph say where its poses are; leave out the anchor")
+    graph, sights = problem.graph, np.bincount(problem.graph.j, minlength=problem.num_poses)
+    if (seen_once := graph.landmarks[sights[graph.landmarks] == 1]).size:
+        named = ", ".join(map(graph.pose_name, seen_once[:5])) + ", .." * (len(seen_once) > 5)
+        message = f"{len(seen_once)} landmarks seen once, of no use to the poses ({named}); look at them again"
+        warnings.warn(f"{graph.name}: {message}", GraphWarning, stacklevel=2)
     if robots is None and (engine is not None or checkpoint is not None):
         raise SettingError("engine and checkpoint are for solves by robots; give robots, a number or a Partition")
     pipeline = pipeline if pipeline is not None else Pipeline()
@@ -250,22 +259,6 @@ def solve(
         frame=frame,
         anchor=held,
     )
-
-
-def framed(poses: Poses, graph: PoseGraph, anchor: int | None) -> tuple[Poses, str, int]:
-    """Poses in the frame of the anchor, first FIX line, estimate or pose 0; which it is; the pose held, or 0."""
-    ids, reference = graph.pose_ids, graph.initial
-    held = anchor if anchor is not None else int(graph.fixed[0]) if len(graph.fixed) else None
-    if held is None and reference is not None:
-        return poses.aligned_to(reference), "aligned with the estimate that came with the graph", 0
-    why = "as asked for" if anchor is not None else "by its FIX line"
-    if anchor is None and len(graph.fixed) > 1:
-        why += f"; those of {len(graph.fixed) - 1} other poses are not minded, F leaves one frame open"
-    if held is not None and reference is not None:
-        return poses.anchored_to(reference, held), f"pose {ids[held]} where the estimate has it, {why}", held
-    if held is not None:
-        return poses.with_gauge_at(held), f"pose {ids[held]} at the identity, {why}", held
-    return poses.with_gauge_at(0), f"pose {ids[0]} at the identity", 0
 
 
 def _robots_for(soc: SOC | PaperSOC | None, robots: Partition | int, graph: PoseGraph) -> Partition:

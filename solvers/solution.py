@@ -144,15 +144,15 @@ class Solution(Solved):
         """
         path = Path(path)
         check_format(path)
-        suffix = path.suffix.lower()
+        suffix, bodies = path.suffix.lower(), self.problem.graph.bodies
         if suffix == ".g2o":
             write_g2o(self.problem.graph, path, self.poses)
         elif suffix == "":
             write_g2o_folder(self.problem.graph, path, self.poses)
         elif suffix in (".tum", ".txt"):
-            write_tum(self.poses, path, self.problem.graph.times)
+            write_tum(self.poses[bodies], path, self.problem.graph.times)
         elif suffix == ".kitti":
-            write_kitti(self.poses, path)
+            write_kitti(self.poses[bodies], path)
         elif suffix == ".json":
             write_json(self.as_json(), path)
         else:
@@ -192,9 +192,9 @@ class Solution(Solved):
 
     def as_json(self) -> dict[str, object]:
         """Return what `.json` files hold: figures, stages, versions, and the poses by id."""
-        graph, certificate = self.problem.graph, self.certificate
+        graph, certificate, named = self.problem.graph, self.certificate, self.problem.graph.in_files
         return {
-            "graph": {"name": graph.name, "d": graph.d, "poses": graph.num_poses, "edges": graph.num_edges},
+            "graph": {"name": graph.name, "d": graph.d, "poses": len(named), "edges": graph.num_edges},
             "objective": self.objective,
             **both_costs(self.problem, self.poses),
             **certificate_json(certificate),
@@ -214,9 +214,9 @@ class Solution(Solved):
             ],
             **self._network_json(),
             "versions": installed_versions(self.problem.backend),
-            "ids": graph.pose_ids.tolist(),
-            "R": self.poses.R.tolist(),
-            "t": self.poses.t.tolist(),
+            "ids": graph.pose_ids[named].tolist(),
+            "R": self.poses.R[named].tolist(),
+            "t": self.poses.t[named].tolist(),
         }
 
     def _network_json(self) -> dict[str, object]:
@@ -241,7 +241,7 @@ class Solution(Solved):
         graph, certificate = self.problem.graph, self.certificate
         relaxed = "   (the semidefinite relaxation's)" if certificate.source is BoundSource.RELAXATION else ""
         return [
-            ("graph", f"{graph.name}: {graph.num_poses} poses, {graph.num_edges} edges, {graph.d}D"),
+            ("graph", f"{graph.name}: {len(graph.bodies)} poses, {graph.num_edges} edges{graph.extras}, {graph.d}D"),
             ("status", f"{self.status.name}: {self.status.value}"),
             (certificate.cost, f"{self.objective:.10g}"),
             ("lower bound", f"{certificate.lower_bound:.10g}{relaxed}"),

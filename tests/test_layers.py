@@ -37,6 +37,7 @@ ORDER = {
         "reporting",
         "solution",
         "explanations",
+        "frames",
         "pipeline",
         "shell",
         "studies",

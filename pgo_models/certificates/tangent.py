@@ -22,7 +22,7 @@ from pgo_models.certificates.newton_polish import polish
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import proper_information, uncoupled_share
+from pgo_models.graphs.precisions import filled, proper_information, uncoupled_share
 from pgo_models.problem.problem import PGOProblem
 
 BISECTIONS = 5
@@ -71,7 +71,7 @@ def softened_bound(problem: PGOProblem, poses: Poses) -> tuple[LowerBound, Poses
         return True
 
     d = problem.d
-    low, high = 0.0, math.log(1.0 + float(np.linalg.cond(proper_information(problem.graph)[:, :d, :d]).max()))
+    low, high = 0.0, math.log(1.0 + float(np.linalg.cond(filled(proper_information(problem.graph)[:, :d, :d])).max()))
     if attempt(low):
         for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)

@@ -81,6 +81,11 @@ class Poses(ReadOnly):
         n = len(X) // (X.shape[1] + 1)
         return cls(unstack_transposes(X[n:]), X[:n])
 
+    @classmethod
+    def of_points(cls, t: Array) -> Poses:
+        """Return poses at points (n, d), unrotated."""
+        return cls(np.broadcast_to(np.eye(np.shape(t)[1]), (len(t), np.shape(t)[1], np.shape(t)[1])), t)
+
     @property
     def num_poses(self) -> int:
         """Number of poses, n."""

@@ -73,12 +73,13 @@ def load(
     *,
     download: bool = True,
     weights: RotationWeight = RotationWeight.SE_SYNC,
+    skip_unknown: bool = False,
 ) -> PoseGraph:
     """Pose graph of a file, a folder with one file for each robot, or a data set's name.
 
     A name is looked for in the project's data folder, in ./data, in the folder named by the environment variable
     PGO_DATA, and in the user's cache; then it is downloaded, unless `download` is false. What the cache holds is
-    checked against its checksum. `weights` as for `read_g2o`.
+    checked against its checksum. `weights` and `skip_unknown` as for `read_g2o`.
     Beside `x.g2o`, or the folder `x`, a file `x.truth.tum` gives the ground truth, in the order of the poses.
 
     Raises
@@ -93,7 +94,7 @@ def load(
     >>> load("sphere")
     PoseGraph('sphere', d=3, poses=50, edges=544, robots=1)
     """
-    return _read(locate(name_or_path, registry, download=download), weights)
+    return _read(locate(name_or_path, registry, download=download), weights, skip_unknown)
 
 
 def locate(name_or_path: str | Path, registry: Registry = SE_SYNC, *, download: bool = True) -> Path:
@@ -157,15 +158,15 @@ def _holds_g2o(folder: Path) -> bool:
     return any(folder.glob("*.g2o"))
 
 
-def _read(path: Path, weights: RotationWeight) -> PoseGraph:
-    graph = read_g2o(path, weights)
+def _read(path: Path, weights: RotationWeight, skip_unknown: bool) -> PoseGraph:
+    graph = read_g2o(path, weights, skip_unknown=skip_unknown)
     beside = path.absolute().parent / f"{graph.name}.truth.tum"
     if not os.path.isfile(beside):
         return graph
     truth = read_tum(beside, d=graph.d)
-    if truth.num_poses != graph.num_poses:
+    if truth.num_poses != len(graph.in_files):
         raise FileFormatError(
-            beside, None, f"{truth.num_poses} poses, but {path} has {graph.num_poses}; remove or redo it"
+            beside, None, f"{truth.num_poses} poses, but {path} has {len(graph.in_files)}; remove or redo it"
         )
     return replace(graph, truth=truth)
 

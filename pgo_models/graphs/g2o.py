@@ -19,19 +19,24 @@ from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOErro
 from pgo_models.files import check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, log_map, quaternions_from_rotations
-from pgo_models.graphs.g2o_parser import G2OLines, IntArray, information_of, poses_of, read_lines
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import RotationWeight, edge_precisions, isotropic_information
+from pgo_models.graphs.g2o_parser import G2OLines, information_of, poses_of, read_lines
+from pgo_models.graphs.g2o_tags import TAGS
+from pgo_models.graphs.measurements import IntArray, isotropic_information
+from pgo_models.graphs.pose_graph import WORLD_ID, PoseGraph
+from pgo_models.graphs.precisions import RotationWeight, edge_precisions
 
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
 MOST_SYMBOLS = len(_LETTERS)  # robots whose poses can be named by GTSAM symbols
 _LETTER_SHIFT = 56  # a GTSAM symbol is a letter in the top byte and an index below it
 
 
-def read_g2o(path: Path | str, weights: RotationWeight = RotationWeight.SE_SYNC) -> PoseGraph:
+def read_g2o(
+    path: Path | str, weights: RotationWeight = RotationWeight.SE_SYNC, *, skip_unknown: bool = False
+) -> PoseGraph:
     """Pose graph of a g2o file, or of a folder with one g2o file for each robot.
 
-    Read are EDGE_SE3:QUAT, EDGE_SE2, VERTEX_SE3:QUAT, VERTEX_SE2 and FIX lines. Poses are numbered by ascending id.
+    Read are FIX lines and those of `g2o_tags`: poses, landmarks, priors. Poses are numbered by ascending id, the world
+    pose of priors last.
     Quaternions are normalised, repeated edges all count. `initial` is set when every pose has a VERTEX line; edges to
     poses without one are accepted, and leave it out.
 
@@ -47,6 +52,8 @@ def read_g2o(path: Path | str, weights: RotationWeight = RotationWeight.SE_SYNC)
     path : path
     weights : RotationWeight
         What kappa becomes of the information, in the plane.
+    skip_unknown : bool
+        Skip lines with other tags and warn of it, instead of an error.
 
     Returns
     -------
@@ -67,7 +74,7 @@ def read_g2o(path: Path | str, weights: RotationWeight = RotationWeight.SE_SYNC)
     PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
     """
     path = Path(path)
-    files = _robots_files([read_lines(file) for file in _files_of(path)])
+    files = _robots_files([read_lines(file, skip_unknown) for file in _files_of(path)])
     for file in files[1:]:
         if file.d != files[0].d:
             raise FileFormatError(file.path, None, f"{file.d}D, but {files[0].path} is {files[0].d}D; part the folder")
@@ -78,11 +85,15 @@ def read_g2o(path: Path | str, weights: RotationWeight = RotationWeight.SE_SYNC)
     if not len(rows):
         raise FileFormatError(path, None, "no edges; a pose graph needs at least one EDGE_SE2 or EDGE_SE3:QUAT line")
     ids = np.unique(np.concatenate([edge_ids.ravel(), *(file.vertex_ids for file in files)]))
-    robot = _robots(ids, files)
+    named = ids[ids != WORLD_ID]  # the largest number there is
+    robot = _robots(named, files)
     R_ij, t_ij = poses_of(d, rows)
     information = information_of(d, rows)
     kappa, tau = edge_precisions(information, weights)
-    both = np.searchsorted(ids, edge_ids)
+    both, initial = np.searchsorted(ids, edge_ids), _initial(named, robot, files)
+    world = len(named) if len(named) < len(ids) else None
+    if world is not None and robot is not None:
+        robot = np.append(robot, robot[both[np.argmax(both[:, 0] == world), 1]])
     return PoseGraph(
         num_poses=len(ids),
         i=both[:, 0],
@@ -94,15 +105,17 @@ def read_g2o(path: Path | str, weights: RotationWeight = RotationWeight.SE_SYNC)
         information=information,
         ids=ids,
         robot=robot,
-        initial=_initial(ids, robot, files),
+        initial=initial,
         fixed=_fixed(ids, files),
         name=_name_of(path),
+        world=world,
+        landmarks=np.flatnonzero(np.isin(ids, np.concatenate([file.landmarks for file in files]))),
     )
 
 
 def edge_place(path: Path | str, edge: int) -> str:
     """`file:line` of an edge of the graph that `read_g2o` has read from a file or folder."""
-    files = _robots_files([read_lines(file) for file in _files_of(Path(path))])
+    files = _robots_files([read_lines(file, skip_unknown=True) for file in _files_of(Path(path))])
     kept = zip(files, _join_edges(files), strict=True)
     return [f"{file.path}:{line}" for file, rows in kept for line in file.edge_lines[rows]][edge]
 
@@ -118,13 +131,14 @@ def read_g2o_poses(path: Path | str, graph: PoseGraph) -> Poses:
     file = read_lines(path)
     if file.d != graph.d:
         raise FileFormatError(path, None, f"{file.d}D, but {graph.name} is {graph.d}D; give poses of this graph")
-    absent = ~np.isin(graph.pose_ids, file.vertex_ids)
+    ids = graph.pose_ids[graph.in_files]
+    absent = ~np.isin(ids, file.vertex_ids)
     if absent.any():
-        first = graph.pose_ids[np.argmax(absent)]
+        first = ids[np.argmax(absent)]
         raise FileFormatError(path, None, f"no VERTEX line for pose {first} ({absent.sum()} missing); add it")
     order = np.argsort(file.vertex_ids)
-    at = order[np.searchsorted(file.vertex_ids[order], graph.pose_ids)]
-    return Poses(*poses_of(file.d, file.vertices[at]))
+    at = order[np.searchsorted(file.vertex_ids[order], ids)]
+    return graph.completed(Poses(*poses_of(file.d, file.vertices[at])))
 
 
 def write_g2o(graph: PoseGraph, path: Path | str, poses: Poses | None = None) -> None:
@@ -175,7 +189,7 @@ def write_g2o_folder(graph: PoseGraph, folder: Path | str, poses: Poses | None =
         raise PGOError(f"cannot write {folder}: {error.strerror}; choose a place that can be written") from error
     for robot, name in enumerate(names):
         mine = graph.robots == robot
-        _write(graph, folder / name, chosen, mine, mine[graph.i] | mine[graph.j])
+        _write(graph, folder / name, chosen, mine, (mine[graph.i] & ~graph.is_prior) | mine[graph.j])
 
 
 def check_g2o_folder(folder: Path | str, num_robots: int) -> None:
@@ -212,11 +226,13 @@ def symbol_ids(robots: IntArray) -> IntArray:
 
 
 def pose_names(graph: PoseGraph) -> list[str]:
-    """Names of the poses for people: a GTSAM symbol as its letter and index, another id as it is."""
-    ids = graph.pose_ids.tolist()
-    if not all(id_ >> _LETTER_SHIFT in map(ord, _LETTERS) for id_ in ids):
-        return [str(id_) for id_ in ids]
-    return [f"{chr(id_ >> _LETTER_SHIFT)}{id_ & ((1 << _LETTER_SHIFT) - 1)}" for id_ in ids]
+    """Names of the poses for people: a GTSAM symbol as its letter and index, another id as it is, or the world."""
+    names = [graph.pose_name(pose) for pose in range(graph.num_poses)]
+    ids = {pose: int(names[pose]) for pose in graph.in_files.tolist()}
+    if all(id_ >> _LETTER_SHIFT in map(ord, _LETTERS) for id_ in ids.values()):
+        for pose, id_ in ids.items():
+            names[pose] = f"{chr(id_ >> _LETTER_SHIFT)}{id_ & ((1 << _LETTER_SHIFT) - 1)}"
+    return names
 
 
 def _name_of(path: Path) -> str:
@@ -300,7 +316,7 @@ def _robots(ids: IntArray, files: list[G2OLines]) -> IntArray | None:
     owner = np.full(len(ids), -1, dtype=np.int64)
     for mentioned in ([file.vertex_ids for file in files], [file.edge_ids.ravel() for file in files]):
         for robot, named in enumerate(mentioned):
-            at = np.searchsorted(ids, named)
+            at = np.searchsorted(ids, named[named != WORLD_ID])
             owner[at[owner[at] < 0]] = robot
     return np.asarray(np.unique(owner, return_inverse=True)[1], dtype=np.int64)
 
@@ -343,25 +359,36 @@ def _poses_to_write(graph: PoseGraph, poses: Poses | None) -> Poses | None:
 
 
 def _write(graph: PoseGraph, path: Path, poses: Poses | None, mine: np.ndarray, edges: np.ndarray) -> None:
-    vertex, edge = ("VERTEX_SE2", "EDGE_SE2") if graph.d == 2 else ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
-    ids = graph.pose_ids
+    d, ids, is_point = graph.d, graph.pose_ids, np.isin(np.arange(graph.num_poses), graph.landmarks)
     information = graph.information
     if information is None:
-        information = isotropic_information(graph.kappa, graph.tau, graph.d)
-    k = information.shape[-1]
-    upper = information[:, *np.triu_indices(k)]
+        information = isotropic_information(graph.kappa, graph.tau, d)
+    to_point, ends = is_point[graph.j], np.stack([ids[graph.i], ids[graph.j]], axis=1)
+    no_turn = graph.is_prior & (graph.kappa == 0) & (graph.R_ij == np.eye(d)).all(axis=(1, 2))
+    kinds = {tag: kind for tag, kind in TAGS.items() if kind.d == d and not kind.is_toro}
     with replace_when_done(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
-        if poses is not None:
-            file.writelines(_lines(vertex, ids[mine, None], _numbers(poses[mine].R, poses[mine].t)))
+        if d == 3 and (edges & (graph.is_prior | to_point)).any():
+            file.write("PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1\n")
+        for tag, kind in kinds.items():
+            if not kind.is_edge and poses is not None:
+                at = np.flatnonzero(mine & (is_point == kind.is_point) & (np.arange(len(mine)) != graph.world))
+                file.writelines(_lines(tag, ids[at, None], poses.t[at] if kind.is_point else _numbers(poses[at])))
         file.writelines(f"FIX {ids[pose]}\n" for pose in graph.fixed if mine[pose])
-        measured = np.concatenate([_numbers(graph.R_ij[edges], graph.t_ij[edges]), upper[edges]], axis=1)
-        file.writelines(_lines(edge, np.stack([ids[graph.i], ids[graph.j]], axis=1)[edges], measured))
+        for tag, kind in kinds.items():
+            if kind.is_edge:
+                wanted = (graph.is_prior == (kind.num_ids == 1)) & (to_point == kind.to_landmark)
+                at = np.flatnonzero(edges & wanted & ((to_point | no_turn) == kind.is_point))
+                measured, k = Poses(graph.R_ij[at], graph.t_ij[at]), d if kind.is_point else information.shape[-1]
+                upper = information[at][:, *np.triu_indices(k)]
+                rows = np.concatenate([measured.t if kind.is_point else _numbers(measured), upper], axis=1)
+                file.writelines(_lines(tag, ends[at, -kind.num_ids :], rows, "0 " * kind.has_offset))
 
 
-def _numbers(R: Array, t: Array) -> Array:
+def _numbers(poses: Poses) -> Array:
+    R, t = poses.R, poses.t
     return np.concatenate([t, log_map(R) if R.shape[-1] == 2 else quaternions_from_rotations(R)], axis=1)
 
 
-def _lines(tag: str, ids: IntArray, numbers: Array) -> Iterator[str]:
+def _lines(tag: str, ids: IntArray, numbers: Array, offset: str = "") -> Iterator[str]:
     for names, row in zip(ids.tolist(), numbers.tolist(), strict=True):
-        yield f"{tag} {' '.join(map(str, names))} {' '.join(map(repr, row))}\n"
+        yield f"{tag} {' '.join(map(str, names))} {offset}{' '.join(map(repr, row))}\n"

@@ -1,4 +1,4 @@
-"""The lines of one g2o file as arrays, every fault named by file:line; the tags are those of SE-Sync's data sets.
+"""The lines of one g2o file as arrays, every fault named by file:line; their tags are in `g2o_tags`.
 
 The way through a sound file is short: one pass over the lines, one call that parses the numbers of all lines of a tag.
 Only when that fails are the lines looked at one by one, to name the one that is wrong.
@@ -6,6 +6,7 @@ Only when that fails are the lines looked at one by one, to name the one that is
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,30 +15,13 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from pgo_models.errors import FileFormatError
+from pgo_models.errors import FileFormatError, GraphWarning
 from pgo_models.files import LARGEST, check_distances, check_length, check_quaternions, finite_number, read_text
-from pgo_models.geometry.rotations import Array, exp_map, rotations_from_quaternions
-
-IntArray = NDArray[np.int64]
+from pgo_models.geometry.rotations import Array, BoolArray, exp_map, rotations_from_quaternions
+from pgo_models.graphs.g2o_tags import ALIASES, TAGS
+from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
 
 _SINGULAR = 1e-15  # a pivot below this part of its diagonal entry is rounding
-
-
-@dataclass(frozen=True)
-class _Tag:
-    """What stands on a line behind its tag: `num_ids` integers, then `num_numbers` numbers."""
-
-    d: int
-    num_ids: int
-    num_numbers: int
-
-
-_TAGS = {
-    "VERTEX_SE2": _Tag(d=2, num_ids=1, num_numbers=3),
-    "VERTEX_SE3:QUAT": _Tag(d=3, num_ids=1, num_numbers=7),
-    "EDGE_SE2": _Tag(d=2, num_ids=2, num_numbers=3 + 6),
-    "EDGE_SE3:QUAT": _Tag(d=3, num_ids=2, num_numbers=7 + 21),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +38,15 @@ class G2OLines:
     vertices : (v, 3) or (v, 7)
         x y theta, or x y z qx qy qz qw.
     edge_ids : (m, 2)
+        `WORLD_ID` and the pose, of a prior.
     edges : (m, 9) or (m, 28)
         The measurement like a vertex, then the upper triangle of its information matrix, row by row.
     edge_lines : (m,)
     fixed : (f,)
         Ids of the FIX lines.
     fixed_lines : (f,)
+    landmarks : (l,)
+        Ids that some line says are of a point.
     """
 
     path: Path
@@ -72,10 +59,13 @@ class G2OLines:
     edge_lines: IntArray
     fixed: IntArray
     fixed_lines: IntArray
+    landmarks: IntArray
 
 
-def read_lines(path: Path | str) -> G2OLines:
+def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
     """Read and check the lines of one g2o file; blank lines, comments (#) and PARAMS_ lines are skipped.
+
+    With `skip_unknown`, so are lines with unknown tags, and a `GraphWarning` says how many of each.
 
     Raises
     ------
@@ -83,51 +73,66 @@ def read_lines(path: Path | str) -> G2OLines:
         With file:line, for: a file that is missing, binary or without VERTEX and EDGE lines; an unknown tag; too few or
         too many numbers on a line, or thousands of them; a word, nan or inf where a number belongs; an id that is no
         integer of 64 bits; a zero quaternion; a length beyond `FARTHEST`; an information matrix whose translation or
-        rotation block is not positive definite; an edge to itself; a second VERTEX line of the same id; 2D and 3D in
-        one file.
+        rotation block is not positive definite, nor zero, or both are zero; an edge to itself; a second VERTEX line of
+        the same id; a measurement in the frame of a sensor that is not that of the pose; an edge from a landmark, or of
+        its rotation; 2D and 3D in one file.
     """
     path = Path(path)
     lines = read_text(path).split("\n")
-    gathered: dict[str, list[int]] = {tag: [] for tag in _TAGS}
-    ids: dict[str, list[str]] = {tag: [] for tag in _TAGS}
-    numbers: dict[str, list[str]] = {tag: [] for tag in _TAGS}
+    source = _Source(path, lines)
     fix: list[tuple[int, str]] = []
+    unknown: dict[str, list[int]] = {}
+    offset = 0  # line of a sensor that is not at its pose
     for number, line in enumerate(lines, 1):
         parts = line.split(None, 3)
         if not parts or parts[0][0] == "#":
             continue
-        tag = parts[0]
-        if tag in _TAGS:
+        tag = ALIASES.get(parts[0], parts[0])
+        if tag in TAGS:
+            kind = TAGS[tag]
             check_length(path, number, line)
-            gathered[tag].append(number)
-            if tag[0] == "E":
-                ids[tag] += parts[1:3]
-                numbers[tag].append(parts[-1])
-            else:
-                ids[tag] += parts[1:2]
-                numbers[tag].append(" ".join(parts[2:]))
+            source.at[tag].append(number)
+            if kind.has_offset:
+                parts = [tag, *source.words(tag, number)]
+            source.ids[tag] += parts[1 : 1 + kind.num_ids]
+            source.numbers[tag].append(" ".join(parts[1 + kind.num_ids :]))
         elif tag == "FIX":
             fix += [(number, word) for word in line.split()[1:]]
+        elif tag == "PARAMS_SE3OFFSET":
+            if any(finite_number(path, number, word) for word in line.split()[2:8]):
+                offset = number
+        elif skip_unknown:
+            unknown.setdefault(tag[:40], []).append(number)
         elif not tag.startswith("PARAMS_"):
-            raise FileFormatError(
-                path, number, f"unknown tag {tag[:40]!r}; supported are {', '.join(_TAGS)} and FIX: remove the line"
-            )
-    d = _dimension(path, gathered)
-    source = _Source(path, lines)
-    vertex, edge = ("VERTEX_SE2", "EDGE_SE2") if d == 2 else ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
-    vertex_ids, vertices = source.parse(vertex, gathered[vertex], ids[vertex], numbers[vertex])
-    edge_ids, edges = source.parse(edge, gathered[edge], ids[edge], numbers[edge])
+            problem = f"unknown tag {tag[:40]!r}; supported are {', '.join(TAGS)} and FIX: remove the line"
+            raise FileFormatError(path, number, f"{problem}, or have such lines skipped with --skip-unknown")
+    if unknown:
+        said = ", ".join(f"{len(at)} of {tag} (first: line {at[0]})" for tag, at in unknown.items())
+        warnings.warn(f"{path}: lines with unknown tags were skipped: {said}", GraphWarning, stacklevel=2)
+    if offset and any(source.at[tag] for tag, kind in TAGS.items() if kind.has_offset):
+        problem = "a sensor that is not at its pose; give what it measured in the frame of the pose, without this line"
+        raise FileFormatError(path, offset, problem)
+    d = _dimension(path, source.at)
+    vertex_ids, vertices, vertex_lines, is_point = source.joined(d, is_edge=False)
+    edge_ids, edges, edge_lines, to_point = source.joined(d, is_edge=True)
+    landmarks = np.unique(np.concatenate([vertex_ids[is_point, 1], edge_ids[to_point, 1]]))
+    is_posed = np.isin(edge_ids, landmarks) & ~np.stack([np.zeros_like(to_point), to_point], axis=1)
+    posed = [*vertex_lines[np.isin(vertex_ids[:, 1], landmarks) & ~is_point], *edge_lines[is_posed.any(axis=1)]]
+    if posed:
+        problem = "a pose, or an edge of poses, with the id of a landmark, which is a point; renumber one of them"
+        raise FileFormatError(path, int(min(posed)), problem)
     found = G2OLines(
         path,
         d,
-        vertex_ids[:, 0],
-        np.array(gathered[vertex], dtype=np.int64),
+        vertex_ids[:, 1],
+        vertex_lines,
         vertices,
         edge_ids,
         edges,
-        np.array(gathered[edge], dtype=np.int64),
+        edge_lines,
         np.array([source.integer(number, word) for number, word in fix], dtype=np.int64),
         np.array([number for number, _ in fix], dtype=np.int64),
+        landmarks,
     )
     for rows, at in ((vertices, found.vertex_lines), (edges, found.edge_lines)):
         check_distances(path, at, rows[:, :d])
@@ -159,10 +164,32 @@ class _Source:
     def __init__(self, path: Path, lines: list[str]) -> None:
         self.path = path
         self.lines = lines
+        self.at: dict[str, list[int]] = {tag: [] for tag in TAGS}
+        self.ids: dict[str, list[str]] = {tag: [] for tag in TAGS}
+        self.numbers: dict[str, list[str]] = {tag: [] for tag in TAGS}
 
-    def parse(self, tag: str, at: list[int], ids: list[str], numbers: list[str]) -> tuple[IntArray, Array]:
+    def joined(self, d: int, is_edge: bool) -> tuple[IntArray, Array, IntArray, BoolArray]:
+        """Ids (n, 2), rows, lines and whether they are of landmarks, of all VERTEX or all EDGE lines, line by line."""
+        wanted = [tag for tag, kind in TAGS.items() if (kind.d, kind.is_edge) == (d, is_edge)]
+        wanted = [tag for tag in wanted if self.at[tag]] or wanted[:1]
+        parsed = [self._parse(tag) for tag in wanted]
+        lines = np.array([line for tag in wanted for line in self.at[tag]], dtype=np.int64)
+        ids = np.concatenate([np.insert(own, 0, WORLD_ID, axis=1)[:, -2:] for own, _ in parsed])
+        rows = np.concatenate([TAGS[tag].rows(own) for tag, (_, own) in zip(wanted, parsed, strict=True)])
+        points = np.repeat([TAGS[tag].to_landmark for tag in wanted], [len(self.at[tag]) for tag in wanted])
+        order = np.argsort(lines)
+        return ids[order], rows[order], lines[order], points[order]
+
+    def words(self, tag: str, line: int) -> list[str]:
+        """Ids and numbers on a line, without the id of an offset."""
+        kind, words = TAGS[tag], self.lines[line - 1].split()[1:]
+        if kind.has_offset and len(words) == kind.num_ids + 1 + kind.num_numbers:
+            words.pop(kind.num_ids)
+        return words
+
+    def _parse(self, tag: str) -> tuple[IntArray, Array]:
         """Ids (n, num_ids) and finite numbers (n, num_numbers) of all lines of one tag."""
-        kind = _TAGS[tag]
+        kind, at, ids, numbers = TAGS[tag], self.at[tag], self.ids[tag], self.numbers[tag]
         if not at:
             return np.zeros((0, kind.num_ids), dtype=np.int64), np.zeros((0, kind.num_numbers))
         joined = "".join(ids)
@@ -173,7 +200,8 @@ class _Source:
             parsed = np.loadtxt(numbers, comments=None, ndmin=2)
         except (ValueError, OverflowError):
             self._diagnose(tag, at)
-        if parsed.shape != (len(at), kind.num_numbers) or not (np.abs(parsed) <= LARGEST).all():
+        fits = parsed.shape == (len(at), kind.num_numbers) and (parsed_ids < WORLD_ID).all()
+        if not fits or not (np.abs(parsed) <= LARGEST).all():
             self._diagnose(tag, at)
         return parsed_ids, parsed
 
@@ -184,14 +212,14 @@ class _Source:
             value = int(word if word.isascii() and "_" not in word else "")
         except ValueError:
             raise self._error(line, f"id {word[:40]!r} is no integer; number the poses") from None
-        if not -(2**63) <= value < 2**63:
+        if not -(2**63) <= value < WORLD_ID:
             raise self._error(line, f"id {word[:40]} does not fit 64 bits; renumber the poses")
         return value
 
     def _diagnose(self, tag: str, at: list[int]) -> NoReturn:
-        kind = _TAGS[tag]
+        kind = TAGS[tag]
         for line in at:
-            words = self.lines[line - 1].split()[1:]
+            words = self.words(tag, line)
             for word in words[: kind.num_ids]:
                 self.integer(line, word)
             for word in words[kind.num_ids :]:
@@ -211,9 +239,9 @@ class _Source:
 
 
 def _dimension(path: Path, gathered: dict[str, list[int]]) -> int:
-    first = {d: min((at[0] for tag, at in gathered.items() if at and _TAGS[tag].d == d), default=0) for d in (2, 3)}
+    first = {d: min((at[0] for tag, at in gathered.items() if at and TAGS[tag].d == d), default=0) for d in (2, 3)}
     if not first[2] and not first[3]:
-        raise FileFormatError(path, None, f"no measurement in it; a pose graph needs lines of {' or '.join(_TAGS)}")
+        raise FileFormatError(path, None, f"no measurement in it; a pose graph needs lines of {' or '.join(TAGS)}")
     if first[2] and first[3]:
         raise FileFormatError(
             path,
@@ -241,8 +269,12 @@ def _faults(found: G2OLines) -> Iterator[tuple[int, str]]:
     # The blocks alone are asked for: the precisions use nothing else, and the coupling blocks of the public cubicle
     # graph make 5,021 of its whole matrices indefinite.
     information = information_of(found.d, found.edges)
+    empty = ~information.any(axis=(1, 2))
+    if empty.any():
+        at = int(np.argmax(empty))
+        yield int(found.edge_lines[at]), "the information matrix is zero; the edge says nothing: remove it"
     for name, block in (("translation", slice(None, found.d)), ("rotation", slice(found.d, None))):
-        bad = ~_is_positive_definite(information[:, block, block])
+        bad = information[:, block, block].any(axis=(1, 2)) & ~_is_positive_definite(information[:, block, block])
         if bad.any():
             at = int(np.argmax(bad))
             smallest = np.linalg.eigvalsh(information[at, block, block])[0]

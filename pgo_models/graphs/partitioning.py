@@ -10,7 +10,8 @@ import numpy as np
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.geometry.arrays import ReadOnly, whole_array, whole_number
 from pgo_models.geometry.rotations import BoolArray
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts, has_no_gap
+from pgo_models.graphs.measurements import has_no_gap
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 
 
 class PartitionMethod(enum.Enum):

@@ -1,27 +1,37 @@
-"""PoseGraph: the measurements as arrays, checked once; its components, and which robot owns which pose."""
+"""PoseGraph: measurements, their components, parts and edits, and which robot owns which pose."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from pgo_models.errors import GraphError
-from pgo_models.geometry.arrays import ReadOnly, read_only, real_array, whole_array, whole_number
-from pgo_models.geometry.poses import Poses, rotations_to_rounding
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.arrays import read_only
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.measurements import IntArray as IntArray  # others have it from here
+from pgo_models.graphs.measurements import Measurements, isotropic_information
 from pgo_models.html_tables import facts_table
 
-IntArray = NDArray[np.int64]
+Weights = Array | float
+WORLD_ID = 2**63 - 1  # of the world pose, which no file names
+_COLLINEAR = 1e-9  # spread of positions across a line, over that along it
+_OF_EDGES = ("i", "j", "R_ij", "t_ij", "kappa", "tau", "information")
 
 
 @dataclass(frozen=True, eq=False)
-class PoseGraph(ReadOnly):
+class PoseGraph(Measurements):
     """n poses and m measured edges; edge e says x_i^-1 x_j = (R_ij, t_ij) with precisions kappa and tau.
+
+    A prior is an edge from the world pose, a pose like any other but that it is the frame of the solution; of a
+    position (GPS) it has kappa = 0 and R_ij = I. A landmark is a pose whose rotation nobody asks for, so that an edge
+    to it has R_ij = I and kappa = 0; but for the first, whose kappa is positive: R_l stands in that term alone, which
+    is so zero at every optimum, R_l = R_i. F over the other unknowns is not changed by it, nor is its minimum.
 
     Attributes
     ----------
@@ -33,7 +43,8 @@ class PoseGraph(ReadOnly):
     t_ij : (m, d)
         Measured translations, metres, in the frame of pose i.
     kappa, tau : (m,)
-        Positive precisions of the rotation (per radian^2) and of the translation (per metre^2).
+        Precisions of the rotation (per radian^2) and of the translation (per metre^2), at least one of them positive.
+        Of edges to landmarks kappa is settled here.
     information : (m, k, k), optional
         Information matrices as read, k = 3 in the plane (x, y, theta) and 6 in space (x, y, z, then rotation).
     ids : (n,), optional
@@ -45,8 +56,12 @@ class PoseGraph(ReadOnly):
     fixed : (f,)
         Poses that the file says are fixed. F does not depend on the gauge: the solution is moved so that the first of
         them is where the file has it, and all are kept for writing.
-    times : (n,), optional
-        Seconds of the poses, ascending, for the trajectories that are written.
+    times : (b,), optional
+        Seconds of the `bodies`, ascending, for the trajectories that are written.
+    world : int, optional
+        The world pose, where edges can only begin; no file names it, and `initial` and `truth` may leave it out.
+    landmarks : (l,)
+        Poses that are points, where edges can only end.
     name : str
 
     All arrays are read-only copies: `dataclasses.replace` makes a graph with others.
@@ -55,7 +70,7 @@ class PoseGraph(ReadOnly):
     ------
     GraphError
         On wrong shapes, entries that are no real or no whole numbers, an edge to itself or to no pose, nan or inf, no
-        rotation, or a precision that is not positive.
+        rotation, a negative precision, two that are zero, or an edge that starts at a landmark or ends at the world.
 
     Examples
     --------
@@ -65,73 +80,20 @@ class PoseGraph(ReadOnly):
     PoseGraph('pair', d=2, poses=2, edges=1, robots=1)
     """
 
-    num_poses: int
-    i: IntArray
-    j: IntArray
-    R_ij: Array
-    t_ij: Array
-    kappa: Array
-    tau: Array
-    information: Array | None = None
-    ids: IntArray | None = None
-    robot: IntArray | None = None
-    initial: Poses | None = None
-    truth: Poses | None = None
-    fixed: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    times: Array | None = None
-    name: str = "graph"
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "num_poses", whole_number(self.num_poses, "num_poses"))
-        for name in ("i", "j", "ids", "robot", "fixed"):
-            value = getattr(self, name)
-            if value is not None:
-                object.__setattr__(self, name, whole_array(value, name))
-        for name in ("R_ij", "t_ij", "kappa", "tau", "information", "times"):
-            value = getattr(self, name)
-            if value is not None:
-                object.__setattr__(self, name, real_array(value, name))
-        self._check_shapes()
-        self._check_values()
-        object.__setattr__(
-            self, "R_ij", rotations_to_rounding(self.R_ij, lambda edge: f"R_ij of {self.edge_label(edge)}")
-        )
-
     @property
-    def d(self) -> int:
-        """Dimension of space: 2 or 3."""
-        return int(self.R_ij.shape[-1])
-
-    @property
-    def num_edges(self) -> int:
-        """Number of measurements, m."""
-        return len(self.i)
-
-    @property
-    def pose_ids(self) -> IntArray:
-        """Names of the poses, (n,)."""
-        return np.arange(self.num_poses) if self.ids is None else self.ids
-
-    @property
-    def robots(self) -> IntArray:
-        """Owner of every pose, (n,)."""
-        return np.zeros(self.num_poses, dtype=np.int64) if self.robot is None else self.robot
-
-    @property
-    def num_robots(self) -> int:
-        """Number of robots that own the poses."""
-        return 1 if self.robot is None else int(self.robot.max()) + 1
+    def extras(self) -> str:
+        """How many landmarks and priors there are, if any, for texts."""
+        found = [(len(self.landmarks), "landmarks"), (int(self.is_prior.sum()), "priors")]
+        return "".join(f", {name}={count}" for count, name in found if count)
 
     def __repr__(self) -> str:
-        return (
-            f"PoseGraph({self.name!r}, d={self.d}, poses={self.num_poses}, edges={self.num_edges}, "
-            f"robots={self.num_robots})"
-        )
+        size = f"poses={len(self.bodies)}, edges={self.num_edges}{self.extras}"
+        return f"PoseGraph({self.name!r}, d={self.d}, {size}, robots={self.num_robots})"
 
     def _repr_html_(self) -> str:
         facts = [
             ("graph", f"{self.name}, {self.d}D"),
-            ("poses", str(self.num_poses)),
+            ("poses", str(len(self.bodies))),
             ("edges", str(self.num_edges)),
             ("robots", str(self.num_robots)),
             ("components", str(len(self.components()))),
@@ -148,9 +110,10 @@ class PoseGraph(ReadOnly):
         edges = np.ones(self.num_edges), (self.i, self.j)
         return read_only(coo_array(edges, shape=(self.num_poses, self.num_poses)).tocsr())
 
-    def components(self) -> list[IntArray]:
-        """Poses of every connected component, largest first."""
-        count, label = connected_components(self.adjacency, directed=False)
+    def components(self, edges: BoolArray | None = None) -> list[IntArray]:
+        """Poses of every connected component, largest first; of some of the edges, (m,), or of all."""
+        kept = slice(None) if edges is None else edges
+        count, label = connected_components(edge_counts(self.i[kept], self.j[kept], self.num_poses), directed=False)
         parts = [np.flatnonzero(label == c) for c in range(count)]
         return sorted(parts, key=lambda part: (-len(part), int(part[0])))
 
@@ -160,7 +123,7 @@ class PoseGraph(ReadOnly):
         return len(self.components()) == 1
 
     def check_connected(self) -> None:
-        """Raise a GraphError that names the components when there is more than one."""
+        """Raise a GraphError that names the components when there is more than one, or poses left undetermined."""
         parts = self.components()
         if len(parts) > 1:
             sizes = ", ".join(str(len(part)) for part in parts[:5])
@@ -170,6 +133,33 @@ class PoseGraph(ReadOnly):
                 f"pose graph has {len(parts)} components (sizes {sizes}{more}; with poses {firsts}{more}); "
                 "solve each on its own: PoseGraph.subgraph(PoseGraph.components()[k])"
             )
+        self._check_determined()
+
+    @property
+    def is_world_loose(self) -> bool:
+        """Whether all priors are of positions, so that the rotation of the world hangs on all of them together."""
+        return self.world is not None and not self.kappa[self.is_prior].any()
+
+    def _check_determined(self) -> None:
+        """Raise a GraphError when no edge with a positive precision ties some poses, or the world, to the others."""
+        loose = self.is_world_loose
+        for name, what in (("tau", "position"), ("kappa", "rotation")):
+            said = getattr(self, name) > 0
+            parts = [] if said.all() else self.components(said)
+            parts = [part for part in parts if name == "tau" or not loose or part[0] != self.world]
+            if len(parts) > 1:
+                raise GraphError(
+                    f"the {what} of {len(parts[1])} poses (with {self.pose_name(parts[1][0])}) is not tied to that of "
+                    f"the others: no edge between has {name} > 0; add one, or leave these poses out"
+                )
+        if loose:
+            measured = self.t_ij[self.is_prior][np.unique(self.j[self.is_prior], return_index=True)[1]]
+            spread = np.linalg.svd(measured - measured.mean(axis=0), compute_uv=False)
+            if len(measured) < self.d or not spread[self.d - 2] > _COLLINEAR * max(spread[0], 1e-300):
+                raise GraphError(
+                    f"the priors do not fix the gauge: positions of {len(measured)} poses, in a point or on a line, "
+                    "leave turns of the world open; give positions of more poses, or a prior with a rotation"
+                )
 
     def subgraph(self, poses: IntArray) -> PoseGraph:
         """Return the graph of the given poses, in ascending order, and of the edges among them."""
@@ -181,24 +171,20 @@ class PoseGraph(ReadOnly):
         return replace(
             self,
             num_poses=len(chosen),
-            i=number[self.i[edges]],
-            j=number[self.j[edges]],
-            R_ij=self.R_ij[edges],
-            t_ij=self.t_ij[edges],
-            kappa=self.kappa[edges],
-            tau=self.tau[edges],
-            information=None if self.information is None else self.information[edges],
+            **(self._rows(edges) | {"i": number[self.i[edges]], "j": number[self.j[edges]]}),
             ids=self.pose_ids[chosen],
             robot=robot,
             initial=None if self.initial is None else self.initial[chosen],
             truth=None if self.truth is None else self.truth[chosen],
             fixed=number[self.fixed][number[self.fixed] >= 0],
-            times=None if self.times is None else self.times[chosen],
+            times=None if self.times is None else self.times[np.isin(self.bodies, chosen)],
+            world=None if self.world not in chosen else int(number[self.world]),
+            landmarks=number[self.landmarks][number[self.landmarks] >= 0],
         )
 
     def unit_weights(self) -> PoseGraph:
-        """Return the same measurements with kappa = tau = 1, the weights of the paper's equation (`min overall`)."""
-        return self.with_weights(np.ones(self.num_edges), np.ones(self.num_edges))
+        """Return the graph with kappa = tau = 1, as in the paper (`min overall`), but where they are zero."""
+        return self.with_weights((self.kappa > 0).astype(float), (self.tau > 0).astype(float))
 
     def with_weights(self, kappa: Array, tau: Array) -> PoseGraph:
         """Return the same measurements with other precisions, (m,); information matrices as read do not go along."""
@@ -208,76 +194,47 @@ class PoseGraph(ReadOnly):
         """Return the same graph with `robot`, (n,), as owners of the poses."""
         return replace(self, robot=robot)
 
-    def edge_label(self, e: int) -> str:
-        """Name edge e by its place and the ids of its poses, for messages."""
-        return f"edge {e} ({self._id_of(self.i[e])} -> {self._id_of(self.j[e])})"
+    def without_edges(self, mask: BoolArray) -> PoseGraph:
+        """Return the graph without the edges of a mask, (m,); with the last prior goes the world pose."""
+        kept = replace(self, **self._rows(~np.asarray(mask, dtype=bool)))
+        return kept if self.world is None or kept.is_prior.any() else kept.subgraph(self.in_files)
 
-    def _id_of(self, pose: int) -> int:
-        return int(self.ids[pose]) if self.ids is not None and 0 <= pose < len(self.ids) else int(pose)
+    def with_edges(self, i: IntArray, j: IntArray, measured: Poses, kappa: Weights, tau: Weights) -> PoseGraph:
+        """Return the graph with more edges (i, j), (k,), of precisions (k,) or the same; information as they say."""
+        kappa, tau = (np.array(np.broadcast_to(one, np.shape(i)), dtype=float) for one in (kappa, tau))
+        more = i, j, measured.R, measured.t, kappa, tau, isotropic_information(kappa, tau, self.d)
+        rows = zip(self._rows(np.ones(self.num_edges, dtype=bool)).items(), more, strict=False)
+        extended: dict[str, Any] = {name: np.concatenate([own, new]) for (name, own), new in rows}
+        return replace(self, **extended)
 
-    def _check_shapes(self) -> None:
-        m = len(self.i)
-        if m == 0:
-            raise GraphError(f"{self.name} has no edges; a pose graph needs at least one measurement")
-        if self.R_ij.ndim != 3 or self.R_ij.shape[1:] not in ((2, 2), (3, 3)):
-            raise GraphError(f"R_ij has shape {self.R_ij.shape}; give (m, 2, 2) or (m, 3, 3)")
-        d = self.R_ij.shape[-1]
-        k = 3 if d == 2 else 6
-        expected: dict[str, tuple[int, ...]] = {
-            "i": (m,),
-            "j": (m,),
-            "R_ij": (m, d, d),
-            "t_ij": (m, d),
-            "kappa": (m,),
-            "tau": (m,),
-            "information": (m, k, k),
-            "ids": (self.num_poses,),
-            "robot": (self.num_poses,),
-            "fixed": (len(self.fixed),),
-            "times": (self.num_poses,),
-        }
-        for name, shape in expected.items():
-            value = getattr(self, name)
-            if value is not None and value.shape != shape:
-                raise GraphError(f"{name} has shape {value.shape}; with {m} edges in {d}D give {shape}")
-        for name in ("initial", "truth"):
-            poses: Poses | None = getattr(self, name)
-            if poses is not None and poses.t.shape != (self.num_poses, d):
-                raise GraphError(f"{name} is {poses}; give {self.num_poses} poses in {d}D")
+    def with_prior(self, poses: IntArray, measured: Poses, kappa: Weights, tau: Weights) -> PoseGraph:
+        """Return the graph with poses (k,) measured in the frame of the world, in which the solution is then."""
+        graph = self
+        if self.world is None:
+            graph = self._with_node(poses[0], WORLD_ID, {"world": self.num_poses})
+        return graph.with_edges(np.full(len(poses), graph.world), poses, measured, kappa, tau)
 
-    def _check_values(self) -> None:
-        both = np.stack([self.i, self.j])
-        outside = ((both < 0) | (both >= self.num_poses)).any(axis=0)
-        if outside.any():
-            raise GraphError(
-                f"{self.edge_label(int(np.argmax(outside)))} names a pose outside 0 .. {self.num_poses - 1}"
-            )
-        loops = self.i == self.j
-        if loops.any():
-            raise GraphError(f"{self.edge_label(int(np.argmax(loops)))} leads from a pose to itself; remove it")
-        if ((self.fixed < 0) | (self.fixed >= self.num_poses)).any():
-            raise GraphError(f"fixed names a pose outside 0 .. {self.num_poses - 1}")
-        if self.times is not None and not (np.isfinite(self.times).all() and (np.diff(self.times) > 0).all()):
-            raise GraphError("times do not ascend; give one for every pose, in the order of their ids")
-        for name in ("R_ij", "t_ij", "kappa", "tau", "information"):
-            value = getattr(self, name)
-            if value is not None and not np.isfinite(value).all():
-                finite = np.isfinite(value.reshape(self.num_edges, -1)).all(axis=1)
-                raise GraphError(f"{name} of {self.edge_label(int(np.argmin(finite)))} has nan or inf; remove the edge")
-        for name in ("kappa", "tau"):
-            value = getattr(self, name)
-            if not (value > 0).all():
-                e = int(np.argmin(value > 0))
-                raise GraphError(f"{name} of {self.edge_label(e)} is {value[e]:.6g}; a precision must be positive")
-        if self.ids is not None and len(np.unique(self.ids)) != self.num_poses:
-            raise GraphError("ids are not unique; every pose needs a name of its own")
-        if self.robot is not None and not has_no_gap(self.robot):
-            raise GraphError("robot must number the robots 0, 1, .. without a gap; see numpy.unique")
+    def with_position_prior(self, poses: IntArray, positions: Array, tau: Weights) -> PoseGraph:
+        """Return the graph with positions (k, d) of poses (k,) measured in the frame of the world, as by GPS."""
+        return self.with_prior(poses, Poses.of_points(positions), 0.0, tau)
 
+    def with_landmark(self, seen_from: IntArray, positions: Array, tau: Weights, name: int | None = None) -> PoseGraph:
+        """Return the graph, without truth, with one more landmark, seen at (k, d) in the frames of poses (k,)."""
+        points, n, first, initial = Poses.of_points(positions), self.num_poses, seen_from[0], self.initial
+        name = int(self.pose_ids[self.in_files].max()) + 1 if name is None else name
+        if initial is not None:
+            there = initial.t[first] + initial.R[first] @ points.t[0]
+            initial = Poses(initial.R[[*range(n), first]], np.append(initial.t, there[None], axis=0))
+        others = {"landmarks": np.append(self.landmarks, n), "initial": initial, "truth": None}
+        return self._with_node(first, name, others).with_edges(seen_from, np.full(len(seen_from), n), points, 0.0, tau)
 
-def has_no_gap(robot: IntArray) -> bool:
-    """Whether the robots are numbered 0, 1, .. and every one owns a pose."""
-    return len(robot) > 0 and robot.min() == 0 and len(np.unique(robot)) == robot.max() + 1
+    def _rows(self, edges: BoolArray) -> dict[str, Any]:
+        return {name: getattr(self, name)[edges] for name in _OF_EDGES if getattr(self, name) is not None}
+
+    def _with_node(self, beside: int, name: int, others: dict[str, Any]) -> PoseGraph:
+        """Graph with one more pose, of the robot of another, and other fields."""
+        robot = None if self.robot is None else np.append(self.robot, self.robot[beside])
+        return replace(self, num_poses=self.num_poses + 1, ids=np.append(self.pose_ids, name), robot=robot, **others)
 
 
 def middle_pose(graph: PoseGraph) -> int:

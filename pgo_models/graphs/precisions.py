@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.measurements import isotropic_information
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 
 _LEAST_SCALED = 1e-12  # smallest eigenvalue of a matrix scaled to ones on its diagonal that counts as positive
@@ -31,7 +32,7 @@ def edge_precisions(information: Array, weights: RotationWeight = RotationWeight
     """(kappa, tau), each (m,), of information matrices (m, 3, 3) in the plane or (m, 6, 6) in space.
 
     d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I_tt^-1), kappa as `weights` say.
-    The blocks themselves are inverted, not the marginal information. Per radian^2 and per metre^2.
+    The blocks themselves are inverted, not the marginal information; those of zeros give 0. Per radian^2 and metre^2.
 
     Raises
     ------
@@ -47,12 +48,6 @@ def edge_precisions(information: Array, weights: RotationWeight = RotationWeight
     return 1.5 / _trace_of_inverse(information[:, 3:, 3:]), tau
 
 
-def isotropic_information(kappa: Array, tau: Array, d: int) -> Array:
-    """Diagonal information matrices, (m, 3, 3) or (m, 6, 6), whose `precisions` are kappa and tau."""
-    diagonal = [tau, tau, kappa] if d == 2 else [tau, tau, tau, 2 * kappa, 2 * kappa, 2 * kappa]
-    return np.asarray(np.stack(diagonal, axis=1)[:, :, None] * np.eye(len(diagonal)))
-
-
 def proper_information(graph: PoseGraph) -> Array:
     """Information matrices that chi2 is of, (m, k, k): the graph's, without coupling blocks that make one indefinite.
 
@@ -63,7 +58,8 @@ def proper_information(graph: PoseGraph) -> Array:
         return isotropic_information(graph.kappa, graph.tau, graph.d)
     if not graph.information[:, : graph.d, graph.d :].any():
         return graph.information
-    scale = 1.0 / np.sqrt(np.einsum("mkk->mk", graph.information))
+    diagonal = np.einsum("mkk->mk", graph.information)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     bad = ~(np.linalg.eigvalsh(graph.information * scale[:, :, None] * scale[:, None, :])[:, 0] > _LEAST_SCALED)
     if not bad.any():
         return graph.information
@@ -76,18 +72,23 @@ def proper_information(graph: PoseGraph) -> Array:
 def uncoupled_share(information: Array, d: int) -> Array:
     """Largest share, (m,), for which I >= share blockdiag(I_tt, I_rr): 1 - ||I_tt^-1/2 I_tr I_rr^-1/2||_2."""
     I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
-    squared = np.linalg.solve(I_rr, np.swapaxes(I_tr, 1, 2)) @ np.linalg.solve(I_tt, I_tr)
+    squared = np.linalg.solve(filled(I_rr), np.swapaxes(I_tr, 1, 2)) @ np.linalg.solve(filled(I_tt), I_tr)
     return np.asarray(1.0 - np.sqrt(np.abs(np.linalg.eigvals(squared)).max(axis=1)))
 
 
 def condition(blocks: Array) -> Array:
-    """Largest over smallest eigenvalue, (m,), of positive definite blocks (m, k, k)."""
-    values = np.linalg.eigvalsh(blocks)
+    """Largest over smallest eigenvalue, (m,), of positive definite blocks (m, k, k), without those that are zero."""
+    values = np.linalg.eigvalsh(blocks[blocks.any(axis=(1, 2))])
     return np.asarray(values[:, -1] / values[:, 0])
 
 
+def filled(A: Array) -> Array:
+    """Blocks (m, k, k) with the identity in place of those that are zero."""
+    return np.asarray(A + ~A.any(axis=(1, 2), keepdims=True) * np.eye(A.shape[1]))
+
+
 def _trace_of_inverse(A: Array) -> Array:
-    return np.asarray(np.trace(np.linalg.inv(A), axis1=1, axis2=2))
+    return np.where(A.any(axis=(1, 2)), np.trace(np.linalg.inv(filled(A)), axis1=1, axis2=2), np.inf)
 
 
 def extreme_weight(graph: PoseGraph) -> tuple[float, int, str]:
@@ -99,13 +100,17 @@ def extreme_weight(graph: PoseGraph) -> tuple[float, int, str]:
     found = []
     for kind in ("kappa", "tau"):
         weight = getattr(graph, kind)
+        if not (weight > 0).all():  # of positions alone, or of rotations
+            continue
         order, ratio = np.argsort(-weight), weight / np.median(weight)
         tree = bisect_left(range(graph.num_edges), -1, key=lambda count: -_num_components(graph, order[:count]))
         e = int(max(order[0], order[tree - 1], key=lambda end: abs(np.log(ratio[end]))))
         i, j = graph.pose_ids[[graph.i[e], graph.j[e]]]
         text = f"{kind} of edge {i} -> {j} is {weight[e]:.3g}, {ratio[e]:.3g} times the median"
         found.append((float(weight[order[0]] / weight[order[tree - 1]]), e, text))
-    return max(found, key=lambda one: round(float(np.log(one[0])), 9))  # kappa where both are equal but for rounding
+    return max(
+        found, default=(0.0, 0, ""), key=lambda one: round(float(np.log(one[0])), 9)
+    )  # kappa where both are equal but for rounding
 
 
 def _num_components(graph: PoseGraph, edges: IntArray) -> int:

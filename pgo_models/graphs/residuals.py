@@ -74,10 +74,9 @@ def edge_residuals(graph: PoseGraph, poses: Poses) -> EdgeResiduals:
 
 
 def uncertain_edges(graph: PoseGraph) -> BoolArray:
-    """Whether kappa or tau of an edge is under `UNCERTAIN_RATIO` of its median over the graph, (m,)."""
-    low_kappa = graph.kappa < UNCERTAIN_RATIO * np.median(graph.kappa)
-    low_tau = graph.tau < UNCERTAIN_RATIO * np.median(graph.tau)
-    return np.asarray(low_kappa | low_tau)
+    """Whether kappa or tau of an edge is under `UNCERTAIN_RATIO` of its median, (m,); 0 claims nothing."""
+    kappa, tau = (np.where(one > 0, one, np.nan) for one in (graph.kappa, graph.tau))
+    return np.asarray((kappa < UNCERTAIN_RATIO * np.nanmedian(kappa)) | (tau < UNCERTAIN_RATIO * np.nanmedian(tau)))
 
 
 class Chi2Convention(enum.Enum):

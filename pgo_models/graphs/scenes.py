@@ -6,7 +6,7 @@ the figures stand in data/reference.json under "scenes". Every function takes it
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,6 +147,41 @@ def random_geometric(
     i, j = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T
     truth = Poses(random_rotations(num_poses, d, rng), t)
     return observe("random_geometric", truth, i, j, noise, noise.kappa(d), noise.tau, rng)
+
+
+def victoria_park(
+    rng: np.random.Generator, *, num_poses: int = 300, noise: NoiseModel = MILD_NOISE, reach: float = 12.0
+) -> PoseGraph:
+    """A drive in rounds among trees, like the Victoria Park data set: poses 1 m apart, landmarks seen within `reach`.
+
+    The poses of the plane are joined by odometry alone, along two rounds of a wavy loop; the trees, one for every four
+    poses, stand along it, those seen but once felled. Truth, estimate and precisions as in `random_geometric`.
+
+    Raises
+    ------
+    SettingError
+        For fewer than 20 poses.
+
+    Examples
+    --------
+    >>> victoria_park(np.random.default_rng(0))
+    PoseGraph('victoria_park', d=2, poses=300, edges=3523, landmarks=75, robots=1)
+    """
+    if num_poses < 20:
+        raise SettingError(f"num_poses must be at least 20, got {num_poses}")
+    angle = 4 * np.pi * np.arange(num_poses) / num_poses
+    radius = num_poses / (4 * np.pi) * (1 + 0.2 * np.cos(3 * angle))
+    t = radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    heading = np.arctan2(*np.gradient(t, axis=0).T[::-1])
+    trees = t[rng.integers(0, num_poses, num_poses // 4)] + rng.uniform(-reach / 2, reach / 2, (num_poses // 4, 2))
+    sight = np.linalg.norm(t[:, None] - trees, axis=2) <= reach
+    trees, sight = trees[sight.sum(axis=0) > 1], sight[:, sight.sum(axis=0) > 1]
+    seen_from, tree = np.nonzero(sight)
+    i, j = np.append(np.arange(num_poses - 1), seen_from), np.append(np.arange(1, num_poses), num_poses + tree)
+    truth = Poses(exp_map(np.append(heading, np.zeros(len(trees)))[:, None]), np.concatenate([t, trees]))
+    made = observe("victoria_park", truth, i, j, noise, noise.kappa(2), noise.tau, rng)
+    R_ij = np.where((j < num_poses)[:, None, None], made.R_ij, np.eye(2))
+    return replace(made, R_ij=R_ij, landmarks=np.arange(num_poses, truth.num_poses))
 
 
 def observe(

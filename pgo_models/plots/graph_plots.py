@@ -32,7 +32,7 @@ _MOST_NAMED_ROBOTS = len(COLOURS)
 
 
 def edge_kinds(graph: PoseGraph, poses: Poses) -> IntArray:
-    """How every edge is drawn, (m,): OWN, BETWEEN (two robots), UNCERTAIN or MISFIT; the last that fits.
+    """How every edge is drawn, (m,): OWN, BETWEEN (two robots), UNCERTAIN or MISFIT; the last that fits. Priors: -1.
 
     Raises
     ------
@@ -42,6 +42,7 @@ def edge_kinds(graph: PoseGraph, poses: Poses) -> IntArray:
     kind = np.where(graph.robots[graph.i] == graph.robots[graph.j], OWN, BETWEEN)
     kind[uncertain_edges(graph)] = UNCERTAIN
     kind[edge_residuals(graph, poses).is_misfit] = MISFIT
+    kind[graph.is_prior] = -1
     return kind
 
 
@@ -74,7 +75,7 @@ def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = Tr
     kind = edge_kinds(graph, poses)
     if not mark_edges:
         kind = np.minimum(kind, np.where(graph.robots[graph.i] == graph.robots[graph.j], OWN, BETWEEN))
-    order = np.argsort(kind, kind="stable")  # what stands out is drawn last
+    order = np.argsort(kind, kind="stable")[int(np.sum(kind < 0)) :]  # what stands out is drawn last
     kind, i, j = kind[order], graph.i[order], graph.j[order]
     palette = np.array([to_rgb(name) for name in (*COLOURS, QUIET_COLOUR, ALARM_COLOUR)])
     colour = np.where(graph.robots[i] == graph.robots[j], graph.robots[i] % len(COLOURS), len(COLOURS))
@@ -86,7 +87,7 @@ def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = Tr
         linestyles=[(0, (1, 1.5)) if one == UNCERTAIN else "solid" for one in kind],
     )
     axes.add_collection(lines)
-    _frame(axes, poses.t)
+    _frame(axes, poses.t[graph.in_files])
 
 
 def plot_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: Array | None = None) -> Figure:
@@ -105,7 +106,8 @@ def plot_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: Arr
         axes.set_title(title or graph.name)
         handles: list[Artist] = list(_legend(graph, edge_kinds(graph, poses)))
         if covariances is not None:
-            outlines, style = list(confidence_ellipses(poses, covariances)), {"colors": QUIET_COLOUR, "linewidths": 0.3}
+            named, style = graph.in_files, {"colors": QUIET_COLOUR, "linewidths": 0.3}
+            outlines = list(confidence_ellipses(poses[named], covariances[named]))
             ellipses = _line_collection(graph.d)(outlines, **style, zorder=1, label="95 % of x, y")
             handles.append(axes.add_collection(ellipses))
         if handles:
@@ -168,6 +170,7 @@ def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = Non
         truth = graph.truth
     if truth is None:
         raise GraphError(f"{graph!r} came without a ground truth; give one as truth=")
+    poses, truth = poses[graph.bodies], truth[graph.bodies]
     aligned = poses.aligned_to(truth)
     metres = np.linalg.norm(aligned.t - truth.t, axis=1)
     degrees = np.rad2deg(np.linalg.norm(log_map(np.swapaxes(truth.R, 1, 2) @ aligned.R), axis=1))

@@ -57,10 +57,10 @@ def explore_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: 
     """
     go = plotly("graph_objects")
     kind, residuals = edge_kinds(graph, poses), edge_residuals(graph, poses)
-    names, several = np.array(pose_names(graph)), graph.num_robots > 1
+    names, several, named = np.array(pose_names(graph)), graph.num_robots > 1, graph.in_files
     traces = []
     for a in range(graph.num_robots):
-        mine, own = graph.robots == a, (kind == OWN) & (graph.robots[graph.i] == a)
+        mine, own = named[graph.robots[named] == a], (kind == OWN) & (graph.robots[graph.i] == a)
         colour, in_legend = COLOURS[a % len(COLOURS)], a < _MOST_NAMED_ROBOTS
         name = f"robot {a}" if several else "edges and poses"
         own_lines = _lines(graph, poses.t, np.flatnonzero(own), name, colour, 1.0, "solid", False)
@@ -80,11 +80,13 @@ def explore_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: 
     middles = 0.5 * (poses.t[graph.i[misfits]] + poses.t[graph.j[misfits]])
     traces.append(_dots(middles, _misfit_text(graph, misfits, residuals), "misfit", ALARM_COLOUR, 6.0))
     if covariances is not None:
-        outlines = np.pad(confidence_ellipses(poses, covariances), ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+        outlines = np.pad(
+            confidence_ellipses(poses[named], covariances[named]), ((0, 0), (0, 1), (0, 0)), constant_values=np.nan
+        )
         gaps, line = outlines.reshape(-1, graph.d), {"color": QUIET_COLOUR, "width": 1.0}
         traces.append({**_points(gaps), "mode": "lines", "line": line, "name": "95 % of x, y", "hoverinfo": "skip"})
     figure = go.Figure(traces)
-    _arrange(figure, poses.t, title)
+    _arrange(figure, poses.t[named], title)
     return figure
 
 
@@ -120,6 +122,7 @@ def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[
     positions = [iterates[k].aligned_to(iterates[-1]).t for k in shown]
     names = [names[k] for k in shown]
     owner = np.where(graph.robots[graph.i] == graph.robots[graph.j], graph.robots[graph.i], -1)
+    owner[graph.is_prior] = -2  # not drawn
 
     def traces(t: Array) -> list[Trace]:
         drawn = []

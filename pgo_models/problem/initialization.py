@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.sparse.csgraph import breadth_first_order
 
@@ -15,6 +17,7 @@ from pgo_models.geometry.rotations import (
     unstack_transposes,
 )
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
+from pgo_models.problem.matrices import columns_of, joint_matrix
 from pgo_models.problem.problem import PGOProblem
 
 
@@ -83,24 +86,28 @@ def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
     if not 0 <= root < graph.num_poses:
         raise SettingError(f"root is {root}; give a pose, 0 to {graph.num_poses - 1}")
     order, parent, edge = spanning_tree(graph, root)
-    return _compose(graph, order, parent, edge, graph.j[edge] == order[1:])
+    return _with_world_fitted(graph, _compose(graph, order, parent, edge, graph.j[edge] == order[1:]))
 
 
 def spanning_tree(graph: PoseGraph, root: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Breadth-first tree: poses in its order, the parent of every pose, and the edges to order[1:]."""
-    n = graph.num_poses
-    order, parent = breadth_first_order(edge_counts(graph.i, graph.j, n), root, directed=False)
-    ends, child = np.stack([graph.i, graph.j]), order[1:]
+    """Breadth-first tree: poses in its order, the parent of every pose, and the edges to order[1:].
+
+    Of edges that say something of rotations: a loose world pose is not in it.
+    """
+    n, turning = graph.num_poses, np.flatnonzero(graph.kappa > 0)
+    order, parent = breadth_first_order(edge_counts(graph.i[turning], graph.j[turning], n), root, directed=False)
+    ends, child = np.stack([graph.i, graph.j])[:, turning], order[1:]
     pairs, first = np.unique(ends.min(axis=0) * n + ends.max(axis=0), return_index=True)
     branches = np.minimum(child, parent[child]) * np.int64(n) + np.maximum(child, parent[child])
-    return order, parent, first[np.searchsorted(pairs, branches)]
+    return order, parent, turning[first[np.searchsorted(pairs, branches)]]
 
 
 def chordal_start(problem: PGOProblem) -> Poses:
     """Minimise tr(X^T M X) without the constraints, pose 0 fixed at the identity, and project the rotations.
 
     Joint in rotations and translations; after the projection the translations are the best ones for
-    the rotations. One factorisation with the pattern of M.
+    the rotations. One factorisation with the pattern of M. Position measurements alone, which may lie in a plane, need
+    not determine the rotation of the world without the constraints: it is fitted to the relaxed positions then.
 
     Examples
     --------
@@ -109,16 +116,32 @@ def chordal_start(problem: PGOProblem) -> Poses:
     >>> bool(problem.objective(chordal_start(problem)) < problem.objective(spanning_tree_start(problem.graph)))
     True
     """
-    n, d = problem.num_poses, problem.d
-    fixed = np.concatenate([[0], n + np.arange(d)])
+    n, d, graph, M = problem.num_poses, problem.d, problem.graph, problem.M
+    held = np.array([int(graph.world == 0)])
+    if graph.world is not None and graph.is_world_loose:
+        held = np.append(held, graph.world)
+        M = joint_matrix(graph, replace(problem.weights, tau=np.where(graph.is_prior, 0.0, problem.weights.tau)))
+    fixed = columns_of(held, n, (1, d))
     X_fixed = np.zeros((problem.side, d))
-    X_fixed[fixed[1:]] = np.eye(d)
-    right_hand_side = -(problem.M @ X_fixed)
+    X_fixed[fixed[len(held) :]] = np.tile(np.eye(d), (len(held), 1))
+    right_hand_side = -(M @ X_fixed)
     right_hand_side[fixed] = X_fixed[fixed]
-    data = problem.M.data.copy()
+    data = M.data.copy()
     problem.leave_out(data, fixed, 1.0)
     X = problem.analysis.factorize(problem.with_pattern_of_M(data)).solve(right_hand_side)
-    return problem.with_best_translations(project_to_rotations(unstack_transposes(X[n:])))
+    poses = Poses(project_to_rotations(unstack_transposes(X[n:])), X[:n])
+    return problem.with_best_translations(_with_world_fitted(graph, poses).R)
+
+
+def _with_world_fitted(graph: PoseGraph, poses: Poses) -> Poses:
+    """Poses with that of a loose world where the positions fit: sum_e ||t_j - t_w - R_w t_wj||^2 is least."""
+    if graph.world is None or not graph.is_world_loose:
+        return poses
+    measured, R, t = Poses.of_points(graph.t_ij[graph.is_prior]), poses.R.copy(), poses.t.copy()
+    fitted = measured.aligned_to(Poses.of_points(t[graph.j[graph.is_prior]]))
+    R[graph.world] = fitted.R[0]
+    t[graph.world] = fitted.t[0] - fitted.R[0] @ measured.t[0]
+    return Poses(R, t)
 
 
 def _compose(graph: PoseGraph, order: IntArray, parent: IntArray, edge: IntArray, forward: BoolArray) -> Poses:

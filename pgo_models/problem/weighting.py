@@ -22,7 +22,7 @@ import numpy as np
 from pgo_models.errors import GraphError
 from pgo_models.geometry.rotations import Array, BoolArray, hat, tangent_dimension, vee
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.graphs.precisions import proper_information, uncoupled_share
+from pgo_models.graphs.precisions import edge_precisions, proper_information, uncoupled_share
 from pgo_models.problem.floating_point import OUTWARD, gamma
 
 _MARGIN = 2.0**-24  # of the smallest eigenvalue: stays between tau and it, so that the excess is strictly convex
@@ -89,8 +89,9 @@ class EdgeWeights:
 
     @property
     def is_convex(self) -> bool:
-        """Whether the quadratic part of the cost is strictly convex in the residuals."""
-        return bool((self.kappa > 0.0).all())
+        """Whether the quadratic part of the cost is strictly convex in the residuals that it is of."""
+        weighed = self.kappa[self.kappa != 0.0] if self.axes is None else self.kappa[self.kappa.any(axis=1)]
+        return bool((weighed > 0.0).all())
 
     def W(self, d: int) -> Array:
         """Weights of the rotation residuals, (m, d, d)."""
@@ -261,7 +262,8 @@ def edge_weights(graph: PoseGraph, weighting: Weighting) -> EdgeWeights:
     Raises
     ------
     GraphError
-        When an information matrix is too far from isotropic for double precision; it names the edge.
+        When an information matrix is too far from isotropic for double precision, or an edge without a position is
+        beside one that is not isotropic; it names the edge.
     """
     if weighting is Weighting.ISOTROPIC:
         return EdgeWeights(graph.tau, graph.kappa)
@@ -271,6 +273,11 @@ def edge_weights(graph: PoseGraph, weighting: Weighting) -> EdgeWeights:
     is_coupled = I_tr.any(axis=(1, 2))
     if (I_tt == I_tt[:, :1, :1] * np.eye(d)).all() and not is_coupled.any():
         return EdgeWeights(I_tt[:, 0, 0].copy(), *_rotation_weights(I_rr))
+    if (silent := ~I_tt.any(axis=(1, 2))).any():
+        edge = graph.edge_label(int(np.argmax(silent)))
+        raise GraphError(
+            f"chi2 of {edge}, of a rotation alone, is not known beside others' matrices; leave out one kind"
+        )
     margin = np.repeat((_MARGIN * smallest + _ROUNDED * trace)[:, None], d, axis=1)
     tau = np.where(
         is_coupled, _COUPLED_SHARE * uncoupled_share(information, d) * smallest, smallest - 2.0 * margin[:, 0]
@@ -279,7 +286,8 @@ def edge_weights(graph: PoseGraph, weighting: Weighting) -> EdgeWeights:
     growth = 1.0
     if is_coupled.any():
         bearing = np.swapaxes(I_tr, 1, 2) @ np.linalg.solve(J, I_tr)
-        spare = _MARGIN * np.linalg.eigvalsh(I_rr)[:, 0] + _ROUNDED * np.einsum("mkk->m", I_rr)
+        unsaid = np.where(I_rr.any(axis=(1, 2)), 0.0, smallest)  # K costs nothing where I_rr is zero: W' is -K's
+        spare = _MARGIN * (np.linalg.eigvalsh(I_rr)[:, 0] + unsaid) + _ROUNDED * np.einsum("mkk->m", I_rr)
         share = 0.5 + 4.0 * margin[:, 0] / smallest + _MARGIN
         K = share[:, None, None] * (bearing + np.swapaxes(bearing, 1, 2)) + 2.0 * spare[:, None, None] * np.eye(p)
         J = np.concatenate([np.concatenate([J, I_tr], 2), np.concatenate([np.swapaxes(I_tr, 1, 2), K], 2)], 1)
@@ -301,7 +309,7 @@ def convex_weights(graph: PoseGraph) -> EdgeWeights:
     I_rr = proper_information(graph)[:, graph.d :, graph.d :]
     kappa, axes, W, _ = _rotation_weights(I_rr)
     if axes is not None:
-        least = _LEAST_CONVEX * 1.5 / np.trace(np.linalg.inv(I_rr), axis1=1, axis2=2)  # of the kappa of F
+        least = _LEAST_CONVEX * edge_precisions(proper_information(graph))[0]  # of the kappa of F
         kappa = np.maximum(kappa, least[:, None])
         W = (axes * kappa[:, None, :]) @ np.swapaxes(axes, 1, 2)
     return EdgeWeights(graph.tau, kappa, axes, W)

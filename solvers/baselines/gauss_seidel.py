@@ -131,6 +131,8 @@ class GaussSeidel:
             robots = partition(problem.graph, method=PartitionMethod.SINGLETONS)
         poses = start if start is not None else Poses.identity(problem.num_poses, problem.d)
         problem.stacked(poses)  # raises unless the poses fit
+        if problem.graph.is_world_loose:
+            raise SettingError("rotations alone do not tell that of the world of position priors; use another method")
         turns = schedule(problem.graph, robots, self.sweep)
         linear = rotation_problem(problem, poses.R[0])
         numbers = problem.d**2

@@ -22,10 +22,11 @@ from typing import Any, cast
 
 import numpy as np
 
-from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError, check_settings
+from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError, SettingError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, log_map, project_to_rotations
-from pgo_models.graphs.precisions import isotropic_information, proper_information
+from pgo_models.graphs.measurements import isotropic_information
+from pgo_models.graphs.precisions import proper_information
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.result import History, Measurement, Record, Run, Status
@@ -157,6 +158,8 @@ def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noq
         Without GTSAM.
     """
     gtsam, graph, d = _import_gtsam(), problem.graph, problem.d
+    if not ((graph.kappa > 0) & (graph.tau > 0)).all():
+        raise SettingError(f"{graph.name} has edges without a rotation or position, which GTSAM is not given; solve()")
     if problem.weighting is Weighting.INFORMATION:
         information = 2.0 * proper_information(graph)  # GTSAM halves
     else:

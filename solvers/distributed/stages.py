@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from pgo_models.certificates.certificate import BoundSource, Certificate, certif
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition
+from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
@@ -52,14 +54,18 @@ def attempt_distributed(
 ) -> tuple[Poses, Certificate]:
     """Start, SOC, Newton and certificate; what was done goes to the stages of `journal`.
 
-    Of the whole `problem` nothing is used but F of the poses that are returned.
+    Of the whole `problem` nothing is used but F of the poses that are returned, and where the rotation of the world
+    hangs on positions alone, the start, which is found in one place then.
     """
     outcome, stages = journal.outcome_of_attempt(), journal.stages
     if outcome is not None:
         return outcome
     if not journal.goes_on_with():
         driver.choose_cost(final=False)
-        stages.append(_start(driver, start))
+        if start is None and problem.graph.is_world_loose:
+            stages.append(replace(_start(driver, chordal_start(problem)), name="chordal start, in one place"))
+        else:
+            stages.append(_start(driver, start))
     if soc is not None and not journal.goes_on_with(SubstructuredNewton):
         stages.append(_run_soc(driver, soc, faults, journal, watch))
     decrement = math.inf

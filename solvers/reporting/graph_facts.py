@@ -18,8 +18,8 @@ def describe_graph(graph: PoseGraph) -> list[tuple[str, str]]:
     degree = np.bincount(np.concatenate([graph.i, graph.j]), minlength=graph.num_poses)
     rows = [
         ("graph", f"{graph.name}, {graph.d}D"),
-        ("poses", str(graph.num_poses)),
-        ("edges", str(graph.num_edges)),
+        ("poses", str(len(graph.bodies))),
+        ("edges", f"{graph.num_edges}{graph.extras}"),
         ("robots", str(graph.num_robots)),
         ("components", f"{len(components)} (sizes {', '.join(str(len(part)) for part in components[:5])})"),
         ("degree", f"{degree.min()} to {degree.max()}, mean {degree.mean():.2f}"),

@@ -162,7 +162,8 @@ def _partition(solution: Solved) -> Partition:
 
 def _header(solution: Solved) -> str:
     graph = solution.problem.graph
-    about = f"{graph.num_poses} poses, {graph.num_edges} edges, {graph.d}D; solved in {solution.seconds:.3g} s"
+    about = f"{len(graph.bodies)} poses, {graph.num_edges} edges{graph.extras}, {graph.d}D"
+    about += f"; solved in {solution.seconds:.3g} s"
     return f"<header><h1>{html.escape(graph.name)}</h1>{paragraph(about, quiet=True)}</header>"
 
 
@@ -177,7 +178,9 @@ def _verdict(solution: Solved) -> str:
     ]
     truth = solution.problem.graph.truth
     if truth is not None:
-        figures.append(("error to truth (ATE)", f"{absolute_trajectory_error(solution.poses, truth):.4g} m"))
+        bodies = solution.problem.graph.bodies
+        ate = absolute_trajectory_error(solution.poses[bodies], truth[bodies])
+        figures.append(("error to truth (ATE)", f"{ate:.4g} m"))
     boxes = "".join(
         f'<div><span class="quiet">{label}</span><b>{html.escape(text)}</b></div>' for label, text in figures
     )

@@ -62,7 +62,7 @@ def write(folder: Path, *lines: str) -> Path:
         ([VERTEX_3D, EDGE_3D, VERTEX_3D], ":3", ["second VERTEX line of pose 0", "line 1"]),
         ([EDGE_3D, EDGE_3D, EDGE_2D], ":3", ["2D and 3D", "line 1"]),
         ([EDGE_3D, "FIX first"], ":2", ["id 'first' is no integer"]),
-        ([EDGE_3D, "EDGE_SE3_PRIOR 0 1 2 3"], ":2", ["'EDGE_SE3_PRIOR'", "EDGE_SE3:QUAT", "FIX"]),
+        ([EDGE_3D, "EDGE_SE3_EXPMAP 0 1 2 3"], ":2", ["'EDGE_SE3_EXPMAP'", "--skip-unknown", "EDGE_SE3:QUAT", "FIX"]),
         ([EDGE_3D, "garbage"], ":2", ["'garbage'"]),
         (["# nothing", ""], "", ["no measurement"]),
     ],
