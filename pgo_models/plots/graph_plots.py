@@ -20,9 +20,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-OWN, BETWEEN, UNCERTAIN, MISFIT = range(4)
-_WIDTHS = np.array([0.6, 0.5, 0.5, 1.8])
+SIGHTING, OWN, BETWEEN, UNCERTAIN, MISFIT = range(5)
+_WIDTHS = np.array([0.15, 0.6, 0.5, 0.5, 1.8])
 KIND_LABELS = {
+    SIGHTING: "a landmark seen",
     BETWEEN: "between robots",
     UNCERTAIN: "uncertain: precision under a tenth of the median",
     MISFIT: "misfit: over six times the mean share of F",
@@ -31,8 +32,10 @@ _ZOOM = 0.82  # leaves room for the labels of axes in space, which the layout do
 _MOST_NAMED_ROBOTS = len(COLOURS)
 
 
-def edge_kinds(graph: PoseGraph, poses: Poses) -> IntArray:
-    """How every edge is drawn, (m,): OWN, BETWEEN (two robots), UNCERTAIN or MISFIT; the last that fits. Priors: -1.
+def edge_kinds(graph: PoseGraph, poses: Poses, mark_edges: bool = True) -> IntArray:
+    """How every edge is drawn, (m,): OWN, BETWEEN (two robots), SIGHTING (a landmark's), marked UNCERTAIN or MISFIT.
+
+    The last that fits; priors are -1.
 
     Raises
     ------
@@ -40,8 +43,10 @@ def edge_kinds(graph: PoseGraph, poses: Poses) -> IntArray:
         When the poses are not those of the graph.
     """
     kind = np.where(graph.robots[graph.i] == graph.robots[graph.j], OWN, BETWEEN)
-    kind[uncertain_edges(graph)] = UNCERTAIN
-    kind[edge_residuals(graph, poses).is_misfit] = MISFIT
+    kind[np.isin(graph.j, graph.landmarks)] = SIGHTING
+    if mark_edges:
+        kind[uncertain_edges(graph)] = UNCERTAIN
+        kind[edge_residuals(graph, poses).is_misfit] = MISFIT
     kind[graph.is_prior] = -1
     return kind
 
@@ -72,14 +77,12 @@ def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = Tr
     """
     from matplotlib.colors import to_rgb
 
-    kind = edge_kinds(graph, poses)
-    if not mark_edges:
-        kind = np.minimum(kind, np.where(graph.robots[graph.i] == graph.robots[graph.j], OWN, BETWEEN))
+    kind = edge_kinds(graph, poses, mark_edges)
     order = np.argsort(kind, kind="stable")[int(np.sum(kind < 0)) :]  # what stands out is drawn last
     kind, i, j = kind[order], graph.i[order], graph.j[order]
     palette = np.array([to_rgb(name) for name in (*COLOURS, QUIET_COLOUR, ALARM_COLOUR)])
     colour = np.where(graph.robots[i] == graph.robots[j], graph.robots[i] % len(COLOURS), len(COLOURS))
-    colour[kind == MISFIT] = len(COLOURS) + 1
+    colour[kind == SIGHTING], colour[kind == MISFIT] = len(COLOURS), len(COLOURS) + 1
     lines = _line_collection(graph.d)(
         list(np.stack([poses.t[i], poses.t[j]], axis=1)),
         colors=palette[colour],
@@ -227,7 +230,8 @@ def _legend(graph: PoseGraph, kind: IntArray) -> list[Line2D]:
     handles = []
     if 1 < graph.num_robots <= _MOST_NAMED_ROBOTS:
         handles = [Line2D([], [], color=COLOURS[a], label=f"robot {a}") for a in range(graph.num_robots)]
-    style = {BETWEEN: (QUIET_COLOUR, "solid"), UNCERTAIN: (COLOURS[0], "dotted"), MISFIT: (ALARM_COLOUR, "solid")}
+    style = {one: (QUIET_COLOUR, "solid") for one in (SIGHTING, BETWEEN)}
+    style |= {UNCERTAIN: (COLOURS[0], "dotted"), MISFIT: (ALARM_COLOUR, "solid")}
     for one, label in KIND_LABELS.items():
         if (kind == one).any():
             colour, line = style[one]

@@ -16,7 +16,16 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import pose_names
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.residuals import EdgeResiduals, edge_residuals
-from pgo_models.plots.graph_plots import BETWEEN, KIND_LABELS, MISFIT, OWN, UNCERTAIN, confidence_ellipses, edge_kinds
+from pgo_models.plots.graph_plots import (
+    BETWEEN,
+    KIND_LABELS,
+    MISFIT,
+    OWN,
+    SIGHTING,
+    UNCERTAIN,
+    confidence_ellipses,
+    edge_kinds,
+)
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, plotly
 
 if TYPE_CHECKING:
@@ -69,6 +78,7 @@ def explore_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: 
         for trace, shown in ((own_lines, False), (_dots(poses.t[mine], text, name, colour, 4.0), in_legend)):
             traces.append({**trace, "legendgroup": name, "showlegend": shown})
     for one, colour, width, dash in (
+        (SIGHTING, QUIET_COLOUR, 0.3, "solid"),
         (BETWEEN, QUIET_COLOUR, 1.0, "solid"),
         (UNCERTAIN, QUIET_COLOUR, 1.5, "dot"),
         (MISFIT, ALARM_COLOUR, 5.0, "solid"),
