@@ -183,6 +183,22 @@ print(f"beside pose 0, pose {widest} is known to {np.sqrt(np.linalg.eigvalsh(blo
 figure = pgo.plot_graph(real, by_chi2.poses, covariances=blocks)
 
 # %% [markdown]
+# A prior is an edge from one more pose, the world; GPS has no rotation, $\kappa = 0$. A landmark is a pose whose rotation
+# nobody asks for. Both stay inside the same problem, so the certificate is what it was (in a file:
+# `EDGE_PRIOR_SE2_XY`, `VERTEX_XY`, `EDGE_SE2_XY` and their likes in space):
+
+# %%
+fixes = rng.choice(real.num_poses, 6, replace=False)
+there = by_chi2.poses.t[fixes] @ np.array([[0.0, -1.0], [1.0, 0.0]]).T + [500.0, 300.0]  # the world, as a receiver has it
+located = real.with_position_prior(fixes, there + rng.normal(0.0, 0.5, there.shape), tau=0.5**-2)
+tree = by_chi2.poses.t[0] + np.array([2.0, 1.0])
+seen = np.einsum("nba,nb->na", by_chi2.poses.R[:3], tree - by_chi2.poses.t[:3]) + rng.normal(0.0, 0.1, (3, 2))
+located = located.with_landmark([0, 1, 2], seen, tau=0.1**-2)
+in_the_world = solvers.solve(pgo.PGOProblem(located, weighting=pgo.Weighting.INFORMATION))
+print(in_the_world)
+print(f"first position: {in_the_world.poses.t[fixes[0]].round(2)}, its receiver said {there[0].round(2)}")
+
+# %% [markdown]
 # ## Where it fails: a wrong loop closure
 #
 # The certificate says that no poses fit *these measurements* better. It does not say that the measurements are
@@ -272,3 +288,4 @@ assert np.isclose(problem.objective(again.initial), solution.objective, rtol=1e-
 folder.cleanup()
 assert by_chi2.is_certified
 assert pgo.chi2(real, by_chi2.poses) <= pgo.chi2(real, by_F.poses)
+assert in_the_world.is_certified
