@@ -84,9 +84,9 @@ def extreme_weight(graph: str) -> str:
     name = max(ratios, key=lambda one: float(np.abs(np.log(ratios[one])).max()))
     e = int(np.argmax(np.abs(np.log(ratios[name]))))
     i, j = int(loaded.pose_ids[loaded.i[e]]), int(loaded.pose_ids[loaded.j[e]])
-    value = float(getattr(loaded, name)[e])
+    value, names = float(getattr(loaded, name)[e]), (loaded.pose_name(loaded.i[e]), loaded.pose_name(loaded.j[e]))
     return (
-        f"{edge_place(path, (i, j))}: {name} of edge {i} -> {j} is {value:.3g}, {ratios[name][e]:.3g} "
+        f"{edge_place(path, (i, j))}: {name} of edge {' -> '.join(names)} is {value:.3g}, {ratios[name][e]:.3g} "
         f"times the median; weights from {min(loaded.kappa.min(), loaded.tau.min()):.3g} to "
         f"{max(loaded.kappa.max(), loaded.tau.max()):.3g} and lengths up to {np.abs(loaded.t_ij).max():.3g} m "
         "are too far apart for doubles; correct the information matrix, or use --unit-weights"
