@@ -149,7 +149,8 @@ def solve(
         File from which a solve by robots that was broken off goes on, and to which it writes what that takes.
     anchor : int, optional
         Pose that stays where the graph's estimate has it, or at the identity if it has none. Unless given, the first of
-        `graph.fixed`; without one the poses are aligned with the estimate, or pose 0 is at the identity.
+        `graph.fixed`; without one the poses are aligned with the estimate, or pose 0 is at the identity. Priors say
+        themselves where the poses are.
     callback : callable, optional
         Called with every state of SOC and Newton and its record; a true answer ends that stage.
     time_limit : float

@@ -215,6 +215,13 @@ def run(*arguments: object) -> int:
     return int(ended.value.code or 0)
 
 
+def test_a_file_of_positions_alone_is_told_what_it_lacks(tmp_path, capsys):
+    (tmp_path / "gps.g2o").write_text("".join(f"EDGE_PRIOR_SE2_XY {k} {k} {k * k} 1 0 1\n" for k in range(4)))
+    for command in ("solve", "info"):
+        assert run(command, tmp_path / "gps.g2o") == 1
+        assert "the rotation of 1 poses (with 1) is not tied" in capsys.readouterr().err
+
+
 def test_files_hold_neither_the_world_nor_trajectories_of_landmarks(tmp_path, capsys):
     assert run("generate", "victoria-park", "--poses", 30, "-o", tmp_path / "park.g2o") == 0
     graph = pgo.load(tmp_path / "park.g2o")

@@ -16,7 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgo_models.errors import FileFormatError, GraphWarning
-from pgo_models.files import LARGEST, check_distances, check_length, check_quaternions, finite_number, read_text
+from pgo_models.files import (
+    LARGEST,
+    LONGEST_LINE,
+    check_distances,
+    check_length,
+    check_quaternions,
+    finite_number,
+    read_text,
+)
 from pgo_models.geometry.rotations import Array, BoolArray, exp_map, rotations_from_quaternions
 from pgo_models.graphs.g2o_tags import ALIASES, TAGS
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
@@ -83,19 +91,25 @@ def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
     fix: list[tuple[int, str]] = []
     unknown: dict[str, list[int]] = {}
     offset = 0  # line of a sensor that is not at its pose
+    slots = {
+        tag: (tag, kind, 1 + kind.num_ids, source.at[tag], source.ids[tag], source.numbers[tag])
+        for tag, kind in TAGS.items()
+    }
+    slots |= {alias: slots[tag] for alias, tag in ALIASES.items()}
     for number, line in enumerate(lines, 1):
         parts = line.split(None, 3)
         if not parts or parts[0][0] == "#":
             continue
-        tag = ALIASES.get(parts[0], parts[0])
-        if tag in TAGS:
-            kind = TAGS[tag]
-            check_length(path, number, line)
-            source.at[tag].append(number)
+        tag = parts[0]
+        if tag in slots:
+            tag, kind, first, its_lines, ids, numbers = slots[tag]
+            if len(line) > LONGEST_LINE:
+                check_length(path, number, line)
+            its_lines.append(number)
             if kind.has_offset:
                 parts = [tag, *source.words(tag, number)]
-            source.ids[tag] += parts[1 : 1 + kind.num_ids]
-            source.numbers[tag].append(" ".join(parts[1 + kind.num_ids :]))
+            ids += parts[1:first]
+            numbers.append(parts[3] if first == 3 and len(parts) == 4 else " ".join(parts[first:]))
         elif tag == "FIX":
             fix += [(number, word) for word in line.split()[1:]]
         elif tag == "PARAMS_SE3OFFSET":

@@ -194,9 +194,7 @@ class Measurements(ReadOnly):
         wrong = turned | np.isin(self.i, self.landmarks) | (self.j == self.world)
         if wrong.any():
             edge = self.edge_label(int(np.argmax(wrong)))
-            raise GraphError(
-                f"{edge} begins at a landmark, measures its rotation or ends at the world; turn it round, R_ij = I"
-            )
+            raise GraphError(f"{edge} begins at a landmark, has R_ij of one, or ends at the world; turn it, R_ij = I")
         for name in ("R_ij", "t_ij", "kappa", "tau", "information"):
             value = getattr(self, name)
             if value is not None and not np.isfinite(value).all():
@@ -207,11 +205,8 @@ class Measurements(ReadOnly):
             if not (value >= 0).all():
                 e = int(np.argmin(value >= 0))
                 raise GraphError(f"{name} of {self.edge_label(e)} is {value[e]:.6g}; a precision must not be negative")
-        empty = (self.kappa == 0) & (self.tau == 0)
-        if empty.any():
-            raise GraphError(
-                f"kappa and tau of {self.edge_label(int(np.argmax(empty)))} are 0; remove it, it says nothing"
-            )
+        if (empty := (self.kappa == 0) & (self.tau == 0)).any():
+            raise GraphError(f"kappa and tau of {self.edge_label(int(np.argmax(empty)))} are 0; remove it")
         if self.ids is not None and len(np.unique(self.ids)) != self.num_poses:
             raise GraphError("ids are not unique; every pose needs a name of its own")
         if self.robot is not None and not has_no_gap(self.robot):

@@ -128,7 +128,7 @@ class PoseGraph(Measurements):
         if len(parts) > 1:
             sizes = ", ".join(str(len(part)) for part in parts[:5])
             more = f" and {len(parts) - 5} more" if len(parts) > 5 else ""
-            firsts = ", ".join(str(self.pose_ids[part[0]]) for part in parts[:5])
+            firsts = ", ".join(self.pose_name(part[0]) for part in parts[:5])
             raise GraphError(
                 f"pose graph has {len(parts)} components (sizes {sizes}{more}; with poses {firsts}{more}); "
                 "solve each on its own: PoseGraph.subgraph(PoseGraph.components()[k])"

@@ -77,8 +77,8 @@ def uncoupled_share(information: Array, d: int) -> Array:
 
 
 def condition(blocks: Array) -> Array:
-    """Largest over smallest eigenvalue, (m,), of positive definite blocks (m, k, k), without those that are zero."""
-    values = np.linalg.eigvalsh(blocks[blocks.any(axis=(1, 2))])
+    """Largest over smallest eigenvalue, (m,), of positive definite blocks (m, k, k); 1 of those that are zero."""
+    values = np.linalg.eigvalsh(filled(blocks))
     return np.asarray(values[:, -1] / values[:, 0])
 
 

@@ -155,12 +155,8 @@ def victoria_park(
     """A drive in rounds among trees, like the Victoria Park data set: poses 1 m apart, landmarks seen within `reach`.
 
     The poses of the plane are joined by odometry alone, along two rounds of a wavy loop; the trees, one for every four
-    poses, stand along it, those seen but once felled. Truth, estimate and precisions as in `random_geometric`.
-
-    Raises
-    ------
-    SettingError
-        For fewer than 20 poses.
+    poses, stand along it, those seen but once felled. Truth, estimate and precisions as in `random_geometric`; a
+    SettingError for fewer than 20 poses.
 
     Examples
     --------

@@ -59,7 +59,7 @@ def odometry_start(graph: PoseGraph) -> Poses:
     if n > 1 and edge.min() < 0:
         missing = int(np.argmin(edge))
         raise GraphError(
-            f"no odometry from pose {graph.pose_ids[missing]} to {graph.pose_ids[missing + 1]}; "
+            f"no odometry from pose {graph.pose_name(missing)} to {graph.pose_name(missing + 1)}; "
             "use spanning_tree_start() or chordal_start()"
         )
     return _compose(graph, np.arange(n), np.arange(-1, n - 1), edge, np.ones(n - 1, dtype=bool))

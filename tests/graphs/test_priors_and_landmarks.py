@@ -114,7 +114,7 @@ def test_new_edges_have_information_where_the_others_have():
         ({"world": 9}, "not different poses, 0 to 3"),
         ({"landmarks": [3, 3]}, "name each once"),
         ({"landmarks": [1]}, r"edge 1 \(1 -> 2\) begins at a landmark"),
-        ({"landmarks": [3], "R_ij": np.tile(np.diag([-1.0, -1, 1]), (3, 1, 1))}, "measures its rotation"),
+        ({"landmarks": [3], "R_ij": np.tile(np.diag([-1.0, -1, 1]), (3, 1, 1))}, "has R_ij of one"),
         ({"world": 1.0}, "whole number"),
     ],
 )
