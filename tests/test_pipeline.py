@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from budget import examples
-from graphs import OPTIMUM, wound_ring
+from graphs import OPTIMUM, informed, wound_ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,6 +13,7 @@ from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, Verdic
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.graphs.trajectories import read_times
+from pgo_models.problem.weighting import Weighting
 from solvers.pipeline import HANDOVER_TOLERANCE
 from solvers.studies.tightness import SweptScene, noisy_scene
 
@@ -210,6 +211,31 @@ def test_units_change_neither_verdict_nor_iterations_nor_digits(seed, weights, m
         moved = pgo.certify(other.problem, pgo.Poses(poses.R, metres * poses.t))
         assert moved.verdict is theirs.verdict
         assert moved.gap == pytest.approx(theirs.gap, rel=1e-6)
+
+
+@settings(max_examples=examples(20))
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    weights=st.sampled_from([1e-9, 1e-3, 1e3, 1e9]),
+    metres=st.sampled_from([1e-3, 1.0, 1e3]),
+    d=st.sampled_from([2, 3]),
+    coupled=st.booleans(),
+    spread=st.sampled_from([0.1, 0.3, 1.0]),
+    robots=st.sampled_from([None, 2]),
+)
+def test_units_change_nothing_of_chi2_either(seed, weights, metres, d, coupled, spread, robots):
+    graph = replace(informed(seed, 15, d, coupled, spread, NoiseModel(0.01, 0.01)), initial=None, truth=None)
+    unit = np.ones(graph.information.shape[1])
+    unit[:d] = 1.0 / metres
+    information = weights * unit[:, None] * graph.information * unit
+    scaled = replace(graph, information=information, t_ij=metres * graph.t_ij)
+    one, other = (
+        solvers.solve(pgo.PGOProblem(g, weighting=Weighting.INFORMATION), robots=robots) for g in (graph, scaled)
+    )
+    assert other.certificate.verdict is one.certificate.verdict
+    assert [stage.iterations for stage in other.stages] == [stage.iterations for stage in one.stages]
+    assert other.objective == pytest.approx(weights * one.objective, rel=1e-9)
+    assert abs(other.certificate.digits - one.certificate.digits) <= 1
 
 
 def test_a_solution_says_in_which_frame_it_is():

@@ -87,9 +87,9 @@ def evaluate_edges(problem: PGOProblem, X: Array, low: Array) -> Evaluation:
     G, sizes, off = weights.weigh(rho), weights.weigh(np.abs(rho), sizes=True), weights.weigh(errors, sizes=True)
     of_edges = np.sum(G * rho, axis=(1, 2))
     value_error = float(np.sum((2.0 * sizes + off) * errors))
-    value_error += gamma(d * d + d + 4) * float(np.sum(sizes * np.abs(rho)))
+    value_error += gamma(d * d + 2 * d + 2) * float(np.sum(sizes * np.abs(rho)))
     if weights.W_error is not None:
-        turning = np.linalg.norm(rho[:, 1:], axis=(1, 2))
+        turning = np.linalg.norm(np.abs(rho[:, 1:]) + errors[:, 1:], axis=(1, 2))
         value_error += OUTWARD * float(np.sum(weights.W_error * turning**2))
         off[:, 1:] += OUTWARD * (weights.W_error * turning)[:, None, None]
     A = problem.plain_residual_matrix
@@ -127,7 +127,7 @@ def _evaluate_tangents(tangent: Tangent, rho: Array, errors: Array, P_i: Array) 
     C, d = tangent.C, rho.shape[2]
     C_size, rho_size, P_size = np.abs(C), np.abs(rho), np.abs(np.swapaxes(P_i, 1, 2))
     apart = rho @ np.swapaxes(P_i, 1, 2) - tangent.Z
-    apart_error = (errors + gamma(d + 1) * rho_size) @ P_size + gamma(d * d + d + 3) * np.abs(apart)
+    apart_error = (errors + gamma(d + 1) * rho_size) @ P_size + gamma(d * d + d + 4) * np.abs(apart)
     constant = tangent.value - tangent.loss
     return _Bent(
         value=2.0 * np.sum(C * apart, axis=(1, 2)) + constant,
@@ -244,7 +244,7 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     in the Euclidean norm of its d, or d^2, numbers; the error is sum tau (2 ||r_t|| e_t + e_t^2) + kappa (2 ||r_R|| e_R
     + e_R^2) and the rounding of the sum. The level is sum tau e_t^2 + kappa e_R^2 with ||t_i|| + ||t_j||, seen from the
     first pose, for ||t_j - t_i||: no poses can do better than the last bits of their coordinates. In chi2, kappa r_R is
-    W r_R, and its excess, whose half gradient is C, adds 2 <|C|, errors> + size ||errors||^2.
+    W r_R, and its excess, whose half gradient is C, adds 2 <|C|, errors> + (size_t e_t + size_R e_R)^2.
     """
     graph, d, m, weights = problem.graph, problem.d, problem.graph.num_edges, problem.weights
     e_t, e_R = _residual_errors(problem, poses, np.linalg.norm(poses.t[graph.j] - poses.t[graph.i], axis=1))
@@ -258,7 +258,8 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     error = _sum_of_squares(problem, e_t, e_R) + 2.0 * cross + _SUMMED * UNIT_ROUNDOFF * F
     if weights.W_error is not None:
         turning = np.sum(residuals[m:] ** 2, axis=1).reshape(m, d).sum(axis=1)
-        error += float(np.sum((weights.W_error + gamma(4.0 * d) * np.abs(weights.kappa).max()) * turning))
+        of_axes = 0.0 if weights.axes is None else gamma(4.0 * d) * np.abs(weights.kappa).max(axis=1)
+        error += float(np.sum((weights.W_error + of_axes) * turning))
     if weights.excess is not None:
         touched = weights.excess.tangent(problem.edge_products(residuals, X))
         moved = np.linalg.norm(touched.Z, axis=2)
@@ -267,7 +268,7 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
         error += 2.0 * float(
             np.sum(np.linalg.norm(touched.C[:, 1:], axis=(1, 2)) * (e_R + slant * moved[:, 1:].sum(axis=1)))
         )
-        error += float(np.sum(touched.value_error))
+        error += float(np.sum(touched.value_error + _SUMMED * UNIT_ROUNDOFF * np.abs(touched.value)))
     return ObjectiveRounding(rounding_level(problem, poses), OUTWARD * error)
 
 
@@ -287,6 +288,7 @@ def _residual_errors(problem: PGOProblem, poses: Poses, distance: Array) -> tupl
 
 def _sum_of_squares(problem: PGOProblem, e_t: Array, e_R: float) -> float:
     weights, kappa = problem.weights, np.abs(problem.weights.kappa)
-    more = 0.0 if weights.excess is None else weights.excess.size
-    of_rotation = float(np.sum((kappa if weights.axes is None else kappa.max(axis=1)) + more))
-    return OUTWARD * (float(np.sum((weights.tau + more) * e_t**2)) + of_rotation * e_R**2)
+    size = np.zeros((1, 2)) if weights.excess is None else weights.excess.size
+    of_excess = float(np.sum((size[:, 0] * e_t + size[:, 1] * e_R) ** 2))
+    of_rotation = float(np.sum(kappa if weights.axes is None else kappa.max(axis=1)))
+    return OUTWARD * (float(np.sum(weights.tau * e_t**2)) + of_rotation * e_R**2 + of_excess)

@@ -19,13 +19,15 @@ import numpy as np
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, prove_at
 from pgo_models.certificates.newton_polish import polish
+from pgo_models.errors import GraphError, NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import filled, proper_information, uncoupled_share
+from pgo_models.graphs.precisions import filled, least_scaled, proper_information, uncoupled_share
 from pgo_models.problem.problem import PGOProblem
 
 BISECTIONS = 5
+_SHOWN = 2.0**-45  # smallest eigenvalue of a matrix with ones on its diagonal that is not rounding
 _MARGIN = 2.0**-40  # of the trace: above the rounding of a block, so that I' is below I all the same
 
 
@@ -33,17 +35,20 @@ def soften(graph: PoseGraph, cap: float) -> PoseGraph:
     """Return the graph with information matrices below its own: condition of I_tt at most `cap`, W convex.
 
     Coupling blocks are taken out first, with what they can take from the others: with C = I_tt^-1/2 I_tr I_rr^-1/2,
-    I >= (1 - ||C||) blockdiag(I_tt, I_rr).
+    I >= (1 - ||C||) blockdiag(I_tt, I_rr), or a smaller share where rounding hides that.
     """
     information, d = proper_information(graph), graph.d
     I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
-    share = uncoupled_share(information, d)
-    share = np.where(I_tr.any(axis=(1, 2)), share - 2.0**-20, 1.0)
-    smaller = np.zeros_like(information)
-    limit = np.array([0.5, 1.0]) if d == 3 else np.ones(1)
-    smaller[:, :d, :d] = _clipped(share[:, None, None] * I_tt, lambda values: cap * values[:, 0])
-    smaller[:, d:, d:] = _clipped(share[:, None, None] * I_rr, lambda values: values[:, :2] @ limit)
-    return replace(graph, information=smaller)
+    share, limit = uncoupled_share(information, d) - 2.0**-20, np.array([0.5, 1.0]) if d == 3 else np.ones(1)
+    share, is_below = np.where(I_tr.any(axis=(1, 2)), np.maximum(share, 0.0), 1.0), ~I_tr.any(axis=(1, 2))
+    while True:
+        smaller = np.zeros_like(information)
+        smaller[:, :d, :d] = _clipped(share[:, None, None] * I_tt, lambda values: cap * values[:, 0])
+        smaller[:, d:, d:] = _clipped(share[:, None, None] * I_rr, lambda values: values[:, :2] @ limit)
+        is_below = is_below | (least_scaled(information - smaller) > _SHOWN)
+        if is_below.all():
+            return replace(graph, information=smaller)
+        share = np.where(is_below, share, 0.5 * share)  # was rounded
 
 
 def softened_bound(problem: PGOProblem, poses: Poses) -> tuple[LowerBound, Poses, Array]:
@@ -61,8 +66,11 @@ def softened_bound(problem: PGOProblem, poses: Poses) -> tuple[LowerBound, Poses
     def attempt(log_cap: float) -> bool:
         nonlocal best, poses
         cap = math.exp(log_cap)
-        softer = PGOProblem(soften(problem.graph, cap), problem.backend, problem.weighting)
-        there = polish(softer, poses)
+        try:
+            softer = PGOProblem(soften(problem.graph, cap), problem.backend, problem.weighting)
+            there = polish(softer, poses)
+        except (GraphError, NotPositiveDefiniteError):
+            return False
         Lambda = multipliers(softer, there)
         bound = prove_at(softer.tangent_at(there), Lambda, there)
         if bound is None or bound.value <= best[0].value:
@@ -84,4 +92,5 @@ def _clipped(block: Array, limit: Callable[[Array], Array]) -> Array:
     values, axes = np.linalg.eigh(block)
     margin = _MARGIN * np.einsum("mkk->m", block)[:, None]
     smaller = np.minimum(values, limit(values)[:, None]) - margin
-    return np.asarray((axes * smaller[:, None, :]) @ np.swapaxes(axes, 1, 2))
+    found = (axes * smaller[:, None, :]) @ np.swapaxes(axes, 1, 2)
+    return np.asarray(0.5 * (found + np.swapaxes(found, 1, 2)))

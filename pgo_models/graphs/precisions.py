@@ -49,24 +49,27 @@ def edge_precisions(information: Array, weights: RotationWeight = RotationWeight
 
 
 def proper_information(graph: PoseGraph) -> Array:
-    """Information matrices that chi2 is of, (m, k, k): the graph's, without coupling blocks that make one indefinite.
+    """Information matrices that chi2 is of, (m, k, k), symmetric: without coupling blocks that make one indefinite.
 
     Those of kappa and tau (`isotropic_information`) where the graph has none. The file's reader asks but for definite
     blocks I_tt and I_rr: 5,021 whole matrices of the public cubicle graph are indefinite.
     """
     if graph.information is None:
         return isotropic_information(graph.kappa, graph.tau, graph.d)
-    if not graph.information[:, : graph.d, graph.d :].any():
-        return graph.information
-    diagonal = np.einsum("mkk->mk", graph.information)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    bad = ~(np.linalg.eigvalsh(graph.information * scale[:, :, None] * scale[:, None, :])[:, 0] > _LEAST_SCALED)
-    if not bad.any():
-        return graph.information
-    information = graph.information.copy()
+    information = 0.5 * (graph.information + np.swapaxes(graph.information, 1, 2))
+    if not information[:, : graph.d, graph.d :].any():
+        return np.asarray(information)
+    bad = least_scaled(information) <= _LEAST_SCALED
     information[bad, : graph.d, graph.d :] = 0.0
     information[bad, graph.d :, : graph.d] = 0.0
     return information
+
+
+def least_scaled(blocks: Array) -> Array:
+    """Smallest eigenvalues, (m,), of symmetric blocks (m, k, k) scaled to ones where the diagonal is positive."""
+    diagonal = np.einsum("mkk->mk", blocks)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    return np.asarray(np.linalg.eigvalsh(blocks * scale[:, :, None] * scale[:, None, :])[:, 0])
 
 
 def uncoupled_share(information: Array, d: int) -> Array:

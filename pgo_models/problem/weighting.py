@@ -22,7 +22,7 @@ import numpy as np
 from pgo_models.errors import GraphError
 from pgo_models.geometry.rotations import Array, BoolArray, hat, tangent_dimension, vee
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.graphs.precisions import edge_precisions, proper_information, uncoupled_share
+from pgo_models.graphs.precisions import edge_precisions, least_scaled, proper_information, uncoupled_share
 from pgo_models.problem.floating_point import OUTWARD, gamma
 
 _MARGIN = 2.0**-24  # of the smallest eigenvalue: stays between tau and it, so that the excess is strictly convex
@@ -171,10 +171,11 @@ class Excess:
         q = d, or d + 1 or d + 3 with coupling blocks.
     K : (m, p, p) or None
         p = 1 in the plane, 3 in space.
-    size : (m,)
-        Bound on the norms of the absolute values that J and K are computed from.
-    least : (m,)
-        A number that no eigenvalue of J, nor of K, is below.
+    size : (m, 2)
+        Of translations and rotations, each in its units: absolute values that a block (a, b) of J or K is computed from
+        have norms of at most size_a size_b.
+    least : (m, 2)
+        J is at least the diagonal matrix of these, K at least the second.
     """
 
     R_ij: Array
@@ -216,10 +217,14 @@ class Excess:
         if H is not None and self.K is not None:
             N = self.K @ H
             C[:, 1:] = 0.5 * np.swapaxes((hat(y[:, d:]) + _bend_adjoint(N + np.swapaxes(N, 1, 2), d)) @ self.R_ij, 1, 2)
-        # Every number of C is a sum of products whose absolute values sum to at most `size` ||Z||, as is the value's.
-        length = np.linalg.norm(Z.reshape(len(Z), -1), axis=1)
-        off = gamma(16.0 * d) * self.size * length
-        return Tangent(C, Z, self.values(Z), OUTWARD * off * length, OUTWARD * 32.0 * off**2 / self.least)
+        # With l = sum_a size_a ||Z_a|| absolute values sum to at most l^2 in the value and size_a l in C_a; where there
+        # are s and H, to at most 8 d times that. The excess is at least least_t ||Z_t||^2 + least_R ||Z_R||^2 / 4, in
+        # the plane for Z_R in the span of R_ij^T and its quarter turn, where it is but for rounding.
+        length = self.size[:, 0] * np.linalg.norm(Z[:, 0], axis=1)
+        length += self.size[:, 1] * np.linalg.norm(Z[:, 1:], axis=(1, 2))
+        share = gamma(16.0 * d) * (1.0 if self.K is None else 8.0 * d)
+        loss = 32.0 * (share * length) ** 2 * np.sum(self.size**2 / self.least, axis=1)
+        return Tangent(C, Z, self.values(Z), OUTWARD * share * length**2, OUTWARD * loss)
 
     def derivatives(self, relative: Array, apart: Array) -> tuple[Array, Array | None]:
         """Derivatives of u and H, (m, q, 2 d + 2 p) and (m, p, p, 2 p), in (R_i^T v_i, R_i^T v_j, w_i, w_j), at poses.
@@ -269,7 +274,9 @@ def edge_weights(graph: PoseGraph, weighting: Weighting) -> EdgeWeights:
         return EdgeWeights(graph.tau, graph.kappa)
     information, d, p = proper_information(graph), graph.d, tangent_dimension(graph.d)
     I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
-    smallest, trace = np.linalg.eigvalsh(I_tt)[:, 0], np.einsum("mkk->m", I_tt)
+    (smallest, trace), (of_R, trace_R) = ((np.linalg.eigvalsh(A)[:, 0], np.einsum("mkk->m", A)) for A in (I_tt, I_rr))
+    is_empty = trace == 0.0, trace_R == 0.0  # of a landmark, or a prior of one kind
+    _check(graph, (is_empty[0] | (smallest > _ROUNDED * trace)) & (is_empty[1] | (of_R > _ROUNDED * trace_R)))
     is_coupled = I_tr.any(axis=(1, 2))
     if (I_tt == I_tt[:, :1, :1] * np.eye(d)).all() and not is_coupled.any():
         return EdgeWeights(I_tt[:, 0, 0].copy(), *_rotation_weights(I_rr))
@@ -283,36 +290,36 @@ def edge_weights(graph: PoseGraph, weighting: Weighting) -> EdgeWeights:
         is_coupled, _COUPLED_SHARE * uncoupled_share(information, d) * smallest, smallest - 2.0 * margin[:, 0]
     )
     J, K, turn = I_tt - tau[:, None, None] * np.eye(d), None, graph.R_ij
-    growth = 1.0
     if is_coupled.any():
         bearing = np.swapaxes(I_tr, 1, 2) @ np.linalg.solve(J, I_tr)
-        unsaid = np.where(I_rr.any(axis=(1, 2)), 0.0, smallest)  # K costs nothing where I_rr is zero: W' is -K's
-        spare = _MARGIN * (np.linalg.eigvalsh(I_rr)[:, 0] + unsaid) + _ROUNDED * np.einsum("mkk->m", I_rr)
+        of_R = np.where(
+            is_empty[1], np.median(of_R[~is_empty[1]]), of_R
+        )  # K costs nothing where I_rr is zero: W' is -K's
+        spare = _MARGIN * of_R + _ROUNDED * trace_R
         share = 0.5 + 4.0 * margin[:, 0] / smallest + _MARGIN
         K = share[:, None, None] * (bearing + np.swapaxes(bearing, 1, 2)) + 2.0 * spare[:, None, None] * np.eye(p)
         J = np.concatenate([np.concatenate([J, I_tr], 2), np.concatenate([np.swapaxes(I_tr, 1, 2), K], 2)], 1)
         turn = np.zeros_like(J)
         turn[:, :d, :d], turn[:, d:, d:] = graph.R_ij, graph.R_ij if d == 3 else 1.0
         margin = np.concatenate([margin, np.repeat(spare[:, None], p, axis=1)], axis=1)
-        growth = 4.0 * d  # of absolute values in the sums of `Excess.arguments` and `Excess.tangent`
     weights = _rotation_weights(I_rr, K)
-    sizes = np.abs(J) + 2.0 * tau[:, None, None] * np.eye(J.shape[1])
     J = turn @ J @ np.swapaxes(turn, 1, 2)
-    size = growth * np.linalg.norm(np.abs(turn) @ sizes @ np.abs(np.swapaxes(turn, 1, 2)), axis=(1, 2))
-    _check_definite(graph, J - margin[:, :, None] * np.eye(J.shape[1]), tau)
+    _check(graph, (tau > 0.0) & (least_scaled(J - margin[:, :, None] * np.eye(J.shape[1])) > 0.0))
+    # Blocks of definite J: ||J_ab||^2 <= tr(J_aa) tr(J_bb); and || |R_ij| ||^2 = d.
+    size = np.sqrt(d * np.stack([trace + d * tau, 0.0 * tau if K is None else np.einsum("mkk->m", K)], axis=1))
     K = None if K is None else J[:, d:, d:]
-    return EdgeWeights(tau, *weights, Excess(graph.R_ij, J, K, OUTWARD * size, 0.5 * margin.min(axis=1)))
+    return EdgeWeights(tau, *weights, Excess(graph.R_ij, J, K, OUTWARD * size, 0.5 * margin[:, [0, -1]]))
 
 
 def convex_weights(graph: PoseGraph) -> EdgeWeights:
-    """Weights of a strictly convex quadratic cost near chi2: tau as in F, and of W what is well above zero."""
-    I_rr = proper_information(graph)[:, graph.d :, graph.d :]
+    """Weights of a strictly convex quadratic cost near chi2: the tau of F, and of W what is well above zero."""
+    I_rr = (information := proper_information(graph))[:, graph.d :, graph.d :]
     kappa, axes, W, _ = _rotation_weights(I_rr)
     if axes is not None:
-        least = _LEAST_CONVEX * edge_precisions(proper_information(graph))[0]  # of the kappa of F
+        least = _LEAST_CONVEX * edge_precisions(information)[0]  # of the kappa of F
         kappa = np.maximum(kappa, least[:, None])
         W = (axes * kappa[:, None, :]) @ np.swapaxes(axes, 1, 2)
-    return EdgeWeights(graph.tau, kappa, axes, W)
+    return EdgeWeights(edge_precisions(information)[1], kappa, axes, W)
 
 
 def _rotation_weights(I_rr: Array, K: Array | None = None) -> tuple[Array, Array | None, Array | None, Array]:
@@ -326,18 +333,12 @@ def _rotation_weights(I_rr: Array, K: Array | None = None) -> tuple[Array, Array
     return (*np.linalg.eigh(W), W, rounded)
 
 
-def _check_definite(graph: PoseGraph, J: Array, tau: Array) -> None:
-    """Raise unless tau is positive and Cholesky factorisations of J go through (Rump 2006)."""
-    try:
-        np.linalg.cholesky(J)
-        definite = tau > 0.0
-    except np.linalg.LinAlgError:
-        definite = (tau > 0.0) & (np.linalg.eigvalsh(J)[:, 0] > 0.0)
-    if not definite.all():
-        edge = graph.edge_label(int(np.argmin(definite)))
+def _check(graph: PoseGraph, good: BoolArray) -> None:
+    if not good.all():
+        edge = graph.edge_label(int(np.argmin(good)))
         raise GraphError(
-            f"the information matrix of {edge} spans more orders of magnitude than double precision carries; give it a "
-            "larger smallest eigenvalue, or solve without the information matrices"
+            f"the information matrix of {edge} is indefinite or spans more orders of magnitude than double precision "
+            "carries; give it a larger smallest eigenvalue, or solve without the information matrices"
         )
 
 

@@ -294,14 +294,14 @@ def test_a_robot_counts_the_rounding_of_its_separators_entries(d: int, monkeypat
     Lambda = np.zeros((8, d, d))
     S, diagonal = shifted_certificate(problem, Lambda, np.zeros(problem.side))
     S_before = S.diagonal()
-    monkeypatch.setattr(robot_proof, "matrix_error", lambda graph: share)
+    monkeypatch.setattr(robot_proof, "matrix_errors", lambda problem, diagonal: np.full(problem.side, share))
     found = robot_proof.verify_interior(problem, Lambda, 0.0, cut, np.zeros(0, dtype=np.int64), 1e-12, None)
     assert found is not None
     lost = S_before - found[0].diagonal()
     assert (lost[cut.boundary] >= (1.0 - 1e-9) * share * diagonal[cut.boundary]).all()
     assert (lost[cut.interior] >= (2.0 - 1e-9) * share * diagonal[cut.interior]).all()
     assert (found[2] <= lost[cut.interior] - (1.0 - 1e-9) * share * diagonal[cut.interior]).all()
-    monkeypatch.setattr(robot_proof, "matrix_error", lambda graph: 0.0)
+    monkeypatch.setattr(robot_proof, "matrix_errors", lambda problem, diagonal: np.zeros(problem.side))
     found = robot_proof.verify_interior(problem, Lambda, 0.0, cut, np.zeros(0, dtype=np.int64), 1e-12, None)
     assert found is not None
     assert (found[1].interior_error > 0.0).all()

@@ -24,7 +24,7 @@ from pgo_models.certificates.tangent import soften, softened_bound
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import proper_information
+from pgo_models.graphs.precisions import least_scaled, proper_information, uncoupled_share
 from pgo_models.graphs.residuals import Chi2Convention, chi2
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.initialization import chordal_start
@@ -181,7 +181,7 @@ def test_rounding_of_chi2(seed: int, n: int, d: int, coupled: bool) -> None:
     problem = of_file(graph)
     poses = random_poses(n, d, seed)
     deviation = abs(exact_chi2(graph, poses) - exact(problem.objective(poses)))
-    assert deviation <= exact(2.0 * objective_rounding(problem, poses).error)
+    assert deviation <= exact(objective_rounding(problem, poses).error)
 
 
 def test_smaller_matrices_cost_less() -> None:
@@ -194,6 +194,32 @@ def test_smaller_matrices_cost_less() -> None:
         assert np.linalg.cond(softer[:, :3, :3]).max() <= cap * (1 + 1e-6)
         values = np.linalg.eigvalsh(softer[:, 3:, 3:])
         assert (values[:, 2] <= (1 + 1e-9) * (values[:, 0] + values[:, 1])).all()
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_smaller_matrices_are_below_whatever_share_was_computed(d: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = informed(3, 8, d, coupled=True, spread=2.0)
+    information = proper_information(graph)
+    monkeypatch.setattr(
+        "pgo_models.certificates.tangent.uncoupled_share",
+        lambda blocks, d: np.minimum(1.0, uncoupled_share(blocks, d) + 0.3),
+    )
+    softer = soften(graph, 1e9).information
+    assert softer is not None
+    assert (least_scaled(information - softer) > 0.0).all()
+
+
+def test_coupling_that_leaves_nothing_gives_no_softened_bound() -> None:
+    graph = informed(3, 8, 3, coupled=False, spread=0.5)
+    information = proper_information(graph).copy()
+    for e, block in enumerate(information):
+        L_t, L_r = np.linalg.cholesky(block[:3, :3]), np.linalg.cholesky(block[3:, 3:])
+        information[e, :3, 3:] = (1.0 - 1e-8) * L_t @ L_r.T
+        information[e, 3:, :3] = information[e, :3, 3:].T
+    graph = replace(graph, information=information)
+    problem = of_file(graph)
+    certificate = certify(problem, polish(problem, chordal_start(problem.convex_part)))
+    assert certificate.lower_bound <= certificate.objective
 
 
 def test_softened_bounds_hold_where_the_tangent_gives_none() -> None:

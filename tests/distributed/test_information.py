@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from budget import examples
 from graphs import DIMENSIONS, SEEDS, informed
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from robots import driver_at
 
 import solvers
 from pgo_models.certificates.certificate import Verdict
@@ -18,9 +20,12 @@ from pgo_models.errors import SettingError
 from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.precisions import proper_information
 from pgo_models.graphs.scenes import NoiseModel, circle
+from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
+from pgo_models.problem.weighting import Tangent, Weighting
 from solvers.distributed.checkpoint import Checkpoint
+from solvers.distributed.lower_bound import prove_with_eta
+from solvers.network.counted_pool import Count
 from solvers.soc.settings import Coupling
 
 QUIET = NoiseModel(0.02, 0.02)
@@ -96,6 +101,22 @@ def test_a_run_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     again = solvers.solve(problem, robots=3, progress=False, checkpoint=checkpoint)
     assert again.objective == pytest.approx(whole.objective, rel=1e-12)
     assert again.certificate.verdict is whole.certificate.verdict
+
+
+def test_robots_count_the_constants_of_their_tangents_and_their_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = of_file(3, 12, 3, coupled=False)
+    eta, values = 1e3 * float(abs(problem.tangent_at(chordal_start(problem.convex_part)).M).max()), []
+    with closing(driver_at(problem, partition(problem.graph, 3), None)) as driver:
+        driver.choose_cost(final=True)
+        driver.describe(Count.OFF)
+        for constant in ((1e9, 0.0), (2e9, 0.0), (2e9, 1e3)):
+            monkeypatch.setattr(Tangent, "constant", constant)
+            found = prove_with_eta(driver, eta)
+            assert found is not None
+            values.append(found.value)
+        robots = len(driver.robots)
+    assert values[1] - values[0] == pytest.approx(1e9 * robots, rel=1e-6)
+    assert values[1] - values[2] == pytest.approx(1e3 * robots, rel=1e-6)
 
 
 def test_without_a_driver_chi2_is_refused() -> None:

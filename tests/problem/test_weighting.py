@@ -15,7 +15,7 @@ from pgo_models.certificates.newton_polish import move_poses, polish
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import tangent_dimension
-from pgo_models.graphs.precisions import isotropic_information, proper_information
+from pgo_models.graphs.precisions import isotropic_information, least_scaled, proper_information
 from pgo_models.graphs.residuals import chi2
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.initialization import chordal_start
@@ -158,3 +158,48 @@ def test_polish_finds_stationary_points_of_chi2(d: int, coupled: bool) -> None:
     poses = polish(problem, chordal_start(problem.convex_part))
     w, v = problem.riemannian_gradient(poses)
     assert max(np.abs(w).max(), np.abs(v).max()) <= 1e-6 * problem.objective(poses)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("block", ["translations", "rotations"])
+@pytest.mark.parametrize("isotropic", [False, True])
+def test_indefinite_blocks_are_refused(d: int, block: str, isotropic: bool) -> None:
+    """Their cost can be negative, where no bound of zero holds."""
+    graph = informed(0, 6, d, coupled=False)
+    information = graph.information.copy()  # type: ignore[union-attr]
+    if isotropic:
+        information[:, :d, :d] = np.eye(d)
+    at = slice(0, d) if block == "translations" else slice(d, None)
+    turned = np.eye(information[:, at, at].shape[1])
+    turned[0, -1] = turned[-1, 0] = 3.0 if len(turned) > 1 else -1.0
+    for bad in (turned, -np.eye(len(turned))):
+        information[3, at, at] = bad
+        problem = PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION)
+        with pytest.raises(GraphError, match=r"edge 3 .* is indefinite or spans"):
+            problem.objective(random_poses(6, d, 0))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_of_a_matrix_that_is_not_symmetric_its_symmetric_part_counts(d: int) -> None:
+    """r^T I r does not see the rest; a tangent of both would not be one."""
+    graph = informed(0, 6, d, coupled=True)
+    odd = graph.information + 0.01 * np.triu(np.ones_like(graph.information), 1)  # type: ignore[operator]
+    even = 0.5 * (odd + np.swapaxes(odd, 1, 2))
+    poses = random_poses(6, d, 0)
+    one, other = (PGOProblem(replace(graph, information=given), None, Weighting.INFORMATION) for given in (odd, even))
+    assert one.objective(poses) == other.objective(poses)
+    np.testing.assert_array_equal(one.tangent_at(poses).M.toarray(), other.tangent_at(poses).M.toarray())
+
+
+def test_the_convex_part_is_of_the_information_alone() -> None:
+    graph = informed(0, 6, 3, coupled=True)
+    other = replace(graph, kappa=1e12 * graph.kappa, tau=1e15 * graph.tau)
+    one, same = (PGOProblem(g, weighting=Weighting.INFORMATION).convex_part.M for g in (graph, other))
+    np.testing.assert_array_equal(one.data, same.data)
+
+
+def test_the_least_eigenvalue_is_seen_in_every_unit() -> None:
+    blocks = np.stack([np.eye(4), np.diag([1.0, 1.0, 1e-9, -1e-12]), np.diag([1e9, 1.0, 1.0, 1e-12])])
+    np.testing.assert_allclose(least_scaled(blocks), [1.0, -1e-12, 1.0], rtol=1e-3)
+    blocks[2, 0, 3] = blocks[2, 3, 0] = 0.04
+    assert least_scaled(blocks)[2] == pytest.approx(1.0 - 0.04 / np.sqrt(1e-3), rel=1e-12)
