@@ -107,6 +107,21 @@ def test_a_run_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     assert again.certificate.verdict is whole.certificate.verdict
 
 
+@pytest.mark.parametrize("seed", [5, 12, 15, 20])
+def test_robots_go_on_until_the_tangent_is_as_sharp_as_in_one_place(seed: int) -> None:
+    """What is left of chi2 weighs up to the condition of I_tt more in the bound."""
+    d, rng = 2 + seed % 2, np.random.default_rng(seed)
+    graph = informed(seed, 25, d, False, 0.3, QUIET)
+    information, axes = proper_information(graph).copy(), np.linalg.qr(rng.standard_normal((graph.num_edges, d, d)))[0]
+    information[:, :d, :d] = (axes * 10.0 ** rng.uniform(-6, 0, (graph.num_edges, 1, d))) @ np.swapaxes(axes, 1, 2)
+    if d == 3:
+        information[:, 3:, 3:] = np.eye(3) * information[:, 3, 3][:, None, None]
+    problem = PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION)
+    central, shared = (solvers.solve(problem, robots=robots, progress=False) for robots in (None, 3))
+    assert shared.gap <= 4.0 * central.gap
+    assert shared.stages[-1].status is solvers.Status.CONVERGED
+
+
 def test_robots_count_the_constants_of_their_tangents_and_their_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = of_file(3, 12, 3, coupled=False)
     eta, values = 1e3 * float(abs(problem.tangent_at(chordal_start(problem.convex_part)).M).max()), []
