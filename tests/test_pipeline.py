@@ -234,7 +234,8 @@ def test_units_change_nothing_of_chi2_either(seed, weights, metres, d, coupled, 
     )
     assert other.certificate.verdict is one.certificate.verdict
     assert [stage.iterations for stage in other.stages] == [stage.iterations for stage in one.stages]
-    assert other.objective == pytest.approx(weights * one.objective, rel=1e-9)
+    level = 10.0 * other.certificate.rounding_level  # of trees, whose measurements agree
+    assert other.objective == pytest.approx(weights * one.objective, rel=1e-9, abs=level)
     assert abs(other.certificate.digits - one.certificate.digits) <= 1
 
 

@@ -47,6 +47,7 @@ class SubstructuredNewtonState:
     decrement: float = math.inf
     moved: bool = True
     is_at_rounding: bool = False
+    tolerance: float = STATIONARY_DECREMENT
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +80,9 @@ class SubstructuredNewton:
         model = self._factorize(driver)
         at_rounding = False
         decrement = scaled_decrement(model.square, driver.at.objective, driver.at.rounding_level)
-        moved = False
+        moved, tolerance = False, STATIONARY_FOR_TANGENTS if driver.is_final else STATIONARY_DECREMENT
         for _ in range(1 + CHORD_STEPS):
-            if decrement <= (STATIONARY_FOR_TANGENTS if driver.is_final else STATIONARY_DECREMENT):
+            if decrement <= tolerance:
                 break
             found = _backtrack(driver, model)
             if found is None:
@@ -99,7 +100,7 @@ class SubstructuredNewton:
             model, decrement, moved = following, after, True
             if not enough:
                 break
-        return SubstructuredNewtonState(state.k + 1, driver.at.objective, decrement, moved, at_rounding)
+        return SubstructuredNewtonState(state.k + 1, driver.at.objective, decrement, moved, at_rounding, tolerance)
 
     def measure(self, driver: Driver, state: SubstructuredNewtonState) -> Measurement:
         """F and the relative decrement."""
@@ -107,7 +108,8 @@ class SubstructuredNewton:
 
     def converged(self, state: SubstructuredNewtonState, measurement: Measurement) -> Status | None:
         """CONVERGED within tolerance or where the gradient is rounding; STALLED when the last step could not move."""
-        if measurement.dual_residual <= self.newton.tolerance or state.is_at_rounding:
+        share = state.tolerance / STATIONARY_DECREMENT if state.moved else 1.0
+        if measurement.dual_residual <= share * self.newton.tolerance or state.is_at_rounding:
             return Status.CONVERGED
         return None if state.moved else Status.STALLED
 

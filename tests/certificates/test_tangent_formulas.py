@@ -20,6 +20,8 @@ from pgo_models.problem.floating_point import gamma
 from pgo_models.problem.matrices import rotation_columns
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Tangent, Weighting
+from solvers.distributed.robots.elimination import Cut
+from solvers.distributed.robots.proof import verify_interior
 
 ENOUGH = 1.0 - 1e-12  # the formulas here are rounded, too; the bounds are rounded up by 2^-30
 CASES = pytest.mark.parametrize(("d", "coupled"), [(2, False), (2, True), (3, False), (3, True)])
@@ -60,6 +62,17 @@ def test_sizes_and_least_eigenvalues_of_an_excess(d: int, coupled: bool) -> None
             assert size[1] == 0.0
         diagonal = np.repeat(least, [d, excess.J.shape[1] - d])
         assert least_scaled(excess.J[e : e + 1] - np.diag(diagonal)) > 0.0
+
+
+@CASES
+def test_error_of_W(d: int, coupled: bool) -> None:
+    weights, p = of_file(d, coupled).weights, 1 if d == 2 else 3
+    I_rr, excess = proper_information(of_file(d, coupled).graph)[:, d:, d:], weights.excess
+    assert excess is not None
+    assert weights.W_error is not None
+    K = np.zeros_like(I_rr) if excess.K is None else excess.K  # in the frame of i, which turns no norm
+    sizes = np.linalg.norm(I_rr, axis=(1, 2)) + np.linalg.norm(K, axis=(1, 2))
+    assert (weights.W_error >= (1.0 - 1e-9) * gamma(4.0 * p) * p * sizes).all()
 
 
 @CASES
@@ -241,3 +254,19 @@ def test_the_constant_and_its_error_in_a_bound_with_eta_alone(d: int) -> None:
         assert found.rounding >= m * value_error
         assert found.value <= max(0.0, expected - m * value_error)
         assert found.value >= (1 - 1e-9) * (expected - m * value_error)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_robot_counts_the_rounding_of_separators_whose_diagonal_is_negative(d: int) -> None:
+    problem, _ = touching(of_file(d, coupled=True, n=8))
+    is_inside = np.concatenate([np.arange(8) >= 4, np.repeat(np.arange(8) >= 4, d)])
+    cut = Cut(np.flatnonzero(is_inside), np.flatnonzero(~is_inside), None)
+    before = problem.M.diagonal()
+    assert (before[cut.boundary] < 0.0).any()
+    eta, Lambda = 1e3 * float(np.abs(before).max()), np.zeros((8, d, d))
+    found = verify_interior(problem, Lambda, eta, cut, np.zeros(0, dtype=np.int64), 1e-9, None)
+    assert found is not None
+    diagonal = np.abs(before) + np.where(is_inside, 2.0 * eta, 0.0) * (np.arange(len(before)) >= 8)
+    lost = matrix_errors(problem, diagonal) * diagonal
+    lost, u_before = lost[cut.boundary], u * np.abs(before[cut.boundary])
+    assert (before[cut.boundary] - found[0].diagonal()[cut.boundary] >= 0.999 * lost - u_before).all()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,9 @@ from robots import driver_at
 
 import solvers
 from pgo_models.certificates.certificate import Verdict
+from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.precisions import proper_information
 from pgo_models.graphs.scenes import NoiseModel, circle
@@ -24,6 +27,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Tangent, Weighting
 from solvers.distributed.checkpoint import Checkpoint
+from solvers.distributed.interface import Interface
 from solvers.distributed.lower_bound import prove_with_eta
 from solvers.network.counted_pool import Count
 from solvers.soc.settings import Coupling
@@ -103,6 +107,21 @@ def test_a_run_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     assert again.certificate.verdict is whole.certificate.verdict
 
 
+@pytest.mark.parametrize("seed", [5, 12, 15, 20])
+def test_robots_go_on_until_the_tangent_is_as_sharp_as_in_one_place(seed: int) -> None:
+    """What is left of chi2 weighs up to the condition of I_tt more in the bound."""
+    d, rng = 2 + seed % 2, np.random.default_rng(seed)
+    graph = informed(seed, 25, d, False, 0.3, QUIET)
+    information, axes = proper_information(graph).copy(), np.linalg.qr(rng.standard_normal((graph.num_edges, d, d)))[0]
+    information[:, :d, :d] = (axes * 10.0 ** rng.uniform(-6, 0, (graph.num_edges, 1, d))) @ np.swapaxes(axes, 1, 2)
+    if d == 3:
+        information[:, 3:, 3:] = np.eye(3) * information[:, 3, 3][:, None, None]
+    problem = PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION)
+    central, shared = (solvers.solve(problem, robots=robots, progress=False) for robots in (None, 3))
+    assert shared.gap <= 4.0 * central.gap
+    assert shared.stages[-1].status is solvers.Status.CONVERGED
+
+
 def test_robots_count_the_constants_of_their_tangents_and_their_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = of_file(3, 12, 3, coupled=False)
     eta, values = 1e3 * float(abs(problem.tangent_at(chordal_start(problem.convex_part)).M).max()), []
@@ -117,6 +136,28 @@ def test_robots_count_the_constants_of_their_tangents_and_their_errors(monkeypat
         robots = len(driver.robots)
     assert values[1] - values[0] == pytest.approx(1e9 * robots, rel=1e-6)
     assert values[1] - values[2] == pytest.approx(1e3 * robots, rel=1e-6)
+
+
+@pytest.mark.parametrize("eta", [0.0, 1e6])
+def test_the_driver_s_rounding_is_a_share_of_at_least_its_diagonal(eta: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, seen, rounding = of_file(3, 12, 3, coupled=True), [], Interface.rounding
+
+    def noted(self: Interface, contributions: Any, own: Any, diagonal: Array) -> Array:
+        seen.append(diagonal.copy())
+        return rounding(self, contributions, own, diagonal)
+
+    monkeypatch.setattr(Interface, "rounding", noted)
+    with closing(
+        driver_at(problem, partition(problem.graph, 3), polish(problem, chordal_start(problem.convex_part)))
+    ) as driver:
+        driver.choose_cost(final=True)
+        driver.describe(Count.OFF)
+        for scale in (1.0, -1.0):
+            driver.at = replace(driver.at, force=scale * driver.at.force)
+            prove_with_eta(driver, eta)
+            least = driver.diagonal.copy()
+            least[driver.rotation_rows] += (eta * np.eye(3) - driver.at.multipliers).diagonal(axis1=1, axis2=2).ravel()
+            assert (seen[-1] >= least).all()
 
 
 def test_without_a_driver_chi2_is_refused() -> None:
