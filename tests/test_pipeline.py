@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import OPTIMUM, informed, wound_ring
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import pgo_models as pgo
@@ -223,6 +223,7 @@ def test_units_change_neither_verdict_nor_iterations_nor_digits(seed, weights, m
     spread=st.sampled_from([0.1, 0.3, 1.0]),
     robots=st.sampled_from([None, 2]),
 )
+@example(seed=3173635, weights=1e-9, metres=1e-3, d=3, coupled=False, spread=1.0, robots=2)
 def test_units_change_nothing_of_chi2_either(seed, weights, metres, d, coupled, spread, robots):
     graph = replace(informed(seed, 15, d, coupled, spread, NoiseModel(0.01, 0.01)), initial=None, truth=None)
     unit = np.ones(graph.information.shape[1])
@@ -233,7 +234,10 @@ def test_units_change_nothing_of_chi2_either(seed, weights, metres, d, coupled, 
         solvers.solve(pgo.PGOProblem(g, weighting=Weighting.INFORMATION), robots=robots) for g in (graph, scaled)
     )
     assert other.certificate.verdict is one.certificate.verdict
-    assert [stage.iterations for stage in other.stages] == [stage.iterations for stage in one.stages]
+    assert [stage.name for stage in other.stages] == [stage.name for stage in one.stages]
+    for stage, same in zip(other.stages, one.stages, strict=True):
+        # Newton goes down to rounding, where one iteration more or less is rounding, too.
+        assert abs(stage.iterations - same.iterations) <= (stage.name == "Newton")
     level = 10.0 * other.certificate.rounding_level  # of trees, whose measurements agree
     assert other.objective == pytest.approx(weights * one.objective, rel=1e-9, abs=level)
     assert abs(other.certificate.digits - one.certificate.digits) <= 1

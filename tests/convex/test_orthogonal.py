@@ -1,5 +1,6 @@
 import itertools
 import math
+from dataclasses import replace
 
 import cvxpy as cp
 import numpy as np
@@ -120,7 +121,7 @@ def test_rotation_averaging_equals_soc_and_newton_on_the_graph() -> None:
     solution = solve_orthogonal(rotation_averaging(graph), rng_of(0), starts=2)
     assert_solved(solution)
     # With tau far below kappa, F is its rotation part.
-    faint = PGOProblem(type(graph)(**{**vars(graph), "tau": 1e-9 * graph.kappa}))
+    faint = PGOProblem(replace(graph, tau=1e-9 * graph.kappa))
     soc = run(SOC(tolerance=1e-8), faint)
     newton = run(Newton(), faint, soc.poses)
     assert solution.objective == pytest.approx(newton.objective, rel=BETTER)
