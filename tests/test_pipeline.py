@@ -229,7 +229,8 @@ def test_units_change_nothing_of_chi2_either(seed, weights, metres, d, coupled, 
     unit = np.ones(graph.information.shape[1])
     unit[:d] = 1.0 / metres
     information = weights * unit[:, None] * graph.information * unit
-    scaled = replace(graph, information=information, t_ij=metres * graph.t_ij)
+    precisions = {"kappa": weights * graph.kappa, "tau": weights * graph.tau / metres**2}
+    scaled = replace(graph, information=information, t_ij=metres * graph.t_ij, **precisions)
     one, other = (
         solvers.solve(pgo.PGOProblem(g, weighting=Weighting.INFORMATION), robots=robots) for g in (graph, scaled)
     )
