@@ -121,15 +121,18 @@ def test_where_the_relaxation_is_not_tight_its_optimum_is_that_of_the_semidefini
 
 
 @settings(max_examples=examples(25))
+@example(seed=15590, n=2, d=2)  # one edge: F wavers about its rounding level, and there may be nothing to climb from
 @given(seed=SEEDS, n=st.integers(2, 10), d=DIMENSIONS)
 def test_its_bound_holds_at_any_noise_and_start(seed: int, n: int, d: int) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE))
     result = run(Staircase(), problem, random_poses(n, d, seed))
     bound = result.state.bound
-    assert bound is not None
-    if result.objective > 1e-15:  # else the graph is a tree, or as good as one, and no bound is better than zero
-        assert result.status is Status.CONVERGED
-        assert result.state.point.value - bound.lower_bound <= DEFAULT_GAP * result.state.point.value
+    if bound is None or not result.objective > 1e-15:  # a tree, or as good as one: no bound is better than zero
+        assert result.objective <= 1e-15
+        assert bound is None or bound.lower_bound <= 1e-15
+        return
+    assert result.status is Status.CONVERGED
+    assert result.state.point.value - bound.lower_bound <= DEFAULT_GAP * result.state.point.value
     for k in range(4):
         best = polish(problem, problem.with_best_translations(random_poses(n, d, seed + k).R))
         assert bound.lower_bound <= rounded_up(problem, best)
