@@ -139,3 +139,12 @@ def best_known(problem: PGOProblem, seed: int = 0) -> float:
 def rounded_up(problem: PGOProblem, poses: Poses) -> float:
     """F of poses, and what it can be off by."""
     return problem.objective(poses) + objective_rounding(problem, poses).error
+
+
+def assert_says(error: Exception, opening: str, words: list[str]) -> None:
+    """One line that opens with where the fault is, and has these words."""
+    message = str(error)
+    assert message.startswith(opening)
+    assert "\n" not in message
+    for word in words:
+        assert word in message

@@ -190,13 +190,16 @@ def test_a_gap_beyond_doubles_is_not_looked_for_in_other_poses(robots):
     assert solution.gap < 1e-13
 
 
+UNITS = {
+    "seed": st.integers(0, 2**32 - 1),
+    "weights": st.sampled_from([1e-9, 1e-3, 1e3, 1e9]),
+    "metres": st.sampled_from([1e-3, 1.0, 1e3]),
+    "d": st.sampled_from([2, 3]),
+}
+
+
 @settings(max_examples=examples(20))
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    weights=st.sampled_from([1e-9, 1e-3, 1e3, 1e9]),
-    metres=st.sampled_from([1e-3, 1.0, 1e3]),
-    d=st.sampled_from([2, 3]),
-)
+@given(**UNITS)
 def test_units_change_neither_verdict_nor_iterations_nor_digits(seed, weights, metres, d):
     graph = pgo.random_geometric(30, np.random.default_rng(seed), d=d)
     kappa, tau = weights * graph.kappa, weights * graph.tau / metres**2
@@ -214,15 +217,7 @@ def test_units_change_neither_verdict_nor_iterations_nor_digits(seed, weights, m
 
 
 @settings(max_examples=examples(20))
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    weights=st.sampled_from([1e-9, 1e-3, 1e3, 1e9]),
-    metres=st.sampled_from([1e-3, 1.0, 1e3]),
-    d=st.sampled_from([2, 3]),
-    coupled=st.booleans(),
-    spread=st.sampled_from([0.1, 0.3, 1.0]),
-    robots=st.sampled_from([None, 2]),
-)
+@given(**UNITS, coupled=st.booleans(), spread=st.sampled_from([0.1, 0.3, 1.0]), robots=st.sampled_from([None, 2]))
 @example(seed=3173635, weights=1e-9, metres=1e-3, d=3, coupled=False, spread=1.0, robots=2)
 def test_units_change_nothing_of_chi2_either(seed, weights, metres, d, coupled, spread, robots):
     graph = replace(informed(seed, 15, d, coupled, spread, NoiseModel(0.01, 0.01)), initial=None, truth=None)

@@ -111,9 +111,8 @@ def extreme_weight(graph: PoseGraph) -> tuple[float, int, str]:
         i, j = graph.pose_ids[[graph.i[e], graph.j[e]]]
         text = f"{kind} of edge {i} -> {j} is {weight[e]:.3g}, {ratio[e]:.3g} times the median"
         found.append((float(weight[order[0]] / weight[order[tree - 1]]), e, text))
-    return max(
-        found, default=(0.0, 0, ""), key=lambda one: round(float(np.log(one[0])), 9)
-    )  # kappa where both are equal but for rounding
+    # Rounded, so that it is kappa where both are equal but for rounding.
+    return max(found, default=(0.0, 0, ""), key=lambda one: round(float(np.log(one[0])), 9))
 
 
 def _num_components(graph: PoseGraph, edges: IntArray) -> int:

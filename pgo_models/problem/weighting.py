@@ -27,7 +27,7 @@ from pgo_models.problem.floating_point import OUTWARD, gamma
 
 _MARGIN = 2.0**-24  # of the smallest eigenvalue: stays between tau and it, so that the excess is strictly convex
 _ROUNDED = 2.0**-42  # of the trace: far above the rounding of a block, which so cannot make it indefinite
-_LEAST_CONVEX = 0.1
+_LEAST_CONVEX = 0.1  # of the kappa of F: the least weight of a rotation row in the convex cost
 _COUPLED_SHARE = 0.5  # of what the coupling leaves of the smallest eigenvalue of I_tt stays in tau
 
 
@@ -76,7 +76,7 @@ class EdgeWeights:
         return EdgeWeights(self.tau[chosen], self.kappa[chosen], axes, W_given, W_error, excess)
 
     def scaled(self, share: Array) -> EdgeWeights:
-        """Weights times shares, (m,), positive; of a cost, not of a tangent."""
+        """Weights times shares, (m,), of a quadratic cost."""
         wide = share[:, None, None]
         return EdgeWeights(
             share * self.tau,
@@ -84,7 +84,6 @@ class EdgeWeights:
             self.axes,
             None if self.W_given is None else wide * self.W_given,
             None if self.W_error is None else share * self.W_error,
-            None if self.excess is None else self.excess.scaled(share),
         )
 
     @property
@@ -189,11 +188,6 @@ class Excess:
         K = None if self.K is None else self.K[chosen]
         return Excess(self.R_ij[chosen], self.J[chosen], K, self.size[chosen], self.least[chosen])
 
-    def scaled(self, share: Array) -> Excess:
-        """The excess times shares, (m,)."""
-        J, K = share[:, None, None] * self.J, None if self.K is None else share[:, None, None] * self.K
-        return Excess(self.R_ij, J, K, share * self.size, share * self.least)
-
     def arguments(self, Z: Array) -> tuple[Array, Array | None]:
         """(u, H) of edges, (m, q) and (m, p, p) or None: linear in Z, (m, d + 1, d)."""
         if self.K is None:
@@ -292,9 +286,8 @@ def edge_weights(graph: PoseGraph, weighting: Weighting) -> EdgeWeights:
     J, K, turn = I_tt - tau[:, None, None] * np.eye(d), None, graph.R_ij
     if is_coupled.any():
         bearing = np.swapaxes(I_tr, 1, 2) @ np.linalg.solve(J, I_tr)
-        of_R = np.where(
-            is_empty[1], np.median(of_R[~is_empty[1]]), of_R
-        )  # K costs nothing where I_rr is zero: W' is -K's
+        # K costs nothing where I_rr is zero: W' is -K's.
+        of_R = np.where(is_empty[1], np.median(of_R[~is_empty[1]]), of_R)
         spare = _MARGIN * of_R + _ROUNDED * trace_R
         share = 0.5 + 4.0 * margin[:, 0] / smallest + _MARGIN
         K = share[:, None, None] * (bearing + np.swapaxes(bearing, 1, 2)) + 2.0 * spare[:, None, None] * np.eye(p)
@@ -313,13 +306,13 @@ def edge_weights(graph: PoseGraph, weighting: Weighting) -> EdgeWeights:
 
 def convex_weights(graph: PoseGraph) -> EdgeWeights:
     """Weights of a strictly convex quadratic cost near chi2: the tau of F, and of W what is well above zero."""
-    I_rr = (information := proper_information(graph))[:, graph.d :, graph.d :]
-    kappa, axes, W, _ = _rotation_weights(I_rr)
+    information = proper_information(graph)
+    kappa_F, tau_F = edge_precisions(information)
+    kappa, axes, W, _ = _rotation_weights(information[:, graph.d :, graph.d :])
     if axes is not None:
-        least = _LEAST_CONVEX * edge_precisions(information)[0]  # of the kappa of F
-        kappa = np.maximum(kappa, least[:, None])
+        kappa = np.maximum(kappa, _LEAST_CONVEX * kappa_F[:, None])
         W = (axes * kappa[:, None, :]) @ np.swapaxes(axes, 1, 2)
-    return EdgeWeights(edge_precisions(information)[1], kappa, axes, W)
+    return EdgeWeights(tau_F, kappa, axes, W)
 
 
 def _rotation_weights(I_rr: Array, K: Array | None = None) -> tuple[Array, Array | None, Array | None, Array]:

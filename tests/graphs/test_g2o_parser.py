@@ -2,6 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from graphs import assert_says
 
 from pgo_models.errors import FileFormatError
 from pgo_models.graphs.g2o_parser import information_of, poses_of, read_lines
@@ -71,11 +72,7 @@ def test_every_fault_has_file_line_and_value(tmp_path: Path, lines: list[str], w
     path = write(tmp_path, *lines)
     with pytest.raises(FileFormatError) as caught:
         read_lines(path)
-    message = str(caught.value)
-    assert message.startswith(f"{path}{where}: ")
-    assert "\n" not in message
-    for word in words:
-        assert word in message
+    assert_says(caught.value, f"{path}{where}: ", words)
 
 
 def test_everything_that_is_no_measurement_is_skipped(tmp_path: Path) -> None:

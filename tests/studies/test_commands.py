@@ -20,17 +20,10 @@ PGO = [sys.executable, "-c", "from solvers.cli import main; main()"]
 
 
 @pytest.fixture
-def pgo_command(capsys, tmp_path, monkeypatch):
-    """Runs `pgo` in this process, in an empty folder: exit code, standard output, standard error."""
+def pgo_command(pgo_command, tmp_path, monkeypatch):
+    """Runs `pgo` as everywhere, in an empty folder."""
     monkeypatch.chdir(tmp_path)
-
-    def call(*arguments):
-        with pytest.raises(SystemExit) as end:
-            cli.main([str(argument) for argument in arguments])
-        streams = capsys.readouterr()
-        return end.value.code, streams.out, streams.err
-
-    return call
+    return pgo_command
 
 
 def test_tables_prints_and_writes_every_format(pgo_command, tmp_path):
