@@ -243,7 +243,7 @@ def solve_command(
         with suppress(NotPositiveDefiniteError):  # writing will say so
             solution = replace(solution, covariances=solution.marginals() if report is not None else None)
     if report is not None:
-        options = {"--unit-weights": unit_weights, "--skip-unknown": skip_unknown}
+        options = {"--unit-weights": unit_weights, "--information": information, "--skip-unknown": skip_unknown}
         source = shlex.join([graph, *(name for name, given in options.items() if given)])
         targets.append((report, partial(write_report, solution, source=source)))
     save_then_show(targets, lambda: typer.echo("\n\n".join([text, *hint_of_chi2(problem, solution.poses)])))

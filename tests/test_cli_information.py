@@ -75,6 +75,14 @@ def test_information_that_is_not_there_is_asked_for_in_vain(pgo_command: Call, f
     assert "--unit-weights takes them away; leave it out" in err
 
 
+def test_the_advice_of_a_report_is_about_the_same_cost(pgo_command: Call, file: Path, tmp_path: Path) -> None:
+    pytest.importorskip("plotly")
+    code, _, err = pgo_command("solve", file, "--information", "--report", tmp_path / "r.html")
+    assert (code, err) == (0, "")
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert f"pgo certify {file} --information --estimate solved.g2o" in page
+
+
 def test_robots_do_it_too(pgo_command: Call, file: Path) -> None:
     code, out, err = pgo_command("solve", file, "--information", "--robots", 3)
     assert (code, err) == (0, "")
