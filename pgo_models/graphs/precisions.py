@@ -13,7 +13,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.measurements import isotropic_information
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 
-_LEAST_SCALED = 1e-12  # smallest eigenvalue of a matrix scaled to ones on its diagonal that counts as positive
+LEAST_SCALED = 1e-12  # smallest eigenvalue of a matrix scaled to ones on its diagonal that counts as positive
 
 
 class RotationWeight(enum.Enum):
@@ -59,7 +59,7 @@ def proper_information(graph: PoseGraph) -> Array:
     information = 0.5 * (graph.information + np.swapaxes(graph.information, 1, 2))
     if not information[:, : graph.d, graph.d :].any():
         return np.asarray(information)
-    bad = least_scaled(information) <= _LEAST_SCALED
+    bad = least_scaled(information) <= LEAST_SCALED
     information[bad, : graph.d, graph.d :] = 0.0
     information[bad, graph.d :, : graph.d] = 0.0
     return information
