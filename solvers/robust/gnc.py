@@ -1,0 +1,324 @@
+"""Graduated non-convexity: a robust cost by a sequence of weighted ones (Yang, Antonante, Tzoumas & Carlone 2020).
+
+    minimise   sum over known inliers of r_e^2 + sum over the others of c_e^2 loss(r_e^2 / c_e^2)
+
+with r_e^2 the share of edge e in the cost and c_e^2 its quantile (`pgo_models.problem.thresholds`) times a scale. A
+surrogate of the loss with a control mu is convex in the residual at one end and the loss at the other. It is minimised
+by turns: in the weights, which have a closed form (equations 12 and 14), and in the poses, by a Newton step or a few.
+
+Files may claim far too little or too much precision: in parking-garage true edges cost 1e-5 of what they may. Once no
+edge is undecided the scale is set by the median of the edges kept, and the control starts once more.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from scipy.special import chdtri
+
+from pgo_models.certificates.newton_polish import polish_step, start_polish
+from pgo_models.errors import SettingError, check_settings
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
+from pgo_models.problem.cholesky import SymbolicCholesky
+from pgo_models.problem.initialization import spanning_tree_start
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.thresholds import chi2_thresholds
+from pgo_models.problem.weighting import Weighting, edge_weights
+from solvers.result import Measurement, Status
+
+_LEFT_OUT = 1e-4  # weight under which an edge is left out where there are as many as poses: its fill-in costs
+_HARD = 1e3  # mu from which on weights are 0 and 1
+_NEARLY_STATIONARY = 1e-2  # relative decrement at which the poses follow the weights well enough
+_LARGEST_SCALE = 2.5  # of the quantile 0.99: about that of 1e-6 beside it
+
+
+class RobustLoss(enum.Enum):
+    """What a large residual costs; all here is over c^2, and `ratio` is r^2 / c^2."""
+
+    TRUNCATED = "truncated least squares, min(r^2, c^2)"
+    GEMAN_MCCLURE = "Geman-McClure, c^2 r^2 / (c^2 + r^2)"
+
+    def values(self, ratio: Array) -> Array:
+        """The loss."""
+        return np.asarray(np.minimum(ratio, 1.0) if self is RobustLoss.TRUNCATED else ratio / (1.0 + ratio))
+
+    def surrogate(self, ratio: Array, mu: float) -> Array:
+        """Its surrogate (equations 7 and 5), which is the loss for mu to infinity (truncated) or 1 (Geman-McClure)."""
+        if self is RobustLoss.GEMAN_MCCLURE:
+            return np.asarray(mu * ratio / (mu + ratio))
+        between = 2.0 * np.sqrt(ratio * mu * (mu + 1.0)) - mu * (1.0 + ratio)
+        return np.where(ratio >= (mu + 1.0) / mu, 1.0, np.where(ratio <= mu / (mu + 1.0), ratio, between))
+
+    def weights(self, ratio: Array, mu: float) -> Array:
+        """Its slope, which is the weight: equations 14 and 12."""
+        if self is RobustLoss.GEMAN_MCCLURE:
+            return np.asarray((mu / (ratio + mu)) ** 2)
+        between = np.sqrt(mu * (mu + 1.0) / np.maximum(ratio, 1e-300)) - mu
+        return np.where(ratio >= (mu + 1.0) / mu, 0.0, np.where(ratio <= mu / (mu + 1.0), 1.0, between))
+
+
+@dataclass(frozen=True, eq=False)
+class GNCState:
+    """State k.
+
+    Attributes
+    ----------
+    k : int
+    poses : Poses
+    mu : float
+        Control of the surrogate of the next step.
+    thresholds : (m,)
+        c_e^2.
+    known : (m,)
+    ratio : (m,)
+        r_e^2 / c_e^2 at the poses.
+    objective : float
+        The robust cost there.
+    is_scaled : bool
+        Whether the scale of the thresholds is settled.
+    undecided : float
+        Share of the edges that the surrogate counts neither in full nor as wrong.
+    decrement : float
+        What the last weighted cost could still lose, relative.
+    reduced, analysis
+        The last weighted problem and its symbolic factorisation, for the next one if it has the same edges.
+    kept : (m,), optional
+        Which they are.
+    """
+
+    k: int
+    poses: Poses
+    mu: float
+    thresholds: Array
+    known: BoolArray
+    ratio: Array
+    objective: float
+    is_scaled: bool
+    undecided: float = 1.0
+    decrement: float = math.inf
+    moved: bool = True
+    reduced: PGOProblem | None = None
+    kept: BoolArray | None = None
+    analysis: SymbolicCholesky | None = None
+
+    @property
+    def inliers(self) -> BoolArray:
+        """Known inliers and edges within their thresholds, (m,)."""
+        return np.asarray(self.known | (self.ratio <= 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class GNC:
+    """Settings of graduated non-convexity; an iteration is one set of weights.
+
+    `primal_residual` is the share of undecided edges, `dual_residual` the relative decrement of the weighted cost.
+
+    Attributes
+    ----------
+    loss : RobustLoss
+    quantile : float
+        c_e^2 is this quantile of an edge's cost, if its information matrix is right.
+    spread : float, optional
+        Thresholds are scaled to `spread` times what the median of the edges kept says, at most to 2.5; None leaves them.
+    known : (m,), optional
+        Edges that are right, whose weight stays 1; unless given, odometry (poses of a robot whose ids are neighbours)
+        and priors.
+    growth : float
+        Factor on mu.
+    inner_steps : int
+        Most Newton steps for one set of weights.
+    tolerance : float
+        On the relative decrement of the last weighted cost.
+    max_iterations : int
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> from solvers.loop import run
+    >>> run(GNC(), PGOProblem(grid(np.random.default_rng(0)))).status.name
+    'CONVERGED'
+    """
+
+    loss: RobustLoss = RobustLoss.TRUNCATED
+    quantile: float = 0.99
+    spread: float | None = 30.0
+    scale: float = 1.0
+    known: BoolArray | None = None
+    growth: float = 2.0
+    inner_steps: int = 1
+    tolerance: float = 1e-6
+    max_iterations: int = 300
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.quantile < 1.0:
+            raise SettingError(f"quantile is {self.quantile}; give one between 0 and 1, such as 0.99")
+        check_settings(
+            self,
+            positive=["tolerance", "spread"],
+            above_one=["growth"],
+            at_least_one=["inner_steps"],
+            not_negative=["max_iterations"],
+        )
+
+    def init(self, problem: PGOProblem, start: Poses | None) -> GNCState:
+        """State 0: at `start`, or where known inliers lead along a tree."""
+        known = self.known_inliers(problem.graph)
+        poses = start if start is not None else first_poses(problem.graph, known)
+        thresholds = self.scale * chi2_thresholds(problem, self.quantile)
+        ratio = problem.edge_costs(poses) / thresholds
+        state = GNCState(0, poses, 1.0, thresholds, known, ratio, 0.0, self.spread is None)
+        mu, floor = self._first_control(ratio[~known]), left_out(problem.graph, known) ** 2 * ratio[~known].min(initial=1)
+        # Before it, all edges are left out.
+        mu = max(mu, floor) if self.loss is RobustLoss.TRUNCATED else mu
+        return replace(state, mu=mu, objective=self._cost(state))
+
+    def step(self, problem: PGOProblem, state: GNCState) -> GNCState:
+        """Weights for the residuals at hand, a lower weighted cost, and the next control."""
+        if self._is_settled(state) and not state.is_scaled:
+            state = self._rescaled(problem, state)
+        known, mu = state.known, state.mu
+        if self.loss is RobustLoss.TRUNCATED and mu >= _HARD:
+            weights = (state.ratio <= 1.0).astype(float)
+        else:
+            weights = self.loss.weights(state.ratio, mu)
+        weights[known] = 1.0
+        least = left_out(problem.graph, known)
+        kept = weights > least
+        kept[bridges(problem.graph, kept, state.ratio)] = True
+        weights = np.maximum(weights, least)
+        same = state.kept is not None and np.array_equal(kept, state.kept)
+        reduced = weighted_problem(problem, weights, kept, state.reduced if same else None)
+        moving = replace(start_polish(reduced, state.poses), analysis=state.analysis if same else None)
+        for _ in range(self.inner_steps):
+            moving = polish_step(reduced, moving)
+            if moving.decrement <= _NEARLY_STATIONARY or not moving.moved:
+                break
+        ratio = problem.edge_costs(moving.poses) / state.thresholds
+        new = replace(
+            state,
+            k=state.k + 1,
+            poses=moving.poses,
+            ratio=ratio,
+            undecided=self._undecided(ratio[~known], mu),
+            decrement=moving.decrement,
+            moved=moving.moved,
+            mu=min(mu * self.growth, _HARD) if self.loss is RobustLoss.TRUNCATED else max(mu / self.growth, 1.0),
+            reduced=reduced,
+            kept=kept,
+            analysis=moving.analysis,
+        )
+        return replace(new, objective=self._cost(new))
+
+    def measure(self, problem: PGOProblem, state: GNCState) -> Measurement:
+        """The robust cost, the share of undecided edges, and the decrement."""
+        return Measurement(state.objective, state.undecided, state.decrement)
+
+    def poses(self, problem: PGOProblem, state: GNCState) -> Poses:
+        """Poses of the state."""
+        return state.poses
+
+    def converged(self, state: GNCState, measurement: Measurement) -> Status | None:
+        """CONVERGED once all edges are decided, by settled thresholds, and the weighted cost is within tolerance."""
+        if not (state.is_scaled and measurement.primal_residual == 0.0):
+            return None
+        if measurement.dual_residual <= self.tolerance:
+            return Status.CONVERGED
+        return None if state.moved else Status.STALLED
+
+    def known_inliers(self, graph: PoseGraph) -> BoolArray:
+        """Edges that are right, (m,)."""
+        if self.known is None:
+            return odometry(graph) | graph.is_prior
+        if np.shape(self.known) != (graph.num_edges,):
+            raise SettingError(f"known has shape {np.shape(self.known)}; {graph.name} has {graph.num_edges} edges")
+        return np.asarray(self.known, dtype=bool)
+
+    def _cost(self, state: GNCState) -> float:
+        loss = np.where(state.known, state.ratio, self.loss.values(state.ratio))
+        return float(np.sum(state.thresholds * loss))
+
+    def _first_control(self, ratio: Array) -> float:
+        """Remark 5 of the paper: the control at which the surrogate is convex at these residuals."""
+        largest = float(ratio.max(initial=0.0))
+        if self.loss is RobustLoss.TRUNCATED:
+            return 1.0 / max(2.0 * largest - 1.0, 1.0)
+        return max(2.0 * largest, 1.0)
+
+    def _undecided(self, ratio: Array, mu: float) -> float:
+        if self.loss is RobustLoss.GEMAN_MCCLURE:
+            return float(mu > 1.0)
+        if mu >= _HARD:
+            return 0.0
+        return float(np.mean((ratio > mu / (mu + 1.0)) & (ratio < (mu + 1.0) / mu))) if len(ratio) else 0.0
+
+    def _is_settled(self, state: GNCState) -> bool:
+        return state.undecided == 0.0 and (state.decrement <= _NEARLY_STATIONARY or not state.moved)
+
+    def _rescaled(self, problem: PGOProblem, state: GNCState) -> GNCState:
+        """State with thresholds scaled by the median of the edges kept beside that of chi2, and the first control."""
+        free = ~state.known & (state.ratio <= 1.0)
+        assert self.spread is not None
+        if not free.any():
+            return replace(state, is_scaled=True)
+        usual = np.divide(*chdtri(problem.d + tangent_dimension(problem.d), [0.5, 1.0 - self.quantile]))
+        now = float(np.median(state.thresholds / chi2_thresholds(problem, self.quantile)))
+        scale = min(self.spread * float(np.median(state.ratio[free])) / usual, _LARGEST_SCALE / now)
+        scale = max(scale, 1e-12)
+        if 0.5 < scale < 1.5:
+            return replace(state, is_scaled=True)
+        thresholds, ratio = scale * state.thresholds, state.ratio / scale
+        scaled = replace(state, thresholds=thresholds, ratio=ratio, is_scaled=False, undecided=1.0)
+        return replace(scaled, mu=self._first_control(ratio[free]))
+
+
+def odometry(graph: PoseGraph) -> BoolArray:
+    """Edges between poses of one robot whose ids are neighbours, (m,)."""
+    ids, robots = graph.pose_ids, graph.robots
+    return np.asarray((np.abs(ids[graph.i] - ids[graph.j]) == 1) & (robots[graph.i] == robots[graph.j]))
+
+
+def left_out(graph: PoseGraph, known: BoolArray) -> float:
+    """Weight under which an edge is left out of a weighted problem.
+
+    Of c closures in a chain of n poses, a closure holds about n / c of them, whose compliance grows with the cube of
+    that: to be left out, the weight has to be as much smaller. kitti_00, with 1 in 30, needs 1e-7.
+    """
+    return float(_LEFT_OUT * min(1.0, (~known).sum() / graph.num_poses) ** 3)
+
+
+def bridges(graph: PoseGraph, kept: BoolArray, ratio: Array) -> IntArray:
+    """Edges of the least ratios that connect what the kept ones leave apart (Kruskal)."""
+    n = graph.num_poses
+    count, part = connected_components(edge_counts(graph.i[kept], graph.j[kept], n), directed=False)
+    order = np.argsort(ratio, kind="stable")
+    ends = np.sort(np.stack([part[graph.i[order]], part[graph.j[order]]]).astype(np.int64), axis=0)
+    order, ends = order[ends[0] != ends[1]], ends[:, ends[0] != ends[1]]
+    _, first = np.unique(ends[0] * count + ends[1], return_index=True)
+    tree = minimum_spanning_tree(csr_array((first + 1.0, ends[:, first]), shape=(count, count)))
+    return np.asarray(order[tree.data.astype(np.int64) - 1])
+
+
+def weighted_problem(
+    problem: PGOProblem, weights: Array, kept: BoolArray, like: PGOProblem | None = None
+) -> PGOProblem:
+    """The problem with the kept edges alone, their costs times weights, (m,); `like` one that has the same edges."""
+    graph = problem.graph.without_edges(~kept) if like is None else like.graph
+    if len(graph.landmarks) and isinstance(problem.weighting, Weighting):  # which edge turns a landmark may be another
+        own = edge_weights(graph, problem.weighting)
+    else:
+        own = problem.weights.of_edges(kept)
+    return replace(problem, graph=graph, weighting=own.scaled(weights[kept]))
+
+
+def first_poses(graph: PoseGraph, known: BoolArray) -> Poses:
+    """Known inliers from pose to pose along a tree; other edges only where they leave poses apart."""
+    chosen = known.copy()
+    chosen[bridges(graph, known, np.zeros(graph.num_edges))] = True
+    return spanning_tree_start(graph.without_edges(~chosen))
