@@ -21,7 +21,7 @@ from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
-from pgo_models.graphs.residuals import Chi2Convention, chi2, edge_residuals
+from pgo_models.graphs.residuals import Chi2Convention, chi2
 from pgo_models.graphs.scenes import circle, grid, random_geometric, sphere, victoria_park
 from pgo_models.graphs.trajectories import read_tum, write_tum
 from pgo_models.plots.graph_plots import compare_poses, plot_graph
@@ -30,6 +30,7 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
 from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.thresholds import edge_residuals
 from pgo_models.problem.weighting import Weighting
 
 if TYPE_CHECKING:

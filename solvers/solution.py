@@ -24,6 +24,7 @@ from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from pgo_models.problem.weighting import Weighting
 from solvers.reporting.report import Solved, write_report
 from solvers.reporting.result_table import finite_or_none
@@ -92,6 +93,11 @@ class Solution(Solved):
     def is_certified(self) -> bool:
         """Whether the gap is within the one asked for."""
         return self.certificate.is_certified
+
+    @property
+    def edge_residuals(self) -> EdgeResiduals:
+        """How well every edge fits the poses, and whether its errors may be so large, in the cost that was solved."""
+        return edge_residuals(self.problem, self.poses)
 
     def __repr__(self) -> str:
         return (

@@ -10,8 +10,9 @@ from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses, absolute_trajectory_error
 from pgo_models.geometry.rotations import Array, log_map
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.graphs.residuals import edge_residuals, uncertain_edges
+from pgo_models.graphs.residuals import uncertain_edges
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, column_figure
+from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -26,16 +27,18 @@ KIND_LABELS = {
     SIGHTING: "a landmark seen",
     BETWEEN: "between robots",
     UNCERTAIN: "uncertain: precision under a tenth of the median",
-    MISFIT: "misfit: over six times the mean share of F",
+    MISFIT: "misfit: costs more than its information allows",
 }
 _ZOOM = 0.82  # leaves room for the labels of axes in space, which the layout does not see
 _MOST_NAMED_ROBOTS = len(COLOURS)
 
 
-def edge_kinds(graph: PoseGraph, poses: Poses, mark_edges: bool = True) -> IntArray:
+def edge_kinds(
+    graph: PoseGraph, poses: Poses, mark_edges: bool = True, residuals: EdgeResiduals | None = None
+) -> IntArray:
     """How every edge is drawn, (m,): OWN, BETWEEN (two robots), SIGHTING (a landmark's), marked UNCERTAIN or MISFIT.
 
-    The last that fits; priors are -1.
+    The last that fits; priors are -1. Misfits are those of F unless `residuals` are given.
 
     Raises
     ------
@@ -46,7 +49,7 @@ def edge_kinds(graph: PoseGraph, poses: Poses, mark_edges: bool = True) -> IntAr
     kind[np.isin(graph.j, graph.landmarks)] = SIGHTING
     if mark_edges:
         kind[uncertain_edges(graph)] = UNCERTAIN
-        kind[edge_residuals(graph, poses).is_misfit] = MISFIT
+        kind[(residuals or edge_residuals(graph, poses)).is_misfit] = MISFIT
     kind[graph.is_prior] = -1
     return kind
 
@@ -65,7 +68,9 @@ def confidence_ellipses(poses: Poses, covariances: Array) -> Array:
     return outlines
 
 
-def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = True) -> None:
+def draw_graph(
+    graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = True, residuals: EdgeResiduals | None = None
+) -> None:
     """Draw positions and edges: each robot's own edges in its colour, those between robots in grey.
 
     Parameters
@@ -73,11 +78,13 @@ def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = Tr
     axes : matplotlib Axes
         Of projection "3d" for graphs in space.
     mark_edges : bool
-        Draw edges with a low precision dotted, and those with a large share of F thick and vermilion.
+        Draw edges with a low precision dotted, and those that cost more than they may thick and vermilion.
+    residuals : EdgeResiduals, optional
+        Of the problem that was solved; those of F unless given.
     """
     from matplotlib.colors import to_rgb
 
-    kind = edge_kinds(graph, poses, mark_edges)
+    kind = edge_kinds(graph, poses, mark_edges, residuals)
     order = np.argsort(kind, kind="stable")[int(np.sum(kind < 0)) :]  # what stands out is drawn last
     kind, i, j = kind[order], graph.i[order], graph.j[order]
     palette = np.array([to_rgb(name) for name in (*COLOURS, QUIET_COLOUR, ALARM_COLOUR)])
@@ -93,7 +100,13 @@ def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = Tr
     _frame(axes, poses.t[graph.in_files])
 
 
-def plot_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: Array | None = None) -> Figure:
+def plot_graph(
+    graph: PoseGraph,
+    poses: Poses,
+    title: str = "",
+    covariances: Array | None = None,
+    residuals: EdgeResiduals | None = None,
+) -> Figure:
     """Figure of a graph by robot, with a legend (`draw_graph`); of covariances (n, p, p), `confidence_ellipses`.
 
     Examples
@@ -105,9 +118,9 @@ def plot_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: Arr
     """
     with column_figure(height=1.15) as figure:
         axes = figure.add_subplot(projection="3d" if graph.d == 3 else None)
-        draw_graph(graph, poses, axes)
+        draw_graph(graph, poses, axes, residuals=residuals)
         axes.set_title(title or graph.name)
-        handles: list[Artist] = list(_legend(graph, edge_kinds(graph, poses)))
+        handles: list[Artist] = list(_legend(graph, edge_kinds(graph, poses, residuals=residuals)))
         if covariances is not None:
             named, style = graph.in_files, {"colors": QUIET_COLOUR, "linewidths": 0.3}
             outlines = list(confidence_ellipses(poses[named], covariances[named]))

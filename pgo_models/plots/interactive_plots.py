@@ -15,7 +15,6 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import pose_names
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.graphs.residuals import EdgeResiduals, edge_residuals
 from pgo_models.plots.graph_plots import (
     BETWEEN,
     KIND_LABELS,
@@ -27,6 +26,7 @@ from pgo_models.plots.graph_plots import (
     edge_kinds,
 )
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, plotly
+from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -47,7 +47,13 @@ PAGE_CONFIG: dict[str, object] = {
 }
 
 
-def explore_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: Array | None = None) -> Figure:
+def explore_graph(
+    graph: PoseGraph,
+    poses: Poses,
+    title: str = "",
+    covariances: Array | None = None,
+    residuals: EdgeResiduals | None = None,
+) -> Figure:
     """Plotly figure of a graph by robot; poses and misfitting edges say who they are under the pointer.
 
     Parameters
@@ -56,6 +62,8 @@ def explore_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: 
         Drawn to seven digits (float32).
     covariances : (n, p, p), optional
         Of every pose, drawn as `confidence_ellipses`.
+    residuals : EdgeResiduals, optional
+        Of the problem that was solved; those of F unless given.
 
     Examples
     --------
@@ -65,7 +73,8 @@ def explore_graph(graph: PoseGraph, poses: Poses, title: str = "", covariances: 
     ['edges and poses', 'edges and poses', 'misfit']
     """
     go = plotly("graph_objects")
-    kind, residuals = edge_kinds(graph, poses), edge_residuals(graph, poses)
+    residuals = residuals or edge_residuals(graph, poses)
+    kind = edge_kinds(graph, poses, residuals=residuals)
     names, several, named = np.array(pose_names(graph)), graph.num_robots > 1, graph.in_files
     traces = []
     for a in range(graph.num_robots):
@@ -211,8 +220,10 @@ def _dots(points: Array, text: list[str], name: str, colour: str, size: float) -
 
 def _misfit_text(graph: PoseGraph, edges: IntArray, residuals: EdgeResiduals) -> list[str]:
     names, share = pose_names(graph), residuals.share
+    times = residuals.cost / np.where(residuals.allowed > 0.0, residuals.allowed, 1.0)
     return [
-        f"edge {e}: {names[graph.i[e]]} to {names[graph.j[e]]}<br>{100 * share[e]:.3g} % of F<br>"
+        f"edge {e}: {names[graph.i[e]]} to {names[graph.j[e]]}<br>{times[e]:.3g} times what it may cost, "
+        f"{100 * share[e]:.3g} % of all<br>"
         f"{residuals.translation[e]:.3g} m, {np.rad2deg(residuals.rotation[e]):.3g} deg"
         for e in edges
     ]

@@ -1,15 +1,106 @@
-"""Chi-square thresholds: what an edge may cost before its measurement is doubted, in either weighting."""
+"""Chi-square tests: what an edge, and all of them, may cost before measurements are doubted, in either weighting."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtri
 
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
+from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import LEAST_SCALED, proper_information
+from pgo_models.graphs.residuals import edge_errors
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
+from pgo_models.problem.weighting import EdgeWeights, Weighting
+
+FALSE_ALARM = 0.01  # probability that right measurements with errors as their matrices say give a misfit at all
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeResiduals:
+    """How well every edge fits some poses, and whether its errors may be so large.
+
+    Attributes
+    ----------
+    translation : (m,)
+        ||t_j - t_i - R_i t_ij||, metres.
+    rotation : (m,)
+        Angle of R_ij^T R_i^T R_j, radians.
+    cost : (m,)
+        The edge's summand of F, or of chi2.
+    allowed : (m,)
+        What an edge may cost: `chi2_thresholds` at 1 - FALSE_ALARM / m (Bonferroni), times `scale`.
+    scale : float
+        Median of cost over its threshold at one half, at least 1: what the median edge contradicts is the matrices.
+    overall : float
+        Sum of the costs over the one expected, about 1 where errors are as the matrices say; 0 without redundancy.
+    overall_allowed : float
+        What `overall` exceeds with probability FALSE_ALARM. One wrong loop closure among few bends the odometry, with
+        no edge above its own threshold: this shows it.
+    """
+
+    translation: Array
+    rotation: Array
+    cost: Array
+    allowed: Array
+    scale: float
+    overall: float
+    overall_allowed: float
+
+    @property
+    def share(self) -> Array:
+        """Share of the cost, (m,); zeros where it is zero."""
+        return np.asarray(self.cost / max(float(self.cost.sum()), np.finfo(float).tiny))
+
+    @property
+    def is_misfit(self) -> BoolArray:
+        """Whether an edge costs more than it may, (m,)."""
+        return self.cost > self.allowed
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether there is a misfit, or all edges together cost more than they may."""
+        return bool(self.is_misfit.any()) or self.overall > self.overall_allowed
+
+
+def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResiduals:
+    """Residuals and cost of every edge at poses (paper: the summands of `min overall`), tested; of a graph those of F.
+
+    Expected of the sum is sum_e sum w (1 - u / r), with r the rank of all information and u the number of unknowns
+    (`chi2_thresholds` has the w).
+
+    Raises
+    ------
+    GraphError
+        When the poses are not those of the graph.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import circle
+    >>> graph = circle(np.random.default_rng(0))
+    >>> residuals = edge_residuals(graph, graph.truth)
+    >>> residuals.translation.shape, bool(residuals.is_misfit.any())
+    ((300,), False)
+    """
+    graph = problem if isinstance(problem, PoseGraph) else problem.graph
+    translation, rotation, cost = edge_errors(graph, poses)
+    if isinstance(problem, PoseGraph):
+        w = _chi2_weights(graph, EdgeWeights(graph.tau, graph.kappa))
+    else:
+        cost, w = problem.edge_costs(poses), _of_problem(problem)
+    d, p, points = graph.d, tangent_dimension(graph.d), len(graph.landmarks)
+    unknowns = (d + p) * (graph.num_poses - points - 1) + d * points
+    redundancy = 1.0 - unknowns / max(int(np.sum(w > 0.0)), 1)
+    mean, square = redundancy * np.sum(w), redundancy * np.sum(w**2)
+    overall, dof = (float(cost.sum() / mean), mean**2 / square) if mean > 0.0 else (0.0, 1.0)
+    typical = _quantiles(w, 0.5)
+    counted = typical > 0.0
+    scale = max(1.0, float(np.median(cost[counted] / typical[counted]))) if counted.any() else 1.0
+    allowed = scale * _quantiles(w, 1.0 - FALSE_ALARM / max(graph.num_edges, 1))
+    return EdgeResiduals(translation, rotation, cost, allowed, scale, overall, float(chdtri(dof, FALSE_ALARM) / dof))
 
 
 def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
@@ -42,21 +133,31 @@ def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
     """
     if not 0.0 < quantile < 1.0:
         raise SettingError(f"quantile is {quantile!r}; give a probability between 0 and 1, such as 0.99")
-    w = _chi2_weights(problem)
+    return _quantiles(_of_problem(problem), quantile)
+
+
+def _quantiles(w: Array, quantile: float) -> Array:
+    """Quantiles of sums of w chi^2_1, (m,)."""
     c_1, c_2, c_3 = (np.sum(w**k, axis=1) for k in (1, 2, 3))
     ratio = c_3 / np.where(c_2 > 0.0, c_2, 1.0)  # of an edge without weight all are zero
     dof = c_2 / np.where(ratio > 0.0, ratio, 1.0) ** 2
     return np.asarray(c_1 + ratio * (chdtri(np.maximum(dof, 1.0), 1.0 - quantile) - dof))
 
 
-def _chi2_weights(problem: PGOProblem) -> Array:
-    """Weights w, (m, k), of the chi^2_1 that an edge's cost is a sum of; of chi2 itself ones, as many as its rank."""
-    d, weights, information = problem.d, problem.weights, proper_information(problem.graph)
+def _of_problem(problem: PGOProblem) -> Array:
+    weights = problem.weights
+    is_chi2 = problem.weighting is Weighting.INFORMATION or weights.excess is not None or weights.tangent is not None
+    return _chi2_weights(problem.graph, None if is_chi2 else weights)
+
+
+def _chi2_weights(graph: PoseGraph, weights: EdgeWeights | None) -> Array:
+    """Weights w, (m, k), of the chi^2_1 that the edges' costs are sums of; of chi2 (None) ones, as many as the rank."""
+    d, information = graph.d, proper_information(graph)
     diagonal = np.einsum("mkk->mk", information)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     values, axes = np.linalg.eigh(information * scale[:, :, None] * scale[:, None, :])
     is_known = values > LEAST_SCALED
-    if problem.weighting is Weighting.INFORMATION or weights.excess is not None or weights.tangent is not None:
+    if weights is None:
         return is_known.astype(float)
     half = scale[:, :, None] * axes * (is_known / np.sqrt(np.where(is_known, values, 1.0)))[:, None, :]
     W = weights.W(d)
@@ -64,4 +165,5 @@ def _chi2_weights(problem: PGOProblem) -> Array:
     V = trace if d == 2 else trace * np.eye(3) - W
     r_t, r_r = half[:, :d], half[:, d:]
     form = weights.tau[:, None, None] * np.swapaxes(r_t, 1, 2) @ r_t + np.swapaxes(r_r, 1, 2) @ V @ r_r
-    return np.asarray(np.maximum(np.linalg.eigvalsh(form), 0.0))
+    w = np.linalg.eigvalsh(form)
+    return np.where(w > LEAST_SCALED * w[:, -1:], w, 0.0)

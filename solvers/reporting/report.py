@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 import html
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +18,14 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import pose_names
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.graphs.published_results import published_run
-from pgo_models.graphs.residuals import EdgeResiduals, edge_residuals
 from pgo_models.plots.interactive_plots import PAGE_CONFIG, explore_graph
 from pgo_models.plots.style import plotly
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from solvers.network.ledger import Ledger
 from solvers.reporting.convergence_plots import explore_convergence
 from solvers.reporting.report_html import PageCell, facts, page, paragraph, section, sortable_table
-from solvers.reporting.report_text import advice, headline, meaning
+from solvers.reporting.report_text import advice, fit, headline, meaning
 from solvers.reporting.versions import installed_versions
 from solvers.result import Stage, Status
 from solvers.soc.soc import SOC
@@ -99,9 +99,10 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
     script = plotly("offline").get_plotlyjs()
     robots = _partition(solution)
     graph = solution.problem.graph.with_robots(robots.robot)
-    residuals = replace(edge_residuals(graph, solution.poses), cost=solution.problem.edge_costs(solution.poses))
+    residuals = edge_residuals(solution.problem, solution.poses)
     place = "graph3d" if graph.d == 3 else "graph2d"
-    figures = {place: explore_graph(graph, solution.poses, covariances=solution.covariances).to_json()}
+    picture = explore_graph(graph, solution.poses, covariances=solution.covariances, residuals=residuals)
+    figures = {place: picture.to_json()}
     sections = [
         _header(solution),
         _verdict(solution),
@@ -128,7 +129,7 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
 
 _GRAPH_HINT = (
     "Drag to turn or to zoom, point at a pose or a misfit to see its name, click on the legend to hide and show. "
-    "Vermilion: edges that cost over six times the mean. Dotted: uncertain edges. Positions in metres."
+    "Vermilion: edges that cost more than they may. Dotted: uncertain edges. Positions in metres."
 )
 _CURVE_HINT = (
     "The stages one after the other. Gap: how far F is above the proven bound, relative. Residuals: primal, distance "
@@ -142,6 +143,7 @@ _GLOSSARY = [
     ("kappa", "precision of an edge's rotation, per rad^2: the larger, the surer"),
     ("tau", "precision of an edge's translation, per m^2"),
     ("separator", "pose with an edge to another robot: what robots have to tell each other"),
+    ("allowed", "what right edges cost more than in one graph of 100 (chi-square quantile 1 - 0.01 / edges)"),
     ("share of F, chi2", "of an edge: its summand; of a robot: its own edges and half of those to other robots"),
     (
         "error",
@@ -194,9 +196,8 @@ def _verdict(solution: Solved) -> str:
 
 
 def _next(solution: Solved, residuals: EdgeResiduals, source: str | None) -> str:
-    misfits = int(residuals.is_misfit.sum())
     items = []
-    for one in advice(solution.problem.graph, solution.certificate, solution.status, misfits, source):
+    for one in advice(solution.problem.graph, solution.certificate, solution.status, residuals, source):
         command = f"<br><code>{html.escape(one.command)}</code>" if one.command else ""
         items.append(f"<li>{html.escape(one.text)}{command}</li>")
     return section("What to try next", f"<ol>{''.join(items)}</ol>")
@@ -256,6 +257,7 @@ def _worst_edges(solution: Solved, robots: Partition, residuals: EdgeResiduals) 
             row[1:] = [_number(robots.robot[i], "d"), row[1], _number(robots.robot[j], "d"), row[2]]
         row += [
             _number(residuals.cost[e], ".4g"),
+            _number(residuals.allowed[e], ".4g"),
             PageCell(f"{100 * share[e]:.3g} %", share[e]),
             _number(residuals.translation[e], ".4g"),
             _number(degrees[e], ".4g"),
@@ -265,10 +267,11 @@ def _worst_edges(solution: Solved, robots: Partition, residuals: EdgeResiduals) 
         rows.append(row)
     ends = ["from robot", "from pose", "to robot", "to pose"] if robots.num_robots > 1 else ["from pose", "to pose"]
     share_of = f"share of {solution.certificate.cost}"
-    heads = ["edge", *ends, "cost", share_of, "error (m)", "error (deg)", "kappa (1/rad^2)", "tau (1/m^2)"]
+    heads = ["edge", *ends, "cost", "allowed", share_of, "error (m)", "error (deg)", "kappa (1/rad^2)", "tau (1/m^2)"]
+    tested = fit(residuals, solution.certificate.cost)
     text = (
         f"The {len(rows)} of {graph.num_edges} edges that cost most, {100 * share[worst].sum():.3g} % "
-        f"of {solution.certificate.cost} together; marked are those over six times the mean. Half of all edges fit to "
+        f"of {solution.certificate.cost} together. {tested} Half of all edges fit to "
         f"{np.median(residuals.translation):.3g} m and {np.median(degrees):.3g} degrees. Click on a head to sort."
     )
     table = sortable_table("edges", heads, rows, residuals.is_misfit[worst].tolist())

@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, gap_text
 from pgo_models.graphs.datasets import known_datasets
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.problem.thresholds import EdgeResiduals
 from solvers.result import Status
 
 _NEARLY = 1e-4  # a gap below it is called nearly closed
 _FINER_GAP = 1e-9
 _SMALL_GAP = 1e-8
+_PESSIMISTIC = 0.25  # of the cost that is expected: standard deviations are twice too large
 
 
 @dataclass(frozen=True)
@@ -83,12 +85,13 @@ def meaning(certificate: Certificate) -> list[str]:
 
 
 def advice(
-    graph: PoseGraph, certificate: Certificate, status: Status, misfits: int, source: str | None = None
+    graph: PoseGraph,
+    certificate: Certificate,
+    status: Status,
+    residuals: EdgeResiduals,
+    source: str | None = None,
 ) -> list[Advice]:
-    """Return what to try next, most promising first.
-
-    `misfits` edges stand out; `source` stands for the graph in commands, as typed, its name unless given.
-    """
+    """Return what to try next, most promising first; `source` is the graph in commands, its name unless given."""
     file = graph.name if graph.name in known_datasets() else f"{graph.name}.g2o"
     name = source if source is not None else shlex.quote(file)
     solve = f"pgo solve {name}"
@@ -102,14 +105,28 @@ def advice(
             found.append(Advice("Ask for a tighter proof.", f"{solve} --gap {_FINER_GAP:g}"))
     else:
         found += _uncertified(graph, certificate, solve)
-    if misfits:
-        some = "1 edge costs" if misfits == 1 else f"{misfits} edges cost"
-        found.append(
-            Advice(f"{some} over six times the mean: look at the worst edges below, and remove or weaken wrong ones.")
-        )
+    tested = fit(residuals, certificate.cost)
+    if residuals.is_doubtful:
+        text = f"{tested} Look for wrong measurements, which need not be the worst."
+        found.append(Advice(text, f"{solve} --robust gnc"))
     elif certificate.is_certified:
-        found.append(Advice("No edge stands out; if the map still looks wrong, suspect the weights."))
+        found.append(Advice(f"{tested} If the map still looks wrong, suspect the weights."))
     return found
+
+
+def fit(residuals: EdgeResiduals, cost: str) -> str:
+    """Return what the chi-square tests say of the edges, one by one and together."""
+    count, overall = int(residuals.is_misfit.sum()), residuals.overall
+    some = {0: "No edge costs", 1: "1 edge costs"}.get(count, f"{count} edges cost")
+    text = f"{some} more than errors as its information matrix says"
+    if residuals.scale > 1.0:
+        text += f", times {residuals.scale:.3g}, which half of all edges exceed"
+    text += f" ({cost} is {overall:.3g} times what is expected"
+    if overall > residuals.overall_allowed:
+        text += f", and over {residuals.overall_allowed:.3g} by chance in one of 100 graphs"
+    elif 0.0 < overall < _PESSIMISTIC:
+        text += f": errors are {overall**-0.5:.2g} times smaller than the matrices say, and wrong edges hide in that"
+    return text + ")."
 
 
 def percent(share: float) -> str:

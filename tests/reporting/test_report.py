@@ -18,7 +18,7 @@ from pgo_models.plots.interactive_plots import animate_poses, save_page
 from solvers import cli
 from solvers.network.ledger import Ledger, Traffic
 from solvers.reporting.report import report_page
-from solvers.reporting.report_text import advice, headline, meaning, percent
+from solvers.reporting.report_text import advice, fit, headline, meaning, percent
 
 plotly = pytest.importorskip("plotly")
 EMPTY = {"meta", "link", "br", "input", "img", "hr"}
@@ -109,8 +109,8 @@ def test_the_worst_edges_come_first_with_their_figures(solution, page):
     assert costs == sorted(costs, reverse=True)
     for row in rows:
         e = int(row[0])
-        figures = [residuals.cost[e], residuals.translation[e], np.rad2deg(residuals.rotation[e])]
-        shown = [float(row[head.index(name)]) for name in ("cost", "error (m)", "error (deg)")]
+        figures = [residuals.cost[e], residuals.allowed[e], residuals.translation[e], np.rad2deg(residuals.rotation[e])]
+        shown = [float(row[head.index(name)]) for name in ("cost", "allowed", "error (m)", "error (deg)")]
         np.testing.assert_allclose(shown, figures, rtol=1e-3, atol=0)
         assert (
             row[head.index("from pose")]
@@ -250,13 +250,14 @@ def cases(solution, uncertain):
 
 def test_every_case_has_a_verdict_and_something_to_try(solution, uncertain, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    known = {option for command in ("solve", "certify") for option in options_of(command)}
+    known = {option for command in ("solve", "certify") for option in options_of(command)} | {"--robust"}
+    residuals = solution.edge_residuals
+    doubtful = replace(residuals, allowed=np.where(np.arange(212) < 3, -1.0, np.inf))
     for graph, certificate, status in cases(solution, uncertain):
         assert certificate.is_certified == headline(certificate).startswith("Certified")
         assert f"{certificate.objective:.10g}" in meaning(certificate)[0]
-        found = advice(graph, certificate, status, 3)
-        assert any(one.command for one in found)
-        assert any("3 edges" in one.text for one in found)
+        found = advice(graph, certificate, status, doubtful)
+        assert any(one.command.endswith("--robust gnc") and "3 edges cost" in one.text for one in found)
         for one in found:
             words = shlex.split(one.command)
             assert not words or words[0] == "pgo"
@@ -271,9 +272,26 @@ def options_of(command):
 
 
 def test_a_gap_that_was_nearly_reached_is_offered(solution):
+    residuals = solution.edge_residuals
     nearly = replace(solution.certificate, verdict=pgo.Verdict.NOT_CERTIFIED, gap=3e-9, wanted_gap=1e-12)
-    commands = [one.command for one in advice(solution.problem.graph, nearly, solvers.Status.CONVERGED, 0, "x y.g2o")]
+    commands = [
+        one.command for one in advice(solution.problem.graph, nearly, solvers.Status.CONVERGED, residuals, "x y.g2o")
+    ]
     assert "pgo solve x y.g2o --gap 1e-08" in commands
+
+
+def test_what_the_edges_say_together_is_said(solution):
+    residuals = replace(solution.edge_residuals, allowed=np.full(212, np.inf), scale=1.0, overall=1.0)
+    assert not residuals.is_doubtful
+    assert fit(residuals, "F").startswith("No edge costs more than errors as its information matrix says (F is 1 times")
+    assert "by chance" not in fit(residuals, "F")
+    bent = replace(residuals, overall=2.0, scale=7.0)
+    assert bent.is_doubtful
+    assert "times 7, which half of all edges exceed" in fit(bent, "chi2")
+    assert f"(chi2 is 2 times what is expected, and over {bent.overall_allowed:.3g} by chance" in fit(bent, "chi2")
+    assert "errors are 10 times smaller than the matrices say" in fit(replace(residuals, overall=0.01), "F")
+    one = replace(residuals, allowed=np.where(np.arange(212) == 7, -1.0, np.inf))
+    assert fit(one, "F").startswith("1 edge costs")
 
 
 def test_exact_measurements_are_reported_too():
