@@ -18,6 +18,7 @@ from solvers.reporting.report import write_report
 from solvers.result import History, Measurement, Record, Run, Stage, Status
 from solvers.riemannian.newton import Newton, gauss_newton
 from solvers.riemannian.staircase import Staircase
+from solvers.robust.gnc import GNC, RobustLoss
 from solvers.soc.anderson import Anderson
 from solvers.soc.paper import PaperSOC
 from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty, MultiplierPenalty
@@ -49,6 +50,7 @@ _LATER = {
 }
 
 __all__ = [
+    "GNC",
     "SOC",
     "AlternatingBregman",
     "Anderson",
@@ -76,6 +78,7 @@ __all__ = [
     "RStep",
     "RayEngine",
     "Record",
+    "RobustLoss",
     "Run",
     "Solution",
     "Solver",

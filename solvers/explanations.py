@@ -14,7 +14,7 @@ from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import GraphWarning, NotPositiveDefiniteError, PGOError
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.datasets import load, locate
-from pgo_models.graphs.g2o import edge_place
+from pgo_models.graphs.g2o import edge_places
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import extreme_weight
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF
@@ -85,7 +85,7 @@ def place_of_weight(graph: str) -> str:
         loaded = load(path, skip_unknown=True)
     _, edge, text = extreme_weight(loaded)
     return (
-        f"{edge_place(path, edge)}: {text}; weights from {min(loaded.kappa.min(), loaded.tau.min()):.3g} to "
+        f"{edge_places(path)[edge]}: {text}; weights from {min(loaded.kappa.min(), loaded.tau.min()):.3g} to "
         f"{max(loaded.kappa.max(), loaded.tau.max()):.3g} and lengths up to {np.abs(loaded.t_ij).max():.3g} m "
         "are too far apart for doubles; correct the information matrix, or use --unit-weights"
     )

@@ -181,6 +181,11 @@ class Watch:
         if not self.time_limit > 0:
             raise SettingError(f"time_limit is {self.time_limit}; give positive seconds")
 
+    @property
+    def left(self) -> float:
+        """Seconds that are left, never none: a run looks at the clock after its first state."""
+        return max(self.time_limit - (time.perf_counter() - self.began), 1e-9)
+
     @overload
     def run(self, method: Solver[S], problem: PGOProblem | PoseGraph, start: Poses | None = None) -> Run[S]: ...
     @overload

@@ -43,6 +43,8 @@ from solvers.network.faults import Faults
 from solvers.result import OUT_OF_TIME, History, Record, Run, Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.staircase import DualBound, Staircase
+from solvers.robust.gnc import GNC
+from solvers.robust_solve import solve_robustly
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
@@ -52,6 +54,7 @@ from solvers.solution import Solution
 HANDOVER_TOLERANCE = 5e-3  # relative residual at which Newton needs one or two factorisations on all graphs tried
 HANDOVER = SOC(tolerance=HANDOVER_TOLERANCE, max_iterations=100)
 _SECOND_TRY_TOLERANCE = 1e-6
+_FEW = 10  # Newton steps that show whether all edges fit, and finish where some were left out
 
 
 @dataclass(frozen=True)
@@ -114,6 +117,7 @@ def solve(
     pipeline: Pipeline | None = None,
     start: Poses | None = None,
     *,
+    robust: GNC | None = None,
     robots: Partition | int | None = None,
     engine: Engine | None = None,
     checkpoint: Checkpoint | None = None,
@@ -139,6 +143,8 @@ def solve(
         `Pipeline()` unless given.
     start : Poses, optional
         Instead of the method's own start.
+    robust : GNC, optional
+        Find wrong edges and leave them out: `solvers.robust_solve`. The solution is then of the edges kept alone.
     robots : Partition or int, optional
         Robots that share the poses: start, SOC, Newton and certificate are run by them and a driver, each as if there
         were one, and what crosses the network is in `Solution.ledger`. A number stands for the robots of the pipeline's
@@ -205,6 +211,14 @@ def solve(
         raise SettingError("without a driver robots run SOC alone, which needs a convex quadratic cost: F, not chi2")
     if pipeline.driver_memory == 0:
         pipeline = replace(pipeline, second_try=False, staircase=None)
+    if robust is not None:
+        if robots is not None:
+            raise SettingError("robust estimation runs in one place; leave out the robots, or solve the edges it keeps")
+        few = replace(pipeline.newton, max_iterations=_FEW)
+        short = replace(pipeline, soc=None, newton=few, second_try=False, staircase=None)
+        shown = partial(solve, anchor=anchor, callback=callback, verbose=verbose, progress=progress)
+        plain = partial(shown, pipeline=short)
+        return solve_robustly(problem, robust, pipeline.gap, start, watch, plain)
     job = _Job(problem, pipeline, watch)
     ledger = None
     if robots is None:

@@ -68,6 +68,8 @@ class Solution(Solved):
         Pose that it is held by, or 0: what `marginals` are relative to.
     covariances : (n, p, p), optional
         All `marginals()`, for ellipses in the report: `dataclasses.replace` puts them in.
+    robust : Rejection, optional
+        Of a robust solve: which edges it kept, of which alone all else here is, and what that leaves unproven.
 
     Examples
     --------
@@ -102,7 +104,7 @@ class Solution(Solved):
     def __repr__(self) -> str:
         return (
             f"Solution({self.problem.graph.name!r}, {self.certificate.cost}={self.objective:.10g}, gap={self.gap:.3g}, "
-            f"{self._verdict.name})"
+            f"{self._verdict.name}{self._given})"
         )
 
     def __str__(self) -> str:
@@ -191,7 +193,7 @@ class Solution(Solved):
         if before is None:
             before, name = spanning_tree_start(graph), "spanning tree"
         verdict, cost = self._verdict.name.lower().replace("_", " "), self.certificate.cost
-        solved = f"{verdict}: {cost} = {self.objective:.6g}, gap {self.gap:.1e}"
+        solved = f"{verdict}{self._given}: {cost} = {self.objective:.6g}, gap {self.gap:.1e}"
         return compare_poses(
             graph, [(f"{name}: {cost} = {self.problem.objective(before):.4g}", before), (solved, self.poses)]
         )
@@ -204,6 +206,7 @@ class Solution(Solved):
             "objective": self.objective,
             **both_costs(self.problem, self.poses),
             **certificate_json(certificate),
+            **({} if self.robust is None else {"robust": self.robust.as_json()}),
             "note": self.note,
             "frame": self.frame,
             "status": self.status.name,
@@ -243,6 +246,12 @@ class Solution(Solved):
     def _verdict(self) -> Verdict:
         return self.certificate.verdict
 
+    @property
+    def _given(self) -> str:
+        """What stands behind the verdict of a robust solve that rejected edges."""
+        gone = 0 if self.robust is None else int(self.robust.rejected.sum())
+        return f" given that {gone} edges are wrong" if gone else ""
+
     def _summary(self) -> list[tuple[str, str]]:
         graph, certificate = self.problem.graph, self.certificate
         relaxed = "   (the semidefinite relaxation's)" if certificate.source is BoundSource.RELAXATION else ""
@@ -252,7 +261,8 @@ class Solution(Solved):
             (certificate.cost, f"{self.objective:.10g}"),
             ("lower bound", f"{certificate.lower_bound:.10g}{relaxed}"),
             ("gap", gap_text(certificate.gap)),
-            ("verdict", f"{certificate.verdict.name}: {certificate.verdict.value}"),
+            ("verdict", f"{certificate.verdict.name}{self._given}: {certificate.verdict.value}"),
+            *([] if self.robust is None else self.robust.facts()),
             *other_cost(self.problem, self.poses),
             *([("note", self.note)] if self.note else []),
             *([("frame", self.frame)] if self.frame else []),

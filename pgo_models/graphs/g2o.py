@@ -113,11 +113,11 @@ def read_g2o(
     )
 
 
-def edge_place(path: Path | str, edge: int) -> str:
-    """`file:line` of an edge of the graph that `read_g2o` has read from a file or folder."""
+def edge_places(path: Path | str) -> list[str]:
+    """`file:line` of every edge of the graph that `read_g2o` has read from a file or folder."""
     files = _robots_files([read_lines(file, skip_unknown=True) for file in _files_of(Path(path))])
     kept = zip(files, _join_edges(files), strict=True)
-    return [f"{file.path}:{line}" for file, rows in kept for line in file.edge_lines[rows]][edge]
+    return [f"{file.path}:{line}" for file, rows in kept for line in file.edge_lines[rows]]
 
 
 def read_g2o_poses(path: Path | str, graph: PoseGraph) -> Poses:

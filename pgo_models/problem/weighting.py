@@ -76,7 +76,7 @@ class EdgeWeights:
         return EdgeWeights(self.tau[chosen], self.kappa[chosen], axes, W_given, W_error, excess)
 
     def scaled(self, share: Array) -> EdgeWeights:
-        """Weights times shares, (m,), of a quadratic cost."""
+        """Weights times shares, (m,); of a cost, not of a tangent."""
         wide = share[:, None, None]
         return EdgeWeights(
             share * self.tau,
@@ -84,6 +84,7 @@ class EdgeWeights:
             self.axes,
             None if self.W_given is None else wide * self.W_given,
             None if self.W_error is None else share * self.W_error,
+            None if self.excess is None else self.excess.scaled(share),
         )
 
     @property
@@ -187,6 +188,12 @@ class Excess:
         """The excess of some of the edges."""
         K = None if self.K is None else self.K[chosen]
         return Excess(self.R_ij[chosen], self.J[chosen], K, self.size[chosen], self.least[chosen])
+
+    def scaled(self, share: Array) -> Excess:
+        """The excess times shares, (m,)."""
+        wide, K = share[:, None, None], None if self.K is None else share[:, None, None] * self.K
+        size = OUTWARD * np.sqrt(share)[:, None] * self.size
+        return Excess(self.R_ij, wide * self.J, K, size, share[:, None] * self.least)
 
     def arguments(self, Z: Array) -> tuple[Array, Array | None]:
         """(u, H) of edges, (m, q) and (m, p, p) or None: linear in Z, (m, d + 1, d)."""

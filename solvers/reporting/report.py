@@ -28,6 +28,7 @@ from solvers.reporting.report_html import PageCell, facts, page, paragraph, sect
 from solvers.reporting.report_text import advice, fit, headline, meaning
 from solvers.reporting.versions import installed_versions
 from solvers.result import Stage, Status
+from solvers.robust.rejection import Rejection
 from solvers.soc.soc import SOC
 
 _WORST_EDGES = 100
@@ -52,6 +53,7 @@ class Solved:
     frame: str = ""
     anchor: int = 0
     covariances: Array | None = None
+    robust: Rejection | None = None
 
 
 def write_report(solution: Solved, path: Path | str, *, source: str | None = None) -> None:

@@ -36,7 +36,9 @@ from solvers.result import Measurement, Status
 _LEFT_OUT = 1e-4  # weight under which an edge is left out where there are as many as poses: its fill-in costs
 _HARD = 1e3  # mu from which on weights are 0 and 1
 _NEARLY_STATIONARY = 1e-2  # relative decrement at which the poses follow the weights well enough
-_LARGEST_SCALE = 2.5  # of the quantile 0.99: about that of 1e-6 beside it
+_LARGEST_SCALE = 2.5  # of the quantile 0.99: then 1 - quantile is about 1e-6
+_LEAST_SCALE = 1e-12
+_SCALINGS, _SAME = 4, (0.5, 1.5)  # at most so many, and what counts as none
 
 
 class RobustLoss(enum.Enum):
@@ -81,12 +83,14 @@ class GNCState:
         r_e^2 / c_e^2 at the poses.
     objective : float
         The robust cost there.
-    is_scaled : bool
-        Whether the scale of the thresholds is settled.
+    rescaled : int
+        How often the thresholds may still be scaled.
     undecided : float
-        Share of the edges that the surrogate counts neither in full nor as wrong.
+        Share of the edges, known ones aside, that the surrogate counts neither in full nor as wrong.
     decrement : float
         What the last weighted cost could still lose, relative.
+    moved : bool
+        Whether the poses have moved in the last step.
     reduced, analysis
         The last weighted problem and its symbolic factorisation, for the next one if it has the same edges.
     kept : (m,), optional
@@ -100,7 +104,7 @@ class GNCState:
     known: BoolArray
     ratio: Array
     objective: float
-    is_scaled: bool
+    rescaled: int
     undecided: float = 1.0
     decrement: float = math.inf
     moved: bool = True
@@ -126,7 +130,9 @@ class GNC:
     quantile : float
         c_e^2 is this quantile of an edge's cost, if its information matrix is right.
     spread : float, optional
-        Thresholds are scaled to `spread` times what the median of the edges kept says, at most to 2.5; None leaves them.
+        Thresholds are scaled to this times what the median of the edges kept says, at most to 2.5; None leaves them.
+    scale : float
+        Of the first thresholds: a small one takes but the edges that agree best before it is settled.
     known : (m,), optional
         Edges that are right, whose weight stays 1; unless given, odometry (poses of a robot whose ids are neighbours)
         and priors.
@@ -161,7 +167,7 @@ class GNC:
             raise SettingError(f"quantile is {self.quantile}; give one between 0 and 1, such as 0.99")
         check_settings(
             self,
-            positive=["tolerance", "spread"],
+            positive=["tolerance", "spread", "scale"],
             above_one=["growth"],
             at_least_one=["inner_steps"],
             not_negative=["max_iterations"],
@@ -173,15 +179,15 @@ class GNC:
         poses = start if start is not None else first_poses(problem.graph, known)
         thresholds = self.scale * chi2_thresholds(problem, self.quantile)
         ratio = problem.edge_costs(poses) / thresholds
-        state = GNCState(0, poses, 1.0, thresholds, known, ratio, 0.0, self.spread is None)
-        mu, floor = self._first_control(ratio[~known]), left_out(problem.graph, known) ** 2 * ratio[~known].min(initial=1)
-        # Before it, all edges are left out.
-        mu = max(mu, floor) if self.loss is RobustLoss.TRUNCATED else mu
+        state = GNCState(0, poses, 1.0, thresholds, known, ratio, 0.0, 0 if self.spread is None else _SCALINGS)
+        mu, free = self._first_control(ratio[~known]), ratio[~known]
+        if self.loss is RobustLoss.TRUNCATED:  # with less, all edges are left out
+            mu = max(mu, left_out(problem.graph, known) ** 2 * float(free.min(initial=1.0)))
         return replace(state, mu=mu, objective=self._cost(state))
 
     def step(self, problem: PGOProblem, state: GNCState) -> GNCState:
         """Weights for the residuals at hand, a lower weighted cost, and the next control."""
-        if self._is_settled(state) and not state.is_scaled:
+        if self._is_settled(state) and state.rescaled:
             state = self._rescaled(problem, state)
         known, mu = state.known, state.mu
         if self.loss is RobustLoss.TRUNCATED and mu >= _HARD:
@@ -226,7 +232,7 @@ class GNC:
 
     def converged(self, state: GNCState, measurement: Measurement) -> Status | None:
         """CONVERGED once all edges are decided, by settled thresholds, and the weighted cost is within tolerance."""
-        if not (state.is_scaled and measurement.primal_residual == 0.0):
+        if state.rescaled or measurement.primal_residual > 0.0:
             return None
         if measurement.dual_residual <= self.tolerance:
             return Status.CONVERGED
@@ -264,18 +270,17 @@ class GNC:
     def _rescaled(self, problem: PGOProblem, state: GNCState) -> GNCState:
         """State with thresholds scaled by the median of the edges kept beside that of chi2, and the first control."""
         free = ~state.known & (state.ratio <= 1.0)
-        assert self.spread is not None
-        if not free.any():
-            return replace(state, is_scaled=True)
+        if self.spread is None or not free.any():
+            return replace(state, rescaled=0)
         usual = np.divide(*chdtri(problem.d + tangent_dimension(problem.d), [0.5, 1.0 - self.quantile]))
         now = float(np.median(state.thresholds / chi2_thresholds(problem, self.quantile)))
         scale = min(self.spread * float(np.median(state.ratio[free])) / usual, _LARGEST_SCALE / now)
-        scale = max(scale, 1e-12)
-        if 0.5 < scale < 1.5:
-            return replace(state, is_scaled=True)
-        thresholds, ratio = scale * state.thresholds, state.ratio / scale
-        scaled = replace(state, thresholds=thresholds, ratio=ratio, is_scaled=False, undecided=1.0)
-        return replace(scaled, mu=self._first_control(ratio[free]))
+        if _SAME[0] < scale < _SAME[1] or scale * now < _LEAST_SCALE:
+            return replace(state, rescaled=0)
+        ratio = state.ratio / scale
+        mu = self._first_control(ratio[free])
+        scaled = replace(state, thresholds=scale * state.thresholds, ratio=ratio, rescaled=state.rescaled - 1)
+        return replace(scaled, undecided=1.0, mu=mu)
 
 
 def odometry(graph: PoseGraph) -> BoolArray:

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pgo_models.graphs.g2o import edge_place, pose_names, symbol_ids, write_g2o
+from pgo_models.graphs.g2o import edge_places, pose_names, symbol_ids, write_g2o
 from pgo_models.graphs.scenes import random_geometric
 
 
@@ -15,5 +15,5 @@ def test_symbols_are_named_by_letter_and_index_and_edges_by_their_line(tmp_path:
     path = tmp_path / "named.g2o"
     write_g2o(named, path)
     first = (int(named.pose_ids[named.i[0]]), int(named.pose_ids[named.j[0]]))
-    line = path.read_text().splitlines()[int(edge_place(path, 0).rpartition(":")[2]) - 1]
+    line = path.read_text().splitlines()[int(edge_places(path)[0].rpartition(":")[2]) - 1]
     assert line.startswith(f"EDGE_SE3:QUAT {first[0]} {first[1]} ")

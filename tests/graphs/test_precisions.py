@@ -9,7 +9,7 @@ import pytest
 import pgo_models as pgo
 import solvers
 from pgo_models.certificates.certificate import Verdict
-from pgo_models.graphs.g2o import edge_place
+from pgo_models.graphs.g2o import edge_places
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import extreme_weight, isotropic_information
 from pgo_models.graphs.scenes import NoiseModel
@@ -80,4 +80,4 @@ def test_the_place_of_an_edge_is_that_of_its_own_line(tmp_path: Path) -> None:
     path = tmp_path / "repeated.g2o"
     pgo.write_g2o(repeated, path)
     last = len(path.read_text().splitlines())
-    assert edge_place(path, extreme_weight(pgo.read_g2o(path))[1]) == f"{path}:{last}"
+    assert edge_places(path)[extreme_weight(pgo.read_g2o(path))[1]] == f"{path}:{last}"
