@@ -1,0 +1,238 @@
+"""Graphs with wrong loop closures: ours and GTSAM's GncLMOptimizer on the same files (extra `peers`), CPU seconds.
+
+    python tests/benchmarks/robust.py [--graphs intel MIT ..] [--shares 0.3 ..] [--kinds random aliased] [--seeds 0 ..]
+    python tests/benchmarks/robust.py --summary rows.jsonl
+
+Both start from odometry, which both are told is right. Each run is a process of its own with a time limit; a row a run
+is printed and appended to --rows, which --summary reads. precision: of the loop closures kept, the share that is right;
+recall: of the right ones, the share kept; ATE: metres to the optimum of the same cost without wrong edges.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+import pgo_models as pgo
+import solvers
+from pgo_models.geometry.poses import absolute_trajectory_error
+from solvers.robust.gnc import first_poses, odometry
+
+NAMES = "smallGrid3D sphere2500 torus3D parking-garage cubicle CSAIL intel manhattan MIT kitti_00"
+TAGS = {"EDGE_SE2": (2, 3), "EDGE_SE3:QUAT": (3, 7)}
+HEADS = ("graph", "share", "kind", "seed", "ours P / R", "ATE m", "s", "verdict (gap)", "GTSAM P / R", "ATE m", "s")
+LOST = 0.99  # precision or recall below it is a failure
+
+
+def spoil(source: Path, out: Path, share: float, kind: str, seed: int) -> list[int]:
+    """Write `source` with wrong loop closures added, `share` of all, and return which edges they are, in file order.
+
+    random: any two poses, a uniform rotation, a translation within three times the measured ones. aliased: runs of 10
+    that agree with each other: poses a .. a + 9 seen from b .. b + 9 under one wrong relative pose.
+    """
+    rng = np.random.default_rng(seed)
+    lines = [line for line in source.read_text().splitlines() if line.strip()]
+    edges = [line.split() for line in lines if line.split()[0] in TAGS]
+    tag = edges[0][0]
+    d, width = TAGS[tag]
+    i, j = np.array([edge[1:3] for edge in edges], dtype=int).T
+    loops = np.flatnonzero(np.abs(i - j) != 1)
+    box = 3 * np.abs(np.array([edge[3 : 3 + d] for edge in edges], dtype=float)).max(axis=0)
+    ids = np.unique(np.concatenate([i, j]))
+    wanted = round(share / (1 - share) * len(loops))
+    wrong: list[str] = []
+    while len(wrong) < wanted:
+        run = 1 if kind == "random" else min(10, wanted - len(wrong))
+        a, b = rng.integers(0, len(ids) - run, 2)
+        if abs(a - b) <= 10 + run:
+            continue
+        around = box / (1 if kind == "random" else 3)
+        t = rng.uniform(-around, around)
+        q = rng.standard_normal(4) if d == 3 else np.array([rng.uniform(-np.pi, np.pi)])
+        measured = np.append(t, q / np.linalg.norm(q) if d == 3 else q)
+        for k in range(run):
+            information = edges[rng.choice(loops)][3 + width :]
+            numbers = " ".join(f"{x:.9g}" for x in measured)
+            wrong.append(f"{tag} {ids[a + k]} {ids[b + k]} {numbers} {' '.join(information)}")
+    out.write_text("\n".join(lines + wrong) + "\n")
+    return list(range(len(edges), len(edges) + len(wrong)))
+
+
+def posed(path: Path, information: bool) -> pgo.PGOProblem:
+    """Problem of a file in the cost that is compared."""
+    return pgo.PGOProblem(
+        pgo.read_g2o(path), weighting=pgo.Weighting.INFORMATION if information else pgo.Weighting.ISOTROPIC
+    )
+
+
+def ours(path: Path, information: bool) -> dict[str, Any]:
+    """Edges kept, poses, seconds and verdict of a robust solve."""
+    problem = posed(path, information)
+    began = time.process_time()
+    solution = solvers.solve(problem, robust=solvers.GNC(), progress=False)
+    seconds = time.process_time() - began
+    verdict, found = solution.certificate.verdict.name, solution.robust
+    return {
+        "kept": np.flatnonzero(found.kept).tolist(),
+        "t": solution.poses.t.tolist(),
+        "seconds": seconds,
+        "verdict": verdict,
+        "gap": solution.gap,
+        "start": found.start,
+        "certified": solution.is_certified,
+    }
+
+
+def theirs(path: Path, _: bool) -> dict[str, Any]:
+    """The same of GTSAM."""
+    gtsam: ModuleType = importlib.import_module("gtsam")
+    graph = pgo.read_g2o(path)
+    is_3d, ids = graph.d == 3, graph.pose_ids.tolist()
+    factors, _ = gtsam.readG2o(str(path), is_3d)
+    poses = first_poses(graph, odometry(graph))
+    start = gtsam.Values()
+    for k, R, t in zip(ids, poses.R, poses.t, strict=True):
+        start.insert(k, gtsam.Pose3(gtsam.Rot3(R), t) if is_3d else gtsam.Pose2(*t, np.arctan2(R[1, 0], R[0, 0])))
+    ends = [tuple(factors.at(e).keys()) for e in range(factors.size())]
+    assert ends == [(ids[i], ids[j]) for i, j in zip(graph.i.tolist(), graph.j.tolist(), strict=True)]
+    tight = gtsam.noiseModel.Isotropic.Sigma(6 if is_3d else 3, 1e-4)
+    prior = gtsam.PriorFactorPose3 if is_3d else gtsam.PriorFactorPose2
+    factors.add(prior(ids[0], (start.atPose3 if is_3d else start.atPose2)(ids[0]), tight))
+    params = gtsam.GncLMParams()
+    params.setKnownInliers([*np.flatnonzero(odometry(graph)).tolist(), graph.num_edges])
+    began = time.process_time()
+    optimizer = gtsam.GncLMOptimizer(factors, start, params)
+    optimizer.setInlierCostThresholdsAtProbability(0.99)
+    answer = optimizer.optimize()
+    seconds = time.process_time() - began
+    weights = np.asarray(optimizer.getWeights())[: graph.num_edges]
+    at = answer.atPose3 if is_3d else answer.atPose2
+    t = [np.atleast_1d(at(k).translation()).tolist() for k in ids]
+    return {"kept": np.flatnonzero(weights > 0.5).tolist(), "t": t, "seconds": seconds}
+
+
+def judged(result: dict[str, Any] | None, problem: pgo.PGOProblem, wrong: list[int], clean: pgo.Poses) -> dict:
+    """Precision, recall and ATE of a run; nothing of one that did not finish."""
+    if result is None:
+        return {"precision": None, "recall": None, "ate": None, "seconds": None}
+    graph = problem.graph
+    kept, is_wrong, loops = (np.zeros(graph.num_edges, dtype=bool) for _ in range(3))
+    kept[result.pop("kept")], is_wrong[wrong], loops = True, True, ~odometry(graph)
+    right = int((kept & loops & ~is_wrong).sum())
+    poses = pgo.Poses(clean.R, np.array(result.pop("t")))
+    return {
+        "precision": right / max(1, int((kept & loops).sum())),
+        "recall": right / max(1, int((loops & ~is_wrong).sum())),
+        "ate": absolute_trajectory_error(poses, clean),
+        **result,
+    }
+
+
+def child(which: str, path: Path, information: bool, limit: float) -> dict[str, Any] | None:
+    """Result of a run in a process of its own; None where it fails or takes too long."""
+    command = [sys.executable, __file__, "--child", which, "--graphs", str(path), *["--information"] * information]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=limit)
+    except (subprocess.TimeoutExpired, subprocess.CalledProcessError) as error:
+        print(str(getattr(error, "stderr", "") or error)[-300:], file=sys.stderr)
+        return None
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def row(one: dict[str, Any]) -> str:
+    """A row of the table."""
+
+    def cells(run: dict[str, Any]) -> list[str]:
+        if run["seconds"] is None:
+            return ["-", "-", "not finished"]
+        return [f"{run['precision']:.3f} / {run['recall']:.3f}", f"{run['ate']:.3g}", f"{run['seconds']:.2f}"]
+
+    a = one["ours"]
+    verdict = "-" if a["seconds"] is None else f"{a['verdict']} ({a['gap']:.1e})"
+    first = [one["graph"], str(one["share"]), one["kind"], str(one["seed"])]
+    return "| " + " | ".join([*first, *cells(a), verdict, *(cells(one["gtsam"]) if one["gtsam"] else "---")]) + " |"
+
+
+def summary(rows: list[dict[str, Any]]) -> None:
+    """Print what all rows say together."""
+    ours = [one["ours"] for one in rows if one["ours"]["seconds"] is not None]
+    failed = [min(run["precision"], run["recall"]) < LOST for run in ours]
+    spoiled = [run["precision"] < 1.0 for run in ours]
+    alarm = [not run["certified"] for run in ours]
+    print(f"{len(rows)} runs, {len(ours)} finished; precision and recall of {LOST} or more in {failed.count(False)}")
+    for what, bad in ((f"precision or recall under {LOST}", failed), ("a wrong edge kept", spoiled)):
+        caught = sum(b and a for b, a in zip(bad, alarm, strict=True))
+        print(f"{what}: {sum(bad)}, not certified of them: {caught}")
+    print(f"not certified and all is well: {sum(a and not b for a, b in zip(alarm, failed, strict=True))}")
+    both = [(one["ours"], one["gtsam"]) for one in rows if one["gtsam"] and one["ours"]["seconds"] is not None]
+    done = [(a, b) for a, b in both if b["seconds"] is not None]
+    if not both:
+        return
+    ratio = [b["seconds"] / a["seconds"] for a, b in done]
+    print(f"GTSAM finished {len(done)} of {len(both)}; its seconds over ours, geometric mean of these:", end=" ")
+    print(f"{np.exp(np.mean(np.log(ratio))):.3g}, from {min(ratio):.3g} to {max(ratio):.3g}")
+    for name in ("precision", "recall"):
+        less = [(a[name] - b[name], one["graph"]) for one in rows for a, b in [(one["ours"], one["gtsam"])] if a and b
+                and a["seconds"] is not None and b["seconds"] is not None]  # fmt: skip
+        lost = sum(b[name] >= LOST > a[name] for a, b in done)
+        print(f"{name}: ours less GTSAM's at worst {min(less)[0]:+.3f} ({min(less)[1]}), at least as good in", end=" ")
+        print(f"{sum(x >= 0 for x, _ in less)} of {len(less)}; under {LOST} where GTSAM is not: {lost}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--graphs", nargs="+", default=NAMES.split())
+    parser.add_argument("--shares", nargs="+", type=float, default=[0.1, 0.3, 0.5, 0.7])
+    parser.add_argument("--kinds", nargs="+", default=["random", "aliased"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--information", action="store_true", help="ours in chi2, not in F")
+    parser.add_argument("--limit", type=float, default=120.0, help="seconds of a run of GTSAM; ours: five times that")
+    parser.add_argument("--no-gtsam", action="store_true")
+    parser.add_argument("--rows", type=Path, help="JSON lines to append to")
+    parser.add_argument("--summary", type=Path, help="print what the rows of this file say, and run nothing")
+    parser.add_argument("--child", choices=("ours", "gtsam"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child:
+        run = ours if options.child == "ours" else theirs
+        print(json.dumps(run(Path(options.graphs[0]), options.information)))
+        return
+    if options.summary:
+        rows = [json.loads(line) for line in options.summary.read_text().splitlines()]
+        summary(rows)
+        return
+    has_gtsam = not options.no_gtsam and importlib.util.find_spec("gtsam") is not None
+    rows = []
+    print(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}")
+    for name in options.graphs:
+        source = Path(os.environ["PGO_DATA"]) / f"{name}.g2o"
+        clean = {w: solvers.solve(posed(source, w), progress=False).poses for w in {options.information, True}}
+        for share, kind, seed in ((a, b, c) for a in options.shares for b in options.kinds for c in options.seeds):
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / f"{name}.g2o"
+                wrong = spoil(source, path, share, kind, seed)
+                problem, w = posed(path, options.information), options.information
+                one = {"graph": name, "share": share, "kind": kind, "seed": seed, "gtsam": None}
+                one["ours"] = judged(child("ours", path, w, 5 * options.limit), problem, wrong, clean[w])
+                if has_gtsam:
+                    one["gtsam"] = judged(child("gtsam", path, w, options.limit), problem, wrong, clean[True])
+            rows.append(one)
+            print(row(one), flush=True)
+            if options.rows:
+                with options.rows.open("a") as file:
+                    file.write(json.dumps(one) + "\n")
+    summary(rows)
+
+
+if __name__ == "__main__":
+    main()
