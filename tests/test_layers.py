@@ -29,6 +29,7 @@ ORDER = {
         "network",
         "soc",
         "riemannian",
+        "robust",
         "loop",
         "convex",
         "baselines",

@@ -1,0 +1,1 @@
+"""Robust estimation: wrong measurements among right ones."""
