@@ -35,12 +35,12 @@ def pairwise_consistent(graph: PoseGraph, known: BoolArray | None = None, quanti
 
     Measured on six public graphs in one robot and in five, with 10 to 70 % wrong ones: at random places 53 to 100 % are
     found. smallGrid3D and manhattan, whose errors are as large as their files say, lose 4 % of the right ones, the
-    others at most 1 %, but MIT 1 of 20; quantile = 1 - 1e-6 loses almost none and finds up to a fifth fewer.
+    others mostly under 1 %, MIT 1 of 20; quantile = 1 - 1e-6 loses almost none and finds up to a fifth fewer.
 
     **Where it fails**: wrong runs that agree with the odometry on both sides, as perceptual aliasing makes them, agree
     with each other. Between two robots with fewer right ones the run is the largest set, and the right ones go (MIT in
     five robots: all wrong ones stay). Where odometry has drifted, they agree with right ones as well: 32 to 77 % are
-    found on smallGrid3D, 26 % on sphere2500. A single closure between two robots is kept. What is kept is no proof.
+    found on smallGrid3D, 26 to 56 % on sphere2500. A single one between two robots is kept. What is kept is no proof.
 
     Parameters
     ----------
