@@ -92,7 +92,7 @@ def chi2(graph: PoseGraph, poses: Poses, convention: Chi2Convention = Chi2Conven
     if d == 3 and convention is Chi2Convention.G2O:
         r_r = 0.5 * chord
     if convention is Chi2Convention.GTSAM:
-        r_t = _logarithm_translation(w, r_t)
+        r_t = logarithm_translation(w, r_t)
     information = proper_information(graph)
     I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
     coupled = np.cos(half) * chord if convention is Chi2Convention.CHORDAL else r_r
@@ -105,7 +105,7 @@ def _check_poses(graph: PoseGraph, poses: Poses) -> None:
         raise GraphError(f"{poses} beside {graph!r}; give one pose for every pose of the graph")
 
 
-def _logarithm_translation(w: Array, t: Array) -> Array:
+def logarithm_translation(w: Array, t: Array) -> Array:
     """U of the logarithm (w, u) in SE(d), (m, d): V(w) u = t, so that u = t - W t / 2 + c W^2 t with W = hat(w)."""
     theta = np.linalg.norm(w, axis=1)
     safe = np.where(theta > 1e-4, theta, 1.0)

@@ -87,10 +87,9 @@ def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResidua
     """
     graph = problem if isinstance(problem, PoseGraph) else problem.graph
     translation, rotation, cost = edge_errors(graph, poses)
-    if isinstance(problem, PoseGraph):
-        w = _chi2_weights(graph, EdgeWeights(graph.tau, graph.kappa))
-    else:
-        cost, w = problem.edge_costs(poses), _of_problem(problem)
+    w = _chi2_weights(problem)
+    if isinstance(problem, PGOProblem):
+        cost = problem.edge_costs(poses)
     d, p, points = graph.d, tangent_dimension(graph.d), len(graph.landmarks)
     unknowns = (d + p) * (graph.num_poses - points - 1) + d * points
     redundancy = 1.0 - unknowns / max(int(np.sum(w > 0.0)), 1)
@@ -123,17 +122,10 @@ def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
     ------
     SettingError
         When quantile is not between 0 and 1.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import circle
-    >>> problem = PGOProblem(circle(np.random.default_rng(0)), weighting=Weighting.INFORMATION)
-    >>> round(float(chi2_thresholds(problem)[0]), 3)  # of six degrees of freedom
-    16.812
     """
     if not 0.0 < quantile < 1.0:
         raise SettingError(f"quantile is {quantile!r}; give a probability between 0 and 1, such as 0.99")
-    return _quantiles(_of_problem(problem), quantile)
+    return _quantiles(_chi2_weights(problem), quantile)
 
 
 def _quantiles(w: Array, quantile: float) -> Array:
@@ -144,20 +136,19 @@ def _quantiles(w: Array, quantile: float) -> Array:
     return np.asarray(c_1 + ratio * (chdtri(np.maximum(dof, 1.0), 1.0 - quantile) - dof))
 
 
-def _of_problem(problem: PGOProblem) -> Array:
-    weights = problem.weights
-    is_chi2 = problem.weighting is Weighting.INFORMATION or weights.excess is not None or weights.tangent is not None
-    return _chi2_weights(problem.graph, None if is_chi2 else weights)
-
-
-def _chi2_weights(graph: PoseGraph, weights: EdgeWeights | None) -> Array:
-    """Weights w, (m, k), of the chi^2_1 that the edges' costs are sums of; of chi2 (None) ones, as many as the rank."""
+def _chi2_weights(problem: PGOProblem | PoseGraph) -> Array:
+    """Weights w, (m, k), of the chi^2_1 that the edges' costs are sums of; of chi2 ones, as many as the rank."""
+    if isinstance(problem, PoseGraph):
+        graph, weights, is_chi2 = problem, EdgeWeights(problem.tau, problem.kappa), False
+    else:
+        graph, weights = problem.graph, problem.weights
+        is_chi2 = problem.weighting is Weighting.INFORMATION or (weights.excess or weights.tangent) is not None
     d, information = graph.d, proper_information(graph)
     diagonal = np.einsum("mkk->mk", information)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     values, axes = np.linalg.eigh(information * scale[:, :, None] * scale[:, None, :])
     is_known = values > LEAST_SCALED
-    if weights is None:
+    if is_chi2:
         return is_known.astype(float)
     half = scale[:, :, None] * axes * (is_known / np.sqrt(np.where(is_known, values, 1.0)))[:, None, :]
     W = weights.W(d)

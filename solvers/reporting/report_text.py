@@ -176,7 +176,8 @@ def _uncertified(graph: PoseGraph, certificate: Certificate, solve: str) -> list
         found.append(
             Advice(
                 "Better poses may not exist; then only better measurements close the gap: more of them, less noisy "
-                "ones, or without those that are wrong."
+                "ones, or without those that are wrong.",
+                f"{solve} --robust gnc",
             )
         )
     found.append(Advice("Keep what there is, with the gap as a warning.", f"{solve} --out solved.g2o"))
