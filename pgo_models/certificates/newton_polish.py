@@ -26,7 +26,7 @@ from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
 
 STATIONARY_DECREMENT = 1e-13
-STATIONARY_FOR_TANGENTS = 1e-15  # what is left of chi2 weighs more in the bound: its tangent is softer than chi2 itself
+STATIONARY_FOR_TANGENTS = 1e-16  # what is left of chi2 weighs more in the bound: its tangent is softer than chi2 itself
 SMALL_DECREMENT = 1e-9
 ROUNDING = 1e-14  # relative change of F that is not told apart from none
 NEARLY_STRAIGHT = 1e-7  # decrement below which the path of the best translations of chi2 is a line
