@@ -125,7 +125,8 @@ def chosen_pipeline(
         max_iterations=usual.max_iterations if max_iterations is None else max_iterations,
     )
     if isinstance(chosen, SOC):
-        return Pipeline(soc=replace(chosen, coupling=Coupling[method.name]), gap=gap, driver_memory=memory)
+        coupling = None if method is FirstStage.JOINT else Coupling[method.name]
+        return Pipeline(soc=replace(chosen, coupling=coupling), gap=gap, driver_memory=memory)
     return Pipeline(soc=chosen, newton=gauss_newton(), gap=gap, driver_memory=memory)
 
 

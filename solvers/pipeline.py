@@ -133,8 +133,9 @@ def solve(
     rounding level, then the dual certificate at the result. Where it is wider than asked for, a second try and then
     the Riemannian staircase, whose optimum is the best bound that the relaxation has.
 
-    chi2 of information matrices that is not quadratic and convex: SOC on its `convex_part`, Newton on chi2 itself; the
-    second try starts at the optimum of F, and smaller information matrices take the place of the staircase.
+    chi2 of information matrices that is not quadratic and convex: Newton on chi2 from the chordal start, or from SOC on
+    its `convex_part` if SOC has other settings than `HANDOVER`; the second try starts at the optimum of F, and smaller
+    information matrices take the place of the staircase.
 
     Parameters
     ----------
@@ -333,7 +334,8 @@ class _Job:
         seconds = time.perf_counter() - began
         self.stages.append(Stage(name, Status.CONVERGED, 0, self.problem.objective(poses), seconds, History()))
         self.watch.found.append(poses)
-        if soc is not None:
+        # The minimum of the convex part is no nearer to that of chi2 than the chordal start: no SOC unless set up.
+        if soc is not None and not (soc == HANDOVER and first_problem is not self.problem):
             first: Run[Any] = self.watch.run(soc, first_problem, poses)
             # A start that is better than SOC's best iterate is kept: CSAIL's chordal start is within 1e-4.
             poses = first.poses if first.objective <= first_problem.objective(poses) else poses

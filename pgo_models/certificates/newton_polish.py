@@ -26,7 +26,7 @@ from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
 
 STATIONARY_DECREMENT = 1e-13
-STATIONARY_FOR_TANGENTS = 1e-17  # what is left of chi2 weighs more in the bound: its tangent is softer than chi2 itself
+STATIONARY_FOR_TANGENTS = 1e-16  # what is left of chi2 weighs more in the bound: its tangent is softer than chi2 itself
 SMALL_DECREMENT = 1e-9
 ROUNDING = 1e-14  # relative change of F that is not told apart from none
 NEARLY_STRAIGHT = 1e-7  # decrement below which the path of the best translations of chi2 is a line
@@ -89,11 +89,13 @@ def polish_step(
     """Factor once, then move as long as the same factor serves; F never rises.
 
     The first move solves H y = -g with the Riemannian Hessian H, or, where H is not positive definite or
-    `second_order` is False, with its Gauss-Newton part, damped until it is. Backtracking (Armijo) keeps F monotone.
+    `second_order` is False, with its Gauss-Newton part, damped until it is; that part is the better model of chi2 far
+    from its minimum, where the first step begins. Backtracking (Armijo) keeps F monotone.
     Further moves take the same factor, with the secants of those before (L-BFGS) or, without `secants`, as it is (chord
     steps), while each cuts the decrement to a tenth.
     """
-    analysis, factor, is_newton = _factorize_model(problem, state, second_order)
+    is_far = state.analysis is None and not problem.is_quadratic
+    analysis, factor, is_newton = _factorize_model(problem, state, second_order and not is_far)
     layout = TangentLayout(problem.num_poses, problem.d)
     now = replace(state, analysis=analysis, factor=factor, is_newton=is_newton, moved=False)
     level = rounding_level(problem, state.poses)  # hardly moves with them

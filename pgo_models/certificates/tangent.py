@@ -23,7 +23,7 @@ from pgo_models.errors import GraphError, NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import filled, least_scaled, proper_information, uncoupled_share
+from pgo_models.graphs.precisions import are_definite, filled, proper_information, uncoupled_share
 from pgo_models.problem.problem import PGOProblem
 
 BISECTIONS = 5
@@ -45,7 +45,7 @@ def soften(graph: PoseGraph, cap: float) -> PoseGraph:
         smaller = np.zeros_like(information)
         smaller[:, :d, :d] = _clipped(share[:, None, None] * I_tt, lambda values: cap * values[:, 0])
         smaller[:, d:, d:] = _clipped(share[:, None, None] * I_rr, lambda values: values[:, :2] @ limit)
-        is_below = is_below | (least_scaled(information - smaller) > _SHOWN)
+        is_below = is_below | are_definite(information - smaller, _SHOWN)
         if is_below.all():
             return replace(graph, information=smaller)
         share = np.where(is_below, share, 0.5 * share)  # was rounded

@@ -112,10 +112,14 @@ class PoseGraph(Measurements):
 
     def components(self, edges: BoolArray | None = None) -> list[IntArray]:
         """Poses of every connected component, largest first; of some of the edges, (m,), or of all."""
-        kept = slice(None) if edges is None else edges
-        count, label = connected_components(edge_counts(self.i[kept], self.j[kept], self.num_poses), directed=False)
-        parts = [np.flatnonzero(label == c) for c in range(count)]
-        return sorted(parts, key=lambda part: (-len(part), int(part[0])))
+        if edges is None:
+            return list(self._components)
+        counts = edge_counts(self.i[edges], self.j[edges], self.num_poses)
+        return _sorted_components(counts)
+
+    @cached_property
+    def _components(self) -> list[IntArray]:
+        return _sorted_components(self.adjacency)
 
     @property
     def is_connected(self) -> bool:
@@ -250,6 +254,12 @@ def middle_pose(graph: PoseGraph) -> int:
 def poses_by_distance(graph: PoseGraph, pose: int) -> IntArray:
     """Poses of a connected graph, (n,), by their number of edges to a pose, which is the first."""
     return np.asarray(breadth_first_order(graph.adjacency, pose, directed=False, return_predecessors=False))
+
+
+def _sorted_components(adjacency: csr_array) -> list[IntArray]:
+    count, label = connected_components(adjacency, directed=False)
+    parts = [np.flatnonzero(label == c) for c in range(count)]
+    return sorted(parts, key=lambda part: (-len(part), int(part[0])))
 
 
 def edge_counts(i: IntArray, j: IntArray, size: int) -> csr_array:

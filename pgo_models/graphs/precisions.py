@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.measurements import isotropic_information
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 
@@ -59,17 +59,22 @@ def proper_information(graph: PoseGraph) -> Array:
     information = 0.5 * (graph.information + np.swapaxes(graph.information, 1, 2))
     if not information[:, : graph.d, graph.d :].any():
         return np.asarray(information)
-    bad = least_scaled(information) <= LEAST_SCALED
+    bad = ~are_definite(information, LEAST_SCALED)
     information[bad, : graph.d, graph.d :] = 0.0
     information[bad, graph.d :, : graph.d] = 0.0
     return information
 
 
-def least_scaled(blocks: Array) -> Array:
-    """Smallest eigenvalues, (m,), of symmetric blocks (m, k, k) scaled to ones where the diagonal is positive."""
+def are_definite(blocks: Array, least: float) -> BoolArray:
+    """Whether symmetric blocks (m, k, k), scaled to ones where the diagonal is positive, are above least I, (m,)."""
     diagonal = np.einsum("mkk->mk", blocks)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    return np.asarray(np.linalg.eigvalsh(blocks * scale[:, :, None] * scale[:, None, :])[:, 0])
+    scaled = blocks * scale[:, :, None] * scale[:, None, :] - least * np.eye(blocks.shape[1])
+    try:
+        np.linalg.cholesky(scaled)
+    except np.linalg.LinAlgError:  # which are not
+        return np.asarray(np.linalg.eigvalsh(scaled)[:, 0] > 0.0)
+    return np.ones(len(blocks), dtype=bool)
 
 
 def uncoupled_share(information: Array, d: int) -> Array:

@@ -14,10 +14,12 @@ from pgo_models.problem.matrices import assemble, block_entries, rotation_column
 
 @dataclass(frozen=True, eq=False)
 class Incidence:
-    """Which edges begin and which end at a pose: sparse matrices of ones, (n, m)."""
+    """Which edges begin and which end at a pose: sparse matrices of ones, (n, m); and these poses, (m,)."""
 
     begins: csr_array
     ends: csr_array
+    i: IntArray
+    j: IntArray
 
     @classmethod
     def of(cls, graph: PoseGraph) -> Incidence:
@@ -27,7 +29,7 @@ class Incidence:
             places = pose, np.arange(graph.num_edges)
             return csr_array((np.ones(graph.num_edges), places), shape=(graph.num_poses, graph.num_edges))
 
-        return cls(ones(graph.i), ones(graph.j))
+        return cls(ones(graph.i), ones(graph.j), graph.i, graph.j)
 
     def at_beginning(self, blocks: Array) -> Array:
         """Sums of blocks (m, a, b) over the edges that begin at a pose, (n a, b)."""
@@ -51,10 +53,11 @@ def rows_of_blocks(blocks: Array, axes: Array | None = None) -> Array:
     return np.concatenate([blocks[:, 0], turning.reshape(-1, blocks.shape[2])])
 
 
-def block_laplacian(graph: PoseGraph, of_edges: Array) -> csc_array:
-    """Laplacian with weights (m, d, d), pose 0 left out: the matrix of translations with such information."""
-    d = graph.d
-    t_i, t_j = rotation_columns(graph.i, 0, d), rotation_columns(graph.j, 0, d)
-    signed = ((t_i, t_i, of_edges), (t_j, t_j, of_edges), (t_i, t_j, -of_edges), (t_j, t_i, -of_edges))
+def block_laplacian(incidence: Incidence, of_edges: Array) -> csc_array:
+    """Laplacian with weights (m, d, d), the matrix of translations with such information; grounded at pose 0."""
+    own, d = incidence.at_both(of_edges, of_edges), of_edges.shape[1]
+    own[0] *= 2.0
+    t_i, t_j, t = (rotation_columns(k, 0, d) for k in (incidence.i, incidence.j, np.arange(len(own))))
+    signed = ((t, t, own), (t_i, t_j, -of_edges), (t_j, t_i, -of_edges))
     blocks = [(*block_entries(rows, columns), values) for rows, columns, values in signed]
-    return assemble(blocks, d * graph.num_poses)[d:, d:].tocsc()
+    return assemble(blocks, d * len(own))

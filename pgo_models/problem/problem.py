@@ -13,12 +13,14 @@ from pgo_models.geometry.arrays import read_only
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes, vee
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.precisions import proper_information
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, analyze, factorize
 from pgo_models.problem.incidence import Incidence, block_laplacian, blocks_of_rows, rows_of_blocks
 from pgo_models.problem.matrices import (
     block_entries,
     connection_laplacian,
     entry_positions,
+    isotropic_weights,
     joint_matrix,
     marginalized_matrix,
     residual_matrix,
@@ -94,7 +96,14 @@ class PGOProblem:
     @cached_property
     def weights(self) -> EdgeWeights:
         """Weights of the edges."""
-        return edge_weights(self.graph, self.weighting) if isinstance(self.weighting, Weighting) else self.weighting
+        if isinstance(self.weighting, EdgeWeights):
+            return self.weighting
+        is_F = self.weighting is Weighting.ISOTROPIC
+        return isotropic_weights(self.graph) if is_F else edge_weights(self.graph, self._information)
+
+    @cached_property
+    def _information(self) -> Array:
+        return proper_information(self.graph)
 
     @property
     def is_quadratic(self) -> bool:
@@ -106,7 +115,7 @@ class PGOProblem:
         """The problem itself if its cost is quadratic and convex in (R, t), else one near it: what SOC is run on."""
         if self.is_quadratic and self.weights.is_convex:
             return self
-        return replace(self, weighting=convex_weights(self.graph))
+        return replace(self, weighting=convex_weights(self._information, self.d))
 
     def check_quadratic(self, method: str, convex: bool = False) -> None:
         """Raise a SettingError where a method needs a cost that is quadratic in the poses, or convex, and it is not."""
@@ -264,16 +273,17 @@ class PGOProblem:
 
     def at_best_translations(self, poses: Poses) -> Poses:
         """Poses with the translations that are best for their rotations, t_0 where it is if chi2 is not quadratic."""
-        excess, (n, d), graph = self.weights.excess, poses.t.shape, self.graph
+        excess, d, X = self.weights.excess, self.d, self.stacked(poses)
         if excess is None:
             return self.with_best_translations(poses.R)
-        R_i = poses.R[graph.i]
-        half = R_i @ (excess.J[:, :d, :d] + self.weights.tau[:, None, None] * np.eye(d)) @ np.swapaxes(R_i, 1, 2)
-        factor = self._chi2_translations.factorize(block_laplacian(graph, half))
-        step = factor.solve(self.tangent_at(poses).apply_M(poses.stacked())[1:n].ravel())
-        t = poses.t.copy()
-        t[1:] -= step.reshape(n - 1, d)
-        return Poses(poses.R, t)
+        R_i, tau = poses.R[self.graph.i], self.weights.tau
+        half = R_i @ (excess.J[:, :d, :d] + tau[:, None, None] * np.eye(d)) @ np.swapaxes(R_i, 1, 2)
+        residuals = self.residuals(X)
+        u, _ = excess.arguments(self.edge_products(residuals, X))
+        pull = tau[:, None] * residuals[: len(tau)] + (R_i @ (excess.J[:, :d] @ u[:, :, None]))[:, :, 0]
+        factor = self._chi2_translations.factorize(block_laplacian(self.incidence, half))
+        step = factor.solve((self.incidence.ends @ pull - self.incidence.begins @ pull).ravel()).reshape(-1, d)
+        return Poses(poses.R, poses.t - (step - step[0]))
 
     def with_refined_translations(self, poses: Poses) -> Poses:
         """Poses after steps of iterative refinement of the translations, as many as lower F, with t_0 where it is.
@@ -327,9 +337,8 @@ class PGOProblem:
     @cached_property
     def _chi2_translations(self) -> SymbolicCholesky:
         """Of the matrix of `at_best_translations`, whose pattern the graph alone gives."""
-        return analyze(
-            block_laplacian(self.graph, np.broadcast_to(np.eye(self.d), self.graph.R_ij.shape)), self.backend
-        )
+        ones = np.broadcast_to(np.eye(self.d), self.graph.R_ij.shape)
+        return analyze(block_laplacian(self.incidence, ones), self.backend)
 
     @cached_property
     def _M_tR(self) -> csr_array:

@@ -16,13 +16,14 @@ from __future__ import annotations
 import enum
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from pgo_models.errors import GraphError
 from pgo_models.geometry.rotations import Array, BoolArray, hat, tangent_dimension, vee
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.graphs.precisions import edge_precisions, least_scaled, proper_information, uncoupled_share
+from pgo_models.graphs.precisions import are_definite, edge_precisions, uncoupled_share
 from pgo_models.problem.floating_point import OUTWARD, gamma
 
 _MARGIN = 2.0**-24  # of the smallest eigenvalue: stays between tau and it, so that the excess is strictly convex
@@ -127,14 +128,45 @@ class Tangent:
     Attributes
     ----------
     C, Z : (m, d + 1, d)
-    value, value_error, loss : (m,)
+    excess : Excess
     """
 
     C: Array
     Z: Array
-    value: Array
-    value_error: Array
-    loss: Array
+    excess: Excess
+
+    @cached_property
+    def value(self) -> Array:
+        """The excess at Z*, (m,)."""
+        return self.excess.values(self.Z)
+
+    @cached_property
+    def value_error(self) -> Array:
+        """Bound on the rounding error of `value`, (m,)."""
+        share, length = self._rounding
+        return OUTWARD * share * length**2
+
+    @cached_property
+    def loss(self) -> Array:
+        """What the minorant gives up for the rounding of C, (m,).
+
+        The excess is at least least_t ||Z_t||^2 + least_R ||Z_R||^2 / 4, in the plane for Z_R in the span of R_ij^T and
+        its quarter turn, where it is but for rounding.
+        """
+        share, length = self._rounding
+        sizes = np.sum(self.excess.size**2 / self.excess.least, axis=1)
+        return np.asarray(OUTWARD * 32.0 * (share * length) ** 2 * sizes)
+
+    @cached_property
+    def _rounding(self) -> tuple[float, Array]:
+        """Roundings, and l = sum_a size_a ||Z_a||: absolute values sum to at most l^2 in the value, size_a l in C_a.
+
+        Where there are s and H, to at most 8 d times that.
+        """
+        d, size = self.Z.shape[2], self.excess.size
+        length = size[:, 0] * np.linalg.norm(self.Z[:, 0], axis=1)
+        length += size[:, 1] * np.linalg.norm(self.Z[:, 1:], axis=(1, 2))
+        return gamma(16.0 * d) * (1.0 if self.excess.K is None else 8.0 * d), length
 
     def values(self, Z: Array) -> Array:
         """The minorant of every edge, (m,)."""
@@ -205,8 +237,10 @@ class Excess:
     def values(self, Z: Array) -> Array:
         """The excess of every edge, (m,)."""
         u, H = self.arguments(Z)
-        found = np.sum(u * (self.J @ u[:, :, None])[:, :, 0], axis=1)
-        return np.asarray(found if H is None or self.K is None else found + np.sum(H * (self.K @ H), axis=(1, 2)))
+        found = np.einsum("ma,ma->m", u, np.einsum("mab,mb->ma", self.J, u))
+        if H is not None and self.K is not None:
+            found += np.einsum("mab,mab->m", H, self.K @ H)
+        return np.asarray(found)
 
     def tangent(self, Z: Array) -> Tangent:
         """Tangent at Z: C is half the gradient of the excess there."""
@@ -218,14 +252,7 @@ class Excess:
         if H is not None and self.K is not None:
             N = self.K @ H
             C[:, 1:] = 0.5 * np.swapaxes((hat(y[:, d:]) + _bend_adjoint(N + np.swapaxes(N, 1, 2), d)) @ self.R_ij, 1, 2)
-        # With l = sum_a size_a ||Z_a|| absolute values sum to at most l^2 in the value and size_a l in C_a; where there
-        # are s and H, to at most 8 d times that. The excess is at least least_t ||Z_t||^2 + least_R ||Z_R||^2 / 4, in
-        # the plane for Z_R in the span of R_ij^T and its quarter turn, where it is but for rounding.
-        length = self.size[:, 0] * np.linalg.norm(Z[:, 0], axis=1)
-        length += self.size[:, 1] * np.linalg.norm(Z[:, 1:], axis=(1, 2))
-        share = gamma(16.0 * d) * (1.0 if self.K is None else 8.0 * d)
-        loss = 32.0 * (share * length) ** 2 * np.sum(self.size**2 / self.least, axis=1)
-        return Tangent(C, Z, self.values(Z), OUTWARD * share * length**2, OUTWARD * loss)
+        return Tangent(C, Z, self)
 
     def derivatives(self, relative: Array, apart: Array) -> tuple[Array, Array | None]:
         """Derivatives of u and H, (m, q, 2 d + 2 p) and (m, p, p, 2 p), in (R_i^T v_i, R_i^T v_j, w_i, w_j), at poses.
@@ -260,10 +287,10 @@ class Excess:
         return np.asarray(found)
 
 
-def edge_weights(graph: PoseGraph, weighting: Weighting) -> EdgeWeights:
-    """Weights of a graph's edges in one of the two costs.
+def edge_weights(graph: PoseGraph, information: Array) -> EdgeWeights:
+    """Weights of a graph's edges in chi2 of information matrices, (m, k, k), as of `proper_information`.
 
-    Coupling blocks count where the whole information matrix is positive definite (`proper_information`).
+    Coupling blocks count where the whole information matrix is positive definite.
 
     Raises
     ------
@@ -271,9 +298,7 @@ def edge_weights(graph: PoseGraph, weighting: Weighting) -> EdgeWeights:
         When an information matrix is too far from isotropic for double precision, or an edge without a position is
         beside one that is not isotropic; it names the edge.
     """
-    if weighting is Weighting.ISOTROPIC:
-        return EdgeWeights(graph.tau, graph.kappa)
-    information, d, p = proper_information(graph), graph.d, tangent_dimension(graph.d)
+    d, p = graph.d, tangent_dimension(graph.d)
     I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
     (smallest, trace), (of_R, trace_R) = ((np.linalg.eigvalsh(A)[:, 0], np.einsum("mkk->m", A)) for A in (I_tt, I_rr))
     is_empty = trace == 0.0, trace_R == 0.0  # of a landmark, or a prior of one kind
@@ -304,18 +329,17 @@ def edge_weights(graph: PoseGraph, weighting: Weighting) -> EdgeWeights:
         margin = np.concatenate([margin, np.repeat(spare[:, None], p, axis=1)], axis=1)
     weights = _rotation_weights(I_rr, K)
     J = turn @ J @ np.swapaxes(turn, 1, 2)
-    _check(graph, (tau > 0.0) & (least_scaled(J - margin[:, :, None] * np.eye(J.shape[1])) > 0.0))
+    _check(graph, (tau > 0.0) & are_definite(J - margin[:, :, None] * np.eye(J.shape[1]), 0.0))
     # Blocks of definite J: ||J_ab||^2 <= tr(J_aa) tr(J_bb); and || |R_ij| ||^2 = d.
     size = np.sqrt(d * np.stack([trace + d * tau, 0.0 * tau if K is None else np.einsum("mkk->m", K)], axis=1))
     K = None if K is None else J[:, d:, d:]
     return EdgeWeights(tau, *weights, Excess(graph.R_ij, J, K, OUTWARD * size, 0.5 * margin[:, [0, -1]]))
 
 
-def convex_weights(graph: PoseGraph) -> EdgeWeights:
+def convex_weights(information: Array, d: int) -> EdgeWeights:
     """Weights of a strictly convex quadratic cost near chi2: the tau of F, and of W what is well above zero."""
-    information = proper_information(graph)
     kappa_F, tau_F = edge_precisions(information)
-    kappa, axes, W, _ = _rotation_weights(information[:, graph.d :, graph.d :])
+    kappa, axes, W, _ = _rotation_weights(information[:, d:, d:])
     if axes is not None:
         kappa = np.maximum(kappa, _LEAST_CONVEX * kappa_F[:, None])
         W = (axes * kappa[:, None, :]) @ np.swapaxes(axes, 1, 2)

@@ -15,7 +15,7 @@ from pgo_models.certificates.newton_polish import move_poses, polish
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import tangent_dimension
-from pgo_models.graphs.precisions import isotropic_information, least_scaled, proper_information
+from pgo_models.graphs.precisions import are_definite, isotropic_information, proper_information
 from pgo_models.graphs.residuals import chi2
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.initialization import chordal_start
@@ -209,6 +209,10 @@ def test_an_excess_that_is_not_convex_is_refused(d: int, monkeypatch: pytest.Mon
 
 def test_the_least_eigenvalue_is_seen_in_every_unit() -> None:
     blocks = np.stack([np.eye(4), np.diag([1.0, 1.0, 1e-9, -1e-12]), np.diag([1e9, 1.0, 1.0, 1e-12])])
-    np.testing.assert_allclose(least_scaled(blocks), [1.0, -1e-12, 1.0], rtol=1e-3)
-    blocks[2, 0, 3] = blocks[2, 3, 0] = 0.04
-    assert least_scaled(blocks)[2] == pytest.approx(1.0 - 0.04 / np.sqrt(1e-3), rel=1e-12)
+    assert are_definite(blocks, 0.0).tolist() == [True, False, True]
+    assert are_definite(blocks, -1.1e-12).all()
+    assert are_definite(blocks, 0.999).tolist() == [True, False, True]
+    blocks[2, 0, 3] = blocks[2, 3, 0] = 0.04  # scaled it is 0.04 / sqrt(1e-3) = 1.265, above one
+    assert are_definite(blocks[[0, 2]], 0.0).tolist() == [True, False]
+    assert are_definite(blocks[[0, 2]], -0.2649).tolist() == [True, False]
+    assert are_definite(blocks[[0, 2]], -0.2650).all()

@@ -1,0 +1,119 @@
+"""Huber's loss by iteratively reweighted least squares (Holland & Welsch 1977).
+
+    minimise  sum_e h(r_e^2),  h(s) = s up to c_e^2, 2 c_e s^1/2 - c_e^2 beyond
+
+with r_e^2 the share of edge e in the cost. h is concave in s: the cost with weights h'(r_e^2) = min(1, c_e / r_e) lies
+above it up to a constant and touches it, so that what lowers the weighted cost lowers this one. Unlike truncated losses
+it has no other minima than the rotations make, and it never lets go of a wrong edge altogether.
+
+Of a bound on this cost: on poses that cost no more than those at hand, H, every r_e is at most (H + c_e^2) / (2 c_e), and
+there a quadratic in the poses touches h from below. With it the certificate proved the minimum to 1e-12 of five public
+graphs without wrong edges (MIT, CSAIL, intel, kitti_07, parking-garage), and nothing wherever H is some ten c_e^2 or
+more, as it is with a single wrong edge: the quadratic is then too weak to hold the certificate matrix up. None is given.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pgo_models.errors import SettingError, check_settings
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.thresholds import chi2_thresholds
+from solvers.result import Measurement, Status
+from solvers.riemannian.newton import Newton
+from solvers.soc.soc import SOC
+
+
+def huber(squares: Array, thresholds: Array) -> Array:
+    """h of r^2, for thresholds c^2."""
+    return np.where(squares <= thresholds, squares, 2.0 * np.sqrt(squares * thresholds) - thresholds)
+
+
+@dataclass(frozen=True, eq=False)
+class IRLSState:
+    """State k.
+
+    Attributes
+    ----------
+    k : int
+    poses : Poses
+    costs : (m,)
+        r_e^2 there.
+    thresholds : (m,)
+    objective : float
+        Huber's cost.
+    change : float
+        By how much the last step lowered it, relative.
+    """
+
+    k: int
+    poses: Poses
+    costs: Array
+    thresholds: Array
+    objective: float
+    change: float = math.inf
+
+
+@dataclass(frozen=True)
+class IRLS:
+    """Settings of Huber's loss by reweighting.
+
+    Attributes
+    ----------
+    quantile : float
+        c_e^2 is this quantile of an edge's cost, if its information matrix is right.
+    inner : Newton or SOC
+        What lowers the weighted cost: `inner_steps` of it for one set of weights.
+    inner_steps : int
+    tolerance : float
+        On the relative change of the cost.
+    max_iterations : int
+    """
+
+    quantile: float = 0.99
+    inner: Newton | SOC = field(default_factory=Newton)
+    inner_steps: int = 1
+    tolerance: float = 1e-10
+    max_iterations: int = 500
+
+    def __post_init__(self) -> None:
+        if isinstance(self.inner, SOC) and self.inner.robots is not None:
+            raise SettingError("weights are found in one place; leave out the robots of SOC")
+        check_settings(self, positive=["tolerance"], at_least_one=["inner_steps"], not_negative=["max_iterations"])
+
+    def init(self, problem: PGOProblem, start: Poses | None) -> IRLSState:
+        """State 0: `start`, or the chordal relaxation."""
+        poses = start if start is not None else chordal_start(problem.convex_part)
+        return self._at(problem, 0, poses, chi2_thresholds(problem, self.quantile))
+
+    def step(self, problem: PGOProblem, state: IRLSState) -> IRLSState:
+        """Weights for the residuals at hand, and steps towards the minimum with them."""
+        weights = np.sqrt(state.thresholds / np.maximum(state.costs, state.thresholds))
+        weighted, method = replace(problem, weighting=problem.weights.scaled(weights)), self.inner
+        inner = method.init(weighted, state.poses)
+        for _ in range(self.inner_steps):
+            inner = method.step(weighted, inner)
+        new = self._at(problem, state.k + 1, method.poses(weighted, inner), state.thresholds)
+        return replace(new, change=abs(state.objective - new.objective) / max(new.objective, np.finfo(float).tiny))
+
+    def measure(self, problem: PGOProblem, state: IRLSState) -> Measurement:
+        """Huber's cost and its change."""
+        return Measurement(state.objective, 0.0, state.change)
+
+    def poses(self, problem: PGOProblem, state: IRLSState) -> Poses:
+        """Poses of the state."""
+        return state.poses
+
+    def converged(self, state: IRLSState, measurement: Measurement) -> Status | None:
+        """CONVERGED where the cost hardly changes."""
+        return Status.CONVERGED if measurement.dual_residual <= self.tolerance else None
+
+    def _at(self, problem: PGOProblem, k: int, poses: Poses, thresholds: Array) -> IRLSState:
+        costs = problem.edge_costs(poses)
+        return IRLSState(k, poses, costs, thresholds, float(huber(costs, thresholds).sum()))
