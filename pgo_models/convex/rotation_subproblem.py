@@ -56,7 +56,9 @@ class RotationQP:
             try:
                 run_clarabel(self.problem, tolerance)
             except cp.SolverError as error:
-                raise PGOError(f"Clarabel could not solve the R-subproblem: {error}") from error
+                if tolerance == TOLERANCES[-1]:
+                    raise PGOError(f"Clarabel could not solve the R-subproblem: {error}") from error
+                continue
             if self.problem.status == cp.OPTIMAL:
                 break
         if self.problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or self.X.value is None:

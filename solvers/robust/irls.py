@@ -6,10 +6,10 @@ with r_e^2 the share of edge e in the cost. h is concave in s: the cost with wei
 above it up to a constant and touches it, so that what lowers the weighted cost lowers this one. Unlike truncated losses
 it has no other minima than the rotations make, and it never lets go of a wrong edge altogether.
 
-Of a bound on this cost: on poses that cost no more than those at hand, H, every r_e is at most (H + c_e^2) / (2 c_e), and
+Of a bound on this cost: on poses that cost at most H, as those at hand, every r_e is at most (H + c_e^2) / (2 c_e), and
 there a quadratic in the poses touches h from below. With it the certificate proved the minimum to 1e-12 of five public
-graphs without wrong edges (MIT, CSAIL, intel, kitti_07, parking-garage), and nothing wherever H is some ten c_e^2 or
-more, as it is with a single wrong edge: the quadratic is then too weak to hold the certificate matrix up. None is given.
+graphs without wrong edges (MIT, CSAIL, intel, kitti_07, parking-garage), and nothing where H is above some ten c_e^2,
+as with one wrong edge: the quadratic is then too weak to hold the certificate matrix up. So none is given.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from solvers.soc.soc import SOC
 
 
 def huber(squares: Array, thresholds: Array) -> Array:
-    """h of r^2, for thresholds c^2."""
+    """Loss h of r^2, for thresholds c^2."""
     return np.where(squares <= thresholds, squares, 2.0 * np.sqrt(squares * thresholds) - thresholds)
 
 
@@ -69,8 +69,9 @@ class IRLS:
     quantile : float
         c_e^2 is this quantile of an edge's cost, if its information matrix is right.
     inner : Newton or SOC
-        What lowers the weighted cost: `inner_steps` of it for one set of weights.
+        What lowers the weighted cost.
     inner_steps : int
+        Most steps of it for one set of weights. SOC begins each time with B = 0, and wants as many as it takes.
     tolerance : float
         On the relative change of the cost.
     max_iterations : int
@@ -99,6 +100,8 @@ class IRLS:
         inner = method.init(weighted, state.poses)
         for _ in range(self.inner_steps):
             inner = method.step(weighted, inner)
+            if method.converged(inner, method.measure(weighted, inner)) is not None:
+                break
         new = self._at(problem, state.k + 1, method.poses(weighted, inner), state.thresholds)
         return replace(new, change=abs(state.objective - new.objective) / max(new.objective, np.finfo(float).tiny))
 

@@ -55,14 +55,21 @@ def theirs(path: Path, own_start: bool) -> tuple[float, float]:
 def main() -> None:
     folder = Path(os.environ["PGO_DATA"])
     paths = [Path(name) for name in sys.argv[1:]] or [folder / f"{name}.g2o" for name in NAMES.split()]
-    print(ROW.format("graph", "chi2", "proven gap", "CPU s", "solves of F", "GTSAM from the file", "GTSAM from its own start"))
+    print(
+        ROW.format(
+            "graph", "chi2", "proven gap", "CPU s", "solves of F", "GTSAM from the file", "GTSAM from its own start"
+        )
+    )
     print("|---|---|---|---|---|---|---|")
     for path in paths:
         pairs = [[ours(path, weighting) for weighting in pgo.Weighting] for _ in range(RUNS)]
         (of_F, _, _), (seconds, value, gap) = (min(found) for found in zip(*pairs, strict=True))
         runs = [theirs(path, own) for own in (False, True)]
         cells = [f"{cost:.6g}, {spent:.2f} s" if np.isfinite(cost) else "fails" for cost, spent in runs]
-        print(ROW.format(path.stem, f"{value:.9g}", f"{gap:.1e}", f"{seconds:.2f}", f"{seconds / of_F:.2f}", *cells), flush=True)
+        print(
+            ROW.format(path.stem, f"{value:.9g}", f"{gap:.1e}", f"{seconds:.2f}", f"{seconds / of_F:.2f}", *cells),
+            flush=True,
+        )
 
 
 if __name__ == "__main__":
