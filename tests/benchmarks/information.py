@@ -3,7 +3,8 @@
     python tests/benchmarks/information.py [FILE ..]
 
 Ours is the least of five runs, with a solve of F between. GTSAM goes by Levenberg-Marquardt from the file's estimate,
-and once more from its own initialisation (LAGO, chordal). Its cost is the residual's logarithm in SE(d), which is not chi2 to the last digit.
+and once more from its own initialisation (LAGO, chordal). Its cost is the residual's logarithm in SE(d), which is not
+chi2 to the last digit.
 """
 
 from __future__ import annotations

@@ -70,10 +70,10 @@ def test_without_large_residuals_it_is_least_squares() -> None:
 
 
 def test_soc_and_a_cvxpy_model_find_the_same_minimum() -> None:
-    problem = PGOProblem(spoiled(3))
+    problem = PGOProblem(spoiled(3, 5))
     thresholds = chi2_thresholds(problem)
     newton = run(IRLS(tolerance=1e-14), problem).state.objective
-    soc = SOC(penalty=MultiplierPenalty(max_refreshes=0), tolerance=1e-7)
+    soc = SOC(penalty=MultiplierPenalty(max_refreshes=0), tolerance=1e-6)
     by_weights = run(IRLS(inner=soc, inner_steps=soc.max_iterations), problem)
     model = run(ExtendedSOC(huber_change(np.arange(problem.graph.num_edges), thresholds), soc=soc), problem)
     for poses in (by_weights.poses, model.poses):
