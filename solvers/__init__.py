@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from solvers.baselines.gauss_seidel import GaussSeidel
 from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
 from solvers.distributed.checkpoint import Checkpoint
+from solvers.growing import extend
 from solvers.loop import Method, Solver, iterate, run
 from solvers.network.engine import InProcess
 from solvers.network.faults import Faults
@@ -19,6 +20,7 @@ from solvers.result import History, Measurement, Record, Run, Stage, Status
 from solvers.riemannian.newton import Newton, gauss_newton
 from solvers.riemannian.staircase import Staircase
 from solvers.robust.gnc import GNC, RobustLoss
+from solvers.robust.irls import IRLS
 from solvers.soc.anderson import Anderson
 from solvers.soc.paper import PaperSOC
 from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty, MultiplierPenalty
@@ -51,6 +53,7 @@ _LATER = {
 
 __all__ = [
     "GNC",
+    "IRLS",
     "SOC",
     "AlternatingBregman",
     "Anderson",
@@ -89,6 +92,7 @@ __all__ = [
     "compare_methods",
     "draw_paper_figures",
     "error_forgetting",
+    "extend",
     "gauss_newton",
     "iterate",
     "noise_sweep",

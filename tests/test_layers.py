@@ -41,6 +41,7 @@ ORDER = {
         "frames",
         "robust_solve",
         "pipeline",
+        "growing",
         "shell",
         "studies",
         "cli_inputs",
