@@ -32,8 +32,9 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
 from pgo_models.problem.weighting import Weighting, edge_weights
 from solvers.result import Measurement, Status
+from solvers.robust.consistency import odometry
 
-_LEFT_OUT = 1e-4  # weight under which an edge is left out where there are as many as poses: its fill-in costs
+_LEFT_OUT = 1e-2  # weight under which an edge is left out where there are as many as poses: its fill-in costs
 _HARD = 1e3  # mu from which on weights are 0 and 1
 _NEARLY_STATIONARY = 1e-2  # relative decrement at which the poses follow the weights well enough
 _LARGEST_SCALE = 2.5  # of the quantile 0.99: then 1 - quantile is about 1e-6
@@ -140,6 +141,8 @@ class GNC:
         Factor on mu.
     inner_steps : int
         Most Newton steps for one set of weights.
+    consistent : bool
+        Whether loop closures that `pairwise_consistent` leaves out are rejected before.
     tolerance : float
         On the relative decrement of the last weighted cost.
     max_iterations : int
@@ -159,6 +162,7 @@ class GNC:
     known: BoolArray | None = None
     growth: float = 2.0
     inner_steps: int = 1
+    consistent: bool = False
     tolerance: float = 1e-6
     max_iterations: int = 300
 
@@ -240,11 +244,7 @@ class GNC:
 
     def known_inliers(self, graph: PoseGraph) -> BoolArray:
         """Edges that are right, (m,)."""
-        if self.known is None:
-            return odometry(graph) | graph.is_prior
-        if np.shape(self.known) != (graph.num_edges,):
-            raise SettingError(f"known has shape {np.shape(self.known)}; {graph.name} has {graph.num_edges} edges")
-        return np.asarray(self.known, dtype=bool)
+        return known_inliers(graph, self.known)
 
     def _cost(self, state: GNCState) -> float:
         loss = np.where(state.known, state.ratio, self.loss.values(state.ratio))
@@ -283,10 +283,15 @@ class GNC:
         return replace(scaled, undecided=1.0, mu=mu)
 
 
-def odometry(graph: PoseGraph) -> BoolArray:
-    """Edges between poses of one robot whose ids are neighbours, (m,)."""
-    ids, robots = graph.pose_ids, graph.robots
-    return np.asarray((np.abs(ids[graph.i] - ids[graph.j]) == 1) & (robots[graph.i] == robots[graph.j]))
+def known_inliers(graph: PoseGraph, known: BoolArray | None) -> BoolArray:
+    """Edges that are right, (m,): those given, else odometry and priors."""
+    if known is None:
+        return odometry(graph) | graph.is_prior
+    if np.shape(known) != (graph.num_edges,):
+        raise SettingError(
+            f"known has shape {np.shape(known)}; {graph.name} has {graph.num_edges} edges, give one each"
+        )
+    return np.asarray(known, dtype=bool)
 
 
 def left_out(graph: PoseGraph, known: BoolArray) -> float:
