@@ -39,6 +39,7 @@ _HARD = 1e3  # mu from which on weights are 0 and 1
 _NEARLY_STATIONARY = 1e-2  # relative decrement at which the poses follow the weights well enough
 _LARGEST_SCALE = 2.5  # of the quantile 0.99: then 1 - quantile is about 1e-6
 _LEAST_SCALE = 1e-12
+_AGAIN = 0.01  # mu, or its inverse, at most, from which edges beyond their thresholds may come back
 _SCALINGS, _SAME = 4, (0.5, 1.5)  # at most so many, and what counts as none
 
 
@@ -275,11 +276,14 @@ class GNC:
         usual = np.divide(*chdtri(problem.d + tangent_dimension(problem.d), [0.5, 1.0 - self.quantile]))
         now = float(np.median(state.thresholds / chi2_thresholds(problem, self.quantile)))
         scale = min(self.spread * float(np.median(state.ratio[free])) / usual, _LARGEST_SCALE / now)
+        left = state.rescaled - 1
         if _SAME[0] < scale < _SAME[1] or scale * now < _LEAST_SCALE:
-            return replace(state, rescaled=0)
-        ratio = state.ratio / scale
-        mu = self._first_control(ratio[free])
-        scaled = replace(state, thresholds=scale * state.thresholds, ratio=ratio, rescaled=state.rescaled - 1)
+            if state.rescaled < _SCALINGS:
+                return replace(state, rescaled=0)
+            scale, left = 1.0, 0
+        ratio, again = state.ratio / scale, 1.0 / _AGAIN if self.loss is RobustLoss.GEMAN_MCCLURE else _AGAIN
+        mu = (max if again > 1.0 else min)(self._first_control(ratio[free]), again)
+        scaled = replace(state, thresholds=scale * state.thresholds, ratio=ratio, rescaled=left)
         return replace(scaled, undecided=1.0, mu=mu)
 
 
