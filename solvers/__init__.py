@@ -19,6 +19,7 @@ from solvers.reporting.report import write_report
 from solvers.result import History, Measurement, Record, Run, Stage, Status
 from solvers.riemannian.newton import Newton, gauss_newton
 from solvers.riemannian.staircase import Staircase
+from solvers.robust.consistency import PCM, pairwise_consistent
 from solvers.robust.gnc import GNC, RobustLoss
 from solvers.robust.irls import IRLS
 from solvers.soc.anderson import Anderson
@@ -54,6 +55,7 @@ _LATER = {
 __all__ = [
     "GNC",
     "IRLS",
+    "PCM",
     "SOC",
     "AlternatingBregman",
     "Anderson",
@@ -96,6 +98,7 @@ __all__ = [
     "gauss_newton",
     "iterate",
     "noise_sweep",
+    "pairwise_consistent",
     "reproduce_tables",
     "run",
     "solve",

@@ -33,8 +33,10 @@ from pgo_models.graphs.trajectories import write_tum
 from pgo_models.problem.marginals import write_covariances
 from solvers.cli_inputs import estimated_poses, load_graph, pose_named, pose_problem, with_times
 from solvers.cli_options import (
+    ROBUST,
     BackEndName,
     FirstStage,
+    Robust,
     Runner,
     Scene,
     Split,
@@ -47,7 +49,7 @@ from solvers.cli_options import (
     chosen_start,
 )
 from solvers.distributed.checkpoint import Checkpoint
-from solvers.explanations import explained_by_its_graph, hint_of_chi2, warn_of_weights
+from solvers.explanations import explained_by_its_graph, hint_of_chi2, warn_of_weights, with_places
 from solvers.pipeline import HANDOVER, solve
 from solvers.reporting.graph_facts import describe_graph
 from solvers.reporting.report import check_report, write_report
@@ -188,6 +190,13 @@ def solve_command(
             help="Write poses' covariances as .csv: id, upper triangle; x y (z) in world axes, m, then turn, rad."
         ),
     ] = None,
+    robust: Annotated[
+        Robust | None,
+        typer.Option(
+            help="Find wrong edges and leave them out, odometry taken to be right: graduated non-convexity with "
+            "truncated least squares (gnc) or Geman-McClure (gm), pairwise consistency (pcm), or both (pcm-gnc)."
+        ),
+    ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print a line an iteration.")] = False,
 ) -> None:
     """Solve a pose graph: poses, their cost, a proven lower bound on the global optimum, and the gap."""
@@ -203,6 +212,8 @@ def solve_command(
         check_target(path, problem.graph.num_robots)
     for other in filter(None, (report, resume, covariances)):
         check_writable(other)
+    if robust is not None and method is not None and method is not FirstStage.NEWTON:
+        raise SettingError(f"--robust goes from its own start straight to Newton, got --method {method.value}")
     about_robots = (robots, split, engine, address, resume, driver_memory)
     is_shared = any(option is not None for option in about_robots)
     chosen = chosen_method(method, robots, is_shared)
@@ -222,6 +233,7 @@ def solve_command(
         problem,
         chosen_pipeline(chosen, shared, r_step, gap, max_iterations, tolerance, driver_memory),
         chosen_start(problem, start),
+        robust=ROBUST[robust] if robust is not None else None,
         robots=shared if on_robots else None,
         engine=runs_on if on_robots else None,
         checkpoint=Checkpoint(resume) if resume is not None else None,
@@ -230,6 +242,7 @@ def solve_command(
         verbose=verbose,
         progress=sys.stderr.isatty(),
     )
+    solution = with_places(solution, graph)
     text, truth = str(solution), problem.graph.truth
     if truth is not None:
         bodies = problem.graph.bodies
@@ -244,7 +257,8 @@ def solve_command(
             solution = replace(solution, covariances=solution.marginals() if report is not None else None)
     if report is not None:
         options = {"--unit-weights": unit_weights, "--information": information, "--skip-unknown": skip_unknown}
-        source = shlex.join([graph, *(name for name, given in options.items() if given)])
+        chosen_robust = ["--robust", robust.value] if robust is not None else []
+        source = shlex.join([graph, *(name for name, given in options.items() if given), *chosen_robust])
         targets.append((report, partial(write_report, solution, source=source)))
     save_then_show(targets, lambda: typer.echo("\n\n".join([text, *hint_of_chi2(problem, solution.poses)])))
     warn_of_weights(graph, problem, solution.certificate)

@@ -22,6 +22,8 @@ from solvers.network.engine import Engine, InProcess
 from solvers.network.ray_engine import RayEngine
 from solvers.pipeline import HANDOVER, Pipeline
 from solvers.riemannian.newton import gauss_newton
+from solvers.robust.consistency import PCM
+from solvers.robust.gnc import GNC, RobustLoss
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
@@ -65,6 +67,23 @@ class Split(enum.Enum):
     CONTIGUOUS = "contiguous"
     METIS = "metis"
     SINGLETONS = "singletons"
+
+
+class Robust(enum.Enum):
+    """How wrong edges are found."""
+
+    GNC = "gnc"
+    GM = "gm"
+    PCM = "pcm"
+    PCM_GNC = "pcm-gnc"
+
+
+ROBUST: dict[Robust, GNC | PCM] = {
+    Robust.GNC: GNC(),
+    Robust.GM: GNC(loss=RobustLoss.GEMAN_MCCLURE),
+    Robust.PCM: PCM(),
+    Robust.PCM_GNC: GNC(consistent=True),
+}
 
 
 class Runner(enum.Enum):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import ParamSpec, TypeVar
 
 import numpy as np
@@ -20,6 +21,7 @@ from pgo_models.graphs.precisions import extreme_weight
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from solvers.solution import Solution
 
 WORTH_SAYING = 1.01  # times its minimum: what chi2 has to be for a hint
 P = ParamSpec("P")
@@ -74,6 +76,15 @@ def hint_of_chi2(problem: PGOProblem, poses: Poses) -> list[str]:
     if not here > WORTH_SAYING * below:
         return []
     return [f"the file's own cost: chi2 {here:.4g} here; its minimum is at most {below:.4g}: --information"]
+
+
+def with_places(solution: Solution, graph: str) -> Solution:
+    """The solution; a robust one with `file:line` of every edge of the graph that was asked for."""
+    if solution.robust is None:
+        return solution
+    with warnings.catch_warnings(action="ignore"):
+        places = tuple(edge_places(locate(graph)))
+    return replace(solution, robust=replace(solution.robust, places=places))
 
 
 def place_of_weight(graph: str) -> str:

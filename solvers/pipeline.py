@@ -43,6 +43,7 @@ from solvers.network.faults import Faults
 from solvers.result import OUT_OF_TIME, History, Record, Run, Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.staircase import DualBound, Staircase
+from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust_solve import solve_robustly
 from solvers.soc.paper import PaperSOC
@@ -117,7 +118,7 @@ def solve(
     pipeline: Pipeline | None = None,
     start: Poses | None = None,
     *,
-    robust: GNC | None = None,
+    robust: GNC | PCM | None = None,
     robots: Partition | int | None = None,
     engine: Engine | None = None,
     checkpoint: Checkpoint | None = None,
@@ -144,7 +145,7 @@ def solve(
         `Pipeline()` unless given.
     start : Poses, optional
         Instead of the method's own start.
-    robust : GNC, optional
+    robust : GNC or PCM, optional
         Find wrong edges and leave them out: `solvers.robust_solve`. The solution is then of the edges kept alone.
     robots : Partition or int, optional
         Robots that share the poses: start, SOC, Newton and certificate are run by them and a driver, each as if there
@@ -215,10 +216,9 @@ def solve(
     if robust is not None:
         if robots is not None:
             raise SettingError("robust estimation runs in one place; leave out the robots, or solve the edges it keeps")
-        few = replace(pipeline.newton, max_iterations=_FEW)
-        short = replace(pipeline, soc=None, newton=few, second_try=False, staircase=None)
+        few, short = replace(pipeline.newton, max_iterations=_FEW), replace(pipeline, soc=None, second_try=False)
         shown = partial(solve, anchor=anchor, callback=callback, verbose=verbose, progress=progress)
-        plain = partial(shown, pipeline=short)
+        plain = partial(shown, pipeline=replace(short, newton=few, staircase=None))
         return solve_robustly(problem, robust, pipeline.gap, start, watch, plain)
     job = _Job(problem, pipeline, watch)
     ledger = None

@@ -108,6 +108,7 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
     sections = [
         _header(solution),
         _verdict(solution),
+        *([] if solution.robust is None else [section("Wrong edges", facts(solution.robust.facts()))]),
         _next(solution, residuals, source),
         section("The graph", paragraph(_GRAPH_HINT, quiet=True), f'<div class="plot" id="{place}"></div>'),
     ]
@@ -189,17 +190,18 @@ def _verdict(solution: Solved) -> str:
         f'<div><span class="quiet">{label}</span><b>{html.escape(text)}</b></div>' for label, text in figures
     )
     name = certificate.verdict.name
+    given = "" if solution.robust is None else f" {solution.robust.conditional}"
     return (
         f'<section class="verdict {name}" id="verdict"><div class="word">{name.replace("_", " ")}</div>'
-        f'<p class="head">{html.escape(headline(certificate))}</p><div class="figures">{boxes}</div>'
+        f'<p class="head">{html.escape(headline(certificate) + given)}</p><div class="figures">{boxes}</div>'
         + "".join(paragraph(sentence) for sentence in meaning(certificate))
         + "</section>"
     )
 
 
 def _next(solution: Solved, residuals: EdgeResiduals, source: str | None) -> str:
-    items = []
-    for one in advice(solution.problem.graph, solution.certificate, solution.status, residuals, source):
+    items, is_robust = [], solution.robust is not None
+    for one in advice(solution.problem.graph, solution.certificate, solution.status, residuals, source, is_robust):
         command = f"<br><code>{html.escape(one.command)}</code>" if one.command else ""
         items.append(f"<li>{html.escape(one.text)}{command}</li>")
     return section("What to try next", f"<ol>{''.join(items)}</ol>")

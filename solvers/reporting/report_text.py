@@ -90,8 +90,12 @@ def advice(
     status: Status,
     residuals: EdgeResiduals,
     source: str | None = None,
+    is_robust: bool = False,
 ) -> list[Advice]:
-    """Return what to try next, most promising first; `source` is the graph in commands, its name unless given."""
+    """Return what to try next, most promising first; `source` is the graph in commands, its name unless given.
+
+    Of a robust solve, which has written a graph without the edges that it rejected, that graph is checked.
+    """
     file = graph.name if graph.name in known_datasets() else f"{graph.name}.g2o"
     name = source if source is not None else shlex.quote(file)
     solve = f"pgo solve {name}"
@@ -100,13 +104,15 @@ def advice(
         found.append(_unfinished(status, solve))
     if certificate.is_certified:
         found.append(Advice("Keep the poses, for example as g2o.", f"{solve} --out solved.g2o"))
-        found.append(Advice("Check them independently of this solve.", f"pgo certify {name} --estimate solved.g2o"))
+        judged = "solved.g2o" if is_robust else f"{name} --estimate solved.g2o"
+        found.append(Advice("Check them independently of this solve.", f"pgo certify {judged}"))
         if certificate.wanted_gap > _SMALL_GAP:
             found.append(Advice("Ask for a tighter proof.", f"{solve} --gap {_FINER_GAP:g}"))
     else:
         found += _uncertified(graph, certificate, solve)
+        found = [one for one in found if not (is_robust and "--robust gnc" in one.command.removeprefix(solve))]
     tested = fit(residuals, certificate.cost)
-    if residuals.is_doubtful:
+    if residuals.is_doubtful and not is_robust:
         text = f"{tested} Look for wrong measurements, which need not be the worst."
         found.append(Advice(text, f"{solve} --robust gnc"))
     elif certificate.is_certified:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.special import chdtri
 
@@ -16,9 +18,17 @@ Motions = tuple[Array, Array]  # R, (m, d, d), and t, (m, d)
 
 
 def odometry(graph: PoseGraph) -> BoolArray:
-    """Whether an edge joins a robot's pose with its next one, (m,)."""
-    robots = graph.robots
-    return np.asarray((np.abs(graph.i - graph.j) == 1) & (robots[graph.i] == robots[graph.j]))
+    """Whether an edge joins poses of one robot whose ids are neighbours, (m,)."""
+    ids, robots, is_posed = graph.pose_ids, graph.robots, ~graph.is_prior & ~np.isin(graph.j, graph.landmarks)
+    return np.asarray(is_posed & (np.abs(ids[graph.i] - ids[graph.j]) == 1) & (robots[graph.i] == robots[graph.j]))
+
+
+@dataclass(frozen=True, eq=False)
+class PCM:
+    """Settings of a robust solve by `pairwise_consistent` alone, which says what they are."""
+
+    known: BoolArray | None = None
+    quantile: float = 0.99
 
 
 def pairwise_consistent(graph: PoseGraph, known: BoolArray | None = None, quantile: float = 0.99) -> BoolArray:

@@ -32,12 +32,14 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
 from pgo_models.problem.weighting import Weighting
 from solvers.result import Measurement, Status
+from solvers.robust.consistency import odometry
 
-_LEFT_OUT = 1e-4  # weight under which an edge is left out where there are as many as poses: its fill-in costs
+_LEFT_OUT = 1e-2  # weight under which an edge is left out where there are as many as poses: its fill-in costs
 _HARD = 1e3  # mu from which on weights are 0 and 1
 _NEARLY_STATIONARY = 1e-2  # relative decrement at which the poses follow the weights well enough
 _LARGEST_SCALE = 2.5  # of the quantile 0.99: then 1 - quantile is about 1e-6
 _LEAST_SCALE = 1e-12
+_AGAIN = 0.01  # mu, or its inverse, at most, from which edges beyond their thresholds may come back
 _SCALINGS, _SAME = 4, (0.5, 1.5)  # at most so many, and what counts as none
 
 
@@ -140,6 +142,8 @@ class GNC:
         Factor on mu.
     inner_steps : int
         Most Newton steps for one set of weights.
+    consistent : bool
+        Whether loop closures that `pairwise_consistent` leaves out are rejected before.
     tolerance : float
         On the relative decrement of the last weighted cost.
     max_iterations : int
@@ -159,6 +163,7 @@ class GNC:
     known: BoolArray | None = None
     growth: float = 2.0
     inner_steps: int = 1
+    consistent: bool = False
     tolerance: float = 1e-6
     max_iterations: int = 300
 
@@ -240,11 +245,7 @@ class GNC:
 
     def known_inliers(self, graph: PoseGraph) -> BoolArray:
         """Edges that are right, (m,)."""
-        if self.known is None:
-            return odometry(graph) | graph.is_prior
-        if np.shape(self.known) != (graph.num_edges,):
-            raise SettingError(f"known has shape {np.shape(self.known)}; {graph.name} has {graph.num_edges} edges")
-        return np.asarray(self.known, dtype=bool)
+        return known_inliers(graph, self.known)
 
     def _cost(self, state: GNCState) -> float:
         loss = np.where(state.known, state.ratio, self.loss.values(state.ratio))
@@ -275,18 +276,26 @@ class GNC:
         usual = np.divide(*chdtri(problem.d + tangent_dimension(problem.d), [0.5, 1.0 - self.quantile]))
         now = float(np.median(state.thresholds / chi2_thresholds(problem, self.quantile)))
         scale = min(self.spread * float(np.median(state.ratio[free])) / usual, _LARGEST_SCALE / now)
+        left = state.rescaled - 1
         if _SAME[0] < scale < _SAME[1] or scale * now < _LEAST_SCALE:
-            return replace(state, rescaled=0)
-        ratio = state.ratio / scale
-        mu = self._first_control(ratio[free])
-        scaled = replace(state, thresholds=scale * state.thresholds, ratio=ratio, rescaled=state.rescaled - 1)
+            if state.rescaled < _SCALINGS:
+                return replace(state, rescaled=0)
+            scale, left = 1.0, 0
+        ratio, again = state.ratio / scale, 1.0 / _AGAIN if self.loss is RobustLoss.GEMAN_MCCLURE else _AGAIN
+        mu = (max if again > 1.0 else min)(self._first_control(ratio[free]), again)
+        scaled = replace(state, thresholds=scale * state.thresholds, ratio=ratio, rescaled=left)
         return replace(scaled, undecided=1.0, mu=mu)
 
 
-def odometry(graph: PoseGraph) -> BoolArray:
-    """Edges between poses of one robot whose ids are neighbours, (m,)."""
-    ids, robots = graph.pose_ids, graph.robots
-    return np.asarray((np.abs(ids[graph.i] - ids[graph.j]) == 1) & (robots[graph.i] == robots[graph.j]))
+def known_inliers(graph: PoseGraph, known: BoolArray | None) -> BoolArray:
+    """Edges that are right, (m,): those given, else odometry and priors."""
+    if known is None:
+        return odometry(graph) | graph.is_prior
+    if np.shape(known) != (graph.num_edges,):
+        raise SettingError(
+            f"known has shape {np.shape(known)}; {graph.name} has {graph.num_edges} edges, give one each"
+        )
+    return np.asarray(known, dtype=bool)
 
 
 def left_out(graph: PoseGraph, known: BoolArray) -> float:

@@ -104,7 +104,8 @@ class Rejection:
         tried = "; ".join(
             f"{one.name}: {one.rejected} rejected, cost {one.cost:.6g}, gap {one.gap:.1e}" for one in self.attempts
         )
-        rows = [("given", self.conditional), ("rejected", self.named(self.rejected))]
+        gone = f"{self.named(self.rejected)}{'; written files are without them' if self.rejected.any() else ''}"
+        rows = [("given", self.conditional), ("rejected", gone)]
         rows += [("doubtful", self.named(self.doubtful)), ("found by", self.start)]
         rows += [("attempts", tried)] if len(self.attempts) > 1 else []
         return rows + ([("warning", self.warning)] if self.warning else [])
