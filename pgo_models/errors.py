@@ -7,13 +7,7 @@ from pathlib import Path
 
 
 class PGOError(Exception):
-    """Root of every error that a wrong input or a missing piece raises here.
-
-    Examples
-    --------
-    >>> issubclass(GraphError, PGOError), issubclass(SettingError, PGOError)
-    (True, True)
-    """
+    """Root of every error that a wrong input or a missing piece raises here."""
 
 
 class GraphError(PGOError):

@@ -24,13 +24,6 @@ class Method(Protocol[P, X, S]):
     """What the loop needs of an iterative method: settings, and these functions of them.
 
     P is the kind of problem, X what a run can be started from, S the method's state.
-
-    Examples
-    --------
-    >>> from solvers.riemannian.newton import Newton
-    >>> method: Method = Newton(max_iterations=7)
-    >>> method.max_iterations
-    7
     """
 
     @property
@@ -51,18 +44,7 @@ class Method(Protocol[P, X, S]):
 
 
 class Solver(Method[PGOProblem, Poses, S], Protocol[S]):
-    """A method for pose graphs: every state stands for feasible poses.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers.riemannian.newton import Newton
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> solver: Solver = Newton()
-    >>> solver.poses(problem, solver.init(problem, None))
-    Poses(n=27, d=3)
-    """
+    """A method for pose graphs: every state stands for feasible poses."""
 
     def poses(self, problem: PGOProblem, state: S) -> Poses:
         """Feasible poses of a state, those whose F `measure` reports."""

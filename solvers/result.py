@@ -51,11 +51,6 @@ class Measurement:
         are. The best iterate of a run has the least infeasibility, and among those the least objective.
     rounds, num_bytes, all_reduces : int, optional
         Communication so far, of methods that run by many robots.
-
-    Examples
-    --------
-    >>> Measurement(objective=2.5, primal_residual=0.1, dual_residual=0.2).infeasibility
-    0.0
     """
 
     objective: float
@@ -69,13 +64,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Record:
-    """One row of a history: iterate k, seconds spent in steps up to it, and its figures.
-
-    Examples
-    --------
-    >>> Record(k=3, seconds=0.5, measurement=Measurement(2.5, 0.1, 0.2)).k
-    3
-    """
+    """One row of a history: iterate k, seconds spent in steps up to it, and its figures."""
 
     k: int
     seconds: float
@@ -84,14 +73,7 @@ class Record:
 
 @dataclass(frozen=True)
 class History:
-    """Records of all measured iterates, in order.
-
-    Examples
-    --------
-    >>> records = tuple(Record(k, 0.1 * k, Measurement(2.0 + 0.5**k, 0.0, 0.0)) for k in range(3))
-    >>> History(records).objective
-    array([3.  , 2.5 , 2.25])
-    """
+    """Records of all measured iterates, in order."""
 
     records: tuple[Record, ...] = ()
 
@@ -170,11 +152,6 @@ class Run(Outcome[S]):
     ----------
     poses : Poses
         Of the last iterate, or of the best one (lowest F) when the run did not succeed; `objective` is F of them.
-
-    Examples
-    --------
-    >>> Run("SOC", 2.5, None, Status.CONVERGED, 7, History(), 0.25, Poses.identity(4, 3)).poses
-    Poses(n=4, d=3)
     """
 
     poses: Poses
@@ -194,12 +171,6 @@ class Stage:
     history : History
     method : object
         The method that ran, which is its settings; None for a start.
-
-    Examples
-    --------
-    >>> run = Run("SOC", 2.5, None, Status.CONVERGED, 7, History(), 0.25, Poses.identity(4, 3))
-    >>> Stage.of(run).name
-    'SOC'
     """
 
     name: str

@@ -68,11 +68,6 @@ def total_variation_scale_space(noisy: Array) -> BregmanProblem:
 
     They begin over-smoothed and take detail back, large contrasts first and noise last: stop when
     ||u - noisy|| falls below the norm of the noise (Osher et al. 2005).
-
-    Examples
-    --------
-    >>> total_variation_scale_space(np.zeros((3, 4)))
-    BregmanProblem(m=12, s=12, blocks=1)
     """
     noisy = finite_array(noisy, "noisy")
     u = cp.Variable(noisy.shape, name="u")

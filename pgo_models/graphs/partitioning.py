@@ -37,14 +37,6 @@ class Partition(ReadOnly):
     ------
     SettingError
         When `robot` does not number the robots so.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> halves = Partition(np.arange(27) // 14, PartitionMethod.CONTIGUOUS)
-    >>> halves.sizes, len(halves.separators(graph))
-    (array([14, 13]), 18)
     """
 
     robot: IntArray

@@ -66,13 +66,7 @@ class PublishedRow:
 
 
 def published_rows() -> tuple[PublishedRow, ...]:
-    """Return the rows of the paper's tables, in its order.
-
-    Examples
-    --------
-    >>> [row.name for row in published_rows()]
-    ['circle', 'grid', 'sphere', 'parking-garage', 'cubicle', 'torus3D', 'rim']
-    """
+    """Return the rows of the paper's tables, in its order."""
     rows = []
     for name, row in _paper_tables().items():
         if isinstance(row, dict):
@@ -87,12 +81,6 @@ def published_run(graph: PoseGraph) -> PublishedRun | None:
     """Return what the paper reports for a graph of this name and size; None where it reports nothing.
 
     Its scenes (circle, grid, sphere) were drawn anew here, with other noise of the same size: compare gaps, not costs.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.datasets import load
-    >>> published_run(load("sphere")).iterations
-    38
     """
     row = _paper_tables().get(graph.name)
     if isinstance(row, dict) and (row["poses"], row["measurements"]) == (graph.num_poses, graph.num_edges):

@@ -102,20 +102,6 @@ def report_partition(partition: Partition, graph: PoseGraph) -> PartitionReport:
     ------
     SettingError
         When the partition is of another number of poses.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from pgo_models.graphs.partitioning import partition
-    >>> graph = grid(np.random.default_rng(0))
-    >>> print(report_partition(partition(graph, 3), graph))
-    robots       3
-    poses each   9 to 9 (largest over mean 1)
-    cut edges    36 of 108 (33.3 %)
-    separators   27 (9 to 9 a robot)
-    vertex cover 9
-    copies       36
     """
     cut = partition.cut_edges(graph)
     robot, i, j = partition.robot, graph.i[cut], graph.j[cut]

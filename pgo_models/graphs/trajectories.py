@@ -119,14 +119,6 @@ def read_kitti(path: Path | str, d: int = 3) -> Poses:
     FileFormatError
         With file:line, for a row that is not 12 finite numbers, a matrix that is no rotation even to three digits, a
         position beyond `FARTHEST`, or, with d = 2, a pose out of the plane.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> path = Path(tempfile.mkdtemp()) / "poses.kitti"
-    >>> write_kitti(Poses.identity(2, 2), path)
-    >>> read_kitti(path, d=2)
-    Poses(n=2, d=2)
     """
     rows, lines = read_table(path, 12)
     matrices = rows.reshape(-1, 3, 4)

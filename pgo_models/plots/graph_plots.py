@@ -159,15 +159,6 @@ def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = Non
     ------
     GraphError
         When there is no truth, or the sizes differ.
-
-    Examples
-    --------
-    >>> from pgo_models.problem.initialization import spanning_tree_start
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> figure = plot_against_truth(graph, spanning_tree_start(graph))
-    >>> [axes.get_ylabel() for axes in figure.axes]
-    ['y (m)', 'position (m)', 'rotation (deg)']
     """
     if truth is None:
         truth = graph.truth

@@ -38,16 +38,6 @@ def smallest_eigenvalues(problem: PGOProblem, Lambda: Array, count: int = 12) ->
     ------
     SettingError
         When count is not 1 to d n.
-
-    Examples
-    --------
-    >>> from pgo_models.certificates.certificate import certify
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> certificate = certify(problem, problem.graph.truth)
-    >>> smallest = smallest_eigenvalues(problem, certificate.Lambda, 4)
-    >>> bool(np.abs(smallest[:3]).max() < 1e-6 < smallest[3])
-    True
     """
     side = problem.num_poses * problem.d
     if not 1 <= count <= side:
@@ -67,14 +57,6 @@ def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12
 
     Eigenvalues stand on a logarithmic axis, negative ones as vermilion triangles. The shaded band, where the
     proof needs an eta, is what that leaves open, |lambda| <= eta.
-
-    Examples
-    --------
-    >>> from pgo_models.certificates.certificate import certify
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> plot_spectrum(problem, certify(problem, problem.graph.truth)).axes[0].get_xlabel()
-    'k-th smallest eigenvalue of S'
     """
     eigenvalues = smallest_eigenvalues(problem, certificate.Lambda, count)
     k, negative = np.arange(1, count + 1), eigenvalues < 0

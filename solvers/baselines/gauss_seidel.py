@@ -98,15 +98,6 @@ class GaussSeidel:
         On the change of a sweep; it ends a stage.
     max_iterations : int
         Sweeps of all stages together.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers.loop import run
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> result = run(GaussSeidel(robots=partition(problem.graph, 3)), problem)
-    >>> result.status.name, result.state.stage.name
-    ('CONVERGED', 'POSES')
     """
 
     robots: Partition | None = None

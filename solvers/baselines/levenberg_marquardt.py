@@ -63,15 +63,6 @@ class LevenbergMarquardt:
         Refused steps count.
     damping : float
         First mu, relative to the diagonal of the Gauss-Newton matrix.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers.loop import run
-    >>> graph = grid(np.random.default_rng(0))
-    >>> run(LevenbergMarquardt(), PGOProblem(graph), graph.initial).status.name
-    'CONVERGED'
     """
 
     tolerance: float = STATIONARY_DECREMENT

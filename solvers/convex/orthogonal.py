@@ -74,14 +74,6 @@ class OrthogonalSOC:
         projection: the largest eigenvalue of the multiplier Lambda. Near 1 the recursion may cycle.
     tolerance : float
         On the primal and the dual residual, both relative.
-
-    Examples
-    --------
-    >>> from pgo_models.convex.orthogonality_examples import procrustes
-    >>> from solvers.loop import run
-    >>> problem = procrustes(np.eye(3), np.eye(3), rotation=True)
-    >>> run(OrthogonalSOC(), problem, problem.point([np.eye(3)])).status.name
-    'CONVERGED'
     """
 
     penalty: float | None = None

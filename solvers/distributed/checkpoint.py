@@ -65,11 +65,6 @@ class Checkpoint:
     path : Path or str
     rounds : int
         A checkpoint is written when SOC and when Newton begins, and after so many rounds of communication.
-
-    Examples
-    --------
-    >>> Checkpoint("run.ckpt").rounds
-    10
     """
 
     path: Path | str

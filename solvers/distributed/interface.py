@@ -135,13 +135,7 @@ class InterfaceFactor:
 
 
 def by_separator(count: int, widths: tuple[int, ...]) -> IntArray:
-    """Unknowns of `count` separators, stacked field by field, in the order separator by separator.
-
-    Examples
-    --------
-    >>> by_separator(2, (1, 2))
-    array([0, 2, 3, 1, 4, 5])
-    """
+    """Unknowns of `count` separators, stacked field by field, in the order separator by separator."""
     fields, first = [], 0
     for width in widths:
         fields.append(first + width * np.arange(count)[:, None] + np.arange(width))

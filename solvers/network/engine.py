@@ -40,15 +40,6 @@ class InProcess:
     ----------
     threads : int
         The factorisations of some back ends hold Python's lock: expect little of more than one.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models import grid
-    >>> from solvers.pipeline import solve
-    >>> solution = solve(grid(np.random.default_rng(0)), robots=3, engine=InProcess(threads=2))
-    >>> solution.is_certified, solution.ledger.num_robots
-    (True, 3)
     """
 
     threads: int = 1

@@ -68,11 +68,6 @@ class RayEngine:
         Most robots that share a CPU; as few as the CPUs allow do. Every robot is a process of 100 MB and more.
     patience : float
         Seconds to wait for robots to start.
-
-    Examples
-    --------
-    >>> RayEngine(num_cpus=2).robots_per_cpu
-    25
     """
 
     address: str | None = None

@@ -93,15 +93,6 @@ class Staircase:
         Relative gap between f and the bound that is proven at the end.
     max_inner_iterations : int
         Conjugate-gradient iterations of one trust-region step.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers.loop import run
-    >>> result = run(Staircase(), PGOProblem(grid(np.random.default_rng(0))))
-    >>> result.status.name, result.state.point.rank, bool(result.objective - result.state.bound.lower_bound < 1e-4)
-    ('CONVERGED', 3, True)
     """
 
     tolerance: float = STATIONARY_DECREMENT

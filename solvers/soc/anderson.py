@@ -37,11 +37,6 @@ class Anderson:
     per_robot : bool
         Every robot extrapolates its own rows with its own inner products, and nothing is summed over the robots.
         Otherwise each round has one all-reduce, of the products of the newest difference with all others.
-
-    Examples
-    --------
-    >>> Anderson(memory=5)
-    Anderson(memory=5, regularization=1e-12, restart_ratio=2.0, per_robot=False)
     """
 
     memory: int = 60

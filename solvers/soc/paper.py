@@ -85,13 +85,6 @@ class PaperSOC:
     tolerance : float
         On the paper's KKT residual, the root mean square over poses of ||omega_i^T omega_i - I||^2 +
         ||omega_i - R_i||^2, and on the gradient of the Lagrangian, over the scale of L.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers.loop import run
-    >>> run(PaperSOC(tolerance=1e-3), PGOProblem(grid(np.random.default_rng(0)))).status.name
-    'CONVERGED'
     """
 
     robots: Partition | None = None

@@ -74,15 +74,6 @@ class MultiplierPenalty(_Rule):
     ----------
     stall_window, stall_ratio : int, float
         Stalled: the residual of the last `stall_window` iterations has not fallen below `stall_ratio` of what it was.
-
-    Examples
-    --------
-    >>> from pgo_models.problem.initialization import chordal_start
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> rho = MultiplierPenalty(factor=8.0).initial(problem, chordal_start(problem))
-    >>> rho.shape, bool(rho.min() > 0)
-    ((27,), True)
     """
 
     factor: float = 8.0
@@ -111,15 +102,7 @@ class MultiplierPenalty(_Rule):
 
 @dataclass(frozen=True)
 class FixedPenalty(_Rule):
-    """rho_i = rho for all poses, unless the safeguard of `solvers.soc.soc` raises it.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> FixedPenalty(2.0).initial(problem, problem.graph.truth)[:3]
-    array([2., 2., 2.])
-    """
+    """rho_i = rho for all poses, unless the safeguard of `solvers.soc.soc` raises it."""
 
     rho: float
 
@@ -143,11 +126,6 @@ class BalancedPenalty(_Rule):
     This is not the rule of Boyd et al. 2011, which is `BoydPenalty`: its dual residual has the factor rho, and so the
     unit of the weights. Here both are lengths of rotations: ||R - omega|| and, without rho, ||omega - omega_last||.
     They seldom differ by `refactor_ratio`^2; on the paper's scenes rho stays where it starts.
-
-    Examples
-    --------
-    >>> BalancedPenalty().factor(primal_residual=1.0, dual_residual=1e-3)
-    5.0
     """
 
     scale: float = 0.3
@@ -184,12 +162,6 @@ class BoydPenalty(_Rule):
         First rho over the mean of m_i; Boyd gives none, and the paper neither.
     imbalance, growth : float
         Boyd's mu and tau.
-
-    Examples
-    --------
-    >>> rule = BoydPenalty()
-    >>> [rule.factor(primal, 1.0) for primal in (10.5, 9.5, 0.05)]
-    [2.0, 1.0, 0.5]
     """
 
     scale: float = 1.0

@@ -156,13 +156,6 @@ class SOC(SOCSettings):
     ------
     SettingError
         When a setting is out of its range or does not go with the coupling.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers.loop import run
-    >>> run(SOC(tolerance=1e-4), PGOProblem(grid(np.random.default_rng(0)))).status.name
-    'CONVERGED'
     """
 
     @property
