@@ -22,7 +22,9 @@ def label(value: object) -> str:
 def test_a_public_function_has_an_example(package: ModuleType, name: str) -> None:
     thing = getattr(package, name)
     assert inspect.isclass(thing) or inspect.isfunction(thing)
-    assert inspect.isclass(thing) or ">>> " in (inspect.getdoc(thing) or ""), f"{thing.__module__}.{name} shows no example"
+    assert inspect.isclass(thing) or ">>> " in (inspect.getdoc(thing) or ""), (
+        f"{thing.__module__}.{name} shows no example"
+    )
 
 
 @pytest.mark.parametrize("package", PACKAGES, ids=label)
