@@ -118,7 +118,6 @@ class Outcome(Generic[S]):
         Of `state`.
     state : S
         The last iterate, or the best one when the run did not succeed.
-    status : Status
     iterations : int
         Finished steps.
     history : History
@@ -159,19 +158,7 @@ class Run(Outcome[S]):
 
 @dataclass(frozen=True)
 class Stage:
-    """What one stage of a solve did.
-
-    Attributes
-    ----------
-    name : str
-    status : Status
-    iterations : int
-    objective : float
-    seconds : float
-    history : History
-    method : object
-        The method that ran, which is its settings; None for a start.
-    """
+    """What one stage of a solve did."""
 
     name: str
     status: Status
@@ -179,7 +166,7 @@ class Stage:
     objective: float
     seconds: float
     history: History
-    method: object = None
+    method: object = None  # the method that ran, which is its settings; None for a start
 
     @classmethod
     def of(cls, run: Run[S]) -> Stage:

@@ -110,23 +110,15 @@ Changer = Callable[[PoseVariables], ModelChange]
 
 @dataclass(frozen=True, eq=False)
 class GraphQP:
-    """A compiled R-subproblem on the poses of a graph.
-
-    Attributes
-    ----------
-    qp : RotationQP
-        The cvxpy problem and its Parameter.
-    A, w
-        Residuals and weights of the edges that count, in the rows of X.
-    between : sparse (N_a, N)
-        A_a^T diag(w) A on the frozen neighbours' rows of the whole graph; empty unless FROZEN.
-    """
+    """A compiled R-subproblem on the poses of a graph."""
 
     variables: PoseVariables
-    qp: RotationQP
+    qp: RotationQP  # the cvxpy problem and its Parameter
     change: ModelChange
+    # A, w: residuals and weights of the edges that count, in the rows of X.
     A: csr_array
     w: Array
+    # Sparse (N_a, N): A_a^T diag(w) A on the frozen neighbours' rows of the whole graph; empty unless FROZEN.
     between: csr_array
 
     def solve(self, V: Array, neighbours: Array | None = None) -> Array:

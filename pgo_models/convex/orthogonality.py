@@ -262,24 +262,13 @@ class SplitProblem:
 
 @dataclass(frozen=True, eq=False)
 class KKTResiduals:
-    """How far a point is from satisfying the KKT conditions of the non-convex problem.
+    """How far a point is from satisfying the KKT conditions of the non-convex problem."""
 
-    Attributes
-    ----------
-    feasibility : float
-        Norm of the violation of X^T X = I, of the convex constraints, and of the agreement of a variable's copies.
-    stationarity : float
-        rho ||X - Z||_F, see `kkt_residuals`.
-    gradient_norm : float
-        Norm of the subgradient of J that the multipliers balance: the scale of `stationarity`.
-    multipliers : tuple of arrays
-        For X^T X = I the symmetric Lambda, (p, p), with X Lambda in the subdifferential of J; for the other sets the
-        normal vector itself, minus.
-    """
-
-    feasibility: float
-    stationarity: float
-    gradient_norm: float
+    feasibility: float  # norm of the violation of all constraints, and of the agreement of a variable's copies
+    stationarity: float  # rho ||X - Z||_F, see `kkt_residuals`
+    gradient_norm: float  # of the subgradient of J that the multipliers balance: the scale of `stationarity`
+    # For X^T X = I the symmetric Lambda, (p, p), with X Lambda in the subdifferential of J; for the other sets the
+    # normal vector itself, minus.
     multipliers: tuple[Array, ...]
 
 

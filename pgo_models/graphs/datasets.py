@@ -27,22 +27,13 @@ _TIMEOUT = 30.0  # seconds without an answer
 
 @dataclass(frozen=True)
 class Registry:
-    """A public folder of g2o files with their checksums.
+    """A public folder of g2o files with their checksums."""
 
-    Attributes
-    ----------
-    base_url : str
-        The file of a name is at `base_url/name.g2o`.
-    checksums : mapping of str to str
-        `sha256:` and the digest of the file, or `blob:` and its git blob id, the SHA-1 of "blob <size>", a zero byte
-        and the file.
-    cache : Path, optional
-        Folder for downloads; the user's cache unless given.
-    """
-
-    base_url: str
+    base_url: str  # the file of a name is at `base_url/name.g2o`
+    # `sha256:` and the digest of the file, or `blob:` and its git blob id: the SHA-1 of "blob <size>", a zero byte and
+    # the file.
     checksums: Mapping[str, str]
-    cache: Path | None = None
+    cache: Path | None = None  # folder for downloads; the user's cache unless given
 
 
 SE_SYNC = Registry(

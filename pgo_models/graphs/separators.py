@@ -47,29 +47,15 @@ def vertex_cover(partition: Partition, graph: PoseGraph) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class PartitionReport:
-    """What a partition costs.
-
-    Attributes
-    ----------
-    num_robots : int
-    sizes : (num_robots,)
-        Poses of every robot.
-    num_cut_edges, num_edges : int
-    separators : (num_robots,)
-        Poses of every robot that have an edge to another.
-    cover : int
-        Poses of the vertex cover: what the driver of the substructured coupling solves for.
-    copies : int
-        Copies of separator poses that robots hold of others' poses.
-    """
+    """What a partition costs."""
 
     num_robots: int
-    sizes: IntArray
+    sizes: IntArray  # (num_robots,): poses of every robot
     num_cut_edges: int
     num_edges: int
-    separators: IntArray
-    cover: int
-    copies: int
+    separators: IntArray  # (num_robots,): poses of every robot that have an edge to another
+    cover: int  # poses of the vertex cover: what the driver of the substructured coupling solves for
+    copies: int  # copies of separator poses that robots hold of others' poses
 
     @property
     def balance(self) -> float:

@@ -62,7 +62,6 @@ class Checkpoint:
 
     Attributes
     ----------
-    path : Path or str
     rounds : int
         A checkpoint is written when SOC and when Newton begins, and after so many rounds of communication.
     """

@@ -47,23 +47,13 @@ A = TypeVar("A")
 
 @dataclass(frozen=True, eq=False)
 class CoverPoses:
-    """What the driver knows of the poses that it and the robots hold.
+    """What the driver knows of the g poses of the cover, which it and the robots hold."""
 
-    Attributes
-    ----------
-    R, t : (g, d, d), (g, d)
-        Poses of the cover.
-    force : ((d+1) g, d)
-        Rows of M X there.
-    objective, rounding_level : float
-        F of all poses, and below what it could not be told from zero.
-    """
-
-    R: Array
-    t: Array
-    force: Array
-    objective: float = math.nan
-    rounding_level: float = 0.0
+    R: Array  # (g, d, d)
+    t: Array  # (g, d)
+    force: Array  # ((d+1) g, d): rows of M X there
+    objective: float = math.nan  # F of all poses
+    rounding_level: float = 0.0  # below it F could not be told from zero
 
     @property
     def multipliers(self) -> Array:

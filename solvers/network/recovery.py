@@ -53,18 +53,10 @@ class Place(Protocol[T]):
 
 @dataclass(frozen=True)
 class Recovery:
-    """How lost robots are made anew.
+    """How lost robots are made anew."""
 
-    Attributes
-    ----------
-    orders_between_snapshots : int
-        An iteration of SOC takes three orders or four. What is kept for a robot is its snapshot and so many orders.
-    max_restarts : int
-        Of one robot; then the run ends with an error.
-    """
-
-    orders_between_snapshots: int = 40
-    max_restarts: int = 3
+    orders_between_snapshots: int = 40  # an iteration of SOC takes three or four; so many are kept for a robot
+    max_restarts: int = 3  # of one robot; then the run ends with an error
 
     def __post_init__(self) -> None:
         check_settings(self, not_negative=["max_restarts"], at_least_one=["orders_between_snapshots"])

@@ -40,15 +40,9 @@ _COLUMNS: tuple[tuple[str, str, Callable[[Any], str]], ...] = (  # head, name in
 
 @dataclass(frozen=True)
 class ComparisonSettings:
-    """Which methods, and what they share.
+    """Which methods, and what they share."""
 
-    Attributes
-    ----------
-    contenders : tuple of BenchmarkMethod
-        All that can be run here unless given: GTSAM only where it is installed.
-    """
-
-    contenders: tuple[BenchmarkMethod, ...] = ()
+    contenders: tuple[BenchmarkMethod, ...] = ()  # all that can be run here unless given: GTSAM where it is installed
     trial: BenchmarkSettings = field(default_factory=BenchmarkSettings)
 
     @property
@@ -62,24 +56,14 @@ class ComparisonSettings:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Methods side by side on one graph.
-
-    Attributes
-    ----------
-    optimum, lower_bound : float
-        The best F known, from `solve` or one of the methods, and the bound that is proven.
-    reasons : tuple of (BenchmarkMethod, str)
-        Methods without figures, and why.
-    is_complete : bool
-        Whether all were run; after Ctrl-C they were not.
-    """
+    """Methods side by side on one graph."""
 
     problem: PGOProblem
-    optimum: float
-    lower_bound: float
+    optimum: float  # the best F known, from `solve` or one of the methods
+    lower_bound: float  # that is proven
     trials: tuple[BenchmarkRun, ...]
-    reasons: tuple[tuple[BenchmarkMethod, str], ...]
-    is_complete: bool = True
+    reasons: tuple[tuple[BenchmarkMethod, str], ...]  # methods without figures, and why
+    is_complete: bool = True  # whether all were run; after Ctrl-C they were not
 
     @property
     def curves(self) -> list[Curve]:

@@ -149,19 +149,11 @@ class ReproducedRow:
 
 @dataclass(frozen=True)
 class Reproduction:
-    """The reproduced tables.
-
-    Attributes
-    ----------
-    rows : tuple of ReproducedRow
-        Graph by graph, and for each SE-Sync, DGS, SOC as in the paper, SOC consensus.
-    is_complete : bool
-        Whether all was done; after Ctrl-C it was not.
-    """
+    """The reproduced tables."""
 
     settings: ReproductionSettings
-    rows: tuple[ReproducedRow, ...]
-    is_complete: bool
+    rows: tuple[ReproducedRow, ...]  # graph by graph, and for each SE-Sync, DGS, SOC as in the paper, SOC consensus
+    is_complete: bool  # whether all was done; after Ctrl-C it was not
 
     def soc_row(self, row: ReproducedRow) -> ReproducedRow:
         """Row of the paper's own method on the same graph."""

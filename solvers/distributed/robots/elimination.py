@@ -34,28 +34,14 @@ class Cut:
 
 @dataclass(frozen=True, eq=False)
 class Elimination:
-    """A robot's matrix with the interior eliminated.
-
-    Attributes
-    ----------
-    cut : Cut
-    K_IG : csr_array, (i, g)
-    factor : CholeskyFactor, optional
-        Of K_II; None when there is no interior.
-    schur : (g (g + 1) / 2,)
-        Lower triangle of K_GG - K_GI K_II^-1 K_IG, `packed`.
-    diagonal : (g,)
-        Diagonal of K_GG.
-    interior_error : (i,)
-        Share of the diagonal of K_II that rounding can take, where it was asked for.
-    """
+    """A robot's matrix with the interior, (i,), eliminated to the boundary, (g,)."""
 
     cut: Cut
-    K_IG: csr_array
-    factor: CholeskyFactor | None
-    schur: Array
-    diagonal: Array
-    interior_error: Array
+    K_IG: csr_array  # sparse (i, g)
+    factor: CholeskyFactor | None  # of K_II; None when there is no interior
+    schur: Array  # (g (g + 1) / 2,): lower triangle of K_GG - K_GI K_II^-1 K_IG, `packed`
+    diagonal: Array  # (g,): of K_GG
+    interior_error: Array  # (i,): share of the diagonal of K_II that rounding can take, where it was asked for
 
     def reduce(self, b: Array) -> tuple[Array, float]:
         """b_G - K_GI K_II^-1 b_I, (g, k), and the inner product of b_I and K_II^-1 b_I."""
