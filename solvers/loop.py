@@ -104,12 +104,10 @@ def run(
     verbose: bool = False,
     progress: bool | None = None,
 ) -> Outcome[S]:
-    """Run a method on a problem of its kind to its end.
+    """Run a method on a problem of its kind to its end; a Solver on a PGOProblem or PoseGraph.
 
     Parameters
     ----------
-    method : Method
-    problem : PGOProblem or PoseGraph for a Solver, or another method's own kind
     start : Poses, or the kind of point that the method starts at, optional
         The method's own start unless given.
     earlier : tuple of Record

@@ -120,7 +120,6 @@ class Outcome(Generic[S]):
         The last iterate, or the best one when the run did not succeed.
     iterations : int
         Finished steps.
-    history : History
     seconds : float
         Wall time of the whole run.
     method : object

@@ -38,20 +38,12 @@ class Neighbours(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class PoseVariables:
-    """The unknowns of a program by the names of the graph.
-
-    Attributes
-    ----------
-    poses : (n_a,)
-        Poses of the graph that are unknown, ascending.
-    X : cp.Variable
-        Rows t_i (not for ROTATIONS), then the rows of every R_i^T.
-    """
+    """The unknowns of a program by the names of the graph."""
 
     graph: PoseGraph
     unknowns: Unknowns
-    poses: IntArray
-    X: cp.Variable
+    poses: IntArray  # (n_a,): poses of the graph that are unknown, ascending
+    X: cp.Variable  # rows t_i (not for ROTATIONS), then the rows of every R_i^T
 
     @property
     def num_translations(self) -> int:
@@ -198,12 +190,8 @@ def robot_qp(
     """Pose the R-subproblem of one robot of `graph.robots` with its neighbours' terms; parameters as `graph_qp`.
 
     With COPIES and `rho_t` on the separators it is the subproblem of SOC's CONSENSUS coupling, whose penalties are the
-    shares of the copies; with FROZEN and ROTATIONS it is the paper's.
-
-    Raises
-    ------
-    SettingError
-        When the robot owns no pose, or frozen neighbours pull on translations that have no penalty.
+    shares of the copies; with FROZEN and ROTATIONS it is the paper's. A SettingError when the robot owns no pose, or
+    frozen neighbours pull on translations that have no penalty.
     """
     owned = graph.robots == robot
     if not owned.any():

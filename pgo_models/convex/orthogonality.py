@@ -142,10 +142,7 @@ class OrthogonalProblem:
     def point(self, values: Sequence[Array]) -> OrthogonalPoint:
         """Point with the projections of `values`, one for every variable in `variables`, and no multipliers.
 
-        Raises
-        ------
-        SettingError
-            When their number or shapes do not fit, or entries are not finite.
+        A SettingError when their number or shapes do not fit, or entries are not finite.
         """
         if len(values) != len(self.variables):
             raise SettingError(f"{len(values)} values for {len(self.variables)} variables")
@@ -273,17 +270,12 @@ class KKTResiduals:
 
 
 def kkt_residuals(problem: OrthogonalProblem, point: OrthogonalPoint, rho: float) -> KKTResiduals:
-    """Judge a point by one convex solve, whatever found it.
+    """Judge a point by one convex solve, whatever found it; rho of the order of the curvature of J.
 
     The normals N of the point, projected once more onto the normal spaces, are its multipliers: for X^T X = I they are
     -X Lambda. X is stationary if and only if -sum N is a subgradient of J at X, and that holds if and only if X is
     Z = argmin J + sum rho/2 ||Z - (X - N / rho)||^2. In general -sum N + rho (X - Z) is a subgradient at Z (times the
     number of terms of the variable), so rho ||X - Z|| is what stationarity lacks.
-
-    Parameters
-    ----------
-    rho : float
-        Of the order of the curvature of J.
     """
     normals = [
         term.constraint.normal_part(copy, normal)

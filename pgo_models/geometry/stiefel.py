@@ -18,12 +18,7 @@ def row_products(A: Array, B: Array) -> Array:
 
 
 def project_to_tangent(Y: Array, V: Array) -> Array:
-    """V_i - sym(V_i Y_i^T) Y_i: the nearest V with V_i Y_i^T skew, which is tangent at Y.
-
-    Parameters
-    ----------
-    Y, V : (n, d, r)
-    """
+    """V_i - sym(V_i Y_i^T) Y_i, (n, d, r): the nearest V with V_i Y_i^T skew, which is tangent at Y, (n, d, r)."""
     return np.asarray(V - row_products(V, Y) @ Y)
 
 

@@ -41,8 +41,6 @@ def grid_world(
 
     Parameters
     ----------
-    num_robots, poses_per_robot : int
-    rng : numpy.random.Generator
     d : int
         2 or 3.
     noise : NoiseModel

@@ -31,7 +31,6 @@ class Partition(ReadOnly):
     ----------
     robot : (n,)
         0 .. num_robots - 1, every one of which owns a pose. A read-only copy.
-    method : PartitionMethod
 
     Raises
     ------
@@ -59,13 +58,7 @@ class Partition(ReadOnly):
         return np.bincount(self.robot, minlength=self.num_robots)
 
     def cut_edges(self, graph: PoseGraph) -> BoolArray:
-        """Whether an edge joins two robots, (m,).
-
-        Raises
-        ------
-        SettingError
-            When the partition is of another number of poses.
-        """
+        """Whether an edge joins two robots, (m,); a SettingError when the partition is of another number of poses."""
         if len(self.robot) != graph.num_poses:
             raise SettingError(f"{self!r} of {len(self.robot)} poses beside {graph!r}; give one robot for every pose")
         return np.asarray(self.robot[graph.i] != self.robot[graph.j])
@@ -85,7 +78,6 @@ def partition(graph: PoseGraph, num_robots: int | None = None, method: Partition
 
     Parameters
     ----------
-    graph : PoseGraph
     num_robots : int, optional
         Needed unless the graph names its robots or every pose is its own.
     method : PartitionMethod, optional

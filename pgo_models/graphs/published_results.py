@@ -13,21 +13,11 @@ from pgo_models.graphs.pose_graph import PoseGraph
 
 @dataclass(frozen=True)
 class PublishedRun:
-    """The paper's SOC on one graph.
-
-    Attributes
-    ----------
-    name : str
-    objective : float
-        F that its SOC reaches.
-    optimum : float
-        F* that it compares with.
-    iterations : int
-    """
+    """The paper's SOC on one graph."""
 
     name: str
-    objective: float
-    optimum: float
+    objective: float  # F that its SOC reaches
+    optimum: float  # F* that it compares with
     iterations: int
 
     @property
@@ -47,20 +37,12 @@ class PublishedFigures:
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """The paper's row of one graph, from tables 1 and 2 or 3 and 4.
-
-    Attributes
-    ----------
-    name : str
-    num_poses, num_edges : int
-    se_sync, dgs, soc : PublishedFigures
-        The objective of SE-Sync is F*. Its times are those of the MATLAB version.
-    """
+    """The paper's row of one graph, from tables 1 and 2 or 3 and 4."""
 
     name: str
     num_poses: int
     num_edges: int
-    se_sync: PublishedFigures
+    se_sync: PublishedFigures  # its objective is F*; the times are those of the MATLAB version
     dgs: PublishedFigures
     soc: PublishedFigures
 

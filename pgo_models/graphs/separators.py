@@ -82,13 +82,7 @@ class PartitionReport:
 
 
 def report_partition(partition: Partition, graph: PoseGraph) -> PartitionReport:
-    """Count what a partition of a graph costs.
-
-    Raises
-    ------
-    SettingError
-        When the partition is of another number of poses.
-    """
+    """Count what a partition of a graph costs; a SettingError when it is of another number of poses."""
     cut = partition.cut_edges(graph)
     robot, i, j = partition.robot, graph.i[cut], graph.j[cut]
     held = np.unique(np.concatenate([robot[i] * graph.num_poses + j, robot[j] * graph.num_poses + i]))

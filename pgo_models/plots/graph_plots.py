@@ -35,12 +35,7 @@ _MOST_NAMED_ROBOTS = len(COLOURS)
 def edge_kinds(graph: PoseGraph, poses: Poses, mark_edges: bool = True) -> IntArray:
     """How every edge is drawn, (m,): OWN, BETWEEN (two robots), SIGHTING (a landmark's), marked UNCERTAIN or MISFIT.
 
-    The last that fits; priors are -1.
-
-    Raises
-    ------
-    GraphError
-        When the poses are not those of the graph.
+    The last that fits; priors are -1. A GraphError when the poses are not those of the graph.
     """
     kind = np.where(graph.robots[graph.i] == graph.robots[graph.j], OWN, BETWEEN)
     kind[np.isin(graph.j, graph.landmarks)] = SIGHTING
@@ -68,12 +63,8 @@ def confidence_ellipses(poses: Poses, covariances: Array) -> Array:
 def draw_graph(graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = True) -> None:
     """Draw positions and edges: each robot's own edges in its colour, those between robots in grey.
 
-    Parameters
-    ----------
-    axes : matplotlib Axes
-        Of projection "3d" for graphs in space.
-    mark_edges : bool
-        Draw edges with a low precision dotted, and those with a large share of F thick and vermilion.
+    The axes are of projection "3d" for graphs in space. With `mark_edges`, edges with a low precision are dotted, and
+    those with a large share of F thick and vermilion.
     """
     from matplotlib.colors import to_rgb
 
@@ -148,17 +139,8 @@ def plot_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> Figure:
 def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = None) -> Figure:
     """Figure of an estimate on top of the truth, and of its errors pose by pose, in metres and degrees.
 
-    Parameters
-    ----------
-    poses : Poses
-        The estimate; it is aligned to the truth first.
-    truth : Poses, optional
-        The graph's own unless given.
-
-    Raises
-    ------
-    GraphError
-        When there is no truth, or the sizes differ.
+    The estimate is aligned to the truth first, which is the graph's own unless given. A GraphError when there is no
+    truth, or the sizes differ.
     """
     if truth is None:
         truth = graph.truth

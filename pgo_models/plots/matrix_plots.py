@@ -32,12 +32,8 @@ def smallest_eigenvalues(problem: PGOProblem, Lambda: Array, count: int = 12) ->
     S_Q = S_RR - S_Rt S_tt^+ S_tR = Q - blockdiag(Lambda) acts on rotations alone, so that all its eigenvalues have the
     unit of kappa (per rad^2) and are those that eta shifts: S + eta blockdiag(0, I) is positive semidefinite if and
     only if lambda_min(S_Q) >= -eta. At a global optimum whose relaxation is tight d of them are zero. Found by
-    shift-invert Lanczos below the spectrum: an estimate for the eye; the proof is `prove_bound`.
-
-    Raises
-    ------
-    SettingError
-        When count is not 1 to d n.
+    shift-invert Lanczos below the spectrum: an estimate for the eye; the proof is `prove_bound`. A SettingError when
+    count is not 1 to d n.
     """
     side = problem.num_poses * problem.d
     if not 1 <= count <= side:

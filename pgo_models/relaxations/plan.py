@@ -64,12 +64,8 @@ def plan_relaxation(
 ) -> RelaxationPlan:
     """Choose what is not given: the cliques with Clarabel where they are small, else the dense primal with SCS.
 
-    Nothing larger than the clique tree is formed.
-
-    Raises
-    ------
-    SettingError
-        When the estimate exceeds `memory_limit`, in bytes, or the limit is not positive.
+    Nothing larger than the clique tree is formed. A SettingError when the estimate exceeds `memory_limit`, in bytes, or
+    the limit is not positive.
     """
     if not memory_limit > 0:
         raise SettingError(f"memory_limit is {memory_limit}; give positive bytes")

@@ -109,9 +109,7 @@ class GaussSeidel:
     max_iterations: int = 5000
 
     def __post_init__(self) -> None:
-        if not 0 < self.alpha < 2:
-            raise SettingError(f"alpha must be in (0, 2), got {self.alpha}; 1 is no over-relaxation")
-        check_settings(self, positive=["tolerance"])
+        check_settings(self, positive=["tolerance"], relaxation=["alpha"])
         check_settings(self, not_negative=["max_iterations"], at_least_one=["gauss_newton_steps"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> GaussSeidelState:

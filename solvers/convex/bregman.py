@@ -97,11 +97,7 @@ class BregmanSettings:
     subproblem_tolerance: float = TOLERANCE
 
     def __post_init__(self) -> None:
-        for name in ("alpha", "tolerance", "subproblem_tolerance"):
-            value = getattr(self, name)
-            if not 0 < value < math.inf:
-                raise SettingError(f"{name} must be positive and finite, got {value}")
-        check_settings(self, not_negative=["max_iterations"])
+        check_settings(self, finite=["alpha", "tolerance", "subproblem_tolerance"], not_negative=["max_iterations"])
 
     def measure(self, problem: BregmanProblem, state: _ExactState | AlternatingState) -> Measurement:
         """J(x), ||K x - f||, relative, and the distance from stationarity, relative."""

@@ -33,10 +33,7 @@ class ExtendedStep:
     def prepare(self, subproblem: RSubproblem) -> GraphQP:
         """Compile the changed quadratic program with the subproblem's penalties.
 
-        Raises
-        ------
-        SettingError
-            When the subproblem is not that of the whole graph, joint in (R, t).
+        A SettingError when the subproblem is not that of the whole graph, joint in (R, t).
         """
         n, d = self.graph.num_poses, self.graph.d
         if subproblem.num_translations != n or not subproblem.needs_ground:

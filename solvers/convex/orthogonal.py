@@ -83,22 +83,11 @@ class OrthogonalSOC:
     max_iterations: int = 1000
 
     def __post_init__(self) -> None:
-        if self.penalty is not None and not 0 < self.penalty < math.inf:
-            raise SettingError(f"penalty must be positive and finite, got {self.penalty}")
-        if not 0 < self.alpha < 2:
-            raise SettingError(f"alpha must be in (0, 2), got {self.alpha}")
-        if not 1 < self.safeguard < math.inf:
-            raise SettingError(f"safeguard must be above 1, got {self.safeguard}")
-        check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
+        check_settings(self, finite=["penalty", "safeguard", "tolerance"], not_negative=["max_iterations"])
+        check_settings(self, above_one=["safeguard"], relaxation=["alpha"])
 
     def init(self, problem: OrthogonalProblem, start: OrthogonalPoint | None) -> OrthogonalState:
-        """State 0: X = P = start; at the first columns of the identity unless a start is given.
-
-        Raises
-        ------
-        SettingError
-            When the start does not fit the problem.
-        """
+        """State 0: X = P = start, first columns of the identity unless given; a SettingError if it does not fit."""
         point = start if start is not None else problem.point([_identity(v.shape) for v in problem.variables])
         problem.check_point(point)
         split = problem.split()

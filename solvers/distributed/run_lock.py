@@ -19,12 +19,7 @@ class RunLock:
     def __init__(self, path: Path) -> None:
         """Take the lock.
 
-        Raises
-        ------
-        SettingError
-            When another run has it.
-        FileFormatError
-            When the lock's file cannot be written.
+        A SettingError when another run has it, a FileFormatError when the lock's file cannot be written.
         """
         path = path.resolve()  # as the file is replaced: a link stays one
         self._path = path.with_name(f"{path.name}.lock")

@@ -27,25 +27,13 @@ class Place(Protocol[T]):
     """Where robots run that can be lost; T is what stands for an order under way."""
 
     def start(self, robots: Sequence[int]) -> None:
-        """Start robots, or start them again, each from its share.
-
-        Raises
-        ------
-        RobotLostError
-            When one was lost while it started.
-        """
+        """Start robots, or start them again, each from its share; a RobotLostError when one was lost meanwhile."""
 
     def send(self, robot: int, order: AnyOrder, request: object) -> T:
         """Give a robot an order."""
 
     def receive(self, robot: int, ticket: T) -> Any:  # noqa: ANN401 - what the order answers
-        """Wait for its answer.
-
-        Raises
-        ------
-        RobotLostError
-            When there will be none.
-        """
+        """Wait for its answer; a RobotLostError when there will be none."""
 
     def close(self) -> None:
         """Let the robots go."""
@@ -79,10 +67,7 @@ class RecoveringPool(Generic[T]):
     def ask(self, order: Callable[[Any, Q], A], requests: Sequence[Q]) -> list[A]:
         """Give every robot an order, each with its request, and wait for all answers.
 
-        Raises
-        ------
-        EngineError
-            When a robot was lost more often than it may be.
+        An EngineError when a robot was lost more often than it may be.
         """
         try:
             answers: list[Any] = self._asked(order, requests)

@@ -60,15 +60,8 @@ class AndersonShare:
     def observe(self, residual: Array, image: Array, keep: int) -> tuple[Array, AndersonShare]:
         """Part of the sums, and the share with the newest of at most `keep` differences.
 
-        Parameters
-        ----------
-        residual, image : (rows, d)
-            `residual` may carry weights; `image` not.
-
-        Returns
-        -------
-        sums : (1 + 2 q,)
-            ||residual||^2; newest . difference for the q differences, the newest last; difference . residual for them.
+        `residual`, (rows, d), may carry weights; `image`, (rows, d), not. The sums, (1 + 2 q,), are ||residual||^2;
+        newest . difference for the q differences, the newest last; difference . residual for them.
         """
         size = inner(residual, residual)
         if self.residual is None or self.image is None or not keep:

@@ -169,9 +169,7 @@ class BoydPenalty(_Rule):
     growth: float = 2.0
 
     def __post_init__(self) -> None:
-        check_settings(self, positive=["scale"])
-        if not self.imbalance > 1 or not self.growth > 1:
-            raise SettingError(f"imbalance and growth must be above 1, got {self.imbalance} and {self.growth}")
+        check_settings(self, positive=["scale"], above_one=["imbalance", "growth"])
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
         """(0, scale, 0)."""
@@ -191,11 +189,6 @@ def rotation_scale(problem: PGOProblem) -> Array:
     """m_i, (n,): the mean diagonal of M over the rotation rows of every pose."""
     diagonal = problem.M.data[problem.diagonal_positions[problem.num_poses :]]
     return np.asarray(diagonal.reshape(problem.num_poses, problem.d).mean(axis=1))
-
-
-def translation_scale(problem: PGOProblem) -> Array:
-    """Diagonal of M over the translation row of every pose, (n,)."""
-    return np.asarray(problem.M.data[problem.diagonal_positions[: problem.num_poses]])
 
 
 class Due(enum.Enum):

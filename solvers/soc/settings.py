@@ -43,10 +43,9 @@ class SOCSettings:
     max_iterations: int = 500
 
     def __post_init__(self) -> None:
-        if not 0 < self.alpha < 2:
-            raise SettingError(f"alpha must be in (0, 2), got {self.alpha}")
         check_settings(
             self,
+            relaxation=["alpha"],
             positive=["translation_penalty", "tolerance"],
             not_negative=["separator_penalty", "max_iterations"],
             at_least_one=["local_passes"],

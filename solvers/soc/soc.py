@@ -131,7 +131,6 @@ class SOC(SOCSettings):
         is, by `solve(.., robots=..)` on robots.
     robots : Partition, optional
         Who owns which pose.
-    penalty : MultiplierPenalty, FixedPenalty or BalancedPenalty
     alpha : float
         Over-relaxation, in (0, 2).
     acceleration : Anderson, optional

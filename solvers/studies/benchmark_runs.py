@@ -53,21 +53,10 @@ def run_benchmark(
     The couplings of SOC hand over to Newton as `solve` does, PAPER to Gauss-Newton. PAPER's second stage and all of
     CONSENSUS and SUBSTRUCTURED are run by the robots and a driver, whose ledger counts. An iteration of PAPER is one
     round between neighbours, and one more, whose bytes are not counted, gives the translations. Its first stage hands
-    on its last iterate, whatever F is there.
+    on its last iterate, whatever F is there. Methods find a start of their own unless one is given, which GAUSS_SEIDEL
+    does not take.
 
-    Parameters
-    ----------
-    settings : BenchmarkSettings, optional
-        `BenchmarkSettings()` unless given.
-    start : Poses, optional
-        Instead of their own; GAUSS_SEIDEL takes none.
-
-    Raises
-    ------
-    PGOError
-        When the method cannot be run on this graph.
-    KeyboardInterrupt
-        After Ctrl-C: half a trial is none.
+    A PGOError when the method cannot be run on this graph; KeyboardInterrupt after Ctrl-C: half a trial is none.
     """
     settings = settings if settings is not None else BenchmarkSettings()
     trial = _RUNS[contender](problem, _Allowance(settings, problem.graph), start)

@@ -97,12 +97,7 @@ class Comparison:
     def save_plot(self, path: Path | str) -> None:
         """Write the gap against rounds, bytes and seconds as a picture or, for .html, as a page to explore.
 
-        Raises
-        ------
-        SettingError
-            On another suffix, or when there is nothing to draw.
-        PGOError
-            When the file cannot be written.
+        A SettingError on another suffix, or when there is nothing to draw; a PGOError when the file cannot be written.
         """
         path = Path(path)
         check_plot_format(path)
@@ -119,7 +114,6 @@ def compare_methods(
 
     Parameters
     ----------
-    problem : PGOProblem or PoseGraph
     settings : ComparisonSettings, optional
         `ComparisonSettings()` unless given.
     progress : bool, optional

@@ -51,12 +51,7 @@ CLASSES = (
 class Agent:
     """A robot that obeys orders: each replaces what it has by what the order makes of it.
 
-    Attributes
-    ----------
-    interior : Interior, optional
-        None when the robot counts no edge.
-    copies : ConsensusRobot, optional
-        None before CONSENSUS begins.
+    Its `interior` is None when it counts no edge, its `copies` are None before CONSENSUS begins.
     """
 
     def __init__(self, subgraph: Subgraph, backend: CholeskyBackend | None) -> None:

@@ -70,10 +70,7 @@ def eliminate(K: csc_array, cut: Cut, backend: CholeskyBackend | None, is_verifi
 
         x^T K x >= x_G^T schur x_G - x_I^T diag(interior_error) diag(K_II) x_I.
 
-    Raises
-    ------
-    NotPositiveDefiniteError
-        When K_II is not positive definite.
+    A NotPositiveDefiniteError when K_II is not positive definite.
     """
     interior, boundary = cut.interior, cut.boundary
     K_G = K[:, boundary].tocsc()

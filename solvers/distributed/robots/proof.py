@@ -94,19 +94,9 @@ def verify_interior(
 ) -> tuple[csc_array, Elimination, Array] | None:
     """S + eta blockdiag(0, I) less a share of its diagonal in the interior, its elimination, and the slack left there.
 
-    Parameters
-    ----------
-    problem : PGOProblem
-        Of the robot's edges.
-    Lambda : (p, d, d)
-        Zero at the separators.
-    eta : float
-        Added in the interior: the separators are the driver's.
-    cut : Cut
-    fixed : (f,)
-        Rows that are left out.
-    share : float
-        At least so much of the diagonal is subtracted, more where rounding needs it.
+    Of the robot's edges, with Lambda, (p, d, d), zero at the separators, and eta added in the interior: the separators
+    are the driver's. The rows `fixed`, (f,), are left out. At least `share` of the diagonal is subtracted, more where
+    rounding needs it.
     """
     if not has_safe_scale(problem):
         return None
