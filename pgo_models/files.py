@@ -1,7 +1,5 @@
 """Text and tables read with our errors; files written whole or not at all, through a temporary one."""
 
-from __future__ import annotations
-
 import os
 import secrets
 import stat

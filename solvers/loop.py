@@ -1,7 +1,5 @@
 """The one loop: steps a solver, keeps the clock, the history and the best iterate, prints, and knows when to end."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator

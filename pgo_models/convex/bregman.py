@@ -5,8 +5,6 @@ three forms of the iteration whose subproblems are compiled here, each with one 
 alternates over the blocks of x. The iterations themselves are in solvers/convex/bregman.py.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

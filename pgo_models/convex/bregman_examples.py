@@ -1,7 +1,5 @@
 """Worked models of the form min J(x) s.t. K x = f, for the Bregman iterations of solvers/convex/bregman.py."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cvxpy as cp

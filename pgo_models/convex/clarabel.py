@@ -1,7 +1,5 @@
 """How cvxpy models are given to Clarabel, and those of Bregman iteration and SOC checked: convex, solved tightly."""
 
-from __future__ import annotations
-
 import math
 import warnings
 

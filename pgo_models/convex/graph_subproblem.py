@@ -5,8 +5,6 @@
 Step (a) of the paper's Algorithm 1 (`algo1: SOC`): rotations only as the paper has it, or joint in (R, t).
 """
 
-from __future__ import annotations
-
 import enum
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Worked models with orthogonality constraints whose answers are known, for solvers.solve_orthogonal."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cvxpy as cp

@@ -6,8 +6,6 @@ joint in rotations and translations, for a whole graph or for one robot's share 
 only Parameter (DPP), so that the problem is compiled once and solved again for every shift.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Numbers as frozen objects hold them: checked, never cast silently, in read-only arrays of their own."""
 
-from __future__ import annotations
-
 import operator
 from typing import Any, TypeVar
 

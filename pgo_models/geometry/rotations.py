@@ -3,8 +3,6 @@
 The projection is step (b) of the paper's Algorithm 1 (`algo1: SOC`), with det = +1 enforced.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation

@@ -4,8 +4,6 @@ For r = d the blocks are the transposes R_i^T of rotations or reflections; a lar
 room (Rosen et al. 2019, section 4; Absil, Mahony & Sepulchre, Optimization Algorithms on Matrix Manifolds, 2008).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from pgo_models.geometry.rotations import Array

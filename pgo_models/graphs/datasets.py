@@ -1,7 +1,5 @@
 """Pose graphs by name: from data/, from the folder named by PGO_DATA, or by a download that is checked."""
 
-from __future__ import annotations
-
 import difflib
 import hashlib
 import os

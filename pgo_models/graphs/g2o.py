@@ -5,8 +5,6 @@ d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I
 with RotationWeight.GAUSSIAN.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import warnings

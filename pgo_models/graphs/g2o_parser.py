@@ -4,8 +4,6 @@ The way through a sound file is short: one pass over the lines, one call that pa
 Only when that fails are the lines looked at one by one, to name the one that is wrong.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A multi-robot grid world of any size, in the plane or in space: Manhattan walks on a lattice with loop closures."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

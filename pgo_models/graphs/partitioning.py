@@ -1,7 +1,5 @@
 """Poses to robots: as the graph names them, contiguous in time, balanced by METIS, or one pose a robot."""
 
-from __future__ import annotations
-
 import enum
 from dataclasses import dataclass
 

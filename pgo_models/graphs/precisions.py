@@ -1,7 +1,5 @@
 """Information matrices as the precisions kappa and tau of the isotropic cost, and back (SE-Sync: Rosen et al. 2019)."""
 
-from __future__ import annotations
-
 import enum
 from bisect import bisect_left
 

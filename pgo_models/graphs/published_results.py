@@ -1,7 +1,5 @@
 """What the paper reports for its graphs (tables 1 to 4), from data/reference.json: the mark beside our curves."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from typing import Any

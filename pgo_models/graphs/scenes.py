@@ -4,8 +4,6 @@ The three networks follow the paper's section `SIMULATION RESULTS` and, for the 
 the figures stand in data/reference.json under "scenes". Every function takes its random generator.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

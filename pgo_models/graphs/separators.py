@@ -1,7 +1,5 @@
 """What a partition costs: separators, a vertex cover of the edges between robots, cut edges and balance."""
 
-from __future__ import annotations
-
 import heapq
 from dataclasses import dataclass
 

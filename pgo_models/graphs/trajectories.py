@@ -4,8 +4,6 @@ TUM: a line `timestamp tx ty tz qx qy qz qw` for each pose. KITTI: the 12 number
 row. Both hold world from body, metres.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

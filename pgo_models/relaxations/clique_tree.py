@@ -1,7 +1,5 @@
 """Cliques of a chordal extension of a pose graph, in a tree: what a sparse semidefinite program decomposes over."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Callable
 from dataclasses import dataclass

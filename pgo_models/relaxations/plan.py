@@ -1,7 +1,5 @@
 """Which form of the semidefinite relaxation to pose, and which solver to give it: by the sizes of the cliques."""
 
-from __future__ import annotations
-
 import enum
 from dataclasses import dataclass
 

@@ -8,8 +8,6 @@ and 9; Carlone et al. 2015). `pgo_models.relaxations.solve_sdp` chooses a form, 
 `pgo_models.relaxations.clique_decomposition` has the form for large sparse graphs.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cvxpy as cp

@@ -1,7 +1,5 @@
 """From a solution of the semidefinite relaxation, Z or its factor Y, to rotations; how far it is from having rank d."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -7,8 +7,6 @@ Its first stage is what the introduction of the paper calls an unconstrained rot
 columns of the paper's tables (`table1` to `table4`).
 """
 
-from __future__ import annotations
-
 import enum
 import math
 from dataclasses import dataclass, replace

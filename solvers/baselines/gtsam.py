@@ -11,8 +11,6 @@ make its cost F to leading order. Its optimum is that of the angles, not of the 
 is of fourth order. GTSAM is BSD-licensed: https://gtsam.org; the extra `peers` brings it.
 """
 
-from __future__ import annotations
-
 import enum
 import math
 import time

@@ -4,8 +4,6 @@ The baseline of g2o and GTSAM, with the damping rule of Nielsen (Madsen, Nielsen
 Least Squares Problems, algorithm 3.16) and the scaling of Marquardt (1963): rotations and translations differ in units.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 

@@ -4,8 +4,6 @@ Flagged initialisation of Choudhary et al. 2017: in a first sweep, from the robo
 neighbours that already have an estimate. Later sweeps have a fixed order.
 """
 
-from __future__ import annotations
-
 import enum
 import heapq
 from dataclasses import dataclass

@@ -8,8 +8,6 @@
 The first three have the same x, with p = K^T lam and lam = -alpha b. Osher et al. 2005; Yin et al. 2008; Esser 2009.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """SOC on a pose graph with convex terms and constraints of one's own: the same recursion, another step (a)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

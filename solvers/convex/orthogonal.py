@@ -7,8 +7,6 @@
 Ebrahimi & Deghat, Algorithm 1 (`algo1: SOC`); Lai & Osher 2014, Algorithm 1.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ The same fixed-point map as `solvers.distributed.consensus` and no all-reduce: o
 old (Peng et al. 2016, ARock).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 

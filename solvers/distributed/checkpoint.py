@@ -4,8 +4,6 @@ A run that is broken off at any moment, and started again with the same graph, p
 last one, in the same place or in another, and ends with the same numbers.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import math

@@ -1,7 +1,5 @@
 """CONSENSUS by robots on a network: `solvers.soc.consensus` from the poses that they and a driver hold."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

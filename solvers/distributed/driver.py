@@ -5,8 +5,6 @@ gather of the robots' reduced right-hand sides, one solve and one scatter are a 
 Newton direction, the best translations of given rotations and a proof of the certificate take one each.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ Recursive bisection of the robot adjacency graph, by how many separators robots 
 the smallest group that holds every robot which touches it: no dense matrix over all separators is formed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 The lock is on a file beside it (NAME.lock), since the file itself is replaced. One that a killed run left is free.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from contextlib import suppress

@@ -3,8 +3,6 @@
 The iterates are those of JOINT to rounding, whatever the number of robots: `solvers.soc.soc` is the recursion to read.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Workers whose messages are counted: what the driver asks of them, and what they send each other."""
 
-from __future__ import annotations
-
 import enum
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar

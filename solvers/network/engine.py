@@ -1,7 +1,5 @@
 """Where robots run: the seam, and robots in this process, in order or in threads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What goes wrong between robots, for study: messages lost, late, or of a robot that is silent."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Generic, TypeVar

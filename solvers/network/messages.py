@@ -1,7 +1,5 @@
 """Orders to workers: functions of a worker and a request. Requests and answers are numbers, arrays and records."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from typing import Any, Protocol

@@ -4,8 +4,6 @@ A worker is deterministic: its state follows from its subgraph and the requests 
 is not in the ledger.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar

@@ -3,8 +3,6 @@
 A tree in JSON says what the object is made of, and names the arrays in it by number.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 import json

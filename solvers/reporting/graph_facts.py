@@ -1,7 +1,5 @@
 """What a pose graph is made of, in words and numbers."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pgo_models.graphs.pose_graph import PoseGraph

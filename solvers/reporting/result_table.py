@@ -1,7 +1,5 @@
 """A table of results for readers and for programs: in the terminal, as Markdown, CSV or JSON."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -4,8 +4,6 @@ min tr(Y^T Q Y) over Y in St(d, r)^n, translations marginalised in Q; where S ha
 point, its eigenvector in one more column of Y leads down (Rosen et al. 2019, algorithms 1 to 3; Boumal 2015).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Truncated conjugate gradients: the minimum of a quadratic model in a trust region, roughly (Steihaug 1983)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ The paper solves step (a) of Algorithm 1 this way. With the Lipschitz constant a
 momentum is constant (Nesterov 2004, scheme 2.2.22); it is restarted when it points uphill (O'Donoghue & Candes 2015).
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 

@@ -12,8 +12,6 @@ With the B that (c) makes of it, the gradient of the Lagrangian of min <Y, L Y> 
 the dual residual: beside the change of omega, as in Boyd et al. 2011 (3.6), that of the frozen neighbours counts.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

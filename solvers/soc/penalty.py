@@ -1,7 +1,5 @@
 """Rules for the ADMM penalty rho: from the multipliers, fixed, or balanced by residuals, relative or Boyd's."""
 
-from __future__ import annotations
-
 import enum
 import math
 from abc import ABC, abstractmethod

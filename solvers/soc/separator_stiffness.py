@@ -1,7 +1,5 @@
 """Separator stiffness: inverse mean compliance of the separator translations, the scale of their ADMM penalty."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

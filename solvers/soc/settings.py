@@ -1,7 +1,5 @@
 """Settings of SOC, for all couplings."""
 
-from __future__ import annotations
-
 import enum
 import math
 from dataclasses import dataclass, field

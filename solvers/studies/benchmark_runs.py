@@ -1,7 +1,5 @@
 """How the methods to compare are run on a graph; `solvers.studies.benchmark` has what comes of it."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Commands of `pgo` that hold methods against each other: tables, compare, figures."""
 
-from __future__ import annotations
-
 import enum
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Chosen methods on one graph, side by side: a table, and the gap against rounds, bytes and seconds."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 from collections.abc import Callable

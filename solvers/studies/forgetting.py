@@ -3,8 +3,6 @@
 Yin & Osher, Error forgetting of Bregman iteration, 2013; the two-line form is the paper's `bregman update`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

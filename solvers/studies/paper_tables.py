@@ -1,7 +1,5 @@
 """The paper's tables 1 to 4, row for row: its figures beside ours, each held against a proven lower bound."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """The reproduced tables in words and figures: one line for each method on each graph, and what they show."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

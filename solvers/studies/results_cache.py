@@ -1,7 +1,5 @@
 """Finished results of a long job in a JSON file, so that the job can go on where it was interrupted."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Where the semidefinite relaxation stops being tight: rotation noise swept on the paper's circle and grid."""
 
-from __future__ import annotations
-
 import enum
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """One robot as an engine runs it: its interior for the driver, and its copies for CONSENSUS."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypeVar

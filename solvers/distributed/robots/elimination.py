@@ -9,8 +9,6 @@ and K is positive definite if and only if every K_II,a and the driver's matrix a
 1968).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

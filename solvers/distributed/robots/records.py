@@ -1,7 +1,5 @@
 """What the driver asks a robot's interior, and what it answers; g boundary poses, vectors of w unknowns a pose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from pgo_models.geometry.rotations import Array
