@@ -94,4 +94,4 @@ class ConsensusSOC:
 
     def converged(self, state: ConsensusState, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals are within tolerance."""
-        return self.soc.status_at(measurement)
+        return self.soc.converged(state, measurement)

@@ -74,7 +74,7 @@ class SubstructuredSOC:
 
     def converged(self, state: SubstructuredState, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals are within tolerance."""
-        return self.soc.status_at(measurement)
+        return self.soc.converged(state, measurement)
 
     def finish(self, driver: Driver) -> None:
         """Leave omega and the best translations for it with driver and robots: two rounds."""

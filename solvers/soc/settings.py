@@ -62,7 +62,7 @@ class SOCSettings:
             return self.coupling
         return Coupling.JOINT if self.robots is None else Coupling.CONSENSUS
 
-    def status_at(self, measurement: Measurement) -> Status | None:
+    def converged(self, state: object, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals are within tolerance."""
         worst = max(measurement.primal_residual, measurement.dual_residual)
         return Status.CONVERGED if worst <= self.tolerance else None

@@ -11,28 +11,12 @@ from solvers.studies.benchmark import BenchmarkMethod
 from solvers.studies.paper_tables import ReproducedRow, Reproduction, TableEntry
 
 _COST_HEADS = (
-    "graph",
-    "poses",
-    "edges",
-    "F*",
-    "proven to (%)",
-    "method",
-    "F",
-    "gap (%)",
-    "after SOC alone (%)",
-    "paper: F",
-    "paper: gap (%)",
-    "remark",
+    *("graph", "poses", "edges", "F*", "proven to (%)", "method", "F", "gap (%)", "after SOC alone (%)"),
+    *("paper: F", "paper: gap (%)", "remark"),
 )
 _EFFORT_HEADS = (
-    "graph",
-    "method",
-    "iterations",
-    "rounds",
-    "paper: iterations",
-    "seconds",
-    "seconds a robot",
-    "paper: seconds",
+    *("graph", "method", "iterations", "rounds", "paper: iterations", "seconds"),
+    *("seconds a robot", "paper: seconds"),
 )
 _WANTED_GAP = 1e-4
 _SAME = 1e-3  # a spread below this part of the mean is not shown

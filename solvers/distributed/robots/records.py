@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.pose_graph import IntArray
 from solvers.distributed.robots.proof import ProofSums
+from solvers.soc.copies import OwnPoses
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +109,7 @@ class ProofAnswer:
 
 
 @dataclass(frozen=True, eq=False)
-class InteriorPoses:
-    """Interior poses, their numbers in the whole graph, and multipliers."""
+class InteriorPoses(OwnPoses):
+    """Interior poses, and their multipliers."""
 
-    poses: IntArray
-    R: Array
-    t: Array
     Lambda: Array
