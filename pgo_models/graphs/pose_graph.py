@@ -95,13 +95,12 @@ class PoseGraph(Measurements):
 
     def facts(self) -> list[tuple[str, str]]:
         """Labels and texts, as they are shown."""
-        sizes = [str(len(part)) for part in self.components()]
         return [
             ("graph", f"{self.name}, {self.d}D"),
             ("poses", str(len(self.bodies))),
             ("edges", f"{self.num_edges}{self.extras}"),
             ("robots", str(self.num_robots)),
-            ("components", f"{len(sizes)} (sizes {', '.join(sizes[:5])})"),
+            ("components", str(len(self.components()))),
             ("kappa", f"{self.kappa.min():.4g} to {self.kappa.max():.4g} per rad^2"),
             ("tau", f"{self.tau.min():.4g} to {self.tau.max():.4g} per m^2"),
             ("estimate", "with the graph" if self.initial is not None else "none"),

@@ -13,10 +13,13 @@ from solvers.reporting.versions import installed_versions
 def describe_graph(graph: PoseGraph) -> list[tuple[str, str]]:
     """What `pgo info` says of a graph: label and text of every row."""
     degree = np.bincount(np.concatenate([graph.i, graph.j]), minlength=graph.num_poses)
-    rows = graph.facts()
-    rows[5:5] = [("degree", f"{degree.min()} to {degree.max()}, mean {degree.mean():.2f}")]
+    rows, sizes = graph.facts(), [str(len(part)) for part in graph.components()]
+    rows[4:5] = [
+        ("components", f"{len(sizes)} (sizes {', '.join(sizes[:5])})"),
+        ("degree", f"{degree.min()} to {degree.max()}, mean {degree.mean():.2f}"),
+    ]
     rows[8:8] = _information_facts(graph)
-    if graph.is_connected:
+    if len(sizes) == 1:
         problem = PGOProblem(graph)
         if graph.initial is not None:
             rows.append(("F, estimate", f"{problem.objective(graph.initial):.8g}"))
