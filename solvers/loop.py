@@ -216,7 +216,6 @@ class Watch:
         return Run(name, objective, state, status, k, history, seconds, poses, method=method)
 
     def _ending(self, method: Method[P, X, S], state: S, record: Record) -> Status | None:
-        """Status when the run ends at this state, else None."""
         is_late = time.perf_counter() - self.began > self.time_limit
         if self.callback is not None and self.callback(state, record):
             return Status.STOPPED

@@ -306,7 +306,6 @@ def norm_of_all(arrays: Sequence[Array]) -> float:
 
 
 def _minimised(problem: cp.Problem) -> cp.Expression:
-    """J, checked, of a problem whose constraints are convex."""
     maximises = isinstance(problem.objective, cp.Maximize)
     expression = problem.objective.args[0]
     if maximises and not expression.is_concave():

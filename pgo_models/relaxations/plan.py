@@ -96,7 +96,6 @@ def plan_relaxation(
 
 
 def _sides(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm) -> Array:
-    """Sides of the cones."""
     if form is RelaxationForm.PRIMAL:
         return np.array([float(problem.d * problem.num_poses)])
     if form is RelaxationForm.CLIQUES:

@@ -120,7 +120,6 @@ def _linearized(
     damping: float,
     analysis: SymbolicCholesky | None = None,
 ) -> LevenbergMarquardtState:
-    """State at new poses."""
     matrix = riemannian_hessian(problem, poses, None)
     ground_pose(matrix, problem)
     gradient = TangentLayout(problem.num_poses, problem.d).join(*problem.riemannian_gradient(poses))
@@ -130,7 +129,6 @@ def _linearized(
 
 
 def _with_step(state: LevenbergMarquardtState) -> LevenbergMarquardtState:
-    """State with the step of its damping."""
     damped = state.matrix.copy()
     damped.setdiag((1.0 + state.damping) * state.matrix.diagonal())
     try:

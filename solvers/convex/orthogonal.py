@@ -289,7 +289,6 @@ def _identity(shape: tuple[int, ...]) -> Array:
 
 
 def _summed(problem: OrthogonalProblem, of_terms: Sequence[Array]) -> list[Array]:
-    """Sums over the terms of every variable."""
     sums = [np.zeros(variable.shape) for variable in problem.variables]
     for term, array in zip(problem.terms, of_terms, strict=True):
         sums[term.variable] += array

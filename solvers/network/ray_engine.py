@@ -201,7 +201,6 @@ class _RayPlace:
         return math.floor(1e4 / a_cpu) / 1e4  # Ray counts in steps of 1e-4
 
     def _wait(self, tickets: Mapping[int, ObjectRef[Any]]) -> None:
-        """Wait until robots are there."""
         deadline = time.monotonic() + self.engine.patience
         missing = list(tickets.values())
         while missing and (left := deadline - time.monotonic()) > 0:
@@ -266,7 +265,6 @@ def _ray() -> ModuleType:
 
 
 def _check_address(address: str) -> None:
-    """Refuse an address where nothing listens."""
     host, colon, port = address.rpartition(":")
     if not colon or not host or "/" in host or not port.isdigit() or not 0 < int(port) < 65536:
         raise SettingError(f"address is {address!r}; give host:port, as `ray start --head` prints it")

@@ -113,7 +113,6 @@ class _Allowance:
 def _one_run(
     solver: Solver[Any], name: str, problem: PGOProblem, allowed: _Allowance, start: Poses | None
 ) -> BenchmarkRun:
-    """A run of one method in one place."""
     finished = allowed.run(solver, problem, start)
     return _run_of(finished, StageRecord(name, finished.status, finished.history))
 

@@ -126,7 +126,6 @@ def _chosen(choices: type[Choice], names: str, kind: str) -> tuple[Choice, ...]:
 
 
 def _split(names: str) -> tuple[str, ...]:
-    """Names between commas, each once."""
     return tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
 
 

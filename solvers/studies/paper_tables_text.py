@@ -219,7 +219,6 @@ def _counted(sentences: Sequence[str], total: int) -> list[str]:
 
 
 def _record(row: ReproducedRow) -> dict[str, Value]:
-    """Figures of a row in full: means, and standard deviations over the draws."""
     figures, published, cells = row.figures, row.published, row.cells
     optimum = published.se_sync.objective
 
