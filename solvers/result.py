@@ -108,32 +108,16 @@ class History:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Outcome(Generic[S]):
-    """A finished run of one method, on a problem of any kind.
+    """A finished run of one method, on a problem of any kind."""
 
-    Attributes
-    ----------
-    name : str
-        Of the method.
-    objective : float
-        Of `state`.
-    state : S
-        The last iterate, or the best one when the run did not succeed.
-    iterations : int
-        Finished steps.
-    seconds : float
-        Wall time of the whole run.
-    method : object
-        The method that ran, which is its settings.
-    """
-
-    name: str
-    objective: float
-    state: S
+    name: str  # of the method
+    objective: float  # of `state`
+    state: S  # the last iterate, or the best one when the run did not succeed
     status: Status
-    iterations: int
+    iterations: int  # finished steps
     history: History
-    seconds: float
-    method: object = field(default=None, kw_only=True)
+    seconds: float  # wall time of the whole run
+    method: object = field(default=None, kw_only=True)  # that ran, which is its settings
 
     def __repr__(self) -> str:
         return (

@@ -89,9 +89,9 @@ class SharedRotationStep:
 def shared_rotation_step(graph: PoseGraph, robots: Partition, V: Array, rho: float) -> SharedRotationStep:
     """Minimise sum_a f_a(x_a) s.t. copies of a pose agree: step (a) of Algorithm 1, split between robots.
 
-    f_a has robot a's edges, kappa ||R_j - R_i R_ij||_F^2, half of those it has with another robot, and rho/2 ||R_p -
-    V_p||_F^2 of its own poses; V = omega - B, (n, d, d). Robot a holds its own poses and their neighbours. K x = 0 says
-    that every copy is what its owner has. With two robots T = 1 is ADMM.
+    f_a has robot a's edges, kappa ||R_j - R_i R_ij||_F^2, half of those it has with another robot, and of its own poses
+    rho/2 ||R_p - V_p||_F^2, with V = omega - B, (n, d, d). Robot a holds its own poses and their neighbours. K x = 0
+    says that every copy is what its owner has. With two robots T = 1 is ADMM.
 
     A SettingError when rho is not positive or V has another shape.
     """

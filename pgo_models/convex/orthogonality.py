@@ -34,18 +34,11 @@ class Term:
 
 @dataclass(frozen=True, eq=False)
 class OrthogonalPoint:
-    """Where SOC starts or ends.
+    """Where SOC starts or ends."""
 
-    Attributes
-    ----------
-    copies : tuple of arrays
-        For every term, a point of its set.
-    normals : tuple of arrays
-        For every term, rho B: the multiplier, as a vector normal to the set at the copy. At a stationary point minus
-        their sum over the terms of a variable is a subgradient of J.
-    """
-
-    copies: tuple[Array, ...]
+    copies: tuple[Array, ...]  # for every term, a point of its set
+    # For every term, rho B: the multiplier, as a vector normal to the set at the copy. At a stationary point minus
+    # their sum over the terms of a variable is a subgradient of J.
     normals: tuple[Array, ...]
 
     def __post_init__(self) -> None:

@@ -90,8 +90,8 @@ def clique_relaxation(
 ) -> CliqueRelaxation:
     """Pose the relaxation over cliques (Fukuda, Kojima, Murota & Nakata, 2001; Vandenberghe & Andersen 2015, ch. 14).
 
-    Unless given, the centre is the stationary point that the chordal start polishes to: far from the optimum it costs
-    digits. So is the tree, `build_clique_tree(problem.graph)`.
+    Unless given, the centre is the stationary point that the chordal start polishes to, and the tree is
+    `build_clique_tree(problem.graph)`. A centre far from the optimum costs digits.
     """
     tree = tree if tree is not None else build_clique_tree(problem.graph)
     centre = centre if centre is not None else polish(problem, chordal_start(problem))

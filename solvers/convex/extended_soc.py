@@ -59,18 +59,6 @@ class ExtendedSOC:
 
     What fixes the gauge, as a prior does, wants a start near it: the default is the chordal start of the unchanged
     problem with pose 0 unrotated, and a pose turned by 180 degrees from its prior is a stationary point too.
-
-    Examples
-    --------
-    >>> import cvxpy as cp, numpy as np
-    >>> from pgo_models.convex.graph_subproblem import ModelChange, PoseVariables
-    >>> from pgo_models.graphs.scenes import random_geometric
-    >>> problem = PGOProblem(random_geometric(4, np.random.default_rng(0)))
-    >>> def near(unknown: PoseVariables) -> ModelChange:
-    ...     return ModelChange(terms=[10.0 * cp.sum_squares(unknown.t(3) - np.array([1.0, 0.0, 0.0]))])
-    >>> from solvers.loop import run
-    >>> run(ExtendedSOC(near), problem).status.name
-    'CONVERGED'
     """
 
     changer: Changer

@@ -79,7 +79,7 @@ class Interface:
     def rounding(self, contributions: Sequence[Array], own: Sequence[tuple[IntArray, Array]], diagonal: Array) -> Array:
         """Diagonal, (side,), that bounds what the factor of `factorize` can differ from the exact sum by.
 
-        What it is given, and `diagonal`, (side,), which is at least the diagonal of the sum.
+        `contributions` and `own` are as there; `diagonal`, (side,), is at least the diagonal of the sum.
         """
         in_column, most = tree_counts(self.tree, sum(self.widths), self.num_separators)
         terms = np.concatenate([np.repeat(in_column, width) for width in self.widths]) + len(contributions)

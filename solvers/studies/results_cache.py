@@ -14,10 +14,10 @@ Entry = dict[str, Any]
 
 
 class KeptResults:
-    """Results by key; the file is written anew, whole, whenever one is added, and where there is no path, not.
+    """Results by key; the file, if there is one, is written anew, whole, whenever a result is added.
 
-    Results that other versions of the software made are not taken up again, with `is_fresh` none of what the file
-    holds. A FileFormatError when the file is there and holds no results.
+    Results that other versions of the software made are not taken up again, with `is_fresh` none of what it holds. A
+    FileFormatError when the file is there and holds no results.
     """
 
     def __init__(self, path: Path | None, is_fresh: bool = False) -> None:
