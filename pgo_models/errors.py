@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 
 class PGOError(Exception):
-    """Root of every error that a wrong input or a missing piece raises here.
-
-    Examples
-    --------
-    >>> issubclass(GraphError, PGOError), issubclass(SettingError, PGOError)
-    (True, True)
-    """
+    """Root of every error that a wrong input or a missing piece raises here."""
 
 
 class GraphError(PGOError):
@@ -79,16 +74,20 @@ def check_settings(
     settings: object,
     *,
     positive: Sequence[str] = (),
+    finite: Sequence[str] = (),
     not_negative: Sequence[str] = (),
     at_least_one: Sequence[str] = (),
     above_one: Sequence[str] = (),
+    relaxation: Sequence[str] = (),
 ) -> None:
     """Raise a SettingError for the first of the named fields that is out of its range; one that is None passes."""
     rules: tuple[tuple[Sequence[str], str, Callable[[float], bool]], ...] = (
         (positive, "be positive", lambda value: value > 0),
+        (finite, "be positive and finite", lambda value: 0 < value < math.inf),
         (not_negative, "not be negative", lambda value: value >= 0),
         (at_least_one, "be at least 1", lambda value: value >= 1),
         (above_one, "be above 1", lambda value: value > 1),
+        (relaxation, "be in (0, 2)", lambda value: 0 < value < 2),
     )
     for names, rule, holds in rules:
         for name in names:

@@ -1,7 +1,5 @@
 """Text and tables read with our errors; files written whole or not at all, through a temporary one."""
 
-from __future__ import annotations
-
 import os
 import secrets
 import stat
@@ -23,10 +21,7 @@ LONGEST_LINE = 10_000  # characters; an edge in space with all its digits has 75
 def read_text(path: Path | str) -> str:
     """Text of a UTF-8 file, a pipe or a device; its lines end with LF, whatever they end with there (CRLF, CR).
 
-    Raises
-    ------
-    FileFormatError
-        When the file is missing, cannot be opened, or is not text.
+    A FileFormatError when the file is missing, cannot be opened, or is not text.
     """
     path = Path(path)
     try:
@@ -71,13 +66,7 @@ def check_quaternions(path: Path | str, lines: Sequence[int] | NDArray[np.int64]
 
 
 def finite_number(path: Path | str, line: int, word: str) -> float:
-    """Value of a word like -1.5e-3.
-
-    Raises
-    ------
-    FileFormatError
-        When the word is no number, or is nan, inf or beyond `LARGEST`.
-    """
+    """Value of a word like -1.5e-3; a FileFormatError when it is no number, or is nan, inf or beyond `LARGEST`."""
     try:
         # float() also takes 1_000 and the digits of other scripts; number files do not.
         value = float(word if word.isascii() and "_" not in word else "")
@@ -93,12 +82,8 @@ def finite_number(path: Path | str, line: int, word: str) -> float:
 def read_table(path: Path | str, columns: int) -> tuple[NDArray[np.float64], list[int]]:
     """Numbers (n, columns) of a text file with one row a line, and the line of every row, from 1.
 
-    Blank lines and comments (#) are skipped.
-
-    Raises
-    ------
-    FileFormatError
-        With file:line, when a line has too few or too many numbers or is not all numbers; when there is no row.
+    Blank lines and comments (#) are skipped. A FileFormatError with file:line, when a line has too few or too many
+    numbers or is not all numbers; when there is no row.
     """
     rows, lines = [], []
     for number, line in enumerate(read_text(path).split("\n"), 1):
@@ -132,13 +117,7 @@ def replace_when_done(path: Path | str) -> Iterator[Path]:
 
 
 def check_writable(path: Path | str) -> None:
-    """Raise what `replace_when_done` would for this path, before there is anything to write.
-
-    Raises
-    ------
-    PGOError
-        See `replace_when_done`.
-    """
+    """Raise the PGOError that `replace_when_done` would for this path, before there is anything to write."""
     with _temporary_beside(path) as (temporary, _):
         temporary.touch()
 

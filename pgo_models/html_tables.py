@@ -1,7 +1,5 @@
 """Short HTML tables, escaped: how graphs, certificates and solutions show themselves in notebooks."""
 
-from __future__ import annotations
-
 import html
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Methods on the problems of `pgo_models`: every one is settings with init, step, measure and converged."""
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING
 
@@ -52,59 +50,18 @@ _LATER = {
     "error_forgetting": "solvers.studies.forgetting",
 }
 
-__all__ = [
-    "GNC",
-    "IRLS",
-    "PCM",
-    "SOC",
-    "AlternatingBregman",
-    "Anderson",
-    "BalancedPenalty",
-    "BoydPenalty",
-    "Bregman",
-    "Checkpoint",
-    "Coupling",
-    "ExtendedSOC",
-    "Faults",
-    "FixedPenalty",
-    "GaussSeidel",
-    "History",
-    "InProcess",
-    "Ledger",
-    "LevenbergMarquardt",
-    "Measurement",
-    "Method",
-    "MethodOfMultipliers",
-    "MultiplierPenalty",
-    "Newton",
-    "OrthogonalSOC",
-    "PaperSOC",
-    "Pipeline",
-    "RStep",
-    "RayEngine",
-    "Record",
-    "RobustLoss",
-    "Run",
-    "Solution",
-    "Solver",
-    "Stage",
-    "Staircase",
-    "Status",
-    "TwoLineBregman",
-    "compare_methods",
-    "draw_paper_figures",
-    "error_forgetting",
-    "extend",
-    "gauss_newton",
-    "iterate",
-    "noise_sweep",
-    "pairwise_consistent",
-    "reproduce_tables",
-    "run",
-    "solve",
-    "solve_orthogonal",
-    "write_report",
-]
+# Room by room.
+__all__ = ["History", "Measurement", "Method", "Record", "Run", "Solver", "Stage", "Status", "iterate", "run"]
+__all__ += ["Pipeline", "Solution", "extend", "solve", "write_report"]
+__all__ += ["SOC", "Anderson", "Coupling", "PaperSOC", "RStep"]
+__all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty"]
+__all__ += ["Newton", "Staircase", "gauss_newton"]
+__all__ += ["GNC", "IRLS", "PCM", "RobustLoss", "pairwise_consistent"]
+__all__ += ["GaussSeidel", "LevenbergMarquardt"]
+__all__ += ["Checkpoint", "Faults", "InProcess", "Ledger", "RayEngine"]
+__all__ += ["AlternatingBregman", "Bregman", "MethodOfMultipliers", "TwoLineBregman"]
+__all__ += ["ExtendedSOC", "OrthogonalSOC", "solve_orthogonal"]
+__all__ += ["compare_methods", "draw_paper_figures", "error_forgetting", "noise_sweep", "reproduce_tables"]
 
 
 def __getattr__(name: str) -> object:

@@ -1,7 +1,5 @@
 """What the arguments of `pgo` name: graphs, problems, poses and their times."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

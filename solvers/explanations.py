@@ -1,7 +1,5 @@
 """Endings explained by the graph: which weight cannot be factored or leaves no bound, what took the memory."""
 
-from __future__ import annotations
-
 import functools
 import warnings
 from collections.abc import Callable

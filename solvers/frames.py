@@ -1,7 +1,5 @@
 """Which frame a solution is in: that of priors, of an anchor, of the estimate that came with the graph."""
 
-from __future__ import annotations
-
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 

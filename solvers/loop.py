@@ -1,7 +1,5 @@
 """The one loop: steps a solver, keeps the clock, the history and the best iterate, prints, and knows when to end."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -24,13 +22,6 @@ class Method(Protocol[P, X, S]):
     """What the loop needs of an iterative method: settings, and these functions of them.
 
     P is the kind of problem, X what a run can be started from, S the method's state.
-
-    Examples
-    --------
-    >>> from solvers.riemannian.newton import Newton
-    >>> method: Method = Newton(max_iterations=7)
-    >>> method.max_iterations
-    7
     """
 
     @property
@@ -51,18 +42,7 @@ class Method(Protocol[P, X, S]):
 
 
 class Solver(Method[PGOProblem, Poses, S], Protocol[S]):
-    """A method for pose graphs: every state stands for feasible poses.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers.riemannian.newton import Newton
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> solver: Solver = Newton()
-    >>> solver.poses(problem, solver.init(problem, None))
-    Poses(n=27, d=3)
-    """
+    """A method for pose graphs: every state stands for feasible poses."""
 
     def poses(self, problem: PGOProblem, state: S) -> Poses:
         """Feasible poses of a state, those whose F `measure` reports."""
@@ -122,12 +102,10 @@ def run(
     verbose: bool = False,
     progress: bool | None = None,
 ) -> Outcome[S]:
-    """Run a method on a problem of its kind to its end.
+    """Run a method on a problem of its kind to its end; a Solver on a PGOProblem or PoseGraph.
 
     Parameters
     ----------
-    method : Method
-    problem : PGOProblem or PoseGraph for a Solver, or another method's own kind
     start : Poses, or the kind of point that the method starts at, optional
         The method's own start unless given.
     earlier : tuple of Record
@@ -243,7 +221,6 @@ class Watch:
         return Run(name, objective, state, status, k, history, seconds, poses, method=method)
 
     def _ending(self, method: Method[P, X, S], state: S, record: Record) -> Status | None:
-        """Status when the run ends at this state, else None."""
         is_late = time.perf_counter() - self.began > self.time_limit
         if self.callback is not None and self.callback(state, record):
             return Status.STOPPED

@@ -91,25 +91,16 @@ class JobBar(Progress):
         self.advance(self._task)
 
 
-class _TerminalBar:
+class _TerminalBar(Progress):
     def __init__(self, name: str, max_iterations: int) -> None:
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-            TextColumn("{task.fields[figures]}"),
-            TimeElapsedColumn(),
-            console=Console(stderr=True),
-            transient=True,
-        )
-        self._progress.start()
-        self._task = self._progress.add_task(name, total=max_iterations, figures="")
+        texts = (TextColumn("{task.completed:.0f}/{task.total:.0f}"), TextColumn("{task.fields[figures]}"))
+        columns = (TextColumn("{task.description}"), BarColumn(), *texts, TimeElapsedColumn())
+        super().__init__(*columns, console=Console(stderr=True), transient=True)
+        self.start()
+        self._task = self.add_task(name, total=max_iterations, figures="")
 
     def show(self, k: int, text: str) -> None:
-        self._progress.update(self._task, completed=k, figures=text)
-
-    def stop(self) -> None:
-        self._progress.stop()
+        self.update(self._task, completed=k, figures=text)
 
 
 class _NotebookBar:

@@ -51,11 +51,6 @@ class Measurement:
         are. The best iterate of a run has the least infeasibility, and among those the least objective.
     rounds, num_bytes, all_reduces : int, optional
         Communication so far, of methods that run by many robots.
-
-    Examples
-    --------
-    >>> Measurement(objective=2.5, primal_residual=0.1, dual_residual=0.2).infeasibility
-    0.0
     """
 
     objective: float
@@ -69,13 +64,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Record:
-    """One row of a history: iterate k, seconds spent in steps up to it, and its figures.
-
-    Examples
-    --------
-    >>> Record(k=3, seconds=0.5, measurement=Measurement(2.5, 0.1, 0.2)).k
-    3
-    """
+    """One row of a history: iterate k, seconds spent in steps up to it, and its figures."""
 
     k: int
     seconds: float
@@ -84,14 +73,7 @@ class Record:
 
 @dataclass(frozen=True)
 class History:
-    """Records of all measured iterates, in order.
-
-    Examples
-    --------
-    >>> records = tuple(Record(k, 0.1 * k, Measurement(2.0 + 0.5**k, 0.0, 0.0)) for k in range(3))
-    >>> History(records).objective
-    array([3.  , 2.5 , 2.25])
-    """
+    """Records of all measured iterates, in order."""
 
     records: tuple[Record, ...] = ()
 
@@ -126,34 +108,16 @@ class History:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Outcome(Generic[S]):
-    """A finished run of one method, on a problem of any kind.
+    """A finished run of one method, on a problem of any kind."""
 
-    Attributes
-    ----------
-    name : str
-        Of the method.
-    objective : float
-        Of `state`.
-    state : S
-        The last iterate, or the best one when the run did not succeed.
-    status : Status
-    iterations : int
-        Finished steps.
-    history : History
-    seconds : float
-        Wall time of the whole run.
-    method : object
-        The method that ran, which is its settings.
-    """
-
-    name: str
-    objective: float
-    state: S
+    name: str  # of the method
+    objective: float  # of `state`
+    state: S  # the last iterate, or the best one when the run did not succeed
     status: Status
-    iterations: int
+    iterations: int  # finished steps
     history: History
-    seconds: float
-    method: object = field(default=None, kw_only=True)
+    seconds: float  # wall time of the whole run
+    method: object = field(default=None, kw_only=True)  # that ran, which is its settings
 
     def __repr__(self) -> str:
         return (
@@ -170,11 +134,6 @@ class Run(Outcome[S]):
     ----------
     poses : Poses
         Of the last iterate, or of the best one (lowest F) when the run did not succeed; `objective` is F of them.
-
-    Examples
-    --------
-    >>> Run("SOC", 2.5, None, Status.CONVERGED, 7, History(), 0.25, Poses.identity(4, 3)).poses
-    Poses(n=4, d=3)
     """
 
     poses: Poses
@@ -182,25 +141,7 @@ class Run(Outcome[S]):
 
 @dataclass(frozen=True)
 class Stage:
-    """What one stage of a solve did.
-
-    Attributes
-    ----------
-    name : str
-    status : Status
-    iterations : int
-    objective : float
-    seconds : float
-    history : History
-    method : object
-        The method that ran, which is its settings; None for a start.
-
-    Examples
-    --------
-    >>> run = Run("SOC", 2.5, None, Status.CONVERGED, 7, History(), 0.25, Poses.identity(4, 3))
-    >>> Stage.of(run).name
-    'SOC'
-    """
+    """What one stage of a solve did."""
 
     name: str
     status: Status
@@ -208,7 +149,7 @@ class Stage:
     objective: float
     seconds: float
     history: History
-    method: object = None
+    method: object = None  # the method that ran, which is its settings; None for a start
 
     @classmethod
     def of(cls, run: Run[S]) -> Stage:

@@ -148,3 +148,16 @@ def assert_says(error: Exception, opening: str, words: list[str]) -> None:
     assert "\n" not in message
     for word in words:
         assert word in message
+
+
+def translation_scale(problem: PGOProblem) -> Array:
+    """Diagonal of M over the translation row of every pose, (n,)."""
+    return np.asarray(problem.M.data[problem.diagonal_positions[: problem.num_poses]])
+
+
+def polar_factor(A: Array, *, rotation: bool = False) -> Array:
+    """U V^T of the SVD, with its determinant made 1 for rotations."""
+    U, _, Vt = np.linalg.svd(A, full_matrices=False)
+    if rotation and np.linalg.det(U @ Vt) < 0:
+        U[:, -1] *= -1.0
+    return np.asarray(U @ Vt)

@@ -5,8 +5,6 @@ three forms of the iteration whose subproblems are compiled here, each with one 
 alternates over the blocks of x. The iterations themselves are in solvers/convex/bregman.py.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -179,12 +177,8 @@ def augmented_lagrangian_subproblem(problem: BregmanProblem, alpha: float, toler
 def block_subproblems(problem: BregmanProblem, alpha: float, tolerance: float = TOLERANCE) -> tuple[Subproblem, ...]:
     """Solve, for block i, c -> argmin J_i(x_i) + alpha/2 ||K_i x_i - c||^2 (paper: `bregman ADMM`).
 
-    Minimises the augmented Lagrangian over x_i when c = f + lam / alpha - sum of K_j x_j over the other blocks.
-
-    Raises
-    ------
-    SettingError
-        When J is not a sum of terms of one variable each.
+    Minimises the augmented Lagrangian over x_i when c = f + lam / alpha - sum of K_j x_j over the other blocks. A
+    SettingError when J is not a sum of terms of one variable each.
     """
     root = float(np.sqrt(alpha / 2))
     separated = _terms_by_variable(problem)

@@ -1,7 +1,5 @@
 """Worked models of the form min J(x) s.t. K x = f, for the Bregman iterations of solvers/convex/bregman.py."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cvxpy as cp
@@ -30,10 +28,7 @@ def basis_pursuit(K: Array, f: Array) -> BregmanProblem:
 def differences(shape: tuple[int, ...]) -> csr_array:
     """Forward differences of a signal or an image, flattened row by row: down the rows first, then across the columns.
 
-    Raises
-    ------
-    SettingError
-        When the shape has not one or two dimensions, or only one entry.
+    A SettingError when the shape has not one or two dimensions, or only one entry.
     """
     if len(shape) not in (1, 2) or int(np.prod(shape)) < 2:
         raise SettingError(f"shape is {shape}; give a signal or an image of two entries or more")
@@ -48,11 +43,7 @@ def total_variation_denoising(noisy: Array, weight: float) -> BregmanProblem:
     """Minimise 1/2 ||u - noisy||^2 + weight ||d||_1 s.t. D u - d = 0: ROF, anisotropic in two dimensions.
 
     D are the forward differences. The variables are u and d, so that AlternatingBregman with T = 1 is split Bregman:
-    a least-squares step in u and soft thresholding in d.
-
-    References
-    ----------
-    Rudin, Osher, Fatemi 1992; Goldstein & Osher 2009.
+    a least-squares step in u and soft thresholding in d (Rudin, Osher, Fatemi 1992; Goldstein & Osher 2009).
     """
     noisy = finite_array(noisy, "noisy")
     if not 0 <= weight < np.inf:
@@ -68,11 +59,6 @@ def total_variation_scale_space(noisy: Array) -> BregmanProblem:
 
     They begin over-smoothed and take detail back, large contrasts first and noise last: stop when
     ||u - noisy|| falls below the norm of the noise (Osher et al. 2005).
-
-    Examples
-    --------
-    >>> total_variation_scale_space(np.zeros((3, 4)))
-    BregmanProblem(m=12, s=12, blocks=1)
     """
     noisy = finite_array(noisy, "noisy")
     u = cp.Variable(noisy.shape, name="u")
@@ -103,18 +89,11 @@ class SharedRotationStep:
 def shared_rotation_step(graph: PoseGraph, robots: Partition, V: Array, rho: float) -> SharedRotationStep:
     """Minimise sum_a f_a(x_a) s.t. copies of a pose agree: step (a) of Algorithm 1, split between robots.
 
-    f_a has robot a's edges, kappa ||R_j - R_i R_ij||_F^2, half of those it has with another robot, and
-    rho/2 ||R_p - V_p||_F^2 of its own poses; V = omega - B. Robot a holds its own poses and their neighbours. K x = 0
+    f_a has robot a's edges, kappa ||R_j - R_i R_ij||_F^2, half of those it has with another robot, and of its own poses
+    rho/2 ||R_p - V_p||_F^2, with V = omega - B, (n, d, d). Robot a holds its own poses and their neighbours. K x = 0
     says that every copy is what its owner has. With two robots T = 1 is ADMM.
 
-    Parameters
-    ----------
-    V : (n, d, d)
-
-    Raises
-    ------
-    SettingError
-        When rho is not positive or V has another shape.
+    A SettingError when rho is not positive or V has another shape.
     """
     n, d = graph.num_poses, graph.d
     V = finite_array(V, "V")

@@ -1,7 +1,5 @@
 """How cvxpy models are given to Clarabel, and those of Bregman iteration and SOC checked: convex, solved tightly."""
 
-from __future__ import annotations
-
 import math
 import warnings
 
@@ -21,13 +19,7 @@ _MEANING = {
 
 
 def check_convex(expression: cp.Expression, name: str) -> None:
-    """Raise unless an expression is one real number, convex by the rules of disciplined convex programming.
-
-    Raises
-    ------
-    SettingError
-        With the shape, or the curvature and the part that has it.
-    """
+    """Raise a SettingError unless an expression is one real number, convex by the rules of cvxpy; how it is not."""
     if not isinstance(expression, cp.Expression):
         raise SettingError(f"{name} is a {type(expression).__name__}; give a cvxpy expression")
     if expression.size != 1:
@@ -52,17 +44,10 @@ def check_variable(variable: cp.Variable, name: str) -> None:
 
 
 def solve_compiled(problem: cp.Problem, name: str, tolerance: float = TOLERANCE) -> None:
-    """Solve a compiled problem by Clarabel, cold, so that equal parameters give equal bits.
+    """Solve a compiled problem by Clarabel, cold, so that equal parameters give equal bits; `name` is for messages.
 
-    Parameters
-    ----------
-    problem : cp.Problem
-        Its variables hold the solution afterwards.
-    name : str
-        For messages.
-    tolerance : float
-        On the gap and on feasibility, absolute and relative. Where rounding does not allow it, 100 times as much is
-        tried, and so on up to LOOSEST_TOLERANCE.
+    The tolerance is on the gap and on feasibility, absolute and relative. Where rounding does not allow it, 100 times
+    as much is tried, and so on up to LOOSEST_TOLERANCE. The variables hold the solution afterwards.
 
     Raises
     ------
@@ -93,10 +78,7 @@ def run_clarabel(
 ) -> None:
     """Run Clarabel on one thread to a tolerance on the gap and on feasibility; `problem.status` says how it ended.
 
-    Raises
-    ------
-    cp.SolverError
-        When it ends without an iterate.
+    A cp.SolverError when it ends without an iterate.
     """
     with warnings.catch_warnings():
         # The status says so too, and every caller minds it.
@@ -114,13 +96,7 @@ def run_clarabel(
 
 
 def finite_array(values: object, name: str) -> Array:
-    """Read-only copy of `values` as doubles.
-
-    Raises
-    ------
-    SettingError
-        When they are no real numbers, or not finite.
-    """
+    """Read-only copy of `values` as doubles; a SettingError when they are no real numbers, or not finite."""
     array = real_array(values, name, SettingError)
     bad = np.argwhere(~np.isfinite(array))
     if len(bad):

@@ -3,8 +3,6 @@
 The projection onto orthonormal columns is Theorem 1 of Lai & Osher 2014 and step (b) of the paper's Algorithm 1.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@
 Step (a) of the paper's Algorithm 1 (`algo1: SOC`): rotations only as the paper has it, or joint in (R, t).
 """
 
-from __future__ import annotations
-
 import enum
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -38,20 +36,12 @@ class Neighbours(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class PoseVariables:
-    """The unknowns of a program by the names of the graph.
-
-    Attributes
-    ----------
-    poses : (n_a,)
-        Poses of the graph that are unknown, ascending.
-    X : cp.Variable
-        Rows t_i (not for ROTATIONS), then the rows of every R_i^T.
-    """
+    """The unknowns of a program by the names of the graph."""
 
     graph: PoseGraph
     unknowns: Unknowns
-    poses: IntArray
-    X: cp.Variable
+    poses: IntArray  # (n_a,): poses of the graph that are unknown, ascending
+    X: cp.Variable  # rows t_i (not for ROTATIONS), then the rows of every R_i^T
 
     @property
     def num_translations(self) -> int:
@@ -110,23 +100,15 @@ Changer = Callable[[PoseVariables], ModelChange]
 
 @dataclass(frozen=True, eq=False)
 class GraphQP:
-    """A compiled R-subproblem on the poses of a graph.
-
-    Attributes
-    ----------
-    qp : RotationQP
-        The cvxpy problem and its Parameter.
-    A, w
-        Residuals and weights of the edges that count, in the rows of X.
-    between : sparse (N_a, N)
-        A_a^T diag(w) A on the frozen neighbours' rows of the whole graph; empty unless FROZEN.
-    """
+    """A compiled R-subproblem on the poses of a graph."""
 
     variables: PoseVariables
-    qp: RotationQP
+    qp: RotationQP  # the cvxpy problem and its Parameter
     change: ModelChange
+    # A, w: residuals and weights of the edges that count, in the rows of X.
     A: csr_array
     w: Array
+    # Sparse (N_a, N): A_a^T diag(w) A on the frozen neighbours' rows of the whole graph; empty unless FROZEN.
     between: csr_array
 
     def solve(self, V: Array, neighbours: Array | None = None) -> Array:
@@ -206,12 +188,8 @@ def robot_qp(
     """Pose the R-subproblem of one robot of `graph.robots` with its neighbours' terms; parameters as `graph_qp`.
 
     With COPIES and `rho_t` on the separators it is the subproblem of SOC's CONSENSUS coupling, whose penalties are the
-    shares of the copies; with FROZEN and ROTATIONS it is the paper's.
-
-    Raises
-    ------
-    SettingError
-        When the robot owns no pose, or frozen neighbours pull on translations that have no penalty.
+    shares of the copies; with FROZEN and ROTATIONS it is the paper's. A SettingError when the robot owns no pose, or
+    frozen neighbours pull on translations that have no penalty.
     """
     owned = graph.robots == robot
     if not owned.any():

@@ -34,18 +34,11 @@ class Term:
 
 @dataclass(frozen=True, eq=False)
 class OrthogonalPoint:
-    """Where SOC starts or ends.
+    """Where SOC starts or ends."""
 
-    Attributes
-    ----------
-    copies : tuple of arrays
-        For every term, a point of its set.
-    normals : tuple of arrays
-        For every term, rho B: the multiplier, as a vector normal to the set at the copy. At a stationary point minus
-        their sum over the terms of a variable is a subgradient of J.
-    """
-
-    copies: tuple[Array, ...]
+    copies: tuple[Array, ...]  # for every term, a point of its set
+    # For every term, rho B: the multiplier, as a vector normal to the set at the copy. At a stationary point minus
+    # their sum over the terms of a variable is a subgradient of J.
     normals: tuple[Array, ...]
 
     def __post_init__(self) -> None:
@@ -142,10 +135,7 @@ class OrthogonalProblem:
     def point(self, values: Sequence[Array]) -> OrthogonalPoint:
         """Point with the projections of `values`, one for every variable in `variables`, and no multipliers.
 
-        Raises
-        ------
-        SettingError
-            When their number or shapes do not fit, or entries are not finite.
+        A SettingError when their number or shapes do not fit, or entries are not finite.
         """
         if len(values) != len(self.variables):
             raise SettingError(f"{len(values)} values for {len(self.variables)} variables")
@@ -262,39 +252,23 @@ class SplitProblem:
 
 @dataclass(frozen=True, eq=False)
 class KKTResiduals:
-    """How far a point is from satisfying the KKT conditions of the non-convex problem.
+    """How far a point is from satisfying the KKT conditions of the non-convex problem."""
 
-    Attributes
-    ----------
-    feasibility : float
-        Norm of the violation of X^T X = I, of the convex constraints, and of the agreement of a variable's copies.
-    stationarity : float
-        rho ||X - Z||_F, see `kkt_residuals`.
-    gradient_norm : float
-        Norm of the subgradient of J that the multipliers balance: the scale of `stationarity`.
-    multipliers : tuple of arrays
-        For X^T X = I the symmetric Lambda, (p, p), with X Lambda in the subdifferential of J; for the other sets the
-        normal vector itself, minus.
-    """
-
-    feasibility: float
-    stationarity: float
-    gradient_norm: float
+    feasibility: float  # norm of the violation of all constraints, and of the agreement of a variable's copies
+    stationarity: float  # rho ||X - Z||_F, see `kkt_residuals`
+    gradient_norm: float  # of the subgradient of J that the multipliers balance: the scale of `stationarity`
+    # For X^T X = I the symmetric Lambda, (p, p), with X Lambda in the subdifferential of J; for the other sets the
+    # normal vector itself, minus.
     multipliers: tuple[Array, ...]
 
 
 def kkt_residuals(problem: OrthogonalProblem, point: OrthogonalPoint, rho: float) -> KKTResiduals:
-    """Judge a point by one convex solve, whatever found it.
+    """Judge a point by one convex solve, whatever found it; rho of the order of the curvature of J.
 
     The normals N of the point, projected once more onto the normal spaces, are its multipliers: for X^T X = I they are
     -X Lambda. X is stationary if and only if -sum N is a subgradient of J at X, and that holds if and only if X is
     Z = argmin J + sum rho/2 ||Z - (X - N / rho)||^2. In general -sum N + rho (X - Z) is a subgradient at Z (times the
     number of terms of the variable), so rho ||X - Z|| is what stationarity lacks.
-
-    Parameters
-    ----------
-    rho : float
-        Of the order of the curvature of J.
     """
     normals = [
         term.constraint.normal_part(copy, normal)
@@ -325,7 +299,6 @@ def norm_of_all(arrays: Sequence[Array]) -> float:
 
 
 def _minimised(problem: cp.Problem) -> cp.Expression:
-    """J, checked, of a problem whose constraints are convex."""
     maximises = isinstance(problem.objective, cp.Maximize)
     expression = problem.objective.args[0]
     if maximises and not expression.is_concave():

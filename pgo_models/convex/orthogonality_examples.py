@@ -1,7 +1,5 @@
 """Worked models with orthogonality constraints whose answers are known, for solvers.solve_orthogonal."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cvxpy as cp
@@ -15,15 +13,11 @@ from pgo_models.graphs.pose_graph import PoseGraph
 
 
 def procrustes(A: Array, B: Array, *, rotation: bool = False) -> OrthogonalProblem:
-    """Minimise ||A X - B||_F^2 s.t. X^T X = I, or X in SO(d).
+    """Minimise ||A X - B||_F^2 s.t. X^T X = I, or X in SO(d) (Schoenemann 1966; Lai & Osher 2014, section 4).
 
     Balanced, A (l, n) and B (l, n): X = U V^T of the SVD of A^T B, with the sign of the last singular pair changed for
     SO(d) when det(U V^T) < 0. With A = I, the nearest orthonormal matrix to B. Unbalanced, B (l, p) with p < n, has no
     closed form (Elden & Park 1999).
-
-    References
-    ----------
-    Schoenemann 1966; Lai & Osher 2014, section 4.
     """
     A, B = _matrix(A, "A"), _matrix(B, "B")
     if len(A) != len(B):
@@ -36,12 +30,8 @@ def procrustes(A: Array, B: Array, *, rotation: bool = False) -> OrthogonalProbl
 def smallest_eigenvectors(A: Array, count: int) -> OrthogonalProblem:
     """Minimise tr(X^T A X) s.t. X^T X = I, A symmetric positive semidefinite: the sum of the smallest eigenvalues.
 
-    X spans their eigenvectors. For the largest ones of A give c I - A, c at least the largest eigenvalue.
-
-    Raises
-    ------
-    SettingError
-        When A is not symmetric positive semidefinite.
+    X spans their eigenvectors. For the largest ones of A give c I - A, c at least the largest eigenvalue. A
+    SettingError when A is not symmetric positive semidefinite.
     """
     A = _matrix(A, "A")
     X = cp.Variable((len(A), count), name="X")
@@ -62,11 +52,8 @@ def one_norm_components(A: Array, count: int) -> OrthogonalProblem:
 def sparse_components(A: Array, count: int, weight: float) -> OrthogonalProblem:
     """Minimise tr(X^T A X) + weight * sum |X| s.t. X^T X = I, A positive semidefinite: compressed modes.
 
-    No answer is below the sum of the smallest eigenvalues + weight * count, since a unit column has 1-norm at least 1.
-
-    References
-    ----------
-    Ozolins, Lai, Caflisch, Osher 2013.
+    No answer is below the sum of the smallest eigenvalues + weight * count, since a unit column has 1-norm at least 1
+    (Ozolins, Lai, Caflisch, Osher 2013).
     """
     A = _matrix(A, "A")
     X = cp.Variable((len(A), count), name="X")
@@ -91,17 +78,13 @@ def rotation_averaging(graph: PoseGraph) -> OrthogonalProblem:
 def sparse_low_rank(Y: Array, rank: int, nonzeros: int) -> OrthogonalProblem:
     """Minimise ||Y - B C||_F^2 s.t. B^T B = I, ||B||_0 <= nonzeros: sparse low-rank approximation (the paper's remark).
 
-    Y, (n, samples), is the data in a transform (wavelet, graph Fourier) in which they are sparse. For B given C = B^T Y
-    is best, which leaves ||Y||_F^2 - ||B^T Y||_F^2. It is concave in B, but on B^T B = I it is
-    tr(B^T (c I - Y Y^T) B) + ||Y||_F^2 - c rank, convex with c = ||Y||_2^2. This is J: the squared error. B is in two
-    sets and has a copy for each, one from the SVD step and one from hard thresholding.
+    Y, (n, samples), is the data in a transform (wavelet, graph Fourier) in which they are sparse (SLRMA: Hou, Chau,
+    Magnenat-Thalmann, He 2017). For B given C = B^T Y is best, which leaves ||Y||_F^2 - ||B^T Y||_F^2. It is concave in
+    B, but on B^T B = I it is tr(B^T (c I - Y Y^T) B) + ||Y||_F^2 - c rank, convex with c = ||Y||_2^2. This is J: the
+    squared error. B is in two sets and has a copy for each, one from the SVD step and one from hard thresholding.
 
     Start at the left singular vectors of Y, with a fixed penalty of 3 c or more: two non-convex sets have many
     stationary points, and from a random start SOC mostly ends at a poor one, or does not end.
-
-    References
-    ----------
-    Hou, Chau, Magnenat-Thalmann, He 2017 (SLRMA).
     """
     Y = _matrix(Y, "Y")
     c = float(np.linalg.norm(Y, 2)) ** 2
@@ -109,14 +92,6 @@ def sparse_low_rank(Y: Array, rank: int, nonzeros: int) -> OrthogonalProblem:
     spectral = cp.sum_squares(_root(c * np.eye(len(Y)) - Y @ Y.T) @ B)
     objective = spectral + float(np.sum(Y**2)) - c * rank
     return OrthogonalProblem(cp.Problem(cp.Minimize(objective)), orthogonal=[B], sparse=[(B, nonzeros)])
-
-
-def polar_factor(A: Array, *, rotation: bool = False) -> Array:
-    """The exact answer of balanced Procrustes for A^T B = `A`: U V^T, with its determinant made 1 for rotations."""
-    U, _, Vt = np.linalg.svd(_matrix(A, "A"), full_matrices=False)
-    if rotation and np.linalg.det(U @ Vt) < 0:
-        U[:, -1] *= -1.0
-    return np.asarray(U @ Vt)
 
 
 def _root(A: Array) -> Array:

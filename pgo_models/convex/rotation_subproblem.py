@@ -6,8 +6,6 @@ joint in rotations and translations, for a whole graph or for one robot's share 
 only Parameter (DPP), so that the problem is compiled once and solved again for every shift.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -24,22 +22,12 @@ TOLERANCES = (1e-12, 1e-10, 1e-8)
 
 @dataclass(frozen=True, eq=False)
 class RotationQP:
-    """A compiled R-subproblem.
-
-    Attributes
-    ----------
-    X : cp.Variable, (N, d)
-        Rows t_i, then the rows of every R_i^T, of the poses concerned.
-    shift : cp.Parameter, (N_D, d)
-        sqrt(D) V on the rows whose penalty is not zero.
-    penalty : (N,)
-        The diagonal of D.
-    """
+    """A compiled R-subproblem."""
 
     problem: cp.Problem
-    X: cp.Variable
-    shift: cp.Parameter
-    penalty: Array
+    X: cp.Variable  # (N, d): rows t_i, then the rows of every R_i^T, of the poses concerned
+    shift: cp.Parameter  # (N_D, d): sqrt(D) V on the rows whose penalty is not zero
+    penalty: Array  # (N,): the diagonal of D
 
     def solve(self, V: Array) -> Array:
         """X, (N, d), for the shift V, (N, d); rows of V without a penalty do not matter.

@@ -1,7 +1,5 @@
 """Numbers as frozen objects hold them: checked, never cast silently, in read-only arrays of their own."""
 
-from __future__ import annotations
-
 import operator
 from typing import Any, TypeVar
 
@@ -38,10 +36,7 @@ def read_only(values: T) -> T:
 def real_array(values: object, name: str, error: type[PGOError] = GraphError) -> Array:
     """Real numbers as doubles, in a read-only array of their own; one that is such an array already is not copied.
 
-    Raises
-    ------
-    error
-        When they are complex, booleans or words, or are no array.
+    Raises `error` when they are complex, booleans or words, or are no array.
     """
     array = _numbers(values, name, "real numbers", error)
     return read_only(np.array(array, dtype=np.float64, order="C")) if _is_shared(array, np.float64) else array
@@ -50,10 +45,7 @@ def real_array(values: object, name: str, error: type[PGOError] = GraphError) ->
 def whole_array(values: object, name: str, error: type[PGOError] = GraphError) -> NDArray[np.int64]:
     """Whole numbers of 64 bits, in a read-only array of their own; floats must hold them exactly.
 
-    Raises
-    ------
-    error
-        As `real_array`; also for a fraction, nan, or a float so large that it may stand for several whole numbers.
+    Raises `error` as `real_array`; also for a fraction, nan, or a float so large that it may stand for several numbers.
     """
     array = _numbers(values, name, "whole numbers", error)
     if not array.ndim:
@@ -68,13 +60,7 @@ def whole_array(values: object, name: str, error: type[PGOError] = GraphError) -
 
 
 def whole_number(value: object, name: str, error: type[PGOError] = GraphError) -> int:
-    """Whole number that is given as an integer.
-
-    Raises
-    ------
-    error
-        For a float, even a whole one, True or False, and anything else.
-    """
+    """Whole number that is given as an integer; raises `error` for a float, even a whole one, True, and all else."""
     try:
         if not isinstance(value, bool | np.bool_):
             return operator.index(value)  # type: ignore[arg-type]  # the TypeError is the check

@@ -117,13 +117,7 @@ class Poses(ReadOnly):
         return self.moved(R, -R @ self.t[index])
 
     def anchored_to(self, other: Poses, index: int) -> Poses:
-        """Move the world so that pose `index` is where `other` has it, to the last bit.
-
-        Raises
-        ------
-        GraphError
-            When the two have not the same number of poses and dimension.
-        """
+        """Move the world so that pose `index` is exactly where `other` has it; a GraphError where sizes differ."""
         _check_same_size(self, other)
         turn = other.R[index] @ self.R[index].T
         moved = self.moved(turn, other.t[index] - turn @ self.t[index])
@@ -135,12 +129,8 @@ class Poses(ReadOnly):
         """Move the world so that positions, then rotations where they leave it open, fit `other` best.
 
         The rigid motion (R, t) minimises sum_i ||R t_i + t - t_i'||^2 (Arun et al. 1987). When the positions do not fix
-        the rotation (all in one point or on a line, in space), sum_i ||R R_i - R_i'||^2 decides instead.
-
-        Raises
-        ------
-        GraphError
-            When the two have not the same number of poses and dimension.
+        the rotation (all in one point or on a line, in space), sum_i ||R R_i - R_i'||^2 decides instead. A GraphError
+        when the two have not the same number of poses and dimension.
         """
         _check_same_size(self, other)
         mine, theirs = self.t - self.t.mean(axis=0), other.t - other.t.mean(axis=0)
@@ -155,10 +145,7 @@ class Poses(ReadOnly):
 def rotations_to_rounding(R: Array, name: Callable[[int], str]) -> Array:
     """R, (n, d, d), with the rotations among them that are so only to `ROTATION_TOLERANCE` projected; read-only.
 
-    Raises
-    ------
-    GraphError
-        For a matrix beyond that; `name` gives the k-th one a name.
+    A GraphError for a matrix beyond that; `name` gives the k-th one a name.
     """
     error = orthogonality_error(R)
     rough = ~(error <= _ROUNDING)

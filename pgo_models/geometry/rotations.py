@@ -3,8 +3,6 @@
 The projection is step (b) of the paper's Algorithm 1 (`algo1: SOC`), with det = +1 enforced.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -18,18 +16,12 @@ _POLAR_MIN_DETERMINANT = 1e-2  # of the matrix scaled to Frobenius norm sqrt(3);
 
 
 def project_to_rotations(A: Array) -> Array:
-    """Nearest rotations: argmin over omega in SO(d) of ||omega - A_i||_F for every A_i.
+    """Nearest rotations: argmin over omega in SO(d) of ||omega - A_i||_F for every A_i, (n, d, d).
 
     With the SVD A = U D V^T the answer is U diag(1, .., 1, det(U V^T)) V^T. Well conditioned 3 x 3 matrices of
     positive determinant take Newton's polar iteration X <- (X + cof(X) / det X) / 2 instead, which has the same limit.
 
-    Parameters
-    ----------
-    A : (n, d, d)
-
-    Returns
-    -------
-    (n, d, d) rotations. Where the nearest one is not unique, one of the nearest.
+    Where the nearest one is not unique, one of the nearest.
 
     References
     ----------

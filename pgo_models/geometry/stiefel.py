@@ -4,8 +4,6 @@ For r = d the blocks are the transposes R_i^T of rotations or reflections; a lar
 room (Rosen et al. 2019, section 4; Absil, Mahony & Sepulchre, Optimization Algorithms on Matrix Manifolds, 2008).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from pgo_models.geometry.rotations import Array
@@ -18,12 +16,7 @@ def row_products(A: Array, B: Array) -> Array:
 
 
 def project_to_tangent(Y: Array, V: Array) -> Array:
-    """V_i - sym(V_i Y_i^T) Y_i: the nearest V with V_i Y_i^T skew, which is tangent at Y.
-
-    Parameters
-    ----------
-    Y, V : (n, d, r)
-    """
+    """V_i - sym(V_i Y_i^T) Y_i, (n, d, r): the nearest V with V_i Y_i^T skew, which is tangent at Y, (n, d, r)."""
     return np.asarray(V - row_products(V, Y) @ Y)
 
 

@@ -1,7 +1,5 @@
 """Pose graphs by name: from data/, from the folder named by PGO_DATA, or by a download that is checked."""
 
-from __future__ import annotations
-
 import difflib
 import hashlib
 import os
@@ -9,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 from pgo_models.errors import DatasetError, FileFormatError
 from pgo_models.files import replace_when_done
@@ -18,31 +15,19 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.graphs.trajectories import read_tum
 
-if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
-
 DATA_VARIABLE = "PGO_DATA"
 _TIMEOUT = 30.0  # seconds without an answer
 
 
 @dataclass(frozen=True)
 class Registry:
-    """A public folder of g2o files with their checksums.
+    """A public folder of g2o files with their checksums."""
 
-    Attributes
-    ----------
-    base_url : str
-        The file of a name is at `base_url/name.g2o`.
-    checksums : mapping of str to str
-        `sha256:` and the digest of the file, or `blob:` and its git blob id, the SHA-1 of "blob <size>", a zero byte
-        and the file.
-    cache : Path, optional
-        Folder for downloads; the user's cache unless given.
-    """
-
-    base_url: str
+    base_url: str  # the file of a name is at `base_url/name.g2o`
+    # `sha256:` and the digest of the file, or `blob:` and its git blob id: the SHA-1 of "blob <size>", a zero byte and
+    # the file.
     checksums: Mapping[str, str]
-    cache: Path | None = None
+    cache: Path | None = None  # folder for downloads; the user's cache unless given
 
 
 SE_SYNC = Registry(
@@ -194,19 +179,25 @@ def _cached(name: str, registry: Registry, download: bool) -> Path:
 
 
 def _download(url: str, path: Path, name: str) -> None:
-    import pooch
-    from requests.exceptions import RequestException, Timeout
+    import requests
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
 
     console = Console(stderr=True)
     columns = (TextColumn("downloading {task.description}"), BarColumn(), DownloadColumn())
     try:
-        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-            fetch = pooch.HTTPDownloader(progressbar=_Bar(progress, progress.add_task(name)), timeout=_TIMEOUT)
-            fetch(url, str(path), None)
-    except RequestException as error:
-        reason = "no answer in time" if isinstance(error, Timeout) else "no connection"
+        with (
+            Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress,
+            requests.get(url, stream=True, timeout=_TIMEOUT) as answer,
+            path.open("wb") as file,
+        ):
+            answer.raise_for_status()
+            task = progress.add_task(name, total=int(answer.headers.get("content-length", 0)) or None)
+            for chunk in answer.iter_content(2**16):
+                file.write(chunk)
+                progress.advance(task, len(chunk))
+    except requests.RequestException as error:
+        reason = "no answer in time" if isinstance(error, requests.Timeout) else "no connection"
         if error.response is not None:
             reason = f"status {error.response.status_code}"
         raise DatasetError(f"{name} is not here, and {url} cannot be had ({reason}); {_by_hand(name)}") from error
@@ -224,30 +215,3 @@ def _fits(path: Path, checksum: str) -> bool:
     else:
         found = hashlib.sha256(data).hexdigest()
     return found == expected
-
-
-class _Bar:
-    """What pooch asks of a progress bar, drawn by rich."""
-
-    def __init__(self, progress: Progress, task: TaskID) -> None:
-        self._progress = progress
-        self._task = task
-        self._total = 0
-
-    @property
-    def total(self) -> int:
-        return self._total
-
-    @total.setter
-    def total(self, value: int) -> None:
-        self._total = value
-        self._progress.update(self._task, total=value or None)
-
-    def update(self, value: int) -> None:
-        self._progress.update(self._task, advance=value)
-
-    def reset(self) -> None:
-        self._progress.reset(self._task, total=self._total or None)
-
-    def close(self) -> None:
-        self._progress.stop_task(self._task)

@@ -5,8 +5,6 @@ d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I
 with RotationWeight.GAUSSIAN.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import warnings
@@ -49,7 +47,6 @@ def read_g2o(
 
     Parameters
     ----------
-    path : path
     weights : RotationWeight
         What kappa becomes of the information, in the plane.
     skip_unknown : bool
@@ -123,10 +120,7 @@ def edge_places(path: Path | str) -> list[str]:
 def read_g2o_poses(path: Path | str, graph: PoseGraph) -> Poses:
     """Poses of the VERTEX lines of a g2o file, in the order of `graph`; the file needs no edges.
 
-    Raises
-    ------
-    FileFormatError
-        See `read_lines`; also when the file has another dimension, or a pose of the graph is not in it.
+    A FileFormatError as of `read_lines`; also when the file has another dimension, or a pose of the graph is not in it.
     """
     file = read_lines(path)
     if file.d != graph.d:
@@ -172,13 +166,9 @@ def write_g2o_folder(graph: PoseGraph, folder: Path | str, poses: Poses | None =
     """Write one file 0.g2o, 1.g2o, .. for each robot: its poses, and all edges that touch one of them.
 
     Edges between two robots stand in both files. Reading the folder gives the graph back, up to the order of its edges;
-    when there are no VERTEX lines, the owners come back only if the ids are symbols (see `symbol_ids`).
-
-    Raises
-    ------
-    GraphError, PGOError
-        As `write_g2o`; also when the folder, which is made if it is not there, holds other g2o files: reading it would
-        join them to this graph.
+    when there are no VERTEX lines, the owners come back only if the ids are symbols (see `symbol_ids`). Errors as of
+    `write_g2o`; also a PGOError when the folder, which is made if it is not there, holds other g2o files: reading it
+    would join them to this graph.
     """
     chosen, folder = _poses_to_write(graph, poses), Path(folder)
     names = [f"{robot}.g2o" for robot in range(graph.num_robots)]
@@ -209,10 +199,7 @@ def check_g2o_folder(folder: Path | str, num_robots: int) -> None:
 def symbol_ids(robots: IntArray) -> IntArray:
     """GTSAM symbols a0, a1, .., b0, .. for poses owned by `robots`, (n,): up to 26 robots a to z, up to 52 A to z.
 
-    Raises
-    ------
-    GraphError
-        For more than 52 robots: there are no more letters.
+    A GraphError for more than 52 robots: there are no more letters.
     """
     count = int(robots.max()) + 1
     if count > MOST_SYMBOLS:

@@ -4,8 +4,6 @@ The way through a sound file is short: one pass over the lines, one call that pa
 Only when that fails are the lines looked at one by one, to name the one that is wrong.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -34,40 +32,20 @@ _SINGULAR = 1e-15  # a pivot below this part of its diagonal entry is rounding
 
 @dataclass(frozen=True, eq=False)
 class G2OLines:
-    """What one g2o file says, in the order of its lines.
-
-    Attributes
-    ----------
-    path : Path
-    d : int
-        2 or 3.
-    vertex_ids, vertex_lines : (v,)
-        Ids of the VERTEX lines, and the lines they stand on, from 1.
-    vertices : (v, 3) or (v, 7)
-        x y theta, or x y z qx qy qz qw.
-    edge_ids : (m, 2)
-        `WORLD_ID` and the pose, of a prior.
-    edges : (m, 9) or (m, 28)
-        The measurement like a vertex, then the upper triangle of its information matrix, row by row.
-    edge_lines : (m,)
-    fixed : (f,)
-        Ids of the FIX lines.
-    fixed_lines : (f,)
-    landmarks : (l,)
-        Ids that some line says are of a point.
-    """
+    """What one g2o file says, in the order of its lines, which count from 1."""
 
     path: Path
-    d: int
-    vertex_ids: IntArray
-    vertex_lines: IntArray
-    vertices: Array
-    edge_ids: IntArray
+    d: int  # 2 or 3
+    vertex_ids: IntArray  # (v,): of the VERTEX lines
+    vertex_lines: IntArray  # (v,): lines that they stand on
+    vertices: Array  # (v, 3) or (v, 7): x y theta, or x y z qx qy qz qw
+    edge_ids: IntArray  # (m, 2): `WORLD_ID` and the pose, of a prior
+    # (m, 9) or (m, 28): the measurement like a vertex, then the upper triangle of its information matrix, row by row.
     edges: Array
-    edge_lines: IntArray
-    fixed: IntArray
-    fixed_lines: IntArray
-    landmarks: IntArray
+    edge_lines: IntArray  # (m,)
+    fixed: IntArray  # (f,): ids of the FIX lines
+    fixed_lines: IntArray  # (f,)
+    landmarks: IntArray  # (l,): ids that some line says are of a point
 
 
 def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:

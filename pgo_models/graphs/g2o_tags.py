@@ -6,8 +6,6 @@ in the world's, that of a landmark in the pose's. TORO's page (Grisetti et al. 2
 the first vertex of an edge for the one that observes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A multi-robot grid world of any size, in the plane or in space: Manhattan walks on a lattice with loop closures."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -41,8 +39,6 @@ def grid_world(
 
     Parameters
     ----------
-    num_robots, poses_per_robot : int
-    rng : numpy.random.Generator
     d : int
         2 or 3.
     noise : NoiseModel

@@ -1,7 +1,5 @@
 """Measurements: the arrays of a pose graph, checked once, and which poses are the world's and landmarks'."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cached_property
 

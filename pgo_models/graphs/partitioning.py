@@ -1,7 +1,5 @@
 """Poses to robots: as the graph names them, contiguous in time, balanced by METIS, or one pose a robot."""
 
-from __future__ import annotations
-
 import enum
 from dataclasses import dataclass
 
@@ -31,20 +29,11 @@ class Partition(ReadOnly):
     ----------
     robot : (n,)
         0 .. num_robots - 1, every one of which owns a pose. A read-only copy.
-    method : PartitionMethod
 
     Raises
     ------
     SettingError
         When `robot` does not number the robots so.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> halves = Partition(np.arange(27) // 14, PartitionMethod.CONTIGUOUS)
-    >>> halves.sizes, len(halves.separators(graph))
-    (array([14, 13]), 18)
     """
 
     robot: IntArray
@@ -67,13 +56,7 @@ class Partition(ReadOnly):
         return np.bincount(self.robot, minlength=self.num_robots)
 
     def cut_edges(self, graph: PoseGraph) -> BoolArray:
-        """Whether an edge joins two robots, (m,).
-
-        Raises
-        ------
-        SettingError
-            When the partition is of another number of poses.
-        """
+        """Whether an edge joins two robots, (m,); a SettingError when the partition is of another number of poses."""
         if len(self.robot) != graph.num_poses:
             raise SettingError(f"{self!r} of {len(self.robot)} poses beside {graph!r}; give one robot for every pose")
         return np.asarray(self.robot[graph.i] != self.robot[graph.j])
@@ -93,7 +76,6 @@ def partition(graph: PoseGraph, num_robots: int | None = None, method: Partition
 
     Parameters
     ----------
-    graph : PoseGraph
     num_robots : int, optional
         Needed unless the graph names its robots or every pose is its own.
     method : PartitionMethod, optional

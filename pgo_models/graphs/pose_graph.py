@@ -91,10 +91,14 @@ class PoseGraph(Measurements):
         return f"PoseGraph({self.name!r}, d={self.d}, {size}, robots={self.num_robots})"
 
     def _repr_html_(self) -> str:
-        facts = [
+        return facts_table(self.facts())
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Labels and texts, as they are shown."""
+        return [
             ("graph", f"{self.name}, {self.d}D"),
             ("poses", str(len(self.bodies))),
-            ("edges", str(self.num_edges)),
+            ("edges", f"{self.num_edges}{self.extras}"),
             ("robots", str(self.num_robots)),
             ("components", str(len(self.components()))),
             ("kappa", f"{self.kappa.min():.4g} to {self.kappa.max():.4g} per rad^2"),
@@ -102,7 +106,6 @@ class PoseGraph(Measurements):
             ("estimate", "with the graph" if self.initial is not None else "none"),
             ("truth", "with the graph" if self.truth is not None else "none"),
         ]
-        return facts_table(facts)
 
     @cached_property
     def adjacency(self) -> csr_array:

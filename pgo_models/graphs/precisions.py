@@ -1,7 +1,5 @@
 """Information matrices as the precisions kappa and tau of the isotropic cost, and back (SE-Sync: Rosen et al. 2019)."""
 
-from __future__ import annotations
-
 import enum
 from bisect import bisect_left
 
@@ -33,11 +31,7 @@ def edge_precisions(information: Array, weights: RotationWeight = RotationWeight
 
     d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I_tt^-1), kappa as `weights` say.
     The blocks themselves are inverted, not the marginal information; those of zeros give 0. Per radian^2 and metre^2.
-
-    Raises
-    ------
-    SettingError
-        When weights is no RotationWeight.
+    A SettingError when weights is no RotationWeight.
     """
     if not isinstance(weights, RotationWeight):
         raise SettingError(f"weights is {weights!r}; give RotationWeight.SE_SYNC or RotationWeight.GAUSSIAN")

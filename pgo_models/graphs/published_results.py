@@ -1,7 +1,5 @@
 """What the paper reports for its graphs (tables 1 to 4), from data/reference.json: the mark beside our curves."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from typing import Any
@@ -13,21 +11,11 @@ from pgo_models.graphs.pose_graph import PoseGraph
 
 @dataclass(frozen=True)
 class PublishedRun:
-    """The paper's SOC on one graph.
-
-    Attributes
-    ----------
-    name : str
-    objective : float
-        F that its SOC reaches.
-    optimum : float
-        F* that it compares with.
-    iterations : int
-    """
+    """The paper's SOC on one graph."""
 
     name: str
-    objective: float
-    optimum: float
+    objective: float  # F that its SOC reaches
+    optimum: float  # F* that it compares with
     iterations: int
 
     @property
@@ -47,32 +35,18 @@ class PublishedFigures:
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """The paper's row of one graph, from tables 1 and 2 or 3 and 4.
-
-    Attributes
-    ----------
-    name : str
-    num_poses, num_edges : int
-    se_sync, dgs, soc : PublishedFigures
-        The objective of SE-Sync is F*. Its times are those of the MATLAB version.
-    """
+    """The paper's row of one graph, from tables 1 and 2 or 3 and 4."""
 
     name: str
     num_poses: int
     num_edges: int
-    se_sync: PublishedFigures
+    se_sync: PublishedFigures  # its objective is F*; the times are those of the MATLAB version
     dgs: PublishedFigures
     soc: PublishedFigures
 
 
 def published_rows() -> tuple[PublishedRow, ...]:
-    """Return the rows of the paper's tables, in its order.
-
-    Examples
-    --------
-    >>> [row.name for row in published_rows()]
-    ['circle', 'grid', 'sphere', 'parking-garage', 'cubicle', 'torus3D', 'rim']
-    """
+    """Return the rows of the paper's tables, in its order."""
     rows = []
     for name, row in _paper_tables().items():
         if isinstance(row, dict):
@@ -87,12 +61,6 @@ def published_run(graph: PoseGraph) -> PublishedRun | None:
     """Return what the paper reports for a graph of this name and size; None where it reports nothing.
 
     Its scenes (circle, grid, sphere) were drawn anew here, with other noise of the same size: compare gaps, not costs.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.datasets import load
-    >>> published_run(load("sphere")).iterations
-    38
     """
     row = _paper_tables().get(graph.name)
     if isinstance(row, dict) and (row["poses"], row["measurements"]) == (graph.num_poses, graph.num_edges):

@@ -4,15 +4,13 @@ The three networks follow the paper's section `SIMULATION RESULTS` and, for the 
 the figures stand in data/reference.json under "scenes". Every function takes its random generator.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, random_rotations, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
@@ -44,10 +42,7 @@ class NoiseModel:
     rotation_std: float = np.pi / 6
 
     def __post_init__(self) -> None:
-        for name in ("translation_std", "rotation_std"):
-            value = getattr(self, name)
-            if not 0 < value < np.inf:
-                raise SettingError(f"{name} must be positive and finite, got {value}")
+        check_settings(self, finite=["translation_std", "rotation_std"])
 
     @property
     def tau(self) -> float:
@@ -194,11 +189,7 @@ def observe(
     """Pose graph with measurements of the edges (i, j), and an initial guess like GPS and IMU, of known poses.
 
     t_ij = R_i^T (t_j - t_i) + N(0, s_t^2 I),  R_ij = Exp(N(0, s_R^2 I)) R_i^T R_j;  the initial guess is
-    t_i + N(0, s_t^2 I),  R_i Exp(N(0, s_R^2 I)).  All draws are independent.
-
-    References
-    ----------
-    Ebrahimi & Deghat, section `SIMULATION RESULTS`.
+    t_i + N(0, s_t^2 I),  R_i Exp(N(0, s_R^2 I)).  All draws are independent (Ebrahimi & Deghat, `SIMULATION RESULTS`).
     """
     R_inverse = np.swapaxes(truth.R[i], 1, 2)
     t_ij = np.einsum("mab,mb->ma", R_inverse, truth.t[j] - truth.t[i])

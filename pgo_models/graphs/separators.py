@@ -1,7 +1,5 @@
 """What a partition costs: separators, a vertex cover of the edges between robots, cut edges and balance."""
 
-from __future__ import annotations
-
 import heapq
 from dataclasses import dataclass
 
@@ -47,29 +45,15 @@ def vertex_cover(partition: Partition, graph: PoseGraph) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class PartitionReport:
-    """What a partition costs.
-
-    Attributes
-    ----------
-    num_robots : int
-    sizes : (num_robots,)
-        Poses of every robot.
-    num_cut_edges, num_edges : int
-    separators : (num_robots,)
-        Poses of every robot that have an edge to another.
-    cover : int
-        Poses of the vertex cover: what the driver of the substructured coupling solves for.
-    copies : int
-        Copies of separator poses that robots hold of others' poses.
-    """
+    """What a partition costs."""
 
     num_robots: int
-    sizes: IntArray
+    sizes: IntArray  # (num_robots,): poses of every robot
     num_cut_edges: int
     num_edges: int
-    separators: IntArray
-    cover: int
-    copies: int
+    separators: IntArray  # (num_robots,): poses of every robot that have an edge to another
+    cover: int  # poses of the vertex cover: what the driver of the substructured coupling solves for
+    copies: int  # copies of separator poses that robots hold of others' poses
 
     @property
     def balance(self) -> float:
@@ -96,27 +80,7 @@ class PartitionReport:
 
 
 def report_partition(partition: Partition, graph: PoseGraph) -> PartitionReport:
-    """Count what a partition of a graph costs.
-
-    Raises
-    ------
-    SettingError
-        When the partition is of another number of poses.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from pgo_models.graphs.partitioning import partition
-    >>> graph = grid(np.random.default_rng(0))
-    >>> print(report_partition(partition(graph, 3), graph))
-    robots       3
-    poses each   9 to 9 (largest over mean 1)
-    cut edges    36 of 108 (33.3 %)
-    separators   27 (9 to 9 a robot)
-    vertex cover 9
-    copies       36
-    """
+    """Count what a partition of a graph costs; a SettingError when it is of another number of poses."""
     cut = partition.cut_edges(graph)
     robot, i, j = partition.robot, graph.i[cut], graph.j[cut]
     held = np.unique(np.concatenate([robot[i] * graph.num_poses + j, robot[j] * graph.num_poses + i]))

@@ -4,8 +4,6 @@ TUM: a line `timestamp tx ty tz qx qy qz qw` for each pose. KITTI: the 12 number
 row. Both hold world from body, metres.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -31,8 +29,6 @@ def write_tum(poses: Poses, path: Path | str, timestamps: Array | None = None) -
 
     Parameters
     ----------
-    poses : Poses
-    path : Path or str
     timestamps : (n,), optional
         Seconds, ascending; 0, 1, .. unless given.
 
@@ -83,11 +79,8 @@ def read_tum(path: Path | str, d: int = 3) -> Poses:
 def read_times(path: Path | str) -> Array:
     """Seconds, (n,), of a TUM file or of one with a number a line, ascending.
 
-    Raises
-    ------
-    FileFormatError
-        With file:line, for a row that is not 8 finite numbers, or one, like the first; for a time that is not after the
-        one before.
+    A FileFormatError with file:line, for a row that is not 8 finite numbers, or one, like the first; for a time that is
+    not after the one before.
     """
     words = (line.split() for line in read_text(path).split("\n"))
     first = next((row for row in words if row and not row[0].startswith("#")), [])
@@ -102,10 +95,7 @@ def read_times(path: Path | str) -> Array:
 def write_kitti(poses: Poses, path: Path | str) -> None:
     """Write one line of 12 numbers for each pose: the 3 x 4 matrix (R_i, t_i) row by row; the floats come back exactly.
 
-    Raises
-    ------
-    PGOError
-        When the file cannot be written; what stood there stays.
+    A PGOError when the file cannot be written; what stood there stays.
     """
     R, t = _lifted(poses)
     _write_rows(np.concatenate([R, t[:, :, None]], axis=2).reshape(-1, 12), path)
@@ -114,19 +104,8 @@ def write_kitti(poses: Poses, path: Path | str) -> None:
 def read_kitti(path: Path | str, d: int = 3) -> Poses:
     """Poses of a KITTI file; the rotations are projected, since its files have few digits.
 
-    Raises
-    ------
-    FileFormatError
-        With file:line, for a row that is not 12 finite numbers, a matrix that is no rotation even to three digits, a
-        position beyond `FARTHEST`, or, with d = 2, a pose out of the plane.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> path = Path(tempfile.mkdtemp()) / "poses.kitti"
-    >>> write_kitti(Poses.identity(2, 2), path)
-    >>> read_kitti(path, d=2)
-    Poses(n=2, d=2)
+    A FileFormatError with file:line, for a row that is not 12 finite numbers, a matrix that is no rotation even to
+    three digits, a position beyond `FARTHEST`, or, with d = 2, a pose out of the plane.
     """
     rows, lines = read_table(path, 12)
     matrices = rows.reshape(-1, 3, 4)

@@ -20,16 +20,7 @@ _LONG_LABEL = 25  # letters: two of them do not fit beside each other
 def plot_tightness(curves: list[tuple[str, Array, Array]]) -> Figure:
     """Figure of how many graphs are certified at which rotation noise.
 
-    Parameters
-    ----------
-    curves : list of (label, rotation_std, fraction)
-        Noise in radians, (levels,), and the certified share there, (levels,), in [0, 1].
-
-    Examples
-    --------
-    >>> figure = plot_tightness([("grid", np.deg2rad([30, 50, 60]), np.array([1.0, 0.2, 0.0]))])
-    >>> figure.axes[0].get_ylabel()
-    'graphs certified (%)'
+    Every curve is a label, the noise in radians, (levels,), and the certified share there, (levels,), in [0, 1].
     """
     with column_figure(height=0.75) as figure:
         axes = figure.add_subplot()
@@ -44,20 +35,9 @@ def plot_tightness(curves: list[tuple[str, Array, Array]]) -> Figure:
 
 
 def plot_decay(curves: list[tuple[str, Array]], quantity: str) -> Figure:
-    """Figure of positive quantities over the iterations, on a logarithmic axis.
+    """Figure of positive quantities over the iterations, on a logarithmic axis; `quantity` is what they are, with unit.
 
-    Parameters
-    ----------
-    curves : list of (label, values)
-        Values from iterate 0 on.
-    quantity : str
-        What they are, with the unit, for the axis.
-
-    Examples
-    --------
-    >>> figure = plot_decay([("half", 0.5 ** np.arange(5)), ("third", 3.0 ** -np.arange(5))], "error (m)")
-    >>> figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()
-    ('iteration', 'error (m)')
+    Every curve is a label and its values from iterate 0 on.
     """
     longest = max((len(label) for label, _ in curves), default=0)
     with column_figure(height=0.8) as figure:

@@ -38,12 +38,8 @@ def edge_kinds(
 ) -> IntArray:
     """How every edge is drawn, (m,): OWN, BETWEEN (two robots), SIGHTING (a landmark's), marked UNCERTAIN or MISFIT.
 
-    The last that fits; priors are -1. Misfits are those of F unless `residuals` are given.
-
-    Raises
-    ------
-    GraphError
-        When the poses are not those of the graph.
+    The last that fits; priors are -1. Misfits are those of F unless `residuals` are given. A GraphError when the poses
+    are not those of the graph.
     """
     kind = np.where(graph.robots[graph.i] == graph.robots[graph.j], OWN, BETWEEN)
     kind[np.isin(graph.j, graph.landmarks)] = SIGHTING
@@ -73,14 +69,8 @@ def draw_graph(
 ) -> None:
     """Draw positions and edges: each robot's own edges in its colour, those between robots in grey.
 
-    Parameters
-    ----------
-    axes : matplotlib Axes
-        Of projection "3d" for graphs in space.
-    mark_edges : bool
-        Draw edges with a low precision dotted, and those that cost more than they may thick and vermilion.
-    residuals : EdgeResiduals, optional
-        Of the problem that was solved; those of F unless given.
+    The axes are of projection "3d" for graphs in space. With `mark_edges`, edges with a low precision are dotted, and
+    those that cost more than they may (`residuals`, those of F unless given) thick and vermilion.
     """
     from matplotlib.colors import to_rgb
 
@@ -161,26 +151,8 @@ def plot_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> Figure:
 def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = None) -> Figure:
     """Figure of an estimate on top of the truth, and of its errors pose by pose, in metres and degrees.
 
-    Parameters
-    ----------
-    poses : Poses
-        The estimate; it is aligned to the truth first.
-    truth : Poses, optional
-        The graph's own unless given.
-
-    Raises
-    ------
-    GraphError
-        When there is no truth, or the sizes differ.
-
-    Examples
-    --------
-    >>> from pgo_models.problem.initialization import spanning_tree_start
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> figure = plot_against_truth(graph, spanning_tree_start(graph))
-    >>> [axes.get_ylabel() for axes in figure.axes]
-    ['y (m)', 'position (m)', 'rotation (deg)']
+    The estimate is aligned to the truth first, which is the graph's own unless given. A GraphError when there is no
+    truth, or the sizes differ.
     """
     if truth is None:
         truth = graph.truth

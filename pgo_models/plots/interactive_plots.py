@@ -230,7 +230,6 @@ def _misfit_text(graph: PoseGraph, edges: IntArray, residuals: EdgeResiduals) ->
 
 
 def _arrange(figure: Figure, points: Array, title: str) -> None:
-    """Equal scales, labels with the unit."""
     lay_out(figure, title, legend_y=-0.12 if points.shape[1] == 2 else 0.0)
     if points.shape[1] == 2:
         figure.update_xaxes(title_text="x (m)", zeroline=False, gridcolor="#eeeeee")

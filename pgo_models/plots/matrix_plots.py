@@ -32,22 +32,8 @@ def smallest_eigenvalues(problem: PGOProblem, Lambda: Array, count: int = 12) ->
     S_Q = S_RR - S_Rt S_tt^+ S_tR = Q - blockdiag(Lambda) acts on rotations alone, so that all its eigenvalues have the
     unit of kappa (per rad^2) and are those that eta shifts: S + eta blockdiag(0, I) is positive semidefinite if and
     only if lambda_min(S_Q) >= -eta. At a global optimum whose relaxation is tight d of them are zero. Found by
-    shift-invert Lanczos below the spectrum: an estimate for the eye; the proof is `prove_bound`.
-
-    Raises
-    ------
-    SettingError
-        When count is not 1 to d n.
-
-    Examples
-    --------
-    >>> from pgo_models.certificates.certificate import certify
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> certificate = certify(problem, problem.graph.truth)
-    >>> smallest = smallest_eigenvalues(problem, certificate.Lambda, 4)
-    >>> bool(np.abs(smallest[:3]).max() < 1e-6 < smallest[3])
-    True
+    shift-invert Lanczos below the spectrum: an estimate for the eye; the proof is `prove_bound`. A SettingError when
+    count is not 1 to d n.
     """
     side = problem.num_poses * problem.d
     if not 1 <= count <= side:
@@ -67,14 +53,6 @@ def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12
 
     Eigenvalues stand on a logarithmic axis, negative ones as vermilion triangles. The shaded band, where the
     proof needs an eta, is what that leaves open, |lambda| <= eta.
-
-    Examples
-    --------
-    >>> from pgo_models.certificates.certificate import certify
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> plot_spectrum(problem, certify(problem, problem.graph.truth)).axes[0].get_xlabel()
-    'k-th smallest eigenvalue of S'
     """
     eigenvalues = smallest_eigenvalues(problem, certificate.Lambda, count)
     k, negative = np.arange(1, count + 1), eigenvalues < 0

@@ -37,31 +37,18 @@ _LEAST_SCALE = 1e-6  # of the mean diagonal of L: noise-free graphs have F near 
 
 @dataclass(frozen=True, eq=False)
 class CliqueRelaxation:
-    """min sum_C <H_C, W_C> such that every W_C is PSD, separators agree, and R_i^T R_i = I.
-
-    Attributes
-    ----------
-    model : cp.Problem
-        Its value times `scale` is that of the relaxation.
-    upper : tuple of cp.Variable
-        Upper triangle of every W_C, row by row.
-    equalities : cp.Constraint
-        A w = b for w all of these, clique after clique: R_i^T R_i = I and the agreement on separators. Its dual value
-        gives Lambda.
-    semidefinite : tuple of cp.Constraint
-        W_C PSD, one for every clique.
-    scale : float
-        The objective is divided by it: F at the centre, or for noise-free graphs a share of L.
-    """
+    """min sum_C <H_C, W_C> such that every W_C is PSD, separators agree, and R_i^T R_i = I."""
 
     problem: PGOProblem
     tree: CliqueTree
     centre: Poses
-    model: cp.Problem
-    upper: tuple[cp.Variable, ...]
+    model: cp.Problem  # its value times `scale` is that of the relaxation
+    upper: tuple[cp.Variable, ...]  # upper triangle of every W_C, row by row
+    # A w = b for w all of these, clique after clique: R_i^T R_i = I and the agreement on separators. Its dual value
+    # gives Lambda.
     equalities: cp.Constraint
-    semidefinite: tuple[cp.Constraint, ...]
-    scale: float
+    semidefinite: tuple[cp.Constraint, ...]  # W_C PSD, one for every clique
+    scale: float  # of the objective: F at the centre, or for noise-free graphs a share of L
     _layout: _Layout
     _to_Lambda: csr_array
 
@@ -101,19 +88,10 @@ class CliqueRelaxation:
 def clique_relaxation(
     problem: PGOProblem, centre: Poses | None = None, tree: CliqueTree | None = None
 ) -> CliqueRelaxation:
-    """Pose the relaxation over cliques.
+    """Pose the relaxation over cliques (Fukuda, Kojima, Murota & Nakata, 2001; Vandenberghe & Andersen 2015, ch. 14).
 
-    Parameters
-    ----------
-    centre : Poses, optional
-        The stationary point that the chordal start polishes to, unless given. Far from the optimum it costs digits.
-    tree : CliqueTree, optional
-        `build_clique_tree(problem.graph)` unless given.
-
-    References
-    ----------
-    Fukuda, Kojima, Murota & Nakata, Exploiting sparsity in semidefinite programming via matrix completion, 2001;
-    Vandenberghe & Andersen 2015, chapter 14.
+    Unless given, the centre is the stationary point that the chordal start polishes to, and the tree is
+    `build_clique_tree(problem.graph)`. A centre far from the optimum costs digits.
     """
     tree = tree if tree is not None else build_clique_tree(problem.graph)
     centre = centre if centre is not None else polish(problem, chordal_start(problem))

@@ -1,7 +1,5 @@
 """Cliques of a chordal extension of a pose graph, in a tree: what a sparse semidefinite program decomposes over."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -39,12 +37,9 @@ def build_clique_tree(graph: PoseGraph) -> CliqueTree:
     """Eliminate poses in the order of least degree, and merge cliques of the elimination where that saves work.
 
     A child and its parent are merged when the cube of the union's side is at most the sum of their cubes and an
-    overhead; sides are those of `pgo_models.relaxations.clique_decomposition`.
-
-    References
-    ----------
-    Vandenberghe & Andersen, Chordal graphs and semidefinite optimization, 2015, chapters 4 and 6; the merging is that
-    of Garstka, Cannon & Goulart, A clique graph based merging strategy, 2020, on the edges of the tree.
+    overhead; sides are those of `pgo_models.relaxations.clique_decomposition`. Vandenberghe & Andersen, Chordal graphs
+    and semidefinite optimization, 2015, chapters 4 and 6; the merging is that of Garstka, Cannon & Goulart, A clique
+    graph based merging strategy, 2020, on the edges of the tree.
     """
     return _merge(*_eliminate(graph), lambda size: clique_side(size, graph.d) ** 3 + _CLIQUE_OVERHEAD)
 

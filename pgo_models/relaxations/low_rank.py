@@ -4,8 +4,6 @@ Q has the translations marginalised and is never formed: they are the best ones 
 (Rosen et al. 2019, problem 7 and section 4.2).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

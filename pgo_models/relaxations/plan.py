@@ -1,7 +1,5 @@
 """Which form of the semidefinite relaxation to pose, and which solver to give it: by the sizes of the cliques."""
 
-from __future__ import annotations
-
 import enum
 from dataclasses import dataclass
 
@@ -64,12 +62,8 @@ def plan_relaxation(
 ) -> RelaxationPlan:
     """Choose what is not given: the cliques with Clarabel where they are small, else the dense primal with SCS.
 
-    Nothing larger than the clique tree is formed.
-
-    Raises
-    ------
-    SettingError
-        When the estimate exceeds `memory_limit`, in bytes, or the limit is not positive.
+    Nothing larger than the clique tree is formed. A SettingError when the estimate exceeds `memory_limit`, in bytes, or
+    the limit is not positive.
     """
     if not memory_limit > 0:
         raise SettingError(f"memory_limit is {memory_limit}; give positive bytes")
@@ -102,7 +96,6 @@ def plan_relaxation(
 
 
 def _sides(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm) -> Array:
-    """Sides of the cones."""
     if form is RelaxationForm.PRIMAL:
         return np.array([float(problem.d * problem.num_poses)])
     if form is RelaxationForm.CLIQUES:

@@ -8,8 +8,6 @@ and 9; Carlone et al. 2015). `pgo_models.relaxations.solve_sdp` chooses a form, 
 `pgo_models.relaxations.clique_decomposition` has the form for large sparse graphs.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cvxpy as cp
@@ -24,24 +22,13 @@ from pgo_models.relaxations.rounding import RankReport, round_gram
 
 @dataclass(frozen=True, eq=False)
 class PrimalRelaxation:
-    """min tr(Q Z) such that Z_ii = I and Z is PSD.
-
-    Attributes
-    ----------
-    model : cp.Problem
-        Its value times `scale` is that of the relaxation.
-    Z : cp.Variable, (dn, dn)
-    orthogonality : tuple of cp.Constraint
-        Z_ii = I for every pose; cvxpy's dual value of each is -Lambda_i / scale.
-    scale : float
-        Q is divided by its largest entry.
-    """
+    """min tr(Q Z) such that Z_ii = I and Z is PSD."""
 
     problem: PGOProblem
-    model: cp.Problem
-    Z: cp.Variable
-    orthogonality: tuple[cp.Constraint, ...]
-    scale: float
+    model: cp.Problem  # its value times `scale` is that of the relaxation
+    Z: cp.Variable  # (dn, dn)
+    orthogonality: tuple[cp.Constraint, ...]  # Z_ii = I for every pose; the dual value of each is -Lambda_i / scale
+    scale: float  # Q is divided by its largest entry
 
     def Lambda(self) -> Array:
         """Multipliers of Z_ii = I, (n, d, d), as solved."""
@@ -55,10 +42,7 @@ class PrimalRelaxation:
 def primal_relaxation(problem: PGOProblem) -> PrimalRelaxation:
     """Pose the primal on the dense matrix Q, translations marginalised out.
 
-    Raises
-    ------
-    SettingError
-        When Q would be larger than `pgo_models.problem.matrices.MAX_DENSE_SIDE`.
+    A SettingError when Q would be larger than `pgo_models.problem.matrices.MAX_DENSE_SIDE`.
     """
     n, d = problem.num_poses, problem.d
     scale = float(np.abs(problem.Q).max())
@@ -71,26 +55,15 @@ def primal_relaxation(problem: PGOProblem) -> PrimalRelaxation:
 
 @dataclass(frozen=True, eq=False)
 class DualRelaxation:
-    """max sum tr Lambda_i such that M - blockdiag(0, Lambda) is PSD, with t_0 grounded.
-
-    Attributes
-    ----------
-    model : cp.Problem
-        Its value times `scale` is that of the relaxation.
-    upper : cp.Variable, (n d (d + 1) / 2,)
-        Upper triangles of Lambda_i / scale, row by row, pose after pose.
-    certificate : cp.Constraint
-        S = M - blockdiag(0, Lambda) PSD, row and column of t_0 left out: S maps a common shift to zero, and with that
-        row the dual has no interior. Its dual value is the Gram matrix of (t, Y).
-    scale : float
-        M is divided by its largest diagonal entry.
-    """
+    """max sum tr Lambda_i such that M - blockdiag(0, Lambda) is PSD, with t_0 grounded."""
 
     problem: PGOProblem
-    model: cp.Problem
-    upper: cp.Variable
+    model: cp.Problem  # its value times `scale` is that of the relaxation
+    upper: cp.Variable  # (n d (d + 1) / 2,): upper triangles of Lambda_i / scale, row by row, pose after pose
+    # S = M - blockdiag(0, Lambda) PSD, row and column of t_0 left out: S maps a common shift to zero, and with that row
+    # the dual has no interior. Its dual value is the Gram matrix of (t, Y).
     certificate: cp.Constraint
-    scale: float
+    scale: float  # M is divided by its largest diagonal entry
 
     def Lambda(self) -> Array:
         """Multipliers, (n, d, d), as solved."""

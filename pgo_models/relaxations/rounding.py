@@ -1,7 +1,5 @@
 """From a solution of the semidefinite relaxation, Z or its factor Y, to rotations; how far it is from having rank d."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,22 +13,12 @@ RANK_TOLERANCE = 1e-3  # of the largest singular value; interior points and firs
 
 @dataclass(frozen=True, eq=False)
 class RankReport:
-    """Singular values of a PSD matrix that has rank d exactly when the relaxation is tight.
+    """Singular values of a PSD matrix that has rank d exactly when the relaxation is tight."""
 
-    Attributes
-    ----------
-    singular_values : (side,)
-        Descending.
-    rank : int
-        How many are above `RANK_TOLERANCE` of the largest.
-    tightness : float
-        Ratio of singular value d + 1 to singular value d; 0 for an exact rank d.
-    """
-
-    singular_values: Array
+    singular_values: Array  # (side,): descending
     d: int
-    rank: int
-    tightness: float
+    rank: int  # how many are above `RANK_TOLERANCE` of the largest
+    tightness: float  # ratio of singular value d + 1 to singular value d; 0 for an exact rank d
 
     @property
     def is_tight(self) -> bool:

@@ -1,7 +1,5 @@
 """solve_relaxation: pose the semidefinite relaxation, solve it, round it, and prove the bound that its duals give."""
 
-from __future__ import annotations
-
 import enum
 import math
 import time

@@ -12,8 +12,6 @@ That is a sum of squares too, and on a connected graph with a fixed pose positiv
 determines its pose.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

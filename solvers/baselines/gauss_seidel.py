@@ -7,8 +7,6 @@ Its first stage is what the introduction of the paper calls an unconstrained rot
 columns of the paper's tables (`table1` to `table4`).
 """
 
-from __future__ import annotations
-
 import enum
 import math
 from dataclasses import dataclass, replace
@@ -98,15 +96,6 @@ class GaussSeidel:
         On the change of a sweep; it ends a stage.
     max_iterations : int
         Sweeps of all stages together.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers.loop import run
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> result = run(GaussSeidel(robots=partition(problem.graph, 3)), problem)
-    >>> result.status.name, result.state.stage.name
-    ('CONVERGED', 'POSES')
     """
 
     robots: Partition | None = None
@@ -118,9 +107,7 @@ class GaussSeidel:
     max_iterations: int = 5000
 
     def __post_init__(self) -> None:
-        if not 0 < self.alpha < 2:
-            raise SettingError(f"alpha must be in (0, 2), got {self.alpha}; 1 is no over-relaxation")
-        check_settings(self, positive=["tolerance"])
+        check_settings(self, positive=["tolerance"], relaxation=["alpha"])
         check_settings(self, not_negative=["max_iterations"], at_least_one=["gauss_newton_steps"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> GaussSeidelState:

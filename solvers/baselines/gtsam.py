@@ -11,8 +11,6 @@ make its cost F to leading order. Its optimum is that of the angles, not of the 
 is of fourth order. GTSAM is BSD-licensed: https://gtsam.org; the extra `peers` brings it.
 """
 
-from __future__ import annotations
-
 import enum
 import math
 import time
@@ -45,10 +43,8 @@ class Gtsam:
 
     Attributes
     ----------
-    method : GtsamMethod
     tolerance : float
         On the relative change of its cost in one iteration; the default is GTSAM's.
-    max_iterations : int
 
     Raises
     ------
@@ -69,7 +65,6 @@ def run_gtsam(problem: PGOProblem, settings: Gtsam | None = None, start: Poses |
 
     Parameters
     ----------
-    problem : PGOProblem
     settings : Gtsam, optional
         `Gtsam()` unless given.
     start : Poses, optional
@@ -150,12 +145,8 @@ def run_gtsam(problem: PGOProblem, settings: Gtsam | None = None, start: Poses |
 def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noqa: ANN401  GTSAM has no types
     """The `gtsam.NonlinearFactorGraph` of a problem, keys 0 .. n-1, with a prior on pose 0.
 
-    The prior, at pose 0 of `start` or at the identity, fixes the gauge, on which F does not depend.
-
-    Raises
-    ------
-    MissingExtraError
-        Without GTSAM.
+    The prior, at pose 0 of `start` or at the identity, fixes the gauge, on which F does not depend. A MissingExtraError
+    without GTSAM.
     """
     gtsam, graph, d = _import_gtsam(), problem.graph, problem.d
     if not ((graph.kappa > 0) & (graph.tau > 0)).all():

@@ -4,8 +4,6 @@ The baseline of g2o and GTSAM, with the damping rule of Nielsen (Madsen, Nielsen
 Least Squares Problems, algorithm 3.16) and the scaling of Marquardt (1963): rotations and translations differ in units.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 
@@ -63,15 +61,6 @@ class LevenbergMarquardt:
         Refused steps count.
     damping : float
         First mu, relative to the diagonal of the Gauss-Newton matrix.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers.loop import run
-    >>> graph = grid(np.random.default_rng(0))
-    >>> run(LevenbergMarquardt(), PGOProblem(graph), graph.initial).status.name
-    'CONVERGED'
     """
 
     tolerance: float = STATIONARY_DECREMENT
@@ -131,7 +120,6 @@ def _linearized(
     damping: float,
     analysis: SymbolicCholesky | None = None,
 ) -> LevenbergMarquardtState:
-    """State at new poses."""
     matrix = riemannian_hessian(problem, poses, None)
     ground_pose(matrix, problem)
     gradient = TangentLayout(problem.num_poses, problem.d).join(*problem.riemannian_gradient(poses))
@@ -141,7 +129,6 @@ def _linearized(
 
 
 def _with_step(state: LevenbergMarquardtState) -> LevenbergMarquardtState:
-    """State with the step of its damping."""
     damped = state.matrix.copy()
     damped.setdiag((1.0 + state.damping) * state.matrix.diagonal())
     try:

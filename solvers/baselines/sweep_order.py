@@ -4,8 +4,6 @@ Flagged initialisation of Choudhary et al. 2017: in a first sweep, from the robo
 neighbours that already have an estimate. Later sweeps have a fixed order.
 """
 
-from __future__ import annotations
-
 import enum
 import heapq
 from dataclasses import dataclass
@@ -56,17 +54,12 @@ class Schedule:
 
 
 def schedule(graph: PoseGraph, robots: Partition, sweep: Sweep) -> Schedule:
-    """Fix the turns of all robots.
+    """Fix the turns of all robots; a SettingError when the partition is of another number of poses.
 
     The order starts at the robot of pose 0 and goes on with the robot that has the most edges to those before it. Each
     robot takes, in that order, the first colour that no neighbour has. In the flagged sweep of `Sweep.ROBOTS` this is
     also the order of the first estimates; otherwise all robots go at once that have a neighbour with an estimate. A
     robot whose poses fall into pieces that only other robots connect estimates each piece when it is reached.
-
-    Raises
-    ------
-    SettingError
-        When the partition is of another number of poses.
     """
     cut = robots.cut_edges(graph)
     i, j = graph.i[cut], graph.j[cut]  # of the edges between robots

@@ -1,7 +1,5 @@
 """The command `pgo` from its first moment: Ctrl-C or SIGTERM while the packages are imported ends in one line."""
 
-from __future__ import annotations
-
 import os
 import signal
 from types import FrameType

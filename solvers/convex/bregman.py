@@ -8,8 +8,6 @@
 The first three have the same x, with p = K^T lam and lam = -alpha b. Osher et al. 2005; Yin et al. 2008; Esser 2009.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -97,11 +95,7 @@ class BregmanSettings:
     subproblem_tolerance: float = TOLERANCE
 
     def __post_init__(self) -> None:
-        for name in ("alpha", "tolerance", "subproblem_tolerance"):
-            value = getattr(self, name)
-            if not 0 < value < math.inf:
-                raise SettingError(f"{name} must be positive and finite, got {value}")
-        check_settings(self, not_negative=["max_iterations"])
+        check_settings(self, finite=["alpha", "tolerance", "subproblem_tolerance"], not_negative=["max_iterations"])
 
     def measure(self, problem: BregmanProblem, state: _ExactState | AlternatingState) -> Measurement:
         """J(x), ||K x - f||, relative, and the distance from stationarity, relative."""
@@ -119,15 +113,8 @@ class BregmanSettings:
 class Bregman(BregmanSettings):
     """Bregman iteration with subgradients (paper: `update B`; Osher et al. 2005). Settings: `BregmanSettings`.
 
-        x^{k+1} = argmin J(x) - J(x^k) - <p^k, x - x^k> + alpha/2 ||K x - f||^2
-        p^{k+1} = p^k - alpha K^T (K x^{k+1} - f), a subgradient of J at x^{k+1}
-
-    Examples
-    --------
-    >>> from pgo_models.convex.bregman_examples import basis_pursuit
-    >>> from solvers.loop import run
-    >>> run(Bregman(), basis_pursuit(np.array([[1.0, 2.0]]), np.array([2.0]))).state.x.round(6).tolist()
-    [0.0, 1.0]
+    x^{k+1} = argmin J(x) - J(x^k) - <p^k, x - x^k> + alpha/2 ||K x - f||^2
+    p^{k+1} = p^k - alpha K^T (K x^{k+1} - f), a subgradient of J at x^{k+1}
     """
 
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> BregmanState:
@@ -152,13 +139,6 @@ class TwoLineBregman(BregmanSettings):
     """Bregman iteration in two lines (paper: `bregman update`; Yin et al. 2008). Settings: `BregmanSettings`.
 
     x^{k+1} = argmin J(x) + alpha/2 ||K x - f + b^k||^2,    b^{k+1} = b^k + K x^{k+1} - f
-
-    Examples
-    --------
-    >>> from pgo_models.convex.bregman_examples import basis_pursuit
-    >>> from solvers.loop import run
-    >>> run(TwoLineBregman(), basis_pursuit(np.array([[1.0, 2.0]]), np.array([2.0]))).state.x.round(6).tolist()
-    [0.0, 1.0]
     """
 
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> TwoLineState:
@@ -185,13 +165,6 @@ class MethodOfMultipliers(BregmanSettings):
         x^{k+1} = argmin L_alpha(x, lam^k),    lam^{k+1} = lam^k + alpha (f - K x^{k+1})
 
     with L_alpha(x, lam) = J(x) + <lam, f - K x> + alpha/2 ||f - K x||^2.
-
-    Examples
-    --------
-    >>> from pgo_models.convex.bregman_examples import basis_pursuit
-    >>> from solvers.loop import run
-    >>> run(MethodOfMultipliers(), basis_pursuit(np.array([[1.0, 2.0]]), np.array([2.0]))).state.x.round(6).tolist()
-    [0.0, 1.0]
     """
 
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> MultiplierState:
@@ -226,14 +199,6 @@ class AlternatingBregman(BregmanSettings):
     ----------
     passes : int
         T.
-
-    Examples
-    --------
-    >>> from pgo_models.convex.bregman_examples import total_variation_denoising
-    >>> from solvers.loop import run
-    >>> problem = total_variation_denoising(np.array([0.1, -0.1, 1.1, 0.9]), weight=0.2)
-    >>> run(AlternatingBregman(passes=2), problem).status.name
-    'CONVERGED'
     """
 
     passes: int = 1
@@ -298,11 +263,6 @@ def feasibility_bound(initial_distance: float, alpha: float, k: int) -> float:
     References
     ----------
     Osher, Burger, Goldfarb, Xu, Yin 2005, Propositions 3.1 to 3.3, where the penalty is H itself.
-
-    Examples
-    --------
-    >>> [feasibility_bound(1.0, alpha=2.0, k=k) for k in (1, 4)]
-    [1.0, 0.5]
     """
     if not (initial_distance >= 0 and alpha > 0 and k >= 1):
         raise SettingError(f"need D_0 >= 0, alpha > 0 and k >= 1, got {initial_distance}, {alpha} and {k}")

@@ -1,7 +1,5 @@
 """SOC on a pose graph with convex terms and constraints of one's own: the same recursion, another step (a)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -33,10 +31,7 @@ class ExtendedStep:
     def prepare(self, subproblem: RSubproblem) -> GraphQP:
         """Compile the changed quadratic program with the subproblem's penalties.
 
-        Raises
-        ------
-        SettingError
-            When the subproblem is not that of the whole graph, joint in (R, t).
+        A SettingError when the subproblem is not that of the whole graph, joint in (R, t).
         """
         n, d = self.graph.num_poses, self.graph.d
         if subproblem.num_translations != n or not subproblem.needs_ground:
@@ -64,18 +59,6 @@ class ExtendedSOC:
 
     What fixes the gauge, as a prior does, wants a start near it: the default is the chordal start of the unchanged
     problem with pose 0 unrotated, and a pose turned by 180 degrees from its prior is a stationary point too.
-
-    Examples
-    --------
-    >>> import cvxpy as cp, numpy as np
-    >>> from pgo_models.convex.graph_subproblem import ModelChange, PoseVariables
-    >>> from pgo_models.graphs.scenes import random_geometric
-    >>> problem = PGOProblem(random_geometric(4, np.random.default_rng(0)))
-    >>> def near(unknown: PoseVariables) -> ModelChange:
-    ...     return ModelChange(terms=[10.0 * cp.sum_squares(unknown.t(3) - np.array([1.0, 0.0, 0.0]))])
-    >>> from solvers.loop import run
-    >>> run(ExtendedSOC(near), problem).status.name
-    'CONVERGED'
     """
 
     changer: Changer

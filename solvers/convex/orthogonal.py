@@ -7,8 +7,6 @@
 Ebrahimi & Deghat, Algorithm 1 (`algo1: SOC`); Lai & Osher 2014, Algorithm 1.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -74,14 +72,6 @@ class OrthogonalSOC:
         projection: the largest eigenvalue of the multiplier Lambda. Near 1 the recursion may cycle.
     tolerance : float
         On the primal and the dual residual, both relative.
-
-    Examples
-    --------
-    >>> from pgo_models.convex.orthogonality_examples import procrustes
-    >>> from solvers.loop import run
-    >>> problem = procrustes(np.eye(3), np.eye(3), rotation=True)
-    >>> run(OrthogonalSOC(), problem, problem.point([np.eye(3)])).status.name
-    'CONVERGED'
     """
 
     penalty: float | None = None
@@ -91,22 +81,11 @@ class OrthogonalSOC:
     max_iterations: int = 1000
 
     def __post_init__(self) -> None:
-        if self.penalty is not None and not 0 < self.penalty < math.inf:
-            raise SettingError(f"penalty must be positive and finite, got {self.penalty}")
-        if not 0 < self.alpha < 2:
-            raise SettingError(f"alpha must be in (0, 2), got {self.alpha}")
-        if not 1 < self.safeguard < math.inf:
-            raise SettingError(f"safeguard must be above 1, got {self.safeguard}")
-        check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
+        check_settings(self, finite=["penalty", "safeguard", "tolerance"], not_negative=["max_iterations"])
+        check_settings(self, above_one=["safeguard"], relaxation=["alpha"])
 
     def init(self, problem: OrthogonalProblem, start: OrthogonalPoint | None) -> OrthogonalState:
-        """State 0: X = P = start; at the first columns of the identity unless a start is given.
-
-        Raises
-        ------
-        SettingError
-            When the start does not fit the problem.
-        """
+        """State 0: X = P = start, first columns of the identity unless given; a SettingError if it does not fit."""
         point = start if start is not None else problem.point([_identity(v.shape) for v in problem.variables])
         problem.check_point(point)
         split = problem.split()
@@ -310,7 +289,6 @@ def _identity(shape: tuple[int, ...]) -> Array:
 
 
 def _summed(problem: OrthogonalProblem, of_terms: Sequence[Array]) -> list[Array]:
-    """Sums over the terms of every variable."""
     sums = [np.zeros(variable.shape) for variable in problem.variables]
     for term, array in zip(problem.terms, of_terms, strict=True):
         sums[term.variable] += array

@@ -4,14 +4,12 @@ The same fixed-point map as `solvers.distributed.consensus` and no all-reduce: o
 old (Peng et al. 2016, ARock).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
 from solvers.distributed.consensus import RobotsOfDriver
 from solvers.distributed.driver import Driver
@@ -50,8 +48,7 @@ class AsynchronousSOC:
     has_driver: bool = True  # as in `ConsensusSOC`
 
     def __post_init__(self) -> None:
-        if not 0 < self.alpha < 2:
-            raise SettingError(f"alpha must be in (0, 2), got {self.alpha}")
+        check_settings(self, relaxation=["alpha"])
         if not 0 < self.damping <= 1:
             raise SettingError(f"damping must be in (0, 1], got {self.damping}")
 
@@ -61,13 +58,7 @@ class AsynchronousSOC:
         return self.soc.max_iterations
 
     def init(self, driver: Driver, start: None) -> AsynchronousState:
-        """State 0: set-up, and the first rows, arrive in full.
-
-        Raises
-        ------
-        SettingError
-            When there is no such robot as the one that is to be silent.
-        """
+        """State 0: set-up, and the first rows, arrive in full; a SettingError where the silent robot is none."""
         robots, silent = RobotsOfDriver(driver, self.has_driver), self.faults.silent_robot
         if silent is not None and silent >= robots.num_robots:
             raise SettingError(f"silent_robot is {silent}; give 0 to {robots.num_robots - 1}")

@@ -4,8 +4,6 @@ A run that is broken off at any moment, and started again with the same graph, p
 last one, in the same place or in another, and ends with the same numbers.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import math
@@ -20,7 +18,7 @@ from numpy.typing import NDArray
 
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict
 from pgo_models.certificates.lower_bound import LowerBound
-from pgo_models.errors import FileFormatError, PGOError, SettingError
+from pgo_models.errors import FileFormatError, PGOError, SettingError, check_settings
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
@@ -62,22 +60,15 @@ class Checkpoint:
 
     Attributes
     ----------
-    path : Path or str
     rounds : int
         A checkpoint is written when SOC and when Newton begins, and after so many rounds of communication.
-
-    Examples
-    --------
-    >>> Checkpoint("run.ckpt").rounds
-    10
     """
 
     path: Path | str
     rounds: int = 10
 
     def __post_init__(self) -> None:
-        if self.rounds < 1:
-            raise SettingError(f"rounds must be at least 1, got {self.rounds}; checkpoints are written between rounds")
+        check_settings(self, at_least_one=["rounds"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,21 +95,14 @@ _CLASSES = (
 class Journal:
     """Writes the checkpoints of one solve, and hands out the one that it goes on from; to be closed after the solve.
 
-    Attributes
-    ----------
-    stages : list of Stage
-        Finished stages of the solve, those of the checkpoint to begin with.
+    `stages` are the finished stages of the solve, those of the checkpoint to begin with.
     """
 
     def __init__(self, checkpoint: Checkpoint | None, mark: Mapping[str, str], stages: list[Stage]) -> None:
         """Read the checkpoint, if there is one.
 
-        Raises
-        ------
-        FileFormatError
-            When the file is no checkpoint, is damaged, or is where none can be written.
-        SettingError
-            When it is one of another graph, partition or settings, or another run uses it.
+        A FileFormatError when the file is no checkpoint, is damaged, or is where none can be written; a SettingError
+        when it is one of another graph, partition or settings, or another run uses it.
         """
         self.stages = stages
         self._checkpoint, self._mark = checkpoint, mark

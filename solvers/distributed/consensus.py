@@ -1,7 +1,5 @@
 """CONSENSUS by robots on a network: `solvers.soc.consensus` from the poses that they and a driver hold."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -96,4 +94,4 @@ class ConsensusSOC:
 
     def converged(self, state: ConsensusState, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals are within tolerance."""
-        return self.soc.status_at(measurement)
+        return self.soc.converged(state, measurement)

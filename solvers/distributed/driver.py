@@ -5,8 +5,6 @@ gather of the robots' reduced right-hand sides, one solve and one scatter are a 
 Newton direction, the best translations of given rotations and a proof of the certificate take one each.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -47,23 +45,13 @@ A = TypeVar("A")
 
 @dataclass(frozen=True, eq=False)
 class CoverPoses:
-    """What the driver knows of the poses that it and the robots hold.
+    """What the driver knows of the g poses of the cover, which it and the robots hold."""
 
-    Attributes
-    ----------
-    R, t : (g, d, d), (g, d)
-        Poses of the cover.
-    force : ((d+1) g, d)
-        Rows of M X there.
-    objective, rounding_level : float
-        F of all poses, and below what it could not be told from zero.
-    """
-
-    R: Array
-    t: Array
-    force: Array
-    objective: float = math.nan
-    rounding_level: float = 0.0
+    R: Array  # (g, d, d)
+    t: Array  # (g, d)
+    force: Array  # ((d+1) g, d): rows of M X there
+    objective: float = math.nan  # F of all poses
+    rounding_level: float = 0.0  # below it F could not be told from zero
 
     @property
     def multipliers(self) -> Array:
@@ -85,25 +73,7 @@ class DriverState:
 
 
 class Driver:
-    """The driver and what it knows.
-
-    Attributes
-    ----------
-    network : CountedPool
-        The robots, and the account of what is sent.
-    at, kept : CoverPoses
-        The poses at hand, and those that were saved.
-    diagonal : ((d+1) g,)
-        Diagonal of M on the cover.
-    grounded : int
-        Which of the cover is left out when a bound is proved.
-    block : RecursionBlock, optional
-        Rotations of the cover in SOC's recursion.
-    is_final : bool
-        Whether the cost at hand is the one that is solved, and not the one near it that SOC is run on.
-    step_a : InterfaceFactor, optional
-        Of its step (a), with the robots' right-hand sides for the next one in `right`.
-    """
+    """The driver and what it knows: the robots' network, the poses at hand and those that were saved."""
 
     def __init__(
         self,
@@ -116,15 +86,12 @@ class Driver:
     ) -> None:
         """Start the robots; orders about interiors go to those that have an edge to count.
 
-        With no `memory` it stands for the network alone: it hands on what robots send each other, and sums.
-
-        Raises
-        ------
-        SettingError
-            When the separators would take more than `memory` bytes.
+        With no `memory` it stands for the network alone: it hands on what robots send each other, and sums. A
+        SettingError when the separators would take more than `memory` bytes.
         """
         working = [(subgraph.robot, part) for subgraph in subgraphs if (part := subgraph.part) is not None]
-        self.num_poses, self.d, self.grounded = num_poses, subgraphs[0].graph.d, grounded
+        self.num_poses, self.d = num_poses, subgraphs[0].graph.d
+        self.grounded = grounded  # which of the cover is left out when a bound is proved
         cover = np.concatenate([subgraph.poses[subgraph.in_cover >= 0] for subgraph in subgraphs])
         place = np.concatenate([subgraph.in_cover[subgraph.in_cover >= 0] for subgraph in subgraphs])
         self.cover: IntArray = np.zeros(len(np.unique(place)), dtype=np.int64)
@@ -142,11 +109,11 @@ class Driver:
         self.robots = np.array([robot for robot, _ in working])
         R = np.broadcast_to(np.eye(d), (g, d, d)).copy()
         self.at = self.kept = CoverPoses(R, np.zeros((g, d)), np.zeros(((d + 1) * g, d)))
-        self.block: RecursionBlock | None = None
-        self.step_a: InterfaceFactor | None = None
-        self.right: list[RightHandSide] = []
+        self.block: RecursionBlock | None = None  # rotations of the cover in SOC's recursion
+        self.step_a: InterfaceFactor | None = None  # of its step (a)
+        self.right: list[RightHandSide] = []  # the robots', for the next step (a)
         self._has_two_costs = any(subgraph.final is not None for subgraph in subgraphs)
-        self.is_final = False
+        self.is_final = False  # whether the cost at hand is the one that is solved, not the one that SOC is run on
         self._laplacian: InterfaceFactor | None = None
         self.network = CountedPool(engine.open(partial(Agent, backend=backend), subgraphs), len(subgraphs))
         self.describe(Count.OFF)
@@ -249,22 +216,13 @@ class Driver:
     def set_poses(self, poses: Poses) -> None:
         """Take all poses from elsewhere, as they are; F and the forces there are the gather of the next round.
 
-        Raises
-        ------
-        GraphError
-            When their number or dimension differs from the graph's.
+        A GraphError when their number or dimension differs from the graph's.
         """
         self.hand_out(poses)
         self.at = self.with_sums(self.at, self.ask(Interior.evaluate, None, Count.PIGGYBACKED))
 
     def hand_out(self, poses: Poses) -> None:
-        """Give driver and robots all poses, as they are.
-
-        Raises
-        ------
-        GraphError
-            When their number or dimension differs from the graph's.
-        """
+        """Give driver and robots all poses, as they are; a GraphError when they are not of the graph's size."""
         if poses.t.shape != (self.num_poses, self.d):
             raise GraphError(
                 f"{poses} for {self.num_poses} poses in {self.d}D; give one pose for every pose of the graph"

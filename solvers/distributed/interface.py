@@ -46,13 +46,7 @@ class Interface:
         return 8 * (contributions + own) + tree_bytes(self.tree, width)
 
     def check_memory(self, limit: float) -> None:
-        """Refuse before the memory is spent.
-
-        Raises
-        ------
-        SettingError
-            When `num_bytes` is above `limit`.
-        """
+        """Refuse before the memory is spent: a SettingError when `num_bytes` is above `limit`."""
         if self.num_bytes > limit:
             raise SettingError(
                 f"the driver would need {1e-9 * self.num_bytes:.1f} GB for {self.num_separators} separators, more than "
@@ -64,12 +58,8 @@ class Interface:
     def factorize(self, contributions: Sequence[Array], own: Sequence[tuple[IntArray, Array]] = ()) -> InterfaceFactor:
         """Sum the robots' Schur complements and the driver's own blocks, and factor: `factorize_tree`.
 
-        Parameters
-        ----------
-        contributions : sequence of (g (g + 1) / 2,)
-            As `Elimination.schur`; g columns a robot.
-        own : sequence of (columns (q, w), values (q, w, w))
-            Blocks that the driver adds, each on unknowns of one separator.
+        The contributions, (g (g + 1) / 2,) for a robot with g columns, are as `Elimination.schur`; the driver's own are
+        pairs of columns (q, w) and values (q, w, w), each block on unknowns of one separator.
         """
         width = sum(self.widths)
         order = by_separator(self.num_separators, self.widths)
@@ -89,12 +79,7 @@ class Interface:
     def rounding(self, contributions: Sequence[Array], own: Sequence[tuple[IntArray, Array]], diagonal: Array) -> Array:
         """Diagonal, (side,), that bounds what the factor of `factorize` can differ from the exact sum by.
 
-        Parameters
-        ----------
-        contributions, own
-            As given to `factorize`.
-        diagonal : (side,)
-            At least the diagonal of the sum.
+        `contributions` and `own` are as there; `diagonal`, (side,), is at least the diagonal of the sum.
         """
         in_column, most = tree_counts(self.tree, sum(self.widths), self.num_separators)
         terms = np.concatenate([np.repeat(in_column, width) for width in self.widths]) + len(contributions)
@@ -135,13 +120,7 @@ class InterfaceFactor:
 
 
 def by_separator(count: int, widths: tuple[int, ...]) -> IntArray:
-    """Unknowns of `count` separators, stacked field by field, in the order separator by separator.
-
-    Examples
-    --------
-    >>> by_separator(2, (1, 2))
-    array([0, 2, 3, 1, 4, 5])
-    """
+    """Unknowns of `count` separators, stacked field by field, in the order separator by separator."""
     fields, first = [], 0
     for width in widths:
         fields.append(first + width * np.arange(count)[:, None] + np.arange(width))

@@ -6,8 +6,6 @@ rotations and translations that they agree on: as near to the optimum as SOC's t
 stage.
 """
 
-from __future__ import annotations
-
 import math
 import time
 

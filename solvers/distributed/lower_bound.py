@@ -5,8 +5,6 @@ rounds; what crosses are Schur complements, right-hand sides, rows of S X on the
 sums.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

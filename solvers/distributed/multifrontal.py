@@ -4,8 +4,6 @@ Recursive bisection of the robot adjacency graph, by how many separators robots 
 the smallest group that holds every robot which touches it: no dense matrix over all separators is formed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -41,10 +39,7 @@ class Front:
 def separator_tree(touched: Sequence[IntArray], num_separators: int) -> tuple[Front, ...]:
     """Fronts in an order in which children come first; the last one holds all robots.
 
-    Parameters
-    ----------
-    touched : sequence of (g_a,)
-        Separators, 0 .. num_separators - 1, that every robot touches.
+    `touched` are the separators, 0 .. num_separators - 1, that every robot touches, (g_a,) each.
     """
     robot = np.repeat(np.arange(len(touched)), [len(poses) for poses in touched])
     pose = np.concatenate([*touched, np.zeros(0, dtype=np.int64)])
@@ -120,21 +115,11 @@ class TreeFactor:
 
 
 def factorize_tree(tree: tuple[Front, ...], width: int, contribution: Callable[[int], Array], own: Array) -> TreeFactor:
-    """Factor the sum of the robots' contributions and of diagonal blocks.
+    """Factor the sum of the robots' contributions and of diagonal blocks, for `width` unknowns a separator.
 
-    Parameters
-    ----------
-    width : int
-        Unknowns of a separator.
-    contribution : callable
-        Matrix of a robot, (width g_a, width g_a), its rows separator by separator, ascending.
-    own : (num_separators, width, width)
-        Diagonal blocks that are added.
-
-    Raises
-    ------
-    NotPositiveDefiniteError
-        When the sum is not positive definite.
+    `contribution` gives the matrix of a robot, (width g_a, width g_a), its rows separator by separator, ascending;
+    `own`, (num_separators, width, width), are diagonal blocks that are added. A NotPositiveDefiniteError when the sum
+    is not positive definite.
     """
     schur: dict[int, Array] = {}
     blocks = []

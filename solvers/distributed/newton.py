@@ -1,7 +1,5 @@
 """The second stage by driver and robots: `pgo_models.certificates.newton_polish` without secants, step for step."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

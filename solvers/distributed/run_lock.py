@@ -3,8 +3,6 @@
 The lock is on a file beside it (NAME.lock), since the file itself is replaced. One that a killed run left is free.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from contextlib import suppress
@@ -19,12 +17,7 @@ class RunLock:
     def __init__(self, path: Path) -> None:
         """Take the lock.
 
-        Raises
-        ------
-        SettingError
-            When another run has it.
-        FileFormatError
-            When the lock's file cannot be written.
+        A SettingError when another run has it, a FileFormatError when the lock's file cannot be written.
         """
         path = path.resolve()  # as the file is replaced: a link stays one
         self._path = path.with_name(f"{path.name}.lock")

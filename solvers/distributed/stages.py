@@ -1,7 +1,5 @@
 """A whole solve by a driver and its robots: start, SOC, Newton and certificate, each as its central twin does it."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import replace

@@ -3,8 +3,6 @@
 The iterates are those of JOINT to rounding, whatever the number of robots: `solvers.soc.soc` is the recursion to read.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -76,7 +74,7 @@ class SubstructuredSOC:
 
     def converged(self, state: SubstructuredState, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals are within tolerance."""
-        return self.soc.status_at(measurement)
+        return self.soc.converged(state, measurement)
 
     def finish(self, driver: Driver) -> None:
         """Leave omega and the best translations for it with driver and robots: two rounds."""

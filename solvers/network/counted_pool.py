@@ -1,7 +1,5 @@
 """Workers whose messages are counted: what the driver asks of them, and what they send each other."""
 
-from __future__ import annotations
-
 import enum
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
@@ -80,13 +78,7 @@ def by_link(sent: Sequence[Mapping[int, A]]) -> dict[tuple[int, int], A]:
 
 
 def delivered(messages: Mapping[tuple[int, int], A], num_robots: int) -> list[Mapping[int, A]]:
-    """Messages of every link (sender, receiver) for each of the receivers, by their senders.
-
-    Examples
-    --------
-    >>> delivered({(0, 1): "to one", (2, 1): "to one, too"}, 3)
-    [{}, {0: 'to one', 2: 'to one, too'}, {}]
-    """
+    """Messages of every link (sender, receiver) for each of the receivers, by their senders."""
     received: list[dict[int, A]] = [{} for _ in range(num_robots)]
     for (sender, receiver), value in messages.items():
         received[receiver][sender] = value

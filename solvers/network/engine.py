@@ -1,7 +1,5 @@
 """Where robots run: the seam, and robots in this process, in order or in threads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -40,15 +38,6 @@ class InProcess:
     ----------
     threads : int
         The factorisations of some back ends hold Python's lock: expect little of more than one.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models import grid
-    >>> from solvers.pipeline import solve
-    >>> solution = solve(grid(np.random.default_rng(0)), robots=3, engine=InProcess(threads=2))
-    >>> solution.is_certified, solution.ledger.num_robots
-    (True, 3)
     """
 
     threads: int = 1

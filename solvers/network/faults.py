@@ -1,7 +1,5 @@
 """What goes wrong between robots, for study: messages lost, late, or of a robot that is silent."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Generic, TypeVar
@@ -29,18 +27,6 @@ class Faults:
         A robot that neither sends nor receives ..
     silent_from, silent_rounds : int
         .. from this round on, for so many rounds.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models import grid, partition
-    >>> from solvers.pipeline import Pipeline, solve
-    >>> from solvers.soc.soc import SOC
-    >>> graph = grid(np.random.default_rng(0))
-    >>> robots = partition(graph, 3)
-    >>> pipeline = Pipeline(soc=SOC(robots=robots, tolerance=2e-3), faults=Faults(loss=0.2, seed=1))
-    >>> solve(graph, pipeline, robots=robots).is_certified
-    True
     """
 
     loss: float = 0.0

@@ -43,16 +43,6 @@ class Ledger:
         Payload of all all-reduces, once up and once down for every robot.
     counted : tuple of (Traffic, int)
         Exchanges, and how often each took place.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> both_ways = Traffic(np.array([0, 1]), np.array([1, 0]), np.array([80, 160]))
-    >>> ledger = Ledger(2).after_round(both_ways).after_round(both_ways)
-    >>> ledger
-    Ledger(2 robots, 2 rounds, 4 messages, 480 bytes)
-    >>> ledger.bytes_sent
-    array([160, 320])
     """
 
     num_robots: int

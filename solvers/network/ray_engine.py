@@ -68,11 +68,6 @@ class RayEngine:
         Most robots that share a CPU; as few as the CPUs allow do. Every robot is a process of 100 MB and more.
     patience : float
         Seconds to wait for robots to start.
-
-    Examples
-    --------
-    >>> RayEngine(num_cpus=2).robots_per_cpu
-    25
     """
 
     address: str | None = None
@@ -89,12 +84,7 @@ class RayEngine:
     def open(self, make: Callable[[T], Worker], shares: Sequence[T]) -> WorkerPool:
         """Robots as actors.
 
-        Raises
-        ------
-        MissingExtraError
-            Without Ray.
-        EngineError
-            When the address is no Ray cluster's, or there are too few CPUs.
+        A MissingExtraError without Ray, an EngineError when the address is no Ray cluster's, or there are too few CPUs.
         """
         is_ours = connect(self.address, self.num_cpus)
         place = _RayPlace(_ray(), make, shares, self, is_ours)
@@ -112,16 +102,9 @@ class RayEngine:
 def connect(address: str | None = None, num_cpus: int | None = None) -> bool:
     """Connect this process to Ray, quietly: to a cluster, or to one started here. False when it was connected before.
 
-    One that is started here has all its sockets on the loopback, at ports that Ray chooses, and no dashboard.
-
-    Raises
-    ------
-    MissingExtraError
-        Without Ray.
-    SettingError
-        When the address is none.
-    EngineError
-        When there is no Ray cluster that can be joined, or Ray cannot be started for this machine alone.
+    One that is started here has all its sockets on the loopback, at ports that Ray chooses, and no dashboard. A
+    MissingExtraError without Ray, a SettingError when the address is none, an EngineError when there is no Ray cluster
+    that can be joined, or Ray cannot be started for this machine alone.
     """
     ray = _ray()
     if address is not None:
@@ -218,7 +201,6 @@ class _RayPlace:
         return math.floor(1e4 / a_cpu) / 1e4  # Ray counts in steps of 1e-4
 
     def _wait(self, tickets: Mapping[int, ObjectRef[Any]]) -> None:
-        """Wait until robots are there."""
         deadline = time.monotonic() + self.engine.patience
         missing = list(tickets.values())
         while missing and (left := deadline - time.monotonic()) > 0:
@@ -237,10 +219,7 @@ class _RayPlace:
     def _look(self) -> None:
         """Whether the cluster is there: a minute after it has gone Ray would end this process, with words of its own.
 
-        Raises
-        ------
-        EngineError
-            When it has died; its actors are not asked for any more.
+        An EngineError when it has died; its actors are not asked for any more.
         """
         address = self.ray.get_runtime_context().gcs_address
         host, _, port = address.rpartition(":")
@@ -286,7 +265,6 @@ def _ray() -> ModuleType:
 
 
 def _check_address(address: str) -> None:
-    """Refuse an address where nothing listens."""
     host, colon, port = address.rpartition(":")
     if not colon or not host or "/" in host or not port.isdigit() or not 0 < int(port) < 65536:
         raise SettingError(f"address is {address!r}; give host:port, as `ray start --head` prints it")

@@ -4,8 +4,6 @@ A worker is deterministic: its state follows from its subgraph and the requests 
 is not in the ledger.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
@@ -27,25 +25,13 @@ class Place(Protocol[T]):
     """Where robots run that can be lost; T is what stands for an order under way."""
 
     def start(self, robots: Sequence[int]) -> None:
-        """Start robots, or start them again, each from its share.
-
-        Raises
-        ------
-        RobotLostError
-            When one was lost while it started.
-        """
+        """Start robots, or start them again, each from its share; a RobotLostError when one was lost meanwhile."""
 
     def send(self, robot: int, order: AnyOrder, request: object) -> T:
         """Give a robot an order."""
 
     def receive(self, robot: int, ticket: T) -> Any:  # noqa: ANN401 - what the order answers
-        """Wait for its answer.
-
-        Raises
-        ------
-        RobotLostError
-            When there will be none.
-        """
+        """Wait for its answer; a RobotLostError when there will be none."""
 
     def close(self) -> None:
         """Let the robots go."""
@@ -53,18 +39,10 @@ class Place(Protocol[T]):
 
 @dataclass(frozen=True)
 class Recovery:
-    """How lost robots are made anew.
+    """How lost robots are made anew."""
 
-    Attributes
-    ----------
-    orders_between_snapshots : int
-        An iteration of SOC takes three orders or four. What is kept for a robot is its snapshot and so many orders.
-    max_restarts : int
-        Of one robot; then the run ends with an error.
-    """
-
-    orders_between_snapshots: int = 40
-    max_restarts: int = 3
+    orders_between_snapshots: int = 40  # an iteration of SOC takes three or four; so many are kept for a robot
+    max_restarts: int = 3  # of one robot; then the run ends with an error
 
     def __post_init__(self) -> None:
         check_settings(self, not_negative=["max_restarts"], at_least_one=["orders_between_snapshots"])
@@ -87,10 +65,7 @@ class RecoveringPool(Generic[T]):
     def ask(self, order: Callable[[Any, Q], A], requests: Sequence[Q]) -> list[A]:
         """Give every robot an order, each with its request, and wait for all answers.
 
-        Raises
-        ------
-        EngineError
-            When a robot was lost more often than it may be.
+        An EngineError when a robot was lost more often than it may be.
         """
         try:
             answers: list[Any] = self._asked(order, requests)

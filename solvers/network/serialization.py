@@ -3,8 +3,6 @@
 A tree in JSON says what the object is made of, and names the arrays in it by number.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 import json
@@ -20,16 +18,8 @@ _TREE = "tree"
 def serialize(value: object) -> dict[str, NDArray[Any]]:
     """Arrays that `deserialize` makes an equal object of.
 
-    Parameters
-    ----------
-    value : object
-        None, a number, a string, an array, an enum's member, a dataclass, a sequence of such, or a mapping of strings
-        or integers to such; a sequence comes back as a tuple.
-
-    Raises
-    ------
-    TypeError
-        When there is something else in it.
+    The object is None, a number, a string, an array, an enum's member, a dataclass, a sequence of such, or a mapping of
+    strings or integers to such; a sequence comes back as a tuple. A TypeError when there is something else in it.
     """
     arrays: list[NDArray[Any]] = []
     tree = json.dumps(_tree(value, arrays))
@@ -37,17 +27,9 @@ def serialize(value: object) -> dict[str, NDArray[Any]]:
 
 
 def deserialize(arrays: Mapping[str, NDArray[Any]], classes: Sequence[type]) -> Any:  # noqa: ANN401 - whatever was packed
-    """Object that `serialize` made the arrays of.
+    """Object that `serialize` made the arrays of, of these dataclasses and enums; nothing else is ever made.
 
-    Parameters
-    ----------
-    classes : sequence of type
-        Dataclasses and enums that may be in it; nothing else is ever made.
-
-    Raises
-    ------
-    ValueError
-        When the arrays are not those of `serialize`, or hold a class that is not among `classes`.
+    A ValueError when the arrays are not those of `serialize`, or hold a class that is not among `classes`.
     """
     known = {one.__name__: one for one in classes}
     try:

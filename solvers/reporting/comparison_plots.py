@@ -26,15 +26,8 @@ _MOST_POINTS = 400  # of a curve in a page: sweeps by the thousand would make it
 def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -> Figure:
     """Figure of the gap of several methods over what they spent; a panel holds those whose effort is counted.
 
-    Parameters
-    ----------
-    efforts : sequence of Effort
-        A panel for each, all but that of iterations with a logarithmic axis.
-
-    Raises
-    ------
-    SettingError
-        When there is no curve with a gap above zero.
+    There is a panel for each effort, all but that of iterations with a logarithmic axis. A SettingError when there is
+    no curve with a gap above zero.
     """
     panels = _panels(curves, efforts)
     styles = _styles(curves, LINES)

@@ -67,13 +67,7 @@ class Curve:
         return self._efforts[effort] is not None
 
     def effort(self, effort: Effort) -> Array:
-        """What was spent up to every record.
-
-        Raises
-        ------
-        SettingError
-            When the curve does not know its communication.
-        """
+        """What was spent up to every record; a SettingError when the curve does not know its communication."""
         if not self.counts(effort):
             raise SettingError(f"{self.name} has no count of {effort.value}; give it to the Curve, or leave it out")
         return np.asarray(self._efforts[effort], dtype=float)

@@ -1,7 +1,5 @@
 """What a pose graph is made of, in words and numbers."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -14,22 +12,14 @@ from solvers.reporting.versions import installed_versions
 
 def describe_graph(graph: PoseGraph) -> list[tuple[str, str]]:
     """What `pgo info` says of a graph: label and text of every row."""
-    components = graph.components()
     degree = np.bincount(np.concatenate([graph.i, graph.j]), minlength=graph.num_poses)
-    rows = [
-        ("graph", f"{graph.name}, {graph.d}D"),
-        ("poses", str(len(graph.bodies))),
-        ("edges", f"{graph.num_edges}{graph.extras}"),
-        ("robots", str(graph.num_robots)),
-        ("components", f"{len(components)} (sizes {', '.join(str(len(part)) for part in components[:5])})"),
+    rows, sizes = graph.facts(), [str(len(part)) for part in graph.components()]
+    rows[4:5] = [
+        ("components", f"{len(sizes)} (sizes {', '.join(sizes[:5])})"),
         ("degree", f"{degree.min()} to {degree.max()}, mean {degree.mean():.2f}"),
-        ("kappa", f"{graph.kappa.min():.4g} to {graph.kappa.max():.4g} per rad^2"),
-        ("tau", f"{graph.tau.min():.4g} to {graph.tau.max():.4g} per m^2"),
-        *_information_facts(graph),
-        ("estimate", "with the graph" if graph.initial is not None else "none"),
-        ("truth", "with the graph" if graph.truth is not None else "none"),
     ]
-    if len(components) == 1:
+    rows[8:8] = _information_facts(graph)
+    if len(sizes) == 1:
         problem = PGOProblem(graph)
         if graph.initial is not None:
             rows.append(("F, estimate", f"{problem.objective(graph.initial):.8g}"))

@@ -1,7 +1,5 @@
 """A table of results for readers and for programs: in the terminal, as Markdown, CSV or JSON."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json
@@ -47,19 +45,11 @@ class TablePart:
 
 @dataclass(frozen=True)
 class ResultTable:
-    """Results in one or more tables for readers, and the figures behind them for programs.
-
-    Attributes
-    ----------
-    records : tuple of dict
-        The same figures in full, for CSV and JSON: every record has the same names.
-    notes : tuple of str
-        Sentences below the tables.
-    """
+    """Results in one or more tables for readers, and the figures behind them for programs."""
 
     parts: tuple[TablePart, ...]
-    records: tuple[dict[str, Value], ...]
-    notes: tuple[str, ...] = ()
+    records: tuple[dict[str, Value], ...]  # the same figures in full, for CSV and JSON: all with the same names
+    notes: tuple[str, ...] = ()  # sentences below the tables
 
     def print(self, console: Console | None = None) -> None:
         """Print to the terminal; lines are as wide as they need to be."""

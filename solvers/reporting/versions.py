@@ -1,7 +1,5 @@
 """Versions of what computed a result, for records."""
 
-from __future__ import annotations
-
 import platform
 from contextlib import suppress
 from importlib import metadata

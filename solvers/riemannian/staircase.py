@@ -4,8 +4,6 @@ min tr(Y^T Q Y) over Y in St(d, r)^n, translations marginalised in Q; where S ha
 point, its eigenvector in one more column of Y leads down (Rosen et al. 2019, algorithms 1 to 3; Boumal 2015).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import partial
@@ -93,15 +91,6 @@ class Staircase:
         Relative gap between f and the bound that is proven at the end.
     max_inner_iterations : int
         Conjugate-gradient iterations of one trust-region step.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers.loop import run
-    >>> result = run(Staircase(), PGOProblem(grid(np.random.default_rng(0))))
-    >>> result.status.name, result.state.point.rank, bool(result.objective - result.state.bound.lower_bound < 1e-4)
-    ('CONVERGED', 3, True)
     """
 
     tolerance: float = STATIONARY_DECREMENT

@@ -1,7 +1,5 @@
 """Truncated conjugate gradients: the minimum of a quadratic model in a trust region, roughly (Steihaug 1983)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,21 +32,10 @@ def truncated_conjugate_gradients(
 ) -> TruncatedStep:
     """Minimise <g, s> + <s, H s> / 2 over ||s||_P <= radius by preconditioned conjugate gradients.
 
-    It ends inside when the residual has fallen by the factor `forcing`, and at the boundary along the first direction
-    that leaves the region or has no positive curvature.
-
-    Parameters
-    ----------
-    hessian : callable
-        H, symmetric on the tangent space.
-    precondition : callable
-        P^-1, symmetric and positive definite on the tangent space.
-    radius : float
-        In the norm ||s||_P^2 = <s, P s>, in which the iterates grow.
-    forcing : float
-        Relative residual, in the norm of P^-1, that is enough.
-    floor : float
-        Squared residual <r, P^-1 r> that is enough.
+    It ends inside when the residual has fallen by the factor `forcing`, in the norm of P^-1, or its square
+    <r, P^-1 r> to `floor`, and at the boundary along the first direction that leaves the region or has no positive
+    curvature. H, `hessian`, is symmetric on the tangent space, P^-1, `precondition`, positive definite, too; the radius
+    is in the norm ||s||_P^2 = <s, P s>, in which the iterates grow.
 
     References
     ----------

@@ -37,11 +37,6 @@ class Anderson:
     per_robot : bool
         Every robot extrapolates its own rows with its own inner products, and nothing is summed over the robots.
         Otherwise each round has one all-reduce, of the products of the newest difference with all others.
-
-    Examples
-    --------
-    >>> Anderson(memory=5)
-    Anderson(memory=5, regularization=1e-12, restart_ratio=2.0, per_robot=False)
     """
 
     memory: int = 60
@@ -65,15 +60,8 @@ class AndersonShare:
     def observe(self, residual: Array, image: Array, keep: int) -> tuple[Array, AndersonShare]:
         """Part of the sums, and the share with the newest of at most `keep` differences.
 
-        Parameters
-        ----------
-        residual, image : (rows, d)
-            `residual` may carry weights; `image` not.
-
-        Returns
-        -------
-        sums : (1 + 2 q,)
-            ||residual||^2; newest . difference for the q differences, the newest last; difference . residual for them.
+        `residual`, (rows, d), may carry weights; `image`, (rows, d), not. The sums, (1 + 2 q,), are ||residual||^2;
+        newest . difference for the q differences, the newest last; difference . residual for them.
         """
         size = inner(residual, residual)
         if self.residual is None or self.image is None or not keep:

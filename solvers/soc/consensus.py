@@ -4,8 +4,6 @@ Robots may be anywhere: in one place they are `LocalRobots`, on a network those 
 one robot does is `solvers.soc.consensus_robot`; here is in which order, and what follows from sums over robots.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

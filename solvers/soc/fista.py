@@ -4,8 +4,6 @@ The paper solves step (a) of Algorithm 1 this way. With the Lipschitz constant a
 momentum is constant (Nesterov 2004, scheme 2.2.22); it is restarted when it points uphill (O'Donoghue & Candes 2015).
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 
@@ -24,31 +22,11 @@ def minimize_with_fista(
     tolerance: float = 1e-12,
     max_iterations: int = 20_000,
 ) -> Array:
-    """Solution of H x = b.
+    """Solution x of H x = b, to `tolerance` on ||H x - b|| / ||b||; the last iterate where that takes too long.
 
-    Parameters
-    ----------
-    apply_H : callable
-        x -> H x, symmetric, with eigenvalues in [strong_convexity, lipschitz].
-    b, start : arrays of one shape
-    lipschitz, strong_convexity : float
-        lipschitz >= strong_convexity > 0; a lipschitz that is too small diverges.
-    tolerance : float
-        On ||H x - b|| / ||b||.
-
-    Returns
-    -------
-    x, the last iterate where `max_iterations` are not enough.
-
-    Raises
-    ------
-    SettingError
-        When the constants are not as they must be.
-
-    Warns
-    -----
-    RuntimeWarning
-        When `max_iterations` are not enough: which accuracy was reached, and the way out.
+    `apply_H` is symmetric with eigenvalues in [strong_convexity, lipschitz], lipschitz >= strong_convexity > 0, else a
+    SettingError; a lipschitz that is too small diverges. `b` and `start` have one shape. A RuntimeWarning says when
+    `max_iterations` are not enough: which accuracy was reached, and the way out.
     """
     if not lipschitz >= strong_convexity > 0:
         raise SettingError(f"need lipschitz >= strong_convexity > 0, got {lipschitz} and {strong_convexity}")

@@ -12,8 +12,6 @@ With the B that (c) makes of it, the gradient of the Lagrangian of min <Y, L Y> 
 the dual residual: beside the change of omega, as in Boyd et al. 2011 (3.6), that of the frozen neighbours counts.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -85,13 +83,6 @@ class PaperSOC:
     tolerance : float
         On the paper's KKT residual, the root mean square over poses of ||omega_i^T omega_i - I||^2 +
         ||omega_i - R_i||^2, and on the gradient of the Lagrangian, over the scale of L.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers.loop import run
-    >>> run(PaperSOC(tolerance=1e-3), PGOProblem(grid(np.random.default_rng(0)))).status.name
-    'CONVERGED'
     """
 
     robots: Partition | None = None

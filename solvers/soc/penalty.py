@@ -1,7 +1,5 @@
 """Rules for the ADMM penalty rho: from the multipliers, fixed, or balanced by residuals, relative or Boyd's."""
 
-from __future__ import annotations
-
 import enum
 import math
 from abc import ABC, abstractmethod
@@ -74,15 +72,6 @@ class MultiplierPenalty(_Rule):
     ----------
     stall_window, stall_ratio : int, float
         Stalled: the residual of the last `stall_window` iterations has not fallen below `stall_ratio` of what it was.
-
-    Examples
-    --------
-    >>> from pgo_models.problem.initialization import chordal_start
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> rho = MultiplierPenalty(factor=8.0).initial(problem, chordal_start(problem))
-    >>> rho.shape, bool(rho.min() > 0)
-    ((27,), True)
     """
 
     factor: float = 8.0
@@ -111,15 +100,7 @@ class MultiplierPenalty(_Rule):
 
 @dataclass(frozen=True)
 class FixedPenalty(_Rule):
-    """rho_i = rho for all poses, unless the safeguard of `solvers.soc.soc` raises it.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> FixedPenalty(2.0).initial(problem, problem.graph.truth)[:3]
-    array([2., 2., 2.])
-    """
+    """rho_i = rho for all poses, unless the safeguard of `solvers.soc.soc` raises it."""
 
     rho: float
 
@@ -143,11 +124,6 @@ class BalancedPenalty(_Rule):
     This is not the rule of Boyd et al. 2011, which is `BoydPenalty`: its dual residual has the factor rho, and so the
     unit of the weights. Here both are lengths of rotations: ||R - omega|| and, without rho, ||omega - omega_last||.
     They seldom differ by `refactor_ratio`^2; on the paper's scenes rho stays where it starts.
-
-    Examples
-    --------
-    >>> BalancedPenalty().factor(primal_residual=1.0, dual_residual=1e-3)
-    5.0
     """
 
     scale: float = 0.3
@@ -184,12 +160,6 @@ class BoydPenalty(_Rule):
         First rho over the mean of m_i; Boyd gives none, and the paper neither.
     imbalance, growth : float
         Boyd's mu and tau.
-
-    Examples
-    --------
-    >>> rule = BoydPenalty()
-    >>> [rule.factor(primal, 1.0) for primal in (10.5, 9.5, 0.05)]
-    [2.0, 1.0, 0.5]
     """
 
     scale: float = 1.0
@@ -197,9 +167,7 @@ class BoydPenalty(_Rule):
     growth: float = 2.0
 
     def __post_init__(self) -> None:
-        check_settings(self, positive=["scale"])
-        if not self.imbalance > 1 or not self.growth > 1:
-            raise SettingError(f"imbalance and growth must be above 1, got {self.imbalance} and {self.growth}")
+        check_settings(self, positive=["scale"], above_one=["imbalance", "growth"])
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
         """(0, scale, 0)."""
@@ -219,11 +187,6 @@ def rotation_scale(problem: PGOProblem) -> Array:
     """m_i, (n,): the mean diagonal of M over the rotation rows of every pose."""
     diagonal = problem.M.data[problem.diagonal_positions[problem.num_poses :]]
     return np.asarray(diagonal.reshape(problem.num_poses, problem.d).mean(axis=1))
-
-
-def translation_scale(problem: PGOProblem) -> Array:
-    """Diagonal of M over the translation row of every pose, (n,)."""
-    return np.asarray(problem.M.data[problem.diagonal_positions[: problem.num_poses]])
 
 
 class Due(enum.Enum):

@@ -63,13 +63,9 @@ class RecursionBlock:
         return bool(np.isfinite(self.s).all())
 
     def after_solve(self, x: Array, z: Array | None = None, drift: Array | float = 0.0) -> tuple[RecursionBlock, Array]:
-        """Block with the x of step (a), and this party's sums for the acceleration.
+        """Block with the x of step (a), (rows, d), and this party's sums for the acceleration.
 
-        Parameters
-        ----------
-        x : (rows, d)
-        z, drift : (rows, d)
-            Where local passes came first: z after them, and by how much they moved z + B.
+        Where local passes came first, z after them and by how much they moved z + B, `drift`, both (rows, d).
         """
         z = self.z if z is None else z
         step = over_relax(x, z, self.settings.alpha) - z + drift
@@ -88,11 +84,7 @@ class RecursionBlock:
     def agreed(self, z: Array) -> tuple[RecursionBlock, Array]:
         """Block after step (b), which gives z, and (c): B = s - z = B + x - z.
 
-        Returns
-        -------
-        block : RecursionBlock
-        sums : (2,)
-            ||x - z||_rho^2 and ||c (z - z_before)||_rho^2, with c as in `solvers.soc.penalty.Steps`.
+        With it sums, (2,): ||x - z||_rho^2 and ||c (z - z_before)||_rho^2, c as in `solvers.soc.penalty.Steps`.
         """
         weight = np.sqrt(self.penalty)
         primal = weight[:, None] * (self.x - z)

@@ -1,7 +1,5 @@
 """Separator stiffness: inverse mean compliance of the separator translations, the scale of their ADMM penalty."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -28,16 +26,8 @@ def stiffness_of_separators(
     held by its neighbourhood, far below where long soft chains join them. The mean is estimated (Hutchinson 1990) with
     the same vectors of signs in every run.
 
-    Parameters
-    ----------
-    factor : CholeskyFactor
-        Of M_a + rho/2, with `GROUND` times D on the separator translations.
-    held : (s,)
-        Rows of the separator translations.
-    half_scale : (s,)
-        D.
-    component : (s,)
-        Which of them hang together by edges that the robot knows.
+    `factor` is of M_a + rho/2, with `GROUND` times D on the separator translations, whose rows are `held`, (s,);
+    `half_scale`, (s,), is D, and `component`, (s,), says which hang together by edges that the robot knows.
     """
     degrees = len(held) - len(np.unique(component))
     if degrees == 0:  # alone in its component, each: nothing but shifts
@@ -58,12 +48,8 @@ def translation_penalty_for(stiffness: float) -> float:
 def travel(moved: Array, pulled: Array, scale: Array) -> Array:
     """Sums over copies of how far translations went, and how much their multipliers changed on the way: (3 + d,).
 
-    Parameters
-    ----------
-    moved, pulled : (q, d)
-        Change of the translations agreed on, and of the unscaled multipliers.
-    scale : (q,)
-        Shares of the copies in the diagonal of M.
+    `moved` and `pulled`, (q, d), are the changes of the translations agreed on, and of the unscaled multipliers,
+    `scale`, (q,), the shares of the copies in the diagonal of M.
     """
     weighted = scale[:, None] * moved
     sums = np.sum(pulled * (pulled / scale[:, None])), np.sum(weighted * moved), np.sum(scale)
@@ -74,16 +60,11 @@ def adapted_penalty(penalty: float, sums: Array) -> float:
     """Penalty of separator translations, times their diagonal in M, after the way that they went with it.
 
     ADMM is fastest where penalties are the ratio of the distances to the optimum of multipliers and of variables; the
-    way so far, without a common shift, estimates it (Xu, Figueiredo & Goldstein 2017 take the ratio of the last steps).
-    Where that is far below the penalty, as after a start with several times the optimal cost, the penalty falls by the
-    square of the quotient, to a tenth at most. The square, and the factor of three from which on it falls, were chosen
-    on M3500, manhattan and intel, which take fewer rounds with them; city10000 took more where a smaller factor was
-    enough, and sphere2500 where the penalty was raised.
-
-    Parameters
-    ----------
-    sums : (3 + d,)
-        `travel`, of all robots.
+    way so far, `travel` of all robots without a common shift, estimates it (Xu, Figueiredo & Goldstein 2017 take the
+    ratio of the last steps). Where that is far below the penalty, as after a start with several times the optimal cost,
+    the penalty falls by the square of the quotient, to a tenth at most. The square, and the factor of three from which
+    on it falls, were chosen on M3500, manhattan and intel, which take fewer rounds with them; city10000 took more where
+    a smaller factor was enough, and sphere2500 where the penalty was raised.
     """
     pulled, moved, scale, along = sums[0], sums[1], sums[2], sums[3:]
     distance = moved - along @ along / scale if scale > 0 else 0.0

@@ -1,7 +1,5 @@
 """Settings of SOC, for all couplings."""
 
-from __future__ import annotations
-
 import enum
 import math
 from dataclasses import dataclass, field
@@ -43,10 +41,9 @@ class SOCSettings:
     max_iterations: int = 500
 
     def __post_init__(self) -> None:
-        if not 0 < self.alpha < 2:
-            raise SettingError(f"alpha must be in (0, 2), got {self.alpha}")
         check_settings(
             self,
+            relaxation=["alpha"],
             positive=["translation_penalty", "tolerance"],
             not_negative=["separator_penalty", "max_iterations"],
             at_least_one=["local_passes"],
@@ -65,7 +62,7 @@ class SOCSettings:
             return self.coupling
         return Coupling.JOINT if self.robots is None else Coupling.CONSENSUS
 
-    def status_at(self, measurement: Measurement) -> Status | None:
+    def converged(self, state: object, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals are within tolerance."""
         worst = max(measurement.primal_residual, measurement.dual_residual)
         return Status.CONVERGED if worst <= self.tolerance else None

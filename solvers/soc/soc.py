@@ -21,7 +21,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from solvers.result import Measurement, Status
+from solvers.result import Measurement
 from solvers.soc.anderson import AndersonSums
 from solvers.soc.consensus import LocalConsensus
 from solvers.soc.penalty import Due, Steps, next_penalty, rotation_scale
@@ -131,7 +131,6 @@ class SOC(SOCSettings):
         is, by `solve(.., robots=..)` on robots.
     robots : Partition, optional
         Who owns which pose.
-    penalty : MultiplierPenalty, FixedPenalty or BalancedPenalty
     alpha : float
         Over-relaxation, in (0, 2).
     acceleration : Anderson, optional
@@ -156,13 +155,6 @@ class SOC(SOCSettings):
     ------
     SettingError
         When a setting is out of its range or does not go with the coupling.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers.loop import run
-    >>> run(SOC(tolerance=1e-4), PGOProblem(grid(np.random.default_rng(0)))).status.name
-    'CONVERGED'
     """
 
     @property
@@ -193,7 +185,3 @@ class SOC(SOCSettings):
     def poses(self, problem: PGOProblem, state: Any) -> Poses:  # noqa: ANN401
         """Omega with the best translations for it."""
         return problem.with_best_translations(state.omega)
-
-    def converged(self, state: object, measurement: Measurement) -> Status | None:
-        """CONVERGED when the residuals are within tolerance."""
-        return self.status_at(measurement)

@@ -86,13 +86,7 @@ class Part:
 
 
 def split_graph(given: PGOProblem | PoseGraph, partition: Partition) -> tuple[Subgraph, ...]:
-    """Give every robot its subgraph.
-
-    Raises
-    ------
-    SettingError
-        When the partition is of another number of poses.
-    """
+    """Give every robot its subgraph; a SettingError when the partition is of another number of poses."""
     problem = as_problem(given)
     graph, first = problem.graph, problem.convex_part
     costs = first.weights, None if first is problem else problem.weights

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.errors import MissingExtraError, SettingError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
@@ -60,12 +60,9 @@ class BenchmarkSettings:
     time_limit: float = math.inf
 
     def __post_init__(self) -> None:
-        if self.num_robots < 1:
-            raise SettingError(f"num_robots is {self.num_robots}; give at least 1")
         if self.max_rounds is not None and self.max_rounds < 2:
             raise SettingError(f"max_rounds is {self.max_rounds}; give at least 2, one for each stage")
-        if not self.time_limit > 0:
-            raise SettingError(f"time_limit is {self.time_limit}; give positive seconds")
+        check_settings(self, positive=["time_limit"], at_least_one=["num_robots"])
 
     def robots(self, graph: PoseGraph) -> Partition:
         """Who owns which pose."""

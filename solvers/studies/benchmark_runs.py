@@ -1,7 +1,5 @@
 """How the methods to compare are run on a graph; `solvers.studies.benchmark` has what comes of it."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -53,21 +51,10 @@ def run_benchmark(
     The couplings of SOC hand over to Newton as `solve` does, PAPER to Gauss-Newton. PAPER's second stage and all of
     CONSENSUS and SUBSTRUCTURED are run by the robots and a driver, whose ledger counts. An iteration of PAPER is one
     round between neighbours, and one more, whose bytes are not counted, gives the translations. Its first stage hands
-    on its last iterate, whatever F is there.
+    on its last iterate, whatever F is there. Methods find a start of their own unless one is given, which GAUSS_SEIDEL
+    does not take.
 
-    Parameters
-    ----------
-    settings : BenchmarkSettings, optional
-        `BenchmarkSettings()` unless given.
-    start : Poses, optional
-        Instead of their own; GAUSS_SEIDEL takes none.
-
-    Raises
-    ------
-    PGOError
-        When the method cannot be run on this graph.
-    KeyboardInterrupt
-        After Ctrl-C: half a trial is none.
+    A PGOError when the method cannot be run on this graph; KeyboardInterrupt after Ctrl-C: half a trial is none.
     """
     settings = settings if settings is not None else BenchmarkSettings()
     trial = _RUNS[contender](problem, _Allowance(settings, problem.graph), start)
@@ -126,7 +113,6 @@ class _Allowance:
 def _one_run(
     solver: Solver[Any], name: str, problem: PGOProblem, allowed: _Allowance, start: Poses | None
 ) -> BenchmarkRun:
-    """A run of one method in one place."""
     finished = allowed.run(solver, problem, start)
     return _run_of(finished, StageRecord(name, finished.status, finished.history))
 

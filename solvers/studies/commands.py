@@ -1,7 +1,5 @@
 """Commands of `pgo` that hold methods against each other: tables, compare, figures."""
 
-from __future__ import annotations
-
 import enum
 import math
 from collections.abc import Callable
@@ -128,7 +126,6 @@ def _chosen(choices: type[Choice], names: str, kind: str) -> tuple[Choice, ...]:
 
 
 def _split(names: str) -> tuple[str, ...]:
-    """Names between commas, each once."""
     return tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
 
 

@@ -1,7 +1,5 @@
 """Chosen methods on one graph, side by side: a table, and the gap against rounds, bytes and seconds."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 from collections.abc import Callable
@@ -40,15 +38,9 @@ _COLUMNS: tuple[tuple[str, str, Callable[[Any], str]], ...] = (  # head, name in
 
 @dataclass(frozen=True)
 class ComparisonSettings:
-    """Which methods, and what they share.
+    """Which methods, and what they share."""
 
-    Attributes
-    ----------
-    contenders : tuple of BenchmarkMethod
-        All that can be run here unless given: GTSAM only where it is installed.
-    """
-
-    contenders: tuple[BenchmarkMethod, ...] = ()
+    contenders: tuple[BenchmarkMethod, ...] = ()  # all that can be run here unless given: GTSAM where it is installed
     trial: BenchmarkSettings = field(default_factory=BenchmarkSettings)
 
     @property
@@ -62,24 +54,14 @@ class ComparisonSettings:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Methods side by side on one graph.
-
-    Attributes
-    ----------
-    optimum, lower_bound : float
-        The best F known, from `solve` or one of the methods, and the bound that is proven.
-    reasons : tuple of (BenchmarkMethod, str)
-        Methods without figures, and why.
-    is_complete : bool
-        Whether all were run; after Ctrl-C they were not.
-    """
+    """Methods side by side on one graph."""
 
     problem: PGOProblem
-    optimum: float
-    lower_bound: float
+    optimum: float  # the best F known, from `solve` or one of the methods
+    lower_bound: float  # that is proven
     trials: tuple[BenchmarkRun, ...]
-    reasons: tuple[tuple[BenchmarkMethod, str], ...]
-    is_complete: bool = True
+    reasons: tuple[tuple[BenchmarkMethod, str], ...]  # methods without figures, and why
+    is_complete: bool = True  # whether all were run; after Ctrl-C they were not
 
     @property
     def curves(self) -> list[Curve]:
@@ -113,12 +95,7 @@ class Comparison:
     def save_plot(self, path: Path | str) -> None:
         """Write the gap against rounds, bytes and seconds as a picture or, for .html, as a page to explore.
 
-        Raises
-        ------
-        SettingError
-            On another suffix, or when there is nothing to draw.
-        PGOError
-            When the file cannot be written.
+        A SettingError on another suffix, or when there is nothing to draw; a PGOError when the file cannot be written.
         """
         path = Path(path)
         check_plot_format(path)
@@ -135,7 +112,6 @@ def compare_methods(
 
     Parameters
     ----------
-    problem : PGOProblem or PoseGraph
     settings : ComparisonSettings, optional
         `ComparisonSettings()` unless given.
     progress : bool, optional

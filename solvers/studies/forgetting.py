@@ -3,8 +3,6 @@
 Yin & Osher, Error forgetting of Bregman iteration, 2013; the two-line form is the paper's `bregman update`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,19 +15,11 @@ from solvers.convex.bregman import TwoLineBregman
 
 @dataclass(frozen=True, eq=False)
 class ErrorForgetting:
-    """||x_k - x*|| of every iterate, from k = 0 on.
-
-    Attributes
-    ----------
-    undisturbed, disturbed : (iterations + 1,)
-        Without and with an error added to x in the first steps.
-    not_added_back : (iterations + 1,)
-        What plain quadratic penalties give, with b held at 0: the error of the model itself, which stays.
-    """
+    """||x_k - x*|| of every iterate, from k = 0 on, (iterations + 1,) each."""
 
     undisturbed: Array
-    disturbed: Array
-    not_added_back: Array
+    disturbed: Array  # with an error added to x in the first steps
+    not_added_back: Array  # by plain quadratic penalties, b held at 0: the error of the model itself, which stays
     disturbed_steps: int
 
     def curves(self) -> list[tuple[str, Array]]:

@@ -1,7 +1,5 @@
 """The paper's tables 1 to 4, row for row: its figures beside ours, each held against a proven lower bound."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -10,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.errors import PGOError, SettingError
+from pgo_models.errors import PGOError, SettingError, check_settings
 from pgo_models.graphs.datasets import load
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.published_results import PublishedFigures, PublishedRow, published_rows
@@ -65,9 +63,7 @@ class ReproductionSettings:
         for name in self.only:
             if name not in known:
                 raise SettingError(f"the paper's tables have no row {name!r}; they have {', '.join(known)}")
-        if self.num_seeds < 1:
-            raise SettingError(f"num_seeds is {self.num_seeds}; give at least 1")
-        BenchmarkSettings(num_robots=self.num_robots)
+        check_settings(self, at_least_one=["num_seeds", "num_robots"])
 
     @property
     def rows(self) -> tuple[PublishedRow, ...]:
@@ -149,19 +145,11 @@ class ReproducedRow:
 
 @dataclass(frozen=True)
 class Reproduction:
-    """The reproduced tables.
-
-    Attributes
-    ----------
-    rows : tuple of ReproducedRow
-        Graph by graph, and for each SE-Sync, DGS, SOC as in the paper, SOC consensus.
-    is_complete : bool
-        Whether all was done; after Ctrl-C it was not.
-    """
+    """The reproduced tables."""
 
     settings: ReproductionSettings
-    rows: tuple[ReproducedRow, ...]
-    is_complete: bool
+    rows: tuple[ReproducedRow, ...]  # graph by graph, and for each SE-Sync, DGS, SOC as in the paper, SOC consensus
+    is_complete: bool  # whether all was done; after Ctrl-C it was not
 
     def soc_row(self, row: ReproducedRow) -> ReproducedRow:
         """Row of the paper's own method on the same graph."""
@@ -227,10 +215,7 @@ def reproduce_tables(
 def graph_of_row(row: PublishedRow, seed: int, download: bool) -> PoseGraph:
     """Graph of a row of the paper's tables: a draw of its scene, or the file; never another graph in its place.
 
-    Raises
-    ------
-    PGOError
-        When it is not here, or what is here under its name is another graph.
+    A PGOError when it is not here, or what is here under its name is another graph.
     """
     if row.name in SCENES:
         return SCENES[row.name](np.random.default_rng(seed))

@@ -1,7 +1,5 @@
 """The reproduced tables in words and figures: one line for each method on each graph, and what they show."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,28 +11,12 @@ from solvers.studies.benchmark import BenchmarkMethod
 from solvers.studies.paper_tables import ReproducedRow, Reproduction, TableEntry
 
 _COST_HEADS = (
-    "graph",
-    "poses",
-    "edges",
-    "F*",
-    "proven to (%)",
-    "method",
-    "F",
-    "gap (%)",
-    "after SOC alone (%)",
-    "paper: F",
-    "paper: gap (%)",
-    "remark",
+    *("graph", "poses", "edges", "F*", "proven to (%)", "method", "F", "gap (%)", "after SOC alone (%)"),
+    *("paper: F", "paper: gap (%)", "remark"),
 )
 _EFFORT_HEADS = (
-    "graph",
-    "method",
-    "iterations",
-    "rounds",
-    "paper: iterations",
-    "seconds",
-    "seconds a robot",
-    "paper: seconds",
+    *("graph", "method", "iterations", "rounds", "paper: iterations", "seconds"),
+    *("seconds a robot", "paper: seconds"),
 )
 _WANTED_GAP = 1e-4
 _SAME = 1e-3  # a spread below this part of the mean is not shown
@@ -237,7 +219,6 @@ def _counted(sentences: Sequence[str], total: int) -> list[str]:
 
 
 def _record(row: ReproducedRow) -> dict[str, Value]:
-    """Figures of a row in full: means, and standard deviations over the draws."""
     figures, published, cells = row.figures, row.published, row.cells
     optimum = published.se_sync.objective
 

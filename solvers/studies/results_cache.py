@@ -1,7 +1,5 @@
 """Finished results of a long job in a JSON file, so that the job can go on where it was interrupted."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -16,21 +14,10 @@ Entry = dict[str, Any]
 
 
 class KeptResults:
-    """Results by key; the file is written anew, whole, whenever one is added.
+    """Results by key; the file, if there is one, is written anew, whole, whenever a result is added.
 
-    Results that other versions of the software made are not taken up again.
-
-    Parameters
-    ----------
-    path : Path, optional
-        None keeps nothing beyond the job.
-    is_fresh : bool
-        Leave aside what the file holds.
-
-    Raises
-    ------
-    FileFormatError
-        When the file is there and holds no results.
+    Results that other versions of the software made are not taken up again, with `is_fresh` none of what it holds. A
+    FileFormatError when the file is there and holds no results.
     """
 
     def __init__(self, path: Path | None, is_fresh: bool = False) -> None:
@@ -49,13 +36,7 @@ class KeptResults:
         return self._entries.get(key)
 
     def add(self, key: str, entry: Entry) -> None:
-        """Keep a result.
-
-        Raises
-        ------
-        PGOError
-            When the file cannot be written.
-        """
+        """Keep a result; a PGOError when the file cannot be written."""
         self._entries[key] = entry
         if self._path is not None:
             text = json.dumps({**self._header, "results": self._entries}, indent=1, allow_nan=False)

@@ -1,7 +1,5 @@
 """Where the semidefinite relaxation stops being tight: rotation noise swept on the paper's circle and grid."""
 
-from __future__ import annotations
-
 import enum
 from dataclasses import dataclass
 
@@ -23,23 +21,14 @@ class SweptScene(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class NoiseSweep:
-    """Which graphs were certified at which noise.
-
-    Attributes
-    ----------
-    rotation_std : (levels,)
-        Radians.
-    certified : (levels, graphs)
-        Whether `solvers.solve` certified its answer. Where it did, the relaxation is tight; where it did not, the
-        relaxation is not tight, or the answer not optimal.
-    gap : (levels, graphs)
-        Certified gap of the answer; the relaxation's own is at most that.
-    """
+    """Which graphs were certified at which noise."""
 
     scene: SweptScene
-    rotation_std: Array
+    rotation_std: Array  # (levels,): radians
+    # (levels, graphs): whether `solvers.solve` certified its answer. Where it did, the relaxation is tight; where it
+    # did not, the relaxation is not tight, or the answer not optimal.
     certified: BoolArray
-    gap: Array
+    gap: Array  # (levels, graphs): certified gap of the answer; the relaxation's own is at most that
 
     @property
     def fraction(self) -> Array:

@@ -2,7 +2,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from budget import examples
-from graphs import DIMENSIONS, SEEDS, random_poses, varied_problem
+from graphs import DIMENSIONS, SEEDS, random_poses, translation_scale, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,7 +13,7 @@ from pgo_models.graphs.partitioning import partition
 from pgo_models.problem.problem import PGOProblem
 from solvers.soc.consensus import LocalConsensus
 from solvers.soc.paper import PaperSOC, PaperState
-from solvers.soc.penalty import FixedPenalty, translation_scale
+from solvers.soc.penalty import FixedPenalty
 from solvers.soc.r_step import RStep, RSubproblem, prepare
 from solvers.soc.soc import SOC
 from solvers.soc.subgraph import split_graph

@@ -6,13 +6,13 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from budget import examples
+from graphs import polar_factor
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem, kkt_residuals
 from pgo_models.convex.orthogonality_examples import (
     one_norm_components,
-    polar_factor,
     procrustes,
     rotation_averaging,
     smallest_eigenvectors,

@@ -2,6 +2,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from budget import examples
+from graphs import polar_factor
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -9,7 +10,6 @@ from pgo_models.convex.constraint_sets import Orthonormal, Rotations, Sparse, Un
 from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem, kkt_residuals
 from pgo_models.convex.orthogonality_examples import (
     one_norm_components,
-    polar_factor,
     procrustes,
     rotation_averaging,
     smallest_eigenvectors,

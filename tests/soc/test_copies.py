@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from graphs import DIMENSIONS, LOUD_NOISE, SEEDS, random_poses, varied_problem
+from graphs import DIMENSIONS, LOUD_NOISE, SEEDS, random_poses, translation_scale, varied_problem
 from hypothesis import given
 from hypothesis import strategies as st
 from robots import PARTITIONERS, Partitioner
@@ -20,7 +20,7 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.network.counted_pool import Count
 from solvers.soc.consensus import ConsensusIterate, LocalConsensus, LocalRobots, ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.penalty import FixedPenalty, MultiplierPenalty, rotation_scale, translation_scale
+from solvers.soc.penalty import FixedPenalty, MultiplierPenalty, rotation_scale
 from solvers.soc.recursion_block import Agreement
 from solvers.soc.soc import SOC
 

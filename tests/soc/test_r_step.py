@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from budget import examples
-from graphs import DIMENSIONS, SEEDS, SIZES, varied_problem
+from graphs import DIMENSIONS, SEEDS, SIZES, translation_scale, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
@@ -18,7 +18,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.soc.consensus import LocalConsensus
 from solvers.soc.paper import PaperSOC
-from solvers.soc.penalty import FixedPenalty, MultiplierPenalty, rotation_scale, translation_scale
+from solvers.soc.penalty import FixedPenalty, MultiplierPenalty, rotation_scale
 from solvers.soc.r_step import RStep, RSubproblem, _largest_eigenvalue_bound, prepare
 from solvers.soc.soc import SOC
 

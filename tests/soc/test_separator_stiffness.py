@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_problem
+from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, translation_scale, varied_problem
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -11,7 +11,7 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyFactor
 from pgo_models.problem.problem import PGOProblem
-from solvers.soc.penalty import rotation_scale, translation_scale
+from solvers.soc.penalty import rotation_scale
 from solvers.soc.separator_stiffness import GROUND, adapted_penalty, stiffness_of_separators, travel
 
 PROBES = 32

@@ -9,6 +9,7 @@ from graphs import (
     LOUD_NOISE,
     SEEDS,
     exact_graph,
+    translation_scale,
     varied_graph,
     varied_problem,
 )
@@ -30,7 +31,7 @@ from solvers.result import Measurement, Status
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus import ConsensusIterate
 from solvers.soc.paper import PaperSOC
-from solvers.soc.penalty import FixedPenalty, rotation_scale, translation_scale
+from solvers.soc.penalty import FixedPenalty, rotation_scale
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC, SOCState
 

@@ -159,9 +159,9 @@ def _interrupted(result):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"num_robots": 0}, "num_robots is 0"),
+        ({"num_robots": 0}, "num_robots must be at least 1, got 0"),
         ({"max_rounds": 1}, "max_rounds is 1; give at least 2"),
-        ({"time_limit": 0.0}, "time_limit is 0.0"),
+        ({"time_limit": 0.0}, "time_limit must be positive, got 0.0"),
     ],
 )
 def test_settings_out_of_range_are_refused(wrong, message):

@@ -109,7 +109,7 @@ def test_figures_are_written_into_a_folder(pgo_command, tmp_path):
         (("compare", "grid", "--out", "table"), "use .md, .csv or .json"),
         (("compare", "grid", "--plot", "plot.gif"), "use .html, .png"),
         (("compare", "nothing-here"), "no file and no data set"),
-        (("compare", "grid", "--time-limit", "0"), "time_limit is 0"),
+        (("compare", "grid", "--time-limit", "0"), "time_limit must be positive, got 0"),
         (("figures", "--only", "scene"), "there is no figure 'scene'; there are scenes"),
     ],
 )

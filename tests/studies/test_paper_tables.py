@@ -222,8 +222,8 @@ def test_scenes_are_drawn_from_their_seeds():
     ("wrong", "message"),
     [
         ({"only": ("torus",)}, "no row 'torus'; they have circle"),
-        ({"num_seeds": 0}, "num_seeds is 0"),
-        ({"num_robots": 0}, "num_robots is 0"),
+        ({"num_seeds": 0}, "num_seeds must be at least 1"),
+        ({"num_robots": 0}, "num_robots must be at least 1"),
     ],
 )
 def test_wrong_settings_are_refused(wrong, message):

@@ -1,7 +1,5 @@
 """One robot as an engine runs it: its interior for the driver, and its copies for CONSENSUS."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -51,12 +49,7 @@ CLASSES = (
 class Agent:
     """A robot that obeys orders: each replaces what it has by what the order makes of it.
 
-    Attributes
-    ----------
-    interior : Interior, optional
-        None when the robot counts no edge.
-    copies : ConsensusRobot, optional
-        None before CONSENSUS begins.
+    Its `interior` is None when it counts no edge, its `copies` are None before CONSENSUS begins.
     """
 
     def __init__(self, subgraph: Subgraph, backend: CholeskyBackend | None) -> None:

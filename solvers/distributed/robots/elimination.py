@@ -9,8 +9,6 @@ and K is positive definite if and only if every K_II,a and the driver's matrix a
 1968).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,28 +32,14 @@ class Cut:
 
 @dataclass(frozen=True, eq=False)
 class Elimination:
-    """A robot's matrix with the interior eliminated.
-
-    Attributes
-    ----------
-    cut : Cut
-    K_IG : csr_array, (i, g)
-    factor : CholeskyFactor, optional
-        Of K_II; None when there is no interior.
-    schur : (g (g + 1) / 2,)
-        Lower triangle of K_GG - K_GI K_II^-1 K_IG, `packed`.
-    diagonal : (g,)
-        Diagonal of K_GG.
-    interior_error : (i,)
-        Share of the diagonal of K_II that rounding can take, where it was asked for.
-    """
+    """A robot's matrix with the interior, (i,), eliminated to the boundary, (g,)."""
 
     cut: Cut
-    K_IG: csr_array
-    factor: CholeskyFactor | None
-    schur: Array
-    diagonal: Array
-    interior_error: Array
+    K_IG: csr_array  # sparse (i, g)
+    factor: CholeskyFactor | None  # of K_II; None when there is no interior
+    schur: Array  # (g (g + 1) / 2,): lower triangle of K_GG - K_GI K_II^-1 K_IG, `packed`
+    diagonal: Array  # (g,): of K_GG
+    interior_error: Array  # (i,): share of the diagonal of K_II that rounding can take, where it was asked for
 
     def reduce(self, b: Array) -> tuple[Array, float]:
         """b_G - K_GI K_II^-1 b_I, (g, k), and the inner product of b_I and K_II^-1 b_I."""
@@ -84,10 +68,7 @@ def eliminate(K: csc_array, cut: Cut, backend: CholeskyBackend | None, is_verifi
 
         x^T K x >= x_G^T schur x_G - x_I^T diag(interior_error) diag(K_II) x_I.
 
-    Raises
-    ------
-    NotPositiveDefiniteError
-        When K_II is not positive definite.
+    A NotPositiveDefiniteError when K_II is not positive definite.
     """
     interior, boundary = cut.interior, cut.boundary
     K_G = K[:, boundary].tocsc()

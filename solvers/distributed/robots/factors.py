@@ -1,7 +1,5 @@
 """Factors of the matrices of a robot's interior; what a state holds is the matrix, so that they can be found again."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from scipy.sparse import csc_array

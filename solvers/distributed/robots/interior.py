@@ -52,36 +52,20 @@ from solvers.soc.subgraph import Part, Subgraph
 
 @dataclass(frozen=True, eq=False)
 class InteriorState:
-    """What orders leave with a robot; poses are those of its part.
-
-    Attributes
-    ----------
-    poses, trial, kept : Poses
-    block : RecursionBlock, optional
-        Rotations of the interior in SOC's recursion.
-    eliminated : Eliminated, optional
-    has_laplacian : bool
-        Whether the driver has been told the matrix of the translations.
-    b, x : (side, k)
-        Right-hand side of the last elimination, and X of the last step (a).
-    step : tuple of (p, .), (p, d), optional
-        Newton's direction: rotations, translations.
-    proof : RobotProof, optional
-    is_final : bool
-        Whether the cost at hand is the one that is solved, and not the one near it that SOC is run on.
-    """
+    """What orders leave with a robot; poses, p of them, are those of its part."""
 
     poses: Poses
     trial: Poses
     kept: Poses
-    block: RecursionBlock | None = None
+    block: RecursionBlock | None = None  # rotations of the interior in SOC's recursion
     eliminated: Eliminated | None = None
-    has_laplacian: bool = False
+    has_laplacian: bool = False  # whether the driver has been told the matrix of the translations
+    # b, x: (side, k); right-hand side of the last elimination, and X of the last step (a).
     b: Array = field(default_factory=lambda: np.zeros((0, 0)))
     x: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    step: tuple[Array, Array] | None = None
+    step: tuple[Array, Array] | None = None  # (p, .), (p, d): Newton's direction: rotations, translations
     proof: RobotProof | None = None
-    is_final: bool = False
+    is_final: bool = False  # whether the cost at hand is the one that is solved, not the one that SOC is run on
 
 
 @dataclass(frozen=True, eq=False)

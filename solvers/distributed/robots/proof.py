@@ -25,53 +25,31 @@ _ATTEMPTS = 3  # the error of a factor is known when it is there, and hardly cha
 
 @dataclass(frozen=True, eq=False)
 class ProofSums:
-    """Parts of the bound at one X.
+    """Parts of the bound at one X."""
 
-    Attributes
-    ----------
-    value, value_error : float
-        Of `evaluate_certificate`.
-    left, quadratic : float
-        Of the interior alone: sums of |G|^2 and (|G| + its error)^2 over slack, G the rows of S X.
-    squared_distances : float
-        Which an eta costs.
-    product, error : ((d+1) g, d)
-        Rows of S X on the boundary, and their errors.
-    """
-
+    # value, value_error: of `evaluate_certificate`.
     value: float
     value_error: float
+    # left, quadratic: of the interior alone; sums of |G|^2 and (|G| + its error)^2 over slack, G the rows of S X.
     left: float
     quadratic: float
-    squared_distances: float
+    squared_distances: float  # which an eta costs
+    # product, error: ((d+1) g, d); rows of S X on the boundary, and their errors.
     product: Array
     error: Array
 
 
 @dataclass(frozen=True, eq=False)
 class RobotProof:
-    """Where a robot evaluates the certificate.
+    """Where a robot evaluates the certificate."""
 
-    Attributes
-    ----------
-    Lambda : (p, d, d)
-        Multipliers, zero at the separators, which are the driver's.
-    start, X : (N, d)
-        Rows of its poses in the frame of the pose that is left out; moved.
-    low : (p, d)
-        To be added to the translations.
-    slack : (i,)
-        S_r is at least so much in the rows of the interior.
-    interior : (i,)
-        Those rows.
-    """
-
-    Lambda: Array
+    Lambda: Array  # (p, d, d): multipliers, zero at the separators, which are the driver's
+    # start, X: (N, d); rows of its poses in the frame of the pose that is left out; moved.
     start: Array
     X: Array
-    low: Array
-    slack: Array
-    interior: IntArray
+    low: Array  # (p, d): to be added to the translations
+    slack: Array  # (i,): S_r is at least so much in the rows of the interior
+    interior: IntArray  # (i,): those rows
 
     def moved(self, step: Array) -> RobotProof:
         """The same at X - step."""
@@ -116,19 +94,9 @@ def verify_interior(
 ) -> tuple[csc_array, Elimination, Array] | None:
     """S + eta blockdiag(0, I) less a share of its diagonal in the interior, its elimination, and the slack left there.
 
-    Parameters
-    ----------
-    problem : PGOProblem
-        Of the robot's edges.
-    Lambda : (p, d, d)
-        Zero at the separators.
-    eta : float
-        Added in the interior: the separators are the driver's.
-    cut : Cut
-    fixed : (f,)
-        Rows that are left out.
-    share : float
-        At least so much of the diagonal is subtracted, more where rounding needs it.
+    Of the robot's edges, with Lambda, (p, d, d), zero at the separators, and eta added in the interior: the separators
+    are the driver's. The rows `fixed`, (f,), are left out. At least `share` of the diagonal is subtracted, more where
+    rounding needs it.
     """
     if not has_safe_scale(problem):
         return None

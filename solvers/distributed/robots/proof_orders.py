@@ -1,7 +1,5 @@
 """Orders about a robot's part of the lower bound: eliminate S for a proof, begin one at a point, move it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

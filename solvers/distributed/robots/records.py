@@ -1,12 +1,10 @@
 """What the driver asks a robot's interior, and what it answers; g boundary poses, vectors of w unknowns a pose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.pose_graph import IntArray
 from solvers.distributed.robots.proof import ProofSums
+from solvers.soc.copies import OwnPoses
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,10 +109,7 @@ class ProofAnswer:
 
 
 @dataclass(frozen=True, eq=False)
-class InteriorPoses:
-    """Interior poses, their numbers in the whole graph, and multipliers."""
+class InteriorPoses(OwnPoses):
+    """Interior poses, and their multipliers."""
 
-    poses: IntArray
-    R: Array
-    t: Array
     Lambda: Array
