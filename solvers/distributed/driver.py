@@ -29,7 +29,8 @@ from solvers.distributed.interface import Interface, InterfaceFactor
 from solvers.distributed.multifrontal import separator_tree
 from solvers.distributed.robots.agent import Agent, order_interior
 from solvers.distributed.robots.interior import Interior
-from solvers.distributed.robots.records import CostParts, ReducedTranslations, RightHandSide
+from solvers.distributed.robots.records import CostParts, ReducedTranslations, Reweigh, RightHandSide
+from solvers.distributed.robots.reweighting import reweigh
 from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import Engine
 from solvers.network.ledger import Ledger
@@ -144,6 +145,13 @@ class Driver:
         if self._has_two_costs and final != self.is_final:
             self.is_final = final
             self.at = self.with_sums(self.at, self.ask(Interior.choose_cost, final, Count.PIGGYBACKED))
+
+    def reweigh(self, order: Reweigh) -> None:
+        """Weigh the robots' edges by their residuals at the poses at hand."""
+        answers = self.ask(reweigh, order)
+        self._laplacian = None
+        self.diagonal = self.interface(1, self.d).gather([answer.diagonal[:, None] for answer in answers])[:, 0]
+        self.at = self.with_sums(self.at, [answer.at for answer in answers])
 
     def close(self) -> None:
         """Let the robots go."""

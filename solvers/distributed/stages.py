@@ -32,9 +32,15 @@ from solvers.soc.soc import SOC
 from solvers.soc.subgraph import middle_separator, split_graph
 
 
-def open_driver(problem: PGOProblem, robots: Partition, engine: Engine, memory: float = DEFAULT_MEMORY) -> Driver:
-    """Driver and robots for a problem."""
-    subgraphs = split_graph(problem, robots)
+def open_driver(
+    problem: PGOProblem,
+    robots: Partition,
+    engine: Engine,
+    memory: float = DEFAULT_MEMORY,
+    thresholds: Array | None = None,
+) -> Driver:
+    """Driver and robots for a problem, for a robust solve with the thresholds, (m,), of its edges."""
+    subgraphs = split_graph(problem, robots, thresholds)
     grounded = middle_separator(problem.graph, subgraphs)
     return Driver(subgraphs, problem.num_poses, engine, problem.backend, memory, grounded)
 

@@ -30,7 +30,7 @@ from pgo_models.problem.cholesky import SymbolicCholesky
 from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
-from pgo_models.problem.weighting import Weighting
+from pgo_models.problem.weighting import Weighting, edge_weights
 from solvers.result import Measurement, Status
 from solvers.robust.consistency import odometry
 
@@ -61,11 +61,47 @@ class RobustLoss(enum.Enum):
         return np.where(ratio >= (mu + 1.0) / mu, 1.0, np.where(ratio <= mu / (mu + 1.0), ratio, between))
 
     def weights(self, ratio: Array, mu: float) -> Array:
-        """Its slope, which is the weight: equations 14 and 12."""
+        """Its slope, which is the weight: equations 14 and 12; from a large mu on 0 or 1."""
         if self is RobustLoss.GEMAN_MCCLURE:
             return np.asarray((mu / (ratio + mu)) ** 2)
+        if mu >= _HARD:
+            return np.asarray(ratio <= 1.0, dtype=float)
         between = np.sqrt(mu * (mu + 1.0) / np.maximum(ratio, 1e-300)) - mu
         return np.where(ratio >= (mu + 1.0) / mu, 0.0, np.where(ratio <= mu / (mu + 1.0), 1.0, between))
+
+    def is_undecided(self, ratio: Array, mu: float) -> BoolArray:
+        """Whether the surrogate counts an edge neither in full nor as wrong."""
+        if self is RobustLoss.GEMAN_MCCLURE:
+            return np.full(ratio.shape, mu > 1.0)
+        return np.asarray((mu < _HARD) & (ratio > mu / (mu + 1.0)) & (ratio < (mu + 1.0) / mu))
+
+
+@dataclass(frozen=True)
+class GNCSchedule:
+    """Where the schedule is: all that does not belong to single edges.
+
+    Attributes
+    ----------
+    mu : float
+        Control of the surrogate of the next step.
+    scale : float
+        Of the thresholds.
+    rescaled : int
+        How often it may still change.
+    undecided : float
+        Share of the edges, known ones aside, that the surrogate counts neither in full nor as wrong.
+    decrement : float
+        What the last weighted cost has lost and could still lose, relative.
+    moved : bool
+        Whether the poses have moved in the last step.
+    """
+
+    mu: float
+    scale: float
+    rescaled: int
+    undecided: float = 1.0
+    decrement: float = math.inf
+    moved: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +112,7 @@ class GNCState:
     ----------
     k : int
     poses : Poses
-    mu : float
-        Control of the surrogate of the next step.
+    schedule : GNCSchedule
     thresholds : (m,)
         c_e^2.
     known : (m,)
@@ -85,14 +120,6 @@ class GNCState:
         r_e^2 / c_e^2 at the poses.
     objective : float
         The robust cost there.
-    rescaled : int
-        How often the thresholds may still be scaled.
-    undecided : float
-        Share of the edges, known ones aside, that the surrogate counts neither in full nor as wrong.
-    decrement : float
-        What the last weighted cost could still lose, relative.
-    moved : bool
-        Whether the poses have moved in the last step.
     reduced, analysis
         The last weighted problem and its symbolic factorisation, for the next one if it has the same edges.
     kept : (m,), optional
@@ -101,15 +128,11 @@ class GNCState:
 
     k: int
     poses: Poses
-    mu: float
+    schedule: GNCSchedule
     thresholds: Array
     known: BoolArray
     ratio: Array
     objective: float
-    rescaled: int
-    undecided: float = 1.0
-    decrement: float = math.inf
-    moved: bool = True
     reduced: PGOProblem | None = None
     kept: BoolArray | None = None
     analysis: SymbolicCholesky | None = None
@@ -184,21 +207,17 @@ class GNC:
         poses = start if start is not None else first_poses(problem.graph, known)
         thresholds = self.scale * chi2_thresholds(problem, self.quantile)
         ratio = problem.edge_costs(poses) / thresholds
-        state = GNCState(0, poses, 1.0, thresholds, known, ratio, 0.0, 0 if self.spread is None else _SCALINGS)
-        mu, free = self._first_control(ratio[~known]), ratio[~known]
-        if self.loss is RobustLoss.TRUNCATED:  # with less, all edges are left out
-            mu = max(mu, left_out(problem.graph, known) ** 2 * float(free.min(initial=1.0)))
-        return replace(state, mu=mu, objective=self._cost(state))
+        free, least = ratio[~known], left_out(problem.graph, known)
+        mu = self.first_control(float(free.max(initial=0.0)), least**2 * float(free.min(initial=1.0)))
+        state = GNCState(0, poses, GNCSchedule(mu, self.scale, self.scalings), thresholds, known, ratio, 0.0)
+        return replace(state, objective=self._cost(state))
 
     def step(self, problem: PGOProblem, state: GNCState) -> GNCState:
         """Weights for the residuals at hand, a lower weighted cost, and the next control."""
-        if self._is_settled(state) and state.rescaled:
+        if state.schedule.rescaled and self.is_settled(state.schedule):
             state = self._rescaled(problem, state)
-        known, mu = state.known, state.mu
-        if self.loss is RobustLoss.TRUNCATED and mu >= _HARD:
-            weights = (state.ratio <= 1.0).astype(float)
-        else:
-            weights = self.loss.weights(state.ratio, mu)
+        known, mu = state.known, state.schedule.mu
+        weights = self.loss.weights(state.ratio, mu)
         weights[known] = 1.0
         least = left_out(problem.graph, known)
         kept = weights > least
@@ -206,21 +225,21 @@ class GNC:
         weights = np.maximum(weights, least)
         same = state.kept is not None and np.array_equal(kept, state.kept)
         reduced = weighted_problem(problem, weights, kept, state.reduced if same else None)
-        moving = replace(start_polish(reduced, state.poses), analysis=state.analysis if same else None)
+        before = start_polish(reduced, state.poses)
+        moving = replace(before, analysis=state.analysis if same else None)
         for _ in range(self.inner_steps):
             moving = polish_step(reduced, moving)
-            if moving.decrement <= _NEARLY_STATIONARY or not moving.moved:
+            if self.follows(moving.decrement, moving.moved):
                 break
         ratio = problem.edge_costs(moving.poses) / state.thresholds
+        undecided = float(np.sum(self.loss.is_undecided(ratio[~known], mu))) / max(1, int((~known).sum()))
+        lost = before.objective / moving.objective - 1.0 if moving.objective else 0.0
         new = replace(
             state,
             k=state.k + 1,
             poses=moving.poses,
+            schedule=self.following(state.schedule, undecided, moving.decrement + lost, moving.moved),
             ratio=ratio,
-            undecided=self._undecided(ratio[~known], mu),
-            decrement=moving.decrement,
-            moved=moving.moved,
-            mu=min(mu * self.growth, _HARD) if self.loss is RobustLoss.TRUNCATED else max(mu / self.growth, 1.0),
             reduced=reduced,
             kept=kept,
             analysis=moving.analysis,
@@ -229,7 +248,7 @@ class GNC:
 
     def measure(self, problem: PGOProblem, state: GNCState) -> Measurement:
         """The robust cost, the share of undecided edges, and the decrement."""
-        return Measurement(state.objective, state.undecided, state.decrement)
+        return Measurement(state.objective, state.schedule.undecided, state.schedule.decrement)
 
     def poses(self, problem: PGOProblem, state: GNCState) -> Poses:
         """Poses of the state."""
@@ -237,11 +256,15 @@ class GNC:
 
     def converged(self, state: GNCState, measurement: Measurement) -> Status | None:
         """CONVERGED once all edges are decided, by settled thresholds, and the weighted cost is within tolerance."""
-        if state.rescaled or measurement.primal_residual > 0.0:
+        return self.ending(state.schedule)
+
+    def ending(self, schedule: GNCSchedule) -> Status | None:
+        """How the run ends there, if it does."""
+        if schedule.rescaled or schedule.undecided > 0.0:
             return None
-        if measurement.dual_residual <= self.tolerance:
+        if schedule.decrement <= self.tolerance:
             return Status.CONVERGED
-        return None if state.moved else Status.STALLED
+        return None if schedule.moved else Status.STALLED
 
     def known_inliers(self, graph: PoseGraph) -> BoolArray:
         """Edges that are right, (m,)."""
@@ -251,40 +274,56 @@ class GNC:
         loss = np.where(state.known, state.ratio, self.loss.values(state.ratio))
         return float(np.sum(state.thresholds * loss))
 
-    def _first_control(self, ratio: Array) -> float:
-        """Remark 5 of the paper: the control at which the surrogate is convex at these residuals."""
-        largest = float(ratio.max(initial=0.0))
+    @property
+    def scalings(self) -> int:
+        """How often the thresholds may be scaled."""
+        return 0 if self.spread is None else _SCALINGS
+
+    def first_control(self, largest: float, least: float) -> float:
+        """Remark 5 of the paper: the surrogate is convex up to the largest ratio; no less, where all were left out."""
         if self.loss is RobustLoss.TRUNCATED:
-            return 1.0 / max(2.0 * largest - 1.0, 1.0)
+            return max(1.0 / max(2.0 * largest - 1.0, 1.0), least)
         return max(2.0 * largest, 1.0)
 
-    def _undecided(self, ratio: Array, mu: float) -> float:
-        if self.loss is RobustLoss.GEMAN_MCCLURE:
-            return float(mu > 1.0)
-        if mu >= _HARD:
-            return 0.0
-        return float(np.mean((ratio > mu / (mu + 1.0)) & (ratio < (mu + 1.0) / mu))) if len(ratio) else 0.0
+    def following(self, schedule: GNCSchedule, undecided: float, decrement: float, moved: bool) -> GNCSchedule:
+        """The schedule after a step, with the next control."""
+        mu, grown = schedule.mu, self.loss is RobustLoss.TRUNCATED
+        mu = min(mu * self.growth, _HARD) if grown else max(mu / self.growth, 1.0)
+        return GNCSchedule(mu, schedule.scale, schedule.rescaled, undecided, decrement, moved)
 
-    def _is_settled(self, state: GNCState) -> bool:
-        return state.undecided == 0.0 and (state.decrement <= _NEARLY_STATIONARY or not state.moved)
+    def rescaled(self, d: int, schedule: GNCSchedule, of_kept: tuple[float, float] | None) -> GNCSchedule:
+        """Schedule with thresholds scaled by the median of the edges kept beside that of chi2, and the first control.
+
+        `of_kept` are the median and the largest ratio of the edges kept, known ones aside, where there are any.
+        """
+        done = replace(schedule, rescaled=0)
+        if self.spread is None or of_kept is None:
+            return done
+        usual = np.divide(*chdtri(d + tangent_dimension(d), [0.5, 1.0 - self.quantile]))
+        factor = min(self.spread * of_kept[0] / float(usual), _LARGEST_SCALE / schedule.scale)
+        left = schedule.rescaled - 1
+        if _SAME[0] < factor < _SAME[1] or factor * schedule.scale < _LEAST_SCALE:
+            if schedule.rescaled < _SCALINGS:
+                return done
+            factor, left = 1.0, 0
+        mu = self.first_control(of_kept[1] / factor, 0.0)
+        mu = min(mu, _AGAIN) if self.loss is RobustLoss.TRUNCATED else max(mu, 1.0 / _AGAIN)
+        return replace(schedule, mu=mu, scale=factor * schedule.scale, rescaled=left, undecided=1.0)
+
+    def follows(self, decrement: float, moved: bool) -> bool:
+        """Whether the poses follow the weights well enough."""
+        return decrement <= _NEARLY_STATIONARY or not moved
+
+    def is_settled(self, schedule: GNCSchedule) -> bool:
+        """Whether all edges are decided."""
+        return schedule.undecided == 0.0 and self.follows(schedule.decrement, schedule.moved)
 
     def _rescaled(self, problem: PGOProblem, state: GNCState) -> GNCState:
-        """State with thresholds scaled by the median of the edges kept beside that of chi2, and the first control."""
-        free = ~state.known & (state.ratio <= 1.0)
-        if self.spread is None or not free.any():
-            return replace(state, rescaled=0)
-        usual = np.divide(*chdtri(problem.d + tangent_dimension(problem.d), [0.5, 1.0 - self.quantile]))
-        now = float(np.median(state.thresholds / chi2_thresholds(problem, self.quantile)))
-        scale = min(self.spread * float(np.median(state.ratio[free])) / usual, _LARGEST_SCALE / now)
-        left = state.rescaled - 1
-        if _SAME[0] < scale < _SAME[1] or scale * now < _LEAST_SCALE:
-            if state.rescaled < _SCALINGS:
-                return replace(state, rescaled=0)
-            scale, left = 1.0, 0
-        ratio, again = state.ratio / scale, 1.0 / _AGAIN if self.loss is RobustLoss.GEMAN_MCCLURE else _AGAIN
-        mu = (max if again > 1.0 else min)(self._first_control(ratio[free]), again)
-        scaled = replace(state, thresholds=scale * state.thresholds, ratio=ratio, rescaled=left)
-        return replace(scaled, undecided=1.0, mu=mu)
+        free = state.ratio[~state.known & (state.ratio <= 1.0)]
+        of_kept = (float(np.median(free)), float(free.max())) if len(free) else None
+        schedule = self.rescaled(problem.d, state.schedule, of_kept)
+        factor = schedule.scale / state.schedule.scale
+        return replace(state, schedule=schedule, thresholds=factor * state.thresholds, ratio=state.ratio / factor)
 
 
 def known_inliers(graph: PoseGraph, known: BoolArray | None) -> BoolArray:
@@ -325,7 +364,7 @@ def weighted_problem(
     """The problem with the kept edges alone, their costs times weights, (m,); `like` one that has the same edges."""
     graph = problem.graph.without_edges(~kept) if like is None else like.graph
     if len(graph.landmarks) and isinstance(problem.weighting, Weighting):  # which edge turns a landmark may be another
-        own = replace(problem, graph=graph).weights
+        own = edge_weights(graph, problem.weighting)
     else:
         own = problem.weights.of_edges(kept)
     return replace(problem, graph=graph, weighting=own.scaled(weights[kept]))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_array
 
-from pgo_models.geometry.rotations import BoolArray
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, middle_pose, poses_by_distance
 from pgo_models.graphs.separators import vertex_cover
@@ -41,6 +42,8 @@ class Subgraph:
     common: tuple[tuple[int, IntArray], ...]
     weights: EdgeWeights  # of its edges, in the cost that SOC is run on
     final: EdgeWeights | None = None  # in the cost that is solved, where that is another (`PGOProblem.convex_part`)
+    edges: IntArray | None = None  # (m_a,): their numbers in the whole graph
+    thresholds: Array | None = None  # (m_a,): what they may cost in a robust solve, inf for known inliers
 
     @cached_property
     def is_own(self) -> BoolArray:
@@ -60,7 +63,8 @@ class Subgraph:
         )
         problem = PartProblem(counted, None, self.weights.of_edges(kept))
         final = None if self.final is None else PartProblem(counted, None, self.final.of_edges(kept))
-        return Part(problem, self.poses[poses], self.in_cover[poses], final)
+        edges, thresholds = (None if one is None else one[kept] for one in (self.edges, self.thresholds))
+        return Part(problem, self.poses[poses], self.in_cover[poses], final, edges, thresholds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +76,25 @@ class Part:
     # (p,): position of each among the poses that the driver solves for, or -1 for the robot's interior.
     in_cover: IntArray
     final: PartProblem | None = None  # the cost that is solved, where SOC is run on another
+    edges: IntArray | None = None  # (k,): numbers of its edges in the whole graph
+    thresholds: Array | None = None  # (k,): as of `Subgraph`
+
+    def weighted(self, weights: Array) -> Part:
+        """The part with the costs of its edges times weights, (k,)."""
+
+        def scaled(one: PartProblem) -> PartProblem:
+            return PartProblem(one.graph, one.backend, one.weights.scaled(weights))
+
+        return replace(self, problem=scaled(self.problem), final=None if self.final is None else scaled(self.final))
+
+    def ratios(self, poses: Poses, scale: float) -> Array:
+        """Costs of its edges over their scaled thresholds, (k,); 0 of known inliers."""
+        assert self.thresholds is not None
+        return np.asarray(self.costs(poses) / (scale * self.thresholds))
+
+    def costs(self, poses: Poses) -> Array:
+        """Shares of its edges, (k,), in the cost that is solved."""
+        return (self.problem if self.final is None else self.final).edge_costs(poses)
 
     @cached_property
     def interior(self) -> IntArray:
@@ -85,8 +108,13 @@ class Part:
         return found[np.argsort(self.in_cover[found])]
 
 
-def split_graph(given: PGOProblem | PoseGraph, partition: Partition) -> tuple[Subgraph, ...]:
-    """Give every robot its subgraph; a SettingError when the partition is of another number of poses."""
+def split_graph(
+    given: PGOProblem | PoseGraph, partition: Partition, thresholds: Array | None = None
+) -> tuple[Subgraph, ...]:
+    """Give every robot its subgraph, for a robust solve with the thresholds, (m,), of its edges.
+
+    A SettingError when the partition is of another number of poses.
+    """
     problem = as_problem(given)
     graph, first = problem.graph, problem.convex_part
     costs = first.weights, None if first is problem else problem.weights
@@ -100,7 +128,7 @@ def split_graph(given: PGOProblem | PoseGraph, partition: Partition) -> tuple[Su
     counts = np.where(cover[graph.j] < 0, owner[graph.j], owner[graph.i])
     holds = _holders(graph, owner, partition.num_robots)
     robots = range(partition.num_robots)
-    return tuple(_subgraph_of(graph, costs, owner, cover, counts, holds, robot) for robot in robots)
+    return tuple(_subgraph_of(graph, costs, owner, cover, counts, holds, robot, thresholds) for robot in robots)
 
 
 def middle_separator(graph: PoseGraph, subgraphs: tuple[Subgraph, ...]) -> int:
@@ -129,6 +157,7 @@ def _subgraph_of(
     counts: IntArray,
     holds: csr_array,
     robot: int,
+    thresholds: Array | None,
 ) -> Subgraph:
     edges = np.flatnonzero((owner[graph.i] == robot) | (owner[graph.j] == robot))
     poses = np.unique(np.concatenate([np.flatnonzero(owner == robot), graph.i[edges], graph.j[edges]]))
@@ -149,4 +178,6 @@ def _subgraph_of(
     copies = np.diff(holds[poses].indptr)
     counted, first = counts[edges] == robot, costs[0].of_edges(edges)
     final = None if costs[1] is None else costs[1].of_edges(edges)
-    return Subgraph(robot, local, poses, owner[poses], cover[poses], counted, copies, common, first, final)
+    allowed = None if thresholds is None else thresholds[edges]
+    of_edges = first, final, edges, allowed
+    return Subgraph(robot, local, poses, owner[poses], cover[poses], counted, copies, common, *of_edges)

@@ -9,7 +9,7 @@ import numpy as np
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
-from solvers.distributed.robots.factors import Eliminated, Factors
+from solvers.distributed.robots.factors import Eliminated
 from solvers.distributed.robots.interior import Interior, InteriorState, interior_of
 from solvers.distributed.robots.proof import RobotProof
 from solvers.network.messages import Snapshot
@@ -66,8 +66,7 @@ class Agent:
         """Go on from a snapshot of this robot."""
         record: AgentRecord = deserialize(snapshot, CLASSES)
         if self.interior is not None and record.interior is not None:
-            factors = Factors(self.interior.part, self.backend)
-            self.interior = replace(self.interior, factors=factors, state=record.interior)
+            self.interior = replace(self.interior, state=record.interior).restored()
         self.copies = self._no_copies.restored(record.copies) if record.copies is not None else None
 
     @property

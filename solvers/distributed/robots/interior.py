@@ -66,6 +66,7 @@ class InteriorState:
     step: tuple[Array, Array] | None = None  # (p, .), (p, d): Newton's direction: rotations, translations
     proof: RobotProof | None = None
     is_final: bool = False  # whether the cost at hand is the one that is solved, not the one that SOC is run on
+    weights: Array | None = None  # (k,): of its edges, in a robust solve
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +76,7 @@ class Interior:
     part: Part
     factors: Factors
     state: InteriorState
+    whole: Part  # with all edges in full
 
     # The start: chordal relaxation, translations, multipliers.
 
@@ -115,7 +117,7 @@ class Interior:
 
     def evaluate(self, _: None) -> tuple[Interior, CostParts]:
         """Parts of F and of M X on the boundary, at the poses at hand."""
-        return self, self._evaluation(self.state.poses)
+        return self, self.evaluation(self.state.poses)
 
     def adopt(self, z: Array) -> tuple[Interior, ReducedTranslations]:
         """Take rotations of the cover's poses, rows (dg, d); then `translations`."""
@@ -219,7 +221,7 @@ class Interior:
         w, v = self.state.step
         trial = move_poses(self.state.poses, length * w, length * v)
         following, gradient = self.with_changes(trial=trial).reduced(self._gradient(trial))
-        return following, TrialEvaluation(self._evaluation(trial), gradient)
+        return following, TrialEvaluation(self.evaluation(trial), gradient)
 
     def turn(self, length: float) -> tuple[Interior, ReducedTranslations]:
         """Trial rotations a length along the direction, and the right-hand side of their best translations."""
@@ -233,7 +235,7 @@ class Interior:
         R = self.state.trial.R
         trial = Poses(R, self._translations(R, t))
         following, gradient = self.with_changes(trial=trial).reduced(self._gradient(trial))
-        return following, TrialEvaluation(self._evaluation(trial), gradient)
+        return following, TrialEvaluation(self.evaluation(trial), gradient)
 
     def accept(self, _: None) -> tuple[Interior, None]:
         """Go to the trial."""
@@ -259,6 +261,12 @@ class Interior:
         return self, self.factors.laplacian.schur if self.state.has_laplacian else None
 
     # What the orders share.
+
+    def restored(self) -> Interior:
+        """The robot with the part and the factors that belong to its state."""
+        weights = self.state.weights
+        part = self.whole if weights is None else self.whole.weighted(weights)
+        return replace(self, part=part, factors=Factors(part, self.factors.backend))
 
     @property
     def problem(self) -> PGOProblem:
@@ -358,7 +366,8 @@ class Interior:
         p = self.part.problem.num_poses
         return np.asarray(-(self.part.problem.M[:p, p:] @ stack_transposes(R)))
 
-    def _evaluation(self, poses: Poses) -> CostParts:
+    def evaluation(self, poses: Poses) -> CostParts:
+        """Parts of F and of M X on the boundary, at poses."""
         problem = self.problem
         force = problem.tangent_at(poses).apply_M(problem.stacked(poses))[self.boundary_rows]
         return CostParts(problem.objective(poses), rounding_level(problem, poses), force)
@@ -378,4 +387,4 @@ def interior_of(subgraph: Subgraph, backend: CholeskyBackend | None) -> Interior
         return None
     p, d = part.problem.num_poses, part.problem.d
     nowhere = Poses(np.broadcast_to(np.eye(d), (p, d, d)).copy(), np.zeros((p, d)))
-    return Interior(part, Factors(part, backend), InteriorState(nowhere, nowhere, nowhere))
+    return Interior(part, Factors(part, backend), InteriorState(nowhere, nowhere, nowhere), part)

@@ -41,6 +41,37 @@ class CostParts:
     force: Array
 
 
+@dataclass(frozen=True)
+class Reweigh:
+    """Control mu of a robust loss's surrogate, the scale of the thresholds, and the least weight."""
+
+    is_truncated: bool
+    mu: float
+    scale: float
+    least: float
+
+
+@dataclass(frozen=True, eq=False)
+class Reweighed:
+    """The cost with new weights, and the diagonal of its M on the boundary."""
+
+    diagonal: Array
+    at: CostParts
+
+
+@dataclass(frozen=True)
+class RatioSums:
+    """Of the edges that may be wrong: counts, and the least and largest r^2 / c^2; and the robust cost of all."""
+
+    count: float
+    undecided: float
+    kept: float
+    least: float
+    largest: float
+    largest_kept: float
+    cost: float
+
+
 @dataclass(frozen=True, eq=False)
 class TrialEvaluation:
     """The same at a trial, and the reduced gradient there."""
