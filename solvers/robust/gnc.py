@@ -90,7 +90,7 @@ class GNCState:
     undecided : float
         Share of the edges, known ones aside, that the surrogate counts neither in full nor as wrong.
     decrement : float
-        What the last weighted cost could still lose, relative.
+        What the last weighted cost has lost and could still lose, relative.
     moved : bool
         Whether the poses have moved in the last step.
     reduced, analysis
@@ -206,7 +206,8 @@ class GNC:
         weights = np.maximum(weights, least)
         same = state.kept is not None and np.array_equal(kept, state.kept)
         reduced = weighted_problem(problem, weights, kept, state.reduced if same else None)
-        moving = replace(start_polish(reduced, state.poses), analysis=state.analysis if same else None)
+        before = start_polish(reduced, state.poses)
+        moving = replace(before, analysis=state.analysis if same else None)
         for _ in range(self.inner_steps):
             moving = polish_step(reduced, moving)
             if moving.decrement <= _NEARLY_STATIONARY or not moving.moved:
@@ -218,7 +219,7 @@ class GNC:
             poses=moving.poses,
             ratio=ratio,
             undecided=self._undecided(ratio[~known], mu),
-            decrement=moving.decrement,
+            decrement=moving.decrement + (before.objective / moving.objective - 1.0 if moving.objective else 0.0),
             moved=moving.moved,
             mu=min(mu * self.growth, _HARD) if self.loss is RobustLoss.TRUNCATED else max(mu / self.growth, 1.0),
             reduced=reduced,
