@@ -34,6 +34,7 @@ from pgo_models.problem.problem import PGOProblem, as_problem
 from solvers.distributed.checkpoint import Checkpoint, Journal, run_fingerprint
 from solvers.distributed.driver import DEFAULT_MEMORY
 from solvers.distributed.leaderless import NO_CERTIFICATE, attempt_leaderless
+from solvers.distributed.robust import estimate_by_robots
 from solvers.distributed.stages import attempt_distributed, collect, open_driver
 from solvers.explanations import note_of_weights
 from solvers.frames import framed
@@ -82,13 +83,6 @@ class Pipeline:
     driver_memory : float
         Bytes that the driver of a solve by robots may take; it is refused before they are spent. 0 is no driver:
         CONSENSUS alone, see `solvers.distributed.leaderless`, with poses and no certificate.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models import circle
-    >>> solve(circle(np.random.default_rng(0)), Pipeline(soc=None, gap=1e-8)).is_certified
-    True
     """
 
     soc: SOC | PaperSOC | None = field(default_factory=lambda: HANDOVER)
@@ -214,12 +208,19 @@ def solve(
     if pipeline.driver_memory == 0:
         pipeline = replace(pipeline, second_try=False, staircase=None)
     if robust is not None:
-        if robots is not None:
-            raise SettingError("robust estimation runs in one place; leave out the robots, or solve the edges it keeps")
+        if checkpoint is not None or pipeline.driver_memory == 0:
+            raise SettingError(
+                "a robust solve needs the driver, and writes no checkpoint; leave out the one or the other"
+            )
         few, short = replace(pipeline.newton, max_iterations=_FEW), replace(pipeline, soc=None, second_try=False)
         shown = partial(solve, anchor=anchor, callback=callback, verbose=verbose, progress=progress)
         plain = partial(shown, pipeline=replace(short, newton=few, staircase=None))
-        return solve_robustly(problem, robust, pipeline.gap, start, watch, plain)
+        shared = None
+        if robots is not None:
+            robots, engine = _robots_for(pipeline.soc, robots, problem.graph), engine or InProcess()
+            plain = partial(plain, robots=robots, engine=engine)
+            shared = partial(estimate_by_robots, robots=robots, engine=engine, memory=pipeline.driver_memory)
+        return solve_robustly(problem, robust, pipeline.gap, start, watch, plain, shared)
     job = _Job(problem, pipeline, watch)
     ledger = None
     if robots is None:
@@ -278,13 +279,7 @@ def solve(
 
 
 def _robots_for(soc: SOC | PaperSOC | None, robots: Partition | int, graph: PoseGraph) -> Partition:
-    """Robots of a solve, who are also those of its SOC.
-
-    Raises
-    ------
-    SettingError
-        When SOC is of other robots, or is not for robots.
-    """
+    """Robots of a solve, who are also those of its SOC; a SettingError when that is of others, or not for robots."""
     own = soc.robots if soc is not None else None
     if not isinstance(robots, Partition):
         robots = whole_number(robots, "robots", SettingError)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 
@@ -16,7 +17,9 @@ from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
+from solvers.distributed.robust import SharedEstimate
 from solvers.loop import Watch
+from solvers.network.ledger import Ledger
 from solvers.result import OUT_OF_TIME, Stage
 from solvers.robust.consistency import PCM, pairwise_consistent
 from solvers.robust.gnc import GNC, RobustLoss, known_inliers
@@ -34,6 +37,7 @@ def solve_robustly(
     start: Poses | None,
     watch: Watch,
     plain: Callable[..., Solution],
+    shared: Callable[..., SharedEstimate] | None = None,
 ) -> Solution:
     """Solution of the edges that are kept; `Solution.robust` says which, and what is proven.
 
@@ -43,15 +47,19 @@ def solve_robustly(
     which are then widened by what the edges kept say; on the pairwise consistent edges; with the other loss. Of those
     certified, or of all if none is, that of the least truncated cost of all edges is kept.
 
+    By robots (`shared`, `plain`) the certificate of every attempt is theirs, and what crosses the network is added up.
+
     Raises
     ------
     SettingError
-        When robust is none.
+        When robust is none, or PCM by robots.
     GraphError
         When known inliers and the edges kept do not connect the poses.
     """
     if not isinstance(robust, GNC | PCM):
         raise SettingError(f"robust is {robust!r:.60}; give GNC() or PCM()")
+    if shared is not None and (isinstance(robust, PCM) or robust.consistent):
+        raise SettingError("pairwise consistency is found in one place; leave out the robots, or use GNC()")
     began, graph, known = time.perf_counter(), problem.graph, known_inliers(problem.graph, robust.known)
     thresholds = chi2_thresholds(problem, robust.quantile)
     is_cheap = (problem.d + 1) * min(problem.num_poses, int((~known).sum())) <= _CHEAP
@@ -73,12 +81,19 @@ def solve_robustly(
         return result(solution, kept, thresholds, "pairwise consistency alone", ())
     attempts: list[_Estimate] = []
     for name, method in _methods(robust, graph, known):
-        attempts.append(_estimate(problem, name, method, known, thresholds, gap, start, watch))
+        if shared is None:
+            attempts.append(_estimate(problem, name, method, known, thresholds, gap, start, watch))
+        else:
+            attempts.append(_estimate_shared(problem, name, method, known, thresholds, start, watch, plain, shared))
         is_done = attempts[-1].certificate.is_certified and len(attempts) > int(is_cheap)
         if is_done or attempts[-1].stage.status in OUT_OF_TIME:
             break
     best = min(attempts, key=lambda one: (not one.certificate.is_certified, one.attempt.cost))
-    solution = plain(inlier_problem(problem, best.kept), start=best.certificate.poses, time_limit=watch.left)
+    if best.solution is None:
+        solution = plain(inlier_problem(problem, best.kept), start=best.certificate.poses, time_limit=watch.left)
+    else:
+        ledgers = [one.solution.ledger for one in attempts if one.solution is not None]
+        solution = replace(best.solution, ledger=reduce(Ledger.joined, filter(None, ledgers)))
     stages = (*(one.stage for one in attempts), *solution.stages)
     last = attempts[-1].stage.status
     solution = replace(solution, stages=stages, status=last if last in OUT_OF_TIME else solution.status)
@@ -111,6 +126,7 @@ class _Estimate:
     scale: float
     certificate: Certificate
     stage: Stage
+    solution: Solution | None = None  # by robots, with the account of all that they sent
 
 
 def _estimate(
@@ -129,16 +145,51 @@ def _estimate(
     if method.consistent:
         kept = known | pairwise_consistent(problem.graph, known)
     run = watch.run(replace(method, known=known[kept]), inlier_problem(problem, kept), start)
-    scale = float(np.median(run.state.thresholds / thresholds[kept]))
+    scale = run.state.schedule.scale
     kept[kept] = run.state.inliers
     inliers = inlier_problem(problem, kept)
     certificate = certify_at(inliers, polish(inliers, run.poses), gap)
-    costs = problem.edge_costs(certificate.poses)
-    cost = float(np.sum(np.where(known, costs, np.minimum(costs, thresholds))))
-    seconds, gone = time.perf_counter() - began, int((~kept).sum())
-    attempt = Attempt(name, cost, gone, certificate.gap, certificate.is_certified, seconds)
+    attempt = _attempt(problem, name, known, thresholds, kept, certificate, time.perf_counter() - began)
     return _Estimate(
         attempt, kept, scale, certificate, replace(Stage.of(run), name=f"GNC, {name}", objective=run.state.objective)
+    )
+
+
+def _attempt(
+    problem: PGOProblem,
+    name: str,
+    known: BoolArray,
+    thresholds: Array,
+    kept: BoolArray,
+    certificate: Certificate,
+    seconds: float,
+) -> Attempt:
+    costs = problem.edge_costs(certificate.poses)
+    cost = float(np.sum(np.where(known, costs, np.minimum(costs, thresholds))))
+    return Attempt(name, cost, int((~kept).sum()), certificate.gap, certificate.is_certified, seconds)
+
+
+def _estimate_shared(
+    problem: PGOProblem,
+    name: str,
+    method: GNC,
+    known: BoolArray,
+    thresholds: Array,
+    start: Poses | None,
+    watch: Watch,
+    plain: Callable[..., Solution],
+    shared: Callable[..., SharedEstimate],
+) -> _Estimate:
+    """The same by robots."""
+    began = time.perf_counter()
+    found = shared(problem, method, thresholds, start, watch)
+    kept = found.kept
+    solution = plain(inlier_problem(problem, kept), start=found.poses, time_limit=watch.left)
+    assert solution.ledger is not None
+    solution = replace(solution, ledger=found.ledger.joined(solution.ledger))
+    attempt = _attempt(problem, name, known, thresholds, kept, solution.certificate, time.perf_counter() - began)
+    return _Estimate(
+        attempt, kept, found.scale, solution.certificate, replace(found.stage, name=f"GNC, {name}"), solution
     )
 
 

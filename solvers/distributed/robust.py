@@ -40,10 +40,7 @@ class SharedGNCState:
 
 @dataclass(frozen=True)
 class SharedGNC:
-    """`GNC` by a driver and its robots, from the poses that they hold.
-
-    An edge that the central run leaves out has a weight of 1e-4 of `least`, so that nothing falls apart.
-    """
+    """`GNC` by a driver and its robots, from the poses that they hold."""
 
     gnc: GNC
     least: float
@@ -141,4 +138,5 @@ def estimate_by_robots(
         scale = run.state.schedule.scale
         kept = np.zeros(problem.graph.num_edges, dtype=bool)
         kept[np.concatenate(driver.ask(kept_edges, scale, Count.OFF))] = True
-        return SharedEstimate(collect(driver)[0], kept, scale, Stage.of(run), driver.network.ledger)
+        stage = Stage("GNC", run.status, run.iterations, run.objective, run.seconds, run.history, gnc)
+        return SharedEstimate(collect(driver)[0], kept, scale, stage, driver.network.ledger)

@@ -68,6 +68,14 @@ class Ledger:
         num_bytes = 2 * BYTES_PER_NUMBER * count * self.num_robots
         return replace(self, all_reduces=self.all_reduces + 1, all_reduce_bytes=self.all_reduce_bytes + num_bytes)
 
+    def joined(self, other: Ledger) -> Ledger:
+        """Return the account of this run and another of as many robots."""
+        counted = dict(self.counted)
+        for traffic, times in other.counted:
+            counted[traffic] = counted.get(traffic, 0) + times
+        sums = self.rounds + other.rounds, self.all_reduces + other.all_reduces
+        return Ledger(self.num_robots, *sums, self.all_reduce_bytes + other.all_reduce_bytes, tuple(counted.items()))
+
     @property
     def messages(self) -> int:
         """Messages in all, all-reduces left out."""

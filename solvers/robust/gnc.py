@@ -30,7 +30,7 @@ from pgo_models.problem.cholesky import SymbolicCholesky
 from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
-from pgo_models.problem.weighting import Weighting, edge_weights
+from pgo_models.problem.weighting import Weighting
 from solvers.result import Measurement, Status
 from solvers.robust.consistency import odometry
 
@@ -364,7 +364,7 @@ def weighted_problem(
     """The problem with the kept edges alone, their costs times weights, (m,); `like` one that has the same edges."""
     graph = problem.graph.without_edges(~kept) if like is None else like.graph
     if len(graph.landmarks) and isinstance(problem.weighting, Weighting):  # which edge turns a landmark may be another
-        own = edge_weights(graph, problem.weighting)
+        own = replace(problem, graph=graph).weights
     else:
         own = problem.weights.of_edges(kept)
     return replace(problem, graph=graph, weighting=own.scaled(weights[kept]))

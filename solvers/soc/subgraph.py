@@ -40,9 +40,9 @@ class Subgraph:
     copies: IntArray  # (n_a,): how many robots hold each pose
     # For every other robot that holds some of the same poses: which of `poses` they are, (q,), ascending.
     common: tuple[tuple[int, IntArray], ...]
+    edges: IntArray  # (m_a,): numbers of its edges in the whole graph
     weights: EdgeWeights  # of its edges, in the cost that SOC is run on
     final: EdgeWeights | None = None  # in the cost that is solved, where that is another (`PGOProblem.convex_part`)
-    edges: IntArray | None = None  # (m_a,): their numbers in the whole graph
     thresholds: Array | None = None  # (m_a,): what they may cost in a robust solve, inf for known inliers
 
     @cached_property
@@ -63,8 +63,8 @@ class Subgraph:
         )
         problem = PartProblem(counted, None, self.weights.of_edges(kept))
         final = None if self.final is None else PartProblem(counted, None, self.final.of_edges(kept))
-        edges, thresholds = (None if one is None else one[kept] for one in (self.edges, self.thresholds))
-        return Part(problem, self.poses[poses], self.in_cover[poses], final, edges, thresholds)
+        allowed = None if self.thresholds is None else self.thresholds[kept]
+        return Part(problem, self.poses[poses], self.in_cover[poses], final, self.edges[kept], allowed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +76,8 @@ class Part:
     # (p,): position of each among the poses that the driver solves for, or -1 for the robot's interior.
     in_cover: IntArray
     final: PartProblem | None = None  # the cost that is solved, where SOC is run on another
-    edges: IntArray | None = None  # (k,): numbers of its edges in the whole graph
-    thresholds: Array | None = None  # (k,): as of `Subgraph`
+    edges: IntArray | None = None  # (k,): as of `Subgraph`
+    thresholds: Array | None = None
 
     def weighted(self, weights: Array) -> Part:
         """The part with the costs of its edges times weights, (k,)."""
@@ -179,5 +179,5 @@ def _subgraph_of(
     counted, first = counts[edges] == robot, costs[0].of_edges(edges)
     final = None if costs[1] is None else costs[1].of_edges(edges)
     allowed = None if thresholds is None else thresholds[edges]
-    of_edges = first, final, edges, allowed
+    of_edges = edges, first, final, allowed
     return Subgraph(robot, local, poses, owner[poses], cover[poses], counted, copies, common, *of_edges)

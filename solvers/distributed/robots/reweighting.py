@@ -10,11 +10,14 @@ from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import RatioSums, Reweigh, Reweighed
 from solvers.robust.gnc import RobustLoss
 
+_LEFT_OUT = 1e-4  # of the least weight stays with an edge that the central run leaves out: nothing falls apart
+
 
 def reweigh(interior: Interior, order: Reweigh) -> tuple[Interior, Reweighed]:
     """Weights for the residuals at the poses at hand, and the cost with them."""
     is_known, ratio = _ratios(interior, order.scale)
-    weights = np.where(is_known, 1.0, np.maximum(_loss(order).weights(ratio, order.mu), order.least))
+    weights = _loss(order).weights(ratio, order.mu)
+    weights = np.where(is_known, 1.0, np.where(weights > order.least, weights, _LEFT_OUT * order.least))
     following = interior.with_changes(weights=weights, eliminated=None, has_laplacian=False, proof=None).restored()
     _, diagonal = following.describe(None)
     return following, Reweighed(diagonal, following.evaluation(interior.state.poses))

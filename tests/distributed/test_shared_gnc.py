@@ -1,0 +1,143 @@
+"""Graduated non-convexity by robots: as in one place, with nothing of single edges on the network."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+from wrong_edges import spoiled
+
+import pgo_models as pgo
+import solvers
+from pgo_models.errors import SettingError
+from pgo_models.graphs.partitioning import partition
+from pgo_models.problem.thresholds import chi2_thresholds
+from solvers.distributed.checkpoint import Checkpoint
+from solvers.distributed.robots.agent import CLASSES, Agent, order_interior
+from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots.records import Reweigh
+from solvers.distributed.robots.reweighting import reweigh, sum_ratios
+from solvers.distributed.robust import SharedGNC
+from solvers.distributed.stages import open_driver
+from solvers.network.counted_pool import Count
+from solvers.network.engine import InProcess
+from solvers.network.messages import count_numbers
+from solvers.network.serialization import deserialize, serialize
+from solvers.robust.gnc import GNC, RobustLoss, first_poses, known_inliers
+from solvers.soc.subgraph import split_graph
+
+COUPLINGS = (solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS)
+
+
+@pytest.fixture(scope="module")
+def wrong() -> tuple[pgo.PoseGraph, np.ndarray]:
+    return spoiled(pgo.grid_world(1, 100, np.random.default_rng(0), d=3), 0.3, "aliased", 0)
+
+
+def allowed(problem: pgo.PGOProblem) -> np.ndarray:
+    return np.where(known_inliers(problem.graph, None), np.inf, chi2_thresholds(problem))
+
+
+@pytest.mark.parametrize("coupling", COUPLINGS)
+@pytest.mark.parametrize("weighting", pgo.Weighting)
+def test_it_is_the_central_run(wrong, weighting: pgo.Weighting, coupling: solvers.Coupling) -> None:
+    graph, is_wrong = wrong
+    problem, robots = pgo.PGOProblem(graph, weighting=weighting), partition(graph, 3)
+    soc = solvers.SOC(robots=robots if coupling is solvers.Coupling.CONSENSUS else None, coupling=coupling)
+    shared = solvers.solve(problem, solvers.Pipeline(soc=soc), robust=GNC(), robots=robots)
+    central = solvers.solve(problem, robust=GNC())
+    np.testing.assert_array_equal(shared.robust.rejected, is_wrong)
+    np.testing.assert_array_equal(shared.robust.rejected, central.robust.rejected)
+    assert shared.objective == pytest.approx(central.objective, rel=1e-9)
+    assert shared.is_certified
+    steps = [[stage.iterations for stage in one.stages if stage.name.startswith("GNC")] for one in (shared, central)]
+    assert steps[0] == steps[1]
+    assert shared.ledger.rounds > 0
+
+
+@pytest.mark.parametrize("loss", RobustLoss)
+def test_sums_and_costs_are_those_of_the_whole_graph(wrong, loss: RobustLoss) -> None:
+    problem, gnc = pgo.PGOProblem(wrong[0]), GNC(loss=loss)
+    known = known_inliers(problem.graph, None)
+    poses = first_poses(problem.graph, known)
+    ratio = problem.edge_costs(poses) / chi2_thresholds(problem)
+    with closing(open_driver(problem, partition(problem.graph, 3), InProcess(), thresholds=allowed(problem))) as driver:
+        driver.set_poses(poses)
+        method = SharedGNC(gnc, 1e-9)
+        state = method.init(driver, None)
+        assert state.objective == pytest.approx(gnc.init(problem, poses).objective, rel=1e-12)
+        assert state.sums.count == np.sum(~known)
+        assert state.sums.largest == pytest.approx(ratio[~known].max(), rel=1e-12)
+        assert state.sums.least == pytest.approx(ratio[~known].min(), rel=1e-12)
+        kept = ratio[~known & (ratio <= 1.0)]
+        assert state.sums.kept == len(kept)
+        if len(kept) % 2:
+            assert method._median(driver, state) == pytest.approx(np.median(kept), rel=1e-5)
+        mu = state.schedule.mu
+        driver.reweigh(Reweigh(loss is RobustLoss.TRUNCATED, mu, 1.0, 1e-9))
+        weights = np.where(known, 1.0, np.maximum(loss.weights(ratio, mu), 1e-13))
+        assert driver.at.objective == pytest.approx(float(weights @ problem.edge_costs(poses)), rel=1e-9)
+
+
+def test_what_is_asked_and_told_does_not_grow_with_the_edges() -> None:
+    numbers = []
+    for length in (40, 80):
+        graph = pgo.grid_world(1, length, np.random.default_rng(1), d=2)
+        problem = pgo.PGOProblem(graph)
+        subgraph = split_graph(problem, partition(graph, 2), allowed(problem))[0]
+        agent, order = Agent(subgraph, None), Reweigh(True, 0.5, 1.0, 1e-9)
+        sums = order_interior(sum_ratios, agent, order)
+        told = order_interior(reweigh, agent, order)
+        boundary = (graph.d + 1) * len(subgraph.part.boundary)
+        assert count_numbers(told) == boundary + 2 + graph.d * boundary
+        numbers.append((count_numbers(order), count_numbers(sums)))
+    assert numbers == [(4, 7), (4, 7)]
+
+
+def test_a_robot_that_is_started_again_has_its_weights(wrong) -> None:
+    problem = pgo.PGOProblem(wrong[0])
+    subgraph = split_graph(problem, partition(problem.graph, 2), allowed(problem))[1]
+    agent, again = Agent(subgraph, None), Agent(subgraph, None)
+    order_interior(Interior.set_poses, agent, first_poses(problem.graph, subgraph_known(problem))[subgraph.part.poses])
+    order_interior(reweigh, agent, Reweigh(True, 0.01, 1.0, 1e-9))
+    before = order_interior(Interior.evaluate, agent, None)
+    again.restore(agent.snapshot())
+    after = order_interior(Interior.evaluate, again, None)
+    assert before.objective == after.objective
+    np.testing.assert_array_equal(before.force, after.force)
+    weights = agent.interior.state.weights
+    assert ((weights > 0) & (weights < 1)).any()
+    np.testing.assert_array_equal(deserialize(serialize(agent.interior.state), CLASSES).weights, weights)
+
+
+def subgraph_known(problem: pgo.PGOProblem) -> np.ndarray:
+    return known_inliers(problem.graph, None)
+
+
+def test_attempts_are_added_up_on_the_ledger(wrong) -> None:
+    solution = solvers.solve(wrong[0], robust=GNC(), robots=2)
+    assert len(solution.robust.attempts) > 1
+    assert solution.ledger.rounds > 2 * sum(stage.iterations for stage in solution.stages if "GNC" in stage.name)
+    counted = sum(times for _, times in solution.ledger.counted)
+    assert solution.ledger.joined(solution.ledger).rounds == 2 * solution.ledger.rounds
+    assert sum(times for _, times in solution.ledger.joined(solution.ledger).counted) == 2 * counted
+
+
+def test_what_is_for_one_place_is_refused(wrong, tmp_path) -> None:
+    graph = wrong[0]
+    for robust in (solvers.PCM(), GNC(consistent=True)):
+        with pytest.raises(SettingError, match="found in one place"):
+            solvers.solve(graph, robust=robust, robots=2)
+    with pytest.raises(SettingError, match="writes no checkpoint"):
+        solvers.solve(graph, robust=GNC(), robots=2, checkpoint=Checkpoint(tmp_path / "c.npz"))
+
+
+def test_the_driver_counts_the_orders(wrong) -> None:
+    problem = pgo.PGOProblem(wrong[0])
+    with closing(open_driver(problem, partition(problem.graph, 3), InProcess(), thresholds=allowed(problem))) as driver:
+        driver.set_poses(first_poses(problem.graph, subgraph_known(problem)))
+        rounds = driver.network.ledger.rounds
+        driver.ask(sum_ratios, Reweigh(True, 0.1, 1.0, 1e-9), Count.ROUND)
+        driver.reweigh(Reweigh(True, 0.1, 1.0, 1e-9))
+        assert driver.network.ledger.rounds == rounds + 2
