@@ -158,7 +158,7 @@ class GNC:
 
     loss: RobustLoss = RobustLoss.TRUNCATED
     quantile: float = 0.99
-    spread: float | None = 30.0
+    spread: float | None = 100.0
     scale: float = 1.0
     known: BoolArray | None = None
     growth: float = 2.0
