@@ -24,6 +24,8 @@ from solvers.robust.rejection import Attempt, Rejection
 from solvers.solution import Solution
 
 _CHEAP = 4000  # rows of a factor that may become dense: of so few, a factorisation takes a fraction of a second
+_CHEAP_ATTEMPTS = 3
+_PAIRED = 4000  # loop closures whose pairs are looked at within seconds
 _TIGHT = (0.1, 0.01)
 
 
@@ -39,9 +41,9 @@ def solve_robustly(
 
     Where a factor of all edges is cheap the plain solution comes first: if it is certified, and no edge but known
     inliers is beyond its threshold, nothing is to be rejected. Else graduated non-convexity is run until the edges it
-    keeps are certified, at least twice where that is cheap: as set; with more and smaller steps; with tight thresholds,
-    which are then widened by what the edges kept say; on the pairwise consistent edges; with the other loss. Of those
-    certified, or of all if none is, that of the least truncated cost of all edges is kept.
+    keeps are certified, at least three times where that is cheap: as set; on the pairwise consistent edges; with more
+    and smaller steps; with tight thresholds, which are then widened by what the edges kept say; with the other loss. Of
+    those certified, or of all if none is, that of the least truncated cost of all edges is kept.
 
     Raises
     ------
@@ -74,8 +76,10 @@ def solve_robustly(
     attempts: list[_Estimate] = []
     for name, method in _methods(robust, graph, known):
         attempts.append(_estimate(problem, name, method, known, thresholds, gap, start, watch))
-        is_done = attempts[-1].certificate.is_certified and len(attempts) > int(is_cheap)
-        if is_done or attempts[-1].stage.status in OUT_OF_TIME:
+        is_done = any(one.certificate.is_certified for one in attempts)
+        if (is_done and len(attempts) >= (_CHEAP_ATTEMPTS if is_cheap else 1)) or attempts[
+            -1
+        ].stage.status in OUT_OF_TIME:
             break
     best = min(attempts, key=lambda one: (not one.certificate.is_certified, one.attempt.cost))
     solution = plain(inlier_problem(problem, best.kept), start=best.certificate.poses, time_limit=watch.left)
@@ -145,10 +149,11 @@ def _estimate(
 def _methods(robust: GNC, graph: PoseGraph, known: BoolArray) -> Iterator[tuple[str, GNC]]:
     """Attempts, the most promising first."""
     yield "as set", robust
+    few = not robust.consistent and (~known).sum() <= _PAIRED
+    if few and len(graph.components(known | pairwise_consistent(graph, known))) == 1:
+        yield "pairwise consistent edges", replace(robust, consistent=True)
     yield "smaller steps", replace(robust, growth=min(robust.growth, 1.4), inner_steps=max(robust.inner_steps, 5))
     for scale in _TIGHT:
         yield f"thresholds times {scale:g} at first", replace(robust, scale=scale * robust.scale)
-    if not robust.consistent and len(graph.components(known | pairwise_consistent(graph, known))) == 1:
-        yield "pairwise consistent edges", replace(robust, consistent=True)
     other = RobustLoss.GEMAN_MCCLURE if robust.loss is RobustLoss.TRUNCATED else RobustLoss.TRUNCATED
     yield f"{other.name.lower().replace('_', '-')} loss", replace(robust, loss=other)
