@@ -26,7 +26,7 @@ from solvers.solution import Solution
 _CHEAP = 4000  # rows of a factor that may become dense: of so few, a factorisation takes a fraction of a second
 _CHEAP_ATTEMPTS = 3
 _PAIRED = 4000  # loop closures whose pairs are looked at within seconds
-_TIGHT = (0.1, 0.01)
+_TIGHT, _NARROW = (0.1, 0.01), 0.3  # of the thresholds at first, and of how far they are widened
 
 
 def solve_robustly(
@@ -153,7 +153,8 @@ def _methods(robust: GNC, graph: PoseGraph, known: BoolArray) -> Iterator[tuple[
     if few and len(graph.components(known | pairwise_consistent(graph, known))) == 1:
         yield "pairwise consistent edges", replace(robust, consistent=True)
     yield "smaller steps", replace(robust, growth=min(robust.growth, 1.4), inner_steps=max(robust.inner_steps, 5))
+    spread = None if robust.spread is None else _NARROW * robust.spread
     for scale in _TIGHT:
-        yield f"thresholds times {scale:g} at first", replace(robust, scale=scale * robust.scale)
+        yield f"thresholds times {scale:g} at first", replace(robust, scale=scale * robust.scale, spread=spread)
     other = RobustLoss.GEMAN_MCCLURE if robust.loss is RobustLoss.TRUNCATED else RobustLoss.TRUNCATED
     yield f"{other.name.lower().replace('_', '-')} loss", replace(robust, loss=other)
