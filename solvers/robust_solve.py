@@ -27,7 +27,9 @@ from solvers.robust.rejection import Attempt, Rejection
 from solvers.solution import Solution
 
 _CHEAP = 4000  # rows of a factor that may become dense: of so few, a factorisation takes a fraction of a second
-_TIGHT = (0.1, 0.01)
+_CHEAP_ATTEMPTS = 3
+_PAIRED = 4000  # loop closures whose pairs are looked at within seconds
+_TIGHT, _NARROW = (0.1, 0.01), 0.3  # of the thresholds at first, and of how far they are widened
 
 
 def solve_robustly(
@@ -43,9 +45,9 @@ def solve_robustly(
 
     Where a factor of all edges is cheap the plain solution comes first: if it is certified, and no edge but known
     inliers is beyond its threshold, nothing is to be rejected. Else graduated non-convexity is run until the edges it
-    keeps are certified, at least twice where that is cheap: as set; with more and smaller steps; with tight thresholds,
-    which are then widened by what the edges kept say; on the pairwise consistent edges; with the other loss. Of those
-    certified, or of all if none is, that of the least truncated cost of all edges is kept.
+    keeps are certified, at least three times where that is cheap: as set; on the pairwise consistent edges; with more
+    and smaller steps; with tight thresholds, which are then widened by what the edges kept say; with the other loss. Of
+    those certified, or of all if none is, that of the least truncated cost of all edges is kept.
 
     By robots (`shared`, `plain`) the certificate of every attempt is theirs, and what crosses the network is added up.
 
@@ -80,12 +82,13 @@ def solve_robustly(
         solution = plain(inlier_problem(problem, kept), start=start, time_limit=watch.left)
         return result(solution, kept, thresholds, "pairwise consistency alone", ())
     attempts: list[_Estimate] = []
-    for name, method in _methods(robust, graph, known):
+    for name, method in _methods(robust, graph, known, shared is None):
         if shared is None:
             attempts.append(_estimate(problem, name, method, known, thresholds, gap, start, watch))
         else:
             attempts.append(_estimate_shared(problem, name, method, known, thresholds, start, watch, plain, shared))
-        is_done = attempts[-1].certificate.is_certified and len(attempts) > int(is_cheap)
+        is_done = any(one.certificate.is_certified for one in attempts)
+        is_done = is_done and len(attempts) >= (_CHEAP_ATTEMPTS if is_cheap else 1)
         if is_done or attempts[-1].stage.status in OUT_OF_TIME:
             break
     best = min(attempts, key=lambda one: (not one.certificate.is_certified, one.attempt.cost))
@@ -193,13 +196,15 @@ def _estimate_shared(
     )
 
 
-def _methods(robust: GNC, graph: PoseGraph, known: BoolArray) -> Iterator[tuple[str, GNC]]:
+def _methods(robust: GNC, graph: PoseGraph, known: BoolArray, is_central: bool) -> Iterator[tuple[str, GNC]]:
     """Attempts, the most promising first."""
     yield "as set", robust
-    yield "smaller steps", replace(robust, growth=min(robust.growth, 1.4), inner_steps=max(robust.inner_steps, 5))
-    for scale in _TIGHT:
-        yield f"thresholds times {scale:g} at first", replace(robust, scale=scale * robust.scale)
-    if not robust.consistent and len(graph.components(known | pairwise_consistent(graph, known))) == 1:
+    few = is_central and not robust.consistent and (~known).sum() <= _PAIRED
+    if few and len(graph.components(known | pairwise_consistent(graph, known))) == 1:
         yield "pairwise consistent edges", replace(robust, consistent=True)
+    yield "smaller steps", replace(robust, growth=min(robust.growth, 1.4), inner_steps=max(robust.inner_steps, 5))
+    spread = None if robust.spread is None else _NARROW * robust.spread
+    for scale in _TIGHT:
+        yield f"thresholds times {scale:g} at first", replace(robust, scale=scale * robust.scale, spread=spread)
     other = RobustLoss.GEMAN_MCCLURE if robust.loss is RobustLoss.TRUNCATED else RobustLoss.TRUNCATED
     yield f"{other.name.lower().replace('_', '-')} loss", replace(robust, loss=other)

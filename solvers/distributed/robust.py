@@ -23,7 +23,7 @@ from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine
 from solvers.network.ledger import Ledger
 from solvers.result import Measurement, Stage, Status
-from solvers.robust.gnc import GNC, GNCSchedule, RobustLoss, first_poses, left_out
+from solvers.robust.gnc import GNC, GNCSchedule, RobustLoss, first_poses, known_inliers, left_out
 
 _HALVINGS = 24  # of an interval of 24 factors of ten, for a median to 1e-6 of itself
 
@@ -126,7 +126,7 @@ def estimate_by_robots(
     memory: float,
 ) -> SharedEstimate:
     """Graduated non-convexity by robots, from `start` or along a tree of known inliers."""
-    known = gnc.known_inliers(problem.graph)
+    known = known_inliers(problem.graph, gnc.known)
     allowed = np.where(known, np.inf, thresholds)
     with closing(open_driver(problem, robots, engine, memory, allowed)) as driver:
         driver.hand_out(start if start is not None else first_poses(problem.graph, known))

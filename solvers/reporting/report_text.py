@@ -131,7 +131,7 @@ def fit(residuals: EdgeResiduals, cost: str) -> str:
     if overall > residuals.overall_allowed:
         text += f", and over {residuals.overall_allowed:.3g} by chance in one of 100 graphs"
     elif 0.0 < overall < _PESSIMISTIC:
-        text += f": errors are {overall**-0.5:.2g} times smaller than the matrices say, and wrong edges hide in that"
+        text += f": errors are {overall**-0.5:.3g} times smaller than the matrices say, and wrong edges hide in that"
     return text + ")."
 
 

@@ -54,7 +54,7 @@ class RobustLoss(enum.Enum):
         return np.asarray(np.minimum(ratio, 1.0) if self is RobustLoss.TRUNCATED else ratio / (1.0 + ratio))
 
     def surrogate(self, ratio: Array, mu: float) -> Array:
-        """Its surrogate (equations 7 and 5), which is the loss for mu to infinity (truncated) or 1 (Geman-McClure)."""
+        """Its surrogate, which is the loss for mu to infinity (truncated) or for mu = 1 (Geman-McClure)."""
         if self is RobustLoss.GEMAN_MCCLURE:
             return np.asarray(mu * ratio / (mu + ratio))
         between = 2.0 * np.sqrt(ratio * mu * (mu + 1.0)) - mu * (1.0 + ratio)
@@ -108,22 +108,9 @@ class GNCSchedule:
 class GNCState:
     """State k.
 
-    Attributes
-    ----------
-    k : int
-    poses : Poses
-    schedule : GNCSchedule
-    thresholds : (m,)
-        c_e^2.
-    known : (m,)
-    ratio : (m,)
-        r_e^2 / c_e^2 at the poses.
-    objective : float
-        The robust cost there.
-    reduced, analysis
-        The last weighted problem and its symbolic factorisation, for the next one if it has the same edges.
-    kept : (m,), optional
-        Which they are.
+    (m,) are the `thresholds` c_e^2, which edges are `known`, their `ratio` r_e^2 / c_e^2 at the poses, and which the last
+    weighted problem, `reduced`, has `kept`: with its symbolic `analysis` it serves the next one if that has the same
+    edges. `objective` is the robust cost.
     """
 
     k: int
@@ -181,7 +168,7 @@ class GNC:
 
     loss: RobustLoss = RobustLoss.TRUNCATED
     quantile: float = 0.99
-    spread: float | None = 30.0
+    spread: float | None = 100.0
     scale: float = 1.0
     known: BoolArray | None = None
     growth: float = 2.0
@@ -193,17 +180,12 @@ class GNC:
     def __post_init__(self) -> None:
         if not 0.0 < self.quantile < 1.0:
             raise SettingError(f"quantile is {self.quantile}; give one between 0 and 1, such as 0.99")
-        check_settings(
-            self,
-            positive=["tolerance", "spread", "scale"],
-            above_one=["growth"],
-            at_least_one=["inner_steps"],
-            not_negative=["max_iterations"],
-        )
+        check_settings(self, positive=["tolerance", "spread", "scale"], not_negative=["max_iterations"])
+        check_settings(self, above_one=["growth"], at_least_one=["inner_steps"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> GNCState:
         """State 0: at `start`, or where known inliers lead along a tree."""
-        known = self.known_inliers(problem.graph)
+        known = known_inliers(problem.graph, self.known)
         poses = start if start is not None else first_poses(problem.graph, known)
         thresholds = self.scale * chi2_thresholds(problem, self.quantile)
         ratio = problem.edge_costs(poses) / thresholds
@@ -266,10 +248,6 @@ class GNC:
             return Status.CONVERGED
         return None if schedule.moved else Status.STALLED
 
-    def known_inliers(self, graph: PoseGraph) -> BoolArray:
-        """Edges that are right, (m,)."""
-        return known_inliers(graph, self.known)
-
     def _cost(self, state: GNCState) -> float:
         loss = np.where(state.known, state.ratio, self.loss.values(state.ratio))
         return float(np.sum(state.thresholds * loss))
@@ -331,9 +309,7 @@ def known_inliers(graph: PoseGraph, known: BoolArray | None) -> BoolArray:
     if known is None:
         return odometry(graph) | graph.is_prior
     if np.shape(known) != (graph.num_edges,):
-        raise SettingError(
-            f"known has shape {np.shape(known)}; {graph.name} has {graph.num_edges} edges, give one each"
-        )
+        raise SettingError(f"known has shape {np.shape(known)}; give one for each of the {graph.num_edges} edges")
     return np.asarray(known, dtype=bool)
 
 

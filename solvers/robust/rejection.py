@@ -15,19 +15,9 @@ _NAMED = 5
 
 @dataclass(frozen=True)
 class Attempt:
-    """One robust estimate.
+    """One robust estimate: how many edges it rejects, and the gap of those that it keeps.
 
-    Attributes
-    ----------
-    name : str
-    cost : float
-        Truncated: known inliers in full, of the others at most the quantile of `GNC.quantile`.
-    rejected : int
-        Number of edges.
-    gap : float
-        Of the edges kept.
-    is_certified : bool
-    seconds : float
+    `cost` is truncated: known inliers in full, of others at most the quantile of `GNC.quantile`.
     """
 
     name: str
@@ -42,23 +32,9 @@ class Attempt:
 class Rejection:
     """What a robust solve decided of every edge of `problem`, the whole one.
 
-    Attributes
-    ----------
-    problem : PGOProblem
-    known : (m,)
-        Inliers that were given.
-    kept : (m,)
-    ratio : (m,)
-        r_e^2 / c_e^2 at the poses of the solution.
-    quantile : float
-        c_e^2 before it was scaled.
-    start : str
-        The attempt that was kept.
-    attempts : tuple of Attempt
-    is_certified : bool
-        Whether the edges kept are.
-    places : tuple of str
-        `file:line` of every edge, where it is known.
+    (m,) are `known`, the inliers given, `kept`, and `ratio`, r_e^2 / c_e^2 at the poses of the solution, with c_e^2 the
+    `quantile`, scaled. `start` names the attempt that was kept, `is_certified` says whether the edges kept are;
+    `places` are `file:line` of every edge, where they are known.
     """
 
     problem: PGOProblem

@@ -75,13 +75,13 @@ def test_where_the_certificate_fails_other_attempts_are_made(clean, share):
     graph, is_wrong = spoiled(clean, share, "random", seed=0)
     loose = replace(graph, kappa=1e-2 * graph.kappa, tau=1e-2 * graph.tau, information=None)
     alone = solvers.run(solvers.GNC(), pgo.PGOProblem(loose)).state
-    assert (alone.inliers & is_wrong).any()
     solution = solvers.solve(loose, robust=solvers.GNC())
-    first, *_, last = solution.robust.attempts
-    assert (first.name, first.is_certified, last.is_certified) == ("as set", False, True)
-    assert solution.robust.start == last.name
+    first = solution.robust.attempts[0]
+    assert (first.name, first.is_certified) == ("as set", False)
+    assert solution.robust.start in [one.name for one in solution.robust.attempts if one.is_certified]
     assert f"{first.name}: {first.rejected} rejected" in str(solution)
-    np.testing.assert_array_equal(solution.robust.rejected, is_wrong)
+    assert (solution.robust.rejected & ~is_wrong).sum() == 0
+    assert (solution.robust.kept & is_wrong).sum() <= 1 < (alone.inliers & is_wrong).sum()
     assert [stage.name for stage in solution.stages[: len(solution.robust.attempts)]] == [
         f"GNC, {one.name}" for one in solution.robust.attempts
     ]
