@@ -4,8 +4,6 @@ Exit codes: 0 done; 1 bad input, one line on stderr; 2 not converged, the result
 130 and 143 after SIGINT (Ctrl-C) and SIGTERM, the best iterate written if there was one.
 """
 
-from __future__ import annotations
-
 import math
 import shlex
 import sys

@@ -1,7 +1,5 @@
 """What the options of `pgo` stand for: methods, starts, partitions and scenes by name."""
 
-from __future__ import annotations
-
 import enum
 import importlib.util
 import os

@@ -1,7 +1,5 @@
 """What the shell does to a command: signals that break it off, pipes that close and disks that fill up under it."""
 
-from __future__ import annotations
-
 import errno
 import math
 import os

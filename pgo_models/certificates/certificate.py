@@ -4,8 +4,6 @@ The bound and its proof are in `pgo_models.certificates.lower_bound`; here it is
 says of poses. gap = (F - lower_bound) / F: neither the units nor the number of measurements change it.
 """
 
-from __future__ import annotations
-
 import enum
 import math
 from dataclasses import dataclass, replace

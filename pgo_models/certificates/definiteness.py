@@ -7,8 +7,6 @@ definite, and what it differs by from the exact S, the rounding of the entries (
 definite (Rump 2006, *Verification of positive definiteness*; Jansson, Chaykin & Keil 2007, VSDP).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Multipliers Lambda of the orthogonality constraints, and the certificate matrix S they give."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.sparse import csc_array
 

@@ -23,8 +23,6 @@ asking nothing of poses: if S + eta blockdiag(0, I) is positive definite without
 F >= tr(Lambda) - eta n d (Rosen et al. 2019, theorem 7; Carlone et al. 2015).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

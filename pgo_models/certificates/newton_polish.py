@@ -8,8 +8,6 @@ One factorisation serves several moves. After the first, the factored matrix is 
 factorisation where moves with the factor alone need two.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

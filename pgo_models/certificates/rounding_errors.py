@@ -6,8 +6,6 @@ of their absolute values, gamma_k = k u / (1 - k u), u = 2^-53. Bounds are round
 out by `has_safe_scale`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

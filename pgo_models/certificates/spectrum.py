@@ -1,7 +1,5 @@
 """Where Q - Lambda is not positive semidefinite: a direction that shows it, by inverse Lanczos on a proven shift."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

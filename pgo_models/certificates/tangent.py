@@ -8,8 +8,6 @@ eigenvalue: those of I'_tt are at most `cap` times that. The largest cap is soug
 gives a bound without a shift.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What every edge measures beside what the poses say, in metres and radians, and chi2 in its conventions."""
 
-from __future__ import annotations
-
 import enum
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The report of a solve: one HTML file that opens offline and says how good the answer is and what to try next."""
 
-from __future__ import annotations
-
 import enum
 import html
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What a report says in words: what the verdict means for this answer, and what to try next."""
 
-from __future__ import annotations
-
 import math
 import shlex
 from dataclasses import dataclass
