@@ -75,17 +75,6 @@ class Certificate(ReadOnly):
     verdict : Verdict
     weighting : Weighting
         Which cost `objective` and the bound are of: F, or chi2.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> certificate = certify(problem, chordal_start(problem))
-    >>> certificate
-    Certificate(F=110.9926545, gap=0.126, NOT_CERTIFIED)
-    >>> bool(certificate.lower_bound <= certificate.poses_objective <= certificate.objective)
-    True
     """
 
     objective: float
@@ -201,10 +190,6 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     gap : float
         The relative gap to certify.
 
-    Returns
-    -------
-    Certificate
-
     Raises
     ------
     SettingError
@@ -216,10 +201,12 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     --------
     >>> import numpy as np
     >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> certificate = certify(PGOProblem(graph), graph.truth)
-    >>> certificate.verdict.name, certificate.source.name, bool(0 < certificate.lower_bound < certificate.objective)
-    ('NOT_CERTIFIED', 'POLISHED', True)
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> certificate = certify(problem, chordal_start(problem))
+    >>> certificate
+    Certificate(F=110.9926545, gap=0.126, NOT_CERTIFIED)
+    >>> certificate.source.name, bool(0 < certificate.lower_bound <= certificate.poses_objective)
+    ('POLISHED', True)
     """
     problem = as_problem(problem)
     stationarity = relative_decrement(problem, poses)
@@ -243,20 +230,8 @@ def certify_at(
 ) -> Certificate:
     """Certificate from the multipliers at the poses as they are: valid anywhere, and sharp near an optimum.
 
-    Parameters
-    ----------
-    problem : PGOProblem
-    poses : Poses
-    gap : float
-    stationarity : float
-        Relative decrement there, reported as it is; nan where it was not measured.
-
-    Raises
-    ------
-    SettingError
-        When gap is not positive and finite.
-    GraphError
-        When the poses do not fit the graph.
+    `stationarity`, the relative decrement there, is reported as it is; nan where it was not measured. Errors as of
+    `certify`.
 
     Examples
     --------
@@ -295,17 +270,9 @@ def certify_with(
 ) -> Certificate:
     """Certificate of poses with multipliers from anywhere: the proof asks nothing of them.
 
-    Parameters
-    ----------
-    bound : LowerBound, optional
-        One that was proved with these multipliers already; found here unless given.
-    ground : Poses, optional
-        Poses at one of which the proof is grounded; the given ones with their best translations unless given.
-
-    Raises
-    ------
-    SettingError
-        When gap is not positive and finite, or Lambda has the wrong shape.
+    Unless a bound is given that was proved with these multipliers already, it is found here, grounded at one of the
+    poses `ground`: the given ones with their best translations, unless given. A SettingError when gap is not positive
+    and finite, or Lambda has the wrong shape.
     """
     if not 0 < gap < math.inf:
         raise SettingError(f"gap is {gap}; give a positive relative gap, as 1e-6")
@@ -335,10 +302,7 @@ def certify_with(
 def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
     """Hold other poses of the same problem against the bound of a certificate.
 
-    Raises
-    ------
-    ProofError
-        When F of the poses is below the bound by more than the rounding of F: then one of the two is wrong.
+    A ProofError when F of the poses is below it by more than the rounding of F: then one of the two is wrong.
     """
     return _judged(problem, certificate, problem.objective(poses), objective_rounding(problem, poses))
 

@@ -50,14 +50,9 @@ def soften(graph: PoseGraph, cap: float) -> PoseGraph:
 
 
 def softened_bound(problem: PGOProblem, poses: Poses) -> tuple[LowerBound, Poses, Array]:
-    """Bound with the largest cap found, the poses and the multipliers that it was found at.
+    """Bound on chi2 with the largest cap found, and the poses and multipliers that it was found at.
 
-    Parameters
-    ----------
-    problem : PGOProblem
-        With `Weighting.INFORMATION`.
-    poses : Poses
-        Where the search for the minima of the smaller costs begins.
+    The search for the minima of the smaller costs begins at the poses given.
     """
     best = NO_BOUND, poses, np.zeros_like(poses.R)
 
