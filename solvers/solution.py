@@ -1,7 +1,5 @@
 """Solution: poses, cost, certificate and what each stage did; prints well, and saves itself."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 from dataclasses import dataclass
@@ -32,9 +30,6 @@ from solvers.reporting.versions import installed_versions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-INFORMATION = "the file's information matrices"
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +146,7 @@ class Solution(Solved):
         """
         write_report(self, path)
 
-    def plot(self) -> Figure:
+    def plot(self) -> "Figure":
         """Figure of the graph as it came (its own estimate, else a spanning tree) and as solved; needs matplotlib."""
         graph = self.problem.graph
         before, name = graph.initial, "estimate that came with the graph"
@@ -252,11 +247,12 @@ def both_costs(problem: PGOProblem, poses: Poses) -> dict[str, float | str | Non
 def other_cost(problem: PGOProblem, poses: Poses) -> list[tuple[str, str]]:
     """What a summary says of the cost that is not bounded, where it is another."""
     costs, objective = both_costs(problem, poses), problem.objective(poses)
-    name, what = ("F", "two precisions an edge") if costs["weighting"] == "INFORMATION" else ("chi2", INFORMATION)
+    is_chi2 = costs["weighting"] == "INFORMATION"
+    name, what = ("F", "two precisions an edge") if is_chi2 else ("chi2", "the file's information matrices")
     found = costs[name]
     if not isinstance(found, float) or abs(found - objective) <= 1e-9 * objective:
         return []
-    return [(name, f"{found:.10g} with {what}; the bound is on {'chi2' if name == 'F' else 'F'} alone")]
+    return [(name, f"{found:.10g} with {what}; the bound is on {'chi2' if is_chi2 else 'F'} alone")]
 
 
 def check_format(path: Path) -> None:

@@ -64,15 +64,11 @@ class Certificate(ReadOnly):
     stationarity : float
         Half the squared Newton decrement of the given poses, over F: about the relative decrease of F down to the
         stationary point beside them.
-    source : BoundSource
-    poses : Poses
-        Where the bound was found.
-    poses_objective : float
-        F there: the best value known.
+    poses, poses_objective, source : Poses, float, BoundSource
+        Where the bound was found, F there, which is the best value known, and how these poses were come by.
     Lambda : (n, d, d)
         Multipliers, which with eta and the poses are the proof: anyone can check it with `prove_bound`.
-    wanted_gap : float
-    verdict : Verdict
+    wanted_gap, verdict : float, Verdict
     weighting : Weighting
         Which cost `objective` and the bound are of: F, or chi2.
     """

@@ -38,8 +38,7 @@ def certificate_matrix(problem: PGOProblem, Lambda: Array, eta: float = 0.0) -> 
     --------
     >>> from pgo_models.graphs.scenes import grid
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> Lambda = multipliers(problem, problem.graph.truth)
-    >>> S = certificate_matrix(problem, Lambda)
+    >>> S = certificate_matrix(problem, multipliers(problem, problem.graph.truth))
     >>> bool(abs(S - S.T).max() < 1e-12)
     True
     """
