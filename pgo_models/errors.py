@@ -1,7 +1,5 @@
 """The errors of the project: one tree, each message with what was wrong, where, the value and the way out."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -34,7 +32,7 @@ class FileFormatError(PGOError):
         self.line = line
         self._given = path, line, problem
 
-    def __reduce__(self) -> tuple[type[FileFormatError], tuple[Path | str, int | None, str]]:
+    def __reduce__(self) -> "tuple[type[FileFormatError], tuple[Path | str, int | None, str]]":
         return type(self), self._given
 
 
@@ -66,7 +64,7 @@ class MissingExtraError(PGOError):
         self.extra = extra
         self._package = package
 
-    def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str]]:
+    def __reduce__(self) -> "tuple[type[MissingExtraError], tuple[str, str]]":
         return type(self), (self._package, self.extra)
 
 

@@ -4,8 +4,6 @@ Exit codes: 0 done; 1 bad input, one line on stderr; 2 not converged, the result
 130 and 143 after SIGINT (Ctrl-C) and SIGTERM, the best iterate written if there was one.
 """
 
-from __future__ import annotations
-
 import math
 import shlex
 import sys
@@ -78,22 +76,14 @@ def _finite_gap(gap: float) -> float:
 
 
 GraphArgument = Annotated[
-    str,
-    typer.Argument(help="A g2o file, a folder with one file a robot, or the name of a data set (pgo info lists them)."),
+    str, typer.Argument(help="A g2o file, a folder with one file a robot, or the name of a data set (see pgo info).")
 ]
 SplitOption = Annotated[
     Split | None,
-    typer.Option(
-        help="How poses go to robots: as the file names them if it does, else with few cut edges where METIS is there, "
-        "else contiguous."
-    ),
+    typer.Option(help="How poses go to robots: as in the file, else with few cut edges (METIS), else contiguous."),
 ]
 InformationOption = Annotated[
-    bool,
-    typer.Option(
-        "--information",
-        help="The cost is chi2 of the file's information matrices, not F of two precisions an edge.",
-    ),
+    bool, typer.Option("--information", help="The cost is chi2 of the file's information matrices, not F.")
 ]
 SkipUnknownOption = Annotated[
     bool, typer.Option("--skip-unknown", help="Skip lines of a g2o file with unknown tags, and say which.")
@@ -107,11 +97,7 @@ def solve_command(
     graph: GraphArgument,
     out: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--out",
-            "-o",
-            help="Write the result: .g2o, .tum, .kitti, .json, .png, .svg or .pdf; may be given several times.",
-        ),
+        typer.Option("--out", "-o", help="Write .g2o, .tum, .kitti, .json, .png, .svg or .pdf; may be repeated."),
     ] = None,
     method: Annotated[
         FirstStage | None,
@@ -123,10 +109,7 @@ def solve_command(
     ] = None,
     robots: Annotated[
         int | None,
-        typer.Option(
-            min=1,
-            help="Number of robots that share the poses; as many as the file names (paper: one a pose) unless given.",
-        ),
+        typer.Option(min=1, help="Robots that share the poses; as the file has them (paper: one a pose) unless given."),
     ] = None,
     split: SplitOption = None,
     engine: Annotated[
@@ -161,7 +144,7 @@ def solve_command(
     max_iterations: Annotated[
         int | None,
         typer.Option(
-            min=0, help=f"Most SOC iterations; {HANDOVER.max_iterations} ({SOC.max_iterations}: paper) unless given."
+            min=0, help=f"Most SOC iterations; default {HANDOVER.max_iterations}, paper {SOC.max_iterations}."
         ),
     ] = None,
     tolerance: Annotated[float | None, typer.Option(help="Residual at which Newton takes over from SOC.")] = None,
@@ -171,10 +154,7 @@ def solve_command(
     skip_unknown: SkipUnknownOption = False,
     anchor: Annotated[
         int | None,
-        typer.Option(
-            metavar="ID",
-            help="Pose that stays where the file has it, as by a FIX line; else the answer is aligned with the file's.",
-        ),
+        typer.Option(metavar="ID", help="Pose held where the file has it, as by FIX; else aligned with the file's."),
     ] = None,
     times: Annotated[
         Path | None,
@@ -186,9 +166,7 @@ def solve_command(
     ] = None,
     covariances: Annotated[
         Path | None,
-        typer.Option(
-            help="Write poses' covariances as .csv: id, upper triangle; x y (z) in world axes, m, then turn, rad."
-        ),
+        typer.Option(help="Write covariances as .csv: id, upper triangle; x y (z) in world axes, m, then turn, rad."),
     ] = None,
     robust: Annotated[
         Robust | None,
@@ -226,9 +204,8 @@ def solve_command(
     on_robots = shared is not None and runs_on is not None and r_step in (None, BackEndName.FACTORIZED)
     of_robots = (engine, address, resume, driver_memory)
     if r_step is not None and not on_robots and any(option is not None for option in of_robots):
-        raise SettingError(
-            f"robots of an engine factor, got --r-step {r_step.value}; leave out --engine, --resume and --driver-memory"
-        )
+        way_out = "leave out --engine, --resume and --driver-memory"
+        raise SettingError(f"robots of an engine factor, got --r-step {r_step.value}; {way_out}")
     solution = solve(
         problem,
         chosen_pipeline(chosen, shared, r_step, gap, max_iterations, tolerance, driver_memory),
@@ -273,9 +250,7 @@ def certify_command(
     graph: GraphArgument,
     estimate: Annotated[
         Path | None,
-        typer.Option(
-            "--estimate", "-e", help="Poses to judge: .g2o, .tum or .kitti; the graph's own VERTEX lines unless given."
-        ),
+        typer.Option("--estimate", "-e", help="Poses to judge: .g2o, .tum or .kitti; else the graph's VERTEX lines."),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the certificate as .json.")] = None,
     gap: GapOption = DEFAULT_GAP,
@@ -346,9 +321,7 @@ def generate_command(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random generator.")] = 0,
     poses: Annotated[
         int | None,
-        typer.Option(
-            min=2, help="Poses: in all (random; victoria-park: 300), or of every robot (grid-world); 100 unless given."
-        ),
+        typer.Option(min=2, help="Poses in all (random; victoria-park: 300) or a robot (grid-world); default 100."),
     ] = None,
     robots: Annotated[int | None, typer.Option(min=1, help="Robots (grid-world); 4 unless given.")] = None,
     dimension: Annotated[

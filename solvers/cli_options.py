@@ -1,7 +1,5 @@
 """What the options of `pgo` stand for: methods, starts, partitions and scenes by name."""
 
-from __future__ import annotations
-
 import enum
 import importlib.util
 import os
@@ -29,80 +27,32 @@ from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
 
-
-class FirstStage(enum.Enum):
-    """First stage of a solve."""
-
-    JOINT = "joint"
-    SUBSTRUCTURED = "substructured"
-    CONSENSUS = "consensus"
-    PAPER = "paper"
-    NEWTON = "newton"
-
+# Words that options take; their values are the names in lower case, unless given.
+FirstStage = enum.StrEnum("FirstStage", "JOINT SUBSTRUCTURED CONSENSUS PAPER NEWTON")  # of a solve
+Start = enum.StrEnum("Start", "CHORDAL TREE ODOMETRY FILE")
+BackEndName = enum.StrEnum("BackEndName", "FACTORIZED FISTA CLARABEL")  # of the R-step
+Split = enum.StrEnum("Split", "GIVEN CONTIGUOUS METIS SINGLETONS")  # how poses go to robots
+Runner = enum.StrEnum("Runner", "PROCESS THREADS RAY")  # where robots run
+Robust = enum.StrEnum("Robust", {"GNC": "gnc", "GM": "gm", "PCM": "pcm", "PCM_GNC": "pcm-gnc"})  # finds wrong edges
+Scene = enum.StrEnum(
+    "Scene",
+    {
+        "CIRCLE": "circle",
+        "GRID": "grid",
+        "SPHERE": "sphere",
+        "RANDOM": "random",
+        "GRID_WORLD": "grid-world",
+        "VICTORIA_PARK": "victoria-park",
+    },
+)
 
 ON_ROBOTS = (FirstStage.SUBSTRUCTURED, FirstStage.CONSENSUS, FirstStage.NEWTON)  # methods that driver and robots run
-
-
-class Start(enum.Enum):
-    """Where a solve starts."""
-
-    CHORDAL = "chordal"
-    TREE = "tree"
-    ODOMETRY = "odometry"
-    FILE = "file"
-
-
-class BackEndName(enum.Enum):
-    """Names of the R-step's back ends."""
-
-    FACTORIZED = "factorized"
-    FISTA = "fista"
-    CLARABEL = "clarabel"
-
-
-class Split(enum.Enum):
-    """Names of the partitions."""
-
-    GIVEN = "given"
-    CONTIGUOUS = "contiguous"
-    METIS = "metis"
-    SINGLETONS = "singletons"
-
-
-class Robust(enum.Enum):
-    """How wrong edges are found."""
-
-    GNC = "gnc"
-    GM = "gm"
-    PCM = "pcm"
-    PCM_GNC = "pcm-gnc"
-
-
 ROBUST: dict[Robust, GNC | PCM] = {
     Robust.GNC: GNC(),
     Robust.GM: GNC(loss=RobustLoss.GEMAN_MCCLURE),
     Robust.PCM: PCM(),
     Robust.PCM_GNC: GNC(consistent=True),
 }
-
-
-class Runner(enum.Enum):
-    """Where robots run."""
-
-    PROCESS = "process"
-    THREADS = "threads"
-    RAY = "ray"
-
-
-class Scene(enum.Enum):
-    """Scenes that can be generated."""
-
-    CIRCLE = "circle"
-    GRID = "grid"
-    SPHERE = "sphere"
-    RANDOM = "random"
-    GRID_WORLD = "grid-world"
-    VICTORIA_PARK = "victoria-park"
 
 
 def chosen_pipeline(
@@ -114,19 +64,15 @@ def chosen_pipeline(
     tolerance: float | None,
     driver_memory: float | None = None,
 ) -> Pipeline:
-    """Pipeline of the options of `pgo solve`; robots are for CONSENSUS and PAPER, the driver's memory is in GB.
+    """Pipeline of the options of `pgo solve`, a SettingError when they do not go together.
 
-    Raises
-    ------
-    SettingError
-        When they do not go together.
+    Robots are for CONSENSUS and PAPER, the driver's memory is in GB.
     """
     if driver_memory is not None and method not in ON_ROBOTS:
         raise SettingError(f"--driver-memory is for methods that run on robots, got --method {method.value}")
     memory = DEFAULT_MEMORY if driver_memory is None else 1e9 * driver_memory
     if method is FirstStage.NEWTON:
-        of_soc = (("--r-step", r_step), ("--max-iterations", max_iterations), ("--tolerance", tolerance))
-        for name, value in of_soc:
+        for name, value in {"--r-step": r_step, "--max-iterations": max_iterations, "--tolerance": tolerance}.items():
             if value is not None:
                 raise SettingError(f"{name} is for SOC, which --method newton leaves out; leave out one of the two")
         return Pipeline(soc=None, gap=gap, driver_memory=memory)
@@ -150,13 +96,7 @@ def chosen_pipeline(
 
 
 def chosen_method(method: FirstStage | None, robots: int | None, is_shared: bool) -> FirstStage:
-    """Method of a solve: as asked for, or the one that suits one robot or, if another option is about robots, many.
-
-    Raises
-    ------
-    SettingError
-        When many robots are to use a method that has one.
-    """
+    """Method of a solve: as asked for, or the one that suits one robot or, if another option is about robots, many."""
     if method is FirstStage.JOINT and (robots or 1) > 1:
         raise SettingError(f"--method joint has one robot, got --robots {robots}; use substructured or consensus")
     if method is None:
@@ -167,12 +107,7 @@ def chosen_method(method: FirstStage | None, robots: int | None, is_shared: bool
 def chosen_partition(graph: PoseGraph, number: int | None, split: Split | None) -> Partition:
     """Partition of the options: as the file names the robots if it does, else with few cut edges where METIS is there.
 
-    Raises
-    ------
-    SettingError
-        When the number of robots does not fit.
-    MissingExtraError
-        When METIS is asked for and not installed.
+    Errors are those of `partition`.
     """
     number = graph.num_robots if number is None else number
     if split is not None:
@@ -184,13 +119,7 @@ def chosen_partition(graph: PoseGraph, number: int | None, split: Split | None) 
 
 
 def chosen_engine(method: FirstStage, engine: Runner | None, address: str | None, checkpoint: bool) -> Engine | None:
-    """Engine of the options; None where the method runs in one place.
-
-    Raises
-    ------
-    SettingError
-        When they do not go together.
-    """
+    """Engine of the options, a SettingError when they do not go together; None where the method runs in one place."""
     asked = [name for name, given in (("--engine", engine), ("--address", address), ("--resume", checkpoint)) if given]
     if method not in ON_ROBOTS:
         if asked:
@@ -233,11 +162,8 @@ def chosen_scene(
 ) -> PoseGraph:
     """Scene with noise in metres and degrees.
 
-    Raises
-    ------
-    SettingError
-        When something is given that is part of the scene: all of it in the paper's scenes, the number of robots in
-        `random`; when noise is out of its range.
+    A SettingError when noise is out of its range, or something is given that is part of the scene: all of it in the
+    paper's scenes, the number of robots in `random`.
     """
     paper = {Scene.CIRCLE: circle, Scene.GRID: grid, Scene.SPHERE: sphere}
     settled: dict[str, float | None] = {} if scene is Scene.GRID_WORLD else {"--robots": robots}

@@ -1,7 +1,5 @@
 """Graphs that grow: new poses start where their edges to the known ones put them, and Newton goes on from there."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pgo_models.errors import GraphError

@@ -1,7 +1,5 @@
 """The one printed table of a run and its progress bar, in a terminal or in a notebook; the bar of a job of runs."""
 
-from __future__ import annotations
-
 import html
 import math
 import sys
@@ -34,7 +32,7 @@ class Table:
         self._console = Console(highlight=False, force_jupyter=False)
         self._bar: _TerminalBar | _NotebookBar | None = None
 
-    def __enter__(self) -> Table:
+    def __enter__(self) -> "Table":
         return self
 
     def row(self, record: Record, elapsed: float) -> None:

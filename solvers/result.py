@@ -1,7 +1,5 @@
 """What happened in a run: Status, one Record per iterate, History, Outcome and Run."""
 
-from __future__ import annotations
-
 import enum
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
@@ -152,6 +150,6 @@ class Stage:
     method: object = None  # the method that ran, which is its settings; None for a start
 
     @classmethod
-    def of(cls, run: Run[S]) -> Stage:
+    def of(cls, run: Run[S]) -> "Stage":
         """Stage of a finished run."""
         return cls(run.name, run.status, run.iterations, run.objective, run.seconds, run.history, run.method)

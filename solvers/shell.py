@@ -1,7 +1,5 @@
 """What the shell does to a command: signals that break it off, pipes that close and disks that fill up under it."""
 
-from __future__ import annotations
-
 import errno
 import math
 import os
@@ -79,16 +77,10 @@ def _run(app: typer.Typer, arguments: list[str]) -> tuple[int, str]:
 
 
 class Broken:
-    """Turns SIGINT and SIGTERM into a KeyboardInterrupt, which the loop of a solve answers with its best iterate.
-
-    Attributes
-    ----------
-    signal : signal.Signals, optional
-        The first that came.
-    """
+    """Turns SIGINT and SIGTERM into a KeyboardInterrupt, which the loop of a solve answers with its best iterate."""
 
     def __init__(self) -> None:
-        self.signal: signal.Signals | None = None
+        self.signal: signal.Signals | None = None  # the first that came
         self._last = -math.inf
 
     @property
@@ -162,12 +154,8 @@ def outlets() -> Iterator[Outlet]:
 def save_then_show(targets: Iterable[tuple[Path, Callable[[Path], object]]], show: Callable[[], object]) -> None:
     """Write every file that can be written, then print the result and the names of the files.
 
-    Signals that come while files are written are too late: there is nothing left to break off.
-
-    Raises
-    ------
-    PGOError
-        At the end, when a file could not be written.
+    Signals that come while files are written are too late: there is nothing left to break off. A PGOError comes at the
+    end, when a file could not be written.
     """
     written: list[Path] = []
     failures: list[str] = []

@@ -1,14 +1,12 @@
 """Solution: poses, cost, certificate and what each stage did; prints well, and saves itself."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, gap_text
+from pgo_models.certificates.certificate import BoundSource, Certificate, gap_text
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.files import check_writable, replace_when_done
@@ -34,51 +32,31 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-INFORMATION = "the file's information matrices"
-
-
 @dataclass(frozen=True, eq=False)
 class Solution(Solved):
     """The answer to a pose graph.
 
     Attributes
     ----------
-    problem : PGOProblem
-    poses : Poses
-        In the frame that `frame` names.
+    problem, poses : PGOProblem, Poses
+    frame : str
+        Which frame the poses are in, which F leaves open.
     objective : float
         Cost of the poses: F, or chi2 with `Weighting.INFORMATION`.
     certificate : Certificate
-        Lower bound on the global optimum, gap and verdict.
-    status : Status
-        How the last stage ended.
-    stages : tuple of Stage
-        The start and the iterative stages, in order.
+        Lower bound on the global optimum, gap and verdict; `note` is what it lacks, and why, or empty.
+    status, stages : Status, tuple of Stage
+        How the last stage ended; the start and the iterative stages, in order.
     seconds : float
         Wall time of it all.
-    ledger : Ledger, optional
-        What crossed the network, of a solve by many robots.
-    robots : Partition, optional
-        Who owned which pose in such a solve.
-    note : str
-        What the certificate lacks, and why; empty where it lacks nothing.
-    frame : str
-        Which frame the poses are in, which F leaves open.
+    ledger, robots : Ledger, Partition, optional
+        Of a solve by many robots: what crossed the network, and who owned which pose.
     anchor : int
         Pose that it is held by, or 0: what `marginals` are relative to.
     covariances : (n, p, p), optional
         All `marginals()`, for ellipses in the report: `dataclasses.replace` puts them in.
     robust : Rejection, optional
         Of a robust solve: which edges it kept, of which alone all else here is, and what that leaves unproven.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import circle
-    >>> from solvers.pipeline import solve
-    >>> solution = solve(circle(np.random.default_rng(0)))
-    >>> solution.is_certified, bool(solution.lower_bound <= solution.objective)
-    (True, True)
     """
 
     @property
@@ -104,7 +82,7 @@ class Solution(Solved):
     def __repr__(self) -> str:
         return (
             f"Solution({self.problem.graph.name!r}, {self.certificate.cost}={self.objective:.10g}, gap={self.gap:.3g}, "
-            f"{self._verdict.name}{self._given})"
+            f"{self.certificate.verdict.name}{self._given})"
         )
 
     def __str__(self) -> str:
@@ -141,14 +119,8 @@ class Solution(Solved):
 
         `.g2o`: the graph with the solved poses (a folder, when the name has no suffix: one file a robot); `.tum` or
         `.txt`: a TUM trajectory; `.kitti`: a KITTI trajectory; `.json`: everything but the measurements; `.png`, `.svg`
-        or `.pdf`: the picture of `plot`. The file is written whole or not at all.
-
-        Raises
-        ------
-        SettingError
-            On another suffix.
-        PGOError
-            When the file cannot be written.
+        or `.pdf`: the picture of `plot`. The file is written whole or not at all. A SettingError on another suffix, a
+        PGOError when the file cannot be written.
         """
         path = Path(path)
         check_format(path)
@@ -169,30 +141,18 @@ class Solution(Solved):
     def report(self, path: Path | str) -> None:
         """Write one HTML page that opens offline: verdict, what to try next, pictures and tables; see `write_report`.
 
-        Raises
-        ------
-        MissingExtraError
-            Without plotly.
-        SettingError
-            When `path` does not end in .html.
-        PGOError
-            When the file cannot be written.
+        A MissingExtraError without plotly, a SettingError when `path` does not end in .html, a PGOError when the file
+        cannot be written.
         """
         write_report(self, path)
 
-    def plot(self) -> Figure:
-        """Figure of the graph as it came (its own estimate, else a spanning tree) and as solved.
-
-        Raises
-        ------
-        MissingExtraError
-            Without matplotlib.
-        """
+    def plot(self) -> "Figure":
+        """Figure of the graph as it came (its own estimate, else a spanning tree) and as solved; needs matplotlib."""
         graph = self.problem.graph
         before, name = graph.initial, "estimate that came with the graph"
         if before is None:
             before, name = spanning_tree_start(graph), "spanning tree"
-        verdict, cost = self._verdict.name.lower().replace("_", " "), self.certificate.cost
+        verdict, cost = self.certificate.verdict.name.lower().replace("_", " "), self.certificate.cost
         solved = f"{verdict}{self._given}: {cost} = {self.objective:.6g}, gap {self.gap:.1e}"
         return compare_poses(
             graph, [(f"{name}: {cost} = {self.problem.objective(before):.4g}", before), (solved, self.poses)]
@@ -201,6 +161,10 @@ class Solution(Solved):
     def as_json(self) -> dict[str, object]:
         """Return what `.json` files hold: figures, stages, versions, and the poses by id."""
         graph, certificate, named = self.problem.graph, self.certificate, self.problem.graph.in_files
+        stages = [
+            dict(name=s.name, status=s.status.name, iterations=s.iterations, objective=s.objective, seconds=s.seconds)
+            for s in self.stages
+        ]
         return {
             "graph": {"name": graph.name, "d": graph.d, "poses": len(named), "edges": graph.num_edges},
             "objective": self.objective,
@@ -211,16 +175,7 @@ class Solution(Solved):
             "frame": self.frame,
             "status": self.status.name,
             "seconds": self.seconds,
-            "stages": [
-                {
-                    "name": stage.name,
-                    "status": stage.status.name,
-                    "iterations": stage.iterations,
-                    "objective": stage.objective,
-                    "seconds": stage.seconds,
-                }
-                for stage in self.stages
-            ],
+            "stages": stages,
             **self._network_json(),
             "versions": installed_versions(self.problem.backend),
             "ids": graph.pose_ids[named].tolist(),
@@ -241,10 +196,6 @@ class Solution(Solved):
             "bytes_received": ledger.bytes_received.tolist(),
         }
         return {"robots": self.robots.robot.tolist(), "network": figures}
-
-    @property
-    def _verdict(self) -> Verdict:
-        return self.certificate.verdict
 
     @property
     def _given(self) -> str:
@@ -271,7 +222,6 @@ class Solution(Solved):
         ]
 
     def _network(self) -> list[tuple[str, str]]:
-        """Robots and what crossed the network, of a solve by robots."""
         if self.ledger is None or self.robots is None:
             return []
         ledger, sizes = self.ledger, self.robots.sizes
@@ -297,11 +247,12 @@ def both_costs(problem: PGOProblem, poses: Poses) -> dict[str, float | str | Non
 def other_cost(problem: PGOProblem, poses: Poses) -> list[tuple[str, str]]:
     """What a summary says of the cost that is not bounded, where it is another."""
     costs, objective = both_costs(problem, poses), problem.objective(poses)
-    name, what = ("F", "two precisions an edge") if costs["weighting"] == "INFORMATION" else ("chi2", INFORMATION)
+    is_chi2 = costs["weighting"] == "INFORMATION"
+    name, what = ("F", "two precisions an edge") if is_chi2 else ("chi2", "the file's information matrices")
     found = costs[name]
     if not isinstance(found, float) or abs(found - objective) <= 1e-9 * objective:
         return []
-    return [(name, f"{found:.10g} with {what}; the bound is on {'chi2' if name == 'F' else 'F'} alone")]
+    return [(name, f"{found:.10g} with {what}; the bound is on {'chi2' if is_chi2 else 'F'} alone")]
 
 
 def check_format(path: Path) -> None:

@@ -4,8 +4,6 @@ The bound and its proof are in `pgo_models.certificates.lower_bound`; here it is
 says of poses. gap = (F - lower_bound) / F: neither the units nor the number of measurements change it.
 """
 
-from __future__ import annotations
-
 import enum
 import math
 from dataclasses import dataclass, replace
@@ -66,28 +64,13 @@ class Certificate(ReadOnly):
     stationarity : float
         Half the squared Newton decrement of the given poses, over F: about the relative decrease of F down to the
         stationary point beside them.
-    source : BoundSource
-    poses : Poses
-        Where the bound was found.
-    poses_objective : float
-        F there: the best value known.
+    poses, poses_objective, source : Poses, float, BoundSource
+        Where the bound was found, F there, which is the best value known, and how these poses were come by.
     Lambda : (n, d, d)
         Multipliers, which with eta and the poses are the proof: anyone can check it with `prove_bound`.
-    wanted_gap : float
-    verdict : Verdict
+    wanted_gap, verdict : float, Verdict
     weighting : Weighting
         Which cost `objective` and the bound are of: F, or chi2.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> certificate = certify(problem, chordal_start(problem))
-    >>> certificate
-    Certificate(F=110.9926545, gap=0.126, NOT_CERTIFIED)
-    >>> bool(certificate.lower_bound <= certificate.poses_objective <= certificate.objective)
-    True
     """
 
     objective: float
@@ -203,10 +186,6 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     gap : float
         The relative gap to certify.
 
-    Returns
-    -------
-    Certificate
-
     Raises
     ------
     SettingError
@@ -218,10 +197,12 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     --------
     >>> import numpy as np
     >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> certificate = certify(PGOProblem(graph), graph.truth)
-    >>> certificate.verdict.name, certificate.source.name, bool(0 < certificate.lower_bound < certificate.objective)
-    ('NOT_CERTIFIED', 'POLISHED', True)
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> certificate = certify(problem, chordal_start(problem))
+    >>> certificate
+    Certificate(F=110.9926545, gap=0.126, NOT_CERTIFIED)
+    >>> certificate.source.name, bool(0 < certificate.lower_bound <= certificate.poses_objective)
+    ('POLISHED', True)
     """
     problem = as_problem(problem)
     stationarity = relative_decrement(problem, poses)
@@ -245,20 +226,8 @@ def certify_at(
 ) -> Certificate:
     """Certificate from the multipliers at the poses as they are: valid anywhere, and sharp near an optimum.
 
-    Parameters
-    ----------
-    problem : PGOProblem
-    poses : Poses
-    gap : float
-    stationarity : float
-        Relative decrement there, reported as it is; nan where it was not measured.
-
-    Raises
-    ------
-    SettingError
-        When gap is not positive and finite.
-    GraphError
-        When the poses do not fit the graph.
+    `stationarity`, the relative decrement there, is reported as it is; nan where it was not measured. Errors as of
+    `certify`.
 
     Examples
     --------
@@ -297,17 +266,9 @@ def certify_with(
 ) -> Certificate:
     """Certificate of poses with multipliers from anywhere: the proof asks nothing of them.
 
-    Parameters
-    ----------
-    bound : LowerBound, optional
-        One that was proved with these multipliers already; found here unless given.
-    ground : Poses, optional
-        Poses at one of which the proof is grounded; the given ones with their best translations unless given.
-
-    Raises
-    ------
-    SettingError
-        When gap is not positive and finite, or Lambda has the wrong shape.
+    Unless a bound is given that was proved with these multipliers already, it is found here, grounded at one of the
+    poses `ground`: the given ones with their best translations, unless given. A SettingError when gap is not positive
+    and finite, or Lambda has the wrong shape.
     """
     if not 0 < gap < math.inf:
         raise SettingError(f"gap is {gap}; give a positive relative gap, as 1e-6")
@@ -337,10 +298,7 @@ def certify_with(
 def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
     """Hold other poses of the same problem against the bound of a certificate.
 
-    Raises
-    ------
-    ProofError
-        When F of the poses is below the bound by more than the rounding of F: then one of the two is wrong.
+    A ProofError when F of the poses is below it by more than the rounding of F: then one of the two is wrong.
     """
     return _judged(problem, certificate, problem.objective(poses), objective_rounding(problem, poses))
 

@@ -7,8 +7,6 @@ definite, and what it differs by from the exact S, the rounding of the entries (
 definite (Rump 2006, *Verification of positive definiteness*; Jansson, Chaykin & Keil 2007, VSDP).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -40,31 +38,15 @@ _SMALLEST, _LARGEST = 1e-150, 1e150  # of diagonal entries: nothing that counts 
 
 @dataclass(frozen=True, eq=False)
 class DefiniteProof:
-    """S + eta blockdiag(0, I), without some rows, factored with a share of its diagonal subtracted.
+    """S + eta blockdiag(0, I), without some rows, factored with a share of its diagonal subtracted."""
 
-    Attributes
-    ----------
-    stored : csc_array, (N, N)
-        The matrix in double precision; only its diagonal in the rows left out.
-    factor : CholeskyFactor
-        Of `stored` with the shift subtracted.
-    diagonal : (N,)
-        That it is a share of; 0 in the rows left out.
-    shift, entries : (N,)
-        Share that is subtracted, and share that the rounding of the entries takes.
-    is_marginal : bool
-        Whether a larger shift failed: the factor may be far from one of the matrix without a shift.
-    error : (N,), optional
-        Share that the rounding of the factorisation takes, where the factor need not be asked.
-    """
-
-    stored: csc_array
-    factor: CholeskyFactor
-    diagonal: Array
-    shift: Array
-    entries: Array
-    is_marginal: bool
-    error: Array | None = None
+    stored: csc_array  # the matrix in double precision, (N, N); only its diagonal in the rows left out
+    factor: CholeskyFactor  # of `stored` with the shift subtracted
+    diagonal: Array  # that it is a share of, (N,); 0 in the rows left out
+    shift: Array  # share that is subtracted, (N,)
+    entries: Array  # share that the rounding of the entries takes, (N,)
+    is_marginal: bool  # whether a larger shift failed: the factor may be far from one of the matrix without a shift
+    error: Array | None = None  # share that the rounding of the factorisation takes, where the factor need not be asked
 
     @property
     def free(self) -> BoolArray:
@@ -89,13 +71,9 @@ class DefiniteProof:
         if self.is_marginal:
             preconditioner = LinearOperator(self.stored.shape, matvec=self.factor.solve, dtype=float)
             for column in range(step.shape[1]):
+                b, x0 = np.where(free, product[:, column], 0.0), step[:, column]
                 step[:, column], _ = cg(
-                    self.stored,
-                    np.where(free, product[:, column], 0.0),
-                    step[:, column],
-                    rtol=_CG_TOLERANCE,
-                    maxiter=_CG_ITERATIONS,
-                    M=preconditioner,
+                    self.stored, b, x0, rtol=_CG_TOLERANCE, maxiter=_CG_ITERATIONS, M=preconditioner
                 )
         step[~free] = 0.0
         return step
@@ -109,22 +87,12 @@ def prove_definite(
     first_shift: float = FIRST_SHIFT,
     turned: Array | None = None,
 ) -> DefiniteProof | None:
-    """Proof that S + eta blockdiag(0, I) is positive definite without some rows; None when none is found.
+    """Proof that S + eta blockdiag(0, I) is positive definite without the rows `fixed`; None when none is found.
 
-    Parameters
-    ----------
-    problem : PGOProblem
-    Lambda : (n, d, d), symmetric
-    eta : float
-    fixed : (f,)
-        Rows of X that are left out.
-    first_shift : float
-        Share of the diagonal that is subtracted first; less where the matrix is not definite with it, more where
-        rounding needs more.
-    turned : (N, d), optional
-        Moves that leave F almost as it is, as a turn of all poses but those left out, which S then holds but weakly:
-        no share above their Rayleigh quotient can be subtracted. Where one far below it is enough for rounding whatever
-        the factor's non-zeros are, they are not counted.
+    The share `first_shift` of the diagonal is subtracted first; less where the matrix is not definite with it, more
+    where rounding needs more. `turned`, (N, d), are moves that leave F almost as it is, as a turn of all poses but
+    those left out, which S then holds but weakly: no share above their Rayleigh quotient can be subtracted. Where one
+    far below it is enough for rounding whatever the factor's non-zeros are, they are not counted.
     """
     shifts = np.zeros(problem.side)
     shifts[problem.num_poses :] = eta
@@ -182,15 +150,9 @@ def search_shift(
     """First factor found that leaves at least half of its shift over, the shift, and whether a larger one failed.
 
     A factor with the first shift whose error is not known before it is taken apart (`CholeskyFactor.known_error`) is
-    returned as it is.
-
-    Parameters
-    ----------
-    attempt : callable
-        Factor with these shares, (N,), of the diagonal subtracted, or None when it does not go through.
-    entries, expected : (N,)
-        Shares of the diagonal that the rounding of the entries takes, and that the factorisation is expected to take.
-    first_shift : float
+    returned as it is. `attempt` factors with shares, (N,), of the diagonal subtracted, or gives None when that does not
+    go through; `entries` and `expected`, (N,), are the shares that the rounding of the entries takes, and that the
+    factorisation is expected to take.
     """
     uniform, is_marginal = first_shift, False
     while uniform >= LEAST_SHIFT:

@@ -1,7 +1,5 @@
 """Multipliers Lambda of the orthogonality constraints, and the certificate matrix S they give."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.sparse import csc_array
 
@@ -18,7 +16,6 @@ def multipliers(problem: PGOProblem, poses: Poses) -> Array:
 
     Examples
     --------
-    >>> import numpy as np
     >>> from pgo_models.graphs.scenes import grid
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
     >>> multipliers(problem, problem.graph.truth).shape
@@ -39,11 +36,9 @@ def certificate_matrix(problem: PGOProblem, Lambda: Array, eta: float = 0.0) -> 
 
     Examples
     --------
-    >>> import numpy as np
     >>> from pgo_models.graphs.scenes import grid
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> Lambda = multipliers(problem, problem.graph.truth)
-    >>> S = certificate_matrix(problem, Lambda)
+    >>> S = certificate_matrix(problem, multipliers(problem, problem.graph.truth))
     >>> bool(abs(S - S.T).max() < 1e-12)
     True
     """
@@ -58,12 +53,8 @@ def factorize_certificate(problem: PGOProblem, Lambda: Array, eta: float) -> Cho
 
     Grounding loses nothing: S maps a common shift of all translations to zero, so the matrix is positive semidefinite
     if it is positive definite with its (t_0, t_0) entry doubled. For a right-hand side that is zero on translations,
-    the rotation part of the solution is that of (Q - blockdiag(Lambda) + eta I) y = b: elimination marginalises them.
-
-    Raises
-    ------
-    NotPositiveDefiniteError
-        When it has a negative eigenvalue, or a zero one beside that of the common shift.
+    the rotation part of the solution is that of (Q - blockdiag(Lambda) + eta I) y = b: elimination marginalises them. A
+    NotPositiveDefiniteError when it has a negative eigenvalue, or a zero one beside that of the common shift.
     """
     shifted = certificate_matrix(problem, Lambda, eta)
     shifted.data[problem.diagonal_positions[0]] *= 2.0

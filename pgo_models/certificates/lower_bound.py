@@ -23,8 +23,6 @@ asking nothing of poses: if S + eta blockdiag(0, I) is positive definite without
 F >= tr(Lambda) - eta n d (Rosen et al. 2019, theorem 7; Carlone et al. 2015).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -49,27 +47,13 @@ SETTLED = 1e-13  # of the value: G adds less, and moving again would gain nothin
 
 @dataclass(frozen=True)
 class LowerBound:
-    """A proven lower bound on F over all poses.
+    """A proven lower bound on F over all poses."""
 
-    Attributes
-    ----------
-    value : float
-        Never negative: F is a sum of squares.
-    eta : float
-        Shift with which it was proved; nan when nothing better than F >= 0 was.
-    is_grounded : bool
-        Whether the proof leaves out one whole pose; else it is one with eta alone.
-    rounding : float
-        Sum of all that was subtracted because of rounding.
-    cap : float
-        Condition that the information matrices were cut down to for it (`pgo_models.certificates.tangent`).
-    """
-
-    value: float
-    eta: float
-    is_grounded: bool
-    rounding: float
-    cap: float = math.inf
+    value: float  # never negative: F is a sum of squares
+    eta: float  # shift with which it was proved; nan when nothing better than F >= 0 was
+    is_grounded: bool  # whether the proof leaves out one whole pose; else it is one with eta alone
+    rounding: float  # sum of all that was subtracted because of rounding
+    cap: float = math.inf  # condition that the information matrices were cut down to (`certificates.tangent`)
 
 
 NO_BOUND = LowerBound(0.0, math.nan, False, 0.0)
@@ -103,10 +87,7 @@ def prove_bound(problem: PGOProblem, Lambda: Array, eta: float = 0.0, poses: Pos
 
     Examples
     --------
-    >>> from pgo_models.problem.initialization import chordal_start
-    >>> from pgo_models.certificates.dual_variables import multipliers
-    >>> from pgo_models.certificates.newton_polish import polish
-    >>> from pgo_models.graphs.scenes import grid
+    >>> from pgo_models import chordal_start, grid, multipliers, polish
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
     >>> poses = polish(problem, chordal_start(problem))
     >>> Lambda = multipliers(problem, poses)
@@ -132,13 +113,8 @@ def prove_at(problem: PGOProblem, Lambda: Array, poses: Poses) -> LowerBound | N
 def best_bound(problem: PGOProblem, Lambda: Array, poses: Poses | None, gap: float, objective: float) -> LowerBound:
     """Grounded without eta where that goes through; else the better of both forms with the smallest eta found.
 
-    Parameters
-    ----------
-    Lambda : (n, d, d)
-    poses : Poses or None
-        With their best translations, to ground the proof at; None leaves the form that asks nothing of poses.
-    gap, objective : float
-        The smallest eta that is tried follows from them.
+    It is grounded at one of the poses, which have their best translations; None leaves the form that asks nothing of
+    poses. The smallest eta that is tried follows from gap and objective.
     """
     Lambda = _symmetric(problem, Lambda)
     point = _grounded_at(problem, poses) if poses is not None else None
@@ -154,16 +130,9 @@ def best_bound(problem: PGOProblem, Lambda: Array, poses: Poses | None, gap: flo
 
 
 def search_bound(prove: Callable[[float], LowerBound | None], smallest: float, trace: float, count: int) -> LowerBound:
-    """Bound with the smallest eta found; `NO_BOUND` when tr(Lambda) - eta n d would not be above zero.
+    """Bound that `prove` gives with the smallest eta found; `NO_BOUND` when tr(Lambda) - eta n d would not be above 0.
 
-    Parameters
-    ----------
-    prove : callable
-        Bound for eta, or None where none was proved.
-    smallest : float
-        First eta (`smallest_eta`).
-    trace, count : float, int
-        tr(Lambda) and n d.
+    The search begins with the eta `smallest` (`smallest_eta`); trace and count are tr(Lambda) and n d.
     """
     first = max(smallest, UNIT_ROUNDOFF * trace / count)  # at F = 0 the smallest would never grow
     found = smallest_eta(prove, first, below=trace / count)
@@ -181,15 +150,10 @@ def quadratic_loss(product: Array, error: Array | float, slack: Array) -> float:
 
 
 def squared_distances(moved: Array, rotations: Array) -> float:
-    """Bound on sum_i ||R_i^T - P_i Q||_F^2 over all rotations R_i, Q, for blocks P_i moved away from rotations.
+    """Bound on sum_i ||R_i^T - P_i Q||_F^2 over all rotations R_i, Q, for blocks P_i moved away from rotations P^_i.
 
     Two rotations are at most sqrt(8) apart, P_i is ||P_i - P^_i|| from P^_i, and that ||P^_i P^_i^T - I|| from one.
-    Rounding of these, a few u beside sqrt(8), is what `OUTWARD` is for.
-
-    Parameters
-    ----------
-    moved, rotations : (d n, d)
-        Rows of P_i and of P^_i.
+    Rounding of these, a few u beside sqrt(8), is what `OUTWARD` is for. Rows of P_i and of P^_i, (d n, d), are given.
     """
     d = rotations.shape[1]
     blocks = rotations.reshape(-1, d, d)
@@ -208,8 +172,7 @@ class _Ground:
 
 def _grounded_at(problem: PGOProblem, poses: Poses) -> _Ground:
     n, d = problem.num_poses, problem.d
-    r = middle_pose(problem.graph)
-    X = problem.stacked(poses)
+    r, X = middle_pose(problem.graph), problem.stacked(poses)
     X[:n] -= poses.t[r]
     X = X @ poses.R[r]
     rows = pose_rows(r, n, d)
@@ -252,9 +215,8 @@ def _prove_grounded(problem: PGOProblem, Lambda: Array, eta: float, ground: _Gro
     if slack is None:  # now the rounding of the factorisation is known
         return _prove_grounded(problem, Lambda, eta, ground)
     free, n = proof.free, problem.num_poses
-    quadratic = quadratic_loss(found.product[free], found.product_error[free], slack[free])
     lost = OUTWARD * eta * squared_distances(X[n:], ground.X[n:])
-    rounding = found.value_error + quadratic
+    rounding = found.value_error + quadratic_loss(found.product[free], found.product_error[free], slack[free])
     return bound_from([found.value, -lost], rounding, eta, is_grounded=True)
 
 

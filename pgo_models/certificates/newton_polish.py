@@ -8,8 +8,6 @@ One factorisation serves several moves. After the first, the factored matrix is 
 factorisation where moves with the factor alone need two.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,35 +38,18 @@ PROGRESS = 0.1  # what a move has to leave at most of the decrement for another 
 
 @dataclass(frozen=True, eq=False)
 class PolishState:
-    """Poses on the way to a stationary point.
-
-    Attributes
-    ----------
-    poses : Poses
-    objective : float
-    decrement : float
-        Half the squared Newton decrement at the poses, less the rounding level of F, over F: the relative decrease that
-        the quadratic model still promises and F can show. inf before the first factorisation.
-    is_newton : bool
-        Whether the last factored matrix was the Hessian, not its damped Gauss-Newton part.
-    moved : bool
-        Whether the last step changed the poses.
-    tolerance : float
-        On the decrement.
-    is_at_rounding : bool
-        Whether a Newton step, which squares a small decrement, hardly changed it: the gradient is rounding.
-    analysis, factor
-        Symbolic and last numeric factorisation, for the next step to reuse.
-    """
+    """Poses on the way to a stationary point."""
 
     poses: Poses
     objective: float
+    # Half the squared Newton decrement at the poses, less the rounding level of F, over F: the relative decrease that
+    # the quadratic model still promises and F can show. inf before the first factorisation.
     decrement: float = np.inf
-    is_newton: bool = False
-    moved: bool = True
-    is_at_rounding: bool = False
-    tolerance: float = STATIONARY_DECREMENT
-    analysis: SymbolicCholesky | None = None
+    is_newton: bool = False  # whether the last factored matrix was the Hessian, not its damped Gauss-Newton part
+    moved: bool = True  # whether the last step changed the poses
+    is_at_rounding: bool = False  # whether a Newton step hardly cut a small decrement, which it squares: rounding
+    tolerance: float = STATIONARY_DECREMENT  # on the decrement
+    analysis: SymbolicCholesky | None = None  # it and the last factor are for the next step to reuse
     factor: CholeskyFactor | None = None
 
     @property
@@ -131,8 +112,7 @@ def polish(problem: PGOProblem, poses: Poses, max_steps: int = 100) -> Poses:
 
     Examples
     --------
-    >>> from pgo_models.problem.initialization import chordal_start
-    >>> from pgo_models.graphs.scenes import grid
+    >>> from pgo_models import chordal_start, grid
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
     >>> start = chordal_start(problem)
     >>> bool(problem.objective(polish(problem, start)) < problem.objective(start))
@@ -248,10 +228,9 @@ def _backtrack(
         if problem.is_quadratic and length == 1.0 and objective <= NEARLY_EXACT * level:
             poses = problem.with_refined_translations(poses)
             objective = problem.objective(poses)
-        if objective <= state.objective + SUFFICIENT * length * slope:
-            return replace(state, poses=poses, objective=objective)
-        if length == 1.0 and objective <= state.objective * (1.0 + ROUNDING):
-            # Too near for F to tell; the decrement decides in the caller.
+        is_lower = objective <= state.objective + SUFFICIENT * length * slope
+        # Where it is too near for F to tell, the decrement decides in the caller.
+        if is_lower or (length == 1.0 and objective <= state.objective * (1.0 + ROUNDING)):
             return replace(state, poses=poses, objective=objective)
         length *= 0.5
     return None

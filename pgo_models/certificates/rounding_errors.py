@@ -6,8 +6,6 @@ of their absolute values, gamma_k = k u / (1 - k u), u = 2^-53. Bounds are round
 out by `has_safe_scale`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -41,22 +39,12 @@ def has_safe_scale(problem: PGOProblem) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """tr(X^T S X) + tr(Lambda) and S X at some X, as computed, and how far from exact they can be.
-
-    Attributes
-    ----------
-    value, value_error : float
-        The exact value is at least value - value_error.
-    product : (N, d)
-        S X.
-    product_error : (N, d)
-        Bound on its error, entry by entry.
-    """
+    """tr(X^T S X) + tr(Lambda) and S X at some X, as computed, and how far from exact they can be."""
 
     value: float
-    value_error: float
-    product: Array
-    product_error: Array
+    value_error: float  # the exact value is at least value - value_error
+    product: Array  # S X, (N, d)
+    product_error: Array  # bound on its error, entry by entry
 
 
 def evaluate_edges(problem: PGOProblem, X: Array, low: Array) -> Evaluation:
@@ -64,14 +52,7 @@ def evaluate_edges(problem: PGOProblem, X: Array, low: Array) -> Evaluation:
 
     A residual t_j - t_i - R_i t_ij is computed in this order, so that its error is in proportion to the edge, not to
     the coordinates: u |t_j - t_i| + gamma_d |R_i| |t_ij| + u |residual|. The last bits of coordinates in kilometres
-    would move it by more; hence `low`.
-
-    Parameters
-    ----------
-    problem : PGOProblem
-    X : (N, d)
-    low : (n, d)
-        To be added to the translations of X, exactly.
+    would move it by more; hence `low`, (n, d), to be added to the translations of X, exactly.
     """
     graph, n, d, weights = problem.graph, problem.num_poses, problem.d, problem.weights
     t, P = X[:n], X[n:].reshape(n, d, d)
@@ -219,18 +200,10 @@ def matrix_errors(problem: PGOProblem, diagonal: Array) -> Array:
 
 @dataclass(frozen=True)
 class ObjectiveRounding:
-    """How well F of given poses is known.
+    """How well F of given poses is known."""
 
-    Attributes
-    ----------
-    level : float
-        F of poses whose residuals are nothing but rounding: F below it cannot be told from zero.
-    error : float
-        Bound on the distance of F as computed from F at the exact rotations nearest to the poses.
-    """
-
-    level: float
-    error: float
+    level: float  # F of poses whose residuals are nothing but rounding: F below it cannot be told from zero
+    error: float  # bound on the distance of F as computed from F at the exact rotations nearest to the poses
 
 
 def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:

@@ -1,7 +1,5 @@
 """Where Q - Lambda is not positive semidefinite: a direction that shows it, by inverse Lanczos on a proven shift."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,40 +18,20 @@ _ACCURACY = 1e-3  # relative, of the eigenvalue: any direction that goes down wi
 
 @dataclass(frozen=True, eq=False)
 class NegativeCurvature:
-    """Smallest eigenvalue of Q - blockdiag(Lambda), which is negative.
+    """Smallest eigenvalue of Q - blockdiag(Lambda), which is negative."""
 
-    Attributes
-    ----------
-    value : float
-        v^T (Q - blockdiag(Lambda)) v: an upper bound on the eigenvalue, evidence but no proof.
-    v : (n, d)
-        Of norm 1.
-    shift : float
-        A little more than the eigenvalue is below zero.
-    factor : CholeskyFactor
-        Of S + shift blockdiag(0, I), positive definite.
-    """
-
-    value: float
-    v: Array
-    shift: float
-    factor: CholeskyFactor
+    value: float  # v^T (Q - blockdiag(Lambda)) v: an upper bound on the eigenvalue, evidence but no proof
+    v: Array  # (n, d), of norm 1
+    shift: float  # a little more than the eigenvalue is below zero
+    factor: CholeskyFactor  # of S + shift blockdiag(0, I), positive definite
 
 
 def negative_curvature(problem: PGOProblem, Lambda: Array, eta: float, rng: np.random.Generator) -> NegativeCurvature:
     """Smallest eigenvalue of Q - blockdiag(Lambda), where it is below -eta < 0, with its eigenvector.
 
     With eta about the smallest for which S + eta blockdiag(0, I) has a Cholesky factor, the inverse of Q - Lambda +
-    eta I has the wanted eigenvalue far above all others, so that Lanczos needs a handful of solves.
-
-    Parameters
-    ----------
-    problem : PGOProblem
-    Lambda : (n, d, d), symmetric
-    eta : float
-        A shift, positive, that does not make the matrix positive definite.
-    rng : np.random.Generator
-        Draws the first Lanczos vector.
+    eta I has the wanted eigenvalue far above all others, so that Lanczos needs a handful of solves. The eta given does
+    not make the matrix positive definite; `rng` draws the first Lanczos vector.
     """
     n, d = problem.num_poses, problem.d
     shift, factor = smallest_definite_shift(problem, Lambda, ETA_GROWTH * eta, too_small=eta)

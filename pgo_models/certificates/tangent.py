@@ -8,8 +8,6 @@ eigenvalue: those of I'_tt are at most `cap` times that. The largest cap is soug
 gives a bound without a shift.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -52,14 +50,9 @@ def soften(graph: PoseGraph, cap: float) -> PoseGraph:
 
 
 def softened_bound(problem: PGOProblem, poses: Poses) -> tuple[LowerBound, Poses, Array]:
-    """Bound with the largest cap found, the poses and the multipliers that it was found at.
+    """Bound on chi2 with the largest cap found, and the poses and multipliers that it was found at.
 
-    Parameters
-    ----------
-    problem : PGOProblem
-        With `Weighting.INFORMATION`.
-    poses : Poses
-        Where the search for the minima of the smaller costs begins.
+    The search for the minima of the smaller costs begins at the poses given.
     """
     best = NO_BOUND, poses, np.zeros_like(poses.R)
 

@@ -1,7 +1,5 @@
 """Huber's loss of whole edges as a change of the cvxpy model: squares up to a threshold, straight on beyond."""
 
-from __future__ import annotations
-
 import cvxpy as cp
 import numpy as np
 

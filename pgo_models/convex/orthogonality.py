@@ -6,8 +6,6 @@ The split form is step (a) of the paper's Algorithm 1 for any J: the same cvxpy 
 rho/2 ||X - V||^2 added, compiled once. The iteration is in solvers/convex/orthogonal.py.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -198,7 +196,7 @@ class OrthogonalProblem:
         parts += [float(np.linalg.norm(constraint.violation())) for constraint in self.problem.constraints]
         return float(np.linalg.norm(parts))
 
-    def split(self) -> SplitProblem:
+    def split(self) -> "SplitProblem":
         """Compile the subproblem."""
         root = cp.Parameter(nonneg=True, name="root")
         shifts = tuple(cp.Parameter(variable.shape, name="shift") for variable in self.variables)

@@ -1,7 +1,5 @@
 """What every edge measures beside what the poses say, in metres and radians, and chi2 in its conventions."""
 
-from __future__ import annotations
-
 import enum
 
 import numpy as np
@@ -18,10 +16,7 @@ UNCERTAIN_RATIO = 0.1  # of the median precision
 def edge_errors(graph: PoseGraph, poses: Poses) -> tuple[Array, Array, Array]:
     """||t_j - t_i - R_i t_ij|| in metres, angle of R_ij^T R_i^T R_j in radians, and summand of F, (m,) each.
 
-    Raises
-    ------
-    GraphError
-        When the poses are not those of the graph.
+    A GraphError when the poses are not those of the graph.
     """
     _check_poses(graph, poses)
     R_i, R_j = poses.R[graph.i], poses.R[graph.j]
@@ -58,7 +53,6 @@ def chi2(graph: PoseGraph, poses: Poses, convention: Chi2Convention = Chi2Conven
     chi2 = sum over edges of r^T I r, r = (r_t, r_r), with the error E_ij = (measurement)^-1 x_i^-1 x_j in the frame of
     the measured end pose: r_t = R_ij^T (R_i^T (t_j - t_i) - t_ij), and r_r as `convention` reads its rotation. The
     rotation block is taken to be of the rotation vector, in radians, also where g2o takes it to be of the quaternion.
-
     Which matrices count is said by `pgo_models.graphs.precisions.proper_information`.
 
     Raises
@@ -70,7 +64,6 @@ def chi2(graph: PoseGraph, poses: Poses, convention: Chi2Convention = Chi2Conven
 
     Examples
     --------
-    >>> import numpy as np
     >>> from pgo_models.graphs.scenes import circle
     >>> graph = circle(np.random.default_rng(0))
     >>> chordal, geodesic = (chi2(graph, graph.truth, c) for c in (Chi2Convention.CHORDAL, Chi2Convention.GEODESIC))

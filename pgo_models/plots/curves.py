@@ -1,7 +1,5 @@
 """Pictures of curves: the share of graphs that is certified over the noise, and quantities that decay."""
 
-from __future__ import annotations
-
 from itertools import cycle
 from typing import TYPE_CHECKING
 
@@ -17,7 +15,7 @@ _MOST_MARKERS = 15
 _LONG_LABEL = 25  # letters: two of them do not fit beside each other
 
 
-def plot_tightness(curves: list[tuple[str, Array, Array]]) -> Figure:
+def plot_tightness(curves: list[tuple[str, Array, Array]]) -> "Figure":
     """Figure of how many graphs are certified at which rotation noise.
 
     Every curve is a label, the noise in radians, (levels,), and the certified share there, (levels,), in [0, 1].
@@ -34,7 +32,7 @@ def plot_tightness(curves: list[tuple[str, Array, Array]]) -> Figure:
     return figure
 
 
-def plot_decay(curves: list[tuple[str, Array]], quantity: str) -> Figure:
+def plot_decay(curves: list[tuple[str, Array]], quantity: str) -> "Figure":
     """Figure of positive quantities over the iterations, on a logarithmic axis; `quantity` is what they are, with unit.
 
     Every curve is a label and its values from iterate 0 on.

@@ -5,8 +5,6 @@ BLAS kernels of `pgo_models.problem.kernels`. Every factor knows how far it can 
 (`pgo_models.problem.floating_point`), so that one that went through proves something in exact arithmetic.
 """
 
-from __future__ import annotations
-
 import enum
 import importlib.util
 import weakref
@@ -24,7 +22,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, FactorCounts, error_of_counts, gamma
 from pgo_models.problem.kernels import kernels_of_the_cpu
 
-_PERMUTE, _FORWARD = 7, 4  # CVXOPT's codes of x = P b and L x = b
+_WHOLE, _PERMUTE, _FORWARD = 0, 7, 4  # CVXOPT's codes of A x = b, x = P b and L x = b
 _Capsule = object  # a factorisation, which CVXOPT keeps to itself
 
 
@@ -58,13 +56,9 @@ class CholeskyFactor(ABC):
 
         R is the computed factor, so that A + diag(epsilon) diag(A) is positive definite. The argument
         (`pgo_models.problem.floating_point`) holds for diagonals between 1e-150 and 1e150, where nothing that counts
-        underflows.
-
-        Parameters
-        ----------
-        beside : int or (N,)
-            Non-zeros of further columns of R in its rows, as of `half_solve`: with them A is the leading block of a
-            larger matrix, and their own columns' share of E is counted apart (`column_error`).
+        underflows. `beside`, an int or (N,), are non-zeros of further columns of R in its rows, as of `half_solve`:
+        with them A is the leading block of a larger matrix, and their own columns' share of E is counted apart
+        (`column_error`).
         """
 
     @abstractmethod
@@ -96,18 +90,9 @@ class SymbolicCholesky(ABC):
 
     @abstractmethod
     def factorize(self, matrix: csc_array, overwrite: CholeskyFactor | None = None) -> CholeskyFactor:
-        """Factor a matrix of the analysed pattern.
+        """Factor a matrix of the analysed pattern; the memory of a factor to `overwrite`, from here, may be taken over.
 
-        Parameters
-        ----------
-        matrix : csc_array, (N, N)
-        overwrite : CholeskyFactor, optional
-            A factor from this analysis that is no longer needed; its memory may be taken over.
-
-        Raises
-        ------
-        NotPositiveDefiniteError
-            When the matrix is not positive definite in floating-point arithmetic, or has nan or inf.
+        A NotPositiveDefiniteError when it is not positive definite in floating-point arithmetic, or has nan or inf.
         """
 
     def expected_error(self, beside: int = 0) -> Array | None:
@@ -119,31 +104,17 @@ class SymbolicCholesky(ABC):
         return np.inf
 
     def _check(self, matrix: csc_array) -> None:
-        same = (
-            matrix.shape == self._shape
-            and np.array_equal(matrix.indptr, self._indptr)
-            and np.array_equal(matrix.indices, self._indices)
-        )
-        if not same:
+        same = np.array_equal(matrix.indptr, self._indptr) and np.array_equal(matrix.indices, self._indices)
+        if not same or matrix.shape != self._shape:
             raise ValueError("the matrix has another sparsity pattern than the one that was analysed")
         if not np.isfinite(matrix.data).all():
             raise NotPositiveDefiniteError("the matrix has nan or inf; check the weights and measurements")
 
 
 def analyze(pattern: csc_array, backend: CholeskyBackend | None = None) -> SymbolicCholesky:
-    """Order and analyse the pattern of a symmetric matrix.
+    """Order and analyse the pattern of a symmetric matrix, whose diagonal must be stored in full.
 
-    Parameters
-    ----------
-    pattern : csc_array, (N, N)
-        Only its pattern counts; its diagonal must be stored in full.
-    backend : CholeskyBackend, optional
-        `default_backend()` unless given.
-
-    Raises
-    ------
-    MissingExtraError
-        When CHOLMOD is asked for without the extra `fast`.
+    With `default_backend()` unless one is given; a MissingExtraError when CHOLMOD is, without the extra `fast`.
     """
     pattern.sort_indices()
     chosen = backend or default_backend()
@@ -156,7 +127,7 @@ def factorize(matrix: csc_array, backend: CholeskyBackend | None = None) -> Chol
 
 
 class _SuperLUFactor(CholeskyFactor):
-    def __init__(self, lu: SuperLU, analysis: _SuperLU, diagonal: Array) -> None:
+    def __init__(self, lu: SuperLU, analysis: "_SuperLU", diagonal: Array) -> None:
         self._lu = lu
         self._analysis = analysis
         self._rows = analysis.order[np.argsort(lu.perm_c)]  # in the order of elimination
@@ -247,7 +218,7 @@ class _SuperLU(SymbolicCholesky):
 class _CholmodFactor(CholeskyFactor):
     """CVXOPT factors in place, symbolic part included: that of a factor out of use is taken over by the next one."""
 
-    def __init__(self, numeric: _Capsule, analysis: _Cholmod) -> None:
+    def __init__(self, numeric: _Capsule, analysis: "_Cholmod") -> None:
         self._numeric: _Capsule | None = numeric  # None: used up
         self._analysis = analysis
 
@@ -255,12 +226,20 @@ class _CholmodFactor(CholeskyFactor):
         numeric, self._numeric = self._numeric, None
         return numeric
 
+    def solve(self, right_hand_side: Array) -> Array:
+        return self._solved(right_hand_side, _WHOLE)
+
     def half_solve(self, right_hand_side: Array) -> Array:
+        return self._solved(right_hand_side, _PERMUTE, _FORWARD)
+
+    def _solved(self, right_hand_side: Array, *systems: int) -> Array:
         cvxopt, cholmod = _import_cvxopt()
-        half = cvxopt.matrix(np.asfortranarray(right_hand_side, dtype=float))
-        for system in (_PERMUTE, _FORWARD):
-            cholmod.solve(self._numeric, half, sys=system)
-        return np.array(half).reshape(right_hand_side.shape)
+        if self._numeric is None:
+            raise ValueError("this factor was overwritten by a later one")
+        solution = cvxopt.matrix(np.asfortranarray(right_hand_side, dtype=float))
+        for system in systems:
+            cholmod.solve(self._numeric, solution, sys=system)
+        return np.array(solution).reshape(right_hand_side.shape)
 
     def take_apart(self) -> tuple[csc_array, np.ndarray]:
         parts, order = self._analysis.take_apart(self.overwrite())
@@ -279,16 +258,7 @@ class _CholmodFactor(CholeskyFactor):
         return self._analysis.counts().most_in_row(beside)
 
     def backward_error(self, beside: Array | int = 0) -> Array:
-        """Bound from the counts of non-zeros, which are those of the pattern."""
         return self._analysis.counts().error(beside)
-
-    def solve(self, right_hand_side: Array) -> Array:
-        cvxopt, cholmod = _import_cvxopt()
-        solution = cvxopt.matrix(np.asfortranarray(right_hand_side, dtype=float))
-        if self._numeric is None:
-            raise ValueError("this factor was overwritten by a later one")
-        cholmod.solve(self._numeric, solution)
-        return np.array(solution).reshape(right_hand_side.shape)
 
 
 class _Cholmod(SymbolicCholesky):
@@ -299,11 +269,9 @@ class _Cholmod(SymbolicCholesky):
         cvxopt, _ = _import_cvxopt()
         columns = np.repeat(np.arange(pattern.shape[1]), np.diff(pattern.indptr))
         self._lower = np.flatnonzero(pattern.indices >= columns)
-        rows = pattern.indices[self._lower].astype(np.int64)
-        self._is_diagonal = rows == columns[self._lower]
-        self._matrix = cvxopt.spmatrix(
-            1.0, cvxopt.matrix(rows), cvxopt.matrix(columns[self._lower].astype(np.int64)), pattern.shape
-        )
+        places = [of_all[self._lower].astype(np.int64) for of_all in (pattern.indices, columns)]
+        self._is_diagonal = places[0] == places[1]
+        self._matrix = cvxopt.spmatrix(1.0, *map(cvxopt.matrix, places), pattern.shape)
         # Symbolic parts with the factor that uses each. No finaliser gives them back: Ctrl-C in one would be lost.
         self._taken: list[tuple[weakref.ref[_CholmodFactor] | None, _Capsule]] = [(None, self._analyze())]
         self._counts: FactorCounts | None = None
@@ -312,7 +280,6 @@ class _Cholmod(SymbolicCholesky):
         return self._counts.error(beside) if self._counts is not None else None
 
     def crude_error(self) -> float:
-        """Bound from rows and columns of N non-zeros."""
         return float(error_of_counts(np.array(float(self._shape[0])), self._shape[0]))
 
     def counts(self) -> FactorCounts:

@@ -12,8 +12,6 @@ a_jj / (1 - gamma). With c_j non-zeros in column j of R and at most p in a row, 
 A bound a row, not one for all: a loop leaves one long column beside thousands of short ones.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import overload
 

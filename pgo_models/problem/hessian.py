@@ -5,8 +5,6 @@ V_{t_i} = v_i^T and V_{R_i} = -hat(w_i) R_i^T: theta = 1 is Newton; theta = 0 is
 linear in X (Rosen et al. 2019, section 4).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,12 +49,10 @@ class TangentLayout:
 
 
 def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) -> csc_array:
-    """Hessian of F(R Exp(hat(w)), t + v) in (v, w), with theta Lambda given as `Lambda`; None is Gauss-Newton.
+    """Hessian of F(R Exp(hat(w)), t + v) in (v, w), (side, side); `Lambda` is theta Lambda, None is Gauss-Newton.
 
-    Returns
-    -------
-    csc_array, (side, side), symmetric; its pattern depends on the graph alone. A rigid motion of all poses is in its
-    null space at stationary points: ground a pose before factoring, as `pgo_models.certificates.newton_polish` does.
+    Its pattern depends on the graph alone. A rigid motion of all poses is in its null space at stationary points:
+    ground a pose before factoring, as `pgo_models.certificates.newton_polish` does.
     """
     graph, d = problem.graph, problem.d
     layout = TangentLayout(problem.num_poses, d)

@@ -1,7 +1,5 @@
 """Arrays of edges against arrays of poses: residual rows as blocks, sums over the edges of a pose, block Laplacians."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +20,7 @@ class Incidence:
     j: IntArray
 
     @classmethod
-    def of(cls, graph: PoseGraph) -> Incidence:
+    def of(cls, graph: PoseGraph) -> "Incidence":
         """Incidence of a graph."""
 
         def ones(pose: IntArray) -> csr_array:

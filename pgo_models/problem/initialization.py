@@ -1,7 +1,5 @@
 """Starts: noisy truth (GPS / IMU), odometry, breadth-first spanning tree, and the chordal relaxation."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -24,12 +22,7 @@ from pgo_models.problem.problem import PGOProblem
 def gps_imu_start(truth: Poses, translation_std: float, rotation_std: float, rng: np.random.Generator) -> Poses:
     """Truth under noise: t_i + N(0, translation_std^2 I) and R_i Exp(N(0, rotation_std^2 I)) (paper: section `sec3`).
 
-    Parameters
-    ----------
-    truth : Poses
-    translation_std, rotation_std : float
-        Standard deviations, metres and radians.
-    rng : np.random.Generator
+    Standard deviations are in metres and radians.
     """
     n, d = truth.num_poses, truth.d
     t = truth.t + rng.normal(0.0, translation_std, (n, d))

@@ -5,8 +5,6 @@ loaded before, keep what they chose. Fused multiply-adds and sums in another ord
 bounds on its error are for any order, with or without them (`pgo_models.problem.floating_point`).
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ to second order (Laplace) moves have the covariance (Hess F / 2)^-1. That takes 
 and 2 kappa for that of an angle: I_theta with `RotationWeight.GAUSSIAN`; SE-Sync's kappa in the plane says 2 I_theta.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path

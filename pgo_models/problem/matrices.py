@@ -3,8 +3,6 @@
 Unknowns are stacked in X, (N, d) with N = (d+1) n: first the n rows t_i, then the d rows of every R_i^T.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -82,9 +80,8 @@ def joint_matrix(graph: PoseGraph, weights: EdgeWeights | None = None) -> csc_ar
         R_i:  kappa I + tau t_ij t_ij^T           R_j: -kappa R_ij
         R_j:  kappa I
 
-    for W = kappa I; see `edge_blocks`.
-
-    The pattern holds every diagonal d x d block in full, so that multipliers can be subtracted in place.
+    for W = kappa I; see `edge_blocks`. The pattern holds every diagonal d x d block in full, so that multipliers can be
+    subtracted in place.
     """
     n, d = graph.num_poses, graph.d
     weights = weights if weights is not None else isotropic_weights(graph)
@@ -130,11 +127,7 @@ def marginalized_matrix(graph: PoseGraph, weights: EdgeWeights | None = None) ->
     """Q, (dn, dn) and dense: min over t of F = tr(Y^T Q Y), Y the rows R_i^T.
 
     Q = M_RR - M_Rt (M_tt)^+ M_tR, the Schur complement of the translations (SE-Sync: Rosen et al. 2019, equation 22).
-
-    Raises
-    ------
-    SettingError
-        When its side would exceed `MAX_DENSE_SIDE`; `PGOProblem.apply_Q` multiplies with it at any size.
+    A SettingError when its side would exceed `MAX_DENSE_SIDE`; `PGOProblem.apply_Q` multiplies with it at any size.
     """
     n, d = graph.num_poses, graph.d
     if d * n > MAX_DENSE_SIDE:

@@ -1,7 +1,5 @@
 """PGOProblem: the cost of a pose graph, its gradients, its matrices and exact translations (paper: `min overall`)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,18 +12,9 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes, vee
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.precisions import proper_information
+from pgo_models.problem import matrices
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, analyze, factorize
 from pgo_models.problem.incidence import Incidence, block_laplacian, blocks_of_rows, rows_of_blocks
-from pgo_models.problem.matrices import (
-    block_entries,
-    connection_laplacian,
-    entry_positions,
-    isotropic_weights,
-    joint_matrix,
-    marginalized_matrix,
-    residual_matrix,
-    rotation_columns,
-)
 from pgo_models.problem.weighting import EdgeWeights, Weighting, convex_weights, edge_weights
 
 
@@ -58,7 +47,6 @@ class PGOProblem:
     Examples
     --------
     >>> from pgo_models.graphs.scenes import circle
-    >>> import numpy as np
     >>> problem = PGOProblem(circle(np.random.default_rng(0)))
     >>> problem
     PGOProblem('circle', d=3, poses=25, edges=300)
@@ -99,7 +87,7 @@ class PGOProblem:
         if isinstance(self.weighting, EdgeWeights):
             return self.weighting
         is_F = self.weighting is Weighting.ISOTROPIC
-        return isotropic_weights(self.graph) if is_F else edge_weights(self.graph, self._information)
+        return matrices.isotropic_weights(self.graph) if is_F else edge_weights(self.graph, self._information)
 
     @cached_property
     def _information(self) -> Array:
@@ -111,7 +99,7 @@ class PGOProblem:
         return self.weights.excess is None
 
     @cached_property
-    def convex_part(self) -> PGOProblem:
+    def convex_part(self) -> "PGOProblem":
         """The problem itself if its cost is quadratic and convex in (R, t), else one near it: what SOC is run on."""
         if self.is_quadratic and self.weights.is_convex:
             return self
@@ -123,7 +111,7 @@ class PGOProblem:
             kind = "convex and quadratic in (R, t)" if convex else "quadratic in (R, t)"
             raise SettingError(f"{method} needs a cost that is {kind}, as F is, and chi2 here is not; use convex_part")
 
-    def tangent_at(self, poses: Poses) -> PGOProblem:
+    def tangent_at(self, poses: Poses) -> "PGOProblem":
         """Quadratic problem with F(X) <= chi2(X) for all poses, and equal value and gradient at the given ones."""
         excess = self.weights.excess
         if excess is None:
@@ -138,7 +126,7 @@ class PGOProblem:
         return found
 
     @cached_property
-    def _touched(self) -> list[tuple[Poses, PGOProblem]]:
+    def _touched(self) -> list[tuple[Poses, "PGOProblem"]]:
         return []
 
     # Matrices, each built when first asked for, read-only: what follows from them is kept, too.
@@ -146,28 +134,29 @@ class PGOProblem:
     @cached_property
     def M(self) -> csc_array:
         """M, (N, N): F = tr(X^T M X)."""
-        return read_only(joint_matrix(self.graph, self.weights))
+        return read_only(matrices.joint_matrix(self.graph, self.weights))
 
     @cached_property
     def L(self) -> csc_array:
         """L, (dn, dn): the rotation part of F is tr(Y^T L Y) for Y the rows R_i^T."""
-        return read_only(connection_laplacian(self.graph, self.weights))
+        return read_only(matrices.connection_laplacian(self.graph, self.weights))
 
     @cached_property
     def Q(self) -> Array:
         """Q, (dn, dn), dense: min over t of F is tr(Y^T Q Y) for Y the rows R_i^T; for small graphs."""
-        return read_only(marginalized_matrix(self.graph, self.weights))
+        return read_only(matrices.marginalized_matrix(self.graph, self.weights))
 
     @cached_property
     def residual_matrix(self) -> tuple[csr_array, Array]:
         """A, ((d+1) m, N), and w: F = sum_rows w ||A X||^2."""
-        A, w = residual_matrix(self.graph, self.weights)
+        A, w = matrices.residual_matrix(self.graph, self.weights)
         return read_only(A), read_only(w)
 
-    @property
+    @cached_property
     def plain_residual_matrix(self) -> csr_array:
         """A with the rotation residuals as they are, not along the axes of W."""
-        return self.residual_matrix[0] if self.weights.axes is None else self._unturned_residual_matrix
+        is_plain = self.weights.axes is None
+        return self.residual_matrix[0] if is_plain else read_only(matrices.residual_matrix(self.graph)[0])
 
     @cached_property
     def analysis(self) -> SymbolicCholesky:
@@ -178,14 +167,14 @@ class PGOProblem:
     def diagonal_positions(self) -> IntArray:
         """Positions in `M.data` of the diagonal of M, (N,)."""
         all_rows = np.arange(self.side)
-        return read_only(entry_positions(self.M, all_rows, all_rows))
+        return read_only(matrices.entry_positions(self.M, all_rows, all_rows))
 
     @cached_property
     def block_positions(self) -> IntArray:
         """Positions in `M.data` of the diagonal d x d rotation blocks of M, (n, d, d)."""
         n, d = self.num_poses, self.d
-        block = rotation_columns(np.arange(n), n, d)
-        return read_only(entry_positions(self.M, *block_entries(block, block)))
+        block = matrices.rotation_columns(np.arange(n), n, d)
+        return read_only(matrices.entry_positions(self.M, *matrices.block_entries(block, block)))
 
     def with_pattern_of_M(self, data: Array) -> csc_array:
         """Return the matrix that has the pattern of M and the given stored values."""
@@ -300,13 +289,7 @@ class PGOProblem:
             poses, objective = refined, self.objective(refined)
 
     def stacked(self, poses: Poses) -> Array:
-        """X of poses, after a check that they fit this graph.
-
-        Raises
-        ------
-        GraphError
-            When their number or dimension differs from the graph's, or they are no Poses.
-        """
+        """X of poses; a GraphError when their number or dimension differs from the graph's, or they are no Poses."""
         if not isinstance(poses, Poses):
             raise GraphError(
                 f"poses are a {type(poses).__name__}; give Poses(R, t), or problem.with_best_translations(R)"
@@ -314,10 +297,6 @@ class PGOProblem:
         if poses.t.shape != (self.num_poses, self.d):
             raise GraphError(f"{poses} beside {self}; give one pose for every pose of the graph, in its order")
         return poses.stacked()
-
-    @cached_property
-    def _unturned_residual_matrix(self) -> csr_array:
-        return read_only(residual_matrix(self.graph)[0])
 
     @cached_property
     def incidence(self) -> Incidence:
@@ -350,24 +329,12 @@ class PGOProblem:
         return self.M[self.num_poses :].tocsr()
 
 
-_OF_THE_PATTERN = (
-    "residual_matrix",
-    "analysis",
-    "diagonal_positions",
-    "block_positions",
-    "incidence",
-    "_unturned_residual_matrix",
-)
+_OF_THE_PATTERN = {"residual_matrix", "plain_residual_matrix", "analysis", "incidence"}
+_OF_THE_PATTERN |= {"diagonal_positions", "block_positions"}
 
 
 def as_problem(given: object) -> PGOProblem:
-    """Return the problem that is given, or that of the graph that is given.
-
-    Raises
-    ------
-    SettingError
-        When it is neither.
-    """
+    """Return the problem that is given, or that of the graph that is given; a SettingError when it is neither."""
     if isinstance(given, PoseGraph):
         return PGOProblem(given)
     if isinstance(given, PGOProblem):

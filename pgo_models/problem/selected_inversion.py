@@ -8,8 +8,6 @@ I is among the rows of the parent in the elimination tree, whose front, Z in all
 one goes down from the roots.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -11,8 +11,6 @@ the translations, r^T (I_tt - tau I) r for a tau below the smallest eigenvalue, 
 couples them with the rotation: see `Excess`.
 """
 
-from __future__ import annotations
-
 import enum
 import math
 from dataclasses import dataclass
@@ -41,34 +39,18 @@ class Weighting(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class EdgeWeights:
-    """Weights of the residuals of every edge.
+    """Weights of the residuals of every edge."""
 
-    Attributes
-    ----------
-    tau : (m,)
-    kappa : (m,), or (m, d) with `axes`
-        W = kappa I, or U diag(kappa) U^T: negative where the cost is not convex.
-    axes : (m, d, d), optional
-        U, orthogonal to rounding.
-    W_given : (m, d, d), optional
-        W itself, with `axes`.
-    W_error : (m,), optional
-        Bound on the Frobenius norm of what W is off from that of the information matrices.
-    excess : Excess, optional
-        What of the cost is not quadratic in the poses.
-    tangent : Tangent, optional
-        A minorant of it, which is; in its place.
-    """
-
-    tau: Array
+    tau: Array  # (m,)
+    # (m,), or (m, d) with `axes`: W = kappa I, or U diag(kappa) U^T, negative where the cost is not convex.
     kappa: Array
-    axes: Array | None = None
-    W_given: Array | None = None
-    W_error: Array | None = None
-    excess: Excess | None = None
-    tangent: Tangent | None = None
+    axes: Array | None = None  # U, (m, d, d), orthogonal to rounding
+    W_given: Array | None = None  # W itself, (m, d, d), with `axes`
+    W_error: Array | None = None  # (m,): bound on the Frobenius norm of what W is off from the information matrices'
+    excess: "Excess | None" = None  # what of the cost is not quadratic in the poses
+    tangent: "Tangent | None" = None  # a minorant of it, which is; in its place
 
-    def of_edges(self, chosen: IntArray | BoolArray) -> EdgeWeights:
+    def of_edges(self, chosen: IntArray | BoolArray) -> "EdgeWeights":
         """Weights of some of the edges; of a cost, not of a tangent."""
         axes, W_given, W_error = (
             None if one is None else one[chosen] for one in (self.axes, self.W_given, self.W_error)
@@ -76,7 +58,7 @@ class EdgeWeights:
         excess = None if self.excess is None else self.excess.of_edges(chosen)
         return EdgeWeights(self.tau[chosen], self.kappa[chosen], axes, W_given, W_error, excess)
 
-    def scaled(self, share: Array) -> EdgeWeights:
+    def scaled(self, share: Array) -> "EdgeWeights":
         """Weights times shares, (m,); of a cost, not of a tangent."""
         wide = share[:, None, None]
         return EdgeWeights(
@@ -124,16 +106,11 @@ class Tangent:
 
     It holds for whatever numbers C has: `loss` is what those that are stored can be off by, so that the minorant is
     below the convex function that the exact ones touch.
-
-    Attributes
-    ----------
-    C, Z : (m, d + 1, d)
-    excess : Excess
     """
 
-    C: Array
-    Z: Array
-    excess: Excess
+    C: Array  # (m, d + 1, d)
+    Z: Array  # Z*, (m, d + 1, d)
+    excess: "Excess"
 
     @cached_property
     def value(self) -> Array:
@@ -195,33 +172,22 @@ class Excess:
     definite. Without coupling blocks u = r and there is no K. A tangent of this function is quadratic in the poses,
     with the pattern of M: what a relaxation with matrix weights gains only by many redundant constraints (Holmes,
     Duembgen & Barfoot 2024).
-
-    Attributes
-    ----------
-    R_ij : (m, d, d)
-    J : (m, q, q)
-        q = d, or d + 1 or d + 3 with coupling blocks.
-    K : (m, p, p) or None
-        p = 1 in the plane, 3 in space.
-    size : (m, 2)
-        Of translations and rotations, each in its units: absolute values that a block (a, b) of J or K is computed from
-        have norms of at most size_a size_b.
-    least : (m, 2)
-        J is at least the diagonal matrix of these, K at least the second.
     """
 
-    R_ij: Array
-    J: Array
-    K: Array | None
+    R_ij: Array  # (m, d, d)
+    J: Array  # (m, q, q), q = d, or d + 1 or d + 3 with coupling blocks
+    K: Array | None  # (m, p, p), p = 1 in the plane, 3 in space
+    # (m, 2), of translations and rotations, each in its units: absolute values that a block (a, b) of J or K is
+    # computed from have norms of at most size_a size_b.
     size: Array
-    least: Array
+    least: Array  # (m, 2): J is at least the diagonal matrix of these, K at least the second
 
-    def of_edges(self, chosen: IntArray | BoolArray) -> Excess:
+    def of_edges(self, chosen: IntArray | BoolArray) -> "Excess":
         """The excess of some of the edges."""
         K = None if self.K is None else self.K[chosen]
         return Excess(self.R_ij[chosen], self.J[chosen], K, self.size[chosen], self.least[chosen])
 
-    def scaled(self, share: Array) -> Excess:
+    def scaled(self, share: Array) -> "Excess":
         """The excess times shares, (m,)."""
         wide, K = share[:, None, None], None if self.K is None else share[:, None, None] * self.K
         size = OUTWARD * np.sqrt(share)[:, None] * self.size
@@ -257,10 +223,7 @@ class Excess:
     def derivatives(self, relative: Array, apart: Array) -> tuple[Array, Array | None]:
         """Derivatives of u and H, (m, q, 2 d + 2 p) and (m, p, p, 2 p), in (R_i^T v_i, R_i^T v_j, w_i, w_j), at poses.
 
-        Parameters
-        ----------
-        relative, apart : (m, d, d), (m, d)
-            R_i^T R_j and R_i^T (t_j - t_i).
+        Of these, R_i^T R_j, (m, d, d), and R_i^T (t_j - t_i), (m, d), are given.
         """
         m, d = apart.shape
         p = tangent_dimension(d)
@@ -290,13 +253,8 @@ class Excess:
 def edge_weights(graph: PoseGraph, information: Array) -> EdgeWeights:
     """Weights of a graph's edges in chi2 of information matrices, (m, k, k), as of `proper_information`.
 
-    Coupling blocks count where the whole information matrix is positive definite.
-
-    Raises
-    ------
-    GraphError
-        When an information matrix is too far from isotropic for double precision, or an edge without a position is
-        beside one that is not isotropic; it names the edge.
+    Coupling blocks count where the whole information matrix is positive definite. A GraphError names the edge whose
+    matrix is too far from isotropic for double precision, or that has no position beside one that is not isotropic.
     """
     d, p = graph.d, tangent_dimension(graph.d)
     I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]

@@ -14,8 +14,6 @@ A partial matrix on a chordal pattern has a PSD completion when its cliques are 
 lost; and only differences of translations occur, so that none has to be grounded.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -49,7 +47,7 @@ class CliqueRelaxation:
     equalities: cp.Constraint
     semidefinite: tuple[cp.Constraint, ...]  # W_C PSD, one for every clique
     scale: float  # of the objective: F at the centre, or for noise-free graphs a share of L
-    _layout: _Layout
+    _layout: "_Layout"
     _to_Lambda: csr_array
 
     def W(self, k: int) -> Array:
@@ -136,7 +134,7 @@ class _Layout:
     home: IntArray  # (n,): the clique nearest to the root that holds a pose
 
     @classmethod
-    def of(cls, problem: PGOProblem, tree: CliqueTree, centre: Poses) -> _Layout:
+    def of(cls, problem: PGOProblem, tree: CliqueTree, centre: Poses) -> "_Layout":
         d, graph = problem.d, problem.graph
         reference, columns = [], []
         home = np.full(problem.num_poses, -1)

@@ -1,7 +1,5 @@
 """Pictures of methods beside each other: the gap against rounds, bytes and seconds, one panel for each."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -23,7 +21,7 @@ _MARKER_DISTANCE = 0.08  # of the diagonal of a panel
 _MOST_POINTS = 400  # of a curve in a page: sweeps by the thousand would make it slow
 
 
-def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -> Figure:
+def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -> "Figure":
     """Figure of the gap of several methods over what they spent; a panel holds those whose effort is counted.
 
     There is a panel for each effort, all but that of iterations with a logarithmic axis. A SettingError when there is
@@ -48,7 +46,7 @@ def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -
     return figure
 
 
-def explore_efforts(curves: Sequence[Curve], title: str = "") -> PlotlyFigure:
+def explore_efforts(curves: Sequence[Curve], title: str = "") -> "PlotlyFigure":
     """Plotly figure of what `plot_efforts` shows; an entry of the legend shows and hides a method in all panels."""
     panels = _panels(curves, _PANELS)
     styles = _styles(curves, _DASHES)

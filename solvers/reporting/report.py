@@ -1,7 +1,5 @@
 """The report of a solve: one HTML file that opens offline and says how good the answer is and what to try next."""
 
-from __future__ import annotations
-
 import enum
 import html
 from collections.abc import Sequence
@@ -167,8 +165,8 @@ def _partition(solution: Solved) -> Partition:
 
 def _header(solution: Solved) -> str:
     graph = solution.problem.graph
-    about = f"{len(graph.bodies)} poses, {graph.num_edges} edges{graph.extras}, {graph.d}D"
-    about += f"; solved in {solution.seconds:.3g} s"
+    size = f"{len(graph.bodies)} poses, {graph.num_edges} edges{graph.extras}, {graph.d}D"
+    about = f"{size}; solved in {solution.seconds:.3g} s"
     return f"<header><h1>{html.escape(graph.name)}</h1>{paragraph(about, quiet=True)}</header>"
 
 
@@ -225,12 +223,9 @@ def _robots(solution: Solved, robots: Partition, residuals: EdgeResiduals) -> st
     lines = [f"{count} robots, {robots.method.value}." if count > 1 else "One robot holds the whole graph."]
     ledger = solution.ledger
     if ledger is not None:
-        reduced = (
-            f", {ledger.all_reduces} all-reduces ({ledger.all_reduce_bytes:,} bytes)" if ledger.all_reduces else ""
-        )
-        lines.append(
-            f"Communication: {ledger.rounds} rounds, {ledger.messages:,} messages, {ledger.num_bytes:,} bytes{reduced}."
-        )
+        sent = f"{ledger.rounds} rounds, {ledger.messages:,} messages, {ledger.num_bytes:,} bytes"
+        sums = f", {ledger.all_reduces} all-reduces ({ledger.all_reduce_bytes:,} bytes)" if ledger.all_reduces else ""
+        lines.append(f"Communication: {sent}{sums}.")
         if ledger.num_robots == count:
             columns.append(("bytes sent", ledger.bytes_sent.tolist()))
             columns.append(("bytes received", ledger.bytes_received.tolist()))

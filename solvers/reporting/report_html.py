@@ -1,7 +1,5 @@
 """The frame of a report: one HTML page with its style, its script and plotly inside, which asks for nothing online."""
 
-from __future__ import annotations
-
 import html
 import json
 from collections.abc import Sequence

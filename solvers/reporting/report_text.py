@@ -1,7 +1,5 @@
 """What a report says in words: what the verdict means for this answer, and what to try next."""
 
-from __future__ import annotations
-
 import math
 import shlex
 from dataclasses import dataclass
@@ -16,6 +14,14 @@ _NEARLY = 1e-4  # a gap below it is called nearly closed
 _FINER_GAP = 1e-9
 _SMALL_GAP = 1e-8
 _PESSIMISTIC = 0.25  # of the cost that is expected: standard deviations are twice too large
+_TRIVIAL = (
+    "The certificate matrix has an eigenvalue so far below zero that the bound it gives is worse than zero. Either the "
+    "poses are a local optimum, or the measurements contradict each other so much that the relaxation says nothing."
+)
+_NOT_TIGHT = (
+    "The bound is the best that the semidefinite relaxation has: it is not tight for these measurements, which happens "
+    "when they are very noisy or some are wrong. The poses may be optimal all the same; this method cannot tell."
+)
 
 
 @dataclass(frozen=True)
@@ -31,57 +37,41 @@ def headline(certificate: Certificate) -> str:
     if certificate.verdict is Verdict.EXACT:
         return "Certified: the measurements agree to the last digits of double precision, and the poses fit them all."
     if certificate.verdict is Verdict.CERTIFIED:
-        return f"Certified: the cost of these poses is the least possible, to within {_excess(certificate)}."
+        return f"Certified: the cost of these poses is the least possible, to within {percent(certificate.gap)} of it."
     if certificate.verdict is Verdict.TRIVIAL:
-        return (
-            f"Not certified: nothing better than {certificate.cost} >= 0 is proven, so these poses may be far from the "
-            "best ones."
-        )
-    return (
-        f"Not certified: the cost of these poses may be too high by up to {_excess(certificate)}; less was asked for."
-    )
+        nothing = f"nothing better than {certificate.cost} >= 0 is proven"
+        return f"Not certified: {nothing}, so these poses may be far from the best ones."
+    most = f"{percent(certificate.gap)} of it"
+    return f"Not certified: the cost of these poses may be too high by up to {most}; less was asked for."
 
 
 def meaning(certificate: Certificate) -> list[str]:
     """Return what the figures mean, in a few sentences that need no further reading."""
     bound, cost = certificate.lower_bound, f"{certificate.cost} = {certificate.objective:.10g}"
-    sentences = [f"The poses cost {cost}: the sum, over all measurements, of squared errors times precisions."]
+    first = f"The poses cost {cost}: the sum, over all measurements, of squared errors times precisions."
     if certificate.verdict is Verdict.EXACT:
-        sentences.append(
-            f"{certificate.cost} cannot be told from zero: rounding alone makes up to "
-            f"{certificate.rounding_level:.2g} of it, and as a sum of squares it is never below zero."
-        )
-        return sentences
+        exact = f"{certificate.cost} cannot be told from zero: rounding alone makes up to "
+        exact += f"{certificate.rounding_level:.2g} of it, and as a sum of squares it is never below zero."
+        return [first, exact]
     if certificate.verdict is Verdict.TRIVIAL:
-        sentences.append(
-            "The certificate matrix has an eigenvalue so far below zero that the bound it gives is worse than zero. "
-            "Either the poses are a local optimum, or the measurements contradict each other so much that the "
-            "relaxation says nothing."
-        )
-        return sentences
-    sentences.append(
+        return [first, _TRIVIAL]
+    proven = (
         f"It is proven that no choice of poses whatever costs less than {bound:.10g}, so the best possible cost is "
         f"between the two: the gap is {gap_text(certificate.gap)}, and {certificate.wanted_gap:.3g} was asked for."
     )
-    sentences.append(
+    proof = (
         f"The proof is a Cholesky factorisation that went through ({certificate.proof}; {certificate.source.value}). "
         "It holds in exact arithmetic, however the poses were found."
     )
     if certificate.verdict is Verdict.CERTIFIED:
-        sentences.append(
-            "Certified means optimal for these measurements and weights; it cannot vouch for the measurements."
-        )
+        last = "Certified means optimal for these measurements and weights; it cannot vouch for the measurements."
     elif certificate.gap <= _NEARLY:
-        sentences.append("The gap is nearly closed: the poses are as good as optimal for most purposes.")
+        last = "The gap is nearly closed: the poses are as good as optimal for most purposes."
     elif certificate.source is BoundSource.RELAXATION:
-        sentences.append(
-            "The bound is the best that the semidefinite relaxation has: it is not tight for these measurements, which "
-            "happens when they are very noisy or some are wrong. The poses may be optimal all the same; this method "
-            "cannot tell."
-        )
+        last = _NOT_TIGHT
     else:
-        sentences.append("The poses may be optimal all the same, or a local optimum; this bound cannot tell.")
-    return sentences
+        last = "The poses may be optimal all the same, or a local optimum; this bound cannot tell."
+    return [first, proven, proof, last]
 
 
 def advice(
@@ -147,11 +137,6 @@ def percent(share: float) -> str:
     return f"{text.rstrip('0').rstrip('.') if '.' in text else text} %"
 
 
-def _excess(certificate: Certificate) -> str:
-    """How much of F there is above the bound, as a share of it."""
-    return f"{percent(certificate.gap)} of it"
-
-
 def _unfinished(status: Status, solve: str) -> Advice:
     if status is Status.MAX_ITERATIONS:
         return Advice("The run ended at its iteration limit: give it more.", f"{solve} --max-iterations 2000")
@@ -163,28 +148,18 @@ def _unfinished(status: Status, solve: str) -> Advice:
 def _uncertified(graph: PoseGraph, certificate: Certificate, solve: str) -> list[Advice]:
     if certificate.gap <= _NEARLY and certificate.verdict is not Verdict.TRIVIAL:
         reached = 10.0 ** math.ceil(math.log10(max(certificate.gap, 1e-16)))
-        return [
-            Advice(
-                "The gap asked for is finer than what was proven here; ask for the one that was reached.",
-                f"{solve} --gap {reached:g}",
-            )
-        ]
+        finer = "The gap asked for is finer than what was proven here; ask for the one that was reached."
+        return [Advice(finer, f"{solve} --gap {reached:g}")]
+    better = "Look for better poses, which would close the gap from above: start from a spanning tree of the edges."
     found = [
-        Advice(
-            "Look for better poses, which would close the gap from above: start from a spanning tree of the edges.",
-            f"{solve} --start tree",
-        ),
+        Advice(better, f"{solve} --start tree"),
         Advice("Go straight from the chordal start to Newton.", f"{solve} --method newton"),
     ]
     if graph.initial is not None:
         found.insert(1, Advice("Start from the estimate that came with the graph.", f"{solve} --start file"))
     if certificate.source is BoundSource.RELAXATION:
-        found.append(
-            Advice(
-                "Better poses may not exist; then only better measurements close the gap: more of them, less noisy "
-                "ones, or without those that are wrong.",
-                f"{solve} --robust gnc",
-            )
-        )
+        wanted = "more of them, less noisy ones, or without those that are wrong"
+        text = f"Better poses may not exist; then only better measurements close the gap: {wanted}."
+        found.append(Advice(text, f"{solve} --robust gnc"))
     found.append(Advice("Keep what there is, with the gap as a warning.", f"{solve} --out solved.g2o"))
     return found

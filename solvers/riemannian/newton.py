@@ -1,7 +1,5 @@
 """Second stage: damped Riemannian Newton, or Gauss-Newton, with sparse Cholesky; F never rises (paper: after SOC)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, PolishState, polish_step, start_polish

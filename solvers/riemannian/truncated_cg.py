@@ -35,11 +35,8 @@ def truncated_conjugate_gradients(
     It ends inside when the residual has fallen by the factor `forcing`, in the norm of P^-1, or its square
     <r, P^-1 r> to `floor`, and at the boundary along the first direction that leaves the region or has no positive
     curvature. H, `hessian`, is symmetric on the tangent space, P^-1, `precondition`, positive definite, too; the radius
-    is in the norm ||s||_P^2 = <s, P s>, in which the iterates grow.
-
-    References
-    ----------
-    Steihaug 1983; Toint 1981; Conn, Gould & Toint, Trust-Region Methods, algorithm 7.5.1.
+    is in the norm ||s||_P^2 = <s, P s>, in which the iterates grow (Steihaug 1983; Toint 1981; Conn, Gould & Toint,
+    Trust-Region Methods, algorithm 7.5.1).
     """
     step, H_step, residual = np.zeros_like(gradient), np.zeros_like(gradient), gradient
     z = precondition(residual)

@@ -1,7 +1,5 @@
 """What a robot that holds copies knows, and what such robots tell each other and whoever sums up."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -180,7 +178,7 @@ class Waiting:
     least: float = math.inf
     turns_since: int = 0
 
-    def after(self, merit: float) -> Waiting:
+    def after(self, merit: float) -> "Waiting":
         """Relax less on stagnation (no new best residual): over-relaxed steps may cycle."""
         if merit <= _PROGRESS * self.least:
             return replace(self, least=merit, turns_since=0)

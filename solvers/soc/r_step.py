@@ -3,8 +3,6 @@
 X(V) = argmin  sum_rows w ||A X||^2 + 1/2 ||sqrt(D) (X - V)||_F^2,     (M + D/2) X = D/2 V
 """
 
-from __future__ import annotations
-
 import enum
 from dataclasses import dataclass
 from functools import cached_property
@@ -142,7 +140,7 @@ class _Fista:
 
 @dataclass(frozen=True, eq=False)
 class _Clarabel:
-    qp: RotationQP
+    qp: "RotationQP"
     grounded_rows: int
 
     def solve(self, V: Array) -> Array:

@@ -8,8 +8,6 @@
 Ebrahimi & Deghat, Algorithm 1 (`algo1: SOC`); Lai & Osher 2014.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any
@@ -38,7 +36,7 @@ class SOCState(Steps):
     r_step: RotationStep  # back end of step (a), prepared for the present rho
 
     @property
-    def steps(self) -> SOCState:
+    def steps(self) -> "SOCState":
         """Residuals, and what they say of the penalty."""
         return self
 

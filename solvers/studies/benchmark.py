@@ -1,7 +1,5 @@
 """What a method did on a graph, start to end: its stages, and their cost in iterations, rounds, bytes and seconds."""
 
-from __future__ import annotations
-
 import enum
 import math
 from dataclasses import dataclass, replace
@@ -32,7 +30,7 @@ class BenchmarkMethod(enum.Enum):
 
     label: str
 
-    def __new__(cls, name: str, label: str) -> BenchmarkMethod:
+    def __new__(cls, name: str, label: str) -> "BenchmarkMethod":
         """Member whose value is its name alone; `label` is what tables and pictures call it."""
         one = object.__new__(cls)
         one._value_, one.label = name, label
