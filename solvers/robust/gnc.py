@@ -108,9 +108,9 @@ class GNCSchedule:
 class GNCState:
     """State k.
 
-    (m,) are the `thresholds` c_e^2, which edges are `known`, their `ratio` r_e^2 / c_e^2 at the poses, and which the last
-    weighted problem, `reduced`, has `kept`: with its symbolic `analysis` it serves the next one if that has the same
-    edges. `objective` is the robust cost.
+    (m,) are the `thresholds` c_e^2, which edges are `known`, their `ratio` r_e^2 / c_e^2 at the poses, and which the
+    last weighted problem, `reduced`, has `kept`: with its symbolic `analysis` it serves the next one if that has the
+    same edges. `objective` is the robust cost.
     """
 
     k: int

@@ -43,7 +43,7 @@ class CostParts:
 
 @dataclass(frozen=True)
 class Reweigh:
-    """Control mu of a robust loss's surrogate, the scale of the thresholds, and the weight under which an edge hardly counts."""
+    """Control mu of a robust loss's surrogate, scale of the thresholds, weight under which an edge hardly counts."""
 
     is_truncated: bool
     mu: float
