@@ -47,7 +47,7 @@ from solvers.cli_options import (
     chosen_start,
 )
 from solvers.distributed.checkpoint import Checkpoint
-from solvers.explanations import explained_by_its_graph, hint_of_chi2, warn_of_weights, with_places
+from solvers.explanations import explained_by_its_graph, hint_of_chi2, hint_of_misfits, warn_of_weights, with_places
 from solvers.pipeline import HANDOVER, solve
 from solvers.reporting.graph_facts import describe_graph
 from solvers.reporting.report import check_report, write_report
@@ -237,7 +237,11 @@ def solve_command(
         chosen_robust = ["--robust", robust.value] if robust is not None else []
         source = shlex.join([graph, *(name for name, given in options.items() if given), *chosen_robust])
         targets.append((report, partial(write_report, solution, source=source)))
-    save_then_show(targets, lambda: typer.echo("\n\n".join([text, *hint_of_chi2(problem, solution.poses)])))
+
+    def show() -> None:
+        typer.echo("\n\n".join([text, *hint_of_chi2(problem, solution.poses), *hint_of_misfits(solution)]))
+
+    save_then_show(targets, show)
     warn_of_weights(graph, problem, solution.certificate)
     if not solution.status.is_success:
         raise typer.Exit(NOT_CONVERGED)

@@ -76,6 +76,16 @@ def hint_of_chi2(problem: PGOProblem, poses: Poses) -> list[str]:
     return [f"the file's own cost: chi2 {here:.4g} here; its minimum is at most {below:.4g}: --information"]
 
 
+def hint_of_misfits(solution: Solution) -> list[str]:
+    """A line that names `--robust gnc` where the edges cost more than their information matrices lead to expect."""
+    residuals = solution.edge_residuals
+    if solution.robust is not None or not residuals.is_doubtful:
+        return []
+    cost, misfits = f"the edges cost {residuals.overall:.3g} times what is expected", int(residuals.is_misfit.sum())
+    named = f", {misfits} of them alone more than they may" if misfits else ""
+    return [f"{cost}{named}; if loop closures may be wrong: --robust gnc"]
+
+
 def with_places(solution: Solution, graph: str) -> Solution:
     """The solution; a robust one with `file:line` of every edge of the graph that was asked for."""
     if solution.robust is None:

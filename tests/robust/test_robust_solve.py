@@ -125,8 +125,6 @@ def test_edges_that_leave_poses_apart_are_one_clear_error(clean):
 
 
 def test_what_does_not_go_together_is_refused(clean):
-    with pytest.raises(SettingError, match="leave out the robots"):
-        solvers.solve(clean, robust=solvers.GNC(), robots=2)
     with pytest.raises(SettingError, match=r"give GNC\(\) or PCM\(\)"):
         solvers.solve(clean, robust=solvers.SOC())
 
