@@ -177,7 +177,8 @@ def summary(rows: list[dict[str, Any]]) -> None:
     print(f"not certified and all is well: {sum(a and not b for a, b in zip(alarm, failed, strict=True))}")
     both = [(one["ours"], one["gtsam"]) for one in rows if one["gtsam"] and one["ours"]["seconds"] is not None]
     done = [(a, b) for a, b in both if b["seconds"] is not None]
-    if not both:
+    if not done:
+        print(f"GTSAM finished none of {len(both)}")
         return
     ratio = [b["seconds"] / a["seconds"] for a, b in done]
     print(f"GTSAM finished {len(done)} of {len(both)}; its seconds over ours, geometric mean of these:", end=" ")
