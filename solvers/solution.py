@@ -170,7 +170,7 @@ class Solution(Solved):
             "objective": self.objective,
             **both_costs(self.problem, self.poses),
             **certificate_json(certificate),
-            **({} if self.robust is None else {"robust": self.robust.as_json()}),
+            **({} if self.robust is None else self.robust.as_json()),
             "note": self.note,
             "frame": self.frame,
             "status": self.status.name,

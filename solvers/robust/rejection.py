@@ -95,8 +95,7 @@ class Rejection:
     def as_json(self) -> dict[str, object]:
         """What `.json` files hold: edges by their place in the file, from 0."""
         lines = {"rejected_lines": [self.places[e] for e in np.flatnonzero(self.rejected)]} if self.places else {}
-        return {
-            "rejected": np.flatnonzero(self.rejected).tolist(),
+        robust = {
             "doubtful": np.flatnonzero(self.doubtful).tolist(),
             "known": np.flatnonzero(self.known).tolist(),
             **lines,
@@ -106,3 +105,4 @@ class Rejection:
             "conditional": self.conditional,
             "warning": self.warning,
         }
+        return {"rejected": np.flatnonzero(self.rejected).tolist(), "robust": robust}

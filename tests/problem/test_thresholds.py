@@ -14,7 +14,7 @@ from pgo_models.geometry.rotations import exp_map
 from pgo_models.graphs.precisions import RotationWeight, edge_precisions
 from pgo_models.problem.initialization import chordal_start, spanning_tree
 from pgo_models.problem.thresholds import EdgeResiduals, chi2_thresholds, edge_residuals
-from pgo_models.problem.weighting import Weighting, edge_weights
+from pgo_models.problem.weighting import Weighting
 
 DRAWS = 20_000
 
@@ -73,7 +73,7 @@ def test_what_an_edge_does_not_measure_has_no_degree_of_freedom():
 def test_thresholds_scale_with_the_weights_and_an_edge_without_has_zero():
     (of_F, _), truth = simulated(2, np.random.default_rng(1))
     share = np.where(np.arange(DRAWS) < 3, [0.0], [0.25])
-    scaled = replace(of_F, weighting=edge_weights(of_F.graph, Weighting.ISOTROPIC).scaled(share))
+    scaled = replace(of_F, weighting=of_F.weights.scaled(share))
     np.testing.assert_allclose(chi2_thresholds(scaled), share * chi2_thresholds(of_F), rtol=1e-9, atol=0)
     assert not (scaled.edge_costs(truth)[:3] > chi2_thresholds(scaled)[:3]).any()
 
