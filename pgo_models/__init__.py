@@ -28,7 +28,7 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
 from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.thresholds import edge_residuals
+from pgo_models.problem.thresholds import chi2_thresholds, edge_residuals
 from pgo_models.problem.weighting import Weighting
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ _LATER = {
 __all__ = ["PGOError"]
 __all__ += ["Poses", "absolute_trajectory_error", "relative_pose_error"]
 __all__ += ["exp_map", "log_map", "project_to_rotations", "random_rotations"]
-__all__ += ["Chi2Convention", "PoseGraph", "RotationWeight", "chi2", "edge_residuals"]
+__all__ += ["Chi2Convention", "PoseGraph", "RotationWeight", "chi2", "chi2_thresholds", "edge_residuals"]
 __all__ += ["Partition", "PartitionMethod", "partition"]
 __all__ += ["known_datasets", "load", "read_g2o", "read_tum", "write_g2o", "write_tum"]
 __all__ += ["circle", "grid", "grid_world", "random_geometric", "sphere", "victoria_park"]

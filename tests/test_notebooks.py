@@ -46,7 +46,7 @@ def text_of(kind: str, lines: list[str]) -> str:
 
 
 def test_there_is_a_notebook_for_every_topic():
-    assert [name[:2] for name in NAMES] == [f"{number:02d}" for number in range(1, 9)]
+    assert [name[:2] for name in NAMES] == [f"{number:02d}" for number in range(1, 10)]
     assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == NAMES
 
 

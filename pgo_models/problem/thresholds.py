@@ -122,6 +122,13 @@ def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
     ------
     SettingError
         When quantile is not between 0 and 1.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import circle
+    >>> problem = PGOProblem(circle(np.random.default_rng(0)))
+    >>> bool((problem.edge_costs(problem.graph.truth) > chi2_thresholds(problem)).mean() < 0.02)
+    True
     """
     if not 0.0 < quantile < 1.0:
         raise SettingError(f"quantile is {quantile!r}; give a probability between 0 and 1, such as 0.99")
