@@ -43,11 +43,12 @@ def solve_robustly(
 ) -> Solution:
     """Solution of the edges that are kept; `Solution.robust` says which, and what is proven.
 
-    Where a factor of all edges is cheap the plain solution comes first: if it is certified, and no edge but known
-    inliers is beyond its threshold, nothing is to be rejected. Else graduated non-convexity is run until the edges it
-    keeps are certified, at least three times where that is cheap: as set; on the pairwise consistent edges; with more
-    and smaller steps; with tight thresholds, which are then widened by what the edges kept say; with the other loss. Of
-    those certified, or of all if none is, that of the least truncated cost of all edges is kept.
+    Where a factor of all edges is cheap the plain solution comes first: if it is certified, no edge but known inliers
+    is beyond its threshold, and all together cost no more than they may, nothing is to be rejected. Else graduated non-
+    convexity is run until the edges it keeps are certified, at least three times where that is cheap: as set; on the
+    pairwise consistent edges; with more and smaller steps; with tight thresholds, which are then widened by what the
+    edges kept say; with the other loss. Of those certified, or of all if none is, that of the least truncated cost of
+    all edges is kept.
 
     By robots (`shared`, `plain`) the certificate of every attempt is theirs, and what crosses the network is added up.
 
@@ -74,8 +75,8 @@ def solve_robustly(
     if is_cheap and start is None:
         solution = plain(problem, time_limit=watch.left)
         everything = np.ones(graph.num_edges, dtype=bool)
-        fits = problem.edge_costs(solution.poses) <= thresholds
-        if (solution.is_certified and (known | fits).all()) or solution.status in OUT_OF_TIME:
+        fits = (known | (problem.edge_costs(solution.poses) <= thresholds)).all() and not _is_bent(solution)
+        if (solution.is_certified and fits) or solution.status in OUT_OF_TIME:
             return result(solution, everything, thresholds, "the plain solution, which fits every edge", ())
     if isinstance(robust, PCM):
         kept = known | pairwise_consistent(graph, known, robust.quantile)
@@ -102,6 +103,12 @@ def solve_robustly(
     solution = replace(solution, stages=stages, status=last if last in OUT_OF_TIME else solution.status)
     made = tuple(one.attempt for one in attempts)
     return result(solution, best.kept, best.scale * thresholds, best.attempt.name, made)
+
+
+def _is_bent(solution: Solution) -> bool:
+    """Whether all edges together cost more than they may: a wrong closure among few bends the odometry."""
+    residuals = solution.edge_residuals
+    return residuals.overall > residuals.overall_allowed
 
 
 def inlier_problem(problem: PGOProblem, kept: BoolArray) -> PGOProblem:

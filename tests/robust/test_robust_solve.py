@@ -50,6 +50,19 @@ def test_what_is_proven_is_said_wherever_the_verdict_is(clean):
     assert solution.robust.warning == ""
 
 
+@pytest.mark.parametrize(("n", "seed", "ends"), [(60, 23, (1, 28)), (80, 19, (29, 59)), (80, 27, (7, 77))])
+def test_a_wrong_closure_that_only_bends_the_odometry_is_found(n, seed, ends):
+    """Its own residual is within its threshold at the plain optimum, which is certified."""
+    right = pgo.grid_world(1, n, np.random.default_rng(seed), d=2, loop_closure_probability=0.03)
+    here = pgo.Poses(np.eye(2)[None], np.zeros((1, 2)))
+    graph = right.with_edges(*np.array(ends)[:, None], here, right.kappa[-1:], right.tau[-1:])
+    plain = solvers.solve(graph)
+    assert plain.is_certified
+    assert plain.edge_residuals.cost[-1] <= pgo.chi2_thresholds(plain.problem)[-1]
+    solution = solvers.solve(graph, robust=solvers.GNC())
+    np.testing.assert_array_equal(np.flatnonzero(solution.robust.rejected), [right.num_edges])
+
+
 def test_nothing_is_rejected_where_every_edge_fits(clean):
     solution = solvers.solve(clean, robust=solvers.GNC())
     assert solution.is_certified
