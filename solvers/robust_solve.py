@@ -44,8 +44,8 @@ def solve_robustly(
     """Solution of the edges that are kept; `Solution.robust` says which, and what is proven.
 
     Where a factor of all edges is cheap the plain solution comes first: if it is certified, no edge but known inliers
-    is beyond its threshold, and all together cost no more than they may, nothing is to be rejected. Else graduated non-
-    convexity is run until the edges it keeps are certified, at least three times where that is cheap: as set; on the
+    is beyond its threshold, and all together cost no more than they may, nothing is to be rejected. Else graduated
+    non-convexity is run until the edges it keeps are certified, at least three times where that is cheap: as set; on the
     pairwise consistent edges; with more and smaller steps; with tight thresholds, which are then widened by what the
     edges kept say; with the other loss. Of those certified, or of all if none is, that of the least truncated cost of
     all edges is kept.
