@@ -32,7 +32,7 @@ def test_it_is_the_solution_of_the_whole_graph(d: int, weighting: Weighting) -> 
     assert grown.is_certified
     assert grown.problem.weighting is weighting
     assert grown.objective == pytest.approx(afresh.objective, rel=1e-9)
-    assert [stage.name for stage in grown.stages][:2] == ["given start", "Newton"]
+    assert grown.stages[0].name == "given start"
 
 
 def test_known_poses_stay_and_new_ones_are_where_exact_measurements_put_them() -> None:
