@@ -1,6 +1,6 @@
 """Graphs that grow: new poses start where their edges to the known ones put them, and `solve` goes on from there.
 
-Every thousand edges of a log this takes 0.9 (manhattan) and 0.7 (torus3D) of the time of a solve afresh, whose chordal
+Every thousand edges of a log this takes 0.9 (manhattan) and 0.8 (torus3D) of the time of a solve afresh, whose chordal
 start it saves: of its three factorisations of the whole graph, for SOC, Newton and certificate, all are needed again.
 """
 

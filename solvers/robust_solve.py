@@ -45,10 +45,10 @@ def solve_robustly(
 
     Where a factor of all edges is cheap the plain solution comes first: if it is certified, no edge but known inliers
     is beyond its threshold, and all together cost no more than they may, nothing is to be rejected. Else graduated
-    non-convexity is run until the edges it keeps are certified, at least three times where that is cheap: as set; on the
-    pairwise consistent edges; with more and smaller steps; with tight thresholds, which are then widened by what the
-    edges kept say; with the other loss. Of those certified, or of all if none is, that of the least truncated cost of
-    all edges is kept.
+    non-convexity is run until the edges it keeps are certified, at least three times where that is cheap: as set; on
+    the pairwise consistent edges; with more and smaller steps; with tight thresholds, which are then widened by what
+    the edges kept say; with the other loss. Of those certified, or of all if none is, that of the least truncated cost
+    of all edges is kept.
 
     By robots (`shared`, `plain`) the certificate of every attempt is theirs, and what crosses the network is added up.
 
