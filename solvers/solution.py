@@ -153,7 +153,8 @@ class Solution(Solved):
         if before is None:
             before, name = spanning_tree_start(graph), "spanning tree"
         verdict, cost = self.certificate.verdict.name.lower().replace("_", " "), self.certificate.cost
-        solved = f"{verdict}{self._given}: {cost} = {self.objective:.6g}, gap {self.gap:.1e}"
+        space = "\n" if self._given else " "
+        solved = f"{verdict}{self._given}:{space}{cost} = {self.objective:.6g}, gap {self.gap:.1e}"
         return compare_poses(
             graph, [(f"{name}: {cost} = {self.problem.objective(before):.4g}", before), (solved, self.poses)]
         )
