@@ -68,6 +68,12 @@ class MissingExtraError(PGOError):
         return type(self), (self._package, self.extra)
 
 
+def check_quantile(quantile: float) -> None:
+    """Raise a SettingError unless a quantile is between 0 and 1."""
+    if not 0.0 < quantile < 1.0:
+        raise SettingError(f"quantile is {quantile!r}; give a probability between 0 and 1, such as 0.99")
+
+
 def check_settings(
     settings: object,
     *,

@@ -61,14 +61,19 @@ def proper_information(graph: PoseGraph) -> Array:
 
 def are_definite(blocks: Array, least: float) -> BoolArray:
     """Whether symmetric blocks (m, k, k), scaled to ones where the diagonal is positive, are above least I, (m,)."""
-    diagonal = np.einsum("mkk->mk", blocks)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    scaled = blocks * scale[:, :, None] * scale[:, None, :] - least * np.eye(blocks.shape[1])
+    scaled = scaled_blocks(blocks)[0] - least * np.eye(blocks.shape[1])
     try:
         np.linalg.cholesky(scaled)
     except np.linalg.LinAlgError:  # which are not
         return np.asarray(np.linalg.eigvalsh(scaled)[:, 0] > 0.0)
     return np.ones(len(blocks), dtype=bool)
+
+
+def scaled_blocks(blocks: Array) -> tuple[Array, Array]:
+    """Blocks (m, k, k) with ones on the diagonal where that is positive, and the scale, (m, k), on either side."""
+    diagonal = np.einsum("mkk->mk", blocks)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    return blocks * scale[:, :, None] * scale[:, None, :], scale
 
 
 def uncoupled_share(information: Array, d: int) -> Array:

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from pgo_models.errors import SettingError
+from pgo_models.errors import check_quantile
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import LEAST_SCALED, proper_information
+from pgo_models.graphs.precisions import LEAST_SCALED, proper_information, scaled_blocks
 from pgo_models.graphs.residuals import edge_errors
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import EdgeWeights, Weighting
@@ -61,9 +61,14 @@ class EdgeResiduals:
         return self.cost > self.allowed
 
     @property
+    def is_overall_misfit(self) -> bool:
+        """Whether all edges together cost more than they may."""
+        return self.overall > self.overall_allowed
+
+    @property
     def is_doubtful(self) -> bool:
         """Whether there is a misfit, or all edges together cost more than they may."""
-        return bool(self.is_misfit.any()) or self.overall > self.overall_allowed
+        return bool(self.is_misfit.any()) or self.is_overall_misfit
 
 
 def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResiduals:
@@ -130,8 +135,7 @@ def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
     >>> bool((problem.edge_costs(problem.graph.truth) > chi2_thresholds(problem)).mean() < 0.02)
     True
     """
-    if not 0.0 < quantile < 1.0:
-        raise SettingError(f"quantile is {quantile!r}; give a probability between 0 and 1, such as 0.99")
+    check_quantile(quantile)
     return _quantiles(_chi2_weights(problem), quantile)
 
 
@@ -150,10 +154,9 @@ def _chi2_weights(problem: PGOProblem | PoseGraph) -> Array:
     else:
         graph, weights = problem.graph, problem.weights
         is_chi2 = problem.weighting is Weighting.INFORMATION or (weights.excess or weights.tangent) is not None
-    d, information = graph.d, proper_information(graph)
-    diagonal = np.einsum("mkk->mk", information)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    values, axes = np.linalg.eigh(information * scale[:, :, None] * scale[:, None, :])
+    d = graph.d
+    scaled, scale = scaled_blocks(proper_information(graph))
+    values, axes = np.linalg.eigh(scaled)
     is_known = values > LEAST_SCALED
     if is_chi2:
         return is_known.astype(float)

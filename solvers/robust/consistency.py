@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from pgo_models.errors import SettingError
+from pgo_models.errors import check_quantile
 from pgo_models.geometry.rotations import Array, BoolArray, hat, log_map, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.precisions import proper_information
@@ -72,8 +72,7 @@ def pairwise_consistent(graph: PoseGraph, known: BoolArray | None = None, quanti
     >>> bool(pairwise_consistent(graph, quantile=0.9999).all())
     True
     """
-    if not 0.0 < quantile < 1.0:
-        raise SettingError(f"quantile is {quantile!r}; give a probability between 0 and 1, such as 0.99")
+    check_quantile(quantile)
     is_whole = (graph.kappa > 0.0) & (graph.tau > 0.0) & ~np.isin(graph.j, graph.landmarks)
     is_known = odometry(graph) if known is None else np.asarray(known, dtype=bool)
     tested = np.flatnonzero(is_whole & ~is_known)

@@ -22,7 +22,7 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.special import chdtri
 
 from pgo_models.certificates.newton_polish import polish_step, start_polish
-from pgo_models.errors import SettingError, check_settings
+from pgo_models.errors import SettingError, check_quantile, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
@@ -178,8 +178,7 @@ class GNC:
     max_iterations: int = 300
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.quantile < 1.0:
-            raise SettingError(f"quantile is {self.quantile}; give one between 0 and 1, such as 0.99")
+        check_quantile(self.quantile)
         check_settings(self, positive=["tolerance", "spread", "scale"], not_negative=["max_iterations"])
         check_settings(self, above_one=["growth"], at_least_one=["inner_steps"])
 

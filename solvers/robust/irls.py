@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pgo_models.errors import SettingError, check_settings
+from pgo_models.errors import SettingError, check_quantile, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.initialization import chordal_start
@@ -84,6 +84,7 @@ class IRLS:
     max_iterations: int = 500
 
     def __post_init__(self) -> None:
+        check_quantile(self.quantile)
         if isinstance(self.inner, SOC) and self.inner.robots is not None:
             raise SettingError("weights are found in one place; leave out the robots of SOC")
         check_settings(self, positive=["tolerance"], at_least_one=["inner_steps"], not_negative=["max_iterations"])
