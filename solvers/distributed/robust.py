@@ -35,7 +35,11 @@ class SharedGNCState:
     k: int
     schedule: GNCSchedule
     sums: RatioSums
-    objective: float
+
+    @property
+    def objective(self) -> float:
+        """The robust cost."""
+        return self.sums.cost
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ class SharedGNC:
         """State 0, at the poses that driver and robots hold."""
         sums = self._sums(driver, 1.0, self.gnc.scale)
         mu = self.gnc.first_control(sums.largest, self.least**2 * min(1.0, sums.least))
-        return SharedGNCState(0, GNCSchedule(mu, self.gnc.scale, self.gnc.scalings), sums, sums.cost)
+        return SharedGNCState(0, GNCSchedule(mu, self.gnc.scale, self.gnc.scalings), sums)
 
     def step(self, driver: Driver, state: SharedGNCState) -> SharedGNCState:
         """Weights for the residuals at hand, Newton steps with them, and the next control."""
@@ -73,7 +77,7 @@ class SharedGNC:
         lost = before / driver.at.objective - 1.0 if driver.at.objective else 0.0
         undecided = sums.undecided / max(1.0, sums.count)
         following = gnc.following(schedule, undecided, moving.decrement + lost, moving.moved)
-        return SharedGNCState(state.k + 1, following, sums, sums.cost)
+        return SharedGNCState(state.k + 1, following, sums)
 
     def measure(self, driver: Driver, state: SharedGNCState) -> Measurement:
         """The robust cost, the share of undecided edges, and the decrement."""
