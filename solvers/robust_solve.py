@@ -72,20 +72,22 @@ def solve_robustly(
         found = Rejection(problem, known, kept, ratio, robust.quantile, name, made, solution.is_certified)
         return replace(solution, robust=found, seconds=time.perf_counter() - began)
 
+    ledgers: list[Ledger | None] = []
     if is_cheap and start is None:
         solution = plain(problem, time_limit=watch.left)
-        everything = np.ones(graph.num_edges, dtype=bool)
-        fits = (known | (problem.edge_costs(solution.poses) <= thresholds)).all() and not _is_bent(solution)
+        everything, residuals = np.ones(graph.num_edges, dtype=bool), solution.edge_residuals
+        fits = (known | (residuals.cost <= thresholds)).all() and not residuals.is_overall_misfit
         if (solution.is_certified and fits) or solution.status in OUT_OF_TIME:
             return result(solution, everything, thresholds, "the plain solution, which fits every edge", ())
+        ledgers.append(solution.ledger)
     if isinstance(robust, PCM):
         kept = known | pairwise_consistent(graph, known, robust.quantile)
         solution = plain(inlier_problem(problem, kept), start=start, time_limit=watch.left)
         return result(solution, kept, thresholds, "pairwise consistency alone", ())
     attempts: list[_Estimate] = []
-    for name, method in _methods(robust, graph, known, shared is None):
+    for name, method, tested in _methods(robust, graph, known, shared is None):
         if shared is None:
-            attempts.append(_estimate(problem, name, method, known, thresholds, gap, start, watch))
+            attempts.append(_estimate(problem, name, method, tested, known, thresholds, gap, start, watch))
         else:
             attempts.append(_estimate_shared(problem, name, method, known, thresholds, start, watch, plain, shared))
         is_done = any(one.certificate.is_certified for one in attempts)
@@ -96,19 +98,13 @@ def solve_robustly(
     if best.solution is None:
         solution = plain(inlier_problem(problem, best.kept), start=best.certificate.poses, time_limit=watch.left)
     else:
-        ledgers = [one.solution.ledger for one in attempts if one.solution is not None]
+        ledgers += [one.solution.ledger for one in attempts if one.solution is not None]
         solution = replace(best.solution, ledger=reduce(Ledger.joined, filter(None, ledgers)))
     stages = (*(one.stage for one in attempts), *solution.stages)
     last = attempts[-1].stage.status
     solution = replace(solution, stages=stages, status=last if last in OUT_OF_TIME else solution.status)
     made = tuple(one.attempt for one in attempts)
     return result(solution, best.kept, best.scale * thresholds, best.attempt.name, made)
-
-
-def _is_bent(solution: Solution) -> bool:
-    """Whether all edges together cost more than they may: a wrong closure among few bends the odometry."""
-    residuals = solution.edge_residuals
-    return residuals.overall > residuals.overall_allowed
 
 
 def inlier_problem(problem: PGOProblem, kept: BoolArray) -> PGOProblem:
@@ -143,17 +139,15 @@ def _estimate(
     problem: PGOProblem,
     name: str,
     method: GNC,
+    tested: BoolArray,
     known: BoolArray,
     thresholds: Array,
     gap: float,
     start: Poses | None,
     watch: Watch,
 ) -> _Estimate:
-    """One run, and the certificate of what it keeps at the stationary poses beside it."""
-    began = time.perf_counter()
-    kept = np.ones(len(known), dtype=bool)
-    if method.consistent:
-        kept = known | pairwise_consistent(problem.graph, known)
+    """One run on the edges that passed the test before, and the certificate of what it keeps, stationary."""
+    began, kept = time.perf_counter(), tested.copy()
     run = watch.run(replace(method, known=known[kept]), inlier_problem(problem, kept), start)
     scale = run.state.schedule.scale
     kept[kept] = run.state.inliers
@@ -203,15 +197,19 @@ def _estimate_shared(
     )
 
 
-def _methods(robust: GNC, graph: PoseGraph, known: BoolArray, is_central: bool) -> Iterator[tuple[str, GNC]]:
-    """Attempts, the most promising first."""
-    yield "as set", robust
-    few = is_central and not robust.consistent and (~known).sum() <= _PAIRED
-    if few and len(graph.components(known | pairwise_consistent(graph, known))) == 1:
-        yield "pairwise consistent edges", replace(robust, consistent=True)
-    yield "smaller steps", replace(robust, growth=min(robust.growth, 1.4), inner_steps=max(robust.inner_steps, 5))
+def _methods(robust: GNC, graph: PoseGraph, known: BoolArray, is_central: bool) -> Iterator[tuple[str, GNC, BoolArray]]:
+    """Attempts and the edges, (m,), that they begin with, the most promising first."""
+    every = known | pairwise_consistent(graph, known) if robust.consistent else np.ones(len(known), dtype=bool)
+    yield "as set", robust, every
+    if is_central and not robust.consistent and (~known).sum() <= _PAIRED:
+        agreed = known | pairwise_consistent(graph, known)
+        if len(graph.components(agreed)) == 1:
+            yield "pairwise consistent edges", replace(robust, consistent=True), agreed
+    slow = replace(robust, growth=min(robust.growth, 1.4), inner_steps=max(robust.inner_steps, 5))
+    yield "smaller steps", slow, every
     spread = None if robust.spread is None else _NARROW * robust.spread
     for scale in _TIGHT:
-        yield f"thresholds times {scale:g} at first", replace(robust, scale=scale * robust.scale, spread=spread)
+        tight = replace(robust, scale=scale * robust.scale, spread=spread)
+        yield f"thresholds times {scale:g} at first", tight, every
     other = RobustLoss.GEMAN_MCCLURE if robust.loss is RobustLoss.TRUNCATED else RobustLoss.TRUNCATED
-    yield f"{other.name.lower().replace('_', '-')} loss", replace(robust, loss=other)
+    yield f"{other.name.lower().replace('_', '-')} loss", replace(robust, loss=other), every

@@ -124,6 +124,16 @@ def test_attempts_are_added_up_on_the_ledger(wrong) -> None:
     assert sum(times for _, times in solution.ledger.joined(solution.ledger).counted) == 2 * counted
 
 
+def test_the_plain_solve_before_the_attempts_is_on_the_ledger(wrong) -> None:
+    graph = wrong[0]
+    few = solvers.Pipeline(soc=None, newton=solvers.Newton(max_iterations=10), second_try=False, staircase=None)
+    plain = solvers.solve(graph, few, robots=2)
+    start = first_poses(graph, subgraph_known(pgo.PGOProblem(graph)))
+    whole, attempts = (solvers.solve(graph, robust=GNC(), robots=2, start=one) for one in (None, start))
+    assert [one.rejected for one in whole.robust.attempts] == [one.rejected for one in attempts.robust.attempts]
+    assert whole.ledger.rounds >= plain.ledger.rounds + attempts.ledger.rounds
+
+
 def test_what_is_for_one_place_is_refused(wrong, tmp_path) -> None:
     graph = wrong[0]
     for robust in (solvers.PCM(), GNC(consistent=True)):
