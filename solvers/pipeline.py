@@ -42,7 +42,7 @@ from solvers.loop import Watch
 from solvers.network.engine import Engine, InProcess
 from solvers.network.faults import Faults
 from solvers.result import OUT_OF_TIME, History, Record, Run, Stage, Status
-from solvers.riemannian.newton import Newton
+from solvers.riemannian.newton import Newton, needs_no_soc
 from solvers.riemannian.staircase import DualBound, Staircase
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
@@ -126,10 +126,9 @@ def solve(
 
     Start (chordal relaxation; a spanning tree for the paper's coupling), SOC until Newton can take over, Newton to
     rounding level, then the dual certificate at the result. Where it is wider than asked for, a second try and then
-    the Riemannian staircase, whose optimum is the best bound that the relaxation has.
-
-    chi2 of information matrices that is not quadratic and convex: Newton on chi2 from the chordal start, or from SOC on
-    its `convex_part` if SOC has other settings than `HANDOVER`; the second try starts at the optimum of F, and smaller
+    the Riemannian staircase, whose optimum is the best bound that the relaxation has. In one place, SOC as `HANDOVER`
+    is left out where Newton alone is faster: in the plane, on small graphs, and of chi2 that is not quadratic and
+    convex, where SOC runs on its `convex_part`. There the second try starts at the optimum of F, and smaller
     information matrices take the place of the staircase.
 
     Parameters
@@ -329,13 +328,13 @@ class _Job:
         seconds = time.perf_counter() - began
         self.stages.append(Stage(name, Status.CONVERGED, 0, self.problem.objective(poses), seconds, History()))
         self.watch.found.append(poses)
-        # The minimum of the convex part is no nearer to that of chi2 than the chordal start: no SOC unless set up.
-        if soc is not None and not (soc == HANDOVER and first_problem is not self.problem):
+        no_nearer = first_problem is not self.problem  # the minimum of chi2's convex part, than the chordal start
+        if soc is not None and not (soc == HANDOVER and (no_nearer or (start is None and needs_no_soc(self.problem)))):
             first: Run[Any] = self.watch.run(soc, first_problem, poses)
             # A start that is better than SOC's best iterate is kept: CSAIL's chordal start is within 1e-4.
             poses = first.poses if first.objective <= first_problem.objective(poses) else poses
             stage = Stage.of(first)
-            if first_problem is not self.problem:
+            if no_nearer:
                 stage = replace(stage, name=f"{stage.name}, convex", objective=self.problem.objective(poses))
             self.stages.append(stage)
             del first  # its factor is the next one's to take over

@@ -185,7 +185,8 @@ def test_poses_that_are_nearly_rotations_are_not_below_the_optimum(factor):
 def test_a_gap_beyond_doubles_is_not_looked_for_in_other_poses(robots):
     graph = pgo.circle(np.random.default_rng(0))
     solution = solvers.solve(graph, solvers.Pipeline(gap=1e-18), robots=robots)
-    assert [stage.name for stage in solution.stages] == ["chordal start", "SOC", "Newton"]
+    by_soc = ["SOC"] if robots else []  # a small graph in one place is left to Newton
+    assert [stage.name for stage in solution.stages] == ["chordal start", *by_soc, "Newton"]
     assert (solution.certificate.verdict, solution.certificate.is_best_in_doubles) == (Verdict.NOT_CERTIFIED, True)
     assert solution.gap < 1e-13
 

@@ -29,6 +29,7 @@ T = TypeVar("T")
 
 FIRST_SHIFT = 1e-9  # of the diagonal; what is not needed for rounding makes the bound sharper
 SHRINK = 1.0 / 32.0
+ROOM = 1.0 / 8.0  # share of the softest energy that may be subtracted at once
 LEAST_SHIFT = 1e-15  # below the rounding of any matrix with a few non-zeros in a row
 MARGIN = 2.125  # twice the rounding, and what the estimate of it may be off by
 ETA_GROWTH, ETA_BISECTIONS = 10.0, 3
@@ -91,8 +92,8 @@ def prove_definite(
 
     The share `first_shift` of the diagonal is subtracted first; less where the matrix is not definite with it, more
     where rounding needs more. `turned`, (N, d), are moves that leave F almost as it is, as a turn of all poses but
-    those left out, which S then holds but weakly: no share above their Rayleigh quotient can be subtracted. Where one
-    far below it is enough for rounding whatever the factor's non-zeros are, they are not counted.
+    those left out, which S then holds but weakly: what is subtracted takes but little of their energy. Where that is
+    enough for rounding whatever the factor's non-zeros are, or as many as they can be, they are not counted.
     """
     shifts = np.zeros(problem.side)
     shifts[problem.num_poses :] = eta
@@ -111,14 +112,19 @@ def prove_definite(
 
     free = diagonal.copy()
     free[fixed] = 0.0
-    expected, crude = problem.analysis.expected_error(), problem.analysis.crude_error()
-    entries = matrix_errors(problem, diagonal)
-    if expected is None and turned is not None and crude < np.inf:
-        enough = np.maximum(first_shift, MARGIN * (entries + crude))
-        if enough.max() <= SHRINK * _softest(stored, free, turned):
-            factor = attempt(enough)
-            if factor is not None:
-                return DefiniteProof(stored, factor, free, enough, entries, False, np.full(problem.side, crude))
+    entries, analysis = matrix_errors(problem, diagonal), problem.analysis
+    if turned is not None:
+        energies, weights = _softness(stored, free, turned)
+        first_shift = min(first_shift, max(float(np.min(SHRINK * energies / weights.sum(axis=0))), LEAST_SHIFT))
+        known = analysis.expected_error()
+        for bound in (analysis.crude_error, analysis.error_before):
+            error = known if known is not None else bound()
+            enough = np.maximum(first_shift, MARGIN * (entries + error))
+            if np.isfinite(enough).all() and (enough @ weights <= ROOM * energies).all():
+                factor = attempt(enough)
+                if factor is not None:
+                    return DefiniteProof(stored, factor, free, enough, entries, False, error)
+    expected = analysis.expected_error()
     found = search_shift(attempt, entries, expected if expected is not None else 0.0 * entries, first_shift)
     if found is None:
         return None
@@ -137,11 +143,10 @@ def shifted_certificate(problem: PGOProblem, Lambda: Array, shifts: Array) -> tu
     return S, np.maximum(problem.M.data[problem.diagonal_positions], stored) + shifts
 
 
-def _softest(stored: csc_array, free: Array, moves: Array) -> float:
-    """Least Rayleigh quotient of the moves, zero where a row is left out, with respect to the diagonal."""
+def _softness(stored: csc_array, free: Array, moves: Array) -> tuple[Array, Array]:
+    """Energies of the moves, (d,), zero where a row is left out, and what a share of the diagonal takes, (N, d)."""
     moves = np.where(free[:, None] > 0.0, moves, 0.0)
-    energies = np.einsum("rc,rc->c", moves, stored @ moves)
-    return float(np.min(energies / np.einsum("rc,r,rc->c", moves, free, moves)))
+    return np.einsum("rc,rc->c", moves, stored @ moves), free[:, None] * moves**2
 
 
 def search_shift(

@@ -19,7 +19,7 @@ from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, project_to_rotations, vee
 from pgo_models.problem.cholesky import CholeskyFactor, SymbolicCholesky, analyze
-from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
+from pgo_models.problem.hessian import TangentLayout, riemannian_hessian, tangent_order
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
 
@@ -155,17 +155,18 @@ def _factorize_model(
 ) -> tuple[SymbolicCholesky, CholeskyFactor, bool]:
     """Factor the Hessian if it is positive definite, else the Gauss-Newton matrix with the least damping that works."""
     analysis = state.analysis
+    order = None if analysis is not None else tangent_order(problem)
     if second_order:
         hessian = riemannian_hessian(problem, state.poses, multipliers(problem, state.poses))
         ground_pose(hessian, problem)
-        analysis = analysis or analyze(hessian, problem.backend)
+        analysis = analysis or analyze(hessian, problem.backend, order)
         try:
             return analysis, analysis.factorize(hessian, overwrite=state.factor), True
         except NotPositiveDefiniteError:
             pass
     gauss_newton = riemannian_hessian(problem, state.poses, None)
     ground_pose(gauss_newton, problem)
-    analysis = analysis or analyze(gauss_newton, problem.backend)
+    analysis = analysis or analyze(gauss_newton, problem.backend, order)
     diagonal = gauss_newton.diagonal()
     damping = 0.0
     while True:

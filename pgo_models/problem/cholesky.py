@@ -9,18 +9,17 @@ import enum
 import importlib.util
 import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager
-from types import ModuleType
+from collections.abc import Callable
 
 import numpy as np
 from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 
-from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError
+from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.problem.cholmod import amd_order, import_cvxopt, lower_triangle, set_option, supernodal
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, FactorCounts, error_of_counts, gamma
-from pgo_models.problem.kernels import kernels_of_the_cpu
 
 _WHOLE, _PERMUTE, _FORWARD = 0, 7, 4  # CVXOPT's codes of A x = b, x = P b and L x = b
 _Capsule = object  # a factorisation, which CVXOPT keeps to itself
@@ -99,9 +98,13 @@ class SymbolicCholesky(ABC):
         """What `CholeskyFactor.backward_error` will be about, where it is known before a factor is."""
         return None
 
-    def crude_error(self) -> float:
+    def crude_error(self) -> Array:
         """Bound on `CholeskyFactor.backward_error` for any number of non-zeros; inf if there is none."""
-        return np.inf
+        return np.full(self._shape[0], np.inf)
+
+    def error_before(self) -> Array:
+        """Bound on it for the most non-zeros that there can be, as given to `analyze`; inf if they were not."""
+        return np.full(self._shape[0], np.inf)
 
     def _check(self, matrix: csc_array) -> None:
         same = np.array_equal(matrix.indptr, self._indptr) and np.array_equal(matrix.indices, self._indices)
@@ -111,19 +114,35 @@ class SymbolicCholesky(ABC):
             raise NotPositiveDefiniteError("the matrix has nan or inf; check the weights and measurements")
 
 
-def analyze(pattern: csc_array, backend: CholeskyBackend | None = None) -> SymbolicCholesky:
-    """Order and analyse the pattern of a symmetric matrix, whose diagonal must be stored in full.
+def analyze(
+    pattern: csc_array,
+    backend: CholeskyBackend | None = None,
+    order: IntArray | None = None,
+    most_counts: Callable[[], FactorCounts] | None = None,
+) -> SymbolicCholesky:
+    """Analyse the pattern of a symmetric matrix, whose diagonal must be stored in full.
 
+    Rows are eliminated in the `order` given, (N,), as of `pgo_models.problem.ordering`, or in one of minimum degree.
+    `most_counts` finds cheaply how many non-zeros the factors have at most.
     With `default_backend()` unless one is given; a MissingExtraError when CHOLMOD is, without the extra `fast`.
     """
     pattern.sort_indices()
     chosen = backend or default_backend()
-    return _Cholmod(pattern) if chosen is CholeskyBackend.CHOLMOD else _SuperLU(pattern)
+    return _Cholmod(pattern, order, most_counts) if chosen is CholeskyBackend.CHOLMOD else _SuperLU(pattern, order)
 
 
-def factorize(matrix: csc_array, backend: CholeskyBackend | None = None) -> CholeskyFactor:
-    """Factor one symmetric positive definite matrix; see `SymbolicCholesky.factorize`."""
-    return analyze(matrix, backend).factorize(matrix)
+def factorize(
+    matrix: csc_array, backend: CholeskyBackend | None = None, order: IntArray | None = None
+) -> CholeskyFactor:
+    """Factor one symmetric positive definite matrix; see `analyze` and `SymbolicCholesky.factorize`."""
+    return analyze(matrix, backend, order).factorize(matrix)
+
+
+def minimum_degree(pattern: csc_array) -> IntArray:
+    """Order of elimination of a symmetric pattern, (N,): AMD with the extra `fast`, else the one SuperLU has."""
+    if importlib.util.find_spec("cvxopt") is None:
+        return _SuperLU(pattern).order
+    return amd_order(pattern)
 
 
 class _SuperLUFactor(CholeskyFactor):
@@ -182,8 +201,11 @@ class _SuperLUFactor(CholeskyFactor):
 class _SuperLU(SymbolicCholesky):
     """LU in symmetric mode without pivoting: L D L^T, whose D shows the inertia."""
 
-    def __init__(self, pattern: csc_array) -> None:
+    def __init__(self, pattern: csc_array, order: IntArray | None = None) -> None:
         super().__init__(pattern)
+        if order is not None:
+            self.order = order
+            return
         # A dominant diagonal on the same pattern is factored once, only for its fill-reducing order.
         n = pattern.shape[0]
         dominant = csc_array((np.zeros(pattern.nnz), pattern.indices, pattern.indptr), shape=pattern.shape)
@@ -233,7 +255,7 @@ class _CholmodFactor(CholeskyFactor):
         return self._solved(right_hand_side, _PERMUTE, _FORWARD)
 
     def _solved(self, right_hand_side: Array, *systems: int) -> Array:
-        cvxopt, cholmod = _import_cvxopt()
+        cvxopt, cholmod = import_cvxopt()
         if self._numeric is None:
             raise ValueError("this factor was overwritten by a later one")
         solution = cvxopt.matrix(np.asfortranarray(right_hand_side, dtype=float))
@@ -262,16 +284,14 @@ class _CholmodFactor(CholeskyFactor):
 
 
 class _Cholmod(SymbolicCholesky):
-    """Supernodal L L^T of the lower triangle; AMD order."""
+    """Supernodal L L^T of the lower triangle; AMD order unless another is given."""
 
-    def __init__(self, pattern: csc_array) -> None:
+    def __init__(
+        self, pattern: csc_array, order: IntArray | None, most_counts: Callable[[], FactorCounts] | None = None
+    ) -> None:
         super().__init__(pattern)
-        cvxopt, _ = _import_cvxopt()
-        columns = np.repeat(np.arange(pattern.shape[1]), np.diff(pattern.indptr))
-        self._lower = np.flatnonzero(pattern.indices >= columns)
-        places = [of_all[self._lower].astype(np.int64) for of_all in (pattern.indices, columns)]
-        self._is_diagonal = places[0] == places[1]
-        self._matrix = cvxopt.spmatrix(1.0, *map(cvxopt.matrix, places), pattern.shape)
+        self._order, self._most_counts = order, most_counts
+        self._matrix, self._lower, self._is_diagonal = lower_triangle(pattern)
         # Symbolic parts with the factor that uses each. No finaliser gives them back: Ctrl-C in one would be lost.
         self._taken: list[tuple[weakref.ref[_CholmodFactor] | None, _Capsule]] = [(None, self._analyze())]
         self._counts: FactorCounts | None = None
@@ -279,8 +299,11 @@ class _Cholmod(SymbolicCholesky):
     def expected_error(self, beside: int = 0) -> Array | None:
         return self._counts.error(beside) if self._counts is not None else None
 
-    def crude_error(self) -> float:
-        return float(error_of_counts(np.array(float(self._shape[0])), self._shape[0]))
+    def crude_error(self) -> Array:
+        return error_of_counts(np.full(self._shape[0], float(self._shape[0])), self._shape[0])
+
+    def error_before(self) -> Array:
+        return self._most_counts().error(0) if self._most_counts is not None else super().error_before()
 
     def counts(self) -> FactorCounts:
         """Counts of every factor with this pattern, if need be of one that is out of use."""
@@ -292,22 +315,23 @@ class _Cholmod(SymbolicCholesky):
             (pointers, rows, _), order = self.take_apart(capsule)
         except (ValueError, ArithmeticError):  # it is symbolic, or of a matrix that was not positive definite
             (pointers, rows, _), order = self.take_apart(self._numeric(np.where(self._is_diagonal, 1.0, 0.0), capsule))
-        in_row = np.diff(np.array(pointers).ravel()).astype(float)
-        in_column = np.bincount(np.array(rows).ravel(), minlength=len(in_row)).astype(float)
-        self._counts = FactorCounts(in_column, in_row, order)
+        self._counts = FactorCounts.of(np.array(pointers).ravel(), np.array(rows).ravel(), order)
         return self._counts
 
     def take_apart(self, capsule: _Capsule) -> tuple[tuple[object, object, object], np.ndarray]:
         """Pointers, rows and values of L, and its order; CVXOPT uses the factor up: the next would be L D L^T in it."""
         self._taken = [(user, other) for user, other in self._taken if other is not capsule]
-        cvxopt, cholmod = _import_cvxopt()
+        cvxopt, cholmod = import_cvxopt()
         order = cvxopt.matrix(np.arange(self._shape[0], dtype=float))
         cholmod.solve(capsule, order, sys=_PERMUTE)
         return cholmod.getfactor(capsule).CCS, np.array(order).ravel().astype(np.int64)
 
     def _analyze(self) -> _Capsule:
-        with _supernodal() as cholmod:
-            return cholmod.symbolic(self._matrix)
+        with supernodal() as cholmod:
+            if self._order is None:
+                return cholmod.symbolic(self._matrix)
+            with set_option(cholmod, "nmethods", 1):  # else it compares the order with its own
+                return cholmod.symbolic(self._matrix, p=import_cvxopt()[0].matrix(self._order))
 
     def factorize(self, matrix: csc_array, overwrite: CholeskyFactor | None = None) -> CholeskyFactor:
         self._check(matrix)
@@ -336,31 +360,9 @@ class _Cholmod(SymbolicCholesky):
 
     def _numeric(self, lower: Array, capsule: _Capsule) -> _Capsule:
         """Fill the capsule with the factor of the matrix that has these values in its lower triangle."""
-        cvxopt, cholmod = _import_cvxopt()
+        cvxopt, cholmod = import_cvxopt()
         self._matrix.V = cvxopt.matrix(lower)
-        with _supernodal():
+        with supernodal():
             cholmod.numeric(self._matrix, capsule)
         cholmod.diag(capsule)  # raises ValueError for L D L^T, which indefinite matrices have, too
         return capsule
-
-
-@contextmanager
-def _supernodal() -> Iterator[ModuleType]:
-    """CHOLMOD set to L L^T, which exists for positive definite matrices only: to analyse for L D L^T accepts others."""
-    _, cholmod = _import_cvxopt()
-    saved = cholmod.options.get("supernodal", 2)
-    cholmod.options["supernodal"] = 2
-    try:
-        yield cholmod
-    finally:
-        cholmod.options["supernodal"] = saved
-
-
-def _import_cvxopt() -> tuple[ModuleType, ModuleType]:
-    try:
-        with kernels_of_the_cpu():
-            import cvxopt
-            from cvxopt import cholmod
-    except ImportError as error:
-        raise MissingExtraError("cvxopt", "fast") from error
-    return cvxopt, cholmod

@@ -14,6 +14,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, hat, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.matrices import assemble, block_entries, edge_blocks, rotation_columns
+from pgo_models.problem.ordering import row_order
 from pgo_models.problem.problem import PGOProblem
 
 
@@ -46,6 +47,11 @@ class TangentLayout:
     def rotations(self, pose: IntArray) -> IntArray:
         """Columns (m, 1 or 3) of w."""
         return rotation_columns(pose, self.num_poses * self.d, tangent_dimension(self.d))
+
+
+def tangent_order(problem: PGOProblem) -> IntArray:
+    """Order of elimination of the Hessian's rows."""
+    return row_order(problem.pose_order, problem.d, tangent_dimension(problem.d))
 
 
 def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) -> csc_array:

@@ -1,7 +1,7 @@
 """PGOProblem: the cost of a pose graph, its gradients, its matrices and exact translations (paper: `min overall`)."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array
@@ -15,6 +15,7 @@ from pgo_models.graphs.precisions import proper_information
 from pgo_models.problem import matrices
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, analyze, factorize
 from pgo_models.problem.incidence import Incidence, block_laplacian, blocks_of_rows, rows_of_blocks
+from pgo_models.problem.ordering import most_counts, pose_order, row_order
 from pgo_models.problem.weighting import EdgeWeights, Weighting, convex_weights, edge_weights
 
 
@@ -161,7 +162,15 @@ class PGOProblem:
     @cached_property
     def analysis(self) -> SymbolicCholesky:
         """Symbolic factorisation of the pattern of M, shared by every matrix that has it."""
-        return analyze(self.M, self.backend) if self.convex_part is self else self.convex_part.analysis
+        if self.convex_part is not self:
+            return self.convex_part.analysis
+        of_poses = self.pose_order, 1, self.d
+        return analyze(self.M, self.backend, row_order(*of_poses), partial(most_counts, self.graph, *of_poses))
+
+    @cached_property
+    def pose_order(self) -> IntArray:
+        """Order of elimination of the poses, (n,), in all matrices that are factored."""
+        return pose_order(self.graph)
 
     @cached_property
     def diagonal_positions(self) -> IntArray:
@@ -311,13 +320,14 @@ class PGOProblem:
     @cached_property
     def _translation_factor(self) -> CholeskyFactor:
         n = self.num_poses
-        return factorize(self.M[1:n, 1:n].tocsc(), self.backend)
+        order = self.pose_order[self.pose_order > 0] - 1
+        return factorize(self.M[1:n, 1:n].tocsc(), self.backend, order)
 
     @cached_property
     def _chi2_translations(self) -> SymbolicCholesky:
         """Of the matrix of `at_best_translations`, whose pattern the graph alone gives."""
         ones = np.broadcast_to(np.eye(self.d), self.graph.R_ij.shape)
-        return analyze(block_laplacian(self.incidence, ones), self.backend)
+        return analyze(block_laplacian(self.incidence, ones), self.backend, row_order(self.pose_order, self.d))
 
     @cached_property
     def _M_tR(self) -> csr_array:
@@ -329,7 +339,7 @@ class PGOProblem:
         return self.M[self.num_poses :].tocsr()
 
 
-_OF_THE_PATTERN = {"residual_matrix", "plain_residual_matrix", "analysis", "incidence"}
+_OF_THE_PATTERN = {"residual_matrix", "plain_residual_matrix", "analysis", "pose_order", "incidence"}
 _OF_THE_PATTERN |= {"diagonal_positions", "block_positions"}
 
 

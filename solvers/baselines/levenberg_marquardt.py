@@ -16,7 +16,7 @@ from pgo_models.errors import NotPositiveDefiniteError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.cholesky import SymbolicCholesky, analyze
-from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
+from pgo_models.problem.hessian import TangentLayout, riemannian_hessian, tangent_order
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
@@ -123,7 +123,7 @@ def _linearized(
     matrix = riemannian_hessian(problem, poses, None)
     ground_pose(matrix, problem)
     gradient = TangentLayout(problem.num_poses, problem.d).join(*problem.riemannian_gradient(poses))
-    analysis = analysis if analysis is not None else analyze(matrix, problem.backend)
+    analysis = analysis if analysis is not None else analyze(matrix, problem.backend, tangent_order(problem))
     level = rounding_level(problem, poses)
     return _with_step(LevenbergMarquardtState(k, poses, objective, level, matrix, gradient, analysis, damping, _GROWTH))
 

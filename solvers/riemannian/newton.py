@@ -9,6 +9,8 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.result import Measurement, Status
 
+SMALL = 1000  # poses in space
+
 
 @dataclass(frozen=True, eq=False)
 class NewtonState:
@@ -83,3 +85,8 @@ def gauss_newton(max_iterations: int = Newton.max_iterations) -> Newton:
     False
     """
     return Newton(max_iterations=max_iterations, second_order=False, secants=False)
+
+
+def needs_no_soc(problem: PGOProblem) -> bool:
+    """Whether Newton alone is faster from the chordal start: in the plane, where its matrix is no larger than SOC's."""
+    return problem.d == 2 or problem.num_poses <= SMALL

@@ -1,0 +1,65 @@
+"""CHOLMOD and AMD as CVXOPT has them: imported on the kernels chosen, its options set for a while, its matrices.
+
+CVXOPT comes with the extra `fast`.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csc_array
+
+from pgo_models.errors import MissingExtraError
+from pgo_models.geometry.rotations import BoolArray
+from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.problem.kernels import kernels_of_the_cpu
+
+
+def lower_triangle(pattern: csc_array) -> tuple[Any, IntArray, BoolArray]:
+    """CVXOPT's matrix of ones, the positions of its entries in the pattern, and which of them are on the diagonal."""
+    cvxopt, _ = import_cvxopt()
+    columns = np.repeat(np.arange(pattern.shape[1]), np.diff(pattern.indptr))
+    lower = np.flatnonzero(pattern.indices >= columns)
+    places = [of_all[lower].astype(np.int64) for of_all in (pattern.indices, columns)]
+    return cvxopt.spmatrix(1.0, *map(cvxopt.matrix, places), pattern.shape), lower, places[0] == places[1]
+
+
+@contextmanager
+def supernodal() -> Iterator[ModuleType]:
+    """CHOLMOD set to L L^T, which exists for positive definite matrices only: to analyse for L D L^T accepts others."""
+    _, cholmod = import_cvxopt()
+    with set_option(cholmod, "supernodal", 2):
+        yield cholmod
+
+
+@contextmanager
+def set_option(cholmod: ModuleType, name: str, value: int) -> Iterator[None]:
+    """An option of CHOLMOD for a while."""
+    saved = dict(cholmod.options)
+    cholmod.options[name] = value
+    try:
+        yield
+    finally:
+        cholmod.options.clear()
+        cholmod.options.update(saved)
+
+
+def import_cvxopt() -> tuple[ModuleType, ModuleType]:
+    """CVXOPT and its CHOLMOD; a MissingExtraError without the extra `fast`."""
+    try:
+        with kernels_of_the_cpu():
+            import cvxopt
+            from cvxopt import cholmod
+    except ImportError as error:
+        raise MissingExtraError("cvxopt", "fast") from error
+    return cvxopt, cholmod
+
+
+def amd_order(pattern: csc_array) -> IntArray:
+    """Order of elimination by approximate minimum degree (Amestoy, Davis & Duff 2004), (N,)."""
+    import_cvxopt()  # on the kernels chosen
+    from cvxopt import amd
+
+    return np.array(amd.order(lower_triangle(pattern)[0])).ravel().astype(np.int64)

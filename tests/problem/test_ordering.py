@@ -1,0 +1,64 @@
+"""Orders of elimination: permutations, with the fill that they promise, whichever library factors."""
+
+import numpy as np
+import pytest
+
+import pgo_models as pgo
+from pgo_models.certificates.newton_polish import ground_pose
+from pgo_models.problem import ordering
+from pgo_models.problem.cholesky import CholeskyBackend, analyze
+from pgo_models.problem.hessian import riemannian_hessian, tangent_order
+from pgo_models.problem.ordering import most_counts, pose_order, row_order
+
+WORLD = pgo.grid_world(4, 40, np.random.default_rng(0), d=3)
+
+
+def test_rows_of_a_pose_stand_together_in_the_order_of_the_poses() -> None:
+    assert row_order(np.array([2, 0, 1]), 1, 2).tolist() == [2, 7, 8, 0, 3, 4, 1, 5, 6]
+
+
+@pytest.mark.parametrize("dissected", [False, True])
+@pytest.mark.parametrize("backend", CholeskyBackend)
+def test_factors_in_either_order_solve(backend: CholeskyBackend, dissected: bool, monkeypatch) -> None:
+    pytest.importorskip("cvxopt")
+    pytest.importorskip("pymetis")
+    if dissected:
+        monkeypatch.setattr(ordering, "DISSECTED_FROM", {2: 2, 3: 2})
+    problem = pgo.PGOProblem(WORLD, backend)
+    order = problem.pose_order
+    assert sorted(order) == list(range(WORLD.num_poses))
+    start = pgo.chordal_start(problem)
+    matrix = riemannian_hessian(problem, start, None)
+    ground_pose(matrix, problem)
+    b = np.random.default_rng(0).normal(size=(matrix.shape[0], 2))
+    x = analyze(matrix, backend, tangent_order(problem)).factorize(matrix).solve(b)
+    assert np.linalg.norm(matrix @ x - b) < 1e-9 * np.linalg.norm(b)
+
+
+def test_a_dissected_world_in_space_fills_less() -> None:
+    pytest.importorskip("cvxopt")
+    pytest.importorskip("pymetis")
+    world = pgo.grid_world(100, 100, np.random.default_rng(0), d=3)
+    assert world.num_poses == ordering.DISSECTED_FROM[3]
+    by_degree = ordering.minimum_degree(ordering._pattern(world))
+    filled = [most_counts(world, order, 1).in_column.sum() for order in (pose_order(world), by_degree)]
+    assert filled[0] < 0.8 * filled[1]
+
+
+@pytest.mark.parametrize("name", ["circle", "grid", "sphere", "smallGrid3D"])
+def test_no_factor_has_more_non_zeros_than_blocks_can_have(name: str) -> None:
+    """Not in a row or column, nor in any row that a column meets: what the bound on rounding asks for."""
+    pytest.importorskip("cvxopt")
+    problem = pgo.PGOProblem(pgo.load(name))
+    M, n, d = problem.M.copy(), problem.num_poses, problem.d
+    M.setdiag(2.0 * M.diagonal())
+    most = most_counts(problem.graph, problem.pose_order, 1, d)
+    factor = analyze(M, CholeskyBackend.CHOLMOD, row_order(problem.pose_order, 1, d)).factorize(M)
+    assert (factor.backward_error() <= most.error(0)).all()
+    L, order = factor.take_apart()
+    in_column, in_row = np.diff(L.tocsr().indptr)[np.argsort(order)], np.diff(L.indptr)[np.argsort(order)]
+    back = np.argsort(most.order)
+    assert (in_column <= most.in_column[back]).all()
+    assert in_row.max() <= most.in_row.max()
+    widest = np.array([in_row[order][L.tocsr()[[k]].indices].max() for k in range(n * (d + 1))])[np.argsort(order)]
+    assert (widest <= most.widest[back]).all()
