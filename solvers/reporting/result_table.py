@@ -6,15 +6,13 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-
-from rich.console import Console
-from rich.markup import escape
-from rich.measure import Measurement
-from rich.table import Table
-from rich.text import Text
+from typing import TYPE_CHECKING
 
 from pgo_models.errors import SettingError
 from pgo_models.files import replace_when_done
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 Value = str | int | float | None
 TABLE_SUFFIXES = (".md", ".csv", ".json")
@@ -51,8 +49,14 @@ class ResultTable:
     records: tuple[dict[str, Value], ...]  # the same figures in full, for CSV and JSON: all with the same names
     notes: tuple[str, ...] = ()  # sentences below the tables
 
-    def print(self, console: Console | None = None) -> None:
+    def print(self, console: "Console | None" = None) -> None:
         """Print to the terminal; lines are as wide as they need to be."""
+        from rich.console import Console
+        from rich.markup import escape
+        from rich.measure import Measurement
+        from rich.table import Table
+        from rich.text import Text
+
         console = console if console is not None else Console(highlight=False)
         for part in self.parts:
             if part.caption:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
+import scipy  # and scipy.special when it is used
 
 from pgo_models.errors import check_quantile
 from pgo_models.geometry.rotations import Array, BoolArray, hat, log_map, tangent_dimension
@@ -88,7 +88,7 @@ def pairwise_consistent(graph: PoseGraph, known: BoolArray | None = None, quanti
     S[back] = _carried(reverse, S[back])
     T[0][back], T[1][back] = reverse
     i, j = np.where(back, j, i), np.where(back, i, j)
-    threshold = float(chdtri(S.shape[1], 1.0 - quantile))
+    threshold = float(scipy.special.chdtri(S.shape[1], 1.0 - quantile))
     kept = np.ones(graph.num_edges, dtype=bool)
     kept[tested] = False
     groups = chain[i] * np.int64(graph.num_poses) + chain[j]

@@ -17,9 +17,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # and scipy.special when it is used
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
-from scipy.special import chdtri
 
 from pgo_models.certificates.newton_polish import polish_step, start_polish
 from pgo_models.errors import SettingError, check_quantile, check_settings
@@ -276,7 +276,7 @@ class GNC:
         done = replace(schedule, rescaled=0)
         if self.spread is None or of_kept is None:
             return done
-        usual = np.divide(*chdtri(d + tangent_dimension(d), [0.5, 1.0 - self.quantile]))
+        usual = np.divide(*scipy.special.chdtri(d + tangent_dimension(d), [0.5, 1.0 - self.quantile]))
         factor = min(self.spread * of_kept[0] / float(usual), _LARGEST_SCALE / schedule.scale)
         left = schedule.rescaled - 1
         if _SAME[0] < factor < _SAME[1] or factor * schedule.scale < _LEAST_SCALE:
