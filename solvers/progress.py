@@ -4,13 +4,11 @@ import html
 import math
 import sys
 import time
+from importlib import import_module
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import Any
 
 from solvers.result import Measurement, Record, Status
-
-if TYPE_CHECKING:
-    from solvers.progress_bars import TerminalBar
 
 _HEADER = f"{'k':>6}  {'F':>18}  {'primal':>10}  {'dual':>10}  {'seconds':>9}"
 _HEADER_OF_ROBOTS = f"  {'rounds':>7}  {'reduces':>7}  {'MB sent':>9}"
@@ -27,9 +25,9 @@ class Table:
 
     def __init__(self, name: str, max_iterations: int, verbose: bool, progress: bool | None) -> None:
         self._name, self._max_iterations = name, max_iterations
-        self._in_notebook = _is_notebook()
+        self._in_notebook = "IPython" in sys.modules and import_module("rich.console").Console().is_jupyter
         self._verbose, self._progress = verbose, self._in_notebook if progress is None else progress
-        self._bar: TerminalBar | _NotebookBar | None = None
+        self._bar: Any = None  # a _NotebookBar, or the TerminalBar of rich
 
     def __enter__(self) -> "Table":
         return self
@@ -48,9 +46,8 @@ class Table:
             )
         elif self._progress:
             if self._bar is None and elapsed > _BAR_AFTER_SECONDS:
-                from solvers.progress_bars import TerminalBar
-
-                kind = _NotebookBar if self._in_notebook else TerminalBar
+                rich = import_module("solvers.progress_bars")
+                kind = _NotebookBar if self._in_notebook else rich.TerminalBar
                 self._bar = kind(self._name, self._max_iterations)
             if self._bar is not None:
                 text = f"F {figures.objective:.8g}  residual {max(figures.primal_residual, figures.dual_residual):.1e}"
@@ -106,11 +103,3 @@ def _communication(figures: Measurement) -> str:
 
 def _figure(value: float) -> str:
     return f"{'-':>10}" if math.isinf(value) else f"{value:>10.2e}"
-
-
-def _is_notebook() -> bool:
-    if "IPython" not in sys.modules:
-        return False
-    from rich.console import Console
-
-    return Console().is_jupyter

@@ -24,8 +24,8 @@ from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from pgo_models.problem.weighting import Weighting
+from solvers.reporting.report_text import Solved
 from solvers.reporting.result_table import finite_or_none
-from solvers.reporting.solved import Solved
 from solvers.reporting.versions import installed_versions
 
 if TYPE_CHECKING:

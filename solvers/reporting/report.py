@@ -20,8 +20,7 @@ from pgo_models.plots.style import plotly
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from solvers.reporting.convergence_plots import explore_convergence
 from solvers.reporting.report_html import PageCell, facts, page, paragraph, section, sortable_table
-from solvers.reporting.report_text import advice, fit, headline, meaning
-from solvers.reporting.solved import Solved
+from solvers.reporting.report_text import Solved, advice, fit, headline, meaning
 from solvers.reporting.versions import installed_versions
 from solvers.soc.soc import SOC
 
