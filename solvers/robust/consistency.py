@@ -25,7 +25,7 @@ def odometry(graph: PoseGraph) -> BoolArray:
 
 @dataclass(frozen=True, eq=False)
 class PCM:
-    """Settings of a robust solve by `pairwise_consistent` alone, which says what they are."""
+    """Settings of a robust solve by `pairwise_consistent` alone, which says what they are; `known` is (m,)."""
 
     known: BoolArray | None = None
     quantile: float = 0.99
