@@ -127,7 +127,7 @@ def test_every_room_has_its_sentence_and_is_installed() -> None:
         (only,) = ast.parse(MODULES[f"{room}.__init__"].read_text(encoding="utf-8")).body
         assert isinstance(only, ast.Expr), f"{room} holds more than its sentence"
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
-    assert set(listed) == rooms | {"pgo_models", "pgo_models.data", "solvers", "pgo_command"}
+    assert set(listed) == rooms | {"pgo_models", "pgo_models.data", "pgo_models.data.robots", "solvers", "pgo_command"}
 
 
 @pytest.mark.parametrize("path", [*FILES, *sorted((ROOT / "tests").glob("**/*.py"))], ids=lambda path: path.stem)
