@@ -10,8 +10,8 @@ from typing import Any
 
 from solvers.result import Measurement, Record, Status
 
-_HEADER = f"{'k':>6}  {'F':>18}  {'primal':>10}  {'dual':>10}  {'seconds':>9}"
-_HEADER_OF_ROBOTS = f"  {'rounds':>7}  {'reduces':>7}  {'MB sent':>9}"
+_HEADER = f"{'k':>5}  {'F':>15}  {'primal':>9}  {'dual':>9}  {'seconds':>8}"  # with that of robots 80 columns
+_HEADER_OF_ROBOTS = f"  {'rounds':>6}  {'reduces':>7}  {'MB sent':>7}"
 _BAR_AFTER_SECONDS = 1.0
 _SECONDS_BETWEEN_UPDATES = 0.1
 
@@ -40,8 +40,8 @@ class Table:
                 robots = "" if figures.rounds is None else _HEADER_OF_ROBOTS
                 print(f"{self._name}\n{_HEADER}{robots}")
             print(
-                f"{record.k:>6}  {figures.objective:>18.10g}  {_figure(figures.primal_residual)}  "
-                f"{_figure(figures.dual_residual)}  {record.seconds:>9.3f}{_communication(figures)}",
+                f"{record.k:>5}  {figures.objective:>15.10g}  {_figure(figures.primal_residual)}  "
+                f"{_figure(figures.dual_residual)}  {record.seconds:>8.3f}{_communication(figures)}",
                 flush=True,
             )
         elif self._progress:
@@ -98,8 +98,8 @@ def _communication(figures: Measurement) -> str:
     if figures.rounds is None or figures.num_bytes is None:
         return ""
     reduces = "-" if figures.all_reduces is None else str(figures.all_reduces)
-    return f"  {figures.rounds:>7}  {reduces:>7}  {1e-6 * figures.num_bytes:>9.3f}"
+    return f"  {figures.rounds:>6}  {reduces:>7}  {1e-6 * figures.num_bytes:>7.3f}"
 
 
 def _figure(value: float) -> str:
-    return f"{'-':>10}" if math.isinf(value) else f"{value:>10.2e}"
+    return f"{'-':>9}" if math.isinf(value) else f"{value:>9.2e}"
