@@ -1,71 +1,51 @@
 """Methods on the problems of `pgo_models`: every one is settings with init, step, measure and converged."""
 
 import importlib
-from typing import TYPE_CHECKING
 
-from solvers.baselines.gauss_seidel import GaussSeidel
-from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
-from solvers.distributed.checkpoint import Checkpoint
-from solvers.growing import extend
-from solvers.loop import Method, Solver, iterate, run
-from solvers.network.engine import InProcess
-from solvers.network.faults import Faults
-from solvers.network.ledger import Ledger
-from solvers.network.ray_engine import RayEngine
-from solvers.pipeline import Pipeline, solve
-from solvers.reporting.report import write_report
-from solvers.result import History, Measurement, Record, Run, Stage, Status
-from solvers.riemannian.newton import Newton, gauss_newton
-from solvers.riemannian.staircase import Staircase
-from solvers.robust.consistency import PCM, pairwise_consistent
-from solvers.robust.gnc import GNC, RobustLoss
-from solvers.robust.irls import IRLS
-from solvers.soc.anderson import Anderson
-from solvers.soc.paper import PaperSOC
-from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty, MultiplierPenalty
-from solvers.soc.r_step import RStep
-from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
-from solvers.solution import Solution
-from solvers.studies.comparison import compare_methods
-from solvers.studies.paper_figures import draw_paper_figures
-from solvers.studies.paper_tables import reproduce_tables
-from solvers.studies.tightness import noise_sweep
-
-if TYPE_CHECKING:
-    from solvers.convex.bregman import AlternatingBregman, Bregman, MethodOfMultipliers, TwoLineBregman
-    from solvers.convex.extended_soc import ExtendedSOC
-    from solvers.convex.orthogonal import OrthogonalSOC, solve_orthogonal
-    from solvers.studies.forgetting import error_forgetting
-
-# These import cvxpy, which takes half of the time of an import: loaded when one of their names is first used.
-_LATER = {
-    "AlternatingBregman": "solvers.convex.bregman",
-    "Bregman": "solvers.convex.bregman",
-    "MethodOfMultipliers": "solvers.convex.bregman",
-    "TwoLineBregman": "solvers.convex.bregman",
-    "ExtendedSOC": "solvers.convex.extended_soc",
-    "OrthogonalSOC": "solvers.convex.orthogonal",
-    "solve_orthogonal": "solvers.convex.orthogonal",
-    "error_forgetting": "solvers.studies.forgetting",
+# Public names, room by room, with the module that is imported when one of them is first used; types are in the stub.
+_NAMES = {
+    "solvers.result": "History Measurement Record Run Stage Status",
+    "solvers.loop": "Method Solver iterate run",
+    "solvers.pipeline": "Pipeline solve",
+    "solvers.solution": "Solution",
+    "solvers.growing": "extend",
+    "solvers.reporting.report": "write_report",
+    "solvers.soc.soc": "SOC",
+    "solvers.soc.anderson": "Anderson",
+    "solvers.soc.settings": "Coupling",
+    "solvers.soc.paper": "PaperSOC",
+    "solvers.soc.r_step": "RStep",
+    "solvers.soc.penalty": "BalancedPenalty BoydPenalty FixedPenalty MultiplierPenalty",
+    "solvers.riemannian.newton": "Newton gauss_newton",
+    "solvers.riemannian.staircase": "Staircase",
+    "solvers.robust.gnc": "GNC RobustLoss",
+    "solvers.robust.irls": "IRLS",
+    "solvers.robust.consistency": "PCM pairwise_consistent",
+    "solvers.baselines.gauss_seidel": "GaussSeidel",
+    "solvers.baselines.levenberg_marquardt": "LevenbergMarquardt",
+    "solvers.distributed.checkpoint": "Checkpoint",
+    "solvers.network.faults": "Faults",
+    "solvers.network.engine": "InProcess",
+    "solvers.network.ledger": "Ledger",
+    "solvers.network.ray_engine": "RayEngine",
+    "solvers.convex.bregman": "AlternatingBregman Bregman MethodOfMultipliers TwoLineBregman",
+    "solvers.convex.extended_soc": "ExtendedSOC",
+    "solvers.convex.orthogonal": "OrthogonalSOC solve_orthogonal",
+    "solvers.studies.comparison": "compare_methods",
+    "solvers.studies.paper_figures": "draw_paper_figures",
+    "solvers.studies.forgetting": "error_forgetting",
+    "solvers.studies.tightness": "noise_sweep",
+    "solvers.studies.paper_tables": "reproduce_tables",
 }
-
-# Room by room.
-__all__ = ["History", "Measurement", "Method", "Record", "Run", "Solver", "Stage", "Status", "iterate", "run"]
-__all__ += ["Pipeline", "Solution", "extend", "solve", "write_report"]
-__all__ += ["SOC", "Anderson", "Coupling", "PaperSOC", "RStep"]
-__all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty"]
-__all__ += ["Newton", "Staircase", "gauss_newton"]
-__all__ += ["GNC", "IRLS", "PCM", "RobustLoss", "pairwise_consistent"]
-__all__ += ["GaussSeidel", "LevenbergMarquardt"]
-__all__ += ["Checkpoint", "Faults", "InProcess", "Ledger", "RayEngine"]
-__all__ += ["AlternatingBregman", "Bregman", "MethodOfMultipliers", "TwoLineBregman"]
-__all__ += ["ExtendedSOC", "OrthogonalSOC", "solve_orthogonal"]
-__all__ += ["compare_methods", "draw_paper_figures", "error_forgetting", "noise_sweep", "reproduce_tables"]
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+__all__ = list(_MODULES)
 
 
 def __getattr__(name: str) -> object:
-    if name not in _LATER:
+    if name not in _MODULES:
         raise AttributeError(f"module 'solvers' has no attribute {name!r}")
-    value: object = getattr(importlib.import_module(_LATER[name]), name)
-    return value
+    return getattr(importlib.import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -7,6 +7,7 @@ Exit codes: 0 done; 1 bad input, one line on stderr; 2 not converged, the result
 import math
 import shlex
 import sys
+import textwrap
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,8 +18,6 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from pgo_models.certificates.certificate import DEFAULT_GAP, certify
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
@@ -29,44 +28,35 @@ from pgo_models.graphs.g2o import MOST_SYMBOLS, symbol_ids, write_g2o, write_g2o
 from pgo_models.graphs.separators import report_partition
 from pgo_models.graphs.trajectories import write_tum
 from pgo_models.problem.marginals import write_covariances
+from solvers import cli_options as choices
 from solvers.cli_inputs import estimated_poses, load_graph, pose_named, pose_problem, with_times
-from solvers.cli_options import (
-    ROBUST,
-    BackEndName,
-    FirstStage,
-    Robust,
-    Runner,
-    Scene,
-    Split,
-    Start,
-    chosen_engine,
-    chosen_method,
-    chosen_partition,
-    chosen_pipeline,
-    chosen_scene,
-    chosen_start,
-)
 from solvers.distributed.checkpoint import Checkpoint
 from solvers.explanations import explained_by_its_graph, hint_of_chi2, hint_of_misfits, warn_of_weights, with_places
 from solvers.pipeline import HANDOVER, solve
 from solvers.reporting.graph_facts import describe_graph
 from solvers.reporting.report import check_report, write_report
-from solvers.reporting.versions import installed_versions
-from solvers.shell import DONE, Commands, run_command, save_then_show
+from solvers.reporting.versions import installation, installed_version, installed_versions
+from solvers.shell import DONE, Commands, JsonOption, QuietOption, run_command, save_then_show
 from solvers.soc.soc import SOC
 from solvers.solution import both_costs, certificate_json, check_format, check_target, other_cost, write_json
-from solvers.studies.commands import UnitWeightsOption, compare_command, figures_command, tables_command
+from solvers.studies.commands import DropEdgeOption, UnitWeightsOption, compare_command, figures_command, tables_command
 
 NOT_CONVERGED, NOT_CERTIFIED = 2, 3
 
 app = typer.Typer(
     name="pgo",
     cls=Commands,
-    help="Pose graph optimisation by splitting, with a certified distance to the global optimum.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+@app.callback(invoke_without_command=True)
+def pgo(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    """Pose graph optimisation by splitting, with a certified distance to the global optimum."""
+    if version:
+        typer.echo(f"pgo {installed_version()}")
 
 
 def _finite_gap(gap: float) -> float:
@@ -79,7 +69,7 @@ GraphArgument = Annotated[
     str, typer.Argument(help="A g2o file, a folder with one file a robot, or the name of a data set (see pgo info).")
 ]
 SplitOption = Annotated[
-    Split | None,
+    choices.Split | None,
     typer.Option(help="How poses go to robots: as in the file, else with few cut edges (METIS), else contiguous."),
 ]
 InformationOption = Annotated[
@@ -100,7 +90,7 @@ def solve_command(
         typer.Option("--out", "-o", help="Write .g2o, .tum, .kitti, .json, .png, .svg or .pdf; may be repeated."),
     ] = None,
     method: Annotated[
-        FirstStage | None,
+        choices.FirstStage | None,
         typer.Option(
             help="First stage: joint SOC (one robot), substructured SOC (robots and a driver, the same iterates), "
             "consensus SOC (robots alone), SOC as in the paper, or none before Newton. Joint unless given, or "
@@ -113,7 +103,7 @@ def solve_command(
     ] = None,
     split: SplitOption = None,
     engine: Annotated[
-        Runner | None, typer.Option(help="Where robots run: in this process, in its threads, or as Ray actors.")
+        choices.Runner | None, typer.Option(help="Where robots run: in this process, in its threads, or as Ray actors.")
     ] = None,
     address: Annotated[
         str | None,
@@ -135,10 +125,11 @@ def solve_command(
         ),
     ] = None,
     start: Annotated[
-        Start | None, typer.Option(help="Start: chordal relaxation (tree for the paper's method) unless given.")
+        choices.Start | None, typer.Option(help="Start: chordal relaxation (tree for the paper's method) unless given.")
     ] = None,
     r_step: Annotated[
-        BackEndName | None, typer.Option("--r-step", help="Back end of SOC's R-subproblem; factorized unless given.")
+        choices.BackEndName | None,
+        typer.Option("--r-step", help="Back end of SOC's R-subproblem; factorized unless given."),
     ] = None,
     gap: GapOption = DEFAULT_GAP,
     max_iterations: Annotated[
@@ -169,57 +160,62 @@ def solve_command(
         typer.Option(help="Write covariances as .csv: id, upper triangle; x y (z) in world axes, m, then turn, rad."),
     ] = None,
     robust: Annotated[
-        Robust | None,
+        choices.Robust | None,
         typer.Option(
             help="Find wrong edges and leave them out, odometry taken to be right: graduated non-convexity with "
             "truncated least squares (gnc) or Geman-McClure (gm), pairwise consistency (pcm), or both (pcm-gnc)."
         ),
     ] = None,
+    drop_edge: DropEdgeOption = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print a line an iteration.")] = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Solve a pose graph: poses, their cost, a proven lower bound on the global optimum, and the gap."""
+    if verbose and (quiet or as_json):
+        raise SettingError("--verbose prints a line an iteration, and --quiet and --json do not; give one of them")
     for path in out or []:
         check_format(path)  # before a long solve, not after it
     if report is not None:
         check_report(report)
     if covariances is not None and covariances.suffix.lower() != ".csv":
         raise SettingError(f"cannot write {covariances}: covariances are written as .csv")
-    loaded = with_times(load_graph(graph, unit_weights, skip_unknown), times)
+    loaded = with_times(load_graph(graph, unit_weights, skip_unknown, drop_edge), times)
     problem = pose_problem(loaded, unit_weights, information)
     for path in out or []:
         check_target(path, problem.graph.num_robots)
     for other in filter(None, (report, resume, covariances)):
         check_writable(other)
-    if robust is not None and method is not None and method is not FirstStage.NEWTON:
+    if robust is not None and method is not None and method is not choices.FirstStage.NEWTON:
         raise SettingError(f"--robust goes from its own start straight to Newton, got --method {method.value}")
     about_robots = (robots, split, engine, address, resume, driver_memory)
     is_shared = any(option is not None for option in about_robots)
-    chosen = chosen_method(method, robots, is_shared)
-    if chosen is FirstStage.JOINT and split is not None:
+    chosen = choices.chosen_method(method, robots, is_shared)
+    if chosen is choices.FirstStage.JOINT and split is not None:
         raise SettingError(f"--method joint has one robot, got --split {split.value}; use substructured or consensus")
-    runs_on = chosen_engine(chosen, engine, address, resume is not None)
-    is_shared |= chosen in (FirstStage.SUBSTRUCTURED, FirstStage.CONSENSUS)
-    shared = chosen_partition(problem.graph, robots, split) if is_shared else None
+    runs_on = choices.chosen_engine(chosen, engine, address, resume is not None)
+    is_shared |= chosen in (choices.FirstStage.SUBSTRUCTURED, choices.FirstStage.CONSENSUS)
+    shared = choices.chosen_partition(problem.graph, robots, split) if is_shared else None
     # Robots factor; the other back ends of CONSENSUS have all robots in one place.
-    on_robots = shared is not None and runs_on is not None and r_step in (None, BackEndName.FACTORIZED)
+    on_robots = shared is not None and runs_on is not None and r_step in (None, choices.BackEndName.FACTORIZED)
     of_robots = (engine, address, resume, driver_memory)
     if r_step is not None and not on_robots and any(option is not None for option in of_robots):
         way_out = "leave out --engine, --resume and --driver-memory"
         raise SettingError(f"robots of an engine factor, got --r-step {r_step.value}; {way_out}")
     solution = solve(
         problem,
-        chosen_pipeline(chosen, shared, r_step, gap, max_iterations, tolerance, driver_memory),
-        chosen_start(problem, start),
-        robust=ROBUST[robust] if robust is not None else None,
+        choices.chosen_pipeline(chosen, shared, r_step, gap, max_iterations, tolerance, driver_memory),
+        choices.chosen_start(problem, start),
+        robust=choices.ROBUST[robust] if robust is not None else None,
         robots=shared if on_robots else None,
         engine=runs_on if on_robots else None,
         checkpoint=Checkpoint(resume) if resume is not None else None,
         anchor=pose_named(problem.graph, anchor) if anchor is not None else None,
         time_limit=time_limit,
         verbose=verbose,
-        progress=sys.stderr.isatty(),
+        progress=sys.stderr.isatty() and not quiet,
     )
-    solution = with_places(solution, graph)
+    solution = with_places(solution, graph, drop_edge)
     text, truth = str(solution), problem.graph.truth
     if truth is not None:
         bodies = problem.graph.bodies
@@ -234,15 +230,18 @@ def solve_command(
             solution = replace(solution, covariances=solution.marginals() if report is not None else None)
     if report is not None:
         options = {"--unit-weights": unit_weights, "--information": information, "--skip-unknown": skip_unknown}
-        chosen_robust = ["--robust", robust.value] if robust is not None else []
-        source = shlex.join([graph, *(name for name, given in options.items() if given), *chosen_robust])
+        words = [word for edge in drop_edge or () for word in ("--drop-edge", edge)]
+        words += ["--robust", robust.value] if robust is not None else []
+        source = shlex.join([graph, *(name for name, given in options.items() if given), *words])
         targets.append((report, partial(write_report, solution, source=source)))
 
     def show() -> None:
-        typer.echo("\n\n".join([text, *hint_of_chi2(problem, solution.poses), *hint_of_misfits(solution)]))
+        typer.echo(
+            "\n\n".join([text, *hint_of_chi2(problem, solution.poses), *hint_of_misfits(solution, graph, drop_edge)])
+        )
 
-    save_then_show(targets, show)
-    warn_of_weights(graph, problem, solution.certificate)
+    save_then_show(targets, show, solution.as_json if as_json else None, quiet)
+    warn_of_weights(graph, problem, solution.certificate, drop_edge)
     if not solution.status.is_success:
         raise typer.Exit(NOT_CONVERGED)
     raise typer.Exit(DONE if solution.is_certified else NOT_CERTIFIED)
@@ -261,13 +260,17 @@ def certify_command(
     unit_weights: UnitWeightsOption = False,
     information: InformationOption = False,
     skip_unknown: SkipUnknownOption = False,
+    drop_edge: DropEdgeOption = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Judge anybody's poses: how far their cost can be above the global optimum."""
     if out is not None:
         if out.suffix.lower() != ".json":
             raise SettingError(f"cannot write {out}: a certificate is written as .json")
         check_writable(out)
-    problem = pose_problem(load_graph(graph, unit_weights, skip_unknown), unit_weights, information)
+    loaded = load_graph(graph, unit_weights, skip_unknown, drop_edge)
+    problem = pose_problem(loaded, unit_weights, information)
     poses = estimated_poses(problem.graph, estimate)
     certificate = certify(problem, poses, gap)
     record = {
@@ -280,8 +283,9 @@ def certify_command(
     }
     targets = [(out, partial(write_json, record))] if out is not None else []
     rows = [f"{label:<12} {text}" for label, text in other_cost(problem, poses)]
-    save_then_show(targets, lambda: typer.echo("\n".join([str(certificate), *rows, *hint_of_chi2(problem, poses)])))
-    warn_of_weights(graph, problem, certificate)
+    text = "\n".join([str(certificate), *rows, *hint_of_chi2(problem, poses)])
+    save_then_show(targets, lambda: typer.echo(text), (lambda: record) if as_json else None, quiet)
+    warn_of_weights(graph, problem, certificate, drop_edge)
     raise typer.Exit(DONE if certificate.is_certified else NOT_CERTIFIED)
 
 
@@ -296,29 +300,23 @@ def info_command(
     skip_unknown: SkipUnknownOption = False,
 ) -> None:
     """Show what a pose graph is made of, or what this installation has."""
-    table = Table(show_header=False, box=None)
     if graph is None:
         if robots is not None or split is not None:
             raise SettingError("--robots and --split describe a graph; give one")
-        for name, version in installed_versions(None).items():
-            table.add_row(name, version)
-        table.add_row("data sets", ", ".join(known_datasets()))
+        rows = [*installation(), ("data sets", ", ".join(known_datasets()))]
     else:
         loaded = load_graph(graph, False, skip_unknown)
-        for label, text in describe_graph(loaded):
-            table.add_row(label, text)
+        rows = describe_graph(loaded)
         if robots is not None or split is not None:
-            shared = chosen_partition(loaded, robots, split)
-            table.add_row("", "")
-            table.add_row("partition", shared.method.value)
-            for label, text in report_partition(shared, loaded).facts():
-                table.add_row(label, text)
-    Console().print(table)
+            shared = choices.chosen_partition(loaded, robots, split)
+            rows += [("", ""), ("partition", shared.method.value), *report_partition(shared, loaded).facts()]
+    for label, text in rows:
+        typer.echo(textwrap.fill(f"{label:<15} {text}", 80, subsequent_indent=16 * " "))
 
 
 @app.command("generate")
 def generate_command(
-    scene: Annotated[Scene, typer.Argument(help="Which scene; the first three are the paper's.")],
+    scene: Annotated[choices.Scene, typer.Argument(help="Which scene; the first three are the paper's.")],
     out: Annotated[
         Path, typer.Option("--out", "-o", help="A .g2o file, or a name without suffix: a folder with one file a robot.")
     ],
@@ -340,7 +338,9 @@ def generate_command(
     ] = None,
 ) -> None:
     """Generate a scene with known truth, written beside it as NAME.truth.tum."""
-    made = chosen_scene(scene, np.random.default_rng(seed), poses, robots, dimension, translation_noise, rotation_noise)
+    made = choices.chosen_scene(
+        scene, np.random.default_rng(seed), poses, robots, dimension, translation_noise, rotation_noise
+    )
     if out.suffix == "":
         # Symbols have 52 letters; poses of more robots are numbered, and the files alone say whose they are.
         named = replace(made, ids=symbol_ids(made.robots)) if made.num_robots <= MOST_SYMBOLS else made

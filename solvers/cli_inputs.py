@@ -1,5 +1,6 @@
-"""What the arguments of `pgo` name: graphs, problems, poses and their times."""
+"""What the arguments of `pgo` name: graphs, edges, problems, poses and their times."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,18 +8,43 @@ import numpy as np
 
 from pgo_models.errors import FileFormatError, SettingError
 from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.datasets import load
-from pgo_models.graphs.g2o import read_g2o_poses
+from pgo_models.geometry.rotations import BoolArray
+from pgo_models.graphs.datasets import load, locate
+from pgo_models.graphs.g2o import edge_places, read_g2o_poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.trajectories import read_kitti, read_times, read_tum
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 
+Dropped = list[str] | None  # edges to leave out, by LINE or FILE:LINE
 
-def load_graph(graph: str, unit_weights: bool, skip_unknown: bool = False) -> PoseGraph:
-    """Graph of a file, folder or data set, with its own weights or those of the paper."""
+
+def load_graph(graph: str, unit_weights: bool, skip_unknown: bool = False, dropped: Dropped = None) -> PoseGraph:
+    """Graph of a file, folder or data set, with its own weights or those of the paper, without the edges dropped."""
     loaded = load(graph, skip_unknown=skip_unknown)
+    if dropped:
+        loaded = loaded.without_edges(~kept_edges(graph, dropped)[0])
     return loaded.unit_weights() if unit_weights else loaded
+
+
+def kept_edges(graph: str, dropped: Dropped) -> tuple[BoolArray, list[str]]:
+    """Whether an edge is kept, (m,), and `file:line` of those that are; a SettingError where no edge has a name.
+
+    An edge is named by its line, in a folder by FILE:LINE, with or without the folder.
+    """
+    path = locate(graph)
+    if not (path.is_file() or path.is_dir()):
+        raise SettingError(f"{graph} can be read only once; give it as a file to name its edges")
+    with warnings.catch_warnings(action="ignore"):
+        places = edge_places(path)
+    kept = np.ones(len(places), dtype=bool)
+    for name in dropped or ():
+        named = [k for k, place in enumerate(places) if f"/{place}".endswith((f"/{name}", f":{name}"))]
+        if len(named) != 1:
+            what = "no edge is" if not named else f"{len(named)} edges are"
+            raise SettingError(f"{what} at {name} of {graph}; name it LINE or FILE:LINE, as {places[0]}")
+        kept[named] = False
+    return kept, [place for place, is_kept in zip(places, kept, strict=True) if is_kept]
 
 
 def pose_problem(graph: PoseGraph, unit_weights: bool, information: bool) -> PGOProblem:

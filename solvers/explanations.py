@@ -4,7 +4,7 @@ import functools
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar, cast
 
 import numpy as np
 
@@ -12,13 +12,13 @@ from pgo_models.certificates.certificate import Certificate, Verdict
 from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import GraphWarning, NotPositiveDefiniteError, PGOError
 from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.datasets import load, locate
-from pgo_models.graphs.g2o import edge_places
+from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import extreme_weight
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from solvers.cli_inputs import Dropped, kept_edges, load_graph
 from solvers.solution import Solution
 
 WORTH_SAYING = 1.01  # times its minimum: what chi2 has to be for a hint
@@ -31,11 +31,11 @@ def explained_by_its_graph(command: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(command)
     def explained(*args: P.args, **kwargs: P.kwargs) -> T:
-        graph = str(kwargs["graph"])
+        graph, dropped = str(kwargs["graph"]), cast("Dropped", kwargs.get("drop_edge"))
         try:
             return command(*args, **kwargs)
         except NotPositiveDefiniteError as error:
-            raise NotPositiveDefiniteError(f"{place_of_weight(graph)} ({error})") from error
+            raise NotPositiveDefiniteError(f"{place_of_weight(graph, dropped)} ({error})") from error
         except MemoryError as error:
             raise PGOError(
                 f"{graph} takes more memory than there is; raise the limit, or share it among machines: "
@@ -52,10 +52,10 @@ def note_of_weights(graph: PoseGraph, certificate: Certificate) -> str:
     return f"{text}, too far from others for a proof; correct it, or solve graph.unit_weights()" if is_cause else ""
 
 
-def warn_of_weights(graph: str, problem: PGOProblem, certificate: Certificate) -> None:
+def warn_of_weights(graph: str, problem: PGOProblem, certificate: Certificate, dropped: Dropped = None) -> None:
     """Say where the weight of `note_of_weights` is, if there is one."""
     if note_of_weights(problem.graph, certificate):
-        warnings.warn(place_of_weight(graph), GraphWarning, stacklevel=2)
+        warnings.warn(place_of_weight(graph, dropped), GraphWarning, stacklevel=2)
 
 
 def hint_of_chi2(problem: PGOProblem, poses: Poses) -> list[str]:
@@ -76,35 +76,39 @@ def hint_of_chi2(problem: PGOProblem, poses: Poses) -> list[str]:
     return [f"the file's own cost: chi2 {here:.4g} here; its minimum is at most {below:.4g}: --information"]
 
 
-def hint_of_misfits(solution: Solution) -> list[str]:
-    """A line that names `--robust gnc` where the edges cost more than their information matrices lead to expect."""
+def hint_of_misfits(solution: Solution, graph: str, dropped: Dropped) -> list[str]:
+    """Where the edges cost more than their information matrices lead to expect: `--robust gnc`, and the worst edge."""
     residuals = solution.edge_residuals
     if solution.robust is not None or not residuals.is_doubtful:
         return []
     cost, misfits = f"the edges cost {residuals.overall:.3g} times what is expected", int(residuals.is_misfit.sum())
-    named = f", {misfits} of them alone more than they may" if misfits else ""
-    return [f"{cost}{named}; if loop closures may be wrong: --robust gnc"]
+    hint = "if loop closures may be wrong: --robust gnc"
+    if not misfits or not (locate(graph).is_file() or locate(graph).is_dir()):
+        return [f"{cost}; {hint}"]
+    worst = kept_edges(graph, dropped)[1][int((residuals.cost / residuals.allowed).argmax())]
+    name = worst.rpartition("/")[2]
+    return [f"{cost}, {misfits} of them alone more than they may, {worst} most; {hint}, --drop-edge {name}"]
 
 
-def with_places(solution: Solution, graph: str) -> Solution:
+def with_places(solution: Solution, graph: str, dropped: Dropped = None) -> Solution:
     """The solution; a robust one with `file:line` of every edge of the graph that was asked for."""
     if solution.robust is None:
         return solution
-    with warnings.catch_warnings(action="ignore"):
-        places = tuple(edge_places(locate(graph)))
+    places = tuple(kept_edges(graph, dropped)[1])
     return replace(solution, robust=replace(solution.robust, places=places))
 
 
-def place_of_weight(graph: str) -> str:
+def place_of_weight(graph: str, dropped: Dropped = None) -> str:
     """Sentence on the weight that is too far from the others: file and line, edge, value, and the way out."""
     path = locate(graph)
     if not (path.is_file() or path.is_dir()):
         return f"{graph}: weights too far apart for doubles; give it as a file to be told which"
     with warnings.catch_warnings(action="ignore"):
-        loaded = load(path, skip_unknown=True)
+        loaded = load_graph(graph, False, True, dropped)
     _, edge, text = extreme_weight(loaded)
+    place = kept_edges(graph, dropped)[1][edge]
     return (
-        f"{edge_places(path)[edge]}: {text}; weights from {min(loaded.kappa.min(), loaded.tau.min()):.3g} to "
+        f"{place}: {text}; weights from {min(loaded.kappa.min(), loaded.tau.min()):.3g} to "
         f"{max(loaded.kappa.max(), loaded.tau.max()):.3g} and lengths up to {np.abs(loaded.t_ij).max():.3g} m "
         "are too far apart for doubles; correct the information matrix, or use --unit-weights"
     )

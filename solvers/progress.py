@@ -1,18 +1,17 @@
-"""The one printed table of a run and its progress bar, in a terminal or in a notebook; the bar of a job of runs."""
+"""The one printed table of a run and its progress bar, in a terminal or in a notebook."""
 
 import html
 import math
 import sys
 import time
+from importlib import import_module
 from types import TracebackType
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from typing import Any
 
 from solvers.result import Measurement, Record, Status
 
-_HEADER = f"{'k':>6}  {'F':>18}  {'primal':>10}  {'dual':>10}  {'seconds':>9}"
-_HEADER_OF_ROBOTS = f"  {'rounds':>7}  {'reduces':>7}  {'MB sent':>9}"
+_HEADER = f"{'k':>5}  {'F':>15}  {'primal':>9}  {'dual':>9}  {'seconds':>8}"  # with that of robots 80 columns
+_HEADER_OF_ROBOTS = f"  {'rounds':>6}  {'reduces':>7}  {'MB sent':>7}"
 _BAR_AFTER_SECONDS = 1.0
 _SECONDS_BETWEEN_UPDATES = 0.1
 
@@ -26,11 +25,9 @@ class Table:
 
     def __init__(self, name: str, max_iterations: int, verbose: bool, progress: bool | None) -> None:
         self._name, self._max_iterations = name, max_iterations
-        self._in_notebook = Console().is_jupyter
+        self._in_notebook = "IPython" in sys.modules and import_module("rich.console").Console().is_jupyter
         self._verbose, self._progress = verbose, self._in_notebook if progress is None else progress
-        # In a notebook, too, lines are lines: rich would make an output of its own of each.
-        self._console = Console(highlight=False, force_jupyter=False)
-        self._bar: _TerminalBar | _NotebookBar | None = None
+        self._bar: Any = None  # a _NotebookBar, or the TerminalBar of rich
 
     def __enter__(self) -> "Table":
         return self
@@ -41,16 +38,16 @@ class Table:
         if self._verbose:
             if record.k == 0:
                 robots = "" if figures.rounds is None else _HEADER_OF_ROBOTS
-                self._console.print(f"{self._name}\n{_HEADER}{robots}", markup=False, soft_wrap=True)
-            self._console.print(
-                f"{record.k:>6}  {figures.objective:>18.10g}  {_figure(figures.primal_residual)}  "
-                f"{_figure(figures.dual_residual)}  {record.seconds:>9.3f}{_communication(figures)}",
-                markup=False,
-                soft_wrap=True,
+                print(f"{self._name}\n{_HEADER}{robots}")
+            print(
+                f"{record.k:>5}  {figures.objective:>15.10g}  {_figure(figures.primal_residual)}  "
+                f"{_figure(figures.dual_residual)}  {record.seconds:>8.3f}{_communication(figures)}",
+                flush=True,
             )
         elif self._progress:
             if self._bar is None and elapsed > _BAR_AFTER_SECONDS:
-                kind = _NotebookBar if self._in_notebook else _TerminalBar
+                rich = import_module("solvers.progress_bars")
+                kind = _NotebookBar if self._in_notebook else rich.TerminalBar
                 self._bar = kind(self._name, self._max_iterations)
             if self._bar is not None:
                 text = f"F {figures.objective:.8g}  residual {max(figures.primal_residual, figures.dual_residual):.1e}"
@@ -60,45 +57,13 @@ class Table:
     def end(self, status: Status, iterations: int) -> None:
         """Show how the run ended."""
         if self._verbose:
-            self._console.print(
-                f"{status.name} after {iterations} iterations: {status.value}", markup=False, soft_wrap=True
-            )
+            print(f"{status.name} after {iterations} iterations: {status.value}", flush=True)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._bar is not None:
             self._bar.stop()
-
-
-class JobBar(Progress):
-    """Progress over the parts of a job, on stderr; with `progress` None, where that is a terminal."""
-
-    def __init__(self, parts: int, progress: bool | None) -> None:
-        is_shown = sys.stderr.isatty() if progress is None else progress
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        super().__init__(*columns, console=Console(stderr=True), transient=True, disable=not is_shown)
-        self._task = self.add_task("", total=parts)
-
-    def name_part(self, text: str) -> None:
-        """Say which part is being done."""
-        self.update(self._task, description=text)
-
-    def end_part(self) -> None:
-        """Count the part as done."""
-        self.advance(self._task)
-
-
-class _TerminalBar(Progress):
-    def __init__(self, name: str, max_iterations: int) -> None:
-        texts = (TextColumn("{task.completed:.0f}/{task.total:.0f}"), TextColumn("{task.fields[figures]}"))
-        columns = (TextColumn("{task.description}"), BarColumn(), *texts, TimeElapsedColumn())
-        super().__init__(*columns, console=Console(stderr=True), transient=True)
-        self.start()
-        self._task = self.add_task(name, total=max_iterations, figures="")
-
-    def show(self, k: int, text: str) -> None:
-        self.update(self._task, completed=k, figures=text)
 
 
 class _NotebookBar:
@@ -133,8 +98,8 @@ def _communication(figures: Measurement) -> str:
     if figures.rounds is None or figures.num_bytes is None:
         return ""
     reduces = "-" if figures.all_reduces is None else str(figures.all_reduces)
-    return f"  {figures.rounds:>7}  {reduces:>7}  {1e-6 * figures.num_bytes:>9.3f}"
+    return f"  {figures.rounds:>6}  {reduces:>7}  {1e-6 * figures.num_bytes:>7.3f}"
 
 
 def _figure(value: float) -> str:
-    return f"{'-':>10}" if math.isinf(value) else f"{value:>10.2e}"
+    return f"{'-':>9}" if math.isinf(value) else f"{value:>9.2e}"

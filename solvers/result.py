@@ -80,27 +80,27 @@ class History:
 
     @property
     def k(self) -> Array:
-        """Iterate numbers."""
+        """Iterate numbers, (k,)."""
         return np.array([record.k for record in self.records], dtype=float)
 
     @property
     def seconds(self) -> Array:
-        """Seconds in steps, measuring and printing left out."""
+        """Seconds in steps, (k,), measuring and printing left out."""
         return np.array([record.seconds for record in self.records])
 
     @property
     def objective(self) -> Array:
-        """F of every iterate."""
+        """F of every iterate, (k,)."""
         return np.array([record.measurement.objective for record in self.records])
 
     @property
     def primal_residual(self) -> Array:
-        """Primal residual of every iterate."""
+        """Primal residual of every iterate, (k,)."""
         return np.array([record.measurement.primal_residual for record in self.records])
 
     @property
     def dual_residual(self) -> Array:
-        """Dual residual of every iterate."""
+        """Dual residual of every iterate, (k,)."""
         return np.array([record.measurement.dual_residual for record in self.records])
 
 

@@ -1,6 +1,7 @@
 """What the shell does to a command: signals that break it off, pipes that close and disks that fill up under it."""
 
 import errno
+import json
 import math
 import os
 import re
@@ -11,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import FrameType
-from typing import Any, TextIO, cast
+from typing import Annotated, Any, TextIO, cast
 
 import typer
 from typer.core import TyperGroup
@@ -22,6 +23,8 @@ DONE, BAD_INPUT, BROKEN_OFF = 0, 1, 130
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _SAME_SIGNAL = 0.5  # seconds: who hits Ctrl-C twice means it once, and the answer takes time
 _LONGEST_WORD = 300  # of an error message, which is to stay a line
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors and warnings alone.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else on standard output.")]
 
 
 class Commands(TyperGroup):
@@ -151,8 +154,13 @@ def outlets() -> Iterator[Outlet]:
             err.flush()
 
 
-def save_then_show(targets: Iterable[tuple[Path, Callable[[Path], object]]], show: Callable[[], object]) -> None:
-    """Write every file that can be written, then print the result and the names of the files.
+def save_then_show(
+    targets: Iterable[tuple[Path, Callable[[Path], object]]],
+    show: Callable[[], object],
+    record: Callable[[], dict[str, object]] | None = None,
+    quiet: bool = False,
+) -> None:
+    """Write every file that can be written, then print the result and their names, or nothing but a record.
 
     Signals that come while files are written are too late: there is nothing left to break off. A PGOError comes at the
     end, when a file could not be written.
@@ -168,9 +176,11 @@ def save_then_show(targets: Iterable[tuple[Path, Callable[[Path], object]]], sho
                 failures.append(str(error))
             except MemoryError:
                 failures.append(f"cannot write {path}: there is not enough memory; choose another format")
-    show()
-    for path in written:
-        typer.echo(f"written: {path}")
+    if record is not None:
+        typer.echo(json.dumps(record(), indent=1, allow_nan=False))
+    elif not quiet:
+        show()
+        typer.echo("".join(f"written: {path}\n" for path in written), nl=False)
     if failures:
         raise PGOError("; ".join(failures))
 

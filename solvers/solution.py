@@ -24,7 +24,7 @@ from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from pgo_models.problem.weighting import Weighting
-from solvers.reporting.report import Solved, write_report
+from solvers.reporting.report_text import Solved
 from solvers.reporting.result_table import finite_or_none
 from solvers.reporting.versions import installed_versions
 
@@ -144,6 +144,8 @@ class Solution(Solved):
         A MissingExtraError without plotly, a SettingError when `path` does not end in .html, a PGOError when the file
         cannot be written.
         """
+        from solvers.reporting.report import write_report
+
         write_report(self, path)
 
     def plot(self) -> "Figure":

@@ -2,10 +2,13 @@
 
 import importlib
 import inspect
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+import typed_user
 
 import pgo_models
 import solvers
@@ -36,3 +39,49 @@ def test_no_file_hides_a_public_name(package: ModuleType) -> None:
         importlib.import_module(f"{package.__name__}.{path.stem}")
     hidden = [name for name in package.__all__ if isinstance(getattr(package, name), ModuleType)]
     assert hidden == []
+
+
+SYMBOL = r"(?:\(d ?\+ ?1\)|[A-Za-z]{1,2}|nnz|count|num_robots|\d|[+ ])+"
+SHAPE = re.compile(rf"\({SYMBOL},(?:{SYMBOL},?)*\)|\bshapes?\b")  # (n, d, d), (m,), ((d+1) n, d), or that of a variable
+
+
+def callables_with_arrays(package: ModuleType) -> Iterator[tuple[str, str]]:
+    """Name and docstring of public functions, methods and classes that take, return or hold arrays."""
+    for name in package.__all__:
+        thing = getattr(package, name)
+        found = {name: thing}
+        if inspect.isclass(thing):
+            for member, value in vars(thing).items():
+                if not member.startswith("_"):
+                    inner = getattr(value, "fget", None) or getattr(value, "func", None) or value
+                    found[f"{name}.{member}"] = getattr(inner, "__func__", inner)
+        for label, one in found.items():
+            hints = inspect.get_annotations(one) if inspect.isclass(one) or inspect.isfunction(one) else {}
+            if any(re.search("Array|ndarray", str(hint)) for hint in hints.values()):
+                yield label, inspect.getdoc(one) or ""
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=label)
+def test_docstrings_say_the_shapes_of_arrays(package: ModuleType) -> None:
+    documented = dict(callables_with_arrays(package))
+    assert len(documented) > 10
+    assert [name for name, text in documented.items() if not SHAPE.search(text)] == []
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=label)
+def test_fields_with_arrays_say_their_shapes(package: ModuleType) -> None:
+    for name in package.__all__:
+        thing = getattr(package, name)
+        if inspect.isclass(thing):
+            text, source = inspect.getdoc(thing) or "", inspect.getsource(thing)
+            for field, hint in inspect.get_annotations(thing).items():
+                if re.search("Array|ndarray", str(hint)) and not field.startswith("_"):
+                    beside = re.findall(rf"^ *{field}:.*#(.*)$|^[^\n]*\b{field}\b(.*)$", f"{source}\n{text}", re.M)
+                    assert any(SHAPE.search("".join(words)) for words in beside), f"{name}.{field}"
+
+
+def test_what_a_user_writes_is_typed_and_runs(tmp_path: Path) -> None:
+    certificate, solution, costs = typed_user.main(tmp_path)
+    assert solution.is_certified
+    assert certificate.is_certified
+    assert len(costs) == 6

@@ -1,6 +1,8 @@
 """Rooms and their order: who may import whom, and what an import may do."""
 
 import ast
+import importlib
+import re
 import subprocess
 import sys
 import tomllib
@@ -25,6 +27,7 @@ ORDER = {
     ),
     "solvers": (
         "result",
+        "progress_bars",
         "progress",
         "network",
         "soc",
@@ -37,6 +40,7 @@ ORDER = {
         "distributed",
         "reporting",
         "solution",
+        "cli_inputs",
         "explanations",
         "frames",
         "robust_solve",
@@ -44,7 +48,6 @@ ORDER = {
         "growing",
         "shell",
         "studies",
-        "cli_inputs",
         "cli_options",
         "cli",
     ),
@@ -124,7 +127,7 @@ def test_every_room_has_its_sentence_and_is_installed() -> None:
         (only,) = ast.parse(MODULES[f"{room}.__init__"].read_text(encoding="utf-8")).body
         assert isinstance(only, ast.Expr), f"{room} holds more than its sentence"
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
-    assert set(listed) == rooms | {"pgo_models", "pgo_models.data", "solvers", "pgo_command"}
+    assert set(listed) == rooms | {"pgo_models", "pgo_models.data", "pgo_models.data.robots", "solvers", "pgo_command"}
 
 
 @pytest.mark.parametrize("path", [*FILES, *sorted((ROOT / "tests").glob("**/*.py"))], ids=lambda path: path.stem)
@@ -155,3 +158,38 @@ for name in {names!r}:
     )
     assert (finished.returncode, finished.stdout, finished.stderr) == (0, "", "")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("package", ["pgo_models", "solvers"])
+def test_the_names_at_a_door_are_those_of_its_stub(package: str) -> None:
+    door = importlib.import_module(package)
+    stub = (ROOT / package / "__init__.pyi").read_text(encoding="utf-8")
+    typed = {
+        alias.name: node.module
+        for node in ast.walk(ast.parse(stub))
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    listed = [name for names in re.findall(r"^__all__ \+?= (.*)", stub, re.M) for name in ast.literal_eval(names)]
+    assert sorted(listed) == sorted(door.__all__) == sorted(typed)
+    assert set(door.__all__) <= set(dir(door))
+    for name, module in typed.items():
+        assert getattr(door, name) is getattr(importlib.import_module(module), name)
+    with pytest.raises(AttributeError, match=f"module '{package}' has no attribute 'nothing'"):
+        _ = door.nothing
+
+
+def test_what_is_slow_to_import_waits_until_it_is_used() -> None:
+    program = """
+import sys
+import pgo_models, solvers
+ours = [name for name in sys.modules if name.startswith(("pgo_models.", "solvers."))]
+assert not ours, ours
+solvers.solve, solvers.SOC, solvers.Solution, pgo_models.PGOProblem, pgo_models.read_g2o, pgo_models.certify
+late = ("rich", "scipy.spatial", "scipy.special", "cvxpy", "solvers.reporting.report", "solvers.studies.benchmark")
+found = [name for name in late if name in sys.modules]
+assert not found, found
+solvers.solve(pgo_models.load("grid"))
+assert "scipy.spatial" in sys.modules and "rich" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-W", "error", "-c", program], cwd=ROOT, check=True)

@@ -39,6 +39,18 @@ def test_verbose_prints_a_header_a_row_an_iterate_and_the_ending(capsys: pytest.
     assert ending == f"CONVERGED after 2 iterations: {Status.CONVERGED.value}"
 
 
+def test_rows_of_a_run_by_robots_fill_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    measured = Measurement(1.234567891e-05, 1e-100, 1e-100, rounds=123456, all_reduces=1234567, num_bytes=999_999_000)
+    with Table("SOC", 100, verbose=True, progress=False) as table:
+        for k in (0, 99_999):
+            table.row(Record(k, 9999.999, measured), 0.0)
+    lines = capsys.readouterr().out.splitlines()[1:]
+    assert {len(line) for line in lines} == {80}
+    assert lines[-1].split() == [
+        *("99999", "1.234567891e-05", "1.00e-100", "1.00e-100", "9999.999", "123456", "1234567", "999.999")
+    ]
+
+
 def test_a_residual_that_is_not_yet_known_is_a_dash(capsys: pytest.CaptureFixture[str]) -> None:
     with Table("SOC", 100, verbose=True, progress=False) as table:
         table.row(Record(0, 0.0, Measurement(1.0, float("inf"), float("inf"))), 0.0)

@@ -1,5 +1,6 @@
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -49,12 +50,28 @@ def test_ci_finds_its_lines(marker):
     assert re.search(rf"<!-- {marker} -->\n```sh\n.*\.venv/bin/.*\n```", README)
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", BENCHMARKS_PAGE], ids=["readme", "benchmarks"])
-def test_pictures_and_files_that_a_page_names_are_there(page):
-    targets = re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8"))
+def test_pictures_and_files_that_the_benchmarks_name_are_there():
+    targets = re.findall(r"\]\(([^)]+)\)", BENCHMARKS)
     assert targets
     for target in targets:
-        assert target.startswith("http") or (page.parent / target).exists(), target
+        assert target.startswith("http") or (BENCHMARKS_PAGE.parent / target).exists(), target
+
+
+def test_the_readme_reads_the_same_where_no_other_file_is():
+    # It is the description of the package as well, where links to files of the repository lead nowhere.
+    for target in re.findall(r"\]\(([^)]+)\)", README):
+        assert target.startswith("https://"), target
+    for notebook in ROOT.glob("notebooks/*.ipynb"):
+        assert f"`{notebook.name}`" in README
+
+
+def test_the_release_is_the_same_everywhere():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    released = re.search(r"^date-released: (\d{4}-\d\d-\d\d)$", citation, re.M)[1]
+    assert re.search(r"^version: (.*)$", citation, re.M)[1] == project["version"]
+    changes = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)
+    assert f"{project['version']} ({released})" in changes[:2]
 
 
 @pytest.mark.parametrize("page", [README, BENCHMARKS], ids=["readme", "benchmarks"])

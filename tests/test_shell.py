@@ -233,3 +233,29 @@ def test_the_same_graph_is_read_whatever_ends_its_lines(tmp_path):
     for name, end in (("cr", b"\r"), ("crlf", b"\r\n")):
         (tmp_path / f"{name}.g2o").write_bytes(data.replace(b"\n", end))
         np.testing.assert_array_equal(pgo.read_g2o(tmp_path / f"{name}.g2o").t_ij, graph.t_ij)
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+@pytest.mark.parametrize("package", ["pgo_models", "solvers"])
+def test_a_package_hidden_by_another_of_its_name_is_one_line_that_names_it(tmp_path, package, kind):
+    hidden = tmp_path / f"{package}.py" if kind == "file" else tmp_path / package / "__init__.py"
+    hidden.parent.mkdir(exist_ok=True)
+    hidden.write_text("raise SystemExit('it was run')\n")
+    command = str(ROOT / "solvers" / "command" / "__init__.py")
+    program = f"import runpy; runpy.run_path({command!r})['main']()"
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    run = [sys.executable, "-P", "-c", program, "info"]  # as a console script, without the folder it is started in
+    done = subprocess.run(run, env=env, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, one_line(done.stderr)) == (1, "", True), done.stderr
+    assert f"{hidden} hides pgo's own {package}; rename it" in done.stderr
+
+
+def test_the_shell_completes_commands_and_options():
+    expected = {"pgo so": "solve", "pgo solve --rob": "--robust", "pgo solve grid --split m": "metis"}
+    for words, completed in expected.items():
+        env = {"_PGO_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+        program = "import sys; sys.argv[0] = 'pgo'; from solvers.cli import main; main()"
+        run = [sys.executable, "-c", program]
+        done = subprocess.run(run, env={**os.environ, **env}, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert completed in done.stdout.split()

@@ -108,13 +108,13 @@ class BregmanProblem:
         return np.concatenate([np.ravel(value) for value in values])
 
     def unstacked(self, x: Array) -> tuple[Array, ...]:
-        """One array for every variable, in its shape; the inverse of `stacked`."""
+        """One array for every variable, in its shape, of x, (m,); the inverse of `stacked`."""
         return tuple(
             x[block].reshape(variable.shape) for block, variable in zip(self.blocks, self.variables, strict=True)
         )
 
     def objective(self, x: Array) -> float:
-        """J(x); inf outside its domain."""
+        """J(x), x (m,); inf outside its domain."""
         for variable, value in zip(self.variables, self.unstacked(x), strict=True):
             variable.save_value(value)
         with np.errstate(all="ignore"):  # outside the domain of J the value says so

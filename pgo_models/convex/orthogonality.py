@@ -131,7 +131,7 @@ class OrthogonalProblem:
         return f"OrthogonalProblem({', '.join(parts)})"
 
     def point(self, values: Sequence[Array]) -> OrthogonalPoint:
-        """Point with the projections of `values`, one for every variable in `variables`, and no multipliers.
+        """Point with the projections of `values`, of the shapes of `variables`, and no multipliers.
 
         A SettingError when their number or shapes do not fit, or entries are not finite.
         """
@@ -168,25 +168,25 @@ class OrthogonalProblem:
         return [term.constraint for term in self.terms if term.variable == variable]
 
     def values(self, copies: Sequence[Array]) -> tuple[Array, ...]:
-        """For every variable, the copy in the first of its sets."""
+        """For every variable, in its shape, the copy in the first of its sets."""
         first: dict[int, Array] = {}
         for term, copy in zip(self.terms, copies, strict=True):
             first.setdefault(term.variable, copy)
         return tuple(first[place] for place in range(len(self.variables)))
 
     def assign(self, values: Sequence[Array], others: Sequence[Array] = ()) -> None:
-        """Put values into the cvxpy variables, `variables` and then `others`."""
+        """Put values, each in its shape, into the cvxpy variables, `variables` and then `others`."""
         for variable, value in zip((*self.variables, *self.others), (*values, *others), strict=False):
             variable.save_value(value)
 
     def objective(self, values: Sequence[Array], others: Sequence[Array] = ()) -> float:
-        """J at values of `variables` and `others`."""
+        """J at values of `variables` and `others`, in their shapes."""
         self.assign(values, others)
         with np.errstate(all="ignore"):  # outside the domain of J the value says so
             return float(self.J.value)
 
     def infeasibility(self, copies: Sequence[Array], others: Sequence[Array] = ()) -> float:
-        """Norm of what is violated: sets (rounding only), agreement of a variable's copies, convex constraints."""
+        """Norm of what copies, in their variables' shapes, violate: sets (rounding), agreement, constraints."""
         values = self.values(copies)
         parts = [term.constraint.distance(copy) for term, copy in zip(self.terms, copies, strict=True)]
         parts += [

@@ -4,8 +4,8 @@ The projection is step (b) of the paper's Algorithm 1 (`algo1: SOC`), with det =
 """
 
 import numpy as np
+import scipy  # and scipy.spatial when it is used
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -140,7 +140,7 @@ def exp_map(w: Array) -> Array:
     """
     if w.shape[-1] == 1:
         return _from_cosine_sine(np.cos(w[..., 0]), np.sin(w[..., 0]))
-    return np.asarray(Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix()).reshape((*w.shape, 3))
+    return np.asarray(scipy.spatial.transform.Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix()).reshape((*w.shape, 3))
 
 
 def log_map(R: Array) -> Array:
@@ -153,7 +153,8 @@ def log_map(R: Array) -> Array:
     """
     if R.shape[-1] == 2:
         return np.arctan2(R[..., 1, 0] - R[..., 0, 1], R[..., 0, 0] + R[..., 1, 1])[..., None]
-    return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()).reshape(R.shape[:-1])
+    turns = scipy.spatial.transform.Rotation.from_matrix(R.reshape(-1, 3, 3))
+    return np.asarray(turns.as_rotvec()).reshape(R.shape[:-1])
 
 
 def random_rotations(count: int, d: int, rng: np.random.Generator) -> Array:
@@ -168,17 +169,17 @@ def random_rotations(count: int, d: int, rng: np.random.Generator) -> Array:
     if d == 2:
         return exp_map(rng.uniform(-np.pi, np.pi, (count, 1)))
     quaternions = rng.standard_normal((count, 4))
-    return np.asarray(Rotation.from_quat(quaternions).as_matrix()).reshape(count, 3, 3)
+    return np.asarray(scipy.spatial.transform.Rotation.from_quat(quaternions).as_matrix()).reshape(count, 3, 3)
 
 
 def rotations_from_quaternions(quaternions: Array) -> Array:
     """Rotations of (n, 4) quaternions (x, y, z, w), normalised first; none may be zero."""
-    return np.asarray(Rotation.from_quat(quaternions).as_matrix()).reshape(-1, 3, 3)
+    return np.asarray(scipy.spatial.transform.Rotation.from_quat(quaternions).as_matrix()).reshape(-1, 3, 3)
 
 
 def quaternions_from_rotations(R: Array) -> Array:
     """Unit quaternions (n, 4), ordered (x, y, z, w) with w >= 0, of (n, 3, 3) rotations."""
-    return np.asarray(Rotation.from_matrix(R).as_quat(canonical=True)).reshape(-1, 4)
+    return np.asarray(scipy.spatial.transform.Rotation.from_matrix(R).as_quat(canonical=True)).reshape(-1, 4)
 
 
 def orthogonality_error(R: Array) -> Array:

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
+import scipy  # and scipy.spatial when it is used
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
@@ -105,7 +105,7 @@ def _quarter_turns(d: int) -> Array:
 
 
 def _loop_closures(t: Array, robot: IntArray, probability: float, rng: np.random.Generator) -> IntArray:
-    pairs = KDTree(t).query_pairs(_REACH, output_type="ndarray").astype(np.int64)
+    pairs = scipy.spatial.KDTree(t).query_pairs(_REACH, output_type="ndarray").astype(np.int64)
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
     consecutive = (pairs[:, 1] == pairs[:, 0] + 1) & (robot[pairs[:, 0]] == robot[pairs[:, 1]])
     pairs = pairs[~consecutive]
@@ -123,7 +123,7 @@ def _meetings(t: Array, robot: IntArray, closures: IntArray) -> IntArray:
         smallest = int(np.argmin(np.where(sizes > 0, sizes, num_robots + 1)))
         mine = np.flatnonzero(group[robot] == smallest)
         rest = np.flatnonzero(group[robot] != smallest)
-        distance, nearest = KDTree(t[rest]).query(t[mine])
+        distance, nearest = scipy.spatial.KDTree(t[rest]).query(t[mine])
         at = int(np.argmin(distance))
         edge = sorted((int(mine[at]), int(rest[nearest[at]])))
         added = np.concatenate([added, [edge]])

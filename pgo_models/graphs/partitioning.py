@@ -62,7 +62,7 @@ class Partition(ReadOnly):
         return np.asarray(self.robot[graph.i] != self.robot[graph.j])
 
     def separators(self, graph: PoseGraph) -> IntArray:
-        """Poses with an edge to another robot, ascending."""
+        """Poses with an edge to another robot, (k,), ascending."""
         cut = self.cut_edges(graph)
         return np.unique(np.concatenate([graph.i[cut], graph.j[cut]]))
 

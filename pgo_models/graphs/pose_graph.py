@@ -169,7 +169,7 @@ class PoseGraph(Measurements):
                 )
 
     def subgraph(self, poses: IntArray) -> PoseGraph:
-        """Return the graph of the given poses, in ascending order, and of the edges among them."""
+        """Return the graph of some poses, (k,), in ascending order, and of the edges among them."""
         chosen = np.unique(poses)
         number = np.full(self.num_poses, -1, dtype=np.int64)
         number[chosen] = np.arange(len(chosen))

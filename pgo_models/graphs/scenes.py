@@ -7,8 +7,8 @@ the figures stand in data/reference.json under "scenes". Every function takes it
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # and scipy.spatial when it is used
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.poses import Poses
@@ -135,7 +135,7 @@ def random_geometric(
         raise SettingError(f"mean_degree must be positive and finite, got {mean_degree}")
     t = rng.uniform(0.0, num_poses ** (1 / d), (num_poses, d))
     ball = np.pi if d == 2 else 4 * np.pi / 3
-    pairs = KDTree(t).query_pairs((mean_degree / ball) ** (1 / d), output_type="ndarray").astype(np.int64)
+    pairs = scipy.spatial.KDTree(t).query_pairs((mean_degree / ball) ** (1 / d), output_type="ndarray").astype(np.int64)
     alone = np.setdiff1d(np.arange(1, num_poses), pairs[:, 1])
     nearest = [int(np.argmin(np.sum((t[:pose] - t[pose]) ** 2, axis=1))) for pose in alone]
     pairs = np.concatenate([pairs, np.column_stack([np.array(nearest, dtype=np.int64), alone])])

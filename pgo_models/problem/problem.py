@@ -186,13 +186,13 @@ class PGOProblem:
         return read_only(matrices.entry_positions(self.M, *matrices.block_entries(block, block)))
 
     def with_pattern_of_M(self, data: Array) -> csc_array:
-        """Return the matrix that has the pattern of M and the given stored values."""
+        """Return the matrix, (N, N), that has the pattern of M and stored values (nnz,)."""
         matrix = csc_array((data, self.M.indices, self.M.indptr), shape=self.M.shape)
         matrix.has_canonical_format = True
         return matrix
 
     def leave_out(self, data: Array, rows: IntArray, diagonal: Array | float) -> None:
-        """Overwrite stored values of a matrix with the pattern of M: rows and columns then hold but a diagonal."""
+        """Overwrite the stored values, (nnz,), of a matrix as M: rows and columns, (k,), then hold but a diagonal."""
         is_out = np.zeros(self.side, dtype=bool)
         is_out[rows] = True
         data[is_out[self.M.indices] | np.repeat(is_out, np.diff(self.M.indptr))] = 0.0
@@ -206,7 +206,7 @@ class PGOProblem:
         return np.asarray(A @ X)
 
     def objective_stacked(self, X: Array) -> float:
-        """F = tr(X^T M X) as a weighted sum of squared residuals, which does not cancel; X need not be feasible."""
+        """F = tr(X^T M X), X (N, d), as a weighted sum of squared residuals: cancels nothing; X may be infeasible."""
         residuals = self.residuals(X)
         _, w = self.residual_matrix
         F = float(np.sum(w[:, None] * residuals**2))  # in pairs: off by a few dozen roundings, not by one an edge
@@ -298,7 +298,7 @@ class PGOProblem:
             poses, objective = refined, self.objective(refined)
 
     def stacked(self, poses: Poses) -> Array:
-        """X of poses; a GraphError when their number or dimension differs from the graph's, or they are no Poses."""
+        """X, (N, d), of poses; a GraphError when number or dimension are not the graph's, or they are no Poses."""
         if not isinstance(poses, Poses):
             raise GraphError(
                 f"poses are a {type(poses).__name__}; give Poses(R, t), or problem.with_best_translations(R)"

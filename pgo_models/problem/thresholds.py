@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
+import scipy  # and scipy.special when it is used
 
 from pgo_models.errors import check_quantile
 from pgo_models.geometry.poses import Poses
@@ -104,7 +104,8 @@ def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResidua
     counted = typical > 0.0
     scale = max(1.0, float(np.median(cost[counted] / typical[counted]))) if counted.any() else 1.0
     allowed = scale * _quantiles(w, 1.0 - FALSE_ALARM / max(graph.num_edges, 1))
-    return EdgeResiduals(translation, rotation, cost, allowed, scale, overall, float(chdtri(dof, FALSE_ALARM) / dof))
+    overall_allowed = float(scipy.special.chdtri(dof, FALSE_ALARM) / dof)
+    return EdgeResiduals(translation, rotation, cost, allowed, scale, overall, overall_allowed)
 
 
 def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
@@ -144,7 +145,7 @@ def _quantiles(w: Array, quantile: float) -> Array:
     c_1, c_2, c_3 = (np.sum(w**k, axis=1) for k in (1, 2, 3))
     ratio = c_3 / np.where(c_2 > 0.0, c_2, 1.0)  # of an edge without weight all are zero
     dof = c_2 / np.where(ratio > 0.0, ratio, 1.0) ** 2
-    return np.asarray(c_1 + ratio * (chdtri(np.maximum(dof, 1.0), 1.0 - quantile) - dof))
+    return np.asarray(c_1 + ratio * (scipy.special.chdtri(np.maximum(dof, 1.0), 1.0 - quantile) - dof))
 
 
 def _chi2_weights(problem: PGOProblem | PoseGraph) -> Array:

@@ -1,7 +1,13 @@
-"""The command `pgo` from its first moment: Ctrl-C or SIGTERM while the packages are imported ends in one line."""
+"""The command `pgo` from its first moment: Ctrl-C or SIGTERM while the packages are imported ends in one line.
+
+So does a file or folder of the same name as one of the packages that comes before it on the path, as with ROS.
+"""
 
 import os
 import signal
+import sys
+from importlib.util import find_spec
+from pathlib import Path
 from types import FrameType
 
 
@@ -9,6 +15,12 @@ def main() -> None:
     """Run `solvers.cli.main`."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _leave)
+    for package, file in (("pgo_models", "errors.py"), ("solvers", "cli.py")):
+        spec = find_spec(package)
+        folders = (spec and spec.submodule_search_locations) or []
+        if spec is not None and not any(Path(folder, file).is_file() for folder in folders):
+            found = spec.origin or next(iter(folders))
+            sys.exit(f"pgo: {found} hides pgo's own {package}; rename it, or take its folder from PYTHONPATH")
     from solvers.cli import main as run
 
     try:

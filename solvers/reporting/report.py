@@ -3,55 +3,30 @@
 import enum
 import html
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
 
-from pgo_models.certificates.certificate import Certificate, gap_text
+from pgo_models.certificates.certificate import gap_text
 from pgo_models.errors import SettingError
 from pgo_models.files import replace_when_done
-from pgo_models.geometry.poses import Poses, absolute_trajectory_error
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.poses import absolute_trajectory_error
 from pgo_models.graphs.g2o import pose_names
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.graphs.published_results import published_run
 from pgo_models.plots.interactive_plots import PAGE_CONFIG, explore_graph
 from pgo_models.plots.style import plotly
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
-from solvers.network.ledger import Ledger
 from solvers.reporting.convergence_plots import explore_convergence
 from solvers.reporting.report_html import PageCell, facts, page, paragraph, section, sortable_table
-from solvers.reporting.report_text import advice, fit, headline, meaning
+from solvers.reporting.report_text import Solved, advice, fit, headline, meaning
 from solvers.reporting.versions import installed_versions
-from solvers.result import Stage, Status
-from solvers.robust.rejection import Rejection
 from solvers.soc.soc import SOC
 
 _WORST_EDGES = 100
 _MOST_ROBOTS = 200
 _PAGE_SUFFIXES = (".html", ".htm")
-
-
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """What a report is of: the fields of `solvers.solution.Solution`, which says what they are."""
-
-    problem: PGOProblem
-    poses: Poses
-    objective: float
-    certificate: Certificate
-    status: Status
-    stages: tuple[Stage, ...]
-    seconds: float
-    ledger: Ledger | None = None
-    robots: Partition | None = None
-    note: str = ""
-    frame: str = ""
-    anchor: int = 0
-    covariances: Array | None = None
-    robust: Rejection | None = None
 
 
 def write_report(solution: Solved, path: Path | str, *, source: str | None = None) -> None:

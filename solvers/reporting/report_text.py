@@ -1,14 +1,20 @@
-"""What a report says in words: what the verdict means for this answer, and what to try next."""
+"""What a report is of, and says in words: what the verdict means for this answer, and what to try next."""
 
 import math
 import shlex
 from dataclasses import dataclass
 
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, gap_text
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.datasets import known_datasets
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals
-from solvers.result import Status
+from solvers.network.ledger import Ledger
+from solvers.result import Stage, Status
+from solvers.robust.rejection import Rejection
 
 _NEARLY = 1e-4  # a gap below it is called nearly closed
 _FINER_GAP = 1e-9
@@ -22,6 +28,26 @@ _NOT_TIGHT = (
     "The bound is the best that the semidefinite relaxation has: it is not tight for these measurements, which happens "
     "when they are very noisy or some are wrong. The poses may be optimal all the same; this method cannot tell."
 )
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """What a report is of: the fields of `solvers.solution.Solution`, which says what they are."""
+
+    problem: PGOProblem
+    poses: Poses
+    objective: float
+    certificate: Certificate
+    status: Status
+    stages: tuple[Stage, ...]
+    seconds: float
+    ledger: Ledger | None = None
+    robots: Partition | None = None
+    note: str = ""
+    frame: str = ""
+    anchor: int = 0
+    covariances: Array | None = None
+    robust: Rejection | None = None
 
 
 @dataclass(frozen=True)

@@ -4,21 +4,19 @@ import csv
 import io
 import json
 import math
+import shutil
+import textwrap
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
-
-from rich.console import Console
-from rich.markup import escape
-from rich.measure import Measurement
-from rich.table import Table
-from rich.text import Text
 
 from pgo_models.errors import SettingError
 from pgo_models.files import replace_when_done
 
 Value = str | int | float | None
 TABLE_SUFFIXES = (".md", ".csv", ".json")
-_WIDEST = 10_000
+_LABELS = ("graph", "method")  # heads of the columns that name a row
+_NARROWEST = 20  # characters of a remark
 
 
 @dataclass(frozen=True)
@@ -42,6 +40,31 @@ class TablePart:
         rule = "|" + "|".join("---" if head in self.texts else "---:" for head in self.heads) + "|"
         return [*caption, _markdown_row(self.heads), rule, *(_markdown_row(row) for row in self.rows), ""]
 
+    def lines(self, width: int) -> list[str]:
+        """Lines for a terminal so wide, in characters: columns that do not fit stand below, beside the labels again."""
+        columns = list(zip(self.heads, *self.rows, strict=True))
+        keys = [k for k, head in enumerate(self.heads) if head in _LABELS]
+        # Heads wrap at blanks, figures do not; a remark, the last column, wraps where the line ends.
+        need = [max(map(len, (*head.split(), *cells))) for head, *cells in columns]
+        blocks = [list(keys)]
+        for k in (k for k, (_, *cells) in enumerate(columns) if k not in keys and any(cells)):
+            if len(blocks[-1]) > len(keys) and sum(need[c] + 2 for c in blocks[-1]) + need[k] > width:
+                blocks.append(list(keys))
+            blocks[-1].append(k)
+        return [line for block in blocks for line in self._block(sorted(block), need, width)]
+
+    def _block(self, shown: list[int], need: list[int], width: int) -> list[str]:
+        room = {k: need[k] for k in shown}
+        room[shown[-1]] = min(need[shown[-1]], max(width - sum(need[k] + 2 for k in shown[:-1]), _NARROWEST))
+        lines = []
+        for row in (self.heads, tuple("-" * room.get(k, 0) for k in range(len(need))), *self.rows):
+            cells = [textwrap.wrap(row[k], room[k], break_long_words=False) for k in shown]
+            for words in zip_longest(*cells, fillvalue=""):
+                placed = zip(shown, words, strict=True)
+                aligned = (f"{word:{'<' if self.heads[k] in self.texts else '>'}{room[k]}}" for k, word in placed)
+                lines.append("  ".join(aligned).rstrip())
+        return [*lines, ""]
+
 
 @dataclass(frozen=True)
 class ResultTable:
@@ -51,27 +74,13 @@ class ResultTable:
     records: tuple[dict[str, Value], ...]  # the same figures in full, for CSV and JSON: all with the same names
     notes: tuple[str, ...] = ()  # sentences below the tables
 
-    def print(self, console: Console | None = None) -> None:
-        """Print to the terminal; lines are as wide as they need to be."""
-        console = console if console is not None else Console(highlight=False)
+    def print(self, width: int | None = None) -> None:
+        """Print within so many columns, those of the terminal unless given, or 80 where there is none."""
+        width = shutil.get_terminal_size().columns if width is None else width
         for part in self.parts:
-            if part.caption:
-                console.print(part.caption, style="bold", markup=False, soft_wrap=True)
-            table = Table(box=None, pad_edge=False, header_style="underline")
-            for head in part.heads:
-                table.add_column(head, justify="left" if head in part.texts else "right", no_wrap=True)
-            for row in part.rows:
-                table.add_row(*(escape(cell) for cell in row))
-            width = Measurement.get(console, console.options.update(max_width=_WIDEST), table).maximum
-            console.width = max(console.width, width)
-            with console.capture() as captured:
-                console.print(table)
-            for line in captured.get().splitlines():
-                # Without the blanks that fill the last column: one long remark would make all lines as long.
-                console.print(Text.from_ansi(line.rstrip()), soft_wrap=True)
-            console.print()
+            print("\n".join([part.caption] * bool(part.caption) + part.lines(width)))
         for note in self.notes:
-            console.print(note, markup=False, soft_wrap=True)
+            print(textwrap.fill(note, width))
 
     def markdown(self) -> str:
         """Return tables and notes as Markdown."""
@@ -88,9 +97,13 @@ class ResultTable:
         return text.getvalue()
 
     def json(self) -> str:
-        """Return records and notes as JSON; what is unknown or not finite is null."""
+        """Return `as_json` in JSON."""
+        return json.dumps(self.as_json(), indent=1, allow_nan=False) + "\n"
+
+    def as_json(self) -> dict[str, object]:
+        """Return records and notes; what is unknown or not finite is None."""
         rows = [{name: finite_or_none(value) for name, value in record.items()} for record in self.records]
-        return json.dumps({"rows": rows, "notes": list(self.notes)}, indent=1, allow_nan=False) + "\n"
+        return {"rows": rows, "notes": list(self.notes)}
 
     def save(self, path: Path | str) -> None:
         """Write the table in the format that the suffix of `path` names: .md, .csv or .json; whole or not at all.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
+import scipy  # and scipy.special when it is used
 
 from pgo_models.errors import check_quantile
 from pgo_models.geometry.rotations import Array, BoolArray, hat, log_map, tangent_dimension
@@ -25,7 +25,7 @@ def odometry(graph: PoseGraph) -> BoolArray:
 
 @dataclass(frozen=True, eq=False)
 class PCM:
-    """Settings of a robust solve by `pairwise_consistent` alone, which says what they are."""
+    """Settings of a robust solve by `pairwise_consistent` alone, which says what they are; `known` is (m,)."""
 
     known: BoolArray | None = None
     quantile: float = 0.99
@@ -88,7 +88,7 @@ def pairwise_consistent(graph: PoseGraph, known: BoolArray | None = None, quanti
     S[back] = _carried(reverse, S[back])
     T[0][back], T[1][back] = reverse
     i, j = np.where(back, j, i), np.where(back, i, j)
-    threshold = float(chdtri(S.shape[1], 1.0 - quantile))
+    threshold = float(scipy.special.chdtri(S.shape[1], 1.0 - quantile))
     kept = np.ones(graph.num_edges, dtype=bool)
     kept[tested] = False
     groups = chain[i] * np.int64(graph.num_poses) + chain[j]

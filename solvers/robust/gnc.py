@@ -17,9 +17,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # and scipy.special when it is used
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
-from scipy.special import chdtri
 
 from pgo_models.certificates.newton_polish import polish_step, start_polish
 from pgo_models.errors import SettingError, check_quantile, check_settings
@@ -44,24 +44,24 @@ _SCALINGS, _SAME = 4, (0.5, 1.5)  # at most so many, and what counts as none
 
 
 class RobustLoss(enum.Enum):
-    """What a large residual costs; all here is over c^2, and `ratio` is r^2 / c^2."""
+    """What a large residual costs; all here is over c^2, and `ratio`, (m,), is r^2 / c^2."""
 
     TRUNCATED = "truncated least squares, min(r^2, c^2)"
     GEMAN_MCCLURE = "Geman-McClure, c^2 r^2 / (c^2 + r^2)"
 
     def values(self, ratio: Array) -> Array:
-        """The loss."""
+        """The loss, (m,)."""
         return np.asarray(np.minimum(ratio, 1.0) if self is RobustLoss.TRUNCATED else ratio / (1.0 + ratio))
 
     def surrogate(self, ratio: Array, mu: float) -> Array:
-        """Its surrogate, which is the loss for mu to infinity (truncated) or for mu = 1 (Geman-McClure)."""
+        """Its surrogate, (m,), which is the loss for mu to infinity (truncated) or for mu = 1 (Geman-McClure)."""
         if self is RobustLoss.GEMAN_MCCLURE:
             return np.asarray(mu * ratio / (mu + ratio))
         between = 2.0 * np.sqrt(ratio * mu * (mu + 1.0)) - mu * (1.0 + ratio)
         return np.where(ratio >= (mu + 1.0) / mu, 1.0, np.where(ratio <= mu / (mu + 1.0), ratio, between))
 
     def weights(self, ratio: Array, mu: float) -> Array:
-        """Its slope, which is the weight: equations 14 and 12; from a large mu on 0 or 1."""
+        """Its slope, (m,), which is the weight: equations 14 and 12; from a large mu on 0 or 1."""
         if self is RobustLoss.GEMAN_MCCLURE:
             return np.asarray((mu / (ratio + mu)) ** 2)
         if mu >= _HARD:
@@ -70,7 +70,7 @@ class RobustLoss(enum.Enum):
         return np.where(ratio >= (mu + 1.0) / mu, 0.0, np.where(ratio <= mu / (mu + 1.0), 1.0, between))
 
     def is_undecided(self, ratio: Array, mu: float) -> BoolArray:
-        """Whether the surrogate counts an edge neither in full nor as wrong."""
+        """Whether the surrogate counts an edge neither in full nor as wrong, (m,)."""
         if self is RobustLoss.GEMAN_MCCLURE:
             return np.full(ratio.shape, mu > 1.0)
         return np.asarray((mu < _HARD) & (ratio > mu / (mu + 1.0)) & (ratio < (mu + 1.0) / mu))
@@ -276,7 +276,7 @@ class GNC:
         done = replace(schedule, rescaled=0)
         if self.spread is None or of_kept is None:
             return done
-        usual = np.divide(*chdtri(d + tangent_dimension(d), [0.5, 1.0 - self.quantile]))
+        usual = np.divide(*scipy.special.chdtri(d + tangent_dimension(d), [0.5, 1.0 - self.quantile]))
         factor = min(self.spread * of_kept[0] / float(usual), _LARGEST_SCALE / schedule.scale)
         left = schedule.rescaled - 1
         if _SAME[0] < factor < _SAME[1] or factor * schedule.scale < _LEAST_SCALE:

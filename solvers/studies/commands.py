@@ -10,11 +10,11 @@ import typer
 
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.files import check_writable
-from pgo_models.graphs.datasets import load
 from pgo_models.problem.problem import PGOProblem
+from solvers.cli_inputs import load_graph
 from solvers.explanations import explained_by_its_graph
 from solvers.reporting.result_table import check_table_format
-from solvers.shell import BROKEN_OFF, save_then_show
+from solvers.shell import BROKEN_OFF, JsonOption, QuietOption, save_then_show
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
 from solvers.studies.comparison import ComparisonSettings, check_plot_format, compare_methods
 from solvers.studies.paper_figures import FigureSet, draw_paper_figures
@@ -28,6 +28,10 @@ DownloadOption = Annotated[
 ]
 UnitWeightsOption = Annotated[
     bool, typer.Option("--unit-weights", help="Set kappa = tau = 1, the weights of the paper's equation.")
+]
+DropEdgeOption = Annotated[
+    list[str] | None,
+    typer.Option(metavar="LINE", help="Leave out the edge on this line of the file (FILE:LINE); may be repeated."),
 ]
 TableOption = Annotated[
     list[Path] | None,
@@ -84,6 +88,9 @@ def compare_command(
     ] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for every method.")] = math.inf,
     unit_weights: UnitWeightsOption = False,
+    drop_edge: DropEdgeOption = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Run several methods on a graph and hold them against each other and a proven bound."""
     _check(out, check_table_format)
@@ -91,11 +98,11 @@ def compare_command(
     settings = ComparisonSettings(
         _chosen(BenchmarkMethod, methods, "method"), BenchmarkSettings(robots, time_limit=time_limit)
     )
-    loaded = load(graph)
-    comparison = compare_methods(PGOProblem(loaded.unit_weights() if unit_weights else loaded), settings)
+    problem = PGOProblem(load_graph(graph, unit_weights, dropped=drop_edge))
+    comparison = compare_methods(problem, settings, progress=False if quiet else None)
     table = comparison.table()
     targets = [(path, table.save) for path in out or []] + [(path, comparison.save_plot) for path in plot or []]
-    save_then_show(targets, table.print)
+    save_then_show(targets, table.print, table.as_json if as_json else None, quiet)
     if not comparison.is_complete:
         raise typer.Exit(BROKEN_OFF)
 

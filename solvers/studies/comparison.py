@@ -16,7 +16,7 @@ from pgo_models.plots.interactive_plots import save_page
 from pgo_models.plots.style import is_picture, save_figure
 from pgo_models.problem.problem import PGOProblem
 from solvers.pipeline import solve
-from solvers.progress import JobBar
+from solvers.progress_bars import JobBar
 from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
 from solvers.reporting.convergence_plots import Curve
 from solvers.reporting.result_table import ResultTable, TablePart, Value, gap_percent

@@ -18,7 +18,7 @@ from pgo_models.plots.interactive_plots import explore_graph, save_page
 from pgo_models.plots.style import column_figure, plotly, save_figure
 from pgo_models.problem.problem import PGOProblem
 from solvers.pipeline import solve
-from solvers.progress import JobBar
+from solvers.progress_bars import JobBar
 from solvers.reporting.convergence_plots import explore_convergence, plot_convergence
 from solvers.reporting.result_table import gap_percent
 from solvers.result import History

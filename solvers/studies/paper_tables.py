@@ -15,7 +15,7 @@ from pgo_models.graphs.published_results import PublishedFigures, PublishedRow, 
 from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.problem.problem import PGOProblem
 from solvers.pipeline import solve
-from solvers.progress import JobBar
+from solvers.progress_bars import JobBar
 from solvers.result import Status
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
 from solvers.studies.benchmark_runs import run_benchmark

@@ -13,7 +13,7 @@ from solvers.reporting.versions import installed_versions
 Entry = dict[str, Any]
 
 
-class KeptResults:
+class KeptResults(dict[str, Entry]):
     """Results by key; the file, if there is one, is written anew, whole, whenever a result is added.
 
     Results that other versions of the software made are not taken up again, with `is_fresh` none of what it holds. A
@@ -23,23 +23,15 @@ class KeptResults:
     def __init__(self, path: Path | None, is_fresh: bool = False) -> None:
         self._path = path
         self._header = {"kind": "results of pgo, by key", "versions": installed_versions(None)}
-        self._entries: dict[str, Entry] = {}
         if path is not None and path.exists():
             found = self._read(path)  # in any case: a file of something else is not to be written over
-            self._entries = {} if is_fresh else found
-
-    def __len__(self) -> int:
-        return len(self._entries)
-
-    def get(self, key: str) -> Entry | None:
-        """Result of a key, if there is one."""
-        return self._entries.get(key)
+            self.update({} if is_fresh else found)
 
     def add(self, key: str, entry: Entry) -> None:
         """Keep a result; a PGOError when the file cannot be written."""
-        self._entries[key] = entry
+        self[key] = entry
         if self._path is not None:
-            text = json.dumps({**self._header, "results": self._entries}, indent=1, allow_nan=False)
+            text = json.dumps({**self._header, "results": self}, indent=1, allow_nan=False)
             with replace_when_done(self._path) as temporary:
                 temporary.write_text(text + "\n", encoding="utf-8")
 
@@ -59,7 +51,5 @@ class KeptResults:
 
 def graph_fingerprint(graph: PoseGraph) -> str:
     """Short text that differs between graphs with different measurements or estimates."""
-    arrays = [graph.i, graph.j, graph.R_ij, graph.t_ij, graph.kappa, graph.tau]
-    if graph.initial is not None:
-        arrays += [graph.initial.R, graph.initial.t]
-    return digest(*arrays)[:12]
+    poses = [] if graph.initial is None else [graph.initial.R, graph.initial.t]
+    return digest(graph.i, graph.j, graph.R_ij, graph.t_ij, graph.kappa, graph.tau, *poses)[:12]
