@@ -15,6 +15,7 @@ from pgo_models.errors import FileFormatError, PGOError
 LARGEST = 1e100  # beyond it squares and determinants would overflow; no measured number is near
 FARTHEST = 1e15  # metres: beyond it neighbouring doubles are more than 0.1 m apart
 _ZERO_QUATERNION = 1e-9  # a norm below this gives no direction: files hold about six digits
+_BLOCK = 2**24  # bytes of a file that are taken apart at a time
 LONGEST_LINE = 10_000  # characters; an edge in space with all its digits has 750
 
 
@@ -23,21 +24,30 @@ def read_text(path: Path | str) -> str:
 
     A FileFormatError when the file is missing, cannot be opened, or is not text.
     """
-    path = Path(path)
+    return "".join(read_blocks(path))
+
+
+def read_blocks(path: Path | str) -> Iterator[str]:
+    """Yield what `read_text` reads, with its errors, in blocks of whole lines: a large file is never held as text."""
+    path, before, encoding = Path(path), 0, "utf-8-sig"
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            while data := file.read(_BLOCK):
+                data += file.readline()
+                line = before + data.count(b"\n", 0, data.find(b"\0")) + 1 if b"\0" in data else None
+                try:
+                    text = data.decode(encoding)
+                except UnicodeDecodeError as error:
+                    line = before + data.count(b"\n", 0, error.start) + 1
+                if line is not None:
+                    problem = "bytes that are no text; give a text file, unpacked if it was compressed"
+                    raise FileFormatError(path, line, problem)
+                before, encoding = before + data.count(b"\n"), "utf-8"
+                yield text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
     except FileNotFoundError:
         raise FileFormatError(path, None, "no such file; check the path") from None
     except OSError as error:
         raise FileFormatError(path, None, f"cannot be read: {error.strerror}; give a readable file") from error
-    line = data.count(b"\n", 0, data.find(b"\0")) + 1 if b"\0" in data else None
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-    if line is not None:
-        raise FileFormatError(path, line, "bytes that are no text; give a text file, unpacked if it was compressed")
-    return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
 
 
 def check_length(path: Path | str, line: int, text: str) -> None:
