@@ -3,6 +3,7 @@
 import os
 import secrets
 import stat
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -95,8 +96,38 @@ def read_table(path: Path | str, columns: int) -> tuple[NDArray[np.float64], lis
     Blank lines and comments (#) are skipped. A FileFormatError with file:line, when a line has too few or too many
     numbers or is not all numbers; when there is no row.
     """
+    tables: list[NDArray[np.float64]] = []
+    lines: list[int] = []
+    first = 1
+    for block in read_blocks(path):
+        text = block.removesuffix("\n").split("\n")
+        table, numbers = _sound_table(text, columns), list(range(first, first + len(text)))
+        if table is None:
+            table, numbers = _checked_table(path, first, text, columns)
+        first, tables, lines = first + len(text), [*tables, table], [*lines, *numbers]
+    if not lines:
+        raise FileFormatError(path, None, f"no rows; give lines of {columns} numbers")
+    return np.concatenate(tables), lines
+
+
+def _sound_table(lines: list[str], columns: int) -> NDArray[np.float64] | None:
+    """Numbers of lines where each is a row of them and nothing else, by one call, or None."""
+    if max(map(len, lines)) > LONGEST_LINE:
+        return None
+    try:
+        with warnings.catch_warnings(action="error"):  # of lines that are all blank
+            table = np.loadtxt(lines, comments=None, ndmin=2)
+    except (ValueError, UserWarning):
+        return None
+    return table if table.shape == (len(lines), columns) and (np.abs(table) <= LARGEST).all() else None
+
+
+def _checked_table(
+    path: Path | str, first: int, text: list[str], columns: int
+) -> tuple[NDArray[np.float64], list[int]]:
+    """Rows and their lines, one by one; errors as `read_table`."""
     rows, lines = [], []
-    for number, line in enumerate(read_text(path).split("\n"), 1):
+    for number, line in enumerate(text, first):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
@@ -105,9 +136,7 @@ def read_table(path: Path | str, columns: int) -> tuple[NDArray[np.float64], lis
         lines.append(number)
         if len(words) != columns:
             raise FileFormatError(path, number, f"{len(words)} numbers where {columns} belong; complete or remove it")
-    if not rows:
-        raise FileFormatError(path, None, f"no rows; give lines of {columns} numbers")
-    return np.array(rows), lines
+    return np.array(rows).reshape(-1, columns), lines
 
 
 @contextmanager

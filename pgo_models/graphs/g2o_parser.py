@@ -170,9 +170,7 @@ class _Source:
             raise FileFormatError(self.path, None, problem)
         if first[2] and first[3]:
             other = f"(the other kind is on line {min(first.values())})"
-            raise self._error(
-                max(first.values()), f"2D and 3D lines in one file {other}; give one file for each"
-            )
+            raise self._error(max(first.values()), f"2D and 3D lines in one file {other}; give one file for each")
         return 2 if first[2] else 3
 
     def check_offset(self) -> None:
