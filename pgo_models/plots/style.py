@@ -57,11 +57,17 @@ def column_figure(height: float, width: float = 1.0) -> Iterator[Figure]:
 
 def plotly(name: str) -> ModuleType:
     """Module of plotly, whose import waits until something is drawn."""
+    return plot_module(f"plotly.{name}")
+
+
+def plot_module(name: str) -> ModuleType:
+    """Module of a package of the extra `plot`, by its full name."""
+    package = name.partition(".")[0]
     try:
-        importlib.import_module("plotly")
-        return importlib.import_module(f"plotly.{name}")
+        importlib.import_module(package)
+        return importlib.import_module(name)
     except ImportError as error:
-        raise MissingExtraError("plotly", "plot") from error
+        raise MissingExtraError(package, "plot") from error
 
 
 def is_picture(path: Path) -> bool:

@@ -181,9 +181,9 @@ def test_names_are_escaped_wherever_they_stand(name, solution):
     text = own_part(report_page(renamed))
     found = Page(text)
     assert name in found.text
-    assert found.scripts == 2
+    assert found.scripts == 4
     assert found.asked == ["data:,"]
-    assert text.count("</script>") == 2
+    assert text.count("</script>") == 4
 
 
 def test_the_page_asks_for_nothing_online(solution):
