@@ -11,7 +11,7 @@ from pgo_models.geometry.poses import Poses, absolute_trajectory_error
 from pgo_models.geometry.rotations import Array, log_map
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.residuals import uncertain_edges
-from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, column_figure
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, column_figure, count_along_x
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 
 if TYPE_CHECKING:
@@ -206,14 +206,15 @@ def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = Non
         _frame(axes, np.concatenate([aligned.t, truth.t]))
         ate = absolute_trajectory_error(poses, truth)
         axes.set_title(f"{graph.name}: ATE {ate:.3g} m, rotation {np.sqrt(np.mean(degrees**2)):.3g} deg (rms)")
-        below: Axes | None = None
-        for row, (error, label) in enumerate([(metres, "position (m)"), (degrees, "rotation (deg)")], 1):
-            below = figure.add_subplot(grid[row], sharex=below)
-            below.plot(error, color=ALARM_COLOUR, linewidth=0.7)
-            below.set_ylabel(label)
-            below.set_ylim(bottom=0.0)
-        assert below is not None
+        above = figure.add_subplot(grid[1])
+        below = figure.add_subplot(grid[2], sharex=above)
+        for panel, error, label in ((above, metres, "position (m)"), (below, degrees, "rotation (deg)")):
+            panel.plot(error, color=ALARM_COLOUR, linewidth=0.7)
+            panel.set_ylabel(label)
+            panel.set_ylim(bottom=0.0)
+            panel.label_outer()
         below.set_xlabel("pose")
+        count_along_x(below)
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 

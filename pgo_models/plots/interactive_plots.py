@@ -203,8 +203,8 @@ def thinning(graph: PoseGraph) -> str:
     step, some = (thinning_step(*counts) for counts in ((graph.num_edges, MOST_LINES), (graph.num_poses, _MOST_DOTS)))
     if step == some == 1:
         return ""
-    lines = f"paths through every {step}. pose and one of {step} other edges, all misfits; " if step > 1 else ""
-    return f"The graph is large, and thinned: {lines}the names of one of {some} poses."
+    lines = f"paths through one of {step} poses, one of {step} other edges, all misfits; " if step > 1 else ""
+    return f"The graph is large, and thinned: {lines}names of one of {some} poses."
 
 
 def _parts(graph: PoseGraph, names: NDArray[np.str_]) -> tuple[IntArray, list[str]]:

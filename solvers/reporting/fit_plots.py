@@ -14,7 +14,8 @@ from solvers.reporting.convergence_plots import LOGARITHMIC
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
-_BIN, _MOST = 0.05, 4.0  # a bar's width, and where the last one ends, which holds all beyond
+_BARS = 8  # a decade
+_LEAST, _MOST = -3, 2  # powers of ten where the first and the last bar end, which hold all beyond
 
 
 def explore_fit(residuals: EdgeResiduals, d: int) -> "Figure":
@@ -24,22 +25,23 @@ def explore_fit(residuals: EdgeResiduals, d: int) -> "Figure":
     for chi2 exactly, for F where its weights are equal. Edges that may cost nothing are left out.
     """
     counted = residuals.allowed > 0.0
-    size = np.sqrt(residuals.cost[counted] / residuals.allowed[counted])
-    bars = int(np.ceil(np.clip(size.max(initial=0.0), 1.0, _MOST) / _BIN))
-    edges, p = _BIN * np.arange(bars + 1), tangent_dimension(d) + d
-    count = np.histogram(np.minimum(size, edges[-1]), edges)[0]
-    expected = len(size) * np.diff(chdtr(p, chdtri(p, FALSE_ALARM / max(len(counted), 1)) * edges**2))
-    middles = (edges[:-1] + 0.5 * _BIN).round(3).tolist()
+    size = np.log10(np.sqrt(np.maximum(residuals.cost[counted] / residuals.allowed[counted], 10.0 ** (2 * _LEAST))))
+    first = int(np.floor(size.min(initial=0.0)))
+    edges = first + np.arange(_BARS * (int(np.ceil(np.clip(size.max(initial=0.0), 0.0, _MOST))) - first) + 1) / _BARS
+    count, p = np.histogram(np.minimum(size, edges[-1]), edges)[0], tangent_dimension(d) + d
+    expected = len(size) * np.diff(chdtr(p, chdtri(p, FALSE_ALARM / max(len(counted), 1)) * 100.0**edges))
+    middles = (edges[:-1] + 0.5 / _BARS).tolist()
     figure = plotly("graph_objects").Figure()
-    for name, colour, shown in (
-        ("edges", COLOURS[0], edges[:-1] < 1.0),
-        ("misfits", ALARM_COLOUR, edges[:-1] >= 1.0),
-    ):
-        figure.add_bar(x=middles, y=np.where(shown, count, 0).tolist(), name=name, marker={"color": colour})
+    for name, colour, shown in (("edges", COLOURS[0], edges[:-1] < 0.0), ("misfits", ALARM_COLOUR, edges[:-1] >= 0.0)):
+        if count[shown].any():
+            figure.add_bar(x=middles, y=np.where(shown, count, 0).tolist(), name=name, marker={"color": colour})
     curve = [float(f"{value:.4g}") if value > 0.1 else None for value in expected]
     figure.add_scatter(x=middles, y=curve, name="as the matrices say", mode="lines", line={"color": COLOURS[5]})
     lay_out(figure, "", legend_y=-0.25)
     figure.update_layout(bargap=0.05, barmode="stack")
-    figure.update_xaxes(title_text="error, in parts of what is allowed", zeroline=False)
-    figure.update_yaxes(**LOGARITHMIC, title_text="edges", range=[-0.3, float(np.log10(count.max(initial=1) * 2.0))])
+    tens = list(range(first, int(edges[-1]) + 1))
+    ticks = {"tickvals": tens, "ticktext": [f"10<sup>{power}</sup>" if power else "1" for power in tens]}
+    figure.update_xaxes(**ticks, title_text="error, in parts of what is allowed", zeroline=False)
+    highest = max(1.0, float(count.max(initial=0)), float(expected.max(initial=0.0)))
+    figure.update_yaxes(**LOGARITHMIC, dtick=1, title_text="edges", range=[-0.3, float(np.log10(2.0 * highest))])
     return figure

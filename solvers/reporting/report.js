@@ -14,8 +14,9 @@ function draw() {
     const scene = layout.scene ? [layout.scene.xaxis, layout.scene.yaxis, layout.scene.zaxis] : [];
     for (const axis of [...flat, ...scene]) Object.assign(axis, {gridcolor: line, linecolor: line, zerolinecolor: line});
     Object.assign(layout, {paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", uirevision: "kept"});
+    layout.modebar = {bgcolor: "rgba(0,0,0,0)", color: line, activecolor: ink};
     layout.font = {...layout.font, color: ink, size: narrow.matches ? 10 : 12};
-    if (narrow.matches) layout.margin = {...layout.margin, l: 48, r: 4};
+    layout.margin = {...layout.margin, t: 34, ...(narrow.matches ? {l: 48, r: 4} : {})};
     const data = figure.data.map(trace => ({
       ...trace,
       line: {...trace.line, color: visible(trace.line?.color)},
