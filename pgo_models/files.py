@@ -96,18 +96,21 @@ def read_table(path: Path | str, columns: int) -> tuple[NDArray[np.float64], lis
     Blank lines and comments (#) are skipped. A FileFormatError with file:line, when a line has too few or too many
     numbers or is not all numbers; when there is no row.
     """
-    tables: list[NDArray[np.float64]] = []
-    lines: list[int] = []
-    first = 1
-    for block in read_blocks(path):
-        text = block.removesuffix("\n").split("\n")
-        table, numbers = _sound_table(text, columns), list(range(first, first + len(text)))
-        if table is None:
-            table, numbers = _checked_table(path, first, text, columns)
-        first, tables, lines = first + len(text), [*tables, table], [*lines, *numbers]
-    if not lines:
+    text, rows, lines = read_text(path).removesuffix("\n").split("\n"), [], []
+    if (table := _sound_table(text, columns)) is not None:
+        return table, list(range(1, len(text) + 1))
+    for number, line in enumerate(text, 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        check_length(path, number, line)
+        rows.append([finite_number(path, number, word) for word in words])
+        lines.append(number)
+        if len(words) != columns:
+            raise FileFormatError(path, number, f"{len(words)} numbers where {columns} belong; complete or remove it")
+    if not rows:
         raise FileFormatError(path, None, f"no rows; give lines of {columns} numbers")
-    return np.concatenate(tables), lines
+    return np.array(rows), lines
 
 
 def _sound_table(lines: list[str], columns: int) -> NDArray[np.float64] | None:
@@ -120,23 +123,6 @@ def _sound_table(lines: list[str], columns: int) -> NDArray[np.float64] | None:
     except (ValueError, UserWarning):
         return None
     return table if table.shape == (len(lines), columns) and (np.abs(table) <= LARGEST).all() else None
-
-
-def _checked_table(
-    path: Path | str, first: int, text: list[str], columns: int
-) -> tuple[NDArray[np.float64], list[int]]:
-    """Rows and their lines, one by one; errors as `read_table`."""
-    rows, lines = [], []
-    for number, line in enumerate(text, first):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        check_length(path, number, line)
-        rows.append([finite_number(path, number, word) for word in words])
-        lines.append(number)
-        if len(words) != columns:
-            raise FileFormatError(path, number, f"{len(words)} numbers where {columns} belong; complete or remove it")
-    return np.array(rows).reshape(-1, columns), lines
 
 
 @contextmanager

@@ -16,6 +16,7 @@ function draw() {
     Object.assign(layout, {paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", uirevision: "kept"});
     layout.modebar = {bgcolor: "rgba(0,0,0,0)", color: line, activecolor: ink};
     layout.font = {...layout.font, color: ink, size: narrow.matches ? 10 : 12};
+    if (narrow.matches && layout.legend?.y < 0) layout.legend.y *= 1.8;
     layout.margin = {...layout.margin, t: 34, ...(narrow.matches ? {l: 48, r: 4} : {})};
     const data = figure.data.map(trace => ({
       ...trace,

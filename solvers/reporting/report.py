@@ -1,8 +1,7 @@
 """The report of a solve: one HTML file that opens offline and says how good the answer is and what to try next."""
 
 import enum
-import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 
@@ -24,7 +23,6 @@ from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from solvers.network.ledger import Ledger
 from solvers.reporting.convergence_plots import explore_convergence
 from solvers.reporting.fit_plots import explore_fit
-from solvers.reporting.report_html import PageCell, PageTable, fill_in, in_script
 from solvers.reporting.report_text import advice, fit, headline, meaning
 from solvers.reporting.versions import installed_versions
 from solvers.result import Stage, Status
@@ -105,7 +103,7 @@ def check_report(path: Path) -> None:
 
 
 def report_page(solution: Solved, *, source: str | None = None) -> str:
-    """HTML of the report; parameters and errors as for `write_report`."""
+    """HTML of the report, `report.html` filled in; parameters and errors as for `write_report`."""
     robots, certificate = _partition(solution), solution.certificate
     graph = solution.problem.graph.with_robots(robots.robot)
     residuals = edge_residuals(solution.problem, solution.poses)
@@ -117,39 +115,58 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
     stages = list(zip(names, (stage.history for stage in solution.stages), strict=True))
     if any(len(history) for _, history in stages):
         plots["convergence"] = explore_convergence(stages, certificate.lower_bound, published_run(graph))
-    figures = ",".join(f'"{name}":{figure.to_json()}' for name, figure in plots.items()).replace("<", "\\u003c")
-    size = f"{len(graph.bodies)} poses, {graph.num_edges} edges{graph.extras}, {graph.d}D"
-    robots_said, robots_table = _robots(solution, robots, residuals)
-    edges_said, edges_table = _worst_edges(solution, robots, residuals)
-    return fill_in(
-        {
-            "name": graph.name,
-            "about": f"{size}; solved in {solution.seconds:.3g} s",
-            "cost": certificate.cost,
-            "verdict": certificate.verdict.name,
-            "headline": headline(certificate) + (f" {solution.robust.conditional}" if solution.robust else ""),
-            "meaning": meaning(certificate),
-            "figures": _figures(solution),
-            "rejection": solution.robust.facts() if solution.robust else [],
-            "advice": advice(graph, certificate, solution.status, residuals, source, solution.robust is not None),
-            "place": place,
-            "before": before_name,
-            "thinned": thinning(graph),
-            "scaled": f", times {residuals.scale:.3g}" if residuals.scale > 1.0 else "",
-            "has_curves": "convergence" in plots,
-            "robots": robots_table,
-            "robots_said": robots_said,
-            "edges": edges_table,
-            "edges_said": edges_said,
-            "stages": _stages(solution, names),
-            "endings": sorted({(stage.status.name, stage.status.value) for stage in solution.stages}),
-            "settings": _settings(solution, names),
-            "versions": list(installed_versions(solution.problem.backend).items()),
-            "plots": in_script(f"{{{figures}}}"),
-            "plot_settings": in_script(json.dumps(PAGE_CONFIG)),
-            "library": in_script(plotly("offline").get_plotlyjs()),
-        }
+    figures = ",".join(f'"{name}":{figure.to_json()}' for name, figure in plots.items())
+    content = {
+        "solution": solution,
+        "graph": graph,
+        "certificate": certificate,
+        "residuals": residuals,
+        "headline": headline(certificate) + (f" {solution.robust.conditional}" if solution.robust else ""),
+        "meaning": meaning(certificate),
+        "figures": _figures(solution),
+        "advice": advice(graph, certificate, solution.status, residuals, source, solution.robust is not None),
+        "place": place,
+        "before": before_name,
+        "thinned": thinning(graph),
+        "has_curves": "convergence" in plots,
+        "robots": _robots(solution, robots, residuals),
+        "edges": _worst_edges(solution, robots, residuals),
+        "stages": _stages(solution, names),
+        "endings": sorted({(stage.status.name, stage.status.value) for stage in solution.stages}),
+        "settings": _settings(solution, names),
+        "versions": installed_versions(solution.problem.backend),
+        "plots": f"{{{figures}}}".replace("<", "\\u003c"),  # in a script element, which </script> would end
+        "plot_settings": PAGE_CONFIG,
+        "library": plotly("offline").get_plotlyjs(),
+    }
+    jinja2 = plot_module("jinja2")
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
     )
+    return str(environment.get_template("report.html").render(content))
+
+
+@dataclass(frozen=True)
+class _Cell:
+    """A cell of a table: what is shown, and what it is sorted by (the text itself unless given)."""
+
+    text: str
+    value: float | None = None
+
+    @property
+    def key(self) -> str:
+        return self.text if self.value is None else repr(float(self.value))
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Table of an id, what is said above it, and which of its rows are marked."""
+
+    name: str
+    said: Sequence[str]
+    heads: Sequence[str]
+    rows: Sequence[Sequence[_Cell]]
+    alarms: Collection[int] = ()
 
 
 def _partition(solution: Solved) -> Partition:
@@ -179,7 +196,7 @@ def _figures(solution: Solved) -> list[tuple[str, str]]:
     return figures
 
 
-def _robots(solution: Solved, robots: Partition, residuals: EdgeResiduals) -> tuple[list[str], PageTable]:
+def _robots(solution: Solved, robots: Partition, residuals: EdgeResiduals) -> _Table:
     graph, count, owner = solution.problem.graph, robots.num_robots, robots.robot
     cut = robots.cut_edges(graph)
     half = 0.5 * residuals.share
@@ -208,16 +225,16 @@ def _robots(solution: Solved, robots: Partition, residuals: EdgeResiduals) -> tu
         lines.append(f"Shown are the {_MOST_ROBOTS} with the largest share of {solution.certificate.cost}.")
     rows = [
         [
-            *(PageCell(f"{values[a]:,}", values[a]) for _, values in columns),
-            PageCell(f"{100 * share[a]:.3g} %", share[a]),
+            *(_Cell(f"{values[a]:,}", values[a]) for _, values in columns),
+            _Cell(f"{100 * share[a]:.3g} %", share[a]),
         ]
         for a in shown.tolist()
     ]
     heads = [*(head for head, _ in columns), f"share of {solution.certificate.cost}"]
-    return lines, PageTable("robots", heads, rows)
+    return _Table("robots", lines, heads, rows)
 
 
-def _worst_edges(solution: Solved, robots: Partition, residuals: EdgeResiduals) -> tuple[str, PageTable]:
+def _worst_edges(solution: Solved, robots: Partition, residuals: EdgeResiduals) -> _Table:
     graph, names = solution.problem.graph, pose_names(solution.problem.graph)
     worst = np.argsort(-residuals.cost, kind="stable")[:_WORST_EDGES]
     share = residuals.share
@@ -225,13 +242,13 @@ def _worst_edges(solution: Solved, robots: Partition, residuals: EdgeResiduals) 
     rows = []
     for e in worst.tolist():
         i, j = int(graph.i[e]), int(graph.j[e])
-        row = [PageCell(str(e), e), PageCell(names[i]), PageCell(names[j])]
+        row = [_Cell(str(e), e), _Cell(names[i]), _Cell(names[j])]
         if robots.num_robots > 1:
             row[1:] = [_number(robots.robot[i], "d"), row[1], _number(robots.robot[j], "d"), row[2]]
         row += [
             _number(residuals.cost[e], ".4g"),
             _number(residuals.allowed[e], ".4g"),
-            PageCell(f"{100 * share[e]:.3g} %", share[e]),
+            _Cell(f"{100 * share[e]:.3g} %", share[e]),
             _number(residuals.translation[e], ".4g"),
             _number(degrees[e], ".4g"),
             _number(graph.kappa[e], ".4g"),
@@ -247,21 +264,21 @@ def _worst_edges(solution: Solved, robots: Partition, residuals: EdgeResiduals) 
         f"of {solution.certificate.cost} together. {tested} Half of all edges fit to "
         f"{np.median(residuals.translation):.3g} m and {np.median(degrees):.3g} degrees. Click on a head to sort."
     )
-    return text, PageTable("edges", heads, rows, np.flatnonzero(residuals.is_misfit[worst]).tolist())
+    return _Table("edges", [text], heads, rows, np.flatnonzero(residuals.is_misfit[worst]).tolist())
 
 
-def _stages(solution: Solved, names: Sequence[str]) -> PageTable:
+def _stages(solution: Solved, names: Sequence[str]) -> _Table:
     rows = [
         [
-            PageCell(name),
+            _Cell(name),
             _number(stage.iterations, "d"),
             _number(stage.objective, ".10g"),
             _number(stage.seconds, ".3f"),
-            PageCell(stage.status.name),
+            _Cell(stage.status.name),
         ]
         for name, stage in zip(names, solution.stages, strict=True)
     ]
-    return PageTable("stages", ["stage", "iterations", solution.certificate.cost, "seconds", "ended"], rows)
+    return _Table("stages", [], ["stage", "iterations", solution.certificate.cost, "seconds", "ended"], rows)
 
 
 def _settings(solution: Solved, names: Sequence[str]) -> list[tuple[str, list[tuple[str, str]]]]:
@@ -288,5 +305,5 @@ def _setting(value: object) -> str:
     return value.name if isinstance(value, enum.Enum) else str(value)
 
 
-def _number(value: float, form: str) -> PageCell:
-    return PageCell(format(value, form), float(value))
+def _number(value: float, form: str) -> _Cell:
+    return _Cell(format(value, form), float(value))
