@@ -21,16 +21,20 @@ class Table:
     """Prints one line an iterate when `verbose`, and shows a bar on long runs when `progress`.
 
     The bar appears after `_BAR_AFTER_SECONDS`, on stderr or in the notebook, and goes away at the end. With `progress`
-    None it is shown in notebooks alone. The lines of the table take its place.
+    None it is shown in notebooks alone. The lines of the table take its place. What is left is said where residuals
+    fall to a `tolerance`: the seconds until then, if their logarithm goes on falling as it did so far.
     """
 
-    def __init__(self, name: str, max_iterations: int, verbose: bool, progress: bool | None) -> None:
-        self._name, self._max_iterations = name, max_iterations
+    def __init__(
+        self, name: str, max_iterations: int, verbose: bool, progress: bool | None, tolerance: float = 0.0
+    ) -> None:
+        self._name, self._max_iterations, self._tolerance = name, max_iterations, tolerance
+        self._first = math.inf  # residual
         self._in_notebook = Console().is_jupyter
         self._verbose, self._progress = verbose, self._in_notebook if progress is None else progress
         # In a notebook, too, lines are lines: rich would make an output of its own of each.
         self._console = Console(highlight=False, force_jupyter=False)
-        self._bar: _TerminalBar | _NotebookBar | None = None
+        self._bar: JobBar | _NotebookBar | None = None
 
     def __enter__(self) -> "Table":
         return self
@@ -38,6 +42,8 @@ class Table:
     def row(self, record: Record, elapsed: float) -> None:
         """Show one record; `elapsed` seconds of wall time have passed."""
         figures = record.measurement
+        residual = max(figures.primal_residual, figures.dual_residual)
+        self._first = residual if math.isinf(self._first) else self._first
         if self._verbose:
             if record.k == 0:
                 robots = "" if figures.rounds is None else _HEADER_OF_ROBOTS
@@ -50,12 +56,13 @@ class Table:
             )
         elif self._progress:
             if self._bar is None and elapsed > _BAR_AFTER_SECONDS:
-                kind = _NotebookBar if self._in_notebook else _TerminalBar
-                self._bar = kind(self._name, self._max_iterations)
+                name, most = self._name, self._max_iterations
+                self._bar = _NotebookBar(name, most) if self._in_notebook else JobBar(most, True, name)
+                self._bar.start()
             if self._bar is not None:
-                text = f"F {figures.objective:.8g}  residual {max(figures.primal_residual, figures.dual_residual):.1e}"
+                text = f"F {figures.objective:.8g}  residual {residual:.1e}"
                 sent = "" if figures.num_bytes is None else f"  {1e-6 * figures.num_bytes:.2f} MB"
-                self._bar.show(record.k, text + sent)
+                self._bar.show(record.k, text + sent + self._left(residual, elapsed))
 
     def end(self, status: Status, iterations: int) -> None:
         """Show how the run ended."""
@@ -70,35 +77,34 @@ class Table:
         if self._bar is not None:
             self._bar.stop()
 
+    def _left(self, residual: float, elapsed: float) -> str:
+        if not 0.0 < self._tolerance < residual < self._first < math.inf:
+            return ""
+        seconds = elapsed * math.log(residual / self._tolerance) / math.log(self._first / residual)
+        return f"  about {seconds:.0f} s left"
+
 
 class JobBar(Progress):
     """Progress over the parts of a job, on stderr; with `progress` None, where that is a terminal."""
 
-    def __init__(self, parts: int, progress: bool | None) -> None:
+    def __init__(self, parts: int, progress: bool | None, name: str = "") -> None:
         is_shown = sys.stderr.isatty() if progress is None else progress
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        texts = (MofNCompleteColumn(), TextColumn("{task.fields[figures]}"), TimeElapsedColumn())
+        columns = (TextColumn("{task.description}", markup=False), BarColumn(), *texts)
         super().__init__(*columns, console=Console(stderr=True), transient=True, disable=not is_shown)
-        self._task = self.add_task("", total=parts)
+        self._task = self.add_task(name, total=parts, figures="")
 
     def name_part(self, text: str) -> None:
         """Say which part is being done."""
         self.update(self._task, description=text)
 
+    def show(self, k: int, text: str) -> None:
+        """Say how many parts are done, and figures of them."""
+        self.update(self._task, completed=k, figures=text)
+
     def end_part(self) -> None:
         """Count the part as done."""
         self.advance(self._task)
-
-
-class _TerminalBar(Progress):
-    def __init__(self, name: str, max_iterations: int) -> None:
-        texts = (TextColumn("{task.completed:.0f}/{task.total:.0f}"), TextColumn("{task.fields[figures]}"))
-        columns = (TextColumn("{task.description}"), BarColumn(), *texts, TimeElapsedColumn())
-        super().__init__(*columns, console=Console(stderr=True), transient=True)
-        self.start()
-        self._task = self.add_task(name, total=max_iterations, figures="")
-
-    def show(self, k: int, text: str) -> None:
-        self.update(self._task, completed=k, figures=text)
 
 
 class _NotebookBar:
@@ -110,7 +116,9 @@ class _NotebookBar:
         self._name, self._max_iterations, self._html = html.escape(name), max_iterations, HTML
         self._began = self._updated = time.perf_counter()
         self._handle = DisplayHandle()
-        self._handle.display(HTML(self._page(0, "")))
+
+    def start(self) -> None:
+        self._handle.display(self._html(self._page(0, "")))
 
     def show(self, k: int, text: str) -> None:
         now = time.perf_counter()

@@ -7,7 +7,7 @@ import re
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import FrameType
@@ -17,6 +17,7 @@ import typer
 from typer.core import TyperGroup
 
 from pgo_models.errors import PGOError, SettingError
+from solvers.progress import JobBar
 
 DONE, BAD_INPUT, BROKEN_OFF = 0, 1, 130
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -151,7 +152,7 @@ def outlets() -> Iterator[Outlet]:
             err.flush()
 
 
-def save_then_show(targets: Iterable[tuple[Path, Callable[[Path], object]]], show: Callable[[], object]) -> None:
+def save_then_show(targets: Sequence[tuple[Path, Callable[[Path], object]]], show: Callable[[], object]) -> None:
     """Write every file that can be written, then print the result and the names of the files.
 
     Signals that come while files are written are too late: there is nothing left to break off. A PGOError comes at the
@@ -159,8 +160,10 @@ def save_then_show(targets: Iterable[tuple[Path, Callable[[Path], object]]], sho
     """
     written: list[Path] = []
     failures: list[str] = []
-    with _handled_by(signal.SIG_IGN):
-        for path, save in targets:
+    with _handled_by(signal.SIG_IGN), JobBar(len(targets), None) as bar:
+        for done, (path, save) in enumerate(targets):
+            bar.name_part(f"writing {path}")
+            bar.show(done, "")
             try:
                 save(path)
                 written.append(path)
