@@ -35,14 +35,14 @@ def read_blocks(path: Path | str) -> Iterator[str]:
         with path.open("rb") as file:
             while data := file.read(_BLOCK):
                 data += file.readline()
-                line = before + data.count(b"\n", 0, data.find(b"\0")) + 1 if b"\0" in data else None
+                wrong = data.find(b"\0")
                 try:
                     text = data.decode(encoding)
                 except UnicodeDecodeError as error:
-                    line = before + data.count(b"\n", 0, error.start) + 1
-                if line is not None:
+                    wrong = error.start
+                if wrong >= 0:
                     problem = "bytes that are no text; give a text file, unpacked if it was compressed"
-                    raise FileFormatError(path, line, problem)
+                    raise FileFormatError(path, before + data.count(b"\n", 0, wrong) + 1, problem)
                 before, encoding = before + data.count(b"\n"), "utf-8"
                 yield text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
     except FileNotFoundError:

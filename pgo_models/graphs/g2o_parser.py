@@ -67,7 +67,6 @@ def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
     source, first = _Source(path, skip_unknown), 1
     for block in read_blocks(path):
         first += source.take(first, block.removesuffix("\n").split("\n"))
-    source.check_offset()
     if source.unknown:
         said = ", ".join(f"{count} of {tag} (first: line {at})" for tag, (count, at) in source.unknown.items())
         warnings.warn(f"{path}: lines with unknown tags were skipped: {said}", GraphWarning, stacklevel=2)
@@ -162,7 +161,10 @@ class _Source:
         return ids[order], rows[order], lines[order], points[order]
 
     def dimension(self) -> int:
-        """2 or 3; a FileFormatError where lines are of neither, or of both."""
+        """2 or 3; a FileFormatError where lines are of neither, or of both, or measured by a sensor off its pose."""
+        if self._offset and any(self.parsed[tag] for tag, kind in TAGS.items() if kind.has_offset):
+            problem = "a sensor that is not at its pose; give what it measured in the frame of the pose"
+            raise self._error(self._offset, f"{problem}, without this line")
         at = [(part[0][0], TAGS[tag].d) for tag, parts in self.parsed.items() for part in parts]
         first = {d: min((line for line, of in at if of == d), default=0) for d in (2, 3)}
         if not first[2] and not first[3]:
@@ -172,12 +174,6 @@ class _Source:
             other = f"(the other kind is on line {min(first.values())})"
             raise self._error(max(first.values()), f"2D and 3D lines in one file {other}; give one file for each")
         return 2 if first[2] else 3
-
-    def check_offset(self) -> None:
-        """Raise a FileFormatError where a sensor was not at the pose whose measurements name one."""
-        if self._offset and any(self.parsed[tag] for tag, kind in TAGS.items() if kind.has_offset):
-            problem = "a sensor that is not at its pose; give what it measured in the frame of the pose"
-            raise self._error(self._offset, f"{problem}, without this line")
 
     def _parse(self, tag: str, at: IntArray, lines: list[str], written: str = "") -> bool:
         """Whether lines are all of one tag, which may be written as its alias, with ids and finite numbers; keep."""

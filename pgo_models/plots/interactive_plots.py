@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 Trace = dict[str, object]  # a plotly trace is plain data
 
 _MOST_NAMED_ROBOTS = 12
-_MOST_DOTS, _MOST_BEHIND = 20_000, 10_000  # poses that say their names, and lines of where they were before
+MOST_DOTS, _MOST_BEHIND = 20_000, 10_000  # poses that say their names, and lines of where they were before
 _FILM_BYTES = 8_000_000
 _BYTES_PER_NUMBER = 7.5  # a float32 in base64, of which plotly writes every / as six characters
 _FRAME_MILLISECONDS = 150
@@ -92,7 +92,7 @@ def explore_graph(
         behind, _ = lines_to_draw(graph, np.where(kind < 0, kind, OWN), _MOST_BEHIND)
         traces.append(_lines(before.aligned_to(poses).t, behind, "before", QUIET_COLOUR, 0.7, "solid", True))
     part, labels = _parts(graph, names)
-    dots = named[:: thinning_step(len(named), _MOST_DOTS)]
+    dots = named[:: thinning_step(len(named), MOST_DOTS)]
     for a, name in enumerate(labels):
         mine, own, colour = dots[part[dots] == a], (kinds == OWN) & (part[ends[:, 0]] == a), COLOURS[a % len(COLOURS)]
         own_lines = _lines(poses.t, ends[own], name, colour, 1.0, "solid", False)
@@ -109,7 +109,7 @@ def explore_graph(
         if (kinds == one).any():
             traces.append(_lines(poses.t, ends[kinds == one], KIND_LABELS[one], colour, width, dash, True))
     misfits = np.flatnonzero(kind == MISFIT)
-    misfits = misfits[:: thinning_step(len(misfits), _MOST_DOTS)]
+    misfits = misfits[:: thinning_step(len(misfits), MOST_DOTS)]
     middles = 0.5 * (poses.t[graph.i[misfits]] + poses.t[graph.j[misfits]])
     traces.append(_dots(middles, _misfit_text(graph, misfits, residuals), "misfit", ALARM_COLOUR, 6.0))
     if covariances is not None:
@@ -196,15 +196,6 @@ def save_page(figure: Figure, path: Path | str) -> None:
     )
     with replace_when_done(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
-
-
-def thinning(graph: PoseGraph) -> str:
-    """What `explore_graph` leaves out of a large graph, in a sentence, or nothing."""
-    step, some = (thinning_step(*counts) for counts in ((graph.num_edges, MOST_LINES), (graph.num_poses, _MOST_DOTS)))
-    if step == some == 1:
-        return ""
-    lines = f"paths through one of {step} poses, one of {step} other edges, all misfits; " if step > 1 else ""
-    return f"The graph is large, and thinned: {lines}names of one of {some} poses."
 
 
 def _parts(graph: PoseGraph, names: NDArray[np.str_]) -> tuple[IntArray, list[str]]:

@@ -15,7 +15,8 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import pose_names
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.graphs.published_results import published_run
-from pgo_models.plots.interactive_plots import PAGE_CONFIG, explore_graph, thinning
+from pgo_models.plots.graph_plots import MOST_LINES, thinning_step
+from pgo_models.plots.interactive_plots import MOST_DOTS, PAGE_CONFIG, explore_graph
 from pgo_models.plots.style import plot_module, plotly
 from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
@@ -123,11 +124,14 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
         "residuals": residuals,
         "headline": headline(certificate) + (f" {solution.robust.conditional}" if solution.robust else ""),
         "meaning": meaning(certificate),
-        "figures": _figures(solution),
+        "gap": gap_text(certificate.gap),
+        "ate": None
+        if graph.truth is None
+        else absolute_trajectory_error(solution.poses[graph.bodies], graph.truth[graph.bodies]),
         "advice": advice(graph, certificate, solution.status, residuals, source, solution.robust is not None),
         "place": place,
         "before": before_name,
-        "thinned": thinning(graph),
+        "thinned": [thinning_step(graph.num_edges, MOST_LINES), thinning_step(graph.num_poses, MOST_DOTS)],
         "has_curves": "convergence" in plots,
         "robots": _robots(solution, robots, residuals),
         "edges": _worst_edges(solution, robots, residuals),
@@ -177,23 +181,6 @@ def _partition(solution: Solved) -> Partition:
         if isinstance(stage.method, SOC) and stage.method.robots is not None:
             return stage.method.robots
     return Partition(solution.problem.graph.robots, PartitionMethod.GIVEN)
-
-
-def _figures(solution: Solved) -> list[tuple[str, str]]:
-    certificate = solution.certificate
-    figures = [
-        (f"cost {certificate.cost}", f"{solution.objective:.10g}"),
-        ("lower bound", f"{certificate.lower_bound:.10g}"),
-        ("gap", gap_text(certificate.gap)),
-        ("gap asked for", f"{certificate.wanted_gap:.3g}"),
-        ("solve ended", solution.status.name),
-    ]
-    truth = solution.problem.graph.truth
-    if truth is not None:
-        bodies = solution.problem.graph.bodies
-        ate = absolute_trajectory_error(solution.poses[bodies], truth[bodies])
-        figures.append(("error to truth (ATE)", f"{ate:.4g} m"))
-    return figures
 
 
 def _robots(solution: Solved, robots: Partition, residuals: EdgeResiduals) -> _Table:
