@@ -57,8 +57,7 @@ class Table:
         elif self._progress:
             if self._bar is None and elapsed > _BAR_AFTER_SECONDS:
                 name, most = self._name, self._max_iterations
-                self._bar = _NotebookBar(name, most) if self._in_notebook else JobBar(most, True, name)
-                self._bar.start()
+                self._bar = _NotebookBar(name, most) if self._in_notebook else JobBar(most, True, name).__enter__()
             if self._bar is not None:
                 text = f"F {figures.objective:.8g}  residual {residual:.1e}"
                 sent = "" if figures.num_bytes is None else f"  {1e-6 * figures.num_bytes:.2f} MB"
@@ -116,9 +115,7 @@ class _NotebookBar:
         self._name, self._max_iterations, self._html = html.escape(name), max_iterations, HTML
         self._began = self._updated = time.perf_counter()
         self._handle = DisplayHandle()
-
-    def start(self) -> None:
-        self._handle.display(self._html(self._page(0, "")))
+        self._handle.display(HTML(self._page(0, "")))
 
     def show(self, k: int, text: str) -> None:
         now = time.perf_counter()

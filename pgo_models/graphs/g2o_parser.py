@@ -7,6 +7,7 @@ that fails are the lines looked at one by one, to name the one that is wrong.
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import methodcaller
 from pathlib import Path
 from typing import NoReturn
 
@@ -180,13 +181,16 @@ class _Source:
         kind = TAGS[tag]
         if max(map(len, lines)) > LONGEST_LINE:
             return False
-        row = np.dtype([("tag", "S20"), ("ids", "i8", kind.num_ids), ("numbers", "f8", kind.num_numbers)])
+        shared = _shared_end(lines, kind.num_numbers - 1)
+        own = kind.num_numbers - len(shared.split())
+        row = np.dtype([("tag", "S20"), ("ids", "i8", (kind.num_ids,)), ("numbers", "f8", (own,))])
         try:
             with warnings.catch_warnings(action="error", category=DeprecationWarning):  # of an id like 1.0
-                found = np.loadtxt(lines, comments=None, ndmin=1, dtype=row)
+                found = np.loadtxt([line.removesuffix(shared) for line in lines], comments=None, ndmin=1, dtype=row)
+            same = np.loadtxt([shared], comments=None, ndmin=2) if shared else np.zeros((1, 0))
         except (ValueError, DeprecationWarning):
             return False
-        ids, numbers = found["ids"].reshape(-1, kind.num_ids), found["numbers"].copy()
+        ids, numbers = found["ids"], np.concatenate([found["numbers"], same.repeat(len(found), axis=0)], axis=1)
         is_sound = len(ids) == len(at) and (found["tag"] == (written or tag).encode()).all()
         if not is_sound or (ids == WORLD_ID).any() or not (np.abs(numbers) <= LARGEST).all():
             return False
@@ -248,6 +252,14 @@ class _Source:
 
     def _error(self, line: int, problem: str) -> FileFormatError:
         return FileFormatError(self.path, line, problem)
+
+
+def _shared_end(lines: list[str], most: int) -> str:
+    """Words that all lines end with, as information matrices are often the same; nothing where they are over `most`."""
+    first, last = (line.split(" ")[::-1] for line in (lines[0], lines[-1]))
+    count = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), 0)
+    shared = " " + " ".join(first[:count][::-1])
+    return shared if 0 < len(shared.split()) <= most and all(map(methodcaller("endswith", shared), lines)) else ""
 
 
 def _faults(found: G2OLines) -> Iterator[tuple[int, str]]:

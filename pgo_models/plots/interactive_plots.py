@@ -108,8 +108,7 @@ def explore_graph(
     ):
         if (kinds == one).any():
             traces.append(_lines(poses.t, ends[kinds == one], KIND_LABELS[one], colour, width, dash, True))
-    misfits = np.flatnonzero(kind == MISFIT)
-    misfits = misfits[:: thinning_step(len(misfits), MOST_DOTS)]
+    misfits = np.flatnonzero(kind == MISFIT)[:: thinning_step(int(np.sum(kind == MISFIT)), MOST_DOTS)]
     middles = 0.5 * (poses.t[graph.i[misfits]] + poses.t[graph.j[misfits]])
     traces.append(_dots(middles, _misfit_text(graph, misfits, residuals), "misfit", ALARM_COLOUR, 6.0))
     if covariances is not None:

@@ -42,6 +42,6 @@ def explore_fit(residuals: EdgeResiduals, d: int) -> "Figure":
     tens = list(range(first, int(edges[-1]) + 1))
     ticks = {"tickvals": tens, "ticktext": [f"10<sup>{power}</sup>" if power else "1" for power in tens]}
     figure.update_xaxes(**ticks, title_text="error, in parts of what is allowed", zeroline=False)
-    highest = max(1.0, float(count.max(initial=0)), float(expected.max(initial=0.0)))
-    figure.update_yaxes(**LOGARITHMIC, dtick=1, title_text="edges", range=[-0.3, float(np.log10(2.0 * highest))])
+    top = float(np.log10(2.0 * max(1.0, count.max(initial=0), expected.max(initial=0.0))))
+    figure.update_yaxes(**LOGARITHMIC, dtick=1, title_text="edges", range=[-0.3, top])
     return figure

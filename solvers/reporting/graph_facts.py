@@ -40,9 +40,8 @@ def memory_note(graph: PoseGraph) -> str:
     """How much memory a solve will take, in words; nothing where it is little.
 
     About 1000 (n + m) bytes and the Cholesky factor: 600 k log2 k bytes in the plane, 2200 k^(4/3) in space, as nested
-    dissection fills lattices, with k = min(n, 2 (m - n + 1)), the poses that are left where chains are eliminated. By
-    grid worlds of 10,000 to 300,000 poses in the plane and 2,000 to 50,000 in space, to 20 %; graphs that are long
-    and narrow take less.
+    dissection fills lattices, with k = min(n, 2 (m - n + 1)), the poses that are left where chains are eliminated. To
+    20 % on grid worlds of 10,000 to 300,000 poses in the plane, 2,000 to 50,000 in space; narrow graphs take less.
     """
     n, m = graph.num_poses, graph.num_edges
     k = max(2, min(n, 2 * (m - n + 1)))

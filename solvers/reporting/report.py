@@ -108,10 +108,9 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
     robots, certificate = _partition(solution), solution.certificate
     graph = solution.problem.graph.with_robots(robots.robot)
     residuals = edge_residuals(solution.problem, solution.poses)
-    place = "graph3d" if graph.d == 3 else "graph2d"
     before, before_name = solution.before()
     picture = explore_graph(graph, solution.poses, covariances=solution.covariances, residuals=residuals, before=before)
-    plots = {place: picture, "fit": explore_fit(residuals, graph.d)}
+    plots = {f"graph{graph.d}d": picture, "fit": explore_fit(residuals, graph.d)}
     names = _stage_names(solution)
     stages = list(zip(names, (stage.history for stage in solution.stages), strict=True))
     if any(len(history) for _, history in stages):
@@ -129,7 +128,6 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
         if graph.truth is None
         else absolute_trajectory_error(solution.poses[graph.bodies], graph.truth[graph.bodies]),
         "advice": advice(graph, certificate, solution.status, residuals, source, solution.robust is not None),
-        "place": place,
         "before": before_name,
         "thinned": [thinning_step(graph.num_edges, MOST_LINES), thinning_step(graph.num_poses, MOST_DOTS)],
         "has_curves": "convergence" in plots,
