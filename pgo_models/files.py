@@ -3,6 +3,7 @@
 import os
 import secrets
 import stat
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -15,6 +16,7 @@ from pgo_models.errors import FileFormatError, PGOError
 LARGEST = 1e100  # beyond it squares and determinants would overflow; no measured number is near
 FARTHEST = 1e15  # metres: beyond it neighbouring doubles are more than 0.1 m apart
 _ZERO_QUATERNION = 1e-9  # a norm below this gives no direction: files hold about six digits
+_BLOCK = 2**24  # bytes of a file that are taken apart at a time
 LONGEST_LINE = 10_000  # characters; an edge in space with all its digits has 750
 
 
@@ -23,21 +25,30 @@ def read_text(path: Path | str) -> str:
 
     A FileFormatError when the file is missing, cannot be opened, or is not text.
     """
-    path = Path(path)
+    return "".join(read_blocks(path))
+
+
+def read_blocks(path: Path | str) -> Iterator[str]:
+    """Yield what `read_text` reads, with its errors, in blocks of whole lines: a large file is never held as text."""
+    path, before, encoding = Path(path), 0, "utf-8-sig"
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            while data := file.read(_BLOCK):
+                data += file.readline()
+                wrong = data.find(b"\0")
+                try:
+                    text = data.decode(encoding)
+                except UnicodeDecodeError as error:
+                    wrong = error.start
+                if wrong >= 0:
+                    problem = "bytes that are no text; give a text file, unpacked if it was compressed"
+                    raise FileFormatError(path, before + data.count(b"\n", 0, wrong) + 1, problem)
+                before, encoding = before + data.count(b"\n"), "utf-8"
+                yield text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
     except FileNotFoundError:
         raise FileFormatError(path, None, "no such file; check the path") from None
     except OSError as error:
         raise FileFormatError(path, None, f"cannot be read: {error.strerror}; give a readable file") from error
-    line = data.count(b"\n", 0, data.find(b"\0")) + 1 if b"\0" in data else None
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-    if line is not None:
-        raise FileFormatError(path, line, "bytes that are no text; give a text file, unpacked if it was compressed")
-    return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
 
 
 def check_length(path: Path | str, line: int, text: str) -> None:
@@ -85,8 +96,10 @@ def read_table(path: Path | str, columns: int) -> tuple[NDArray[np.float64], lis
     Blank lines and comments (#) are skipped. A FileFormatError with file:line, when a line has too few or too many
     numbers or is not all numbers; when there is no row.
     """
-    rows, lines = [], []
-    for number, line in enumerate(read_text(path).split("\n"), 1):
+    text, rows, lines = read_text(path).removesuffix("\n").split("\n"), [], []
+    if (table := _sound_table(text, columns)) is not None:
+        return table, list(range(1, len(text) + 1))
+    for number, line in enumerate(text, 1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
@@ -98,6 +111,18 @@ def read_table(path: Path | str, columns: int) -> tuple[NDArray[np.float64], lis
     if not rows:
         raise FileFormatError(path, None, f"no rows; give lines of {columns} numbers")
     return np.array(rows), lines
+
+
+def _sound_table(lines: list[str], columns: int) -> NDArray[np.float64] | None:
+    """Numbers of lines where each is a row of them and nothing else, by one call, or None."""
+    if max(map(len, lines)) > LONGEST_LINE:
+        return None
+    try:
+        with warnings.catch_warnings(action="error"):  # of lines that are all blank
+            table = np.loadtxt(lines, comments=None, ndmin=2)
+    except (ValueError, UserWarning):
+        return None
+    return table if table.shape == (len(lines), columns) and (np.abs(table) <= LARGEST).all() else None
 
 
 @contextmanager

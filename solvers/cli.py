@@ -33,7 +33,8 @@ from solvers.cli_inputs import estimated_poses, load_graph, pose_named, pose_pro
 from solvers.distributed.checkpoint import Checkpoint
 from solvers.explanations import explained_by_its_graph, hint_of_chi2, hint_of_misfits, warn_of_weights, with_places
 from solvers.pipeline import HANDOVER, solve
-from solvers.reporting.graph_facts import describe_graph
+from solvers.progress_bars import JobBar
+from solvers.reporting.graph_facts import describe_graph, memory_note
 from solvers.reporting.report import check_report, write_report
 from solvers.reporting.versions import installation, installed_version, installed_versions
 from solvers.shell import DONE, Commands, JsonOption, QuietOption, run_command, save_then_show
@@ -180,8 +181,11 @@ def solve_command(
         check_report(report)
     if covariances is not None and covariances.suffix.lower() != ".csv":
         raise SettingError(f"cannot write {covariances}: covariances are written as .csv")
-    loaded = with_times(load_graph(graph, unit_weights, skip_unknown, drop_edge), times)
+    with JobBar(1, None, f"reading {graph}"):
+        loaded = with_times(load_graph(graph, unit_weights, skip_unknown, drop_edge), times)
     problem = pose_problem(loaded, unit_weights, information)
+    if note := memory_note(problem.graph):
+        typer.echo(f"pgo: {note}", err=True)
     for path in out or []:
         check_target(path, problem.graph.num_robots)
     for other in filter(None, (report, resume, covariances)):

@@ -184,7 +184,8 @@ class Watch:
         best: tuple[Measurement, S] | None = None
         records = list(earlier)
         k = len(earlier)
-        with Table(name, method.max_iterations, self.verbose, self.progress) as table:
+        tolerance = getattr(method, "tolerance", 0.0)
+        with Table(name, method.max_iterations, self.verbose, self.progress, tolerance) as table:
             try:
                 while True:
                     measurement = method.measure(problem, state)

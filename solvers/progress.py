@@ -20,14 +20,18 @@ class Table:
     """Prints one line an iterate when `verbose`, and shows a bar on long runs when `progress`.
 
     The bar appears after `_BAR_AFTER_SECONDS`, on stderr or in the notebook, and goes away at the end. With `progress`
-    None it is shown in notebooks alone. The lines of the table take its place.
+    None it is shown in notebooks alone. The lines of the table take its place. What is left is said where residuals
+    fall to a `tolerance`: the seconds until then, if their logarithm goes on falling as it did so far.
     """
 
-    def __init__(self, name: str, max_iterations: int, verbose: bool, progress: bool | None) -> None:
-        self._name, self._max_iterations = name, max_iterations
+    def __init__(
+        self, name: str, max_iterations: int, verbose: bool, progress: bool | None, tolerance: float = 0.0
+    ) -> None:
+        self._name, self._max_iterations, self._tolerance = name, max_iterations, tolerance
+        self._first = math.inf  # residual
         self._in_notebook = "IPython" in sys.modules and import_module("rich.console").Console().is_jupyter
         self._verbose, self._progress = verbose, self._in_notebook if progress is None else progress
-        self._bar: Any = None  # a _NotebookBar, or the TerminalBar of rich
+        self._bar: Any = None  # a _NotebookBar, or the JobBar of rich
 
     def __enter__(self) -> "Table":
         return self
@@ -35,6 +39,8 @@ class Table:
     def row(self, record: Record, elapsed: float) -> None:
         """Show one record; `elapsed` seconds of wall time have passed."""
         figures = record.measurement
+        residual = max(figures.primal_residual, figures.dual_residual)
+        self._first = residual if math.isinf(self._first) else self._first
         if self._verbose:
             if record.k == 0:
                 robots = "" if figures.rounds is None else _HEADER_OF_ROBOTS
@@ -46,13 +52,12 @@ class Table:
             )
         elif self._progress:
             if self._bar is None and elapsed > _BAR_AFTER_SECONDS:
-                rich = import_module("solvers.progress_bars")
-                kind = _NotebookBar if self._in_notebook else rich.TerminalBar
-                self._bar = kind(self._name, self._max_iterations)
+                rich, name, most = import_module("solvers.progress_bars"), self._name, self._max_iterations
+                self._bar = _NotebookBar(name, most) if self._in_notebook else rich.JobBar(most, True, name).__enter__()
             if self._bar is not None:
-                text = f"F {figures.objective:.8g}  residual {max(figures.primal_residual, figures.dual_residual):.1e}"
+                text = f"F {figures.objective:.8g}  residual {residual:.1e}"
                 sent = "" if figures.num_bytes is None else f"  {1e-6 * figures.num_bytes:.2f} MB"
-                self._bar.show(record.k, text + sent)
+                self._bar.show(record.k, text + sent + self._left(residual, elapsed))
 
     def end(self, status: Status, iterations: int) -> None:
         """Show how the run ended."""
@@ -64,6 +69,12 @@ class Table:
     ) -> None:
         if self._bar is not None:
             self._bar.stop()
+
+    def _left(self, residual: float, elapsed: float) -> str:
+        if not 0.0 < self._tolerance < residual < self._first < math.inf:
+            return ""
+        seconds = elapsed * math.log(residual / self._tolerance) / math.log(self._first / residual)
+        return f"  about {seconds:.0f} s left"
 
 
 class _NotebookBar:

@@ -8,7 +8,7 @@ import re
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import FrameType
@@ -18,6 +18,7 @@ import typer
 from typer.core import TyperGroup
 
 from pgo_models.errors import PGOError, SettingError
+from solvers.progress_bars import JobBar
 
 DONE, BAD_INPUT, BROKEN_OFF = 0, 1, 130
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -155,7 +156,7 @@ def outlets() -> Iterator[Outlet]:
 
 
 def save_then_show(
-    targets: Iterable[tuple[Path, Callable[[Path], object]]],
+    targets: Sequence[tuple[Path, Callable[[Path], object]]],
     show: Callable[[], object],
     record: Callable[[], dict[str, object]] | None = None,
     quiet: bool = False,
@@ -167,8 +168,10 @@ def save_then_show(
     """
     written: list[Path] = []
     failures: list[str] = []
-    with _handled_by(signal.SIG_IGN):
-        for path, save in targets:
+    with _handled_by(signal.SIG_IGN), JobBar(len(targets), None) as bar:
+        for done, (path, save) in enumerate(targets):
+            bar.name_part(f"writing {path}")
+            bar.show(done, "")
             try:
                 save(path)
                 written.append(path)

@@ -19,7 +19,6 @@ from pgo_models.html_tables import facts_table, rows_table
 from pgo_models.plots.graph_plots import compare_poses
 from pgo_models.plots.style import is_picture, save_figure
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
-from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
@@ -150,15 +149,16 @@ class Solution(Solved):
 
     def plot(self) -> "Figure":
         """Figure of the graph as it came (its own estimate, else a spanning tree) and as solved; needs matplotlib."""
-        graph = self.problem.graph
-        before, name = graph.initial, "estimate that came with the graph"
-        if before is None:
-            before, name = spanning_tree_start(graph), "spanning tree"
+        graph, (before, name) = self.problem.graph, self.before()
+        if self.robots is not None:
+            graph = graph.with_robots(self.robots.robot)
         verdict, cost = self.certificate.verdict.name.lower().replace("_", " "), self.certificate.cost
         space = "\n" if self._given else " "
         solved = f"{verdict}{self._given}:{space}{cost} = {self.objective:.6g}, gap {self.gap:.1e}"
         return compare_poses(
-            graph, [(f"{name}: {cost} = {self.problem.objective(before):.4g}", before), (solved, self.poses)]
+            graph,
+            [(f"{name}: {cost} = {self.problem.objective(before):.4g}", before), (solved, self.poses)],
+            self.edge_residuals,
         )
 
     def as_json(self) -> dict[str, object]:

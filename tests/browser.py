@@ -12,6 +12,8 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
@@ -94,6 +96,18 @@ class Browser:
         self.requests.clear()
         self.call("Page.navigate", {"url": path.resolve().as_uri()})
         self.wait_for("document.readyState === 'complete'")
+
+    @contextmanager
+    def showing(self, width: int, scheme: str) -> Iterator[None]:
+        """Show pages in a window so wide, on a system whose colours are light or dark."""
+        metrics = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
+        self.call("Emulation.setDeviceMetricsOverride", metrics)
+        self.call("Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]})
+        try:
+            yield
+        finally:
+            self.call("Emulation.clearDeviceMetricsOverride", {})
+            self.call("Emulation.setEmulatedMedia", {"features": []})
 
     def wait_for(self, condition: str) -> None:
         """Wait until a JavaScript expression is true."""

@@ -58,7 +58,7 @@ FILES = sorted(path for package in ("pgo_models", "solvers") for path in (ROOT /
 MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in FILES}
 MOST_LINES = 400
 # Imported where they are used, as what is optional or slow to import has to be.
-EXTRAS = ("matplotlib", "plotly", "ray", "cvxopt", "pymetis", "jupytext", "gtsam", "IPython")
+EXTRAS = ("matplotlib", "plotly", "jinja2", "ray", "cvxopt", "pymetis", "jupytext", "gtsam", "IPython")
 SLOW = ("pooch", "requests")
 
 
@@ -128,6 +128,20 @@ def test_every_room_has_its_sentence_and_is_installed() -> None:
         assert isinstance(only, ast.Expr), f"{room} holds more than its sentence"
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
     assert set(listed) == rooms | {"pgo_models", "pgo_models.data", "pgo_models.data.robots", "solvers", "pgo_command"}
+
+
+def test_a_wheel_has_all_that_is_no_code() -> None:
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
+    for package in settings["packages"]:
+        folder = ROOT / package.replace(".", "/")
+        for name, path in settings["package-dir"].items():
+            if package == name or package.startswith(f"{name}."):
+                folder = ROOT / path / package[len(name) + 1 :].replace(".", "/")
+        patterns = settings["package-data"].get(package, [])
+        assert all(any(folder.glob(pattern)) for pattern in patterns), f"{package}: a file that is not there"
+        packed = {path for pattern in patterns for path in folder.glob(pattern)}
+        others = {path for path in folder.iterdir() if path.is_file() and path.suffix not in (".py", ".pyc")}
+        assert others <= packed, f"{package}: {others - packed} would be left out"
 
 
 @pytest.mark.parametrize("path", [*FILES, *sorted((ROOT / "tests").glob("**/*.py"))], ids=lambda path: path.stem)

@@ -79,6 +79,15 @@ def test_a_long_run_shows_a_bar_on_stderr_alone(
     assert "2/100" in err
 
 
+@pytest.mark.parametrize(("tolerance", "left"), [(2e-2, True), (0.0, False), (2.0, False)])
+def test_it_says_what_is_left_where_residuals_fall_to_a_tolerance(tolerance, left, monkeypatch) -> None:
+    notebook = Notebook(monkeypatch)
+    with Table("SOC", 100, verbose=False, progress=True, tolerance=tolerance) as table:
+        table.row(RECORDS[0], 0.5)
+        table.row(RECORDS[1], 10.0)  # one decade of two in ten seconds
+    assert ("about 10 s left" in notebook.outputs[0][-2]) == left
+
+
 @pytest.mark.parametrize("status", Status)
 def test_lines_are_not_wrapped(status: Status, capsys: pytest.CaptureFixture[str]) -> None:
     with Table("SOC", 100, verbose=True, progress=False) as table:

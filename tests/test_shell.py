@@ -177,8 +177,10 @@ def test_a_graph_beyond_the_memory_is_one_line_with_its_file(tmp_path):
                 file.write(f"EDGE_SE2 {k} {k + step[k]} 20 0 0 1 0 0 1 0 1\n")
     limited = {"preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_AS, (2**30, 2**30))}
     ending, out, err = ended(started("solve", path, **limited))
-    assert (ending, out, one_line(err)) == (1, "", True), err
-    assert "big.g2o takes more memory than there is" in err
+    said, _, error = err.partition("\n")
+    assert said == "pgo: a solve takes about 1.1 GB of memory"
+    assert (ending, out, one_line(error)) == (1, "", True), err
+    assert "big.g2o takes more memory than there is" in error
 
 
 def test_weights_that_cannot_be_factored_are_named_with_line_and_edge(tmp_path):

@@ -1,12 +1,13 @@
 """The lines of one g2o file as arrays, every fault named by file:line; their tags are in `g2o_tags`.
 
-The way through a sound file is short: one pass over the lines, one call that parses the numbers of all lines of a tag.
-Only when that fails are the lines looked at one by one, to name the one that is wrong.
+The way through a sound file is short: blocks of some megabytes, whose lines of a tag are parsed by one call. Only when
+that fails are the lines looked at one by one, to name the one that is wrong.
 """
 
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import methodcaller
 from pathlib import Path
 from typing import NoReturn
 
@@ -21,7 +22,7 @@ from pgo_models.files import (
     check_length,
     check_quaternions,
     finite_number,
-    read_text,
+    read_blocks,
 )
 from pgo_models.geometry.rotations import Array, BoolArray, exp_map, rotations_from_quaternions
 from pgo_models.graphs.g2o_tags import ALIASES, TAGS
@@ -64,47 +65,13 @@ def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
         its rotation; 2D and 3D in one file.
     """
     path = Path(path)
-    lines = read_text(path).split("\n")
-    source = _Source(path, lines)
-    fix: list[tuple[int, str]] = []
-    unknown: dict[str, list[int]] = {}
-    offset = 0  # line of a sensor that is not at its pose
-    slots = {
-        tag: (tag, kind, 1 + kind.num_ids, source.at[tag], source.ids[tag], source.numbers[tag])
-        for tag, kind in TAGS.items()
-    }
-    slots |= {alias: slots[tag] for alias, tag in ALIASES.items()}
-    for number, line in enumerate(lines, 1):
-        parts = line.split(None, 3)
-        if not parts or parts[0][0] == "#":
-            continue
-        tag = parts[0]
-        if tag in slots:
-            tag, kind, first, its_lines, ids, numbers = slots[tag]
-            if len(line) > LONGEST_LINE:
-                check_length(path, number, line)
-            its_lines.append(number)
-            if kind.has_offset:
-                parts = [tag, *source.words(tag, number)]
-            ids += parts[1:first]
-            numbers.append(parts[3] if first == 3 and len(parts) == 4 else " ".join(parts[first:]))
-        elif tag == "FIX":
-            fix += [(number, word) for word in line.split()[1:]]
-        elif tag == "PARAMS_SE3OFFSET":
-            if any(finite_number(path, number, word) for word in line.split()[2:8]):
-                offset = number
-        elif skip_unknown:
-            unknown.setdefault(tag[:40], []).append(number)
-        elif not tag.startswith("PARAMS_"):
-            problem = f"unknown tag {tag[:40]!r}; supported are {', '.join(TAGS)} and FIX: remove the line"
-            raise FileFormatError(path, number, f"{problem}, or have such lines skipped with --skip-unknown")
-    if unknown:
-        said = ", ".join(f"{len(at)} of {tag} (first: line {at[0]})" for tag, at in unknown.items())
+    source, first = _Source(path, skip_unknown), 1
+    for block in read_blocks(path):
+        first += source.take(first, block.removesuffix("\n").split("\n"))
+    if source.unknown:
+        said = ", ".join(f"{count} of {tag} (first: line {at})" for tag, (count, at) in source.unknown.items())
         warnings.warn(f"{path}: lines with unknown tags were skipped: {said}", GraphWarning, stacklevel=2)
-    if offset and any(source.at[tag] for tag, kind in TAGS.items() if kind.has_offset):
-        problem = "a sensor that is not at its pose; give what it measured in the frame of the pose, without this line"
-        raise FileFormatError(path, offset, problem)
-    d = _dimension(path, source.at)
+    d = source.dimension()
     vertex_ids, vertices, vertex_lines, is_point = source.joined(d, is_edge=False)
     edge_ids, edges, edge_lines, to_point = source.joined(d, is_edge=True)
     landmarks = np.unique(np.concatenate([vertex_ids[is_point, 1], edge_ids[to_point, 1]]))
@@ -122,8 +89,8 @@ def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
         edge_ids,
         edges,
         edge_lines,
-        np.array([source.integer(number, word) for number, word in fix], dtype=np.int64),
-        np.array([number for number, _ in fix], dtype=np.int64),
+        np.array([pose for pose, _ in source.fixed], dtype=np.int64),
+        np.array([line for _, line in source.fixed], dtype=np.int64),
         landmarks,
     )
     for rows, at in ((vertices, found.vertex_lines), (edges, found.edge_lines)):
@@ -151,53 +118,109 @@ def information_of(d: int, edges: Array) -> Array:
 
 
 class _Source:
-    """The lines of a file, to parse and, when that fails, to say which one is wrong."""
+    """What the lines of a file say so far: parsed tag by tag, and when that fails, one by one to say which is wrong."""
 
-    def __init__(self, path: Path, lines: list[str]) -> None:
-        self.path = path
-        self.lines = lines
-        self.at: dict[str, list[int]] = {tag: [] for tag in TAGS}
-        self.ids: dict[str, list[str]] = {tag: [] for tag in TAGS}
-        self.numbers: dict[str, list[str]] = {tag: [] for tag in TAGS}
+    def __init__(self, path: Path, skip_unknown: bool) -> None:
+        self.path, self._skip_unknown = path, skip_unknown
+        self.parsed: dict[str, list[tuple[IntArray, IntArray, Array]]] = {tag: [] for tag in TAGS}
+        self.fixed: list[tuple[int, int]] = []  # a pose and its line
+        self.unknown: dict[str, tuple[int, int]] = {}  # how many lines, and the first
+        self._offset = 0  # line of a sensor that is not at its pose
+
+    def take(self, first: int, lines: list[str]) -> int:
+        """Parse lines, of which the first has that number, and return how many they are."""
+        tags = [line.split(None, 1)[:1] for line in (lines[0], lines[-1])]
+        plain = tags[0] == tags[1] and tags[0] and tags[0][0] in TAGS and not TAGS[tags[0][0]].has_offset
+        if plain and self._parse(tags[0][0], np.arange(first, first + len(lines)), lines):
+            return len(lines)
+        groups: dict[str, list[int]] = {}
+        for place, line in enumerate(lines):
+            if words := line.split(None, 1):
+                groups.setdefault(words[0], []).append(place)
+        for tag, at in groups.items():
+            numbers, mine = np.array(at) + first, [lines[place] for place in at]
+            if (known := ALIASES.get(tag, tag)) in TAGS:
+                if TAGS[known].has_offset:
+                    mine = [" ".join([tag, *self._words(known, line)]) for line in mine]
+                if not self._parse(known, numbers, mine, tag):
+                    self._diagnose(known, numbers.tolist(), mine)
+            elif not tag.startswith("#"):
+                self._take_other(tag, numbers.tolist(), mine)
+        return len(lines)
 
     def joined(self, d: int, is_edge: bool) -> tuple[IntArray, Array, IntArray, BoolArray]:
         """Ids (n, 2), rows, lines and whether they are of landmarks, of all VERTEX or all EDGE lines, line by line."""
         wanted = [tag for tag, kind in TAGS.items() if (kind.d, kind.is_edge) == (d, is_edge)]
-        wanted = [tag for tag in wanted if self.at[tag]] or wanted[:1]
-        parsed = [self._parse(tag) for tag in wanted]
-        lines = np.array([line for tag in wanted for line in self.at[tag]], dtype=np.int64)
-        ids = np.concatenate([np.insert(own, 0, WORLD_ID, axis=1)[:, -2:] for own, _ in parsed])
-        rows = np.concatenate([TAGS[tag].rows(own) for tag, (_, own) in zip(wanted, parsed, strict=True)])
-        points = np.repeat([TAGS[tag].to_landmark for tag in wanted], [len(self.at[tag]) for tag in wanted])
-        order = np.argsort(lines)
+        found = [(TAGS[tag], *part) for tag in wanted for part in self.parsed.pop(tag)]
+        kind, none = TAGS[wanted[0]], np.zeros(0, dtype=np.int64)
+        found = found or [(kind, none, none.reshape(0, kind.num_ids), np.zeros((0, kind.num_numbers)))]
+        lines = np.concatenate([at for _, at, _, _ in found])
+        ids = np.concatenate([np.insert(own, 0, WORLD_ID, axis=1)[:, -2:] for _, _, own, _ in found])
+        rows = np.concatenate([kind.rows(own) for kind, _, _, own in found])
+        points = np.repeat([kind.to_landmark for kind, *_ in found], [len(at) for _, at, _, _ in found])
+        order = np.argsort(lines) if (np.diff(lines) < 0).any() else slice(None)
         return ids[order], rows[order], lines[order], points[order]
 
-    def words(self, tag: str, line: int) -> list[str]:
+    def dimension(self) -> int:
+        """2 or 3; a FileFormatError where lines are of neither, or of both, or measured by a sensor off its pose."""
+        if self._offset and any(self.parsed[tag] for tag, kind in TAGS.items() if kind.has_offset):
+            problem = "a sensor that is not at its pose; give what it measured in the frame of the pose"
+            raise self._error(self._offset, f"{problem}, without this line")
+        at = [(part[0][0], TAGS[tag].d) for tag, parts in self.parsed.items() for part in parts]
+        first = {d: min((line for line, of in at if of == d), default=0) for d in (2, 3)}
+        if not first[2] and not first[3]:
+            problem = f"no measurement in it; a pose graph needs lines of {' or '.join(TAGS)}"
+            raise FileFormatError(self.path, None, problem)
+        if first[2] and first[3]:
+            other = f"(the other kind is on line {min(first.values())})"
+            raise self._error(max(first.values()), f"2D and 3D lines in one file {other}; give one file for each")
+        return 2 if first[2] else 3
+
+    def _parse(self, tag: str, at: IntArray, lines: list[str], written: str = "") -> bool:
+        """Whether lines are all of one tag, which may be written as its alias, with ids and finite numbers; keep."""
+        kind = TAGS[tag]
+        if max(map(len, lines)) > LONGEST_LINE:
+            return False
+        shared = _shared_end(lines, kind.num_numbers - 1)
+        own = kind.num_numbers - len(shared.split())
+        row = np.dtype([("tag", "S20"), ("ids", "i8", (kind.num_ids,)), ("numbers", "f8", (own,))])
+        try:
+            with warnings.catch_warnings(action="error", category=DeprecationWarning):  # of an id like 1.0
+                found = np.loadtxt([line.removesuffix(shared) for line in lines], comments=None, ndmin=1, dtype=row)
+            same = np.loadtxt([shared], comments=None, ndmin=2) if shared else np.zeros((1, 0))
+        except (ValueError, DeprecationWarning):
+            return False
+        ids, numbers = found["ids"], np.concatenate([found["numbers"], same.repeat(len(found), axis=0)], axis=1)
+        is_sound = len(ids) == len(at) and (found["tag"] == (written or tag).encode()).all()
+        if not is_sound or (ids == WORLD_ID).any() or not (np.abs(numbers) <= LARGEST).all():
+            return False
+        self.parsed[tag].append((at, ids.copy(), numbers))
+        return True
+
+    def _take_other(self, tag: str, at: list[int], lines: list[str]) -> None:
+        """Take lines of a tag that is no measurement's."""
+        for number, line in zip(at, lines, strict=True):
+            words = line.split()
+            if tag == "FIX":
+                self.fixed += [(self._integer(number, word), number) for word in words[1:]]
+            elif tag == "PARAMS_SE3OFFSET":
+                if any(finite_number(self.path, number, word) for word in words[2:8]):
+                    self._offset = number
+            elif not self._skip_unknown and not tag.startswith("PARAMS_"):
+                problem = f"unknown tag {tag[:40]!r}; supported are {', '.join(TAGS)} and FIX: remove the line"
+                raise self._error(number, f"{problem}, or have such lines skipped with --skip-unknown")
+        if self._skip_unknown and tag not in ("FIX", "PARAMS_SE3OFFSET"):
+            count, earliest = self.unknown.get(tag[:40], (0, at[0]))
+            self.unknown[tag[:40]] = count + len(at), earliest
+
+    def _words(self, tag: str, line: str) -> list[str]:
         """Ids and numbers on a line, without the id of an offset."""
-        kind, words = TAGS[tag], self.lines[line - 1].split()[1:]
+        kind, words = TAGS[tag], line.split()[1:]
         if kind.has_offset and len(words) == kind.num_ids + 1 + kind.num_numbers:
             words.pop(kind.num_ids)
         return words
 
-    def _parse(self, tag: str) -> tuple[IntArray, Array]:
-        """Ids (n, num_ids) and finite numbers (n, num_numbers) of all lines of one tag."""
-        kind, at, ids, numbers = TAGS[tag], self.at[tag], self.ids[tag], self.numbers[tag]
-        if not at:
-            return np.zeros((0, kind.num_ids), dtype=np.int64), np.zeros((0, kind.num_numbers))
-        joined = "".join(ids)
-        if len(ids) != kind.num_ids * len(at) or not all(numbers) or "_" in joined or not joined.isascii():
-            self._diagnose(tag, at)
-        try:
-            parsed_ids = np.array(list(map(int, ids)), dtype=np.int64).reshape(-1, kind.num_ids)
-            parsed = np.loadtxt(numbers, comments=None, ndmin=2)
-        except (ValueError, OverflowError):
-            self._diagnose(tag, at)
-        fits = parsed.shape == (len(at), kind.num_numbers) and (parsed_ids < WORLD_ID).all()
-        if not fits or not (np.abs(parsed) <= LARGEST).all():
-            self._diagnose(tag, at)
-        return parsed_ids, parsed
-
-    def integer(self, line: int, word: str) -> int:
+    def _integer(self, line: int, word: str) -> int:
         """Id of 64 bits."""
         try:
             # int() also takes 1_000 and the digits of other scripts; number files do not.
@@ -208,19 +231,20 @@ class _Source:
             raise self._error(line, f"id {word[:40]} does not fit 64 bits; renumber the poses")
         return value
 
-    def _diagnose(self, tag: str, at: list[int]) -> NoReturn:
+    def _diagnose(self, tag: str, at: list[int], lines: list[str]) -> NoReturn:
         kind = TAGS[tag]
-        for line in at:
-            words = self.words(tag, line)
+        for number, line in zip(at, lines, strict=True):
+            check_length(self.path, number, line)
+            words = self._words(tag, line)
             for word in words[: kind.num_ids]:
-                self.integer(line, word)
+                self._integer(number, word)
             for word in words[kind.num_ids :]:
-                finite_number(self.path, line, word)
+                finite_number(self.path, number, word)
             expected = kind.num_ids + kind.num_numbers
             if len(words) != expected:
                 few = "the line is cut off" if len(words) < expected else "the line is too long"
                 raise self._error(
-                    line,
+                    number,
                     f"{tag} needs {kind.num_ids} id{'s' * (kind.num_ids > 1)} and {kind.num_numbers} numbers, "
                     f"{expected} in all, found {len(words)}; {few}: complete or remove it",
                 )
@@ -230,17 +254,12 @@ class _Source:
         return FileFormatError(self.path, line, problem)
 
 
-def _dimension(path: Path, gathered: dict[str, list[int]]) -> int:
-    first = {d: min((at[0] for tag, at in gathered.items() if at and TAGS[tag].d == d), default=0) for d in (2, 3)}
-    if not first[2] and not first[3]:
-        raise FileFormatError(path, None, f"no measurement in it; a pose graph needs lines of {' or '.join(TAGS)}")
-    if first[2] and first[3]:
-        raise FileFormatError(
-            path,
-            max(first.values()),
-            f"2D and 3D lines in one file (the other kind is on line {min(first.values())}); give one file for each",
-        )
-    return 2 if first[2] else 3
+def _shared_end(lines: list[str], most: int) -> str:
+    """Words that all lines end with, as information matrices are often the same; nothing where they are over `most`."""
+    first, last = (line.split(" ")[::-1] for line in (lines[0], lines[-1]))
+    count = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), 0)
+    shared = " " + " ".join(first[:count][::-1])
+    return shared if 0 < len(shared.split()) <= most and all(map(methodcaller("endswith", shared), lines)) else ""
 
 
 def _faults(found: G2OLines) -> Iterator[tuple[int, str]]:

@@ -87,7 +87,9 @@ class Measurements(ReadOnly):
     @cached_property
     def bodies(self) -> IntArray:
         """Poses that are neither the world's nor a landmark's, (b,)."""
-        return read_only(np.setdiff1d(self.in_files, self.landmarks))
+        is_body = np.arange(self.num_poses) != self.world
+        is_body[self.landmarks] = False
+        return read_only(np.flatnonzero(is_body))
 
     @property
     def in_files(self) -> IntArray:
@@ -205,7 +207,7 @@ class Measurements(ReadOnly):
                 raise GraphError(f"{name} of {self.edge_label(e)} is {value[e]:.6g}; a precision must not be negative")
         if (empty := (self.kappa == 0) & (self.tau == 0)).any():
             raise GraphError(f"kappa and tau of {self.edge_label(int(np.argmax(empty)))} are 0; remove it")
-        if self.ids is not None and len(np.unique(self.ids)) != self.num_poses:
+        if self.ids is not None and not np.diff(np.sort(self.ids)).all():
             raise GraphError("ids are not unique; every pose needs a name of its own")
         if self.robot is not None and not has_no_gap(self.robot):
             raise GraphError("robot must number the robots 0, 1, .. without a gap; see numpy.unique")
@@ -219,4 +221,4 @@ def isotropic_information(kappa: Array, tau: Array, d: int) -> Array:
 
 def has_no_gap(robot: IntArray) -> bool:
     """Whether the robots are numbered 0, 1, .. and every one owns a pose."""
-    return len(robot) > 0 and robot.min() == 0 and len(np.unique(robot)) == robot.max() + 1
+    return len(robot) > 0 and robot.min() == 0 and robot.max() < len(robot) and bool(np.bincount(robot).all())

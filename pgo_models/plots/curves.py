@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pgo_models.geometry.rotations import Array
-from pgo_models.plots.style import COLOURS, MARKERS, column_figure
+from pgo_models.plots.style import COLOURS, MARKERS, column_figure, count_along_x
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,6 +45,7 @@ def plot_decay(curves: list[tuple[str, Array]], quantity: str) -> "Figure":
             every = max(1, len(values) // _MOST_MARKERS)
             axes.semilogy(np.arange(len(values)), values, color=colour, marker=marker, markevery=every, label=label)
         axes.set_xlabel("iteration")
+        count_along_x(axes)
         axes.set_ylabel(quantity)
         figure.legend(loc="outside upper center", ncols=1 if longest > _LONG_LABEL else 2)
     return figure

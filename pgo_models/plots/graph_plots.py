@@ -11,7 +11,7 @@ from pgo_models.geometry.poses import Poses, absolute_trajectory_error
 from pgo_models.geometry.rotations import Array, log_map
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.residuals import uncertain_edges
-from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, column_figure
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, column_figure, count_along_x
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ KIND_LABELS = {
     UNCERTAIN: "uncertain: precision under a tenth of the median",
     MISFIT: "misfit: costs more than its information allows",
 }
+MOST_LINES = 40_000  # of a picture
 _ZOOM = 0.82  # leaves room for the labels of axes in space, which the layout does not see
 _MOST_NAMED_ROBOTS = len(COLOURS)
 
@@ -48,6 +49,33 @@ def edge_kinds(
         kind[(residuals or edge_residuals(graph, poses)).is_misfit] = MISFIT
     kind[graph.is_prior] = -1
     return kind
+
+
+def lines_to_draw(graph: PoseGraph, kind: IntArray, most: int = MOST_LINES) -> tuple[IntArray, IntArray]:
+    """Poses (l, 2) to join by lines, and the kinds of these, (l,), for edges of some kinds (m,): what stands out last.
+
+    They are all edges but priors while `most` are as many. Else, k = `thinning_step`, they are misfits, paths through
+    every k-th pose that consecutive edges join, and every k-th of the other edges.
+    """
+    ends, step = np.stack([graph.i, graph.j], axis=1), thinning_step(graph.num_edges, most)
+    if step > 1:
+        pose, on_path = np.arange(graph.num_poses), (kind == OWN) & (graph.j == graph.i + 1)
+        goes_on = np.zeros(graph.num_poses + 1, dtype=bool)
+        goes_on[graph.j[on_path]] = True
+        first = np.maximum.accumulate(np.where(goes_on[:-1], 0, pose))
+        path = np.flatnonzero(((pose - first) % step == 0) | ~goes_on[1:])
+        paths = np.stack([path[:-1], path[1:]], axis=1)[first[path[1:]] == first[path[:-1]]]
+        misfits = np.flatnonzero(kind == MISFIT)
+        others = np.flatnonzero((kind >= 0) & (kind != MISFIT) & ~on_path)[::step]
+        kept = np.append(others, misfits[:: thinning_step(len(misfits), most)])
+        ends, kind = np.concatenate([paths, ends[kept]]), np.append(np.full(len(paths), OWN), kind[kept])
+    order = np.argsort(kind, kind="stable")[int(np.sum(kind < 0)) :]
+    return ends[order], kind[order]
+
+
+def thinning_step(count: int, most: int) -> int:
+    """Every how many of `count` things are drawn, of which there may be `most`."""
+    return max(1, -(-count // most))
 
 
 def confidence_ellipses(poses: Poses, covariances: Array) -> Array:
@@ -75,8 +103,8 @@ def draw_graph(
     from matplotlib.colors import to_rgb
 
     kind = edge_kinds(graph, poses, mark_edges, residuals)
-    order = np.argsort(kind, kind="stable")[int(np.sum(kind < 0)) :]  # what stands out is drawn last
-    kind, i, j = kind[order], graph.i[order], graph.j[order]
+    ends, kind = lines_to_draw(graph, kind)
+    i, j = ends.T
     palette = np.array([to_rgb(name) for name in (*COLOURS, QUIET_COLOUR, ALARM_COLOUR)])
     colour = np.where(graph.robots[i] == graph.robots[j], graph.robots[i] % len(COLOURS), len(COLOURS))
     colour[kind == SIGHTING], colour[kind == MISFIT] = len(COLOURS), len(COLOURS) + 1
@@ -85,6 +113,7 @@ def draw_graph(
         colors=palette[colour],
         linewidths=_WIDTHS[kind],
         linestyles=[(0, (1, 1.5)) if one == UNCERTAIN else "solid" for one in kind],
+        rasterized=graph.num_edges > MOST_LINES,
     )
     axes.add_collection(lines)
     _frame(axes, poses.t[graph.in_files])
@@ -121,8 +150,8 @@ def plot_graph(
     return figure
 
 
-def compare_poses(graph: PoseGraph, panels: list[tuple[str, Poses]]) -> Figure:
-    """Figure with one panel for every (title, poses), side by side.
+def compare_poses(graph: PoseGraph, panels: list[tuple[str, Poses]], residuals: EdgeResiduals | None = None) -> Figure:
+    """Figure with one panel for every (title, poses), side by side; edges are marked by `residuals` of the last.
 
     Examples
     --------
@@ -133,18 +162,21 @@ def compare_poses(graph: PoseGraph, panels: list[tuple[str, Poses]]) -> Figure:
     >>> [axes.get_title() for axes in figure.axes]
     ['truth', 'tree']
     """
-    return plot_panels([[(title, graph, poses) for title, poses in panels]])
+    return plot_panels([[(title, graph, poses) for title, poses in panels]], residuals)
 
 
-def plot_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> Figure:
-    """Figure with a row of pictures for every list of (title, graph, poses)."""
-    columns = max(len(row) for row in panels)
+def plot_panels(panels: list[list[tuple[str, PoseGraph, Poses]]], residuals: EdgeResiduals | None = None) -> Figure:
+    """Figure with a row of pictures for every list of (title, graph, poses); `residuals` are of the last picture."""
+    columns, marked = max(len(row) for row in panels), None
     with column_figure(height=1.0 * len(panels), width=columns) as figure:
         for r, row in enumerate(panels):
             for place, (title, graph, poses) in enumerate(row, r * columns + 1):
                 axes = figure.add_subplot(len(panels), columns, place, projection="3d" if graph.d == 3 else None)
-                draw_graph(graph, poses, axes, mark_edges=False)
+                marked = residuals if (r, place) == (len(panels) - 1, r * columns + len(row)) else None
+                draw_graph(graph, poses, axes, marked is not None, marked)
                 axes.set_title(title)
+        if marked is not None and (handles := _legend(graph, edge_kinds(graph, poses, residuals=marked))):
+            figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
 
 
@@ -174,14 +206,15 @@ def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = Non
         _frame(axes, np.concatenate([aligned.t, truth.t]))
         ate = absolute_trajectory_error(poses, truth)
         axes.set_title(f"{graph.name}: ATE {ate:.3g} m, rotation {np.sqrt(np.mean(degrees**2)):.3g} deg (rms)")
-        below: Axes | None = None
-        for row, (error, label) in enumerate([(metres, "position (m)"), (degrees, "rotation (deg)")], 1):
-            below = figure.add_subplot(grid[row], sharex=below)
-            below.plot(error, color=ALARM_COLOUR, linewidth=0.7)
-            below.set_ylabel(label)
-            below.set_ylim(bottom=0.0)
-        assert below is not None
+        above = figure.add_subplot(grid[1])
+        below = figure.add_subplot(grid[2], sharex=above)
+        for panel, error, label in ((above, metres, "position (m)"), (below, degrees, "rotation (deg)")):
+            panel.plot(error, color=ALARM_COLOUR, linewidth=0.7)
+            panel.set_ylabel(label)
+            panel.set_ylim(bottom=0.0)
+            panel.label_outer()
         below.set_xlabel("pose")
+        count_along_x(below)
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 

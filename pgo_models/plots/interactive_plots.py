@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pgo_models.errors import GraphError
 from pgo_models.files import replace_when_done
@@ -19,11 +20,14 @@ from pgo_models.plots.graph_plots import (
     BETWEEN,
     KIND_LABELS,
     MISFIT,
+    MOST_LINES,
     OWN,
     SIGHTING,
     UNCERTAIN,
     confidence_ellipses,
     edge_kinds,
+    lines_to_draw,
+    thinning_step,
 )
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, plotly
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
@@ -35,6 +39,7 @@ if TYPE_CHECKING:
 Trace = dict[str, object]  # a plotly trace is plain data
 
 _MOST_NAMED_ROBOTS = 12
+MOST_DOTS, _MOST_BEHIND = 20_000, 10_000  # poses that say their names, and lines of where they were before
 _FILM_BYTES = 8_000_000
 _BYTES_PER_NUMBER = 7.5  # a float32 in base64, of which plotly writes every / as six characters
 _FRAME_MILLISECONDS = 150
@@ -53,8 +58,11 @@ def explore_graph(
     title: str = "",
     covariances: Array | None = None,
     residuals: EdgeResiduals | None = None,
+    before: Poses | None = None,
 ) -> Figure:
     """Plotly figure of a graph by robot; poses and misfitting edges say who they are under the pointer.
+
+    Of a large graph, what `lines_to_draw` leaves, and some of the poses; one of a single robot is parted by time.
 
     Parameters
     ----------
@@ -64,6 +72,8 @@ def explore_graph(
         Of every pose, drawn as `confidence_ellipses`.
     residuals : EdgeResiduals, optional
         Of the problem that was solved; those of F unless given.
+    before : Poses, optional
+        Drawn in grey, moved to fit `poses`.
 
     Examples
     --------
@@ -76,15 +86,19 @@ def explore_graph(
     residuals = residuals or edge_residuals(graph, poses)
     kind = edge_kinds(graph, poses, residuals=residuals)
     names, several, named = np.array(pose_names(graph)), graph.num_robots > 1, graph.in_files
+    ends, kinds = lines_to_draw(graph, kind)
     traces = []
-    for a in range(graph.num_robots):
-        mine, own = named[graph.robots[named] == a], (kind == OWN) & (graph.robots[graph.i] == a)
-        colour, in_legend = COLOURS[a % len(COLOURS)], a < _MOST_NAMED_ROBOTS
-        name = f"robot {a}" if several else "edges and poses"
-        own_lines = _lines(graph, poses.t, np.flatnonzero(own), name, colour, 1.0, "solid", False)
-        text = [f"pose {one}, robot {a}" if several else f"pose {one}" for one in names[mine]]
+    if before is not None:
+        behind, _ = lines_to_draw(graph, np.where(kind < 0, kind, OWN), _MOST_BEHIND)
+        traces.append(_lines(before.aligned_to(poses).t, behind, "before", QUIET_COLOUR, 0.7, "solid", True))
+    part, labels = _parts(graph, names)
+    dots = named[:: thinning_step(len(named), MOST_DOTS)]
+    for a, name in enumerate(labels):
+        mine, own, colour = dots[part[dots] == a], (kinds == OWN) & (part[ends[:, 0]] == a), COLOURS[a % len(COLOURS)]
+        own_lines = _lines(poses.t, ends[own], name, colour, 1.0, "solid", False)
+        text = [f"pose {names[k]}, robot {graph.robots[k]}" if several else f"pose {names[k]}" for k in mine]
         # One entry of the legend shows and hides both; a robot may have no edge of its own, but has poses.
-        for trace, shown in ((own_lines, False), (_dots(poses.t[mine], text, name, colour, 4.0), in_legend)):
+        for trace, shown in ((own_lines, False), (_dots(poses.t[mine], text, name, colour, 4.0), True)):
             traces.append({**trace, "legendgroup": name, "showlegend": shown})
     for one, colour, width, dash in (
         (SIGHTING, QUIET_COLOUR, 0.3, "solid"),
@@ -92,10 +106,9 @@ def explore_graph(
         (UNCERTAIN, QUIET_COLOUR, 1.5, "dot"),
         (MISFIT, ALARM_COLOUR, 5.0, "solid"),
     ):
-        edges = np.flatnonzero(kind == one)
-        if len(edges):
-            traces.append(_lines(graph, poses.t, edges, KIND_LABELS[one], colour, width, dash, True))
-    misfits = np.flatnonzero(kind == MISFIT)
+        if (kinds == one).any():
+            traces.append(_lines(poses.t, ends[kinds == one], KIND_LABELS[one], colour, width, dash, True))
+    misfits = np.flatnonzero(kind == MISFIT)[:: thinning_step(int(np.sum(kind == MISFIT)), MOST_DOTS)]
     middles = 0.5 * (poses.t[graph.i[misfits]] + poses.t[graph.j[misfits]])
     traces.append(_dots(middles, _misfit_text(graph, misfits, residuals), "misfit", ALARM_COLOUR, 6.0))
     if covariances is not None:
@@ -146,12 +159,12 @@ def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[
     def traces(t: Array) -> list[Trace]:
         drawn = []
         for a in [*range(graph.num_robots), -1]:
-            edges = np.flatnonzero(owner == a)
-            if len(edges):
+            if (owner == a).any():
+                ends = np.stack([graph.i, graph.j], axis=1)[owner == a]
                 name = "between robots" if a < 0 else f"robot {a}"
                 colour = QUIET_COLOUR if a < 0 else COLOURS[a % len(COLOURS)]
                 in_legend = graph.num_robots > 1 and a < _MOST_NAMED_ROBOTS
-                drawn.append(_lines(graph, t, edges, name, colour, 1.0, "solid", in_legend))
+                drawn.append(_lines(t, ends, name, colour, 1.0, "solid", in_legend))
         return drawn
 
     frames = [go.Frame(data=traces(t), name=name) for t, name in zip(positions, names, strict=True)]
@@ -184,22 +197,36 @@ def save_page(figure: Figure, path: Path | str) -> None:
         temporary.write_text(page, encoding="utf-8")
 
 
+def _parts(graph: PoseGraph, names: NDArray[np.str_]) -> tuple[IntArray, list[str]]:
+    """Part of every pose, (n,), that an entry of the legend shows and hides, and the entries: robots, or times."""
+    if graph.num_robots == 1 and graph.num_edges <= MOST_LINES:
+        return graph.robots, ["edges and poses"]
+    owner, what = (graph.robots, "robot") if graph.num_robots > 1 else (np.arange(graph.num_poses), "pose")
+    count = int(owner.max()) + 1
+    parts = min(count, _MOST_NAMED_ROBOTS if what == "robot" else len(COLOURS))
+    part = owner * parts // count
+    of_part = [owner[part == a] for a in range(parts)]
+    spans = [(int(own.min()), int(own.max())) for own in of_part]
+    called = names if what == "pose" else np.arange(count).astype(str)
+    said = [f"{what} {called[a]}" if a == b else f"{what}s {called[a]} to {called[b]}" for a, b in spans]
+    return part, said
+
+
 def _points(points: Array) -> Trace:
     """Trace at points, (k, d), which plotly packs as float32 in base64."""
     x, y, *z = np.ascontiguousarray(points.T, dtype=np.float32)
     return {"type": "scatter3d", "x": x, "y": y, "z": z[0]} if z else {"type": "scattergl", "x": x, "y": y}
 
 
-def _lines(
-    graph: PoseGraph, t: Array, edges: IntArray, name: str, colour: str, width: float, dash: str, in_legend: bool
-) -> Trace:
-    """One trace for many edges: start, end, and a gap."""
-    ends = np.full((len(edges), 3, graph.d), np.nan)
-    ends[:, 0], ends[:, 1] = t[graph.i[edges]], t[graph.j[edges]]
+def _lines(t: Array, ends: IntArray, name: str, colour: str, width: float, dash: str, in_legend: bool) -> Trace:
+    """One trace for many lines between poses, (l, 2): start, end, and a gap."""
+    d = t.shape[1]
+    points = np.full((len(ends), 3, d), np.nan)
+    points[:, :2] = t[ends]
     return {
-        **_points(ends.reshape(-1, graph.d)),
+        **_points(points.reshape(-1, d)),
         "mode": "lines",
-        "line": {"color": colour, "width": width if graph.d == 2 else 2.0 * width, "dash": dash},
+        "line": {"color": colour, "width": width if d == 2 else 2.0 * width, "dash": dash},
         "name": name,
         "hoverinfo": "skip",
         "showlegend": in_legend,
@@ -231,11 +258,14 @@ def _misfit_text(graph: PoseGraph, edges: IntArray, residuals: EdgeResiduals) ->
 
 def _arrange(figure: Figure, points: Array, title: str) -> None:
     lay_out(figure, title, legend_y=-0.12 if points.shape[1] == 2 else 0.0)
-    if points.shape[1] == 2:
-        figure.update_xaxes(title_text="x (m)", zeroline=False, gridcolor="#eeeeee")
-        figure.update_yaxes(title_text="y (m)", zeroline=False, gridcolor="#eeeeee", scaleanchor="x")
-        return
     lower, upper = points.min(axis=0), points.max(axis=0)
+    if points.shape[1] == 2:
+        margin = 0.04 * float((upper - lower).max())
+        (left, low), (right, high) = lower - margin, upper + margin
+        plain = {"zeroline": False, "gridcolor": "#eeeeee"}
+        figure.update_xaxes(title_text="x (m)", range=[left, right], **plain)
+        figure.update_yaxes(title_text="y (m)", range=[low, high], scaleanchor="x", **plain)
+        return
     middle, half = (lower + upper) / 2, max(0.52 * float((upper - lower).max()), 1e-9)
     figure.update_scenes(
         aspectmode="cube",

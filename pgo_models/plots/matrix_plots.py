@@ -14,7 +14,7 @@ from pgo_models.certificates.spectrum import rotation_inverse, smallest_definite
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, SMALL_POINTS, column_figure
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, SMALL_POINTS, column_figure, count_along_x
 from pgo_models.problem.problem import PGOProblem
 
 if TYPE_CHECKING:
@@ -57,8 +57,6 @@ def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12
     eigenvalues = smallest_eigenvalues(problem, certificate.Lambda, count)
     k, negative = np.arange(1, count + 1), eigenvalues < 0
     with column_figure(height=0.8) as figure:
-        from matplotlib.ticker import MaxNLocator
-
         axes = figure.add_subplot()
         axes.set_yscale("log")
         size = np.maximum(np.abs(eigenvalues), np.finfo(float).tiny)
@@ -73,7 +71,7 @@ def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12
         axes.set_xlabel("k-th smallest eigenvalue of S")
         axes.set_ylabel("|eigenvalue| (per rad$^2$)")
         axes.set_title(f"{problem.graph.name}: gap {certificate.gap:.1e}, {certificate.verdict.name}")
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        count_along_x(axes)
         figure.legend(loc="outside lower center", ncols=3, columnspacing=1.0, handletextpad=0.4)
     return figure
 

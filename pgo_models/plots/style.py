@@ -15,6 +15,7 @@ from pgo_models.errors import MissingExtraError
 from pgo_models.files import replace_when_done
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 COLUMN_INCHES = 3.4  # a column of a two-column paper
@@ -24,6 +25,8 @@ PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
 # Okabe & Ito 2008: told apart by readers with any of the common colour blindnesses.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#000000")
+# Of methods, which may be more: Tol's muted ones besides.
+METHOD_COLOURS = (*COLOURS, "#882255", "#999933", "#661100", "#44AA99")
 ALARM_COLOUR = "#D55E00"  # vermilion, kept for what is wrong
 QUIET_COLOUR = "#999999"
 MARKERS = ("o", "s", "D", "^", "v", "P")
@@ -57,11 +60,24 @@ def column_figure(height: float, width: float = 1.0) -> Iterator[Figure]:
 
 def plotly(name: str) -> ModuleType:
     """Module of plotly, whose import waits until something is drawn."""
+    return plot_module(f"plotly.{name}")
+
+
+def plot_module(name: str) -> ModuleType:
+    """Module of a package of the extra `plot`, by its full name."""
+    package = name.partition(".")[0]
     try:
-        importlib.import_module("plotly")
-        return importlib.import_module(f"plotly.{name}")
+        importlib.import_module(package)
+        return importlib.import_module(name)
     except ImportError as error:
-        raise MissingExtraError("plotly", "plot") from error
+        raise MissingExtraError(package, "plot") from error
+
+
+def count_along_x(axes: Axes) -> None:
+    """Ticks at whole numbers alone, for axes of things that are counted."""
+    from matplotlib.ticker import MaxNLocator
+
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def is_picture(path: Path) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.plots.interactive_plots import lay_out
-from pgo_models.plots.style import COLOURS, MARKERS, column_figure, plotly
+from pgo_models.plots.style import MARKERS, METHOD_COLOURS, column_figure, count_along_x, plotly
 from solvers.reporting.convergence_plots import LINES, LOGARITHMIC, Curve, Effort
 
 if TYPE_CHECKING:
@@ -39,6 +39,8 @@ def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -
                 draw = axes.semilogy if effort is Effort.ITERATIONS else axes.loglog
                 (handles[curve.name],) = draw(x, y, f"{marker}{line}", color=colour, markevery=_MARKER_DISTANCE)
             axes.set_xlabel(effort.value)
+            if effort is Effort.ITERATIONS:
+                count_along_x(axes)
         grid[0].set_ylabel("relative gap")
         names = [curve.name for curve in curves if curve.name in handles]
         columns = min(len(names), 2 * len(panels))
@@ -98,8 +100,9 @@ def _points(curve: Curve, effort: Effort) -> tuple[Array, Array]:
 
 def _styles(curves: Sequence[Curve], lines: Sequence[str]) -> dict[str, tuple[str, str, str]]:
     """Colour, marker and line of every method, in all panels the same."""
-    number = len(COLOURS)
-    return {
-        curve.name: (COLOURS[k % number], MARKERS[(k + k // number) % len(MARKERS)], lines[k // number % len(lines)])
-        for k, curve in enumerate(curves)
-    }
+    number, found = len(METHOD_COLOURS), {}
+    for place, curve in enumerate(curves):
+        k = place if curve.place is None else curve.place
+        marker, line = MARKERS[(k + k // number) % len(MARKERS)], lines[k // number % len(lines)]
+        found[curve.name] = METHOD_COLOURS[k % number], marker, line
+    return found

@@ -15,7 +15,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.published_results import PublishedRun
 from pgo_models.plots.interactive_plots import lay_out
-from pgo_models.plots.style import ALARM_COLOUR, COLOURS, column_figure, plotly
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, column_figure, count_along_x, plotly
 from solvers.result import History
 
 if TYPE_CHECKING:
@@ -48,6 +48,7 @@ class Curve:
     # rounds, num_bytes: (len(history),); communication up to every record.
     rounds: Array | None = None
     num_bytes: Array | None = None
+    place: int | None = None  # of its colour; its place in the figure unless given
 
     def __post_init__(self) -> None:
         for label in ("rounds", "num_bytes"):
@@ -117,6 +118,7 @@ def plot_convergence(
         above.set_ylabel("relative residual")
         below.set_ylabel("relative gap")
         below.set_xlabel("iteration")
+        count_along_x(below)
         if published is not None:
             _mark(below, published, begin)
         figure.legend(loc="outside lower center", ncols=2)
@@ -159,8 +161,9 @@ def explore_convergence(
             line={"color": ALARM_COLOUR, "dash": "dot"},
         )
     lay_out(figure, "", legend_y=-0.14)
+    counted = {"dtick": 1} if begin < 10 else {}  # else plotly puts ticks between iterations
     figure.update_layout(
-        xaxis={"title": {"text": "iteration"}, "anchor": "y2", "gridcolor": "#eeeeee", "zeroline": False},
+        xaxis={"title": {"text": "iteration"}, "anchor": "y2", "gridcolor": "#eeeeee", "zeroline": False, **counted},
         yaxis={**LOGARITHMIC, "title": {"text": "relative gap"}, "domain": [0.54, 1.0]},
         yaxis2={**LOGARITHMIC, "title": {"text": "relative residual"}, "domain": [0.0, 0.46]},
     )

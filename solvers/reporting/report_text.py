@@ -10,6 +10,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.datasets import known_datasets
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals
 from solvers.network.ledger import Ledger
@@ -48,6 +49,13 @@ class Solved:
     anchor: int = 0
     covariances: Array | None = None
     robust: Rejection | None = None
+
+    def before(self) -> tuple[Poses, str]:
+        """Poses that the graph came with, else those along a spanning tree, and what they are."""
+        graph = self.problem.graph
+        if graph.initial is not None:
+            return graph.initial, "estimate that came with the graph"
+        return spanning_tree_start(graph), "spanning tree"
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,8 @@ class BenchmarkRun:
                 records.append(replace(record, k=k + record.k, seconds=seconds + record.seconds))
             k, seconds = records[-1].k, records[-1].seconds
         rounds, num_bytes = _joined([leg.rounds for leg in self.legs]), _joined([leg.num_bytes for leg in self.legs])
-        return Curve(self.contender.label, History(tuple(records)), lower_bound, rounds, num_bytes)
+        place = list(BenchmarkMethod).index(self.contender)
+        return Curve(self.contender.label, History(tuple(records)), lower_bound, rounds, num_bytes, place)
 
     def __repr__(self) -> str:
         rounds = "" if self.rounds is None else f", {self.rounds} rounds"

@@ -86,6 +86,32 @@ def test_everything_that_is_no_measurement_is_skipped(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.fixed_lines, [6, 6])
 
 
+def test_numbers_that_all_lines_end_with_are_read_like_others(tmp_path: Path) -> None:
+    lines = [EDGE_2D.replace("0.5", angle) for angle in ("0.5", "-0.25", "10.5")]
+    expected = [[1, 2, angle, 4, 0, 0, 4, 0, 9] for angle in (0.5, -0.25, 10.5)]
+    np.testing.assert_array_equal(read_lines(write(tmp_path, *lines)).edges, expected)
+    np.testing.assert_array_equal(read_lines(write(tmp_path, *(f"{line} " for line in lines))).edges, expected)
+    for end, words in (("4 0 x", "'x' is no number"), ("4 0 inf", "not finite"), ("4 0", "cut off")):
+        with pytest.raises(FileFormatError, match=words):
+            read_lines(write(tmp_path, *(line.replace("4 0 9", end) for line in lines)))
+
+
+def test_a_block_of_a_file_knows_its_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pgo_models.files._BLOCK", 100)
+    lines = [f"VERTEX_SE2 {k} {k} 0 0" for k in range(20)] + [
+        f"EDGE_SE2 {k} {k + 1} 1 0 0 1 0 0 1 0 1" for k in range(19)
+    ]
+    found = read_lines(write(tmp_path, *lines))
+    np.testing.assert_array_equal(found.vertices[:, 0], np.arange(20))
+    np.testing.assert_array_equal(found.edge_lines, np.arange(21, 40))
+    with pytest.raises(FileFormatError, match=r":40: 'x' is no number"):
+        read_lines(write(tmp_path, *lines, "EDGE_SE2 0 1 x 0 0 1 0 0 1 0 1"))
+    path = write(tmp_path, *lines)
+    path.write_bytes(path.read_bytes() + b"# \xff\n")
+    with pytest.raises(FileFormatError, match=r":40: bytes that are no text"):
+        read_lines(path)
+
+
 def test_large_ids_are_exact(tmp_path: Path) -> None:
     ids = [(ord("a") << 56) + 1, (ord("a") << 56) + 2]
     path = write(tmp_path, EDGE_2D.replace(" 0 1 ", f" {ids[0]} {ids[1]} ", 1), EDGE_2D.replace(" 0 1 ", " -5 7 ", 1))

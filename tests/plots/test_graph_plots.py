@@ -1,4 +1,5 @@
 import builtins
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,11 +8,19 @@ import pgo_models as pgo
 import solvers
 from pgo_models.errors import GraphError, MissingExtraError
 from pgo_models.plots.curves import plot_decay, plot_tightness
-from pgo_models.plots.graph_plots import confidence_ellipses, draw_graph, plot_against_truth
+from pgo_models.plots.graph_plots import (
+    OWN,
+    confidence_ellipses,
+    draw_graph,
+    edge_kinds,
+    lines_to_draw,
+    plot_against_truth,
+    thinning_step,
+)
 from pgo_models.plots.matrix_plots import plot_sparsity, plot_spectrum
 from pgo_models.plots.style import save_figure
 from solvers.reporting.comparison_plots import plot_efforts
-from solvers.reporting.convergence_plots import Curve, plot_convergence
+from solvers.reporting.convergence_plots import Curve, Effort, plot_convergence
 
 pytest.importorskip("matplotlib")
 
@@ -76,10 +85,56 @@ def test_errors_to_the_truth_are_those_after_alignment(d):
     )
 
 
+def test_errors_share_an_axis_that_counts_poses():
+    graph = pgo.grid_world(1, 4, np.random.default_rng(0), d=2)
+    figure = plot_against_truth(graph, graph.initial)
+    _, above, below = figure.axes
+    assert above.get_shared_x_axes().joined(above, below)
+    figure.canvas.draw()
+    assert not any(label.get_visible() for label in above.get_xticklabels())
+    assert all(tick == round(tick) for tick in below.get_xticks())
+
+
+def test_a_large_graph_is_drawn_as_paths_and_some_of_its_edges():
+    graph = pgo.grid_world(3, 40, np.random.default_rng(0), d=2)
+    kind = edge_kinds(graph, graph.truth)
+    every = np.stack([graph.i, graph.j], axis=1)
+    ends, kinds = lines_to_draw(graph, kind)
+    assert sorted(map(tuple, ends)) == sorted(map(tuple, every))
+    for most in (100, 20):
+        ends, kinds = lines_to_draw(graph, kind, most)
+        k = thinning_step(graph.num_edges, most)
+        assert most / 2 < len(ends) <= most + 2 * graph.num_robots
+        known = set(map(tuple, every))
+        for (a, b), one in zip(ends, kinds, strict=True):
+            steps = [(pose, pose + 1) for pose in range(a, b)]
+            assert (a, b) in known or (one == OWN and b - a <= k and all(step in known for step in steps))
+    drawn = {pose for (a, b), one in zip(ends, kinds, strict=True) if one == OWN for pose in (a, b)}
+    assert {0, 39, 40, 79, 80, 119} <= drawn  # every path has its ends
+
+
+def test_a_solution_by_robots_shows_them_and_marks_misfits():
+    graph = pgo.load("sphere")
+    wrong = graph.t_ij + 30.0 * (np.arange(544) == 5)[:, None]
+    solution = solvers.solve(replace(graph, t_ij=wrong), robots=3)
+    assert solution.edge_residuals.is_misfit.any()
+    (legend,) = solution.plot().legends
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert texts[:3] == ["robot 0", "robot 1", "robot 2"]
+    assert any(text.startswith("misfit") for text in texts)
+
+
+def test_a_method_has_the_same_colour_beside_whatever_others():
+    curve = Curve("SOC", solvers.run(solvers.SOC(), pgo.load("grid")).history, 97.0)
+    names = [replace(curve, name=name, place=place) for place, name in enumerate("abcdefghij")]
+    lines = [plot_efforts(shown, [Effort.SECONDS]).axes[0].lines for shown in (names, names[4:])]
+    colours = [[line.get_color() for line in drawn] for drawn in lines]
+    assert len(set(colours[0])) == 10
+    assert colours[0][4:] == colours[1]
+
+
 def test_without_a_truth_one_line_says_so():
     graph = pgo.grid_world(1, 12, np.random.default_rng(0))
-    from dataclasses import replace
-
     with pytest.raises(GraphError, match="without a ground truth"):
         plot_against_truth(replace(graph, truth=None), graph.truth)
 

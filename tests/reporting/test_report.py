@@ -2,85 +2,23 @@ import re
 import shlex
 import sys
 from dataclasses import replace
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from browser import Browser, find_browser
+from pages import Page, own_part
 
 import pgo_models as pgo
 import solvers
 from pgo_models.certificates.certificate import BoundSource
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.errors import SettingError
-from pgo_models.graphs.scenes import NoiseModel
-from pgo_models.plots.interactive_plots import animate_poses, save_page
 from solvers import cli
 from solvers.network.ledger import Ledger, Traffic
+from solvers.reporting.fit_plots import explore_fit
 from solvers.reporting.report import report_page
 from solvers.reporting.report_text import advice, fit, headline, meaning, percent
 
-plotly = pytest.importorskip("plotly")
-EMPTY = {"meta", "link", "br", "input", "img", "hr"}
-
-
-class Page(HTMLParser):
-    """What a reader finds: texts, tables by id, tags that ask for something; fails on tags that do not match."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.texts, self.tables, self.asked, self.open_tags, self.row, self.table = [], {}, [], [], None, None
-        self.scripts = 0
-        self.feed(text)
-        self.close()
-        assert self.open_tags == []
-
-    def handle_starttag(self, tag, attributes):
-        named = dict(attributes)
-        self.asked += [named[name] for name in ("src", "href", "srcset", "data", "action") if name in named]
-        self.scripts += tag == "script"
-        if tag not in EMPTY:
-            self.open_tags.append(tag)
-        if tag == "table":
-            self.table = self.tables.setdefault(named["id"], [])
-        if tag == "tr":
-            self.row = []
-            self.table.append(self.row)
-        if tag in ("td", "th"):
-            self.row.append("")
-
-    def handle_endtag(self, tag):
-        assert self.open_tags.pop() == tag
-        if tag == "tr":
-            self.row = None
-
-    def handle_data(self, data):
-        if self.open_tags and self.open_tags[-1] not in ("script", "style"):
-            self.texts.append(data)
-            if self.row:
-                self.row[-1] += data
-
-    @property
-    def text(self):
-        return " ".join(" ".join(self.texts).split())
-
-
-def own_part(text):
-    """The page without plotly's script."""
-    return text.replace(plotly.offline.get_plotlyjs(), "")
-
-
-@pytest.fixture(scope="module")
-def solution():
-    return solvers.solve(pgo.load("robots"))
-
-
-@pytest.fixture(scope="module")
-def uncertain():
-    graph = pgo.random_geometric(12, np.random.default_rng(5), noise=NoiseModel(1.0, 2.5))
-    solution = solvers.solve(graph)
-    assert not solution.is_certified
-    return solution
+pytest.importorskip("plotly")
 
 
 @pytest.fixture(scope="module")
@@ -169,8 +107,8 @@ def test_communication_is_shown_when_it_was_counted(solution):
 
 
 def test_settings_and_versions_are_on_the_page(solution, page):
-    soc = next(stage.method for stage in solution.stages if isinstance(stage.method, solvers.SOC))
-    assert f"tolerance {soc.tolerance}" in page.text
+    newton = next(stage.method for stage in solution.stages if isinstance(stage.method, solvers.Newton))
+    assert f"tolerance {newton.tolerance}" in page.text
     assert f"numpy {np.__version__}" in page.text
 
 
@@ -181,9 +119,9 @@ def test_names_are_escaped_wherever_they_stand(name, solution):
     text = own_part(report_page(renamed))
     found = Page(text)
     assert name in found.text
-    assert found.scripts == 2
+    assert found.scripts == 4
     assert found.asked == ["data:,"]
-    assert text.count("</script>") == 2
+    assert text.count("</script>") == 4
 
 
 def test_the_page_asks_for_nothing_online(solution):
@@ -212,12 +150,14 @@ def test_a_report_is_written_whole_under_a_pages_name_only(solution, tmp_path):
         solution.report(tmp_path / "no" / "out.html")
 
 
-def test_without_plotly_one_line_names_the_extra_before_anything_is_solved(monkeypatch, tmp_path, capsys):
-    monkeypatch.setitem(sys.modules, "plotly", None)
+@pytest.mark.parametrize("package", ["plotly", "jinja2"])
+def test_without_its_package_one_line_names_the_extra_before_anything_is_solved(package, monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(SystemExit) as end:
         cli.main(["solve", "no-such-graph", "--report", str(tmp_path / "out.html")])
     err = capsys.readouterr().err
     assert (end.value.code, err.count("\n")) == (1, 1)
+    assert f"{package} is not installed" in err
     assert "pgo-splitting[plot]" in err
     assert list(tmp_path.iterdir()) == []
 
@@ -318,63 +258,10 @@ def test_percentages_have_two_digits(share, text):
     assert percent(share) == text
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    if find_browser() is None:
-        pytest.skip("no chromium or chrome on PATH to open the page in")
-    with Browser(tmp_path_factory.mktemp("profile")) as opened:
-        yield opened
-
-
-def test_the_browser_hears_what_goes_wrong(browser, tmp_path):
-    page = tmp_path / "wrong.html"
-    page.write_text("<img src='missing.png'><script>console.error('one'); throw Error('two')</script>")
-    browser.open(page)
-    browser.wait_for("true")
-    told = " ".join(browser.errors)
-    assert all(word in told for word in ("one", "two", "missing.png"))
-    assert (tmp_path / "missing.png").as_uri() in browser.requests
-
-
-@pytest.mark.parametrize("which", ["solution", "uncertain", "plane"])
-def test_a_browser_shows_it_without_a_complaint_and_sorts_the_table(which, browser, tmp_path, request):
-    if which == "plane":
-        solved = solvers.solve(pgo.random_geometric(40, np.random.default_rng(0), d=2))
-    else:
-        solved = request.getfixturevalue(which)
-    solved.report(tmp_path / "out.html")
-    browser.open(tmp_path / "out.html")
-    browser.wait_for("document.querySelectorAll('.plot .main-svg').length > 0")
-    place = "graph2d" if which == "plane" else "graph3d"
-    for plot in (place, "convergence"):
-        browser.wait_for(f"document.getElementById('{plot}')._fullData?.length > 0")
-        assert browser.value(f"document.getElementById('{plot}').getBoundingClientRect().height") > 300
-    # WebGL has drawn: no message in its place.
-    assert browser.value(f"document.querySelectorAll('#{place} canvas').length") > 0
-    assert "WebGL is not supported" not in browser.value("document.body.innerText")
-    column = browser.value(
-        "[...document.querySelectorAll('#edges th')].findIndex(head => head.innerText.startsWith('error (m)'))"
-    )
-    cells = f"[...document.querySelectorAll('#edges tbody tr')].map(row => +row.cells[{column}].dataset.value)"
-    before = browser.value(cells)
-    for descending in (True, False):
-        browser.click(f"#edges th:nth-child({column + 1}) button")
-        assert browser.value(cells) == sorted(before, reverse=descending)
-    assert browser.value("document.querySelector('#edges th[aria-sort]').getAttribute('aria-sort')") == "ascending"
-    assert browser.errors == []
-    assert browser.requests == [(tmp_path / "out.html").as_uri()]
-
-
-def test_a_film_steps_through_its_iterates_in_a_browser(browser, tmp_path):
-    graph = pgo.circle(np.random.default_rng(0))
-    film = animate_poses(graph, [pgo.spanning_tree_start(graph), graph.truth], ["tree", "truth"])
-    save_page(film, tmp_path / "film.html")
-    browser.open(tmp_path / "film.html")
-    browser.wait_for("document.querySelectorAll('.slider-group').length > 0")
-    plot = "document.querySelector('.plotly-graph-div')"
-    assert browser.value(f"{plot}._fullLayout.sliders[0].active") == 0
-    browser.value(f"Plotly.animate({plot}, ['truth'], {{mode: 'immediate'}}).then(() => true)")
-    browser.wait_for(f"{plot}._fullLayout.sliders[0].active === 1")
-    shown = browser.value(f"Array.from({plot}._fullData[0].x).slice(0, 1)")[0]
-    np.testing.assert_allclose(shown, graph.truth.t[graph.i[0], 0], rtol=1e-6, atol=1e-6)
-    assert browser.errors == []
+def test_the_histogram_counts_every_edge(solution):
+    residuals = solution.edge_residuals
+    for shown, misfits in ((residuals, 0), (replace(residuals, allowed=0.5 * residuals.cost), 212)):
+        bars = {trace.name: sum(trace.y) for trace in explore_fit(shown, 3).data if trace.type == "bar"}
+        assert (bars.get("misfits", 0), sum(bars.values())) == (misfits, 212)
+    (curve,) = [trace for trace in explore_fit(residuals, 3).data if trace.type == "scatter"]
+    assert sum(value or 0.0 for value in curve.y) == pytest.approx(212, rel=0.01)

@@ -1,0 +1,124 @@
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from browser import Browser, find_browser
+from pages import Page, own_part
+
+import pgo_models as pgo
+import solvers
+from pgo_models.plots.interactive_plots import animate_poses, save_page
+
+pytest.importorskip("plotly")
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    if find_browser() is None:
+        pytest.skip("no chromium or chrome on PATH to open the page in")
+    with Browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+def test_the_browser_hears_what_goes_wrong(browser, tmp_path):
+    page = tmp_path / "wrong.html"
+    page.write_text("<img src='missing.png'><script>console.error('one'); throw Error('two')</script>")
+    browser.open(page)
+    browser.wait_for("true")
+    told = " ".join(browser.errors)
+    assert all(word in told for word in ("one", "two", "missing.png"))
+    assert (tmp_path / "missing.png").as_uri() in browser.requests
+
+
+@pytest.mark.parametrize("which", ["solution", "uncertain", "plane"])
+def test_a_browser_shows_it_without_a_complaint_and_sorts_the_table(which, browser, tmp_path, request):
+    if which == "plane":
+        solved = solvers.solve(pgo.random_geometric(40, np.random.default_rng(0), d=2))
+    else:
+        solved = request.getfixturevalue(which)
+    solved.report(tmp_path / "out.html")
+    browser.open(tmp_path / "out.html")
+    browser.wait_for("document.querySelectorAll('.plot .main-svg').length > 0")
+    place = "graph2d" if which == "plane" else "graph3d"
+    for plot in (place, "convergence"):
+        browser.wait_for(f"document.getElementById('{plot}')._fullData?.length > 0")
+        assert browser.value(f"document.getElementById('{plot}').getBoundingClientRect().height") > 300
+    # WebGL has drawn: no message in its place.
+    assert browser.value(f"document.querySelectorAll('#{place} canvas').length") > 0
+    assert "WebGL is not supported" not in browser.value("document.body.innerText")
+    column = browser.value(
+        "[...document.querySelectorAll('#edges th')].findIndex(head => head.innerText.startsWith('error (m)'))"
+    )
+    cells = f"[...document.querySelectorAll('#edges tbody tr')].map(row => +row.cells[{column}].dataset.value)"
+    before = browser.value(cells)
+    for descending in (True, False):
+        browser.click(f"#edges th:nth-child({column + 1}) button")
+        assert browser.value(cells) == sorted(before, reverse=descending)
+    assert browser.value("document.querySelector('#edges th[aria-sort]').getAttribute('aria-sort')") == "ascending"
+    assert browser.errors == []
+    assert browser.requests == [(tmp_path / "out.html").as_uri()]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 1150])
+def test_it_fits_a_phone_and_follows_the_colours_of_the_system(width, scheme, browser, solution, tmp_path):
+    solution.report(tmp_path / "out.html")
+    with browser.showing(width, scheme):
+        browser.open(tmp_path / "out.html")
+        browser.wait_for("document.querySelectorAll('.plot .main-svg').length > 0")
+        assert browser.value("document.documentElement.scrollWidth") <= width
+        edges = browser.value(
+            "[...document.querySelectorAll('section, p, dd, code, .plot, .plot svg')]"
+            ".map(one => one.getBoundingClientRect().right)"
+        )
+        assert max(edges) <= width
+        ground, ink = (
+            sum(map(int, re.findall(r"\d+", browser.value(f"getComputedStyle(document.body).{name}"))[:3]))
+            for name in ("backgroundColor", "color")
+        )
+        assert (ground < ink) == (scheme == "dark")
+        written = browser.value("document.getElementById('fit')._fullLayout.font.color")
+        assert (written > "#888") == (scheme == "dark")
+        assert browser.errors == []
+
+
+def test_the_page_is_painted_before_the_library_is_parsed(browser, solution, tmp_path):
+    solution.report(tmp_path / "out.html")
+    browser.open(tmp_path / "out.html")
+    browser.wait_for(
+        "performance.getEntriesByName('library').length + performance.getEntriesByType('paint').length > 2"
+    )
+    painted = browser.value("performance.getEntriesByName('first-contentful-paint')[0].startTime")
+    assert painted <= browser.value("performance.getEntriesByName('library')[0].startTime")
+
+
+def test_a_large_graph_is_thinned_and_its_page_can_be_opened(browser, solution, tmp_path):
+    graph = pgo.grid_world(1, 44_521, np.random.default_rng(0), d=2)
+    bounded = replace(solution, problem=pgo.PGOProblem(graph), poses=graph.truth)
+    bounded.report(tmp_path / "out.html")
+    assert (tmp_path / "out.html").stat().st_size < 15e6
+    text = Page(own_part((tmp_path / "out.html").read_text(encoding="utf-8"))).text
+    assert "paths through one of 3 poses, one of 3 other edges" in text
+    browser.open(tmp_path / "out.html")
+    browser.wait_for("document.getElementById('graph2d')._fullData?.length > 0")
+    entries = browser.value(
+        "document.getElementById('graph2d')._fullData.filter(one => one.showlegend).map(one => one.name)"
+    )
+    assert entries[:2] == ["before", "poses 0 to 7420"]
+    assert browser.errors == []
+
+
+def test_a_film_steps_through_its_iterates_in_a_browser(browser, tmp_path):
+    graph = pgo.circle(np.random.default_rng(0))
+    film = animate_poses(graph, [pgo.spanning_tree_start(graph), graph.truth], ["tree", "truth"])
+    save_page(film, tmp_path / "film.html")
+    browser.open(tmp_path / "film.html")
+    browser.wait_for("document.querySelectorAll('.slider-group').length > 0")
+    plot = "document.querySelector('.plotly-graph-div')"
+    assert browser.value(f"{plot}._fullLayout.sliders[0].active") == 0
+    browser.value(f"Plotly.animate({plot}, ['truth'], {{mode: 'immediate'}}).then(() => true)")
+    browser.wait_for(f"{plot}._fullLayout.sliders[0].active === 1")
+    shown = browser.value(f"Array.from({plot}._fullData[0].x).slice(0, 1)")[0]
+    np.testing.assert_allclose(shown, graph.truth.t[graph.i[0], 0], rtol=1e-6, atol=1e-6)
+    assert browser.errors == []
