@@ -7,12 +7,12 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array, eye_array, hstack, kron, vstack
 
 from pgo_models.convex.bregman import BregmanProblem
-from pgo_models.convex.clarabel import finite_array
+from pgo_models.convex.convex_solver import finite_array
+from pgo_models.convex.graph_subproblem import Neighbours, robot_qp
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.problem.matrices import residual_matrix, rotation_columns
 
 
 def basis_pursuit(K: Array, f: Array) -> BregmanProblem:
@@ -101,26 +101,16 @@ def shared_rotation_step(graph: PoseGraph, robots: Partition, V: Array, rho: flo
         raise SettingError(f"V has shape {V.shape}; it must be {(n, d, d)}")
     if not 0 < rho < np.inf:
         raise SettingError(f"rho must be positive, got {rho}")
-    shift = stack_transposes(V)
-    owner_i, owner_j = robots.robot[graph.i], robots.robot[graph.j]
-    A, _ = residual_matrix(graph)
-    variables, held, terms = [], [], []
-    for robot in range(robots.num_robots):
-        mine = (owner_i == robot) | (owner_j == robot)
-        own = np.flatnonzero(robots.robot == robot)
-        poses = np.union1d(own, np.concatenate([graph.i[mine], graph.j[mine]]))
-        x = cp.Variable((d * len(poses), d), name=f"x_{robot}")
-        weight = np.where(owner_i == owner_j, 1.0, 0.5)[mine] * graph.kappa[mine]
-        rows = rotation_columns(np.flatnonzero(mine), graph.num_edges, d).ravel()
-        residuals = A[rows][:, rotation_columns(poses, n, d).ravel()]
-        own_rows = rotation_columns(np.searchsorted(poses, own), 0, d).ravel()
-        edges = cp.sum_squares(diags_array(np.sqrt(np.repeat(weight, d))) @ residuals @ x)
-        terms.append(edges + 0.5 * rho * cp.sum_squares(x[own_rows] - shift[rotation_columns(own, 0, d).ravel()]))
-        variables.append(x)
-        held.append(poses)
+    shift, graph = stack_transposes(V), graph.with_robots(robots.robot)
+    mine = [robots.robot == robot for robot in range(robots.num_robots)]
+    programs = [robot_qp(graph, robot, rho * own, Neighbours.COPIES) for robot, own in enumerate(mine)]
+    held = [program.variables.poses for program in programs]
+    for own, program in zip(mine, programs, strict=True):
+        program.qp.shift.value = np.sqrt(rho) * shift[np.repeat(own, d)]
     K = _agreement(held, robots.robot, d)
-    J = sum(terms[1:], terms[0])
-    return SharedRotationStep(BregmanProblem(J, variables, K, np.zeros(K.shape[0])), tuple(held), robots.robot, d)
+    J = sum(program.qp.problem.objective.args[0] for program in programs)
+    problem = BregmanProblem(J, [program.variables.X for program in programs], K, np.zeros(K.shape[0]))
+    return SharedRotationStep(problem, tuple(held), robots.robot, d)
 
 
 def _forward(length: int) -> csr_array:

@@ -13,8 +13,16 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from pgo_models.convex.clarabel import check_convex, check_variable, finite_array, solve_compiled
 from pgo_models.convex.constraint_sets import ConstraintSet, Orthonormal, Rotations, Sparse, UnitColumns, UnitRows
+from pgo_models.convex.convex_solver import (
+    COLD,
+    ConvexSolver,
+    check_convex,
+    check_terms,
+    check_variable,
+    finite_array,
+    solve_compiled,
+)
 from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import real_array
 from pgo_models.geometry.rotations import Array
@@ -196,8 +204,8 @@ class OrthogonalProblem:
         parts += [float(np.linalg.norm(constraint.violation())) for constraint in self.problem.constraints]
         return float(np.linalg.norm(parts))
 
-    def split(self) -> "SplitProblem":
-        """Compile the subproblem."""
+    def split(self, solver: ConvexSolver | str = COLD) -> "SplitProblem":
+        """Compile the subproblem, for a solver."""
         root = cp.Parameter(nonneg=True, name="root")
         shifts = tuple(cp.Parameter(variable.shape, name="shift") for variable in self.variables)
         counts = tuple(len(self.terms_of(place)) for place in range(len(self.variables)))
@@ -208,7 +216,7 @@ class OrthogonalProblem:
         problem = cp.Problem(cp.Minimize(self.J + penalty), self.problem.constraints)
         if not problem.is_dcp(dpp=True):
             raise SettingError("a Parameter of the problem is not used by the rules of DPP; see cvxpy's manual")
-        return SplitProblem(problem, self.variables, self.others, tuple(self.terms), root, shifts)
+        return SplitProblem(problem, self.variables, self.others, tuple(self.terms), root, shifts, solver)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,6 +233,7 @@ class SplitProblem:
     terms: tuple[Term, ...]
     root: cp.Parameter
     shifts: tuple[cp.Parameter, ...]
+    solver: ConvexSolver | str = COLD
 
     def solve(self, V: Sequence[Array], rho: float) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         """Minimisers X, one for every variable, and y, for one V for every term.
@@ -241,7 +250,7 @@ class SplitProblem:
         for place, shift in enumerate(self.shifts):
             of_variable = [V_term for term, V_term in zip(self.terms, V, strict=True) if term.variable == place]
             shift.value = np.sqrt(rho) * np.mean(of_variable, axis=0)
-        solve_compiled(self.problem, "split subproblem")
+        solve_compiled(self.problem, "split subproblem", solver=self.solver)
         return (
             tuple(np.array(variable.value, dtype=float) for variable in self.variables),
             tuple(np.array(variable.value, dtype=float) for variable in self.others),
@@ -260,7 +269,9 @@ class KKTResiduals:
     multipliers: tuple[Array, ...]
 
 
-def kkt_residuals(problem: OrthogonalProblem, point: OrthogonalPoint, rho: float) -> KKTResiduals:
+def kkt_residuals(
+    problem: OrthogonalProblem, point: OrthogonalPoint, rho: float, solver: ConvexSolver | str = COLD
+) -> KKTResiduals:
     """Judge a point by one convex solve, whatever found it; rho of the order of the curvature of J.
 
     The normals N of the point, projected once more onto the normal spaces, are its multipliers: for X^T X = I they are
@@ -273,7 +284,7 @@ def kkt_residuals(problem: OrthogonalProblem, point: OrthogonalPoint, rho: float
         for term, copy, normal in zip(problem.terms, point.copies, point.normals, strict=True)
     ]
     V = [copy - normal / rho for copy, normal in zip(point.copies, normals, strict=True)]
-    Z, others = problem.split().solve(V, rho)
+    Z, others = problem.split(solver).solve(V, rho)
     values = problem.values(point.copies)
     gaps = [len(problem.terms_of(place)) * rho * (X - Z[place]) for place, X in enumerate(values)]
     gradients = [np.zeros(X.shape) for X in values]
@@ -306,7 +317,5 @@ def _minimised(problem: cp.Problem) -> cp.Expression:
         )
     J = -expression if maximises else expression
     check_convex(J, "the objective")
-    for place, constraint in enumerate(problem.constraints):
-        if not constraint.is_dcp():
-            raise SettingError(f"constraints[{place}], {constraint}, is not convex by the rules of DCP")
+    check_terms((), problem.constraints)
     return J

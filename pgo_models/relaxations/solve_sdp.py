@@ -3,7 +3,6 @@
 import enum
 import math
 import time
-import warnings
 from dataclasses import dataclass
 
 import cvxpy as cp
@@ -11,20 +10,18 @@ import cvxpy as cp
 from pgo_models.certificates.certificate import Verdict, gap_text, relative_gap, verdict_of
 from pgo_models.certificates.lower_bound import LowerBound, best_bound
 from pgo_models.certificates.rounding_errors import objective_rounding
-from pgo_models.convex.clarabel import run_clarabel
+from pgo_models.convex.convex_solver import ConvexSolver
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.clique_decomposition import CliqueRelaxation, clique_relaxation
-from pgo_models.relaxations.plan import DEFAULT_MEMORY_LIMIT, RelaxationForm, RelaxationPlan, SDPSolver, plan_relaxation
+from pgo_models.relaxations.plan import DEFAULT_MEMORY_LIMIT, RelaxationForm, RelaxationPlan, plan_relaxation
 from pgo_models.relaxations.primal_dual import DualRelaxation, PrimalRelaxation, dual_relaxation, primal_relaxation
 from pgo_models.relaxations.rounding import RankReport
 
 DEFAULT_RELAXATION_GAP = 1e-5
-CLARABEL_TOLERANCE = 1e-10
-SCS_TOLERANCE = 1e-7
-_SCS_MAX_ITERATIONS = 20_000
+TOLERANCE = 1e-10
 
 Relaxation = PrimalRelaxation | DualRelaxation | CliqueRelaxation
 
@@ -116,7 +113,7 @@ class RelaxationSolution:
 def solve_relaxation(
     problem: PGOProblem,
     form: RelaxationForm | None = None,
-    solver: SDPSolver | None = None,
+    solver: ConvexSolver | str | None = None,
     *,
     gap: float = DEFAULT_RELAXATION_GAP,
     memory_limit: float = DEFAULT_MEMORY_LIMIT,
@@ -127,8 +124,8 @@ def solve_relaxation(
 
     Parameters
     ----------
-    solver : SDPSolver, optional
-        Both are chosen by `plan_relaxation` unless given.
+    solver : ConvexSolver or str, optional
+        Both are chosen by `plan_relaxation` unless given. Any conic solver of cvxpy that takes semidefinite cones.
     gap : float
         Relative gap for the verdict; where the proof needs a shift eta, the smallest that is tried follows from it.
     memory_limit : float
@@ -196,31 +193,18 @@ def _posed(problem: PGOProblem, plan: RelaxationPlan) -> Relaxation:
     return clique_relaxation(problem, tree=plan.tree)
 
 
-def _solve(model: cp.Problem, solver: SDPSolver, time_limit: float, verbose: bool) -> RelaxationStatus:
+def _solve(model: cp.Problem, solver: ConvexSolver, time_limit: float, verbose: bool) -> RelaxationStatus:
     try:
-        if solver is SDPSolver.CLARABEL:
-            run_clarabel(model, CLARABEL_TOLERANCE, time_limit=time_limit, verbose=verbose)
-        else:
-            with warnings.catch_warnings():
-                # Said by the status, and made good by the proof of the bound.
-                warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
-                model.solve(
-                    solver=cp.SCS,
-                    verbose=verbose,
-                    eps_abs=SCS_TOLERANCE,
-                    eps_rel=SCS_TOLERANCE,
-                    max_iters=_SCS_MAX_ITERATIONS,
-                    time_limit_secs=time_limit if math.isfinite(time_limit) else 0.0,
-                )
+        solver.run(model, TOLERANCE, time_limit=time_limit, verbose=verbose)
     except cp.SolverError as error:
-        raise PGOError(f"{solver.name} failed on the relaxation: {error}; try the other solver or form") from error
+        raise PGOError(f"{solver.name} failed on the relaxation: {error}; try another solver or form") from error
     if model.value is None or not math.isfinite(model.value):
         raise PGOError(
             f"{solver.name} ended with status {model.status} on the relaxation and gave no iterate; "
-            "raise time_limit, or try the other solver or form"
+            "raise time_limit, or try another solver or form"
         )
     if model.status == cp.OPTIMAL:
         return RelaxationStatus.OPTIMAL
     # SCS calls inaccurate what its limits stopped.
-    stalled = model.status == cp.OPTIMAL_INACCURATE and solver is SDPSolver.CLARABEL
+    stalled = model.status == cp.OPTIMAL_INACCURATE and not solver.is_first_order
     return RelaxationStatus.INACCURATE if stalled else RelaxationStatus.LIMIT

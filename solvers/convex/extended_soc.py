@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass, field, replace
 
+import cvxpy as cp
 import numpy as np
 
+from pgo_models.convex.convex_solver import ConvexSolver, solve_compiled
 from pgo_models.convex.graph_subproblem import Changer, GraphQP, graph_qp
-from pgo_models.errors import SettingError
+from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, stack_transposes
+from pgo_models.geometry.rotations import Array, project_to_rotations, stack_transposes
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
@@ -16,6 +18,8 @@ from solvers.soc.penalty import MultiplierPenalty
 from solvers.soc.r_step import RStep, RSubproblem
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC, Joint, SOCState
+
+_FAINT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +31,7 @@ class ExtendedStep:
 
     graph: PoseGraph
     changer: Changer
+    solver: ConvexSolver | str = "CLARABEL"
 
     def prepare(self, subproblem: RSubproblem) -> GraphQP:
         """Compile the changed quadratic program with the subproblem's penalties.
@@ -36,7 +41,7 @@ class ExtendedStep:
         n, d = self.graph.num_poses, self.graph.d
         if subproblem.num_translations != n or not subproblem.needs_ground:
             raise SettingError("a changed subproblem is that of the whole graph; use Coupling.JOINT")
-        return graph_qp(self.graph, subproblem.penalty[n::d], changer=self.changer)
+        return graph_qp(self.graph, subproblem.penalty[n::d], changer=self.changer, solver=self.solver)
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,8 @@ class ExtendedSOC:
     soc : SOC
         Settings; JOINT. The penalty's multipliers are those of the unchanged problem at its start, and are not taken
         anew.
+    solver : ConvexSolver or str
+        Of step (a).
 
     Notes
     -----
@@ -57,12 +64,13 @@ class ExtendedSOC:
     of an iterate are omega with the translations of step (a) at its shift: constraints on translations hold at every
     iterate, those on rotations in the limit.
 
-    What fixes the gauge, as a prior does, wants a start near it: the default is the chordal start of the unchanged
-    problem with pose 0 unrotated, and a pose turned by 180 degrees from its prior is a stationary point too.
+    The default start is the chordal one of the unchanged problem, moved as a whole to where the terms want it, which
+    matters to terms that fix the gauge, as priors do: a pose turned by 180 degrees from its prior is stationary too.
     """
 
     changer: Changer
     soc: SOC = field(default_factory=lambda: SOC(penalty=MultiplierPenalty(max_refreshes=0)))
+    solver: ConvexSolver | str = "CLARABEL"
 
     def __post_init__(self) -> None:
         if self.soc.effective_coupling is not Coupling.JOINT:
@@ -77,14 +85,17 @@ class ExtendedSOC:
 
     def init(self, problem: PGOProblem, start: Poses | None) -> SOCState:
         """State 0 of SOC; the changed program is compiled here, and again when rho changes."""
-        return self._recursion(problem).init(problem, start if start is not None else chordal_start(problem))
+        if start is None:
+            model = graph_qp(problem.graph, np.ones(problem.num_poses), changer=self.changer, solver=self.solver)
+            start = moved_to_terms(model, chordal_start(problem))
+        return self._recursion(problem).init(problem, start)
 
     def step(self, problem: PGOProblem, state: SOCState) -> SOCState:
         """One iteration of SOC."""
         return self._recursion(problem).step(problem, state)
 
     def _recursion(self, problem: PGOProblem) -> Joint:
-        return Joint(replace(self.soc, r_step=ExtendedStep(problem.graph, self.changer)))
+        return Joint(replace(self.soc, r_step=ExtendedStep(problem.graph, self.changer, self.solver)))
 
     def measure(self, problem: PGOProblem, state: SOCState) -> Measurement:
         """Objective of the changed problem at the poses, and the residuals of SOC."""
@@ -111,3 +122,27 @@ def _model(state: SOCState) -> GraphQP:
     model = state.r_step
     assert isinstance(model, GraphQP)
     return model
+
+
+def moved_to_terms(model: GraphQP, poses: Poses) -> Poses:
+    """Poses moved as a whole, where that lowers the added terms, or to where the constraints allow it.
+
+    At Q poses + s the terms are convex in (Q, s), without Q in SO(d): Q is projected, and s is found again. What says
+    nothing of a direction of Q is held near a small multiple of I, which its projection completes to a rotation.
+    """
+    change, X, X_0, n, d = model.change, model.variables.X, poses.stacked(), len(poses.t), poses.d
+    Q, s = cp.Variable((d, d)), cp.Variable((1, d))
+    fixed: list[cp.Constraint] = []
+    motion = X_0 @ Q.T + np.repeat([1.0, 0.0], [n, d * n])[:, None] @ s == X
+    faint = _FAINT * cp.sum_squares(Q - _FAINT * np.eye(d))
+    for _ in range(2):
+        problem = cp.Problem(cp.Minimize(sum(change.terms, faint)), [*change.constraints, motion, *fixed])
+        try:
+            solve_compiled(problem, "motion of the start", solver=model.qp.solver)
+        except PGOError:  # no motion meets the constraints: the poses will have to change
+            return poses
+        turn = project_to_rotations(Q.value[None])[0]
+        fixed = [turn == Q]
+    moved = poses.moved(turn, s.value[0])
+    is_lower = model.cost(moved.stacked()) < (1.0 - _FAINT) * model.cost(X_0)
+    return moved if is_lower or change.constraints else poses

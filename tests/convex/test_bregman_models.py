@@ -20,7 +20,7 @@ from pgo_models.convex.bregman_examples import (
     total_variation_denoising,
     total_variation_scale_space,
 )
-from pgo_models.convex.clarabel import solve_compiled
+from pgo_models.convex.convex_solver import solve_compiled
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.rotations import random_rotations
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
