@@ -33,7 +33,8 @@ from pgo_models.problem.weighting import Weighting
 
 if TYPE_CHECKING:
     from pgo_models.convex.bregman import BregmanProblem
-    from pgo_models.convex.graph_subproblem import graph_qp
+    from pgo_models.convex.convex_solver import ConvexSolver
+    from pgo_models.convex.graph_subproblem import ModelChange, graph_qp
     from pgo_models.convex.orthogonality import OrthogonalProblem
     from pgo_models.convex.rotation_subproblem import rotation_qp
     from pgo_models.relaxations.solve_sdp import solve_relaxation
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
 # These import cvxpy, which takes half of the time of an import: loaded when one of their names is first used.
 _LATER = {
     "BregmanProblem": "pgo_models.convex.bregman",
+    "ConvexSolver": "pgo_models.convex.convex_solver",
+    "ModelChange": "pgo_models.convex.graph_subproblem",
     "graph_qp": "pgo_models.convex.graph_subproblem",
     "OrthogonalProblem": "pgo_models.convex.orthogonality",
     "rotation_qp": "pgo_models.convex.rotation_subproblem",
@@ -59,7 +62,8 @@ __all__ += ["CholeskyBackend", "Marginals", "PGOProblem", "Weighting"]
 __all__ += ["chordal_start", "odometry_start", "spanning_tree_start"]
 __all__ += ["Certificate", "Verdict", "certificate_matrix", "certify", "certify_at"]
 __all__ += ["multipliers", "polish", "prove_bound"]
-__all__ += ["BregmanProblem", "OrthogonalProblem", "graph_qp", "rotation_qp", "solve_relaxation"]
+__all__ += ["BregmanProblem", "ConvexSolver", "ModelChange", "OrthogonalProblem"]
+__all__ += ["graph_qp", "rotation_qp", "solve_relaxation"]
 __all__ += ["compare_poses", "explore_graph", "plot_graph"]
 
 

@@ -40,6 +40,7 @@ ORDER = {
         "explanations",
         "frames",
         "robust_solve",
+        "extended_solve",
         "pipeline",
         "growing",
         "shell",

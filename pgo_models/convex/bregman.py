@@ -60,18 +60,8 @@ class BregmanProblem:
     K : (s, m), dense or sparse
     f : (s,)
 
-    Raises
-    ------
-    SettingError
-        When J is not convex or not one real number, has a variable that is not named or one that is named is not
-        continuous and real, or when K and f have other shapes or entries that are not finite.
-
-    Examples
-    --------
-    >>> import cvxpy as cp, numpy as np
-    >>> x = cp.Variable(3)
-    >>> BregmanProblem(cp.norm1(x), x, np.ones((1, 3)), [1.0])
-    BregmanProblem(m=3, s=1, blocks=1)
+    A SettingError when J is not convex or not one real number, has a variable that is not named or one that is named is
+    not continuous and real, or when K and f have other shapes or entries that are not finite.
     """
 
     J: Any
@@ -145,13 +135,7 @@ class Subproblem:
     solver: ConvexSolver | str = COLD
 
     def solve(self, value: Array) -> Array:
-        """Minimiser, stacked.
-
-        Raises
-        ------
-        PGOError
-            When the solver ends without a solution: J may be unbounded below on K x = const.
-        """
+        """Minimiser, stacked; a PGOError where there is none: J may be unbounded below on K x = const."""
         self.parameter.value = self.scale * value
         solve_compiled(self.problem, "Bregman subproblem", self.tolerance, self.solver)
         return np.concatenate([np.ravel(variable.value) for variable in self.variables])

@@ -16,9 +16,10 @@ from pgo_models.geometry.rotations import Array, project_by_svd
 class ConstraintSet(ABC):
     """A closed set of matrices with a closed-form projection."""
 
-    @abstractmethod
     def check_shape(self, shape: tuple[int, ...], name: str) -> None:
         """Raise SettingError unless the set has matrices of this shape; `name` is for the message."""
+        if len(shape) not in (1, 2):
+            raise SettingError(f"{name} has shape {shape}; give a vector or a matrix")
 
     @abstractmethod
     def project(self, V: Array) -> Array:
@@ -99,10 +100,6 @@ class UnitColumns(ConstraintSet):
         """The vectors of unit norm as columns; of those again, V but for its shape."""
         return V
 
-    def check_shape(self, shape: tuple[int, ...], name: str) -> None:
-        """One or two dimensions."""
-        _check_vector_or_matrix(shape, name)
-
     def project(self, V: Array) -> Array:
         """Each over its norm; zero becomes the first unit vector."""
         return self._columns(project_unit_columns(self._columns(V))).reshape(V.shape)
@@ -140,10 +137,6 @@ class Sparse(ConstraintSet):
     def __post_init__(self) -> None:
         check_settings(self, at_least_one=["nonzeros"])
 
-    def check_shape(self, shape: tuple[int, ...], name: str) -> None:
-        """One or two dimensions."""
-        _check_vector_or_matrix(shape, name)
-
     def project(self, V: Array) -> Array:
         """Hard thresholding: the largest entries are kept; of equal ones the first."""
         return project_sparse(V, self.nonzeros)
@@ -165,8 +158,3 @@ class Sparse(ConstraintSet):
 
 def _symmetric(A: Array) -> Array:
     return 0.5 * (A + A.T)
-
-
-def _check_vector_or_matrix(shape: tuple[int, ...], name: str) -> None:
-    if len(shape) not in (1, 2):
-        raise SettingError(f"{name} has shape {shape}; give a vector or a matrix")

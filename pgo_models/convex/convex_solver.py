@@ -62,7 +62,7 @@ def check_terms(terms: Sequence[cp.Expression], constraints: Sequence[cp.Constra
         check_convex(term, f"terms[{place}]")
     for place, constraint in enumerate(constraints):
         if not (isinstance(constraint, cp.Constraint) and constraint.is_dcp()):
-            raise SettingError(f"constraints[{place}], {constraint!s:.100}, is not convex by the rules of DCP")
+            raise SettingError(f"constraints[{place}], {_short(constraint)}, is not convex by the rules of DCP")
 
 
 def check_variable(variable: cp.Variable, name: str) -> None:
@@ -89,10 +89,7 @@ class ConvexSolver:
     warm_start : bool
         Go on from the last solution (SCS, OSQP), or factorisation pattern (Clarabel); last bits then depend on it.
 
-    Raises
-    ------
-    SettingError
-        When it is not installed.
+    A SettingError when it is not installed.
     """
 
     name: str = cp.CLARABEL
@@ -150,12 +147,8 @@ def solve_compiled(
     """Solve a compiled problem; `name` is for messages. The variables hold the solution afterwards.
 
     The tolerance is on the gap and on feasibility, absolute and relative. Where rounding does not allow it, 100 times
-    as much is tried, and so on up to LOOSEST_TOLERANCE, where another status than optimal may be accepted.
-
-    Raises
-    ------
-    PGOError
-        When the solver ends without a solution; the message has its status and what it means.
+    as much is tried, and so on up to LOOSEST_TOLERANCE, where another status than optimal may be accepted. A PGOError
+    when the solver ends without a solution; the message has its status and what it means.
     """
     solver = as_solver(solver)
     while True:
@@ -192,5 +185,5 @@ def _product_of_unknowns(expression: cp.Expression) -> cp.Expression | None:
     return next(filter(None, map(_product_of_unknowns, expression.args)), None)
 
 
-def _short(expression: cp.Expression) -> str:
+def _short(expression: cp.Expression | cp.Constraint) -> str:
     return " ".join(str(expression).split())[:_SHOWN]

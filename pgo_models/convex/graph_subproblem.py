@@ -94,10 +94,7 @@ class ModelChange:
     replaced_edges : sequence of int
         Edges whose squared residuals leave F, where terms have another loss for them.
 
-    Raises
-    ------
-    SettingError
-        When a term is not one convex number, or a constraint not convex.
+    A SettingError when a term is not one convex number, or a constraint not convex.
     """
 
     terms: Sequence[cp.Expression] = ()
@@ -133,12 +130,8 @@ class GraphQP:
         neighbours : (N, d), optional
             X of the whole graph, for FROZEN: the shift becomes V - 2 D^-1 M_between X.
 
-        Raises
-        ------
-        SettingError
-            When frozen neighbours are missing.
-        PGOError
-            When the solver does not end with a solution, as where constraints contradict each other.
+        A SettingError when frozen neighbours are missing, a PGOError when there is no solution, as where constraints
+        contradict each other.
         """
         if self.between.nnz:
             if neighbours is None:

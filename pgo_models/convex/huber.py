@@ -18,10 +18,7 @@ def huber_change(edges: IntArray, thresholds: Array) -> Changer:
     thresholds : (m,)
         c_e^2 of all edges, as of `chi2_thresholds`.
 
-    Raises
-    ------
-    SettingError
-        When the program lacks unknowns of these edges.
+    A SettingError when the program lacks unknowns of these edges.
     """
 
     def change(unknown: PoseVariables) -> ModelChange:

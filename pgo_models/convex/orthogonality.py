@@ -70,18 +70,8 @@ class OrthogonalProblem:
     sparse : sequence of (variable, int)
         At most so many nonzeros. A variable may be here and in one of the other lists too.
 
-    Raises
-    ------
-    SettingError
-        When J or a constraint is not convex, a variable is not in the problem, not real, or has the wrong shape, or
-        no variable is named.
-
-    Examples
-    --------
-    >>> import cvxpy as cp, numpy as np
-    >>> X = cp.Variable((3, 2))
-    >>> OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(X - np.ones((3, 2))))), orthogonal=[X])
-    OrthogonalProblem((3, 2) Orthonormal)
+    A SettingError when J or a constraint is not convex, a variable is not in the problem, not real, or has the wrong
+    shape, or no variable is named.
     """
 
     problem: Any
@@ -143,12 +133,10 @@ class OrthogonalProblem:
 
         A SettingError when their number or shapes do not fit, or entries are not finite.
         """
-        if len(values) != len(self.variables):
-            raise SettingError(f"{len(values)} values for {len(self.variables)} variables")
         checked = [finite_array(value, f"values[{place}]") for place, value in enumerate(values)]
-        for place, (value, variable) in enumerate(zip(checked, self.variables, strict=True)):
-            if value.shape != variable.shape:
-                raise SettingError(f"values[{place}] has shape {value.shape}, its variable {variable.shape}")
+        given, needed = [value.shape for value in checked], [variable.shape for variable in self.variables]
+        if given != needed:
+            raise SettingError(f"{len(given)} values for {len(needed)} variables, of shapes {given}; need {needed}")
         copies = tuple(term.constraint.project(checked[term.variable]) for term in self.terms)
         return OrthogonalPoint(copies, tuple(np.zeros(copy.shape) for copy in copies))
 
@@ -240,21 +228,15 @@ class SplitProblem:
 
         Optimality of X gives a subgradient of J without differentiating J: at X, and partially minimised over y and the
         convex constraints, the sum over the terms of rho (V_term - X) is one.
-
-        Raises
-        ------
-        PGOError
-            When the convex constraints contradict each other, or J has no minimum over y.
+        A PGOError when the convex constraints contradict each other, or J has no minimum over y.
         """
         self.root.value = np.sqrt(rho)
         for place, shift in enumerate(self.shifts):
             of_variable = [V_term for term, V_term in zip(self.terms, V, strict=True) if term.variable == place]
             shift.value = np.sqrt(rho) * np.mean(of_variable, axis=0)
         solve_compiled(self.problem, "split subproblem", solver=self.solver)
-        return (
-            tuple(np.array(variable.value, dtype=float) for variable in self.variables),
-            tuple(np.array(variable.value, dtype=float) for variable in self.others),
-        )
+        X, y = ([np.array(v.value, dtype=float) for v in group] for group in (self.variables, self.others))
+        return tuple(X), tuple(y)
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,10 +33,7 @@ class RotationQP:
     def solve(self, V: Array) -> Array:
         """X, (N, d), for the shift V, (N, d); rows of V without a penalty do not matter.
 
-        Raises
-        ------
-        PGOError
-            When the solver does not end with a solution; the message has its status.
+        A PGOError when the solver does not end with a solution; the message has its status.
         """
         held = self.penalty > 0
         self.shift.value = np.sqrt(self.penalty[held])[:, None] * V[held]
@@ -73,25 +70,12 @@ def rotation_qp(
         Convex terms to add to the objective; `pgo_models.convex.graph_subproblem` writes them on poses and edges.
     solver : ConvexSolver or str, optional
 
-    Raises
-    ------
-    SettingError
-        When a penalty is negative or all are zero, or a term or a constraint is not convex.
+    A SettingError when a penalty is negative or all are zero, or a term or a constraint is not convex.
 
     Notes
     -----
     rho is data, not a Parameter: as one it is DPP too, and small problems re-solve as fast with it, but compiling holds
     the product of all parameters with all entries, tens of gigabytes on 2500 poses.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.problem.problem import PGOProblem
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> A, w = problem.residual_matrix
-    >>> rotation_qp(A, w, np.ones(problem.side), problem.d).X.shape
-    (108, 3)
     """
     if not ((penalty >= 0).all() and (penalty > 0).any()):
         raise SettingError("penalties must not be negative, and one must be positive")

@@ -71,9 +71,8 @@ def plan_relaxation(
     if form is None and solver is None:
         small = _seconds(problem, tree, RelaxationForm.CLIQUES, CLARABEL)
         dense = _seconds(problem, tree, RelaxationForm.PRIMAL, SCS)
-        form, chosen = RelaxationForm.CLIQUES, CLARABEL
-        if small > max(_PATIENCE, dense):
-            form, chosen = RelaxationForm.PRIMAL, SCS
+        is_small = small <= max(_PATIENCE, dense)
+        form, chosen = (RelaxationForm.CLIQUES, CLARABEL) if is_small else (RelaxationForm.PRIMAL, SCS)
         reason = f"{shape}; estimated {small:.2g} s for the cliques with Clarabel, {dense:.2g} s dense with SCS"
     else:
         chosen = as_solver(solver or (SCS if form is RelaxationForm.PRIMAL else CLARABEL))

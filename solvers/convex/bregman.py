@@ -260,16 +260,8 @@ def feasibility_bound(initial_distance: float, alpha: float, k: int) -> float:
 
     With H(x) = alpha/2 ||K x - f||^2 and D_k the distance at iterate k, optimality of x^{k+1} and convexity of H give
     D_{k+1} + D(x^{k+1}, x^k) + H(x^{k+1}) <= D_k + H(x~), and H(x~) = 0. H(x^k) does not rise, because x^{k+1} beats
-    x^k in its own subproblem. Summed over k steps: k H(x^k) <= D_0.
-
-    Raises
-    ------
-    SettingError
-        When D_0 is negative, alpha not positive or k below 1.
-
-    References
-    ----------
-    Osher, Burger, Goldfarb, Xu, Yin 2005, Propositions 3.1 to 3.3, where the penalty is H itself.
+    x^k in its own subproblem. Summed over k steps: k H(x^k) <= D_0. A SettingError when D_0 is negative, alpha not
+    positive or k below 1. Osher et al. 2005, Propositions 3.1 to 3.3, where the penalty is H itself.
     """
     if not (initial_distance >= 0 and alpha > 0 and k >= 1):
         raise SettingError(f"need D_0 >= 0, alpha > 0 and k >= 1, got {initial_distance}, {alpha} and {k}")

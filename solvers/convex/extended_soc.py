@@ -1,5 +1,6 @@
 """SOC on a pose graph with convex terms and constraints of one's own: the same recursion, another step (a)."""
 
+import math
 from dataclasses import dataclass, field, replace
 
 import cvxpy as cp
@@ -7,12 +8,13 @@ import numpy as np
 
 from pgo_models.convex.convex_solver import ConvexSolver, solve_compiled
 from pgo_models.convex.graph_subproblem import Changer, GraphQP, graph_qp
-from pgo_models.errors import PGOError, SettingError
+from pgo_models.errors import GraphError, PGOError, SettingError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, project_to_rotations, stack_transposes
+from pgo_models.geometry.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.result import Measurement, Status
 from solvers.soc.penalty import MultiplierPenalty
 from solvers.soc.r_step import RStep, RSubproblem
@@ -20,6 +22,7 @@ from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC, Joint, SOCState
 
 _FAINT = 1e-3
+_SAME = 1e-9  # relative: values of one term
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +89,14 @@ class ExtendedSOC:
     def init(self, problem: PGOProblem, start: Poses | None) -> SOCState:
         """State 0 of SOC; the changed program is compiled here, and again when rho changes."""
         if start is None:
-            model = graph_qp(problem.graph, np.ones(problem.num_poses), changer=self.changer, solver=self.solver)
-            start = moved_to_terms(model, chordal_start(problem))
+            start = moved_to_terms(self.model(problem), chordal_start(problem))
         return self._recursion(problem).init(problem, start)
+
+    def model(self, problem: PGOProblem) -> GraphQP:
+        """The changed program with penalties of 1; a SettingError unless the cost is F."""
+        if problem.weighting is not Weighting.ISOTROPIC:
+            raise SettingError("terms are added to F, with two precisions an edge; use Weighting.ISOTROPIC")
+        return graph_qp(problem.graph, np.ones(problem.num_poses), changer=self.changer, solver=self.solver)
 
     def step(self, problem: PGOProblem, state: SOCState) -> SOCState:
         """One iteration of SOC."""
@@ -146,3 +154,35 @@ def moved_to_terms(model: GraphQP, poses: Poses) -> Poses:
     moved = poses.moved(turn, s.value[0])
     is_lower = model.cost(moved.stacked()) < (1.0 - _FAINT) * model.cost(X_0)
     return moved if is_lower or change.constraints else poses
+
+
+def with_priors(model: GraphQP) -> tuple[PoseGraph, list[cp.Expression]]:
+    """The graph with the terms that are priors, and the terms that are not.
+
+    A term is one if it is sum tau_i ||t_i - p_i||^2 + kappa_i ||R_i - P_i||_F^2 with P_i in SO(d): these are read off
+    its gradient, which is affine, and it is then compared at a random point, where no other quadratic has its value.
+    """
+    whole, X, left = model.variables.graph, model.variables.X, []
+    graph, n, d, point = whole, whole.num_poses, whole.d, np.random.default_rng(0).standard_normal(X.shape)
+    for term in model.change.terms:
+        left.append(term)
+        if whole.world is not None or not term.is_quadratic():  # its world has a frame of its own
+            continue
+        gradients = []
+        for entry in (0.0, 1.0):
+            X.value = np.full(X.shape, entry)
+            gradients.append(np.reshape(term.grad[X].toarray(), X.shape, order="F"))
+        w = 0.5 * (gradients[1] - gradients[0])[:, 0]
+        centre, turned = -0.5 * gradients[0] / np.where(w > 0, w, np.inf)[:, None], w[n::d] > 0
+        R = np.where(turned[:, None, None], project_to_rotations(unstack_transposes(centre[n:])), np.eye(d))
+        priors, X.value = Poses(R, centre[:n]), point
+        poses = np.flatnonzero((w[:n] > 0) | turned)
+        squares = w @ np.sum((point - priors.stacked()) ** 2, axis=1)
+        if poses.size and math.isclose(squares, term.value, rel_tol=_SAME):
+            left.pop()
+            graph = graph.with_prior(poses, priors[poses], w[n::d][poses], w[:n][poses])
+    try:
+        graph.check_connected()
+    except GraphError:  # positions on a line leave turns open, of which a graph has none
+        return whole, list(model.change.terms)
+    return graph, left

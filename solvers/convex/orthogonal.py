@@ -254,20 +254,7 @@ def solve_orthogonal(
     verbose : bool
         Print every run's table.
 
-    Raises
-    ------
-    SettingError
-        When starts is below 1.
-    PGOError
-        When the convex subproblem has no solution.
-
-    Examples
-    --------
-    >>> import cvxpy as cp, numpy as np
-    >>> x = cp.Variable(2)
-    >>> problem = OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(x - [3.0, 4.0]))), unit_columns=[x])
-    >>> solve_orthogonal(problem, np.random.default_rng(0)).values[0].round(4).tolist()
-    [0.6, 0.8]
+    A SettingError when starts is below 1, a PGOError when the convex subproblem has no solution.
     """
     if starts < 1:
         raise SettingError(f"starts must be at least 1, got {starts}")

@@ -64,7 +64,7 @@ def test_three_roads_lead_to_one_optimum(seed: int, n: int, d: int, form: Relaxa
 def test_the_duals_are_the_multipliers_with_their_sign(seed: int, n: int, d: int, form: RelaxationForm) -> None:
     problem = varied_problem(seed, n, d, LOUD_NOISE)
     solution = solve_relaxation(problem, form, "CLARABEL")
-    Lambda = solution.Lambda
+    Lambda = solution.certificate.Lambda
     trace = float(np.einsum("naa->", Lambda))
     assert trace == pytest.approx(solution.value, abs=1e-4 * max(1.0, solution.value))
     if solution.verdict is Verdict.CERTIFIED:
