@@ -33,8 +33,8 @@ def solve_extended(
     graph, left = with_priors(model)
     if not all(term.is_nonneg() for term in left):
         raise SettingError("a term may be negative, so there is no bound; use solvers.run(ExtendedSOC(..), problem)")
-    own_start = None if start is None else graph.completed(start)
-    solution = plain(replace(problem, graph=graph), replace(pipeline, soc=pipeline.soc.soc), own_start)
+    first, start_of_it = replace(pipeline, soc=pipeline.soc.soc), None if start is None else graph.completed(start)
+    solution = plain(replace(problem, graph=graph), first, start_of_it, time_limit=watch.left)
     parts = {
         "terms other than tau ||t - p||^2 and kappa ||R - P||_F^2": len(left),
         "constraints": len(model.change.constraints),
@@ -43,6 +43,8 @@ def solve_extended(
     left_out = [f"{name} ({count})" for name, count in parts.items() if count]
     if not left_out:
         return solution
+    if solution.robots is not None or solution.robust is not None:
+        raise SettingError(f"robots and robust go with priors alone, and there are {left_out[0]}; leave them out")
     run, certificate = watch.run(pipeline.soc, problem, start), solution.certificate
     objective, level = model.cost(run.poses.stacked()), certificate.rounding_level
     bound = NO_BOUND if model.change.replaced_edges else certificate.bound

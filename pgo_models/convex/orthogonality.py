@@ -89,13 +89,9 @@ class OrthogonalProblem:
         if not isinstance(self.problem, cp.Problem):
             raise SettingError(f"the problem is a {type(self.problem).__name__}; give a cvxpy Problem")
         named: list[tuple[Any, ConstraintSet, str]] = []
-        simple: tuple[tuple[str, Sequence[Any], ConstraintSet], ...] = (
-            ("orthogonal", self.orthogonal, Orthonormal()),
-            ("rotations", self.rotations, Rotations()),
-            ("unit_columns", self.unit_columns, UnitColumns()),
-            ("unit_rows", self.unit_rows, UnitRows()),
-        )
-        for kind, chosen, constraint in simple:
+        sets = (Orthonormal(), Rotations(), UnitColumns(), UnitRows())
+        for kind, constraint in zip(("orthogonal", "rotations", "unit_columns", "unit_rows"), sets, strict=True):
+            chosen = getattr(self, kind)
             if isinstance(chosen, cp.Expression):
                 raise SettingError(f"{kind} is one expression; give a list of variables")
             named += [(variable, constraint, f"{kind}[{place}]") for place, variable in enumerate(chosen)]

@@ -130,6 +130,14 @@ def solve_relaxation(
 
     A SettingError when a limit or the gap is not positive, or the memory would not do; a PGOError when the solver ends
     without an iterate.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.scenes import circle
+    >>> solution = solve_relaxation(PGOProblem(circle(np.random.default_rng(0))))
+    >>> solution.status.name, solution.verdict.name, solution.rank.rank
+    ('OPTIMAL', 'CERTIFIED', 3)
     """
     for name, value in (("gap", gap), ("time_limit", time_limit)):
         if not value > 0:

@@ -10,7 +10,7 @@ from pgo_models.convex.convex_solver import ConvexSolver, solve_compiled
 from pgo_models.convex.graph_subproblem import Changer, GraphQP, graph_qp
 from pgo_models.errors import GraphError, PGOError, SettingError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
+from pgo_models.geometry.rotations import project_to_rotations, unstack_transposes
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
@@ -21,7 +21,7 @@ from solvers.soc.r_step import RStep, RSubproblem
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC, Joint, SOCState
 
-_FAINT = 1e-3
+_FAINT = 1e-3  # beside terms of metres and radians
 _SAME = 1e-9  # relative: values of one term
 
 
@@ -118,8 +118,7 @@ class ExtendedSOC:
 
     def cost(self, state: SOCState, poses: Poses) -> float:
         """F of the edges that count plus the added terms, at anybody's poses."""
-        X: Array = np.concatenate([poses.t, stack_transposes(poses.R)])
-        return _model(state).cost(X)
+        return _model(state).cost(poses.stacked())
 
     def converged(self, state: SOCState, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals are within tolerance."""

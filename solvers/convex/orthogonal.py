@@ -255,6 +255,14 @@ def solve_orthogonal(
         Print every run's table.
 
     A SettingError when starts is below 1, a PGOError when the convex subproblem has no solution.
+
+    Examples
+    --------
+    >>> import cvxpy as cp, numpy as np
+    >>> x = cp.Variable(2)
+    >>> problem = OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(x - [3.0, 4.0]))), unit_columns=[x])
+    >>> solve_orthogonal(problem, np.random.default_rng(0)).values[0].round(4).tolist()
+    [0.6, 0.8]
     """
     if starts < 1:
         raise SettingError(f"starts must be at least 1, got {starts}")

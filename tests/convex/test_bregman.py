@@ -8,13 +8,13 @@ import pytest
 from budget import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shared_rotations import shared_rotation_step
 from signals import sparse_signal
 
 import solvers
 from pgo_models.convex.bregman import BregmanPoint, BregmanProblem
 from pgo_models.convex.bregman_examples import (
     differences,
-    shared_rotation_step,
     total_variation_denoising,
     total_variation_scale_space,
 )

@@ -1,6 +1,8 @@
 """A changed subproblem leads SOC to a stationary point of the changed problem: checked without cvxpy, by scipy."""
 
+import json
 from collections.abc import Callable
+from pathlib import Path
 
 import cvxpy as cp
 import numpy as np
@@ -21,6 +23,7 @@ from solvers.convex.extended_soc import ExtendedSOC, ExtendedStep, with_priors
 from solvers.loop import run
 from solvers.pipeline import Pipeline, solve
 from solvers.result import Run, Status
+from solvers.robust.gnc import GNC
 from solvers.soc.penalty import MultiplierPenalty
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
@@ -234,7 +237,7 @@ def test_what_is_almost_a_prior_is_none(almost: Callable[[PoseVariables], cp.Exp
     assert graph.num_edges == problem().graph.num_edges + 3
 
 
-def test_the_bound_of_what_is_no_prior_is_below_all_poses_and_the_note_says_why() -> None:
+def test_the_bound_of_what_is_no_prior_is_below_all_poses_and_the_note_says_why(tmp_path: Path) -> None:
     graph, positions = problem().graph, np.arange(6.0).reshape(3, 2) ** 2
 
     def change(unknown: PoseVariables) -> ModelChange:
@@ -253,6 +256,10 @@ def test_the_bound_of_what_is_no_prior_is_below_all_poses_and_the_note_says_why(
     assert solution.note.startswith("the bound leaves out terms other than tau ||t - p||^2")
     assert solution.note.endswith("(1), constraints (1)")
     assert solution.note in str(solution)
+    solution.save(tmp_path / "x.json")
+    assert json.loads((tmp_path / "x.json").read_text())["objective"] == solution.objective
+    solution.report(tmp_path / "x.html")
+    assert solution.certificate.verdict.value in (tmp_path / "x.html").read_text()
 
 
 def test_a_position_alone_costs_nothing_so_that_the_bound_without_it_is_tight() -> None:
@@ -273,6 +280,9 @@ def test_replaced_edges_leave_no_bound_and_terms_that_may_be_negative_are_refuse
     linear = ExtendedSOC(lambda unknown: ModelChange(terms=[cp.sum(unknown.t(0))]))
     with pytest.raises(SettingError, match="a term may be negative"):
         solve(problem(), Pipeline(soc=linear))
+    for more in ({"robots": 2}, {"robust": GNC()}):
+        with pytest.raises(SettingError, match=r"go with priors alone, and there are terms other .* \(1\)"):
+            solve(problem(), Pipeline(soc=ExtendedSOC(absolute, SETTINGS)), **more)
     information = PGOProblem(varied_problem(4, N, D).graph, weighting=Weighting.INFORMATION)
     with pytest.raises(SettingError, match="terms are added to F"):
         run(linear, information)
