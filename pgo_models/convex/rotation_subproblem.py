@@ -76,6 +76,16 @@ def rotation_qp(
     -----
     rho is data, not a Parameter: as one it is DPP too, and small problems re-solve as fast with it, but compiling holds
     the product of all parameters with all entries, tens of gigabytes on 2500 poses.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.problem.problem import PGOProblem
+    >>> from pgo_models.graphs.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> A, w = problem.residual_matrix
+    >>> rotation_qp(A, w, np.ones(problem.side), problem.d).X.shape
+    (108, 3)
     """
     if not ((penalty >= 0).all() and (penalty > 0).any()):
         raise SettingError("penalties must not be negative, and one must be positive")
