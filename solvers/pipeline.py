@@ -195,7 +195,7 @@ def solve(
         raise SettingError("engine and checkpoint are for solves by robots; give robots, a number or a Partition")
     pipeline = pipeline if pipeline is not None else Pipeline()
     if not isinstance(pipeline, Pipeline):
-        raise SettingError(f"the pipeline is a {type(pipeline).__name__}; give Pipeline(soc=..), or run(SOC(..), ..)")
+        raise SettingError(f"the pipeline is a {type(pipeline).__name__}; give Pipeline(soc=SOC(..)), or run(SOC(..))")
     shown = partial(solve, anchor=anchor, callback=callback, verbose=verbose, progress=progress)
     if getattr(pipeline.soc, "changer", None) is not None:
         from solvers.extended_solve import solve_extended  # cvxpy, which is slow to import
