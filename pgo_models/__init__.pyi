@@ -3,7 +3,8 @@ from pgo_models.certificates.dual_variables import certificate_matrix, multiplie
 from pgo_models.certificates.lower_bound import prove_bound
 from pgo_models.certificates.newton_polish import polish
 from pgo_models.convex.bregman import BregmanProblem
-from pgo_models.convex.graph_subproblem import graph_qp
+from pgo_models.convex.convex_solver import ConvexSolver
+from pgo_models.convex.graph_subproblem import ModelChange, graph_qp
 from pgo_models.convex.orthogonality import OrthogonalProblem
 from pgo_models.convex.rotation_subproblem import rotation_qp
 from pgo_models.errors import PGOError
@@ -39,5 +40,6 @@ __all__ += ["CholeskyBackend", "Marginals", "PGOProblem", "Weighting"]
 __all__ += ["chordal_start", "odometry_start", "spanning_tree_start"]
 __all__ += ["Certificate", "Verdict", "certificate_matrix", "certify", "certify_at"]
 __all__ += ["multipliers", "polish", "prove_bound"]
-__all__ += ["BregmanProblem", "OrthogonalProblem", "graph_qp", "rotation_qp", "solve_relaxation"]
+__all__ += ["BregmanProblem", "ConvexSolver", "ModelChange", "OrthogonalProblem"]
+__all__ += ["graph_qp", "rotation_qp", "solve_relaxation"]
 __all__ += ["compare_poses", "explore_graph", "plot_graph"]

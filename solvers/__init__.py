@@ -14,7 +14,7 @@ _NAMES = {
     "solvers.soc.anderson": "Anderson",
     "solvers.soc.settings": "Coupling",
     "solvers.soc.paper": "PaperSOC",
-    "solvers.soc.r_step": "RStep",
+    "solvers.soc.r_step": "CvxpyStep RStep",
     "solvers.soc.penalty": "BalancedPenalty BoydPenalty FixedPenalty MultiplierPenalty",
     "solvers.riemannian.newton": "Newton gauss_newton",
     "solvers.riemannian.staircase": "Staircase",

@@ -21,7 +21,7 @@ from solvers.robust.irls import IRLS
 from solvers.soc.anderson import Anderson
 from solvers.soc.paper import PaperSOC
 from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty, MultiplierPenalty
-from solvers.soc.r_step import RStep
+from solvers.soc.r_step import CvxpyStep, RStep
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
 from solvers.solution import Solution
@@ -33,7 +33,7 @@ from solvers.studies.tightness import noise_sweep
 
 __all__ = ["History", "Measurement", "Method", "Record", "Run", "Solver", "Stage", "Status", "iterate", "run"]
 __all__ += ["Pipeline", "Solution", "extend", "solve", "write_report"]
-__all__ += ["SOC", "Anderson", "Coupling", "PaperSOC", "RStep"]
+__all__ += ["SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "RStep"]
 __all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty"]
 __all__ += ["Newton", "Staircase", "gauss_newton"]
 __all__ += ["GNC", "IRLS", "PCM", "RobustLoss", "pairwise_consistent"]

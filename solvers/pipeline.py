@@ -65,7 +65,7 @@ class Pipeline:
 
     Attributes
     ----------
-    soc : SOC or PaperSOC, optional
+    soc : SOC, PaperSOC or ExtendedSOC, optional
         First stage; None goes from the start straight to Newton. Its tolerance says when Newton takes over.
     newton : Newton
         Second stage.
@@ -194,10 +194,13 @@ def solve(
         raise SettingError("engine and checkpoint are for solves by robots; give robots, a number or a Partition")
     pipeline = pipeline if pipeline is not None else Pipeline()
     if not isinstance(pipeline, Pipeline):
-        raise SettingError(
-            f"the pipeline is a {type(pipeline).__name__}; give Pipeline(soc=SOC(..)), or run one method alone: "
-            "solvers.run(SOC(..), problem)"
-        )
+        raise SettingError(f"the pipeline is a {type(pipeline).__name__}; give Pipeline(soc=SOC(..)), or run(SOC(..))")
+    shown = partial(solve, anchor=anchor, callback=callback, verbose=verbose, progress=progress)
+    if getattr(pipeline.soc, "changer", None) is not None:
+        from solvers.extended_solve import solve_extended  # cvxpy, which is slow to import
+
+        plain = partial(shown, robust=robust, robots=robots, engine=engine, checkpoint=checkpoint)
+        return solve_extended(problem, pipeline, start, watch, plain)
     if robots is None and pipeline.faults is not None:
         raise SettingError("faults are of messages between robots; give solve() the robots of SOC, too")
     if robots is None and pipeline.driver_memory != DEFAULT_MEMORY:
@@ -212,7 +215,6 @@ def solve(
                 "a robust solve needs the driver, and writes no checkpoint; leave out the one or the other"
             )
         few, short = replace(pipeline.newton, max_iterations=_FEW), replace(pipeline, soc=None, second_try=False)
-        shown = partial(solve, anchor=anchor, callback=callback, verbose=verbose, progress=progress)
         plain = partial(shown, pipeline=replace(short, newton=few, staircase=None))
         shared = None
         if robots is not None:

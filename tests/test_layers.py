@@ -44,6 +44,7 @@ ORDER = {
         "explanations",
         "frames",
         "robust_solve",
+        "extended_solve",
         "pipeline",
         "growing",
         "shell",

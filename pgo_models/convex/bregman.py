@@ -14,7 +14,15 @@ import cvxpy as cp
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
-from pgo_models.convex.clarabel import TOLERANCE, check_convex, check_variable, finite_array, solve_compiled
+from pgo_models.convex.convex_solver import (
+    COLD,
+    TOLERANCE,
+    ConvexSolver,
+    check_convex,
+    check_variable,
+    finite_array,
+    solve_compiled,
+)
 from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import ReadOnly, read_only, real_array
 from pgo_models.geometry.rotations import Array
@@ -52,18 +60,8 @@ class BregmanProblem:
     K : (s, m), dense or sparse
     f : (s,)
 
-    Raises
-    ------
-    SettingError
-        When J is not convex or not one real number, has a variable that is not named or one that is named is not
-        continuous and real, or when K and f have other shapes or entries that are not finite.
-
-    Examples
-    --------
-    >>> import cvxpy as cp, numpy as np
-    >>> x = cp.Variable(3)
-    >>> BregmanProblem(cp.norm1(x), x, np.ones((1, 3)), [1.0])
-    BregmanProblem(m=3, s=1, blocks=1)
+    A SettingError when J is not convex or not one real number, has a variable that is not named or one that is named is
+    not continuous and real, or when K and f have other shapes or entries that are not finite.
     """
 
     J: Any
@@ -133,48 +131,41 @@ class Subproblem:
     variables: tuple[cp.Variable, ...]
     parameter: cp.Parameter  # p, (m,), or lam, (s,), or the scaled shift, (s,)
     scale: float  # the parameter's value is `scale` times what `solve` is given
-    tolerance: float  # Clarabel's
+    tolerance: float = TOLERANCE  # the solver's
+    solver: ConvexSolver | str = COLD
 
     def solve(self, value: Array) -> Array:
-        """Minimiser, stacked.
-
-        Raises
-        ------
-        PGOError
-            When Clarabel ends without a solution: J may be unbounded below on K x = const.
-        """
+        """Minimiser, stacked; a PGOError where there is none: J may be unbounded below on K x = const."""
         self.parameter.value = self.scale * value
-        solve_compiled(self.problem, "Bregman subproblem", self.tolerance)
+        solve_compiled(self.problem, "Bregman subproblem", self.tolerance, self.solver)
         return np.concatenate([np.ravel(variable.value) for variable in self.variables])
 
 
-def bregman_subproblem(problem: BregmanProblem, alpha: float, tolerance: float = TOLERANCE) -> Subproblem:
+def bregman_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
     """Solve p -> argmin J(x) - <p, x> + alpha/2 ||K x - f||^2 (paper: `update B`, constants dropped)."""
     p = cp.Parameter(problem.K.shape[1], name="p")
     x = _stack(problem.variables)
     penalty = cp.sum_squares(np.sqrt(alpha / 2) * (problem.K @ x - problem.f))
-    return Subproblem(cp.Problem(cp.Minimize(problem.J - p @ x + penalty)), problem.variables, p, 1.0, tolerance)
+    return Subproblem(cp.Problem(cp.Minimize(problem.J - p @ x + penalty)), problem.variables, p, 1.0)
 
 
-def two_line_subproblem(problem: BregmanProblem, alpha: float, tolerance: float = TOLERANCE) -> Subproblem:
+def two_line_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
     """Solve f - b -> argmin J(x) + alpha/2 ||K x - f + b||^2 (paper: `bregman update`)."""
     root = float(np.sqrt(alpha / 2))
     shift = cp.Parameter(problem.K.shape[0], name="shift")
     penalty = cp.sum_squares((root * problem.K) @ _stack(problem.variables) - shift)
-    return Subproblem(cp.Problem(cp.Minimize(problem.J + penalty)), problem.variables, shift, root, tolerance)
+    return Subproblem(cp.Problem(cp.Minimize(problem.J + penalty)), problem.variables, shift, root)
 
 
-def augmented_lagrangian_subproblem(problem: BregmanProblem, alpha: float, tolerance: float = TOLERANCE) -> Subproblem:
+def augmented_lagrangian_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
     """Solve lam -> argmin J(x) + <lam, f - K x> + alpha/2 ||f - K x||^2 (paper: `minbregman`)."""
     lam = cp.Parameter(problem.K.shape[0], name="lam")
     residual = problem.f - problem.K @ _stack(problem.variables)
     penalty = cp.sum_squares(np.sqrt(alpha / 2) * residual)
-    return Subproblem(
-        cp.Problem(cp.Minimize(problem.J + lam @ residual + penalty)), problem.variables, lam, 1.0, tolerance
-    )
+    return Subproblem(cp.Problem(cp.Minimize(problem.J + lam @ residual + penalty)), problem.variables, lam, 1.0)
 
 
-def block_subproblems(problem: BregmanProblem, alpha: float, tolerance: float = TOLERANCE) -> tuple[Subproblem, ...]:
+def block_subproblems(problem: BregmanProblem, alpha: float) -> tuple[Subproblem, ...]:
     """Solve, for block i, c -> argmin J_i(x_i) + alpha/2 ||K_i x_i - c||^2 (paper: `bregman ADMM`).
 
     Minimises the augmented Lagrangian over x_i when c = f + lam / alpha - sum of K_j x_j over the other blocks. A
@@ -186,7 +177,7 @@ def block_subproblems(problem: BregmanProblem, alpha: float, tolerance: float = 
     for variable, block, J_i in zip(problem.variables, problem.blocks, separated, strict=True):
         c = cp.Parameter(problem.K.shape[0], name="c")
         penalty = cp.sum_squares((root * problem.K[:, block]) @ _stack((variable,)) - c)
-        compiled.append(Subproblem(cp.Problem(cp.Minimize(J_i + penalty)), (variable,), c, root, tolerance))
+        compiled.append(Subproblem(cp.Problem(cp.Minimize(J_i + penalty)), (variable,), c, root))
     return tuple(compiled)
 
 

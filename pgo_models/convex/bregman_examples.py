@@ -1,18 +1,13 @@
 """Worked models of the form min J(x) s.t. K x = f, for the Bregman iterations of solvers/convex/bregman.py."""
 
-from dataclasses import dataclass
-
 import cvxpy as cp
 import numpy as np
-from scipy.sparse import coo_array, csr_array, diags_array, eye_array, hstack, kron, vstack
+from scipy.sparse import csr_array, diags_array, eye_array, hstack, kron, vstack
 
 from pgo_models.convex.bregman import BregmanProblem
-from pgo_models.convex.clarabel import finite_array
+from pgo_models.convex.convex_solver import finite_array
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
-from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.problem.matrices import residual_matrix, rotation_columns
+from pgo_models.geometry.rotations import Array
 
 
 def basis_pursuit(K: Array, f: Array) -> BregmanProblem:
@@ -66,80 +61,6 @@ def total_variation_scale_space(noisy: Array) -> BregmanProblem:
     return BregmanProblem(J, u, eye_array(noisy.size), noisy.ravel())
 
 
-@dataclass(frozen=True, eq=False)
-class SharedRotationStep:
-    """The R-subproblem of several robots that agree on the rotations they share."""
-
-    problem: BregmanProblem  # one variable a robot: the rows R_p^T of the poses it holds
-    # (poses,) each: poses that a robot holds, its own and copies of their neighbours, ascending.
-    held: tuple[IntArray, ...]
-    robot: IntArray  # (n,): owner of every pose
-    d: int
-
-    def rotations(self, x: Array) -> Array:
-        """The owners' matrices, (n, d, d), of the stacked x; relaxed, not projected."""
-        Y = np.zeros((self.d * len(self.robot), self.d))
-        for robot, (poses, rows) in enumerate(zip(self.held, self.problem.unstacked(x), strict=True)):
-            own = self.robot[poses] == robot
-            blocks = rows.reshape(len(poses), self.d, self.d)
-            Y.reshape(-1, self.d, self.d)[poses[own]] = blocks[own]
-        return unstack_transposes(Y)
-
-
-def shared_rotation_step(graph: PoseGraph, robots: Partition, V: Array, rho: float) -> SharedRotationStep:
-    """Minimise sum_a f_a(x_a) s.t. copies of a pose agree: step (a) of Algorithm 1, split between robots.
-
-    f_a has robot a's edges, kappa ||R_j - R_i R_ij||_F^2, half of those it has with another robot, and of its own poses
-    rho/2 ||R_p - V_p||_F^2, with V = omega - B, (n, d, d). Robot a holds its own poses and their neighbours. K x = 0
-    says that every copy is what its owner has. With two robots T = 1 is ADMM.
-
-    A SettingError when rho is not positive or V has another shape.
-    """
-    n, d = graph.num_poses, graph.d
-    V = finite_array(V, "V")
-    if V.shape != (n, d, d):
-        raise SettingError(f"V has shape {V.shape}; it must be {(n, d, d)}")
-    if not 0 < rho < np.inf:
-        raise SettingError(f"rho must be positive, got {rho}")
-    shift = stack_transposes(V)
-    owner_i, owner_j = robots.robot[graph.i], robots.robot[graph.j]
-    A, _ = residual_matrix(graph)
-    variables, held, terms = [], [], []
-    for robot in range(robots.num_robots):
-        mine = (owner_i == robot) | (owner_j == robot)
-        own = np.flatnonzero(robots.robot == robot)
-        poses = np.union1d(own, np.concatenate([graph.i[mine], graph.j[mine]]))
-        x = cp.Variable((d * len(poses), d), name=f"x_{robot}")
-        weight = np.where(owner_i == owner_j, 1.0, 0.5)[mine] * graph.kappa[mine]
-        rows = rotation_columns(np.flatnonzero(mine), graph.num_edges, d).ravel()
-        residuals = A[rows][:, rotation_columns(poses, n, d).ravel()]
-        own_rows = rotation_columns(np.searchsorted(poses, own), 0, d).ravel()
-        edges = cp.sum_squares(diags_array(np.sqrt(np.repeat(weight, d))) @ residuals @ x)
-        terms.append(edges + 0.5 * rho * cp.sum_squares(x[own_rows] - shift[rotation_columns(own, 0, d).ravel()]))
-        variables.append(x)
-        held.append(poses)
-    K = _agreement(held, robots.robot, d)
-    J = sum(terms[1:], terms[0])
-    return SharedRotationStep(BregmanProblem(J, variables, K, np.zeros(K.shape[0])), tuple(held), robots.robot, d)
-
-
 def _forward(length: int) -> csr_array:
     ones = np.ones(max(length - 1, 0))
     return csr_array(diags_array([-ones, ones], offsets=[0, 1], shape=(len(ones), length)))
-
-
-def _agreement(held: list[IntArray], robot: IntArray, d: int) -> csr_array:
-    """K: for every copy of another robot's pose, owner's entries minus the copy's."""
-    starts = np.cumsum([0, *(d * d * len(poses) for poses in held)])
-    owners, copies = [], []
-    for holder, poses in enumerate(held):
-        for place in np.flatnonzero(robot[poses] != holder):
-            owner = robot[poses[place]]
-            owners.append(starts[owner] + d * d * np.searchsorted(held[owner], poses[place]))
-            copies.append(starts[holder] + d * d * place)
-    entries = np.arange(d * d)
-    plus = (np.array(owners, dtype=int)[:, None] + entries).ravel()
-    minus = (np.array(copies, dtype=int)[:, None] + entries).ravel()
-    s = len(plus)
-    data, rows = np.concatenate([np.ones(s), -np.ones(s)]), np.tile(np.arange(s), 2)
-    return csr_array(coo_array((data, (rows, np.concatenate([plus, minus]))), shape=(s, int(starts[-1]))))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pgo_models.convex.prox import project_sparse, project_stiefel, project_unit_columns
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array, project_by_svd
 
@@ -15,9 +16,10 @@ from pgo_models.geometry.rotations import Array, project_by_svd
 class ConstraintSet(ABC):
     """A closed set of matrices with a closed-form projection."""
 
-    @abstractmethod
     def check_shape(self, shape: tuple[int, ...], name: str) -> None:
         """Raise SettingError unless the set has matrices of this shape; `name` is for the message."""
+        if len(shape) not in (1, 2):
+            raise SettingError(f"{name} has shape {shape}; give a vector or a matrix")
 
     @abstractmethod
     def project(self, V: Array) -> Array:
@@ -53,8 +55,7 @@ class Orthonormal(ConstraintSet):
 
     def project(self, V: Array) -> Array:
         """U V^T of the SVD."""
-        U, _, Vt = np.linalg.svd(V, full_matrices=False)
-        return np.asarray(U @ Vt)
+        return project_stiefel(V)
 
     def normal_part(self, P: Array, G: Array) -> Array:
         """P Lambda, with Lambda = sym(P^T G)."""
@@ -95,53 +96,36 @@ class Rotations(Orthonormal):
 class UnitColumns(ConstraintSet):
     """||x_j|| = 1 for every column x_j; a vector is one column."""
 
-    def check_shape(self, shape: tuple[int, ...], name: str) -> None:
-        """One or two dimensions."""
-        _check_vector_or_matrix(shape, name)
+    def _columns(self, V: Array) -> Array:
+        """The vectors of unit norm as columns; of those again, V but for its shape."""
+        return V
 
     def project(self, V: Array) -> Array:
-        """Columns over their norms; a zero column becomes the first unit vector."""
-        norms = np.linalg.norm(V, axis=0)
-        first = np.zeros(V.shape)
-        first[0] = 1.0
-        return np.asarray(np.where(norms > 0, V, first) / np.where(norms > 0, norms, 1.0))
+        """Each over its norm; zero becomes the first unit vector."""
+        return self._columns(project_unit_columns(self._columns(V))).reshape(V.shape)
 
     def normal_part(self, P: Array, G: Array) -> Array:
         """P diag(Lambda), with Lambda_j = <p_j, g_j>."""
-        return np.asarray(P * np.sum(P * G, axis=0))
+        return self._columns(self._columns(P) * self._products(P, G)).reshape(P.shape)
 
     def least_penalty(self, P: Array, N: Array) -> float:
         """Largest -Lambda_j, N = P diag(Lambda)."""
-        return max(0.0, float(-np.min(np.sum(P * N, axis=0))))
+        return max(0.0, float(-np.min(self._products(P, N))))
 
     def distance(self, P: Array) -> float:
         """Norm of the vector of ||p_j||^2 - 1."""
-        return float(np.linalg.norm(np.sum(P**2, axis=0) - 1.0))
+        return float(np.linalg.norm(self._products(P, P) - 1.0))
+
+    def _products(self, P: Array, G: Array) -> Array:
+        return np.asarray(np.sum(self._columns(P) * self._columns(G), axis=0))
 
 
 @dataclass(frozen=True)
-class UnitRows(ConstraintSet):
+class UnitRows(UnitColumns):
     """||x_i|| = 1 for every row x_i; of a vector, every entry is -1 or 1."""
 
-    def check_shape(self, shape: tuple[int, ...], name: str) -> None:
-        """One or two dimensions."""
-        _check_vector_or_matrix(shape, name)
-
-    def project(self, V: Array) -> Array:
-        """Rows over their norms."""
-        return UnitColumns().project(_rows_as_columns(V)).T.reshape(V.shape)
-
-    def normal_part(self, P: Array, G: Array) -> Array:
-        """diag(Lambda) P, with Lambda_i the product of rows i of P and G."""
-        return UnitColumns().normal_part(_rows_as_columns(P), _rows_as_columns(G)).T.reshape(P.shape)
-
-    def least_penalty(self, P: Array, N: Array) -> float:
-        """Largest -Lambda_i, N = diag(Lambda) P."""
-        return UnitColumns().least_penalty(_rows_as_columns(P), _rows_as_columns(N))
-
-    def distance(self, P: Array) -> float:
-        """Norm of the vector of ||p_i||^2 - 1."""
-        return UnitColumns().distance(_rows_as_columns(P))
+    def _columns(self, V: Array) -> Array:
+        return V.reshape(1, -1) if V.ndim == 1 else V.T
 
 
 @dataclass(frozen=True)
@@ -153,18 +137,9 @@ class Sparse(ConstraintSet):
     def __post_init__(self) -> None:
         check_settings(self, at_least_one=["nonzeros"])
 
-    def check_shape(self, shape: tuple[int, ...], name: str) -> None:
-        """One or two dimensions."""
-        _check_vector_or_matrix(shape, name)
-
     def project(self, V: Array) -> Array:
         """Hard thresholding: the largest entries are kept; of equal ones the first."""
-        if self.nonzeros >= V.size:
-            return V.copy()
-        kept = np.argsort(-np.abs(V), axis=None, kind="stable")[: self.nonzeros]
-        P = np.zeros(V.shape)
-        P.flat[kept] = V.flat[kept]
-        return P
+        return project_sparse(V, self.nonzeros)
 
     def normal_part(self, P: Array, G: Array) -> Array:
         """G off the support of P; 0 where P has room for another nonzero."""
@@ -183,12 +158,3 @@ class Sparse(ConstraintSet):
 
 def _symmetric(A: Array) -> Array:
     return 0.5 * (A + A.T)
-
-
-def _rows_as_columns(V: Array) -> Array:
-    return V.reshape(1, -1) if V.ndim == 1 else V.T
-
-
-def _check_vector_or_matrix(shape: tuple[int, ...], name: str) -> None:
-    if len(shape) not in (1, 2):
-        raise SettingError(f"{name} has shape {shape}; give a vector or a matrix")

@@ -8,11 +8,13 @@ Step (a) of the paper's Algorithm 1 (`algo1: SOC`): rotations only as the paper 
 import enum
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csr_array, diags_array, eye_array
 
+from pgo_models.convex.convex_solver import ConvexSolver, check_terms
 from pgo_models.convex.rotation_subproblem import RotationQP, rotation_qp
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, BoolArray
@@ -35,45 +37,48 @@ class Neighbours(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False)
+class Stack:
+    """Expressions by number: `[3]` or `(3)` is one; `[ids]`, `[mask]` and `[10:20]` are many, compiled as one."""
+
+    whole: csr_array  # (count side, (d + 1) n): their rows in terms of t_i and R_i^T of the whole graph
+    columns: IntArray  # which of these the program has
+    X: cp.Variable
+    side: int  # 1 of vectors, d of matrices, which are transposed in X
+
+    def __getitem__(self, which: int | slice | IntArray | BoolArray | Sequence[int]) -> cp.Expression:
+        """(d,) or (d, d) of a number, (k, d) or (k, d, d) of k of them."""
+        numbers: Any = np.arange(self.whole.shape[0] // self.side)[which]
+        rows = self.whole[rotation_columns(np.atleast_1d(numbers), 0, self.side).ravel()]
+        ours = rows[:, self.columns]
+        if ours.nnz < rows.nnz:
+            has = f"which has {len(self.columns)} of {rows.shape[1]}; ask for its own poses, or Unknowns.POSES for t"
+            raise SettingError(f"[{which!r:.60}] needs rows of t or R that are not unknown in this program, {has}")
+        found = ours @ self.X
+        if np.ndim(numbers) == 0:
+            return found[0] if self.side == 1 else found.T
+        if self.side == 1:
+            return found
+        shape = (len(numbers), self.side, self.side)
+        return cp.transpose(cp.reshape(found, shape, order="C"), axes=(0, 2, 1))
+
+    __call__ = __getitem__
+
+
+@dataclass(frozen=True, eq=False)
 class PoseVariables:
-    """The unknowns of a program by the names of the graph."""
+    """The unknowns of a program by the numbers of the graph: R, t, and residuals of edges, each a `Stack`.
+
+    Norms of many matrices are those of rows: `cp.norm(cp.reshape(R[ids], (len(ids), d * d), order="C"), axis=1)`.
+    """
 
     graph: PoseGraph
     unknowns: Unknowns
     poses: IntArray  # (n_a,): poses of the graph that are unknown, ascending
     X: cp.Variable  # rows t_i (not for ROTATIONS), then the rows of every R_i^T
-
-    @property
-    def num_translations(self) -> int:
-        """Rows of X before the rotations."""
-        return len(self.poses) if self.unknowns is Unknowns.POSES else 0
-
-    def R(self, pose: int) -> cp.Expression:
-        """R_i, (d, d)."""
-        first = self.num_translations + self.graph.d * self._place(pose)
-        return self.X[first : first + self.graph.d].T
-
-    def t(self, pose: int) -> cp.Expression:
-        """t_i, (d,)."""
-        if self.unknowns is Unknowns.ROTATIONS:
-            raise SettingError("a program in rotations only has no translations; use Unknowns.POSES")
-        return self.X[self._place(pose)]
-
-    def rotation_residual(self, e: int) -> cp.Expression:
-        """R_j - R_i R_ij of edge e, (d, d)."""
-        graph = self.graph
-        return self.R(int(graph.j[e])) - self.R(int(graph.i[e])) @ graph.R_ij[e]
-
-    def translation_residual(self, e: int) -> cp.Expression:
-        """t_j - t_i - R_i t_ij of edge e, (d,)."""
-        i, j = int(self.graph.i[e]), int(self.graph.j[e])
-        return self.t(j) - self.t(i) - self.R(i) @ self.graph.t_ij[e]
-
-    def _place(self, pose: int) -> int:
-        place = int(np.searchsorted(self.poses, pose))
-        if not (place < len(self.poses) and self.poses[place] == pose):
-            raise SettingError(f"pose {pose} is not among the {len(self.poses)} unknown poses of this program")
-        return place
+    t: Stack  # t_i, (d,)
+    R: Stack  # R_i, (d, d)
+    translation_residual: Stack  # t_j - t_i - R_i t_ij of edge e, (d,)
+    rotation_residual: Stack  # R_j - R_i R_ij of edge e, (d, d)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,11 +93,16 @@ class ModelChange:
         Convex, in the same variables.
     replaced_edges : sequence of int
         Edges whose squared residuals leave F, where terms have another loss for them.
+
+    A SettingError when a term is not one convex number, or a constraint not convex.
     """
 
     terms: Sequence[cp.Expression] = ()
     constraints: Sequence[cp.Constraint] = ()
     replaced_edges: Sequence[int] = ()
+
+    def __post_init__(self) -> None:
+        check_terms(self.terms, self.constraints)
 
 
 Changer = Callable[[PoseVariables], ModelChange]
@@ -120,12 +130,8 @@ class GraphQP:
         neighbours : (N, d), optional
             X of the whole graph, for FROZEN: the shift becomes V - 2 D^-1 M_between X.
 
-        Raises
-        ------
-        SettingError
-            When frozen neighbours are missing.
-        PGOError
-            When Clarabel does not end with a solution, as where constraints contradict each other.
+        A SettingError when frozen neighbours are missing, a PGOError when there is no solution, as where constraints
+        contradict each other.
         """
         if self.between.nnz:
             if neighbours is None:
@@ -150,6 +156,7 @@ def graph_qp(
     unknowns: Unknowns = Unknowns.POSES,
     changer: Changer | None = None,
     rho_t: Array | None = None,
+    solver: ConvexSolver | str = "CLARABEL",
 ) -> GraphQP:
     """Pose the R-subproblem of a whole graph.
 
@@ -161,6 +168,8 @@ def graph_qp(
         Given the variables, returns the ModelChange: terms, constraints, and edges whose loss they replace.
     rho_t : (n,), optional
         Penalty of every translation; none unless given.
+    solver : ConvexSolver or str, optional
+        Clarabel unless given.
 
     Examples
     --------
@@ -173,7 +182,7 @@ def graph_qp(
     (True, 1)
     """
     everyone = np.ones(graph.num_poses, dtype=bool)
-    return _posed(graph, everyone, np.ones(graph.num_edges), rho, rho_t, unknowns, changer)
+    return _posed(graph, everyone, np.ones(graph.num_edges), rho, rho_t, unknowns, changer, solver)
 
 
 def robot_qp(
@@ -184,6 +193,7 @@ def robot_qp(
     unknowns: Unknowns = Unknowns.ROTATIONS,
     changer: Changer | None = None,
     rho_t: Array | None = None,
+    solver: ConvexSolver | str = "CLARABEL",
 ) -> GraphQP:
     """Pose the R-subproblem of one robot of `graph.robots` with its neighbours' terms; parameters as `graph_qp`.
 
@@ -202,7 +212,7 @@ def robot_qp(
         share = 0.5 * touches
         unknown = owned.copy()
         unknown[np.concatenate([graph.i[touches > 0], graph.j[touches > 0]])] = True
-    return _posed(graph, unknown, share, rho, rho_t, unknowns, changer)
+    return _posed(graph, unknown, share, rho, rho_t, unknowns, changer, solver)
 
 
 def _posed(
@@ -213,21 +223,25 @@ def _posed(
     rho_t: Array | None,
     unknowns: Unknowns,
     changer: Changer | None,
+    solver: ConvexSolver | str,
 ) -> GraphQP:
     n, m, d = graph.num_poses, graph.num_edges, graph.d
     poses = np.flatnonzero(unknown)
-    rotations = rotation_columns(poses, n, d).ravel()
     joint = unknowns is Unknowns.POSES
-    mine = np.concatenate([poses, rotations]) if joint else rotations
+    mine = np.concatenate([poses[: len(poses) * joint], rotation_columns(poses, n, d).ravel()])
     penalty_t = np.zeros(n) if rho_t is None else rho_t
     penalty = np.concatenate([penalty_t[poses] if joint else np.zeros(0), np.repeat(rho[poses], d)])
 
     X = cp.Variable((len(mine), d), name="X")
-    variables = PoseVariables(graph, unknowns, poses, X)
+    whole, weights = residual_matrix(graph)
+    each = csr_array(eye_array(whole.shape[1]))
+    stacks = ((each[:n], 1), (each[n:], d), (whole[:m], 1), (whole[m:], d))
+    variables = PoseVariables(graph, unknowns, poses, X, *(Stack(rows, mine, X, side) for rows, side in stacks))
     change = changer(variables) if changer is not None else ModelChange()
+    if not isinstance(change, ModelChange):
+        raise SettingError(f"the changer returned a {type(change).__name__}; return ModelChange(terms=[..])")
     share = share.copy()
     share[list(change.replaced_edges)] = 0.0
-    whole, weights = residual_matrix(graph)
     weights = weights * np.concatenate([share if joint else np.zeros(m), np.repeat(share, d)])
     counted = weights > 0
     whole, w = whole[counted], weights[counted]
@@ -239,5 +253,5 @@ def _posed(
     pulled = np.diff(between.indptr) > 0
     if (penalty[pulled] == 0).any():
         raise SettingError("frozen neighbours enter the shift, so every row they pull on needs a penalty; give rho_t")
-    qp = rotation_qp(A, w, penalty, d, X, change.terms, change.constraints)
+    qp = rotation_qp(A, w, penalty, d, X, change.terms, change.constraints, solver)
     return GraphQP(variables, qp, change, A, w, between)

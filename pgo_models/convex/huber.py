@@ -3,11 +3,9 @@
 import cvxpy as cp
 import numpy as np
 
-from pgo_models.convex.graph_subproblem import Changer, ModelChange, PoseVariables, Unknowns
-from pgo_models.errors import SettingError
+from pgo_models.convex.graph_subproblem import Changer, ModelChange, PoseVariables
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.matrices import residual_matrix
 
 
 def huber_change(edges: IntArray, thresholds: Array) -> Changer:
@@ -20,23 +18,16 @@ def huber_change(edges: IntArray, thresholds: Array) -> Changer:
     thresholds : (m,)
         c_e^2 of all edges, as of `chi2_thresholds`.
 
-    Raises
-    ------
-    SettingError
-        When the program has no translations.
+    A SettingError when the program lacks unknowns of these edges.
     """
 
     def change(unknown: PoseVariables) -> ModelChange:
         graph = unknown.graph
-        if unknown.unknowns is Unknowns.ROTATIONS or len(unknown.poses) < graph.num_poses:
-            raise SettingError("the loss is of whole edges of the whole graph; use graph_qp with Unknowns.POSES")
-        A, w = residual_matrix(graph)
-        d, m = graph.d, graph.num_edges
-        rows = np.concatenate([edges[:, None], m + d * edges[:, None] + np.arange(d)], axis=1).ravel()
-        rho = cp.multiply(np.sqrt(w[rows])[:, None], A[rows] @ unknown.X)
+        turned = cp.reshape(unknown.rotation_residual[edges], (len(edges), graph.d**2), order="C")
+        weighted = zip((graph.tau, graph.kappa), (unknown.translation_residual[edges], turned), strict=True)
+        rho = cp.hstack([cp.multiply(np.sqrt(precision[edges])[:, None], rows) for precision, rows in weighted])
         c = np.sqrt(thresholds[edges])
-        r = cp.norm(cp.reshape(rho, (len(edges), (d + 1) * d), order="C"), 2, axis=1)
-        loss = cp.sum(cp.multiply(c**2, cp.huber(cp.multiply(1.0 / c, r))))
+        loss = cp.sum(cp.multiply(c**2, cp.huber(cp.multiply(1.0 / c, cp.norm(rho, 2, axis=1)))))
         return ModelChange(terms=[loss], replaced_edges=edges.tolist())
 
     return change

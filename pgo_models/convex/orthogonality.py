@@ -13,8 +13,16 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from pgo_models.convex.clarabel import check_convex, check_variable, finite_array, solve_compiled
 from pgo_models.convex.constraint_sets import ConstraintSet, Orthonormal, Rotations, Sparse, UnitColumns, UnitRows
+from pgo_models.convex.convex_solver import (
+    COLD,
+    ConvexSolver,
+    check_convex,
+    check_terms,
+    check_variable,
+    finite_array,
+    solve_compiled,
+)
 from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import real_array
 from pgo_models.geometry.rotations import Array
@@ -62,18 +70,8 @@ class OrthogonalProblem:
     sparse : sequence of (variable, int)
         At most so many nonzeros. A variable may be here and in one of the other lists too.
 
-    Raises
-    ------
-    SettingError
-        When J or a constraint is not convex, a variable is not in the problem, not real, or has the wrong shape, or
-        no variable is named.
-
-    Examples
-    --------
-    >>> import cvxpy as cp, numpy as np
-    >>> X = cp.Variable((3, 2))
-    >>> OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(X - np.ones((3, 2))))), orthogonal=[X])
-    OrthogonalProblem((3, 2) Orthonormal)
+    A SettingError when J or a constraint is not convex, a variable is not in the problem, not real, or has the wrong
+    shape, or no variable is named.
     """
 
     problem: Any
@@ -91,13 +89,9 @@ class OrthogonalProblem:
         if not isinstance(self.problem, cp.Problem):
             raise SettingError(f"the problem is a {type(self.problem).__name__}; give a cvxpy Problem")
         named: list[tuple[Any, ConstraintSet, str]] = []
-        simple: tuple[tuple[str, Sequence[Any], ConstraintSet], ...] = (
-            ("orthogonal", self.orthogonal, Orthonormal()),
-            ("rotations", self.rotations, Rotations()),
-            ("unit_columns", self.unit_columns, UnitColumns()),
-            ("unit_rows", self.unit_rows, UnitRows()),
-        )
-        for kind, chosen, constraint in simple:
+        sets = (Orthonormal(), Rotations(), UnitColumns(), UnitRows())
+        for kind, constraint in zip(("orthogonal", "rotations", "unit_columns", "unit_rows"), sets, strict=True):
+            chosen = getattr(self, kind)
             if isinstance(chosen, cp.Expression):
                 raise SettingError(f"{kind} is one expression; give a list of variables")
             named += [(variable, constraint, f"{kind}[{place}]") for place, variable in enumerate(chosen)]
@@ -135,12 +129,10 @@ class OrthogonalProblem:
 
         A SettingError when their number or shapes do not fit, or entries are not finite.
         """
-        if len(values) != len(self.variables):
-            raise SettingError(f"{len(values)} values for {len(self.variables)} variables")
         checked = [finite_array(value, f"values[{place}]") for place, value in enumerate(values)]
-        for place, (value, variable) in enumerate(zip(checked, self.variables, strict=True)):
-            if value.shape != variable.shape:
-                raise SettingError(f"values[{place}] has shape {value.shape}, its variable {variable.shape}")
+        given, needed = [value.shape for value in checked], [variable.shape for variable in self.variables]
+        if given != needed:
+            raise SettingError(f"{len(given)} values for {len(needed)} variables, of shapes {given}; need {needed}")
         copies = tuple(term.constraint.project(checked[term.variable]) for term in self.terms)
         return OrthogonalPoint(copies, tuple(np.zeros(copy.shape) for copy in copies))
 
@@ -196,8 +188,8 @@ class OrthogonalProblem:
         parts += [float(np.linalg.norm(constraint.violation())) for constraint in self.problem.constraints]
         return float(np.linalg.norm(parts))
 
-    def split(self) -> "SplitProblem":
-        """Compile the subproblem."""
+    def split(self, solver: ConvexSolver | str = COLD) -> "SplitProblem":
+        """Compile the subproblem, for a solver."""
         root = cp.Parameter(nonneg=True, name="root")
         shifts = tuple(cp.Parameter(variable.shape, name="shift") for variable in self.variables)
         counts = tuple(len(self.terms_of(place)) for place in range(len(self.variables)))
@@ -208,7 +200,7 @@ class OrthogonalProblem:
         problem = cp.Problem(cp.Minimize(self.J + penalty), self.problem.constraints)
         if not problem.is_dcp(dpp=True):
             raise SettingError("a Parameter of the problem is not used by the rules of DPP; see cvxpy's manual")
-        return SplitProblem(problem, self.variables, self.others, tuple(self.terms), root, shifts)
+        return SplitProblem(problem, self.variables, self.others, tuple(self.terms), root, shifts, solver)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,27 +217,22 @@ class SplitProblem:
     terms: tuple[Term, ...]
     root: cp.Parameter
     shifts: tuple[cp.Parameter, ...]
+    solver: ConvexSolver | str = COLD
 
     def solve(self, V: Sequence[Array], rho: float) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         """Minimisers X, one for every variable, and y, for one V for every term.
 
         Optimality of X gives a subgradient of J without differentiating J: at X, and partially minimised over y and the
         convex constraints, the sum over the terms of rho (V_term - X) is one.
-
-        Raises
-        ------
-        PGOError
-            When the convex constraints contradict each other, or J has no minimum over y.
+        A PGOError when the convex constraints contradict each other, or J has no minimum over y.
         """
         self.root.value = np.sqrt(rho)
         for place, shift in enumerate(self.shifts):
             of_variable = [V_term for term, V_term in zip(self.terms, V, strict=True) if term.variable == place]
             shift.value = np.sqrt(rho) * np.mean(of_variable, axis=0)
-        solve_compiled(self.problem, "split subproblem")
-        return (
-            tuple(np.array(variable.value, dtype=float) for variable in self.variables),
-            tuple(np.array(variable.value, dtype=float) for variable in self.others),
-        )
+        solve_compiled(self.problem, "split subproblem", solver=self.solver)
+        X, y = ([np.array(v.value, dtype=float) for v in group] for group in (self.variables, self.others))
+        return tuple(X), tuple(y)
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +247,9 @@ class KKTResiduals:
     multipliers: tuple[Array, ...]
 
 
-def kkt_residuals(problem: OrthogonalProblem, point: OrthogonalPoint, rho: float) -> KKTResiduals:
+def kkt_residuals(
+    problem: OrthogonalProblem, point: OrthogonalPoint, rho: float, solver: ConvexSolver | str = COLD
+) -> KKTResiduals:
     """Judge a point by one convex solve, whatever found it; rho of the order of the curvature of J.
 
     The normals N of the point, projected once more onto the normal spaces, are its multipliers: for X^T X = I they are
@@ -273,7 +262,7 @@ def kkt_residuals(problem: OrthogonalProblem, point: OrthogonalPoint, rho: float
         for term, copy, normal in zip(problem.terms, point.copies, point.normals, strict=True)
     ]
     V = [copy - normal / rho for copy, normal in zip(point.copies, normals, strict=True)]
-    Z, others = problem.split().solve(V, rho)
+    Z, others = problem.split(solver).solve(V, rho)
     values = problem.values(point.copies)
     gaps = [len(problem.terms_of(place)) * rho * (X - Z[place]) for place, X in enumerate(values)]
     gradients = [np.zeros(X.shape) for X in values]
@@ -306,7 +295,5 @@ def _minimised(problem: cp.Problem) -> cp.Expression:
         )
     J = -expression if maximises else expression
     check_convex(J, "the objective")
-    for place, constraint in enumerate(problem.constraints):
-        if not constraint.is_dcp():
-            raise SettingError(f"constraints[{place}], {constraint}, is not convex by the rules of DCP")
+    check_terms((), problem.constraints)
     return J

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import cvxpy as cp
 import numpy as np
 
-from pgo_models.convex.clarabel import finite_array
+from pgo_models.convex.convex_solver import finite_array
 from pgo_models.convex.orthogonality import OrthogonalProblem
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array

@@ -1,4 +1,4 @@
-"""The R-subproblem, step (a) of the paper's Algorithm 1, as a cvxpy quadratic program for Clarabel.
+"""The R-subproblem, step (a) of the paper's Algorithm 1, as a cvxpy quadratic program.
 
     minimise over X   sum_rows w ||A X||^2 + 1/2 ||sqrt(D) (X - V)||_F^2
 
@@ -13,11 +13,11 @@ import cvxpy as cp
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
-from pgo_models.convex.clarabel import run_clarabel
-from pgo_models.errors import PGOError, SettingError
+from pgo_models.convex.convex_solver import ConvexSolver, solve_compiled
+from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 
-TOLERANCES = (1e-12, 1e-10, 1e-8)
+TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,32 +28,17 @@ class RotationQP:
     X: cp.Variable  # (N, d): rows t_i, then the rows of every R_i^T, of the poses concerned
     shift: cp.Parameter  # (N_D, d): sqrt(D) V on the rows whose penalty is not zero
     penalty: Array  # (N,): the diagonal of D
+    solver: ConvexSolver | str = "CLARABEL"
 
     def solve(self, V: Array) -> Array:
         """X, (N, d), for the shift V, (N, d); rows of V without a penalty do not matter.
 
-        Raises
-        ------
-        PGOError
-            When Clarabel does not end with a solution; the message has its status.
+        A PGOError when the solver does not end with a solution; the message has its status.
         """
         held = self.penalty > 0
         self.shift.value = np.sqrt(self.penalty[held])[:, None] * V[held]
-        # The quadratic program reaches the first tolerance; added cones may not, and stop where rounding lets them.
-        for tolerance in TOLERANCES:
-            try:
-                run_clarabel(self.problem, tolerance)
-            except cp.SolverError as error:
-                if tolerance == TOLERANCES[-1]:
-                    raise PGOError(f"Clarabel could not solve the R-subproblem: {error}") from error
-                continue
-            if self.problem.status == cp.OPTIMAL:
-                break
-        if self.problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or self.X.value is None:
-            raise PGOError(
-                f"Clarabel ended with status {self.problem.status} on the R-subproblem; "
-                "check its scaling, and that constraints do not contradict each other"
-            )
+        # The quadratic program reaches the tolerance; added cones may not, and stop where rounding lets them.
+        solve_compiled(self.problem, "R-subproblem", TOLERANCE, self.solver, (cp.OPTIMAL_INACCURATE,))
         return np.asarray(self.X.value)
 
 
@@ -65,6 +50,7 @@ def rotation_qp(
     X: cp.Variable | None = None,
     terms: Sequence[cp.Expression] = (),
     constraints: Sequence[cp.Constraint] = (),
+    solver: ConvexSolver | str = "CLARABEL",
 ) -> RotationQP:
     """Pose the R-subproblem.
 
@@ -82,11 +68,9 @@ def rotation_qp(
         The variable, where terms or constraints are already written in it.
     terms : sequence of cp.Expression
         Convex terms to add to the objective; `pgo_models.convex.graph_subproblem` writes them on poses and edges.
+    solver : ConvexSolver or str, optional
 
-    Raises
-    ------
-    SettingError
-        When a penalty is negative or all are zero, or a term or a constraint is not convex.
+    A SettingError when a penalty is negative or all are zero, or a term or a constraint is not convex.
 
     Notes
     -----
@@ -116,4 +100,4 @@ def rotation_qp(
         raise SettingError(
             "an added term or constraint is not convex by the rules of cvxpy (DCP, and DPP in Parameters)"
         )
-    return RotationQP(problem, X, shift, penalty)
+    return RotationQP(problem, X, shift, penalty, solver)

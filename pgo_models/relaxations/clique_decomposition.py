@@ -148,19 +148,10 @@ class _Layout:
         sides = [clique_side(len(clique), d) for clique in tree.cliques]
         lengths = [side * (side + 1) // 2 for side in sides]
         offsets = np.concatenate([[0], np.cumsum(lengths)]).tolist()
-        return cls(
-            problem=problem,
-            tree=tree,
-            centre=centre,
-            sigma=float(np.sqrt(np.median(graph.kappa[graph.kappa > 0]))),
-            sigma_t=float(np.sqrt(np.median(graph.tau[graph.tau > 0]))),
-            reference=reference,
-            columns=columns,
-            sides=sides,
-            offsets=offsets[:-1],
-            num_entries=offsets[-1],
-            home=home,
-        )
+        sigma = float(np.sqrt(np.median(graph.kappa[graph.kappa > 0])))
+        sigma_t = float(np.sqrt(np.median(graph.tau[graph.tau > 0])))
+        ends = offsets[:-1], offsets[-1]
+        return cls(problem, tree, centre, sigma, sigma_t, reference, columns, sides, *ends, home)
 
     def position(self, k: int) -> IntArray:
         """Place in w of every entry of W_C, (side, side)."""
@@ -175,23 +166,22 @@ class _Layout:
 
     def reference_rotation(self, k: int, A: Array) -> Array:
         """P_r A for A of shape (d, c)."""
-        coefficients = np.zeros((self.sides[k], A.shape[1]))
-        coefficients[: self.problem.d] = A
-        return coefficients
+        return self._placed(k, 0, A)
 
     def rotation_deviation(self, k: int, u: int, A: Array) -> Array:
         """(P_u - P_r) A."""
-        coefficients = np.zeros((self.sides[k], A.shape[1]))
-        if u != self.reference[k]:
-            first = self.columns[k][u]
-            coefficients[first : first + self.problem.d] = A / self.sigma
-        return coefficients
+        return self._placed(k, self.columns[k].get(u), A / self.sigma)
 
     def translation_deviation(self, k: int, u: int) -> Array:
         """t_u - t_r - P_r (t^_u - t^_r)."""
-        coefficients = np.zeros((self.sides[k], 1))
-        if u != self.reference[k]:
-            coefficients[self.columns[k][u] + self.problem.d] = 1.0 / self.sigma_t
+        column = self.columns[k].get(u)
+        return self._placed(k, None if column is None else column + self.problem.d, np.array([[1.0 / self.sigma_t]]))
+
+    def _placed(self, k: int, first: int | None, A: Array) -> Array:
+        """A in the rows of clique k from `first` on; zero for its reference, which has none."""
+        coefficients = np.zeros((self.sides[k], A.shape[1]))
+        if first is not None:
+            coefficients[first : first + len(A)] = A
         return coefficients
 
 

@@ -5,12 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pgo_models.convex.convex_solver import ConvexSolver, as_solver
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.clique_tree import CliqueTree, build_clique_tree, clique_side
 
 DEFAULT_MEMORY_LIMIT = 4e9  # bytes
+CLARABEL = ConvexSolver()  # interior point, accurate; its work grows with the sixth power of a cone's side
+SCS = ConvexSolver("SCS")  # first order, rougher; with the third power
 
 # Measured on one core (tests/benchmarks/test_relaxations_benchmark.py). Clarabel factors a dense matrix of the order of
 # every cone's triangle at every iteration, about 15 of them; SCS takes an eigendecomposition of every cone, about 1000
@@ -32,19 +35,12 @@ class RelaxationForm(enum.Enum):
     CLIQUES = "one small cone for every clique of a chordal extension"
 
 
-class SDPSolver(enum.Enum):
-    """Which solver it is given to."""
-
-    CLARABEL = "interior point, accurate; its work grows with the sixth power of a cone's side"
-    SCS = "first order, rougher; its work grows with the third power of a cone's side"
-
-
 @dataclass(frozen=True, eq=False)
 class RelaxationPlan:
     """A form and a solver, what they will take, and why they were chosen."""
 
     form: RelaxationForm
-    solver: SDPSolver
+    solver: ConvexSolver
     tree: CliqueTree
     seconds: float  # rough estimate
     memory: float  # estimate in bytes
@@ -57,7 +53,7 @@ class RelaxationPlan:
 def plan_relaxation(
     problem: PGOProblem,
     form: RelaxationForm | None = None,
-    solver: SDPSolver | None = None,
+    solver: ConvexSolver | str | None = None,
     memory_limit: float = DEFAULT_MEMORY_LIMIT,
 ) -> RelaxationPlan:
     """Choose what is not given: the cliques with Clarabel where they are small, else the dense primal with SCS.
@@ -73,26 +69,24 @@ def plan_relaxation(
         f"the largest of {len(tree.cliques)} cliques has side {largest}, the dense cone {problem.d * problem.num_poses}"
     )
     if form is None and solver is None:
-        small = _seconds(problem, tree, RelaxationForm.CLIQUES, SDPSolver.CLARABEL)
-        dense = _seconds(problem, tree, RelaxationForm.PRIMAL, SDPSolver.SCS)
-        if small <= max(_PATIENCE, dense):
-            form, solver = RelaxationForm.CLIQUES, SDPSolver.CLARABEL
-        else:
-            form, solver = RelaxationForm.PRIMAL, SDPSolver.SCS
+        small = _seconds(problem, tree, RelaxationForm.CLIQUES, CLARABEL)
+        dense = _seconds(problem, tree, RelaxationForm.PRIMAL, SCS)
+        is_small = small <= max(_PATIENCE, dense)
+        form, chosen = (RelaxationForm.CLIQUES, CLARABEL) if is_small else (RelaxationForm.PRIMAL, SCS)
         reason = f"{shape}; estimated {small:.2g} s for the cliques with Clarabel, {dense:.2g} s dense with SCS"
     else:
-        asked = [choice.name for choice in (form, solver) if choice is not None]
-        solver = solver or (SDPSolver.SCS if form is RelaxationForm.PRIMAL else SDPSolver.CLARABEL)
-        form = form or (RelaxationForm.PRIMAL if solver is SDPSolver.SCS else RelaxationForm.CLIQUES)
+        chosen = as_solver(solver or (SCS if form is RelaxationForm.PRIMAL else CLARABEL))
+        asked = [*([] if form is None else [form.name]), *([] if solver is None else [chosen.name])]
+        form = form or (RelaxationForm.PRIMAL if chosen.is_first_order else RelaxationForm.CLIQUES)
         reason = f"{' and '.join(asked)} as asked for; {shape}"
-    memory = _memory(problem, tree, form, solver)
+    memory = _memory(problem, tree, form, chosen)
     if memory > memory_limit:
         raise SettingError(
-            f"the relaxation of {problem!r} as {form.name} with {solver.name} needs about {_bytes(memory)}, above the "
+            f"the relaxation of {problem!r} as {form.name} with {chosen.name} needs about {_bytes(memory)}, above the "
             f"limit of {_bytes(memory_limit)} ({reason}); use certify(problem, poses), which proves the same bound by "
             "one sparse factorisation, or raise memory_limit"
         )
-    return RelaxationPlan(form, solver, tree, _seconds(problem, tree, form, solver), memory, reason)
+    return RelaxationPlan(form, chosen, tree, _seconds(problem, tree, form, chosen), memory, reason)
 
 
 def _sides(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm) -> Array:
@@ -103,16 +97,16 @@ def _sides(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm) -> Array
     return np.asarray((problem.d + 1.0) * tree.sizes)  # as Clarabel will decompose it, about
 
 
-def _seconds(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm, solver: SDPSolver) -> float:
+def _seconds(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm, solver: ConvexSolver) -> float:
     sides = _sides(problem, tree, form)
-    if solver is SDPSolver.CLARABEL:
+    if not solver.is_first_order:
         return float(_CLARABEL_ITERATIONS * np.sum(_triangle(sides) ** 3) / _CLARABEL_RATE)
     return float(_SCS_ITERATIONS * np.sum(sides**3) / _SCS_RATE)
 
 
-def _memory(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm, solver: SDPSolver) -> float:
+def _memory(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm, solver: ConvexSolver) -> float:
     triangles = _triangle(_sides(problem, tree, form))
-    cones = _CLARABEL_BYTES * np.sum(triangles**2) if solver is SDPSolver.CLARABEL else 0.0
+    cones = _CLARABEL_BYTES * np.sum(triangles**2) if not solver.is_first_order else 0.0
     dense_side = {
         RelaxationForm.PRIMAL: problem.d * problem.num_poses,
         RelaxationForm.DUAL: problem.side,  # cvxpy vectorises the inequality as a whole

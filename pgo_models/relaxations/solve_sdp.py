@@ -3,28 +3,24 @@
 import enum
 import math
 import time
-import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import cvxpy as cp
 
-from pgo_models.certificates.certificate import Verdict, gap_text, relative_gap, verdict_of
-from pgo_models.certificates.lower_bound import LowerBound, best_bound
-from pgo_models.certificates.rounding_errors import objective_rounding
-from pgo_models.convex.clarabel import run_clarabel
+from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, certify_with, gap_text, relative_gap
+from pgo_models.convex.convex_solver import ConvexSolver
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.clique_decomposition import CliqueRelaxation, clique_relaxation
-from pgo_models.relaxations.plan import DEFAULT_MEMORY_LIMIT, RelaxationForm, RelaxationPlan, SDPSolver, plan_relaxation
+from pgo_models.relaxations.plan import DEFAULT_MEMORY_LIMIT, RelaxationForm, RelaxationPlan, plan_relaxation
 from pgo_models.relaxations.primal_dual import DualRelaxation, PrimalRelaxation, dual_relaxation, primal_relaxation
 from pgo_models.relaxations.rounding import RankReport
 
 DEFAULT_RELAXATION_GAP = 1e-5
-CLARABEL_TOLERANCE = 1e-10
-SCS_TOLERANCE = 1e-7
-_SCS_MAX_ITERATIONS = 20_000
+TOLERANCE = 1e-10
 
 Relaxation = PrimalRelaxation | DualRelaxation | CliqueRelaxation
 
@@ -49,14 +45,8 @@ class RelaxationSolution:
         The model with its variables and duals as solved.
     value : float
         Optimal value as the solver reports it: evidence, not a bound.
-    Lambda : (n, d, d)
-        Multipliers from the duals.
-    bound : LowerBound
-        Proven bound on F (`pgo_models.certificates.lower_bound`): it holds whatever the solver did.
-    poses : Poses
-        Rounded.
-    objective, rounding_level : float
-        F of the poses, and below what it could not be told from zero.
+    certificate : Certificate
+        Of the rounded poses, with the multipliers from the duals: its bound on F is proven, whatever the solver did.
     seconds : float
         From posing to proof.
     """
@@ -65,35 +55,35 @@ class RelaxationSolution:
     plan: RelaxationPlan
     status: RelaxationStatus
     value: float
-    Lambda: Array
-    bound: LowerBound
-    poses: Poses
+    certificate: Certificate
     rank: RankReport
-    objective: float
-    rounding_level: float
-    wanted_gap: float
     iterations: int
     seconds: float
 
     @property
-    def lower_bound(self) -> float:
-        """Proven: F of no poses is below it."""
-        return self.bound.value
+    def poses(self) -> Poses:
+        """Rounded."""
+        return self.certificate.poses
 
     @property
-    def eta(self) -> float:
-        """Shift of the proof; nan when only F >= 0 is left."""
-        return self.bound.eta
+    def objective(self) -> float:
+        """F of the rounded poses."""
+        return self.certificate.objective
+
+    @property
+    def lower_bound(self) -> float:
+        """Proven: F of no poses is below it."""
+        return self.certificate.lower_bound
 
     @property
     def gap(self) -> float:
         """(objective - lower_bound) / objective of the rounded poses."""
-        return relative_gap(self.objective, self.lower_bound, self.rounding_level)
+        return self.certificate.gap
 
     @property
     def verdict(self) -> Verdict:
         """What the bound says of the rounded poses."""
-        return verdict_of(self.objective, self.rounding_level, self.gap, self.bound, self.wanted_gap)
+        return self.certificate.verdict
 
     def gap_to(self, poses: Poses) -> float:
         """The same gap for anybody's poses of the graph."""
@@ -105,8 +95,8 @@ class RelaxationSolution:
             f"status       {self.status.name}: {self.status.value}",
             f"effort       {self.iterations} iterations, {self.seconds:.3g} s",
             f"F rounded    {self.objective:.10g}",
-            f"lower bound  {self.lower_bound:.10g}   (solver: {self.value:.10g}; eta = {self.eta:.3g})",
-            f"gap          {gap_text(self.gap)}   (asked for: {self.wanted_gap:.3g})",
+            f"lower bound  {self.lower_bound:.10g}   (solver: {self.value:.10g}; eta = {self.certificate.eta:.3g})",
+            f"gap          {gap_text(self.gap)}   (asked for: {self.certificate.wanted_gap:.3g})",
             f"rank         {self.rank}",
             f"verdict      {self.verdict.name}: {self.verdict.value}",
         ]
@@ -116,7 +106,7 @@ class RelaxationSolution:
 def solve_relaxation(
     problem: PGOProblem,
     form: RelaxationForm | None = None,
-    solver: SDPSolver | None = None,
+    solver: ConvexSolver | str | None = None,
     *,
     gap: float = DEFAULT_RELAXATION_GAP,
     memory_limit: float = DEFAULT_MEMORY_LIMIT,
@@ -127,8 +117,8 @@ def solve_relaxation(
 
     Parameters
     ----------
-    solver : SDPSolver, optional
-        Both are chosen by `plan_relaxation` unless given.
+    solver : ConvexSolver or str, optional
+        Both are chosen by `plan_relaxation` unless given. Any conic solver of cvxpy that takes semidefinite cones.
     gap : float
         Relative gap for the verdict; where the proof needs a shift eta, the smallest that is tried follows from it.
     memory_limit : float
@@ -138,12 +128,8 @@ def solve_relaxation(
     verbose : bool
         Print the plan with its reason, the solver's table, and the result.
 
-    Raises
-    ------
-    SettingError
-        When a limit or the gap is not positive, or the memory would not do.
-    PGOError
-        When the solver ends without an iterate.
+    A SettingError when a limit or the gap is not positive, or the memory would not do; a PGOError when the solver ends
+    without an iterate.
 
     Examples
     --------
@@ -161,25 +147,22 @@ def solve_relaxation(
     plan = plan_relaxation(problem, form, solver, memory_limit)
     if verbose:
         print(plan)
-    relaxation = _posed(problem, plan)
+    forms: dict[RelaxationForm, Callable[[PGOProblem], Relaxation]] = {
+        RelaxationForm.PRIMAL: primal_relaxation,
+        RelaxationForm.DUAL: dual_relaxation,
+        RelaxationForm.CLIQUES: partial(clique_relaxation, tree=plan.tree),
+    }
+    relaxation = forms[plan.form](problem)
     status = _solve(relaxation.model, plan.solver, time_limit, verbose)
-    Lambda = relaxation.Lambda()
     poses, rank = relaxation.rounded()
-    objective = problem.objective(poses)
-    rounding = objective_rounding(problem, poses)
-    bound = best_bound(problem, Lambda, poses, gap, objective)
+    certificate = certify_with(problem, poses, relaxation.Lambda(), gap, math.nan, BoundSource.RELAXATION, ground=poses)
     solution = RelaxationSolution(
         relaxation=relaxation,
         plan=plan,
         status=status,
         value=float(relaxation.model.value) * relaxation.scale,
-        Lambda=Lambda,
-        bound=bound,
-        poses=poses,
+        certificate=certificate,
         rank=rank,
-        objective=objective,
-        rounding_level=rounding.level,
-        wanted_gap=gap,
         iterations=int(relaxation.model.solver_stats.num_iters or 0),
         seconds=time.perf_counter() - began,
     )
@@ -188,39 +171,18 @@ def solve_relaxation(
     return solution
 
 
-def _posed(problem: PGOProblem, plan: RelaxationPlan) -> Relaxation:
-    if plan.form is RelaxationForm.PRIMAL:
-        return primal_relaxation(problem)
-    if plan.form is RelaxationForm.DUAL:
-        return dual_relaxation(problem)
-    return clique_relaxation(problem, tree=plan.tree)
-
-
-def _solve(model: cp.Problem, solver: SDPSolver, time_limit: float, verbose: bool) -> RelaxationStatus:
+def _solve(model: cp.Problem, solver: ConvexSolver, time_limit: float, verbose: bool) -> RelaxationStatus:
     try:
-        if solver is SDPSolver.CLARABEL:
-            run_clarabel(model, CLARABEL_TOLERANCE, time_limit=time_limit, verbose=verbose)
-        else:
-            with warnings.catch_warnings():
-                # Said by the status, and made good by the proof of the bound.
-                warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
-                model.solve(
-                    solver=cp.SCS,
-                    verbose=verbose,
-                    eps_abs=SCS_TOLERANCE,
-                    eps_rel=SCS_TOLERANCE,
-                    max_iters=_SCS_MAX_ITERATIONS,
-                    time_limit_secs=time_limit if math.isfinite(time_limit) else 0.0,
-                )
+        solver.run(model, TOLERANCE, time_limit=time_limit, verbose=verbose)
     except cp.SolverError as error:
-        raise PGOError(f"{solver.name} failed on the relaxation: {error}; try the other solver or form") from error
+        raise PGOError(f"{solver.name} failed on the relaxation: {error}; try another solver or form") from error
     if model.value is None or not math.isfinite(model.value):
         raise PGOError(
             f"{solver.name} ended with status {model.status} on the relaxation and gave no iterate; "
-            "raise time_limit, or try the other solver or form"
+            "raise time_limit, or try another solver or form"
         )
     if model.status == cp.OPTIMAL:
         return RelaxationStatus.OPTIMAL
     # SCS calls inaccurate what its limits stopped.
-    stalled = model.status == cp.OPTIMAL_INACCURATE and solver is SDPSolver.CLARABEL
+    stalled = model.status == cp.OPTIMAL_INACCURATE and not solver.is_first_order
     return RelaxationStatus.INACCURATE if stalled else RelaxationStatus.LIMIT

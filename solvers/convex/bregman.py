@@ -9,7 +9,7 @@ The first three have the same x, with p = K^T lam and lam = -alpha b. Osher et a
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from pgo_models.convex.bregman import (
     bregman_subproblem,
     two_line_subproblem,
 )
-from pgo_models.convex.clarabel import TOLERANCE, finite_array
+from pgo_models.convex.convex_solver import COLD, TOLERANCE, ConvexSolver, finite_array
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
 from solvers.result import Measurement, Status
@@ -86,16 +86,23 @@ class BregmanSettings:
     tolerance : float
         On ||K x - f|| / max(1, ||f||) and on the distance from stationarity over max(1, ||K^T lam||).
     subproblem_tolerance : float
-        Clarabel's. Loosen it to see that Bregman iteration forgets the errors of its subproblems (Yin & Osher 2013).
+        The solver's. Loosen it to see that Bregman iteration forgets the errors of its subproblems (Yin & Osher 2013).
+    solver : ConvexSolver or str
+        For the subproblems: Clarabel, cold, unless given.
     """
 
     alpha: float = 1.0
     tolerance: float = 1e-6
     max_iterations: int = 1000
     subproblem_tolerance: float = TOLERANCE
+    solver: ConvexSolver | str = COLD
 
     def __post_init__(self) -> None:
         check_settings(self, finite=["alpha", "tolerance", "subproblem_tolerance"], not_negative=["max_iterations"])
+
+    def compiled(self, subproblem: Subproblem) -> Subproblem:
+        """The subproblem with the solver of these settings."""
+        return replace(subproblem, tolerance=self.subproblem_tolerance, solver=self.solver)
 
     def measure(self, problem: BregmanProblem, state: _ExactState | AlternatingState) -> Measurement:
         """J(x), ||K x - f||, relative, and the distance from stationarity, relative."""
@@ -120,7 +127,7 @@ class Bregman(BregmanSettings):
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> BregmanState:
         """State 0 at `start`, else at x = 0 and p = 0."""
         point = _checked_start(problem, start)
-        subproblem = bregman_subproblem(problem, self.alpha, self.subproblem_tolerance)
+        subproblem = self.compiled(bregman_subproblem(problem, self.alpha))
         return BregmanState(0, point.x, subproblem, np.asarray(problem.K.T @ point.lam))
 
     def step(self, problem: BregmanProblem, state: BregmanState) -> BregmanState:
@@ -144,7 +151,7 @@ class TwoLineBregman(BregmanSettings):
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> TwoLineState:
         """State 0 at `start`, else at x = 0 and b = 0."""
         point = _checked_start(problem, start)
-        subproblem = two_line_subproblem(problem, self.alpha, self.subproblem_tolerance)
+        subproblem = self.compiled(two_line_subproblem(problem, self.alpha))
         return TwoLineState(0, point.x, subproblem, -point.lam / self.alpha)
 
     def step(self, problem: BregmanProblem, state: TwoLineState) -> TwoLineState:
@@ -170,7 +177,7 @@ class MethodOfMultipliers(BregmanSettings):
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> MultiplierState:
         """State 0 at `start`, else at x = 0 and lam = 0."""
         point = _checked_start(problem, start)
-        subproblem = augmented_lagrangian_subproblem(problem, self.alpha, self.subproblem_tolerance)
+        subproblem = self.compiled(augmented_lagrangian_subproblem(problem, self.alpha))
         return MultiplierState(0, point.x, subproblem, point.lam)
 
     def step(self, problem: BregmanProblem, state: MultiplierState) -> MultiplierState:
@@ -210,8 +217,8 @@ class AlternatingBregman(BregmanSettings):
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> AlternatingState:
         """State 0 at `start`, else at x = 0 and lam = 0."""
         point = _checked_start(problem, start)
-        subproblems = block_subproblems(problem, self.alpha, self.subproblem_tolerance)
-        return AlternatingState(0, point.x, point.lam, subproblems)
+        subproblems = map(self.compiled, block_subproblems(problem, self.alpha))
+        return AlternatingState(0, point.x, point.lam, tuple(subproblems))
 
     def step(self, problem: BregmanProblem, state: AlternatingState) -> AlternatingState:
         """T passes and the multiplier."""
@@ -253,16 +260,8 @@ def feasibility_bound(initial_distance: float, alpha: float, k: int) -> float:
 
     With H(x) = alpha/2 ||K x - f||^2 and D_k the distance at iterate k, optimality of x^{k+1} and convexity of H give
     D_{k+1} + D(x^{k+1}, x^k) + H(x^{k+1}) <= D_k + H(x~), and H(x~) = 0. H(x^k) does not rise, because x^{k+1} beats
-    x^k in its own subproblem. Summed over k steps: k H(x^k) <= D_0.
-
-    Raises
-    ------
-    SettingError
-        When D_0 is negative, alpha not positive or k below 1.
-
-    References
-    ----------
-    Osher, Burger, Goldfarb, Xu, Yin 2005, Propositions 3.1 to 3.3, where the penalty is H itself.
+    x^k in its own subproblem. Summed over k steps: k H(x^k) <= D_0. A SettingError when D_0 is negative, alpha not
+    positive or k below 1. Osher et al. 2005, Propositions 3.1 to 3.3, where the penalty is H itself.
     """
     if not (initial_distance >= 0 and alpha > 0 and k >= 1):
         raise SettingError(f"need D_0 >= 0, alpha > 0 and k >= 1, got {initial_distance}, {alpha} and {k}")

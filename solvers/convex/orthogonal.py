@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pgo_models.convex.convex_solver import COLD, ConvexSolver
 from pgo_models.convex.orthogonality import (
     KKTResiduals,
     OrthogonalPoint,
@@ -72,6 +73,8 @@ class OrthogonalSOC:
         projection: the largest eigenvalue of the multiplier Lambda. Near 1 the recursion may cycle.
     tolerance : float
         On the primal and the dual residual, both relative.
+    solver : ConvexSolver or str
+        Of step (a): Clarabel, cold, unless given.
     """
 
     penalty: float | None = None
@@ -79,6 +82,7 @@ class OrthogonalSOC:
     safeguard: float = 2.0
     tolerance: float = 1e-6
     max_iterations: int = 1000
+    solver: ConvexSolver | str = COLD
 
     def __post_init__(self) -> None:
         check_settings(self, finite=["penalty", "safeguard", "tolerance"], not_negative=["max_iterations"])
@@ -88,7 +92,7 @@ class OrthogonalSOC:
         """State 0: X = P = start, first columns of the identity unless given; a SettingError if it does not fit."""
         point = start if start is not None else problem.point([_identity(v.shape) for v in problem.variables])
         problem.check_point(point)
-        split = problem.split()
+        split = problem.split(self.solver)
         rho, others = self._first_penalty(split, point)
         return OrthogonalState(
             k=0,
@@ -250,12 +254,7 @@ def solve_orthogonal(
     verbose : bool
         Print every run's table.
 
-    Raises
-    ------
-    SettingError
-        When starts is below 1.
-    PGOError
-        When the convex subproblem has no solution.
+    A SettingError when starts is below 1, a PGOError when the convex subproblem has no solution.
 
     Examples
     --------
@@ -271,7 +270,7 @@ def solve_orthogonal(
     outcomes = [run(method, problem, problem.random_point(rng), verbose=verbose) for _ in range(starts)]
     best = min(outcomes, key=lambda outcome: (not outcome.status.is_success, outcome.objective))
     values = problem.values(best.state.copies)
-    kkt = kkt_residuals(problem, method.point(problem, best.state), best.state.rho)
+    kkt = kkt_residuals(problem, method.point(problem, best.state), best.state.rho, method.solver)
     problem.assign(values, best.state.others)
     return OrthogonalSolution(
         problem=problem,

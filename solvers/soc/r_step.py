@@ -17,6 +17,7 @@ from pgo_models.problem.matrices import entry_positions
 from solvers.soc.fista import minimize_with_fista
 
 if TYPE_CHECKING:
+    from pgo_models.convex.convex_solver import ConvexSolver
     from pgo_models.convex.rotation_subproblem import RotationQP
 
 _BOUND_SWEEPS = 10  # then at most 1.27 times the largest eigenvalue of H on the benchmark graphs
@@ -89,10 +90,22 @@ def prepare(subproblem: RSubproblem, back_end: BackEnd) -> RotationStep:
         return _Factorized(subproblem.analysis.factorize(subproblem.K), 0.5 * subproblem.penalty[:, None])
     if back_end is RStep.FISTA:
         return _Fista(subproblem)
-    from pgo_models.convex.rotation_subproblem import rotation_qp
+    return CvxpyStep().prepare(subproblem)
 
-    qp = rotation_qp(subproblem.A, subproblem.w, subproblem.penalty, subproblem.d)
-    return _Clarabel(qp, subproblem.num_translations if subproblem.needs_ground else 0)
+
+@dataclass(frozen=True)
+class CvxpyStep:
+    """`RStep.CLARABEL` by another solver of cvxpy that takes quadratic programs: a name, or a `ConvexSolver`."""
+
+    solver: "ConvexSolver | str" = "CLARABEL"
+
+    def prepare(self, subproblem: RSubproblem) -> RotationStep:
+        """Compile the cvxpy quadratic program."""
+        from pgo_models.convex.rotation_subproblem import rotation_qp
+
+        s = subproblem
+        qp = rotation_qp(s.A, s.w, s.penalty, s.d, solver=self.solver)
+        return _Cvxpy(qp, s.num_translations if s.needs_ground else 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +152,7 @@ class _Fista:
 
 
 @dataclass(frozen=True, eq=False)
-class _Clarabel:
+class _Cvxpy:
     qp: "RotationQP"
     grounded_rows: int
 

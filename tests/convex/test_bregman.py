@@ -8,16 +8,17 @@ import pytest
 from budget import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shared_rotations import shared_rotation_step
 from signals import sparse_signal
 
 import solvers
 from pgo_models.convex.bregman import BregmanPoint, BregmanProblem
 from pgo_models.convex.bregman_examples import (
     differences,
-    shared_rotation_step,
     total_variation_denoising,
     total_variation_scale_space,
 )
+from pgo_models.convex.prox import soft_threshold
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, random_rotations, stack_transposes
 from pgo_models.graphs.partitioning import partition
@@ -57,10 +58,6 @@ def split_lasso(seed: int) -> tuple[BregmanProblem, Array, Array]:
     return BregmanProblem(J, (u, v), np.hstack([np.eye(5), -np.eye(5)]), np.zeros(5)), A, c
 
 
-def soft(x: Array, threshold: float) -> Array:
-    return np.sign(x) * np.maximum(np.abs(x) - threshold, 0.0)
-
-
 @settings(max_examples=examples(8), deadline=None)
 @given(seed=SEEDS, alpha=ALPHAS)
 def test_three_forms_have_the_same_states(seed: int, alpha: float) -> None:
@@ -92,7 +89,7 @@ def test_one_pass_is_admm(seed: int, alpha: float) -> None:
     u, v, scaled = np.zeros(5), np.zeros(5), np.zeros(5)
     for state in states(AlternatingBregman(alpha=alpha), problem, 10)[1:]:
         u = np.linalg.solve(A.T @ A + alpha * np.eye(5), A.T @ c + alpha * (v - scaled))
-        v = soft(u + scaled, 0.5 / alpha)
+        v = soft_threshold(u + scaled, 0.5 / alpha)
         scaled = scaled + u - v
         np.testing.assert_allclose(state.x, np.r_[u, v], rtol=0, atol=EQUIVALENCE)
         np.testing.assert_allclose(state.lam, -alpha * scaled, rtol=0, atol=EQUIVALENCE)

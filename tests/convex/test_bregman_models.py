@@ -5,6 +5,7 @@ from budget import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
+from shared_rotations import shared_rotation_step
 
 from pgo_models.convex.bregman import (
     BregmanProblem,
@@ -16,11 +17,10 @@ from pgo_models.convex.bregman import (
 from pgo_models.convex.bregman_examples import (
     basis_pursuit,
     differences,
-    shared_rotation_step,
     total_variation_denoising,
     total_variation_scale_space,
 )
-from pgo_models.convex.clarabel import solve_compiled
+from pgo_models.convex.convex_solver import solve_compiled
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.rotations import random_rotations
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition

@@ -1,6 +1,8 @@
 """A changed subproblem leads SOC to a stationary point of the changed problem: checked without cvxpy, by scipy."""
 
+import json
 from collections.abc import Callable
+from pathlib import Path
 
 import cvxpy as cp
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from graphs import varied_problem
 from scipy.optimize import Bounds, minimize
 
+from pgo_models.certificates.certificate import Verdict
 from pgo_models.convex.graph_subproblem import Changer, ModelChange, PoseVariables
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.poses import Poses
@@ -15,9 +18,12 @@ from pgo_models.geometry.rotations import Array, exp_map, log_map
 from pgo_models.graphs.partitioning import partition
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from solvers.convex.extended_soc import ExtendedSOC, ExtendedStep
+from pgo_models.problem.weighting import Weighting
+from solvers.convex.extended_soc import ExtendedSOC, ExtendedStep, with_priors
 from solvers.loop import run
+from solvers.pipeline import Pipeline, solve
 from solvers.result import Run, Status
+from solvers.robust.gnc import GNC
 from solvers.soc.penalty import MultiplierPenalty
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
@@ -162,3 +168,143 @@ def test_contradicting_constraints_are_an_error() -> None:
 
     with pytest.raises(PGOError, match="infeasible"):
         run(ExtendedSOC(impossible, SETTINGS), problem())
+
+
+@pytest.mark.parametrize("norm", [cp.sum_squares, lambda x: cp.sum(cp.norm(x, 2, axis=1))], ids=["squares", "norms"])
+def test_the_default_start_is_moved_to_positions_in_a_frame_far_away(norm: Callable[..., cp.Expression]) -> None:
+    graph, Q = varied_problem(3, 12, 3).graph, exp_map(np.array([[0.3, 2.5, -1.0]]))[0]
+    where = np.array([0, 3, 5, 8, 11])
+    positions = chordal_start(PGOProblem(graph)).t[where] @ Q.T + 100.0
+    changer = lambda unknown: ModelChange(terms=[norm(unknown.t[where] - positions)])  # noqa: E731
+    outcome = run(ExtendedSOC(changer, SETTINGS), PGOProblem(graph))
+    assert outcome.status is Status.CONVERGED
+    best = solve(graph.with_position_prior(where, positions, 1.0))
+    limit = best.objective if norm is cp.sum_squares else outcome.history.objective[0]
+    assert outcome.history.objective[-1] <= limit * (1 + ACCURACY)
+    assert np.abs(outcome.poses.t[where] - positions).max() < 1.0
+
+
+def test_what_says_nothing_of_the_frame_leaves_the_start_where_it_is() -> None:
+    graph = problem().graph
+    edges = np.arange(3)
+    rows = lambda unknown: cp.sum(cp.norm(unknown.translation_residual[edges], 2, axis=1))  # noqa: E731
+    method = ExtendedSOC(lambda unknown: ModelChange(terms=[rows(unknown)], replaced_edges=edges), SETTINGS)
+    np.testing.assert_array_equal(method.init(problem(), None).omega, chordal_start(problem()).R)
+    assert graph.num_edges > 3
+
+
+@pytest.mark.parametrize("robots", [None, 2])
+def test_terms_that_are_priors_are_certified_as_the_graph_with_them_is(robots: int | None) -> None:
+    graph = varied_problem(3, 12, 3).graph
+    rng = np.random.default_rng(0)
+    start = chordal_start(PGOProblem(graph))
+    where, positions = np.array([1, 4, 9]), start.t[[1, 4, 9]] + 0.1 * rng.standard_normal((3, 3))
+
+    def change(unknown: PoseVariables) -> ModelChange:
+        at_two = 2.0 * cp.sum_squares(unknown.R[2] - start.R[2]) + 3.0 * cp.sum_squares(unknown.t(2) - 0.5)
+        return ModelChange(terms=[4.0 * cp.sum_squares(unknown.t[where] - positions), at_two])
+
+    solution = solve(graph, Pipeline(soc=ExtendedSOC(change)), robots=robots)
+    given = graph.with_position_prior(where, positions, 4.0)
+    given = given.with_prior(np.array([2]), Poses(start.R[2:3], np.full((1, 3), 0.5)), 2.0, 3.0)
+    expected = solve(given)
+    assert solution.is_certified
+    assert solution.frame == "that of the priors"
+    assert solution.objective == pytest.approx(expected.objective, rel=1e-9)
+    np.testing.assert_allclose(solution.poses.t, expected.poses.t, rtol=0, atol=1e-6)
+    model = ExtendedSOC(change).model(PGOProblem(graph))
+    assert model.cost(solution.poses[:12].stacked()) == pytest.approx(solution.objective, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "almost",
+    [
+        lambda u: cp.sum_squares(u.t(2) - u.t(3)),
+        lambda u: cp.sum_squares(u.R[2] - 2.0 * np.eye(2)),
+        lambda u: cp.sum_squares(u.t[2][0]),
+        lambda u: cp.sum_squares(u.t(2)) + 1.0,
+        lambda u: cp.sum_squares(u.t(2)) + cp.norm(u.t(3)),
+        lambda u: cp.sum(cp.huber(u.t(2), 0.1)),
+        lambda u: cp.sum_squares(u.R[2] @ np.array([1.0, 0.0])),
+    ],
+)
+def test_what_is_almost_a_prior_is_none(almost: Callable[[PoseVariables], cp.Expression]) -> None:
+    changer = lambda unknown: ModelChange(terms=[almost(unknown), cp.sum_squares(unknown.t[1:4] - np.eye(3, 2))])  # noqa: E731
+    model = ExtendedSOC(changer).model(problem())
+    graph, left = with_priors(model)
+    (term,) = left
+    assert term is model.change.terms[0]
+    assert graph.num_edges == problem().graph.num_edges + 3
+
+
+def test_the_bound_of_what_is_no_prior_is_below_all_poses_and_the_note_says_why(tmp_path: Path) -> None:
+    graph, positions = problem().graph, np.arange(6.0).reshape(3, 2) ** 2
+
+    def change(unknown: PoseVariables) -> ModelChange:
+        tied = [cp.sum_squares(unknown.t[:3] - positions), cp.norm(unknown.t(5) - 1.0)]
+        return ModelChange(terms=tied, constraints=[unknown.t(0) <= 0.5])
+
+    method = ExtendedSOC(change, SETTINGS)
+    solution = solve(graph, Pipeline(soc=method))
+    assert solution.status is Status.CONVERGED
+    assert solution.poses.num_poses == N
+    assert solution.objective == pytest.approx(method.model(problem()).cost(solution.poses.stacked()), rel=1e-12)
+    with_priors_alone = solve(graph.with_position_prior(np.arange(3), positions, 1.0))
+    assert solution.lower_bound == pytest.approx(with_priors_alone.lower_bound, rel=1e-9)
+    assert 0 < solution.lower_bound < solution.objective
+    assert solution.certificate.verdict is Verdict.NOT_CERTIFIED
+    assert solution.note.startswith("the bound leaves out terms other than tau ||t - p||^2")
+    assert solution.note.endswith("(1), constraints (1)")
+    assert solution.note in str(solution)
+    solution.save(tmp_path / "x.json")
+    assert json.loads((tmp_path / "x.json").read_text())["objective"] == solution.objective
+    solution.report(tmp_path / "x.html")
+    assert "ExtendedSOC" in (tmp_path / "x.html").read_text()
+
+
+def test_a_position_alone_costs_nothing_so_that_the_bound_without_it_is_tight() -> None:
+    tied = ExtendedSOC(lambda unknown: ModelChange(terms=[cp.sum_squares(unknown.t(2) - 3.0)]), SETTINGS)
+    solution = solve(problem(), Pipeline(soc=tied, gap=1e-4))
+    assert solution.is_certified
+    assert "(1)" in solution.note
+    np.testing.assert_allclose(solution.poses.t[2], 3.0, rtol=0, atol=1e-3)
+
+
+def test_replaced_edges_leave_no_bound_and_terms_that_may_be_negative_are_refused() -> None:
+    def absolute(unknown: PoseVariables) -> ModelChange:
+        return ModelChange(terms=[cp.sum(cp.abs(unknown.translation_residual[:2]))], replaced_edges=range(2))
+
+    solution = solve(problem(), Pipeline(soc=ExtendedSOC(absolute, SETTINGS)))
+    assert (solution.lower_bound, solution.certificate.verdict) == (0.0, Verdict.TRIVIAL)
+    assert "replaced edges (2)" in solution.note
+    linear = ExtendedSOC(lambda unknown: ModelChange(terms=[cp.sum(unknown.t(0))]))
+    with pytest.raises(SettingError, match="a term may be negative"):
+        solve(problem(), Pipeline(soc=linear))
+    for more in ({"robots": 2}, {"robust": GNC()}):
+        with pytest.raises(SettingError, match=r"go with priors alone, and there are terms other .* \(1\)"):
+            solve(problem(), Pipeline(soc=ExtendedSOC(absolute, SETTINGS)), **more)
+    information = PGOProblem(varied_problem(4, N, D).graph, weighting=Weighting.INFORMATION)
+    with pytest.raises(SettingError, match="terms are added to F"):
+        run(linear, information)
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (lambda u: cp.sum_squares(u.t(3)), r"returned a quad_over_lin; return ModelChange\(terms=\[\.\.\]\)"),
+        (lambda u: [cp.sum_squares(u.t(3))], r"returned a list; return ModelChange"),
+        (lambda u: ModelChange(terms=[u.t(3) - 1.0]), r"terms\[0\] has shape \(2,\); .* cp\.sum_squares"),
+        (
+            lambda u: ModelChange(terms=cp.sum_squares(u.t(3))),
+            r"terms is one quad_over_lin; give a list",
+        ),
+        (lambda u: ModelChange(constraints=u.t(3) >= 0), r"constraints is one Inequality; give a list"),
+        (lambda u: ModelChange(terms=[-cp.sum_squares(u.t(3))]), r"terms\[0\] is not convex: cvxpy finds it concave"),
+        (lambda u: ModelChange(constraints=[cp.norm(u.t(3)) >= 1]), r"constraints\[0\], .* is not convex"),
+        (lambda u: ModelChange(terms=[u.t(99)]), r"index 99 is out of bounds"),
+    ],
+)
+def test_what_a_changer_returns_wrongly_is_told_the_right_form(returned: Changer, message: str) -> None:
+    error = IndexError if "99" in message else SettingError
+    with pytest.raises(error, match=message):
+        run(ExtendedSOC(returned), problem())

@@ -155,7 +155,7 @@ def test_wrong_points_are_refused() -> None:
     problem = small()
     with pytest.raises(SettingError, match="2 values for 1 variables"):
         problem.point([np.eye(3, 2), np.eye(3, 2)])
-    with pytest.raises(SettingError, match=r"shape \(2, 3\)"):
+    with pytest.raises(SettingError, match=r"shapes \[\(2, 3\)\]; need \[\(3, 2\)\]"):
         problem.point([np.eye(2, 3)])
     with pytest.raises(SettingError, match="not finite"):
         problem.point([np.full((3, 2), np.nan)])

@@ -24,7 +24,7 @@ from pgo_models.certificates.lower_bound import prove_bound
 from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import SettingError
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.relaxations.solve_sdp import CLARABEL_TOLERANCE, solve_relaxation
+from pgo_models.relaxations.solve_sdp import TOLERANCE, solve_relaxation
 from solvers.loop import run
 from solvers.result import Status
 from solvers.riemannian.newton import Newton, gauss_newton
@@ -32,7 +32,7 @@ from solvers.riemannian.staircase import Staircase, StaircaseState
 from solvers.studies.tightness import SweptScene, noisy_scene
 
 # The solver's tolerance is on its own scale, of which the optimum of a relaxation is a small part.
-SDP_TOLERANCE = 1e4 * CLARABEL_TOLERANCE
+SDP_TOLERANCE = 1e4 * TOLERANCE
 
 
 def assert_bound_is_proven(problem: PGOProblem, state: StaircaseState) -> None:

@@ -1,0 +1,64 @@
+"""solve() of F with convex terms and constraints of one's own: priors are certified, what is left out is said."""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from pgo_models.certificates.certificate import relative_gap, verdict_of
+from pgo_models.certificates.lower_bound import NO_BOUND
+from pgo_models.errors import SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.problem.problem import PGOProblem
+from solvers.convex.extended_soc import with_priors
+from solvers.loop import Watch
+from solvers.result import Stage
+from solvers.solution import Solution
+
+
+def solve_extended(
+    problem: PGOProblem,
+    pipeline: Any,  # noqa: ANN401 - a Pipeline, whose file imports this one
+    start: Poses | None,
+    watch: Watch,
+    plain: Callable[..., Solution],
+) -> Solution:
+    """Solve with priors for the terms that are such by `plain`, and where there is more run the ExtendedSOC, too.
+
+    With priors alone the solution is that of the graph with them, whose last pose is the world. Else poses are of
+    ExtendedSOC, the objective has all terms, and the bound leaves out what its note says: terms that are never
+    negative (a SettingError where one might be) and constraints, which can only raise it. Replaced edges leave none.
+    """
+    model = pipeline.soc.model(problem)
+    graph, left = with_priors(model)
+    if not all(term.is_nonneg() for term in left):
+        raise SettingError("a term may be negative, so there is no bound; use solvers.run(ExtendedSOC(..), problem)")
+    first, start_of_it = replace(pipeline, soc=pipeline.soc.soc), None if start is None else graph.completed(start)
+    solution = plain(replace(problem, graph=graph), first, start_of_it, time_limit=watch.left)
+    parts = {
+        "terms other than tau ||t - p||^2 and kappa ||R - P||_F^2": len(left),
+        "constraints": len(model.change.constraints),
+        "replaced edges": len(model.change.replaced_edges),
+    }
+    left_out = [f"{name} ({count})" for name, count in parts.items() if count]
+    if not left_out:
+        return solution
+    if solution.robots is not None or solution.robust is not None:
+        raise SettingError(f"robots and robust go with priors alone, and there are {left_out[0]}; leave them out")
+    run, certificate = watch.run(pipeline.soc, problem, start), solution.certificate
+    objective, level = model.cost(run.poses.stacked()), certificate.rounding_level
+    bound = NO_BOUND if model.change.replaced_edges else certificate.bound
+    gap = relative_gap(objective, bound.value, level)
+    verdict = verdict_of(objective, level, gap, bound, certificate.wanted_gap)
+    return replace(
+        solution,
+        problem=problem,
+        poses=run.poses,
+        objective=objective,
+        certificate=replace(certificate, objective=objective, bound=bound, gap=gap, verdict=verdict),
+        status=run.status,
+        stages=(*solution.stages, replace(Stage.of(run), objective=objective)),
+        seconds=time.perf_counter() - watch.began,
+        note=f"the bound leaves out {', '.join(left_out)}",
+        frame="that of the added terms",
+    )

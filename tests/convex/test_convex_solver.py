@@ -1,0 +1,135 @@
+"""Any solver of cvxpy by name or with options, for every model; and what is said of models that are not convex."""
+
+import math
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from graphs import varied_problem
+
+from pgo_models.convex.bregman import BregmanProblem
+from pgo_models.convex.convex_solver import COLD, ConvexSolver, as_solver, check_convex, solve_compiled
+from pgo_models.convex.graph_subproblem import ModelChange, PoseVariables, graph_qp
+from pgo_models.convex.orthogonality import OrthogonalProblem
+from pgo_models.convex.orthogonality_examples import procrustes
+from pgo_models.errors import PGOError, SettingError
+from pgo_models.graphs.scenes import circle
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.relaxations.plan import RelaxationForm
+from pgo_models.relaxations.solve_sdp import solve_relaxation
+from solvers.convex.bregman import TwoLineBregman
+from solvers.convex.extended_soc import ExtendedSOC
+from solvers.convex.orthogonal import OrthogonalSOC, solve_orthogonal
+from solvers.loop import run
+from solvers.pipeline import solve
+from solvers.result import Status
+from solvers.soc.r_step import CvxpyStep
+from solvers.soc.soc import SOC
+
+FINE_SCS = ConvexSolver("SCS", {"eps_abs": 1e-10, "eps_rel": 1e-10, "max_iters": 100_000})
+SOLVERS = ["CLARABEL", "SCS", "OSQP", FINE_SCS]
+ROBUST_CVXOPT = ConvexSolver("CVXOPT", {"kktsolver": "robust"})  # the equations of the primal are not independent
+ROUGH = 1e-5  # what a tolerance of 1e-7 of a first-order method leaves
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=str)
+def test_the_r_step_of_soc_by_any_of_them(solver: ConvexSolver | str) -> None:
+    problem = varied_problem(4, 6, 2)
+    found = run(SOC(r_step=CvxpyStep(solver), tolerance=1e-4), problem)
+    assert found.status is Status.CONVERGED
+    assert found.objective == pytest.approx(run(SOC(tolerance=1e-4), problem).objective, rel=1e-3)
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=str)
+def test_a_program_with_terms_by_any_of_them(solver: ConvexSolver | str) -> None:
+    problem = varied_problem(4, 6, 2)
+
+    def change(unknown: PoseVariables) -> ModelChange:
+        return ModelChange(terms=[cp.sum_squares(unknown.t[:3] - 1.0)], constraints=[unknown.t[0] >= 0.5])
+
+    V = np.random.default_rng(0).standard_normal((problem.side, 2))
+    exact = graph_qp(problem.graph, np.ones(6), changer=change).solve(V)
+    found = graph_qp(problem.graph, np.ones(6), changer=change, solver=solver).solve(V)
+    np.testing.assert_allclose(found, exact, rtol=0, atol=100 * ROUGH)
+
+
+@pytest.mark.parametrize("solver", ["CLARABEL", "SCS", ROBUST_CVXOPT], ids=str)
+@pytest.mark.parametrize("form", RelaxationForm)
+def test_the_relaxation_by_any_of_them(solver: ConvexSolver | str, form: RelaxationForm) -> None:
+    problem = varied_problem(1, 8, 2)
+    solution = solve_relaxation(problem, form, solver)
+    assert solution.plan.solver == as_solver(solver)
+    assert as_solver(solver).name in solution.plan.reason
+    assert solution.lower_bound <= solve(problem).objective
+    assert solution.gap <= 1e-4
+
+
+def test_bregman_iterations_and_orthogonality_constraints_by_another() -> None:
+    x = cp.Variable(4, name="x")
+    K = np.random.default_rng(1).standard_normal((2, 4))
+    problem = BregmanProblem(cp.norm1(x), x, K, np.ones(2))
+    by_clarabel, by_scs = (
+        run(TwoLineBregman(alpha=5.0, solver=solver, tolerance=1e-5), problem) for solver in (COLD, FINE_SCS)
+    )
+    assert by_scs.status is by_clarabel.status is Status.CONVERGED
+    assert by_scs.objective == pytest.approx(by_clarabel.objective, rel=1e-4)
+    rng = np.random.default_rng(0)
+    model = procrustes(rng.standard_normal((5, 3)), rng.standard_normal((5, 3)))
+    soc = OrthogonalSOC(solver="OSQP", tolerance=1e-4)
+    found, exact = (solve_orthogonal(model, np.random.default_rng(0), s, 3) for s in (soc, OrthogonalSOC()))
+    assert found.status is Status.CONVERGED
+    assert found.objective == pytest.approx(exact.objective, rel=1e-3)
+
+
+def test_an_extended_model_by_another() -> None:
+    problem = varied_problem(4, 6, 2)
+
+    def change(unknown: PoseVariables) -> ModelChange:
+        return ModelChange(terms=[cp.sum_squares(unknown.t[[0, 3]])])
+
+    soc = SOC(tolerance=1e-4)
+    found, exact = (run(ExtendedSOC(change, soc, solver=solver), problem) for solver in ("SCS", "CLARABEL"))
+    assert found.status is exact.status is Status.CONVERGED
+    assert found.history.objective[-1] == pytest.approx(exact.history.objective[-1], rel=1e-2)
+
+
+def test_a_warm_start_saves_iterations_and_a_cold_one_gives_equal_bits() -> None:
+    x, c = cp.Variable(30), cp.Parameter(30)
+    rng = np.random.default_rng(0)
+    A = rng.standard_normal((40, 30))
+    problem = cp.Problem(cp.Minimize(cp.sum_squares(A @ x - 1.0) + cp.sum_squares(x - c) + cp.norm1(x)))
+
+    def iterations(warm_start: bool) -> tuple[int, bytes]:
+        c.value = np.ones(30)
+        solve_compiled(problem, "toy", solver=ConvexSolver("SCS", warm_start=warm_start))
+        return int(problem.solver_stats.num_iters), x.value.tobytes()
+
+    first = iterations(warm_start=False)
+    assert iterations(warm_start=False) == first
+    assert iterations(warm_start=True)[0] < first[0]
+
+
+def test_options_win_and_what_is_not_there_is_named() -> None:
+    x = cp.Variable(2)
+    quadratic = cp.Problem(cp.Minimize(cp.sum_squares(x - 1.0)))
+    with pytest.raises(PGOError, match="SCS ended with status optimal_inaccurate on the toy"):
+        solve_compiled(quadratic, "toy", solver=ConvexSolver("SCS", {"max_iters": 1}))
+    with pytest.raises(PGOError, match=r"OSQP ended with status solver_error on the toy: .*OSQP"):
+        solve_compiled(cp.Problem(cp.Minimize(cp.norm(x - 1.0))), "toy", solver="OSQP")
+    with pytest.raises(SettingError, match="solver 'SNOPT' is not installed; cvxpy finds CLARABEL, "):
+        as_solver("SNOPT")
+    with pytest.raises(SettingError, match="what CVXOPT calls it is not known"):
+        solve_relaxation(PGOProblem(circle(np.random.default_rng(0))), solver="CVXOPT", time_limit=10.0)
+    assert math.isfinite(solve_relaxation(varied_problem(1, 8, 2), solver="SCS", time_limit=10.0).value)
+
+
+def test_what_is_not_convex_is_told_how_to_be_written() -> None:
+    rng = np.random.default_rng(0)
+    Y, D, C = rng.standard_normal((6, 10)), cp.Variable((6, 2), name="D"), cp.Variable((2, 10), name="C")
+    with pytest.raises(SettingError, match=r"multiplies unknowns, D @ C; .*C = D\^T Y .*sparse_low_rank") as caught:
+        OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(Y - D @ C))), orthogonal=[D], sparse=[(C, 5)])
+    assert "\n" not in str(caught.value)
+    with pytest.raises(SettingError, match=r"multiplies unknowns, D @ D\.T"):
+        check_convex(cp.sum_squares(Y - D @ D.T @ Y), "J")
+    with pytest.raises(SettingError, match=r"J is not convex: .* disciplined convex programming"):
+        check_convex(-cp.sum_squares(D), "J")
