@@ -47,13 +47,13 @@ class SubstructuredSOC:
     def step(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
         """One round: (a) by elimination; and one all-reduce: (b), (c)."""
         state = self._with_penalty_due(driver, state)
-        space, rows, block = driver.interface(1, driver.d), driver.rotation_rows, _block(driver)
+        rows, block = driver.rotation_rows, _block(driver)
         assert driver.step_a is not None
-        b = space.gather([part.b for part in driver.right])
-        b[rows] += (0.5 * block.penalty)[:, None] * block.shift
-        x = driver.step_a.solve(b)
+        b = np.zeros((driver.interface(1, driver.d).side, driver.d))
+        b[rows] = (0.5 * block.penalty)[:, None] * block.shift
+        x, parts, _ = driver.step_a.solve([part.b for part in driver.right], b)
         block, own = block.after_solve(x[rows])  # (a)
-        sums = own + np.sum(driver.ask_each(Interior.solve, space.scatter(x)), axis=0)
+        sums = own + np.sum(driver.ask_each(Interior.solve, parts, is_along=True), axis=0)
         merit = math.sqrt(sums[0])
         if not math.isfinite(merit):
             return state.broken()

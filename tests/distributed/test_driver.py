@@ -182,7 +182,7 @@ def test_what_crosses_has_the_size_of_the_separators(d: int, noise: NoiseModel) 
             "force": {((d + 1) * g, d)},
             "norms": {(inside,)},
             "scale": {(inside,)},
-            "fixed": {((d + 1) * g,)},
+            **{name: {((d + 1) * g,)} for name in ("fixed", "sizes")},
             **{name: {((d + 1) * g, d)} for name in ("point", "product", "error")},
             "gamma": {(k,) for k in range(memory + 1)},
             "sums": {(k,) for k in range(2 * memory + 2)},

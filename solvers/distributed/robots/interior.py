@@ -30,7 +30,8 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed.robots.factors import Eliminated, Factors, Widths
+from solvers.distributed.robots.elimination import Widths
+from solvers.distributed.robots.factors import Eliminated, Factors
 from solvers.distributed.robots.proof import RobotProof
 from solvers.distributed.robots.records import (
     Agreed,
@@ -256,9 +257,10 @@ class Interior:
         found = self.factors.of(self.state.eliminated)
         return self, Reduced(found.schur, found.diagonal, RightHandSide(*found.reduce(self.state.b)))
 
-    def eliminated_translations(self, _: None) -> tuple[Interior, Array | None]:
+    def eliminated_translations(self, _: None) -> tuple[Interior, ReducedTranslations]:
         """Matrix of the translations once more, if there has been one."""
-        return self, self.factors.laplacian.schur if self.state.has_laplacian else None
+        schur = self.factors.laplacian.schur if self.state.has_laplacian else None
+        return self, ReducedTranslations(np.zeros((0, self.part.problem.d)), schur)
 
     # What the orders share.
 

@@ -6,6 +6,8 @@ from pgo_models.geometry.rotations import Array
 from solvers.distributed.robots.proof import ProofSums
 from solvers.soc.copies import OwnPoses
 
+ALONG_TREE = ("b", "schur", "x")  # fields of what goes between a robot and the front above it
+
 
 @dataclass(frozen=True, eq=False)
 class RightHandSide:
@@ -119,6 +121,7 @@ class ProofOrder:
     eta: float
     share: float  # at least so much of the diagonal is subtracted
     fixed: Array  # ((d+1) g,): 1 for rows on the boundary that are left out
+    diagonal: Array  # ((d+1) g,): of S there, summed over robots, or more
     point: Array | None  # ((d+1) g, d): X there, where a proof begins
 
 
@@ -135,6 +138,7 @@ class ProofAnswer:
     """S with the interior eliminated, None where it is not definite; part of tr(Lambda); the first step of a proof."""
 
     schur: Array | None
+    sizes: Array | None  # ((d+1) g,): `row_sums` of it
     trace: float
     step: ProofStep | None
 
