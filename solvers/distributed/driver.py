@@ -91,7 +91,7 @@ class Driver:
         With no `memory` it stands for the network alone: it hands on what robots send each other, and sums. A
         SettingError when the separators would take more than `memory` bytes.
         """
-        working = [(subgraph.robot, part) for subgraph in subgraphs if (part := subgraph.part) is not None]
+        working = [(subgraph, subgraph.counted[0]) for subgraph in subgraphs if subgraph.is_counted.any()]
         self.num_poses, self.d = num_poses, subgraphs[0].graph.d
         self.grounded = grounded  # which of the cover is left out when a bound is proved
         cover = np.concatenate([subgraph.poses[subgraph.in_cover >= 0] for subgraph in subgraphs])
@@ -100,15 +100,16 @@ class Driver:
         self.cover[place] = cover
         g, d = len(self.cover), self.d
         self.tangent = (d, tangent_dimension(d))
-        touched = tuple(part.in_cover[part.boundary] for _, part in working)
+        in_cover = [subgraph.in_cover[part] for subgraph, part in working]
+        touched = tuple(np.sort(place[place >= 0]) for place in in_cover)
         kinds: tuple[tuple[int, ...], ...] = ((1,), (1, d), self.tangent)
         fronts = FrontOwners(touched if memory else (), g)
         self._interfaces = {widths: Interface(g, widths, touched, fronts) for widths in kinds}
         if memory:
             self._interfaces[self.tangent].check_memory(memory)
         self._held_cover = [subgraph.in_cover[subgraph.in_cover >= 0] for subgraph in subgraphs]
-        self._parts = [part.poses for _, part in working]
-        self.robots = np.array([robot for robot, _ in working])
+        self._parts = [subgraph.poses[part] for subgraph, part in working]
+        self.robots = np.array([subgraph.robot for subgraph, _ in working])
         R = np.broadcast_to(np.eye(d), (g, d, d)).copy()
         self.at = self.kept = CoverPoses(R, np.zeros((g, d)), np.zeros(((d + 1) * g, d)))
         self.block: RecursionBlock | None = None  # rotations of the cover in SOC's recursion

@@ -1,6 +1,5 @@
 """Orders to workers: functions of a worker and a request. Requests and answers are numbers, arrays and records."""
 
-import dataclasses
 import enum
 from collections.abc import Collection, Mapping
 from typing import Any, Protocol
@@ -46,9 +45,8 @@ def count_numbers(record: object, elsewhere: Collection[str] = ()) -> int:
         return record.size
     if record is None or isinstance(record, Mapping):
         return 0
-    if dataclasses.is_dataclass(record):
-        names = [field.name for field in dataclasses.fields(record) if field.name not in elsewhere]
-        return sum(count_numbers(getattr(record, name), elsewhere) for name in names)
+    if (names := getattr(type(record), "__dataclass_fields__", None)) is not None:
+        return sum(count_numbers(getattr(record, name), elsewhere) for name in names if name not in elsewhere)
     if isinstance(record, tuple):
         return sum(count_numbers(item, elsewhere) for item in record)
     return int(np.size(record))  # type: ignore[arg-type] # a number or an array
