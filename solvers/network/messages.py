@@ -39,14 +39,15 @@ class Idle(enum.Enum):
 def count_numbers(record: object, elsewhere: Collection[str] = ()) -> int:
     """Numbers in a request or an answer; a mapping is between workers, and counted where it is handed on.
 
-    So are fields with names in `elsewhere`.
+    So are fields with names in `elsewhere`; those whose names begin with `measured` are off the ledger.
     """
     if isinstance(record, np.ndarray):
         return record.size
     if record is None or isinstance(record, Mapping):
         return 0
     if (names := getattr(type(record), "__dataclass_fields__", None)) is not None:
-        return sum(count_numbers(getattr(record, name), elsewhere) for name in names if name not in elsewhere)
+        counted = [name for name in names if name not in elsewhere and not name.startswith("measured")]
+        return sum(count_numbers(getattr(record, name), elsewhere) for name in counted)
     if isinstance(record, tuple):
         return sum(count_numbers(item, elsewhere) for item in record)
     return int(np.size(record))  # type: ignore[arg-type] # a number or an array

@@ -34,6 +34,7 @@ from solvers.distributed.robots.elimination import Widths
 from solvers.distributed.robots.factors import Eliminated, Factors
 from solvers.distributed.robots.proof import RobotProof
 from solvers.distributed.robots.records import (
+    Agree,
     Agreed,
     CostParts,
     InteriorPoses,
@@ -47,7 +48,7 @@ from solvers.distributed.robots.records import (
 )
 from solvers.soc.copies import Norms
 from solvers.soc.penalty import PenaltyOrder
-from solvers.soc.recursion_block import Agreement, RecursionBlock
+from solvers.soc.recursion_block import RecursionBlock
 from solvers.soc.subgraph import Part, Subgraph
 
 
@@ -166,11 +167,11 @@ class Interior:
         block, sums = self.block.after_solve(X[self._interior_rows])
         return self.with_changes(x=X, block=block), sums
 
-    def agree(self, agreement: Agreement) -> tuple[Interior, Agreed]:
-        """Steps (b) and (c): sums of the residuals, and the right-hand side of the next step (a)."""
-        block, sums = self.block.extrapolated(agreement).projected()
+    def agree(self, order: Agree) -> tuple[Interior, Agreed]:
+        """Steps (b) and (c): sums of the residuals, and the right-hand side of the next step (a); with it `cost`."""
+        block, sums = self.block.extrapolated(order.agreement).projected()
         following, right = self.with_changes(block=block).reduced(self._pull(block))
-        return following, Agreed(sums, right)
+        return following, Agreed(sums, right, following.cost(order.measured_at)[1])
 
     def cost(self, z: Array) -> tuple[Interior, float]:
         """Part of F at omega, from its rows on the boundary, and the translations of step (a)."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pgo_models.geometry.rotations import Array
 from solvers.distributed.robots.proof import ProofSums
 from solvers.soc.copies import OwnPoses
+from solvers.soc.recursion_block import Agreement
 
 ALONG_TREE = ("b", "schur", "x")  # fields of what goes between a robot and the front above it
 
@@ -91,11 +92,20 @@ class RescaleInterior:
 
 
 @dataclass(frozen=True, eq=False)
+class Agree:
+    """What all parties learn from step (a), and the rows of the next omega on the boundary, (dg, d)."""
+
+    agreement: Agreement
+    measured_at: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Agreed:
-    """Squared residuals, (2,), and the right-hand side of the next step (a)."""
+    """Squared residuals, (2,), the right-hand side of the next step (a), and part of F at omega."""
 
     sums: Array
     right: RightHandSide
+    measured: float
 
 
 @dataclass(frozen=True)
