@@ -35,8 +35,8 @@ class Traffic:
 class Ledger:
     """Account of a distributed run.
 
-    A round is one exchange that robots wait for: between neighbours, or to the driver and back. An all-reduce, by which
-    all robots come to know a sum of a few numbers, is counted apart.
+    A round is one exchange that robots wait for: between neighbours, or to the driver and back, level by level where
+    there is a tree of robots. An all-reduce, by which all come to know a sum of a few numbers, is counted apart.
 
     Attributes
     ----------
