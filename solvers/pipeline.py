@@ -81,7 +81,7 @@ class Pipeline:
         What goes wrong between robots in a CONSENSUS stage, which then does not wait:
         `solvers.distributed.asynchronous`. Only with `solve(.., robots=..)`.
     driver_memory : float
-        Bytes that the driver of a solve by robots may take; it is refused before they are spent. 0 is no driver:
+        Bytes that driver and fronts of a solve by robots may take; it is refused before they are spent. 0: no driver,
         CONSENSUS alone, see `solvers.distributed.leaderless`, with poses and no certificate.
     """
 

@@ -12,14 +12,17 @@ from hypothesis import strategies as st
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, random_rotations
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.scenes import observe
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import Driver
+from solvers.distributed.interface import Interface
+from solvers.distributed.multifrontal import FrontOwners
 from solvers.distributed.robots.agent import Agent
 from solvers.distributed.stages import open_driver
 from solvers.network.engine import Engine, InProcess, WorkerPool
+from solvers.network.messages import Idle
 from solvers.soc.subgraph import Subgraph
 
 Partitioner = Callable[[PoseGraph, int], Partition]
@@ -105,6 +108,12 @@ def spoil(agent: Agent, factor: float) -> None:
     agent.copies = replace(agent.copies, state=state)
 
 
+def interface_of(touched: tuple[IntArray, ...], num_separators: int, widths: tuple[int, ...]) -> Interface:
+    """Interface of robots that touch these separators, all fronts with the driver."""
+    fronts = FrontOwners(touched, num_separators)
+    return Interface(num_separators, widths, touched, fronts)
+
+
 def name_of(order: object) -> str:
     """Class and method of an order, or the function that it is."""
     inner = order.args[0] if isinstance(order, partial) else order
@@ -122,7 +131,7 @@ def arrays_in(record: object, name: str = "value") -> Iterator[tuple[str, Array]
     elif isinstance(record, tuple):
         for value in record:
             yield from arrays_in(value, name)
-    elif record is not None:
+    elif record is not None and record is not Idle.IDLE:
         yield name, np.asarray(record)
 
 
@@ -141,7 +150,8 @@ class Recording:
         return self
 
     def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
-        answers = [order(agent, request) for agent, request in zip(self.agents, requests, strict=True)]
+        pairs = zip(self.agents, requests, strict=True)
+        answers = [None if request is Idle.IDLE else order(agent, request) for agent, request in pairs]
         self.log.append((name_of(order), list(requests), answers))
         return answers
 

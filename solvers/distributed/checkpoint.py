@@ -44,7 +44,7 @@ from solvers.soc.soc import SOC
 
 S = TypeVar("S")
 Attempt = tuple[Poses, Certificate]
-_FORMAT = b"pgo-splitting checkpoint 3\n"  # first line of a file; the second is the SHA-256 of all that follows
+_FORMAT = b"pgo-splitting checkpoint 4\n"  # first line of a file; the second is the SHA-256 of all that follows
 _DIGEST_SIZE = 65
 _LOG = logging.getLogger(__name__)
 _PARTS = ("graph", "partition", "settings")

@@ -2,7 +2,8 @@
 
 It holds the poses G of a vertex cover of the edges between robots, and never an interior pose or a private edge. One
 gather of the robots' reduced right-hand sides, one solve and one scatter are a round; a solve of M x = b, a step (a), a
-Newton direction, the best translations of given rotations and a proof of the certificate take one each.
+Newton direction, the best translations of given rotations and a proof of the certificate take one each. Where robots
+hold fronts of the separator tree gather and scatter go along it, level by level (`Ledger.bytes_by_level`).
 """
 
 import math
@@ -25,8 +26,8 @@ from pgo_models.geometry.rotations import (
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.matrices import columns_of
-from solvers.distributed.interface import Interface, InterfaceFactor
-from solvers.distributed.multifrontal import separator_tree
+from solvers.distributed.interface import Interface
+from solvers.distributed.multifrontal import FrontOwners
 from solvers.distributed.robots.agent import Agent, order_interior
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import CostParts, ReducedTranslations, Reweigh, RightHandSide
@@ -90,7 +91,7 @@ class Driver:
         With no `memory` it stands for the network alone: it hands on what robots send each other, and sums. A
         SettingError when the separators would take more than `memory` bytes.
         """
-        working = [(subgraph.robot, part) for subgraph in subgraphs if (part := subgraph.part) is not None]
+        working = [(subgraph, subgraph.counted[0]) for subgraph in subgraphs if subgraph.is_counted.any()]
         self.num_poses, self.d = num_poses, subgraphs[0].graph.d
         self.grounded = grounded  # which of the cover is left out when a bound is proved
         cover = np.concatenate([subgraph.poses[subgraph.in_cover >= 0] for subgraph in subgraphs])
@@ -99,24 +100,26 @@ class Driver:
         self.cover[place] = cover
         g, d = len(self.cover), self.d
         self.tangent = (d, tangent_dimension(d))
-        touched = tuple(part.in_cover[part.boundary] for _, part in working)
-        tree = separator_tree(touched, g) if memory else ()
+        in_cover = [subgraph.in_cover[part] for subgraph, part in working]
+        touched = tuple(np.sort(place[place >= 0]) for place in in_cover)
         kinds: tuple[tuple[int, ...], ...] = ((1,), (1, d), self.tangent)
-        self._interfaces = {widths: Interface(g, widths, touched, tree) for widths in kinds}
+        fronts = FrontOwners(touched if memory else (), g)
+        self._interfaces = {widths: Interface(g, widths, touched, fronts) for widths in kinds}
         if memory:
             self._interfaces[self.tangent].check_memory(memory)
         self._held_cover = [subgraph.in_cover[subgraph.in_cover >= 0] for subgraph in subgraphs]
-        self._parts = [part.poses for _, part in working]
-        self.robots = np.array([robot for robot, _ in working])
+        self._parts = [subgraph.poses[part] for subgraph, part in working]
+        self.robots = np.array([subgraph.robot for subgraph, _ in working])
         R = np.broadcast_to(np.eye(d), (g, d, d)).copy()
         self.at = self.kept = CoverPoses(R, np.zeros((g, d)), np.zeros(((d + 1) * g, d)))
         self.block: RecursionBlock | None = None  # rotations of the cover in SOC's recursion
-        self.step_a: InterfaceFactor | None = None  # of its step (a)
+        self.step_a: Interface | None = None  # of its step (a)
         self.right: list[RightHandSide] = []  # the robots', for the next step (a)
         self._has_two_costs = any(subgraph.final is not None for subgraph in subgraphs)
         self.is_final = False  # whether the cost at hand is the one that is solved, not the one that SOC is run on
-        self._laplacian: InterfaceFactor | None = None
+        self._laplacian: Interface | None = None
         self.network = CountedPool(engine.open(partial(Agent, backend=backend), subgraphs), len(subgraphs))
+        fronts.hand_out(self.network, self.robots)
         self.describe(Count.OFF)
 
     def ask(
@@ -126,13 +129,17 @@ class Driver:
         return self.ask_each(order, [request] * len(self.robots), count)
 
     def ask_each(
-        self, order: Callable[[Interior, Q], tuple[Interior, A]], requests: Sequence[Q], count: Count = Count.ROUND
+        self,
+        order: Callable[[Interior, Q], tuple[Interior, A]],
+        requests: Sequence[Q],
+        count: Count = Count.ROUND,
+        is_along: bool = False,
     ) -> list[A]:
-        """Answers of all interiors to an order, each with its request."""
+        """Answers of all interiors to an order, each with its request, of a solve along the tree or of the driver."""
         to_all: list[Q | None] = [None] * self.network.ledger.num_robots
         for robot, request in zip(self.robots.tolist(), requests, strict=True):
             to_all[robot] = request
-        answers = self.network.ask(partial(order_interior, order), to_all, count, self.robots)
+        answers = self.network.ask(partial(order_interior, order), to_all, count, self.robots, is_along)
         return [cast(A, answers[robot]) for robot in self.robots.tolist()]
 
     def describe(self, count: Count) -> None:
@@ -205,9 +212,9 @@ class Driver:
         self.network.ask(restore, snapshots, Count.OFF)
         self.at, self.kept, self.block, self.network.ledger = state.at, state.kept, state.block, state.ledger
         self.is_final = state.is_final
-        matrices = self.ask(Interior.eliminated_translations, None, Count.PIGGYBACKED)
-        known = [matrix for matrix in matrices if matrix is not None]
-        if known and len(known) == len(matrices):
+        answers = self.ask(Interior.eliminated_translations, None, Count.PIGGYBACKED)
+        known = [answer.schur for answer in answers if answer.schur is not None]
+        if known and len(known) == len(answers):
             self._laplacian = self.interface(1).factorize(known, self.grounded_translation())
 
     # The start.
@@ -215,11 +222,10 @@ class Driver:
     def start(self) -> None:
         """Chordal relaxation: one round, and one for the best translations."""
         answers = self.ask(Interior.chordal, None, Count.PIGGYBACKED)
-        space = self.interface(1, self.d)
-        factor = space.factorize([answer.schur for answer in answers])
-        x = factor.solve(space.gather([answer.right.b for answer in answers]))
+        factor = self.interface(1, self.d).factorize([answer.schur for answer in answers])
+        x, parts, _ = factor.solve([answer.right.b for answer in answers])
         self.at = replace(self.at, R=project_to_rotations(unstack_transposes(x[self.rotation_rows])))
-        self.set_translations(self.ask_each(Interior.project, space.scatter(x)))
+        self.set_translations(self.ask_each(Interior.project, parts, is_along=True))
 
     def set_poses(self, poses: Poses) -> None:
         """Take all poses from elsewhere, as they are; F and the forces there are the gather of the next round.
@@ -260,16 +266,15 @@ class Driver:
     def set_translations(self, answers: Sequence[ReducedTranslations]) -> None:
         """Best translations for the rotations at hand, from the robots' right-hand sides: one round."""
         t, parts = self.best_translations(answers)
-        self.at = self.with_sums(replace(self.at, t=t), self.ask_each(Interior.set_translations, parts))
+        found = self.ask_each(Interior.set_translations, parts, is_along=True)
+        self.at = self.with_sums(replace(self.at, t=t), found)
 
     def best_translations(self, answers: Sequence[ReducedTranslations]) -> tuple[Array, list[Array]]:
         """Translations of the cover, and what every robot is sent of them."""
-        line = self.interface(1)
         if self._laplacian is None:
             matrices = [answer.schur for answer in answers if answer.schur is not None]
-            self._laplacian = line.factorize(matrices, self.grounded_translation())
-        t = self._laplacian.solve(line.gather([answer.b for answer in answers]))
-        return t, line.scatter(t)
+            self._laplacian = self.interface(1).factorize(matrices, self.grounded_translation())
+        return self._laplacian.solve([answer.b for answer in answers])[:2]
 
     def with_sums(self, poses: CoverPoses, answers: Sequence[CostParts]) -> CoverPoses:
         """Poses of the cover with F, its rounding level, and the rows of M X there."""

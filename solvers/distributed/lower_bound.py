@@ -32,7 +32,7 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, gamma
 from pgo_models.problem.matrices import columns_of
 from solvers.distributed.driver import Driver
-from solvers.distributed.interface import InterfaceFactor
+from solvers.distributed.interface import Interface
 from solvers.distributed.robots.proof_orders import move_proof, prove_interior
 from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep
 from solvers.network.counted_pool import Count
@@ -42,7 +42,7 @@ from solvers.network.counted_pool import Count
 class InterfaceProof:
     """S on the separators: its factor, what it is at least, the robots' answers, and parts of tr(Lambda)."""
 
-    factor: InterfaceFactor
+    factor: Interface
     slack: Array
     answers: list[ProofAnswer]
     Lambda: Array
@@ -92,18 +92,17 @@ def prove_grounded(driver: Driver, eta: float) -> LowerBound | None:
         proof = _eliminate(driver, fixed, eta, share, X)
         share *= SHRINK
     start = X
-    space, free = driver.interface(1, d), np.ones(len(X), dtype=bool)
+    free = np.ones(len(X), dtype=bool)
     free[fixed] = False
     steps = [answer.step for answer in proof.answers if answer.step is not None]
     at = _sum_up(driver, proof, X, steps, free)
     for _ in range(MOST_MOVES):
         if at.left <= SETTLED * abs(at.value):
             break
-        b = space.gather([one.right.b for one in at.steps]) + at.own
-        b[fixed] = 0.0
-        step = proof.factor.solve(b)
-        step[fixed] = 0.0
-        steps = driver.ask_each(move_proof, space.scatter(step))
+        own = at.own.copy()
+        own[fixed] = 0.0  # as it is of the robots
+        step, parts, _ = proof.factor.solve([one.right.b for one in at.steps], own)
+        steps = driver.ask_each(move_proof, parts, is_along=True)
         X = X.copy()
         X[g:] -= step[g:]  # the translations matter in the residuals alone, which the robots have
         moved = _sum_up(driver, proof, X, steps, free)
@@ -164,22 +163,23 @@ def _eliminate(
     g, d = len(driver.cover), driver.d
     space, marked = driver.interface(1, d), np.zeros((d + 1) * g)
     marked[fixed] = 1.0
-    points: Sequence[Array | None] = space.scatter(X) if X is not None else [None] * len(driver.robots)
-    orders = [ProofOrder(eta, share, part, at) for part, at in zip(space.scatter(marked), points, strict=True)]
-    answers = driver.ask_each(prove_interior, orders)
     Lambda = driver.at.multipliers
-    traces = [*np.einsum("naa->na", Lambda).ravel().tolist(), *(answer.trace for answer in answers)]
-    contributions = [answer.schur for answer in answers if answer.schur is not None]
-    if len(contributions) < len(answers):
-        return None
     added = eta * np.eye(d) - Lambda
     columns = driver.rotation_rows.reshape(g, d)
     diagonal = driver.diagonal.copy()
     diagonal[columns] += np.maximum(np.einsum("naa->na", added), 0.0)
+    points: Sequence[Array | None] = space.scatter(X) if X is not None else [None] * len(driver.robots)
+    known = zip(space.scatter(marked), space.scatter(diagonal), points, strict=True)
+    answers = driver.ask_each(prove_interior, [ProofOrder(eta, share, *one) for one in known])
+    traces = [*np.einsum("naa->na", Lambda).ravel().tolist(), *(answer.trace for answer in answers)]
+    contributions = [answer.schur for answer in answers if answer.schur is not None]
+    sizes = [answer.sizes for answer in answers if answer.sizes is not None]
+    if len(contributions) < len(answers):
+        return None
     is_fixed = np.zeros(len(diagonal), dtype=bool)
     is_fixed[fixed] = True
     added[is_fixed[columns].any(axis=1)] = 0.0
-    lost = space.rounding(contributions, [(columns, added)], diagonal) + 8.0 * UNIT_ROUNDOFF * diagonal
+    lost = space.rounding(sizes, [(columns, added)], diagonal) + 8.0 * UNIT_ROUNDOFF * diagonal
     shift = np.maximum(share * diagonal, MARGIN * lost)
     shifted = np.where(is_fixed, diagonal, -shift)
     own = [(columns, added), (np.arange(len(diagonal))[:, None], shifted[:, None, None])]

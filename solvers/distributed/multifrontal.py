@@ -1,45 +1,59 @@
 """The driver's matrix, eliminated in a tree of groups of robots: dense fronts, the multifrontal method (Liu 1992).
 
 Recursive bisection of the robot adjacency graph, by how many separators robots share. A separator pose is eliminated at
-the smallest group that holds every robot which touches it: no dense matrix over all separators is formed.
+the smallest group that holds every robot which touches it: no dense matrix over all separators is formed. The driver
+holds the front of all robots, the root; those below are held by robots where there are many
+large ones.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
+from typing import Any, TypeVar
 
 import numpy as np
-from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from scipy.sparse import csr_array
 
-from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
+from solvers.distributed.robots.agent import order_front, take_front
+from solvers.distributed.robots.elimination import FrontParts, HeldFront
+from solvers.distributed.robots.records import ALONG_TREE
+from solvers.network.counted_pool import Count, CountedPool
+from solvers.network.ledger import DRIVER
+from solvers.network.messages import Idle
 
+Q = TypeVar("Q")
+A = TypeVar("A")
+LEAST = 200  # separators of a front that is worth messages of its own
+FEW = 8  # fewer such fronts are held by the driver
 _SPECTRAL = 300  # robots; more are halved in their order
-_AT_WORK = 4.25  # times a front: itself, and copies of what is added to it or split off from it
 
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """One group of robots."""
+    """One group of robots, of at least two unless there is but one."""
 
-    robots: tuple[int, ...]  # whose contributions are added here: one robot at a leaf, none above
+    robots: tuple[int, ...]  # whose contributions are added here
     children: tuple[int, ...]  # earlier fronts, whose Schur complements are added here
     # eliminated, boundary: (e,), (b,); separators that only this group touches and that no child has eliminated; those
     # left to groups above.
     eliminated: IntArray
     boundary: IntArray
+    level: int  # one above its highest child's; 1 where there is none
 
     @property
-    def poses(self) -> IntArray:
+    def separators(self) -> IntArray:
         """Rows of the front: eliminated, then boundary."""
         return np.concatenate([self.eliminated, self.boundary])
 
 
-def separator_tree(touched: Sequence[IntArray], num_separators: int) -> tuple[Front, ...]:
-    """Fronts in an order in which children come first; the last one holds all robots.
+def separator_tree(touched: Sequence[IntArray], num_separators: int, least: int = 0) -> tuple[Front, ...]:
+    """Fronts in order of their levels, so that children come first; the last one holds all robots.
 
-    `touched` are the separators, 0 .. num_separators - 1, that every robot touches, (g_a,) each.
+    `touched` are the separators, 0 .. num_separators - 1, that every robot touches, (g_a,) each. What would be a front
+    of fewer than `least` separators is left to the next one above.
     """
     robot = np.repeat(np.arange(len(touched)), [len(poses) for poses in touched])
     pose = np.concatenate([*touched, np.zeros(0, dtype=np.int64)])
@@ -48,23 +62,31 @@ def separator_tree(touched: Sequence[IntArray], num_separators: int) -> tuple[Fr
     left_to_touch = np.bincount(pose, minlength=num_separators)
     fronts: list[Front] = []
 
-    def grow(group: IntArray) -> tuple[int, IntArray, IntArray]:
-        """Front of a group: its number, the separators it leaves, and how many of the group touch each."""
+    def combined(robots: tuple[int, ...], children: tuple[int, ...], inside: IntArray, left: IntArray) -> None:
+        level = 1 + max((fronts[child].level for child in children), default=0)
+        fronts.append(Front(robots, children, inside, left, level))
+
+    def grow(group: IntArray) -> tuple[tuple[int, ...], tuple[int, ...], IntArray, IntArray]:
+        """Robots and fronts of a group that the one above adds, the separators they leave, and how many touch each."""
         if len(group) == 1:
-            poses, counts = touched[group[0]], np.ones(len(touched[group[0]]), dtype=np.int64)
-            members, children = [int(group[0])], []
-        else:
-            grown = [grow(half) for half in _halves(group, shared)]
-            members, children = [], [number for number, _, _ in grown]
-            poses, place = np.unique(np.concatenate([left for _, left, _ in grown]), return_inverse=True)
-            counts = np.bincount(place, weights=np.concatenate([count for _, _, count in grown])).astype(np.int64)
+            return (int(group[0]),), (), touched[group[0]], np.ones(len(touched[group[0]]), dtype=np.int64)
+        one, other = (grow(half) for half in _halves(group, shared))
+        robots, children = one[0] + other[0], one[1] + other[1]
+        poses, place = np.unique(np.concatenate([one[2], other[2]]), return_inverse=True)
+        counts = np.bincount(place, weights=np.concatenate([one[3], other[3]])).astype(np.int64)
         is_inside = counts == left_to_touch[poses]
-        fronts.append(Front(tuple(members), tuple(children), poses[is_inside], poses[~is_inside]))
-        return len(fronts) - 1, poses[~is_inside], counts[~is_inside]
+        if not is_inside.any() or len(poses) < least:
+            return robots, children, poses, counts
+        combined(robots, children, poses[is_inside], poses[~is_inside])
+        return (), (len(fronts) - 1,), poses[~is_inside], counts[~is_inside]
 
     if touched:
-        grow(np.arange(len(touched)))
-    return tuple(fronts)
+        robots, children, left, _ = grow(np.arange(len(touched)))
+        if robots or len(children) > 1:
+            combined(robots, children, left, left[:0])
+    order = sorted(range(len(fronts)), key=lambda number: fronts[number].level)
+    after = np.argsort(order).tolist()
+    return tuple(replace(fronts[k], children=tuple(after[child] for child in fronts[k].children)) for k in order)
 
 
 def _halves(group: IntArray, shared: Array) -> tuple[IntArray, IntArray]:
@@ -79,95 +101,68 @@ def _halves(group: IntArray, shared: Array) -> tuple[IntArray, IntArray]:
     return np.sort(group[order[:middle]]), np.sort(group[order[middle:]])
 
 
-def tree_bytes(tree: Sequence[Front], width: int) -> int:
-    """Largest memory while a matrix with `width` unknowns a separator is factored, bytes: factor and fronts."""
-    kept = waiting = 0
-    most = 0.0
-    for front in tree:
-        e, b = len(front.eliminated), len(front.boundary)
-        most = max(most, kept + waiting + _AT_WORK * (e + b) ** 2)
-        waiting += b**2 - sum(len(tree[child].boundary) ** 2 for child in front.children)
-        kept += e * (e + b)
-    return int(8 * width**2 * most)
+def levels(tree: Sequence[Front]) -> list[list[int]]:
+    """Numbers of the fronts of every level."""
+    return [list(one) for _, one in groupby(range(len(tree)), lambda number: tree[number].level)]
 
 
-@dataclass(frozen=True, eq=False)
-class TreeFactor:
-    """Cholesky factor, a pair (L_EE, L_BE) for every front, E its eliminated and B its boundary unknowns."""
+class FrontOwners:
+    """Fronts of the tree of robots that touch these separators; the driver holds all, until they are handed out."""
 
-    tree: tuple[Front, ...]
-    width: int
-    blocks: tuple[tuple[Array, Array], ...]
+    def __init__(self, touched: Sequence[IntArray], num_separators: int) -> None:
+        tree = separator_tree(touched, num_separators, LEAST)
+        self._is_shared = len(tree) >= FEW
+        self.tree = tree = tree if self._is_shared else separator_tree(touched, num_separators)
+        self.owner, self.held = [DRIVER] * len(tree), {}
+        self._robots: list[int] = []
+        for number, front in enumerate(tree):
+            order = np.argsort(front.separators)
+            parts = [touched[robot] for robot in front.robots] + [tree[child].boundary for child in front.children]
+            places = tuple(order[np.searchsorted(front.separators, part, sorter=order)] for part in parts)
+            self.held[number] = HeldFront(len(front.eliminated), len(order), places, len(front.robots))
 
-    def solve(self, b: Array) -> Array:
-        """Solution x, (side, k), for b whose rows are separator by separator."""
-        x = np.array(b, dtype=float)
-        rows = [(_rows(f.eliminated, self.width), _rows(f.boundary, self.width)) for f in self.tree]
-        for (eliminated, boundary), (L_EE, L_BE) in zip(rows, self.blocks, strict=True):
-            if len(eliminated):
-                x[eliminated] = solve_triangular(L_EE, x[eliminated], lower=True, check_finite=False)
-                x[boundary] -= L_BE @ x[eliminated]
-        for (eliminated, boundary), (L_EE, L_BE) in zip(reversed(rows), reversed(self.blocks), strict=True):
-            if len(eliminated):
-                known = x[eliminated] - L_BE.T @ x[boundary]
-                x[eliminated] = solve_triangular(L_EE, known, lower=True, trans="T", check_finite=False)
-        return x
+    def hand_out(self, network: CountedPool, robots: IntArray) -> None:
+        """Give every front but the root to a robot of its group, none two, if there are not few.
 
+        `robots` are the numbers in the network of those who touch separators.
+        """
+        if not self._is_shared:
+            return
+        self._network, self._robots, network.elsewhere = network, robots.tolist(), ALONG_TREE
+        free: list[list[int]] = []  # robots of every group that hold no front yet
+        given: list[HeldFront | None] = [None] * network.ledger.num_robots
+        for number, front in enumerate(self.tree[:-1]):
+            owner, *others = [*front.robots, *(robot for child in front.children for robot in free[child])]
+            free.append(others)
+            self.owner[number] = self._robots[owner]
+            given[self._robots[owner]] = self.held.pop(number)
+        network.ask(take_front, given, Count.OFF)
 
-def factorize_tree(tree: tuple[Front, ...], width: int, contribution: Callable[[int], Array], own: Array) -> TreeFactor:
-    """Factor the sum of the robots' contributions and of diagonal blocks, for `width` unknowns a separator.
+    def ask(self, order: Callable[[HeldFront, Q], tuple[HeldFront, A]], requests: Mapping[int, Q]) -> Mapping[int, A]:
+        """Answers of fronts of one level, by their numbers, to an order, each with its request."""
+        answers: dict[int, A] = {}
+        for number in self.held.keys() & requests.keys():
+            self.held[number], answers[number] = order(self.held[number], requests[number])
+        asked = {self.owner[number]: number for number in requests if number not in answers}
+        if asked:
+            to_all = [
+                requests[asked[one]] if one in asked else Idle.IDLE for one in range(self._network.ledger.num_robots)
+            ]
+            found = self._network.workers.ask(partial(order_front, order), to_all)
+            answers.update({number: found[robot] for robot, number in asked.items()})
+        if self._is_shared:
+            links = [link for number in requests for link in self._links(number, requests[number], answers[number])]
+            level = self.tree[next(iter(requests))].level
+            sender, receiver, numbers = np.array(links).T
+            self._network.count(sender, receiver, numbers, is_round=False, level=level)
+        return answers
 
-    `contribution` gives the matrix of a robot, (width g_a, width g_a), its rows separator by separator, ascending;
-    `own`, (num_separators, width, width), are diagonal blocks that are added. A NotPositiveDefiniteError when the sum
-    is not positive definite.
-    """
-    schur: dict[int, Array] = {}
-    blocks = []
-    for number, front in enumerate(tree):
-        poses = front.poses
-        ascending = np.argsort(poses)
-        F = np.zeros((width * len(poses), width * len(poses)))
-        for robot in front.robots:
-            rows = _rows(ascending, width)
-            F[np.ix_(rows, rows)] += contribution(robot)
-        for child in front.children:
-            rows = _rows(ascending[np.searchsorted(poses, tree[child].boundary, sorter=ascending)], width)
-            F[np.ix_(rows, rows)] += schur.pop(child)
-        e = width * len(front.eliminated)
-        inside = np.arange(e).reshape(-1, width)
-        F[inside[:, :, None], inside[:, None, :]] += own[front.eliminated]
-        if e:
-            L_EE = _cholesky(F[:e, :e])
-            L_BE = np.ascontiguousarray(solve_triangular(L_EE, F[e:, :e].T, lower=True, check_finite=False).T)
-            schur[number] = F[e:, e:] - L_BE @ L_BE.T
-        else:
-            L_EE, L_BE = np.zeros((0, 0)), np.zeros((len(F), 0))
-            schur[number] = F
-        blocks.append((L_EE, L_BE))
-        del F  # before the next front is allocated
-    return TreeFactor(tree, width, tuple(blocks))
-
-
-def tree_counts(tree: Sequence[Front], width: int, num_separators: int) -> tuple[IntArray, int]:
-    """Terms that are summed for an entry in the column of a separator, at most, (num_separators,); most in a row of R.
-
-    Eliminated unknowns of every front that the separator is in, and one for every addition of a front.
-    """
-    in_column, most = np.zeros(num_separators, dtype=np.int64), 0
-    for front in tree:
-        in_column[front.poses] += width * len(front.eliminated) + 1
-        most = max(most, width * len(front.poses))
-    return in_column, most
-
-
-def _rows(poses: IntArray, width: int) -> IntArray:
-    return (width * poses[:, None] + np.arange(width)).ravel()
-
-
-def _cholesky(matrix: Array) -> Array:
-    if not np.isfinite(matrix).all():
-        raise NotPositiveDefiniteError("the matrix has nan or inf; check the weights and measurements")
-    try:
-        return np.asarray(cholesky(matrix, lower=True, check_finite=False))
-    except LinAlgError as error:
-        raise NotPositiveDefiniteError("the matrix has a pivot that is not positive") from error
+    def _links(self, number: int, request: Any, answer: Any) -> list[tuple[int, int, int]]:  # noqa: ANN401 - as ordered
+        """Sender, receiver and numbers of what a front takes and gives."""
+        own, front = self.owner[number], self.tree[number]
+        below = [*(self._robots[robot] for robot in front.robots), *(self.owner[child] for child in front.children)]
+        if isinstance(request, FrontParts):  # its parts; of the driver; |y|^2
+            links = [(one, own, part.size) for one, part in zip(below, request.parts, strict=True)]
+            links.append((DRIVER, own, request.own.size if request.own is not None else 0))
+            return [*links, (own, DRIVER, int(isinstance(answer, tuple)))]
+        return [(own, DRIVER, answer[0].size), *((own, one, x.size) for one, x in zip(below, answer[1], strict=True))]

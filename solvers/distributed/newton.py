@@ -26,9 +26,8 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.hessian import TangentLayout
-from pgo_models.problem.matrices import inner
 from solvers.distributed.driver import CoverPoses, Driver
-from solvers.distributed.interface import InterfaceFactor
+from solvers.distributed.interface import Interface
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import ModelOrder, Move, Reduced, RightHandSide, TrialEvaluation
 from solvers.network.counted_pool import Count
@@ -53,8 +52,9 @@ class Model:
     """A factored model at the poses at hand, Newton's or another, and the solution y = H^-1 g on the cover."""
 
     is_newton: bool
-    factor: InterfaceFactor
+    factor: Interface
     y: Array
+    parts: list[Array]  # of y, at every robot
     square: float  # g^T H^-1 g
 
 
@@ -87,7 +87,7 @@ class SubstructuredNewton:
                 break
             trial, answers = found
             gradients = [answer.gradient for answer in answers]
-            following = _solved(driver, model.is_newton, model.factor, gradients)
+            following = _solved(model.is_newton, model.factor, gradients)
             after = scaled_decrement(following.square, trial.objective, trial.rounding_level)
             at_rounding = reached_rounding(decrement, after, model.is_newton and not moved)
             if trial.objective >= driver.at.objective and after > 0.5 * decrement:
@@ -139,7 +139,7 @@ def model_at(driver: Driver, second_order: bool, damping: float) -> Model | None
         factor = interface.factorize([answer.schur for answer in reduced], own)
     except NotPositiveDefiniteError:
         return None
-    return _solved(driver, second_order, factor, [answer.right for answer in reduced])
+    return _solved(second_order, factor, [answer.right for answer in reduced])
 
 
 def _own(
@@ -165,11 +165,10 @@ def _own(
     return own
 
 
-def _solved(driver: Driver, is_newton: bool, factor: InterfaceFactor, right: Sequence[RightHandSide]) -> Model:
+def _solved(is_newton: bool, factor: Interface, right: Sequence[RightHandSide]) -> Model:
     """Solution y = H^-1 g on the cover, and g^T H^-1 g."""
-    b = driver.interface(*driver.tangent).gather([part.b for part in right])
-    y = factor.solve(b)
-    return Model(is_newton, factor, y, math.fsum(part.energy for part in right) + inner(b, y))
+    y, parts, energy = factor.solve([part.b for part in right])
+    return Model(is_newton, factor, y, parts, math.fsum(part.energy for part in right) + energy)
 
 
 def _backtrack(driver: Driver, model: Model) -> tuple[CoverPoses, list[TrialEvaluation]] | None:
@@ -177,7 +176,7 @@ def _backtrack(driver: Driver, model: Model) -> tuple[CoverPoses, list[TrialEval
     now, layout = Poses(driver.at.R, driver.at.t), TangentLayout(len(driver.cover), driver.d)
     w, v = layout.split(-model.y[:, 0])
     length = 1.0
-    moves = [Move(part, length) for part in driver.interface(*driver.tangent).scatter(model.y)]
+    moves = [Move(part, length) for part in model.parts]
     for _ in range(HALVINGS):
         there = move_poses(now, length * w, length * v)
         R, t, is_first = there.R, there.t, length == 1.0
@@ -188,7 +187,7 @@ def _backtrack(driver: Driver, model: Model) -> tuple[CoverPoses, list[TrialEval
             turn = Interior.turn
             turned = driver.ask_each(Interior.move, moves) if is_first else driver.ask(turn, length, Count.PIGGYBACKED)
             t, parts = driver.best_translations(turned)
-            answers = driver.ask_each(Interior.evaluate_trial, parts)
+            answers = driver.ask_each(Interior.evaluate_trial, parts, is_along=True)
         trial = driver.with_sums(CoverPoses(R, t, driver.at.force), [answer.at for answer in answers])
         objective, before = trial.objective, driver.at.objective
         if objective <= before - SUFFICIENT * length * model.square:

@@ -13,7 +13,7 @@ from pgo_models.certificates.dual_variables import multiplier_norms
 from pgo_models.geometry.rotations import unstack_transposes
 from solvers.distributed.driver import Driver
 from solvers.distributed.robots.interior import Interior
-from solvers.distributed.robots.records import Reduced, RescaleInterior
+from solvers.distributed.robots.records import Agree, Reduced, RescaleInterior
 from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Status
 from solvers.soc.penalty import Due, SharedSteps, next_penalty
@@ -24,6 +24,8 @@ from solvers.soc.soc import SOC
 @dataclass(frozen=True, eq=False)
 class SubstructuredState(SharedSteps):
     """Figures of iterate k; its rows are with driver and robots, and a step replaces them."""
+
+    objective: float = math.nan  # F at omega and the translations of step (a), where that is known with the step
 
 
 @dataclass(frozen=True)
@@ -47,28 +49,32 @@ class SubstructuredSOC:
     def step(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
         """One round: (a) by elimination; and one all-reduce: (b), (c)."""
         state = self._with_penalty_due(driver, state)
-        space, rows, block = driver.interface(1, driver.d), driver.rotation_rows, _block(driver)
+        rows, block = driver.rotation_rows, _block(driver)
         assert driver.step_a is not None
-        b = space.gather([part.b for part in driver.right])
-        b[rows] += (0.5 * block.penalty)[:, None] * block.shift
-        x = driver.step_a.solve(b)
+        b = np.zeros((driver.interface(1, driver.d).side, driver.d))
+        b[rows] = (0.5 * block.penalty)[:, None] * block.shift
+        x, parts, _ = driver.step_a.solve([part.b for part in driver.right], b)
         block, own = block.after_solve(x[rows])  # (a)
-        sums = own + np.sum(driver.ask_each(Interior.solve, space.scatter(x)), axis=0)
+        sums = own + np.sum(driver.ask_each(Interior.solve, parts, is_along=True), axis=0)
         merit = math.sqrt(sums[0])
         if not math.isfinite(merit):
             return state.broken()
         gamma, anderson = state.sums.coefficients(self.soc.acceleration, sums)
         agreement = Agreement(gamma, state.is_best(merit))
         block, own = block.extrapolated(agreement).projected()  # (b), (c)
-        answers = driver.ask(Interior.agree, agreement, Count.ALL_REDUCE)
+        orders = [Agree(agreement, z) for z in driver.scattered_rotations(block.z)]
+        answers = driver.ask_each(Interior.agree, orders, Count.ALL_REDUCE)
         driver.block, driver.right = block, [answer.right for answer in answers]
         squares = own + np.sum([answer.sums for answer in answers], axis=0)
-        return state.after(merit, squares, state.size, anderson)
+        objective = math.fsum(answer.measured for answer in answers)
+        return replace(state.after(merit, squares, state.size, anderson), objective=objective)
 
     def measure(self, driver: Driver, state: SubstructuredState) -> Measurement:
         """F at omega and the translations of step (a), and the residuals."""
         if math.isnan(state.primal_residual):
             return driver.measured(Measurement(np.nan, np.nan, np.nan))
+        if not math.isnan(state.objective):  # told with the step
+            return driver.measured(state.measurement(state.objective))
         parts = driver.ask_each(Interior.cost, driver.scattered_rotations(_block(driver).z), Count.OFF)
         return driver.measured(state.measurement(math.fsum(parts)))
 

@@ -31,24 +31,31 @@ class CountedPool:
     def __init__(self, workers: WorkerPool, num_robots: int) -> None:
         self.workers, self.ledger = workers, Ledger(num_robots)
         self._traffic: dict[bytes, Traffic] = {}
+        self.elsewhere: tuple[str, ...] = ()  # fields that go along a tree of workers
 
     def ask(
-        self, order: Callable[[Any, Q], A], requests: Sequence[Q], count: Count, robots: IntArray | None = None
+        self,
+        order: Callable[[Any, Q], A],
+        requests: Sequence[Q],
+        count: Count,
+        robots: IntArray | None = None,
+        is_along: bool = False,
     ) -> list[A]:
         """Answers of all workers to an order; of them `robots`, all unless given, exchange something with the driver.
 
-        What goes to other workers is counted when it is handed on.
+        What goes to other workers is counted when it is handed on; if along a tree, so are requests that `is_along`.
         """
         answers = self.workers.ask(order, requests)
         if count is Count.OFF:
             return answers
         if robots is None:
             robots = np.arange(len(requests))
-        sizes = [count_numbers(requests[robot]) for robot in robots.tolist()]
-        sizes += [count_numbers(answers[robot]) for robot in robots.tolist()]
+        asked = requests if not (is_along and self.elsewhere) else [None] * len(requests)
+        sizes = [count_numbers(asked[robot], self.elsewhere) for robot in robots.tolist()]
+        sizes += [count_numbers(answers[robot], self.elsewhere) for robot in robots.tolist()]
         driver = np.full(len(robots), DRIVER)
         sender, receiver = np.concatenate([driver, robots]), np.concatenate([robots, driver])
-        self._count(sender, receiver, sizes, is_round=count is Count.ROUND)
+        self.count(sender, receiver, sizes, is_round=count is Count.ROUND)
         if count is Count.ALL_REDUCE:
             self.ledger = self.ledger.after_all_reduce(0)
         return answers
@@ -60,15 +67,19 @@ class CountedPool:
         """
         messages = by_link(sent)
         links = np.array(list(messages), dtype=np.int64).reshape(-1, 2)
-        self._count(links[:, 0], links[:, 1], [count_numbers(value) for value in messages.values()], is_round=True)
+        self.count(links[:, 0], links[:, 1], [count_numbers(value) for value in messages.values()], is_round=True)
         return delivered(messages if channel is None else channel.carry(messages), len(sent))
 
-    def _count(self, sender: IntArray, receiver: IntArray, numbers: Sequence[int], is_round: bool) -> None:
-        """Count an exchange; equal ones are one object, which the ledger counts."""
+    def count(
+        self, sender: IntArray, receiver: IntArray, numbers: Sequence[int] | IntArray, is_round: bool, level: int = 0
+    ) -> None:
+        """Count an exchange, without what a worker has itself; equal ones are one object, which the ledger counts."""
         num_bytes = BYTES_PER_NUMBER * np.array(numbers, dtype=np.int64)
-        used = num_bytes > 0
+        used = (num_bytes > 0) & (sender != receiver)
         exchange = sender[used], receiver[used], num_bytes[used]
-        traffic = self._traffic.setdefault(np.concatenate(exchange).tobytes(), Traffic(*exchange))
+        traffic = self._traffic.setdefault(
+            np.append(np.concatenate(exchange), level).tobytes(), Traffic(*exchange, level)
+        )
         self.ledger = self.ledger.after_exchange(traffic, is_round)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 from pgo_models.errors import check_settings
-from solvers.network.messages import Worker
+from solvers.network.messages import Idle, Worker
 
 T = TypeVar("T")
 Q = TypeVar("Q")
@@ -17,7 +17,7 @@ class WorkerPool(Protocol):
     """Robots that wait for orders."""
 
     def ask(self, order: Callable[[Any, Q], A], requests: Sequence[Q]) -> list[A]:
-        """Give every robot an order, each with its request, and wait for all answers."""
+        """Give every robot an order, each with its request, and wait for all answers; `Idle` ones get none."""
 
     def close(self) -> None:
         """Let the robots go."""
@@ -56,9 +56,10 @@ class _LocalPool:
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def ask(self, order: Callable[[Any, Q], A], requests: Sequence[Q]) -> list[A]:
-        if self._pool is None:
-            return [order(worker, request) for worker, request in zip(self._workers, requests, strict=True)]
-        return list(self._pool.map(order, self._workers, requests))
+        def obeyed(worker: Worker, request: Any) -> Any:  # noqa: ANN401 - as the order has it
+            return None if request is Idle.IDLE else order(worker, request)
+
+        return list((map if self._pool is None else self._pool.map)(obeyed, self._workers, requests))
 
     def close(self) -> None:
         if self._pool is not None:

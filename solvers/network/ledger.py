@@ -21,6 +21,7 @@ class Traffic:
     sender: IntArray
     receiver: IntArray
     num_bytes: IntArray  # (q,): payload of every message: eight bytes a number
+    level: int = 0  # of a tree of robots, 1 at its leaves; 0 between driver and robots, or neighbours
 
     def __post_init__(self) -> None:
         if not self.sender.shape == self.receiver.shape == self.num_bytes.shape:
@@ -34,8 +35,8 @@ class Traffic:
 class Ledger:
     """Account of a distributed run.
 
-    A round is one exchange that robots wait for: between neighbours, or to the driver and back. An all-reduce, by which
-    all robots come to know a sum of a few numbers, is counted apart.
+    A round is one exchange that robots wait for: between neighbours, or to the driver and back, level by level where
+    there is a tree of robots. An all-reduce, by which all come to know a sum of a few numbers, is counted apart.
 
     Attributes
     ----------
@@ -85,6 +86,13 @@ class Ledger:
     def num_bytes(self) -> int:
         """Payload in all, all-reduces left out."""
         return int(self.by_link()[3].sum())
+
+    @property
+    def bytes_by_level(self) -> IntArray:
+        """Payload on every level of a tree of robots, (levels + 1,); first what is on none."""
+        level = [traffic.level for traffic, _ in self.counted]
+        payload = [times * int(traffic.num_bytes.sum()) for traffic, times in self.counted]
+        return np.bincount(level, weights=payload, minlength=1).astype(np.int64)
 
     @property
     def bytes_sent(self) -> IntArray:

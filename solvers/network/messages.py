@@ -1,7 +1,7 @@
 """Orders to workers: functions of a worker and a request. Requests and answers are numbers, arrays and records."""
 
-import dataclasses
-from collections.abc import Mapping
+import enum
+from collections.abc import Collection, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -30,12 +30,24 @@ def restore(worker: Worker, snapshot: Snapshot) -> None:
     worker.restore(snapshot)
 
 
-def count_numbers(record: object) -> int:
-    """Numbers in a request or an answer; a mapping is between workers, and counted where it is handed on."""
+class Idle(enum.Enum):
+    """In place of a request: the worker gets no order, and its answer is None."""
+
+    IDLE = "no order"
+
+
+def count_numbers(record: object, elsewhere: Collection[str] = ()) -> int:
+    """Numbers in a request or an answer; a mapping is between workers, and counted where it is handed on.
+
+    So are fields with names in `elsewhere`; those whose names begin with `measured` are off the ledger.
+    """
+    if isinstance(record, np.ndarray):
+        return record.size
     if record is None or isinstance(record, Mapping):
         return 0
-    if dataclasses.is_dataclass(record):
-        return sum(count_numbers(getattr(record, field.name)) for field in dataclasses.fields(record))
+    if (names := getattr(type(record), "__dataclass_fields__", None)) is not None:
+        counted = [name for name in names if name not in elsewhere and not name.startswith("measured")]
+        return sum(count_numbers(getattr(record, name), elsewhere) for name in counted)
     if isinstance(record, tuple):
-        return sum(map(count_numbers, record))
+        return sum(count_numbers(item, elsewhere) for item in record)
     return int(np.size(record))  # type: ignore[arg-type] # a number or an array

@@ -16,7 +16,7 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from ipaddress import ip_address
@@ -116,10 +116,10 @@ def connect(address: str | None = None, num_cpus: int | None = None) -> bool:
     if address is not None:
         _check_cluster(address)
     # What a dying cluster tells would be printed to stdout, whatever `log_to_driver` is.
-    silent = _replaced(ray._private.worker, listen_error_messages=lambda worker, threads_stopped: None)
+    silent = _replaced(vars(ray._private.worker), {"listen_error_messages": lambda worker, threads_stopped: None})
     # Ray's rule on Windows and macOS, and its only way to listen on the loopback: _node_ip_address does not take that.
-    local = _replaced(ray._private.ray_constants, **({"ENABLE_RAY_CLUSTER": False} if address is None else {}))
-    with _environment(_ENVIRONMENT), _hushed("ray"), silent, local:
+    local = _replaced(vars(ray._private.ray_constants), {"ENABLE_RAY_CLUSTER": False} if address is None else {})
+    with _replaced(os.environ, _ENVIRONMENT, adds=True), _hushed("ray"), silent, local:
         quiet = {"log_to_driver": False, "logging_level": logging.CRITICAL, "configure_logging": False}
         try:
             with _own_sigterm():
@@ -316,31 +316,17 @@ def _check_cluster(address: str) -> None:
 
 
 @contextmanager
-def _environment(wanted: Mapping[str, str]) -> Iterator[None]:
-    """Environment for processes that are started within."""
-    before = {name: os.environ.get(name) for name in wanted}
-    os.environ.update(wanted)
+def _replaced(table: MutableMapping[str, Any], wanted: Mapping[str, object], adds: bool = False) -> Iterator[None]:
+    """Other values in a table, of the environment or of a module's names, where it has them or adds them."""
+    wanted = {name: value for name, value in wanted.items() if adds or name in table}
+    before = {name: table[name] for name in wanted if name in table}
+    table.update(wanted)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-@contextmanager
-def _replaced(module: ModuleType, **values: object) -> Iterator[None]:
-    """Other values for names of a module, where it has them."""
-    before = {name: getattr(module, name) for name in values if hasattr(module, name)}
-    for name in before:
-        setattr(module, name, values[name])
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            setattr(module, name, value)
+        for name in wanted:
+            del table[name]
+        table.update(before)
 
 
 @contextmanager

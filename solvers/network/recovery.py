@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
 from pgo_models.errors import EngineError, PGOError, check_settings
-from solvers.network.messages import Snapshot, restore, take_snapshot
+from solvers.network.messages import Idle, Snapshot, restore, take_snapshot
 
 T = TypeVar("T")
 Q = TypeVar("Q")
@@ -84,15 +84,16 @@ class RecoveringPool(Generic[T]):
         self.place.close()
 
     def _asked(self, order: AnyOrder, requests: Sequence[object]) -> list[Any]:
-        tickets = [self.place.send(robot, order, request) for robot, request in enumerate(requests)]
-        answers = []
+        working = [robot for robot, request in enumerate(requests) if request is not Idle.IDLE]
+        tickets = [self.place.send(robot, order, requests[robot]) for robot in working]
+        answers: list[Any] = [None] * len(requests)
         refusal: PGOError | None = None
-        for robot, ticket in enumerate(tickets):
+        for robot, ticket in zip(working, tickets, strict=True):
             try:
                 try:
-                    answers.append(self.place.receive(robot, ticket))
+                    answers[robot] = self.place.receive(robot, ticket)
                 except RobotLostError as lost:
-                    answers.append(self._recovered(robot, order, requests[robot], lost))
+                    answers[robot] = self._recovered(robot, order, requests[robot], lost)
             except EngineError:
                 raise
             except PGOError as error:  # the robot's own; the others' answers are waited for all the same
@@ -110,7 +111,8 @@ class RecoveringPool(Generic[T]):
                 if self._snapshots:
                     self._order(robot, restore, self._snapshots[robot])
                 for earlier, requests in self._log:
-                    self._again(robot, earlier, requests[robot])
+                    if requests[robot] is not Idle.IDLE:
+                        self._again(robot, earlier, requests[robot])
                 return self._order(robot, order, request)
             except RobotLostError as error:
                 lost = error

@@ -51,12 +51,17 @@ class Subgraph:
         return np.asarray(self.owner == self.robot)
 
     @cached_property
+    def counted(self) -> tuple[IntArray, IntArray]:
+        """Which of `poses` the edges that this robot counts join, and where their ends are in these."""
+        kept = self.is_counted
+        return np.unique(np.concatenate([self.graph.i[kept], self.graph.j[kept]]), return_inverse=True)
+
+    @cached_property
     def part(self) -> Part | None:
         """The edges that this robot counts; None when there are none."""
         if not self.is_counted.any():
             return None
-        graph, kept = self.graph, self.is_counted
-        poses, ends = np.unique(np.concatenate([graph.i[kept], graph.j[kept]]), return_inverse=True)
+        graph, kept, (poses, ends) = self.graph, self.is_counted, self.counted
         i, j = np.split(ends, 2)
         counted = PoseGraph(
             len(poses), i, j, graph.R_ij[kept], graph.t_ij[kept], graph.kappa[kept], graph.tau[kept], name=graph.name
@@ -127,8 +132,13 @@ def split_graph(
     # An end outside the cover decides: such ends of one edge have one owner. Else the owner of the first end counts it.
     counts = np.where(cover[graph.j] < 0, owner[graph.j], owner[graph.i])
     holds = _holders(graph, owner, partition.num_robots)
-    robots = range(partition.num_robots)
-    return tuple(_subgraph_of(graph, costs, owner, cover, counts, holds, robot, thresholds) for robot in robots)
+    held = holds.tocsc()
+    m, robots = graph.num_edges, range(partition.num_robots)
+    robot, edge = np.divmod(np.unique(np.concatenate([owner[end] * m + np.arange(m) for end in (graph.i, graph.j)])), m)
+    edges = np.split(edge, np.searchsorted(robot, robots[1:]))
+    poses = [np.sort(part) for part in np.split(held.indices, held.indptr[1:-1])]
+    each = [(robot, edges[robot], poses[robot]) for robot in robots]
+    return tuple(_subgraph_of(graph, costs, owner, cover, counts, holds, thresholds, *one) for one in each)
 
 
 def middle_separator(graph: PoseGraph, subgraphs: tuple[Subgraph, ...]) -> int:
@@ -156,11 +166,11 @@ def _subgraph_of(
     cover: IntArray,
     counts: IntArray,
     holds: csr_array,
-    robot: int,
     thresholds: Array | None,
+    robot: int,
+    edges: IntArray,
+    poses: IntArray,
 ) -> Subgraph:
-    edges = np.flatnonzero((owner[graph.i] == robot) | (owner[graph.j] == robot))
-    poses = np.unique(np.concatenate([np.flatnonzero(owner == robot), graph.i[edges], graph.j[edges]]))
     local = PoseGraph(
         num_poses=len(poses),
         i=np.searchsorted(poses, graph.i[edges]),

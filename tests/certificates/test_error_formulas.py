@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from graphs import varied_graph
+from robots import interface_of
 from scipy.sparse import csc_array
 
 from pgo_models.certificates import lower_bound
@@ -30,11 +31,9 @@ from pgo_models.problem.floating_point import UNIT_ROUNDOFF as u
 from pgo_models.problem.floating_point import column_error, error_of_counts, gamma
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed.interface import Interface
-from solvers.distributed.multifrontal import separator_tree
 from solvers.distributed.robots import elimination as substructure
 from solvers.distributed.robots import proof as robot_proof
-from solvers.distributed.robots.elimination import Cut, eliminate, packed, row_sums
+from solvers.distributed.robots.elimination import Cut, eliminate, row_sums
 
 ENOUGH = 1.0 - 1e-12  # the formulas here are rounded, too; the bounds are rounded up by 2^-30
 SIZES = [(t, low, P) for t in (1e-6, 1.0, 1e6) for low in (0.0, 1.0, 1e9) for P in (1e-6, 1.0, 1e4)]
@@ -198,13 +197,14 @@ def test_errors_of_an_elimination_and_of_the_driver(backend: CholeskyBackend, mo
     monkeypatch.undo()
     assert (verified.interior_error >= ENOUGH * plain.factor.backward_error(beside)).all()
     touched = (np.array([0, 1]), np.array([1, 2]))
-    interface = Interface(3, (1,), touched, separator_tree(touched, 3))
+    interface = interface_of(touched, 3, (1,))
     parts = [np.array([[2.0, 1.0], [1.0, 3.0]]), np.array([[5.0, -1.0], [-1.0, 4.0]])]
     diagonal = np.array([2.0, 8.0, 4.0])
-    found = interface.rounding([packed(part) for part in parts], [], diagonal)
+    sizes = [row_sums(part, diagonal[poses]) for poses, part in zip(touched, parts, strict=True)]
+    found = interface.rounding(sizes, [], diagonal)
     sums = np.zeros(3)
-    for poses, part in zip(touched, parts, strict=True):
-        sums[poses] += row_sums(part, diagonal[poses])
+    for poses, size in zip(touched, sizes, strict=True):
+        sums[poses] += size
     # Of every pose at least its own column, two contributions and eight more roundings.
     assert (found >= ENOUGH * (gamma(11.0) * sums + column_error(np.full(3, 3.0), 2.0) * diagonal)).all()
 
@@ -276,7 +276,9 @@ def test_errors_of_a_robot_s_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = evaluate_certificate(problem, Lambda, X, low)
     whole = replace(whole, product_error=whole.product_error + np.abs(whole.product))  # large enough to be seen
     monkeypatch.setattr(robot_proof, "evaluate_certificate", lambda *_: whole)
-    found, product = robot_proof.RobotProof(Lambda, start, X, low, slack, inside).evaluated(problem, boundary)
+    found, product = robot_proof.RobotProof(Lambda, start, X, low, slack, inside, np.zeros(0)).evaluated(
+        problem, boundary
+    )
     np.testing.assert_array_equal(product, whole.product)
     np.testing.assert_array_equal(found.error, whole.product_error[boundary])
     assert (found.value, found.value_error) == (whole.value, whole.value_error)

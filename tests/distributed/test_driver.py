@@ -114,7 +114,7 @@ def test_the_ledger_counts_what_was_sent(
             continue
         for robot in range(number):
             for total, message in ((received, down[robot]), (sent, up[robot])):
-                size = 8 * sum(np.size(value) for _, value in arrays_in(message))
+                size = 8 * sum(np.size(value) for name, value in arrays_in(message) if not name.startswith("measured"))
                 total[0, robot] += size
                 messages += size > 0
     np.testing.assert_array_equal(ledger.bytes_sent, sent[0])
@@ -181,8 +181,9 @@ def test_what_crosses_has_the_size_of_the_separators(d: int, noise: NoiseModel) 
             "x": any_side,
             "force": {((d + 1) * g, d)},
             "norms": {(inside,)},
+            "measured_at": {(d * g, d)},
             "scale": {(inside,)},
-            "fixed": {((d + 1) * g,)},
+            **{name: {((d + 1) * g,)} for name in ("fixed", "sizes")},
             **{name: {((d + 1) * g, d)} for name in ("point", "product", "error")},
             "gamma": {(k,) for k in range(memory + 1)},
             "sums": {(k,) for k in range(2 * memory + 2)},
@@ -196,6 +197,7 @@ def test_what_crosses_has_the_size_of_the_separators(d: int, noise: NoiseModel) 
             "Interior.solve": any_side | sums,
             "Interior.cost": {(d * g, d), ()},
             "Interior.finish": {(d * g, d)},
+            "Interior.agree": {()},
             "move_proof": any_side | {()},
         }
         for order, sent, got in engine.log:

@@ -142,9 +142,9 @@ def test_robots_count_the_constants_of_their_tangents_and_their_errors(monkeypat
 def test_the_driver_s_rounding_is_a_share_of_at_least_its_diagonal(eta: float, monkeypatch: pytest.MonkeyPatch) -> None:
     problem, seen, rounding = of_file(3, 12, 3, coupled=True), [], Interface.rounding
 
-    def noted(self: Interface, contributions: Any, own: Any, diagonal: Array) -> Array:
+    def noted(self: Interface, sizes: Any, own: Any, diagonal: Array) -> Array:
         seen.append(diagonal.copy())
-        return rounding(self, contributions, own, diagonal)
+        return rounding(self, sizes, own, diagonal)
 
     monkeypatch.setattr(Interface, "rounding", noted)
     with closing(

@@ -6,12 +6,15 @@ from budget import examples
 from graphs import SEEDS
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from robots import interface_of
 
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from solvers.distributed import multifrontal as rooms
-from solvers.distributed.multifrontal import Front, factorize_tree, separator_tree, tree_bytes
+from solvers.distributed.interface import Interface
+from solvers.distributed.multifrontal import Front, FrontOwners, separator_tree
+from solvers.distributed.robots.elimination import packed
 
 
 def random_team(seed: int, robots: int, separators: int) -> tuple[IntArray, ...]:
@@ -23,7 +26,7 @@ def random_team(seed: int, robots: int, separators: int) -> tuple[IntArray, ...]
 
 
 def random_contributions(seed: int, touched: tuple[IntArray, ...], width: int) -> list[Array]:
-    """Positive semidefinite matrices, each of half rank."""
+    """Positive semidefinite matrices, each of half rank, their rows separator by separator."""
     rng = np.random.default_rng([seed, 1])
     halves = [rng.standard_normal((width * len(poses), max(1, width * len(poses) // 2))) for poses in touched]
     return [half @ half.T for half in halves]
@@ -55,11 +58,12 @@ def check_tree(tree: tuple[Front, ...], touched: tuple[IntArray, ...], separator
     for number, front in enumerate(tree):
         assert all(child < number for child in front.children)
         below.append(set(front.robots).union(*(below[child] for child in front.children)))
+        assert front.level > max((tree[child].level for child in front.children), default=0)
         inside = {int(pose) for robot in below[number] for pose in touched[robot]}
         outside = {int(pose) for robot in range(len(touched)) if robot not in below[number] for pose in touched[robot]}
         assert not set(front.eliminated.tolist()) & outside  # where nobody else touches it ..
         assert set(front.boundary.tolist()) == inside & outside  # .. and no later
-        assert set(front.poses.tolist()) == set(front.eliminated.tolist()) | set(front.boundary.tolist())
+        assert set(front.separators.tolist()) == set(front.eliminated.tolist()) | set(front.boundary.tolist())
 
 
 @settings(max_examples=examples(40))
@@ -71,19 +75,28 @@ def test_factor_and_solve_are_those_of_the_dense_sum(seed: int, robots: int, sep
 
 def check_system(seed: int, touched: tuple[IntArray, ...], separators: int, width: int) -> None:
     rng = np.random.default_rng([seed, 2])
-    tree = separator_tree(touched, separators)
+    fronts = FrontOwners(touched, separators)
+    tree = fronts.tree
     check_tree(tree, touched, separators)
     contributions = random_contributions(seed, touched, width)
     half = rng.standard_normal((separators, width, width))
     own = half @ np.swapaxes(half, 1, 2) + 0.1 * np.eye(width)
-    factor = factorize_tree(tree, width, contributions.__getitem__, own)
+    interface = Interface(separators, (width,), touched, fronts)
+    columns = np.arange(width * separators).reshape(separators, width)
+    factor = interface.factorize([packed(one) for one in contributions], [(columns, own)])
     total = dense(touched, contributions, own)
-    b = rng.standard_normal((len(total), 3))
-    kept = b.copy()
-    x = factor.solve(b)
-    np.testing.assert_array_equal(b, kept)
-    np.testing.assert_allclose(x, np.linalg.solve(total, b), rtol=0, atol=1e-10 * np.linalg.cond(total))
-    logs = [2.0 * np.log(np.diag(L_EE)).sum() for L_EE, _ in factor.blocks]
+    shares = [rng.standard_normal((width * len(poses), 3)) for poses in touched]
+    of_driver = rng.standard_normal((width * separators, 3))
+    b = of_driver.copy()
+    for poses, part in zip(touched, shares, strict=True):
+        b[rows_of(poses, width)] += part
+    x, on_parts, energy = factor.solve(shares, of_driver)
+    expected = np.linalg.solve(total, b)
+    np.testing.assert_allclose(x, expected, rtol=0, atol=1e-10 * np.linalg.cond(total))
+    for poses, part in zip(touched, on_parts, strict=True):
+        np.testing.assert_array_equal(part, x[rows_of(poses, width)])
+    assert energy == pytest.approx(np.vdot(b, expected), rel=1e-9 * np.linalg.cond(total))
+    logs = [2.0 * np.log(np.diag(front.factors[str((width,))].L_EE)).sum() for front in fronts.held.values()]
     assert sum(logs) == pytest.approx(np.linalg.slogdet(total)[1], rel=1e-9, abs=1e-9)
 
 
@@ -93,11 +106,13 @@ def test_a_sum_that_is_not_positive_definite_is_refused(seed: int, robots: int, 
     contributions = random_contributions(seed, touched, width)
     own = np.zeros((separators, width, width))
     values = np.linalg.eigvalsh(dense(touched, contributions, own))
-    tree, near = separator_tree(touched, separators), 1e-6 * values[-1] + 1e-9
+    fronts, near = FrontOwners(touched, separators), 1e-6 * values[-1] + 1e-9
     blocks = np.broadcast_to(np.eye(width), own.shape)
-    factorize_tree(tree, width, contributions.__getitem__, (near - values[0]) * blocks)
+    interface, given = Interface(separators, (width,), touched, fronts), [packed(one) for one in contributions]
+    columns = np.arange(width * separators).reshape(separators, width)
+    interface.factorize(given, [(columns, (near - values[0]) * blocks)])
     with pytest.raises(NotPositiveDefiniteError, match="pivot that is not positive"):
-        factorize_tree(tree, width, contributions.__getitem__, (-near - values[0]) * blocks)
+        interface.factorize(given, [(columns, (-near - values[0]) * blocks)])
 
 
 def test_robots_on_a_ring_need_only_small_fronts() -> None:
@@ -108,8 +123,8 @@ def test_robots_on_a_ring_need_only_small_fronts() -> None:
     order = np.random.default_rng(0).permutation(number)  # the tree finds out who is whose neighbour
     tree = separator_tree([touched[a] for a in order], each * number)
     check_tree(tree, tuple(touched[a] for a in order), each * number)
-    assert max(len(front.poses) for front in tree) <= 5 * each
-    assert tree_bytes(tree, 6) < 0.1 * 8 * (6 * each * number) ** 2
+    assert max(len(front.separators) for front in tree) <= 5 * each
+    assert interface_of(touched, each * number, (6,)).num_bytes < 0.2 * 8 * (6 * each * number) ** 2
 
 
 @pytest.mark.parametrize("most", [0, 5])
@@ -118,12 +133,9 @@ def test_teams_too_large_for_the_spectral_cut_are_halved_in_order(most: int, mon
     for seed in range(5):
         touched = random_team(seed, 23, 17)
         check_system(seed, touched, 17, 3)
-        tree = separator_tree(touched, 17)
-        *_, top = tree
-        below: list[list[int]] = []
-        for front in tree:
-            below.append(sorted([*front.robots, *(robot for child in front.children for robot in below[child])]))
-        assert [below[child] for child in top.children] == [list(range(11)), list(range(11, 23))]
+        shared = np.random.default_rng(seed).random((23, 23))
+        one, other = rooms._halves(np.arange(23), shared + shared.T)
+        assert (one.tolist(), other.tolist()) == (list(range(11)), list(range(11, 23)))
 
 
 def test_more_robots_than_the_spectral_cut_takes() -> None:
@@ -131,9 +143,18 @@ def test_more_robots_than_the_spectral_cut_takes() -> None:
     touched = tuple(np.array([a, (a + 1) % number]) for a in range(number))
     tree = separator_tree(touched, number)
     check_tree(tree, touched, number)
-    assert max(len(front.poses) for front in tree) <= 6
+    assert max(len(front.separators) for front in tree) <= 6
+
+
+@settings(max_examples=examples(30))
+@given(seed=SEEDS, robots=st.integers(1, 12), separators=st.integers(1, 30), least=st.integers(1, 20))
+def test_small_fronts_are_left_to_those_above(seed: int, robots: int, separators: int, least: int) -> None:
+    touched = random_team(seed, robots, separators)
+    tree = separator_tree(touched, separators, least)
+    check_tree(tree, touched, separators)
+    assert all(len(front.separators) >= least for front in tree[:-1])
 
 
 def test_nobody_has_nothing_to_eliminate() -> None:
     assert separator_tree([], 0) == ()
-    assert tree_bytes((), 4) == 0
+    assert interface_of((), 0, (4,)).num_bytes == 0

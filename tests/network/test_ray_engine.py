@@ -274,7 +274,7 @@ def test_names_of_a_module_are_replaced_for_a_while_where_it_has_them():
     module.one = 1
 
     def fail():
-        with ray_engine._replaced(module, one=2, two=2):
+        with ray_engine._replaced(vars(module), {"one": 2, "two": 2}):
             assert module.one == 2
             assert not hasattr(module, "two")
             raise KeyError

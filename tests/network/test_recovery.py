@@ -8,6 +8,7 @@ from graphs import varied_graph
 import solvers
 from pgo_models.errors import EngineError, NotPositiveDefiniteError, SettingError
 from pgo_models.graphs.partitioning import PartitionMethod, partition
+from solvers.distributed import multifrontal
 from solvers.distributed.robots.agent import Agent
 from solvers.network.messages import restore, take_snapshot
 from solvers.network.recovery import RecoveringPool, Recovery, RobotLostError
@@ -73,8 +74,10 @@ def pipeline(coupling, robots):
 
 @pytest.mark.parametrize("coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS])
 @pytest.mark.parametrize("orders", [1, 7, 1000])
-@pytest.mark.parametrize("is_before", [True, False])
-def test_lost_robots_change_nothing(coupling, orders, is_before):
+@pytest.mark.parametrize(("is_before", "least"), [(True, 200), (False, 200), (True, 0)])
+def test_lost_robots_change_nothing(coupling, orders, is_before, least, monkeypatch):
+    monkeypatch.setattr(multifrontal, "LEAST", least)  # with 0 robots hold the fronts, too
+    monkeypatch.setattr(multifrontal, "FEW", 1 if least == 0 else multifrontal.FEW)
     graph = varied_graph(orders, 60, 2 + orders % 2)
     robots = partition(graph, 4, PartitionMethod.CONTIGUOUS)
     expected = solvers.solve(graph, pipeline(coupling, robots), robots=robots)

@@ -9,6 +9,7 @@ import numpy as np
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
+from solvers.distributed.robots.elimination import FrontFactor, HeldFront
 from solvers.distributed.robots.factors import Eliminated
 from solvers.distributed.robots.interior import Interior, InteriorState, interior_of
 from solvers.distributed.robots.proof import RobotProof
@@ -30,6 +31,7 @@ class AgentRecord:
 
     interior: InteriorState | None
     copies: CopiesState | None
+    front: HeldFront | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,25 +44,27 @@ class CoverRotations:
 
 CLASSES = (
     *(AgentRecord, InteriorState, CopiesState, Poses, RecursionBlock, StepSettings, Anderson, AndersonShare),
-    *(AndersonSums, RobotProof, Eliminated, Waiting, TurnSettings),
+    *(AndersonSums, RobotProof, Eliminated, Waiting, TurnSettings, HeldFront, FrontFactor),
 )
 
 
 class Agent:
     """A robot that obeys orders: each replaces what it has by what the order makes of it.
 
-    Its `interior` is None when it counts no edge, its `copies` are None before CONSENSUS begins.
+    Its `interior` is None when it counts no edge, its `copies` are None before CONSENSUS begins, its `front` is None
+    when it holds none of the separator tree.
     """
 
     def __init__(self, subgraph: Subgraph, backend: CholeskyBackend | None) -> None:
         self.subgraph, self.backend = subgraph, backend
         self.interior = interior_of(subgraph, backend)
         self.copies: ConsensusRobot | None = None
+        self.front: HeldFront | None = None
 
     def snapshot(self) -> Snapshot:
         """All that earlier orders left here, as arrays; matrices instead of their factors."""
         interior = self.interior.state if self.interior is not None else None
-        return serialize(AgentRecord(interior, self.copies.state if self.copies is not None else None))
+        return serialize(AgentRecord(interior, self.copies.state if self.copies is not None else None, self.front))
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go on from a snapshot of this robot."""
@@ -68,6 +72,7 @@ class Agent:
         if self.interior is not None and record.interior is not None:
             self.interior = replace(self.interior, state=record.interior).restored()
         self.copies = self._no_copies.restored(record.copies) if record.copies is not None else None
+        self.front = record.front
 
     @property
     def _no_copies(self) -> ConsensusRobot:
@@ -89,6 +94,18 @@ def order_copies(order: Callable[[ConsensusRobot, Q], tuple[ConsensusRobot, A]],
     """Give the copies an order."""
     assert agent.copies is not None
     agent.copies, answer = order(agent.copies, request)
+    return answer
+
+
+def take_front(agent: Agent, front: HeldFront | None) -> None:
+    """Hold a front of the separator tree from now on."""
+    agent.front = front
+
+
+def order_front(order: Callable[[HeldFront, Q], tuple[HeldFront, A]], agent: Agent, request: Q) -> A:
+    """Give the front that is held an order."""
+    assert agent.front is not None
+    agent.front, answer = order(agent.front, request)
     return answer
 
 

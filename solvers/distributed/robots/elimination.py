@@ -1,4 +1,4 @@
-"""Elimination to the separators: a robot's interior factored once, its Schur complement, and the driver's sum of them.
+"""Elimination to the separators: a robot's interior factored once, its Schur complement, and fronts of the sum of them.
 
 With the unknowns of a robot split into its interior I and the poses G that the driver solves for, K x = b becomes
 
@@ -9,16 +9,23 @@ and K is positive definite if and only if every K_II,a and the driver's matrix a
 1968).
 """
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dtrtrs
 from scipy.sparse import csc_array, csr_array
 
+from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, analyze
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, column_error
 from pgo_models.problem.matrices import inner
+
+Widths = tuple[int, ...]  # numbers a separator in every field
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,3 +116,96 @@ def unpacked(lower: Array, side: int) -> Array:
     matrix[np.tri(side, dtype=bool)] = lower
     matrix += np.tril(matrix, -1).T
     return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class FrontParts:
+    """What a front, or its right-hand side, is the sum of: its parts, and the driver's where it eliminates."""
+
+    widths: Widths
+    parts: tuple[Array, ...]  # lower triangles, packed; or (unknowns, k)
+    own: Array | None  # (e, w, w); or (e, w, k)
+
+
+@dataclass(frozen=True, eq=False)
+class FrontFactor:
+    """Factor of a front for one kind of unknowns, where every part is in it, and what it reduced last."""
+
+    L_EE: Array
+    L_BE: Array
+    rows: tuple[IntArray, ...]
+    y: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+
+@dataclass(frozen=True, eq=False)
+class HeldFront:
+    """A front F with its factors; its methods are orders, as those of `Interior`.
+
+    With its unknowns split into those that it eliminates, E, and those of the fronts above, B, L_EE L_EE^T = F_EE and
+    L_BE = F_BE L_EE^-T (the multifrontal method, Liu 1992).
+    """
+
+    num_eliminated: int  # separators; those of the boundary come after them
+    num_separators: int
+    places: tuple[IntArray, ...]  # separators of every part: of robots, which stack field by field, then of fronts
+    num_robots: int
+    factors: Mapping[str, FrontFactor] = field(default_factory=dict)  # by widths
+
+    def eliminate(self, order: FrontParts) -> tuple[HeldFront, Array]:
+        """Sum the parts and factor; F_BB - L_BE L_BE^T, packed.
+
+        A NotPositiveDefiniteError when F_EE is not positive definite.
+        """
+        width, fields = sum(order.widths), np.split(np.arange(sum(order.widths)), np.cumsum(order.widths)[:-1])
+        kinds = [fields] * self.num_robots + [[np.arange(width)]] * (len(self.places) - self.num_robots)
+        each = [
+            [(width * at[:, None] + one).ravel() for one in kind] for at, kind in zip(self.places, kinds, strict=True)
+        ]
+        rows, e = tuple(map(np.concatenate, each)), width * self.num_eliminated
+        F = np.zeros((width * self.num_separators, width * self.num_separators))
+        for at, part in zip(rows, order.parts, strict=True):
+            F[np.ix_(at, at)] += unpacked(part, len(at))
+        if order.own is not None:
+            inside = np.arange(e).reshape(-1, width)
+            F[inside[:, :, None], inside[:, None, :]] += order.own
+        L_EE = _cholesky(F[:e, :e])
+        L_BE = np.ascontiguousarray(_solved(L_EE, F[:e, e:]).T)
+        F = F[e:, e:] - L_BE @ L_BE.T  # the front itself is let go before its complement is packed
+        return self._with(order.widths, FrontFactor(L_EE, L_BE, rows)), packed(F)
+
+    def reduce(self, order: FrontParts) -> tuple[HeldFront, tuple[Array, float]]:
+        """b_B - L_BE y, (unknowns, k), y = L_EE^-1 b_E; and |y|^2, of which b^T K^-1 b is the sum over all fronts."""
+        factor = self.factors[str(order.widths)]
+        e = len(factor.L_EE)
+        b = np.zeros((e + len(factor.L_BE), order.parts[0].shape[1]))
+        for at, part in zip(factor.rows, order.parts, strict=True):
+            b[at] += part
+        if order.own is not None:
+            b[:e] += order.own.reshape(e, -1)
+        y = _solved(factor.L_EE, b[:e])
+        return self._with(order.widths, replace(factor, y=y)), (b[e:] - factor.L_BE @ y, inner(y, y))
+
+    def substitute(self, known: tuple[Array, Widths]) -> tuple[HeldFront, tuple[Array, tuple[Array, ...]]]:
+        """x_E = L_EE^-T (y - L_BE^T x_B), (unknowns, k), and x on every part, from x_B."""
+        factor = self.factors[str(known[1])]
+        x_E = _solved(factor.L_EE, factor.y - factor.L_BE.T @ known[0], is_transposed=True)
+        x = np.concatenate([x_E, known[0]])
+        return self, (x_E, tuple(x[at] for at in factor.rows))
+
+    def _with(self, widths: Widths, factor: FrontFactor) -> HeldFront:
+        return replace(self, factors={**self.factors, str(widths): factor})
+
+
+def _cholesky(matrix: Array) -> Array:
+    """L with L L^T = matrix, stored by rows."""
+    if not np.isfinite(matrix).all():
+        raise NotPositiveDefiniteError("the matrix has nan or inf; check the weights and measurements")
+    factor, info = dpotrf(matrix.T, lower=0, clean=1) if len(matrix) else (matrix, 0)
+    if info:
+        raise NotPositiveDefiniteError("the matrix has a pivot that is not positive")
+    return np.asarray(factor.T)
+
+
+def _solved(L: Array, b: Array, is_transposed: bool = False) -> Array:
+    """L^-1 b, or L^-T b."""
+    return np.asarray(dtrtrs(L.T, b, lower=0, trans=0 if is_transposed else 1)[0]) if b.size else b

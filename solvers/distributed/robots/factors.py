@@ -8,10 +8,8 @@ from pgo_models.geometry.rotations import Array, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.matrices import columns_of
-from solvers.distributed.robots.elimination import Cut, Elimination, eliminate
+from solvers.distributed.robots.elimination import Cut, Elimination, Widths, eliminate
 from solvers.soc.subgraph import Part
-
-Widths = tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,9 +30,11 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed.robots.factors import Eliminated, Factors, Widths
+from solvers.distributed.robots.elimination import Widths
+from solvers.distributed.robots.factors import Eliminated, Factors
 from solvers.distributed.robots.proof import RobotProof
 from solvers.distributed.robots.records import (
+    Agree,
     Agreed,
     CostParts,
     InteriorPoses,
@@ -46,7 +48,7 @@ from solvers.distributed.robots.records import (
 )
 from solvers.soc.copies import Norms
 from solvers.soc.penalty import PenaltyOrder
-from solvers.soc.recursion_block import Agreement, RecursionBlock
+from solvers.soc.recursion_block import RecursionBlock
 from solvers.soc.subgraph import Part, Subgraph
 
 
@@ -165,11 +167,11 @@ class Interior:
         block, sums = self.block.after_solve(X[self._interior_rows])
         return self.with_changes(x=X, block=block), sums
 
-    def agree(self, agreement: Agreement) -> tuple[Interior, Agreed]:
-        """Steps (b) and (c): sums of the residuals, and the right-hand side of the next step (a)."""
-        block, sums = self.block.extrapolated(agreement).projected()
+    def agree(self, order: Agree) -> tuple[Interior, Agreed]:
+        """Steps (b) and (c): sums of the residuals, and the right-hand side of the next step (a); with it `cost`."""
+        block, sums = self.block.extrapolated(order.agreement).projected()
         following, right = self.with_changes(block=block).reduced(self._pull(block))
-        return following, Agreed(sums, right)
+        return following, Agreed(sums, right, following.cost(order.measured_at)[1])
 
     def cost(self, z: Array) -> tuple[Interior, float]:
         """Part of F at omega, from its rows on the boundary, and the translations of step (a)."""
@@ -256,9 +258,10 @@ class Interior:
         found = self.factors.of(self.state.eliminated)
         return self, Reduced(found.schur, found.diagonal, RightHandSide(*found.reduce(self.state.b)))
 
-    def eliminated_translations(self, _: None) -> tuple[Interior, Array | None]:
+    def eliminated_translations(self, _: None) -> tuple[Interior, ReducedTranslations]:
         """Matrix of the translations once more, if there has been one."""
-        return self, self.factors.laplacian.schur if self.state.has_laplacian else None
+        schur = self.factors.laplacian.schur if self.state.has_laplacian else None
+        return self, ReducedTranslations(np.zeros((0, self.part.problem.d)), schur)
 
     # What the orders share.
 

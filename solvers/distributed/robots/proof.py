@@ -50,6 +50,7 @@ class RobotProof:
     low: Array  # (p, d): to be added to the translations
     slack: Array  # (i,): S_r is at least so much in the rows of the interior
     interior: IntArray  # (i,): those rows
+    fixed: Array  # ((d+1) g,): 1 for rows on the boundary that are left out
 
     def moved(self, step: Array) -> RobotProof:
         """The same at X - step."""
@@ -69,7 +70,9 @@ class RobotProof:
         return ProofSums(*sums, found.product[boundary], found.product_error[boundary]), found.product
 
 
-def begin_proof(part: Part, poses: Poses, Lambda: Array, slack: Array, cut: Cut, point: Array) -> RobotProof:
+def begin_proof(
+    part: Part, poses: Poses, Lambda: Array, slack: Array, cut: Cut, point: Array, fixed: Array
+) -> RobotProof:
     """Proof at given poses, turned to the frame in which the driver gives the rows of X on the boundary, `point`.
 
     One separator is enough to know that frame: with its pose (R, t) here and its rows s and P^T there, it is turned by
@@ -80,7 +83,7 @@ def begin_proof(part: Part, poses: Poses, Lambda: Array, slack: Array, cut: Cut,
     R = poses.R[first] @ point[g : g + d]
     X = Poses(R.T @ poses.R, (poses.t - poses.t[first]) @ R + point[0]).stacked()
     X[cut.boundary] = point
-    return RobotProof(Lambda, X, X, np.zeros((poses.num_poses, d)), slack, cut.interior)
+    return RobotProof(Lambda, X, X, np.zeros((poses.num_poses, d)), slack, cut.interior, fixed)
 
 
 def verify_interior(

@@ -1,10 +1,12 @@
 """Orders about a robot's part of the lower bound: eliminate S for a proof, begin one at a point, move it."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from pgo_models.geometry.rotations import Array
+from solvers.distributed.robots.elimination import row_sums, unpacked
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.proof import begin_proof, verify_interior
 from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep
@@ -22,14 +24,15 @@ def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofA
     fixed = np.append(fixed, 0) if order.point is None and factors.grounds else fixed
     found = verify_interior(problem, Lambda, order.eta, cut, fixed, order.share, factors.backend)
     if found is None:
-        return robot.with_changes(proof=None), ProofAnswer(None, trace, None)
+        return robot.with_changes(proof=None), ProofAnswer(None, None, trace, None)
     matrix, elimination, slack = found
     following = robot.with_changes(proof=None, eliminated=factors.keep(matrix, widths, elimination))
+    sizes = row_sums(unpacked(elimination.schur, len(cut.boundary)), order.diagonal)
     if order.point is None:
-        return following, ProofAnswer(elimination.schur, trace, None)
-    proof = begin_proof(robot.part, robot.state.poses, Lambda, slack, elimination.cut, order.point)
+        return following, ProofAnswer(elimination.schur, sizes, trace, None)
+    proof = begin_proof(robot.part, robot.state.poses, Lambda, slack, elimination.cut, order.point, order.fixed)
     following, step = _evaluated(following.with_changes(proof=proof))
-    return following, ProofAnswer(elimination.schur, trace, step)
+    return following, ProofAnswer(elimination.schur, sizes, trace, step)
 
 
 def move_proof(robot: Interior, x: Array) -> tuple[Interior, ProofStep]:
@@ -39,7 +42,8 @@ def move_proof(robot: Interior, x: Array) -> tuple[Interior, ProofStep]:
 
 
 def _evaluated(robot: Interior) -> tuple[Interior, ProofStep]:
-    assert robot.state.proof is not None
-    sums, product = robot.state.proof.evaluated(robot.tangent_problem, robot.boundary_rows)
+    proof = robot.state.proof
+    assert proof is not None
+    sums, product = proof.evaluated(robot.tangent_problem, robot.boundary_rows)
     following, right = robot.reduced(product)
-    return following, ProofStep(sums, right)
+    return following, ProofStep(sums, replace(right, b=np.where(proof.fixed[:, None] > 0, 0.0, right.b)))

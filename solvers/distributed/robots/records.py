@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from pgo_models.geometry.rotations import Array
 from solvers.distributed.robots.proof import ProofSums
 from solvers.soc.copies import OwnPoses
+from solvers.soc.recursion_block import Agreement
+
+ALONG_TREE = ("b", "schur", "x")  # fields of what goes between a robot and the front above it
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +92,20 @@ class RescaleInterior:
 
 
 @dataclass(frozen=True, eq=False)
+class Agree:
+    """What all parties learn from step (a), and the rows of the next omega on the boundary, (dg, d)."""
+
+    agreement: Agreement
+    measured_at: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Agreed:
-    """Squared residuals, (2,), and the right-hand side of the next step (a)."""
+    """Squared residuals, (2,), the right-hand side of the next step (a), and part of F at omega."""
 
     sums: Array
     right: RightHandSide
+    measured: float
 
 
 @dataclass(frozen=True)
@@ -119,6 +131,7 @@ class ProofOrder:
     eta: float
     share: float  # at least so much of the diagonal is subtracted
     fixed: Array  # ((d+1) g,): 1 for rows on the boundary that are left out
+    diagonal: Array  # ((d+1) g,): of S there, summed over robots, or more
     point: Array | None  # ((d+1) g, d): X there, where a proof begins
 
 
@@ -135,6 +148,7 @@ class ProofAnswer:
     """S with the interior eliminated, None where it is not definite; part of tr(Lambda); the first step of a proof."""
 
     schur: Array | None
+    sizes: Array | None  # ((d+1) g,): `row_sums` of it
     trace: float
     step: ProofStep | None
 

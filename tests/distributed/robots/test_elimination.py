@@ -7,7 +7,7 @@ from budget import examples
 from graphs import DIMENSIONS, EPS, LOUD_NOISE, SEEDS, random_poses, varied_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from robots import BACKENDS, PARTITIONERS, Partitioner
+from robots import BACKENDS, PARTITIONERS, Partitioner, interface_of
 from scipy.sparse import csc_array, diags_array
 
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
@@ -19,8 +19,8 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import riemannian_hessian
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed.interface import Interface, InterfaceFactor, by_separator
-from solvers.distributed.multifrontal import separator_tree
+from solvers.distributed.interface import Interface
+from solvers.distributed.multifrontal import FrontOwners
 from solvers.distributed.robots.elimination import Cut, Elimination, eliminate, packed, unpacked
 from solvers.soc.subgraph import Part, split_graph
 
@@ -52,7 +52,7 @@ class Split:
     interface: Interface
     cover_columns: IntArray
 
-    def eliminate(self, backend: CholeskyBackend) -> tuple[list[Elimination], InterfaceFactor]:
+    def eliminate(self, backend: CholeskyBackend) -> tuple[list[Elimination], Interface]:
         robots = [eliminate(piece, cut, backend) for piece, cut in zip(self.pieces, self.cuts, strict=True)]
         return robots, self.interface.factorize([robot.schur for robot in robots], self.own)
 
@@ -89,7 +89,7 @@ def split(problem: PGOProblem, parts: Partition, kind: str, seed: int, diagonal:
         cuts=cuts,
         columns=columns,
         own=[(np.arange(len(at))[:, None], diagonal[at][:, None, None])],
-        interface=Interface(len(cover), widths, touched, separator_tree(touched, len(cover))),
+        interface=interface_of(touched, len(cover), widths),
         cover_columns=at,
     )
 
@@ -117,15 +117,16 @@ def test_elimination_and_back_substitution_solve_the_whole_system(
         shares.append(left[mine])
         left[mine] = 0.0
     reduced = [robot.reduce(share) for robot, share in zip(robots, shares, strict=True)]
-    b_G = system.interface.gather([vector for vector, _ in reduced])
-    x_G = driver.solve(b_G)
+    x_G, on_parts, of_cover = driver.solve([vector for vector, _ in reduced])
     x = np.full_like(b, np.nan)
-    for mine, robot, share, part in zip(system.columns, robots, shares, system.interface.scatter(x_G), strict=True):
+    for one, other in zip(on_parts, system.interface.scatter(x_G), strict=True):
+        np.testing.assert_array_equal(one, other)
+    for mine, robot, share, part in zip(system.columns, robots, shares, on_parts, strict=True):
         x[mine] = robot.back_substitute(share, part)
     np.testing.assert_array_equal(x[system.cover_columns], x_G)
     allowed = 100 * EPS * len(b) * np.linalg.norm(system.whole, 2) * np.linalg.norm(x)
     assert np.linalg.norm(system.whole @ x - b) <= allowed
-    energy = sum(inside for _, inside in reduced) + np.vdot(b_G, x_G)
+    energy = sum(inside for _, inside in reduced) + of_cover
     assert energy == pytest.approx(np.vdot(b, x), rel=1e-9)
 
 
@@ -173,16 +174,16 @@ def test_the_whole_is_positive_definite_where_all_parts_of_it_are(
 
 def test_numbers_that_are_not_finite_are_not_positive_definite() -> None:
     touched = (np.array([0, 1]),)
-    interface = Interface(2, (1,), touched, separator_tree(touched, 2))
+    interface = interface_of(touched, 2, (1,))
     for bad in (np.nan, np.inf):
         with pytest.raises(NotPositiveDefiniteError, match="nan or inf"):
             interface.factorize([np.array([1.0, bad, 1.0])])
 
 
 def test_without_separators_there_is_nothing_to_solve() -> None:
-    interface = Interface(0, (1, 3), (np.zeros(0, dtype=int),), separator_tree((np.zeros(0, dtype=int),), 0))
+    interface = interface_of((np.zeros(0, dtype=int),), 0, (1, 3))
     factor = interface.factorize([np.zeros(0)])
-    assert factor.solve(interface.gather([np.zeros((0, 3))])).shape == (0, 3)
+    assert factor.solve([np.zeros((0, 3))])[0].shape == (0, 3)
 
 
 # Columns and packing.
@@ -190,7 +191,7 @@ def test_without_separators_there_is_nothing_to_solve() -> None:
 
 @given(count=st.integers(0, 6), widths=st.lists(st.integers(1, 4), min_size=1, max_size=3))
 def test_unknowns_by_field_and_by_separator_are_the_same(count: int, widths: list[int]) -> None:
-    order = by_separator(count, tuple(widths))
+    order = Interface(count, tuple(widths), (), FrontOwners((), 0)).order
     assert sorted(order.tolist()) == list(range(count * sum(widths)))
     for separator, columns in enumerate(order.reshape(count, sum(widths))):
         np.testing.assert_array_equal(columns, columns_of(np.array([separator]), count, tuple(widths)))
@@ -225,7 +226,7 @@ def test_factoring_takes_no_more_memory_than_was_said(
     number: int, separators: int, each: int, widths: tuple[int, ...]
 ) -> None:
     touched = copies(0, number, separators, each)
-    interface = Interface(separators, widths, touched, separator_tree(touched, separators))
+    interface = interface_of(touched, separators, widths)
     interface.factorize([packed(np.eye(len(columns))) for columns in interface.columns])  # imports and caches
     said = interface.num_bytes
     tracemalloc.start()
@@ -234,15 +235,15 @@ def test_factoring_takes_no_more_memory_than_was_said(
         most = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert factor.order.size == interface.side
-    small = 100_000 + 2000 * len(interface.tree)  # objects, and arrays of a few numbers
+    assert factor.fronts.held
+    small = 100_000 + 2000 * len(interface.fronts.tree)  # objects, and arrays of a few numbers
     assert most <= said + small
     assert most >= 0.2 * said  # and it is not said from far above
 
 
 def test_what_would_not_fit_is_refused_with_the_way_out() -> None:
     touched = copies(0, 5, 160, 70)
-    interface = Interface(160, (3, 3), touched, separator_tree(touched, 160))
+    interface = interface_of(touched, 160, (3, 3))
     interface.check_memory(interface.num_bytes)
     with pytest.raises(
         SettingError, match=r"for 160 separators, more than .* METIS partition or fewer robots, raise driver_memory"

@@ -159,7 +159,7 @@ def test_every_term_of_a_driver_s_errors_is_there(monkeypatch: pytest.MonkeyPatc
         error += 1e-15 * abs(own) + gamma(len(parts) + 2.0) * 2.0 * abs(own)
         assert sums.quadratic >= enough * np.sum(error**2 / slack[:, None]) > 0.0
         assert sums.value_error >= enough * (blocks.value_error + u * abs(sums.value)) > 0.0
-        monkeypatch.setattr(Interface, "rounding", lambda self, contributions, own, diagonal: 0.0 * diagonal)
+        monkeypatch.setattr(Interface, "rounding", lambda self, sizes, own, diagonal: 0.0 * diagonal)
         fixed = driver.ground(1).ravel()
         found = distributed_bound._eliminate(driver, fixed, 1.0, 1e-13, None)
         assert found is not None

@@ -22,6 +22,7 @@ from graphs import DIMENSIONS, SEEDS, still_ring, varied_graph
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from roads import road
+from robots import interface_of
 from scipy.sparse import csc_array
 
 from pgo_models.geometry.rotations import Array
@@ -38,9 +39,8 @@ from pgo_models.problem.cholesky import (
 from pgo_models.problem.floating_point import gamma
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed.interface import Interface, InterfaceFactor
-from solvers.distributed.multifrontal import separator_tree
-from solvers.distributed.robots.elimination import Cut, eliminate, packed, unpacked
+from solvers.distributed.interface import Interface
+from solvers.distributed.robots.elimination import Cut, eliminate, packed, row_sums, unpacked
 from solvers.distributed.robots.proof import verify_interior
 from solvers.soc.subgraph import Part, split_graph
 
@@ -209,7 +209,7 @@ def test_the_drivers_factor_is_within_its_rounding(cancelling: float) -> None:
         rng = np.random.default_rng(seed)
         g, d = int(rng.integers(3, 7)), int(rng.integers(2, 4))
         touched = tuple(np.arange(g) if a < 2 else np.sort(rng.permutation(g)[:2]) for a in range(4))
-        space = Interface(g, (1, d), touched, separator_tree(touched, g))
+        space = interface_of(touched, g, (1, d))
         contributions, K = [], np.full((space.side, space.side), MP.mpf(0), dtype=object)
         for a, columns in enumerate(space.columns):
             W = rng.standard_normal((len(columns), len(columns)))
@@ -221,21 +221,24 @@ def test_the_drivers_factor_is_within_its_rounding(cancelling: float) -> None:
         for block in zip(columns, values, strict=True):
             K[np.ix_(block[0], block[0])] += exact(block[1])
         diagonal = np.asarray(K.diagonal(), dtype=float) * (1.0 + 1e-12)
-        lost = space.rounding(contributions, [(columns, values)], diagonal)
+        sides = [(unpacked(one, len(at)), diagonal[at]) for one, at in zip(contributions, space.columns, strict=True)]
+        lost = space.rounding([row_sums(*side) for side in sides], [(columns, values)], diagonal)
         factor = space.factorize(contributions, [(columns, values)])
         difference = square_of_tree(factor) - K
         assert largest_share(difference, diagonal) > 0.0
         assert largest_share(difference - np.diag(exact(lost)), diagonal) < 0.0
 
 
-def square_of_tree(factor: InterfaceFactor) -> Exact:
+def square_of_tree(factor: Interface) -> Exact:
     """R^T R of the driver's factor, taken exactly, in the order of its unknowns."""
-    tree, width, side = factor.factor.tree, factor.factor.width, len(factor.order)
+    tree, width, side = factor.fronts.tree, sum(factor.widths), factor.side
+    order = factor.order
     product = np.full((side, side), MP.mpf(0), dtype=object)
-    for front, (L_EE, L_BE) in zip(tree, factor.factor.blocks, strict=True):
+    for number, front in enumerate(tree):
         if len(front.eliminated):
-            rows = factor.order[(width * front.poses[:, None] + np.arange(width)).ravel()]
-            L = exact(np.concatenate([L_EE, L_BE]))
+            found = factor.fronts.held[number].factors[str(factor.widths)]
+            rows = order[(width * front.separators[:, None] + np.arange(width)).ravel()]
+            L = exact(np.concatenate([found.L_EE, found.L_BE]))
             product[np.ix_(rows, rows)] += L @ L.T
     return product
 
