@@ -9,7 +9,7 @@ import enum
 import importlib.util
 import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
 
@@ -19,6 +19,7 @@ from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 
 from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, FactorCounts, error_of_counts, gamma
 from pgo_models.problem.kernels import kernels_of_the_cpu
 
@@ -111,14 +112,17 @@ class SymbolicCholesky(ABC):
             raise NotPositiveDefiniteError("the matrix has nan or inf; check the weights and measurements")
 
 
-def analyze(pattern: csc_array, backend: CholeskyBackend | None = None) -> SymbolicCholesky:
+def analyze(
+    pattern: csc_array, backend: CholeskyBackend | None = None, widths: Sequence[int] = (1,)
+) -> SymbolicCholesky:
     """Order and analyse the pattern of a symmetric matrix, whose diagonal must be stored in full.
 
-    With `default_backend()` unless one is given; a MissingExtraError when CHOLMOD is, without the extra `fast`.
+    With `default_backend()` unless one is given; a MissingExtraError when CHOLMOD is, without the extra `fast`. Rows
+    are those of nodes stacked field by field, `widths[f]` a node (`matrices.columns_of`): nodes can be ordered as one.
     """
     pattern.sort_indices()
     chosen = backend or default_backend()
-    return _Cholmod(pattern) if chosen is CholeskyBackend.CHOLMOD else _SuperLU(pattern)
+    return _Cholmod(pattern, widths) if chosen is CholeskyBackend.CHOLMOD else _SuperLU(pattern)
 
 
 def factorize(matrix: csc_array, backend: CholeskyBackend | None = None) -> CholeskyFactor:
@@ -262,15 +266,16 @@ class _CholmodFactor(CholeskyFactor):
 
 
 class _Cholmod(SymbolicCholesky):
-    """Supernodal L L^T of the lower triangle; AMD order."""
+    """Supernodal L L^T of the lower triangle; AMD order of nodes, which fills as little as one of their rows."""
 
-    def __init__(self, pattern: csc_array) -> None:
+    def __init__(self, pattern: csc_array, widths: Sequence[int] = (1,)) -> None:
         super().__init__(pattern)
         cvxopt, _ = _import_cvxopt()
         columns = np.repeat(np.arange(pattern.shape[1]), np.diff(pattern.indptr))
         self._lower = np.flatnonzero(pattern.indices >= columns)
         places = [of_all[self._lower].astype(np.int64) for of_all in (pattern.indices, columns)]
         self._is_diagonal = places[0] == places[1]
+        self._order = cvxopt.matrix(_order_of_nodes(places, pattern.shape[0], widths))
         self._matrix = cvxopt.spmatrix(1.0, *map(cvxopt.matrix, places), pattern.shape)
         # Symbolic parts with the factor that uses each. No finaliser gives them back: Ctrl-C in one would be lost.
         self._taken: list[tuple[weakref.ref[_CholmodFactor] | None, _Capsule]] = [(None, self._analyze())]
@@ -307,7 +312,7 @@ class _Cholmod(SymbolicCholesky):
 
     def _analyze(self) -> _Capsule:
         with _supernodal() as cholmod:
-            return cholmod.symbolic(self._matrix)
+            return cholmod.symbolic(self._matrix, p=self._order)
 
     def factorize(self, matrix: csc_array, overwrite: CholeskyFactor | None = None) -> CholeskyFactor:
         self._check(matrix)
@@ -346,20 +351,31 @@ class _Cholmod(SymbolicCholesky):
 
 @contextmanager
 def _supernodal() -> Iterator[ModuleType]:
-    """CHOLMOD set to L L^T, which exists for positive definite matrices only: to analyse for L D L^T accepts others."""
+    """CHOLMOD set to L L^T, which positive definite matrices alone have, in the order given, its one method."""
     _, cholmod = _import_cvxopt()
-    saved = cholmod.options.get("supernodal", 2)
-    cholmod.options["supernodal"] = 2
+    saved = {"supernodal": 2, "nmethods": 0} | cholmod.options
+    cholmod.options.update(supernodal=2, nmethods=1)
     try:
         yield cholmod
     finally:
-        cholmod.options["supernodal"] = saved
+        cholmod.options.update(saved)
+
+
+def _order_of_nodes(places: list[IntArray], side: int, widths: Sequence[int]) -> IntArray:
+    """Order of rows that keeps those of a node together, from a lower triangle, of which first rows show all edges."""
+    cvxopt, _ = _import_cvxopt()
+    n, first = side // sum(widths), widths[0]
+    shown = (places[0] < n * first) & (places[0] % first == 0) & (places[1] % first == 0)
+    nodes = cvxopt.spmatrix(1.0, *(cvxopt.matrix(place[shown] // first) for place in places), (n, n))
+    order, ends = np.array(cvxopt.amd.order(nodes)), n * np.cumsum(widths)
+    rows = [end - width * (n - order) + np.arange(width) for end, width in zip(ends, widths, strict=True)]
+    return np.concatenate(rows, axis=1).ravel()
 
 
 def _import_cvxopt() -> tuple[ModuleType, ModuleType]:
     try:
         with kernels_of_the_cpu():
-            import cvxopt
+            import cvxopt.amd
             from cvxopt import cholmod
     except ImportError as error:
         raise MissingExtraError("cvxopt", "fast") from error

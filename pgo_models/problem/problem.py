@@ -161,7 +161,7 @@ class PGOProblem:
     @cached_property
     def analysis(self) -> SymbolicCholesky:
         """Symbolic factorisation of the pattern of M, shared by every matrix that has it."""
-        return analyze(self.M, self.backend) if self.convex_part is self else self.convex_part.analysis
+        return analyze(self.M, self.backend, (1, self.d)) if self.convex_part is self else self.convex_part.analysis
 
     @cached_property
     def diagonal_positions(self) -> IntArray:
