@@ -19,7 +19,6 @@ from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 
 from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, FactorCounts, error_of_counts, gamma
 from pgo_models.problem.kernels import kernels_of_the_cpu
 
@@ -275,7 +274,13 @@ class _Cholmod(SymbolicCholesky):
         self._lower = np.flatnonzero(pattern.indices >= columns)
         places = [of_all[self._lower].astype(np.int64) for of_all in (pattern.indices, columns)]
         self._is_diagonal = places[0] == places[1]
-        self._order = cvxopt.matrix(_order_of_nodes(places, pattern.shape[0], widths))
+        # Rows of a node stay together. Their first ones show all edges, and have a pattern in which AMD is quick.
+        n, first = pattern.shape[0] // sum(widths), widths[0]
+        shown = (places[0] < n * first) & (places[0] % first == 0) & (places[1] % first == 0)
+        nodes = cvxopt.spmatrix(1.0, *(cvxopt.matrix(place[shown] // first) for place in places), (n, n))
+        order, ends = np.array(cvxopt.amd.order(nodes)), n * np.cumsum(widths)
+        rows = [end - width * (n - order) + np.arange(width) for end, width in zip(ends, widths, strict=True)]
+        self._order = cvxopt.matrix(np.concatenate(rows, axis=1).ravel())
         self._matrix = cvxopt.spmatrix(1.0, *map(cvxopt.matrix, places), pattern.shape)
         # Symbolic parts with the factor that uses each. No finaliser gives them back: Ctrl-C in one would be lost.
         self._taken: list[tuple[weakref.ref[_CholmodFactor] | None, _Capsule]] = [(None, self._analyze())]
@@ -359,17 +364,6 @@ def _supernodal() -> Iterator[ModuleType]:
         yield cholmod
     finally:
         cholmod.options.update(saved)
-
-
-def _order_of_nodes(places: list[IntArray], side: int, widths: Sequence[int]) -> IntArray:
-    """Order of rows that keeps those of a node together, from a lower triangle, of which first rows show all edges."""
-    cvxopt, _ = _import_cvxopt()
-    n, first = side // sum(widths), widths[0]
-    shown = (places[0] < n * first) & (places[0] % first == 0) & (places[1] % first == 0)
-    nodes = cvxopt.spmatrix(1.0, *(cvxopt.matrix(place[shown] // first) for place in places), (n, n))
-    order, ends = np.array(cvxopt.amd.order(nodes)), n * np.cumsum(widths)
-    rows = [end - width * (n - order) + np.arange(width) for end, width in zip(ends, widths, strict=True)]
-    return np.concatenate(rows, axis=1).ravel()
 
 
 def _import_cvxopt() -> tuple[ModuleType, ModuleType]:
