@@ -36,13 +36,14 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, orthogonality_error
 from pgo_models.graphs.pose_graph import IntArray, middle_pose
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF
-from pgo_models.problem.matrices import rotation_columns
+from pgo_models.problem.matrices import inner, rotation_columns
 from pgo_models.problem.problem import PGOProblem
 
 _ETA_SHARE = 0.5  # of the wanted gap is spent on eta; the rest is for poses a little off the optimum
 UNGROUNDED_SHIFT = 1e-11  # of the diagonal: with eta, what is subtracted for rounding has to be made up for
 MOST_MOVES = 3
 SETTLED = 1e-13  # of the value: G adds less, and moving again would gain nothing
+NEGLIGIBLE = 0.01  # of what moving has gained, about the gap of the poses
 
 
 @dataclass(frozen=True)
@@ -224,11 +225,12 @@ def _move(problem: PGOProblem, Lambda: Array, X: Array, proof: DefiniteProof) ->
     """X - S_r^-1 S X, again while that helps, and the certificate there."""
     n, d, free = problem.num_poses, problem.d, proof.free
     weight = (proof.shift * proof.diagonal)[free]
-    low, left, found = np.zeros((n, d)), math.inf, None
+    low, left, gained, found = np.zeros((n, d)), math.inf, 0.0, None
     product = problem.apply_M(X)
     product[n:] -= (Lambda @ X[n:].reshape(n, d, d)).reshape(-1, d)
     for _ in range(MOST_MOVES):
         step = proof.solve(product)
+        gained += inner(step, product)
         there = X.copy(), low - step[:n]
         there[0][n:] -= step[n:]
         moved = evaluate_certificate(problem, Lambda, *there)
@@ -236,7 +238,7 @@ def _move(problem: PGOProblem, Lambda: Array, X: Array, proof: DefiniteProof) ->
         if not after < left:
             break
         (X, low), found, product, left = there, moved, moved.product, after
-        if left <= SETTLED * abs(found.value):
+        if left <= max(SETTLED * abs(found.value), NEGLIGIBLE * gained):
             break
     return X, found if found is not None else evaluate_certificate(problem, Lambda, X, low)
 

@@ -58,9 +58,9 @@ class PolishState:
         return self.decrement <= self.tolerance or self.is_at_rounding
 
 
-def start_polish(problem: PGOProblem, poses: Poses) -> PolishState:
-    """State before the first step."""
-    tolerance = STATIONARY_DECREMENT if problem.is_quadratic else STATIONARY_FOR_TANGENTS
+def start_polish(problem: PGOProblem, poses: Poses, share: float = 1.0) -> PolishState:
+    """State before the first step; `share` is how many times looser than usual its tolerance is."""
+    tolerance = share * (STATIONARY_DECREMENT if problem.is_quadratic else STATIONARY_FOR_TANGENTS)
     return PolishState(poses=poses, objective=problem.objective(poses), tolerance=tolerance)
 
 
@@ -73,7 +73,7 @@ def polish_step(
     `second_order` is False, with its Gauss-Newton part, damped until it is; that part is the better model of chi2 far
     from its minimum, where the first step begins. Backtracking (Armijo) keeps F monotone.
     Further moves take the same factor, with the secants of those before (L-BFGS) or, without `secants`, as it is (chord
-    steps), while each cuts the decrement to a tenth.
+    steps), while each cuts the decrement to a tenth, or by so much that those left would bring it within tolerance.
     """
     is_far = state.analysis is None and not problem.is_quadratic
     analysis, factor, is_newton = _factorize_model(problem, state, second_order and not is_far)
@@ -100,7 +100,8 @@ def polish_step(
         if tie and decrement > 0.5 * now.decrement:
             now = replace(now, is_at_rounding=at_rounding)
             break
-        enough = decrement <= PROGRESS * now.decrement
+        cut, left = decrement / now.decrement, SECANT_STEPS - len(learned)
+        enough = cut <= PROGRESS or (secants and decrement * cut**left <= now.tolerance)
         now = replace(candidate, decrement=decrement, moved=True, is_at_rounding=at_rounding)
         if not enough:
             break
@@ -167,8 +168,7 @@ def _factorize_model(
     gauss_newton = riemannian_hessian(problem, state.poses, None)
     ground_pose(gauss_newton, problem)
     analysis = analysis or analyze(gauss_newton, problem.backend, order)
-    diagonal = gauss_newton.diagonal()
-    damping = 0.0
+    diagonal, damping = gauss_newton.diagonal(), 0.0
     while True:
         try:
             return analysis, analysis.factorize(gauss_newton), False

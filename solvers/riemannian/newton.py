@@ -55,7 +55,8 @@ class Newton:
 
     def init(self, problem: PGOProblem, start: Poses | None) -> NewtonState:
         """State 0: `start`, or the chordal relaxation."""
-        return NewtonState(0, start_polish(problem, start if start is not None else chordal_start(problem)))
+        poses, share = start if start is not None else chordal_start(problem), self.tolerance / STATIONARY_DECREMENT
+        return NewtonState(0, start_polish(problem, poses, share))
 
     def step(self, problem: PGOProblem, state: NewtonState) -> NewtonState:
         """One factorisation and the moves it serves."""

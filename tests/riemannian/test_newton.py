@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, polish, relative_decrement
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.scenes import grid
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.loop import run
@@ -151,3 +152,12 @@ def test_settings_are_checked(settings: dict[str, float], message: str) -> None:
     for kind in (SettingError, ValueError):
         with pytest.raises(kind, match=message):
             Newton(**settings)
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-8])
+def test_no_moves_are_made_within_the_tolerance(tolerance: float) -> None:
+    problem = PGOProblem(grid(np.random.default_rng(1)))
+    loose, tight = run(Newton(tolerance=tolerance), problem), run(Newton(), problem)
+    assert loose.status is Status.CONVERGED
+    assert STATIONARY_DECREMENT < loose.state.polish.decrement <= tolerance
+    assert tight.objective < loose.objective <= tight.objective * (1.0 + 2.0 * tolerance)
