@@ -3,10 +3,10 @@
 #
 # Open with `jupyter lab notebooks/10_soc_beyond_robots.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
 #
-# Nothing in the paper's equation (19), its three steps, knows of robots: (a) is any convex problem, (b) a projection, (c) a
-# sum. Four problems from elsewhere, each with a rival that is usually taken: modes of a vibrating plate that live somewhere,
-# a rotation fitted to points of which some are wrong, principal components that can be read, and the sparse low-rank
-# approximation that the paper's second remark names for compressing what robots send.
+# Nothing in the paper's equation (19), its three steps, knows of robots: (a) is any convex problem, (b) a projection,
+# (c) a sum. Four problems from elsewhere, each with a rival that is usually taken: modes of a vibrating plate that
+# live somewhere, a rotation fitted to points of which some are wrong, principal components that can be read, and the
+# sparse low-rank approximation that the paper's second remark names for compressing what robots send.
 
 # %%
 import itertools
@@ -40,8 +40,8 @@ def nearest_orthonormal(V):  # step (b): U V^T of the SVD
 #
 # $$\min_X \; \operatorname{tr}(X^\top A X) + w \sum |X_{ij}| \quad \text{subject to} \quad X^\top X = I.$$
 #
-# Convex but for the constraint. Split twice: a copy $P$ carries the constraint, a copy $Q$ the 1-norm. Then (a) is a linear
-# system with one matrix for all iterations, (b) an SVD and a soft threshold, (c) two sums.
+# Convex but for the constraint. Split twice: a copy $P$ carries the constraint, a copy $Q$ the 1-norm. Then (a) is a
+# linear system with one matrix for all iterations, (b) an SVD and a soft threshold, (c) two sums.
 
 
 # %%
@@ -82,13 +82,13 @@ for row, (name, columns) in enumerate((("eigenvector", waves), ("compressed mode
         panels[row, k].axis("off")
 
 # %% [markdown]
-# Above the eigenvectors, below the compressed modes: each has a place of its own, and is exactly zero elsewhere. They are no
-# eigenvectors; as $w$ goes to zero they span the same space.
+# Above the eigenvectors, below the compressed modes: each has a place of its own, and is exactly zero elsewhere. They
+# are no eigenvectors; as $w$ goes to zero they span the same space.
 #
 # ## The library agrees
 #
-# `sparse_components` is the same problem for `solve_orthogonal`, whose step (a) is cvxpy and Clarabel with the 1-norm left in
-# it: another splitting, the same stationary points. Started at ours it stays there.
+# `sparse_components` is the same problem for `solve_orthogonal`, whose step (a) is cvxpy and Clarabel with the 1-norm
+# left in it: another splitting, the same stationary points. Started at ours it stays there.
 
 # %%
 string = path_laplacian(20)
@@ -100,9 +100,9 @@ print(f"objective by hand {price(string, 0.2, by_hand):.6f}, by the library {run
 # %% [markdown]
 # ## A rotation, and points of which some are wrong
 #
-# Two scans of the same points, turned against each other: Procrustes' problem. The sum of *squares* has the closed form of
-# [notebook 4](04_splitting_orthogonality.ipynb), and one point that was matched to the wrong partner turns it. The sum of
-# *distances* has no closed form, and is just as convex.
+# Two scans of the same points, turned against each other: Procrustes' problem. The sum of *squares* has the closed
+# form of [notebook 4](04_splitting_orthogonality.ipynb), and one point that was matched to the wrong partner turns
+# it. The sum of *distances* has no closed form, and is just as convex.
 
 # %%
 rng = np.random.default_rng(1)
@@ -136,8 +136,8 @@ assert np.isclose(procrustes(points, seen, rotation=True).objective([squares]), 
 # %% [markdown]
 # ## Principal components that can be read
 #
-# Thirty sensors, three hidden causes, each of which moves eight sensors. Principal components mix the causes, since whatever
-# rotates them explains the same variance. With a price on the 1-norm the mixing costs something.
+# Thirty sensors, three hidden causes, each of which moves eight sensors. Principal components mix the causes, since
+# whatever rotates them explains the same variance. With a price on the 1-norm the mixing costs something.
 
 # %%
 causes = np.zeros((30, 3))
@@ -147,7 +147,7 @@ readings = rng.standard_normal((80, 3)) @ np.diag([3.0, 2.8, 2.6]) @ causes.T + 
 covariance = readings.T @ readings / 80
 values, vectors = np.linalg.eigh(covariance)
 principal = vectors[:, -3:]
-sparse = sparse_components(values[-1] * np.eye(30) - covariance, 3, 0.6)  # largest variance: smallest of c I - covariance
+sparse = sparse_components(values[-1] * np.eye(30) - covariance, 3, 0.6)  # largest of C: smallest of c I - C
 components = solvers.run(solvers.OrthogonalSOC(tolerance=1e-4), sparse, sparse.point([principal])).state.X[0]
 
 
@@ -166,14 +166,14 @@ for axes, title, X in zip(panels, ("principal", "sparse"), (principal, component
 # %% [markdown]
 # ## Sparse low-rank approximation
 #
-# The paper's remark: robots send samples that are alike among each other (*low rank*) and smooth in time (*sparse* in a cosine
-# transform). SLRMA (Hou, Chau, Magnenat-Thalmann and He 2017) wants both at once:
+# The paper's remark: robots send samples that are alike among each other (*low rank*) and smooth in time (*sparse* in
+# a cosine transform). SLRMA (Hou, Chau, Magnenat-Thalmann and He 2017) wants both at once:
 #
 # $$\min_{B, C} \lVert Y - B C \rVert_F^2 \quad \text{subject to} \quad B^\top B = I, \quad \lVert B \rVert_0 \le s.$$
 #
 # For a given $B$ the best $C$ is $B^\top Y$, which leaves $\lVert Y \rVert^2 - \lVert B^\top Y \rVert^2$: concave. On
-# $B^\top B = I$ it is $\operatorname{tr}(B^\top (c I - Y Y^\top) B)$ plus a constant, convex for $c = \lVert Y \rVert_2^2$.
-# Now $B$ is in *two* sets, neither convex, and has a copy in each.
+# $B^\top B = I$ it is $\operatorname{tr}(B^\top (c I - Y Y^\top) B)$ plus a constant, convex for $c = \lVert Y
+# \rVert_2^2$. Now $B$ is in *two* sets, neither convex, and has a copy in each.
 
 # %%
 rng = np.random.default_rng(2)
@@ -241,9 +241,10 @@ print(f"{sent} numbers in place of {Y.size}; error {relative_error(restored):.1%
 # %% [markdown]
 # ## Where it fails
 #
-# 1. $\rho$ has a threshold, as with robots: the multipliers of the constraint decide. Below it the modes never settle.
-# 2. What is found is a *stationary point*. The compressed modes of another start sit elsewhere; with two sets that are not
-#    convex, as in SLRMA, a random start mostly ends worse than that of the SVD.
+# 1. $\rho$ has a threshold, as with robots: the multipliers of the constraint decide. Below it the modes never
+#    settle.
+# 2. What is found is a *stationary point*. The compressed modes of another start sit elsewhere; with two sets that
+#    are not convex, as in SLRMA, a random start mostly ends worse than that of the SVD.
 
 # %%
 never = compressed_modes(plate, 4, 0.2, 1.0, 800, np.random.default_rng(0))[2]
@@ -256,12 +257,13 @@ print("rho = 8, other starts: objectives", np.round(sorted(objectives), 3))
 # %% [markdown]
 # ## Exercises
 #
-# **1.** Which $\rho$ does a larger price need? Find by trial one with which the modes settle at $w = 0.5$, where 8 is too small.
+# **1.** Which $\rho$ does a larger price need? Find by trial one with which the modes settle at $w = 0.5$, where 8 is
+# too small.
 #
 # <details><summary>Answer</summary>
 #
-# The subgradient of $w \sum |X|$ grows with $w$, and with it the multiplier of $X^\top X = I$ that has to balance it. The
-# threshold of $\rho$ grows in proportion.
+# The subgradient of $w \sum |X|$ grows with $w$, and with it the multiplier of $X^\top X = I$ that has to balance it.
+# The threshold of $\rho$ grows in proportion.
 #
 # ```python
 # settled = {rho: compressed_modes(plate, 4, 0.5, rho, 800, np.random.default_rng(0))[2] for rho in (8.0, 20.0)}
@@ -270,7 +272,8 @@ print("rho = 8, other starts: objectives", np.round(sorted(objectives), 3))
 #
 # </details>
 #
-# **2.** No answer of `sparse_components` is below the sum of the smallest eigenvalues plus $w$ times the number of columns. Why?
+# **2.** No answer of `sparse_components` is below the sum of the smallest eigenvalues plus $w$ times the number of
+# columns. Why?
 #
 # <details><summary>Answer</summary>
 #
@@ -288,13 +291,14 @@ print("rho = 8, other starts: objectives", np.round(sorted(objectives), 3))
 #
 # <details><summary>Answer</summary>
 #
-# Random errors cancel, so half of them do little. Errors that agree are a second rotation, and the majority wins: with 60 % of
-# them the fit is theirs. Wrong loop closures behave alike ([notebook 9](09_wrong_edges.ipynb)).
+# Random errors cancel, so half of them do little. Errors that agree are a second rotation, and the majority wins:
+# with 60 % of them the fit is theirs. Wrong loop closures behave alike ([notebook 9](09_wrong_edges.ipynb)).
 #
 # ```python
 # def fitted(seen):
 #     X = cp.Variable((3, 3))
-#     problem = pgo.OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum(cp.norm(points @ X - seen, axis=1)))), rotations=[X])
+#     distances = cp.Problem(cp.Minimize(cp.sum(cp.norm(points @ X - seen, axis=1))))
+#     problem = pgo.OrthogonalProblem(distances, rotations=[X])
 #     start = problem.point([pgo.project_to_rotations((points.T @ seen)[None])[0]])
 #     return solvers.run(solvers.OrthogonalSOC(tolerance=1e-3), problem, start).state.copies[0]
 # other = pgo.random_rotations(1, 3, np.random.default_rng(5))[0]

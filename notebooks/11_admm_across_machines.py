@@ -3,10 +3,10 @@
 #
 # Open with `jupyter lab notebooks/11_admm_across_machines.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
 #
-# The paper's section *Equivalence to ADMM* ends where ADMM becomes useful for robots: with one pass ($T = 1$) the blocks of
-# $x$ are minimised one by one, and blocks that share no term can be minimised *at the same time*, on different machines. Boyd
-# et al. (2011, chapter 7) know three patterns of it. This notebook codes them, and then does with two robots, line for line,
-# what it did with five hospitals.
+# The paper's section *Equivalence to ADMM* ends where ADMM becomes useful for robots: with one pass ($T = 1$) the
+# blocks of $x$ are minimised one by one, and blocks that share no term can be minimised *at the same time*, on
+# different machines. Boyd et al. (2011, chapter 7) know three patterns of it. This notebook codes them, and then does
+# with two robots, line for line, what it did with five hospitals.
 
 # %%
 import itertools
@@ -33,8 +33,9 @@ def soft(v, threshold):
 #
 # $$\min_x \sum_a \tfrac12 \lVert A_a x - b_a \rVert^2 + w \lVert x \rVert_1 .$$
 #
-# Give each its own $x_a$, and one $z$ that all must equal: $x_a - z = 0$ is the constraint $\mathcal{K} x = f$ of equation (1),
-# `problem bregman`. Minimise over all $x_a$ (they share no term), then over $z$, then add the residual back:
+# Give each its own $x_a$, and one $z$ that all must equal: $x_a - z = 0$ is the constraint $\mathcal{K} x = f$ of
+# equation (1), `problem bregman`. Minimise over all $x_a$ (they share no term), then over $z$, then add the residual
+# back:
 #
 # $$\begin{aligned}
 #   x_a &= \arg\min_x f_a(x) + \tfrac\rho2 \lVert x - z + u_a \rVert^2 && \text{each machine alone} \\
@@ -77,8 +78,9 @@ rounds = consensus(
 by_hand = list(itertools.islice(rounds, 60))
 
 x = cp.Variable(size)
-pooled = cp.Problem(cp.Minimize(0.5 * cp.sum_squares(np.vstack(A) @ x - np.concatenate(b)) + price * cp.norm1(x)))
-pooled.solve(solver=cp.CLARABEL, tol_gap_abs=1e-11, tol_gap_rel=1e-11, tol_feas=1e-11)
+loss = 0.5 * cp.sum_squares(np.vstack(A) @ x - np.concatenate(b))
+accurate = {"solver": cp.CLARABEL, "tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12, "tol_feas": 1e-12}
+cp.Problem(cp.Minimize(loss + price * cp.norm1(x))).solve(**accurate)
 distance = [np.linalg.norm(z - x.value) for z in by_hand]
 print("distance to the model from pooled data, after 10, 30, 60 rounds:", *(f"{distance[k]:.0e}" for k in (9, 29, 59)))
 print(f"nonzeros: {np.count_nonzero(by_hand[-1])} of {size}, the truth has {np.count_nonzero(model)}")
@@ -86,7 +88,8 @@ print(f"nonzeros: {np.count_nonzero(by_hand[-1])} of {size}, the truth has {np.c
 # %% [markdown]
 # ## The library agrees
 #
-# `AlternatingBregman` with $T = 1$ is equation (9), `bregman ADMM`, over the blocks that the problem names: five $x_a$ and $z$.
+# `AlternatingBregman` with $T = 1$ is equation (9), `bregman ADMM`, over the blocks that the problem names: five
+# $x_a$ and $z$.
 
 # %%
 blocks = [cp.Variable(size, name=f"x_{a}") for a in range(machines)]
@@ -101,13 +104,14 @@ print(f"differs from ours by {difference:.0e} in 10 rounds")
 # %% [markdown]
 # ## Sharing: many plans, one total
 #
-# Twelve power stations plan 24 hours. Each has its own cost and its own limits, and what counts for all is the *sum*: how far it
-# is from the demand,
+# Twelve power stations plan 24 hours. Each has its own cost and its own limits, and what counts for all is the *sum*:
+# how far it is from the demand,
 #
-# $$\min \sum_a f_a(x_a) + g\Bigl(\sum_a x_a\Bigr), \qquad f_a(x) = \tfrac{q_a}2 \lVert x \rVert^2 \text{ on } [0, c_a], \quad
-#   g(s) = \tfrac w2 \lVert s - \text{demand} \rVert^2 .$$
+# $$\min \sum_a f_a(x_a) + g\Bigl(\sum_a x_a\Bigr), \qquad
+#   f_a(x) = \tfrac{q_a}2 \lVert x \rVert^2 \text{ on } [0, c_a], \quad   g(s) = \tfrac w2 \lVert s - \text{demand} \rVert^2 .$$
 #
-# Nobody needs to see another's plan, only the *mean* (7.3): with $\bar x$ the mean of the plans and $\bar z$ what it should be,
+# Nobody needs to see another's plan, only the *mean* (7.3): with $\bar x$ the mean of the plans and $\bar z$ what it
+# should be,
 #
 # $$x_a \leftarrow \operatorname{prox}_{f_a / \rho}\bigl(x_a + \bar z - \bar x - u\bigr), \qquad
 #   \bar z \leftarrow \arg\min_{\bar z} g(N \bar z) + \tfrac{N \rho}2 \lVert \bar z - u - \bar x \rVert^2, \qquad
@@ -134,7 +138,7 @@ def sharing(rounds):
 X = cp.Variable((stations, hours))
 cost = cp.sum(cp.multiply(q / 2, cp.square(X))) + w / 2 * cp.sum_squares(cp.sum(X, axis=0) - demand)
 central = cp.Problem(cp.Minimize(cost), [X >= 0, cp.multiply(np.ones((1, hours)), X) <= np.tile(cap, (1, hours))])
-central.solve(solver=cp.CLARABEL)
+central.solve(**accurate)
 film = list(sharing(200))
 shared_distance = [np.abs(plans - X.value).max() for plans, _ in film]
 print("largest difference from the central plan, after 20, 60, 200 rounds:", end=" ")
@@ -143,13 +147,14 @@ print(*(f"{shared_distance[k]:.0e}" for k in (19, 59, 199)))
 # %% [markdown]
 # ## Exchange: a price that nobody sets
 #
-# Special case: $g$ says that the sum *is* zero. Buyers want $x_a > 0$, sellers $x_a < 0$; each knows only what it is worth to
-# itself, $f_a(x) = \tfrac{q_a}2 \lVert x - \text{wish}_a \rVert^2$. Then $\bar z = 0$ and two lines are left,
+# Special case: $g$ says that the sum *is* zero. Buyers want $x_a > 0$, sellers $x_a < 0$; each knows only what it is
+# worth to itself, $f_a(x) = \tfrac{q_a}2 \lVert x - \text{wish}_a \rVert^2$. Then $\bar z = 0$ and two lines are
+# left,
 #
 # $$x_a \leftarrow \operatorname{prox}_{f_a / \rho}(x_a - \bar x - u), \qquad u \leftarrow u + \bar x .$$
 #
-# $\rho u$ goes up where more is wanted than offered and down where less is: it is the price, and its limit is the multiplier of
-# $\sum_a x_a = 0$.
+# $\rho u$ goes up where more is wanted than offered and down where less is: it is the price, and its limit is the
+# multiplier of $\sum_a x_a = 0$.
 
 # %%
 traders, goods = 20, 3
@@ -187,10 +192,10 @@ _ = right.set(xlabel="round", ylabel="price", title="dotted: cvxpy's multiplier"
 # %% [markdown]
 # ## The bridge: two robots
 #
-# Now the machines are robots and $z$ is poses. $f_a$ are the edges that robot $a$ knows, half of those it shares with the other;
-# it holds its own poses and copies of the other's separators (`held`). In place of the soft threshold $z$ goes through the
-# projection to rotations: the constraint of equation (18), `relaxation rotation`, on the consensus variable. Everything else is
-# the function `consensus` from above, unchanged. That is the coupling `CONSENSUS`.
+# Now the machines are robots and $z$ is poses. $f_a$ are the edges that robot $a$ knows, half of those it shares with
+# the other; it holds its own poses and copies of the other's separators (`held`). In place of the soft threshold $z$
+# goes through the projection to rotations: the constraint of equation (18), `relaxation rotation`, on the consensus
+# variable. Everything else is the function `consensus` from above, unchanged. That is the coupling `CONSENSUS`.
 
 # %%
 graph = pgo.load("grid")
@@ -249,10 +254,11 @@ print(f"two robots: differs from the library by {bridge:.0e} in 25 rounds; gap {
 # %% [markdown]
 # ## Where it fails
 #
-# 1. *Everybody corrects the whole error.* In the exchange each trader takes back the *mean* excess. If each took back the whole of
-#    it, twenty would correct it twentyfold.
+# 1. *Everybody corrects the whole error.* In the exchange each trader takes back the *mean* excess. If each took back
+#    the whole of it, twenty would correct it twentyfold.
 # 2. *Bytes.* Each round of consensus sends two vectors a machine. Here it would have been cheaper to send the data.
-# 3. Nothing is secret: from $x_a + u_a$ over the rounds others can infer much of $A_a$ and $b_a$. Privacy needs more than ADMM.
+# 3. Nothing is secret: from $x_a + u_a$ over the rounds others can infer much of $A_a$ and $b_a$. Privacy needs more
+#    than ADMM.
 
 # %%
 with np.errstate(over="ignore", invalid="ignore"):
@@ -285,8 +291,8 @@ print(f"numbers sent in 60 rounds: {sent}; the data: {data}")
 #
 # <details><summary>Answer</summary>
 #
-# At the price $p$ trader $a$ takes $x_a = \text{wish}_a - p / q_a$. The sum is zero for $p \sum_a 1 / q_a = \sum_a \text{wish}_a$;
-# with one $q$ the price is $q$ times the mean wish.
+# At the price $p$ trader $a$ takes $x_a = \text{wish}_a - p / q_a$. The sum is zero for $p \sum_a 1 / q_a = \sum_a
+# \text{wish}_a$; with one $q$ the price is $q$ times the mean wish.
 #
 # ```python
 # assert np.allclose(prices[-1], wish.sum(axis=0) / (1 / q_a).sum(), atol=1e-5)
@@ -298,8 +304,8 @@ print(f"numbers sent in 60 rounds: {sent}; the data: {data}")
 #
 # <details><summary>Answer</summary>
 #
-# On the minimum of $F$ over all matrices, without orthogonality: that is zero, with all poses in one point and all $R_i = 0$. The
-# constraint is what holds the graph open.
+# On the minimum of $F$ over all matrices, without orthogonality: that is zero, with all poses in one point and all
+# $R_i = 0$. The constraint is what holds the graph open.
 #
 # ```python
 # loose = itertools.islice(consensus(steps, held, lambda v: v, start.stacked(), u), 400)

@@ -1,4 +1,4 @@
-"""The documentation: it builds without a warning, every link leads somewhere, and a browser opens and searches it offline."""
+"""The documentation: it builds without a warning, all links lead somewhere, a browser opens and searches it offline."""
 
 import os
 import re
@@ -136,7 +136,9 @@ def test_a_browser_searches_it_from_the_disk(browser, site):
     opened_without_complaint(browser)
 
 
-@pytest.mark.parametrize("page", ["proved.html", "notebooks/01_quickstart.html", "reference/pgo_models.certificates.html"])
+@pytest.mark.parametrize(
+    "page", ["proved.html", "notebooks/01_quickstart.html", "reference/pgo_models.certificates.html"]
+)
 def test_a_browser_shows_formulas_and_pictures_without_a_complaint(page, browser, site):
     browser.open(site / page)
     if "reference" not in page:

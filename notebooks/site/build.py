@@ -3,8 +3,9 @@
     python notebooks/site/build.py            # notebooks/site/_build/html/index.html; a warning is an error
     python notebooks/site/build.py --links    # also asks every address outside whether it answers
 
-Needs the extra `docs`. Pages are the .md files beside this; the notebooks are those of the folder above, with the outputs they
-were committed with; benchmarks and changelog are those of the repository; the reference is made from the docstrings.
+Needs the extra `docs`. Pages are the .md files beside this; the notebooks are those of the folder above, with the
+outputs they were committed with; benchmarks and changelog are those of the repository; the reference is made from the
+docstrings.
 """
 
 import argparse
@@ -81,13 +82,13 @@ def write_reference(folder: Path) -> None:
     import docstrings  # beside this file; needs the packages
 
     folder.mkdir()
-    index = ["# Reference", ""]
-    index += ["Room by room: each package is a row of rooms, and a file imports only from its own room and earlier ones.", ""]
+    index = ["# Reference", "", "Room by room: a file imports only from its own room and from earlier ones.", ""]
     for package, module in PACKAGES.items():
         index += [f"## {package}", "", first_sentence(module.__doc__) + ".", "", "| name | what it is |", "|---|---|"]
         for name in module.__all__:
             target = docstrings.NAMES[f"{package}.{name}"]
-            index.append(f"| {{py:obj}}`{name} <{target}>` | {table_text(first_sentence(getattr(module, name).__doc__))} |")
+            sentence = table_text(first_sentence(getattr(module, name).__doc__))
+            index.append(f"| {{py:obj}}`{name} <{target}>` | {sentence} |")
         names = []
         for room in rooms(package):
             name = ".".join(room.relative_to(ROOT).parts)
@@ -97,7 +98,8 @@ def write_reference(folder: Path) -> None:
             (folder / f"{name}.rst").write_text("\n".join(lines), encoding="utf-8")
             names.append(name)
         door = [path for path in sorted((ROOT / package).glob("*.py")) if path.stem != "__init__"]
-        lines = [package, "=" * len(package), "", "What lies at the door of the package.", "", *reference_of_modules(door)]
+        lines = [package, "=" * len(package), "", "What lies at the door of the package.", ""]
+        lines += reference_of_modules(door)
         (folder / f"{package}.rst").write_text("\n".join(lines), encoding="utf-8")
         index += ["", "```{toctree}", ":maxdepth: 1", "", package, *names, "```", ""]
     (folder / "index.md").write_text("\n".join(index), encoding="utf-8")
@@ -138,7 +140,8 @@ def main() -> int:
     for part in ("source", "html", "doctrees"):
         shutil.rmtree(out / part, ignore_errors=True)
     assemble(out / "source")
-    options = ["-c", str(SITE), "-d", str(out / "doctrees"), "-W", "--keep-going", "-q", "-j", "auto", str(out / "source")]
+    options = ["-c", str(SITE), "-d", str(out / "doctrees"), "-W", "--keep-going", "-q", "-j", "auto"]
+    options.append(str(out / "source"))
     code = build_main(["-b", "html", *options, str(out / "html")])
     if code == 0 and arguments.links:
         code = build_main(["-b", "linkcheck", *options, str(out / "links")])

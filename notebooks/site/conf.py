@@ -1,4 +1,4 @@
-"""Settings of Sphinx for the site that `build.py` assembles: docstrings as they are, and nothing fetched from elsewhere."""
+"""Settings of Sphinx for the site that `build.py` assembles: nothing is run, and nothing fetched from elsewhere."""
 
 import sys
 from importlib.util import find_spec

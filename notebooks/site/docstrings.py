@@ -59,7 +59,7 @@ def escaped(line: str) -> str:
 
 
 def parameter(line: str) -> str:
-    """A line of a section: "name : type" with a literal type, of which single letters would else be looked up, or prose."""
+    """A line of a section: "name : type" with a literal type, or prose."""
     if match := re.match(r"(\w+(?:, \w+)*) : (.+)$", line):
         return f"{match[1]} : ``{match[2].replace('`', '')}``"
     return escaped(line)
@@ -180,7 +180,7 @@ def process(app: object, what: str, name: str, thing: object, options: object, l
 
 
 def link_types(app: object, tree: nodes.document) -> None:
-    """Types in signatures: public names become links, all others words; Sphinx would search for `int` in all classes."""
+    """Types in signatures: public names become links, all others words, for which Sphinx would search all classes."""
     for found in list(tree.findall(pending_xref)):
         if found.get("refdomain") == "py" and found.get("refspecific"):
             target = NAMES.get(found["reftarget"].removeprefix("~").rpartition(".")[2])
