@@ -80,7 +80,7 @@ boxes = [
     ("then", "Gauss-Newton on all poses,\ncertificate"),
 ]
 figure, axes = plt.subplots(figsize=(5.4, 3.9), layout="constrained")
-axes.set(xlim=(-1.0, 7.2), ylim=(-0.7, 5.6))
+axes.set(xlim=(-1.0, 6.0), ylim=(-0.5, 5.5))
 axes.axis("off")
 for row, (name, text) in zip(range(5, -1, -1), boxes, strict=True):
     colour = "#FDE9D9" if name == "done?" else "#DCEBF7"
@@ -89,9 +89,9 @@ for row, (name, text) in zip(range(5, -1, -1), boxes, strict=True):
     if row > 0:
         axes.annotate("", (3.0, row - 0.67), (3.0, row - 0.33), arrowprops={"arrowstyle": "->"})
 axes.text(3.15, 0.5, "yes", fontsize=8, va="center")
-axes.plot([5.0, 6.6, 6.6], [1.0, 1.0, 4.0], color="black", linewidth=0.9)
-axes.annotate("", (5.0, 4.0), (6.64, 4.0), arrowprops={"arrowstyle": "->"})
-_ = axes.text(6.7, 2.5, "no: next k", fontsize=8, rotation=90, va="center")
+axes.plot([4.1, 5.4, 5.4], [1.0, 1.0, 4.0], color="black", linewidth=0.9)
+axes.annotate("", (4.3, 4.0), (5.44, 4.0), arrowprops={"arrowstyle": "->"})
+_ = axes.text(5.5, 2.5, "no: next k", fontsize=8, rotation=90, va="center")
 
 # %%
 problem = pgo.PGOProblem(pgo.load("grid"))

@@ -57,7 +57,7 @@ for robot, other, towards in ((0, 1, -0.55), (1, 0, 0.55)):
     for pose in (1, 3):
         copy = two[other][pose] + [towards, 0.16]
         right.plot(*copy, "o", color=COLOURS[other], markersize=9, markerfacecolor="white")
-        right.annotate(f"robot {robot + 1}'s copy", (copy[0], copy[1] + 0.16), ha="center", fontsize=6)
+        right.text(copy[0], copy[1] + 0.16, f"robot {robot + 1}'s copy", ha="center", fontsize=6)
 right.annotate("", (2.9, 1.52), (1.1, 1.52), arrowprops={"arrowstyle": "->", "color": COLOURS[0]})
 right.annotate("", (1.1, 1.28), (2.9, 1.28), arrowprops={"arrowstyle": "->", "color": COLOURS[1]})
 _ = right.text(2.0, 1.6, "x + u of what both have", ha="center", fontsize=7)
@@ -315,10 +315,10 @@ faulty = {
 figure, axes = plt.subplots(figsize=(5.4, 2.8), layout="constrained")
 for (name, solution), colour in zip(faulty.items(), COLOURS, strict=True):
     history = solution.stages[1].history
-    above = np.maximum(history.objective / solution.objective - 1, 1e-14)
-    axes.semilogy(history.k, above, color=colour, label=f"{name}: gap {solution.gap:.0e} in the end")
+    label = f"{name}: gap {solution.gap:.0e} in the end"
+    axes.semilogy(history.k[1:], history.primal_residual[1:], color=colour, label=label)
 axes.axvspan(3, 23, color="#eeeeee", zorder=0)
-axes.set(xlabel="round of SOC", ylabel="F / F* - 1", title="grey: robot 2 silent in one of them")
+axes.set(xlabel="round of SOC", ylabel="primal residual", title="grey: robot 2 silent, in one of them")
 axes.title.set_fontsize(9)
 _ = figure.legend(fontsize=8, loc="outside lower center", ncols=2)
 
