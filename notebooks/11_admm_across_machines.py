@@ -108,7 +108,8 @@ print(f"differs from ours by {difference:.0e} in 10 rounds")
 # how far it is from the demand,
 #
 # $$\min \sum_a f_a(x_a) + g\Bigl(\sum_a x_a\Bigr), \qquad
-#   f_a(x) = \tfrac{q_a}2 \lVert x \rVert^2 \text{ on } [0, c_a], \quad g(s) = \tfrac w2 \lVert s - \text{demand} \rVert^2 .$$
+#   f_a(x) = \tfrac{q_a}2 \lVert x \rVert^2 \text{ on } [0, c_a], \quad
+#   g(s) = \tfrac w2 \lVert s - \text{demand} \rVert^2 .$$
 #
 # Nobody needs to see another's plan, only the *mean* (7.3): with $\bar x$ the mean of the plans and $\bar z$ what it
 # should be,

@@ -49,7 +49,7 @@ def escaped(line: str) -> str:
     pieces = re.split(r"(``[^`]+``|`[^`]+`|\*\*[^*\s](?:[^*]*[^*\s])?\*\*)", line)
     for k, piece in enumerate(pieces):
         if k % 2 == 0:
-            pieces[k] = re.sub(r"([*|_\\`])", r"\\\1", piece)
+            pieces[k] = re.sub(r"([*|_\\`]|(?<=\bfile):)", r"\\\1", piece)  # file:line is no address
         elif piece.startswith("`") and not piece.startswith("``"):
             pieces[k] = as_code(piece.strip("`"))
             before, after = pieces[k - 1], re.sub(r"^\\?", "", pieces[k + 1])
