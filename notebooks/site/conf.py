@@ -31,6 +31,7 @@ napoleon_google_docstring = False
 napoleon_use_rtype = False
 napoleon_use_ivar = True
 add_module_names = False
+highlight_language = "none"  # formulas and tables in docstrings; examples say what they are
 python_maximum_signature_line_length = 100
 toc_object_entries_show_parents = "hide"
 

@@ -19,6 +19,10 @@ import solvers
 
 SECTIONS = ("Parameters", "Returns", "Yields", "Raises", "Examples", "Attributes", "Notes", "References", "See Also")
 LIST_ITEM = re.compile(r"(?:[-*+]|\d+\.|\([a-z]\)) ")
+ARRAY = re.compile(
+    r"~?(?:numpy\.)?ndarray\[~?tuple\[~?(?:typing\.)?Any, \.\.\.\], ~?(?:numpy\.)?dtype\[~?(?:numpy\.)?(\w+)\]\]"
+)
+ARRAYS = {"float64": "Array", "int64": "IntArray", "bool": "BoolArray", "bool_": "BoolArray"}
 FIELD = re.compile(r"^    (\w+): ([^=#]+?)(?: = .*?)?  # (.+)$")
 
 
@@ -190,7 +194,13 @@ def link_types(app: object, tree: nodes.document) -> None:
                 found["reftarget"], found["refspecific"] = target, False
 
 
+def with_array_names(app: object, what: str, name: str, thing: object, options: object, *texts: str | None) -> tuple:
+    """Signature and what is returned, with the project's names for arrays in place of what they stand for."""
+    return tuple(text and ARRAY.sub(lambda match: ARRAYS.get(match[1], match[0]), text) for text in texts)
+
+
 def connect(app: object) -> None:
-    """Ask Sphinx to call `process` on every docstring before napoleon reads it, and `link_types` on every page."""
+    """Ask Sphinx to call these on every docstring, before napoleon reads it, on every signature and on every page."""
     app.connect("autodoc-process-docstring", process, priority=400)
+    app.connect("autodoc-process-signature", with_array_names)
     app.connect("doctree-read", link_types)
