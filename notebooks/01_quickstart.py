@@ -1,6 +1,8 @@
 # %% [markdown]
 # # 1. How far from the best possible is an answer?
 #
+# Open with `jupyter lab notebooks/01_quickstart.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+#
 # A robot measures how it moved between poses, and recognises places it has seen. Every measurement is a little
 # wrong, and together they contradict each other. *Pose graph optimisation* looks for the poses that contradict
 # them least. Many methods give an answer; this notebook is about knowing how good the answer is.
@@ -31,7 +33,7 @@ pgo.compare_poses(graph, [("truth", graph.truth), ("GPS and IMU", graph.initial)
 # ## The cost
 #
 # An edge $(i, j)$ measures $R_{ij} \approx R_i^\top R_j$ and $t_{ij} \approx R_i^\top (t_j - t_i)$. The cost of
-# poses is what the paper's equation `min overall` says, each edge with its weights $\kappa_{ij}, \tau_{ij}$:
+# poses is what the paper's equation (16), `min overall` says, each edge with its weights $\kappa_{ij}, \tau_{ij}$:
 #
 # $$F(R, t) = \sum_{(i,j)} \kappa_{ij} \lVert R_j - R_i R_{ij} \rVert_F^2
 #   + \tau_{ij} \lVert t_j - t_i - R_i t_{ij} \rVert_2^2, \qquad R_i \in \mathrm{SO}(d).$$
@@ -203,6 +205,53 @@ pgo.compare_poses(
 # the answer, though. If the noise is very strong, $S_r$ is not positive definite even at the optimum. The library
 # then adds a shift $\eta$ to make it so, pays for that, and an optimal answer keeps a gap: [notebook
 # 5](05_sdp_and_certificates.ipynb) looks for the noise at which that begins.
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** All weights are multiplied by 100. What becomes of $F$, of the bound, of the gap?
+#
+# <details><summary>Answer</summary>
+#
+# $F$, $M$, $\Lambda$ and the bound are multiplied by 100; the gap, a share, stays.
+#
+# ```python
+# heavy = solvers.solve(graph.with_weights(100 * graph.kappa, 100 * graph.tau))
+# assert np.isclose(heavy.objective, 100 * solution.objective, rtol=1e-9)
+# assert heavy.certificate.digits >= 11
+# ```
+#
+# </details>
+#
+# **2.** The proof takes *any* $\Lambda$. What does $\Lambda = 0$ prove?
+#
+# <details><summary>Answer</summary>
+#
+# $S = M$, and the bound is the minimum of $\operatorname{tr}(X^\top M X)$ over all matrices with pose $r$ held at
+# $(0, I)$: least squares without the constraints. It holds, and it is a poor one.
+#
+# ```python
+# without_multipliers = pgo.prove_bound(problem, np.zeros((n, d, d)), poses=solution.poses)
+# assert 0 < without_multipliers < 0.9 * solution.lower_bound
+# ```
+#
+# </details>
+#
+# **3.** How often does the worst of the eight rings wind round? Add up its angles.
+#
+# <details><summary>Answer</summary>
+#
+# Twice or more, or the wrong way: any number but once. Changing it means tearing the chain open, so that no small
+# move does.
+#
+# ```python
+# angles = pgo.log_map(np.swapaxes(stuck.R, 1, 2) @ np.roll(stuck.R, -1, axis=0))[:, 0]
+# winding = np.sum(angles) / (2 * np.pi)
+# assert np.isclose(winding, round(winding))
+# assert round(winding) != 1
+# ```
+#
+# </details>
 
 # %%
 assert np.isclose(cost(graph, graph.truth), problem.objective(graph.truth))

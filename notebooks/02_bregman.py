@@ -1,7 +1,9 @@
 # %% [markdown]
 # # 2. Why does adding the residual back make a penalty exact?
 #
-# The paper's section *Background of Bregman iteration* starts from equation `problem bregman`,
+# Open with `jupyter lab notebooks/02_bregman.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+#
+# The paper's section *Background of Bregman iteration* starts from equation (1), `problem bregman`,
 #
 # $$\min_x J(x) \quad \text{subject to} \quad \mathcal{K} x = f,$$
 #
@@ -49,7 +51,7 @@ for alpha in (1.0, 10.0, 100.0):
 # %% [markdown]
 # ## The iteration by hand
 #
-# Equation `update B`: let $p^k$ be a subgradient of $J$ at $x^k$, and replace $J$ by the *Bregman distance*
+# Equation (2), `update B`: let $p^k$ be a subgradient of $J$ at $x^k$, and replace $J$ by the *Bregman distance*
 # $\mathcal{B}_J^{p^k}(x, x^k) = J(x) - J(x^k) - \langle p^k, x - x^k \rangle$, by how much $J$ rises above its
 # tangent at $x^k$:
 #
@@ -84,7 +86,7 @@ for k in range(12):
 #
 # ## Two lines
 #
-# Equation `bregman update` has no subgradient in it. Put $p^k = -\alpha \mathcal{K}^\top b^k$ and complete the
+# Equation (4), `bregman update`, has no subgradient in it. Put $p^k = -\alpha \mathcal{K}^\top b^k$ and complete the
 # square: $-\langle p^k, x \rangle = \alpha \langle b^k, \mathcal{K} x \rangle$ moves into the penalty,
 #
 # $$x^{k+1} = \arg\min_x J(x) + \tfrac\alpha2 \lVert \mathcal{K} x - f + b^k \rVert^2, \qquad
@@ -190,6 +192,58 @@ impossible = basis_pursuit(np.vstack([K[:3], K[:1]]), np.append(f[:3], f[0] + 1.
 states = list(itertools.islice(solvers.iterate(solvers.TwoLineBregman(alpha=alpha), impossible), 41))
 growth = [float(np.linalg.norm(state.b)) for state in states]
 print("||b|| at k = 10, 20, 30, 40:", np.round(growth[10::10], 2))
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** What does the *first* step of Bregman iteration compute, with $p^0 = 0$?
+#
+# <details><summary>Answer</summary>
+#
+# The penalty's answer: $\mathcal{B}_J^0(x, x^0)$ is $J(x)$ plus a constant. All that is gained comes from the second
+# step on.
+#
+# ```python
+# first = cp.Problem(cp.Minimize(cp.norm1(x) + alpha / 2 * cp.sum_squares(K @ x - f)))
+# first.solve(**accurate)
+# assert np.allclose(x.value, by_hand[0][0], atol=1e-5)
+# ```
+#
+# </details>
+#
+# **2.** $J$ is replaced by $10 J$. Which $\alpha$ gives the same iterates?
+#
+# <details><summary>Answer</summary>
+#
+# Ten times the old one: every subproblem is multiplied by 10, $p$ too, and $b$ stays.
+#
+# ```python
+# y = cp.Variable(60)
+# tenfold = type(problem)(10 * cp.norm1(y), y, K, f)
+# third = [
+#     next(itertools.islice(solvers.iterate(solvers.TwoLineBregman(alpha=a), q), 3, None)).x
+#     for a, q in ((alpha, problem), (10 * alpha, tenfold))
+# ]
+# assert np.allclose(*third, atol=1e-5)
+# ```
+#
+# </details>
+#
+# **3.** Take only the first 12 of the 25 equations. Does the iteration still converge? To the truth?
+#
+# <details><summary>Answer</summary>
+#
+# It converges, to a smallest 1-norm under 12 equations, and that is not the truth: too few for five nonzeros. Nothing
+# in the residual tells.
+#
+# ```python
+# fewer = solvers.run(solvers.TwoLineBregman(alpha=alpha), basis_pursuit(K[:12], f[:12])).state.x
+# assert np.linalg.norm(K[:12] @ fewer - f[:12]) < 1e-4
+# assert np.abs(fewer).sum() < np.abs(truth).sum() + 1e-4
+# assert np.linalg.norm(fewer - truth) > 0.1
+# ```
+#
+# </details>
 
 # %%
 assert np.linalg.norm(result.state.x - truth) < 1e-5

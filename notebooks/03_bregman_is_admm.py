@@ -1,6 +1,8 @@
 # %% [markdown]
 # # 3. What does it cost to minimise only a little before the multiplier moves?
 #
+# Open with `jupyter lab notebooks/03_bregman_is_admm.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+#
 # The paper's subsection *Equivalence to ADMM* says: iterate the minimisation of the augmented Lagrangian $T$
 # times, then update the multiplier; with $T = 1$ this is ADMM. Is $T = 1$ a sacrifice? This notebook counts.
 
@@ -24,11 +26,11 @@ plt.rcParams["figure.dpi"] = 150
 # $$\mathcal{L}_\alpha(x, \lambda) = J(x) + \langle \lambda, f - \mathcal{K} x \rangle
 #   + \tfrac\alpha2 \lVert f - \mathcal{K} x \rVert^2,$$
 #
-# and the *method of multipliers* (equation `minbregman`) is
+# and the *method of multipliers* (equation (8), `minbregman`) is
 # $x^{k+1} = \arg\min_x \mathcal{L}_\alpha(x, \lambda^k)$,
 # $\lambda^{k+1} = \lambda^k + \alpha (f - \mathcal{K} x^{k+1})$. Complete the square with
-# $b = -\lambda / \alpha$: it is the two-line form `bregman update` of [notebook 2](02_bregman.ipynb). Put
-# $p = \mathcal{K}^\top \lambda$: it is `update B`. No approximation is involved, as the same numbers in all
+# $b = -\lambda / \alpha$: it is the two-line form (4), `bregman update`, of [notebook 2](02_bregman.ipynb). Put
+# $p = \mathcal{K}^\top \lambda$: it is (2), `update B`. No approximation is involved, as the same numbers in all
 # three show.
 
 # %%
@@ -230,6 +232,71 @@ for T, size in spiral.items():
 # Here, for once, $T$ decides: with enough passes it is the method of multipliers, which converges. SOC has two
 # blocks, $R$ and $\omega$, so this does not hit it; what can hit it is that $\omega$'s set is not convex
 # ([notebook 4](04_splitting_orthogonality.ipynb)).
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** The signal is measured in millivolts in place of volts: $f$ and $w$ are 1000 times as large. Which $\alpha$
+# gives the same run?
+#
+# <details><summary>Answer</summary>
+#
+# The same $\alpha$: it weighs $D u$ against $u$, both in millivolts now. All iterates are multiplied by 1000. Where
+# the penalty has a unit, as $\rho$ in SOC has that of the weights, it changes with it.
+#
+# ```python
+# millivolts = total_variation_denoising(1000 * noisy, 1000 * weight)
+# state = next(itertools.islice(solvers.iterate(solvers.AlternatingBregman(alpha=1.0), millivolts), 10, None))
+# u, d, *_ = list(alternate(1.0, 1, 10))[-1]
+# assert np.allclose(state.x, 1000 * np.concatenate([u, d]), atol=0.1)
+# ```
+#
+# </details>
+#
+# **2.** *Over-relaxation*: in the update of $d$ and of $b$ put $\beta D u + (1 - \beta) d$ for $D u$. What does
+# $\beta = 1.6$ bring at $\alpha = 1$?
+#
+# <details><summary>Answer</summary>
+#
+# About a third of the iterations, for no work. The library's `over_relaxation` and `alpha` of its methods are this
+# $\beta$.
+#
+# ```python
+# def relaxed(alpha, beta):
+#     d, b = np.zeros(99), np.zeros(99)
+#     inverse = np.linalg.inv(np.eye(100) + alpha * D.T @ D)
+#     for k in range(1, 3000):
+#         d_before, u = d, inverse @ (noisy + alpha * D.T @ (d - b))
+#         moved = beta * D @ u + (1 - beta) * d
+#         v = moved + b
+#         d = np.sign(v) * np.maximum(np.abs(v) - weight / alpha, 0.0)
+#         b = v - d
+#         if max(np.linalg.norm(D @ u - d), alpha * np.linalg.norm(D.T @ (d - d_before))) < 1e-4:
+#             return k
+#
+# assert relaxed(1.0, 1.6) < 0.8 * relaxed(1.0, 1.0)
+# ```
+#
+# </details>
+#
+# **3.** The pass over three blocks is a linear map of $(x, b)$. Which number of it decides between spiral and
+# convergence?
+#
+# <details><summary>Answer</summary>
+#
+# Its spectral radius: above 1 it spirals outwards.
+#
+# ```python
+# def one_pass(x, b):
+#     for i in range(3):
+#         x[i] = -K[:, i] @ (K @ x - K[:, i] * x[i] + b) / (K[:, i] @ K[:, i])
+#     return np.concatenate([x, b + K @ x])
+#
+# matrix = np.column_stack([one_pass(column[:3].copy(), column[3:].copy()) for column in np.eye(6)])
+# assert 1.0 < np.abs(np.linalg.eigvals(matrix)).max() < 1.1
+# ```
+#
+# </details>
 
 # %%
 assert all(difference < 1e-5 for difference in worst_difference.values())

@@ -1,8 +1,10 @@
 # %% [markdown]
 # # 4. How can a convex solver be made to return rotations, and how large must rho be?
 #
+# Open with `jupyter lab notebooks/04_splitting_orthogonality.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+#
 # The constraint $R^\top R = I$ is the whole difficulty of pose graph optimisation: without it, equation
-# `min overall` of the paper is a least-squares problem. *Splitting of orthogonality constraints* (SOC, Lai and
+# (16), `min overall`, of the paper is a least-squares problem. *Splitting of orthogonality constraints* (SOC, Lai and
 # Osher 2014; the paper's Algorithm 1, `algo1: SOC`) gives every $R$ a copy $\omega$ that carries the
 # constraint, and lets Bregman iteration pull the two together.
 
@@ -57,14 +59,39 @@ print(f"closed form {closed_form:.8f}, SOC {found.objective:.8f}")
 # %% [markdown]
 # ## Algorithm 1 by hand
 #
+# The paper's equation (19), and its flow chart drawn anew:
+#
 # $$\text{(a)}\; R = \arg\min_R f(R) + \tfrac\rho2 \lVert R - \omega + B \rVert_F^2, \qquad
 #   \text{(b)}\; \omega = \text{nearest rotation to } R + B, \qquad
 #   \text{(c)}\; B \leftarrow B + R - \omega.$$
 #
-# $f$ is the whole of equation `min overall` here, in rotations *and* translations. (The paper's step (a) has
+# $f$ is the whole of equation (16), `min overall` here, in rotations *and* translations. (The paper's step (a) has
 # rotations only, each robot with its neighbours frozen; [notebook 7](07_the_papers_tables.ipynb) runs that
 # one.) Its residuals are linear in $X$, which stacks the $t_i$ and the rows of all $R_i^\top$. (a) is a convex
 # quadratic program; cvxpy compiles it once, with $V = \omega - B$ as a parameter.
+
+# %%
+boxes = [
+    ("start", "R = omega, B = 0, rho > 0"),
+    ("(a)", "R: convex quadratic program,\npulled to omega - B"),
+    ("(b)", "omega: nearest rotation to R + B,\nby one SVD a pose"),
+    ("(c)", "B: add R - omega"),
+    ("done?", "||R - omega|| small,\nomega moves no more"),
+    ("then", "Gauss-Newton on all poses,\ncertificate"),
+]
+figure, axes = plt.subplots(figsize=(5.4, 3.9), layout="constrained")
+axes.set(xlim=(-1.0, 6.0), ylim=(-0.5, 5.5))
+axes.axis("off")
+for row, (name, text) in zip(range(5, -1, -1), boxes, strict=True):
+    colour = "#FDE9D9" if name == "done?" else "#DCEBF7"
+    axes.text(3.0, row, text, ha="center", va="center", fontsize=8, bbox={"boxstyle": "round,pad=0.45", "fc": colour})
+    axes.text(-0.9, row, name, va="center", fontsize=9, weight="bold")
+    if row > 0:
+        axes.annotate("", (3.0, row - 0.67), (3.0, row - 0.33), arrowprops={"arrowstyle": "->"})
+axes.text(3.15, 0.5, "yes", fontsize=8, va="center")
+axes.plot([4.1, 5.4, 5.4], [1.0, 1.0, 4.0], color="black", linewidth=0.9)
+axes.annotate("", (4.3, 4.0), (5.44, 4.0), arrowprops={"arrowstyle": "->"})
+_ = axes.text(5.5, 2.5, "no: next k", fontsize=8, rotation=90, va="center")
 
 # %%
 problem = pgo.PGOProblem(pgo.load("grid"))
@@ -227,6 +254,60 @@ twice = ring_problem.with_best_translations(pgo.exp_map(4 * np.pi / count * np.a
 stuck = solvers.run(solvers.SOC(acceleration=None), ring_problem, twice)
 print(stuck)
 pgo.certify(ring_problem, stuck.poses)
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** $Y = \operatorname{diag}(1, 1, -0.1)$. Which rotation is nearest, and how much farther is it than the nearest
+# orthogonal matrix?
+#
+# <details><summary>Answer</summary>
+#
+# $I$, at a distance of 1.1: the smallest singular value pays. The nearest orthogonal matrix is the reflection
+# $\operatorname{diag}(1, 1, -1)$, at 0.9.
+#
+# ```python
+# flipped = np.diag([1.0, 1.0, -0.1])
+# assert np.allclose(nearest_rotation(flipped), np.eye(3))
+# others = pgo.random_rotations(1000, 3, np.random.default_rng(1))
+# assert np.linalg.norm(others - flipped, axis=(1, 2)).min() >= 1.1
+# ```
+#
+# </details>
+#
+# **2.** All weights are multiplied by 100. Which $\rho$ gives the same $\omega$?
+#
+# <details><summary>Answer</summary>
+#
+# 100 times the old one: (a) is multiplied by 100, $B$ stays. So $\rho$ has the unit of the weights, and a fixed
+# default must be wrong for some graph; the multipliers scale with them.
+#
+# ```python
+# light = problem.graph
+# heavy = pgo.PGOProblem(light.with_weights(100 * light.kappa, 100 * light.tau))
+# found_by = []
+# for r, weighted in ((12.0, problem), (1200.0, heavy)):
+#     fixed = solvers.SOC(penalty=solvers.FixedPenalty(r), acceleration=None)
+#     found_by.append(list(itertools.islice(solvers.iterate(fixed, weighted), 6))[-1].omega)
+# assert np.allclose(*found_by, atol=1e-8)
+# ```
+#
+# </details>
+#
+# **3.** Start SOC at the certified optimum. Does it stay there?
+#
+# <details><summary>Answer</summary>
+#
+# No: it begins with $B = 0$, and what holds an optimum in place is its multiplier, $\rho B$. It moves off and comes
+# back.
+#
+# ```python
+# film = list(itertools.islice(solvers.iterate(solvers.SOC(**plain), problem, best.poses), 200))
+# moved_by = [problem.objective(problem.with_best_translations(state.omega)) / best.objective - 1 for state in film]
+# assert max(moved_by) > 1e-6 > 100 * abs(moved_by[-1])
+# ```
+#
+# </details>
 
 # %%
 assert np.allclose(by_svd, pgo.project_to_rotations(Y))

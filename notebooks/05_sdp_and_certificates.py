@@ -1,6 +1,8 @@
 # %% [markdown]
 # # 5. When does a convex relaxation prove that a local answer is the global one?
 #
+# Open with `jupyter lab notebooks/05_sdp_and_certificates.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+#
 # SE-Sync, which the paper compares with, finds certified global optima of a problem that is not convex. The
 # reason is a semidefinite relaxation that is *tight* as long as the noise is not too strong. This notebook
 # writes the relaxation and its dual in a few lines, shows which number is the certificate and which only looks
@@ -26,7 +28,7 @@ plt.rcParams["figure.dpi"] = 150
 # ## The relaxation
 #
 # Given rotations, the best translations solve a linear system. Put them in: what is left of equation
-# `min overall` is a quadratic form in the rotations alone. With $Y$ the rows of all $R_i^\top$,
+# (16), `min overall`, is a quadratic form in the rotations alone. With $Y$ the rows of all $R_i^\top$,
 #
 # $$\min_t F(R, t) = \operatorname{tr}(Y^\top Q Y) = \operatorname{tr}(Q Z), \qquad Z = Y Y^\top.$$
 #
@@ -224,8 +226,7 @@ _ = axes.legend(fontsize=8)
 # %%
 degrees = np.array([30.0, 40.0, 45.0, 50.0, 55.0, 60.0, 70.0])
 sweeps = {
-    scene.value: solvers.noise_sweep(scene, np.deg2rad(degrees), 4, np.random.default_rng(0))
-    for scene in SweptScene
+    scene.value: solvers.noise_sweep(scene, np.deg2rad(degrees), 4, np.random.default_rng(0)) for scene in SweptScene
 }
 plot_tightness([(name, sweep.rotation_std, sweep.fraction) for name, sweep in sweeps.items()])
 
@@ -265,6 +266,57 @@ plot_spectrum(loose_problem, loose.certificate, count=10)
 # The verdict is `NOT_CERTIFIED`, **which does not mean that the poses are wrong**: they may be optimal. What is
 # known is the gap, 0.2 %: no poses whatever are better by more. A bound remains useful when tightness is gone; a
 # yes or no would not.
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** Take $0.9 \Lambda$ for $\Lambda$. Is what it proves still a lower bound?
+#
+# <details><summary>Answer</summary>
+#
+# Yes, as with any multipliers; it is a smaller one.
+#
+# ```python
+# weaker = pgo.prove_bound(problem, 0.9 * from_poses, poses=answer.poses)
+# assert weaker < answer.lower_bound
+# ```
+#
+# </details>
+#
+# **2.** Take two sets of rotations and the mean of their $Z = Y Y^\top$. Is it feasible for the relaxation? Is there
+# a set of rotations behind it?
+#
+# <details><summary>Answer</summary>
+#
+# Feasible it is: the relaxation is convex. Its rank is $2 d$, so that no rotations have it.
+#
+# ```python
+# grams = []
+# for seed in (1, 2):
+#     stacked = pgo.random_rotations(n, d, np.random.default_rng(seed)).transpose(0, 2, 1).reshape(n * d, d)
+#     grams.append(stacked @ stacked.T)
+# mean = (grams[0] + grams[1]) / 2
+# assert all(np.allclose(mean[rows_i, rows_i], np.eye(d)) for rows_i in block)
+# assert np.linalg.matrix_rank(mean) == 2 * d
+# assert np.trace(problem.Q @ mean) >= primal.value - 1e-6
+# ```
+#
+# </details>
+#
+# **3.** In the ring's local minimum, what bound do its own multipliers prove? Compare it with the optimum.
+#
+# <details><summary>Answer</summary>
+#
+# A true one, and far below: the shift that makes $S_r$ definite costs more than the optimum is worth. `certify` also
+# looks elsewhere, at the point that the chordal start polishes to.
+#
+# ```python
+# own = pgo.certify_at(ring, candidates[3][2])
+# assert own.lower_bound <= climbed.objective * (1 + 1e-9)
+# assert own.gap >= stuck.gap > 0.9
+# ```
+#
+# </details>
 
 # %%
 assert np.isclose(primal.value, answer.objective, rtol=1e-5)

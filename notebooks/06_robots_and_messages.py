@@ -1,11 +1,13 @@
 # %% [markdown]
 # # 6. What must robots tell each other, and what if a message is lost or a robot dies?
 #
+# Open with `jupyter lab notebooks/06_robots_and_messages.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+#
 # The paper's problem is that of several robots, each with its own trajectory, who have met here and there (its
 # figure of four robots with four poses each). Nobody holds all measurements. This notebook splits a graph,
 # codes SOC as a conversation between neighbours, counts the bytes, and then breaks the network.
 #
-# Needs the extra `fast` for METIS, which partitions graphs.
+# (The extra `fast` is for METIS, which partitions graphs.)
 
 # %%
 import itertools
@@ -19,6 +21,57 @@ from pgo_models.graphs.separators import report_partition
 from pgo_models.plots.curves import plot_decay
 
 plt.rcParams["figure.dpi"] = 150
+
+# %% [markdown]
+# ## A picture first
+#
+# Left the paper's figure 1: four robots with four poses each. A solid line is a measurement that a robot made of its
+# own motion, a dotted one a meeting of two. Right only two robots, and what has to cross between them: a pose with a
+# dotted line is a *separator*, and the other robot holds a *copy* of it. In a round each sends the other what it
+# thinks of the poses that both have; nothing else ever leaves a robot.
+
+
+# %%
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+
+
+def draw_robots(axes, places, meetings):
+    for robot, line in enumerate(places):
+        axes.plot(*line.T, "o-", color=COLOURS[robot], markersize=9, label=f"robot {robot + 1}")
+    for (a, i), (b, j) in meetings:
+        axes.plot(*np.array([places[a][i], places[b][j]]).T, ":", color="#555555", linewidth=1.6, zorder=0)
+    axes.set_aspect("equal")
+    axes.axis("off")
+
+
+square = np.array([[0.0, 0.0], [1.0, 0.3], [1.1, 1.3], [0.1, 1.1]])
+four = [square + shift for shift in ([0.0, 2.2], [2.2, 2.2], [0.0, 0.0], [2.2, 0.0])]
+meetings = [((0, 1), (1, 0)), ((0, 2), (1, 3)), ((0, 0), (2, 3)), ((1, 1), (3, 2)), ((2, 2), (3, 3)), ((2, 1), (3, 0))]
+left_robot = np.array([[0.0, 0.0], [0.7, 0.6], [0.5, 1.5], [0.9, 2.2]])
+two = [left_robot, np.array([[4.1, 0.1], [3.3, 0.7], [3.5, 1.6], [3.0, 2.3]])]
+figure, (left, right) = plt.subplots(1, 2, figsize=(7.5, 3.0), layout="constrained", width_ratios=[1, 1.3])
+draw_robots(left, four, meetings)
+left.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, 0.02), ncols=4, handlelength=1.0)
+draw_robots(right, two, [((0, 1), (1, 1)), ((0, 3), (1, 3))])
+for robot, other, towards in ((0, 1, -0.55), (1, 0, 0.55)):
+    for pose in (1, 3):
+        copy = two[other][pose] + [towards, 0.16]
+        right.plot(*copy, "o", color=COLOURS[other], markersize=9, markerfacecolor="white")
+        right.text(copy[0], copy[1] + 0.16, f"robot {robot + 1}'s copy", ha="center", fontsize=6)
+right.annotate("", (2.9, 1.52), (1.1, 1.52), arrowprops={"arrowstyle": "->", "color": COLOURS[0]})
+right.annotate("", (1.1, 1.28), (2.9, 1.28), arrowprops={"arrowstyle": "->", "color": COLOURS[1]})
+_ = right.text(2.0, 1.6, "x + u of what both have", ha="center", fontsize=7)
+
+# %% [markdown]
+# With two robots it is two machines that agree on four poses, and line for line the consensus of [notebook
+# 11](11_admm_across_machines.ipynb).
+
+# %%
+pair = pgo.load("grid")
+halves = pgo.partition(pair, 2, pgo.PartitionMethod.CONTIGUOUS)
+together = solvers.run(solvers.SOC(robots=halves, coupling=solvers.Coupling.CONSENSUS), pgo.PGOProblem(pair))
+shared_poses = np.unique(np.concatenate([pair.i[halves.cut_edges(pair)], pair.j[halves.cut_edges(pair)]]))
+print(f"two robots, {pair.num_poses} poses, {len(shared_poses)} of them at the seam: {together!r}")
 
 # %% [markdown]
 # ## Four robots
@@ -259,10 +312,63 @@ faulty = {
     name: solvers.solve(graph, solvers.Pipeline(soc=consensus, faults=kind), robots=robots)
     for name, kind in faults.items()
 }
-for name, solution in faulty.items():
-    print(f"{name:22} {solution.stages[1].iterations:3} rounds of SOC, gap {solution.gap:.1e}")
+figure, axes = plt.subplots(figsize=(5.4, 2.8), layout="constrained")
+for (name, solution), colour in zip(faulty.items(), COLOURS, strict=True):
+    history = solution.stages[1].history
+    label = f"{name}: gap {solution.gap:.0e} in the end"
+    axes.semilogy(history.k[1:], history.primal_residual[1:], color=colour, label=label)
+axes.axvspan(3, 23, color="#eeeeee", zorder=0)
+axes.set(xlabel="round of SOC", ylabel="primal residual", title="grey: robot 2 silent, in one of them")
+axes.title.set_fontsize(9)
+_ = figure.legend(fontsize=8, loc="outside lower center", ncols=2)
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** How many numbers cross in one round of the conversation between the four robots?
+#
+# <details><summary>Answer</summary>
+#
+# $d (d + 1)$ for every pose and every pair that holds it.
+#
+# ```python
+# numbers = sum(d * (d + 1) * len(poses) for poses in links.values())
+# assert numbers == sum(len(rows_of(poses)) * d for poses in links.values())
+# assert 8 * numbers < pooled
+# ```
+#
+# </details>
+#
+# **2.** *No* message arrives after the first round. Where does the run end?
+#
+# <details><summary>Answer</summary>
+#
+# Every robot converges to the best answer that agrees with what it heard once: a gap stays, as with the dead robot,
+# at every seam.
+#
+# ```python
+# alone = [gap(omega) for omega in converse(rounds, arrives=lambda k, a, b: False)]
+# assert alone[-1] > 1e-4 > 10 * losses["60% lost"][-1]
+# assert abs(alone[-1] - alone[-20]) < 1e-2
+# ```
+#
+# </details>
+#
+# **3.** Does *which* messages get lost change where the run ends? Try other seeds.
+#
+# <details><summary>Answer</summary>
+#
+# No. A fixed point has every copy equal to $z$ and every $u$ unchanged, whatever was heard last.
+#
+# ```python
+# ends = [lossy(0.6, seed=seed)[-1] for seed in (1, 2)]
+# assert max(ends) < 1e-5
+# ```
+#
+# </details>
 
 # %%
+assert together.status is solvers.Status.CONVERGED
 assert difference < 1e-8
 assert gap(ours[-1]) < 1e-3
 assert shared.is_certified

@@ -1,6 +1,8 @@
 # %% [markdown]
 # # 8. You have a pose graph, and perhaps a solution: what now?
 #
+# Open with `jupyter lab notebooks/08_your_own_graph.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+#
 # This notebook starts from a `.g2o` file, as SLAM front ends write it, judges a solution that came from
 # elsewhere, looks for the measurement that is to blame, and hands the result on to
 # [evo](https://github.com/MichaelGrupp/evo).
@@ -53,7 +55,7 @@ print(*lines[:2], lines[-1], sep="\n")
 # %% [markdown]
 # ## Read it
 #
-# The cost $F$ of the paper's equation `min overall` has one number for the rotation and one for the translation
+# The cost $F$ of the paper's equation (16), `min overall` has one number for the rotation and one for the translation
 # of an edge. An information matrix becomes the precisions $\kappa$ and $\tau$ as in SE-Sync: in the plane
 # $\kappa = I_{\theta\theta}$, $\tau = 2 / \operatorname{tr}(I_{tt}^{-1})$; in space
 # $\kappa = 3 / (2 \operatorname{tr}(I_{rr}^{-1}))$, $\tau = 3 / \operatorname{tr}(I_{tt}^{-1})$. In the plane that is
@@ -183,13 +185,14 @@ print(f"beside pose 0, pose {widest} is known to {np.sqrt(np.linalg.eigvalsh(blo
 figure = pgo.plot_graph(real, by_chi2.poses, covariances=blocks)
 
 # %% [markdown]
-# A prior is an edge from one more pose, the world; GPS has no rotation, $\kappa = 0$. A landmark is a pose whose rotation
-# nobody asks for. Both stay inside the same problem, so the certificate is what it was (in a file:
+# A prior is an edge from one more pose, the world; GPS has no rotation, $\kappa = 0$. A landmark is a pose whose
+# rotation nobody asks for. Both stay inside the same problem, so the certificate is what it was (in a file:
 # `EDGE_PRIOR_SE2_XY`, `VERTEX_XY`, `EDGE_SE2_XY` and their likes in space):
 
 # %%
 fixes = rng.choice(real.num_poses, 6, replace=False)
-there = by_chi2.poses.t[fixes] @ np.array([[0.0, -1.0], [1.0, 0.0]]).T + [500.0, 300.0]  # the world, as a receiver has it
+quarter_turn = np.array([[0.0, -1.0], [1.0, 0.0]])
+there = by_chi2.poses.t[fixes] @ quarter_turn.T + [500.0, 300.0]  # the world, as a receiver has it
 located = real.with_position_prior(fixes, there + rng.normal(0.0, 0.5, there.shape), tau=0.5**-2)
 tree = by_chi2.poses.t[0] + np.array([2.0, 1.0])
 seen = np.einsum("nba,nb->na", by_chi2.poses.R[:3], tree - by_chi2.poses.t[:3]) + rng.normal(0.0, 0.1, (3, 2))
@@ -236,6 +239,30 @@ print(repr(shown))
 # few others contradict it, so that it bends the odometry and no edge stands out; and the worst edge need not be the
 # wrong one. `pgo solve square.g2o --robust gnc` looks for wrong measurements and solves without them.
 
+# %% [markdown]
+# The same wrong closure, where only three of the 22 right ones contradict it. Take out the closure that costs most,
+# as one would:
+
+# %%
+few = [*lines[: num_poses - 1], *(lines[num_poses - 1 + k] for k in (0, 9, 18)), wrong]
+path.write_text("\n".join(few) + "\n", encoding="utf-8")
+sparse_graph = pgo.read_g2o(path)
+misled = solvers.solve(sparse_graph)
+is_closure = np.arange(sparse_graph.num_edges) >= num_poses - 1
+ranking = np.where(is_closure, misled.edge_residuals.cost / misled.edge_residuals.allowed, 0.0)
+blamed, guilty = int(np.argmax(ranking)), sparse_graph.num_edges - 1
+relieved = solvers.solve(sparse_graph.without_edges(np.arange(sparse_graph.num_edges) == blamed))
+print(f"blamed {sparse_graph.edge_label(blamed)}; the wrong one is {sparse_graph.edge_label(guilty)}")
+for name, found in (("before", misled), ("after", relieved)):
+    costs = found.edge_residuals
+    print(f"{name:7} costs {costs.overall:.1f} times what is expected, {costs.overall_allowed:.1f} may be;", end=" ")
+    print(f"beyond their own threshold {costs.is_misfit.sum()}; {found!r}")
+
+# %% [markdown]
+# A right closure went, the wrong one stays, and now everything looks well: no edge is beyond its threshold, nor is
+# the sum, and the certificate holds, for these edges. [Notebook 9](09_wrong_edges.ipynb) says why, and what can be
+# done.
+
 # %%
 truth = pgo.Poses(pgo.exp_map(heading[:, None]), position)
 for name, poses in (("odometry", odometry), ("with the wrong edge", fooled.poses), ("without it", solution.poses)):
@@ -271,6 +298,61 @@ kitti = read_kitti(Path(folder.name) / "solved.kitti", d=2)
 print(f"F of the poses: solved {solution.objective:.9f}, TUM {problem.objective(returned):.9f}, ", end="")
 print(f"KITTI {problem.objective(kitti):.9f}, g2o {problem.objective(again.initial):.9f}")
 
+# %% [markdown]
+# ## Exercises
+#
+# **1.** A colleague says that all sensors are twice as exact as the file has it. What becomes of the poses, of the
+# covariances, of the test of the edges?
+#
+# <details><summary>Answer</summary>
+#
+# Information is four times as large. The poses stay; covariances are a quarter; every cost is four times as large, so
+# that edges fail the test which passed it.
+#
+# ```python
+# confident = graph.with_weights(4 * graph.kappa, 4 * graph.tau)
+# sure, before = solvers.solve(confident), solvers.solve(graph)
+# assert np.allclose(sure.poses.t, before.poses.t, atol=1e-6)
+# assert np.allclose(4 * sure.marginals()[5], before.marginals()[5], rtol=1e-6)
+# assert sure.edge_residuals.overall > 3.9 * before.edge_residuals.overall
+# ```
+#
+# </details>
+#
+# **2.** Turn the whole trajectory by a degree and shift it by a kilometre. What does the certificate say?
+#
+# <details><summary>Answer</summary>
+#
+# The same: $F$ does not know the frame.
+#
+# ```python
+# R = pgo.exp_map(np.array([[np.deg2rad(1.0)]]))[0]
+# elsewhere = pgo.Poses(R @ theirs.R, theirs.t @ R.T + 1000.0)
+# assert np.isclose(pgo.certify(problem, elsewhere).gap, certificate.gap, rtol=1e-5)
+# ```
+#
+# </details>
+#
+# **3.** With one closure that is wrong and no other, can any test of residuals find it?
+#
+# <details><summary>Answer</summary>
+#
+# No. Without a second closure nothing contradicts it: the odometry bends by as much as the closure asks, spread over
+# all its edges, and every one of them stays below its threshold.
+#
+# ```python
+# alone = Path(tempfile.mkdtemp()) / "alone.g2o"
+# closure = f"EDGE_SE2 0 {4 * side} 1.0 0.0 0.0 100 0 0 100 0 400"
+# alone.write_text("\n".join([*lines[: num_poses - 1], closure]) + "\n", encoding="utf-8")
+# bent = solvers.solve(pgo.read_g2o(alone))
+# alone.unlink()
+# alone.parent.rmdir()
+# assert bent.is_certified
+# assert not bent.edge_residuals.is_misfit.any()
+# ```
+#
+# </details>
+
 # %%
 assert np.isclose(graph.tau[0], 0.05**-2, rtol=1e-5)
 assert np.isclose(graph.kappa[0], 0.03**-2, rtol=1e-5)
@@ -288,6 +370,10 @@ assert worst == graph.num_edges
 assert np.flatnonzero(suspect.is_misfit).tolist() == [worst]
 assert not solution.edge_residuals.is_doubtful
 assert not shown.is_certified
+assert blamed != guilty
+assert misled.edge_residuals.is_doubtful
+assert relieved.is_certified
+assert not relieved.edge_residuals.is_doubtful
 assert pgo.absolute_trajectory_error(solution.poses, truth) < 0.8 * pgo.absolute_trajectory_error(fooled.poses, truth)
 assert np.isclose(problem.objective(returned), solution.objective, rtol=1e-9)
 assert np.isclose(problem.objective(kitti), solution.objective, rtol=1e-9)

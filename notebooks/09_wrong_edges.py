@@ -1,6 +1,8 @@
 # %% [markdown]
 # # 9. Can one wrong edge be found?
 #
+# Open with `jupyter lab notebooks/09_wrong_edges.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+#
 # A place is taken for another that looks the same, and a wrong loop closure enters the graph. Least squares believes
 # it like all others. The certificate then proves that no poses fit *these measurements* better ([notebook
 # 8](08_your_own_graph.ipynb)): of a wrong map, too. Whoever wants the wrong edge out has to decide, edge by edge. This
@@ -306,6 +308,57 @@ def truncated_cost(poses):
 
 
 print(f"truncated cost: right map {truncated_cost(right_map.poses):.0f}, wrong map {truncated_cost(silent.poses):.0f}")
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** With thresholds at the quantile 0.5 in place of 0.99, how many of the *right* closures would lie beyond them?
+#
+# <details><summary>Answer</summary>
+#
+# About half: that is what a quantile is. A threshold is a share of right edges that one is willing to lose.
+#
+# ```python
+# right_world = world(0, 0.1)
+# found_there = solvers.solve(right_world)
+# costs, free = pgo.PGOProblem(right_world).edge_costs(found_there.poses), ~is_odometry(right_world)
+# beyond = np.mean(costs[free] > pgo.chi2_thresholds(pgo.PGOProblem(right_world), 0.5)[free])
+# assert 0.1 < beyond < 0.8
+# ```
+#
+# </details>
+#
+# **2.** What is the surrogate for very large $\mu$, and where does it differ most from it for small ones?
+#
+# <details><summary>Answer</summary>
+#
+# The truncated cost $\min(r^2, c^2)$. For small $\mu$ it is a wide parabola: an error far out still pulls.
+#
+# ```python
+# r = np.linspace(0.0, 5.0, 50)
+# assert np.allclose(solvers.RobustLoss.TRUNCATED.surrogate(r**2, 1e8), np.minimum(r**2, 1.0), atol=1e-3)
+# assert solvers.RobustLoss.TRUNCATED.surrogate(r**2, 0.01)[-1] > 1.0 / 3.0
+# ```
+#
+# </details>
+#
+# **3.** Put the wrong edge's error up by half: it says that pose 42 lies beyond pose 8. By how much does its cost
+# grow, and does it stand out now?
+#
+# <details><summary>Answer</summary>
+#
+# What it brings in grows, and nearly all of the growth is in the others: its own share is still below a fifth.
+# Leverage is a matter of the graph, not of the size of the error.
+#
+# ```python
+# true_place = truth.R[8].T @ (truth.t[42] - truth.t[8])
+# further, _ = with_wrong(clean, [8], [42], pgo.Poses(np.eye(2)[None], -0.5 * true_place[None]))
+# grown = solvers.solve(further)
+# assert grown.objective > 1.2 * fooled.objective
+# assert grown.edge_residuals.cost[wrong] < 0.2 * (grown.objective - without.objective)
+# ```
+#
+# </details>
 
 # %%
 assert without.is_certified

@@ -18,7 +18,7 @@ from nbclient import NotebookClient
 from PIL import Image
 
 FOLDER = Path(__file__).parent
-COLOURS = 48  # of a picture: line drawings need no more
+COLOURS = 128  # of a picture: fewer make two robots alike
 MOST_BYTES = 400_000
 
 

@@ -6,6 +6,7 @@
 import ast
 import json
 import os
+import re
 import subprocess
 import sys
 from itertools import pairwise
@@ -19,8 +20,25 @@ import solvers
 FOLDER = Path(__file__).parent.parent / "notebooks"
 SOURCES = sorted(FOLDER.glob("[0-9][0-9]_*.py"))
 NAMES = [source.stem for source in SOURCES]
-LIBRARIES = {"cvxpy", "matplotlib", "numpy", "scipy"}
+LIBRARIES = {"cvxpy", "matplotlib", "numpy", "pandas", "scipy"}
+ANSWER = re.compile(r"<details><summary>Answer</summary>\n\n(.*?)\n\n</details>", re.S)
+EXERCISES = 3
 MOST_BYTES = 400_000
+
+# Equations of the paper that have a label, by the number that they are printed with.
+EQUATIONS = {
+    "problem bregman": 1,
+    "update B": 2,
+    "bregman update": 4,
+    "minbregman": 8,
+    "bregman ADMM": 9,
+    "min": 13,
+    "translation": 14,
+    "rotation": 15,
+    "min overall": 16,
+    "rotation subproblem with constraint": 17,
+    "relaxation rotation": 18,
+}
 
 each_source = pytest.mark.parametrize("source", SOURCES, ids=NAMES)
 
@@ -45,13 +63,25 @@ def text_of(kind: str, lines: list[str]) -> str:
     return "\n".join(lines).strip("\n")
 
 
+def with_answers(source: Path) -> str:
+    """The code of a notebook, with that of the answers to its exercises where they stand."""
+    parts = []
+    for kind, text in cells(source):
+        parts += [text] if kind == "code" else [code for answer in ANSWER.findall(text) for code in code_of(answer)]
+    return "\n\n".join(parts)
+
+
+def code_of(answer: str) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```", answer, re.M | re.S)
+
+
 def test_there_is_a_notebook_for_every_topic():
-    assert [name[:2] for name in NAMES] == [f"{number:02d}" for number in range(1, 10)]
+    assert [name[:2] for name in NAMES] == [f"{number:02d}" for number in range(1, 13)]
     assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == NAMES
 
 
 @each_source
-def test_a_source_runs_and_leaves_nothing_behind(source):
+def test_a_source_runs_with_its_answers_and_leaves_nothing_behind(source):
     before = sorted(FOLDER.iterdir())
     environment = {name: value for name, value in os.environ.items() if name != "PGO_DATA"}
     environment |= {
@@ -61,7 +91,11 @@ def test_a_source_runs_and_leaves_nothing_behind(source):
         "PYTHONPATH": str(FOLDER.parent),
     }
     ended = subprocess.run(  # where Jupyter would run it
-        [sys.executable, "-W", "error", source.name], cwd=FOLDER, env=environment, capture_output=True, text=True
+        [sys.executable, "-W", "error", "-c", with_answers(source)],
+        cwd=FOLDER,
+        env=environment,
+        capture_output=True,
+        text=True,
     )
     assert ended.returncode == 0, ended.stderr
     assert sorted(FOLDER.iterdir()) == before
@@ -95,6 +129,24 @@ def test_a_source_asks_a_question_and_ends_with_asserts(source):
     assert "?" in opening
     kind, ending = [part for part in parts if part[0] == "code"][-1]
     assert any(isinstance(node, ast.Assert) for node in ast.parse(ending).body)
+
+
+@each_source
+def test_a_source_says_how_to_open_it_and_has_exercises_with_hidden_answers(source):
+    parts = cells(source)
+    assert f"Open with `jupyter lab notebooks/{source.stem}.ipynb`" in parts[0][1]
+    (exercises,) = (text for kind, text in parts if kind == "markdown" and text.startswith("## Exercises"))
+    assert re.findall(r"^\*\*(\d)\.\*\*", exercises, re.M) == [str(k) for k in range(1, EXERCISES + 1)]
+    answers = ANSWER.findall(exercises)
+    assert len(answers) == exercises.count("<details>") == EXERCISES
+    assert all(any("assert " in code for code in code_of(answer)) for answer in answers)
+
+
+@each_source
+def test_equations_of_the_paper_have_their_numbers(source):
+    text = "\n".join(text for kind, text in cells(source) if kind == "markdown")
+    for label, number in EQUATIONS.items():
+        assert text.count(f"`{label}`") == len(re.findall(rf"\({number}\),\s`{label}`", text)), label
 
 
 @each_source
