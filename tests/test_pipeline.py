@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 import pgo_models as pgo
 import solvers
+from pgo_models.certificates import definiteness
 from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, Verdict
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.graphs.scenes import NoiseModel
@@ -285,3 +286,13 @@ def test_times_go_along_and_are_written(tmp_path):
         replace(graph, times=times[::-1])
     with pytest.raises(GraphError, match="times has shape"):
         replace(graph, times=times[1:])
+
+
+def test_where_rounding_alone_is_in_the_way_no_other_poses_are_looked_for(monkeypatch):
+    """As on planes of 360,000 poses: S_r has a factor, whose rounding may be more than what it is definite by."""
+    monkeypatch.setattr(definiteness, "MARGIN", 1e16)
+    solution = solvers.solve(pgo.grid(np.random.default_rng(0)))
+    assert [stage.name for stage in solution.stages] == ["chordal start", "Newton"]
+    certificate = solution.certificate
+    assert (certificate.verdict, certificate.can_improve, certificate.lower_bound) == (Verdict.TRIVIAL, False, 0.0)
+    assert "definite in doubles" in str(certificate)

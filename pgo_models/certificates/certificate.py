@@ -107,7 +107,7 @@ class Certificate(ReadOnly):
     @property
     def can_improve(self) -> bool:
         """Whether other poses, or multipliers of another rank, could give what was asked for."""
-        return not (self.is_certified or self.is_best_in_doubles)
+        return not (self.is_certified or self.is_best_in_doubles or self.bound.is_definite)
 
     @property
     def digits(self) -> int:
@@ -150,7 +150,8 @@ class Certificate(ReadOnly):
     def proof(self) -> str:
         """How the bound was proved, in a few words."""
         if math.isnan(self.eta):
-            return f"{self.cost} is never negative"
+            why = "; S_r is definite in doubles, by less than rounding can take" if self.bound.is_definite else ""
+            return f"{self.cost} is never negative{why}"
         form = "grounded at a pose" if self.bound.is_grounded else "with a shift"
         shift = f", eta = {self.eta:.3g}" if self.eta > 0 else ""
         cap = f", conditions cut to {self.bound.cap:.3g}" if self.bound.cap < math.inf else ""

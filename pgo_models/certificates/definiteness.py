@@ -132,6 +132,17 @@ def prove_definite(
     return DefiniteProof(stored, factor, free, shift, entries, is_marginal)
 
 
+def is_definite_in_doubles(problem: PGOProblem, Lambda: Array, fixed: IntArray) -> bool:
+    """Whether S without the rows `fixed` has a Cholesky factor in floating point, which proves nothing."""
+    stored, diagonal = shifted_certificate(problem, Lambda, np.zeros(problem.side))
+    problem.leave_out(stored.data, fixed, 2.0 * diagonal[fixed])
+    try:
+        problem.analysis.factorize(stored)
+    except NotPositiveDefiniteError:
+        return False
+    return True
+
+
 def shifted_certificate(problem: PGOProblem, Lambda: Array, shifts: Array) -> tuple[csc_array, Array]:
     """S + diag(shifts) in double precision, (N, N), and a diagonal, (N,), no smaller than any its rounding comes from.
 

@@ -25,11 +25,11 @@ F >= tr(Lambda) - eta n d (Rosen et al. 2019, theorem 7; Carlone et al. 2015).
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pgo_models.certificates.definiteness import DefiniteProof, prove_definite, smallest_eta
+from pgo_models.certificates.definiteness import DefiniteProof, is_definite_in_doubles, prove_definite, smallest_eta
 from pgo_models.certificates.rounding_errors import Evaluation, evaluate_certificate, has_safe_scale
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
@@ -55,6 +55,7 @@ class LowerBound:
     is_grounded: bool  # whether the proof leaves out one whole pose; else it is one with eta alone
     rounding: float  # sum of all that was subtracted because of rounding
     cap: float = math.inf  # condition that the information matrices were cut down to (`certificates.tangent`)
+    is_definite: bool = False  # whether S_r is in doubles, where it could not be proved: no other poses would help
 
 
 NO_BOUND = LowerBound(0.0, math.nan, False, 0.0)
@@ -127,7 +128,8 @@ def best_bound(problem: PGOProblem, Lambda: Array, poses: Poses | None, gap: flo
     bounds = [search_bound(lambda eta: _prove(problem, Lambda, eta, None), smallest, most, count)]
     if point is not None:
         bounds.append(search_bound(lambda eta: _prove(problem, Lambda, eta, point), smallest, most, count))
-    return max([NO_BOUND, *bounds], key=lambda bound: bound.value)
+    is_definite = point is not None and is_definite_in_doubles(problem, Lambda, point.rows)
+    return replace(max([NO_BOUND, *bounds], key=lambda bound: bound.value), is_definite=is_definite)
 
 
 def search_bound(prove: Callable[[float], LowerBound | None], smallest: float, trace: float, count: int) -> LowerBound:

@@ -291,6 +291,7 @@ class _Cholmod(SymbolicCholesky):
     ) -> None:
         super().__init__(pattern)
         self._order, self._most_counts = order, most_counts
+        self._error_before: Array | None = None
         self._matrix, self._lower, self._is_diagonal = lower_triangle(pattern)
         # Symbolic parts with the factor that uses each. No finaliser gives them back: Ctrl-C in one would be lost.
         self._taken: list[tuple[weakref.ref[_CholmodFactor] | None, _Capsule]] = [(None, self._analyze())]
@@ -303,7 +304,10 @@ class _Cholmod(SymbolicCholesky):
         return error_of_counts(np.full(self._shape[0], float(self._shape[0])), self._shape[0])
 
     def error_before(self) -> Array:
-        return self._most_counts().error(0) if self._most_counts is not None else super().error_before()
+        if self._error_before is None:
+            found = self._most_counts
+            self._error_before = super().error_before() if found is None else found().error(0)
+        return self._error_before
 
     def counts(self) -> FactorCounts:
         """Counts of every factor with this pattern, if need be of one that is out of use."""
