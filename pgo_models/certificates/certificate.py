@@ -179,19 +179,8 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     at the poses as they are. Of a problem with `Weighting.INFORMATION` all of this is chi2 instead of F, bounded by its
     tangent at the stationary point, and where that fails by smaller information matrices (`softened_bound`).
 
-    Parameters
-    ----------
-    problem : PGOProblem or PoseGraph
-    poses : Poses
-    gap : float
-        The relative gap to certify.
-
-    Raises
-    ------
-    SettingError
-        When gap is not positive and finite.
-    GraphError
-        When the poses do not fit the graph.
+    A SettingError when gap, the relative one to certify, is not positive and finite; a GraphError when the poses do not
+    fit the graph.
 
     Examples
     --------

@@ -64,15 +64,10 @@ def load(
 
     A name is looked for in the project's data folder, in ./data, in the folder named by the environment variable
     PGO_DATA, and in the user's cache; then it is downloaded, unless `download` is false. What the cache holds is
-    checked against its checksum. `weights` and `skip_unknown` as for `read_g2o`.
-    Beside `x.g2o`, or the folder `x`, a file `x.truth.tum` gives the ground truth, in the order of the poses.
-
-    Raises
-    ------
-    DatasetError
-        When the name is unknown, the download fails or is not wanted, or what came does not have the right checksum.
-    FileFormatError
-        See `read_g2o`; also when the truth has not one pose for each of the graph.
+    checked against its checksum. `weights` and `skip_unknown` as for `read_g2o`. Beside `x.g2o`, or the folder `x`, a
+    file `x.truth.tum` gives the ground truth, in the order of the poses. A DatasetError when the name is unknown, the
+    download fails or is not wanted, or what came does not have the right checksum; a FileFormatError as of `read_g2o`;
+    also when the truth has not one pose for each of the graph.
 
     Examples
     --------

@@ -52,17 +52,13 @@ class G2OLines:
 def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
     """Read and check the lines of one g2o file; blank lines, comments (#) and PARAMS_ lines are skipped.
 
-    With `skip_unknown`, so are lines with unknown tags, and a `GraphWarning` says how many of each.
-
-    Raises
-    ------
-    FileFormatError
-        With file:line, for: a file that is missing, binary or without VERTEX and EDGE lines; an unknown tag; too few or
-        too many numbers on a line, or thousands of them; a word, nan or inf where a number belongs; an id that is no
-        integer of 64 bits; a zero quaternion; a length beyond `FARTHEST`; an information matrix whose translation or
-        rotation block is not positive definite, nor zero, or both are zero; an edge to itself; a second VERTEX line of
-        the same id; a measurement in the frame of a sensor that is not that of the pose; an edge from a landmark, or of
-        its rotation; 2D and 3D in one file.
+    With `skip_unknown`, so are lines with unknown tags, and a `GraphWarning` says how many of each. A FileFormatError
+    with file:line, for: a file that is missing, binary or without VERTEX and EDGE lines; an unknown tag; too few or too
+    many numbers on a line, or thousands of them; a word, nan or inf where a number belongs; an id that is no integer of
+    64 bits; a zero quaternion; a length beyond `FARTHEST`; an information matrix whose translation or rotation block is
+    not positive definite, nor zero, or both are zero; an edge to itself; a second VERTEX line of the same id; a
+    measurement in the frame of a sensor that is not that of the pose; an edge from a landmark, or of its rotation; 2D
+    and 3D in one file.
     """
     path = Path(path)
     source, first = _Source(path, skip_unknown), 1
@@ -80,18 +76,9 @@ def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
     if posed:
         problem = "a pose, or an edge of poses, with the id of a landmark, which is a point; renumber one of them"
         raise FileFormatError(path, int(min(posed)), problem)
+    fixed, fixed_lines = np.array(source.fixed, dtype=np.int64).reshape(-1, 2).T
     found = G2OLines(
-        path,
-        d,
-        vertex_ids[:, 1],
-        vertex_lines,
-        vertices,
-        edge_ids,
-        edges,
-        edge_lines,
-        np.array([pose for pose, _ in source.fixed], dtype=np.int64),
-        np.array([line for _, line in source.fixed], dtype=np.int64),
-        landmarks,
+        path, d, vertex_ids[:, 1], vertex_lines, vertices, edge_ids, edges, edge_lines, fixed, fixed_lines, landmarks
     )
     for rows, at in ((vertices, found.vertex_lines), (edges, found.edge_lines)):
         check_distances(path, at, rows[:, :d])

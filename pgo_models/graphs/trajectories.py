@@ -27,17 +27,8 @@ _MATRIX_TOLERANCE = 1e-3  # KITTI's own files have about seven digits; this tell
 def write_tum(poses: Poses, path: Path | str, timestamps: Array | None = None) -> None:
     """Write one line `timestamp tx ty tz qx qy qz qw` for each pose; the floats come back exactly.
 
-    Parameters
-    ----------
-    timestamps : (n,), optional
-        Seconds, ascending; 0, 1, .. unless given.
-
-    Raises
-    ------
-    GraphError
-        When there is not one finite timestamp for each pose, or they do not ascend.
-    PGOError
-        When the file cannot be written; what stood there stays.
+    `timestamps`, (n,), are ascending seconds; 0, 1, .. unless given. A GraphError when there is not one finite one for
+    each pose, or they do not ascend; a PGOError when the file cannot be written; what stood there stays.
 
     Examples
     --------
@@ -57,11 +48,8 @@ def write_tum(poses: Poses, path: Path | str, timestamps: Array | None = None) -
 def read_tum(path: Path | str, d: int = 3) -> Poses:
     """Poses of a TUM file, in the order of its lines; `read_times` reads the timestamps.
 
-    Raises
-    ------
-    FileFormatError
-        With file:line, for a row that is not 8 finite numbers, a zero quaternion, a position beyond `FARTHEST`, or,
-        with d = 2, a pose out of the plane.
+    A FileFormatError with file:line, for a row that is not 8 finite numbers, a zero quaternion, a position beyond
+    `FARTHEST`, or, with d = 2, a pose out of the plane.
 
     Examples
     --------

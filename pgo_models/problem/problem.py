@@ -38,12 +38,7 @@ class PGOProblem:
     weighting : Weighting or EdgeWeights
         Which cost, F or chi2, or its weights themselves.
 
-    Raises
-    ------
-    GraphError
-        When the graph is not connected.
-    SettingError
-        When weighting is none.
+    A GraphError when the graph is not connected; a SettingError when weighting is none.
 
     Examples
     --------

@@ -241,12 +241,7 @@ def _orthogonality(equations: _Equations) -> None:
             for a, b in _upper(d):
                 first, second = unit[column + a], unit[column + b]
                 equations.add(
-                    [
-                        (k, unit[a], second, 1.0),
-                        (k, first, unit[b], 1.0),
-                        (k, first, second, 1.0 / layout.sigma),
-                    ],
-                    0.0,
+                    [(k, unit[a], second, 1.0), (k, first, unit[b], 1.0), (k, first, second, 1.0 / layout.sigma)], 0.0
                 )
                 equations.last_is(u, a, b, layout.sigma)
                 equations.last_is(r, a, b, -layout.sigma)
