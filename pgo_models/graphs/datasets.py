@@ -206,7 +206,5 @@ def _fits(path: Path, checksum: str) -> bool:
     kind, _, expected = checksum.partition(":")
     data = path.read_bytes()
     if kind == "blob":
-        found = hashlib.sha1(b"blob %d\0" % len(data) + data, usedforsecurity=False).hexdigest()
-    else:
-        found = hashlib.sha256(data).hexdigest()
-    return found == expected
+        return hashlib.sha1(b"blob %d\0" % len(data) + data, usedforsecurity=False).hexdigest() == expected
+    return hashlib.sha256(data).hexdigest() == expected

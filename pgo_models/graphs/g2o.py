@@ -1,8 +1,6 @@
 """g2o files, one for all robots or a folder with one for each, as a PoseGraph and back.
 
-Information matrices become the precisions of SE-Sync (Rosen et al. 2019):
-d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I_tt^-1), kappa = I_theta, or half of it
-with RotationWeight.GAUSSIAN.
+Information matrices become the precisions of SE-Sync (Rosen et al. 2019), see `edge_precisions`.
 """
 
 import os
@@ -315,11 +313,8 @@ def _fixed(ids: IntArray, files: list[G2OLines]) -> IntArray:
         unknown = ~np.isin(file.fixed, ids)
         if unknown.any():
             at = int(np.argmax(unknown))
-            raise FileFormatError(
-                file.path,
-                int(file.fixed_lines[at]),
-                f"FIX names pose {file.fixed[at]}, which has no other line; remove it",
-            )
+            problem = f"FIX names pose {file.fixed[at]}, which has no other line; remove it"
+            raise FileFormatError(file.path, int(file.fixed_lines[at]), problem)
     return np.unique(np.searchsorted(ids, np.concatenate([file.fixed for file in files])))
 
 

@@ -230,11 +230,11 @@ class _Source:
             expected = kind.num_ids + kind.num_numbers
             if len(words) != expected:
                 few = "the line is cut off" if len(words) < expected else "the line is too long"
-                raise self._error(
-                    number,
-                    f"{tag} needs {kind.num_ids} id{'s' * (kind.num_ids > 1)} and {kind.num_numbers} numbers, "
-                    f"{expected} in all, found {len(words)}; {few}: complete or remove it",
+                needed = (
+                    f"{kind.num_ids} id{'s' * (kind.num_ids > 1)} and {kind.num_numbers} numbers, {expected} in all"
                 )
+                problem = f"{tag} needs {needed}, found {len(words)}; {few}: complete or remove it"
+                raise self._error(number, problem)
         raise self._error(at[0], f"the {tag} lines cannot be read; write numbers like 1.5e-3, separated by blanks")
 
     def _error(self, line: int, problem: str) -> FileFormatError:
@@ -255,10 +255,10 @@ def _faults(found: G2OLines) -> Iterator[tuple[int, str]]:
     again = np.flatnonzero(np.diff(found.vertex_ids[order]) == 0)
     if again.size:
         earlier, later = order[again[0]], order[again[0] + 1]
-        first = found.vertex_lines[earlier]
+        first = f"(the first is line {found.vertex_lines[earlier]})"
         yield (
             int(found.vertex_lines[later]),
-            f"a second VERTEX line of pose {found.vertex_ids[later]} (the first is line {first}); remove one",
+            f"a second VERTEX line of pose {found.vertex_ids[later]} {first}; remove one",
         )
     loops = found.edge_ids[:, 0] == found.edge_ids[:, 1]
     if loops.any():
@@ -276,11 +276,9 @@ def _faults(found: G2OLines) -> Iterator[tuple[int, str]]:
         if bad.any():
             at = int(np.argmax(bad))
             smallest = np.linalg.eigvalsh(information[at, block, block])[0]
-            yield (
-                int(found.edge_lines[at]),
-                f"{name} block of the information matrix is not positive definite (smallest eigenvalue "
-                f"{smallest:.3g}); give the upper triangle row by row, or remove the line",
-            )
+            indefinite = f"information matrix is not positive definite (smallest eigenvalue {smallest:.3g})"
+            way_out = "give the upper triangle row by row, or remove the line"
+            yield int(found.edge_lines[at]), f"{name} block of the {indefinite}; {way_out}"
 
 
 def _is_positive_definite(A: Array) -> NDArray[np.bool_]:

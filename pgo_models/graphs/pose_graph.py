@@ -112,8 +112,7 @@ class PoseGraph(Measurements):
         """Poses of every connected component, largest first; of some of the edges, (m,), or of all."""
         if edges is None:
             return list(self._components)
-        counts = edge_counts(self.i[edges], self.j[edges], self.num_poses)
-        return _sorted_components(counts)
+        return _sorted_components(edge_counts(self.i[edges], self.j[edges], self.num_poses))
 
     @cached_property
     def _components(self) -> list[IntArray]:

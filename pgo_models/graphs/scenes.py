@@ -25,11 +25,12 @@ _SPHERE_PAIR_LEFT_OUT = (0, 12)
 class NoiseModel:
     """Zero-mean Gaussian noise of measurements and initial guesses; the defaults are the paper's.
 
-    A SettingError when one is not positive and finite: a precision would be infinite.
+    Standard deviations of every component of a translation, metres, and of the tangent vector of a rotation, radians. A
+    SettingError when one is not positive and finite: a precision would be infinite.
     """
 
-    translation_std: float = 0.5  # metres, of every component of a translation
-    rotation_std: float = np.pi / 6  # radians, of every component of the tangent vector of a rotation
+    translation_std: float = 0.5
+    rotation_std: float = np.pi / 6
 
     def __post_init__(self) -> None:
         check_settings(self, finite=["translation_std", "rotation_std"])
@@ -226,7 +227,6 @@ def _equal_area_points(count: int) -> Array:
     for theta in np.pi * (np.arange(num_circles) + 0.5) / num_circles:
         on_circle = round(2 * np.pi * np.sin(theta) * np.pi / num_circles / area)
         phi = 2 * np.pi * np.arange(on_circle) / on_circle
-        points.append(
-            np.column_stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi])
-        )
+        latitude = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi
+        points.append(np.column_stack(latitude))
     return np.concatenate(points)

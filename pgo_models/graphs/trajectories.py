@@ -1,7 +1,6 @@
 """Trajectories in the TUM and KITTI text formats, as evo reads and writes them; poses in the plane are lifted to z = 0.
 
-TUM: a line `timestamp tx ty tz qx qy qz qw` for each pose. KITTI: the 12 numbers of the 3 x 4 matrix (R_i, t_i), row by
-row. Both hold world from body, metres.
+Both hold world from body, metres: see `write_tum` and `write_kitti`.
 """
 
 from collections.abc import Sequence
@@ -100,10 +99,8 @@ def read_kitti(path: Path | str, d: int = 3) -> Poses:
     error = orthogonality_error(matrices[:, :, :3])
     worst = int(np.argmax(error))
     if not error[worst] < _MATRIX_TOLERANCE:
-        problem = (
-            f"the 3 x 3 part is no rotation: ||R^T R - I|| or 1 - det R is {error[worst]:.3g}; give (R, t) by rows"
-        )
-        raise FileFormatError(path, lines[worst], problem)
+        what = f"||R^T R - I|| or 1 - det R is {error[worst]:.3g}"
+        raise FileFormatError(path, lines[worst], f"the 3 x 3 part is no rotation: {what}; give (R, t) by rows")
     return _in_dimension(project_to_rotations(matrices[:, :, :3]), matrices[:, :, 3], d, path, lines)
 
 
@@ -122,9 +119,8 @@ def _in_dimension(R: Array, t: Array, d: int, path: Path | str, lines: Sequence[
     out = np.maximum(np.abs(t[:, 2]), np.abs(R[:, 2, :] - [0.0, 0.0, 1.0]).max(axis=1))
     worst = int(np.argmax(out))
     if out[worst] > _PLANE_TOLERANCE:
-        raise FileFormatError(
-            path, lines[worst], f"pose is out of the x-y plane by {out[worst]:.3g}; read it with d = 3"
-        )
+        problem = f"pose is out of the x-y plane by {out[worst]:.3g}; read it with d = 3"
+        raise FileFormatError(path, lines[worst], problem)
     return Poses(project_to_rotations(R[:, :2, :2]), t[:, :2])
 
 

@@ -133,7 +133,8 @@ def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[
     for poses in iterates:
         if poses.t.shape != (graph.num_poses, graph.d):
             raise GraphError(f"{poses} beside {graph!r}; give one pose for every pose of the graph")
-    shown = _evenly(len(iterates), int(_FILM_BYTES / (3 * graph.d * graph.num_edges * _BYTES_PER_NUMBER)))
+    most = max(2, int(_FILM_BYTES / (3 * graph.d * graph.num_edges * _BYTES_PER_NUMBER)))
+    shown = np.unique(np.linspace(0, len(iterates) - 1, min(len(iterates), most)).round().astype(int)).tolist()
     positions = [iterates[k].aligned_to(iterates[-1]).t for k in shown]
     names = [names[k] for k in shown]
     owner = np.where(graph.robots[graph.i] == graph.robots[graph.j], graph.robots[graph.i], -1)
@@ -257,12 +258,6 @@ def _arrange(figure: Figure, points: Array, title: str) -> None:
             for letter, centre in zip("xyz", middle.tolist(), strict=True)
         },
     )
-
-
-def _evenly(number: int, most: int) -> list[int]:
-    """Return at most `most`, but two, of 0 .. number - 1, evenly, first and last among them."""
-    chosen = np.linspace(0, number - 1, min(number, max(most, 2))).round()
-    return [int(k) for k in np.unique(chosen)]
 
 
 def _add_controls(figure: Figure, names: list[str]) -> None:

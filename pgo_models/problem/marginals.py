@@ -28,13 +28,16 @@ class Marginals:
 
     v is along the axes of the world, w about the pose's own. GTSAM and g2o have R_i^T v_i, and Pose3 that after w.
 
+    `hessian`, (n p, n p), with the rows of `layout`, is the second derivative of a cost without a factor 1/2, such as
+    `riemannian_hessian`. `anchor` is the pose that does not move, the gauge; its covariances are zero.
+
     A SettingError when the anchor, or a pose asked for, is none; a NotPositiveDefiniteError when a covariance is asked
     for where the Hessian is that of no strict minimum.
     """
 
-    hessian: csc_array  # (n p, n p): second derivative of a cost without a factor 1/2, such as `riemannian_hessian`
-    layout: TangentLayout  # its rows
-    anchor: int = 0  # pose that does not move, the gauge; its covariances are zero
+    hessian: csc_array
+    layout: TangentLayout
+    anchor: int = 0
     backend: CholeskyBackend | None = None
 
     def joint(self, *poses: int) -> Array:

@@ -153,10 +153,6 @@ class _Layout:
         ends = offsets[:-1], offsets[-1]
         return cls(problem, tree, centre, sigma, sigma_t, reference, columns, sides, *ends, home)
 
-    def position(self, k: int) -> IntArray:
-        """Place in w of every entry of W_C, (side, side)."""
-        return self.offsets[k] + _triangle_places(self.sides[k])
-
     def gram(self, k: int, W: Array) -> Array:
         """Gram matrix of the P_u of clique k, (d c_k, d c_k): the clique's part of Z but for a turn of every pose."""
         eye = np.eye(self.problem.d)
@@ -190,7 +186,9 @@ class _Equations:
 
     def __init__(self, layout: _Layout) -> None:
         self.layout = layout
-        self._positions = [layout.position(k) for k in range(len(layout.sides))]
+        # Place in w of every entry of every W_C, (side, side).
+        places = zip(layout.offsets, layout.sides, strict=True)
+        self._positions = [first + _triangle_places(side) for first, side in places]
         self._rows: list[IntArray] = []
         self._columns: list[IntArray] = []
         self._values: list[Array] = []

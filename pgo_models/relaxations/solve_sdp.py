@@ -3,9 +3,7 @@
 import enum
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import cvxpy as cp
 
@@ -137,12 +135,10 @@ def solve_relaxation(
     plan = plan_relaxation(problem, form, solver, memory_limit)
     if verbose:
         print(plan)
-    forms: dict[RelaxationForm, Callable[[PGOProblem], Relaxation]] = {
-        RelaxationForm.PRIMAL: primal_relaxation,
-        RelaxationForm.DUAL: dual_relaxation,
-        RelaxationForm.CLIQUES: partial(clique_relaxation, tree=plan.tree),
-    }
-    relaxation = forms[plan.form](problem)
+    if plan.form is RelaxationForm.CLIQUES:
+        relaxation: Relaxation = clique_relaxation(problem, tree=plan.tree)
+    else:
+        relaxation = primal_relaxation(problem) if plan.form is RelaxationForm.PRIMAL else dual_relaxation(problem)
     status = _solve(relaxation.model, plan.solver, time_limit, verbose)
     poses, rank = relaxation.rounded()
     certificate = certify_with(problem, poses, relaxation.Lambda(), gap, math.nan, BoundSource.RELAXATION, ground=poses)
