@@ -36,8 +36,7 @@ class Poses(ReadOnly):
     t : (n, d)
         Positions in the world, metres.
 
-    Both are read-only copies. A GraphError on wrong shapes, entries that are no real numbers, nan or inf, or a matrix
-    that is no rotation.
+    Both are read-only copies. A GraphError on wrong shapes, entries that are not real or finite, or no rotation.
     """
 
     R: Array

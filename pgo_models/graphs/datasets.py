@@ -24,8 +24,7 @@ class Registry:
     """A public folder of g2o files with their checksums."""
 
     base_url: str  # the file of a name is at `base_url/name.g2o`
-    # `sha256:` and the digest of the file, or `blob:` and its git blob id: the SHA-1 of "blob <size>", a zero byte and
-    # the file.
+    # `sha256:` and the digest of the file, or `blob:` and its git blob id: SHA-1 of "blob <size>", zero byte, file.
     checksums: Mapping[str, str]
     cache: Path | None = None  # folder for downloads; the user's cache unless given
 

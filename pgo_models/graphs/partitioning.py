@@ -68,8 +68,7 @@ def partition(graph: PoseGraph, num_robots: int | None = None, method: Partition
 
     The number of robots is needed unless the graph names its robots or every pose is its own; the method is GIVEN when
     the graph names as many robots as asked for, else CONTIGUOUS, unless another is given. A SettingError when the
-    number of robots is not a whole one of 1 to n, or GIVEN does not fit it; a MissingExtraError when METIS is asked for
-    without the extra `fast`.
+    number is not a whole one of 1 to n, or GIVEN does not fit; a MissingExtraError for METIS without the extra `fast`.
 
     Examples
     --------

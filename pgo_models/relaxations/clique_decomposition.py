@@ -42,8 +42,7 @@ class CliqueRelaxation:
     centre: Poses
     model: cp.Problem  # its value times `scale` is that of the relaxation
     upper: tuple[cp.Variable, ...]  # upper triangle of every W_C, row by row
-    # A w = b for w all of these, clique after clique: R_i^T R_i = I and the agreement on separators. Its dual value
-    # gives Lambda.
+    # A w = b for w all of these, clique after clique: R_i^T R_i = I and agreement on separators; its dual gives Lambda.
     equalities: cp.Constraint
     semidefinite: tuple[cp.Constraint, ...]  # W_C PSD, one for every clique
     scale: float  # of the objective: F at the centre, or for noise-free graphs a share of L

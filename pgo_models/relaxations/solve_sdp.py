@@ -37,8 +37,7 @@ class RelaxationStatus(enum.Enum):
 class RelaxationSolution:
     """What the relaxation says of a pose graph.
 
-    The certificate is of the rounded poses, with the multipliers from the duals: its bound on F is proven, whatever the
-    solver did.
+    The certificate is of the rounded poses, with multipliers from the duals: its bound holds whatever the solver did.
     """
 
     relaxation: Relaxation  # the model with its variables and duals as solved
@@ -116,8 +115,7 @@ def solve_relaxation(
     verbose : bool
         Print the plan with its reason, the solver's table, and the result.
 
-    A SettingError when a limit or the gap is not positive, or the memory would not do; a PGOError when the solver ends
-    without an iterate.
+    A SettingError when a limit or the gap is not positive, or memory would not do; a PGOError when there is no iterate.
 
     Examples
     --------
