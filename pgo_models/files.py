@@ -129,12 +129,8 @@ def _sound_table(lines: list[str], columns: int) -> NDArray[np.float64] | None:
 def replace_when_done(path: Path | str) -> Iterator[Path]:
     """Lend a temporary path in the same folder, and move it over `path` when the block ends without an error.
 
-    A reader sees the old file or the whole new one, never a part; after an error nothing is left behind.
-
-    Raises
-    ------
-    PGOError
-        When the folder or the file cannot be written, or `path` is there and is no regular file.
+    A reader sees the old file or the whole new one, never a part; after an error nothing is left behind. A PGOError
+    when the folder or the file cannot be written, or `path` is there and is no regular file.
     """
     with _temporary_beside(path) as (temporary, target):
         yield temporary

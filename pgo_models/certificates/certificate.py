@@ -180,19 +180,7 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     at the poses as they are. Of a problem with `Weighting.INFORMATION` all of this is chi2 instead of F, bounded by its
     tangent at the stationary point, and where that fails by smaller information matrices (`softened_bound`).
 
-    Parameters
-    ----------
-    problem : PGOProblem or PoseGraph
-    poses : Poses
-    gap : float
-        The relative gap to certify.
-
-    Raises
-    ------
-    SettingError
-        When gap is not positive and finite.
-    GraphError
-        When the poses do not fit the graph.
+    A SettingError unless gap, the relative one to certify, is positive and finite; a GraphError when poses do not fit.
 
     Examples
     --------
@@ -227,8 +215,7 @@ def certify_at(
 ) -> Certificate:
     """Certificate from the multipliers at the poses as they are: valid anywhere, and sharp near an optimum.
 
-    `stationarity`, the relative decrement there, is reported as it is; nan where it was not measured. Errors as of
-    `certify`.
+    `stationarity`, the relative decrement there, is reported as it is; nan where not measured. Errors as of `certify`.
 
     Examples
     --------

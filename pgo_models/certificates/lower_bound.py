@@ -68,24 +68,10 @@ def prove_bound(problem: PGOProblem, Lambda: Array, eta: float = 0.0, poses: Pos
     entries, of the factorisation and of the sums is bounded and subtracted (this file's opening,
     `pgo_models.certificates.rounding_errors`, `pgo_models.problem.cholesky`). Lambda is made symmetric first.
 
-    Parameters
-    ----------
-    problem : PGOProblem
-    Lambda : (n, d, d)
-        From anywhere; at a certified optimum those of `multipliers` give a bound equal to F but for rounding.
-    eta : float
-    poses : Poses, optional
-        Where the proof is grounded at a pose in the middle of the graph; without them eta has to make S definite.
-
-    Returns
-    -------
-    float, or None when the matrix cannot be shown to be positive definite, as without poses at eta = 0 or any eta that
-    rounding swallows.
-
-    Raises
-    ------
-    SettingError
-        When eta is negative or not finite, or Lambda has the wrong shape.
+    Lambda, (n, d, d), may come from anywhere; at a certified optimum those of `multipliers` give a bound equal to F but
+    for rounding. The proof is grounded at a pose in the middle of the graph; without poses eta has to make S definite.
+    None when the matrix cannot be shown to be positive definite, as without poses at eta = 0 or any eta that rounding
+    swallows. A SettingError when eta is negative or not finite, or Lambda has the wrong shape.
 
     Examples
     --------

@@ -13,8 +13,7 @@ from pgo_models.geometry.rotations import Array
 def basis_pursuit(K: Array, f: Array) -> BregmanProblem:
     """Minimise ||x||_1 s.t. K x = f: the sparsest x, when K is incoherent and x sparse enough.
 
-    Bregman iteration ends after finitely many steps, and forgets errors made on the way (Yin et al. 2008; Yin & Osher
-    2013).
+    Bregman iteration ends after finitely many steps, and forgets errors on the way (Yin et al. 2008; Yin & Osher 2013).
     """
     x = cp.Variable(np.shape(K)[-1], name="x")
     return BregmanProblem(cp.norm1(x), x, K, f)

@@ -124,14 +124,9 @@ class GraphQP:
     def solve(self, V: Array, neighbours: Array | None = None) -> Array:
         """X for the shift V = omega - B, both (N_a, d).
 
-        Parameters
-        ----------
-        V : (N_a, d)
-        neighbours : (N, d), optional
-            X of the whole graph, for FROZEN: the shift becomes V - 2 D^-1 M_between X.
-
-        A SettingError when frozen neighbours are missing, a PGOError when there is no solution, as where constraints
-        contradict each other.
+        For FROZEN, `neighbours` is X of the whole graph, (N, d): the shift becomes V - 2 D^-1 M_between X. A
+        SettingError when it is missing, a PGOError when there is no solution, as where constraints contradict each
+        other.
         """
         if self.between.nnz:
             if neighbours is None:
@@ -168,8 +163,6 @@ def graph_qp(
         Given the variables, returns the ModelChange: terms, constraints, and edges whose loss they replace.
     rho_t : (n,), optional
         Penalty of every translation; none unless given.
-    solver : ConvexSolver or str, optional
-        Clarabel unless given.
 
     Examples
     --------

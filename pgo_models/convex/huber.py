@@ -11,14 +11,8 @@ from pgo_models.graphs.pose_graph import IntArray
 def huber_change(edges: IntArray, thresholds: Array) -> Changer:
     """Changer for `graph_qp` and `ExtendedSOC`: r_e^2 becomes 2 c_e r_e - c_e^2 beyond r_e^2 = c_e^2 (Huber 1964).
 
-    Parameters
-    ----------
-    edges : (k,)
-        Those with this loss; the others keep their squares.
-    thresholds : (m,)
-        c_e^2 of all edges, as of `chi2_thresholds`.
-
-    A SettingError when the program lacks unknowns of these edges.
+    For `edges`, (k,); the others keep their squares. `thresholds`, (m,), are c_e^2 of all edges, as of
+    `chi2_thresholds`. A SettingError when the program lacks unknowns of these edges.
     """
 
     def change(unknown: PoseVariables) -> ModelChange:

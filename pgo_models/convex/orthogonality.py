@@ -116,9 +116,8 @@ class OrthogonalProblem:
         for variable in others:
             check_variable(variable, "a variable of the problem")
         object.__setattr__(self, "J", _minimised(self.problem))
-        object.__setattr__(self, "variables", tuple(variables))
-        object.__setattr__(self, "others", tuple(others))
-        object.__setattr__(self, "terms", tuple(terms))
+        for name, found in (("variables", variables), ("others", others), ("terms", terms)):
+            object.__setattr__(self, name, tuple(found))
 
     def __repr__(self) -> str:
         parts = [f"{self.variables[term.variable].shape} {term.constraint!r}".removesuffix("()") for term in self.terms]

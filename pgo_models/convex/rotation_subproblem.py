@@ -62,13 +62,10 @@ def rotation_qp(
         Their weights.
     penalty : (N,)
         Diagonal of D: rho on the rows of penalised rotations (and translations), else 0.
-    d : int
-        Columns of X: the dimension of space.
     X : cp.Variable, (N, d), optional
         The variable, where terms or constraints are already written in it.
     terms : sequence of cp.Expression
         Convex terms to add to the objective; `pgo_models.convex.graph_subproblem` writes them on poses and edges.
-    solver : ConvexSolver or str, optional
 
     A SettingError when a penalty is negative or all are zero, or a term or a constraint is not convex.
 
@@ -79,7 +76,6 @@ def rotation_qp(
 
     Examples
     --------
-    >>> import numpy as np
     >>> from pgo_models.problem.problem import PGOProblem
     >>> from pgo_models.graphs.scenes import grid
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))

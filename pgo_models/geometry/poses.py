@@ -36,17 +36,7 @@ class Poses(ReadOnly):
     t : (n, d)
         Positions in the world, metres.
 
-    Both are read-only copies.
-
-    Raises
-    ------
-    GraphError
-        On wrong shapes, entries that are no real numbers, nan or inf, or a matrix that is no rotation.
-
-    Examples
-    --------
-    >>> Poses.identity(4, 3)
-    Poses(n=4, d=3)
+    Both are read-only copies. A GraphError on wrong shapes, entries that are not real or finite, or no rotation.
     """
 
     R: Array
@@ -179,12 +169,8 @@ def absolute_trajectory_error(estimate: Poses, truth: Poses) -> float:
 def relative_pose_error(estimate: Poses, truth: Poses, step: int = 1) -> tuple[float, float]:
     """RPE over pairs (i, i + step): root mean square of the translation error (metres) and rotation error (radians).
 
-    The error of a pair is (x_i'^-1 x_{i+step}')^-1 (x_i^-1 x_{i+step}), with ' for the truth; no alignment is needed.
-
-    Raises
-    ------
-    GraphError
-        When the sizes differ or there is no such pair.
+    The error of a pair is (x_i'^-1 x_{i+step}')^-1 (x_i^-1 x_{i+step}), with ' for the truth; no alignment is needed. A
+    GraphError when the sizes differ or there is no such pair.
 
     Examples
     --------

@@ -20,16 +20,11 @@ def project_to_rotations(A: Array) -> Array:
 
     With the SVD A = U D V^T the answer is U diag(1, .., 1, det(U V^T)) V^T. Well conditioned 3 x 3 matrices of
     positive determinant take Newton's polar iteration X <- (X + cof(X) / det X) / 2 instead, which has the same limit.
-
-    Where the nearest one is not unique, one of the nearest.
-
-    References
-    ----------
-    Ebrahimi & Deghat, Algorithm 1, steps 4 and 5; Higham, Functions of Matrices, section 8.3.
+    Where the nearest one is not unique, one of the nearest (Ebrahimi & Deghat, Algorithm 1, steps 4 and 5; Higham,
+    Functions of Matrices, section 8.3).
 
     Examples
     --------
-    >>> import numpy as np
     >>> project_to_rotations(np.array([[[0.0, -2.0], [2.0, 0.0]]]))[0].round(3).tolist()
     [[0.0, -1.0], [1.0, 0.0]]
     """

@@ -24,8 +24,7 @@ class Registry:
     """A public folder of g2o files with their checksums."""
 
     base_url: str  # the file of a name is at `base_url/name.g2o`
-    # `sha256:` and the digest of the file, or `blob:` and its git blob id: the SHA-1 of "blob <size>", a zero byte and
-    # the file.
+    # `sha256:` and the digest of the file, or `blob:` and its git blob id: SHA-1 of "blob <size>", zero byte, file.
     checksums: Mapping[str, str]
     cache: Path | None = None  # folder for downloads; the user's cache unless given
 
@@ -64,15 +63,10 @@ def load(
 
     A name is looked for in the project's data folder, in ./data, in the folder named by the environment variable
     PGO_DATA, and in the user's cache; then it is downloaded, unless `download` is false. What the cache holds is
-    checked against its checksum. `weights` and `skip_unknown` as for `read_g2o`.
-    Beside `x.g2o`, or the folder `x`, a file `x.truth.tum` gives the ground truth, in the order of the poses.
-
-    Raises
-    ------
-    DatasetError
-        When the name is unknown, the download fails or is not wanted, or what came does not have the right checksum.
-    FileFormatError
-        See `read_g2o`; also when the truth has not one pose for each of the graph.
+    checked against its checksum. `weights` and `skip_unknown` as for `read_g2o`. Beside `x.g2o`, or the folder `x`, a
+    file `x.truth.tum` gives the ground truth, in the order of the poses. A DatasetError when the name is unknown, the
+    download fails or is not wanted, or what came does not have the right checksum; a FileFormatError as of `read_g2o`;
+    also when the truth has not one pose for each of the graph.
 
     Examples
     --------
@@ -211,7 +205,5 @@ def _fits(path: Path, checksum: str) -> bool:
     kind, _, expected = checksum.partition(":")
     data = path.read_bytes()
     if kind == "blob":
-        found = hashlib.sha1(b"blob %d\0" % len(data) + data, usedforsecurity=False).hexdigest()
-    else:
-        found = hashlib.sha256(data).hexdigest()
-    return found == expected
+        return hashlib.sha1(b"blob %d\0" % len(data) + data, usedforsecurity=False).hexdigest() == expected
+    return hashlib.sha256(data).hexdigest() == expected

@@ -1,8 +1,6 @@
 """g2o files, one for all robots or a folder with one for each, as a PoseGraph and back.
 
-Information matrices become the precisions of SE-Sync (Rosen et al. 2019):
-d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I_tt^-1), kappa = I_theta, or half of it
-with RotationWeight.GAUSSIAN.
+Information matrices become the precisions of SE-Sync (Rosen et al. 2019), see `edge_precisions`.
 """
 
 import os
@@ -46,21 +44,10 @@ def read_g2o(
     all others once more, under the same ids or others, is the whole graph, no robot: a `GraphWarning` names it, and it
     is left out (`fullGraph.g2o` of distributed-mapper's folders).
 
-    Parameters
-    ----------
-    weights : RotationWeight
-        What kappa becomes of the information, in the plane.
-    skip_unknown : bool
-        Skip lines with other tags and warn of it, instead of an error.
+    Translations are in the file's unit, taken as metres, and `information` is as in the file; what kappa becomes of it
+    in the plane is said by `weights`. With `skip_unknown`, lines with other tags are skipped with a warning.
 
-    Returns
-    -------
-    PoseGraph with translations in the file's unit, taken as metres, and `information` as in the file.
-
-    Raises
-    ------
-    FileFormatError
-        See `read_lines`; also for a folder without g2o files, no edges, and a FIX line of an unknown pose.
+    A FileFormatError as of `read_lines`; also for a folder without g2o files, no edges, or FIX of an unknown pose.
 
     Examples
     --------
@@ -142,14 +129,8 @@ def write_g2o(graph: PoseGraph, path: Path | str, poses: Poses | None = None) ->
 
     Numbers are written so that reading gives the same floats. Without `graph.information` the matrices are
     tau I, 2 kappa I in space and diag(tau, tau, kappa) in the plane, which read back as the same kappa and tau
-    (RotationWeight.SE_SYNC).
-
-    Raises
-    ------
-    GraphError
-        When `poses` do not have the size of the graph.
-    PGOError
-        When the file cannot be written; what stood there stays.
+    (RotationWeight.SE_SYNC). A GraphError when `poses` do not have the size of the graph, a PGOError when the file
+    cannot be written; what stood there stays.
 
     Examples
     --------
@@ -332,11 +313,8 @@ def _fixed(ids: IntArray, files: list[G2OLines]) -> IntArray:
         unknown = ~np.isin(file.fixed, ids)
         if unknown.any():
             at = int(np.argmax(unknown))
-            raise FileFormatError(
-                file.path,
-                int(file.fixed_lines[at]),
-                f"FIX names pose {file.fixed[at]}, which has no other line; remove it",
-            )
+            problem = f"FIX names pose {file.fixed[at]}, which has no other line; remove it"
+            raise FileFormatError(file.path, int(file.fixed_lines[at]), problem)
     return np.unique(np.searchsorted(ids, np.concatenate([file.fixed for file in files])))
 
 

@@ -52,17 +52,13 @@ class G2OLines:
 def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
     """Read and check the lines of one g2o file; blank lines, comments (#) and PARAMS_ lines are skipped.
 
-    With `skip_unknown`, so are lines with unknown tags, and a `GraphWarning` says how many of each.
-
-    Raises
-    ------
-    FileFormatError
-        With file:line, for: a file that is missing, binary or without VERTEX and EDGE lines; an unknown tag; too few or
-        too many numbers on a line, or thousands of them; a word, nan or inf where a number belongs; an id that is no
-        integer of 64 bits; a zero quaternion; a length beyond `FARTHEST`; an information matrix whose translation or
-        rotation block is not positive definite, nor zero, or both are zero; an edge to itself; a second VERTEX line of
-        the same id; a measurement in the frame of a sensor that is not that of the pose; an edge from a landmark, or of
-        its rotation; 2D and 3D in one file.
+    With `skip_unknown`, so are lines with unknown tags, and a `GraphWarning` says how many of each. A FileFormatError
+    with file:line, for: a file that is missing, binary or without VERTEX and EDGE lines; an unknown tag; too few or too
+    many numbers on a line, or thousands of them; a word, nan or inf where a number belongs; an id that is no integer of
+    64 bits; a zero quaternion; a length beyond `FARTHEST`; an information matrix whose translation or rotation block is
+    not positive definite, nor zero, or both are zero; an edge to itself; a second VERTEX line of the same id; a
+    measurement in the frame of a sensor that is not that of the pose; an edge from a landmark, or of its rotation; 2D
+    and 3D in one file.
     """
     path = Path(path)
     source, first = _Source(path, skip_unknown), 1
@@ -80,18 +76,9 @@ def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
     if posed:
         problem = "a pose, or an edge of poses, with the id of a landmark, which is a point; renumber one of them"
         raise FileFormatError(path, int(min(posed)), problem)
+    fixed, fixed_lines = np.array(source.fixed, dtype=np.int64).reshape(-1, 2).T
     found = G2OLines(
-        path,
-        d,
-        vertex_ids[:, 1],
-        vertex_lines,
-        vertices,
-        edge_ids,
-        edges,
-        edge_lines,
-        np.array([pose for pose, _ in source.fixed], dtype=np.int64),
-        np.array([line for _, line in source.fixed], dtype=np.int64),
-        landmarks,
+        path, d, vertex_ids[:, 1], vertex_lines, vertices, edge_ids, edges, edge_lines, fixed, fixed_lines, landmarks
     )
     for rows, at in ((vertices, found.vertex_lines), (edges, found.edge_lines)):
         check_distances(path, at, rows[:, :d])
@@ -243,11 +230,11 @@ class _Source:
             expected = kind.num_ids + kind.num_numbers
             if len(words) != expected:
                 few = "the line is cut off" if len(words) < expected else "the line is too long"
-                raise self._error(
-                    number,
-                    f"{tag} needs {kind.num_ids} id{'s' * (kind.num_ids > 1)} and {kind.num_numbers} numbers, "
-                    f"{expected} in all, found {len(words)}; {few}: complete or remove it",
+                needed = (
+                    f"{kind.num_ids} id{'s' * (kind.num_ids > 1)} and {kind.num_numbers} numbers, {expected} in all"
                 )
+                problem = f"{tag} needs {needed}, found {len(words)}; {few}: complete or remove it"
+                raise self._error(number, problem)
         raise self._error(at[0], f"the {tag} lines cannot be read; write numbers like 1.5e-3, separated by blanks")
 
     def _error(self, line: int, problem: str) -> FileFormatError:
@@ -268,10 +255,10 @@ def _faults(found: G2OLines) -> Iterator[tuple[int, str]]:
     again = np.flatnonzero(np.diff(found.vertex_ids[order]) == 0)
     if again.size:
         earlier, later = order[again[0]], order[again[0] + 1]
-        first = found.vertex_lines[earlier]
+        first = f"(the first is line {found.vertex_lines[earlier]})"
         yield (
             int(found.vertex_lines[later]),
-            f"a second VERTEX line of pose {found.vertex_ids[later]} (the first is line {first}); remove one",
+            f"a second VERTEX line of pose {found.vertex_ids[later]} {first}; remove one",
         )
     loops = found.edge_ids[:, 0] == found.edge_ids[:, 1]
     if loops.any():
@@ -289,11 +276,9 @@ def _faults(found: G2OLines) -> Iterator[tuple[int, str]]:
         if bad.any():
             at = int(np.argmax(bad))
             smallest = np.linalg.eigvalsh(information[at, block, block])[0]
-            yield (
-                int(found.edge_lines[at]),
-                f"{name} block of the information matrix is not positive definite (smallest eigenvalue "
-                f"{smallest:.3g}); give the upper triangle row by row, or remove the line",
-            )
+            indefinite = f"information matrix is not positive definite (smallest eigenvalue {smallest:.3g})"
+            way_out = "give the upper triangle row by row, or remove the line"
+            yield int(found.edge_lines[at]), f"{name} block of the {indefinite}; {way_out}"
 
 
 def _is_positive_definite(A: Array) -> NDArray[np.bool_]:

@@ -37,19 +37,9 @@ def grid_world(
     Connected by construction: odometry connects a robot's own poses, and where closures leave groups of robots apart,
     the smallest group gets an edge to the rest between the two poses that come closest, until there is one group.
 
-    Parameters
-    ----------
-    d : int
-        2 or 3.
-    noise : NoiseModel
-        Precisions of all edges are `noise.tau` and `noise.kappa(d)`; the initial guess is the truth with this noise.
-    loop_closure_probability : float
-        0 to 1.
+    Precisions of all edges are `noise.tau` and `noise.kappa(d)`; the initial guess is the truth with this noise.
 
-    Raises
-    ------
-    SettingError
-        For a number of robots below 1, fewer than 2 poses a robot, d other than 2 and 3, or no probability.
+    A SettingError for a number of robots below 1, fewer than 2 poses a robot, d other than 2 and 3, or no probability.
 
     Examples
     --------

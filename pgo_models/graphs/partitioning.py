@@ -25,18 +25,10 @@ class PartitionMethod(enum.Enum):
 class Partition(ReadOnly):
     """Which robot owns which pose.
 
-    Attributes
-    ----------
-    robot : (n,)
-        0 .. num_robots - 1, every one of which owns a pose. A read-only copy.
-
-    Raises
-    ------
-    SettingError
-        When `robot` does not number the robots so.
+    A SettingError when `robot`, (n,), does not number the robots 0 .. num_robots - 1, each of which owns a pose.
     """
 
-    robot: IntArray
+    robot: IntArray  # a read-only copy
     method: PartitionMethod
 
     def __post_init__(self) -> None:
@@ -74,19 +66,9 @@ class Partition(ReadOnly):
 def partition(graph: PoseGraph, num_robots: int | None = None, method: PartitionMethod | None = None) -> Partition:
     """Give the poses of a graph to robots.
 
-    Parameters
-    ----------
-    num_robots : int, optional
-        Needed unless the graph names its robots or every pose is its own.
-    method : PartitionMethod, optional
-        GIVEN when the graph names as many robots as asked for, else CONTIGUOUS.
-
-    Raises
-    ------
-    SettingError
-        When the number of robots is not a whole one of 1 to n, or GIVEN does not fit it.
-    MissingExtraError
-        When METIS is asked for without the extra `fast`.
+    The number of robots is needed unless the graph names its robots or every pose is its own; the method is GIVEN when
+    the graph names as many robots as asked for, else CONTIGUOUS, unless another is given. A SettingError when the
+    number is not a whole one of 1 to n, or GIVEN does not fit; a MissingExtraError for METIS without the extra `fast`.
 
     Examples
     --------

@@ -64,17 +64,12 @@ class PoseGraph(Measurements):
         Poses that are points, where edges can only end.
     name : str
 
-    All arrays are read-only copies: `dataclasses.replace` makes a graph with others.
-
-    Raises
-    ------
-    GraphError
-        On wrong shapes, entries that are no real or no whole numbers, an edge to itself or to no pose, nan or inf, no
-        rotation, a negative precision, two that are zero, or an edge that starts at a landmark or ends at the world.
+    All arrays are read-only copies: `dataclasses.replace` makes a graph with others. A GraphError on wrong shapes,
+    entries that are no real or no whole numbers, an edge to itself or to no pose, nan or inf, no rotation, a negative
+    precision, two that are zero, or an edge that starts at a landmark or ends at the world.
 
     Examples
     --------
-    >>> import numpy as np
     >>> turn = np.eye(2)[None]
     >>> PoseGraph(2, np.array([0]), np.array([1]), turn, np.ones((1, 2)), np.ones(1), np.ones(1), name="pair")
     PoseGraph('pair', d=2, poses=2, edges=1, robots=1)
@@ -117,8 +112,7 @@ class PoseGraph(Measurements):
         """Poses of every connected component, largest first; of some of the edges, (m,), or of all."""
         if edges is None:
             return list(self._components)
-        counts = edge_counts(self.i[edges], self.j[edges], self.num_poses)
-        return _sorted_components(counts)
+        return _sorted_components(edge_counts(self.i[edges], self.j[edges], self.num_poses))
 
     @cached_property
     def _components(self) -> list[IntArray]:

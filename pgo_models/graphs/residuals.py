@@ -53,14 +53,8 @@ def chi2(graph: PoseGraph, poses: Poses, convention: Chi2Convention = Chi2Conven
     chi2 = sum over edges of r^T I r, r = (r_t, r_r), with the error E_ij = (measurement)^-1 x_i^-1 x_j in the frame of
     the measured end pose: r_t = R_ij^T (R_i^T (t_j - t_i) - t_ij), and r_r as `convention` reads its rotation. The
     rotation block is taken to be of the rotation vector, in radians, also where g2o takes it to be of the quaternion.
-    Which matrices count is said by `pgo_models.graphs.precisions.proper_information`.
-
-    Raises
-    ------
-    GraphError
-        When the poses are not those of the graph.
-    SettingError
-        When convention is none.
+    Which matrices count is said by `pgo_models.graphs.precisions.proper_information`. A GraphError when the poses are
+    not those of the graph; a SettingError when convention is none.
 
     Examples
     --------

@@ -25,17 +25,8 @@ _SPHERE_PAIR_LEFT_OUT = (0, 12)
 class NoiseModel:
     """Zero-mean Gaussian noise of measurements and initial guesses; the defaults are the paper's.
 
-    Attributes
-    ----------
-    translation_std : float
-        Metres, of every component of a translation.
-    rotation_std : float
-        Radians, of every component of the tangent vector of a rotation.
-
-    Raises
-    ------
-    SettingError
-        When one is not positive and finite: a precision would be infinite.
+    Standard deviations of every component of a translation, metres, and of the tangent vector of a rotation, radians. A
+    SettingError when one is not positive and finite: a precision would be infinite.
     """
 
     translation_std: float = 0.5
@@ -105,23 +96,14 @@ def sphere(rng: np.random.Generator) -> PoseGraph:
 
 
 def random_geometric(
-    num_poses: int,
-    rng: np.random.Generator,
-    *,
-    d: int = 3,
-    mean_degree: float = 6.0,
-    noise: NoiseModel = MILD_NOISE,
+    num_poses: int, rng: np.random.Generator, *, d: int = 3, mean_degree: float = 6.0, noise: NoiseModel = MILD_NOISE
 ) -> PoseGraph:
     """Poses uniform in a box at one per metre^d, with an edge i < j wherever two are closer than a radius.
 
     The radius is that of the ball which holds `mean_degree` poses on average; near the walls there are fewer. Connected
     by construction: a pose without an edge to an earlier one gets an edge to the nearest earlier one. Precisions are
-    `noise.tau` and `noise.kappa(d)`; truth rotations are uniform, the initial guess is the truth with the same noise.
-
-    Raises
-    ------
-    SettingError
-        For fewer than 2 poses, d other than 2 and 3, or a mean degree that is not positive.
+    `noise.tau` and `noise.kappa(d)`; truth rotations are uniform, the initial guess is the truth with the same noise. A
+    SettingError for fewer than 2 poses, d other than 2 and 3, or a mean degree that is not positive.
 
     Examples
     --------
@@ -245,7 +227,6 @@ def _equal_area_points(count: int) -> Array:
     for theta in np.pi * (np.arange(num_circles) + 0.5) / num_circles:
         on_circle = round(2 * np.pi * np.sin(theta) * np.pi / num_circles / area)
         phi = 2 * np.pi * np.arange(on_circle) / on_circle
-        points.append(
-            np.column_stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi])
-        )
+        latitude = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi
+        points.append(np.column_stack(latitude))
     return np.concatenate(points)

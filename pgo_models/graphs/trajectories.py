@@ -1,7 +1,6 @@
 """Trajectories in the TUM and KITTI text formats, as evo reads and writes them; poses in the plane are lifted to z = 0.
 
-TUM: a line `timestamp tx ty tz qx qy qz qw` for each pose. KITTI: the 12 numbers of the 3 x 4 matrix (R_i, t_i), row by
-row. Both hold world from body, metres.
+Both hold world from body, metres: see `write_tum` and `write_kitti`.
 """
 
 from collections.abc import Sequence
@@ -27,17 +26,8 @@ _MATRIX_TOLERANCE = 1e-3  # KITTI's own files have about seven digits; this tell
 def write_tum(poses: Poses, path: Path | str, timestamps: Array | None = None) -> None:
     """Write one line `timestamp tx ty tz qx qy qz qw` for each pose; the floats come back exactly.
 
-    Parameters
-    ----------
-    timestamps : (n,), optional
-        Seconds, ascending; 0, 1, .. unless given.
-
-    Raises
-    ------
-    GraphError
-        When there is not one finite timestamp for each pose, or they do not ascend.
-    PGOError
-        When the file cannot be written; what stood there stays.
+    `timestamps`, (n,), are ascending seconds; 0, 1, .. unless given. A GraphError when there is not one finite one for
+    each pose, or they do not ascend; a PGOError when the file cannot be written; what stood there stays.
 
     Examples
     --------
@@ -57,11 +47,8 @@ def write_tum(poses: Poses, path: Path | str, timestamps: Array | None = None) -
 def read_tum(path: Path | str, d: int = 3) -> Poses:
     """Poses of a TUM file, in the order of its lines; `read_times` reads the timestamps.
 
-    Raises
-    ------
-    FileFormatError
-        With file:line, for a row that is not 8 finite numbers, a zero quaternion, a position beyond `FARTHEST`, or,
-        with d = 2, a pose out of the plane.
+    A FileFormatError with file:line, for a row that is not 8 finite numbers, a zero quaternion, a position beyond
+    `FARTHEST`, or, with d = 2, a pose out of the plane.
 
     Examples
     --------
@@ -112,10 +99,8 @@ def read_kitti(path: Path | str, d: int = 3) -> Poses:
     error = orthogonality_error(matrices[:, :, :3])
     worst = int(np.argmax(error))
     if not error[worst] < _MATRIX_TOLERANCE:
-        problem = (
-            f"the 3 x 3 part is no rotation: ||R^T R - I|| or 1 - det R is {error[worst]:.3g}; give (R, t) by rows"
-        )
-        raise FileFormatError(path, lines[worst], problem)
+        what = f"||R^T R - I|| or 1 - det R is {error[worst]:.3g}"
+        raise FileFormatError(path, lines[worst], f"the 3 x 3 part is no rotation: {what}; give (R, t) by rows")
     return _in_dimension(project_to_rotations(matrices[:, :, :3]), matrices[:, :, 3], d, path, lines)
 
 
@@ -134,9 +119,8 @@ def _in_dimension(R: Array, t: Array, d: int, path: Path | str, lines: Sequence[
     out = np.maximum(np.abs(t[:, 2]), np.abs(R[:, 2, :] - [0.0, 0.0, 1.0]).max(axis=1))
     worst = int(np.argmax(out))
     if out[worst] > _PLANE_TOLERANCE:
-        raise FileFormatError(
-            path, lines[worst], f"pose is out of the x-y plane by {out[worst]:.3g}; read it with d = 3"
-        )
+        problem = f"pose is out of the x-y plane by {out[worst]:.3g}; read it with d = 3"
+        raise FileFormatError(path, lines[worst], problem)
     return Poses(project_to_rotations(R[:, :2, :2]), t[:, :2])
 
 

@@ -155,12 +155,11 @@ def compare_poses(graph: PoseGraph, panels: list[tuple[str, Poses]], residuals: 
 
     Examples
     --------
-    >>> from pgo_models.problem.initialization import spanning_tree_start
     >>> from pgo_models.graphs.scenes import grid
     >>> graph = grid(np.random.default_rng(0))
-    >>> figure = compare_poses(graph, [("truth", graph.truth), ("tree", spanning_tree_start(graph))])
+    >>> figure = compare_poses(graph, [("truth", graph.truth), ("start", graph.initial)])
     >>> [axes.get_title() for axes in figure.axes]
-    ['truth', 'tree']
+    ['truth', 'start']
     """
     return plot_panels([[(title, graph, poses) for title, poses in panels]], residuals)
 

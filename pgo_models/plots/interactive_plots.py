@@ -64,16 +64,8 @@ def explore_graph(
 
     Of a large graph, what `lines_to_draw` leaves, and some of the poses; one of a single robot is parted by time.
 
-    Parameters
-    ----------
-    poses : Poses
-        Drawn to seven digits (float32).
-    covariances : (n, p, p), optional
-        Of every pose, drawn as `confidence_ellipses`.
-    residuals : EdgeResiduals, optional
-        Of the problem that was solved; those of F unless given.
-    before : Poses, optional
-        Drawn in grey, moved to fit `poses`.
+    Positions are drawn to seven digits (float32); covariances, (n, p, p), as `confidence_ellipses`; poses `before` in
+    grey, moved to fit. `residuals` are those of F unless given: give those of the problem that was solved.
 
     Examples
     --------
@@ -128,18 +120,9 @@ def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[
     Edges are drawn straight between the positions of every iterate; the colours are the robots'. A film of a large
     graph is thinned evenly to about 8 MB, first and last iterate kept.
 
-    Parameters
-    ----------
-    iterates : sequence of Poses
-        For example `[soc.poses(problem, state) for state in itertools.islice(iterate(soc, problem), 30)]`. Each is
-        aligned with the last one, so that only what changes moves.
-    labels : sequence of str, optional
-        What the slider shows; `k = 0`, `k = 1`, .. unless given.
-
-    Raises
-    ------
-    GraphError
-        When there are no iterates, their labels are not as many, or they are not poses of the graph.
+    Iterates, for example `[soc.poses(problem, state) for state in itertools.islice(iterate(soc, problem), 30)]`, are
+    aligned with the last one, so that only what changes moves. The slider shows `labels`; `k = 0`, `k = 1`, .. unless
+    given. A GraphError when there are no iterates, their labels are not as many, or they are not poses of the graph.
     """
     go = plotly("graph_objects")
     if not iterates:
@@ -150,7 +133,8 @@ def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[
     for poses in iterates:
         if poses.t.shape != (graph.num_poses, graph.d):
             raise GraphError(f"{poses} beside {graph!r}; give one pose for every pose of the graph")
-    shown = _evenly(len(iterates), int(_FILM_BYTES / (3 * graph.d * graph.num_edges * _BYTES_PER_NUMBER)))
+    most = max(2, int(_FILM_BYTES / (3 * graph.d * graph.num_edges * _BYTES_PER_NUMBER)))
+    shown = np.unique(np.linspace(0, len(iterates) - 1, min(len(iterates), most)).round().astype(int)).tolist()
     positions = [iterates[k].aligned_to(iterates[-1]).t for k in shown]
     names = [names[k] for k in shown]
     owner = np.where(graph.robots[graph.i] == graph.robots[graph.j], graph.robots[graph.i], -1)
@@ -276,19 +260,9 @@ def _arrange(figure: Figure, points: Array, title: str) -> None:
     )
 
 
-def _evenly(number: int, most: int) -> list[int]:
-    """Return at most `most`, but two, of 0 .. number - 1, evenly, first and last among them."""
-    chosen = np.linspace(0, number - 1, min(number, max(most, 2))).round()
-    return [int(k) for k in np.unique(chosen)]
-
-
 def _add_controls(figure: Figure, names: list[str]) -> None:
     def shown(milliseconds: int) -> dict[str, object]:
-        return {
-            "frame": {"duration": milliseconds, "redraw": True},
-            "mode": "immediate",
-            "transition": {"duration": 0},
-        }
+        return {"frame": {"duration": milliseconds, "redraw": True}, "mode": "immediate", "transition": {"duration": 0}}
 
     steps = [{"args": [[name], shown(0)], "label": name, "method": "animate"} for name in names]
     buttons = [
@@ -299,7 +273,5 @@ def _add_controls(figure: Figure, names: list[str]) -> None:
         margin={"b": 20},
         legend={"orientation": "v", "x": 0.0, "y": 1.0, "yanchor": "top"},
         sliders=[{"steps": steps, "x": 0.16, "len": 0.84, "pad": {"t": 45}, "currentvalue": {"prefix": ""}}],
-        updatemenus=[
-            {"type": "buttons", "direction": "left", "buttons": buttons, "x": 0.13, "y": 0, "pad": {"t": 60}},
-        ],
+        updatemenus=[{"type": "buttons", "direction": "left", "buttons": buttons, "x": 0.13, "y": 0, "pad": {"t": 60}}],
     )

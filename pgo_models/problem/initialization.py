@@ -32,10 +32,7 @@ def gps_imu_start(truth: Poses, translation_std: float, rotation_std: float, rng
 def odometry_start(graph: PoseGraph) -> Poses:
     """Compose the measurements i -> i + 1 from pose 0 on; the first of repeated ones counts.
 
-    Raises
-    ------
-    GraphError
-        When a link i -> i + 1 is missing: `spanning_tree_start` needs none.
+    A GraphError when a link i -> i + 1 is missing: `spanning_tree_start` needs none.
 
     Examples
     --------
@@ -61,12 +58,7 @@ def odometry_start(graph: PoseGraph) -> Poses:
 def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
     """Compose measurements along a breadth-first spanning tree from pose `root`, the paper's start for SLAM graphs.
 
-    Raises
-    ------
-    GraphError
-        When the graph is not connected.
-    SettingError
-        When root is no pose.
+    A GraphError when the graph is not connected; a SettingError when root is no pose.
 
     Examples
     --------

@@ -28,32 +28,11 @@ class Marginals:
 
     v is along the axes of the world, w about the pose's own. GTSAM and g2o have R_i^T v_i, and Pose3 that after w.
 
-    Attributes
-    ----------
-    hessian : csc_array, (n p, n p)
-        Second derivative of a cost without a factor 1/2, such as `riemannian_hessian`.
-    layout : TangentLayout
-        Its rows.
-    anchor : int
-        Pose that does not move, the gauge; its covariances are zero.
-    backend : CholeskyBackend, optional
+    `hessian`, (n p, n p), with the rows of `layout`, is the second derivative of a cost without a factor 1/2, such as
+    `riemannian_hessian`. `anchor` is the pose that does not move, the gauge; its covariances are zero.
 
-    Raises
-    ------
-    SettingError
-        When the anchor, or a pose asked for, is none.
-    NotPositiveDefiniteError
-        When a covariance is asked for where the Hessian is that of no strict minimum.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from pgo_models.problem.hessian import riemannian_hessian
-    >>> from pgo_models.problem.problem import PGOProblem
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> marginals = Marginals(riemannian_hessian(problem, problem.graph.truth, None), TangentLayout(27, 3))
-    >>> marginals.diagonal.shape, marginals.joint(3, 7).shape
-    ((27, 6, 6), (12, 12))
+    A SettingError when the anchor, or a pose asked for, is none; a NotPositiveDefiniteError when a covariance is asked
+    for where the Hessian is that of no strict minimum.
     """
 
     hessian: csc_array

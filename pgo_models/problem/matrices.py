@@ -36,10 +36,8 @@ def residual_matrix(graph: PoseGraph, weights: EdgeWeights | None = None) -> tup
         rows[3], columns[3] = rows[4], np.repeat(block_j[:, None], d, axis=1).ravel()
         at_j, at_i = np.swapaxes(weights.axes, 1, 2).ravel(), graph.R_ij @ weights.axes
     values = [np.ones(m), -np.ones(m), -graph.t_ij.ravel(), at_j, -np.swapaxes(at_i, 1, 2).ravel()]
-    A = csr_array(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=((d + 1) * m, (d + 1) * n)
-    )
-    return A, weights.of_rows(d)
+    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    return csr_array(entries, shape=((d + 1) * m, (d + 1) * n)), weights.of_rows(d)
 
 
 def isotropic_weights(graph: PoseGraph) -> EdgeWeights:

@@ -38,12 +38,7 @@ class PGOProblem:
     weighting : Weighting or EdgeWeights
         Which cost, F or chi2, or its weights themselves.
 
-    Raises
-    ------
-    GraphError
-        When the graph is not connected.
-    SettingError
-        When weighting is none.
+    A GraphError when the graph is not connected; a SettingError when weighting is none.
 
     Examples
     --------
@@ -202,8 +197,7 @@ class PGOProblem:
 
     def residuals(self, X: Array) -> Array:
         """A X, ((d+1) m, d): translation residuals of the edges, then the rows of their rotation residuals."""
-        A, _ = self.residual_matrix
-        return np.asarray(A @ X)
+        return np.asarray(self.residual_matrix[0] @ X)
 
     def objective_stacked(self, X: Array) -> float:
         """F = tr(X^T M X), X (N, d), as a weighted sum of squared residuals: cancels nothing; X may be infeasible."""
@@ -331,8 +325,7 @@ class PGOProblem:
 
     @cached_property
     def _M_tR(self) -> csr_array:
-        n = self.num_poses
-        return self.M[:n, n:].tocsr()
+        return self.M[: self.num_poses, self.num_poses :].tocsr()
 
     @cached_property
     def _M_rotation_rows(self) -> csr_array:

@@ -75,12 +75,7 @@ def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResidua
     """Residuals and cost of every edge at poses (paper: the summands of `min overall`), tested; of a graph those of F.
 
     Expected of the sum is sum_e sum w (1 - u / r), with r the rank of all information and u the number of unknowns
-    (`chi2_thresholds` has the w).
-
-    Raises
-    ------
-    GraphError
-        When the poses are not those of the graph.
+    (`chi2_thresholds` has the w). A GraphError when the poses are not those of the graph.
 
     Examples
     --------
@@ -120,14 +115,10 @@ def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
 
         c_1 + c_3 / c_2 (chi^2_l - l),  c_k = sum w^k,  l = c_2^3 / c_3^2,
 
-    exact where the w are equal; else at the quantile 0.99 within 7 %, at 1 - 2e-6 within 2.5 times, of 1 - quantile.
-    F of SE-Sync's kappa in the plane has w = 2 of the angle. Least squares fits the poses to the errors, so that the
-    residuals of an optimum are smaller than these where few edges say the same.
-
-    Raises
-    ------
-    SettingError
-        When quantile is not between 0 and 1.
+    exact where the w are equal; else at the quantile 0.99 within 7 %, at 1 - 2e-6 within 2.5 times, of 1 - quantile. F
+    of SE-Sync's kappa in the plane has w = 2 of the angle. Least squares fits the poses to the errors, so that the
+    residuals of an optimum are smaller than these where few edges say the same. A SettingError when quantile is not
+    between 0 and 1.
 
     Examples
     --------

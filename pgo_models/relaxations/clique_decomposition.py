@@ -42,8 +42,7 @@ class CliqueRelaxation:
     centre: Poses
     model: cp.Problem  # its value times `scale` is that of the relaxation
     upper: tuple[cp.Variable, ...]  # upper triangle of every W_C, row by row
-    # A w = b for w all of these, clique after clique: R_i^T R_i = I and the agreement on separators. Its dual value
-    # gives Lambda.
+    # A w = b for w all of these, clique after clique: R_i^T R_i = I and agreement on separators; its dual gives Lambda.
     equalities: cp.Constraint
     semidefinite: tuple[cp.Constraint, ...]  # W_C PSD, one for every clique
     scale: float  # of the objective: F at the centre, or for noise-free graphs a share of L
@@ -153,10 +152,6 @@ class _Layout:
         ends = offsets[:-1], offsets[-1]
         return cls(problem, tree, centre, sigma, sigma_t, reference, columns, sides, *ends, home)
 
-    def position(self, k: int) -> IntArray:
-        """Place in w of every entry of W_C, (side, side)."""
-        return self.offsets[k] + _triangle_places(self.sides[k])
-
     def gram(self, k: int, W: Array) -> Array:
         """Gram matrix of the P_u of clique k, (d c_k, d c_k): the clique's part of Z but for a turn of every pose."""
         eye = np.eye(self.problem.d)
@@ -190,7 +185,9 @@ class _Equations:
 
     def __init__(self, layout: _Layout) -> None:
         self.layout = layout
-        self._positions = [layout.position(k) for k in range(len(layout.sides))]
+        # Place in w of every entry of every W_C, (side, side).
+        places = zip(layout.offsets, layout.sides, strict=True)
+        self._positions = [first + _triangle_places(side) for first, side in places]
         self._rows: list[IntArray] = []
         self._columns: list[IntArray] = []
         self._values: list[Array] = []
@@ -241,12 +238,7 @@ def _orthogonality(equations: _Equations) -> None:
             for a, b in _upper(d):
                 first, second = unit[column + a], unit[column + b]
                 equations.add(
-                    [
-                        (k, unit[a], second, 1.0),
-                        (k, first, unit[b], 1.0),
-                        (k, first, second, 1.0 / layout.sigma),
-                    ],
-                    0.0,
+                    [(k, unit[a], second, 1.0), (k, first, unit[b], 1.0), (k, first, second, 1.0 / layout.sigma)], 0.0
                 )
                 equations.last_is(u, a, b, layout.sigma)
                 equations.last_is(r, a, b, -layout.sigma)

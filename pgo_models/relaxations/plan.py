@@ -16,8 +16,7 @@ CLARABEL = ConvexSolver()  # interior point, accurate; its work grows with the s
 SCS = ConvexSolver("SCS")  # first order, rougher; with the third power
 
 # Measured on one core (tests/benchmarks/test_relaxations_benchmark.py). Clarabel factors a dense matrix of the order of
-# every cone's triangle at every iteration, about 15 of them; SCS takes an eigendecomposition of every cone, about 1000
-# times.
+# every cone's triangle at every iteration, about 15 of them; SCS takes an eigendecomposition of each, about 1000 times.
 _CLARABEL_ITERATIONS, _CLARABEL_RATE = 15, 2e10
 _SCS_ITERATIONS, _SCS_RATE = 1000, 2e9
 _PATIENCE = 2.0  # seconds: up to here the interior point is preferred for its accuracy

@@ -3,9 +3,7 @@
 import enum
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import cvxpy as cp
 
@@ -39,26 +37,17 @@ class RelaxationStatus(enum.Enum):
 class RelaxationSolution:
     """What the relaxation says of a pose graph.
 
-    Attributes
-    ----------
-    relaxation : PrimalRelaxation, DualRelaxation or CliqueRelaxation
-        The model with its variables and duals as solved.
-    value : float
-        Optimal value as the solver reports it: evidence, not a bound.
-    certificate : Certificate
-        Of the rounded poses, with the multipliers from the duals: its bound on F is proven, whatever the solver did.
-    seconds : float
-        From posing to proof.
+    The certificate is of the rounded poses, with multipliers from the duals: its bound holds whatever the solver did.
     """
 
-    relaxation: Relaxation
+    relaxation: Relaxation  # the model with its variables and duals as solved
     plan: RelaxationPlan
     status: RelaxationStatus
-    value: float
+    value: float  # optimal value as the solver reports it: evidence, not a bound
     certificate: Certificate
     rank: RankReport
     iterations: int
-    seconds: float
+    seconds: float  # from posing to proof
 
     @property
     def poses(self) -> Poses:
@@ -121,15 +110,12 @@ def solve_relaxation(
         Both are chosen by `plan_relaxation` unless given. Any conic solver of cvxpy that takes semidefinite cones.
     gap : float
         Relative gap for the verdict; where the proof needs a shift eta, the smallest that is tried follows from it.
-    memory_limit : float
-        Bytes; an estimate above it is refused before anything is formed.
-    time_limit : float
-        Seconds for the solver.
+    memory_limit, time_limit : float
+        Bytes, an estimate above which is refused before anything is formed, and seconds for the solver.
     verbose : bool
         Print the plan with its reason, the solver's table, and the result.
 
-    A SettingError when a limit or the gap is not positive, or the memory would not do; a PGOError when the solver ends
-    without an iterate.
+    A SettingError when a limit or the gap is not positive, or memory would not do; a PGOError when there is no iterate.
 
     Examples
     --------
@@ -139,33 +125,24 @@ def solve_relaxation(
     >>> solution.status.name, solution.verdict.name, solution.rank.rank
     ('OPTIMAL', 'CERTIFIED', 3)
     """
-    for name, value in (("gap", gap), ("time_limit", time_limit)):
-        if not value > 0:
-            raise SettingError(f"{name} is {value}; it must be positive")
+    for name, given in (("gap", gap), ("time_limit", time_limit)):
+        if not given > 0:
+            raise SettingError(f"{name} is {given}; it must be positive")
     problem.check_quadratic("the relaxation")
     began = time.perf_counter()
     plan = plan_relaxation(problem, form, solver, memory_limit)
     if verbose:
         print(plan)
-    forms: dict[RelaxationForm, Callable[[PGOProblem], Relaxation]] = {
-        RelaxationForm.PRIMAL: primal_relaxation,
-        RelaxationForm.DUAL: dual_relaxation,
-        RelaxationForm.CLIQUES: partial(clique_relaxation, tree=plan.tree),
-    }
-    relaxation = forms[plan.form](problem)
+    if plan.form is RelaxationForm.CLIQUES:
+        relaxation: Relaxation = clique_relaxation(problem, tree=plan.tree)
+    else:
+        relaxation = primal_relaxation(problem) if plan.form is RelaxationForm.PRIMAL else dual_relaxation(problem)
     status = _solve(relaxation.model, plan.solver, time_limit, verbose)
     poses, rank = relaxation.rounded()
     certificate = certify_with(problem, poses, relaxation.Lambda(), gap, math.nan, BoundSource.RELAXATION, ground=poses)
-    solution = RelaxationSolution(
-        relaxation=relaxation,
-        plan=plan,
-        status=status,
-        value=float(relaxation.model.value) * relaxation.scale,
-        certificate=certificate,
-        rank=rank,
-        iterations=int(relaxation.model.solver_stats.num_iters or 0),
-        seconds=time.perf_counter() - began,
-    )
+    value, iterations = float(relaxation.model.value) * relaxation.scale, relaxation.model.solver_stats.num_iters or 0
+    seconds = time.perf_counter() - began
+    solution = RelaxationSolution(relaxation, plan, status, value, certificate, rank, int(iterations), seconds)
     if verbose:
         print(solution)
     return solution
