@@ -39,7 +39,7 @@ from solvers.distributed.lower_bound import best_bound_distributed, prove_with_e
 from solvers.distributed.stages import collect
 from solvers.network.engine import InProcess
 from solvers.network.faults import Faults
-from solvers.pipeline import Pipeline, solve
+from solvers.pipeline import HANDOVER, Pipeline, solve
 from solvers.result import Record, Status
 from solvers.riemannian.newton import Newton, gauss_newton
 from solvers.soc.anderson import Anderson
@@ -50,7 +50,8 @@ from solvers.solution import Solution
 ROOT = Path(__file__).parents[2]
 SIZES = st.integers(2, 20)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
-SHORT = Pipeline(second_try=False, staircase=None)
+BY_SOC = replace(HANDOVER, max_iterations=99)  # in one place, too, where the default goes to Newton at once
+SHORT = Pipeline(soc=BY_SOC, second_try=False, staircase=None)
 
 
 def check_certificate(problem: PGOProblem, parts: Partition, poses: Poses) -> None:
@@ -167,7 +168,12 @@ def test_the_solution_is_the_central_one(
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize(
     "pipeline",
-    [Pipeline(), Pipeline(soc=None), Pipeline(soc=None, newton=gauss_newton()), Pipeline(soc=SOC(tolerance=1e-8))],
+    [
+        Pipeline(soc=BY_SOC),
+        Pipeline(soc=None),
+        Pipeline(soc=None, newton=gauss_newton()),
+        Pipeline(soc=SOC(tolerance=1e-8)),
+    ],
     ids=["SOC", "no SOC", "Gauss-Newton", "SOC to the end"],
 )
 def test_every_pipeline_ends_at_the_central_solution(pipeline: Pipeline, d: int, given_start: bool) -> None:
@@ -195,7 +201,7 @@ def test_a_second_try_and_the_staircase_follow_where_the_gap_stays_wide(d: int) 
     # The cycle closes with half a turn too much: the chordal start is at a local minimum or the relaxation is loose.
     problem = PGOProblem(varied_graph(11, 14, d, NoiseModel(translation_std=1.0, rotation_std=1.5)))
     solution = solve(problem, robots=3)
-    central = solve(problem)
+    central = solve(problem, Pipeline(soc=BY_SOC))
     assert [stage.name for stage in solution.stages] == [stage.name for stage in central.stages]
     assert solution.lower_bound <= min(solution.objective, central.objective)
     assert solution.gap == pytest.approx(central.gap, abs=1e-4)
@@ -299,7 +305,7 @@ def check_folder(folder: Path) -> None:
     assert solution.is_certified
     assert solution.ledger is not None
     assert solution.ledger.num_robots == graph.num_robots
-    check_equal(solution, solve(graph))
+    check_equal(solution, solve(graph, Pipeline(soc=BY_SOC)))
 
 
 def test_the_folder_of_robots_that_comes_along_solves_and_certifies() -> None:
