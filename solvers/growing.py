@@ -26,19 +26,9 @@ _SHARE = 0.01  # of the gap that Newton may leave F above its minimum: the bound
 def extend(solution: Solution, graph: PoseGraph, pipeline: Pipeline | None = None) -> Solution:
     """Solve a graph that has grown out of the solution's, from the solution.
 
-    Newton alone first; where its certificate fails, the whole pipeline: the stages of the solution are those of both.
-
-    Parameters
-    ----------
-    solution : Solution
-    graph : PoseGraph
-        With poses of the solution, told by their ids, and new ones.
-    pipeline : Pipeline, optional
-
-    Raises
-    ------
-    GraphError
-        When it has none of the solution's poses, or is not connected.
+    `graph` has poses of the solution, told by their ids, and new ones. Newton alone first; where its certificate fails,
+    the whole pipeline: the stages of the solution are those of both. A GraphError when the graph has none of the
+    solution's poses, or is not connected.
 
     Examples
     --------

@@ -104,6 +104,8 @@ def run(
 ) -> Outcome[S]:
     """Run a method on a problem of its kind to its end; a Solver on a PGOProblem or PoseGraph.
 
+    A SettingError when time_limit is not positive, or a Solver's problem is none.
+
     Parameters
     ----------
     start : Poses, or the kind of point that the method starts at, optional
@@ -123,11 +125,6 @@ def run(
     Run, or Outcome of a method that has no poses
         Its state is the last iterate after success, else the best one: least infeasibility, then least objective.
         Ctrl-C ends it with Status.INTERRUPTED.
-
-    Raises
-    ------
-    SettingError
-        When time_limit is not positive, or a Solver's problem is none.
 
     Examples
     --------

@@ -52,12 +52,8 @@ def solve_robustly(
 
     By robots (`shared`, `plain`) the certificate of every attempt is theirs, and what crosses the network is added up.
 
-    Raises
-    ------
-    SettingError
-        When robust is none, or PCM by robots.
-    GraphError
-        When known inliers and the edges kept do not connect the poses.
+    A SettingError when robust is none, or PCM by robots, a GraphError when known inliers and the edges kept do not
+    connect the poses.
     """
     if not isinstance(robust, GNC | PCM):
         raise SettingError(f"robust is {robust!r:.60}; give GNC() or PCM()")
@@ -85,11 +81,10 @@ def solve_robustly(
         solution = plain(inlier_problem(problem, kept), start=start, time_limit=watch.left)
         return result(solution, kept, thresholds, "pairwise consistency alone", ())
     attempts: list[_Estimate] = []
+    trials = _Trials(problem, known, thresholds, gap, start, watch)
     for name, method, tested in _methods(robust, graph, known, shared is None):
-        if shared is None:
-            attempts.append(_estimate(problem, name, method, tested, known, thresholds, gap, start, watch))
-        else:
-            attempts.append(_estimate_shared(problem, name, method, known, thresholds, start, watch, plain, shared))
+        found = trials.run(name, method, tested) if shared is None else trials.share(name, method, plain, shared)
+        attempts.append(found)
         is_done = any(one.certificate.is_certified for one in attempts)
         is_done = is_done and len(attempts) >= (_CHEAP_ATTEMPTS if is_cheap else 1)
         if is_done or attempts[-1].stage.status in OUT_OF_TIME:
@@ -108,13 +103,7 @@ def solve_robustly(
 
 
 def inlier_problem(problem: PGOProblem, kept: BoolArray) -> PGOProblem:
-    """The problem with the kept edges, (m,), alone.
-
-    Raises
-    ------
-    GraphError
-        When they do not connect the poses.
-    """
+    """The problem with the kept edges, (m,), alone; a GraphError when they do not connect the poses."""
     graph = problem.graph
     parts = graph.components(kept)
     if len(parts) > 1:
@@ -135,66 +124,45 @@ class _Estimate:
     solution: Solution | None = None  # by robots, with the account of all that they sent
 
 
-def _estimate(
-    problem: PGOProblem,
-    name: str,
-    method: GNC,
-    tested: BoolArray,
-    known: BoolArray,
-    thresholds: Array,
-    gap: float,
-    start: Poses | None,
-    watch: Watch,
-) -> _Estimate:
-    """One run on the edges that passed the test before, and the certificate of what it keeps, stationary."""
-    began, kept = time.perf_counter(), tested.copy()
-    run = watch.run(replace(method, known=known[kept]), inlier_problem(problem, kept), start)
-    scale = run.state.schedule.scale
-    kept[kept] = run.state.inliers
-    inliers = inlier_problem(problem, kept)
-    certificate = certify_at(inliers, polish(inliers, run.poses), gap)
-    attempt = _attempt(problem, name, known, thresholds, kept, certificate, time.perf_counter() - began)
-    return _Estimate(
-        attempt, kept, scale, certificate, replace(Stage.of(run), name=f"GNC, {name}", objective=run.state.objective)
-    )
+@dataclass(frozen=True, eq=False)
+class _Trials:
+    """What the attempts of a robust solve share."""
 
+    problem: PGOProblem
+    known: BoolArray
+    thresholds: Array
+    gap: float
+    start: Poses | None
+    watch: Watch
 
-def _attempt(
-    problem: PGOProblem,
-    name: str,
-    known: BoolArray,
-    thresholds: Array,
-    kept: BoolArray,
-    certificate: Certificate,
-    seconds: float,
-) -> Attempt:
-    costs = problem.edge_costs(certificate.poses)
-    cost = float(np.sum(np.where(known, costs, np.minimum(costs, thresholds))))
-    return Attempt(name, cost, int((~kept).sum()), certificate.gap, certificate.is_certified, seconds)
+    def run(self, name: str, method: GNC, tested: BoolArray) -> _Estimate:
+        """One run on the edges that passed the test before, and the certificate of what it keeps, stationary."""
+        began, kept = time.perf_counter(), tested.copy()
+        run = self.watch.run(replace(method, known=self.known[kept]), inlier_problem(self.problem, kept), self.start)
+        kept[kept] = run.state.inliers
+        inliers = inlier_problem(self.problem, kept)
+        certificate = certify_at(inliers, polish(inliers, run.poses), self.gap)
+        stage = replace(Stage.of(run), name=f"GNC, {name}", objective=run.state.objective)
+        attempt = self._attempt(name, kept, certificate, began)
+        return _Estimate(attempt, kept, run.state.schedule.scale, certificate, stage)
 
+    def share(
+        self, name: str, method: GNC, plain: Callable[..., Solution], shared: Callable[..., SharedEstimate]
+    ) -> _Estimate:
+        """The same by robots."""
+        began = time.perf_counter()
+        found = shared(self.problem, method, self.thresholds, self.start, self.watch)
+        kept, stage = found.kept, replace(found.stage, name=f"GNC, {name}")
+        solution = plain(inlier_problem(self.problem, kept), start=found.poses, time_limit=self.watch.left)
+        assert solution.ledger is not None
+        solution = replace(solution, ledger=found.ledger.joined(solution.ledger))
+        attempt = self._attempt(name, kept, solution.certificate, began)
+        return _Estimate(attempt, kept, found.scale, solution.certificate, stage, solution)
 
-def _estimate_shared(
-    problem: PGOProblem,
-    name: str,
-    method: GNC,
-    known: BoolArray,
-    thresholds: Array,
-    start: Poses | None,
-    watch: Watch,
-    plain: Callable[..., Solution],
-    shared: Callable[..., SharedEstimate],
-) -> _Estimate:
-    """The same by robots."""
-    began = time.perf_counter()
-    found = shared(problem, method, thresholds, start, watch)
-    kept = found.kept
-    solution = plain(inlier_problem(problem, kept), start=found.poses, time_limit=watch.left)
-    assert solution.ledger is not None
-    solution = replace(solution, ledger=found.ledger.joined(solution.ledger))
-    attempt = _attempt(problem, name, known, thresholds, kept, solution.certificate, time.perf_counter() - began)
-    return _Estimate(
-        attempt, kept, found.scale, solution.certificate, replace(found.stage, name=f"GNC, {name}"), solution
-    )
+    def _attempt(self, name: str, kept: BoolArray, certificate: Certificate, began: float) -> Attempt:
+        seconds, costs = time.perf_counter() - began, self.problem.edge_costs(certificate.poses)
+        cost = float(np.sum(np.where(self.known, costs, np.minimum(costs, self.thresholds))))
+        return Attempt(name, cost, int((~kept).sum()), certificate.gap, certificate.is_certified, seconds)
 
 
 def _methods(robust: GNC, graph: PoseGraph, known: BoolArray, is_central: bool) -> Iterator[tuple[str, GNC, BoolArray]]:

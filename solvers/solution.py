@@ -155,11 +155,8 @@ class Solution(Solved):
         verdict, cost = self.certificate.verdict.name.lower().replace("_", " "), self.certificate.cost
         space = "\n" if self._given else " "
         solved = f"{verdict}{self._given}:{space}{cost} = {self.objective:.6g}, gap {self.gap:.1e}"
-        return compare_poses(
-            graph,
-            [(f"{name}: {cost} = {self.problem.objective(before):.4g}", before), (solved, self.poses)],
-            self.edge_residuals,
-        )
+        given = f"{name}: {cost} = {self.problem.objective(before):.4g}"
+        return compare_poses(graph, [(given, before), (solved, self.poses)], self.edge_residuals)
 
     def as_json(self) -> dict[str, object]:
         """Return what `.json` files hold: figures, stages, versions, and the poses by id."""

@@ -124,18 +124,10 @@ class GaussSeidel:
         linear = rotation_problem(problem, poses.R[0])
         numbers = problem.d**2
         is_flagged = start is None and self.is_flagged
-        return GaussSeidelState(
-            k=0,
-            stage=DGSStage.ROTATIONS,
-            R=poses.R,
-            t=poses.t,
-            x=stack_transposes(poses.R[1:]),
-            turns=sweep_turns(linear, turns, numbers, problem.backend),
-            first=flagged_turns(linear, problem.graph, turns, numbers, problem.backend) if is_flagged else (),
-            schedule=turns,
-            is_flagged=is_flagged,
-            ledger=Ledger(robots.num_robots),
-        )
+        sweep = sweep_turns(linear, turns, numbers, problem.backend)
+        first = flagged_turns(linear, problem.graph, turns, numbers, problem.backend) if is_flagged else ()
+        x, ledger = stack_transposes(poses.R[1:]), Ledger(robots.num_robots)
+        return GaussSeidelState(0, DGSStage.ROTATIONS, poses.R, poses.t, x, sweep, first, turns, is_flagged, ledger)
 
     def step(self, problem: PGOProblem, state: GaussSeidelState) -> GaussSeidelState:
         """One sweep, of the next stage when the last one has ended."""
@@ -177,16 +169,11 @@ def rotation_problem(problem: PGOProblem, R_0: Array) -> LeastSquares:
 
     Unknown are the rows of R_1^T, R_2^T, .., a least-squares problem for each of the d columns.
     """
-    graph, n, m, d = problem.graph, problem.num_poses, problem.graph.num_edges, problem.d
+    n, m, d = problem.num_poses, problem.graph.num_edges, problem.d
     A, w = problem.residual_matrix
     J = A[m:, n:].tocsr()
-    return LeastSquares(
-        J=J[:, d:],
-        w=w[m:],
-        r=J[:, :d] @ R_0.T,
-        edge=np.repeat(np.arange(m), d),
-        pose=np.repeat(np.arange(1, graph.num_poses), d),
-    )
+    edge, pose = np.repeat(np.arange(m), d), np.repeat(np.arange(1, n), d)
+    return LeastSquares(J[:, d:], w[m:], J[:, :d] @ R_0.T, edge, pose)
 
 
 def pose_problem(problem: PGOProblem, R: Array) -> LeastSquares:
@@ -211,13 +198,8 @@ def pose_problem(problem: PGOProblem, R: Array) -> LeastSquares:
     residuals = A @ Poses(R, np.zeros((n, d))).stacked()
     edge = np.concatenate([np.arange(m), np.repeat(np.arange(m), d)])
     pose = np.concatenate([np.repeat(every, d), np.repeat(every, tangent_dimension(d))])
-    return LeastSquares(
-        J=vstack(parts, format="csr")[:, pose > 0],
-        w=np.tile(w, d),
-        r=residuals.T.reshape(-1, 1),
-        edge=np.tile(edge, d),
-        pose=pose[pose > 0],
-    )
+    J, r = vstack(parts, format="csr")[:, pose > 0], residuals.T.reshape(-1, 1)
+    return LeastSquares(J, np.tile(w, d), r, np.tile(edge, d), pose[pose > 0])
 
 
 def _linearized(problem: PGOProblem, state: GaussSeidelState) -> GaussSeidelState:

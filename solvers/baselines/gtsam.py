@@ -39,17 +39,12 @@ class GtsamMethod(enum.Enum):
 
 @dataclass(frozen=True)
 class Gtsam:
-    """Settings of a run of GTSAM.
+    """Settings of a run of GTSAM; a SettingError when one is out of its range.
 
     Attributes
     ----------
     tolerance : float
         On the relative change of its cost in one iteration; the default is GTSAM's.
-
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
     """
 
     method: GtsamMethod = GtsamMethod.LEVENBERG_MARQUARDT
@@ -63,6 +58,9 @@ class Gtsam:
 def run_gtsam(problem: PGOProblem, settings: Gtsam | None = None, start: Poses | None = None) -> Run[Poses]:
     """Solve a pose graph by GTSAM.
 
+    A MissingExtraError without GTSAM, a GraphError when the start does not fit the graph, a NotPositiveDefiniteError
+    when GTSAM meets a singular linear system, as Gauss-Newton does far from a solution.
+
     Parameters
     ----------
     settings : Gtsam, optional
@@ -75,23 +73,6 @@ def run_gtsam(problem: PGOProblem, settings: Gtsam | None = None, start: Poses |
     Run
         History and objective are our F at its iterates. Seconds hold the making of the factors and the start, and leave
         out importing GTSAM and judging its poses.
-
-    Raises
-    ------
-    MissingExtraError
-        Without GTSAM.
-    NotPositiveDefiniteError
-        When GTSAM meets a singular linear system, as Gauss-Newton does far from a solution.
-    GraphError
-        When the start does not fit the graph.
-
-    Examples
-    --------
-    >>> from pgo_models import certify, grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> result = run_gtsam(problem)                                        # doctest: +SKIP
-    >>> certify(problem, result.poses).verdict.name                        # doctest: +SKIP
-    'NOT_CERTIFIED'
     """
     gtsam = _import_gtsam()
     settings = settings if settings is not None else Gtsam()
@@ -130,16 +111,8 @@ def run_gtsam(problem: PGOProblem, settings: Gtsam | None = None, start: Poses |
         if change <= settings.tolerance or cost <= np.finfo(float).tiny:
             status, best = Status.CONVERGED, (objective, poses)
             break
-    return Run(
-        name=f"GTSAM {settings.method.value}",
-        objective=best[0],
-        state=best[1],
-        status=status,
-        iterations=k,
-        history=History(tuple(records)),
-        seconds=seconds,
-        poses=best[1],
-    )
+    (objective, poses), name = best, f"GTSAM {settings.method.value}"
+    return Run(name, objective, poses, status, k, History(tuple(records)), seconds, poses)
 
 
 def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noqa: ANN401  GTSAM has no types

@@ -94,15 +94,8 @@ class OrthogonalSOC:
         problem.check_point(point)
         split = problem.split(self.solver)
         rho, others = self._first_penalty(split, point)
-        return OrthogonalState(
-            k=0,
-            X=problem.values(point.copies),
-            others=others,
-            copies=point.copies,
-            B=tuple(normal / rho for normal in point.normals),
-            rho=rho,
-            split=split,
-        )
+        B = tuple(normal / rho for normal in point.normals)
+        return OrthogonalState(0, problem.values(point.copies), others, point.copies, B, rho, split)
 
     def step(self, problem: OrthogonalProblem, state: OrthogonalState) -> OrthogonalState:
         """One iteration: (a), (b), (c)."""
@@ -197,31 +190,16 @@ class OrthogonalSOC:
 
 @dataclass(frozen=True, eq=False)
 class OrthogonalSolution:
-    """The best of several runs.
+    """The best of several runs."""
 
-    Attributes
-    ----------
-    problem : OrthogonalProblem
-        Its cvxpy variables hold the solution.
-    values, others : tuple of arrays
-        For every variable in problem.variables and in problem.others.
-    objective : float
-        J there.
-    kkt : KKTResiduals
-        Computed afresh by one convex solve.
-    outcome : Outcome
-        The run it came from: status, history, state.
-    objectives : tuple of float
-        J of every start, nan where a run did not converge.
-    """
-
-    problem: OrthogonalProblem
+    problem: OrthogonalProblem  # its cvxpy variables hold the solution
+    # values, others: for every variable in problem.variables and in problem.others, of its shape.
     values: tuple[Array, ...]
     others: tuple[Array, ...]
-    objective: float
-    kkt: KKTResiduals
-    outcome: Outcome[OrthogonalState]
-    objectives: tuple[float, ...]
+    objective: float  # J there
+    kkt: KKTResiduals  # computed afresh by one convex solve
+    outcome: Outcome[OrthogonalState]  # the run it came from: status, history, state
+    objectives: tuple[float, ...]  # J of every start, nan where a run did not converge
 
     @property
     def status(self) -> Status:
@@ -245,16 +223,8 @@ def solve_orthogonal(
 ) -> OrthogonalSolution:
     """Run SOC from random starts and keep the best: converged first, then the lowest J.
 
-    Nothing proves that the best of the stationary points found is the global minimum.
-
-    Parameters
-    ----------
-    starts : int
-        How many.
-    verbose : bool
-        Print every run's table.
-
-    A SettingError when starts is below 1, a PGOError when the convex subproblem has no solution.
+    Nothing proves that the best of the stationary points found is the global minimum. `verbose` prints every run's
+    table. A SettingError when starts is below 1, a PGOError when the convex subproblem has no solution.
 
     Examples
     --------
@@ -272,15 +242,8 @@ def solve_orthogonal(
     values = problem.values(best.state.copies)
     kkt = kkt_residuals(problem, method.point(problem, best.state), best.state.rho, method.solver)
     problem.assign(values, best.state.others)
-    return OrthogonalSolution(
-        problem=problem,
-        values=values,
-        others=best.state.others,
-        objective=best.objective,
-        kkt=kkt,
-        outcome=best,
-        objectives=tuple(outcome.objective if outcome.status.is_success else math.nan for outcome in outcomes),
-    )
+    objectives = tuple(outcome.objective if outcome.status.is_success else math.nan for outcome in outcomes)
+    return OrthogonalSolution(problem, values, best.state.others, best.objective, kkt, best, objectives)
 
 
 def _identity(shape: tuple[int, ...]) -> Array:

@@ -113,8 +113,7 @@ class Driver:
         R = np.broadcast_to(np.eye(d), (g, d, d)).copy()
         self.at = self.kept = CoverPoses(R, np.zeros((g, d)), np.zeros(((d + 1) * g, d)))
         self.block: RecursionBlock | None = None  # rotations of the cover in SOC's recursion
-        self.step_a: Interface | None = None  # of its step (a)
-        self.right: list[RightHandSide] = []  # the robots', for the next step (a)
+        self.right: list[RightHandSide] = []  # the robots', for its next step (a)
         self._has_two_costs = any(subgraph.final is not None for subgraph in subgraphs)
         self.is_final = False  # whether the cost at hand is the one that is solved, not the one that SOC is run on
         self._laplacian: Interface | None = None

@@ -2,8 +2,7 @@
 
 Recursive bisection of the robot adjacency graph, by how many separators robots share. A separator pose is eliminated at
 the smallest group that holds every robot which touches it: no dense matrix over all separators is formed. The driver
-holds the front of all robots, the root; those below are held by robots where there are many
-large ones.
+holds the front of all robots, the root; those below are held by robots where there are many large ones.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -145,9 +144,8 @@ class FrontOwners:
             self.held[number], answers[number] = order(self.held[number], requests[number])
         asked = {self.owner[number]: number for number in requests if number not in answers}
         if asked:
-            to_all = [
-                requests[asked[one]] if one in asked else Idle.IDLE for one in range(self._network.ledger.num_robots)
-            ]
+            robots = range(self._network.ledger.num_robots)
+            to_all = [requests[asked[one]] if one in asked else Idle.IDLE for one in robots]
             found = self._network.workers.ask(partial(order_front, order), to_all)
             answers.update({number: found[robot] for robot, number in asked.items()})
         if self._is_shared:

@@ -6,21 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pgo_models.certificates.newton_polish import (
-    CHORD_STEPS,
-    DAMPING_GROWTH,
-    DAMPING_MAX,
-    DAMPING_START,
-    HALVINGS,
-    PROGRESS,
-    ROUNDING,
-    STATIONARY_DECREMENT,
-    STATIONARY_FOR_TANGENTS,
-    SUFFICIENT,
-    move_poses,
-    reached_rounding,
-    scaled_decrement,
-)
+from pgo_models.certificates import newton_polish as central
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -44,7 +30,7 @@ class SubstructuredNewtonState:
     decrement: float = math.inf
     moved: bool = True
     is_at_rounding: bool = False
-    tolerance: float = STATIONARY_DECREMENT
+    tolerance: float = central.STATIONARY_DECREMENT
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +63,9 @@ class SubstructuredNewton:
         """One factorisation and the moves it serves, two rounds each."""
         model = self._factorize(driver)
         at_rounding = False
-        decrement = scaled_decrement(model.square, driver.at.objective, driver.at.rounding_level)
-        moved, tolerance = False, STATIONARY_FOR_TANGENTS if driver.is_final else STATIONARY_DECREMENT
-        for _ in range(1 + CHORD_STEPS):
+        decrement = central.scaled_decrement(model.square, driver.at.objective, driver.at.rounding_level)
+        moved, tolerance = False, central.STATIONARY_FOR_TANGENTS if driver.is_final else central.STATIONARY_DECREMENT
+        for _ in range(1 + central.CHORD_STEPS):
             if decrement <= tolerance:
                 break
             found = _backtrack(driver, model)
@@ -88,13 +74,13 @@ class SubstructuredNewton:
             trial, answers = found
             gradients = [answer.gradient for answer in answers]
             following = _solved(model.is_newton, model.factor, gradients)
-            after = scaled_decrement(following.square, trial.objective, trial.rounding_level)
-            at_rounding = reached_rounding(decrement, after, model.is_newton and not moved)
+            after = central.scaled_decrement(following.square, trial.objective, trial.rounding_level)
+            at_rounding = central.reached_rounding(decrement, after, model.is_newton and not moved)
             if trial.objective >= driver.at.objective and after > 0.5 * decrement:
                 break
             driver.ask(Interior.accept, None, Count.PIGGYBACKED)
             driver.at = trial
-            enough = after <= PROGRESS * decrement
+            enough = after <= central.PROGRESS * decrement
             model, decrement, moved = following, after, True
             if not enough:
                 break
@@ -106,7 +92,7 @@ class SubstructuredNewton:
 
     def converged(self, state: SubstructuredNewtonState, measurement: Measurement) -> Status | None:
         """CONVERGED within tolerance or where the gradient is rounding; STALLED when the last step could not move."""
-        share = state.tolerance / STATIONARY_DECREMENT if state.moved else 1.0
+        share = state.tolerance / central.STATIONARY_DECREMENT if state.moved else 1.0
         if measurement.dual_residual <= share * self.newton.tolerance or state.is_at_rounding:
             return Status.CONVERGED
         return None if state.moved else Status.STALLED
@@ -122,8 +108,8 @@ class SubstructuredNewton:
             model = model_at(driver, second_order=False, damping=damping)
             if model is not None:
                 return model
-            damping = max(DAMPING_START, DAMPING_GROWTH * damping)
-            if damping > DAMPING_MAX:
+            damping = max(central.DAMPING_START, central.DAMPING_GROWTH * damping)
+            if damping > central.DAMPING_MAX:
                 raise NotPositiveDefiniteError("the damped Gauss-Newton matrix is not positive definite")
 
 
@@ -177,8 +163,8 @@ def _backtrack(driver: Driver, model: Model) -> tuple[CoverPoses, list[TrialEval
     w, v = layout.split(-model.y[:, 0])
     length = 1.0
     moves = [Move(part, length) for part in model.parts]
-    for _ in range(HALVINGS):
-        there = move_poses(now, length * w, length * v)
+    for _ in range(central.HALVINGS):
+        there = central.move_poses(now, length * w, length * v)
         R, t, is_first = there.R, there.t, length == 1.0
         if driver.is_final:  # chi2, whose best translations have another matrix at all rotations
             straight, further = Interior.move_straight, Interior.go_straight
@@ -190,9 +176,9 @@ def _backtrack(driver: Driver, model: Model) -> tuple[CoverPoses, list[TrialEval
             answers = driver.ask_each(Interior.evaluate_trial, parts, is_along=True)
         trial = driver.with_sums(CoverPoses(R, t, driver.at.force), [answer.at for answer in answers])
         objective, before = trial.objective, driver.at.objective
-        if objective <= before - SUFFICIENT * length * model.square:
+        if objective <= before - central.SUFFICIENT * length * model.square:
             return trial, answers
-        if length == 1.0 and objective <= before * (1.0 + ROUNDING):
+        if length == 1.0 and objective <= before * (1.0 + central.ROUNDING):
             return trial, answers
         length *= 0.5
     return None

@@ -50,10 +50,10 @@ class SubstructuredSOC:
         """One round: (a) by elimination; and one all-reduce: (b), (c)."""
         state = self._with_penalty_due(driver, state)
         rows, block = driver.rotation_rows, _block(driver)
-        assert driver.step_a is not None
-        b = np.zeros((driver.interface(1, driver.d).side, driver.d))
+        interface = driver.interface(1, driver.d)
+        b = np.zeros((interface.side, driver.d))
         b[rows] = (0.5 * block.penalty)[:, None] * block.shift
-        x, parts, _ = driver.step_a.solve([part.b for part in driver.right], b)
+        x, parts, _ = interface.solve([part.b for part in driver.right], b)
         block, own = block.after_solve(x[rows])  # (a)
         sums = own + np.sum(driver.ask_each(Interior.solve, parts, is_along=True), axis=0)
         merit = math.sqrt(sums[0])
@@ -85,7 +85,7 @@ class SubstructuredSOC:
     def finish(self, driver: Driver) -> None:
         """Leave omega and the best translations for it with driver and robots: two rounds."""
         z = _block(driver).z
-        driver.step_a, driver.right = None, []
+        driver.right = []
         driver.at = replace(driver.at, R=unstack_transposes(z))
         driver.set_translations(driver.ask_each(Interior.finish, driver.scattered_rotations(z)))
 
@@ -133,5 +133,5 @@ def _take(driver: Driver, block: RecursionBlock, reduced: Sequence[Reduced]) -> 
     """Go on from a block, with the robots' eliminations for its penalty: factor the driver's matrix of step (a)."""
     own = [(driver.rotation_rows[:, None], (0.5 * block.penalty)[:, None, None]), *driver.grounded_translation()]
     matrices = [answer.schur for answer in reduced]
-    driver.step_a = driver.interface(1, driver.d).factorize(matrices, own)
+    driver.interface(1, driver.d).factorize(matrices, own)
     driver.block, driver.right = block, [answer.right for answer in reduced]

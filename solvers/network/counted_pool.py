@@ -77,9 +77,8 @@ class CountedPool:
         num_bytes = BYTES_PER_NUMBER * np.array(numbers, dtype=np.int64)
         used = (num_bytes > 0) & (sender != receiver)
         exchange = sender[used], receiver[used], num_bytes[used]
-        traffic = self._traffic.setdefault(
-            np.append(np.concatenate(exchange), level).tobytes(), Traffic(*exchange, level)
-        )
+        key = np.append(np.concatenate(exchange), level).tobytes()
+        traffic = self._traffic.setdefault(key, Traffic(*exchange, level))
         self.ledger = self.ledger.after_exchange(traffic, is_round)
 
 

@@ -43,11 +43,7 @@ _ENVIRONMENT = {
     "MKL_NUM_THREADS": "1",
 }
 # Where Ray says why a cluster cannot be joined, best first; its last line often says that it failed, and no more.
-_REASONS = (
-    r"^ray\.exceptions\.\w+: (.+)",
-    r"^\w+Error: (?!Failed to connect to )([\s\S]+)",
-    r"\.(?:cc|h):\d+: (.+)",
-)
+_REASONS = (r"^ray\.exceptions\.\w+: (.+)", r"^\w+Error: (?!Failed to connect to )([\s\S]+)", r"\.(?:cc|h):\d+: (.+)")
 
 
 @dataclass(frozen=True)

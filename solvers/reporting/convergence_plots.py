@@ -88,6 +88,8 @@ def plot_convergence(
 ) -> Figure:
     """Figure of primal and dual residual, and of the gap, over the iterations of one or more stages in a row.
 
+    A SettingError when no stage has a record.
+
     Parameters
     ----------
     stages : sequence of (name, History)
@@ -97,11 +99,6 @@ def plot_convergence(
         The gap is (F - lower_bound) / F.
     published : PublishedRun, optional
         The paper's gap and iterations as a star; as a line with the figures where these are far to the right.
-
-    Raises
-    ------
-    SettingError
-        When no stage has a record.
     """
     run = _with_records(stages)
     with column_figure(height=1.3) as figure:

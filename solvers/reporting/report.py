@@ -176,10 +176,7 @@ def _robots(solution: Solved, robots: Partition, residuals: EdgeResiduals) -> _T
     if count > _MOST_ROBOTS:
         lines.append(f"Shown are the {_MOST_ROBOTS} with the largest share of {solution.certificate.cost}.")
     rows = [
-        [
-            *(_Cell(f"{values[a]:,}", values[a]) for _, values in columns),
-            _Cell(f"{100 * share[a]:.3g} %", share[a]),
-        ]
+        [*(_Cell(f"{values[a]:,}", values[a]) for _, values in columns), _Cell(f"{100 * share[a]:.3g} %", share[a])]
         for a in shown.tolist()
     ]
     heads = [*(head for head, _ in columns), f"share of {solution.certificate.cost}"]
@@ -220,16 +217,10 @@ def _worst_edges(solution: Solved, robots: Partition, residuals: EdgeResiduals) 
 
 
 def _stages(solution: Solved, names: Sequence[str]) -> _Table:
-    rows = [
-        [
-            _Cell(name),
-            _number(stage.iterations, "d"),
-            _number(stage.objective, ".10g"),
-            _number(stage.seconds, ".3f"),
-            _Cell(stage.status.name),
-        ]
-        for name, stage in zip(names, solution.stages, strict=True)
-    ]
+    rows = []
+    for name, stage in zip(names, solution.stages, strict=True):
+        figures = _number(stage.iterations, "d"), _number(stage.objective, ".10g"), _number(stage.seconds, ".3f")
+        rows.append([_Cell(name), *figures, _Cell(stage.status.name)])
     return _Table("stages", [], ["stage", "iterations", solution.certificate.cost, "seconds", "ended"], rows)
 
 

@@ -35,14 +35,6 @@ class Newton:
     secants : bool
         Whether moves with one factorisation learn from those before (L-BFGS); robots do without, as each learned one
         would cost them a reduction.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers.loop import run
-    >>> import numpy as np
-    >>> run(Newton(), PGOProblem(grid(np.random.default_rng(0)))).status.name
-    'CONVERGED'
     """
 
     tolerance: float = STATIONARY_DECREMENT

@@ -170,13 +170,8 @@ class Staircase:
             return replace(state, k=state.k + 1, radius=radius, inner_iterations=spent, is_stationary=stuck)
         arrived = self._arrive(problem, state.k + 1, candidate, state.preconditioner, state.rounding_level)
         stuck = trial.decrease <= rounding and arrived.decrement > 0.5 * state.decrement
-        return replace(
-            arrived,
-            radius=radius,
-            inner_iterations=spent,
-            bound=state.bound,
-            is_stationary=arrived.is_stationary or stuck,
-        )
+        stuck = stuck or arrived.is_stationary
+        return replace(arrived, radius=radius, inner_iterations=spent, bound=state.bound, is_stationary=stuck)
 
     def _climb(self, problem: PGOProblem, state: StaircaseState) -> StaircaseState:
         """Prove that the relaxation is solved, or leave along the eigenvector that shows it is not."""
@@ -207,15 +202,8 @@ class Staircase:
         squared = inner(point.gradient, _precondition(problem, preconditioner, point.Y, point.gradient))
         # An F below its rounding level is zero, whatever the gradient of its rounding is relative to it.
         decrement = scaled_decrement(0.5 * squared, point.value, level) if point.value > level else 0.0
-        return StaircaseState(
-            k=k,
-            point=point,
-            preconditioner=preconditioner,
-            decrement=decrement,
-            radius=_FIRST_RADIUS * math.sqrt(max(squared, 0.0)),
-            rounding_level=level,
-            is_stationary=decrement <= self.tolerance,
-        )
+        radius, is_stationary = _FIRST_RADIUS * math.sqrt(max(squared, 0.0)), decrement <= self.tolerance
+        return StaircaseState(k, point, preconditioner, decrement, radius, level, is_stationary=is_stationary)
 
 
 def _precondition(problem: PGOProblem, factor: CholeskyFactor, Y: Array, V: Array) -> Array:

@@ -58,12 +58,7 @@ def pairwise_consistent(graph: PoseGraph, known: BoolArray | None = None, quanti
         Edges that are right; `odometry` unless given. Edges that measure no whole motion (landmarks, positions) are
         kept untested.
     quantile : float
-        Probability that two right loop closures agree.
-
-    Raises
-    ------
-    SettingError
-        When quantile is not between 0 and 1.
+        Probability that two right loop closures agree; a SettingError when it is not between 0 and 1.
 
     Examples
     --------

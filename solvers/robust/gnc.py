@@ -78,30 +78,14 @@ class RobustLoss(enum.Enum):
 
 @dataclass(frozen=True)
 class GNCSchedule:
-    """Where the schedule is: all that does not belong to single edges.
+    """Where the schedule is: all that does not belong to single edges."""
 
-    Attributes
-    ----------
-    mu : float
-        Control of the surrogate of the next step.
-    scale : float
-        Of the thresholds.
-    rescaled : int
-        How often it may still change.
-    undecided : float
-        Share of the edges, known ones aside, that the surrogate counts neither in full nor as wrong.
-    decrement : float
-        What the last weighted cost has lost and could still lose, relative.
-    moved : bool
-        Whether the poses have moved in the last step.
-    """
-
-    mu: float
-    scale: float
-    rescaled: int
-    undecided: float = 1.0
-    decrement: float = math.inf
-    moved: bool = True
+    mu: float  # control of the surrogate of the next step
+    scale: float  # of the thresholds
+    rescaled: int  # how often it may still change
+    undecided: float = 1.0  # share of edges, known ones aside, that the surrogate counts neither in full nor as wrong
+    decrement: float = math.inf  # what the last weighted cost has lost and could still lose, relative
+    moved: bool = True  # whether the poses have moved in the last step
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +122,6 @@ class GNC:
 
     Attributes
     ----------
-    loss : RobustLoss
     quantile : float
         c_e^2 is this quantile of an edge's cost, if its information matrix is right.
     spread : float, optional
@@ -156,14 +139,6 @@ class GNC:
         Whether loop closures that `pairwise_consistent` leaves out are rejected before.
     tolerance : float
         On the relative decrement of the last weighted cost.
-    max_iterations : int
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers.loop import run
-    >>> run(GNC(), PGOProblem(grid(np.random.default_rng(0)))).status.name
-    'CONVERGED'
     """
 
     loss: RobustLoss = RobustLoss.TRUNCATED

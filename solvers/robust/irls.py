@@ -37,27 +37,15 @@ def huber(squares: Array, thresholds: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class IRLSState:
-    """State k.
-
-    Attributes
-    ----------
-    k : int
-    poses : Poses
-    costs : (m,)
-        r_e^2 there.
-    thresholds : (m,)
-    objective : float
-        Huber's cost.
-    change : float
-        By how much the last step lowered it, relative.
-    """
+    """State k."""
 
     k: int
     poses: Poses
+    # costs, thresholds: (m,); r_e^2 there, and c_e^2.
     costs: Array
     thresholds: Array
-    objective: float
-    change: float = math.inf
+    objective: float  # Huber's cost
+    change: float = math.inf  # by how much the last step lowered it, relative
 
 
 @dataclass(frozen=True)
@@ -74,7 +62,6 @@ class IRLS:
         Most steps of it for one set of weights. SOC begins each time with B = 0, and wants as many as it takes.
     tolerance : float
         On the relative change of the cost.
-    max_iterations : int
     """
 
     quantile: float = 0.99

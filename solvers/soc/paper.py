@@ -23,7 +23,7 @@ from pgo_models.geometry.rotations import Array, project_to_rotations, stack_tra
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.problem.cholesky import SymbolicCholesky, analyze
 from pgo_models.problem.initialization import spanning_tree_start
-from pgo_models.problem.matrices import assemble, norm, rotation_columns
+from pgo_models.problem.matrices import assemble, block_entries, norm, rotation_columns
 from pgo_models.problem.problem import PGOProblem
 from solvers.result import Measurement, Status
 from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty
@@ -108,17 +108,9 @@ class PaperSOC:
         if robots is None:
             robots = partition(problem.graph, method=PartitionMethod.SINGLETONS)
         blocks = _split(problem, robots)
-        rho = float(self.penalty.initial(problem, start).mean())
-        return PaperState(
-            k=0,
-            R=start.R,
-            omega=start.R,
-            B=np.zeros_like(start.R),
-            rho=rho,
-            blocks=blocks,
-            r_step=_prepare(problem, blocks, rho, self.r_step),
-            scale=float(problem.L.diagonal().mean()),
-        )
+        rho, scale = float(self.penalty.initial(problem, start).mean()), float(problem.L.diagonal().mean())
+        r_step = _prepare(problem, blocks, rho, self.r_step)
+        return PaperState(0, start.R, start.R, np.zeros_like(start.R), rho, blocks, r_step, scale)
 
     def step(self, problem: PGOProblem, state: PaperState) -> PaperState:
         """Steps (a), (b), (c), then the adaptive rho with B rescaled."""
@@ -198,20 +190,9 @@ def _with_adapted_rho(
 
 
 def _prepare(problem: PGOProblem, blocks: Blocks, rho: float, back_end: BackEnd) -> RotationStep:
-    penalty = np.full(blocks.own.shape[0], rho)
-    return prepare(
-        RSubproblem(
-            A=blocks.A,
-            w=blocks.w,
-            M=blocks.own,
-            d=problem.d,
-            num_translations=0,
-            penalty=penalty,
-            analysis=blocks.analysis,
-            backend=problem.backend,
-        ),
-        back_end,
-    )
+    penalty, d = np.full(blocks.own.shape[0], rho), problem.d
+    subproblem = RSubproblem(blocks.A, blocks.w, blocks.own, d, 0, penalty, blocks.analysis, problem.backend)
+    return prepare(subproblem, back_end)
 
 
 def _split(problem: PGOProblem, robots: Partition) -> Blocks:
@@ -226,13 +207,8 @@ def _split(problem: PGOProblem, robots: Partition) -> Blocks:
     alone = [csr_array((across.data[at], (across.row[at], across.col[at])), shape=across.shape) for at in (of_i, ~of_i)]
     A_own = vstack([rotations[inner], *alone], format="csr")
     w_own = np.concatenate([w[inner], w[between], w[between]])
-    every = np.arange(n)
-    full_blocks = rotation_columns(every, 0, d)
-    zero = (
-        np.repeat(full_blocks[:, :, None], d, axis=2),
-        np.repeat(full_blocks[:, None, :], d, axis=1),
-        np.zeros((n, d, d)),
-    )
+    full_blocks = rotation_columns(np.arange(n), 0, d)
+    zero = *block_entries(full_blocks, full_blocks), np.zeros((n, d, d))
     product = (A_own.T @ (A_own * w_own[:, None])).tocoo()
     own = assemble([(product.row, product.col, product.data), zero], n * d)
     between = (problem.L - own).tocsr()

@@ -122,6 +122,8 @@ class Joint:
 class SOC(SOCSettings):
     """Splitting of orthogonality constraints (Ebrahimi & Deghat, Algorithm 1; Lai & Osher 2014).
 
+    A SettingError when a setting is out of its range or does not go with the coupling.
+
     Attributes
     ----------
     coupling : Coupling, optional
@@ -148,11 +150,6 @@ class SOC(SOCSettings):
         times the root of the translation penalty, at most 0.3.
     tolerance : float
         On the primal and the dual residual, both relative.
-
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range or does not go with the coupling.
     """
 
     @property

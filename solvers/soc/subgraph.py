@@ -135,10 +135,24 @@ def split_graph(
     held = holds.tocsc()
     m, robots = graph.num_edges, range(partition.num_robots)
     robot, edge = np.divmod(np.unique(np.concatenate([owner[end] * m + np.arange(m) for end in (graph.i, graph.j)])), m)
-    edges = np.split(edge, np.searchsorted(robot, robots[1:]))
-    poses = [np.sort(part) for part in np.split(held.indices, held.indptr[1:-1])]
-    each = [(robot, edges[robot], poses[robot]) for robot in robots]
-    return tuple(_subgraph_of(graph, costs, owner, cover, counts, holds, thresholds, *one) for one in each)
+    every_edge = np.split(edge, np.searchsorted(robot, robots[1:]))
+    every_pose = [np.sort(part) for part in np.split(held.indices, held.indptr[1:-1])]
+
+    def subgraph_of(robot: int, edges: IntArray, poses: IntArray) -> Subgraph:
+        i, j = np.searchsorted(poses, graph.i[edges]), np.searchsorted(poses, graph.j[edges])
+        measured = graph.R_ij[edges], graph.t_ij[edges], graph.kappa[edges], graph.tau[edges]
+        name = f"{graph.name}, robot {robot}"
+        local = PoseGraph(len(poses), i, j, *measured, ids=graph.pose_ids[poses], name=name)
+        held = holds[poses].tocsc()
+        others = [other for other in np.flatnonzero(np.diff(held.indptr)).tolist() if other != robot]
+        common = tuple((other, np.sort(held.indices[held.indptr[other] : held.indptr[other + 1]])) for other in others)
+        copies, counted = np.diff(holds[poses].indptr), counts[edges] == robot
+        final = None if costs[1] is None else costs[1].of_edges(edges)
+        allowed = None if thresholds is None else thresholds[edges]
+        of_edges = edges, costs[0].of_edges(edges), final, allowed
+        return Subgraph(robot, local, poses, owner[poses], cover[poses], counted, copies, common, *of_edges)
+
+    return tuple(map(subgraph_of, robots, every_edge, every_pose))
 
 
 def middle_separator(graph: PoseGraph, subgraphs: tuple[Subgraph, ...]) -> int:
@@ -157,37 +171,3 @@ def _holders(graph: PoseGraph, owner: IntArray, num_robots: int) -> csr_array:
     once = np.unique(pose * num_robots + robot)
     pose, robot = np.divmod(once, num_robots)
     return csr_array((np.ones(len(once)), (pose, robot)), shape=(graph.num_poses, num_robots))
-
-
-def _subgraph_of(
-    graph: PoseGraph,
-    costs: tuple[EdgeWeights, EdgeWeights | None],
-    owner: IntArray,
-    cover: IntArray,
-    counts: IntArray,
-    holds: csr_array,
-    thresholds: Array | None,
-    robot: int,
-    edges: IntArray,
-    poses: IntArray,
-) -> Subgraph:
-    local = PoseGraph(
-        num_poses=len(poses),
-        i=np.searchsorted(poses, graph.i[edges]),
-        j=np.searchsorted(poses, graph.j[edges]),
-        R_ij=graph.R_ij[edges],
-        t_ij=graph.t_ij[edges],
-        kappa=graph.kappa[edges],
-        tau=graph.tau[edges],
-        ids=graph.pose_ids[poses],
-        name=f"{graph.name}, robot {robot}",
-    )
-    held = holds[poses].tocsc()
-    others = [other for other in np.flatnonzero(np.diff(held.indptr)).tolist() if other != robot]
-    common = tuple((other, np.sort(held.indices[held.indptr[other] : held.indptr[other + 1]])) for other in others)
-    copies = np.diff(holds[poses].indptr)
-    counted, first = counts[edges] == robot, costs[0].of_edges(edges)
-    final = None if costs[1] is None else costs[1].of_edges(edges)
-    allowed = None if thresholds is None else thresholds[edges]
-    of_edges = edges, first, final, allowed
-    return Subgraph(robot, local, poses, owner[poses], cover[poses], counted, copies, common, *of_edges)

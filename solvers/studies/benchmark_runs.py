@@ -19,7 +19,7 @@ from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
 from solvers.baselines.sweep_order import Sweep, schedule
 from solvers.loop import Solver, run
 from solvers.network.ledger import Ledger
-from solvers.pipeline import HANDOVER_TOLERANCE, Pipeline, solve
+from solvers.pipeline import HANDOVER, Pipeline, solve
 from solvers.result import OUT_OF_TIME, History, Record, Run, Status
 from solvers.riemannian.newton import Newton, gauss_newton
 from solvers.riemannian.staircase import Staircase
@@ -30,7 +30,6 @@ from solvers.soc.soc import SOC
 from solvers.solution import Solution
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings, StageRecord
 
-_HANDOVER_ITERATIONS = 100
 _MOST_SWEEPS = 20_000
 _MOST_PAPER_ITERATIONS = 5_000
 _SECOND_STAGE_TOLERANCE = 1e-6  # relative decrement; Gauss-Newton closes the rest slowly
@@ -97,14 +96,9 @@ class _Allowance:
         self, problem: PGOProblem, soc: SOC | None, newton: Newton, start: Poses | None, by_robots: bool = True
     ) -> tuple[Solution, tuple[StageRecord, ...]]:
         """SOC, if any, and Newton, by the robots and their driver or in one place."""
-        solution = solve(
-            problem,
-            Pipeline(soc=soc, newton=newton, second_try=False, staircase=None),
-            start,
-            robots=self.robots if by_robots else None,
-            time_limit=self._time_limit,
-            progress=False,
-        )
+        pipeline = Pipeline(soc=soc, newton=newton, second_try=False, staircase=None)
+        robots = self.robots if by_robots else None
+        solution = solve(problem, pipeline, start, robots=robots, time_limit=self._time_limit, progress=False)
         if any(stage.status is Status.INTERRUPTED for stage in solution.stages):
             raise KeyboardInterrupt
         return solution, _legs_of(solution)
@@ -125,12 +119,7 @@ def _run_of(found: Run[Any] | Solution, *legs: StageRecord, remark: str = "", is
 def _soc_and_newton(coupling: Coupling, problem: PGOProblem, allowed: _Allowance, start: Poses | None) -> BenchmarkRun:
     """A run of a coupling as `solve` runs it: JOINT in one place, the others by robots and their driver."""
     is_joint = coupling is Coupling.JOINT
-    soc = SOC(
-        coupling=coupling,
-        robots=None if is_joint else allowed.robots,
-        tolerance=HANDOVER_TOLERANCE,
-        max_iterations=_HANDOVER_ITERATIONS,
-    )
+    soc = replace(HANDOVER, coupling=coupling, robots=None if is_joint else allowed.robots)
     solution, legs = allowed.solve(problem, soc, Newton(), start, by_robots=not is_joint)
     return _run_of(solution, *legs)
 
@@ -174,14 +163,9 @@ def _gauss_seidel(problem: PGOProblem, allowed: _Allowance, start: Poses | None)
     ledgers: list[Ledger] = []
     method = GaussSeidel(robots=allowed.robots, max_iterations=_MOST_SWEEPS)
     finished = allowed.run(method, problem, None, lambda state, record: ledgers.append(state.ledger))
-    leg = StageRecord(
-        "DGS",
-        finished.status,
-        finished.history,
-        allowed.robots.num_robots,
-        np.array([ledger.rounds for ledger in ledgers], dtype=float),
-        np.array([ledger.num_bytes for ledger in ledgers], dtype=float),
-    )
+    rounds = np.array([ledger.rounds for ledger in ledgers], dtype=float)
+    num_bytes = np.array([ledger.num_bytes for ledger in ledgers], dtype=float)
+    leg = StageRecord("DGS", finished.status, finished.history, allowed.robots.num_robots, rounds, num_bytes)
     is_answer = finished.state.stage is not DGSStage.ROTATIONS
     remark = ""
     if not is_answer:

@@ -110,6 +110,8 @@ def compare_methods(
 ) -> Comparison:
     """Run methods on a graph, one after the other, and hold them against a proven lower bound.
 
+    A PGOError when the graph is not connected; KeyboardInterrupt after Ctrl-C before the bound is there.
+
     Parameters
     ----------
     settings : ComparisonSettings, optional
@@ -121,13 +123,6 @@ def compare_methods(
     -------
     Comparison
         Also after Ctrl-C: what was done until then. A method that fails leaves its reason.
-
-    Raises
-    ------
-    PGOError
-        When the graph is not connected.
-    KeyboardInterrupt
-        After Ctrl-C before the bound is there.
 
     Examples
     --------

@@ -43,7 +43,8 @@ def error_forgetting(
 ) -> ErrorForgetting:
     """Run Bregman iteration with and without errors in its first steps.
 
-    An error e ~ N(0, error_std^2 I) of step k gives x_k + e and, as the residual is added up, b_k + K e.
+    An error e ~ N(0, error_std^2 I) of step k gives x_k + e and, as the residual is added up, b_k + K e. A SettingError
+    when error_std is negative or there are fewer iterations than disturbed steps.
 
     Parameters
     ----------
@@ -51,11 +52,6 @@ def error_forgetting(
         x*, which the distances are measured to.
     method : TwoLineBregman, optional
         Its alpha and its subproblem's tolerance are used.
-
-    Raises
-    ------
-    SettingError
-        When error_std is negative or there are fewer iterations than disturbed steps.
 
     Examples
     --------

@@ -71,13 +71,11 @@ class Shown:
 
 
 def draw_paper_figures(
-    folder: Path | str,
-    only: tuple[FigureSet, ...] = (),
-    *,
-    download: bool = False,
-    progress: bool | None = None,
+    folder: Path | str, only: tuple[FigureSet, ...] = (), *, download: bool = False, progress: bool | None = None
 ) -> tuple[list[Path], list[str]]:
     """Run the paper's SOC on its graphs, as the tables do, and write the figures as PNG and interactive HTML.
+
+    A PGOError when a file cannot be written.
 
     Parameters
     ----------
@@ -95,11 +93,6 @@ def draw_paper_figures(
     written : list of Path
     reasons : list of str
         Why graphs were left out.
-
-    Raises
-    ------
-    PGOError
-        When a file cannot be written.
 
     Examples
     --------
@@ -177,12 +170,8 @@ def _run(row: PublishedRow, download: bool) -> Shown:
     graph = graph_of_row(row, 0, download)
     problem = PGOProblem(graph)
     bound = solve(problem, progress=False).lower_bound
-    start = graph.initial if row.name in SCENES else None
-    return Shown(
-        graph,
-        run_benchmark(BenchmarkMethod.PAPER, problem, BenchmarkSettings(max_rounds=row.soc.iterations), start),
-        bound,
-    )
+    start, settings = graph.initial if row.name in SCENES else None, BenchmarkSettings(max_rounds=row.soc.iterations)
+    return Shown(graph, run_benchmark(BenchmarkMethod.PAPER, problem, settings, start), bound)
 
 
 def _write_grid(one: FigureSet, here: list[Shown], folder: Path) -> list[Path]:

@@ -22,19 +22,14 @@ from solvers.studies.benchmark_runs import run_benchmark
 from solvers.studies.results_cache import Entry, KeptResults, graph_fingerprint
 
 SCENES: dict[str, Callable[[np.random.Generator], PoseGraph]] = {"circle": circle, "grid": grid, "sphere": sphere}
-TABLE_CONTENDERS = (
-    BenchmarkMethod.STAIRCASE,
-    BenchmarkMethod.GAUSS_SEIDEL,
-    BenchmarkMethod.PAPER,
-    BenchmarkMethod.CONSENSUS,
-)
+TABLE_CONTENDERS = tuple(BenchmarkMethod[name] for name in ("STAIRCASE", "GAUSS_SEIDEL", "PAPER", "CONSENSUS"))
 # What a method can fail with on a graph that it was not made for; anything else is a mistake of ours.
 _FAILURES = (PGOError, np.linalg.LinAlgError, MemoryError)
 
 
 @dataclass(frozen=True)
 class ReproductionSettings:
-    """Which rows, and how they are made.
+    """Which rows, and how they are made; a SettingError when a row is unknown or a number is out of its range.
 
     Attributes
     ----------
@@ -46,11 +41,6 @@ class ReproductionSettings:
         See `BenchmarkSettings`.
     download : bool
         Whether graphs that are not here are downloaded; otherwise their row says how to get them.
-
-    Raises
-    ------
-    SettingError
-        When a row is unknown or a number is out of its range.
     """
 
     only: tuple[str, ...] = ()
@@ -174,7 +164,8 @@ def reproduce_tables(
     settings : ReproductionSettings, optional
         `ReproductionSettings()` unless given.
     keep : Path, optional
-        A JSON file that holds every figure from the moment it is there; what it holds already is not run again.
+        A JSON file that holds every figure from the moment it is there; what it holds already is not run again. A
+        PGOError when it cannot be read or written.
     is_fresh : bool
         Run all anew whatever the file holds.
     progress : bool, optional
@@ -184,11 +175,6 @@ def reproduce_tables(
     -------
     Reproduction
         Also after Ctrl-C: what was done until then. A method that fails on a graph leaves its reason there.
-
-    Raises
-    ------
-    PGOError
-        When `keep` cannot be read or written.
 
     Examples
     --------
@@ -306,20 +292,10 @@ def _cell(
     trial = run_benchmark(contender, problem, allowed, start)
     if not trial.is_answer or not np.isfinite(trial.objective):
         raise PGOError(trial.remark)
-    first = trial.first_objective
-    return asdict(
-        TableEntry(
-            objective=float(trial.objective),
-            gap=float(relative_gap(trial.objective, optimum.lower_bound)),
-            first_gap=None if first is None else float(relative_gap(first, optimum.lower_bound)),
-            iterations=trial.iterations,
-            rounds=trial.rounds,
-            num_bytes=trial.num_bytes,
-            seconds=trial.seconds,
-            seconds_per_robot=trial.seconds_per_robot,
-            remark=trial.remark,
-        )
-    )
+    first, gap = trial.first_objective, float(relative_gap(trial.objective, optimum.lower_bound))
+    first_gap = None if first is None else float(relative_gap(first, optimum.lower_bound))
+    effort = trial.iterations, trial.rounds, trial.num_bytes, trial.seconds, trial.seconds_per_robot
+    return asdict(TableEntry(float(trial.objective), gap, first_gap, *effort, trial.remark))
 
 
 def _reason(error: BaseException) -> str:

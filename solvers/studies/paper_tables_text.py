@@ -212,16 +212,11 @@ def _deviation(values: Sequence[float]) -> float | None:
 
 def _counted(sentences: Sequence[str], total: int) -> list[str]:
     """Sentences, and of how many draws they are said unless of all."""
-    return [
-        sentence if count == total else f"{sentence} ({count} of {total})"
-        for sentence, count in Counter(sentences).items()
-    ]
+    return [one if count == total else f"{one} ({count} of {total})" for one, count in Counter(sentences).items()]
 
 
 def _record(row: ReproducedRow) -> dict[str, Value]:
     figures, published, cells = row.figures, row.published, row.cells
-    optimum = published.se_sync.objective
-
     objectives, gaps = [cell.objective for cell in cells], [cell.gap for cell in cells]
     stages = np.mean([cell.iterations for cell in cells], axis=0).tolist() if cells else []
     return {
@@ -249,7 +244,7 @@ def _record(row: ReproducedRow) -> dict[str, Value]:
         "seconds": _mean([cell.seconds for cell in cells]),
         "seconds_per_robot": _mean([cell.seconds_per_robot for cell in cells]),
         "paper_objective": None if figures is None else figures.objective,
-        "paper_optimum": optimum,
+        "paper_optimum": published.se_sync.objective,
         "paper_gap": row.published_gap,
         "paper_iterations": None if figures is None else figures.iterations,
         "paper_seconds": None if figures is None else figures.seconds,

@@ -59,17 +59,8 @@ def noisy_scene(scene: SweptScene, rotation_std: float, rng: np.random.Generator
 def noise_sweep(scene: SweptScene, rotation_std: Array, graphs: int, rng: np.random.Generator) -> NoiseSweep:
     """Solve and certify `graphs` random graphs at every noise level.
 
-    Parameters
-    ----------
-    rotation_std : (levels,)
-        Standard deviations, radians, ascending.
-    graphs : int
-        At every level.
-
-    Raises
-    ------
-    SettingError
-        When the levels are not positive and ascending, or graphs is not positive.
+    `rotation_std`, (levels,), are standard deviations in radians. A SettingError when they are not positive and
+    ascending, or graphs is not positive.
 
     Examples
     --------

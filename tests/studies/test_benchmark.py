@@ -124,7 +124,7 @@ def test_dgs_that_is_cut_short_in_its_first_stage_is_no_answer(problem, monkeypa
 
 
 def test_a_stage_that_did_not_converge_is_said(problem, monkeypatch):
-    monkeypatch.setattr(trial_runs, "_HANDOVER_ITERATIONS", 2)
+    monkeypatch.setattr(trial_runs, "HANDOVER", replace(trial_runs.HANDOVER, max_iterations=2))
     assert run_benchmark(BenchmarkMethod.JOINT, problem).remark == "SOC: MAX_ITERATIONS"
 
 
