@@ -60,7 +60,7 @@ def substructured_job(name: str, robots: str, method: str) -> dict[str, object]:
     assert solution.ledger is not None
     return {
         "cover": len(vertex_cover(shared, graph)),
-        "soc": solution.stages[1].iterations,
+        "soc": sum(stage.iterations for stage in solution.stages if stage.name == "SOC"),
         "rounds": solution.ledger.rounds,
         "all_reduces": solution.ledger.all_reduces,
         "sent": solution.ledger.bytes_sent.max() / 1e3,

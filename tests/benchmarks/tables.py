@@ -51,8 +51,8 @@ def one_job(name: str) -> None:
         "objective": solution.objective,
         "gap": solution.gap,
         "verdict": solution.certificate.verdict.name,
-        "soc": solution.stages[1].iterations,
-        "newton": solution.stages[2].iterations,
+        "soc": sum(stage.iterations for stage in solution.stages if stage.name == "SOC"),
+        "newton": sum(stage.iterations for stage in solution.stages if stage.name == "Newton"),
     }
     print(json.dumps(figures))
 
