@@ -30,7 +30,7 @@ def load_graph(graph: str, unit_weights: bool, skip_unknown: bool = False, dropp
 def kept_edges(graph: str, dropped: Dropped) -> tuple[BoolArray, list[str]]:
     """Whether an edge is kept, (m,), and `file:line` of those that are; a SettingError where no edge has a name.
 
-    An edge is named by its line, in a folder by FILE:LINE, with or without the folder.
+    An edge is named by its line, in a folder by `FILE:LINE`, with or without the folder.
     """
     path = locate(graph)
     if not (path.is_file() or path.is_dir()):
