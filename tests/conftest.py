@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from browser import Browser, find_browser
 from budget import EXAMPLES, PROFILE
 from hypothesis import settings
 
@@ -40,6 +41,14 @@ def benchmark_problem(benchmark_data: Path) -> Callable[[str], PGOProblem]:
 def benchmark_optimum(benchmark_problem: Callable[[str], PGOProblem]) -> Callable[[str], Poses]:
     """Stationary poses that the chordal start of a benchmark graph polishes to, found once."""
     return cache(lambda name: polish(benchmark_problem(name), chordal_start(benchmark_problem(name))))
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    if find_browser() is None:
+        pytest.skip("no chromium or chrome on PATH to open the page in")
+    with Browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
 
 
 @pytest.fixture

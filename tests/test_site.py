@@ -9,7 +9,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
-from browser import Browser, find_browser
+from browser import Browser
 
 import pgo_models
 import solvers
@@ -108,14 +108,6 @@ def test_the_reference_has_every_public_name_and_every_notebook_is_there(pages, 
             assert f"{thing.__module__}.{thing.__qualname__}" in anchors, name
     for notebook in (ROOT / "notebooks").glob("[0-9][0-9]_*.py"):
         assert site / "notebooks" / f"{notebook.stem}.html" in pages
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    if find_browser() is None:
-        pytest.skip("no chromium or chrome on PATH to open the pages in")
-    with Browser(tmp_path_factory.mktemp("profile")) as opened:
-        yield opened
 
 
 def opened_without_complaint(browser: Browser) -> None:

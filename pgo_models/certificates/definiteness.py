@@ -105,26 +105,22 @@ def prove_definite(
     def attempt(shift: Array) -> CholeskyFactor | None:
         data = stored.data.copy()
         data[problem.diagonal_positions] -= shift * diagonal
-        try:
-            return problem.analysis.factorize(problem.with_pattern_of_M(data))
-        except NotPositiveDefiniteError:
-            return None
+        return _factor(problem, problem.with_pattern_of_M(data))
 
     free = diagonal.copy()
     free[fixed] = 0.0
     entries, analysis = matrix_errors(problem, diagonal), problem.analysis
+    expected = analysis.expected_error()
     if turned is not None:
         energies, weights = _softness(stored, free, turned)
         first_shift = min(first_shift, max(float(np.min(SHRINK * energies / weights.sum(axis=0))), LEAST_SHIFT))
-        known = analysis.expected_error()
-        for bound in (analysis.crude_error, analysis.error_before):
-            error = known if known is not None else bound()
+        for bound in (analysis.crude_error, analysis.error_before) if expected is None else ():
+            error = bound()
             enough = np.maximum(first_shift, MARGIN * (entries + error))
             if np.isfinite(enough).all() and (enough @ weights <= ROOM * energies).all():
                 factor = attempt(enough)
                 if factor is not None:
                     return DefiniteProof(stored, factor, free, enough, entries, False, error)
-    expected = analysis.expected_error()
     found = search_shift(attempt, entries, expected if expected is not None else 0.0 * entries, first_shift)
     if found is None:
         return None
@@ -136,11 +132,14 @@ def is_definite_in_doubles(problem: PGOProblem, Lambda: Array, fixed: IntArray) 
     """Whether S without the rows `fixed` has a Cholesky factor in floating point, which proves nothing."""
     stored, diagonal = shifted_certificate(problem, Lambda, np.zeros(problem.side))
     problem.leave_out(stored.data, fixed, 2.0 * diagonal[fixed])
+    return _factor(problem, stored) is not None
+
+
+def _factor(problem: PGOProblem, matrix: csc_array) -> CholeskyFactor | None:
     try:
-        problem.analysis.factorize(stored)
+        return problem.analysis.factorize(matrix)
     except NotPositiveDefiniteError:
-        return False
-    return True
+        return None
 
 
 def shifted_certificate(problem: PGOProblem, Lambda: Array, shifts: Array) -> tuple[csc_array, Array]:

@@ -3,7 +3,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from browser import Browser, find_browser
 from pages import Page, own_part
 
 import pgo_models as pgo
@@ -11,14 +10,6 @@ import solvers
 from pgo_models.plots.interactive_plots import animate_poses, save_page
 
 pytest.importorskip("plotly")
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    if find_browser() is None:
-        pytest.skip("no chromium or chrome on PATH to open the page in")
-    with Browser(tmp_path_factory.mktemp("profile")) as opened:
-        yield opened
 
 
 def test_the_browser_hears_what_goes_wrong(browser, tmp_path):
