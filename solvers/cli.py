@@ -37,7 +37,7 @@ from solvers.progress_bars import JobBar
 from solvers.reporting.graph_facts import describe_graph, memory_note
 from solvers.reporting.report import check_report, write_report
 from solvers.reporting.versions import installation, installed_version, installed_versions
-from solvers.shell import DONE, Commands, JsonOption, QuietOption, run_command, save_then_show
+from solvers.shell import DONE, Commands, JsonOption, QuietOption, ThreadsOption, run_command, save_then_show
 from solvers.soc.soc import SOC
 from solvers.solution import both_costs, certificate_json, check_format, check_target, other_cost, write_json
 from solvers.studies.commands import DropEdgeOption, UnitWeightsOption, compare_command, figures_command, tables_command
@@ -168,6 +168,7 @@ def solve_command(
         ),
     ] = None,
     drop_edge: DropEdgeOption = None,
+    threads: ThreadsOption = None,  # read by `solvers.command`, before BLAS is imported
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print a line an iteration.")] = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,

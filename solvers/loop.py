@@ -3,7 +3,9 @@
 import math
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any, Protocol, TypeVar, cast, overload
 
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
@@ -12,6 +14,8 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem, as_problem
 from solvers.progress import Table
 from solvers.result import History, Measurement, Outcome, Record, Run, Status
+
+_TAKES_SECONDS = 20_000  # poses from which a factorisation is long enough to be told of
 
 P = TypeVar("P", contravariant=True)
 X = TypeVar("X", contravariant=True)
@@ -151,6 +155,7 @@ class Watch:
     callback: Callable[[Any, Record], bool | None] | None = None
     began: float = field(default_factory=time.perf_counter)
     found: list[Poses] = field(default_factory=list)
+    plan: list[str] = field(default_factory=list)  # names of the stages, in turn: bars say what is still to come
 
     def __post_init__(self) -> None:
         if not self.time_limit > 0:
@@ -160,6 +165,18 @@ class Watch:
     def left(self) -> float:
         """Seconds that are left, never none: a run looks at the clock after its first state."""
         return max(self.time_limit - (time.perf_counter() - self.began), 1e-9)
+
+    @contextmanager
+    def showing(self, name: str, problem: PGOProblem) -> Iterator[None]:
+        """Show what is done outside of `run`, a stage without iterations, on graphs where that takes seconds."""
+        is_shown = bool(self.progress) and not self.verbose and problem.num_poses >= _TAKES_SECONDS
+        bar = import_module("solvers.progress_bars").JobBar(None, True, self._titled(name)) if is_shown else None
+        with bar if bar is not None else nullcontext():
+            yield
+
+    def _titled(self, name: str) -> str:
+        left = self.plan[self.plan.index(name) + 1 :] if name in self.plan and not self.verbose else []
+        return f"{name}, then {', '.join(left)}" if left else name
 
     @overload
     def run(self, method: Solver[S], problem: PGOProblem | PoseGraph, start: Poses | None = None) -> Run[S]: ...
@@ -182,7 +199,7 @@ class Watch:
         records = list(earlier)
         k = len(earlier)
         tolerance = getattr(method, "tolerance", 0.0)
-        with Table(name, method.max_iterations, self.verbose, self.progress, tolerance) as table:
+        with Table(self._titled(name), method.max_iterations, self.verbose, self.progress, tolerance) as table:
             try:
                 while True:
                     measurement = method.measure(problem, state)

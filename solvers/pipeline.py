@@ -326,12 +326,19 @@ class _Job:
     def attempt(self, soc: SOC | PaperSOC | None, start: Poses | None) -> tuple[Poses, Certificate]:
         """SOC, Newton and certificate from a start; the first on the convex part of chi2 where that is not convex."""
         began, first_problem = time.perf_counter(), self.problem.convex_part
-        poses, name = (start, "given start") if start is not None else _own_start(first_problem, soc)
+        no_nearer = first_problem is not self.problem  # the minimum of chi2's convex part, than the chordal start
+        if soc is not None and soc == HANDOVER and (no_nearer or (start is None and needs_no_soc(self.problem))):
+            soc = None
+        is_paper = isinstance(soc, PaperSOC)
+        name = ("spanning tree" if is_paper else "chordal start") if start is None else "given start"
+        self.watch.plan[:] = [name, *([] if soc is None else [type(soc).__name__]), "Newton", "certificate"]
+        with self.watch.showing(name, self.problem):
+            if (poses := start) is None:
+                poses = spanning_tree_start(first_problem.graph) if is_paper else chordal_start(first_problem)
         seconds = time.perf_counter() - began
         self.stages.append(Stage(name, Status.CONVERGED, 0, self.problem.objective(poses), seconds, History()))
         self.watch.found.append(poses)
-        no_nearer = first_problem is not self.problem  # the minimum of chi2's convex part, than the chordal start
-        if soc is not None and not (soc == HANDOVER and (no_nearer or (start is None and needs_no_soc(self.problem)))):
+        if soc is not None:
             first: Run[Any] = self.watch.run(soc, first_problem, poses)
             # A start that is better than SOC's best iterate is kept: CSAIL's chordal start is within 1e-4.
             poses = first.poses if first.objective <= first_problem.objective(poses) else poses
@@ -350,7 +357,8 @@ class _Job:
             self.stages.append(Stage.of(second))
             poses, decrement = second.poses, second.state.polish.decrement
             del second
-        return poses, certify_at(self.problem, poses, self.pipeline.gap, decrement)
+        with self.watch.showing("certificate", self.problem):
+            return poses, certify_at(self.problem, poses, self.pipeline.gap, decrement)
 
     def climb(self, staircase: Staircase, poses: Poses, certificate: Certificate) -> tuple[Poses, Certificate]:
         """Staircase from the best poses, Newton from what it rounds to, and the relaxation's bound if still needed."""
@@ -379,12 +387,6 @@ class _Job:
     def interrupt(self, objective: float) -> None:
         """Note that what was under way was broken off."""
         self.stages.append(Stage("interruption", Status.INTERRUPTED, 0, objective, 0.0, History()))
-
-
-def _own_start(problem: PGOProblem, soc: SOC | PaperSOC | None) -> tuple[Poses, str]:
-    if isinstance(soc, PaperSOC):
-        return spanning_tree_start(problem.graph), "spanning tree"
-    return chordal_start(problem), "chordal start"
 
 
 def _better(

@@ -7,11 +7,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 class JobBar(Progress):
-    """Progress over the parts of a job, or iterations of a run; with `progress` None, where stderr is a terminal."""
+    """Progress over the parts of a job, or iterations of a run, None where there is one; on a terminal's stderr.
 
-    def __init__(self, parts: int, progress: bool | None, name: str = "") -> None:
+    With `progress` given, it decides.
+    """
+
+    def __init__(self, parts: int | None, progress: bool | None, name: str = "") -> None:
         is_shown = sys.stderr.isatty() if progress is None else progress
-        texts = (MofNCompleteColumn(), TextColumn("{task.fields[figures]}"), TimeElapsedColumn())
+        counts = () if parts is None else (MofNCompleteColumn(),)
+        texts = (*counts, TextColumn("{task.fields[figures]}"), TimeElapsedColumn())
         columns = (TextColumn("{task.description}", markup=False), BarColumn(), *texts)
         super().__init__(*columns, console=Console(stderr=True), transient=True, disable=not is_shown)
         self._task = self.add_task(name, total=parts, figures="")

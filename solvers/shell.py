@@ -25,6 +25,9 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _SAME_SIGNAL = 0.5  # seconds: who hits Ctrl-C twice means it once, and the answer takes time
 _LONGEST_WORD = 300  # of an error message, which is to stay a line
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors and warnings alone.")]
+ThreadsOption = Annotated[
+    int | None, typer.Option(min=1, help="Threads of the linear algebra; one for every core unless given.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else on standard output.")]
 
 
@@ -168,7 +171,7 @@ def save_then_show(
     """
     written: list[Path] = []
     failures: list[str] = []
-    with _handled_by(signal.SIG_IGN), JobBar(len(targets), None) as bar:
+    with _handled_by(signal.SIG_IGN), JobBar(len(targets), None if targets else False) as bar:
         for done, (path, save) in enumerate(targets):
             bar.name_part(f"writing {path}")
             bar.show(done, "")

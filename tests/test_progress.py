@@ -1,10 +1,14 @@
 import sys
 from types import ModuleType, TracebackType
 
+import numpy as np
 import pytest
 from rich.progress import Progress
 
+import solvers
 import solvers.progress as table_module
+from pgo_models.graphs import scenes
+from solvers import loop
 from solvers.progress import Table
 from solvers.result import Measurement, Record, Status
 
@@ -192,3 +196,20 @@ def test_it_swallows_no_exception() -> None:
     table = Table("SOC", 100, verbose=False, progress=False)
     nothing: tuple[type[BaseException] | None, BaseException | None, TracebackType | None] = (None, None, None)
     assert table.__exit__(*nothing) is None
+
+
+def test_stages_without_iterations_are_shown_on_large_graphs_with_what_is_still_to_come(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
+    graph = scenes.grid(np.random.default_rng(0))
+    solvers.solve(graph, progress=True)
+    assert "chordal start" not in capsys.readouterr().err
+    monkeypatch.setattr(loop, "_TAKES_SECONDS", 1)
+    solvers.solve(graph, progress=True)
+    err = capsys.readouterr().err
+    assert "chordal start, then Newton, certificate" in err
+    assert "certificate " in err.split("chordal start, then Newton, certificate")[-1]

@@ -184,12 +184,12 @@ def test_a_graph_beyond_the_memory_is_one_line_with_its_file(tmp_path):
 
 
 def test_weights_that_cannot_be_factored_are_named_with_line_and_edge(tmp_path):
-    lines = [f"EDGE_SE2 {k} {k + 1} 1 0 0 {(w := 1e30 if k == 77 else 1)} 0 0 {w} 0 1\n" for k in range(199)]
+    lines = [f"EDGE_SE2 {k} {k + 1} 1 0 0 {(w := 1e30 if k == 77 else 1)} 0 0 {w} 0 {w}\n" for k in range(199)]
     lines += [f"EDGE_SE2 {k} {k + 20} 20 0 0.01 1 0 0 1 0 1\n" for k in range(0, 180, 7)]
     (tmp_path / "weights.g2o").write_text("".join(lines))
     ending, out, err = ended(started("solve", tmp_path / "weights.g2o"))
     assert (ending, out, one_line(err)) == (1, "", True), err
-    assert "weights.g2o:78: tau of edge 77 -> 78 is 1e+30, 1e+30 times the median" in err
+    assert "weights.g2o:78: kappa of edge 77 -> 78 is 1e+30, 1e+30 times the median" in err
     assert "correct the information matrix" in err
 
 
@@ -261,3 +261,15 @@ def test_the_shell_completes_commands_and_options():
         done = subprocess.run(run, env={**os.environ, **env}, capture_output=True, text=True, check=False)
         assert (done.returncode, done.stderr) == (0, "")
         assert completed in done.stdout.split()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in /proc")
+def test_the_linear_algebra_has_the_threads_that_are_asked_for():
+    def threads(number: int) -> int:
+        program = "import os, sys, pgo_command\ntry:\n    pgo_command.main()\nexcept SystemExit:\n"
+        program += "    print(len(os.listdir('/proc/self/task')), file=sys.stderr)"
+        run = [sys.executable, "-c", program, "solve", "grid", "--quiet", "--threads", str(number)]
+        env = {**os.environ, "PYTHONPATH": str(ROOT)}
+        return int(subprocess.run(run, env=env, capture_output=True, text=True, check=True).stderr)
+
+    assert 1 <= threads(1) < threads(2)

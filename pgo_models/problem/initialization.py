@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.sparse import csc_array
 from scipy.sparse.csgraph import breadth_first_order
 
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
+    Array,
     BoolArray,
     exp_map,
     project_to_rotations,
@@ -15,7 +17,9 @@ from pgo_models.geometry.rotations import (
     unstack_transposes,
 )
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
-from pgo_models.problem.matrices import columns_of, joint_matrix
+from pgo_models.problem.cholesky import factorize
+from pgo_models.problem.matrices import connection_laplacian, rotation_columns
+from pgo_models.problem.ordering import row_order
 from pgo_models.problem.problem import PGOProblem
 
 
@@ -88,11 +92,12 @@ def spanning_tree(graph: PoseGraph, root: int) -> tuple[IntArray, IntArray, IntA
 
 
 def chordal_start(problem: PGOProblem) -> Poses:
-    """Minimise tr(X^T M X) without the constraints, pose 0 fixed at the identity, and project the rotations.
+    """Minimise sum_e kappa ||R_j - R_i R_ij||_F^2 without the constraints, R_0 = I, and project; then the best t.
 
-    Joint in rotations and translations; after the projection the translations are the best ones for
-    the rotations. One factorisation with the pattern of M. Position measurements alone, which may lie in a plane, need
-    not determine the rotation of the world without the constraints: it is fitted to the relaxed positions then.
+    The chordal relaxation of rotation averaging (Martinec & Pajdla 2007; Carlone, Tron, Daniilidis & Dellaert 2015).
+    Of rotations alone: jointly with translations the relaxed R_i shrink where noise makes a smaller map fit better, the
+    more the larger the map is, and the start is far off: F = 382381 instead of 118421 on a grid world of 36,000 poses.
+    Position measurements alone leave the rotation of the world open: it is fitted to the positions found without them.
 
     Examples
     --------
@@ -101,21 +106,32 @@ def chordal_start(problem: PGOProblem) -> Poses:
     >>> bool(problem.objective(chordal_start(problem)) < problem.objective(spanning_tree_start(problem.graph)))
     True
     """
-    n, d, graph, M = problem.num_poses, problem.d, problem.graph, problem.M
-    held = np.array([int(graph.world == 0)])
-    if graph.world is not None and graph.is_world_loose:
-        held = np.append(held, graph.world)
-        M = joint_matrix(graph, replace(problem.weights, tau=np.where(graph.is_prior, 0.0, problem.weights.tau)))
-    fixed = columns_of(held, n, (1, d))
-    X_fixed = np.zeros((problem.side, d))
-    X_fixed[fixed[len(held) :]] = np.tile(np.eye(d), (len(held), 1))
-    right_hand_side = -(M @ X_fixed)
-    right_hand_side[fixed] = X_fixed[fixed]
-    data = M.data.copy()
-    problem.leave_out(data, fixed, 1.0)
-    X = problem.analysis.factorize(problem.with_pattern_of_M(data)).solve(right_hand_side)
-    poses = Poses(project_to_rotations(unstack_transposes(X[n:])), X[:n])
-    return problem.with_best_translations(_with_world_fitted(graph, poses).R)
+    graph, world = problem.graph, problem.graph.world
+    if world is not None and graph.is_world_loose:
+        inner = np.delete(np.arange(graph.num_poses), world)
+        weights = problem.weights.of_edges(~graph.is_prior)
+        found = chordal_start(replace(problem, graph=graph.subgraph(inner), weighting=weights))
+        poses = Poses(np.insert(found.R, world, np.eye(problem.d), axis=0), np.insert(found.t, world, 0.0, axis=0))
+        return problem.with_best_translations(_with_world_fitted(graph, poses).R)
+    L, b = relaxed_rotations(problem, 0)
+    Y = factorize(L, problem.backend, row_order(problem.pose_order, problem.d)).solve(b)
+    return problem.with_best_translations(project_to_rotations(unstack_transposes(Y)))
+
+
+def relaxed_rotations(problem: PGOProblem, held: int | None) -> tuple[csc_array, Array]:
+    """L, (dn, dn), and b, (dn, d), with L Y = b where tr(Y^T L Y) is least and the `held` pose, if any, has R = I."""
+    L, d = connection_laplacian(problem.graph, problem.weights), problem.d
+    b = np.zeros((len(L.indptr) - 1, d))
+    if held is not None:
+        fixed = rotation_columns(np.array([held]), 0, d)[0]
+        b -= L[:, fixed].toarray()
+        is_out = np.zeros(len(b), dtype=bool)
+        is_out[fixed] = True
+        columns = np.repeat(np.arange(len(b)), np.diff(L.indptr))
+        L.data[is_out[L.indices] | is_out[columns]] = 0.0
+        L.data[is_out[columns] & (L.indices == columns)] = 1.0
+        b[fixed] = np.eye(d)
+    return L, b
 
 
 def _with_world_fitted(graph: PoseGraph, poses: Poses) -> Poses:

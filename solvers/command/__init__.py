@@ -4,15 +4,20 @@ So does a file or folder of the same name as one of the packages that comes befo
 """
 
 import os
+import re
 import signal
 import sys
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 
+_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
 
 def main() -> None:
-    """Run `solvers.cli.main`."""
+    """Run `solvers.cli.main`, BLAS with the threads of an option --threads: it looks once, as it is imported."""
+    if asked := re.search(r"--threads[= ]([1-9]\d*)", " ".join(sys.argv[1:])):
+        os.environ.update(dict.fromkeys(_THREADS, asked[1]))
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _leave)
     for package, file in (("pgo_models", "errors.py"), ("solvers", "cli.py")):

@@ -102,7 +102,7 @@ class Driver:
         self.tangent = (d, tangent_dimension(d))
         in_cover = [subgraph.in_cover[part] for subgraph, part in working]
         touched = tuple(np.sort(place[place >= 0]) for place in in_cover)
-        kinds: tuple[tuple[int, ...], ...] = ((1,), (1, d), self.tangent)
+        kinds: tuple[tuple[int, ...], ...] = ((1,), (d,), (1, d), self.tangent)
         fronts = FrontOwners(touched if memory else (), g)
         self._interfaces = {widths: Interface(g, widths, touched, fronts) for widths in kinds}
         if memory:
@@ -219,11 +219,11 @@ class Driver:
     # The start.
 
     def start(self) -> None:
-        """Chordal relaxation: one round, and one for the best translations."""
+        """Chordal relaxation of the rotations: one round, and one for the best translations."""
         answers = self.ask(Interior.chordal, None, Count.PIGGYBACKED)
-        factor = self.interface(1, self.d).factorize([answer.schur for answer in answers])
-        x, parts, _ = factor.solve([answer.right.b for answer in answers])
-        self.at = replace(self.at, R=project_to_rotations(unstack_transposes(x[self.rotation_rows])))
+        factor = self.interface(self.d).factorize([answer.schur for answer in answers])
+        Y, parts, _ = factor.solve([answer.right.b for answer in answers])
+        self.at = replace(self.at, R=project_to_rotations(unstack_transposes(Y)))
         self.set_translations(self.ask_each(Interior.project, parts, is_along=True))
 
     def set_poses(self, poses: Poses) -> None:

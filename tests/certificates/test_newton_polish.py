@@ -193,7 +193,7 @@ def test_secants_save_a_factorisation(
     secants: bool, factorisations: int, benchmark_problem: Callable[[str], PGOProblem]
 ) -> None:
     problem = benchmark_problem("sphere2500")
-    state = start_polish(problem, run(SOC(tolerance=5e-3), problem).poses)
+    state = start_polish(problem, run(SOC(tolerance=1e-2), problem).poses)
     for _ in range(factorisations):
         assert not state.is_stationary
         state = polish_step(problem, state, secants=secants)

@@ -173,10 +173,10 @@ def test_what_crosses_has_the_size_of_the_separators(d: int, noise: NoiseModel) 
             continue
         g, inside = len(part.boundary), len(part.interior)
         assert inside not in (0, g)
-        any_side = {(width * g, k) for width, k in ((1, d), (d + 1, d), (tangent, 1))}
+        any_side = {(width * g, k) for width, k in ((1, d), (d, d), (d + 1, d), (tangent, 1))}
         allowed = {
-            "schur": {lower(g, 1), lower(g, d + 1), lower(g, tangent)},
-            "diagonal": {((d + 1) * g,), (tangent * g,)},
+            "schur": {lower(g, 1), lower(g, d), lower(g, d + 1), lower(g, tangent)},
+            "diagonal": {(d * g,), ((d + 1) * g,), (tangent * g,)},
             "b": any_side,
             "x": any_side,
             "force": {((d + 1) * g, d)},

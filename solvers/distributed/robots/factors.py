@@ -35,7 +35,7 @@ class Factors:
         self.part, self.backend = part, backend
         self.cuts: dict[Widths, Cut] = {
             widths: Cut(columns_of(part.interior, p, widths), columns_of(part.boundary, p, widths), None)
-            for widths in ((1,), (1, d), (d, tangent_dimension(d)))
+            for widths in ((1,), (d,), (1, d), (d, tangent_dimension(d)))
         }
         self._of: tuple[Eliminated, Elimination] | None = None
         self._laplacian: Elimination | None = None

@@ -28,7 +28,7 @@ from pgo_models.geometry.rotations import (
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
-from pgo_models.problem.matrices import columns_of
+from pgo_models.problem.initialization import relaxed_rotations
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.robots.elimination import Widths
 from solvers.distributed.robots.factors import Eliminated, Factors
@@ -89,25 +89,13 @@ class Interior:
         return self, diagonal[self.boundary_rows]
 
     def chordal(self, _: None) -> tuple[Interior, Reduced]:
-        """M without the constraints, pose 0 at the identity."""
-        problem = self.part.problem
-        p, d = problem.num_poses, problem.d
-        K, b = problem.M, np.zeros((problem.side, d))
-        if self.part.poses[0] == 0:
-            fixed = columns_of(np.zeros(1, dtype=np.int64), p, (1, d))
-            at = np.concatenate([np.zeros((1, d)), np.eye(d)])
-            b -= K[:, fixed] @ at
-            data = K.data.copy()
-            problem.leave_out(data, fixed, 1.0)
-            b[fixed] = at
-            K = problem.with_pattern_of_M(data)
-        return self._eliminate(K, (1, d), b)
+        """Rotations without the constraints, that of pose 0 the identity."""
+        K, b = relaxed_rotations(self.part.problem, 0 if self.part.poses[0] == 0 else None)
+        return self._eliminate(K, (self.part.problem.d,), b)
 
     def project(self, x: Array) -> tuple[Interior, ReducedTranslations]:
         """Back-substitute the relaxation and project its rotations; then `translations`."""
-        X = self.back_substitute(x)
-        R = project_to_rotations(unstack_transposes(X[self.part.problem.num_poses :]))
-        return self._at(R).translations(None)
+        return self._at(project_to_rotations(unstack_transposes(self.back_substitute(x)))).translations(None)
 
     def choose_cost(self, final: bool) -> tuple[Interior, CostParts]:
         """Go over to the cost that is solved, or back: its parts at the poses at hand."""
