@@ -41,21 +41,13 @@ class BenchmarkMethod(enum.Enum):
 class BenchmarkSettings:
     """What all contenders share.
 
-    Attributes
-    ----------
-    num_robots : int
-        Of CONSENSUS, SUBSTRUCTURED, GAUSS_SEIDEL and the second stages; at most one a pose. Poses stay with the robots
-        that the graph names if they are as many; otherwise METIS shares them out, without it they go in order of time.
-        The first stage of PAPER has one pose a robot, as the paper has.
-    max_rounds : int, optional
-        Of PAPER, both stages together.
-    time_limit : float
-        Seconds for each contender.
+    Poses stay with the robots that the graph names if they are as many; otherwise METIS shares them out, without it
+    they go in order of time. The first stage of PAPER has one pose a robot, as the paper has.
     """
 
-    num_robots: int = 5
-    max_rounds: int | None = None
-    time_limit: float = math.inf
+    num_robots: int = 5  # of CONSENSUS, SUBSTRUCTURED, GAUSS_SEIDEL and the second stages; at most one a pose
+    max_rounds: int | None = None  # of PAPER, both stages together
+    time_limit: float = math.inf  # seconds for each contender
 
     def __post_init__(self) -> None:
         if self.max_rounds is not None and self.max_rounds < 2:
@@ -65,10 +57,9 @@ class BenchmarkSettings:
     def robots(self, graph: PoseGraph) -> Partition:
         """Who owns which pose."""
         number = min(self.num_robots, graph.num_poses)
-        if graph.num_robots == number > 1:
-            return partition(graph, number, PartitionMethod.GIVEN)
+        given = PartitionMethod.GIVEN if graph.num_robots == number > 1 else None
         try:
-            return partition(graph, number, PartitionMethod.METIS)
+            return partition(graph, number, given or PartitionMethod.METIS)
         except MissingExtraError:
             return partition(graph, number, PartitionMethod.CONTIGUOUS)
 
