@@ -24,6 +24,7 @@ from pgo_models.files import (
     finite_number,
     read_blocks,
 )
+from pgo_models.geometry.arrays import triangle_places
 from pgo_models.geometry.rotations import Array, BoolArray, exp_map, rotations_from_quaternions
 from pgo_models.graphs.g2o_tags import ALIASES, TAGS
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
@@ -99,9 +100,7 @@ def poses_of(d: int, numbers: Array) -> tuple[Array, Array]:
 def information_of(d: int, edges: Array) -> Array:
     """Information matrices (m, k, k) of EDGE rows, k = 3 in the plane and 6 in space."""
     k, first = (3, 3) if d == 2 else (6, 7)
-    place = np.zeros((k, k), dtype=np.int64)
-    place[np.triu_indices(k)] = np.arange(k * (k + 1) // 2)
-    return np.asarray(edges[:, first + np.maximum(place, place.T)])
+    return np.asarray(edges[:, first + triangle_places(k)])
 
 
 class _Source:
