@@ -51,11 +51,8 @@ def read_g2o(
 
     Examples
     --------
-    >>> import tempfile
-    >>> from pgo_models.graphs.scenes import grid
-    >>> path = Path(tempfile.mkdtemp()) / "grid.g2o"
-    >>> write_g2o(grid(np.random.default_rng(0)), path)
-    >>> read_g2o(path)
+    >>> from pgo_models.graphs.datasets import locate
+    >>> read_g2o(locate("grid"))
     PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
     """
     path = Path(path)
