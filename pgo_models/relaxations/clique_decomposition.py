@@ -100,11 +100,7 @@ def clique_relaxation(
     _agreement(equations)
     A, b = equations.matrix()
     upper = tuple(cp.Variable(side * (side + 1) // 2, name=f"W_{k}") for k, side in enumerate(layout.sides))
-    whole = {side: _from_triangle(side) for side in set(layout.sides)}
-    blocks = tuple(
-        cp.reshape(whole[side] @ triangle, (side, side), order="C") >> 0
-        for side, triangle in zip(layout.sides, upper, strict=True)
-    )
+    blocks = tuple(w_k[triangle_places(side)] >> 0 for side, w_k in zip(layout.sides, upper, strict=True))
     w = cp.hstack(upper)
     agree = A @ w == b
     model = cp.Problem(cp.Minimize((_costs(layout) / scale) @ w), [agree, *blocks])
@@ -293,13 +289,6 @@ def _costs(layout: _Layout) -> Array:
         rows, columns = np.triu_indices(len(matrix))
         costs.append(np.where(rows == columns, 1.0, 2.0) * matrix[rows, columns])
     return np.concatenate(costs)
-
-
-def _from_triangle(side: int) -> csr_array:
-    """Map the upper triangle of a symmetric matrix to all its entries, row by row, (side^2, side (side + 1) / 2)."""
-    places = triangle_places(side).ravel()
-    shape = (side * side, side * (side + 1) // 2)
-    return csr_array((np.ones(len(places)), places, np.arange(len(places) + 1)), shape=shape)
 
 
 def _upper(side: int) -> Iterator[tuple[int, int]]:
