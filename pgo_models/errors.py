@@ -1,8 +1,10 @@
 """The errors of the project: one tree, each message with what was wrong, where, the value and the way out."""
 
+import importlib
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import ModuleType
 
 
 class PGOError(Exception):
@@ -66,6 +68,16 @@ class MissingExtraError(PGOError):
 
     def __reduce__(self) -> "tuple[type[MissingExtraError], tuple[str, str]]":
         return type(self), (self._package, self.extra)
+
+
+def extra_module(name: str, extra: str) -> ModuleType:
+    """Module of a package that an extra brings, by its full name; a MissingExtraError where it is not installed."""
+    package = name.partition(".")[0]
+    try:
+        importlib.import_module(package)
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise MissingExtraError(package, extra) from error
 
 
 def check_quantile(quantile: float) -> None:

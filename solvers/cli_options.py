@@ -1,7 +1,6 @@
 """What the options of `pgo` stand for: methods, starts, partitions and scenes by name."""
 
 import enum
-import importlib.util
 import os
 from dataclasses import replace
 
@@ -10,7 +9,7 @@ import numpy as np
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.grid_worlds import grid_world
-from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
+from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition, suited_partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, circle, grid, random_geometric, sphere, victoria_park
 from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
@@ -105,17 +104,9 @@ def chosen_method(method: FirstStage | None, robots: int | None, is_shared: bool
 
 
 def chosen_partition(graph: PoseGraph, number: int | None, split: Split | None) -> Partition:
-    """Partition of the options: as the file names the robots if it does, else with few cut edges where METIS is there.
-
-    Errors are those of `partition`.
-    """
+    """Partition of the options, by default among as many robots as the file names; errors are those of `partition`."""
     number = graph.num_robots if number is None else number
-    if split is not None:
-        return partition(graph, number, PartitionMethod[split.name])
-    if graph.robot is not None and number == graph.num_robots:
-        return partition(graph, number, PartitionMethod.GIVEN)
-    has_metis = importlib.util.find_spec("pymetis") is not None
-    return partition(graph, number, PartitionMethod.METIS if has_metis else PartitionMethod.CONTIGUOUS)
+    return suited_partition(graph, number) if split is None else partition(graph, number, PartitionMethod[split.name])
 
 
 def chosen_engine(method: FirstStage, engine: Runner | None, address: str | None, checkpoint: bool) -> Engine | None:

@@ -153,16 +153,10 @@ def graph_qp(
     rho_t: Array | None = None,
     solver: ConvexSolver | str = "CLARABEL",
 ) -> GraphQP:
-    """Pose the R-subproblem of a whole graph.
+    """Pose the R-subproblem of a whole graph, with penalties rho, (n,), of rotations, and rho_t, (n,), of translations.
 
-    Parameters
-    ----------
-    rho : (n,)
-        Penalty of every rotation.
-    changer : callable, optional
-        Given the variables, returns the ModelChange: terms, constraints, and edges whose loss they replace.
-    rho_t : (n,), optional
-        Penalty of every translation; none unless given.
+    Translations have none unless given. The changer, given the variables, returns the ModelChange: terms, constraints,
+    and edges whose loss they replace.
 
     Examples
     --------

@@ -54,23 +54,13 @@ def rotation_qp(
 ) -> RotationQP:
     """Pose the R-subproblem.
 
-    Parameters
-    ----------
-    A : (rows, N), sparse
-        Residuals A X, as from `pgo_models.problem.matrices.residual_matrix`.
-    w : (rows,)
-        Their weights.
-    penalty : (N,)
-        Diagonal of D: rho on the rows of penalised rotations (and translations), else 0.
-    X : cp.Variable, (N, d), optional
-        The variable, where terms or constraints are already written in it.
-    terms : sequence of cp.Expression
-        Convex terms to add to the objective; `pgo_models.convex.graph_subproblem` writes them on poses and edges.
+    A, sparse (rows, N), gives the residuals A X, as from `pgo_models.problem.matrices.residual_matrix`, and w, (rows,),
+    their weights; `penalty`, (N,), is the diagonal of D: rho on the rows of penalised rotations (and translations),
+    else 0. X, (N, d), is given where `terms`, which are convex and added to the objective, or constraints are already
+    written in it; `pgo_models.convex.graph_subproblem` writes them on poses and edges.
 
     A SettingError when a penalty is negative or all are zero, or a term or a constraint is not convex.
 
-    Notes
-    -----
     rho is data, not a Parameter: as one it is DPP too, and small problems re-solve as fast with it, but compiling holds
     the product of all parameters with all entries, tens of gigabytes on 2500 poses.
 

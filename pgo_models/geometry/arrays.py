@@ -69,6 +69,14 @@ def whole_number(value: object, name: str, error: type[PGOError] = GraphError) -
     raise error(f"{name} is {value!r:.60}; give a whole number")
 
 
+def triangle_places(side: int) -> NDArray[np.int64]:
+    """Place of every entry of a symmetric matrix in its upper triangle, row by row, (side, side)."""
+    place = np.zeros((side, side), dtype=np.int64)
+    rows, columns = np.triu_indices(side)
+    place[rows, columns] = place[columns, rows] = np.arange(len(rows))
+    return place
+
+
 def _numbers(values: object, name: str, wanted: str, error: type[PGOError]) -> NDArray[Any]:
     try:
         array = np.asarray(values)

@@ -35,17 +35,11 @@ def project_to_rotations(A: Array) -> Array:
     cofactors = _cofactors(X)
     determinant = np.einsum("nb,nb->n", X[:, 0], cofactors[:, 0])
     good = determinant > _POLAR_MIN_DETERMINANT
-    if good.all():
-        omega, settled = _polar(X, cofactors, determinant)
-        bad = ~settled
-    else:
-        omega = np.empty_like(X)
-        polar, settled = _polar(X[good], cofactors[good], determinant[good])
-        omega[good] = polar
-        bad = ~good
-        bad[np.flatnonzero(good)[~settled]] = True
-    if bad.any():
-        omega[bad] = project_by_svd(A[bad])
+    taken = slice(None) if good.all() else good  # a slice copies nothing
+    omega, settled = np.empty_like(X), np.zeros(len(X), dtype=bool)
+    omega[taken], settled[taken] = _polar(X[taken], cofactors[taken], determinant[taken])
+    if not settled.all():
+        omega[~settled] = project_by_svd(A[~settled])
     return omega
 
 

@@ -51,11 +51,8 @@ def read_g2o(
 
     Examples
     --------
-    >>> import tempfile
-    >>> from pgo_models.graphs.scenes import grid
-    >>> path = Path(tempfile.mkdtemp()) / "grid.g2o"
-    >>> write_g2o(grid(np.random.default_rng(0)), path)
-    >>> read_g2o(path)
+    >>> from pgo_models.graphs.datasets import locate
+    >>> read_g2o(locate("grid"))
     PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
     """
     path = Path(path)
@@ -73,30 +70,16 @@ def read_g2o(
     ids = ids[np.append(True, np.diff(ids) != 0)]  # numpy.unique takes ten times as long
     named = ids[ids != WORLD_ID]  # the largest number there is
     robot = _robots(named, files)
-    R_ij, t_ij = poses_of(d, rows)
     information = information_of(d, rows)
     kappa, tau = edge_precisions(information, weights)
     both, initial = np.searchsorted(ids, edge_ids), _initial(named, robot, files)
     world = len(named) if len(named) < len(ids) else None
     if world is not None and robot is not None:
         robot = np.append(robot, robot[both[np.argmax(both[:, 0] == world), 1]])
-    return PoseGraph(
-        num_poses=len(ids),
-        i=both[:, 0],
-        j=both[:, 1],
-        R_ij=R_ij,
-        t_ij=t_ij,
-        kappa=kappa,
-        tau=tau,
-        information=information,
-        ids=ids,
-        robot=robot,
-        initial=initial,
-        fixed=_fixed(ids, files),
-        name=_name_of(path),
-        world=world,
-        landmarks=np.flatnonzero(np.isin(ids, np.concatenate([file.landmarks for file in files]))),
-    )
+    name, fixed = _name_of(path), _fixed(ids, files)
+    landmarks = np.flatnonzero(np.isin(ids, np.concatenate([file.landmarks for file in files])))
+    measured = both[:, 0], both[:, 1], *poses_of(d, rows), kappa, tau, information
+    return PoseGraph(len(ids), *measured, ids, robot, initial, fixed=fixed, name=name, world=world, landmarks=landmarks)
 
 
 def edge_places(path: Path | str) -> list[str]:

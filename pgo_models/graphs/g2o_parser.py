@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pgo_models.errors import FileFormatError, GraphWarning
 from pgo_models.files import (
@@ -24,11 +23,13 @@ from pgo_models.files import (
     finite_number,
     read_blocks,
 )
+from pgo_models.geometry.arrays import triangle_places
 from pgo_models.geometry.rotations import Array, BoolArray, exp_map, rotations_from_quaternions
 from pgo_models.graphs.g2o_tags import ALIASES, TAGS
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
+from pgo_models.graphs.precisions import are_definite
 
-_SINGULAR = 1e-15  # a pivot below this part of its diagonal entry is rounding
+_SINGULAR = 1e-15  # an eigenvalue below it, of a matrix with ones on its diagonal, is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +100,7 @@ def poses_of(d: int, numbers: Array) -> tuple[Array, Array]:
 def information_of(d: int, edges: Array) -> Array:
     """Information matrices (m, k, k) of EDGE rows, k = 3 in the plane and 6 in space."""
     k, first = (3, 3) if d == 2 else (6, 7)
-    place = np.zeros((k, k), dtype=np.int64)
-    place[np.triu_indices(k)] = np.arange(k * (k + 1) // 2)
-    return np.asarray(edges[:, first + np.maximum(place, place.T)])
+    return np.asarray(edges[:, first + triangle_places(k)])
 
 
 class _Source:
@@ -281,15 +280,8 @@ def _faults(found: G2OLines) -> Iterator[tuple[int, str]]:
             yield int(found.edge_lines[at]), f"{name} block of the {indefinite}; {way_out}"
 
 
-def _is_positive_definite(A: Array) -> NDArray[np.bool_]:
-    """Whether every (k, k) matrix of a stack is positive definite, by the signs of the pivots."""
-    schur = A.copy()
-    diagonal = np.einsum("mkk->mk", A)
-    positive = np.ones(len(A), dtype=bool)
-    with np.errstate(all="ignore"):  # a matrix already known to be bad may divide by zero
-        for p in range(A.shape[-1]):
-            pivot = schur[:, p, p]
-            positive &= (pivot > 1 / LARGEST) & (pivot > _SINGULAR * diagonal[:, p])
-            column = schur[:, p + 1 :, p]
-            schur[:, p + 1 :, p + 1 :] -= column[:, :, None] * (column / pivot[:, None])[:, None, :]
-    return positive
+def _is_positive_definite(A: Array) -> BoolArray:
+    """Whether every (k, k) matrix of a stack is positive definite, (m,), beyond rounding and underflow."""
+    positive = (np.einsum("mkk->mk", A) > 1.0 / LARGEST).all(axis=1)
+    positive[positive] = are_definite(A[positive], _SINGULAR)
+    return np.asarray(positive)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.errors import MissingExtraError, SettingError, extra_module
 from pgo_models.geometry.arrays import ReadOnly, whole_array, whole_number
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.measurements import has_no_gap
@@ -72,9 +72,8 @@ def partition(graph: PoseGraph, num_robots: int | None = None, method: Partition
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> partition(grid(np.random.default_rng(0)), 3)
+    >>> from pgo_models.graphs.datasets import load
+    >>> partition(load("grid"), 3)
     Partition(3 robots, 9 to 9 poses each, contiguous in time)
     """
     n = graph.num_poses
@@ -96,11 +95,21 @@ def partition(graph: PoseGraph, num_robots: int | None = None, method: Partition
     return Partition(_metis(graph, num_robots), method)
 
 
-def _metis(graph: PoseGraph, num_robots: int) -> IntArray:
+def suited_partition(graph: PoseGraph, num_robots: int) -> Partition:
+    """As the graph names its robots if they are as many, else with few cut edges where METIS is there, else contiguous.
+
+    Errors as of `partition`.
+    """
+    if graph.robot is not None and num_robots == graph.num_robots:
+        return partition(graph, num_robots, PartitionMethod.GIVEN)
     try:
-        import pymetis
-    except ImportError as error:
-        raise MissingExtraError("pymetis", "fast") from error
+        return partition(graph, num_robots, PartitionMethod.METIS)
+    except MissingExtraError:
+        return partition(graph, num_robots, PartitionMethod.CONTIGUOUS)
+
+
+def _metis(graph: PoseGraph, num_robots: int) -> IntArray:
+    pymetis = extra_module("pymetis", "fast")
     adjacency = edge_counts(graph.i, graph.j, graph.num_poses)
     _, part = pymetis.part_graph(
         num_robots,

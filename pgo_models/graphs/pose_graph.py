@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from pgo_models.errors import GraphError
 from pgo_models.geometry.arrays import read_only
@@ -67,12 +67,6 @@ class PoseGraph(Measurements):
     All arrays are read-only copies: `dataclasses.replace` makes a graph with others. A GraphError on wrong shapes,
     entries that are no real or no whole numbers, an edge to itself or to no pose, nan or inf, no rotation, a negative
     precision, two that are zero, or an edge that starts at a landmark or ends at the world.
-
-    Examples
-    --------
-    >>> turn = np.eye(2)[None]
-    >>> PoseGraph(2, np.array([0]), np.array([1]), turn, np.ones((1, 2)), np.ones(1), np.ones(1), name="pair")
-    PoseGraph('pair', d=2, poses=2, edges=1, robots=1)
     """
 
     @property
@@ -251,6 +245,18 @@ def middle_pose(graph: PoseGraph) -> int:
 def poses_by_distance(graph: PoseGraph, pose: int) -> IntArray:
     """Poses of a connected graph, (n,), by their number of edges to a pose, which is the first."""
     return np.asarray(breadth_first_order(graph.adjacency, pose, directed=False, return_predecessors=False))
+
+
+def bridges(graph: PoseGraph, kept: BoolArray, ratio: Array) -> IntArray:
+    """Edges of the least ratios, (m,), that connect what the kept ones, (m,), leave apart (Kruskal)."""
+    n = graph.num_poses
+    count, part = connected_components(edge_counts(graph.i[kept], graph.j[kept], n), directed=False)
+    order = np.argsort(ratio, kind="stable")
+    ends = np.sort(np.stack([part[graph.i[order]], part[graph.j[order]]]).astype(np.int64), axis=0)
+    order, ends = order[ends[0] != ends[1]], ends[:, ends[0] != ends[1]]
+    _, first = np.unique(ends[0] * count + ends[1], return_index=True)
+    tree = minimum_spanning_tree(csr_array((first + 1.0, ends[:, first]), shape=(count, count)))
+    return np.asarray(order[tree.data.astype(np.int64) - 1])
 
 
 def _sorted_components(adjacency: csr_array) -> list[IntArray]:

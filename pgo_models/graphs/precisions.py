@@ -1,15 +1,13 @@
 """Information matrices as the precisions kappa and tau of the isotropic cost, and back (SE-Sync: Rosen et al. 2019)."""
 
 import enum
-from bisect import bisect_left
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.measurements import isotropic_information
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
+from pgo_models.graphs.pose_graph import PoseGraph, bridges
 
 LEAST_SCALED = 1e-12  # smallest eigenvalue of a matrix scaled to ones on its diagonal that counts as positive
 
@@ -109,16 +107,11 @@ def extreme_weight(graph: PoseGraph) -> tuple[float, int, str]:
         weight = getattr(graph, kind)
         if not (weight > 0).all():  # of positions alone, or of rotations
             continue
-        order, ratio = np.argsort(-weight), weight / np.median(weight)
-        tree = bisect_left(range(graph.num_edges), -1, key=lambda count: -_num_components(graph, order[:count]))
-        e = int(max(order[0], order[tree - 1], key=lambda end: abs(np.log(ratio[end]))))
+        ratio, tree = weight / np.median(weight), bridges(graph, np.zeros(graph.num_edges, dtype=bool), -weight)
+        heaviest, lightest = int(np.argmax(weight)), int(tree[np.argmin(weight[tree])])
+        e = max(heaviest, lightest, key=lambda end: abs(np.log(ratio[end])))
         i, j = graph.pose_ids[[graph.i[e], graph.j[e]]]
         text = f"{kind} of edge {i} -> {j} is {weight[e]:.3g}, {ratio[e]:.3g} times the median"
-        found.append((float(weight[order[0]] / weight[order[tree - 1]]), e, text))
+        found.append((float(weight[heaviest] / weight[lightest]), e, text))
     # Rounded, so that it is kappa where both are equal but for rounding.
     return max(found, default=(0.0, 0, ""), key=lambda one: round(float(np.log(one[0])), 9))
-
-
-def _num_components(graph: PoseGraph, edges: IntArray) -> int:
-    adjacency = edge_counts(graph.i[edges], graph.j[edges], graph.num_poses)
-    return int(connected_components(adjacency, directed=False)[0])

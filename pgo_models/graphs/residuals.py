@@ -18,7 +18,7 @@ def edge_errors(graph: PoseGraph, poses: Poses) -> tuple[Array, Array, Array]:
 
     A GraphError when the poses are not those of the graph.
     """
-    _check_poses(graph, poses)
+    check_poses(graph, poses)
     R_i, R_j = poses.R[graph.i], poses.R[graph.j]
     predicted = R_i @ graph.R_ij
     shift = poses.t[graph.j] - poses.t[graph.i] - np.einsum("mab,mb->ma", R_i, graph.t_ij)
@@ -66,7 +66,7 @@ def chi2(graph: PoseGraph, poses: Poses, convention: Chi2Convention = Chi2Conven
     """
     if not isinstance(convention, Chi2Convention):
         raise SettingError(f"convention is {convention!r}; give one of {', '.join(map(str, Chi2Convention))}")
-    _check_poses(graph, poses)
+    check_poses(graph, poses)
     i, j, d = graph.i, graph.j, graph.d
     back = np.swapaxes(graph.R_ij, 1, 2)
     E = back @ np.swapaxes(poses.R[i], 1, 2) @ poses.R[j]
@@ -87,7 +87,8 @@ def chi2(graph: PoseGraph, poses: Poses, convention: Chi2Convention = Chi2Conven
     return sum(float(np.einsum("ma,mab,mb->", *term, optimize=True)) for term in terms)
 
 
-def _check_poses(graph: PoseGraph, poses: Poses) -> None:
+def check_poses(graph: PoseGraph, poses: Poses) -> None:
+    """Raise a GraphError unless there is one pose for every pose of the graph."""
     if poses.t.shape != (graph.num_poses, graph.d):
         raise GraphError(f"{poses} beside {graph!r}; give one pose for every pose of the graph")
 

@@ -181,19 +181,8 @@ def observe(
         truth.R @ _random_turns(truth.num_poses, truth.d, noise, rng),
         truth.t + noise.translation_std * rng.standard_normal(truth.t.shape),
     )
-    return PoseGraph(
-        num_poses=truth.num_poses,
-        i=i,
-        j=j,
-        R_ij=R_ij,
-        t_ij=t_ij,
-        kappa=np.full(len(i), kappa),
-        tau=np.full(len(i), tau),
-        robot=robot,
-        initial=initial,
-        truth=truth,
-        name=name,
-    )
+    measured = R_ij, t_ij, np.full(len(i), kappa), np.full(len(i), tau)
+    return PoseGraph(truth.num_poses, i, j, *measured, robot=robot, initial=initial, truth=truth, name=name)
 
 
 def check_dimension(d: int) -> None:

@@ -52,11 +52,9 @@ def read_tum(path: Path | str, d: int = 3) -> Poses:
 
     Examples
     --------
-    >>> import tempfile
-    >>> path = Path(tempfile.mkdtemp()) / "poses.tum"
-    >>> write_tum(Poses.identity(2, 3), path)
-    >>> read_tum(path)
-    Poses(n=2, d=3)
+    >>> from pgo_models.graphs.datasets import locate
+    >>> read_tum(locate("grid").with_suffix(".truth.tum"))
+    Poses(n=27, d=3)
     """
     rows, lines = read_table(path, 8)
     check_quaternions(path, lines, rows[:, 4:])

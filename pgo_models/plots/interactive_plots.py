@@ -16,6 +16,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import pose_names
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.residuals import check_poses
 from pgo_models.plots.graph_plots import (
     BETWEEN,
     KIND_LABELS,
@@ -131,8 +132,7 @@ def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[
     if len(names) != len(iterates):
         raise GraphError(f"{len(names)} labels for {len(iterates)} iterates; give one each")
     for poses in iterates:
-        if poses.t.shape != (graph.num_poses, graph.d):
-            raise GraphError(f"{poses} beside {graph!r}; give one pose for every pose of the graph")
+        check_poses(graph, poses)
     most = max(2, int(_FILM_BYTES / (3 * graph.d * graph.num_edges * _BYTES_PER_NUMBER)))
     shown = np.unique(np.linspace(0, len(iterates) - 1, min(len(iterates), most)).round().astype(int)).tolist()
     positions = [iterates[k].aligned_to(iterates[-1]).t for k in shown]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -11,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from pgo_models.errors import MissingExtraError
+from pgo_models.errors import extra_module
 from pgo_models.files import replace_when_done
 
 if TYPE_CHECKING:
@@ -35,10 +34,7 @@ MARKERS = ("o", "s", "D", "^", "v", "P")
 @contextmanager
 def column_figure(height: float, width: float = 1.0) -> Iterator[Figure]:
     """Context manager yielding a figure in the project's style, `width` columns wide, `height` of them high."""
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise MissingExtraError("matplotlib", "plot") from error
+    matplotlib = extra_module("matplotlib", "plot")
     style = {
         "font.size": LETTER_POINTS,
         "axes.titlesize": LETTER_POINTS,
@@ -60,17 +56,7 @@ def column_figure(height: float, width: float = 1.0) -> Iterator[Figure]:
 
 def plotly(name: str) -> ModuleType:
     """Module of plotly, whose import waits until something is drawn."""
-    return plot_module(f"plotly.{name}")
-
-
-def plot_module(name: str) -> ModuleType:
-    """Module of a package of the extra `plot`, by its full name."""
-    package = name.partition(".")[0]
-    try:
-        importlib.import_module(package)
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise MissingExtraError(package, "plot") from error
+    return extra_module(f"plotly.{name}", "plot")
 
 
 def count_along_x(axes: Axes) -> None:

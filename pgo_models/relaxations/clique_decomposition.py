@@ -22,6 +22,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 
 from pgo_models.certificates.newton_polish import polish
+from pgo_models.geometry.arrays import triangle_places
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations
 from pgo_models.graphs.pose_graph import IntArray
@@ -51,7 +52,7 @@ class CliqueRelaxation:
 
     def W(self, k: int) -> Array:
         """W_C of clique k, (side, side), as solved."""
-        return np.asarray(self.upper[k].value[_triangle_places(self._layout.sides[k])])
+        return np.asarray(self.upper[k].value[triangle_places(self._layout.sides[k])])
 
     def Lambda(self) -> Array:
         """Multipliers of R_i^T R_i = I, (n, d, d).
@@ -99,11 +100,7 @@ def clique_relaxation(
     _agreement(equations)
     A, b = equations.matrix()
     upper = tuple(cp.Variable(side * (side + 1) // 2, name=f"W_{k}") for k, side in enumerate(layout.sides))
-    whole = {side: _from_triangle(side) for side in set(layout.sides)}
-    blocks = tuple(
-        cp.reshape(whole[side] @ triangle, (side, side), order="C") >> 0
-        for side, triangle in zip(layout.sides, upper, strict=True)
-    )
+    blocks = tuple(w_k[triangle_places(side)] >> 0 for side, w_k in zip(layout.sides, upper, strict=True))
     w = cp.hstack(upper)
     agree = A @ w == b
     model = cp.Problem(cp.Minimize((_costs(layout) / scale) @ w), [agree, *blocks])
@@ -187,7 +184,7 @@ class _Equations:
         self.layout = layout
         # Place in w of every entry of every W_C, (side, side).
         places = zip(layout.offsets, layout.sides, strict=True)
-        self._positions = [first + _triangle_places(side) for first, side in places]
+        self._positions = [first + triangle_places(side) for first, side in places]
         self._rows: list[IntArray] = []
         self._columns: list[IntArray] = []
         self._values: list[Array] = []
@@ -292,21 +289,6 @@ def _costs(layout: _Layout) -> Array:
         rows, columns = np.triu_indices(len(matrix))
         costs.append(np.where(rows == columns, 1.0, 2.0) * matrix[rows, columns])
     return np.concatenate(costs)
-
-
-def _triangle_places(side: int) -> IntArray:
-    """Place of every entry of a symmetric matrix in its upper triangle, row by row, (side, side)."""
-    place = np.zeros((side, side), dtype=np.int64)
-    rows, columns = np.triu_indices(side)
-    place[rows, columns] = place[columns, rows] = np.arange(len(rows))
-    return place
-
-
-def _from_triangle(side: int) -> csr_array:
-    """Map the upper triangle of a symmetric matrix to all its entries, row by row, (side^2, side (side + 1) / 2)."""
-    places = _triangle_places(side).ravel()
-    shape = (side * side, side * (side + 1) // 2)
-    return csr_array((np.ones(len(places)), places, np.arange(len(places) + 1)), shape=shape)
 
 
 def _upper(side: int) -> Iterator[tuple[int, int]]:

@@ -14,6 +14,7 @@ import cvxpy as cp
 import numpy as np
 from scipy.sparse import csc_array
 
+from pgo_models.geometry.arrays import triangle_places
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
@@ -67,13 +68,8 @@ class DualRelaxation:
 
     def Lambda(self) -> Array:
         """Multipliers, (n, d, d), as solved."""
-        n, d = self.problem.num_poses, self.problem.d
-        rows, columns = np.triu_indices(d)
-        Lambda = np.zeros((n, d, d))
-        values = self.scale * self.upper.value.reshape(n, len(rows))
-        Lambda[:, rows, columns] = values
-        Lambda[:, columns, rows] = values
-        return Lambda
+        triangles = self.scale * self.upper.value.reshape(self.problem.num_poses, -1)
+        return np.asarray(triangles[:, triangle_places(self.problem.d)])
 
     def rounded(self) -> tuple[Poses, RankReport]:
         """Poses of the rotation part of the constraint's dual value, and its rank report."""
@@ -86,21 +82,16 @@ def dual_relaxation(problem: PGOProblem) -> DualRelaxation:
     n, d = problem.num_poses, problem.d
     grounded = problem.M[1:, 1:].tocsc()
     side, scale = grounded.shape[0], float(grounded.diagonal().max())
-    rows, columns = np.triu_indices(d)
-    upper = cp.Variable(n * len(rows), name="Lambda")
-    place = n - 1 + d * np.arange(n)[:, None]
-    number = np.arange(n * len(rows)).reshape(n, -1)
-    off_diagonal = rows != columns
-    entries = np.concatenate(
-        [
-            ((place + rows) + side * (place + columns)).ravel(),
-            ((place + columns) + side * (place + rows))[:, off_diagonal].ravel(),
-        ]
-    )
-    variables = np.concatenate([number.ravel(), number[:, off_diagonal].ravel()])
-    embed = csc_array((np.ones(len(entries)), (entries, variables)), shape=(side * side, n * len(rows)))
+    triangle = d * (d + 1) // 2
+    upper = cp.Variable(n * triangle, name="Lambda")
+    pose = np.arange(n)[:, None, None]
+    rows = n - 1 + d * pose + np.arange(d)[:, None]  # of the blocks of all poses, (n, d, 1)
+    entries = rows + side * np.swapaxes(rows, 1, 2)
+    places = entries.ravel(), (triangle * pose + triangle_places(d)).ravel()
+    embed = csc_array((np.ones(entries.size), places), shape=(side * side, n * triangle))
     S = grounded / scale - cp.reshape(embed @ upper, (side, side), order="F")
     certificate = S >> 0
-    trace = np.tile((~off_diagonal).astype(float), n)
+    is_diagonal = np.equal(*np.triu_indices(d))
+    trace = np.tile(is_diagonal.astype(float), n)
     model = cp.Problem(cp.Maximize(trace @ upper), [certificate])
     return DualRelaxation(problem, model, upper, certificate, scale)

@@ -104,24 +104,17 @@ def solve_relaxation(
 ) -> RelaxationSolution:
     """Solve the semidefinite relaxation of a pose graph.
 
-    Parameters
-    ----------
-    solver : ConvexSolver or str, optional
-        Both are chosen by `plan_relaxation` unless given. Any conic solver of cvxpy that takes semidefinite cones.
-    gap : float
-        Relative gap for the verdict; where the proof needs a shift eta, the smallest that is tried follows from it.
-    memory_limit, time_limit : float
-        Bytes, an estimate above which is refused before anything is formed, and seconds for the solver.
-    verbose : bool
-        Print the plan with its reason, the solver's table, and the result.
+    Form and solver, any of cvxpy that takes semidefinite cones, are chosen by `plan_relaxation` unless given. The
+    relative `gap` is for the verdict; where the proof needs a shift eta, the smallest that is tried follows from it.
+    An estimate above `memory_limit`, in bytes, is refused before anything is formed; `time_limit`, in seconds, is for
+    the solver. With `verbose`, the plan with its reason, the solver's table, and the result are printed.
 
     A SettingError when a limit or the gap is not positive, or memory would not do; a PGOError when there is no iterate.
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import circle
-    >>> solution = solve_relaxation(PGOProblem(circle(np.random.default_rng(0))))
+    >>> from pgo_models.graphs.datasets import load
+    >>> solution = solve_relaxation(PGOProblem(load("circle")))
     >>> solution.status.name, solution.verdict.name, solution.rank.rank
     ('OPTIMAL', 'CERTIFIED', 3)
     """

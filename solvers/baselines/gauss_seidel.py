@@ -113,9 +113,7 @@ class GaussSeidel:
     def init(self, problem: PGOProblem, start: Poses | None) -> GaussSeidelState:
         """State 0: at `start`, whose pose 0 stays where it is, or at the identity."""
         problem.check_quadratic("Gauss-Seidel", convex=True)
-        robots = self.robots
-        if robots is None:
-            robots = partition(problem.graph, method=PartitionMethod.SINGLETONS)
+        robots = self.robots or partition(problem.graph, method=PartitionMethod.SINGLETONS)
         poses = start if start is not None else Poses.identity(problem.num_poses, problem.d)
         problem.stacked(poses)  # raises unless the poses fit
         if problem.graph.is_world_loose:

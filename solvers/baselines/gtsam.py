@@ -14,13 +14,15 @@ is of fourth order. GTSAM is BSD-licensed: https://gtsam.org; the extra `peers` 
 import enum
 import math
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError, SettingError, check_settings
+from pgo_models.errors import NotPositiveDefiniteError, SettingError, check_settings, extra_module
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, log_map, project_to_rotations
 from pgo_models.graphs.measurements import isotropic_information
@@ -39,16 +41,10 @@ class GtsamMethod(enum.Enum):
 
 @dataclass(frozen=True)
 class Gtsam:
-    """Settings of a run of GTSAM; a SettingError when one is out of its range.
-
-    Attributes
-    ----------
-    tolerance : float
-        On the relative change of its cost in one iteration; the default is GTSAM's.
-    """
+    """Settings of a run of GTSAM; a SettingError when one is out of its range."""
 
     method: GtsamMethod = GtsamMethod.LEVENBERG_MARQUARDT
-    tolerance: float = 1e-5
+    tolerance: float = 1e-5  # on the relative change of its cost in one iteration; the default is GTSAM's
     max_iterations: int = 100
 
     def __post_init__(self) -> None:
@@ -56,35 +52,23 @@ class Gtsam:
 
 
 def run_gtsam(problem: PGOProblem, settings: Gtsam | None = None, start: Poses | None = None) -> Run[Poses]:
-    """Solve a pose graph by GTSAM.
+    """Solve a pose graph by GTSAM; history and objective are our F at its iterates.
+
+    Without a start GTSAM has its own: chordal rotations and a Gauss-Newton step in space, LAGO in the plane. Seconds
+    hold the making of the factors and the start, and leave out importing GTSAM and judging its poses.
 
     A MissingExtraError without GTSAM, a GraphError when the start does not fit the graph, a NotPositiveDefiniteError
     when GTSAM meets a singular linear system, as Gauss-Newton does far from a solution.
-
-    Parameters
-    ----------
-    settings : Gtsam, optional
-        `Gtsam()` unless given.
-    start : Poses, optional
-        GTSAM's own initialisation unless given: chordal rotations and a Gauss-Newton step in space, LAGO in the plane.
-
-    Returns
-    -------
-    Run
-        History and objective are our F at its iterates. Seconds hold the making of the factors and the start, and leave
-        out importing GTSAM and judging its poses.
     """
-    gtsam = _import_gtsam()
+    gtsam = extra_module("gtsam", "peers")
     settings = settings if settings is not None else Gtsam()
     if start is not None:
         problem.stacked(start)  # raises unless the poses fit
     began = time.perf_counter()
     graph = factor_graph(problem, start)
-    try:
+    with _named_singular():
         values = _own_start(gtsam, problem, graph) if start is None else _values(gtsam, start)
         optimizer = _optimizer(gtsam, settings, graph, values)
-    except RuntimeError as error:
-        raise _singular(error) from error
     seconds = time.perf_counter() - began
     poses = _poses(gtsam, optimizer.values(), problem.d)
     best = (problem.objective(poses), poses)
@@ -92,10 +76,8 @@ def run_gtsam(problem: PGOProblem, settings: Gtsam | None = None, start: Poses |
     status, k = Status.MAX_ITERATIONS, 0
     while k < settings.max_iterations:
         before, began = optimizer.error(), time.perf_counter()
-        try:
+        with _named_singular():
             optimizer.iterate()
-        except RuntimeError as error:
-            raise _singular(error) from error
         seconds += time.perf_counter() - began
         k += 1
         cost = optimizer.error()
@@ -121,7 +103,7 @@ def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noq
     The prior, at pose 0 of `start` or at the identity, fixes the gauge, on which F does not depend. A MissingExtraError
     without GTSAM.
     """
-    gtsam, graph, d = _import_gtsam(), problem.graph, problem.d
+    gtsam, graph, d = extra_module("gtsam", "peers"), problem.graph, problem.d
     if not ((graph.kappa > 0) & (graph.tau > 0)).all():
         raise SettingError(f"{graph.name} has edges without a rotation or position, which GTSAM is not given; solve()")
     if problem.weighting is Weighting.INFORMATION:
@@ -144,14 +126,6 @@ def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noq
     return factors
 
 
-def _import_gtsam() -> ModuleType:
-    try:
-        import gtsam
-    except ImportError as error:
-        raise MissingExtraError("gtsam", "peers") from error
-    return cast(ModuleType, gtsam)
-
-
 def _own_start(gtsam: ModuleType, problem: PGOProblem, graph: Any) -> Any:  # noqa: ANN401
     if problem.d == 3:
         return gtsam.InitializePose3.initialize(graph)
@@ -164,9 +138,15 @@ def _optimizer(gtsam: ModuleType, settings: Gtsam, graph: Any, values: Any) -> A
     return gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams())
 
 
-def _singular(error: RuntimeError) -> NotPositiveDefiniteError:
-    first_paragraph = " ".join(str(error).strip().split("\n\n")[0].split())
-    return NotPositiveDefiniteError(f"GTSAM met a singular linear system: {first_paragraph}; try another start")
+@contextmanager
+def _named_singular() -> Iterator[None]:
+    """Raise GTSAM's error as ours."""
+    try:
+        yield
+    except RuntimeError as error:
+        first_paragraph = " ".join(str(error).strip().split("\n\n")[0].split())
+        message = f"GTSAM met a singular linear system: {first_paragraph}; try another start"
+        raise NotPositiveDefiniteError(message) from error
 
 
 def _gtsam_poses(gtsam: ModuleType, poses: Poses) -> list[Any]:

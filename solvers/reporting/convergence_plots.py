@@ -86,19 +86,11 @@ class Curve:
 def plot_convergence(
     stages: Sequence[tuple[str, History]], lower_bound: float, published: PublishedRun | None = None
 ) -> Figure:
-    """Figure of primal and dual residual, and of the gap, over the iterations of one or more stages in a row.
+    """Figure of primal and dual residual, and of the gap (F - lower_bound) / F, over the iterations of stages in a row.
 
-    A SettingError when no stage has a record.
-
-    Parameters
-    ----------
-    stages : sequence of (name, History)
-        For example `[(stage.name, stage.history) for stage in solution.stages]`; the later ones go on where the earlier
-        ones end.
-    lower_bound : float
-        The gap is (F - lower_bound) / F.
-    published : PublishedRun, optional
-        The paper's gap and iterations as a star; as a line with the figures where these are far to the right.
+    Stages are for example `[(stage.name, stage.history) for stage in solution.stages]`; the later ones go on where the
+    earlier ones end. The paper's gap and iterations, if given, are a star; a line with the figures where these are far
+    to the right. A SettingError when no stage has a record.
     """
     run = _with_records(stages)
     with column_figure(height=1.3) as figure:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pgo_models.certificates.certificate import gap_text
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, extra_module
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.poses import absolute_trajectory_error
 from pgo_models.graphs.g2o import pose_names
@@ -16,7 +16,7 @@ from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.graphs.published_results import published_run
 from pgo_models.plots.graph_plots import MOST_LINES, thinning_step
 from pgo_models.plots.interactive_plots import MOST_DOTS, PAGE_CONFIG, explore_graph
-from pgo_models.plots.style import plot_module, plotly
+from pgo_models.plots.style import plotly
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from solvers.reporting.convergence_plots import explore_convergence
 from solvers.reporting.fit_plots import explore_fit
@@ -33,15 +33,9 @@ def write_report(solution: Solved, path: Path | str, *, source: str | None = Non
     """Write the report of a solution as one HTML page, whole or not at all.
 
     Verdict and gap in words, what to try next, the graph to turn and hover over, convergence, a table of robots, the
-    worst edges in a table that sorts, stages, settings and versions. Plotly's script is inside (about 5 MB).
-
-    Parameters
-    ----------
-    path : Path or str
-        Ends in .html or .htm.
-    source : str, optional
-        What stands for the graph in commands: a file, folder or name, quoted where a shell needs it, and options that
-        change the problem; the graph's name unless given.
+    worst edges in a table that sorts, stages, settings and versions. Plotly's script is inside (about 5 MB). The path
+    ends in .html or .htm; `source` is what stands for the graph in commands: a file, folder or name, quoted where a
+    shell needs it, and options that change the problem; the graph's name unless given.
 
     Errors as `check_report` and `replace_when_done`.
 
@@ -67,7 +61,7 @@ def check_report(path: Path) -> None:
     if path.suffix.lower() not in _PAGE_SUFFIXES:
         raise SettingError(f"cannot write {path}: a report is a page; give a name that ends in .html")
     plotly("offline")
-    plot_module("jinja2")
+    extra_module("jinja2", "plot")
 
 
 def report_page(solution: Solved, *, source: str | None = None) -> str:
@@ -108,7 +102,7 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
         "plot_settings": PAGE_CONFIG,
         "library": plotly("offline").get_plotlyjs(),
     }
-    jinja2 = plot_module("jinja2")
+    jinja2 = extra_module("jinja2", "plot")
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
     )
@@ -194,16 +188,10 @@ def _worst_edges(solution: Solved, robots: Partition, residuals: EdgeResiduals) 
         row = [_Cell(str(e), e), _Cell(names[i]), _Cell(names[j])]
         if robots.num_robots > 1:
             row[1:] = [_number(robots.robot[i], "d"), row[1], _number(robots.robot[j], "d"), row[2]]
-        row += [
-            _number(residuals.cost[e], ".4g"),
-            _number(residuals.allowed[e], ".4g"),
-            _Cell(f"{100 * share[e]:.3g} %", share[e]),
-            _number(residuals.translation[e], ".4g"),
-            _number(degrees[e], ".4g"),
-            _number(graph.kappa[e], ".4g"),
-            _number(graph.tau[e], ".4g"),
-        ]
-        rows.append(row)
+        cost = residuals.cost[e], residuals.allowed[e]
+        errors = residuals.translation[e], degrees[e], graph.kappa[e], graph.tau[e]
+        costs, others = ([_number(value, ".4g") for value in values] for values in (cost, errors))
+        rows.append([*row, *costs, _Cell(f"{100 * share[e]:.3g} %", share[e]), *others])
     ends = ["from robot", "from pose", "to robot", "to pose"] if robots.num_robots > 1 else ["from pose", "to pose"]
     share_of = f"share of {solution.certificate.cost}"
     heads = ["edge", *ends, "cost", "allowed", share_of, "error (m)", "error (deg)", "kappa (1/rad^2)", "tau (1/m^2)"]

@@ -52,13 +52,9 @@ def pairwise_consistent(graph: PoseGraph, known: BoolArray | None = None, quanti
     five robots: all wrong ones stay). Where odometry has drifted, they agree with right ones as well: 32 to 77 % are
     found on smallGrid3D, 26 to 56 % on sphere2500. A single one between two robots is kept. What is kept is no proof.
 
-    Parameters
-    ----------
-    known : (m,), optional
-        Edges that are right; `odometry` unless given. Edges that measure no whole motion (landmarks, positions) are
-        kept untested.
-    quantile : float
-        Probability that two right loop closures agree; a SettingError when it is not between 0 and 1.
+    Edges `known` to be right, (m,), are `odometry` unless given; those that measure no whole motion (landmarks,
+    positions) are kept untested. `quantile` is the probability that two right loop closures agree; a SettingError when
+    it is not between 0 and 1.
 
     Examples
     --------

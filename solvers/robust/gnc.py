@@ -18,14 +18,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy  # and scipy.special when it is used
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from pgo_models.certificates.newton_polish import polish_step, start_polish
 from pgo_models.errors import SettingError, check_quantile, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
+from pgo_models.graphs.pose_graph import PoseGraph, bridges
 from pgo_models.problem.cholesky import SymbolicCholesky
 from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
@@ -294,18 +292,6 @@ def left_out(graph: PoseGraph, known: BoolArray) -> float:
     that: to be left out, the weight has to be as much smaller. kitti_00, with 1 in 30, needs 1e-7.
     """
     return float(_LEFT_OUT * min(1.0, (~known).sum() / graph.num_poses) ** 3)
-
-
-def bridges(graph: PoseGraph, kept: BoolArray, ratio: Array) -> IntArray:
-    """Edges of the least ratios that connect what the kept ones leave apart (Kruskal)."""
-    n = graph.num_poses
-    count, part = connected_components(edge_counts(graph.i[kept], graph.j[kept], n), directed=False)
-    order = np.argsort(ratio, kind="stable")
-    ends = np.sort(np.stack([part[graph.i[order]], part[graph.j[order]]]).astype(np.int64), axis=0)
-    order, ends = order[ends[0] != ends[1]], ends[:, ends[0] != ends[1]]
-    _, first = np.unique(ends[0] * count + ends[1], return_index=True)
-    tree = minimum_spanning_tree(csr_array((first + 1.0, ends[:, first]), shape=(count, count)))
-    return np.asarray(order[tree.data.astype(np.int64) - 1])
 
 
 def weighted_problem(

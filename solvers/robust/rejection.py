@@ -86,11 +86,11 @@ class Rejection:
         rows += [("attempts", tried)] if len(self.attempts) > 1 else []
         return rows + ([("warning", self.warning)] if self.warning else [])
 
-    def named(self, chosen: BoolArray, most: int = _NAMED) -> str:
+    def named(self, chosen: BoolArray) -> str:
         """Number of chosen edges, (m,), and the first of them by name, with file and line where they are known."""
         at, graph = np.flatnonzero(chosen), self.problem.graph
-        names = [f"{graph.edge_label(e)}{f' {self.places[e]}' if self.places else ''}" for e in at[:most].tolist()]
-        return f"{len(at)}{': ' if names else ''}{', '.join(names)}{', ..' if len(at) > most else ''}"
+        names = [f"{graph.edge_label(e)}{f' {self.places[e]}' if self.places else ''}" for e in at[:_NAMED].tolist()]
+        return f"{len(at)}{': ' if names else ''}{', '.join(names)}{', ..' if len(at) > _NAMED else ''}"
 
     def as_json(self) -> dict[str, object]:
         """What `.json` files hold: edges by their place in the file, from 0."""

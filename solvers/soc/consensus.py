@@ -19,7 +19,7 @@ from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.copies import CopiesState, CopyLayout, RescaleCopies, Rows, SeparatorPenalty
 from solvers.soc.penalty import Due, MultiplierPenalty, SharedSteps, next_penalty
 from solvers.soc.recursion_block import Agreement
-from solvers.soc.separator_stiffness import adapted_penalty, fell_most, translation_penalty_for
+from solvers.soc.separator_stiffness import TRANSLATION_PENALTY, adapted_penalty, fell_most
 from solvers.soc.settings import SOCSettings
 from solvers.soc.subgraph import split_graph
 
@@ -85,7 +85,7 @@ class Consensus:
             separators = before.separators
         else:
             given = self.soc.translation_penalty
-            separators = self._separators(given if given is not None else translation_penalty_for(stiffness))
+            separators = self._separators(given if given is not None else TRANSLATION_PENALTY * stiffness)
         started = ask_all(robots, ConsensusRobot.start, separators, Count.ALL_REDUCE)
         size = math.sqrt(math.fsum(answer.size for answer in started))
         ratio = np.concatenate([answer.ratio for answer in started])

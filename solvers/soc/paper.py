@@ -104,10 +104,7 @@ class PaperSOC:
         problem.check_quadratic("SOC", convex=True)
         start = start if start is not None else spanning_tree_start(problem.graph)
         problem.stacked(start)  # raises unless the poses fit
-        robots = self.robots
-        if robots is None:
-            robots = partition(problem.graph, method=PartitionMethod.SINGLETONS)
-        blocks = _split(problem, robots)
+        blocks = _split(problem, self.robots or partition(problem.graph, method=PartitionMethod.SINGLETONS))
         rho, scale = float(self.penalty.initial(problem, start).mean()), float(problem.L.diagonal().mean())
         r_step = _prepare(problem, blocks, rho, self.r_step)
         return PaperState(0, start.R, start.R, np.zeros_like(start.R), rho, blocks, r_step, scale)

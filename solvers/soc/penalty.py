@@ -112,8 +112,18 @@ class FixedPenalty(_Rule):
         return 0.0, 0.0, self.rho
 
 
+class _ScaledRule(_Rule):
+    """A rule that begins at `scale` times m_i, and balances residuals from there."""
+
+    scale: float
+
+    def bounds(self, ratio: Array) -> tuple[float, float, float]:
+        """(0, scale, 0)."""
+        return 0.0, self.scale, 0.0
+
+
 @dataclass(frozen=True)
-class BalancedPenalty(_Rule):
+class BalancedPenalty(_ScaledRule):
     """rho that balances relative residuals (after OSQP, Stellato et al. 2020, section 5.2).
 
     It starts at `scale` times m_i, the mean diagonal of M over the rotation rows of the pose. The balance asks for rho
@@ -132,10 +142,6 @@ class BalancedPenalty(_Rule):
     def __post_init__(self) -> None:
         check_settings(self, positive=["scale"], above_one=["refactor_ratio"])
 
-    def bounds(self, ratio: Array) -> tuple[float, float, float]:
-        """(0, scale, 0)."""
-        return 0.0, self.scale, 0.0
-
     def factor(self, primal_residual: float, dual_residual: float) -> float:
         """Factor by which rho moves now; 1 for not at all."""
         worth_it = self.refactor_ratio**2
@@ -147,7 +153,7 @@ class BalancedPenalty(_Rule):
 
 
 @dataclass(frozen=True)
-class BoydPenalty(_Rule):
+class BoydPenalty(_ScaledRule):
     """One rho for all poses that balances residuals as in Boyd et al. 2011, section 3.4.1, (3.13); for PaperSOC.
 
     rho <- growth rho where ||r|| > imbalance ||s||, rho / growth where ||s|| > imbalance ||r||, with r = R - omega and
@@ -168,10 +174,6 @@ class BoydPenalty(_Rule):
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["scale"], above_one=["imbalance", "growth"])
-
-    def bounds(self, ratio: Array) -> tuple[float, float, float]:
-        """(0, scale, 0)."""
-        return 0.0, self.scale, 0.0
 
     def factor(self, primal_residual: float, dual_residual: float) -> float:
         """Factor by which rho moves now, from ||r|| and ||s||; 1 for not at all."""

@@ -10,7 +10,7 @@ from pgo_models.problem.cholesky import CholeskyFactor
 
 GROUND = 1e-7  # of the diagonal of M: holds the shifts that are left out
 _PROBES = 32  # vectors that estimate the mean
-_TRANSLATION_PENALTY = 0.6  # times the stiffness of the separators
+TRANSLATION_PENALTY = 0.6  # of separators at the start, times their stiffness and the diagonal of M
 _LEAST_FACTOR, _ENOUGH = 0.1, 1.0 / 3.0  # by which the translation penalty is lowered at once
 _SECOND_LOOK, _FAR_AWAY = 20, 1e-3  # iterations after penalties were taken anew, and residual that is still large then
 
@@ -38,11 +38,6 @@ def stiffness_of_separators(
     force[held] = np.sqrt(half_scale)[:, None] * pulled
     moved = np.sqrt(half_scale)[:, None] * factor.solve(force)[held]
     return _PROBES * degrees / float(np.sum(pulled * moved))
-
-
-def translation_penalty_for(stiffness: float) -> float:
-    """Penalty of separator translations, times their diagonal in M, at the start."""
-    return _TRANSLATION_PENALTY * stiffness
 
 
 def travel(moved: Array, pulled: Array, scale: Array) -> Array:

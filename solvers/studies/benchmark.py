@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pgo_models.errors import MissingExtraError, SettingError, check_settings
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
+from pgo_models.graphs.partitioning import Partition, suited_partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from solvers.reporting.convergence_plots import Curve
 from solvers.result import History, Status
@@ -41,21 +41,12 @@ class BenchmarkMethod(enum.Enum):
 class BenchmarkSettings:
     """What all contenders share.
 
-    Attributes
-    ----------
-    num_robots : int
-        Of CONSENSUS, SUBSTRUCTURED, GAUSS_SEIDEL and the second stages; at most one a pose. Poses stay with the robots
-        that the graph names if they are as many; otherwise METIS shares them out, without it they go in order of time.
-        The first stage of PAPER has one pose a robot, as the paper has.
-    max_rounds : int, optional
-        Of PAPER, both stages together.
-    time_limit : float
-        Seconds for each contender.
+    Who owns which pose says `suited_partition`; the first stage of PAPER has one pose a robot, as the paper has.
     """
 
-    num_robots: int = 5
-    max_rounds: int | None = None
-    time_limit: float = math.inf
+    num_robots: int = 5  # of CONSENSUS, SUBSTRUCTURED, GAUSS_SEIDEL and the second stages; at most one a pose
+    max_rounds: int | None = None  # of PAPER, both stages together
+    time_limit: float = math.inf  # seconds for each contender
 
     def __post_init__(self) -> None:
         if self.max_rounds is not None and self.max_rounds < 2:
@@ -64,13 +55,7 @@ class BenchmarkSettings:
 
     def robots(self, graph: PoseGraph) -> Partition:
         """Who owns which pose."""
-        number = min(self.num_robots, graph.num_poses)
-        if graph.num_robots == number > 1:
-            return partition(graph, number, PartitionMethod.GIVEN)
-        try:
-            return partition(graph, number, PartitionMethod.METIS)
-        except MissingExtraError:
-            return partition(graph, number, PartitionMethod.CONTIGUOUS)
+        return suited_partition(graph, min(self.num_robots, graph.num_poses))
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,6 +67,14 @@ def run_benchmark(
     return replace(trial, contender=contender, status=status, remark="; ".join(said))
 
 
+def solve_whole(problem: PGOProblem, *args: Any, **settings: Any) -> Solution:  # noqa: ANN401 - those of `solve`
+    """Return what `solve` finds, without a bar; KeyboardInterrupt after Ctrl-C: half a solve is none."""
+    solution = solve(problem, *args, **settings, progress=False)
+    if any(stage.status is Status.INTERRUPTED for stage in solution.stages):
+        raise KeyboardInterrupt
+    return solution
+
+
 class _Allowance:
     """Settings and robots of a trial, and the time that is left of it."""
 
@@ -98,9 +106,7 @@ class _Allowance:
         """SOC, if any, and Newton, by the robots and their driver or in one place."""
         pipeline = Pipeline(soc=soc, newton=newton, second_try=False, staircase=None)
         robots = self.robots if by_robots else None
-        solution = solve(problem, pipeline, start, robots=robots, time_limit=self._time_limit, progress=False)
-        if any(stage.status is Status.INTERRUPTED for stage in solution.stages):
-            raise KeyboardInterrupt
+        solution = solve_whole(problem, pipeline, start, robots=robots, time_limit=self._time_limit)
         return solution, _legs_of(solution)
 
 

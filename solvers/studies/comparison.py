@@ -15,14 +15,12 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.plots.interactive_plots import save_page
 from pgo_models.plots.style import is_picture, save_figure
 from pgo_models.problem.problem import PGOProblem
-from solvers.pipeline import solve
 from solvers.progress_bars import JobBar
 from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
 from solvers.reporting.convergence_plots import Curve
 from solvers.reporting.result_table import ResultTable, TablePart, Value, gap_percent
-from solvers.result import Status
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings
-from solvers.studies.benchmark_runs import run_benchmark
+from solvers.studies.benchmark_runs import run_benchmark, solve_whole
 
 _COLUMNS: tuple[tuple[str, str, Callable[[Any], str]], ...] = (  # head, name in the record, how it is written
     ("F", "objective", "{:.9g}".format),
@@ -110,19 +108,9 @@ def compare_methods(
 ) -> Comparison:
     """Run methods on a graph, one after the other, and hold them against a proven lower bound.
 
-    A PGOError when the graph is not connected; KeyboardInterrupt after Ctrl-C before the bound is there.
-
-    Parameters
-    ----------
-    settings : ComparisonSettings, optional
-        `ComparisonSettings()` unless given.
-    progress : bool, optional
-        Show a bar on stderr; where that is a terminal, unless given.
-
-    Returns
-    -------
-    Comparison
-        Also after Ctrl-C: what was done until then. A method that fails leaves its reason.
+    A method that fails leaves its reason; Ctrl-C ends it with what was done until then. `progress` shows a bar on
+    stderr; where that is a terminal, unless given. A PGOError when the graph is not connected; KeyboardInterrupt after
+    Ctrl-C before the bound is there.
 
     Examples
     --------
@@ -133,9 +121,7 @@ def compare_methods(
     """
     settings = settings if settings is not None else ComparisonSettings()
     problem = PGOProblem(problem) if isinstance(problem, PoseGraph) else problem
-    solution = solve(problem, progress=False)
-    if any(stage.status is Status.INTERRUPTED for stage in solution.stages):
-        raise KeyboardInterrupt
+    solution = solve_whole(problem)
     trials: list[BenchmarkRun] = []
     reasons: list[tuple[BenchmarkMethod, str]] = []
     is_complete = True

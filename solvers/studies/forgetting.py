@@ -43,15 +43,9 @@ def error_forgetting(
 ) -> ErrorForgetting:
     """Run Bregman iteration with and without errors in its first steps.
 
-    An error e ~ N(0, error_std^2 I) of step k gives x_k + e and, as the residual is added up, b_k + K e. A SettingError
+    An error e ~ N(0, error_std^2 I) of step k gives x_k + e and, as the residual is added up, b_k + K e. `solution` is
+    x*, (m,), to which distances are measured; of `method` alpha and its subproblem's tolerance are used. A SettingError
     when error_std is negative or there are fewer iterations than disturbed steps.
-
-    Parameters
-    ----------
-    solution : (m,)
-        x*, which the distances are measured to.
-    method : TwoLineBregman, optional
-        Its alpha and its subproblem's tolerance are used.
 
     Examples
     --------

@@ -75,24 +75,9 @@ def draw_paper_figures(
 ) -> tuple[list[Path], list[str]]:
     """Run the paper's SOC on its graphs, as the tables do, and write the figures as PNG and interactive HTML.
 
-    A PGOError when a file cannot be written.
-
-    Parameters
-    ----------
-    folder : Path
-        Made if it is not there.
-    only : tuple of FigureSet
-        All unless given.
-    download : bool
-        Whether graphs that are not here are downloaded; otherwise they are left out.
-    progress : bool, optional
-        Show a bar on stderr; where that is a terminal, unless given.
-
-    Returns
-    -------
-    written : list of Path
-    reasons : list of str
-        Why graphs were left out.
+    Files written, and why graphs were left out: those that are not here, unless `download` fetches them. The folder is
+    made if it is not there; `only` are all sets unless given; `progress` shows a bar on stderr, where that is a
+    terminal unless given. A PGOError when a file cannot be written.
 
     Examples
     --------

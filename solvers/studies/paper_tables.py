@@ -14,11 +14,9 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.published_results import PublishedFigures, PublishedRow, published_rows
 from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.problem.problem import PGOProblem
-from solvers.pipeline import solve
 from solvers.progress_bars import JobBar
-from solvers.result import Status
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
-from solvers.studies.benchmark_runs import run_benchmark
+from solvers.studies.benchmark_runs import run_benchmark, solve_whole
 from solvers.studies.results_cache import Entry, KeptResults, graph_fingerprint
 
 SCENES: dict[str, Callable[[np.random.Generator], PoseGraph]] = {"circle": circle, "grid": grid, "sphere": sphere}
@@ -29,24 +27,12 @@ _FAILURES = (PGOError, np.linalg.LinAlgError, MemoryError)
 
 @dataclass(frozen=True)
 class ReproductionSettings:
-    """Which rows, and how they are made; a SettingError when a row is unknown or a number is out of its range.
+    """Which rows, and how they are made; a SettingError when a row is unknown or a number is out of its range."""
 
-    Attributes
-    ----------
-    only : tuple of str
-        Graphs of the paper's tables; all unless given.
-    num_seeds : int
-        Draws of the random scenes: those of `numpy.random.default_rng(0)`, `(1)`, and so on.
-    num_robots : int
-        See `BenchmarkSettings`.
-    download : bool
-        Whether graphs that are not here are downloaded; otherwise their row says how to get them.
-    """
-
-    only: tuple[str, ...] = ()
-    num_seeds: int = 20
+    only: tuple[str, ...] = ()  # graphs of the paper's tables; all unless given
+    num_seeds: int = 20  # draws of the random scenes: those of `numpy.random.default_rng(0)`, `(1)`, and so on
     num_robots: int = BenchmarkSettings.num_robots
-    download: bool = False
+    download: bool = False  # whether graphs that are not here are downloaded; otherwise their row says how to get them
 
     def __post_init__(self) -> None:
         known = [row.name for row in published_rows()]
@@ -157,24 +143,12 @@ def reproduce_tables(
     """Run the methods of the paper's tables on its graphs.
 
     On the scenes SOC as in the paper starts at the estimate by GPS and IMU, on the others at a spanning tree; it has as
-    many rounds as the paper's SOC took iterations, for both its stages. All other methods start on their own.
+    many rounds as the paper's SOC took iterations, for both its stages. All other methods start on their own. One that
+    fails on a graph leaves its reason there; Ctrl-C ends all with what was done until then.
 
-    Parameters
-    ----------
-    settings : ReproductionSettings, optional
-        `ReproductionSettings()` unless given.
-    keep : Path, optional
-        A JSON file that holds every figure from the moment it is there; what it holds already is not run again. A
-        PGOError when it cannot be read or written.
-    is_fresh : bool
-        Run all anew whatever the file holds.
-    progress : bool, optional
-        Show a bar on stderr; where that is a terminal, unless given.
-
-    Returns
-    -------
-    Reproduction
-        Also after Ctrl-C: what was done until then. A method that fails on a graph leaves its reason there.
+    `keep` is a JSON file that holds every figure from the moment it is there; what it holds already is not run again
+    unless `is_fresh`. `progress` shows a bar on stderr; where that is a terminal, unless given. A PGOError when the
+    file cannot be read or written.
 
     Examples
     --------
@@ -277,9 +251,7 @@ def _found(kept: KeptResults, key: str, find: Callable[[], Entry]) -> Entry | st
 
 
 def _optimum(problem: PGOProblem) -> Entry:
-    solution = solve(problem, progress=False)
-    if any(stage.status is Status.INTERRUPTED for stage in solution.stages):
-        raise KeyboardInterrupt
+    solution = solve_whole(problem)
     best = min(solution.objective, solution.certificate.poses_objective)
     return asdict(Optimum(float(best), float(solution.lower_bound)))
 

@@ -1,4 +1,4 @@
-import builtins
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -186,15 +186,8 @@ def test_poses_of_another_graph_are_refused():
 
 
 def test_without_matplotlib_one_line_names_the_extra(monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *rest):
-        if name.startswith("matplotlib"):
-            raise ImportError(name)
-        return real(name, *rest)
-
     solution = solvers.solve(pgo.circle(np.random.default_rng(0)))
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(MissingExtraError, match=r"pgo-splitting\[plot\]"):
         solution.plot()
 

@@ -1,5 +1,6 @@
 import importlib.util
 import math
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 
 import pgo_models as pgo
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.graphs.published_results import published_rows
 from solvers import Run, Status, solve
 from solvers.reporting.convergence_plots import Effort
@@ -179,12 +180,7 @@ def test_robots_are_at_most_one_a_pose_and_contiguous_without_metis(monkeypatch)
     graph = pgo.grid(np.random.default_rng(0))
     assert BenchmarkSettings(num_robots=99).robots(graph).num_robots <= 27
 
-    def partition(graph, number, method):
-        if method is pgo.PartitionMethod.METIS:
-            raise MissingExtraError("pymetis", "fast")
-        return pgo.partition(graph, number, method)
-
-    monkeypatch.setattr("solvers.studies.benchmark.partition", partition)
+    monkeypatch.setitem(sys.modules, "pymetis", None)
     assert BenchmarkSettings().robots(graph).method is pgo.PartitionMethod.CONTIGUOUS
 
 
