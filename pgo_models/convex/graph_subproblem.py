@@ -144,6 +144,18 @@ class GraphQP:
         added = sum(float(term.value) for term in self.change.terms)
         return float(self.w @ np.einsum("rc,rc->r", residuals, residuals)) + added
 
+    def gradient(self, X: Array) -> Array:
+        """Gradient of `cost` in X, (N, d), of terms that have one there."""
+        self.variables.X.value = X
+        of_edges = np.asarray(self.A.T @ (2.0 * self.w[:, None] * (self.A @ X)))
+        return sum(map(self.gradient_of, self.change.terms), of_edges)
+
+    def gradient_of(self, term: cp.Expression) -> Array:
+        """Gradient of a term, (N, d), at the value of X."""
+        X = self.variables.X
+        found = term.grad.get(X, csr_array((X.size, 1)))
+        return np.asarray(found.toarray().reshape(X.shape, order="F"))
+
 
 def graph_qp(
     graph: PoseGraph,
