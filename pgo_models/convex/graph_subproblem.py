@@ -91,7 +91,7 @@ class ModelChange:
         Convex, in the variables that `PoseVariables` names and no others; added to F.
     constraints : sequence of cp.Constraint
         Convex, in the same variables.
-    replaced_edges : sequence of int
+    replaced_edges : sequence of int, or (m,) mask
         Edges whose squared residuals leave F, where terms have another loss for them.
 
     A SettingError when a term is not one convex number, or a constraint not convex.
@@ -99,10 +99,13 @@ class ModelChange:
 
     terms: Sequence[cp.Expression] = ()
     constraints: Sequence[cp.Constraint] = ()
-    replaced_edges: Sequence[int] = ()
+    replaced_edges: Sequence[int] | IntArray | BoolArray = ()
 
     def __post_init__(self) -> None:
         check_terms(self.terms, self.constraints)
+        edges = np.asarray(self.replaced_edges)
+        chosen = np.flatnonzero(edges) if edges.dtype == bool else edges.astype(int)
+        object.__setattr__(self, "replaced_edges", tuple(chosen.tolist()))
 
 
 Changer = Callable[[PoseVariables], ModelChange]
@@ -246,7 +249,7 @@ def _posed(
     if not isinstance(change, ModelChange):
         raise SettingError(f"the changer returned a {type(change).__name__}; return ModelChange(terms=[..])")
     share = share.copy()
-    share[list(change.replaced_edges)] = 0.0
+    share[np.array(change.replaced_edges, dtype=int)] = 0.0
     weights = weights * np.concatenate([share if joint else np.zeros(m), np.repeat(share, d)])
     counted = weights > 0
     whole, w = whole[counted], weights[counted]
