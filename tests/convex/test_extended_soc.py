@@ -259,7 +259,9 @@ def test_the_bound_of_what_is_no_prior_is_below_all_poses_and_the_note_says_why(
     solution.save(tmp_path / "x.json")
     assert json.loads((tmp_path / "x.json").read_text())["objective"] == solution.objective
     solution.report(tmp_path / "x.html")
-    assert "ExtendedSOC" in (tmp_path / "x.html").read_text()
+    page = (tmp_path / "x.html").read_text()
+    assert "ExtendedSOC" in page
+    assert solution.note in page
 
 
 def test_a_position_alone_costs_nothing_so_that_the_bound_without_it_is_tight() -> None:
