@@ -40,8 +40,8 @@ class ExtendedNewtonState:
     k: int
     poses: Poses
     objective: float  # with all terms
-    gradient: Array  # (side,), in the order of `TangentLayout`
-    direction: Array  # (side,): where the next step leads
+    direction: Array  # (side,), in the order of `TangentLayout`: where the next step leads
+    slope: float  # of the objective along it
     decrement: float  # half the squared Newton decrement less the rounding level, over the objective; inf at saddles
     model: GraphQP
     factor: CholeskyFactor  # of the Gauss-Newton matrix of F at the start, for preconditioning
@@ -68,11 +68,11 @@ class ExtendedNewton:
 
     def step(self, problem: PGOProblem, state: ExtendedNewtonState) -> ExtendedNewtonState:
         """The first of the moves direction, direction/2, .. that lowers the objective enough (Armijo)."""
-        w, v = _layout(problem).split(state.direction)
-        slope, tie = polish.SUFFICIENT * inner(state.gradient, state.direction), polish.ROUNDING * state.objective
+        w, v = TangentLayout(problem.num_poses, problem.d).split(state.direction)
         for length in 0.5 ** np.arange(polish.HALVINGS):
             poses = polish.move_poses(state.poses, length * w, length * v)
-            if state.model.cost(poses.stacked()) - state.objective <= (tie if length == 1.0 else length * slope):
+            enough = polish.SUFFICIENT * length * state.slope if length < 1.0 else polish.ROUNDING * state.objective
+            if state.model.cost(poses.stacked()) - state.objective <= enough:
                 return _arrive(problem, state.k + 1, poses, state.model, state.factor)
         return replace(state, k=state.k + 1, moved=False)
 
@@ -109,36 +109,30 @@ def kinks(term: cp.Expression, is_flat: bool = False) -> set[str]:
     return set().union(*(kinks(part, inside) for part in term.args))
 
 
-def _layout(problem: PGOProblem) -> TangentLayout:
-    return TangentLayout(problem.num_poses, problem.d)
-
-
 def _arrive(problem: PGOProblem, k: int, poses: Poses, model: GraphQP, factor: CholeskyFactor) -> ExtendedNewtonState:
     """State at poses, with the direction from there."""
-    layout, X, n, d = _layout(problem), poses.stacked(), problem.num_poses, problem.d
-    G, turned = model.gradient(X), np.swapaxes(poses.R, 1, 2)
+    n, d, X = problem.num_poses, problem.d, poses.stacked()
+    layout, G, objective, R = TangentLayout(n, d), model.gradient(X), model.cost(X), poses.R
+    Lambda = G[n:].reshape(n, d, d) @ R
+    Lambda = 0.5 * (Lambda + np.swapaxes(Lambda, 1, 2))
 
     def adjoint(U: Array) -> Array:
-        return layout.join(-2.0 * vee(U[n:].reshape(n, d, d) @ poses.R), U[:n])
+        return layout.join(-2.0 * vee(U[n:].reshape(n, d, d) @ R), U[:n])
 
     def hessian(move: Array) -> Array:
         w, v = layout.split(move)
-        V = np.concatenate([v, (-hat(w) @ turned).reshape(d * n, d)])
+        V = np.concatenate([v, (-hat(w) @ np.swapaxes(R, 1, 2)).reshape(d * n, d)])
         step = _DIFFERENCE * (1.0 + np.abs(X).max()) / np.abs(V).max()
         U = (model.gradient(X + step * V) - G) / step
         U[n:] -= (Lambda @ V[n:].reshape(n, d, d)).reshape(d * n, d)
         return adjoint(U)
 
-    product = G[n:].reshape(n, d, d) @ poses.R
-    Lambda = 0.5 * (product + np.swapaxes(product, 1, 2))
-    gradient, objective = adjoint(G), model.cost(X)
-    level = rounding_level(problem, poses)
-    squared = inner(gradient, factor.solve(gradient))
+    gradient = adjoint(G)
+    radius = _RADIUS * np.sqrt(inner(gradient, factor.solve(gradient)))
     floor = 0.1 * polish.STATIONARY_DECREMENT * objective
-    found = truncated_conjugate_gradients(
-        gradient, hessian, factor.solve, _RADIUS * np.sqrt(squared), _FORCING, floor, _MOST_PRODUCTS
+    found = truncated_conjugate_gradients(gradient, hessian, factor.solve, radius, _FORCING, floor, _MOST_PRODUCTS)
+    slope = inner(gradient, found.step)
+    decrement = polish.scaled_decrement(-slope, objective, rounding_level(problem, poses))
+    return ExtendedNewtonState(
+        k, poses, objective, found.step, slope, np.inf if found.is_at_boundary else decrement, model, factor
     )
-    decrement = polish.scaled_decrement(-inner(gradient, found.step), objective, level)
-    if found.is_at_boundary:
-        decrement = np.inf
-    return ExtendedNewtonState(k, poses, objective, gradient, found.step, decrement, model, factor)
