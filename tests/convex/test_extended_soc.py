@@ -262,6 +262,7 @@ def test_the_bound_of_what_is_no_prior_is_below_all_poses_and_the_note_says_why(
     page = (tmp_path / "x.html").read_text()
     assert "ExtendedSOC" in page
     assert solution.note in page
+    assert "What to try next" not in page  # commands that know nothing of these terms
 
 
 def test_a_position_alone_costs_nothing_so_that_the_bound_without_it_is_tight() -> None:
