@@ -204,3 +204,20 @@ def test_what_has_a_kink() -> None:
     }
     for name, terms in kinked.items():
         assert [kinks(term) for term in terms] == [{name}] * len(terms)
+
+
+def test_it_keeps_the_contract_of_solvers() -> None:
+    method = ExtendedNewton(lambda u: ModelChange(terms=robust_positions(u)))
+    state = method.init(problem(2), chordal_start(problem(2)))
+    before = state.poses.t.copy(), state.direction.copy()
+    following = method.step(problem(2), state)
+    assert following.objective < state.objective
+    for array, kept in zip((state.poses.t, state.direction), before, strict=True):
+        np.testing.assert_array_equal(array, kept)
+    done = run(method, problem(2))
+    again = run(method, problem(2), done.poses)
+    assert (again.status, again.iterations) == (Status.CONVERGED, 0)
+    np.testing.assert_array_equal(run(method, problem(2)).poses.t, done.poses.t)
+    limited = run(ExtendedNewton(method.changer, max_iterations=1), problem(2))
+    assert limited.status is Status.MAX_ITERATIONS
+    assert limited.history.objective[-1] < limited.history.objective[0]
