@@ -19,17 +19,9 @@ from scipy.fft import dct, idct
 import pgo_models as pgo
 import solvers
 from pgo_models.convex.orthogonality_examples import procrustes, sparse_components, sparse_low_rank
+from pgo_models.convex.prox import project_sparse, project_stiefel, soft_threshold
 
 plt.rcParams["figure.dpi"] = 110
-
-
-def soft(V, threshold):  # argmin threshold |x| + (x - V)^2 / 2
-    return np.sign(V) * np.maximum(np.abs(V) - threshold, 0.0)
-
-
-def nearest_orthonormal(V):  # step (b): U V^T of the SVD
-    U, _, Vt = np.linalg.svd(V, full_matrices=False)
-    return U @ Vt
 
 
 # %% [markdown]
@@ -41,17 +33,18 @@ def nearest_orthonormal(V):  # step (b): U V^T of the SVD
 # $$\min_X \; \operatorname{tr}(X^\top A X) + w \sum |X_{ij}| \quad \text{subject to} \quad X^\top X = I.$$
 #
 # Convex but for the constraint. Split twice: a copy $P$ carries the constraint, a copy $Q$ the 1-norm. Then (a) is a
-# linear system with one matrix for all iterations, (b) an SVD and a soft threshold, (c) two sums.
+# linear system with one matrix for all iterations, (b) two proximal operators in closed form, an SVD and a soft
+# threshold ($\operatorname{sign}(v) \max(|v| - s, 0)$, in `pgo_models.convex.prox`), (c) two sums.
 
 
 # %%
 def compressed_modes(A, count, weight, rho, iterations, rng):
-    P = Q = nearest_orthonormal(rng.standard_normal((len(A), count)))
+    P = Q = project_stiefel(rng.standard_normal((len(A), count)))
     B, C = np.zeros_like(P), np.zeros_like(Q)
     solve = np.linalg.inv(2 * A + 2 * rho * np.eye(len(A)))
     for _ in range(iterations):
         X = solve @ (rho * (P - B) + rho * (Q - C))  # (a)
-        P, Q = nearest_orthonormal(X + B), soft(X + C, weight / rho)  # (b), one for each copy
+        P, Q = project_stiefel(X + B), soft_threshold(X + C, weight / rho)  # (b), one for each copy
         B, C = B + X - P, C + X - Q  # (c)
     return P, Q, np.linalg.norm(X - P) + np.linalg.norm(X - Q)
 
@@ -155,7 +148,7 @@ def likeness(X):
     return np.abs(X.T @ causes).max(axis=1)
 
 
-explained = [np.trace(X.T @ covariance @ X) / values.sum() for X in (principal, nearest_orthonormal(components))]
+explained = [np.trace(X.T @ covariance @ X) / values.sum() for X in (principal, project_stiefel(components))]
 print("likeness to a cause: principal", likeness(principal).round(2), " sparse", likeness(components).round(2))
 print("variance explained: principal {:.1%}, sparse {:.1%}".format(*explained))
 figure, panels = plt.subplots(1, 2, figsize=(7.0, 1.8), layout="constrained", sharey=True)
@@ -186,18 +179,14 @@ U, spectrum, _ = np.linalg.svd(Y, full_matrices=False)
 c = spectrum[0] ** 2
 
 
-def hard(V, nonzeros):
-    return np.where(np.abs(V) >= np.sort(np.abs(V).ravel())[-nonzeros], V, 0.0)
-
-
 def slrma(nonzeros, iterations):
     rho = rho_share * c
     solve = np.linalg.inv(2 * (c * np.eye(time_steps) - Y @ Y.T) + 2 * rho * np.eye(time_steps))
-    P, Q = U[:, :rank], hard(U[:, :rank], nonzeros)
+    P, Q = U[:, :rank], project_sparse(U[:, :rank], nonzeros)
     B_P, B_Q = np.zeros_like(P), np.zeros_like(Q)
     for _ in range(iterations):
         X = solve @ (rho * (P - B_P) + rho * (Q - B_Q))
-        P, Q = nearest_orthonormal(X + B_P), hard(X + B_Q, nonzeros)
+        P, Q = project_stiefel(X + B_P), project_sparse(X + B_Q, nonzeros)
         B_P, B_Q = B_P + X - P, B_Q + X - Q
     return P, Q
 
@@ -209,7 +198,7 @@ def relative_error(basis):
 kept = (12, 16, 24, 40, 64)
 curves = {
     "SLRMA": [relative_error(slrma(s, 2000)[1]) for s in kept],
-    "SVD, small entries cut": [relative_error(hard(U[:, :rank], s)) for s in kept],
+    "SVD, small entries cut": [relative_error(project_sparse(U[:, :rank], s)) for s in kept],
 }
 figure, axes = plt.subplots(figsize=(5.0, 2.8), layout="constrained")
 for (name, curve), marker in zip(curves.items(), "os", strict=True):

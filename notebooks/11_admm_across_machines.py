@@ -17,13 +17,10 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
+from pgo_models.convex.prox import soft_threshold
 
 plt.rcParams["figure.dpi"] = 110
 rng = np.random.default_rng(0)
-
-
-def soft(v, threshold):
-    return np.sign(v) * np.maximum(np.abs(v) - threshold, 0.0)
 
 
 # %% [markdown]
@@ -73,7 +70,7 @@ b = [A_a @ model + 0.5 * rng.standard_normal(60) for A_a in A]
 everything = [np.arange(size)] * machines
 local = [ridge(A_a, b_a, rho) for A_a, b_a in zip(A, b, strict=True)]
 rounds = consensus(
-    local, everything, lambda v: soft(v, price / (rho * machines)), np.zeros(size), [np.zeros(size)] * machines
+    local, everything, lambda v: soft_threshold(v, price / (rho * machines)), np.zeros(size), [np.zeros(size)] * machines
 )
 by_hand = list(itertools.islice(rounds, 60))
 
@@ -279,7 +276,7 @@ print(f"numbers sent in 60 rounds: {sent}; the data: {data}")
 #
 # ```python
 # with_sixth = consensus(
-#     [*local, lambda v: v], [np.arange(size)] * 6, lambda v: soft(v, price / (20.0 * 6)), np.zeros(size),
+#     [*local, lambda v: v], [np.arange(size)] * 6, lambda v: soft_threshold(v, price / (20.0 * 6)), np.zeros(size),
 #     [np.zeros(size)] * 6,
 # )
 # later = [np.linalg.norm(z - x.value) for z in itertools.islice(with_sixth, 60)]

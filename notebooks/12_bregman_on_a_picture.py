@@ -20,6 +20,7 @@ from scipy.fft import dctn, idctn
 
 import pgo_models as pgo
 import solvers
+from pgo_models.convex.prox import group_soft_threshold, singular_value_threshold, soft_threshold
 
 plt.rcParams["figure.dpi"] = 110
 
@@ -58,18 +59,19 @@ def show(panels, height=2.3):
 # $$\begin{aligned}
 #   u &= (I + \alpha D^\top D)^{-1} \bigl(f + \alpha D^\top (d - b)\bigr) && \text{diagonal in Fourier space, if } D
 #     \text{ wraps round} \\
-#   d_p &= \max(1 - w / (\alpha \lVert v_p \rVert), 0) \, v_p, \quad v = D u + b && \text{a threshold on lengths} \\
+#   d_p &= \max(1 - w / (\alpha \lVert v_p \rVert), 0) \, v_p, \quad v = D u + b && \text{a threshold on lengths, a prox} \\
 #   b &\leftarrow b + D u - d
 # \end{aligned}$$
 
 
 # %%
 def D(u):
-    return np.stack([np.roll(u, -1, 0) - u, np.roll(u, -1, 1) - u])
+    return np.stack([np.roll(u, -1, 0) - u, np.roll(u, -1, 1) - u], axis=-1)
 
 
 def D_transposed(p):
-    return np.roll(p[0], 1, 0) - p[0] + np.roll(p[1], 1, 1) - p[1]
+    down, right = p[..., 0], p[..., 1]
+    return np.roll(down, 1, 0) - down + np.roll(right, 1, 1) - right
 
 
 def spectrum(shape):  # of D^T D
@@ -77,19 +79,14 @@ def spectrum(shape):  # of D^T D
     return rows[:, None] + columns
 
 
-def shrink(v, threshold):
-    length = np.maximum(np.sqrt(np.sum(v**2, axis=0)), 1e-300)
-    return np.maximum(1 - threshold / length, 0.0) * v
-
-
 def split_bregman(f, weight, alpha):
     """Yields u and the residual ||D u - d||."""
-    d = b = np.zeros((2, *f.shape))
+    d = b = np.zeros((*f.shape, 2))
     denominator = 1 + alpha * spectrum(f.shape)
     while True:
         u = np.fft.ifft2(np.fft.fft2(f + alpha * D_transposed(d - b)) / denominator).real
         v = D(u) + b
-        d = shrink(v, weight / alpha)
+        d = group_soft_threshold(v, weight / alpha)  # one group a pixel
         b = v - d
         yield u, np.linalg.norm(D(u) - d)
 
@@ -110,8 +107,8 @@ print(f"noisy {decibel(noisy):.1f} dB, denoised {decibel(smooth):.1f} dB; ||D u 
 patch = noisy[96:108, 96:108]
 basis = np.eye(patch.size).reshape(-1, *patch.shape)
 matrix = np.column_stack([D(column).ravel() for column in basis])
-u, d = cp.Variable(patch.size), cp.Variable((2, patch.size))
-J = 0.5 * cp.sum_squares(u - patch.ravel()) + 0.08 * cp.sum(cp.norm(d, axis=0))
+u, d = cp.Variable(patch.size), cp.Variable((patch.size, 2))
+J = 0.5 * cp.sum_squares(u - patch.ravel()) + 0.08 * cp.sum(cp.norm(d, axis=1))
 problem = pgo.BregmanProblem(J, (u, d), np.hstack([matrix, -np.eye(2 * patch.size)]), np.zeros(2 * patch.size))
 states = itertools.islice(solvers.iterate(solvers.AlternatingBregman(alpha=2.0, passes=1), problem), 1, 11)
 pairs = zip(states, split_bregman(patch, 0.08, 2.0), strict=False)
@@ -164,10 +161,6 @@ show(
 
 
 # %%
-def soft(v, threshold):
-    return np.sign(v) * np.maximum(np.abs(v) - threshold, 0.0)
-
-
 part = clean[40:168, 60:188]
 seen = rng.random(part.shape) < 0.5
 f = part * seen
@@ -184,14 +177,14 @@ def K_transposed(y):
 def ista(weight):
     x = np.zeros_like(f)
     while True:
-        x = soft(x + K_transposed(f - K(x)), weight)
+        x = soft_threshold(x + K_transposed(f - K(x)), weight)
         yield x
 
 
 def fista(weight):
     x, y, t = np.zeros_like(f), np.zeros_like(f), 1.0
     while True:
-        x_new = soft(y + K_transposed(f - K(y)), weight)
+        x_new = soft_threshold(y + K_transposed(f - K(y)), weight)
         t_new = (1 + np.sqrt(1 + 4 * t**2)) / 2
         x, y, t = x_new, x_new + (t - 1) / t_new * (x_new - x), t_new
         yield x
@@ -201,7 +194,7 @@ def linearised_bregman(mu, delta=1.0):
     x = v = np.zeros_like(f)
     while True:
         v = v + K_transposed(f - K(x))
-        x = delta * soft(v, mu)
+        x = delta * soft_threshold(v, mu)
         yield x
 
 
@@ -245,8 +238,7 @@ def complete(M, known, mu, delta, iterations):
     X = Y = np.zeros_like(M)
     for _ in range(iterations):
         Y = Y + delta * known * (M - X)
-        U, singular, Vt = np.linalg.svd(Y, full_matrices=False)
-        X = (U * soft(singular, mu)) @ Vt
+        X = singular_value_threshold(Y, mu)
     return X
 
 

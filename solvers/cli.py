@@ -4,10 +4,11 @@ Exit codes: 0 done; 1 bad input, one line on stderr; 2 not converged, the result
 130 and 143 after SIGINT (Ctrl-C) and SIGTERM, the best iterate written if there was one.
 """
 
+import json
 import math
+import re
 import shlex
 import sys
-import textwrap
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -37,7 +38,7 @@ from solvers.progress_bars import JobBar
 from solvers.reporting.graph_facts import describe_graph, memory_note
 from solvers.reporting.report import check_report, write_report
 from solvers.reporting.versions import installation, installed_version, installed_versions
-from solvers.shell import DONE, Commands, JsonOption, QuietOption, ThreadsOption, run_command, save_then_show
+from solvers.shell import DONE, Commands, JsonOption, QuietOption, ThreadsOption, run_command, save_then_show, wrapped
 from solvers.soc.soc import SOC
 from solvers.solution import both_costs, certificate_json, check_format, check_target, other_cost, write_json
 from solvers.studies.commands import DropEdgeOption, UnitWeightsOption, compare_command, figures_command, tables_command
@@ -241,9 +242,8 @@ def solve_command(
         targets.append((report, partial(write_report, solution, source=source)))
 
     def show() -> None:
-        typer.echo(
-            "\n\n".join([text, *hint_of_chi2(problem, solution.poses), *hint_of_misfits(solution, graph, drop_edge)])
-        )
+        hints = [*hint_of_chi2(problem, solution.poses), *hint_of_misfits(solution, graph, drop_edge)]
+        typer.echo("\n\n".join([wrapped(text, 13), *map(wrapped, hints)]))
 
     save_then_show(targets, show, solution.as_json if as_json else None, quiet)
     warn_of_weights(graph, problem, solution.certificate, drop_edge)
@@ -288,8 +288,9 @@ def certify_command(
     }
     targets = [(out, partial(write_json, record))] if out is not None else []
     rows = [f"{label:<12} {text}" for label, text in other_cost(problem, poses)]
-    text = "\n".join([str(certificate), *rows, *hint_of_chi2(problem, poses)])
-    save_then_show(targets, lambda: typer.echo(text), (lambda: record) if as_json else None, quiet)
+    text = wrapped("\n".join([str(certificate), *rows]), 13)
+    hints = map(wrapped, hint_of_chi2(problem, poses))
+    save_then_show(targets, lambda: typer.echo("\n".join([text, *hints])), (lambda: record) if as_json else None, quiet)
     warn_of_weights(graph, problem, certificate, drop_edge)
     raise typer.Exit(DONE if certificate.is_certified else NOT_CERTIFIED)
 
@@ -303,20 +304,31 @@ def info_command(
     robots: Annotated[int | None, typer.Option(min=1, help="Show what sharing the poses among so many costs.")] = None,
     split: SplitOption = None,
     skip_unknown: SkipUnknownOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Show what a pose graph is made of, or what this installation has."""
     if graph is None:
         if robots is not None or split is not None:
             raise SettingError("--robots and --split describe a graph; give one")
         rows = [*installation(), ("data sets", ", ".join(known_datasets()))]
+        record: dict[str, object] = dict(rows)
     else:
         loaded = load_graph(graph, False, skip_unknown)
         rows = describe_graph(loaded)
+        record = _figures(rows)
         if robots is not None or split is not None:
             shared = choices.chosen_partition(loaded, robots, split)
-            rows += [("", ""), ("partition", shared.method.value), *report_partition(shared, loaded).facts()]
-    for label, text in rows:
-        typer.echo(textwrap.fill(f"{label:<15} {text}", 80, subsequent_indent=16 * " "))
+            costs = [("partition", shared.method.value), *report_partition(shared, loaded).facts()]
+            rows += [("", ""), *costs]
+            record["partition"] = _figures(costs)
+    text = wrapped("\n".join(f"{label:<15} {text}" for label, text in rows), 16)
+    save_then_show([], lambda: typer.echo(text), (lambda: record) if as_json else None)
+
+
+def _figures(rows: list[tuple[str, str]]) -> dict[str, object]:
+    """Rows for JSON: a text that is a number becomes one."""
+    number = re.compile(r"-?\d+(\.\d+)?(e[-+]\d+)?")
+    return {label: json.loads(text) if number.fullmatch(text) else text for label, text in rows}
 
 
 @app.command("generate")
@@ -341,11 +353,14 @@ def generate_command(
     rotation_noise: Annotated[
         float | None, typer.Option(help="Standard deviation, degrees (random, grid-world, victoria-park).")
     ] = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Generate a scene with known truth, written beside it as NAME.truth.tum."""
     made = choices.chosen_scene(
         scene, np.random.default_rng(seed), poses, robots, dimension, translation_noise, rotation_noise
     )
+    truth = out.absolute().parent / f"{out.absolute().stem}.truth.tum"
     if out.suffix == "":
         # Symbols have 52 letters; poses of more robots are numbered, and the files alone say whose they are.
         named = replace(made, ids=symbol_ids(made.robots)) if made.num_robots <= MOST_SYMBOLS else made
@@ -355,9 +370,10 @@ def generate_command(
     else:
         raise SettingError(f"cannot write {out}: give a name that ends in .g2o, or a folder's name without a suffix")
     assert made.truth is not None
-    truth = out.absolute().parent / f"{out.absolute().stem}.truth.tum"
     write_tum(made.truth, truth)
-    typer.echo(f"{made!r}\nwritten: {out}, {truth}")
+    record = {**_figures(made.facts()), "written": [str(out), str(truth)]}
+    text = f"{made!r}\nwritten: {out}\nwritten: {truth}"
+    save_then_show([], lambda: typer.echo(text), (lambda: record) if as_json else None, quiet)
 
 
 app.command("tables")(tables_command)

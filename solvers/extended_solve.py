@@ -1,5 +1,6 @@
 """solve() of F with convex terms and constraints of one's own: priors are certified, what is left out is said."""
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,9 +11,10 @@ from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.problem import PGOProblem
+from solvers.convex.extended_newton import ExtendedNewton, kinks
 from solvers.convex.extended_soc import with_priors
 from solvers.loop import Watch
-from solvers.result import Stage
+from solvers.result import OUT_OF_TIME, Stage
 from solvers.solution import Solution
 
 
@@ -26,8 +28,9 @@ def solve_extended(
     """Solve with priors for the terms that are such by `plain`, and where there is more run the ExtendedSOC, too.
 
     With priors alone the solution is that of the graph with them, whose last pose is the world. Else poses are of
-    ExtendedSOC, the objective has all terms, and the bound leaves out what its note says: terms that are never
-    negative (a SettingError where one might be) and constraints, which can only raise it. Replaced edges leave none.
+    ExtendedSOC and, where that leaves all terms smooth and there are no constraints, of ExtendedNewton; the objective
+    has all terms, and the bound leaves out what its note says: terms that are never negative (a SettingError where one
+    might be) and constraints, which can only raise it. Replaced edges leave none.
     """
     model = pipeline.soc.model(problem)
     graph, left = with_priors(model)
@@ -46,7 +49,20 @@ def solve_extended(
     if solution.robots is not None or solution.robust is not None:
         raise SettingError(f"robots and robust go with priors alone, and there are {left_out[0]}; leave them out")
     run, certificate = watch.run(pipeline.soc, problem, start), solution.certificate
-    objective, level = model.cost(run.poses.stacked()), certificate.rounding_level
+    level, stationarity, runs = certificate.rounding_level, math.nan, [run]
+    model.variables.X.value = run.poses.stacked()
+    if not_smooth := sorted(
+        set(["constraints"] * bool(model.change.constraints)).union(*map(kinks, model.change.terms))
+    ):
+        left_out[-1] += (
+            f"; SOC is the last stage, as Newton needs smooth terms alone, and there are {', '.join(not_smooth)}"
+        )
+    elif run.status not in OUT_OF_TIME:
+        newton = pipeline.newton
+        second = ExtendedNewton(pipeline.soc.changer, newton.tolerance, newton.max_iterations)
+        runs.append(run := watch.run(second, problem, run.poses))
+        stationarity = run.state.decrement
+    objective = model.cost(run.poses.stacked())
     bound = NO_BOUND if model.change.replaced_edges else certificate.bound
     gap = relative_gap(objective, bound.value, level)
     verdict = verdict_of(objective, level, gap, bound, certificate.wanted_gap)
@@ -55,9 +71,11 @@ def solve_extended(
         problem=problem,
         poses=run.poses,
         objective=objective,
-        certificate=replace(certificate, objective=objective, bound=bound, gap=gap, verdict=verdict),
+        certificate=replace(
+            certificate, objective=objective, bound=bound, gap=gap, verdict=verdict, stationarity=stationarity
+        ),
         status=run.status,
-        stages=(*solution.stages, replace(Stage.of(run), objective=objective)),
+        stages=(*solution.stages, *(replace(Stage.of(r), objective=model.cost(r.poses.stacked())) for r in runs)),
         seconds=time.perf_counter() - watch.began,
         note=f"the bound leaves out {', '.join(left_out)}",
         frame="that of the added terms",

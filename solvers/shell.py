@@ -5,8 +5,10 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
@@ -156,6 +158,13 @@ def outlets() -> Iterator[Outlet]:
         finally:
             out.flush()
             err.flush()
+
+
+def wrapped(text: str, indent: int = 0) -> str:
+    """Text within the columns of the terminal, 80 where there is none; what goes on is indented."""
+    columns, hang = shutil.get_terminal_size().columns, " " * indent
+    fill = textwrap.TextWrapper(columns, subsequent_indent=hang, break_long_words=False, break_on_hyphens=False).fill
+    return "\n".join(map(fill, text.splitlines()))
 
 
 def save_then_show(

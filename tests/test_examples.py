@@ -45,27 +45,41 @@ SYMBOL = r"(?:\(d ?\+ ?1\)|[A-Za-z]{1,2}|nnz|count|num_robots|\d|[+ ])+"
 SHAPE = re.compile(rf"\({SYMBOL},(?:{SYMBOL},?)*\)|\bshapes?\b")  # (n, d, d), (m,), ((d+1) n, d), or that of a variable
 
 
-def callables_with_arrays(package: ModuleType) -> Iterator[tuple[str, str]]:
-    """Name and docstring of public functions, methods and classes that take, return or hold arrays."""
+ARRAYS = re.compile("Array|ndarray")
+
+
+def callables_with_arrays(package: ModuleType) -> Iterator[tuple[str, dict[str, object], str]]:
+    """Name, types and docstring (with its class's) of public functions, methods and classes that have arrays."""
     for name in package.__all__:
         thing = getattr(package, name)
-        found = {name: thing}
+        found, outer = {name: thing}, ""
         if inspect.isclass(thing):
+            outer = inspect.getdoc(thing) or ""
             for member, value in vars(thing).items():
                 if not member.startswith("_"):
                     inner = getattr(value, "fget", None) or getattr(value, "func", None) or value
                     found[f"{name}.{member}"] = getattr(inner, "__func__", inner)
         for label, one in found.items():
             hints = inspect.get_annotations(one) if inspect.isclass(one) or inspect.isfunction(one) else {}
-            if any(re.search("Array|ndarray", str(hint)) for hint in hints.values()):
-                yield label, inspect.getdoc(one) or ""
+            hints = {what: hint for what, hint in hints.items() if ARRAYS.search(str(hint))}
+            if hints:
+                own = inspect.getdoc(one) or ""
+                yield label, {} if inspect.isclass(one) else hints, own if one is thing else f"{own}\n\n{outer}"
 
 
 @pytest.mark.parametrize("package", PACKAGES, ids=label)
 def test_docstrings_say_the_shapes_of_arrays(package: ModuleType) -> None:
-    documented = dict(callables_with_arrays(package))
+    documented = list(callables_with_arrays(package))
     assert len(documented) > 10
-    assert [name for name, text in documented.items() if not SHAPE.search(text)] == []
+    assert [name for name, _, text in documented if not SHAPE.search(text)] == []
+    silent = []
+    for name, hints, text in documented:
+        for what in hints.keys() - {"return"}:  # a parameter, and then its shape, in one sentence
+            if not re.search(rf"\b{what}\b[^.]*?(?:{SHAPE.pattern})", text, re.S):
+                silent.append(f"{name}: {what}")
+        if "return" in hints and not SHAPE.search(text.partition("\n\nExamples")[0]):
+            silent.append(f"{name}: what it returns")
+    assert silent == []
 
 
 @pytest.mark.parametrize("package", PACKAGES, ids=label)

@@ -2,6 +2,7 @@ import re
 import shlex
 import tomllib
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -63,6 +64,28 @@ def test_the_readme_reads_the_same_where_no_other_file_is():
         assert target.startswith("https://"), target
     for notebook in ROOT.glob("notebooks/*.ipynb"):
         assert f"`{notebook.name}`" in README
+
+
+ADDRESS = re.compile(r"https?://[^\s)>\]\"'`;]+")
+
+
+def test_addresses_outside_are_well_formed():
+    # Whether they answer takes a network: `python notebooks/site/build.py --links`.
+    kinds = ("*.md", "*.cff", "*.toml", "notebooks/**/*.md", "notebooks/*.py", "notebooks/*.ipynb", "data/*.md")
+    pages = [
+        path
+        for kind in (*kinds, "tests/benchmarks/*.md", "pgo_models/**/*.py", "solvers/**/*.py")
+        for path in ROOT.glob(kind)
+        if "_build" not in path.parts
+    ]
+    found = {address for path in pages for address in ADDRESS.findall(path.read_text(encoding="utf-8"))}
+    assert found
+    for address in found:
+        parts = urlsplit(address)
+        assert parts.scheme == "https", address
+        assert re.fullmatch(r"[a-z0-9-]+(\.[a-z0-9-]+)+", parts.netloc), address
+        assert parts.netloc.rpartition(".")[2].isalpha(), address
+        assert not address.endswith((".", ",", ":")), address
 
 
 def test_the_release_is_the_same_everywhere():

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -108,6 +109,20 @@ def test_the_reference_has_every_public_name_and_every_notebook_is_there(pages, 
             assert f"{thing.__module__}.{thing.__qualname__}" in anchors, name
     for notebook in (ROOT / "notebooks").glob("[0-9][0-9]_*.py"):
         assert site / "notebooks" / f"{notebook.stem}.html" in pages
+
+
+ENTRY = re.compile(r'<dl class="py (property|method|function)">\s*<dt[^>]*id="([^"]+)">(.*?)</dt>', re.S)
+
+
+def test_every_property_and_function_of_the_reference_has_its_type_in_the_projects_words(site):
+    counts = dict.fromkeys(("property", "method", "function"), 0)
+    for page in (site / "reference").glob("*.html"):
+        for kind, name, head in ENTRY.findall(page.read_text(encoding="utf-8")):
+            counts[kind] += 1
+            text = " ".join(unescape(re.sub("<[^>]+>", "", head)).split())
+            assert re.search(r": \w" if kind == "property" else "\N{RIGHTWARDS ARROW}", text), name
+            assert "ndarray[" not in text, f"{name}: {text}"
+    assert min(counts.values()) > 100
 
 
 def opened_without_complaint(browser: Browser) -> None:

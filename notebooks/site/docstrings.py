@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator
 
 from docutils import nodes
-from sphinx.addnodes import pending_xref
+from sphinx.addnodes import desc_annotation, pending_xref
 
 import pgo_models
 import solvers
@@ -20,9 +20,10 @@ import solvers
 SECTIONS = ("Parameters", "Returns", "Yields", "Raises", "Examples", "Attributes", "Notes", "References", "See Also")
 LIST_ITEM = re.compile(r"(?:[-*+]|\d+\.|\([a-z]\)) ")
 ARRAY = re.compile(
-    r"~?(?:numpy\.)?ndarray\[~?tuple\[~?(?:typing\.)?Any, \.\.\.\], ~?(?:numpy\.)?dtype\[~?(?:numpy\.)?(\w+)\]\]"
+    r"~?(?:numpy\.)?ndarray\[~?tuple\[~?(?:typing\.)?Any, \.\.\.\], "
+    r"~?(?:numpy\.)?dtype\[~?(?:numpy\.|typing\.)?(\w+)\]\]"
 )
-ARRAYS = {"float64": "Array", "int64": "IntArray", "bool": "BoolArray", "bool_": "BoolArray"}
+ARRAYS = {"float64": "Array", "int64": "IntArray", "bool": "BoolArray", "bool_": "BoolArray", "Any": "ndarray"}
 FIELD = re.compile(r"^    (\w+): ([^=#]+?)(?: = .*?)?  # (.+)$")
 
 
@@ -194,9 +195,23 @@ def link_types(app: object, tree: nodes.document) -> None:
                 found["reftarget"], found["refspecific"] = target, False
 
 
+def short_types(app: object, tree: nodes.document) -> None:
+    """Types of properties, which no hook on signatures sees, with the project's names for arrays."""
+    for found in tree.findall(desc_annotation):
+        text = found.astext()
+        if (short := with_names(text)) != text:
+            found.children = []
+            found += nodes.Text(short)
+
+
+def with_names(text: str) -> str:
+    """A type with the project's names for arrays in place of what they stand for."""
+    return ARRAY.sub(lambda match: ARRAYS.get(match[1], match[0]), text)
+
+
 def with_array_names(app: object, what: str, name: str, thing: object, options: object, *texts: str | None) -> tuple:
     """Signature and what is returned, with the project's names for arrays in place of what they stand for."""
-    return tuple(text and ARRAY.sub(lambda match: ARRAYS.get(match[1], match[0]), text) for text in texts)
+    return tuple(text and with_names(text) for text in texts)
 
 
 def connect(app: object) -> None:
@@ -204,3 +219,4 @@ def connect(app: object) -> None:
     app.connect("autodoc-process-docstring", process, priority=400)
     app.connect("autodoc-process-signature", with_array_names)
     app.connect("doctree-read", link_types)
+    app.connect("doctree-read", short_types)

@@ -32,7 +32,7 @@ def multiplier_norms(Lambda: Array) -> Array:
 
 
 def certificate_matrix(problem: PGOProblem, Lambda: Array, eta: float = 0.0) -> csc_array:
-    """S + eta blockdiag(0, I), (N, N), with S = M - blockdiag(0, Lambda); the pattern is that of M.
+    """S + eta blockdiag(0, I), (N, N), with S = M - blockdiag(0, Lambda), Lambda (n, d, d); the pattern is that of M.
 
     Examples
     --------

@@ -76,7 +76,7 @@ def polish_step(
     steps), while each cuts the decrement to a tenth, or by so much that those left would bring it within tolerance.
     """
     is_far = state.analysis is None and not problem.is_quadratic
-    analysis, factor, is_newton = _factorize_model(problem, state, second_order and not is_far)
+    analysis, factor, is_newton = factorize_model(problem, state, second_order and not is_far)
     layout = TangentLayout(problem.num_poses, problem.d)
     now = replace(state, analysis=analysis, factor=factor, is_newton=is_newton, moved=False)
     level = rounding_level(problem, state.poses)  # hardly moves with them
@@ -139,7 +139,7 @@ def relative_decrement(problem: PGOProblem, poses: Poses) -> float:
     `STATIONARY_DECREMENT` in any case.
     """
     state = start_polish(problem, poses)
-    _, factor, is_newton = _factorize_model(problem, state, second_order=True)
+    _, factor, is_newton = factorize_model(problem, state, second_order=True)
     gradient = TangentLayout(problem.num_poses, problem.d).join(*problem.riemannian_gradient(poses))
     square = inner(gradient, factor.solve(gradient))
     decrement = scaled_decrement(square, state.objective, rounding_level(problem, poses))
@@ -151,7 +151,7 @@ def move_poses(poses: Poses, w: Array, v: Array) -> Poses:
     return Poses(project_to_rotations(poses.R @ exp_map(w)), poses.t + v)
 
 
-def _factorize_model(
+def factorize_model(
     problem: PGOProblem, state: PolishState, second_order: bool
 ) -> tuple[SymbolicCholesky, CholeskyFactor, bool]:
     """Factor the Hessian if it is positive definite, else the Gauss-Newton matrix with the least damping that works."""

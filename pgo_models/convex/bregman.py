@@ -102,7 +102,7 @@ class BregmanProblem:
         return tuple(slice(int(start), int(end)) for start, end in pairwise(ends))
 
     def stacked(self, values: Sequence[Array]) -> Array:
-        """x, (m,), of one array for every variable."""
+        """x, (m,), of `values`, one array for every variable, in its shape."""
         return np.concatenate([np.ravel(value) for value in values])
 
     def unstacked(self, x: Array) -> tuple[Array, ...]:

@@ -1,6 +1,7 @@
 """How cvxpy models are given to a solver, Clarabel unless another is named, and checked: convex, solved tightly."""
 
 import math
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -126,7 +127,10 @@ class ConvexSolver:
             said = "Solution may be inaccurate|.* expression with dimension greater than 2"
             warnings.filterwarnings("ignore", message=said, category=UserWarning)
             given = {**options, **self.options}
-            problem.solve(solver=self.name, warm_start=self.warm_start, verbose=verbose, **given)
+            try:
+                problem.solve(solver=self.name, warm_start=self.warm_start, verbose=verbose, **given)
+            except getattr(sys.modules.get("mosek"), "Error", cp.SolverError) as error:  # as of a missing licence
+                raise cp.SolverError(" ".join(str(error).split())) from error
 
 
 COLD = ConvexSolver(warm_start=False)  # equal parameters give equal bits

@@ -91,7 +91,7 @@ class ModelChange:
         Convex, in the variables that `PoseVariables` names and no others; added to F.
     constraints : sequence of cp.Constraint
         Convex, in the same variables.
-    replaced_edges : sequence of int
+    replaced_edges : sequence of int, or (m,) mask
         Edges whose squared residuals leave F, where terms have another loss for them.
 
     A SettingError when a term is not one convex number, or a constraint not convex.
@@ -99,10 +99,13 @@ class ModelChange:
 
     terms: Sequence[cp.Expression] = ()
     constraints: Sequence[cp.Constraint] = ()
-    replaced_edges: Sequence[int] = ()
+    replaced_edges: Sequence[int] | IntArray | BoolArray = ()
 
     def __post_init__(self) -> None:
         check_terms(self.terms, self.constraints)
+        edges = np.asarray(self.replaced_edges)
+        chosen = np.flatnonzero(edges) if edges.dtype == bool else edges.astype(int)
+        object.__setattr__(self, "replaced_edges", tuple(chosen.tolist()))
 
 
 Changer = Callable[[PoseVariables], ModelChange]
@@ -143,6 +146,18 @@ class GraphQP:
         self.variables.X.value = X
         added = sum(float(term.value) for term in self.change.terms)
         return float(self.w @ np.einsum("rc,rc->r", residuals, residuals)) + added
+
+    def gradient(self, X: Array) -> Array:
+        """Gradient of `cost` in X, (N, d), of terms that have one there."""
+        self.variables.X.value = X
+        of_edges = np.asarray(self.A.T @ (2.0 * self.w[:, None] * (self.A @ X)))
+        return sum(map(self.gradient_of, self.change.terms), of_edges)
+
+    def gradient_of(self, term: cp.Expression) -> Array:
+        """Gradient of a term, (N, d), at the value of X."""
+        X = self.variables.X
+        found = term.grad.get(X, csr_array((X.size, 1)))
+        return np.asarray(found.toarray().reshape(X.shape, order="F"))
 
 
 def graph_qp(
@@ -228,7 +243,7 @@ def _posed(
     if not isinstance(change, ModelChange):
         raise SettingError(f"the changer returned a {type(change).__name__}; return ModelChange(terms=[..])")
     share = share.copy()
-    share[list(change.replaced_edges)] = 0.0
+    share[np.array(change.replaced_edges, dtype=int)] = 0.0
     weights = weights * np.concatenate([share if joint else np.zeros(m), np.repeat(share, d)])
     counted = weights > 0
     whole, w = whole[counted], weights[counted]

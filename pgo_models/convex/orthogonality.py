@@ -159,14 +159,14 @@ class OrthogonalProblem:
         return [term.constraint for term in self.terms if term.variable == variable]
 
     def values(self, copies: Sequence[Array]) -> tuple[Array, ...]:
-        """For every variable, in its shape, the copy in the first of its sets."""
+        """For every variable the one of `copies`, in its shape, that is in the first of its sets."""
         first: dict[int, Array] = {}
         for term, copy in zip(self.terms, copies, strict=True):
             first.setdefault(term.variable, copy)
         return tuple(first[place] for place in range(len(self.variables)))
 
     def assign(self, values: Sequence[Array], others: Sequence[Array] = ()) -> None:
-        """Put values, each in its shape, into the cvxpy variables, `variables` and then `others`."""
+        """Put values and others, each in its shape, into the cvxpy variables of these names."""
         for variable, value in zip((*self.variables, *self.others), (*values, *others), strict=False):
             variable.save_value(value)
 
@@ -177,7 +177,7 @@ class OrthogonalProblem:
             return float(self.J.value)
 
     def infeasibility(self, copies: Sequence[Array], others: Sequence[Array] = ()) -> float:
-        """Norm of what copies, in their variables' shapes, violate: sets (rounding), agreement, constraints."""
+        """Norm of what copies and others, of the shape of their variables, violate: sets, agreement, constraints."""
         values = self.values(copies)
         parts = [term.constraint.distance(copy) for term, copy in zip(self.terms, copies, strict=True)]
         parts += [

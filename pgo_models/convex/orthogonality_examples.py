@@ -9,7 +9,6 @@ from pgo_models.convex.convex_solver import finite_array
 from pgo_models.convex.orthogonality import OrthogonalProblem
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.pose_graph import PoseGraph
 
 
 def procrustes(A: Array, B: Array, *, rotation: bool = False) -> OrthogonalProblem:
@@ -27,52 +26,16 @@ def procrustes(A: Array, B: Array, *, rotation: bool = False) -> OrthogonalProbl
     return OrthogonalProblem(problem, rotations=[X]) if rotation else OrthogonalProblem(problem, orthogonal=[X])
 
 
-def smallest_eigenvectors(A: Array, count: int) -> OrthogonalProblem:
-    """Minimise tr(X^T A X) s.t. X^T X = I, A symmetric positive semidefinite: the sum of the smallest eigenvalues.
-
-    X spans their eigenvectors. For the largest ones of A give c I - A, c at least the largest eigenvalue. A
-    SettingError when A is not symmetric positive semidefinite.
-    """
-    A = _matrix(A, "A")
-    X = cp.Variable((len(A), count), name="X")
-    return OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(_root(A) @ X))), orthogonal=[X])
-
-
-def one_norm_components(A: Array, count: int) -> OrthogonalProblem:
-    """Minimise sum |A X| s.t. X^T X = I: the `count` directions in which the rows of A are smallest in the 1-norm.
-
-    The 1-norm form of the last principal components. When most rows lie in a hyperplane, its normal is the answer for
-    count = 1 whatever the other rows are, where the eigenvector of A^T A is turned by them (Tsakiris & Vidal 2018).
-    """
-    A = _matrix(A, "A")
-    X = cp.Variable((A.shape[1], count), name="X")
-    return OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum(cp.abs(A @ X)))), orthogonal=[X])
-
-
 def sparse_components(A: Array, count: int, weight: float) -> OrthogonalProblem:
     """Minimise tr(X^T A X) + weight * sum |X| s.t. X^T X = I, A positive semidefinite: compressed modes.
 
-    No answer is below the sum of the smallest eigenvalues + weight * count, since a unit column has 1-norm at least 1
-    (Ozolins, Lai, Caflisch, Osher 2013).
+    With weight 0 they span the eigenvectors of the smallest eigenvalues. No answer is below the sum of these + weight *
+    count, since a unit column has 1-norm at least 1 (Ozolins, Lai, Caflisch, Osher 2013).
     """
     A = _matrix(A, "A")
     X = cp.Variable((len(A), count), name="X")
     objective = cp.sum_squares(_root(A) @ X) + weight * cp.sum(cp.abs(X))
     return OrthogonalProblem(cp.Problem(cp.Minimize(objective)), orthogonal=[X])
-
-
-def rotation_averaging(graph: PoseGraph) -> OrthogonalProblem:
-    """Minimise sum_e kappa ||R_j - R_i R_ij||_F^2 over rotations R_0 .. R_{n-1} (paper: `rotation`).
-
-    The rotation part of F, one (d, d) variable a pose. A common rotation of all is free.
-    """
-    R = [cp.Variable((graph.d, graph.d), name=f"R_{pose}") for pose in range(graph.num_poses)]
-    root = np.sqrt(graph.kappa)
-    residuals = [
-        root[edge] * (R[j] - R[i] @ graph.R_ij[edge])
-        for edge, (i, j) in enumerate(zip(graph.i.tolist(), graph.j.tolist(), strict=True))
-    ]
-    return OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(cp.vstack(residuals)))), rotations=R)
 
 
 def sparse_low_rank(Y: Array, rank: int, nonzeros: int) -> OrthogonalProblem:

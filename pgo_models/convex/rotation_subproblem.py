@@ -7,13 +7,13 @@ only Parameter (DPP), so that the problem is compiled once and solved again for 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cvxpy as cp
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
-from pgo_models.convex.convex_solver import ConvexSolver, solve_compiled
+from pgo_models.convex.convex_solver import ConvexSolver, as_solver, solve_compiled
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 
@@ -28,7 +28,8 @@ class RotationQP:
     X: cp.Variable  # (N, d): rows t_i, then the rows of every R_i^T, of the poses concerned
     shift: cp.Parameter  # (N_D, d): sqrt(D) V on the rows whose penalty is not zero
     penalty: Array  # (N,): the diagonal of D
-    solver: ConvexSolver | str = "CLARABEL"
+    solver: ConvexSolver
+    last: dict[bytes, Array] = field(default_factory=dict)  # X, (N, d), of the shift that was solved for last
 
     def solve(self, V: Array) -> Array:
         """X, (N, d), for the shift V, (N, d); rows of V without a penalty do not matter.
@@ -37,9 +38,13 @@ class RotationQP:
         """
         held = self.penalty > 0
         self.shift.value = np.sqrt(self.penalty[held])[:, None] * V[held]
-        # The quadratic program reaches the tolerance; added cones may not, and stop where rounding lets them.
-        solve_compiled(self.problem, "R-subproblem", TOLERANCE, self.solver, (cp.OPTIMAL_INACCURATE,))
-        return np.asarray(self.X.value)
+        key = self.shift.value.tobytes()
+        if key not in self.last:  # SOC asks for the translations of an iterate, and in its next step for the rotations
+            # The quadratic program reaches the tolerance; added cones may not, and stop where rounding lets them.
+            solve_compiled(self.problem, "R-subproblem", TOLERANCE, self.solver, (cp.OPTIMAL_INACCURATE,))
+            self.last.clear()
+            self.last[key] = np.asarray(self.X.value)
+        return self.last[key].copy()
 
 
 def rotation_qp(
@@ -86,4 +91,4 @@ def rotation_qp(
         raise SettingError(
             "an added term or constraint is not convex by the rules of cvxpy (DCP, and DPP in Parameters)"
         )
-    return RotationQP(problem, X, shift, penalty, solver)
+    return RotationQP(problem, X, shift, penalty, as_solver(solver))

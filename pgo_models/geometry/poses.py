@@ -73,7 +73,7 @@ class Poses(ReadOnly):
 
     @classmethod
     def of_points(cls, t: Array) -> Poses:
-        """Return poses at points (n, d), unrotated."""
+        """Return unrotated poses at points t, (n, d), in metres."""
         return cls(np.broadcast_to(np.eye(np.shape(t)[1]), (len(t), np.shape(t)[1], np.shape(t)[1])), t)
 
     @property

@@ -16,7 +16,7 @@ _POLAR_MIN_DETERMINANT = 1e-2  # of the matrix scaled to Frobenius norm sqrt(3);
 
 
 def project_to_rotations(A: Array) -> Array:
-    """Nearest rotations: argmin over omega in SO(d) of ||omega - A_i||_F for every A_i, (n, d, d).
+    """Nearest rotations: argmin over omega in SO(d) of ||omega - A_i||_F for every A_i of A, (n, d, d).
 
     With the SVD A = U D V^T the answer is U diag(1, .., 1, det(U V^T)) V^T. Well conditioned 3 x 3 matrices of
     positive determinant take Newton's polar iteration X <- (X + cof(X) / det X) / 2 instead, which has the same limit.
@@ -133,7 +133,7 @@ def exp_map(w: Array) -> Array:
 
 
 def log_map(R: Array) -> Array:
-    """Tangent vectors w, (n, 1) or (n, 3), in radians, with Exp(hat(w)) = R and ||w|| <= pi.
+    """Tangent vectors w, (n, 1) or (n, 3), in radians, with Exp(hat(w)) = R, (n, d, d), and ||w|| <= pi.
 
     Examples
     --------

@@ -182,7 +182,7 @@ class PoseGraph(Measurements):
         return self.with_weights((self.kappa > 0).astype(float), (self.tau > 0).astype(float))
 
     def with_weights(self, kappa: Array, tau: Array) -> PoseGraph:
-        """Return the same measurements with other precisions, (m,); information matrices as read do not go along."""
+        """The same measurements with other kappa and tau, (m,); information matrices as read do not go along."""
         return replace(self, kappa=kappa, tau=tau, information=None)
 
     def with_robots(self, robot: IntArray) -> PoseGraph:
@@ -214,7 +214,7 @@ class PoseGraph(Measurements):
         return self.with_prior(poses, Poses.of_points(positions), 0.0, tau)
 
     def with_landmark(self, seen_from: IntArray, positions: Array, tau: Weights, name: int | None = None) -> PoseGraph:
-        """Return the graph, without truth, with one more landmark, seen at (k, d) in the frames of poses (k,)."""
+        """The graph, without truth, with a landmark `seen_from` poses, (k,), at `positions` in their frames, (k, d)."""
         points, n, first, initial = Poses.of_points(positions), self.num_poses, seen_from[0], self.initial
         name = int(self.pose_ids[self.in_files].max()) + 1 if name is None else name
         if initial is not None:

@@ -181,13 +181,13 @@ class PGOProblem:
         return read_only(matrices.entry_positions(self.M, *matrices.block_entries(block, block)))
 
     def with_pattern_of_M(self, data: Array) -> csc_array:
-        """Return the matrix, (N, N), that has the pattern of M and stored values (nnz,)."""
+        """Return the matrix, (N, N), that has the pattern of M and stored values `data`, (nnz,)."""
         matrix = csc_array((data, self.M.indices, self.M.indptr), shape=self.M.shape)
         matrix.has_canonical_format = True
         return matrix
 
     def leave_out(self, data: Array, rows: IntArray, diagonal: Array | float) -> None:
-        """Overwrite the stored values, (nnz,), of a matrix as M: rows and columns, (k,), then hold but a diagonal."""
+        """Overwrite `data`, (nnz,), stored of a matrix as M: `rows` and columns, (k,), hold but a `diagonal`, (k,)."""
         is_out = np.zeros(self.side, dtype=bool)
         is_out[rows] = True
         data[is_out[self.M.indices] | np.repeat(is_out, np.diff(self.M.indptr))] = 0.0
@@ -260,7 +260,7 @@ class PGOProblem:
         return t
 
     def with_best_translations(self, R: Array) -> Poses:
-        """Poses (R, t) with the translations of `recover_translations`."""
+        """Poses (R, t), R of shape (n, d, d), with the translations of `recover_translations`."""
         return Poses(R, self.recover_translations(R))
 
     def at_best_translations(self, poses: Poses) -> Poses:
@@ -307,7 +307,7 @@ class PGOProblem:
         return Incidence.of(self.graph)
 
     def edge_products(self, residuals: Array, X: Array) -> Array:
-        """Z, (m, d + 1, d): the residual rows of every edge, times R_i."""
+        """Z, (m, d + 1, d): the residual rows of every edge, of `residuals`, ((d+1) m, d), times R_i of X, (N, d)."""
         rho = blocks_of_rows(residuals, self.graph.num_edges, self.weights.axes)
         return np.asarray(rho @ unstack_transposes(X[self.num_poses :])[self.graph.i])
 

@@ -170,7 +170,7 @@ def with_priors(model: GraphQP) -> tuple[PoseGraph, list[cp.Expression]]:
         gradients = []
         for entry in (0.0, 1.0):
             X.value = np.full(X.shape, entry)
-            gradients.append(np.reshape(term.grad[X].toarray(), X.shape, order="F"))
+            gradients.append(model.gradient_of(term))
         w = 0.5 * (gradients[1] - gradients[0])[:, 0]
         centre, turned = -0.5 * gradients[0] / np.where(w > 0, w, np.inf)[:, None], w[n::d] > 0
         R = np.where(turned[:, None, None], project_to_rotations(unstack_transposes(centre[n:])), np.eye(d))

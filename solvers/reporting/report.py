@@ -77,6 +77,7 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
     if any(len(history) for _, history in stages):
         plots["convergence"] = explore_convergence(stages, certificate.lower_bound, published_run(graph))
     figures = ",".join(f'"{name}":{figure.to_json()}' for name, figure in plots.items())
+    suggested = advice(graph, certificate, solution.status, residuals, source, solution.robust is not None)
     content = {
         "solution": solution,
         "graph": graph,
@@ -88,7 +89,8 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
         "ate": None
         if graph.truth is None
         else absolute_trajectory_error(solution.poses[graph.bodies], graph.truth[graph.bodies]),
-        "advice": advice(graph, certificate, solution.status, residuals, source, solution.robust is not None),
+        # Commands solve the graph without terms of one's own.
+        "advice": [] if any(stage.name == "ExtendedSOC" for stage in solution.stages) else suggested,
         "before": before_name,
         "thinned": [thinning_step(graph.num_edges, MOST_LINES), thinning_step(graph.num_poses, MOST_DOTS)],
         "has_curves": "convergence" in plots,

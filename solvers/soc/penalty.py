@@ -52,7 +52,7 @@ class _Rule(ABC):
 
     @abstractmethod
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
-        """(per_norm, per_scale, least), from ||Lambda_i||_2 / m_i of all poses, (n,)."""
+        """(per_norm, per_scale, least), from ||Lambda_i||_2 / m_i, the `ratio` of all poses, (n,)."""
 
     def initial(self, problem: PGOProblem, poses: Poses) -> Array:
         """rho, (n,), at poses."""
@@ -91,7 +91,7 @@ class MultiplierPenalty(_Rule):
             )
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
-        """(per_norm, per_scale, least), from ||Lambda_i||_2 / m_i of all poses, (n,)."""
+        """(per_norm, per_scale, least), from ||Lambda_i||_2 / m_i, the `ratio` of all poses, (n,)."""
         # Where the multipliers are zero but for rounding (measurements without noise) any penalty works that M + D/2
         # does not lose to rounding.
         floor = max(float(np.quantile(ratio, self.quantile)), _SMALLEST_RATIO)
@@ -108,7 +108,7 @@ class FixedPenalty(_Rule):
         check_settings(self, positive=["rho"])
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
-        """(0, 0, rho)."""
+        """(0, 0, rho), whatever the `ratio`, (n,)."""
         return 0.0, 0.0, self.rho
 
 

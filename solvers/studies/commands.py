@@ -56,14 +56,16 @@ def tables_command(
     ] = KEPT_FILE,
     fresh: Annotated[bool, typer.Option("--fresh", help="Leave aside what is kept, and run all anew.")] = False,
     download: DownloadOption = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Run the paper's tables 1 to 4, row for row: its figures beside ours, held against proven bounds."""
     _check(out, check_table_format)
     check_writable(keep)
     settings = ReproductionSettings(_split(only), seeds, robots, download)
-    tables = reproduce_tables(settings, keep, is_fresh=fresh)
+    tables = reproduce_tables(settings, keep, is_fresh=fresh, progress=False if quiet else None)
     table = tables_as_text(tables)
-    save_then_show([(path, table.save) for path in out or []], table.print)
+    save_then_show([(path, table.save) for path in out or []], table.print, table.as_json if as_json else None, quiet)
     if not tables.is_complete:
         raise typer.Exit(BROKEN_OFF)
 
@@ -113,11 +115,15 @@ def figures_command(
         str, typer.Option(help=f"With commas between: {', '.join(one.value for one in FigureSet)}. All unless given.")
     ] = "",
     download: DownloadOption = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Draw the paper's figures anew, as PNG and as pages to explore."""
-    written, reasons = draw_paper_figures(out, _chosen(FigureSet, only, "figure"), download=download)
-    for path in written:
-        typer.echo(f"written: {path}")
+    sets, progress = _chosen(FigureSet, only, "figure"), False if quiet else None
+    written, reasons = draw_paper_figures(out, sets, download=download, progress=progress)
+    record: dict[str, object] = {"written": list(map(str, written)), "left_out": reasons}
+    text = "\n".join(f"written: {path}" for path in written)
+    save_then_show([], lambda: typer.echo(text), (lambda: record) if as_json else None, quiet)
     for reason in reasons:
         typer.echo(f"left out: {reason}", err=True)
     if not written:

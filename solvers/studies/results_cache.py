@@ -1,4 +1,7 @@
-"""Finished results of a long job in a JSON file, so that the job can go on where it was interrupted."""
+"""Finished results of a long job in a JSON file, so that the job can go on where it was interrupted.
+
+Readers and other programs can open it, which they cannot with what joblib.Memory or diskcache keep.
+"""
 
 import json
 from pathlib import Path

@@ -1,10 +1,13 @@
 """Any solver of cvxpy by name or with options, for every model; and what is said of models that are not convex."""
 
 import math
+import sys
+from types import SimpleNamespace
 
 import cvxpy as cp
 import numpy as np
 import pytest
+from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC, SOLVER_MAP_QP
 from graphs import varied_problem
 
 from pgo_models.convex.bregman import BregmanProblem
@@ -121,6 +124,77 @@ def test_options_win_and_what_is_not_there_is_named() -> None:
     with pytest.raises(SettingError, match="what CVXOPT calls it is not known"):
         solve_relaxation(PGOProblem(circle(np.random.default_rng(0))), solver="CVXOPT", time_limit=10.0)
     assert math.isfinite(solve_relaxation(varied_problem(1, 8, 2), solver="SCS", time_limit=10.0).value)
+
+
+@pytest.mark.parametrize("name", cp.installed_solvers())
+def test_every_installed_solver_solves_what_it_can_and_says_in_one_line_what_it_cannot(name: str) -> None:
+    problem = varied_problem(4, 5, 2)
+    cone = lambda u: ModelChange(terms=[cp.norm(u.t(0) - 1.0)])  # noqa: E731
+    V = np.random.default_rng(0).standard_normal((problem.side, 2))
+    exact = graph_qp(problem.graph, np.ones(5), changer=cone).solve(V)
+    rounds = {
+        "quadratic": lambda: graph_qp(problem.graph, np.ones(5), solver=name).solve(V),
+        "cone": lambda: graph_qp(problem.graph, np.ones(5), changer=cone, solver=name).solve(V),
+        "semidefinite": lambda: solve_relaxation(problem, solver=name).lower_bound,
+    }
+    cones = {one.__name__ for one in getattr(SOLVER_MAP_CONIC.get(name), "SUPPORTED_CONSTRAINTS", ())}
+    can = {"cone": "SOC" in cones, "semidefinite": bool({"PSD", "SvecPSD"} & cones)}
+    can["quadratic"] = (can["cone"] and name != "CVXOPT") or name in SOLVER_MAP_QP  # CVXOPT: see ROBUST_CVXOPT
+    for kind, solve_it in rounds.items():
+        if can[kind]:
+            found = solve_it()
+            if kind == "cone":
+                np.testing.assert_allclose(found, exact, rtol=0, atol=100 * ROUGH)
+            if kind == "semidefinite":
+                assert found <= solve(problem).objective
+            continue
+        with pytest.raises(PGOError, match=f"^{name} ") as caught:
+            solve_it()
+        assert "\n" not in str(caught.value)
+
+
+def test_options_reach_mosek_by_their_name_and_a_missing_licence_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """MOSEK is not on every machine: a stand-in of its name hears what it would be given."""
+
+    class Error(Exception):
+        pass
+
+    heard: list[dict[str, object]] = []
+
+    def unlicensed(self: cp.Problem, **options: object) -> None:
+        heard.append(options)
+        raise Error("rescode.err_missing_license_file(1008): License cannot be located.\nThe default is mosek.lic")
+
+    monkeypatch.setitem(sys.modules, "mosek", SimpleNamespace(Error=Error))
+    monkeypatch.setattr(cp, "installed_solvers", lambda: ["CLARABEL", "MOSEK"])
+    monkeypatch.setattr(cp.Problem, "solve", unlicensed)
+    mosek = ConvexSolver("MOSEK", {"mosek_params": {"MSK_DPAR_INTPNT_CO_TOL_REL_GAP": 1e-10}}, warm_start=False)
+    problem = varied_problem(4, 5, 2)
+    for solve_it in (
+        lambda: graph_qp(problem.graph, np.ones(5), solver=mosek).solve(np.zeros((problem.side, 2))),
+        lambda: solve_relaxation(problem, solver=mosek),
+        lambda: run(SOC(r_step=CvxpyStep(mosek)), problem),
+        lambda: solve_orthogonal(
+            procrustes(np.eye(3), np.eye(3)), np.random.default_rng(0), OrthogonalSOC(solver=mosek)
+        ),
+    ):
+        heard.clear()
+        with pytest.raises(PGOError, match=r"^MOSEK .*License cannot be located\. The default is mosek\.lic") as caught:
+            solve_it()
+        assert "\n" not in str(caught.value)
+        assert {options["solver"] for options in heard} == {"MOSEK"}
+        assert all(options["mosek_params"] == {"MSK_DPAR_INTPNT_CO_TOL_REL_GAP": 1e-10} for options in heard)
+        assert all(set(options) == {"solver", "warm_start", "verbose", "mosek_params"} for options in heard)
+
+
+def test_a_solver_that_is_not_installed_is_one_line_that_names_those_that_are() -> None:
+    missing = next(name for name in ("MOSEK", "GUROBI", "KNITRO", "COPT") if name not in cp.installed_solvers())
+    for use in (lambda: ConvexSolver(missing), lambda: solve_relaxation(varied_problem(4, 5, 2), solver=missing)):
+        with pytest.raises(
+            SettingError, match=rf"^solver '{missing}' is not installed; cvxpy finds CLARABEL, "
+        ) as caught:
+            use()
+        assert "\n" not in str(caught.value)
 
 
 def test_what_is_not_convex_is_told_how_to_be_written() -> None:

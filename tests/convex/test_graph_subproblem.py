@@ -205,3 +205,10 @@ def test_what_is_not_there_is_named() -> None:
         graph_qp(graph, rho, Unknowns.ROTATIONS, lambda unknown: ModelChange(terms=[cp.sum_squares(unknown.t(0))]))
     with pytest.raises(SettingError, match="not convex"):
         graph_qp(graph, rho, changer=lambda unknown: ModelChange(terms=[-cp.sum_squares(unknown.t(0))]))
+
+
+def test_edges_are_replaced_by_number_by_array_or_by_mask() -> None:
+    mask = np.array([False, True, False, True])
+    for edges in ([1, 3], range(1, 4, 2), np.array([1, 3]), mask):
+        assert ModelChange(replaced_edges=edges).replaced_edges == (1, 3)
+    assert ModelChange().replaced_edges == ()

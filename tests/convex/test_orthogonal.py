@@ -9,16 +9,10 @@ from budget import examples
 from graphs import polar_factor
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from orthogonal_models import one_norm_components, rotation_averaging, smallest_eigenvectors
 
 from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem, kkt_residuals
-from pgo_models.convex.orthogonality_examples import (
-    one_norm_components,
-    procrustes,
-    rotation_averaging,
-    smallest_eigenvectors,
-    sparse_components,
-    sparse_low_rank,
-)
+from pgo_models.convex.orthogonality_examples import procrustes, sparse_components, sparse_low_rank
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, orthogonality_error, random_rotations
 from pgo_models.graphs.scenes import MILD_NOISE, grid, random_geometric

@@ -5,17 +5,11 @@ from budget import examples
 from graphs import polar_factor
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from orthogonal_models import one_norm_components, rotation_averaging, smallest_eigenvectors
 
 from pgo_models.convex.constraint_sets import Orthonormal, Rotations, Sparse, UnitColumns, UnitRows
 from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem, kkt_residuals
-from pgo_models.convex.orthogonality_examples import (
-    one_norm_components,
-    procrustes,
-    rotation_averaging,
-    smallest_eigenvectors,
-    sparse_components,
-    sparse_low_rank,
-)
+from pgo_models.convex.orthogonality_examples import procrustes, sparse_components, sparse_low_rank
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.rotations import random_rotations
 from pgo_models.graphs.scenes import grid
@@ -245,7 +239,7 @@ def test_examples_check_their_matrices() -> None:
     with pytest.raises(SettingError, match="A has 2 rows and B 3"):
         procrustes(np.eye(2), np.ones((3, 2)))
     with pytest.raises(SettingError, match="give a matrix"):
-        one_norm_components(np.ones(3), 1)
+        procrustes(np.ones(3), np.ones((3, 3)))
 
 
 @settings(max_examples=examples(20), deadline=None)
