@@ -72,6 +72,29 @@ class Subgraph:
         return Part(problem, self.poses[poses], self.in_cover[poses], final, self.edges[kept], allowed)
 
 
+    @cached_property
+    def outline(self) -> Outline:
+        """What the driver is told of it."""
+        part, held = self.counted[0], np.flatnonzero(self.in_cover >= 0)
+        touched = self.in_cover[part][self.in_cover[part] >= 0]
+        counts = np.sort(touched) if self.is_counted.any() else None
+        known = self.graph.d, self.poses[held], self.in_cover[held], counts, self.final is not None
+        return Outline(self.robot, *known, self.poses[part])
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """What a driver knows of a robot: of the poses that it solves for, those that the robot holds."""
+
+    robot: int
+    d: int
+    cover: IntArray  # (h,): their numbers in the whole graph
+    in_cover: IntArray  # (h,): their positions among all that the driver solves for
+    touched: IntArray | None  # positions of those that an edge which the robot counts joins; None if it counts none
+    has_two_costs: bool
+    part: IntArray | None  # (p,): numbers of all poses that these edges join; None where they are the robot's to know
+
+
 @dataclass(frozen=True, eq=False)
 class Part:
     """The cost of the edges that one robot counts."""
@@ -131,7 +154,7 @@ def split_graph(
     owner = partition.robot
     # An end outside the cover decides: such ends of one edge have one owner. Else the owner of the first end counts it.
     counts = np.where(cover[graph.j] < 0, owner[graph.j], owner[graph.i])
-    holds = _holders(graph, owner, partition.num_robots)
+    holds = holders(graph.i, graph.j, owner, partition.num_robots)
     held = holds.tocsc()
     m, robots = graph.num_edges, range(partition.num_robots)
     robot, edge = np.divmod(np.unique(np.concatenate([owner[end] * m + np.arange(m) for end in (graph.i, graph.j)])), m)
@@ -143,10 +166,7 @@ def split_graph(
         measured = graph.R_ij[edges], graph.t_ij[edges], graph.kappa[edges], graph.tau[edges]
         name = f"{graph.name}, robot {robot}"
         local = PoseGraph(len(poses), i, j, *measured, ids=graph.pose_ids[poses], name=name)
-        held = holds[poses].tocsc()
-        others = [other for other in np.flatnonzero(np.diff(held.indptr)).tolist() if other != robot]
-        common = tuple((other, np.sort(held.indices[held.indptr[other] : held.indptr[other + 1]])) for other in others)
-        copies, counted = np.diff(holds[poses].indptr), counts[edges] == robot
+        (copies, common), counted = held_with(holds, poses, robot), counts[edges] == robot
         final = None if costs[1] is None else costs[1].of_edges(edges)
         allowed = None if thresholds is None else thresholds[edges]
         of_edges = edges, costs[0].of_edges(edges), final, allowed
@@ -164,10 +184,20 @@ def middle_separator(graph: PoseGraph, subgraphs: tuple[Subgraph, ...]) -> int:
     return int(in_cover[order[np.argmax(in_cover[order] >= 0)]])
 
 
-def _holders(graph: PoseGraph, owner: IntArray, num_robots: int) -> csr_array:
-    """Whether a robot holds a pose, (n, num_robots): its own, and the far ends of its edges."""
-    pose = np.concatenate([np.arange(graph.num_poses), graph.i, graph.j])
-    robot = np.concatenate([owner, owner[graph.j], owner[graph.i]])
+def holders(i: IntArray, j: IntArray, owner: IntArray, num_robots: int) -> csr_array:
+    """Whether a robot holds a pose, (n, num_robots): its own, and the far ends of its edges (i, j)."""
+    pose = np.concatenate([np.arange(len(owner)), i, j])
+    robot = np.concatenate([owner, owner[j], owner[i]])
     once = np.unique(pose * num_robots + robot)
     pose, robot = np.divmod(once, num_robots)
-    return csr_array((np.ones(len(once)), (pose, robot)), shape=(graph.num_poses, num_robots))
+    return csr_array((np.ones(len(once)), (pose, robot)), shape=(len(owner), num_robots))
+
+
+def held_with(
+    holds: csr_array, poses: IntArray, robot: int
+) -> tuple[IntArray, tuple[tuple[int, IntArray], ...]]:
+    """`Subgraph.copies` and `Subgraph.common` of poses that a robot holds, from who holds which."""
+    held = holds[poses].tocsc()
+    others = [other for other in np.flatnonzero(np.diff(held.indptr)).tolist() if other != robot]
+    common = tuple((other, np.sort(held.indices[held.indptr[other] : held.indptr[other + 1]])) for other in others)
+    return np.diff(holds[poses].indptr), common
