@@ -19,11 +19,11 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from pgo_models.certificates.certificate import DEFAULT_GAP, certify
+from pgo_models.certificates.certificate import DEFAULT_GAP, Certificate, certify
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
 from pgo_models.files import check_writable
 from pgo_models.geometry.poses import absolute_trajectory_error
-from pgo_models.graphs.datasets import known_datasets
+from pgo_models.graphs.datasets import known_datasets, locate
 from pgo_models.graphs.g2o import MOST_SYMBOLS, symbol_ids, write_g2o, write_g2o_folder
 from pgo_models.graphs.separators import report_partition
 from pgo_models.graphs.trajectories import write_tum
@@ -32,11 +32,13 @@ from solvers import cli_options as choices
 from solvers.cli_inputs import estimated_poses, load_graph, pose_named, pose_problem, with_times
 from solvers.distributed.checkpoint import Checkpoint
 from solvers.explanations import explained_by_its_graph, hint_of_chi2, hint_of_misfits, warn_of_weights, with_places
+from solvers.folder_solve import solve_folder
 from solvers.pipeline import HANDOVER, solve
 from solvers.progress_bars import JobBar
 from solvers.reporting.graph_facts import describe_graph, memory_note
 from solvers.reporting.report import check_report, write_report
 from solvers.reporting.versions import installation, installed_version, installed_versions
+from solvers.result import Status
 from solvers.shell import DONE, Commands, JsonOption, QuietOption, run_command, save_then_show
 from solvers.soc.soc import SOC
 from solvers.solution import both_costs, certificate_json, check_format, check_target, other_cost, write_json
@@ -177,6 +179,22 @@ def solve_command(
         raise SettingError("--verbose prints a line an iteration, and --quiet and --json do not; give one of them")
     for path in out or []:
         check_format(path)  # before a long solve, not after it
+    bar = sys.stderr.isatty() and not quiet
+    if choices.reads_own_files(graph, engine, address, robots, split):
+        whole: dict[str, object] = {"report": report, "covariances": covariances, "resume": resume, "robust": robust}
+        whole |= {"drop-edge": drop_edge, "anchor": anchor is not None, "times": times, "start": start}
+        whole |= {"r-step": r_step, "information": information, "unit-weights": unit_weights, "json": as_json}
+        whole |= {"skip-unknown": skip_unknown, "out FILE": out and (len(out) > 1 or out[0].suffix)}
+        if refused := [name for name, given in whole.items() if given]:
+            raise SettingError(f"--{refused[0]} takes the whole graph in one process; to have it read: --split given")
+        chosen = choices.chosen_method(method, None, True)
+        pipeline = choices.chosen_pipeline(chosen, None, None, gap, max_iterations, tolerance, driver_memory)
+        place, to = choices.chosen_engine(chosen, engine, address, False), out[0] if out else None
+        found = solve_folder(
+            locate(graph), pipeline, engine=place, out=to, time_limit=time_limit, verbose=verbose, progress=bar
+        )
+        typer.echo("" if quiet else f"{found}\n", nl=False)
+        raise typer.Exit(_exit_code(found.status, found.certificate))
     if report is not None:
         check_report(report)
     if covariances is not None and covariances.suffix.lower() != ".csv":
@@ -217,7 +235,7 @@ def solve_command(
         anchor=pose_named(problem.graph, anchor) if anchor is not None else None,
         time_limit=time_limit,
         verbose=verbose,
-        progress=sys.stderr.isatty() and not quiet,
+        progress=bar,
     )
     solution = with_places(solution, graph, drop_edge)
     text, truth = str(solution), problem.graph.truth
@@ -246,9 +264,13 @@ def solve_command(
 
     save_then_show(targets, show, solution.as_json if as_json else None, quiet)
     warn_of_weights(graph, problem, solution.certificate, drop_edge)
-    if not solution.status.is_success:
-        raise typer.Exit(NOT_CONVERGED)
-    raise typer.Exit(DONE if solution.is_certified else NOT_CERTIFIED)
+    raise typer.Exit(_exit_code(solution.status, solution.certificate))
+
+
+def _exit_code(status: Status, certificate: Certificate) -> int:
+    if not status.is_success:
+        return NOT_CONVERGED
+    return DONE if certificate.is_certified else NOT_CERTIFIED
 
 
 @app.command("certify")

@@ -23,7 +23,7 @@ def vertex_cover(partition: Partition, graph: PoseGraph) -> IntArray:
 def cover_of_edges(i: IntArray, j: IntArray) -> IntArray:
     """The same for all edges (i, j), which are those between robots."""
     poses, ends = np.unique(np.concatenate([i, j]), return_inverse=True)
-    adjacency = edge_counts(*np.split(ends, 2), len(poses))
+    adjacency = edge_counts(ends[: len(i)], ends[len(i) :], len(poses))
     degree = np.diff(adjacency.indptr)
     chosen = np.zeros(len(poses), dtype=bool)
     queue = [(-int(degree[pose]), int(pose)) for pose in np.flatnonzero(degree)]
