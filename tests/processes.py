@@ -26,7 +26,7 @@ def data_megabytes() -> float:
 def allow(megabytes: float) -> None:
     """From now on this process may take so much more memory, and no more."""
     most = int((data_megabytes() + megabytes) * _MEGABYTE)
-    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    resource.setrlimit(resource.RLIMIT_DATA, (most, resource.getrlimit(resource.RLIMIT_DATA)[1]))
 
 
 def under_limit(megabytes: float, act: Callable[..., Any], *arguments: object) -> Any:
@@ -56,7 +56,8 @@ class LimitedProcesses:
 
 class _Processes:
     def __init__(self, megabytes: float, make: Callable[[Any], Any], shares: Sequence[Any]) -> None:
-        spawning = multiprocessing.get_context("spawn")
+        spawning = multiprocessing.get_context("forkserver")
+        spawning.set_forkserver_preload([__name__])
         self.links, self.processes = [], []
         for share in shares:
             here, there = spawning.Pipe()
