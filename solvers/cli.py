@@ -175,24 +175,21 @@ def solve_command(
     as_json: JsonOption = False,
 ) -> None:
     """Solve a pose graph: poses, their cost, a proven lower bound on the global optimum, and the gap."""
+    more = {name for name, value in locals().items() if value not in (None, False)} - choices.FOR_OWN_FILES
     if verbose and (quiet or as_json):
         raise SettingError("--verbose prints a line an iteration, and --quiet and --json do not; give one of them")
     for path in out or []:
         check_format(path)  # before a long solve, not after it
     bar = sys.stderr.isatty() and not quiet
-    if choices.reads_own_files(graph, engine, address, robots, split):
-        whole: dict[str, object] = {"report": report, "covariances": covariances, "resume": resume, "robust": robust}
-        whole |= {"drop-edge": drop_edge, "anchor": anchor is not None, "times": times, "start": start}
-        whole |= {"r-step": r_step, "information": information, "unit-weights": unit_weights, "json": as_json}
-        whole |= {"skip-unknown": skip_unknown, "out FILE": out and (len(out) > 1 or out[0].suffix)}
-        if refused := [name for name, given in whole.items() if given]:
-            raise SettingError(f"--{refused[0]} takes the whole graph in one process; to have it read: --split given")
+    if (engine is choices.Runner.RAY or address) and not (robots or split) and locate(graph).is_dir():
+        if more or any(path.suffix for path in out or []):  # robots have the files, and nobody the graph
+            way_out = "takes the whole graph in one process; to have it read: --split given"
+            raise SettingError(f"--{min(more, default='out FILE').removeprefix('as_').replace('_', '-')} {way_out}")
         chosen = choices.chosen_method(method, None, True)
         pipeline = choices.chosen_pipeline(chosen, None, None, gap, max_iterations, tolerance, driver_memory)
-        place, to = choices.chosen_engine(chosen, engine, address, False), out[0] if out else None
-        found = solve_folder(
-            locate(graph), pipeline, engine=place, out=to, time_limit=time_limit, verbose=verbose, progress=bar
-        )
+        settings = partial(solve_folder, time_limit=time_limit, verbose=verbose, progress=bar)
+        place = choices.chosen_engine(chosen, engine, address, False)
+        found = settings(locate(graph), pipeline, engine=place, out=out[0] if out else None)
         typer.echo("" if quiet else f"{found}\n", nl=False)
         raise typer.Exit(_exit_code(found.status, found.certificate))
     if report is not None:
@@ -268,9 +265,7 @@ def solve_command(
 
 
 def _exit_code(status: Status, certificate: Certificate) -> int:
-    if not status.is_success:
-        return NOT_CONVERGED
-    return DONE if certificate.is_certified else NOT_CERTIFIED
+    return NOT_CONVERGED if not status.is_success else DONE if certificate.is_certified else NOT_CERTIFIED
 
 
 @app.command("certify")

@@ -9,7 +9,6 @@ import numpy as np
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -48,6 +47,9 @@ Scene = enum.StrEnum(
 )
 
 ON_ROBOTS = (FirstStage.SUBSTRUCTURED, FirstStage.CONSENSUS, FirstStage.NEWTON)  # methods that driver and robots run
+# What `pgo solve` can be told of robots that load their own files.
+FOR_OWN_FILES = {"graph", "out", "method", "engine", "address", "driver_memory", "gap", "max_iterations", "tolerance"}
+FOR_OWN_FILES |= {"time_limit", "verbose", "quiet"}
 ROBUST: dict[Robust, GNC | PCM] = {
     Robust.GNC: GNC(),
     Robust.GM: GNC(loss=RobustLoss.GEMAN_MCCLURE),
@@ -134,14 +136,6 @@ def chosen_engine(method: FirstStage, engine: Runner | None, address: str | None
     if engine is Runner.RAY or address is not None:
         return RayEngine(address=address)
     return InProcess(threads=(os.cpu_count() or 1) if engine is Runner.THREADS else 1)
-
-
-def reads_own_files(
-    graph: str, engine: Runner | None, address: str | None, robots: int | None, split: Split | None
-) -> bool:
-    """Whether Ray runs the robots of a folder, as their files give them."""
-    is_on_ray = engine is Runner.RAY or (address is not None and engine is None)
-    return is_on_ray and robots is None and split is None and locate(graph).is_dir()
 
 
 def chosen_start(problem: PGOProblem, start: Start | None) -> Poses | None:

@@ -15,7 +15,7 @@ from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOErro
 from pgo_models.files import check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, log_map, quaternions_from_rotations
-from pgo_models.graphs.g2o_parser import EdgeRows, G2OLines, information_of, poses_of, read_lines
+from pgo_models.graphs.g2o_parser import G2OLines, information_of, poses_of, read_lines
 from pgo_models.graphs.g2o_tags import TAGS
 from pgo_models.graphs.measurements import IntArray, isotropic_information
 from pgo_models.graphs.pose_graph import WORLD_ID, PoseGraph
@@ -64,7 +64,7 @@ def read_g2o(
         if file.d != files[0].d:
             raise FileFormatError(file.path, None, f"{file.d}D, but {files[0].path} is {files[0].d}D; part the folder")
     d = files[0].d
-    edges = join_edges(files)
+    edges = _join_edges(files)
     edge_ids = np.concatenate([file.edge_ids[kept] for file, kept in zip(files, edges, strict=True)])
     rows = np.concatenate([file.edges[kept] for file, kept in zip(files, edges, strict=True)])
     if not len(rows):
@@ -102,7 +102,7 @@ def read_g2o(
 def edge_places(path: Path | str) -> list[str]:
     """`file:line` of every edge of the graph that `read_g2o` has read from a file or folder."""
     files = _robots_files([read_lines(file, skip_unknown=True) for file in g2o_files(Path(path))])
-    kept = zip(files, join_edges(files), strict=True)
+    kept = zip(files, _join_edges(files), strict=True)
     return [f"{file.path}:{line}" for file, rows in kept for line in file.edge_lines[rows]]
 
 
@@ -247,7 +247,7 @@ def _is_whole(whole: G2OLines, others: list[G2OLines]) -> bool:
         (whole.edges[:, exact] == file.edges[0, exact]).all(axis=1).any() for file in others if len(file.edges)
     ):
         return False
-    joined = join_edges(others)
+    joined = _join_edges(others)
     ids = np.concatenate([file.edge_ids[kept] for file, kept in zip(others, joined, strict=True)])
     edges = np.concatenate([file.edges[kept] for file, kept in zip(others, joined, strict=True)])
     if len(edges) != len(whole.edges):
@@ -265,16 +265,20 @@ def _is_whole(whole: G2OLines, others: list[G2OLines]) -> bool:
     return len(whole.vertex_ids) > 0 and bool(np.isin(whole.vertex_ids, known).all())
 
 
-def join_edges(files: Sequence[EdgeRows]) -> list[IntArray | slice]:
+def _join_edges(files: list[G2OLines]) -> list[IntArray | slice]:
+    return join_edges([(file.edge_ids, file.edges) for file in files])
+
+
+def join_edges(files: Sequence[tuple[IntArray, Array]]) -> list[IntArray | slice]:
     """Rows of every file to keep: the k-th copy of an edge counts in the first file that has k copies of it."""
     if len(files) == 1:
         return [slice(None)]
     seen: set[tuple[bytes, int]] = set()
     kept: list[IntArray | slice] = []
-    for file in files:
+    for edge_ids, edges in files:
         copies: dict[bytes, int] = {}
         new = []
-        for row, (ids, numbers) in enumerate(zip(file.edge_ids, file.edges + 0.0, strict=True)):  # -0.0 is 0.0
+        for row, (ids, numbers) in enumerate(zip(edge_ids, edges + 0.0, strict=True)):  # -0.0 is 0.0
             edge = ids.tobytes() + numbers.tobytes()
             copies[edge] = copies.get(edge, 0) + 1
             if (edge, copies[edge]) not in seen:
@@ -284,14 +288,9 @@ def join_edges(files: Sequence[EdgeRows]) -> list[IntArray | slice]:
     return kept
 
 
-def symbol_letters(ids: IntArray) -> IntArray | None:
-    """Letters of GTSAM symbols, (k,); None where an id is none."""
-    letters = ids >> _LETTER_SHIFT
-    return letters if np.isin(letters, [ord(letter) for letter in _LETTERS]).all() else None
-
-
 def _robots(ids: IntArray, files: list[G2OLines]) -> IntArray | None:
-    if (letters := symbol_letters(ids)) is not None:
+    letters = ids >> _LETTER_SHIFT
+    if np.isin(letters, [ord(letter) for letter in _LETTERS]).all():
         return np.asarray(np.unique(letters, return_inverse=True)[1], dtype=np.int64)
     if len(files) == 1:
         return None

@@ -31,17 +31,8 @@ from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
 _SINGULAR = 1e-15  # a pivot below this part of its diagonal entry is rounding
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class EdgeRows:
-    """Edges as files have them."""
-
-    edge_ids: IntArray  # (m, 2): `WORLD_ID` and the pose, of a prior
-    # (m, 9) or (m, 28): the measurement like a vertex, then the upper triangle of its information matrix, row by row.
-    edges: Array
-
-
 @dataclass(frozen=True, eq=False)
-class G2OLines(EdgeRows):
+class G2OLines:
     """What one g2o file says, in the order of its lines, which count from 1."""
 
     path: Path
@@ -49,6 +40,9 @@ class G2OLines(EdgeRows):
     vertex_ids: IntArray  # (v,): of the VERTEX lines
     vertex_lines: IntArray  # (v,): lines that they stand on
     vertices: Array  # (v, 3) or (v, 7): x y theta, or x y z qx qy qz qw
+    edge_ids: IntArray  # (m, 2): `WORLD_ID` and the pose, of a prior
+    # (m, 9) or (m, 28): the measurement like a vertex, then the upper triangle of its information matrix, row by row.
+    edges: Array
     edge_lines: IntArray  # (m,)
     fixed: IntArray  # (f,): ids of the FIX lines
     fixed_lines: IntArray  # (f,)
@@ -83,8 +77,9 @@ def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
         problem = "a pose, or an edge of poses, with the id of a landmark, which is a point; renumber one of them"
         raise FileFormatError(path, int(min(posed)), problem)
     fixed, fixed_lines = np.array(source.fixed, dtype=np.int64).reshape(-1, 2).T
-    rest = edge_lines, fixed, fixed_lines, landmarks
-    found = G2OLines(path, d, vertex_ids[:, 1], vertex_lines, vertices, *rest, edge_ids=edge_ids, edges=edges)
+    found = G2OLines(
+        path, d, vertex_ids[:, 1], vertex_lines, vertices, edge_ids, edges, edge_lines, fixed, fixed_lines, landmarks
+    )
     for rows, at in ((vertices, found.vertex_lines), (edges, found.edge_lines)):
         check_distances(path, at, rows[:, :d])
         if d == 3:

@@ -1,8 +1,8 @@
 """Robots that load their own files, and a driver that learns nothing of the graph but the interface between them.
 
 Ids reach the driver as runs of consecutive ones, so that it can number the poses; edges between robots by their ends,
-of which it takes the vertex cover. What robots measured of each other they send each other. Who owns a pose, and which
-edges of several files are one, is as of `pgo_models.graphs.g2o.read_g2o`.
+of which it takes the vertex cover. What robots measured of each other they send each other. A pose belongs to the first
+file with a VERTEX line of it, else to the first that names it; edges of several files are one as of `read_g2o`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import FileFormatError, GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
-from pgo_models.graphs.g2o import join_edges, make_folder, symbol_letters, write_g2o
-from pgo_models.graphs.g2o_parser import EdgeRows, G2OLines, information_of, poses_of, read_lines
+from pgo_models.graphs.g2o import join_edges, make_folder, write_g2o
+from pgo_models.graphs.g2o_parser import G2OLines, information_of, poses_of, read_lines
 from pgo_models.graphs.measurements import IntArray
 from pgo_models.graphs.pose_graph import WORLD_ID, PoseGraph, edge_counts, middle_pose
 from pgo_models.graphs.precisions import edge_precisions
@@ -29,7 +29,7 @@ from solvers.distributed.robots.agent import Agent, held_poses
 from solvers.distributed.robots.interior import interior_of
 from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import Engine
-from solvers.soc.subgraph import Outline, Placement, place_poses, placed
+from solvers.soc.subgraph import Outline, Placement, Subgraph, place_poses
 
 READ_HERE = "have the graph read in one process: --split given, or solve(read_g2o(folder), robots=..)"
 
@@ -42,34 +42,30 @@ class RobotFile:
     path: Path
 
 
-@dataclass(frozen=True, eq=False)
-class Claim:
-    """Runs of consecutive ids in a file, (k, 2), first and last: of VERTEX lines, and of edges alone."""
-
-    d: int
-    vertices: IntArray
-    others: IntArray
+Claim = tuple[int, IntArray, IntArray]  # d, and ids of VERTEX lines, and of edges alone, as `_runs`
 
 
 @dataclass(frozen=True, eq=False)
 class OwnedRuns:
-    """Runs of ids that a file names, in ascending order, (k,): the first, its number in the whole graph, the owner."""
+    """Runs of consecutive ids, (k,): the first, its number in the whole graph, and who owns them."""
 
     first: IntArray
     number: IntArray
     owner: IntArray
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Edges(EdgeRows):
-    """Edges, and the numbers and owners of their ends, (m, 2)."""
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Edges as of `G2OLines`, and the numbers and owners of their ends, (m, 2)."""
 
+    ids: IntArray
+    rows: Array
     numbers: IntArray
     owners: IntArray
 
     def some(self, chosen: IntArray | BoolArray | slice) -> Edges:
         """Some of them."""
-        return Edges(**{name: values[chosen] for name, values in vars(self).items()})
+        return Edges(*(values[chosen] for values in vars(self).values()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +121,7 @@ def read_file(agent: FileAgent, _: None) -> Claim:
     agent.lines = lines = read_lines(path)
     if len(lines.landmarks) or (lines.edge_ids == WORLD_ID).any():
         raise GraphError(f"{path} has priors or landmarks, which all robots share; {READ_HERE}")
-    return Claim(lines.d, _runs(np.unique(lines.vertex_ids)), _runs(np.setdiff1d(lines.edge_ids, lines.vertex_ids)))
+    return lines.d, _runs(np.unique(lines.vertex_ids)), _runs(np.setdiff1d(lines.edge_ids, lines.vertex_ids))
 
 
 def number_poses(agent: FileAgent, runs: OwnedRuns) -> Mapping[int, Edges]:
@@ -133,7 +129,7 @@ def number_poses(agent: FileAgent, runs: OwnedRuns) -> Mapping[int, Edges]:
     ids, robot = agent.lines.edge_ids, agent.source.robot
     at = np.searchsorted(runs.first, ids, side="right") - 1
     numbers, owners = runs.number[at] + ids - runs.first[at], runs.owner[at]
-    edges = Edges(edge_ids=ids, edges=agent.lines.edges, numbers=numbers, owners=owners)
+    edges = Edges(ids, agent.lines.edges, numbers, owners)
     agent.edges = edges.some((owners == robot).any(axis=1))
     return {to: edges.some((owners == to).any(axis=1)) for to in np.unique(owners).tolist() if to != robot}
 
@@ -142,34 +138,36 @@ def join_neighbours(agent: FileAgent, received: Mapping[int, Edges]) -> Border:
     """Make the robot's graph of its edges and those that others have of its poses; FIX lines of its own poses count."""
     lines, robot, path = agent.lines, agent.source.robot, agent.source.path
     files = [one for _, one in sorted({**received, robot: agent.edges}.items())]
-    parts = [vars(file.some(kept)) for file, kept in zip(files, join_edges(files), strict=True)]
-    edges = Edges(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
-    if not len(edges.edges):
+    joined = join_edges([(file.ids, file.rows) for file in files])
+    parts = [vars(file.some(kept)).values() for file, kept in zip(files, joined, strict=True)]
+    edges = Edges(*map(np.concatenate, zip(*parts, strict=True)))
+    if not len(edges.rows):
         raise GraphError(f"{path}: no edge touches a pose of this robot; add one, or take the file away")
     agent.numbers, at, ends = np.unique(edges.numbers, return_index=True, return_inverse=True)
-    agent.owners, ids, (i, j) = edges.owners.ravel()[at], edges.edge_ids.ravel()[at], ends.reshape(-1, 2).T
-    is_own, information = agent.owners == robot, information_of(lines.d, edges.edges)
-    measured = *poses_of(lines.d, edges.edges), *edge_precisions(information), information
+    agent.owners, ids, (i, j) = edges.owners.ravel()[at], edges.ids.ravel()[at], ends.reshape(-1, 2).T
+    is_own, information = agent.owners == robot, information_of(lines.d, edges.rows)
+    measured = *poses_of(lines.d, edges.rows), *edge_precisions(information), information
     fixed = np.flatnonzero(is_own & np.isin(ids, lines.fixed))
     agent.graph = graph = PoseGraph(len(ids), i, j, *measured, ids, fixed=fixed, name=path.stem)
     given = lines.vertices[lines.vertex_ids == ids[fixed[0] if len(fixed) else np.argmax(is_own)]]
     agent.given = Poses(*poses_of(lines.d, given)).stacked() if len(given) else np.full((lines.d + 1, lines.d), np.nan)
     del agent.lines, agent.edges
-    ends = np.stack([i, j], axis=1)
-    pairs = np.unique(ends[agent.owners[i] != agent.owners[j]], axis=0)
+    both = np.stack([i, j], axis=1)
+    pairs = np.unique(both[agent.owners[i] != agent.owners[j]], axis=0)
     poses, kinds = np.unique(pairs), (graph.tau >= 0, graph.tau > 0, graph.kappa > 0)
     labels = [connected_components(edge_counts(i[kind], j[kind], len(ids)))[1] for kind in kinds]
     alone = np.array([len(np.setdiff1d(label, label[poses])) for label in labels])
-    counts = int(is_own.sum()), int((agent.owners[ends].min(axis=1) == robot).sum())
-    joined = agent.numbers[pairs], agent.owners[pairs], agent.numbers[poses], np.stack(labels)[:, poses]
-    return Border(counts, *joined, alone, -1 if len(poses) else int(agent.numbers[middle_pose(graph)]))
+    counts = int(is_own.sum()), int((agent.owners[both].min(axis=1) == robot).sum())
+    middle = -1 if len(poses) else int(agent.numbers[middle_pose(graph)])
+    tied = agent.numbers[poses], np.stack(labels)[:, poses]
+    return Border(counts, agent.numbers[pairs], agent.owners[pairs], *tied, alone, middle)
 
 
 def settle(agent: FileAgent, placement: Placement) -> Outline:
     """Learn which poses the driver solves for, and who else holds which: from now on an agent like any other."""
-    graph, every = agent.graph, np.arange(agent.graph.num_edges)
-    known = graph, agent.numbers, agent.owners, placement, every, isotropic_weights(graph)
-    agent.subgraph = placed(agent.source.robot, *known)
+    known = agent.source.robot, agent.graph, agent.numbers, agent.owners
+    of_edges = np.arange(agent.graph.num_edges), isotropic_weights(agent.graph)
+    agent.subgraph = Subgraph(*known, *placement.of(*known), *of_edges)
     agent.interior = interior_of(agent.subgraph, agent.backend)
     return replace(agent.subgraph.outline, part=None)
 
@@ -214,7 +212,7 @@ def open_files(files: Sequence[RobotFile], engine: Engine, memory: float) -> tup
 
 def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> tuple[list[OwnedRuns], int]:
     """Numbers and owners of the ids that every file names, and how many ids there are."""
-    ends = np.concatenate([runs for claim in claims for runs in (claim.vertices, claim.others)])
+    ends = np.concatenate([runs for _, *both in claims for runs in both])
     marks = np.unique(np.concatenate([ends[:, 0], ends[:, 1] + 1]))
     first, size = marks[:-1], np.diff(marks)  # between two marks all ids are of the same files, or of none
 
@@ -223,15 +221,12 @@ def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> tuple[lis
         change = np.bincount(at[:, 0], minlength=len(marks)) - np.bincount(at[:, 1], minlength=len(marks))
         return np.asarray(np.cumsum(change)[:-1] > 0)
 
-    has_vertex = np.stack([covered(claim.vertices) for claim in claims])
-    names = has_vertex | np.stack([covered(claim.others) for claim in claims])
+    has_vertex = np.stack([covered(vertices) for _, vertices, _ in claims])
+    names = has_vertex | np.stack([covered(others) for _, _, others in claims])
     owner, known = np.where(has_vertex.any(axis=0), has_vertex, names).argmax(axis=0), np.flatnonzero(names.any(axis=0))
-    if (letters := symbol_letters(first[known])) is not None:  # the robot whose file has most poses of a letter
-        for mine in (known[letters == letter] for letter in np.unique(letters)):
-            owner[mine] = ((has_vertex[:, mine] + 1) * names[:, mine] @ size[mine]).argmax()
-    for file, claim in zip(files, claims, strict=True):
-        if claim.d != claims[0].d or file.robot not in owner[known]:
-            problem = "no pose in it is of this robot" if claim.d == claims[0].d else "2D beside 3D"
+    for file, (d, *_) in zip(files, claims, strict=True):
+        if d != claims[0][0] or file.robot not in owner[known]:
+            problem = "no pose in it is of this robot" if d == claims[0][0] else "2D beside 3D"
             raise FileFormatError(file.path, None, f"{problem}; take it away, or {READ_HERE}")
     number = np.cumsum(np.where(names.any(axis=0), size, 0)) - size
     return [OwnedRuns(first[own], number[own], owner[own]) for own in names], int(size[known].sum())

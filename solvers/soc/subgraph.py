@@ -103,6 +103,17 @@ class Placement:
     copies: IntArray
     common: tuple[tuple[int, IntArray], ...]  # positions in `poses`
 
+    def of(
+        self, robot: int, graph: PoseGraph, poses: IntArray, owner: IntArray
+    ) -> tuple[IntArray, BoolArray, IntArray, tuple[tuple[int, IntArray], ...]]:
+        """`in_cover`, `is_counted`, `copies` and `common` of the robot's subgraph."""
+        at = np.searchsorted(poses, self.poses)
+        in_cover, copies = np.full(len(poses), -1), np.ones(len(poses), dtype=np.int64)
+        in_cover[at], copies[at] = self.in_cover, self.copies
+        # An end outside the cover decides: such ends of one edge have one owner. Else that of the first end counts it.
+        counted = np.where(in_cover[graph.j] < 0, owner[graph.j], owner[graph.i]) == robot
+        return in_cover, counted, copies, tuple((other, at[both]) for other, both in self.common)
+
 
 @dataclass(frozen=True, eq=False)
 class Part:
@@ -173,7 +184,7 @@ def split_graph(
         final = None if costs[1] is None else costs[1].of_edges(edges)
         allowed = None if thresholds is None else thresholds[edges]
         of_edges = edges, costs[0].of_edges(edges), final, allowed
-        return placed(robot, local, poses, owner[poses], placement, *of_edges)
+        return Subgraph(robot, local, poses, owner[poses], *placement.of(robot, local, poses, owner[poses]), *of_edges)
 
     return tuple(map(subgraph_of, robots, every_edge, placements))
 
@@ -195,36 +206,13 @@ def place_poses(pairs: IntArray, owners: IntArray, num_robots: int, middle: int)
     pose, robot = np.divmod(np.unique(pose * num_robots + robot), num_robots)
     holds = csr_array((np.ones(len(pose)), (pose, robot)), shape=(len(poses), num_robots))
     found = []
-    for own in range(num_robots):
-        mine = np.sort(pose[robot == own])
+    for own, mine in enumerate(np.split(holds.tocsc().indices, holds.tocsc().indptr[1:-1])):
+        mine.sort()
         held = holds[mine].tocsc()
-        shares = {
-            other: np.sort(held.indices[held.indptr[other] : held.indptr[other + 1]]) for other in range(num_robots)
-        }
-        common = tuple((other, both) for other, both in shares.items() if other != own and len(both))
+        others = [other for other in np.flatnonzero(np.diff(held.indptr)).tolist() if other != own]
+        common = tuple((other, np.sort(held.indices[held.indptr[other] : held.indptr[other + 1]])) for other in others)
         found.append(Placement(poses[mine], in_cover[mine], np.diff(holds[mine].indptr), common))
     return found
-
-
-def placed(
-    robot: int,
-    graph: PoseGraph,
-    poses: IntArray,
-    owner: IntArray,
-    placement: Placement,
-    edges: IntArray,
-    weights: EdgeWeights,
-    final: EdgeWeights | None = None,
-    thresholds: Array | None = None,
-) -> Subgraph:
-    """Subgraph of a robot, from its graph and the numbers and owners of the poses of that, (n_a,)."""
-    at = np.searchsorted(poses, placement.poses)
-    in_cover, copies = np.full(len(poses), -1), np.ones(len(poses), dtype=np.int64)
-    in_cover[at], copies[at] = placement.in_cover, placement.copies
-    common = tuple((other, at[both]) for other, both in placement.common)
-    # An end outside the cover decides: such ends of one edge have one owner. Else the owner of the first end counts it.
-    counted = np.where(in_cover[graph.j] < 0, owner[graph.j], owner[graph.i]) == robot
-    return Subgraph(robot, graph, poses, owner, in_cover, counted, copies, common, edges, weights, final, thresholds)
 
 
 def middle_separator(graph: PoseGraph, subgraphs: tuple[Subgraph, ...]) -> int:
