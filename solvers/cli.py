@@ -175,21 +175,22 @@ def solve_command(
     as_json: JsonOption = False,
 ) -> None:
     """Solve a pose graph: poses, their cost, a proven lower bound on the global optimum, and the gap."""
-    more = {name for name, value in locals().items() if value not in (None, False)} - choices.FOR_OWN_FILES
+    given = {name for name, value in locals().items() if value is not None and value is not False}
     if verbose and (quiet or as_json):
         raise SettingError("--verbose prints a line an iteration, and --quiet and --json do not; give one of them")
     for path in out or []:
         check_format(path)  # before a long solve, not after it
     bar = sys.stderr.isatty() and not quiet
     if (engine is choices.Runner.RAY or address) and not (robots or split) and locate(graph).is_dir():
-        if more or any(path.suffix for path in out or []):  # robots have the files, and nobody the graph
+        more = sorted(given - choices.FOR_OWN_FILES)
+        if more or len(out or []) > 1 or (out and out[0].suffix):  # robots have the files, and nobody the graph
             way_out = "takes the whole graph in one process; to have it read: --split given"
-            raise SettingError(f"--{min(more, default='out FILE').removeprefix('as_').replace('_', '-')} {way_out}")
+            raise SettingError(f"--{[*more, 'out FILE'][0].removeprefix('as_').replace('_', '-')} {way_out}")
         chosen = choices.chosen_method(method, None, True)
         pipeline = choices.chosen_pipeline(chosen, None, None, gap, max_iterations, tolerance, driver_memory)
         settings = partial(solve_folder, time_limit=time_limit, verbose=verbose, progress=bar)
         place = choices.chosen_engine(chosen, engine, address, False)
-        found = settings(locate(graph), pipeline, engine=place, out=out[0] if out else None)
+        found = settings(graph, pipeline, engine=place, out=out[0] if out else None)
         typer.echo("" if quiet else f"{found}\n", nl=False)
         raise typer.Exit(_exit_code(found.status, found.certificate))
     if report is not None:

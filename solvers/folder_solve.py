@@ -22,6 +22,7 @@ from pgo_models.certificates.rounding_errors import ObjectiveRounding
 from pgo_models.errors import NotPositiveDefiniteError, PGOError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.g2o import check_g2o_folder, g2o_files
 from pgo_models.graphs.measurements import IntArray
 from solvers.distributed.checkpoint import Journal
@@ -96,8 +97,8 @@ def solve_folder(
 ) -> FolderSolution:
     """Solve and certify F of a folder with one g2o file a robot, of which every robot reads its own, and nobody more.
 
-    Poses belong to the robots as `read_g2o` says; an edge between two robots may stand in the file of either, or of
-    both. Start, SOC, Newton and certificate are those of `solve(.., robots=..)`, but for the staircase, which is left
+    A pose belongs to the first file with a VERTEX line of it, else to the first that names it; an edge between two
+    robots may stand in the file of either, or of both. Start, SOC, Newton and certificate are those of `solve(.., robots=..)`, but for the staircase, which is left
     out and said so. CONSENSUS, robust losses, chi2, priors, landmarks and checkpoints take `solve`. A lost robot reads
     its file again, and is told all that it had been told. The frame is that of the first pose with a FIX line, or else
     the first of all, where its file has it.
@@ -105,7 +106,7 @@ def solve_folder(
     Parameters
     ----------
     folder : Path
-        Its name on every machine where robots run. The calling process lists the files, and reads none.
+        Its path, on every machine where robots run, or its name as of `load`. The calling process reads none of it.
     engine : Engine, optional
         Where the robots run: a `RayEngine`, or this process unless given.
     out : Path, optional
@@ -114,7 +115,7 @@ def solve_folder(
         As of `solve`, with its errors and those of `read_g2o`; a SettingError for another first stage.
     """
     watch, pipeline = Watch(time_limit, verbose, progress, callback), pipeline if pipeline is not None else Pipeline()
-    folder, soc, gap = Path(folder).absolute(), pipeline.soc, pipeline.gap
+    folder, soc, gap = locate(folder).absolute(), pipeline.soc, pipeline.gap
     if soc is not None and (type(soc) is not SOC or soc.effective_coupling is Coupling.CONSENSUS):
         raise SettingError(f"robots with files of their own run SUBSTRUCTURED SOC, got {soc}; {READ_HERE}")
     files = [RobotFile(robot, path) for robot, path in enumerate(g2o_files(folder))]
