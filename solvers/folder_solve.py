@@ -98,10 +98,10 @@ def solve_folder(
     """Solve and certify F of a folder with one g2o file a robot, of which every robot reads its own, and nobody more.
 
     A pose belongs to the first file with a VERTEX line of it, else to the first that names it; an edge between two
-    robots may stand in the file of either, or of both. Start, SOC, Newton and certificate are those of `solve(.., robots=..)`, but for the staircase, which is left
-    out and said so. CONSENSUS, robust losses, chi2, priors, landmarks and checkpoints take `solve`. A lost robot reads
-    its file again, and is told all that it had been told. The frame is that of the first pose with a FIX line, or else
-    the first of all, where its file has it.
+    robots may stand in the file of either, or of both. Start, SOC, Newton and certificate are those of
+    `solve(.., robots=..)`, but for the staircase, which is left out and said so. CONSENSUS, robust losses, chi2,
+    priors, landmarks and checkpoints take `solve`. A lost robot reads its file again, and is told all that it had been
+    told. The frame is that of the first pose with a FIX line, or else the first of all, where its file has it.
 
     Parameters
     ----------

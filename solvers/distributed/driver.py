@@ -104,6 +104,7 @@ class Driver:
             self._interfaces[self.tangent].check_memory(memory)
         self._held_cover = [robot.in_cover for robot in outlines]
         self._parts = [robot.part for robot in outlines if robot.touched is not None]
+        self.has_whole = all(robot.part is not None for robot in outlines)  # the process has the graph, too
         self.robots = np.array([robot.robot for robot in outlines if robot.touched is not None])
         R = np.broadcast_to(np.eye(d), (g, d, d)).copy()
         self.at = self.kept = CoverPoses(R, np.zeros((g, d)), np.zeros(((d + 1) * g, d)))

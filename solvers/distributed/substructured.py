@@ -21,7 +21,7 @@ from solvers.soc.penalty import Due, SharedSteps, next_penalty
 from solvers.soc.recursion_block import Agreement, RecursionBlock
 from solvers.soc.soc import SOC
 
-ENOUGH_NORMS = 2**12  # for the quantile that the penalty is taken from
+ENOUGH_NORMS = 2**12  # for the penalty's quantile, where robots have files of their own and poses are many
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ class SubstructuredSOC:
 
     def _penalized(self, driver: Driver, is_stationary: bool) -> SubstructuredState:
         """State 0 at the poses that driver and robots hold; one round, in which the quantile is found."""
-        step = driver.num_poses // ENOUGH_NORMS or None  # of many poses, so many stand for all
+        step = None if driver.has_whole else driver.num_poses // ENOUGH_NORMS or None  # so many stand for all
         Lambda = driver.at.multipliers
         answers = [*driver.ask(Interior.multiplier_norms, step, Count.PIGGYBACKED)]
         answers.append(thinned(Norms(multiplier_norms(Lambda), driver.scale), step))
