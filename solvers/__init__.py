@@ -8,6 +8,7 @@ _NAMES = {
     "solvers.loop": "Method Solver iterate run",
     "solvers.pipeline": "Pipeline solve",
     "solvers.solution": "Solution",
+    "solvers.folder_solve": "FolderSolution solve_folder",
     "solvers.growing": "extend",
     "solvers.reporting.report": "write_report",
     "solvers.soc.soc": "SOC",

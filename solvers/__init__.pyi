@@ -4,6 +4,7 @@ from solvers.convex.bregman import AlternatingBregman, Bregman, MethodOfMultipli
 from solvers.convex.extended_soc import ExtendedSOC
 from solvers.convex.orthogonal import OrthogonalSOC, solve_orthogonal
 from solvers.distributed.checkpoint import Checkpoint
+from solvers.folder_solve import FolderSolution, solve_folder
 from solvers.growing import extend
 from solvers.loop import Method, Solver, iterate, run
 from solvers.network.engine import InProcess
@@ -32,7 +33,7 @@ from solvers.studies.paper_tables import reproduce_tables
 from solvers.studies.tightness import noise_sweep
 
 __all__ = ["History", "Measurement", "Method", "Record", "Run", "Solver", "Stage", "Status", "iterate", "run"]
-__all__ += ["Pipeline", "Solution", "extend", "solve", "write_report"]
+__all__ += ["FolderSolution", "Pipeline", "Solution", "extend", "solve", "solve_folder", "write_report"]
 __all__ += ["SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "RStep"]
 __all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty"]
 __all__ += ["Newton", "Staircase", "gauss_newton"]

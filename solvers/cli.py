@@ -20,24 +20,27 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from pgo_models.certificates.certificate import DEFAULT_GAP, certify
+from pgo_models.certificates.certificate import DEFAULT_GAP, Certificate, certify
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
 from pgo_models.files import check_writable
 from pgo_models.geometry.poses import absolute_trajectory_error
-from pgo_models.graphs.datasets import known_datasets
+from pgo_models.graphs.datasets import known_datasets, locate
 from pgo_models.graphs.g2o import MOST_SYMBOLS, symbol_ids, write_g2o, write_g2o_folder
 from pgo_models.graphs.separators import report_partition
 from pgo_models.graphs.trajectories import write_tum
 from pgo_models.problem.marginals import write_covariances
 from solvers import cli_options as choices
 from solvers.cli_inputs import estimated_poses, load_graph, pose_named, pose_problem, with_times
+from solvers.cli_options import GapOption, GraphArgument, InformationOption, SkipUnknownOption, SplitOption
 from solvers.distributed.checkpoint import Checkpoint
 from solvers.explanations import explained_by_its_graph, hint_of_chi2, hint_of_misfits, warn_of_weights, with_places
+from solvers.folder_solve import solve_folder
 from solvers.pipeline import HANDOVER, solve
 from solvers.progress_bars import JobBar
 from solvers.reporting.graph_facts import describe_graph, memory_note
 from solvers.reporting.report import check_report, write_report
 from solvers.reporting.versions import installation, installed_version, installed_versions
+from solvers.result import Status
 from solvers.shell import DONE, Commands, JsonOption, QuietOption, ThreadsOption, run_command, save_then_show, wrapped
 from solvers.soc.soc import SOC
 from solvers.solution import both_costs, certificate_json, check_format, check_target, other_cost, write_json
@@ -59,28 +62,6 @@ def pgo(version: Annotated[bool, typer.Option("--version", help="Print the versi
     """Pose graph optimisation by splitting, with a certified distance to the global optimum."""
     if version:
         typer.echo(f"pgo {installed_version()}")
-
-
-def _finite_gap(gap: float) -> float:
-    if not 0 < gap < math.inf:
-        raise typer.BadParameter(f"{gap} is no positive, finite number; 1e-6 is usual")
-    return gap
-
-
-GraphArgument = Annotated[
-    str, typer.Argument(help="A g2o file, a folder with one file a robot, or the name of a data set (see pgo info).")
-]
-SplitOption = Annotated[
-    choices.Split | None,
-    typer.Option(help="How poses go to robots: as in the file, else with few cut edges (METIS), else contiguous."),
-]
-InformationOption = Annotated[
-    bool, typer.Option("--information", help="The cost is chi2 of the file's information matrices, not F.")
-]
-SkipUnknownOption = Annotated[
-    bool, typer.Option("--skip-unknown", help="Skip lines of a g2o file with unknown tags, and say which.")
-]
-GapOption = Annotated[float, typer.Option(callback=_finite_gap, help="Relative gap to certify.")]
 
 
 @app.command("solve")
@@ -175,10 +156,24 @@ def solve_command(
     as_json: JsonOption = False,
 ) -> None:
     """Solve a pose graph: poses, their cost, a proven lower bound on the global optimum, and the gap."""
+    given = {name for name, value in locals().items() if value is not None and value is not False}
     if verbose and (quiet or as_json):
         raise SettingError("--verbose prints a line an iteration, and --quiet and --json do not; give one of them")
     for path in out or []:
         check_format(path)  # before a long solve, not after it
+    bar = sys.stderr.isatty() and not quiet
+    if (engine is choices.Runner.RAY or address) and not (robots or split) and locate(graph).is_dir():
+        more = sorted(given - choices.FOR_OWN_FILES)
+        if more or len(out or []) > 1 or (out and out[0].suffix):  # robots have the files, and nobody the graph
+            way_out = "takes the whole graph in one process; to have it read: --split given"
+            raise SettingError(f"--{[*more, 'out FILE'][0].removeprefix('as_').replace('_', '-')} {way_out}")
+        chosen = choices.chosen_method(method, None, True)
+        pipeline = choices.chosen_pipeline(chosen, None, None, gap, max_iterations, tolerance, driver_memory)
+        settings = partial(solve_folder, time_limit=time_limit, verbose=verbose, progress=bar)
+        place = choices.chosen_engine(chosen, engine, address, False)
+        found = settings(graph, pipeline, engine=place, out=out[0] if out else None)
+        typer.echo("" if quiet else f"{found}\n", nl=False)
+        raise typer.Exit(_exit_code(found.status, found.certificate))
     if report is not None:
         check_report(report)
     if covariances is not None and covariances.suffix.lower() != ".csv":
@@ -219,7 +214,7 @@ def solve_command(
         anchor=pose_named(problem.graph, anchor) if anchor is not None else None,
         time_limit=time_limit,
         verbose=verbose,
-        progress=sys.stderr.isatty() and not quiet,
+        progress=bar,
     )
     solution = with_places(solution, graph, drop_edge)
     text, truth = str(solution), problem.graph.truth
@@ -247,9 +242,11 @@ def solve_command(
 
     save_then_show(targets, show, solution.as_json if as_json else None, quiet)
     warn_of_weights(graph, problem, solution.certificate, drop_edge)
-    if not solution.status.is_success:
-        raise typer.Exit(NOT_CONVERGED)
-    raise typer.Exit(DONE if solution.is_certified else NOT_CERTIFIED)
+    raise typer.Exit(_exit_code(solution.status, solution.certificate))
+
+
+def _exit_code(status: Status, certificate: Certificate) -> int:
+    return NOT_CONVERGED if not status.is_success else DONE if certificate.is_certified else NOT_CERTIFIED
 
 
 @app.command("certify")

@@ -1,10 +1,13 @@
 """What the options of `pgo` stand for: methods, starts, partitions and scenes by name."""
 
 import enum
+import math
 import os
 from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
+import typer
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
@@ -46,12 +49,37 @@ Scene = enum.StrEnum(
 )
 
 ON_ROBOTS = (FirstStage.SUBSTRUCTURED, FirstStage.CONSENSUS, FirstStage.NEWTON)  # methods that driver and robots run
+# What `pgo solve` can be told of robots that load their own files.
+FOR_OWN_FILES = {"graph", "out", "method", "engine", "address", "driver_memory", "gap", "max_iterations", "tolerance"}
+FOR_OWN_FILES |= {"time_limit", "threads", "verbose", "quiet"}
 ROBUST: dict[Robust, GNC | PCM] = {
     Robust.GNC: GNC(),
     Robust.GM: GNC(loss=RobustLoss.GEMAN_MCCLURE),
     Robust.PCM: PCM(),
     Robust.PCM_GNC: GNC(consistent=True),
 }
+
+
+def _finite_gap(gap: float) -> float:
+    if not 0 < gap < math.inf:
+        raise typer.BadParameter(f"{gap} is no positive, finite number; 1e-6 is usual")
+    return gap
+
+
+GraphArgument = Annotated[
+    str, typer.Argument(help="A g2o file, a folder with one file a robot, or the name of a data set (see pgo info).")
+]
+SplitOption = Annotated[
+    Split | None,
+    typer.Option(help="How poses go to robots: as in the file, else with few cut edges (METIS), else contiguous."),
+]
+InformationOption = Annotated[
+    bool, typer.Option("--information", help="The cost is chi2 of the file's information matrices, not F.")
+]
+SkipUnknownOption = Annotated[
+    bool, typer.Option("--skip-unknown", help="Skip lines of a g2o file with unknown tags, and say which.")
+]
+GapOption = Annotated[float, typer.Option(callback=_finite_gap, help="Relative gap to certify.")]
 
 
 def chosen_pipeline(

@@ -55,7 +55,7 @@ from solvers.solution import Solution
 
 HANDOVER_TOLERANCE = 5e-3  # relative residual at which Newton needs one or two factorisations on all graphs tried
 HANDOVER = SOC(tolerance=HANDOVER_TOLERANCE, max_iterations=100)
-_SECOND_TRY_TOLERANCE = 1e-6
+SECOND_TRY_TOLERANCE = 1e-6
 _FEW = 10  # Newton steps that show whether all edges fit, and finish where some were left out
 
 
@@ -319,7 +319,7 @@ class _Job:
                 other = attempt(None, polish(F, chordal_start(F)))[1]
                 return _better(self.problem, poses, certificate, other)
             soc = self.pipeline.soc if self.pipeline.soc is not None else SOC()
-            fine = replace(soc, tolerance=min(soc.tolerance, _SECOND_TRY_TOLERANCE), max_iterations=SOC.max_iterations)
+            fine = replace(soc, tolerance=min(soc.tolerance, SECOND_TRY_TOLERANCE), max_iterations=SOC.max_iterations)
             poses, certificate = _better(self.problem, poses, certificate, attempt(fine, None)[1])
         return poses, certificate
 

@@ -46,6 +46,7 @@ ORDER = {
         "robust_solve",
         "extended_solve",
         "pipeline",
+        "folder_solve",
         "growing",
         "shell",
         "studies",

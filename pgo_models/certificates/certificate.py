@@ -123,12 +123,13 @@ class Certificate(ReadOnly):
         return f"Certificate({self.cost}={self.objective:.10g}, gap={self.gap:.3g}, {self.verdict.name})"
 
     def __str__(self) -> str:
-        return "\n".join(f"{label:<12} {text}" for label, text in self._facts())
+        return "\n".join(f"{label:<12} {text}" for label, text in self.facts())
 
     def _repr_html_(self) -> str:
-        return facts_table(self._facts())
+        return facts_table(self.facts())
 
-    def _facts(self) -> list[tuple[str, str]]:
+    def facts(self) -> list[tuple[str, str]]:
+        """Labels and figures, as they are printed."""
         measured = not math.isnan(self.stationarity)
         stationary = f"   (stationary to {self.stationarity:.2g})" if measured else ""
         facts = [
@@ -239,7 +240,7 @@ def soften(problem: PGOProblem, certificate: Certificate) -> Certificate:
     if bound.value <= certificate.lower_bound:
         return certificate
     softer = replace(certificate, bound=bound, Lambda=Lambda, source=BoundSource.SOFTENED)
-    return _judged(problem, softer, certificate.objective, objective_rounding(problem, certificate.poses))
+    return judge_cost(problem, softer, certificate.objective, objective_rounding(problem, certificate.poses))
 
 
 def certify_with(
@@ -280,7 +281,7 @@ def certify_with(
         verdict=Verdict.TRIVIAL,
         weighting=problem.weighting if isinstance(problem.weighting, Weighting) else Weighting.ISOTROPIC,
     )
-    return _judged(problem, unjudged, objective, rounding)
+    return judge_cost(problem, unjudged, objective, rounding)
 
 
 def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
@@ -288,12 +289,13 @@ def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certif
 
     A ProofError when F of the poses is below it by more than the rounding of F: then one of the two is wrong.
     """
-    return _judged(problem, certificate, problem.objective(poses), objective_rounding(problem, poses))
+    return judge_cost(problem, certificate, problem.objective(poses), objective_rounding(problem, poses))
 
 
-def _judged(
-    problem: PGOProblem, certificate: Certificate, objective: float, rounding: ObjectiveRounding
+def judge_cost(
+    problem: PGOProblem | str, certificate: Certificate, objective: float, rounding: ObjectiveRounding
 ) -> Certificate:
+    """Hold the cost of some poses against the bound of a certificate; errors as of `judge`."""
     bound = certificate.bound
     if bound.value > objective + rounding.error:
         raise ProofError(

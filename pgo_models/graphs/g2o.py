@@ -6,7 +6,7 @@ Information matrices become the precisions of SE-Sync (Rosen et al. 2019), see `
 import os
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOError
 from pgo_models.files import check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, log_map, quaternions_from_rotations
+from pgo_models.geometry.rotations import Array, BoolArray, log_map, quaternions_from_rotations
 from pgo_models.graphs.g2o_parser import G2OLines, information_of, poses_of, read_lines
 from pgo_models.graphs.g2o_tags import TAGS
 from pgo_models.graphs.measurements import IntArray, isotropic_information
@@ -56,7 +56,7 @@ def read_g2o(
     PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
     """
     path = Path(path)
-    files = _robots_files([read_lines(file, skip_unknown) for file in _files_of(path)])
+    files = _robots_files([read_lines(file, skip_unknown) for file in g2o_files(path)])
     for file in files[1:]:
         if file.d != files[0].d:
             raise FileFormatError(file.path, None, f"{file.d}D, but {files[0].path} is {files[0].d}D; part the folder")
@@ -84,7 +84,7 @@ def read_g2o(
 
 def edge_places(path: Path | str) -> list[str]:
     """`file:line` of every edge of the graph that `read_g2o` has read from a file or folder."""
-    files = _robots_files([read_lines(file, skip_unknown=True) for file in _files_of(Path(path))])
+    files = _robots_files([read_lines(file, skip_unknown=True) for file in g2o_files(Path(path))])
     kept = zip(files, _join_edges(files), strict=True)
     return [f"{file.path}:{line}" for file, rows in kept for line in file.edge_lines[rows]]
 
@@ -107,13 +107,13 @@ def read_g2o_poses(path: Path | str, graph: PoseGraph) -> Poses:
     return graph.completed(Poses(*poses_of(file.d, file.vertices[at])))
 
 
-def write_g2o(graph: PoseGraph, path: Path | str, poses: Poses | None = None) -> None:
+def write_g2o(graph: PoseGraph, path: Path | str, poses: Poses | None = None, mine: BoolArray | None = None) -> None:
     """Write VERTEX lines (of `poses`, else of `graph.initial`, else none), FIX lines and EDGE lines to one file.
 
     Numbers are written so that reading gives the same floats. Without `graph.information` the matrices are
     tau I, 2 kappa I in space and diag(tau, tau, kappa) in the plane, which read back as the same kappa and tau
-    (RotationWeight.SE_SYNC). A GraphError when `poses` do not have the size of the graph, a PGOError when the file
-    cannot be written; what stood there stays.
+    (RotationWeight.SE_SYNC). VERTEX and FIX lines are of `mine`, (n,), alone, if given. A GraphError when `poses` do
+    not have the size of the graph, a PGOError when the file cannot be written; what stood there stays.
 
     Examples
     --------
@@ -125,7 +125,8 @@ def write_g2o(graph: PoseGraph, path: Path | str, poses: Poses | None = None) ->
     'VERTEX_SE3:QUAT'
     """
     every = np.ones(graph.num_edges, dtype=bool)
-    _write(graph, Path(path), _poses_to_write(graph, poses), np.ones(graph.num_poses, dtype=bool), every)
+    mine = np.ones(graph.num_poses, dtype=bool) if mine is None else mine
+    _write(graph, Path(path), _poses_to_write(graph, poses), mine, every)
 
 
 def write_g2o_folder(graph: PoseGraph, folder: Path | str, poses: Poses | None = None) -> None:
@@ -139,13 +140,18 @@ def write_g2o_folder(graph: PoseGraph, folder: Path | str, poses: Poses | None =
     chosen, folder = _poses_to_write(graph, poses), Path(folder)
     names = [f"{robot}.g2o" for robot in range(graph.num_robots)]
     check_g2o_folder(folder, graph.num_robots)
+    make_folder(folder)
+    for robot, name in enumerate(names):
+        mine = graph.robots == robot
+        _write(graph, folder / name, chosen, mine, (mine[graph.i] & ~graph.is_prior) | mine[graph.j])
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder if it is not there; a PGOError when that cannot be."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise PGOError(f"cannot write {folder}: {error.strerror}; choose a place that can be written") from error
-    for robot, name in enumerate(names):
-        mine = graph.robots == robot
-        _write(graph, folder / name, chosen, mine, (mine[graph.i] & ~graph.is_prior) | mine[graph.j])
 
 
 def check_g2o_folder(folder: Path | str, num_robots: int) -> None:
@@ -194,7 +200,8 @@ def _name_of(path: Path) -> str:
     return path.resolve().stem if path.is_file() else path.stem  # a pipe has no better name than that it was asked by
 
 
-def _files_of(path: Path) -> list[Path]:
+def g2o_files(path: Path) -> list[Path]:
+    """A file itself, or those of a folder in the order 0, 1, .., 9, 10; a FileFormatError where it has none."""
     if not path.is_dir():
         return [path]
     found = [file for file in path.iterdir() if file.suffix == ".g2o" and file.is_file()]
@@ -242,15 +249,19 @@ def _is_whole(whole: G2OLines, others: list[G2OLines]) -> bool:
 
 
 def _join_edges(files: list[G2OLines]) -> list[IntArray | slice]:
+    return join_edges([(file.edge_ids, file.edges) for file in files])
+
+
+def join_edges(files: Sequence[tuple[IntArray, Array]]) -> list[IntArray | slice]:
     """Rows of every file to keep: the k-th copy of an edge counts in the first file that has k copies of it."""
     if len(files) == 1:
         return [slice(None)]
     seen: set[tuple[bytes, int]] = set()
     kept: list[IntArray | slice] = []
-    for file in files:
+    for edge_ids, edges in files:
         copies: dict[bytes, int] = {}
         new = []
-        for row, (ids, numbers) in enumerate(zip(file.edge_ids, file.edges + 0.0, strict=True)):  # -0.0 is 0.0
+        for row, (ids, numbers) in enumerate(zip(edge_ids, edges + 0.0, strict=True)):  # -0.0 is 0.0
             edge = ids.tobytes() + numbers.tobytes()
             copies[edge] = copies.get(edge, 0) + 1
             if (edge, copies[edge]) not in seen:
@@ -308,7 +319,7 @@ def _poses_to_write(graph: PoseGraph, poses: Poses | None) -> Poses | None:
     return chosen
 
 
-def _write(graph: PoseGraph, path: Path, poses: Poses | None, mine: np.ndarray, edges: np.ndarray) -> None:
+def _write(graph: PoseGraph, path: Path, poses: Poses | None, mine: BoolArray, edges: BoolArray) -> None:
     d, ids, is_point = graph.d, graph.pose_ids, np.isin(np.arange(graph.num_poses), graph.landmarks)
     information = graph.information
     if information is None:

@@ -17,9 +17,15 @@ def vertex_cover(partition: Partition, graph: PoseGraph) -> IntArray:
     superfluous are dropped. The smallest cover is NP-hard to find; this one leaves out no pose that could be.
     """
     cut = partition.cut_edges(graph)
-    adjacency = edge_counts(graph.i[cut], graph.j[cut], graph.num_poses)
+    return cover_of_edges(graph.i[cut], graph.j[cut])
+
+
+def cover_of_edges(i: IntArray, j: IntArray) -> IntArray:
+    """The same for all edges (i, j), which are those between robots."""
+    poses, ends = np.unique(np.concatenate([i, j]), return_inverse=True)
+    adjacency = edge_counts(ends[: len(i)], ends[len(i) :], len(poses))
     degree = np.diff(adjacency.indptr)
-    chosen = np.zeros(graph.num_poses, dtype=bool)
+    chosen = np.zeros(len(poses), dtype=bool)
     queue = [(-int(degree[pose]), int(pose)) for pose in np.flatnonzero(degree)]
     heapq.heapify(queue)
     order = []
@@ -40,7 +46,7 @@ def vertex_cover(partition: Partition, graph: PoseGraph) -> IntArray:
         neighbours = adjacency.indices[adjacency.indptr[pose] : adjacency.indptr[pose + 1]]
         if chosen[neighbours].all():
             chosen[pose] = False
-    return np.flatnonzero(chosen)
+    return np.asarray(poses[chosen])
 
 
 @dataclass(frozen=True, eq=False)

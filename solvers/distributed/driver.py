@@ -24,21 +24,20 @@ from pgo_models.geometry.rotations import (
     unstack_transposes,
 )
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.matrices import columns_of
 from solvers.distributed.interface import Interface
 from solvers.distributed.multifrontal import FrontOwners
-from solvers.distributed.robots.agent import Agent, order_interior
+from solvers.distributed.robots.agent import order_interior
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import CostParts, ReducedTranslations, Reweigh, RightHandSide
 from solvers.distributed.robots.reweighting import reweigh
 from solvers.network.counted_pool import Count, CountedPool
-from solvers.network.engine import Engine
+from solvers.network.engine import WorkerPool
 from solvers.network.ledger import Ledger
 from solvers.network.messages import Snapshot, restore, take_snapshot
 from solvers.result import Measurement
 from solvers.soc.recursion_block import RecursionBlock
-from solvers.soc.subgraph import Subgraph
+from solvers.soc.subgraph import Outline
 
 DEFAULT_MEMORY = 4e9
 Q = TypeVar("Q")
@@ -79,45 +78,43 @@ class Driver:
 
     def __init__(
         self,
-        subgraphs: Sequence[Subgraph],
+        outlines: Sequence[Outline],
         num_poses: int,
-        engine: Engine,
-        backend: CholeskyBackend | None,
+        start: Callable[[], WorkerPool | CountedPool],
         memory: float = DEFAULT_MEMORY,
         grounded: int = 0,
     ) -> None:
-        """Start the robots; orders about interiors go to those that have an edge to count.
+        """Start the robots, if they are not at work; orders about interiors go to those that have an edge to count.
 
         With no `memory` it stands for the network alone: it hands on what robots send each other, and sums. A
         SettingError when the separators would take more than `memory` bytes.
         """
-        working = [(subgraph, subgraph.counted[0]) for subgraph in subgraphs if subgraph.is_counted.any()]
-        self.num_poses, self.d = num_poses, subgraphs[0].graph.d
+        self.num_poses, self.d = num_poses, outlines[0].d
         self.grounded = grounded  # which of the cover is left out when a bound is proved
-        cover = np.concatenate([subgraph.poses[subgraph.in_cover >= 0] for subgraph in subgraphs])
-        place = np.concatenate([subgraph.in_cover[subgraph.in_cover >= 0] for subgraph in subgraphs])
+        place = np.concatenate([robot.in_cover for robot in outlines])
         self.cover: IntArray = np.zeros(len(np.unique(place)), dtype=np.int64)
-        self.cover[place] = cover
+        self.cover[place] = np.concatenate([robot.cover for robot in outlines])
         g, d = len(self.cover), self.d
         self.tangent = (d, tangent_dimension(d))
-        in_cover = [subgraph.in_cover[part] for subgraph, part in working]
-        touched = tuple(np.sort(place[place >= 0]) for place in in_cover)
+        touched = tuple(robot.touched for robot in outlines if robot.touched is not None)
         kinds: tuple[tuple[int, ...], ...] = ((1,), (d,), (1, d), self.tangent)
         fronts = FrontOwners(touched if memory else (), g)
         self._interfaces = {widths: Interface(g, widths, touched, fronts) for widths in kinds}
         if memory:
             self._interfaces[self.tangent].check_memory(memory)
-        self._held_cover = [subgraph.in_cover[subgraph.in_cover >= 0] for subgraph in subgraphs]
-        self._parts = [subgraph.poses[part] for subgraph, part in working]
-        self.robots = np.array([subgraph.robot for subgraph, _ in working])
+        self._held_cover = [robot.in_cover for robot in outlines]
+        self._parts = [robot.part for robot in outlines if robot.touched is not None]
+        self.has_whole = all(robot.part is not None for robot in outlines)  # the process has the graph, too
+        self.robots = np.array([robot.robot for robot in outlines if robot.touched is not None])
         R = np.broadcast_to(np.eye(d), (g, d, d)).copy()
         self.at = self.kept = CoverPoses(R, np.zeros((g, d)), np.zeros(((d + 1) * g, d)))
         self.block: RecursionBlock | None = None  # rotations of the cover in SOC's recursion
         self.right: list[RightHandSide] = []  # the robots', for its next step (a)
-        self._has_two_costs = any(subgraph.final is not None for subgraph in subgraphs)
+        self._has_two_costs = any(robot.has_two_costs for robot in outlines)
         self.is_final = False  # whether the cost at hand is the one that is solved, not the one that SOC is run on
         self._laplacian: Interface | None = None
-        self.network = CountedPool(engine.open(partial(Agent, backend=backend), subgraphs), len(subgraphs))
+        pool = start()
+        self.network = pool if isinstance(pool, CountedPool) else CountedPool(pool, len(outlines))
         fronts.hand_out(self.network, self.robots)
         self.describe(Count.OFF)
 
@@ -241,7 +238,7 @@ class Driver:
                 f"{poses} for {self.num_poses} poses in {self.d}D; give one pose for every pose of the graph"
             )
         self.at = replace(self.at, R=poses.R[self.cover], t=poses.t[self.cover])
-        self.ask_each(Interior.set_poses, [poses[part] for part in self._parts], Count.OFF)
+        self.ask_each(Interior.set_poses, [poses[part] for part in self._parts if part is not None], Count.OFF)
 
     def poses_of_cover(self) -> list[Poses]:
         """What every robot is sent of the cover's poses that it holds."""

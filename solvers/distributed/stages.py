@@ -3,6 +3,7 @@
 import math
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.distributed.driver import DEFAULT_MEMORY, Driver
 from solvers.distributed.lower_bound import best_bound_distributed
 from solvers.distributed.newton import SubstructuredNewton
+from solvers.distributed.robots.agent import Agent
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
 from solvers.loop import Watch
@@ -42,7 +44,8 @@ def open_driver(
     """Driver and robots for a problem, for a robust solve with the thresholds, (m,), of its edges."""
     subgraphs = split_graph(problem, robots, thresholds)
     grounded = middle_separator(problem.graph, subgraphs)
-    return Driver(subgraphs, problem.num_poses, engine, problem.backend, memory, grounded)
+    start = partial(engine.open, partial(Agent, backend=problem.backend), subgraphs)
+    return Driver([subgraph.outline for subgraph in subgraphs], problem.num_poses, start, memory, grounded)
 
 
 def attempt_distributed(
@@ -67,9 +70,22 @@ def attempt_distributed(
     if not journal.goes_on_with():
         driver.choose_cost(final=False)
         if start is None and problem.graph.is_world_loose:
-            stages.append(replace(_start(driver, chordal_start(problem)), name="chordal start, in one place"))
+            stages.append(replace(start_robots(driver, chordal_start(problem)), name="chordal start, in one place"))
         else:
-            stages.append(_start(driver, start))
+            stages.append(start_robots(driver, start))
+    decrement = refine(driver, newton, faults, journal, watch, soc)
+    bound = best_bound_distributed(driver, gap)
+    poses, Lambda = collect(driver)
+    outcome = poses, certify_with(problem, poses, Lambda, gap, decrement, BoundSource.GIVEN, bound)
+    journal.end_attempt(outcome)
+    return outcome
+
+
+def refine(
+    driver: Driver, newton: Newton, faults: Faults | None, journal: Journal, watch: Watch, soc: SOC | None
+) -> float:
+    """SOC and Newton from the poses at hand; the last relative decrement."""
+    stages = journal.stages
     if soc is not None and not journal.goes_on_with(SubstructuredNewton):
         stages.append(_run_soc(driver, soc, faults, journal, watch))
     decrement = math.inf
@@ -79,14 +95,11 @@ def attempt_distributed(
         decrement = second.state.decrement
         figures = second.status, second.iterations, driver.at.objective, second.seconds, second.history, newton
         stages.append(Stage("Newton", *figures))
-    bound = best_bound_distributed(driver, gap)
-    poses, Lambda = collect(driver)
-    outcome = poses, certify_with(problem, poses, Lambda, gap, decrement, BoundSource.GIVEN, bound)
-    journal.end_attempt(outcome)
-    return outcome
+    return decrement
 
 
-def _start(driver: Driver, start: Poses | None) -> Stage:
+def start_robots(driver: Driver, start: Poses | None) -> Stage:
+    """Chordal start, or given poses."""
     began = time.perf_counter()
     if start is None:
         driver.start()

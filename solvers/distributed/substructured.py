@@ -16,9 +16,12 @@ from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import Agree, Reduced, RescaleInterior
 from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Status
+from solvers.soc.copies import Norms, thinned
 from solvers.soc.penalty import Due, SharedSteps, next_penalty
 from solvers.soc.recursion_block import Agreement, RecursionBlock
 from solvers.soc.soc import SOC
+
+ENOUGH_NORMS = 2**12  # for the penalty's quantile, where robots have files of their own and poses are many
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,15 +94,17 @@ class SubstructuredSOC:
 
     def _penalized(self, driver: Driver, is_stationary: bool) -> SubstructuredState:
         """State 0 at the poses that driver and robots hold; one round, in which the quantile is found."""
-        answers = driver.ask(Interior.multiplier_norms, None, Count.PIGGYBACKED)
+        step = None if driver.has_whole else driver.num_poses // ENOUGH_NORMS or None  # so many stand for all
         Lambda = driver.at.multipliers
-        all_norms = np.concatenate([multiplier_norms(Lambda), *(answer.norms for answer in answers)])
-        all_scales = np.concatenate([driver.scale, *(answer.scale for answer in answers)])
+        answers = [*driver.ask(Interior.multiplier_norms, step, Count.PIGGYBACKED)]
+        answers.append(thinned(Norms(multiplier_norms(Lambda), driver.scale), step))
+        all_norms = np.concatenate([answer.norms for answer in answers])
+        all_scales = np.concatenate([answer.scale for answer in answers])
         order = self.soc.penalty_order(all_norms / all_scales, is_stationary)
         ratio = order.rho(all_norms, all_scales) / all_scales
         block = order.block(driver.at.R, Lambda, driver.diagonal[driver.rotation_rows])
         _take(driver, block, driver.ask(Interior.penalize, order))
-        return SubstructuredState(ratio=ratio, size=math.sqrt(driver.d * float(ratio @ all_scales)))
+        return SubstructuredState(ratio=ratio, size=math.sqrt(driver.d * (step or 1) * float(ratio @ all_scales)))
 
     def _with_penalty_due(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
         """As in `solvers.soc.soc`: the penalty that the rule, or the safeguard, wants from now on."""

@@ -28,6 +28,12 @@ class Norms:
     scale: Array
 
 
+def thinned(norms: Norms, step: int | None) -> Norms:
+    """Every so manieth of the poses in the order of their ratios, if a step is given."""
+    some = slice(None) if step is None else np.argsort(norms.norms / norms.scale)[step // 2 :: step]
+    return Norms(norms.norms[some], norms.scale[some])
+
+
 @dataclass(frozen=True, eq=False)
 class Known:
     """What one robot tells another of the poses that both hold."""

@@ -12,7 +12,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, middle_pose, poses_by_distance
-from pgo_models.graphs.separators import vertex_cover
+from pgo_models.graphs.separators import cover_of_edges
 from pgo_models.problem.problem import PGOProblem, as_problem
 from pgo_models.problem.weighting import EdgeWeights
 
@@ -71,6 +71,49 @@ class Subgraph:
         allowed = None if self.thresholds is None else self.thresholds[kept]
         return Part(problem, self.poses[poses], self.in_cover[poses], final, self.edges[kept], allowed)
 
+    @cached_property
+    def outline(self) -> Outline:
+        """What the driver is told of it."""
+        part, held = self.counted[0], np.flatnonzero(self.in_cover >= 0)
+        touched = self.in_cover[part][self.in_cover[part] >= 0]
+        counts = np.sort(touched) if self.is_counted.any() else None
+        known = self.graph.d, self.poses[held], self.in_cover[held], counts, self.final is not None
+        return Outline(self.robot, *known, self.poses[part])
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """What a driver knows of a robot: of the poses that it solves for, those that the robot holds."""
+
+    robot: int
+    d: int
+    cover: IntArray  # (h,): their numbers in the whole graph
+    in_cover: IntArray  # (h,): their positions among all that the driver solves for
+    touched: IntArray | None  # positions of those that an edge which the robot counts joins; None if it counts none
+    has_two_costs: bool
+    part: IntArray | None  # (p,): numbers of all poses that these edges join; None where they are the robot's to know
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Of the poses that a robot shares with others, their numbers, (h,), and what `Subgraph` says of them."""
+
+    poses: IntArray
+    in_cover: IntArray
+    copies: IntArray
+    common: tuple[tuple[int, IntArray], ...]  # positions in `poses`
+
+    def of(
+        self, robot: int, graph: PoseGraph, poses: IntArray, owner: IntArray
+    ) -> tuple[IntArray, BoolArray, IntArray, tuple[tuple[int, IntArray], ...]]:
+        """`in_cover`, `is_counted`, `copies` and `common` of the robot's subgraph."""
+        at = np.searchsorted(poses, self.poses)
+        in_cover, copies = np.full(len(poses), -1), np.ones(len(poses), dtype=np.int64)
+        in_cover[at], copies[at] = self.in_cover, self.copies
+        # An end outside the cover decides: such ends of one edge have one owner. Else that of the first end counts it.
+        counted = np.where(in_cover[graph.j] < 0, owner[graph.j], owner[graph.i]) == robot
+        return in_cover, counted, copies, tuple((other, at[both]) for other, both in self.common)
+
 
 @dataclass(frozen=True, eq=False)
 class Part:
@@ -123,36 +166,53 @@ def split_graph(
     problem = as_problem(given)
     graph, first = problem.graph, problem.convex_part
     costs = first.weights, None if first is problem else problem.weights
-    cover = np.full(graph.num_poses, -1)
-    solved_for = vertex_cover(partition, graph)
-    if not len(solved_for):  # the bound is grounded at a pose that the driver has
-        solved_for = np.array([middle_pose(graph)])
-    cover[solved_for] = np.arange(len(solved_for))
-    owner = partition.robot
-    # An end outside the cover decides: such ends of one edge have one owner. Else the owner of the first end counts it.
-    counts = np.where(cover[graph.j] < 0, owner[graph.j], owner[graph.i])
-    holds = _holders(graph, owner, partition.num_robots)
-    held = holds.tocsc()
+    owner, cut = partition.robot, partition.cut_edges(graph)
+    pairs = np.stack([graph.i[cut], graph.j[cut]], axis=1)
+    middle = -1 if cut.any() else middle_pose(graph)
+    placements = place_poses(pairs, owner[pairs], partition.num_robots, middle)
     m, robots = graph.num_edges, range(partition.num_robots)
     robot, edge = np.divmod(np.unique(np.concatenate([owner[end] * m + np.arange(m) for end in (graph.i, graph.j)])), m)
     every_edge = np.split(edge, np.searchsorted(robot, robots[1:]))
-    every_pose = [np.sort(part) for part in np.split(held.indices, held.indptr[1:-1])]
+    own = np.split(np.argsort(owner, kind="stable"), np.cumsum(partition.sizes)[:-1])
 
-    def subgraph_of(robot: int, edges: IntArray, poses: IntArray) -> Subgraph:
+    def subgraph_of(robot: int, edges: IntArray, placement: Placement) -> Subgraph:
+        poses = np.union1d(own[robot], placement.poses)
         i, j = np.searchsorted(poses, graph.i[edges]), np.searchsorted(poses, graph.j[edges])
         measured = graph.R_ij[edges], graph.t_ij[edges], graph.kappa[edges], graph.tau[edges]
         name = f"{graph.name}, robot {robot}"
         local = PoseGraph(len(poses), i, j, *measured, ids=graph.pose_ids[poses], name=name)
-        held = holds[poses].tocsc()
-        others = [other for other in np.flatnonzero(np.diff(held.indptr)).tolist() if other != robot]
-        common = tuple((other, np.sort(held.indices[held.indptr[other] : held.indptr[other + 1]])) for other in others)
-        copies, counted = np.diff(holds[poses].indptr), counts[edges] == robot
         final = None if costs[1] is None else costs[1].of_edges(edges)
         allowed = None if thresholds is None else thresholds[edges]
         of_edges = edges, costs[0].of_edges(edges), final, allowed
-        return Subgraph(robot, local, poses, owner[poses], cover[poses], counted, copies, common, *of_edges)
+        return Subgraph(robot, local, poses, owner[poses], *placement.of(robot, local, poses, owner[poses]), *of_edges)
 
-    return tuple(map(subgraph_of, robots, every_edge, every_pose))
+    return tuple(map(subgraph_of, robots, every_edge, placements))
+
+
+def place_poses(pairs: IntArray, owners: IntArray, num_robots: int, middle: int) -> list[Placement]:
+    """What every robot must know of the poses that it shares, from pairs, (k, 2), that edges between robots join.
+
+    `owners`, (k, 2), are theirs; where there are none the driver solves for the pose `middle`.
+    """
+    poses, at, ends = np.unique(pairs, return_index=True, return_inverse=True)
+    (i, j), owner = ends.reshape(-1, 2).T, owners.ravel()[at]
+    cover = cover_of_edges(i, j)
+    if not len(poses):  # the bound is grounded at a pose that the driver has
+        poses, owner, cover = np.array([[middle], [0], [0]])
+    in_cover = np.full(len(poses), -1)
+    in_cover[cover] = np.arange(len(cover))
+    # Whether a robot holds a pose: its own, and the far ends of its edges.
+    pose, robot = np.concatenate([np.arange(len(poses)), i, j]), np.concatenate([owner, owner[j], owner[i]])
+    pose, robot = np.divmod(np.unique(pose * num_robots + robot), num_robots)
+    holds = csr_array((np.ones(len(pose)), (pose, robot)), shape=(len(poses), num_robots))
+    found = []
+    for own, mine in enumerate(np.split(holds.tocsc().indices, holds.tocsc().indptr[1:-1])):
+        mine.sort()
+        held = holds[mine].tocsc()
+        others = [other for other in np.flatnonzero(np.diff(held.indptr)).tolist() if other != own]
+        common = tuple((other, np.sort(held.indices[held.indptr[other] : held.indptr[other + 1]])) for other in others)
+        found.append(Placement(poses[mine], in_cover[mine], np.diff(holds[mine].indptr), common))
+    return found
 
 
 def middle_separator(graph: PoseGraph, subgraphs: tuple[Subgraph, ...]) -> int:
@@ -162,12 +222,3 @@ def middle_separator(graph: PoseGraph, subgraphs: tuple[Subgraph, ...]) -> int:
         in_cover[subgraph.poses] = np.maximum(in_cover[subgraph.poses], subgraph.in_cover)
     order = poses_by_distance(graph, middle_pose(graph))
     return int(in_cover[order[np.argmax(in_cover[order] >= 0)]])
-
-
-def _holders(graph: PoseGraph, owner: IntArray, num_robots: int) -> csr_array:
-    """Whether a robot holds a pose, (n, num_robots): its own, and the far ends of its edges."""
-    pose = np.concatenate([np.arange(graph.num_poses), graph.i, graph.j])
-    robot = np.concatenate([owner, owner[graph.j], owner[graph.i]])
-    once = np.unique(pose * num_robots + robot)
-    pose, robot = np.divmod(once, num_robots)
-    return csr_array((np.ones(len(once)), (pose, robot)), shape=(graph.num_poses, num_robots))

@@ -18,10 +18,9 @@ from pgo_models.graphs.scenes import NoiseModel, grid
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed.driver import Driver
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.proof_orders import move_proof, prove_interior
-from solvers.distributed.stages import collect
+from solvers.distributed.stages import collect, open_driver
 from solvers.network.engine import InProcess
 from solvers.pipeline import Pipeline, solve
 from solvers.soc.subgraph import split_graph
@@ -86,7 +85,7 @@ def test_separators_that_would_not_fit_are_refused_before_a_robot_starts() -> No
     graph = grid(np.random.default_rng(0))
     engine = Recording()
     with pytest.raises(SettingError, match="use a METIS partition or fewer robots"):
-        Driver(split_graph(graph, partition(graph, 3)), graph.num_poses, engine, None, memory=1e3)
+        open_driver(PGOProblem(graph), partition(graph, 3), engine, memory=1e3)
     assert engine.shares == ()
 
 

@@ -309,7 +309,7 @@ def test_cpus_of_a_cluster_are_its_own():
 def test_a_solve_starts_and_stops_ray_and_is_quiet(tmp_path):
     path = Path(cli.__file__).parent.parent
     command = [sys.executable, "-W", "error", "-c", "from solvers.cli import main; main()"]
-    options = ["solve", "robots", "--engine", "ray", "--resume", str(tmp_path / "run.ckpt")]
+    options = ["solve", "robots", "--engine", "ray", "--split", "given", "--resume", str(tmp_path / "run.ckpt")]
     finished = subprocess.run(
         [*command, *options],
         env={**os.environ, "PYTHONPATH": str(path)},
@@ -321,6 +321,29 @@ def test_a_solve_starts_and_stops_ray_and_is_quiet(tmp_path):
     assert (finished.returncode, finished.stderr) == (0, "")
     assert "4, 40 to 40 poses each, as the graph names them" in finished.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+def test_robots_of_a_folder_read_and_write_files_of_their_own(tmp_path, actors, pgo_command):
+    folder, out = Path(cli.__file__).parent.parent / "data" / "robots", tmp_path / "out"
+    code, said, _ = pgo_command("solve", folder, "--engine", "ray", "--out", out)
+    expected = solvers.solve_folder(folder, out=tmp_path / "here")
+    assert code == 0
+    assert f"F            {expected.certificate.objective:.10g} " in said
+    assert "as their own files have them" in said
+    for name in ("0.g2o", "1.g2o", "2.g2o", "3.g2o"):
+        assert (out / name).read_text() == (tmp_path / "here" / name).read_text()
+    for refused in (("--report", tmp_path / "x.html"), ("--json",), ("--anchor", 0), ("--out", tmp_path / "x.tum")):
+        code, _, said = pgo_command("solve", folder, "--engine", "ray", *refused)
+        assert code == 1
+        assert "takes the whole graph in one process; to have it read: --split given" in said
+
+    def lose(state, record):
+        if record.k == 1 and type(state).__name__ == "SubstructuredState":
+            ray.kill(actors[-1].actors[2])
+
+    found = solvers.solve_folder(folder, engine=RayEngine(), callback=lose)
+    assert found.certificate.objective == expected.certificate.objective
+    assert found.certificate.lower_bound == expected.certificate.lower_bound
 
 
 def test_nothing_is_left_open():

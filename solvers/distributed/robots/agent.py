@@ -111,6 +111,13 @@ def order_front(order: Callable[[HeldFront, Q], tuple[HeldFront, A]], agent: Age
 
 def begin_copies(agent: Agent, cover: Poses) -> Rows:
     """Give the poses at hand to the copies: interior ones, and those of the cover, which the driver sends."""
+    if agent.copies is None:
+        agent.copies = agent._no_copies
+    return order_copies(ConsensusRobot.begin, agent, held_poses(agent, cover))
+
+
+def held_poses(agent: Agent, cover: Poses) -> Poses:
+    """Poses at hand of all that the robot holds, others' at the identity unless they are of the cover."""
     subgraph, d = agent.subgraph, agent.subgraph.graph.d
     n, in_cover = len(subgraph.poses), subgraph.in_cover >= 0
     R, t = np.broadcast_to(np.eye(d), (n, d, d)).copy(), np.zeros((n, d))
@@ -119,9 +126,7 @@ def begin_copies(agent: Agent, cover: Poses) -> Rows:
         part, poses = agent.interior.part, agent.interior.state.poses
         place = np.searchsorted(subgraph.poses, part.poses[part.interior])
         R[place], t[place] = poses.R[part.interior], poses.t[part.interior]
-    if agent.copies is None:
-        agent.copies = agent._no_copies
-    return order_copies(ConsensusRobot.begin, agent, Poses(R, t))
+    return Poses(R, t)
 
 
 def finish_copies(agent: Agent, _: None) -> CoverRotations:

@@ -46,7 +46,7 @@ from solvers.distributed.robots.records import (
     RightHandSide,
     TrialEvaluation,
 )
-from solvers.soc.copies import Norms
+from solvers.soc.copies import Norms, thinned
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.recursion_block import RecursionBlock
 from solvers.soc.subgraph import Part, Subgraph
@@ -132,9 +132,9 @@ class Interior:
         R = self.state.poses.R
         return self.with_changes(poses=Poses(R, self._translations(R, t))).evaluate(None)
 
-    def multiplier_norms(self, _: None) -> tuple[Interior, Norms]:
-        """||Lambda_i||_2 and m_i of the interior poses."""
-        return self, Norms(multiplier_norms(self.multipliers()[self.part.interior]), self._scale)
+    def multiplier_norms(self, step: int | None) -> tuple[Interior, Norms]:
+        """||Lambda_i||_2 and m_i of the interior poses, `thinned`."""
+        return self, thinned(Norms(multiplier_norms(self.multipliers()[self.part.interior]), self._scale), step)
 
     # SOC.
 

@@ -1,0 +1,172 @@
+"""solve_folder(folder): robots load their own files, solve together, and write their own poses; nobody has the whole.
+
+The process that calls it is the driver: it learns the interface between the robots (`solvers.distributed.own_files`),
+and of the answer F, its bound and sums.
+"""
+
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, judge_cost
+from pgo_models.certificates.lower_bound import NO_BOUND
+from pgo_models.certificates.rounding_errors import ObjectiveRounding
+from pgo_models.errors import NotPositiveDefiniteError, PGOError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.datasets import locate
+from pgo_models.graphs.g2o import check_g2o_folder, g2o_files
+from pgo_models.graphs.measurements import IntArray
+from solvers.distributed.checkpoint import Journal
+from solvers.distributed.lower_bound import best_bound_distributed
+from solvers.distributed.own_files import READ_HERE, Answer, RobotFile, keep_answer, open_files, write_answer
+from solvers.distributed.stages import refine, start_robots
+from solvers.loop import Watch
+from solvers.network.counted_pool import Count
+from solvers.network.engine import Engine, InProcess
+from solvers.network.ledger import Ledger
+from solvers.network.ray_engine import RayEngine
+from solvers.pipeline import SECOND_TRY_TOLERANCE, Pipeline
+from solvers.result import Record, Stage, Status
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC
+
+
+@dataclass(frozen=True, eq=False)
+class FolderSolution:
+    """What the driver knows of a solve by robots with files of their own, who have the poses.
+
+    Attributes
+    ----------
+    certificate : Certificate
+        Without poses and multipliers.
+    sizes : (2, num_robots)
+        How many poses, and edges, every robot has.
+    note, frame : str
+        What the certificate lacks, and why, or empty; the frame of the poses that were written.
+    """
+
+    name: str
+    certificate: Certificate
+    sizes: IntArray
+    stages: tuple[Stage, ...]
+    ledger: Ledger
+    frame: str
+    note: str
+    seconds: float
+
+    @property
+    def status(self) -> Status:
+        """How the last stage ended."""
+        return self.stages[-1].status
+
+    def __str__(self) -> str:
+        (poses, edges), ledger = self.sizes, self.ledger
+        facts = [
+            ("graph", f"{self.name}: {poses.sum()} poses, {edges.sum()} edges, {self.certificate.poses.d}D"),
+            ("status", f"{self.status.name}: {self.status.value}"),
+            *self.certificate.facts(),
+            ("note", self.note),
+            ("frame", self.frame),
+            ("seconds", f"{self.seconds:.3g}"),
+            ("robots", f"{len(poses)}, {poses.min()} to {poses.max()} poses each, as their own files have them"),
+            ("network", f"{ledger.rounds} rounds, {ledger.all_reduces} all-reduces, {ledger.messages} messages"),
+            ("bytes", f"{ledger.num_bytes:,}"),
+        ]
+        return "\n".join(f"{label:<12} {text}" for label, text in facts if text)
+
+
+def solve_folder(
+    folder: Path | str,
+    pipeline: Pipeline | None = None,
+    *,
+    engine: Engine | None = None,
+    out: Path | str | None = None,
+    callback: Callable[[Any, Record], bool | None] | None = None,
+    time_limit: float = math.inf,
+    verbose: bool = False,
+    progress: bool | None = None,
+) -> FolderSolution:
+    """Solve and certify F of a folder with one g2o file a robot, of which every robot reads its own, and nobody more.
+
+    A pose belongs to the first file with a VERTEX line of it, else to the first that names it; an edge between two
+    robots may stand in the file of either, or of both. Start, SOC, Newton and certificate are those of
+    `solve(.., robots=..)`, but for the staircase, which is left out and said so. CONSENSUS, robust losses, chi2,
+    priors, landmarks and checkpoints take `solve`. A lost robot reads its file again, and is told all that it had been
+    told. The frame is that of the first pose with a FIX line, or else the first of all, where its file has it.
+
+    Parameters
+    ----------
+    folder : Path
+        Its path, on every machine where robots run, or its name as of `load`. The calling process reads none of it.
+    engine : Engine, optional
+        Where the robots run: a `RayEngine`, or this process unless given.
+    out : Path, optional
+        Folder, there, to which every robot writes its poses and edges as 0.g2o, 1.g2o, .., each file whole or not.
+    pipeline, callback, time_limit, verbose, progress
+        As of `solve`, with its errors and those of `read_g2o`; a SettingError for another first stage.
+    """
+    watch, pipeline = Watch(time_limit, verbose, progress, callback), pipeline if pipeline is not None else Pipeline()
+    folder, soc, gap = locate(folder).absolute(), pipeline.soc, pipeline.gap
+    if soc is not None and (type(soc) is not SOC or soc.effective_coupling is Coupling.CONSENSUS):
+        raise SettingError(f"robots with files of their own run SUBSTRUCTURED SOC, got {soc}; {READ_HERE}")
+    files = [RobotFile(robot, path) for robot, path in enumerate(g2o_files(folder))]
+    if isinstance(engine, RayEngine):  # snapshots would be here, of all that robots have
+        engine = replace(engine, recovery=replace(engine.recovery, orders_between_snapshots=sys.maxsize))
+    if out is not None:
+        check_g2o_folder(out, len(files))
+    stages: list[Stage] = []
+    answers: list[Answer] = []
+    bounds, F, rounding, decrement = [NO_BOUND], math.inf, ObjectiveRounding(0.0, 0.0), math.inf
+    driver, sizes = open_files(files, engine if engine is not None else InProcess(), pipeline.driver_memory)
+    nowhere = Poses(np.zeros((0, driver.d, driver.d)), np.zeros((0, driver.d)))
+    with closing(driver), closing(Journal(None, {}, stages)) as journal:
+        for is_second in (False, True)[: 1 + pipeline.second_try]:
+            if is_second:
+                soc = soc if soc is not None else SOC()
+                tolerance = min(soc.tolerance, SECOND_TRY_TOLERANCE)
+                soc = replace(soc, tolerance=tolerance, max_iterations=SOC.max_iterations)
+            try:
+                stages.append(start_robots(driver, None))
+                last = refine(driver, pipeline.newton, None, journal, watch, soc)
+                bounds.append(best_bound_distributed(driver, gap))
+            except NotPositiveDefiniteError as error:
+                raise PGOError(f"{folder}: weights too far apart for doubles ({error}); see pgo info FILE") from error
+            if driver.at.objective < F or not answers:
+                answers = driver.network.ask(keep_answer, driver.poses_of_cover(), Count.ROUND)
+                F, decrement = driver.at.objective, last
+                rounding = ObjectiveRounding(driver.at.rounding_level, math.fsum(answer.error for answer in answers))
+            bound = max(bounds, key=lambda found: found.value)
+            found = Certificate(
+                *(F, bound, math.nan, rounding.level, decrement, BoundSource.GIVEN, nowhere, F, nowhere.R, gap),
+                Verdict.TRIVIAL,
+            )
+            certificate = judge_cost(folder.name, found, F, rounding)
+            if not (certificate.can_improve and stages[-1].status.is_success):
+                break
+        turn, shift, frame = _frame(answers)
+        if out is not None:
+            to = partial(write_answer, Path(out).absolute())
+            driver.network.ask(to, [(turn, shift)] * len(files), Count.ROUND)
+    needs_more = pipeline.staircase is not None and certificate.can_improve
+    note = f"the staircase was left out, which takes the whole graph in one process; {READ_HERE}" if needs_more else ""
+    told = tuple(stages), driver.network.ledger, frame, note, time.perf_counter() - watch.began
+    return FolderSolution(folder.name, certificate, sizes, *told)
+
+
+def _frame(answers: Sequence[Answer]) -> tuple[Array, Array, str]:
+    """Motion (R, t) to the frame of the answer, and what that is."""
+    first = min(answers, key=lambda answer: (not answer.held[0], answer.held[1]))
+    has_given, d = bool(np.isfinite(first.given).all()), first.given.shape[1]
+    goal = first.given if has_given else np.concatenate([np.zeros((1, d)), np.eye(d)])
+    R = goal[1:].T @ first.solved[1:]
+    where = "where its file has it" if has_given else "at the identity"
+    return R, goal[0] - R @ first.solved[0], f"pose {first.held[2]} {where}"

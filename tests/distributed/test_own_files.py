@@ -1,0 +1,209 @@
+"""Robots with files of their own: the answer of the whole graph, and what the driver's process learns of it."""
+
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, SEEDS, varied_graph
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from processes import LimitedProcesses, under_limit
+from robots import PARTITIONERS, Partitioner, Recording, arrays_in
+
+import pgo_models as pgo
+import solvers
+from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import exp_map
+from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import NoiseModel, observe
+from solvers.distributed import substructured
+from solvers.folder_solve import FolderSolution, solve_folder
+
+ROBOTS = Path(pgo.__file__).parent.parent / "data" / "robots"
+LIMIT = 27.0  # MB beside the program itself
+
+
+def tower(num_robots: int, poses_each: int) -> PoseGraph:
+    """Robots one above the other on a spiral stair, six steps a turn: six poses of one see the next robot's first."""
+    k, turn, noise = np.arange(num_robots * poses_each), 6, NoiseModel(0.002, 0.0005)
+    angle = 2.0 * np.pi * k / turn
+    t, axis = np.stack([np.cos(angle), np.sin(angle), 0.1 * k], axis=1), np.array([0.0, 0.0, 1.0])
+    i, j = np.concatenate([k[:-1], k[:-turn]]), np.concatenate([k[1:], k[turn:]])
+    poses = Poses(exp_map(angle[:, None] * axis), t)
+    graph = observe("tower", poses, i, j, noise, 2.5e5, 4e6, np.random.default_rng(0))
+    return graph.with_robots(k // poses_each)
+
+
+def check_same(found: FolderSolution, graph: PoseGraph, out: Path) -> None:
+    """Objective and bound of the central solve, and files with poses that have this objective."""
+    central = solvers.solve(graph, robots=pgo.partition(graph, graph.num_robots))
+    certificate = found.certificate
+    assert found.status.is_success
+    assert certificate.verdict is central.certificate.verdict
+    level = central.certificate.rounding_level
+    assert certificate.objective == pytest.approx(central.objective, rel=1e-9, abs=level)
+    assert certificate.lower_bound == pytest.approx(central.lower_bound, rel=1e-6, abs=level)
+    assert found.sizes.sum(axis=1).tolist() == [graph.num_poses, graph.num_edges]
+    written = read_g2o(out)
+    assert (written.num_poses, written.num_edges) == (graph.num_poses, graph.num_edges)
+    np.testing.assert_array_equal(written.robots, graph.robots)
+    assert written.initial is not None
+    assert pgo.PGOProblem(written).objective(written.initial) == pytest.approx(
+        certificate.objective, rel=1e-9, abs=level
+    )
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=SEEDS, n=st.integers(4, 30), d=DIMENSIONS, partitioner=PARTITIONERS, drop=st.booleans())
+def test_folders_are_solved_as_the_whole_graph(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, n: int, d: int, partitioner: Partitioner, drop: bool
+) -> None:
+    graph, folder = varied_graph(seed, n, d), tmp_path_factory.mktemp("folder")
+    graph = graph.with_robots(partitioner(graph, seed).robot)
+    graph = replace(graph, initial=Poses.of_points(np.zeros((n, d))))
+    write_g2o_folder(graph, folder)
+    if drop:  # every edge between two robots in the file of one of them alone
+        seen: set[str] = set()
+        for path in sorted(folder.glob("*.g2o")):
+            lines = path.read_text().splitlines(keepends=True)
+            kept = [line for line in lines if not line.startswith("EDGE") or line not in seen]
+            if any(line.startswith("EDGE") for line in kept):
+                path.write_text("".join(kept))
+                seen |= set(lines)
+    assert read_g2o(folder).num_edges == graph.num_edges
+    check_same(solve_folder(folder, out=folder / "out"), graph, folder / "out")
+
+
+def test_an_edge_that_no_end_has_counts_all_the_same(tmp_path: Path) -> None:
+    """Edges between robots 0 and 1 stand in the file of robot 2, twice in that of robot 3."""
+    shutil.copytree(ROBOTS, tmp_path / "in")
+    graph, moved = read_g2o(ROBOTS), []
+    for robot in (0, 1):
+        path = tmp_path / "in" / f"{robot}.g2o"
+        lines = path.read_text().splitlines(keepends=True)
+        cut = [k for k, line in enumerate(lines) if {word >> 56 for word in ends_of(line)} == {ord("a"), ord("b")}]
+        moved += [lines[k] for k in cut] if robot == 0 else []
+        path.write_text("".join(line for k, line in enumerate(lines) if k not in cut))
+    assert moved
+    for robot, times in ((2, 1), (3, 2)):
+        with (tmp_path / "in" / f"{robot}.g2o").open("a") as file:
+            file.writelines(moved * times)
+    doubled = read_g2o(tmp_path / "in")
+    assert doubled.num_edges == graph.num_edges + len(moved)
+    check_same(solve_folder(tmp_path / "in", out=tmp_path / "out"), doubled, tmp_path / "out")
+
+
+def ends_of(line: str) -> list[int]:
+    return [int(word) for word in line.split()[1:3]] if line.startswith("EDGE") else []
+
+
+def test_the_frame_is_that_of_a_fixed_pose(tmp_path: Path) -> None:
+    shutil.copytree(ROBOTS, tmp_path / "in")
+    graph = read_g2o(ROBOTS)
+    assert graph.initial is not None
+    for pose in (100, 130):
+        with (tmp_path / "in" / f"{graph.robots[pose]}.g2o").open("a") as file:
+            file.write(f"FIX {graph.pose_ids[pose]}\n")
+    found = solve_folder(tmp_path / "in", out=tmp_path / "out")
+    written = read_g2o(tmp_path / "out")
+    assert found.frame == f"pose {graph.pose_ids[100]} where its file has it"
+    assert written.initial is not None
+    assert written.fixed.tolist() == [100, 130]
+    np.testing.assert_allclose(written.initial.t[100], graph.initial.t[100], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(written.initial.R[100], graph.initial.R[100], rtol=0, atol=1e-9)
+
+
+# What crosses.
+
+
+def test_messages_do_not_grow_with_the_interiors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor do requests and answers that are off the ledger."""
+    monkeypatch.setattr(substructured, "ENOUGH_NORMS", 60)
+    largest = []
+    for poses_each in (100, 800):
+        graph, engine, folder = tower(3, poses_each), Recording(), tmp_path / str(poses_each)
+        write_g2o_folder(graph, folder)
+        found = solve_folder(folder, engine=engine, out=folder / "out")
+        assert found.certificate.is_certified
+        assert max(agent.subgraph.graph.num_edges for agent in engine.agents) >= 2 * poses_each - 10
+        on_ledger = max(int(traffic.num_bytes.max(initial=0)) for traffic, _ in found.ledger.counted)
+        sizes = [np.size(value) for _, *both in engine.log for one in both for _, value in arrays_in(tuple(one))]
+        largest.append((on_ledger, max(sizes)))
+    # Of 12 poses in the cover, 6 at most with one robot twice: a triangle of 72 rows. Norms are at most 60 + 3.
+    assert largest[0] == largest[1]
+    assert largest[1][1] <= 72 * 73 // 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_DATA counts private memory on Linux alone")
+@pytest.mark.slow
+def test_no_process_has_room_for_the_whole_graph(tmp_path: Path) -> None:
+    graph = tower(16, 600)
+    write_g2o_folder(graph, tmp_path / "in")
+    with pytest.raises(MemoryError):
+        under_limit(LIMIT, read_size, tmp_path / "in")
+    found = under_limit(LIMIT, solve_limited, tmp_path / "in", tmp_path / "out")
+    assert found.certificate.is_certified
+    check_same(found, graph, tmp_path / "out")
+
+
+def read_size(folder: Path) -> int:
+    return read_g2o(folder).num_edges
+
+
+def solve_limited(folder: Path, out: Path) -> FolderSolution:
+    found = solve_folder(folder, engine=LimitedProcesses(LIMIT), out=out)
+    return replace(found, stages=found.stages[-1:])
+
+
+# What is refused, and what is said.
+
+
+def test_what_takes_the_whole_graph_is_refused(tmp_path: Path) -> None:
+    robots = pgo.partition(read_g2o(ROBOTS), 4)
+    for soc in (solvers.SOC(robots=robots), solvers.PaperSOC()):
+        with pytest.raises(SettingError, match="own run SUBSTRUCTURED SOC"):
+            solve_folder(ROBOTS, solvers.Pipeline(soc=soc))
+    shutil.copytree(ROBOTS, tmp_path / "in")
+    graph = read_g2o(ROBOTS)
+    write_g2o_folder(graph.with_position_prior(np.arange(5), np.eye(3)[np.arange(5) % 3], 1.0), tmp_path / "in")
+    with pytest.raises(GraphError, match=r"0\.g2o has priors or landmarks, .* --split given"):
+        solve_folder(tmp_path / "in")
+
+
+def test_files_that_are_no_robots_are_named(tmp_path: Path) -> None:
+    shutil.copytree(ROBOTS, tmp_path / "in")
+    pgo.write_g2o(read_g2o(ROBOTS), tmp_path / "in" / "fullGraph.g2o")
+    with pytest.raises(FileFormatError, match=r"fullGraph\.g2o: no pose in it is of this robot"):
+        solve_folder(tmp_path / "in")
+    pgo.write_g2o(pgo.load("circle"), tmp_path / "in" / "fullGraph.g2o")
+    with pytest.raises(GraphError, match="the graph of all robots fall into 2 parts"):
+        solve_folder(tmp_path / "in")
+    pgo.write_g2o(varied_graph(0, 6, 2), tmp_path / "in" / "fullGraph.g2o")
+    with pytest.raises(FileFormatError, match=r"fullGraph\.g2o: 2D beside 3D"):
+        solve_folder(tmp_path / "in")
+    (tmp_path / "in" / "fullGraph.g2o").write_text("VERTEX_SE3:QUAT 7 0 0 0 0 0 0 1\n")
+    with pytest.raises(GraphError, match="no edge touches a pose of this robot"):
+        solve_folder(tmp_path / "in")
+    with pytest.raises(PGOError, match="it holds another graph's"):
+        solve_folder(ROBOTS, out=tmp_path / "in")
+
+
+def test_the_staircase_is_left_out_and_said_so() -> None:
+    unfinished = solvers.Pipeline(soc=None, newton=solvers.Newton(max_iterations=0), second_try=False)
+    found = solve_folder(ROBOTS, unfinished)
+    assert not found.certificate.is_certified
+    assert "the staircase was left out" in str(found)
+    assert solve_folder(ROBOTS, replace(unfinished, staircase=None)).note == ""
+
+
+def test_a_second_try_keeps_the_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = solvers.Pipeline(newton=solvers.Newton(max_iterations=0), staircase=None, gap=1e-15)
+    alone = solve_folder(ROBOTS, replace(first, second_try=False))
+    both = solve_folder(ROBOTS, replace(first, newton=solvers.Newton()))
+    assert both.certificate.objective <= alone.certificate.objective
+    assert both.certificate.lower_bound >= alone.certificate.lower_bound

@@ -1,0 +1,108 @@
+"""Robots as processes of their own, under a limit of memory: an engine for tests, without Ray."""
+
+import multiprocessing
+import resource
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pgo_models.errors import PGOError
+from pgo_models.graphs.scenes import grid
+from solvers.network.messages import Idle
+from solvers.pipeline import solve
+
+_MEGABYTE = 2**20
+
+
+def data_megabytes() -> float:
+    """Memory of this process that RLIMIT_DATA counts."""
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return int(status.split("VmData:")[1].split()[0]) / 1024
+
+
+def allow(megabytes: float) -> None:
+    """From now on this process may take so much more memory, and no more."""
+    most = int((data_megabytes() + megabytes) * _MEGABYTE)
+    resource.setrlimit(resource.RLIMIT_DATA, (most, resource.getrlimit(resource.RLIMIT_DATA)[1]))
+
+
+def under_limit(megabytes: float, act: Callable[..., Any], *arguments: object) -> Any:
+    """What a function returns, or the error that it raises, in a process that may take so much memory."""
+    with LimitedProcesses(megabytes).open(_Act, [(act, arguments)]) as pool:
+        return pool.ask(_Act.run, [None])[0]
+
+
+class _Act:
+    def __init__(self, given: tuple[Callable[..., Any], tuple[object, ...]]) -> None:
+        self.given = given
+
+    def run(self, _: None) -> object:
+        act, arguments = self.given
+        return act(*arguments)
+
+
+class LimitedProcesses:
+    """An engine: every robot is a process that may take so many megabytes beside what its imports take."""
+
+    def __init__(self, megabytes: float) -> None:
+        self.megabytes = megabytes
+
+    def open(self, make: Callable[[Any], Any], shares: Sequence[Any]) -> "_Processes":
+        return _Processes(self.megabytes, make, shares)
+
+
+class _Processes:
+    def __init__(self, megabytes: float, make: Callable[[Any], Any], shares: Sequence[Any]) -> None:
+        spawning = multiprocessing.get_context("forkserver")
+        spawning.set_forkserver_preload([__name__])
+        self.links, self.processes = [], []
+        for share in shares:
+            here, there = spawning.Pipe()
+            process = spawning.Process(target=_serve, args=(there, megabytes, make, share))
+            process.start()
+            there.close()
+            self.links.append(here)
+            self.processes.append(process)
+
+    def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
+        asked = [link for link, request in zip(self.links, requests, strict=True) if request is not Idle.IDLE]
+        for link, request in zip(self.links, requests, strict=True):
+            if request is not Idle.IDLE:
+                link.send((order, request))
+        answers = {id(link): link.recv() for link in asked}
+        for answer in answers.values():
+            if isinstance(answer, Exception):
+                raise answer
+        return [answers.get(id(link)) for link in self.links]
+
+    def close(self) -> None:
+        for link, process in zip(self.links, self.processes, strict=True):
+            link.close()
+            process.join()
+            process.close()
+        self.links, self.processes = [], []
+
+    def __enter__(self) -> "_Processes":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _serve(link: Connection, megabytes: float, make: Callable[[Any], Any], share: Any) -> None:
+    solve(grid(np.random.default_rng(0)), robots=2)  # what is imported late, and the buffers of BLAS
+    allow(megabytes)
+    worker = make(share)
+    while True:
+        try:
+            order, request = link.recv()
+        except EOFError:
+            return
+        try:
+            answer = order(worker, request)
+        except (PGOError, MemoryError) as error:  # whoever asked gets it
+            answer = error
+        link.send(answer)
