@@ -57,7 +57,9 @@ class RobotsOfDriver:
         """Residuals, with F at omega and the translations at hand, and the account so far."""
         if math.isnan(measurement.primal_residual):
             return self.driver.measured(Measurement(np.nan, np.nan, np.nan))
-        objective = math.fsum(ask_all(self, ConsensusRobot.cost, None, Count.OFF))
+        objective = measurement.objective  # told with the step, or
+        if math.isnan(objective):
+            objective = math.fsum(ask_all(self, ConsensusRobot.cost, None, Count.OFF))
         return self.driver.measured(Measurement(objective, measurement.primal_residual, measurement.dual_residual))
 
     def finish(self) -> None:
@@ -85,12 +87,12 @@ class ConsensusSOC:
         return start if start is not None else Consensus(self.soc).init(RobotsOfDriver(driver, self.has_driver))
 
     def step(self, driver: Driver, state: ConsensusState) -> ConsensusState:
-        """One round between neighbours, and two all-reduces."""
+        """One round between neighbours, and with it an all-reduce."""
         return Consensus(self.soc).step(RobotsOfDriver(driver, self.has_driver), state)
 
     def measure(self, driver: Driver, state: ConsensusState) -> Measurement:
         """F at omega and the translations at hand, and the residuals."""
-        return RobotsOfDriver(driver).measured(state.measurement(math.nan))
+        return RobotsOfDriver(driver).measured(state.measurement(state.objective))
 
     def converged(self, state: ConsensusState, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals are within tolerance."""

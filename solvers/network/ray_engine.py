@@ -27,7 +27,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from pgo_models.errors import EngineError, MissingExtraError, SettingError, check_settings
-from solvers.network.engine import Engine, WorkerPool
+from solvers.network.engine import WorkerPool
 from solvers.network.messages import Worker, obey
 from solvers.network.recovery import AnyOrder, RecoveringPool, Recovery, RobotLostError
 
@@ -75,6 +75,7 @@ class RayEngine:
     actors: int | None = None
     patience: float = 120.0
     recovery: Recovery = field(default_factory=Recovery)
+    idle: list[Any] | None = field(default=None, repr=False)  # of `kept`: actors that no solve has now
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["num_cpus", "actors", "patience"])
@@ -86,41 +87,25 @@ class RayEngine:
 
         A MissingExtraError without Ray, an EngineError when the address is no Ray cluster's, or there are too few CPUs.
         """
-        return _opened(make, shares, self, connect(self.address, self.num_cpus))
+        place = _RayPlace(_ray(), make, shares, self, connect(self.address, self.num_cpus))
+        try:
+            place.start(range(len(place.groups)))
+        except RobotLostError as error:
+            place.close()
+            raise EngineError(f"{error}; install the same version of this package on every machine") from error
+        except BaseException:  # also Ctrl-C: nothing stays behind
+            place.close()
+            raise
+        return RecoveringPool(place, self.recovery)
 
     @contextmanager
-    def kept(self) -> Iterator[Engine]:
+    def kept(self) -> Iterator[RayEngine]:
         """Engine for many solves: Ray and the actors that one has started wait for the next, until the block ends."""
         is_ours, idle = connect(self.address, self.num_cpus), list[Any]()
         try:
-            yield _KeptActors(self, idle)
+            yield replace(self, address=None, num_cpus=None, idle=idle)
         finally:
             _let_go(idle, is_ours)
-
-
-@dataclass(frozen=True, eq=False)
-class _KeptActors:
-    engine: RayEngine
-    idle: list[Any]  # actors that no solve has now
-
-    def open(self, make: Callable[[T], Worker], shares: Sequence[T]) -> WorkerPool:
-        """Robots in actors that wait, and in new ones where those are too few."""
-        return _opened(make, shares, self.engine, False, self.idle)
-
-
-def _opened(
-    make: Callable[[T], Worker], shares: Sequence[T], engine: RayEngine, is_ours: bool, idle: list[Any] | None = None
-) -> WorkerPool:
-    place = _RayPlace(_ray(), make, shares, engine, is_ours, idle)
-    try:
-        place.start(range(len(place.groups)))
-    except RobotLostError as error:
-        place.close()
-        raise EngineError(f"{error}; install the same version of this package on every machine") from error
-    except BaseException:  # also Ctrl-C: nothing stays behind
-        place.close()
-        raise
-    return RecoveringPool(place, engine.recovery)
 
 
 def _let_go(actors: Iterable[Any], is_ours: bool) -> None:
@@ -177,7 +162,6 @@ class _RayPlace:
     shares: Sequence[Any]
     engine: RayEngine
     is_ours: bool
-    idle: list[Any] | None = None  # where actors are kept for others to come
     actors: dict[int, Any] = field(init=False, default_factory=dict)  # by group
     _seen: float = field(init=False, default=-math.inf)
 
@@ -214,10 +198,12 @@ class _RayPlace:
             return answers
 
     def close(self) -> None:
-        if self.idle is None:
+        if self.engine.idle is None:
             _let_go(self.actors.values(), self.is_ours)
         else:
-            self.idle.extend(self.actors.values())
+            for actor in self.actors.values():
+                actor.hold.remote(self.make, [])  # nothing
+            self.engine.idle.extend(self.actors.values())
         self.actors = {}
 
     @cached_property
@@ -231,14 +217,14 @@ class _RayPlace:
 
     @cached_property
     def _cpus(self) -> int:
-        if cpus := math.floor(self.ray.cluster_resources().get("CPU", 0.0)):
+        if (cpus := int(self.ray.cluster_resources().get("CPU", 0.0))) > 0:
             return cpus
         raise EngineError("the Ray cluster has no CPU; add one, or run in this process (--engine process)")
 
     def _actor(self) -> Any:  # noqa: ANN401 - Ray's handle
-        """One that waits and has let its robots go, or a new one."""
-        while self.idle:
-            actor = self.idle.pop()
+        """One that waits, or a new one."""
+        while self.engine.idle:
+            actor = self.engine.idle.pop()
             try:
                 self.ray.get(actor.hold.remote(self.make, []), timeout=_SECONDS_TO_ANSWER)
             except self.ray.exceptions.RayError:

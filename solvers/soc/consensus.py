@@ -16,7 +16,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from solvers.network.counted_pool import Count, by_link, delivered
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.copies import CopiesState, CopyLayout, RescaleCopies, Rows, SeparatorPenalty
+from solvers.soc.copies import CopiesState, CopyLayout, RescaleCopies, Rows, SeparatorPenalty, Solved, StepOrder
 from solvers.soc.penalty import Due, MultiplierPenalty, SharedSteps, next_penalty
 from solvers.soc.recursion_block import Agreement
 from solvers.soc.separator_stiffness import adapted_penalty, fell_most, translation_penalty_for
@@ -55,14 +55,18 @@ class ConsensusState(SharedSteps):
     """Iterate k: the sums that all robots know; the iterates are theirs."""
 
     separators: SeparatorPenalty
+    objective: float = math.nan  # F at omega and the translations at hand, where that is known with the step
+    # Of the next step (a), unless the penalties change before: sums, and rows as their receivers have them.
+    ahead: Array | None = None
+    rows: Sequence[Rows] = ()
 
 
 @dataclass(frozen=True)
 class Consensus:
     """The recursion by robots, from the poses that they begin at.
 
-    An iteration is one round between neighbours and two all-reduces: the sums of the acceleration, of which only the
-    merit is left where every robot accelerates alone, and the residuals.
+    An iteration is one exchange: a round between neighbours, and with it one all-reduce, of the residuals and, for the
+    next iterate, the sums of the acceleration, of which only the merit is left where every robot accelerates alone.
     """
 
     soc: SOCSettings  # settings; its coupling and robots are not looked at
@@ -92,18 +96,23 @@ class Consensus:
         return ConsensusState(ratio=ratio, size=size, separators=separators)
 
     def step(self, robots: Robots, state: ConsensusState) -> ConsensusState:
-        """One round: (a) on every robot, its rows to the neighbours, (b) and (c)."""
-        state = self._with_penalty_due(robots, state)
-        sums = np.sum(ask_all(robots, ConsensusRobot.solve, None, Count.ALL_REDUCE), axis=0)  # (a)
-        merit = math.sqrt(sums[0])
+        """One exchange: (b) and (c) on every robot, and (a) of the next step."""
+        due = self._with_penalty_due(robots, state)
+        if due is not state or state.ahead is None:
+            state = _solved(robots, due, ask_all(robots, ConsensusRobot.solve, None, Count.ALL_REDUCE))  # (a)
+        assert state.ahead is not None
+        merit = math.sqrt(state.ahead[0])
         if not math.isfinite(merit):
             return state.broken()
         together = self.soc.acceleration if self.soc.step_settings.alone is None else None
-        gamma, anderson = state.sums.coefficients(together, sums)
+        gamma, anderson = state.sums.coefficients(together, state.ahead)
         agreement = Agreement(gamma, state.is_best(merit))
-        rows = robots.hand_on(ask_all(robots, ConsensusRobot.extrapolate, agreement, Count.PIGGYBACKED))
-        squares = np.sum(robots.ask(ConsensusRobot.agree, rows, Count.ALL_REDUCE), axis=0)  # (b), (c)
-        return state.after(merit, squares, state.size, anderson)
+        orders = [StepOrder(agreement, rows) for rows in state.rows]
+        answers = robots.ask(ConsensusRobot.step, orders, Count.ALL_REDUCE)  # (b), (c)
+        squares = np.sum([answer.squares for answer in answers], axis=0)
+        objective = math.fsum(answer.measured for answer in answers)
+        following = replace(state.after(merit, squares, state.size, anderson), objective=objective)
+        return _solved(robots, following, [answer.solved for answer in answers])
 
     def _with_penalty_due(self, robots: Robots, state: ConsensusState) -> ConsensusState:
         """State with the penalty that the rule, or the safeguard, wants from now on; mostly the state itself."""
@@ -139,6 +148,12 @@ class Consensus:
             orders = [replace(order, rows=rows) for rows in robots.hand_on(sent)]
         robots.ask(ConsensusRobot.rescale, orders, Count.PIGGYBACKED)
         return state.rescaled(factor)
+
+
+def _solved(robots: Robots, state: ConsensusState, answers: Sequence[Solved]) -> ConsensusState:
+    """State with what step (a) gave, handed on."""
+    rows = robots.hand_on([answer.rows for answer in answers])
+    return replace(state, ahead=np.sum([answer.sums for answer in answers], axis=0), rows=rows)
 
 
 # In one place.

@@ -11,9 +11,9 @@ from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.matrices import columns_of
-from solvers.soc.anderson import AndersonSums
+from solvers.soc.anderson import AndersonShare, AndersonSums
 from solvers.soc.r_step import BackEnd, RStep, RSubproblem
-from solvers.soc.recursion_block import RecursionBlock, StepSettings
+from solvers.soc.recursion_block import Agreement, RecursionBlock, StepSettings
 from solvers.soc.subgraph import PartProblem, Subgraph
 
 Rows = Mapping[int, Array]  # to or from every neighbour
@@ -60,6 +60,31 @@ class RescaleCopies:
     factor: float
     translation: float
     rows: Rows | None
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Sums of step (a), and for every neighbour its rows of s after it, before what is extrapolated together."""
+
+    sums: Array
+    rows: Rows
+
+
+@dataclass(frozen=True, eq=False)
+class StepOrder:
+    """What all learn from the sums of step (a), and the neighbours' rows after it."""
+
+    agreement: Agreement
+    rows: Rows
+
+
+@dataclass(frozen=True, eq=False)
+class Stepped:
+    """Squared residuals, (2,), part of F at omega, and what the next step (a) gave."""
+
+    squares: Array
+    measured: float
+    solved: Solved
 
 
 @dataclass(frozen=True)
@@ -188,6 +213,15 @@ class Waiting:
 
 
 @dataclass(frozen=True, eq=False)
+class Ahead:
+    """Step (a) of the iterate to come."""
+
+    X: Array  # (rows, d): its x with all translations
+    block: RecursionBlock
+    sums: AndersonSums  # of a robot that accelerates alone, whose s is extrapolated already
+
+
+@dataclass(frozen=True, eq=False)
 class CopiesState:
     """What orders leave with a robot; rows as in `CopyLayout`."""
 
@@ -204,7 +238,7 @@ class CopiesState:
     settings: StepSettings = field(default_factory=StepSettings)
     block: RecursionBlock | None = None
     origin: tuple[Array, Array] | None = None  # (rows, d) each: z and s when the penalties were set
-    # Of a robot that accelerates alone, with `gamma` from them.
-    sums: AndersonSums = field(default_factory=AndersonSums)
-    gamma: Array | None = None
+    sums: AndersonSums = field(default_factory=AndersonSums)  # of a robot that accelerates alone
+    heard: Mapping[int, AndersonShare] = field(default_factory=dict)  # neighbours' rows, to be extrapolated as theirs
+    ahead: Ahead | None = None
     waiting: Waiting | None = None

@@ -75,11 +75,8 @@ class RecursionBlock:
 
     def extrapolated(self, agreement: Agreement) -> RecursionBlock:
         """Block with the next s, before it is agreed on."""
-        gamma, anderson = agreement.gamma, self.anderson
-        if gamma is None:
-            gamma, anderson = np.zeros(0), anderson.restarted()
-        best = self.s if agreement.is_best else self.best
-        return replace(self, s=anderson.combine(gamma), best=best, anderson=anderson)
+        s, anderson = self.anderson.extrapolated(agreement.gamma)
+        return replace(self, s=s, best=self.s if agreement.is_best else self.best, anderson=anderson)
 
     def agreed(self, z: Array) -> tuple[RecursionBlock, Array]:
         """Block after step (b), which gives z, and (c): B = s - z = B + x - z.
