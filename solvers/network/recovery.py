@@ -119,14 +119,9 @@ class RecoveringPool(Generic[T]):
             except RobotLostError as error:
                 lost = error
         raise EngineError(
-            f"{named(robots)} lost {self.restarts[group] + 1} times ({lost}); look at the memory of the machine, or "
-            "run in this process"
+            f"the process of robots {', '.join(map(str, robots))} was lost {self.restarts[group] + 1} times ({lost}); "
+            "look at the memory of its machine, or run in this process"
         ) from lost
 
     def _order(self, group: int, order: AnyOrder, requests: Sequence[object]) -> list[Any]:
         return self.place.receive(group, self.place.send(group, order, requests))
-
-
-def named(robots: Sequence[int]) -> str:
-    """Robots as the subject of a sentence in the past."""
-    return f"robot {robots[0]} was" if len(robots) == 1 else f"robots {', '.join(map(str, robots))} were"

@@ -16,7 +16,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from solvers.network.counted_pool import Count, by_link, delivered
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.copies import CopiesState, CopyLayout, RescaleCopies, Rows, SeparatorPenalty, Solved, StepOrder
+from solvers.soc.copies import CopiesState, CopyLayout, RescaleCopies, Rows, SeparatorPenalty, Solved
 from solvers.soc.penalty import Due, MultiplierPenalty, SharedSteps, next_penalty
 from solvers.soc.recursion_block import Agreement
 from solvers.soc.separator_stiffness import adapted_penalty, fell_most, translation_penalty_for
@@ -107,7 +107,7 @@ class Consensus:
         together = self.soc.acceleration if self.soc.step_settings.alone is None else None
         gamma, anderson = state.sums.coefficients(together, state.ahead)
         agreement = Agreement(gamma, state.is_best(merit))
-        orders = [StepOrder(agreement, rows) for rows in state.rows]
+        orders = [(agreement, rows) for rows in state.rows]
         answers = robots.ask(ConsensusRobot.step, orders, Count.ALL_REDUCE)  # (b), (c)
         squares = np.sum([answer.squares for answer in answers], axis=0)
         objective = math.fsum(answer.measured for answer in answers)

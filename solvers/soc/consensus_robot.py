@@ -20,7 +20,6 @@ from pgo_models.geometry.rotations import Array, unstack_transposes
 from pgo_models.problem.matrices import inner
 from solvers.soc.anderson import AndersonShare, AndersonSums, over_relax
 from solvers.soc.copies import (
-    Ahead,
     CopiesState,
     CopyLayout,
     Known,
@@ -31,7 +30,6 @@ from solvers.soc.copies import (
     SeparatorPenalty,
     Solved,
     Started,
-    StepOrder,
     Stepped,
     TurnAnswer,
     TurnSettings,
@@ -139,24 +137,25 @@ class ConsensusRobot:
             s = block.s
         assert s is not None
         rows = {robot: s[rows] for robot, rows in self.layout.common.items()}
-        return self._with(ahead=Ahead(X, block, known)), Solved(sums, rows)
+        return self._with(ahead=(X, block, known)), Solved(sums, rows)
 
-    def step(self, order: StepOrder) -> tuple[ConsensusRobot, Stepped]:
+    def step(self, order: tuple[Agreement, Rows]) -> tuple[ConsensusRobot, Stepped]:
         """Extrapolate what was solved, own rows and the neighbours'; (b) and (c) with them; and (a) of the next step.
 
         A neighbour extrapolates its rows with the same coefficients: nobody waits for them a second time.
         """
-        agreement, before, ahead = order.agreement, self.block, self.state.ahead
-        assert ahead is not None
-        block, memory, heard, rows = ahead.block, before.settings.memory, {}, {}
+        (agreement, received), before = order, self.block
+        assert self.state.ahead is not None
+        X, block, sums = self.state.ahead
+        memory, heard, rows = before.settings.memory, {}, {}
         if before.settings.alone is not None:
             block, memory = replace(block, best=before.s if agreement.is_best else before.best), 0
         else:
             block = block.extrapolated(agreement)
-        for robot, image in order.rows.items():
+        for robot, image in received.items():
             known = self.state.heard.get(robot, AndersonShare()).after(np.zeros((0, 0)), image, memory)
             rows[robot], heard[robot] = known.extrapolated(agreement.gamma)
-        moved = self._with(X=ahead.X, block=block, sums=ahead.sums, heard=heard)
+        moved = self._with(X=X, block=block, sums=sums, heard=heard)
         block, squares = block.agreed(moved._mean(rows))
         moved = moved._with(block=block)
         following, solved = moved.solve(None)

@@ -13,7 +13,7 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.matrices import columns_of
 from solvers.soc.anderson import AndersonShare, AndersonSums
 from solvers.soc.r_step import BackEnd, RStep, RSubproblem
-from solvers.soc.recursion_block import Agreement, RecursionBlock, StepSettings
+from solvers.soc.recursion_block import RecursionBlock, StepSettings
 from solvers.soc.subgraph import PartProblem, Subgraph
 
 Rows = Mapping[int, Array]  # to or from every neighbour
@@ -67,14 +67,6 @@ class Solved:
     """Sums of step (a), and for every neighbour its rows of s after it, before what is extrapolated together."""
 
     sums: Array
-    rows: Rows
-
-
-@dataclass(frozen=True, eq=False)
-class StepOrder:
-    """What all learn from the sums of step (a), and the neighbours' rows after it."""
-
-    agreement: Agreement
     rows: Rows
 
 
@@ -213,15 +205,6 @@ class Waiting:
 
 
 @dataclass(frozen=True, eq=False)
-class Ahead:
-    """Step (a) of the iterate to come."""
-
-    X: Array  # (rows, d): its x with all translations
-    block: RecursionBlock
-    sums: AndersonSums  # of a robot that accelerates alone, whose s is extrapolated already
-
-
-@dataclass(frozen=True, eq=False)
 class CopiesState:
     """What orders leave with a robot; rows as in `CopyLayout`."""
 
@@ -240,5 +223,5 @@ class CopiesState:
     origin: tuple[Array, Array] | None = None  # (rows, d) each: z and s when the penalties were set
     sums: AndersonSums = field(default_factory=AndersonSums)  # of a robot that accelerates alone
     heard: Mapping[int, AndersonShare] = field(default_factory=dict)  # neighbours' rows, to be extrapolated as theirs
-    ahead: Ahead | None = None
+    ahead: tuple[Array, RecursionBlock, AndersonSums] | None = None  # X, block and sums after the next step (a)
     waiting: Waiting | None = None

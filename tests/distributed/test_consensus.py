@@ -188,7 +188,7 @@ def test_robots_forget_when_the_acceleration_restarts(seed: int) -> None:
     restarts = []
     for one, other in islice(zip(iterate(soc, problem, start), iterate(ConsensusSOC(soc), driver), strict=False), 16):
         check_state(one, other, engine)
-        orders = [down[0].agreement.gamma is None for order, down, _ in engine.log if order == "ConsensusRobot.step"]
+        orders = [down[0][0].gamma is None for order, down, _ in engine.log if order == "ConsensusRobot.step"]
         restarts.append(bool(orders) and bool(orders[-1]))
     assert sum(restarts[:-3]) >= 1  # and steps follow
 

@@ -173,7 +173,7 @@ def test_a_robot_that_is_lost_too_often_ends_the_run(graph, actors):
         ray.kill(actors[0].actors[1])
 
     engine = RayEngine(recovery=Recovery(max_restarts=0))
-    with pytest.raises(EngineError, match=r"robot 1 was lost 1 times \(the actor is gone"):
+    with pytest.raises(EngineError, match=r"the process of robots 1 was lost 1 times \(the actor is gone"):
         solvers.solve(graph, robots=2, engine=engine, callback=kill)
     assert actors[0].actors == {}
 

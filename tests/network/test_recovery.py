@@ -189,7 +189,7 @@ def test_of_two_refusals_the_first_robots_is_told():
 def test_a_robot_that_is_lost_again_and_again_ends_the_run():
     graph = varied_graph(4, 30, 2)
     engine = LeakyEngine(frozenset(range(20, 10_000)), Recovery(max_restarts=2))
-    with pytest.raises(EngineError, match=r"robot \d was lost 3 times \(gone\); look at the memory"):
+    with pytest.raises(EngineError, match=r"the process of robots \d was lost 3 times \(gone\); look at the memory"):
         solvers.solve(graph, robots=3, engine=engine)
 
 

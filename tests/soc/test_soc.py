@@ -185,7 +185,7 @@ def test_anderson_per_robot_sums_nothing_over_the_robots(seed: int, n: int, d: i
         following = soc.step(problem, state)
         for a, (before, after) in enumerate(zip(image.robots, following.robots, strict=True)):
             moved, _ = before.solve(None)
-            x = moved.state.ahead.block.x
+            x = moved.state.ahead[1].x
             residual = np.sqrt(before.block.penalty)[:, None] * (x - before.block.z)
             share, sums = known[a]
             told, share = share.observe(residual, x + before.block.B, Anderson().memory)

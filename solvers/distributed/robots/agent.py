@@ -17,7 +17,7 @@ from solvers.network.messages import Snapshot
 from solvers.network.serialization import deserialize, serialize
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.copies import Ahead, CopiesState, CopyLayout, Rows, TurnSettings, Waiting
+from solvers.soc.copies import CopiesState, CopyLayout, Rows, TurnSettings, Waiting
 from solvers.soc.recursion_block import RecursionBlock, StepSettings
 from solvers.soc.subgraph import Subgraph
 
@@ -44,7 +44,7 @@ class CoverRotations:
 
 CLASSES = (
     *(AgentRecord, InteriorState, CopiesState, Poses, RecursionBlock, StepSettings, Anderson, AndersonShare),
-    *(AndersonSums, RobotProof, Eliminated, Ahead, Waiting, TurnSettings, HeldFront, FrontFactor),
+    *(AndersonSums, RobotProof, Eliminated, Waiting, TurnSettings, HeldFront, FrontFactor),
 )
 
 
