@@ -26,6 +26,8 @@ from ipaddress import ip_address
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
+
 from pgo_models.errors import EngineError, MissingExtraError, SettingError, check_settings
 from solvers.network.engine import WorkerPool
 from solvers.network.messages import Worker, obey
@@ -208,12 +210,10 @@ class _RayPlace:
 
     @cached_property
     def groups(self) -> list[list[int]]:
-        """Robots of every actor: the largest share first, each to the actor that has least."""
+        """Robots of every actor, dealt by size, the largest share first."""
         sizes = [len(pickle.dumps(replace(share))) for share in self.shares]
-        groups: list[list[int]] = [[] for _ in range(min(self.engine.actors or self._cpus, len(sizes)))]
-        for robot in sorted(range(len(sizes)), key=lambda robot: -sizes[robot]):
-            min(groups, key=lambda group: sum(sizes[one] for one in group)).append(robot)
-        return [sorted(group) for group in groups]
+        ordered, count = np.argsort(sizes)[::-1].tolist(), min(self.engine.actors or self._cpus, len(sizes))
+        return [sorted(ordered[first::count]) for first in range(count)]
 
     @cached_property
     def _cpus(self) -> int:

@@ -17,14 +17,15 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.network.counted_pool import Count, by_link, delivered
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.copies import CopiesState, CopyLayout, RescaleCopies, Rows, SeparatorPenalty, Solved
-from solvers.soc.penalty import Due, MultiplierPenalty, SharedSteps, next_penalty
-from solvers.soc.recursion_block import Agreement
+from solvers.soc.penalty import Due, MultiplierPenalty, PenaltyOrder, SharedSteps, next_penalty
+from solvers.soc.recursion_block import Agreement, Rotations
 from solvers.soc.separator_stiffness import adapted_penalty, fell_most, translation_penalty_for
 from solvers.soc.settings import SOCSettings
 from solvers.soc.subgraph import split_graph
 
 Q = TypeVar("Q")
 A = TypeVar("A")
+_RELAXED = 1e-6  # of m_i: penalty of rotations that nothing is asked of
 Order = Callable[[ConsensusRobot, Q], tuple[ConsensusRobot, A]]
 
 
@@ -70,6 +71,7 @@ class Consensus:
     """
 
     soc: SOCSettings  # settings; its coupling and robots are not looked at
+    rotations: Rotations = Rotations.PROJECTED
 
     def init(self, robots: Robots, before: ConsensusState | None = None) -> ConsensusState:
         """State 0: omega = the rotations at hand, B in balance; two rounds for poses, penalties and forces.
@@ -77,27 +79,30 @@ class Consensus:
         Separators are held as in the state `before`, if there was one.
         """
         rows = robots.hand_on(robots.begin(before is None))
-        answers = robots.ask(ConsensusRobot.multiplier_norms, rows, Count.ALL_REDUCE)
+        answers = robots.ask(ConsensusRobot.multiplier_norms, rows, Count.GATHER)
         norms = np.concatenate([answer.norms for answer in answers])
         scales = np.concatenate([answer.scale for answer in answers])
         has_multipliers = isinstance(self.soc.penalty, MultiplierPenalty)
         is_stationary = (has_multipliers and robots.num_robots > 1) or before is not None
         order = self.soc.penalty_order(norms / scales, is_stationary)
+        if self.rotations is not Rotations.PROJECTED:
+            least = _RELAXED if self.rotations is Rotations.RELAXED else 1.0
+            order = PenaltyOrder(0.0, least, 0.0, settings=replace(order.settings, rotations=self.rotations))
         known = robots.hand_on(ask_all(robots, ConsensusRobot.penalize, order, Count.PIGGYBACKED))
-        stiffness = float(np.median(robots.ask(ConsensusRobot.stiffness, known, Count.ALL_REDUCE)))
+        stiffness = float(np.median(robots.ask(ConsensusRobot.stiffness, known, Count.GATHER)))
         if before is not None:
             separators = before.separators
         else:
             given = self.soc.translation_penalty
             separators = self._separators(given if given is not None else translation_penalty_for(stiffness))
-        started = ask_all(robots, ConsensusRobot.start, separators, Count.ALL_REDUCE)
+        started = ask_all(robots, ConsensusRobot.start, separators, Count.GATHER)
         size = math.sqrt(math.fsum(answer.size for answer in started))
         ratio = np.concatenate([answer.ratio for answer in started])
         return ConsensusState(ratio=ratio, size=size, separators=separators)
 
     def step(self, robots: Robots, state: ConsensusState) -> ConsensusState:
         """One exchange: (b) and (c) on every robot, and (a) of the next step."""
-        due = self._with_penalty_due(robots, state)
+        due = state if self.rotations is not Rotations.PROJECTED else self._with_penalty_due(robots, state)
         if due is not state or state.ahead is None:
             state = _solved(robots, due, ask_all(robots, ConsensusRobot.solve, None, Count.ALL_REDUCE))  # (a)
         assert state.ahead is not None
@@ -129,8 +134,8 @@ class Consensus:
         return state
 
     def _separators(self, translation: float) -> SeparatorPenalty:
-        has_multipliers = isinstance(self.soc.penalty, MultiplierPenalty)
-        return SeparatorPenalty(translation, self.soc.separator_penalty_for(translation) if has_multipliers else 0.0)
+        is_held = self.rotations is Rotations.RELAXED or isinstance(self.soc.penalty, MultiplierPenalty)
+        return SeparatorPenalty(translation, self.soc.separator_penalty_for(translation) if is_held else 0.0)
 
     def _adapted(self, robots: Robots, state: ConsensusState) -> ConsensusState:
         """State with the penalties of separators that the way so far suggests."""

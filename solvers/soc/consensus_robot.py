@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pgo_models.certificates.dual_variables import multiplier_norms, multipliers
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, unstack_transposes
+from pgo_models.geometry.rotations import Array, project_to_rotations, unstack_transposes
 from pgo_models.problem.matrices import inner
 from solvers.soc.anderson import AndersonShare, AndersonSums, over_relax
 from solvers.soc.copies import (
@@ -37,7 +37,7 @@ from solvers.soc.copies import (
 )
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.r_step import RotationStep, prepare
-from solvers.soc.recursion_block import Agreement, RecursionBlock, block_at, nearest_rotations, stationary_B
+from solvers.soc.recursion_block import Agreement, RecursionBlock, Rotations, block_at, nearest_rotations, stationary_B
 from solvers.soc.separator_stiffness import GROUND, stiffness_of_separators, travel
 
 
@@ -111,6 +111,8 @@ class ConsensusRobot:
         n, d, held, own = layout.problem.num_poses, layout.problem.d, layout.held, layout.own
         floor = separators.rotation * self._scale
         rho = np.where(layout.subgraph.copies > 1, np.maximum(state.rho, floor), state.rho)
+        if state.settings.rotations is Rotations.RELAXED:
+            rho = np.where(layout.subgraph.poses == 0, np.maximum(rho, self._scale), rho)
         penalty = self._penalty(rho, separators.translation)
         # B makes every subproblem stationary; its mean over the copies is the multiplier of the constraint.
         mean = np.concatenate([np.zeros((n, d)), (state.pull / rho[:, None]).reshape(d * n, d)])
@@ -217,8 +219,9 @@ class ConsensusRobot:
 
     @property
     def omega(self) -> Array:
-        """Rotations of the robot's poses, (n_a, d, d)."""
-        return unstack_transposes(self.block.z[self.layout.problem.num_poses :])
+        """Rotations of the robot's poses, (n_a, d, d); those nearest to a relaxation."""
+        R = unstack_transposes(self.block.z[self.layout.problem.num_poses :])
+        return project_to_rotations(R) if self.block.settings.rotations is Rotations.RELAXED else R
 
     @property
     def poses(self) -> Poses:
@@ -284,5 +287,11 @@ class ConsensusRobot:
             total[self.layout.common.get(robot, slice(None))] += parts[robot]
         mean = total / self.layout.copies
         z = np.where(self.layout.held, mean, 0.0)
-        z[n:] = nearest_rotations(mean[n:])
+        if block.settings.rotations is Rotations.PROJECTED:
+            z[n:] = nearest_rotations(mean[n:])
+        else:
+            is_relaxed = block.settings.rotations is Rotations.RELAXED
+            held = np.flatnonzero(self.layout.subgraph.poses == 0) if is_relaxed else np.arange(n)
+            rows = self.layout.rows(held)[len(held) :]
+            z[rows] = block.z[rows]
         return z
