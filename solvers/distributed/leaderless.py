@@ -67,11 +67,13 @@ def attempt_leaderless(
         for rotations in (Rotations.RELAXED, Rotations.FIXED):
             rounds = run(ConsensusSOC(few, False, rotations is Rotations.FIXED, rotations), driver)
             iterations, status, history = iterations + rounds.iterations, rounds.status, rounds.history
+            if not status.is_success:
+                break
         found = collect_copies(driver)
-        goes_on = problem.objective(found) < problem.objective(before)  # else from the tree
+        goes_on = status.is_success and problem.objective(found) < problem.objective(before)  # else from the tree
         before = found if goes_on else before
     if not journal.goes_on_with():
-        name = "chordal start, by rounds" if start is None else "given start"
+        name = "chordal start, by rounds" if goes_on else "given start" if start is not None else "spanning tree"
         objective, seconds = problem.objective(before), time.perf_counter() - began
         journal.stages.append(Stage(name, status, iterations, objective, seconds, history))
     began = time.perf_counter()

