@@ -35,7 +35,7 @@ STALLED = MultiplierPenalty(stall_window=3, stall_ratio=1e-6)  # anything counts
 STAR = {  # to and from whoever sums up: settings, figures of all poses in no order, and sums
     *("per_norm", "per_scale", "least", "is_stationary", "alpha", "memory", "local_passes", "per_robot"),
     *("regularization", "restart_ratio", "norms", "scale", "translation", "rotation", "factor", "size", "ratio"),
-    *("gamma", "is_best", "sums", "squares", "measured", "value"),
+    *("gamma", "is_best", "sums", "squares", "measured", "rotations", "value"),
 }
 Copies, Inner = ConsensusRobot, Interior
 ROUNDS = (  # orders that are, or end, a round
