@@ -104,7 +104,7 @@ def solve_command(
         typer.Option(
             min=0.0,
             help="GB that the driver of a solve by robots may take, 4 unless given; 0 is no driver, with --method "
-            "consensus: poses from a spanning tree, and no certificate.",
+            "consensus: poses, and no certificate.",
         ),
     ] = None,
     start: Annotated[

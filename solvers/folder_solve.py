@@ -119,8 +119,9 @@ def solve_folder(
     if soc is not None and (type(soc) is not SOC or soc.effective_coupling is Coupling.CONSENSUS):
         raise SettingError(f"robots with files of their own run SUBSTRUCTURED SOC, got {soc}; {READ_HERE}")
     files = [RobotFile(robot, path) for robot, path in enumerate(g2o_files(folder))]
-    if isinstance(engine, RayEngine):  # snapshots would be here, of all that robots have
-        engine = replace(engine, recovery=replace(engine.recovery, orders_between_snapshots=sys.maxsize))
+    if isinstance(engine, RayEngine):  # a process for every robot; snapshots would be here, of all that they have
+        recovery = replace(engine.recovery, orders_between_snapshots=sys.maxsize)
+        engine = replace(engine, recovery=recovery, actors=engine.actors or len(files))
     if out is not None:
         check_g2o_folder(out, len(files))
     stages: list[Stage] = []

@@ -45,7 +45,9 @@ class AsynchronousSOC:
     faults: Faults = field(default_factory=Faults)
     alpha: float = 1.8  # over-relaxation, in (0, 2)
     damping: float = 1.0  # share of a step that is taken, in (0, 1]
-    has_driver: bool = True  # as in `ConsensusSOC`
+    # has_driver, goes_on: as in `ConsensusSOC`.
+    has_driver: bool = True
+    goes_on: bool = False
 
     def __post_init__(self) -> None:
         check_settings(self, relaxation=["alpha"])
@@ -59,7 +61,7 @@ class AsynchronousSOC:
 
     def init(self, driver: Driver, start: None) -> AsynchronousState:
         """State 0: set-up, and the first rows, arrive in full; a SettingError where the silent robot is none."""
-        robots, silent = RobotsOfDriver(driver, self.has_driver), self.faults.silent_robot
+        robots, silent = RobotsOfDriver(driver, self.has_driver, self.goes_on), self.faults.silent_robot
         if silent is not None and silent >= robots.num_robots:
             raise SettingError(f"silent_robot is {silent}; give 0 to {robots.num_robots - 1}")
         state = Consensus(self.soc).init(robots)

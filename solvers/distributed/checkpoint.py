@@ -38,7 +38,7 @@ from solvers.soc.consensus import ConsensusState
 from solvers.soc.copies import SeparatorPenalty
 from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty
 from solvers.soc.r_step import RStep
-from solvers.soc.recursion_block import RecursionBlock, StepSettings
+from solvers.soc.recursion_block import RecursionBlock, Rotations, StepSettings
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
 
@@ -86,7 +86,7 @@ class Saved:
 _CLASSES = (
     *(Saved, DriverState, CoverPoses, Poses, Certificate, LowerBound, BoundSource, Verdict, Weighting, Ledger, Traffic),
     *(Stage, Status, History, Record, Measurement, RecursionBlock, StepSettings, AndersonShare, AndersonSums),
-    *(SubstructuredState, ConsensusState, SubstructuredNewtonState, SeparatorPenalty),
+    *(SubstructuredState, ConsensusState, SubstructuredNewtonState, SeparatorPenalty, Rotations),
     *(SOC, Newton, Anderson, Coupling, RStep, MultiplierPenalty, FixedPenalty, BalancedPenalty),
     *(Partition, PartitionMethod),
 )

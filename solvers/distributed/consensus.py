@@ -16,6 +16,7 @@ from solvers.result import Measurement, Status
 from solvers.soc.consensus import Consensus, ConsensusState, Order, ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.copies import Rows
+from solvers.soc.recursion_block import Rotations
 from solvers.soc.soc import SOC
 
 Q = TypeVar("Q")
@@ -30,6 +31,7 @@ class RobotsOfDriver:
     # Whether a driver sends the cover's poses at the start, and finds the best translations where penalties are taken
     # anew. Else robots begin at poses that they know, and go on from the translations that they agreed on.
     has_driver: bool = True
+    goes_on: bool = False  # whether robots without a driver begin where an earlier run has left them
 
     @property
     def num_robots(self) -> int:
@@ -38,7 +40,7 @@ class RobotsOfDriver:
 
     def begin(self, is_first: bool) -> list[Rows]:
         """Give all robots the poses to start at, or to go on from; what they send each other then."""
-        if not is_first and not self.has_driver:
+        if self.goes_on or not (is_first or self.has_driver):
             return ask_all(self, ConsensusRobot.begin_here, None, Count.PIGGYBACKED)
         if not is_first:
             self.finish()
@@ -57,7 +59,9 @@ class RobotsOfDriver:
         """Residuals, with F at omega and the translations at hand, and the account so far."""
         if math.isnan(measurement.primal_residual):
             return self.driver.measured(Measurement(np.nan, np.nan, np.nan))
-        objective = math.fsum(ask_all(self, ConsensusRobot.cost, None, Count.OFF))
+        objective = measurement.objective  # told with the step, or
+        if math.isnan(objective):
+            objective = math.fsum(ask_all(self, ConsensusRobot.cost, None, Count.OFF))
         return self.driver.measured(Measurement(objective, measurement.primal_residual, measurement.dual_residual))
 
     def finish(self) -> None:
@@ -73,7 +77,10 @@ class ConsensusSOC:
     """SOC by robots, from the poses that they and the driver hold; a step replaces what they have."""
 
     soc: SOC = field(default_factory=SOC)  # settings; its coupling and robots are not looked at
-    has_driver: bool = True  # as in `RobotsOfDriver`
+    # has_driver, goes_on: as in `RobotsOfDriver`; rotations: as in `Consensus`.
+    has_driver: bool = True
+    goes_on: bool = False
+    rotations: Rotations = Rotations.PROJECTED
 
     @property
     def max_iterations(self) -> int:
@@ -82,15 +89,16 @@ class ConsensusSOC:
 
     def init(self, driver: Driver, start: ConsensusState | None) -> ConsensusState:
         """State 0: omega = the rotations at hand, B in balance; two rounds for poses, penalties and forces."""
-        return start if start is not None else Consensus(self.soc).init(RobotsOfDriver(driver, self.has_driver))
+        robots = RobotsOfDriver(driver, self.has_driver, self.goes_on)
+        return start if start is not None else Consensus(self.soc, self.rotations).init(robots)
 
     def step(self, driver: Driver, state: ConsensusState) -> ConsensusState:
-        """One round between neighbours, and two all-reduces."""
-        return Consensus(self.soc).step(RobotsOfDriver(driver, self.has_driver), state)
+        """One round between neighbours, and with it an all-reduce."""
+        return Consensus(self.soc, self.rotations).step(RobotsOfDriver(driver, self.has_driver), state)
 
     def measure(self, driver: Driver, state: ConsensusState) -> Measurement:
         """F at omega and the translations at hand, and the residuals."""
-        return RobotsOfDriver(driver).measured(state.measurement(math.nan))
+        return RobotsOfDriver(driver).measured(state.measurement(state.objective))
 
     def converged(self, state: ConsensusState, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals are within tolerance."""

@@ -1,35 +1,42 @@
-"""CONSENSUS without a driver: robots alone find poses, from a spanning tree, and nothing is proved about them.
+"""CONSENSUS without a driver: robots alone find poses, from a start by rounds, and nothing is proved about them.
 
 In a solve by robots the driver solves for the separators in the chordal start, the best translations of given
-rotations, Newton and the certificate. Robots alone start at a spanning tree, or at given poses, and end with the
-rotations and translations that they agree on: as near to the optimum as SOC's tolerance says, for there is no second
-stage.
+rotations, Newton and the certificate. Robots alone begin at a spanning tree, relax rotations and translations jointly,
+then find translations for the rotations, by rounds of CONSENSUS, or begin at given poses; they end with what they agree
+on: as near to the optimum as SOC's tolerance says, for there is no second stage. Sums, and so the tests, go along a
+tree.
 """
 
 import math
 import time
+from dataclasses import replace
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order
 
 from pgo_models.certificates.certificate import BoundSource, Certificate, certify_with
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
+from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.initialization import spanning_tree, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.distributed.driver import Driver
-from solvers.loop import Watch
+from solvers.loop import Watch, run
 from solvers.network.counted_pool import Count
 from solvers.network.faults import Faults
 from solvers.network.ledger import BYTES_PER_NUMBER, Traffic
 from solvers.result import History, Outcome, Stage, Status
 from solvers.soc.consensus import ConsensusState, ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
+from solvers.soc.recursion_block import Rotations
 from solvers.soc.soc import SOC
 
+_TOLERANCE, _MOST_ROUNDS = 1e-2, 100  # of the relaxation: SOC goes on from the rotations nearest to it
 NO_CERTIFICATE = "no driver: Newton and the certificate were left out, and F >= 0 is all that is known of the optimum"
 
 
@@ -46,25 +53,36 @@ def attempt_leaderless(
 ) -> tuple[Poses, Certificate]:
     """Start and CONSENSUS; what was done goes to the stages of `journal`. The bound is F >= 0.
 
-    Of the whole `problem` nothing is used but the tree, and F of the start and of the poses that are returned.
+    Of the whole `problem` nothing is used but the trees, and F of the start and of the poses that are returned.
     """
     assert soc is not None
+    driver.network.tree = robot_tree(problem, robots)
     began = time.perf_counter()
+    iterations, status, history, goes_on = 0, Status.CONVERGED, History(), False
     before = start if start is not None else spanning_tree_start(problem.graph)
+    driver.hand_out(before)
+    if start is None:
+        for traffic in tree_traffic(problem, robots):
+            driver.network.ledger = driver.network.ledger.after_round(traffic)
+        few = replace(soc, local_passes=1, tolerance=_TOLERANCE, max_iterations=_MOST_ROUNDS)
+        for rotations in (Rotations.RELAXED, Rotations.FIXED):
+            rounds = run(ConsensusSOC(few, False, rotations is Rotations.FIXED, rotations), driver)
+            iterations, status, history = iterations + rounds.iterations, rounds.status, rounds.history
+            if not status.is_success:
+                break
+        found = collect_copies(driver)
+        goes_on = status.is_success and problem.objective(found) < problem.objective(before)  # else from the tree
+        before = found if goes_on else before
     if not journal.goes_on_with():
-        driver.hand_out(before)
-        if start is None:
-            for traffic in tree_traffic(problem, robots):
-                driver.network.ledger = driver.network.ledger.after_round(traffic)
-        name = "spanning tree" if start is None else "given start"
-        seconds = time.perf_counter() - began
-        journal.stages.append(Stage(name, Status.CONVERGED, 0, problem.objective(before), seconds, History()))
+        name = "chordal start, by rounds" if goes_on else "given start" if start is not None else "spanning tree"
+        objective, seconds = problem.objective(before), time.perf_counter() - began
+        journal.stages.append(Stage(name, status, iterations, objective, seconds, history))
     began = time.perf_counter()
     first: Outcome[AsynchronousState] | Outcome[ConsensusState]
     if faults is not None:
-        first = watch.run(AsynchronousSOC(soc, faults, has_driver=False), driver)
+        first = watch.run(AsynchronousSOC(soc, faults, has_driver=False, goes_on=goes_on), driver)
     else:
-        first = journal.run(ConsensusSOC(soc, has_driver=False), driver, watch)
+        first = journal.run(ConsensusSOC(soc, has_driver=False, goes_on=goes_on), driver, watch)
     poses = collect_copies(driver)
     if not problem.objective(poses) <= problem.objective(before):
         poses = before
@@ -81,6 +99,18 @@ def collect_copies(driver: Driver) -> Poses:
     for own in ask_all(RobotsOfDriver(driver), ConsensusRobot.own_poses, None, Count.OFF):
         R[own.poses], t[own.poses] = own.R, own.t
     return Poses(R, t)
+
+
+def robot_tree(problem: PGOProblem, robots: Partition) -> tuple[IntArray, IntArray]:
+    """Robots in order of their distance from robot 0, and the neighbour by which each is reached; the root is its own.
+
+    Up it go sums, and figures that are not summed up; down what follows from them.
+    """
+    links = robots.robot[problem.graph.i], robots.robot[problem.graph.j]
+    adjacency = csr_array((np.ones(problem.graph.num_edges), links), shape=(robots.num_robots, robots.num_robots))
+    order, parents = breadth_first_order(adjacency, 0, directed=False)
+    parents[0] = 0
+    return order, parents
 
 
 def tree_traffic(problem: PGOProblem, robots: Partition) -> list[Traffic]:

@@ -21,6 +21,7 @@ class Count(enum.Enum):
 
     ROUND = "robots wait for values at the separators"
     ALL_REDUCE = "sums of a few numbers, and what follows from them"
+    GATHER = "likewise, of numbers that are not summed up: figures of all poses"
     PIGGYBACKED = "counted with the next round"
     OFF = "measuring, setting up, and collecting the answer are off the ledger"
 
@@ -32,6 +33,8 @@ class CountedPool:
         self.workers, self.ledger = workers, Ledger(num_robots)
         self._traffic: dict[bytes, Traffic] = {}
         self.elsewhere: tuple[str, ...] = ()  # fields that go along a tree of workers
+        # Of robots without a driver, whose sums go along a tree to its root: all, parents first, and their parents.
+        self.tree: tuple[IntArray, IntArray] | None = None
 
     def ask(
         self,
@@ -54,9 +57,13 @@ class CountedPool:
         sizes = [count_numbers(asked[robot], self.elsewhere) for robot in robots.tolist()]
         sizes += [count_numbers(answers[robot], self.elsewhere) for robot in robots.tolist()]
         driver = np.full(len(robots), DRIVER)
+        if self.tree is not None:
+            outwards, driver = self.tree
+            for robot in outwards[:0:-1].tolist() if count is Count.GATHER else ():
+                sizes[len(robots) + driver[robot]] += sizes[len(robots) + robot]
         sender, receiver = np.concatenate([driver, robots]), np.concatenate([robots, driver])
         self.count(sender, receiver, sizes, is_round=count is Count.ROUND)
-        if count is Count.ALL_REDUCE:
+        if count in (Count.ALL_REDUCE, Count.GATHER):
             self.ledger = self.ledger.after_all_reduce(0)
         return answers
 

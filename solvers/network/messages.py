@@ -1,11 +1,13 @@
 """Orders to workers: functions of a worker and a request. Requests and answers are numbers, arrays and records."""
 
 import enum
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pgo_models.errors import PGOError
 
 Snapshot = Mapping[str, NDArray[Any]]
 
@@ -34,6 +36,18 @@ class Idle(enum.Enum):
     """In place of a request: the worker gets no order, and its answer is None."""
 
     IDLE = "no order"
+
+
+def obey(workers: Sequence[Worker], order: Callable[[Any, Any], Any], requests: Sequence[object]) -> list[Any]:
+    """Answers of workers to an order; a PGOError of one stands for its answer, so that the others' are not lost."""
+
+    def obeyed(worker: Worker, request: object) -> Any:  # noqa: ANN401 - as the order has it
+        try:
+            return None if request is Idle.IDLE else order(worker, request)
+        except PGOError as error:
+            return error
+
+    return list(map(obeyed, workers, requests))
 
 
 def count_numbers(record: object, elsewhere: Collection[str] = ()) -> int:

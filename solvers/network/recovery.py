@@ -22,16 +22,20 @@ class RobotLostError(EngineError):
 
 
 class Place(Protocol[T]):
-    """Where robots run that can be lost; T is what stands for an order under way."""
+    """Where groups of robots run that can be lost, each as a whole; T is what stands for an order under way."""
 
-    def start(self, robots: Sequence[int]) -> None:
-        """Start robots, or start them again, each from its share; a RobotLostError when one was lost meanwhile."""
+    @property
+    def groups(self) -> Sequence[Sequence[int]]:
+        """Robots of every group."""
 
-    def send(self, robot: int, order: AnyOrder, request: object) -> T:
-        """Give a robot an order."""
+    def start(self, groups: Sequence[int]) -> None:
+        """Start groups, or start them again, from their shares; a RobotLostError when one was lost meanwhile."""
 
-    def receive(self, robot: int, ticket: T) -> Any:  # noqa: ANN401 - what the order answers
-        """Wait for its answer; a RobotLostError when there will be none."""
+    def send(self, group: int, order: AnyOrder, requests: Sequence[object]) -> T:
+        """Give the robots of a group an order, each with its request."""
+
+    def receive(self, group: int, ticket: T) -> list[Any]:
+        """Wait for their answers, see `obey`; a RobotLostError when there will be none."""
 
     def close(self) -> None:
         """Let the robots go."""
@@ -42,7 +46,7 @@ class Recovery:
     """How lost robots are made anew."""
 
     orders_between_snapshots: int = 40  # an iteration of SOC takes three or four; so many are kept for a robot
-    max_restarts: int = 3  # of one robot; then the run ends with an error
+    max_restarts: int = 3  # of one group; then the run ends with an error
 
     def __post_init__(self) -> None:
         check_settings(self, not_negative=["max_restarts"], at_least_one=["orders_between_snapshots"])
@@ -53,14 +57,13 @@ class RecoveringPool(Generic[T]):
     """Robots in a place where they can be lost; answers are those of robots that never are."""
 
     place: Place[T]  # with all robots started
-    num_robots: int
     recovery: Recovery
-    restarts: list[int] = field(init=False)  # how often every robot was started again
+    restarts: list[int] = field(init=False)  # how often every group was started again
     _log: list[tuple[AnyOrder, tuple[Any, ...]]] = field(init=False, default_factory=list)
     _snapshots: list[Snapshot] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
-        self.restarts = [0] * self.num_robots
+        self.restarts = [0] * len(self.place.groups)
 
     def ask(self, order: Callable[[Any, Q], A], requests: Sequence[Q]) -> list[A]:
         """Give every robot an order, each with its request, and wait for all answers.
@@ -76,7 +79,7 @@ class RecoveringPool(Generic[T]):
         elif order is restore:
             self._snapshots, self._log = [*self._log[-1][1]], []
         elif len(self._log) >= self.recovery.orders_between_snapshots:
-            self.ask(take_snapshot, [None] * self.num_robots)
+            self.ask(take_snapshot, [None] * len(requests))
         return answers
 
     def close(self) -> None:
@@ -84,50 +87,41 @@ class RecoveringPool(Generic[T]):
         self.place.close()
 
     def _asked(self, order: AnyOrder, requests: Sequence[object]) -> list[Any]:
-        working = [robot for robot, request in enumerate(requests) if request is not Idle.IDLE]
-        tickets = [self.place.send(robot, order, requests[robot]) for robot in working]
+        each = {group: [requests[one] for one in robots] for group, robots in enumerate(self.place.groups)}
+        working = {group: mine for group, mine in each.items() if any(one is not Idle.IDLE for one in mine)}
+        tickets = {group: self.place.send(group, order, mine) for group, mine in working.items()}
         answers: list[Any] = [None] * len(requests)
-        refusal: PGOError | None = None
-        for robot, ticket in zip(working, tickets, strict=True):
+        for group, ticket in tickets.items():
             try:
-                try:
-                    answers[robot] = self.place.receive(robot, ticket)
-                except RobotLostError as lost:
-                    answers[robot] = self._recovered(robot, order, requests[robot], lost)
-            except EngineError:
-                raise
-            except PGOError as error:  # the robot's own; the others' answers are waited for all the same
-                refusal = refusal or error
-        if refusal is not None:
-            raise refusal
+                found = self.place.receive(group, ticket)
+            except RobotLostError as lost:
+                found = self._recovered(group, order, working[group], lost)
+            for robot, answer in zip(self.place.groups[group], found, strict=True):
+                answers[robot] = answer
+        for answer in answers:
+            if isinstance(answer, PGOError):
+                raise answer
         return answers
 
-    def _recovered(self, robot: int, order: AnyOrder, request: object, lost: RobotLostError) -> object:
-        """Answer of a robot that was lost before it gave one."""
-        while self.restarts[robot] < self.recovery.max_restarts:
-            self.restarts[robot] += 1
+    def _recovered(self, group: int, order: AnyOrder, requests: Sequence[object], lost: RobotLostError) -> list[Any]:
+        """Answers of a group that was lost before it gave them; what robots refused they refuse again."""
+        robots = self.place.groups[group]
+        while self.restarts[group] < self.recovery.max_restarts:
+            self.restarts[group] += 1
             try:
-                self.place.start([robot])
+                self.place.start([group])
                 if self._snapshots:
-                    self._order(robot, restore, self._snapshots[robot])
-                for earlier, requests in self._log:
-                    if requests[robot] is not Idle.IDLE:
-                        self._again(robot, earlier, requests[robot])
-                return self._order(robot, order, request)
+                    self._order(group, restore, [self._snapshots[one] for one in robots])
+                for earlier, asked in self._log:
+                    if any(asked[one] is not Idle.IDLE for one in robots):
+                        self._order(group, earlier, [asked[one] for one in robots])
+                return self._order(group, order, requests)
             except RobotLostError as error:
                 lost = error
         raise EngineError(
-            f"robot {robot} was lost {self.restarts[robot] + 1} times ({lost}); look at the memory of its machine, or "
-            "run in this process"
+            f"the process of robots {', '.join(map(str, robots))} was lost {self.restarts[group] + 1} times ({lost}); "
+            "look at the memory of its machine, or run in this process"
         ) from lost
 
-    def _order(self, robot: int, order: AnyOrder, request: object) -> object:
-        return self.place.receive(robot, self.place.send(robot, order, request))
-
-    def _again(self, robot: int, order: AnyOrder, request: object) -> None:
-        try:
-            self._order(robot, order, request)
-        except EngineError:
-            raise
-        except PGOError:  # as it was the first time, when the driver was told
-            return
+    def _order(self, group: int, order: AnyOrder, requests: Sequence[object]) -> list[Any]:
+        return self.place.receive(group, self.place.send(group, order, requests))

@@ -63,27 +63,28 @@ class AndersonShare:
         `residual`, (rows, d), may carry weights; `image`, (rows, d), not. The sums, (1 + 2 q,), are ||residual||^2;
         newest . difference for the q differences, the newest last; difference . residual for them.
         """
-        size = inner(residual, residual)
+        share = self.after(residual, image, keep)
+        known = share.residual_differences
+        sums = [inner(known[-1], other) for other in known] + [inner(other, residual) for other in known]
+        return np.array([inner(residual, residual), *sums]), share
+
+    def after(self, residual: Array, image: Array, keep: int) -> AndersonShare:
+        """Return the share with the newest of at most `keep` differences."""
         if self.residual is None or self.image is None or not keep:
-            return np.array([size]), AndersonShare(residual=residual, image=image)
-        newest = residual - self.residual
-        residuals = (*(self.residual_differences[-(keep - 1) :] if keep > 1 else ()), newest)
+            return AndersonShare(residual=residual, image=image)
+        residuals = (*(self.residual_differences[-(keep - 1) :] if keep > 1 else ()), residual - self.residual)
         images = (*(self.image_differences[-(keep - 1) :] if keep > 1 else ()), image - self.image)
-        sums = [size, *(inner(newest, other) for other in residuals), *(inner(other, residual) for other in residuals)]
-        return np.array(sums), AndersonShare(residuals, images, residual, image)
+        return AndersonShare(residuals, images, residual, image)
 
-    def combine(self, gamma: Array) -> Array:
-        """Rows of image - sum_k gamma_k dg_k; no coefficient is a plain step."""
+    def extrapolated(self, gamma: Array | None) -> tuple[Array, AndersonShare]:
+        """Rows of image - sum_k gamma_k dg_k, and the share; None is a plain step after which it starts anew."""
         assert self.image is not None
+        if gamma is None or not len(gamma):
+            return self.image, self if gamma is not None else AndersonShare(residual=self.residual, image=self.image)
         following = self.image.copy()
-        latest = self.image_differences[len(self.image_differences) - len(gamma) :]
-        for coefficient, difference in zip(gamma, latest, strict=True):
+        for coefficient, difference in zip(gamma, self.image_differences[-len(gamma) :], strict=True):
             following -= coefficient * difference
-        return following
-
-    def restarted(self) -> AndersonShare:
-        """Return the share with the differences forgotten."""
-        return AndersonShare(residual=self.residual, image=self.image)
+        return following, self
 
 
 @dataclass(frozen=True, eq=False)

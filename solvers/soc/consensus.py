@@ -16,15 +16,16 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from solvers.network.counted_pool import Count, by_link, delivered
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.copies import CopiesState, CopyLayout, RescaleCopies, Rows, SeparatorPenalty
-from solvers.soc.penalty import Due, MultiplierPenalty, SharedSteps, next_penalty
-from solvers.soc.recursion_block import Agreement
+from solvers.soc.copies import CopiesState, CopyLayout, RescaleCopies, Rows, SeparatorPenalty, Solved
+from solvers.soc.penalty import Due, MultiplierPenalty, PenaltyOrder, SharedSteps, next_penalty
+from solvers.soc.recursion_block import Agreement, Rotations
 from solvers.soc.separator_stiffness import TRANSLATION_PENALTY, adapted_penalty, fell_most
 from solvers.soc.settings import SOCSettings
 from solvers.soc.subgraph import split_graph
 
 Q = TypeVar("Q")
 A = TypeVar("A")
+_RELAXED = 1e-6  # of m_i: penalty of rotations that nothing is asked of
 Order = Callable[[ConsensusRobot, Q], tuple[ConsensusRobot, A]]
 
 
@@ -55,17 +56,22 @@ class ConsensusState(SharedSteps):
     """Iterate k: the sums that all robots know; the iterates are theirs."""
 
     separators: SeparatorPenalty
+    objective: float = math.nan  # F at omega and the translations at hand, where that is known with the step
+    # Of the next step (a), unless the penalties change before: sums, and rows as their receivers have them.
+    ahead: Array | None = None
+    rows: Sequence[Rows] = ()
 
 
 @dataclass(frozen=True)
 class Consensus:
     """The recursion by robots, from the poses that they begin at.
 
-    An iteration is one round between neighbours and two all-reduces: the sums of the acceleration, of which only the
-    merit is left where every robot accelerates alone, and the residuals.
+    An iteration is one exchange: a round between neighbours, and with it one all-reduce, of the residuals and, for the
+    next iterate, the sums of the acceleration, of which only the merit is left where every robot accelerates alone.
     """
 
     soc: SOCSettings  # settings; its coupling and robots are not looked at
+    rotations: Rotations = Rotations.PROJECTED
 
     def init(self, robots: Robots, before: ConsensusState | None = None) -> ConsensusState:
         """State 0: omega = the rotations at hand, B in balance; two rounds for poses, penalties and forces.
@@ -73,37 +79,45 @@ class Consensus:
         Separators are held as in the state `before`, if there was one.
         """
         rows = robots.hand_on(robots.begin(before is None))
-        answers = robots.ask(ConsensusRobot.multiplier_norms, rows, Count.ALL_REDUCE)
+        answers = robots.ask(ConsensusRobot.multiplier_norms, rows, Count.GATHER)
         norms = np.concatenate([answer.norms for answer in answers])
         scales = np.concatenate([answer.scale for answer in answers])
         has_multipliers = isinstance(self.soc.penalty, MultiplierPenalty)
         is_stationary = (has_multipliers and robots.num_robots > 1) or before is not None
         order = self.soc.penalty_order(norms / scales, is_stationary)
+        if self.rotations is not Rotations.PROJECTED:
+            least = _RELAXED if self.rotations is Rotations.RELAXED else 1.0
+            order = PenaltyOrder(0.0, least, 0.0, settings=replace(order.settings, rotations=self.rotations))
         known = robots.hand_on(ask_all(robots, ConsensusRobot.penalize, order, Count.PIGGYBACKED))
-        stiffness = float(np.median(robots.ask(ConsensusRobot.stiffness, known, Count.ALL_REDUCE)))
+        stiffness = float(np.median(robots.ask(ConsensusRobot.stiffness, known, Count.GATHER)))
         if before is not None:
             separators = before.separators
         else:
             given = self.soc.translation_penalty
             separators = self._separators(given if given is not None else TRANSLATION_PENALTY * stiffness)
-        started = ask_all(robots, ConsensusRobot.start, separators, Count.ALL_REDUCE)
+        started = ask_all(robots, ConsensusRobot.start, separators, Count.GATHER)
         size = math.sqrt(math.fsum(answer.size for answer in started))
         ratio = np.concatenate([answer.ratio for answer in started])
         return ConsensusState(ratio=ratio, size=size, separators=separators)
 
     def step(self, robots: Robots, state: ConsensusState) -> ConsensusState:
-        """One round: (a) on every robot, its rows to the neighbours, (b) and (c)."""
-        state = self._with_penalty_due(robots, state)
-        sums = np.sum(ask_all(robots, ConsensusRobot.solve, None, Count.ALL_REDUCE), axis=0)  # (a)
-        merit = math.sqrt(sums[0])
+        """One exchange: (b) and (c) on every robot, and (a) of the next step."""
+        due = state if self.rotations is not Rotations.PROJECTED else self._with_penalty_due(robots, state)
+        if due is not state or state.ahead is None:
+            state = _solved(robots, due, ask_all(robots, ConsensusRobot.solve, None, Count.ALL_REDUCE))  # (a)
+        assert state.ahead is not None
+        merit = math.sqrt(state.ahead[0])
         if not math.isfinite(merit):
             return state.broken()
         together = self.soc.acceleration if self.soc.step_settings.alone is None else None
-        gamma, anderson = state.sums.coefficients(together, sums)
+        gamma, anderson = state.sums.coefficients(together, state.ahead)
         agreement = Agreement(gamma, state.is_best(merit))
-        rows = robots.hand_on(ask_all(robots, ConsensusRobot.extrapolate, agreement, Count.PIGGYBACKED))
-        squares = np.sum(robots.ask(ConsensusRobot.agree, rows, Count.ALL_REDUCE), axis=0)  # (b), (c)
-        return state.after(merit, squares, state.size, anderson)
+        orders = [(agreement, rows) for rows in state.rows]
+        answers = robots.ask(ConsensusRobot.step, orders, Count.ALL_REDUCE)  # (b), (c)
+        squares = np.sum([answer.squares for answer in answers], axis=0)
+        objective = math.fsum(answer.measured for answer in answers)
+        following = replace(state.after(merit, squares, state.size, anderson), objective=objective)
+        return _solved(robots, following, [answer.solved for answer in answers])
 
     def _with_penalty_due(self, robots: Robots, state: ConsensusState) -> ConsensusState:
         """State with the penalty that the rule, or the safeguard, wants from now on; mostly the state itself."""
@@ -120,8 +134,8 @@ class Consensus:
         return state
 
     def _separators(self, translation: float) -> SeparatorPenalty:
-        has_multipliers = isinstance(self.soc.penalty, MultiplierPenalty)
-        return SeparatorPenalty(translation, self.soc.separator_penalty_for(translation) if has_multipliers else 0.0)
+        is_held = self.rotations is Rotations.RELAXED or isinstance(self.soc.penalty, MultiplierPenalty)
+        return SeparatorPenalty(translation, self.soc.separator_penalty_for(translation) if is_held else 0.0)
 
     def _adapted(self, robots: Robots, state: ConsensusState) -> ConsensusState:
         """State with the penalties of separators that the way so far suggests."""
@@ -139,6 +153,12 @@ class Consensus:
             orders = [replace(order, rows=rows) for rows in robots.hand_on(sent)]
         robots.ask(ConsensusRobot.rescale, orders, Count.PIGGYBACKED)
         return state.rescaled(factor)
+
+
+def _solved(robots: Robots, state: ConsensusState, answers: Sequence[Solved]) -> ConsensusState:
+    """State with what step (a) gave, handed on."""
+    rows = robots.hand_on([answer.rows for answer in answers])
+    return replace(state, ahead=np.sum([answer.sums for answer in answers], axis=0), rows=rows)
 
 
 # In one place.

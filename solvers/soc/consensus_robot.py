@@ -16,9 +16,9 @@ from scipy.sparse.csgraph import connected_components
 
 from pgo_models.certificates.dual_variables import multiplier_norms, multipliers
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, unstack_transposes
+from pgo_models.geometry.rotations import Array, project_to_rotations, unstack_transposes
 from pgo_models.problem.matrices import inner
-from solvers.soc.anderson import AndersonSums, over_relax
+from solvers.soc.anderson import AndersonShare, AndersonSums, over_relax
 from solvers.soc.copies import (
     CopiesState,
     CopyLayout,
@@ -28,14 +28,16 @@ from solvers.soc.copies import (
     RescaleCopies,
     Rows,
     SeparatorPenalty,
+    Solved,
     Started,
+    Stepped,
     TurnAnswer,
     TurnSettings,
     Waiting,
 )
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.r_step import RotationStep, prepare
-from solvers.soc.recursion_block import Agreement, RecursionBlock, block_at, nearest_rotations, stationary_B
+from solvers.soc.recursion_block import Agreement, RecursionBlock, Rotations, block_at, nearest_rotations, stationary_B
 from solvers.soc.separator_stiffness import GROUND, stiffness_of_separators, travel
 
 
@@ -109,6 +111,8 @@ class ConsensusRobot:
         n, d, held, own = layout.problem.num_poses, layout.problem.d, layout.held, layout.own
         floor = separators.rotation * self._scale
         rho = np.where(layout.subgraph.copies > 1, np.maximum(state.rho, floor), state.rho)
+        if state.settings.rotations is Rotations.RELAXED:
+            rho = np.where(layout.subgraph.poses == 0, np.maximum(rho, self._scale), rho)
         penalty = self._penalty(rho, separators.translation)
         # B makes every subproblem stationary; its mean over the copies is the multiplier of the constraint.
         mean = np.concatenate([np.zeros((n, d)), (state.pull / rho[:, None]).reshape(d * n, d)])
@@ -117,34 +121,47 @@ class ConsensusRobot:
         diagonal = np.concatenate([state.diagonal[:, 0], state.diagonal[:, 1:].ravel()]) / layout.copies[:, 0]
         block = block_at(z, penalty, diagonal, state.settings, B)
         started = Started(d * float(rho[own].sum()), (rho / self._scale)[own])
-        following = self._with(rho=rho, block=block, origin=(z, block.s), sums=AndersonSums(), gamma=None)
+        following = self._with(rho=rho, block=block, origin=(z, block.s), sums=AndersonSums(), heard={}, ahead=None)
         return following._prepared(), started
 
     # The recursion.
 
-    def solve(self, _: None) -> tuple[ConsensusRobot, Array]:
-        """Step (a); this robot's sums for the acceleration, or the merit alone where it accelerates alone."""
+    def solve(self, _: None) -> tuple[ConsensusRobot, Solved]:
+        """Step (a): rows of s after it, and sums; of those the merit alone where robots accelerate alone."""
         X, z, _B, drift = self._solved_after_local_passes()
         block, sums = self.block.after_solve(np.where(self.layout.held, X, 0.0), z, drift)
-        alone = block.settings.alone
-        if alone is None:
-            return self._with(X=X, block=block), sums
-        gamma: Array | None = None
-        known = self.state.sums
-        if np.isfinite(sums).all():
-            gamma, known = known.coefficients(alone, sums)
-        return self._with(X=X, block=block, gamma=gamma, sums=known), sums[:1]
+        alone, known, s = block.settings.alone, self.state.sums, block.anderson.image
+        if alone is not None:
+            gamma: Array | None = None
+            if np.isfinite(sums).all():
+                gamma, known = known.coefficients(alone, sums)
+            block, sums = block.extrapolated(Agreement(gamma, is_best=False)), sums[:1]
+            s = block.s
+        assert s is not None
+        rows = {robot: s[rows] for robot, rows in self.layout.common.items()}
+        return self._with(ahead=(X, block, known)), Solved(sums, rows)
 
-    def extrapolate(self, agreement: Agreement) -> tuple[ConsensusRobot, Rows]:
-        """Extrapolate s; its rows for every neighbour."""
-        if self.block.settings.alone is not None:
-            agreement = replace(agreement, gamma=self.state.gamma)
-        return self._sending(self.block.extrapolated(agreement))
+    def step(self, order: tuple[Agreement, Rows]) -> tuple[ConsensusRobot, Stepped]:
+        """Extrapolate what was solved, own rows and the neighbours'; (b) and (c) with them; and (a) of the next step.
 
-    def agree(self, rows: Rows) -> tuple[ConsensusRobot, Array]:
-        """Steps (b) and (c) with the neighbours' rows: sums of the residuals."""
-        block, sums = self.block.agreed(self._mean(rows))
-        return self._with(block=block), sums
+        A neighbour extrapolates its rows with the same coefficients: nobody waits for them a second time.
+        """
+        (agreement, received), before = order, self.block
+        assert self.state.ahead is not None
+        X, block, sums = self.state.ahead
+        memory, heard, rows = before.settings.memory, {}, {}
+        if before.settings.alone is not None:
+            block, memory = replace(block, best=before.s if agreement.is_best else before.best), 0
+        else:
+            block = block.extrapolated(agreement)
+        for robot, image in received.items():
+            known = self.state.heard.get(robot, AndersonShare()).after(np.zeros((0, 0)), image, memory)
+            rows[robot], heard[robot] = known.extrapolated(agreement.gamma)
+        moved = self._with(X=X, block=block, sums=sums, heard=heard)
+        block, squares = block.agreed(moved._mean(rows))
+        moved = moved._with(block=block)
+        following, solved = moved.solve(None)
+        return following, Stepped(squares, moved.cost(None)[1], solved)
 
     def announce(self, settings: TurnSettings) -> tuple[ConsensusRobot, Rows]:
         """Return the robot's rows for every neighbour, before the first turn."""
@@ -190,7 +207,7 @@ class ConsensusRobot:
         block = self.block if order.rows is None else replace(self.block, z=self._mean(order.rows))
         rho = order.factor * self.state.rho
         block = block.rescaled(self._penalty(rho, order.translation))
-        return self._with(rho=rho, block=block, sums=AndersonSums())._prepared(), None
+        return self._with(rho=rho, block=block, sums=AndersonSums(), heard={}, ahead=None)._prepared(), None
 
     # Answers.
 
@@ -202,8 +219,9 @@ class ConsensusRobot:
 
     @property
     def omega(self) -> Array:
-        """Rotations of the robot's poses, (n_a, d, d)."""
-        return unstack_transposes(self.block.z[self.layout.problem.num_poses :])
+        """Rotations of the robot's poses, (n_a, d, d); those nearest to a relaxation."""
+        R = unstack_transposes(self.block.z[self.layout.problem.num_poses :])
+        return project_to_rotations(R) if self.block.settings.rotations is Rotations.RELAXED else R
 
     @property
     def poses(self) -> Poses:
@@ -269,5 +287,11 @@ class ConsensusRobot:
             total[self.layout.common.get(robot, slice(None))] += parts[robot]
         mean = total / self.layout.copies
         z = np.where(self.layout.held, mean, 0.0)
-        z[n:] = nearest_rotations(mean[n:])
+        if block.settings.rotations is Rotations.PROJECTED:
+            z[n:] = nearest_rotations(mean[n:])
+        else:
+            is_relaxed = block.settings.rotations is Rotations.RELAXED
+            held = np.flatnonzero(self.layout.subgraph.poses == 0) if is_relaxed else np.arange(n)
+            rows = self.layout.rows(held)[len(held) :]
+            z[rows] = block.z[rows]
         return z

@@ -11,7 +11,7 @@ from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.matrices import columns_of
-from solvers.soc.anderson import AndersonSums
+from solvers.soc.anderson import AndersonShare, AndersonSums
 from solvers.soc.r_step import BackEnd, RStep, RSubproblem
 from solvers.soc.recursion_block import RecursionBlock, StepSettings
 from solvers.soc.subgraph import PartProblem, Subgraph
@@ -66,6 +66,23 @@ class RescaleCopies:
     factor: float
     translation: float
     rows: Rows | None
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Sums of step (a), and for every neighbour its rows of s after it, before what is extrapolated together."""
+
+    sums: Array
+    rows: Rows
+
+
+@dataclass(frozen=True, eq=False)
+class Stepped:
+    """Squared residuals, (2,), part of F at omega, and what the next step (a) gave."""
+
+    squares: Array
+    measured: float
+    solved: Solved
 
 
 @dataclass(frozen=True)
@@ -210,7 +227,7 @@ class CopiesState:
     settings: StepSettings = field(default_factory=StepSettings)
     block: RecursionBlock | None = None
     origin: tuple[Array, Array] | None = None  # (rows, d) each: z and s when the penalties were set
-    # Of a robot that accelerates alone, with `gamma` from them.
-    sums: AndersonSums = field(default_factory=AndersonSums)
-    gamma: Array | None = None
+    sums: AndersonSums = field(default_factory=AndersonSums)  # of a robot that accelerates alone
+    heard: Mapping[int, AndersonShare] = field(default_factory=dict)  # neighbours' rows, to be extrapolated as theirs
+    ahead: tuple[Array, RecursionBlock, AndersonSums] | None = None  # X, block and sums after the next step (a)
     waiting: Waiting | None = None

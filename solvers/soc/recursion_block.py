@@ -7,6 +7,7 @@ acceleration) are all that they need of each other.
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,6 +15,14 @@ import numpy as np
 from pgo_models.geometry.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
 from pgo_models.problem.matrices import inner
 from solvers.soc.anderson import Anderson, AndersonShare, over_relax
+
+
+class Rotations(enum.Enum):
+    """What step (b) does with them; the chordal start relaxes them, then finds translations for what it projects."""
+
+    PROJECTED = "to the nearest ones"
+    RELAXED = "means, but for pose 0, which is held at the identity"
+    FIXED = "all are held"
 
 
 @dataclass(frozen=True)
@@ -24,6 +33,7 @@ class StepSettings:
     memory: int = 0  # of the acceleration; 0 for none
     local_passes: int = 1
     alone: Anderson | None = None  # given where every robot extrapolates its own rows
+    rotations: Rotations = Rotations.PROJECTED
 
 
 @dataclass(frozen=True)
@@ -75,11 +85,8 @@ class RecursionBlock:
 
     def extrapolated(self, agreement: Agreement) -> RecursionBlock:
         """Block with the next s, before it is agreed on."""
-        gamma, anderson = agreement.gamma, self.anderson
-        if gamma is None:
-            gamma, anderson = np.zeros(0), anderson.restarted()
-        best = self.s if agreement.is_best else self.best
-        return replace(self, s=anderson.combine(gamma), best=best, anderson=anderson)
+        s, anderson = self.anderson.extrapolated(agreement.gamma)
+        return replace(self, s=s, best=self.s if agreement.is_best else self.best, anderson=anderson)
 
     def agreed(self, z: Array) -> tuple[RecursionBlock, Array]:
         """Block after step (b), which gives z, and (c): B = s - z = B + x - z.

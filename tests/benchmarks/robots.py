@@ -1,8 +1,8 @@
 """Prints the tables of many robots (README.md beside this file): rounds, bytes, seconds, faults, a world of 100 robots.
 
-    PGO_DATA=folder python tests/benchmarks/robots.py [substructured] [consensus] [seconds] [faults] [world]
+    PGO_DATA=folder python tests/benchmarks/robots.py [substructured] [consensus] [seconds] [faults] [world] [ray]
 
-Every line runs in a process of its own, one thread, robots in this process.
+Every line runs in a process of its own, one thread, robots in this process; those of `ray` in actors on two CPUs, too.
 """
 
 import json
@@ -32,8 +32,9 @@ from solvers.distributed.consensus import RobotsOfDriver
 from solvers.distributed.stages import open_driver
 from solvers.loop import run
 from solvers.network.counted_pool import Count
-from solvers.network.engine import InProcess
+from solvers.network.engine import Engine, InProcess
 from solvers.network.faults import Faults
+from solvers.network.ray_engine import RayEngine
 from solvers.soc.consensus import ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
 
@@ -105,6 +106,30 @@ def faults_job(name: str, fault: str) -> dict[str, object]:
 
     outcome = run(AsynchronousSOC(soc, FAULTS[fault]), driver, callback=is_done)
     return {"rounds": outcome.iterations if gaps[-1] <= LEVELS[-1] else None}
+
+
+def ray_job(name: str, robots: str, coupling: str) -> dict[str, object]:
+    """Iterations of SOC, no tolerance, in this process and in two actors that are kept: least of five solves each."""
+    graph = pgo.load(name)
+    shared = pgo.partition(graph, int(robots), METIS)
+    soc = solvers.SOC(robots=shared, coupling=solvers.Coupling[coupling], tolerance=1e-14, max_iterations=40)
+    pipeline = solvers.Pipeline(soc=soc, second_try=False, staircase=None)
+
+    def least(engine: Engine) -> dict[str, float]:
+        found = []
+        for _ in range(5):
+            began, cpu = time.perf_counter(), time.process_time()
+            solution = solvers.solve(graph, pipeline, robots=shared, engine=engine)
+            whole, driver = time.perf_counter() - began, time.process_time() - cpu
+            (stage,) = (stage for stage in solution.stages if stage.name == "SOC")
+            steps = np.diff(stage.history.seconds)
+            found.append((stage.seconds / stage.iterations, np.median(steps), driver / stage.iterations, whole))
+        return dict(zip(("mean", "median", "cpu", "whole"), np.min(found, axis=0).tolist(), strict=True))
+
+    here = least(InProcess())
+    with RayEngine(num_cpus=2).kept() as engine:
+        there = least(engine)
+    return {"here": here, "there": there}
 
 
 def world_job() -> dict[str, object]:
@@ -232,6 +257,19 @@ def world_table() -> Table:
     return table
 
 
+def ray_table() -> Table:
+    """Robots in two Ray actors: ms an iteration of SOC, set-up and snapshots included; whole solves."""
+    heads = ("graph", "robots", "coupling", "process, ms", "Ray, ms", "(median)", "driver's CPU, ms", "solve, s")
+    table = Table(*heads, box=MARKDOWN)
+    for name, robots in (("smallGrid3D", 5), ("smallGrid3D", 25), ("sphere2500", 5)):
+        for coupling in ("SUBSTRUCTURED", "CONSENSUS"):
+            row = child("ray", name, str(robots), coupling)
+            here, there = row["here"], row["there"]
+            figures = here["mean"], there["mean"], there["median"], there["cpu"]
+            table.add_row(name, str(robots), coupling, *(f"{1e3 * x:.1f}" for x in figures), f"{there['whole']:.2f}")
+    return table
+
+
 def as_text(rounds: list[int | None]) -> str:
     """Rounds to the levels."""
     return " / ".join("-" if count is None else str(count) for count in rounds)
@@ -250,6 +288,7 @@ JOBS: dict[str, Callable[..., dict[str, object]]] = {
     "consensus": consensus_job,
     "faults": faults_job,
     "world": world_job,
+    "ray": ray_job,
 }
 TABLES = {
     "substructured": substructured_table,
@@ -257,6 +296,7 @@ TABLES = {
     "seconds": seconds_table,
     "faults": faults_table,
     "world": world_table,
+    "ray": ray_table,
 }
 
 if __name__ == "__main__":

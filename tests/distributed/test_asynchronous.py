@@ -181,7 +181,7 @@ def test_a_solve_with_faults_is_certified_with_the_central_gap(d: int, fault: st
     assert solution.objective == pytest.approx(central.objective, rel=1e-9)
     assert solution.gap == pytest.approx(central.gap, abs=1e-9)
     assert engine.times(ConsensusRobot.turn) == solution.stages[1].iterations > 0
-    assert engine.times(ConsensusRobot.extrapolate, ConsensusRobot.solve) == 0
+    assert engine.times(ConsensusRobot.step, ConsensusRobot.solve) == 0
     again = solve(graph, pipeline, robots=parts)
     np.testing.assert_array_equal(again.poses.R, solution.poses.R)  # the same seed, the same faults
 

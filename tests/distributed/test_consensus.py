@@ -188,7 +188,7 @@ def test_robots_forget_when_the_acceleration_restarts(seed: int) -> None:
     restarts = []
     for one, other in islice(zip(iterate(soc, problem, start), iterate(ConsensusSOC(soc), driver), strict=False), 16):
         check_state(one, other, engine)
-        orders = [down[0].gamma is None for order, down, _ in engine.log if order == "ConsensusRobot.extrapolate"]
+        orders = [down[0][0].gamma is None for order, down, _ in engine.log if order == "ConsensusRobot.step"]
         restarts.append(bool(orders) and bool(orders[-1]))
     assert sum(restarts[:-3]) >= 1  # and steps follow
 
@@ -260,7 +260,7 @@ def test_solve_and_soc_have_the_same_robots() -> None:
     solution = solve(graph, pipeline, robots=3, engine=engine)  # so many are SOC's
     assert solution.robots is three
     assert engine.times(ConsensusRobot.turn, Interior.penalize) == 0
-    assert engine.times(ConsensusRobot.extrapolate) == solution.stages[1].iterations > 0
+    assert engine.times(ConsensusRobot.step) == solution.stages[1].iterations > 0
     same = Partition(three.robot.copy(), three.method)
     assert solve(graph, pipeline, robots=same).gap == solution.gap
     for other in (four, 4, partition(graph, 3, PartitionMethod.CONTIGUOUS)):

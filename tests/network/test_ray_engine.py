@@ -1,5 +1,6 @@
 import gc
 import os
+import pickle
 import signal
 import socket
 import subprocess
@@ -85,6 +86,8 @@ def sent_arrays(value):
     if isinstance(value, np.ndarray):
         if value.dtype.kind in "fiub":
             yield value
+    elif isinstance(value, bytes):
+        yield from sent_arrays(pickle.loads(value))
     elif isinstance(value, dict):
         for item in value.values():
             yield from sent_arrays(item)
@@ -97,7 +100,7 @@ def sent_arrays(value):
 
 @pytest.fixture
 def sent(monkeypatch):
-    """Arguments of all that crosses to every actor, those of its constructor first."""
+    """Arguments of all that crosses to every actor, those of its constructor first, then what it holds."""
     from ray.actor import ActorClass, ActorMethod
 
     crossed = {}
@@ -117,9 +120,10 @@ def sent(monkeypatch):
     return crossed
 
 
+@pytest.mark.parametrize("processes", [3, None])
 @pytest.mark.parametrize("coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS])
 def test_killed_actors_change_nothing_and_no_process_receives_anothers_private_edges(
-    coupling, graph, robots, actors, sent
+    coupling, processes, graph, robots, actors, sent
 ):
     settings = pipeline(coupling, robots)
     expected = solvers.solve(graph, settings, robots=robots)
@@ -133,25 +137,29 @@ def test_killed_actors_change_nothing_and_no_process_receives_anothers_private_e
         if len(steps) == 12:
             ray.kill(place.actors[0])
 
-    engine = RayEngine(recovery=Recovery(orders_between_snapshots=20))
+    engine = RayEngine(actors=processes, recovery=Recovery(orders_between_snapshots=20))
     found = solvers.solve(graph, settings, robots=robots, engine=engine, callback=kill)
     assert len(steps) > 12
     assert_same(found, expected)
     assert ray.is_initialized()  # it was not the engine that started it
-    assert len(sent) == 5  # three, and two in place of those that were killed
+    assert len(sent) == (processes or 2) + 2  # two in place of those that were killed
     for crossed in sent.values():
         assert_only_own_edges(crossed, graph, robots)
+    assert {len(crossed[2][0][1]) for crossed in sent.values()} == ({1} if processes else {1, 2})
 
 
 def assert_only_own_edges(crossed, graph, robots):
-    """First what makes the agent is sent, and its share; never an edge between two poses of another robot."""
-    _, share = crossed[0]
-    assert isinstance(share, Subgraph)
-    assert set(vars(share)) == set(Subgraph.__dataclass_fields__)  # nothing that was worked out of it
-    assert isinstance(share.graph, PoseGraph)
+    """First what makes the agents is sent, and their shares; never an edge between two poses of others."""
+    _, shares = crossed[2][0]
+    for share in shares:
+        assert isinstance(share, Subgraph)
+        assert set(vars(share)) == set(Subgraph.__dataclass_fields__)  # nothing that was worked out of it
+        assert isinstance(share.graph, PoseGraph)
     assert len(crossed) > 10
+    mine = [share.robot for share in shares]
     i, j = robots.robot[graph.i], robots.robot[graph.j]
-    others, own = np.flatnonzero((i == j) & (i != share.robot)), np.flatnonzero((i == share.robot) | (j == share.robot))
+    is_own = np.isin(i, mine) | np.isin(j, mine)
+    others, own = np.flatnonzero((i == j) & ~is_own), np.flatnonzero(is_own)
     numbers = np.concatenate([array.ravel().astype(float) for array in sent_arrays(crossed)])
     assert np.isin(graph.t_ij[own], numbers).all()
     # Weights are drawn from continuous distributions. A pose at the end of a single edge may be that edge.
@@ -165,7 +173,7 @@ def test_a_robot_that_is_lost_too_often_ends_the_run(graph, actors):
         ray.kill(actors[0].actors[1])
 
     engine = RayEngine(recovery=Recovery(max_restarts=0))
-    with pytest.raises(EngineError, match=r"robot 1 was lost 1 times \(robot 1's actor is gone"):
+    with pytest.raises(EngineError, match=r"the process of robots 1 was lost 1 times \(the actor is gone"):
         solvers.solve(graph, robots=2, engine=engine, callback=kill)
     assert actors[0].actors == {}
 
@@ -182,9 +190,10 @@ def test_errors_of_robots_arrive_as_what_they_are(graph):
 def test_a_slow_answer_is_waited_for_while_the_cluster_lives(graph, actors, monkeypatch):
     pool = RayEngine().open(partial(Agent, backend=None), split_graph(graph, pgo.partition(graph, 1)))
     monkeypatch.setattr(ray_engine, "_SECONDS_TO_ANSWER", 0.1)
+    slow = pickle.dumps(["slow"])
     try:
-        ticket = actors[0].actors[0].__ray_call__.remote(lambda holder: time.sleep(1) or "slow")
-        assert actors[0].receive(0, ticket) == "slow"
+        ticket = actors[0].actors[0].__ray_call__.remote(lambda holder: time.sleep(1) or slow)
+        assert actors[0].receive(0, ticket) == ["slow"]
         monkeypatch.setattr(ray_engine, "_SECONDS_TO_COME_BACK", 0.5)
         monkeypatch.setattr(ray, "nodes", lambda: [{"Alive": False}])
         ticket = actors[0].actors[0].__ray_call__.remote(lambda holder: time.sleep(5) or {})
@@ -197,25 +206,53 @@ def test_a_slow_answer_is_waited_for_while_the_cluster_lives(graph, actors, monk
 
 @pytest.mark.parametrize("error", [MissingExtraError("cvxopt", "fast"), FileFormatError("x.g2o", 3, "bad")])
 def test_errors_can_be_sent(error):
-    import pickle
-
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
-@pytest.mark.parametrize(("robots", "share"), [(1, 1.0), (2, 1.0), (3, 0.5), (4, 0.5), (6, 0.3333)])
-def test_every_cpu_has_room_for_as_many_robots(robots, share, graph):
-    shares = split_graph(graph, pgo.partition(graph, robots))
-    assert (
-        ray_engine._RayPlace(
-            ray, partial(Agent, backend=None), shares, RayEngine(robots_per_cpu=3), False
-        )._cpus_a_robot
-        == share
-    )
+@pytest.mark.parametrize(
+    ("robots", "wanted", "groups"), [(1, None, 1), (2, None, 2), (5, None, 2), (5, 3, 3), (3, 7, 3)]
+)
+def test_robots_are_dealt_among_actors_by_size(robots, wanted, groups, graph):
+    sizes = [40, 2, 3, 5, 10][:robots]
+    parts = pgo.Partition(np.repeat(np.arange(robots), [*sizes[:-1], 60 - sum(sizes[:-1])]), graph)
+    shares = split_graph(graph, parts)
+    place = ray_engine._RayPlace(ray, partial(Agent, backend=None), shares, RayEngine(actors=wanted), False)
+    assert sorted(robot for group in place.groups for robot in group) == list(range(robots))
+    assert len(place.groups) == groups
+    assert all(place.groups)
+    if robots == 5:
+        assert not any({0, 4} <= {*group} for group in place.groups)  # the two largest
 
 
-def test_too_few_cpus_are_told_at_once(graph):
-    with pytest.raises(EngineError, match="too few CPUs: 5 robots with at most 2 a CPU, on 2; use fewer robots"):
-        solvers.solve(graph, robots=5, engine=RayEngine(robots_per_cpu=2))
+def test_actors_are_started_once_for_many_solves(graph, robots, sent):
+    settings = pipeline(solvers.Coupling.SUBSTRUCTURED, robots)
+    expected, other = solvers.solve(graph, settings, robots=robots), varied_graph(1, 40, 2)
+    with RayEngine().kept() as engine:
+        with pytest.raises(SettingError, match="give both the same robots"):
+            solvers.solve(other, settings, robots=2, engine=engine)
+        for _ in range(2):
+            assert_same(solvers.solve(graph, settings, robots=robots, engine=engine), expected)
+        assert_same(solvers.solve(other, robots=5, engine=engine), solvers.solve(other, robots=5))
+        assert len(sent) == 2
+        ray.kill(engine.idle[0])  # one that is lost between two solves is started anew
+        assert_same(solvers.solve(graph, settings, robots=robots, engine=engine), expected)
+        assert len(sent) == 3
+        pids = [pid_of(actor) for actor in engine.idle]
+        assert len(pids) == 2
+    assert ray.is_initialized()  # it was not the engine that started it
+    for pid in pids:
+        assert has_ended(pid)
+
+
+def has_ended(pid):
+    """Whether a process ends within seconds."""
+    for _ in range(100):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.1)
+    return False
 
 
 def test_cpus_that_others_use_are_told_in_time(graph):
@@ -225,7 +262,7 @@ def test_cpus_that_others_use_are_told_in_time(graph):
     ray.get(held.snapshot.remote())
     try:
         with pytest.raises(
-            EngineError, match=r"too few CPUs: 2 of 2 robots have not started in 0\.5 s, 0 CPUs are free"
+            EngineError, match=r"too few CPUs: 2 of 2 actors have not started in 0\.5 s, 0 CPUs are free"
         ):
             solvers.solve(graph, robots=2, engine=RayEngine(patience=0.5))
     finally:
@@ -294,7 +331,7 @@ def test_without_ray_the_extra_is_named(monkeypatch, capsys):
     assert capsys.readouterr().err == "pgo: ray is not installed; run: pip install 'pgo-splitting[ray]'\n"
 
 
-@pytest.mark.parametrize("wrong", [{"num_cpus": 0}, {"robots_per_cpu": 0}, {"patience": 0.0}])
+@pytest.mark.parametrize("wrong", [{"num_cpus": 0}, {"actors": 0}, {"patience": 0.0}])
 def test_settings_are_checked(wrong):
     with pytest.raises(SettingError, match=f"{next(iter(wrong))} must be positive, got 0"):
         RayEngine(**wrong)

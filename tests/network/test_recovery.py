@@ -10,40 +10,44 @@ from pgo_models.errors import EngineError, NotPositiveDefiniteError, SettingErro
 from pgo_models.graphs.partitioning import PartitionMethod, partition
 from solvers.distributed import multifrontal
 from solvers.distributed.robots.agent import Agent
-from solvers.network.messages import restore, take_snapshot
+from solvers.network.messages import obey, restore, take_snapshot
 from solvers.network.recovery import RecoveringPool, Recovery, RobotLostError
 from solvers.soc.subgraph import split_graph
 
 
 @dataclass(eq=False)
 class Leaky:
-    """A place that loses the robot of every order whose number is in `losses`, before or after it has obeyed."""
+    """A place that loses the group of every order whose number is in `losses`, before or after it has obeyed."""
 
     shares: tuple
     losses: set
     is_before: bool = True
-    agents: dict = field(default_factory=dict)
+    groups: list = field(default_factory=list)  # every robot alone unless given
+    agents: dict = field(default_factory=dict)  # by group
     count: int = 0
     lost: int = 0
 
-    def start(self, robots):
-        self.agents |= {robot: Agent(replace(self.shares[robot]), None) for robot in robots}
+    def __post_init__(self):
+        self.groups = self.groups or [[robot] for robot in range(len(self.shares))]
 
-    def send(self, robot, order, request):
-        return order, request
+    def start(self, groups):
+        for group in groups:
+            self.agents[group] = [Agent(replace(self.shares[robot]), None) for robot in self.groups[group]]
 
-    def receive(self, robot, ticket):
+    def send(self, group, order, requests):
+        return order, requests
+
+    def receive(self, group, ticket):
         self.count += 1
         if self.count in self.losses and self.is_before:
-            self.lose(robot)
-        order, request = ticket
-        answer = order(self.agents[robot], request)
+            self.lose(group)
+        answers = obey(self.agents[group], *ticket)
         if self.count in self.losses:
-            self.lose(robot)
-        return answer
+            self.lose(group)
+        return answers
 
-    def lose(self, robot):
-        del self.agents[robot]
+    def lose(self, group):
+        del self.agents[group]
         self.lost += 1
         raise RobotLostError("gone")
 
@@ -58,12 +62,13 @@ class LeakyEngine:
     losses: frozenset = frozenset()
     recovery: Recovery = field(default_factory=lambda: Recovery(max_restarts=1000))
     is_before: bool = True
+    groups: tuple = ()
     opened: list = field(default_factory=list)
 
     def open(self, make, shares):
-        place = Leaky(shares, set(self.losses), self.is_before)
-        place.start(range(len(shares)))
-        self.opened.append(RecoveringPool(place, len(shares), self.recovery))
+        place = Leaky(shares, set(self.losses), self.is_before, [*self.groups])
+        place.start(range(len(place.groups)))
+        self.opened.append(RecoveringPool(place, self.recovery))
         return self.opened[-1]
 
 
@@ -74,15 +79,18 @@ def pipeline(coupling, robots):
 
 @pytest.mark.parametrize("coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS])
 @pytest.mark.parametrize("orders", [1, 7, 1000])
-@pytest.mark.parametrize(("is_before", "least"), [(True, 200), (False, 200), (True, 0)])
-def test_lost_robots_change_nothing(coupling, orders, is_before, least, monkeypatch):
+@pytest.mark.parametrize(
+    ("is_before", "least", "groups"),
+    [(True, 200, ()), (False, 200, ()), (True, 0, ()), (True, 200, ((0, 2, 3), (1,))), (False, 0, ((0, 2), (1, 3)))],
+)
+def test_lost_robots_change_nothing(coupling, orders, is_before, least, groups, monkeypatch):
     monkeypatch.setattr(multifrontal, "LEAST", least)  # with 0 robots hold the fronts, too
     monkeypatch.setattr(multifrontal, "FEW", 1 if least == 0 else multifrontal.FEW)
     graph = varied_graph(orders, 60, 2 + orders % 2)
     robots = partition(graph, 4, PartitionMethod.CONTIGUOUS)
     expected = solvers.solve(graph, pipeline(coupling, robots), robots=robots)
     losses = frozenset(np.random.default_rng(orders).integers(1, 300, 12).tolist())
-    engine = LeakyEngine(losses, Recovery(orders, max_restarts=1000), is_before)
+    engine = LeakyEngine(losses, Recovery(orders, max_restarts=1000), is_before, groups)
     found = solvers.solve(graph, pipeline(coupling, robots), robots=robots, engine=engine)
     (pool,) = engine.opened
     assert pool.place.lost > 3
@@ -136,7 +144,7 @@ def test_a_snapshot_and_a_restore_take_the_place_of_the_orders_before(monkeypatc
     graph = varied_graph(5, 24, 2)
     place = Leaky(split_graph(graph, partition(graph, 2)), set())
     place.start(range(2))
-    pool = RecoveringPool(place, 2, Recovery())
+    pool = RecoveringPool(place, Recovery())
     pool.ask(obeyed.order("one"), [0] * 2)
     for order, requests, kept in (
         (take_snapshot, [None] * 2, {"of": 1}),
@@ -161,7 +169,7 @@ def test_a_snapshot_is_taken_after_so_many_orders(monkeypatch):
     obeyed = Obeyed(monkeypatch)
     place = Leaky(split_graph(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 1)), set())
     place.start([0])
-    pool = RecoveringPool(place, 1, Recovery(orders_between_snapshots=3))
+    pool = RecoveringPool(place, Recovery(orders_between_snapshots=3))
     for _ in range(7):
         pool.ask(obeyed.order("go"), [None])
         assert len(pool._log) < 3
@@ -175,13 +183,13 @@ def test_of_two_refusals_the_first_robots_is_told():
     place = Leaky(split_graph(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 2)), set())
     place.start(range(2))
     with pytest.raises(NotPositiveDefiniteError, match="robot 0"):
-        RecoveringPool(place, 2, Recovery()).ask(refuse, [None] * 2)
+        RecoveringPool(place, Recovery()).ask(refuse, [None] * 2)
 
 
 def test_a_robot_that_is_lost_again_and_again_ends_the_run():
     graph = varied_graph(4, 30, 2)
     engine = LeakyEngine(frozenset(range(20, 10_000)), Recovery(max_restarts=2))
-    with pytest.raises(EngineError, match=r"robot \d was lost 3 times \(gone\); look at the memory"):
+    with pytest.raises(EngineError, match=r"the process of robots \d was lost 3 times \(gone\); look at the memory"):
         solvers.solve(graph, robots=3, engine=engine)
 
 
@@ -201,7 +209,7 @@ def test_a_robots_own_error_is_told_after_all_have_obeyed_and_is_passed_over_in_
 
     place = Leaky(shares, losses={4})
     place.start(range(3))
-    pool = RecoveringPool(place, 3, Recovery())
+    pool = RecoveringPool(place, Recovery())
     with pytest.raises(NotPositiveDefiniteError, match="no"):
         pool.ask(refuse, [None] * 3)
     assert obeyed == [(0, "refuse"), (1, "refuse"), (2, "refuse")]

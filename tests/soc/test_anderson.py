@@ -25,9 +25,8 @@ def extrapolate(
 ) -> tuple[Array, AndersonMemory]:
     sums, share = memory.share.observe(residual, image, settings.memory)
     gamma, known = memory.sums.coefficients(settings, sums)
-    if gamma is None:
-        gamma, share = np.zeros(0), share.restarted()
-    return share.combine(gamma), AndersonMemory(share, known)
+    following, share = share.extrapolated(gamma)
+    return following, AndersonMemory(share, known)
 
 
 def contraction(seed: int, side: int, rate: float = 0.95) -> tuple[Callable[[Array], Array], Array]:

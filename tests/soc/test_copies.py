@@ -18,7 +18,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
 from solvers.network.counted_pool import Count
-from solvers.soc.consensus import ConsensusIterate, LocalConsensus, LocalRobots, ask_all
+from solvers.soc.consensus import ConsensusIterate, LocalConsensus, LocalRobots
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.penalty import FixedPenalty, MultiplierPenalty, rotation_scale
 from solvers.soc.recursion_block import Agreement
@@ -124,13 +124,14 @@ def test_agreement_is_the_mean_and_its_nearest_rotation(seed: int, n: int, d: in
     moved = []
     for robot in state.robots:
         s = np.where(robot.layout.held, rng.standard_normal(robot.block.s.shape), 0.0)
-        anderson = replace(robot.block.anderson, image=s)
-        moved.append(replace(robot, state=replace(robot.state, block=replace(robot.block, s=s, anderson=anderson))))
+        block = replace(robot.block, s=s, anderson=replace(robot.block.anderson, image=s))
+        moved.append(replace(robot, state=replace(robot.state, ahead=(s, block, robot.state.sums))))
     here = LocalRobots(problem, tuple(moved))
-    rows = here.hand_on(ask_all(here, ConsensusRobot.extrapolate, Agreement(np.zeros(0), is_best=True), Count.OFF))
-    here.ask(ConsensusRobot.agree, rows, Count.OFF)
+    told = [{to: robot.state.ahead[0][rows] for to, rows in robot.layout.common.items()} for robot in moved]
+    agreement = Agreement(np.zeros(0), is_best=True)
+    here.ask(ConsensusRobot.step, [(agreement, rows) for rows in here.hand_on(told)], Count.OFF)
     count = np.maximum(held_by(problem, here.robots), 1.0)[:, None]
-    mean = sums_over(problem, here.robots, [robot.block.s for robot in moved]) / count
+    mean = sums_over(problem, here.robots, [robot.state.ahead[0] for robot in moved]) / count
     mean[n:] = stack_transposes(project_by_svd(unstack_transposes(mean[n:])))
     for robot, before in zip(here.robots, state.robots, strict=True):
         expected = np.where(robot.layout.held, mean[rows_of(robot, problem)], 0.0)

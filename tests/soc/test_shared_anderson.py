@@ -67,13 +67,11 @@ class Parties:
             sums, self.shares[party] = share.observe(residual[rows], image[rows], settings.memory)
             told.append(sums)
         gamma, self.sums = self.sums.coefficients(settings, np.sum(told, axis=0))
-        if gamma is None:
-            self.restarts += 1
-            self.shares = [share.restarted() for share in self.shares]
-            gamma = np.zeros(0)
+        self.restarts += gamma is None
         following = np.empty_like(image)
         for party, share in enumerate(self.shares):
-            following[self.owner == party] = share.combine(gamma)
+            rows, self.shares[party] = share.extrapolated(gamma)
+            following[self.owner == party] = rows
         return following
 
 
@@ -134,6 +132,6 @@ def test_what_was_is_left_alone() -> None:
         _, following = share.observe(rng.standard_normal((4, 2)), rng.standard_normal((4, 2)), 3)
         assert (share.residual_differences, share.image_differences, share.residual, share.image) == kept
         image = following.image.copy()
-        following.combine(np.ones(len(following.image_differences)))
+        following.extrapolated(np.ones(len(following.image_differences)))
         np.testing.assert_array_equal(following.image, image)
         share = following

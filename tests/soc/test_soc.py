@@ -185,13 +185,13 @@ def test_anderson_per_robot_sums_nothing_over_the_robots(seed: int, n: int, d: i
         following = soc.step(problem, state)
         for a, (before, after) in enumerate(zip(image.robots, following.robots, strict=True)):
             moved, _ = before.solve(None)
-            residual = np.sqrt(before.block.penalty)[:, None] * (moved.block.x - before.block.z)
+            x = moved.state.ahead[1].x
+            residual = np.sqrt(before.block.penalty)[:, None] * (x - before.block.z)
             share, sums = known[a]
-            told, share = share.observe(residual, moved.block.x + before.block.B, Anderson().memory)
+            told, share = share.observe(residual, x + before.block.B, Anderson().memory)
             gamma, sums = sums.coefficients(Anderson(), told)
-            share = share if gamma is not None else share.restarted()
+            s, share = share.extrapolated(gamma)
             known[a] = share, sums
-            s = share.combine(gamma if gamma is not None else np.zeros(0))
             np.testing.assert_allclose(after.block.s, s, rtol=0, atol=1e-12 * (1 + np.abs(s).max()))
         state = following
 

@@ -18,7 +18,7 @@ from solvers.network.serialization import deserialize, serialize
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.copies import CopiesState, CopyLayout, Rows, TurnSettings, Waiting
-from solvers.soc.recursion_block import RecursionBlock, StepSettings
+from solvers.soc.recursion_block import RecursionBlock, Rotations, StepSettings
 from solvers.soc.subgraph import Subgraph
 
 Q = TypeVar("Q")
@@ -43,8 +43,8 @@ class CoverRotations:
 
 
 CLASSES = (
-    *(AgentRecord, InteriorState, CopiesState, Poses, RecursionBlock, StepSettings, Anderson, AndersonShare),
-    *(AndersonSums, RobotProof, Eliminated, Waiting, TurnSettings, HeldFront, FrontFactor),
+    *(AgentRecord, InteriorState, CopiesState, Poses, RecursionBlock, StepSettings, Rotations, Anderson),
+    *(AndersonShare, AndersonSums, RobotProof, Eliminated, Waiting, TurnSettings, HeldFront, FrontFactor),
 )
 
 

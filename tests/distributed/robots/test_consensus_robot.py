@@ -35,15 +35,15 @@ STALLED = MultiplierPenalty(stall_window=3, stall_ratio=1e-6)  # anything counts
 STAR = {  # to and from whoever sums up: settings, figures of all poses in no order, and sums
     *("per_norm", "per_scale", "least", "is_stationary", "alpha", "memory", "local_passes", "per_robot"),
     *("regularization", "restart_ratio", "norms", "scale", "translation", "rotation", "factor", "size", "ratio"),
-    *("gamma", "is_best", "value"),
+    *("gamma", "is_best", "sums", "squares", "measured", "rotations", "value"),
 }
 Copies, Inner = ConsensusRobot, Interior
 ROUNDS = (  # orders that are, or end, a round
     *(Inner.project, Inner.set_translations, Inner.move, Inner.evaluate_trial, prove_interior),
-    *(move_proof, Inner.adopt, begin_copies, Copies.penalize, Copies.extrapolate, Copies.back_at_best),
+    *(move_proof, Inner.adopt, begin_copies, Copies.penalize, Copies.solve, Copies.step, Copies.back_at_best),
 )
 ENDS, POSES = ("begin_copies", "finish_copies"), ("R", "t", "in_cover")  # with the driver, at the cover
-ALL_REDUCES = (*(Copies.travel, Copies.multiplier_norms, Copies.stiffness, Copies.start, Copies.solve, Copies.agree),)
+ALL_REDUCES = (*(Copies.travel, Copies.multiplier_norms, Copies.stiffness, Copies.start, Copies.solve, Copies.step),)
 OFF = ("Interior.describe", "Interior.set_poses", "Interior.cost", "ConsensusRobot.cost", "Interior.result")
 
 
@@ -106,12 +106,15 @@ def test_the_ledger_counts_what_was_sent(
         if order in OFF:
             continue
         for robot in range(number):
-            for _, value in arrays_in(down[robot]):
-                received[:, robot] += 8 * np.size(value)
+            for name, value in arrays_in(down[robot]):
+                received[:, robot] += 8 * np.size(value) * (">" not in name)  # from robots: counted where it is sent
             for name, value in arrays_in(up[robot]):
+                if name == "measured":
+                    continue
                 sent[:, robot] += 8 * np.size(value)
                 if ">" in name:
                     link = robot, int(name.partition(">")[2])
+                    received[:, link[1]] += 8 * np.size(value)
                     links[link] = links.get(link, 0) + 8 * np.size(value)
     np.testing.assert_array_equal(ledger.bytes_sent, sent[0])
     np.testing.assert_array_equal(ledger.bytes_received, received[0])
@@ -129,10 +132,12 @@ def test_rounds_of_a_whole_solve_are_as_documented() -> None:
     _, stage, _ = solution.stages
     assert solution.ledger is not None
     assert engine.times(begin_copies, Copies.back_at_best) == 1  # no refresh, no raise
-    assert [record.measurement.rounds for record in stage.history.records] == [4 + k for k in range(len(stage.history))]
-    # 2 to start, 2 for poses and penalties, 1 a step, 2 for the result of SOC, 2 a move of Newton, 2 for the proof.
-    assert solution.ledger.rounds == 2 + (2 + stage.iterations + 2) + 2 * engine.times(Interior.move) + 2
-    assert solution.ledger.all_reduces == 3 + 2 * stage.iterations
+    rounds = [record.measurement.rounds for record in stage.history.records]
+    assert rounds == [4, *range(6, 5 + len(rounds))]
+    # 2 to start, 2 for poses and penalties, 1 before the first step and 1 a step, 2 for the result of SOC, 2 a move of
+    # Newton, 2 for the proof.
+    assert solution.ledger.rounds == 2 + (2 + 1 + stage.iterations + 2) + 2 * engine.times(Interior.move) + 2
+    assert solution.ledger.all_reduces == 3 + 1 + stage.iterations
 
 
 @pytest.mark.parametrize("per_robot", [False, True])
@@ -156,7 +161,7 @@ def test_neighbours_send_rows_of_common_poses_and_sums_go_to_all(
                     kind, between, other = name.partition(">")
                     if not between:
                         assert name in (STAR if order not in ENDS else POSES), (order, name)
-                        if name in ("value", "gamma"):
+                        if name in ("value", "gamma", "sums", "squares"):
                             assert np.size(value) <= (3 + d if order.endswith("travel") else 2 if per_robot else 11)
                         continue
                     poses = common[int(other)]
@@ -166,7 +171,7 @@ def test_neighbours_send_rows_of_common_poses_and_sums_go_to_all(
                     allowed = {"force": rows, "rows": rows, "value": rows, "of_own": {(known, 1 + (d + 1) + d * d)}}
                     assert np.shape(value) in allowed[kind], (order, name)
                     seen.add(kind)
-    assert seen == {"value", "force", "of_own"}
+    assert seen == {"value", "force", "of_own", "rows"}
     assert engine.times(begin_copies) == 2
 
 
