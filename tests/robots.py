@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
+from enum import Enum
 from functools import partial
 from typing import Any
 
@@ -132,7 +133,7 @@ def arrays_in(record: object, name: str = "value") -> Iterator[tuple[str, Array]
         for value in record:
             yield from arrays_in(value, name)
     elif record is not None and record is not Idle.IDLE:
-        yield name, np.asarray(record)
+        yield name, np.asarray(0.0 if isinstance(record, Enum) else record)  # a word is a number
 
 
 class Recording:
