@@ -42,25 +42,15 @@ from solvers.soc.soc import SOC
 
 @dataclass(frozen=True, eq=False)
 class FolderSolution:
-    """What the driver knows of a solve by robots with files of their own, who have the poses.
-
-    Attributes
-    ----------
-    certificate : Certificate
-        Without poses and multipliers.
-    sizes : (2, num_robots)
-        How many poses, and edges, every robot has.
-    note, frame : str
-        What the certificate lacks, and why, or empty; the frame of the poses that were written.
-    """
+    """What the driver knows of a solve by robots with files of their own, who have the poses."""
 
     name: str
-    certificate: Certificate
-    sizes: IntArray
+    certificate: Certificate  # without poses and multipliers
+    sizes: IntArray  # (2, num_robots): how many poses, and edges, every robot has
     stages: tuple[Stage, ...]
     ledger: Ledger
-    frame: str
-    note: str
+    frame: str  # of the poses that were written
+    note: str  # what the certificate lacks, and why, or empty
     seconds: float
 
     @property
@@ -103,16 +93,10 @@ def solve_folder(
     priors, landmarks and checkpoints take `solve`. A lost robot reads its file again, and is told all that it had been
     told. The frame is that of the first pose with a FIX line, or else the first of all, where its file has it.
 
-    Parameters
-    ----------
-    folder : Path
-        Its path, on every machine where robots run, or its name as of `load`. The calling process reads none of it.
-    engine : Engine, optional
-        Where the robots run: a `RayEngine`, or this process unless given.
-    out : Path, optional
-        Folder, there, to which every robot writes its poses and edges as 0.g2o, 1.g2o, .., each file whole or not.
-    pipeline, callback, time_limit, verbose, progress
-        As of `solve`, with its errors and those of `read_g2o`; a SettingError for another first stage.
+    `folder` is its path, on every machine where robots run, or its name as of `load`; the calling process reads none of
+    it. Robots run where `engine` says, a `RayEngine`, or in this process. To the folder `out`, there, every robot
+    writes its poses and edges as 0.g2o, 1.g2o, .., each file whole or not. The other settings, and errors, are as of
+    `solve`, with those of `read_g2o`; a SettingError for another first stage.
     """
     watch, pipeline = Watch(time_limit, verbose, progress, callback), pipeline if pipeline is not None else Pipeline()
     folder, soc, gap = locate(folder).absolute(), pipeline.soc, pipeline.gap

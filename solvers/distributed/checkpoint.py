@@ -57,15 +57,10 @@ class Checkpoint:
     If the file is there when a solve begins, the solve goes on from it. It is removed when the solve has converged, and
     stays when the solve was stopped, interrupted or out of time. While a solve runs it is locked for others. One that
     cannot be written, say on a full disk, is told once, and the solve goes on with the last one that could.
-
-    Attributes
-    ----------
-    rounds : int
-        A checkpoint is written when SOC and when Newton begins, and after so many rounds of communication.
     """
 
     path: Path | str
-    rounds: int = 10
+    rounds: int = 10  # of communication, after which one is written; also when SOC and when Newton begins
 
     def __post_init__(self) -> None:
         check_settings(self, at_least_one=["rounds"])
