@@ -33,6 +33,7 @@ from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, gamma
 from pgo_models.problem.matrices import columns_of
 from solvers.distributed.driver import Driver
 from solvers.distributed.interface import Interface
+from solvers.distributed.robots.proof import ProofSums
 from solvers.distributed.robots.proof_orders import move_proof, prove_interior
 from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep
 from solvers.network.counted_pool import Count
@@ -99,35 +100,21 @@ def prove_grounded(driver: Driver, eta: float) -> LowerBound | None:
     for _ in range(MOST_MOVES):
         if at.left <= SETTLED * abs(at.value):
             break
-        own = at.own.copy()
-        own[fixed] = 0.0  # as it is of the robots
-        step, parts, _ = proof.factor.solve([one.right.b for one in at.steps], own)
+        at.product[fixed] = 0.0  # as it is of the robots
+        step, parts, _ = proof.factor.solve([one.right.b for one in steps], at.product)
         steps = driver.ask_each(move_proof, parts, is_along=True)
-        X = X.copy()
-        X[g:] -= step[g:]  # the translations matter in the residuals alone, which the robots have
-        moved = _sum_up(driver, proof, X, steps, free)
+        there = X.copy()
+        there[g:] -= step[g:]  # the translations matter in the residuals alone, which the robots have
+        moved = _sum_up(driver, proof, there, steps, free)
         if not moved.left < at.left:
             break
-        at = moved
-    lost = OUTWARD * eta * (at.squared_distances + squared_distances(at.X[g:], start[g:]))
+        X, at = there, moved
+    lost = OUTWARD * eta * (at.squared_distances + squared_distances(X[g:], start[g:]))
     return bound_from([at.value, -lost], at.value_error + at.quadratic, eta, is_grounded=True)
 
 
-@dataclass(frozen=True, eq=False)
-class _Sums:
-    """What `pgo_models.certificates.lower_bound` needs at one X: sums over robots and driver."""
-
-    value: float
-    value_error: float
-    left: float
-    quadratic: float
-    squared_distances: float  # of the interiors
-    X: Array
-    own: Array  # the driver's part of S X
-    steps: Sequence[ProofStep]
-
-
-def _sum_up(driver: Driver, proof: InterfaceProof, X: Array, steps: Sequence[ProofStep], free: Array) -> _Sums:
+def _sum_up(driver: Driver, proof: InterfaceProof, X: Array, steps: Sequence[ProofStep], free: Array) -> ProofSums:
+    """Sums at X over robots and driver; of S X its own part, and the error of the whole."""
     g, d = len(driver.cover), driver.d
     space = driver.interface(1, d)
     blocks = evaluate_multipliers(proof.Lambda, X[g:].reshape(g, d, d))
@@ -140,20 +127,12 @@ def _sum_up(driver: Driver, proof: InterfaceProof, X: Array, steps: Sequence[Pro
     product = space.gather(parts) + own
     slack = proof.slack[free]
     values = [*(one.value for one in found), blocks.value]
-    value_error = (
-        math.fsum(one.value_error for one in found) + blocks.value_error + UNIT_ROUNDOFF * abs(math.fsum(values))
-    )
-    return _Sums(
-        value=math.fsum(values),
-        value_error=OUTWARD * value_error,
-        left=math.fsum(one.left for one in found) + quadratic_loss(product[free], 0.0, slack),
-        quadratic=OUTWARD
-        * (math.fsum(one.quadratic for one in found) + quadratic_loss(product[free], error[free], slack)),
-        squared_distances=math.fsum(one.squared_distances for one in found),
-        X=X,
-        own=own,
-        steps=steps,
-    )
+    value = math.fsum(values)
+    value_error = math.fsum(one.value_error for one in found) + blocks.value_error + UNIT_ROUNDOFF * abs(value)
+    left = math.fsum(one.left for one in found) + quadratic_loss(product[free], 0.0, slack)
+    quadratic = math.fsum(one.quadratic for one in found) + quadratic_loss(product[free], error[free], slack)
+    apart = math.fsum(one.squared_distances for one in found)
+    return ProofSums(value, OUTWARD * value_error, left, OUTWARD * quadratic, apart, own, error)
 
 
 def _eliminate(
