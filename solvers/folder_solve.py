@@ -27,7 +27,7 @@ from pgo_models.graphs.g2o import check_g2o_folder, g2o_files
 from pgo_models.graphs.measurements import IntArray
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.lower_bound import best_bound_distributed
-from solvers.distributed.own_files import READ_HERE, Answer, RobotFile, keep_answer, open_files, write_answer
+from solvers.distributed.own_files import READ_HERE, Answer, keep_answer, open_files, write_answer
 from solvers.distributed.stages import refine, start_robots
 from solvers.loop import Watch
 from solvers.network.counted_pool import Count
@@ -102,7 +102,7 @@ def solve_folder(
     folder, soc, gap = locate(folder).absolute(), pipeline.soc, pipeline.gap
     if soc is not None and (type(soc) is not SOC or soc.effective_coupling is Coupling.CONSENSUS):
         raise SettingError(f"robots with files of their own run SUBSTRUCTURED SOC, got {soc}; {READ_HERE}")
-    files = [RobotFile(robot, path) for robot, path in enumerate(g2o_files(folder))]
+    files = list(enumerate(g2o_files(folder)))
     if isinstance(engine, RayEngine):  # snapshots would be here, of all that robots have
         engine = replace(engine, recovery=replace(engine.recovery, orders_between_snapshots=sys.maxsize))
     if out is not None:
