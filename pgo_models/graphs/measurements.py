@@ -153,15 +153,12 @@ class Measurements(ReadOnly):
         d = self.R_ij.shape[-1]
         k = 3 if d == 2 else 6
         expected: dict[str, tuple[int, ...]] = {
-            "i": (m,),
-            "j": (m,),
+            **dict.fromkeys(("i", "j"), (m,)),
             "R_ij": (m, d, d),
             "t_ij": (m, d),
-            "kappa": (m,),
-            "tau": (m,),
+            **dict.fromkeys(("kappa", "tau"), (m,)),
             "information": (m, k, k),
-            "ids": (self.num_poses,),
-            "robot": (self.num_poses,),
+            **dict.fromkeys(("ids", "robot"), (self.num_poses,)),
             "fixed": (len(self.fixed),),
             "times": (len(self.bodies),),
         }
