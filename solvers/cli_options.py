@@ -84,17 +84,14 @@ GapOption = Annotated[float, typer.Option(callback=_finite_gap, help="Relative g
 
 def chosen_pipeline(
     method: FirstStage,
-    robots: Partition | None,
+    robots: Partition | None,  # for CONSENSUS and PAPER
     r_step: BackEndName | None,
     gap: float,
     max_iterations: int | None,
     tolerance: float | None,
-    driver_memory: float | None = None,
+    driver_memory: float | None = None,  # GB
 ) -> Pipeline:
-    """Pipeline of the options of `pgo solve`, a SettingError when they do not go together.
-
-    Robots are for CONSENSUS and PAPER, the driver's memory is in GB.
-    """
+    """Pipeline of the options of `pgo solve`, a SettingError when they do not go together."""
     if driver_memory is not None and method not in ON_ROBOTS:
         raise SettingError(f"--driver-memory is for methods that run on robots, got --method {method.value}")
     memory = DEFAULT_MEMORY if driver_memory is None else 1e9 * driver_memory

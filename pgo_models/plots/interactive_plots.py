@@ -170,10 +170,7 @@ def lay_out(figure: Figure, title: str, legend_y: float) -> None:
 
 
 def save_page(figure: Figure, path: Path | str) -> None:
-    """Write a plotly figure as one HTML page that opens offline, plotly's own script inside (about 5 MB).
-
-    Errors as `replace_when_done`.
-    """
+    """Write a plotly figure as an HTML page that opens offline, about 5 MB more; errors as `replace_when_done`."""
     page = figure.to_html(
         include_plotlyjs=True, full_html=True, config=PAGE_CONFIG, auto_play=False, default_height="96vh"
     )

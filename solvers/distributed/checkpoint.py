@@ -88,10 +88,7 @@ _CLASSES = (
 
 
 class Journal:
-    """Writes the checkpoints of one solve, and hands out the one that it goes on from; to be closed after the solve.
-
-    `stages` are the finished stages of the solve, those of the checkpoint to begin with.
-    """
+    """Writes the checkpoints of one solve, and hands out the one that it goes on from; to be closed after the solve."""
 
     def __init__(self, checkpoint: Checkpoint | None, mark: Mapping[str, str], stages: list[Stage]) -> None:
         """Read the checkpoint, if there is one.
@@ -99,7 +96,7 @@ class Journal:
         A FileFormatError when the file is no checkpoint, is damaged, or is where none can be written; a SettingError
         when it is one of another graph, partition or settings, or another run uses it.
         """
-        self.stages = stages
+        self.stages = stages  # finished ones of the solve, those of the checkpoint to begin with
         self._checkpoint, self._mark = checkpoint, mark
         self._finished: list[Attempt] = []
         self._saved: Saved | None = None
