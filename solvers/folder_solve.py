@@ -42,7 +42,7 @@ from solvers.soc.soc import SOC
 
 @dataclass(frozen=True, eq=False)
 class FolderSolution:
-    """What the driver knows of a solve by robots with files of their own, who have the poses."""
+    """What the driver knows of a solve by robots that have files of their own, and the poses; `sizes`: (2, num_robots)."""
 
     name: str
     certificate: Certificate  # without poses and multipliers
@@ -97,6 +97,11 @@ def solve_folder(
     it. Robots run where `engine` says, a `RayEngine`, or in this process. To the folder `out`, there, every robot
     writes its poses and edges as 0.g2o, 1.g2o, .., each file whole or not. The other settings, and errors, are as of
     `solve`, with those of `read_g2o`; a SettingError for another first stage.
+
+    Examples
+    --------
+    >>> solve_folder("robots").certificate.verdict.name
+    'CERTIFIED'
     """
     watch, pipeline = Watch(time_limit, verbose, progress, callback), pipeline if pipeline is not None else Pipeline()
     folder, soc, gap = locate(folder).absolute(), pipeline.soc, pipeline.gap
@@ -109,7 +114,7 @@ def solve_folder(
         check_g2o_folder(out, len(files))
     stages: list[Stage] = []
     answers: list[Answer] = []
-    bounds, F, rounding, decrement = [NO_BOUND], math.inf, ObjectiveRounding(0.0, 0.0), math.inf
+    bound, F, rounding, decrement = NO_BOUND, math.inf, ObjectiveRounding(0.0, 0.0), math.inf
     driver, sizes = open_files(files, engine if engine is not None else InProcess(), pipeline.driver_memory)
     nowhere = Poses(np.zeros((0, driver.d, driver.d)), np.zeros((0, driver.d)))
     with closing(driver), closing(Journal(None, {}, stages)) as journal:
@@ -121,14 +126,13 @@ def solve_folder(
             try:
                 stages.append(start_robots(driver, None))
                 last = refine(driver, pipeline.newton, None, journal, watch, soc)
-                bounds.append(best_bound_distributed(driver, gap))
+                bound = max(bound, best_bound_distributed(driver, gap), key=lambda found: found.value)
             except NotPositiveDefiniteError as error:
                 raise PGOError(f"{folder}: weights too far apart for doubles ({error}); see pgo info FILE") from error
             if driver.at.objective < F or not answers:
                 answers = driver.network.ask(keep_answer, driver.poses_of_cover(), Count.ROUND)
                 F, decrement = driver.at.objective, last
                 rounding = ObjectiveRounding(driver.at.rounding_level, math.fsum(answer.error for answer in answers))
-            bound = max(bounds, key=lambda found: found.value)
             found = Certificate(
                 *(F, bound, math.nan, rounding.level, decrement, BoundSource.GIVEN, nowhere, F, nowhere.R, gap),
                 Verdict.TRIVIAL,
