@@ -1,9 +1,7 @@
-"""CONSENSUS without a driver: robots alone find poses, from a spanning tree, and nothing is proved about them.
+"""CONSENSUS without a driver: robots alone find poses, from a spanning tree or given ones; nothing is proved of them.
 
-In a solve by robots the driver solves for the separators in the chordal start, the best translations of given
-rotations, Newton and the certificate. Robots alone start at a spanning tree, or at given poses, and end with the
-rotations and translations that they agree on: as near to the optimum as SOC's tolerance says, for there is no second
-stage.
+They end with the rotations and translations that they agree on: as near to the optimum as SOC's tolerance says, for
+chordal start, best translations of given rotations, Newton and certificate are the driver's.
 """
 
 import math
