@@ -102,9 +102,8 @@ def chosen_pipeline(
         return Pipeline(soc=None, gap=gap, driver_memory=memory)
     r_step = BackEndName.FACTORIZED if r_step is None else r_step
     if method is FirstStage.SUBSTRUCTURED and r_step is not BackEndName.FACTORIZED:
-        raise SettingError(
-            f"--method substructured factors, got --r-step {r_step.value}; use joint, consensus or paper"
-        )
+        way_out = "use joint, consensus or paper"
+        raise SettingError(f"--method substructured factors, got --r-step {r_step.value}; {way_out}")
     usual = PaperSOC() if method is FirstStage.PAPER else HANDOVER if memory > 0 else SOC()
     chosen = replace(
         usual,
@@ -140,9 +139,8 @@ def chosen_engine(method: FirstStage, engine: Runner | None, address: str | None
     if method not in ON_ROBOTS:
         if asked:
             names = " or ".join(one.value for one in ON_ROBOTS)
-            raise SettingError(
-                f"{asked[0]} is for methods that run on robots, got --method {method.value}; use {names}"
-            )
+            what = f"{asked[0]} is for methods that run on robots"
+            raise SettingError(f"{what}, got --method {method.value}; use {names}")
         return None
     if address is not None and engine not in (None, Runner.RAY):
         raise SettingError(f"--address is that of a Ray cluster, got --engine {engine.value}; use --engine ray")

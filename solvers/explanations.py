@@ -37,10 +37,8 @@ def explained_by_its_graph(command: Callable[P, T]) -> Callable[P, T]:
         except NotPositiveDefiniteError as error:
             raise NotPositiveDefiniteError(f"{place_of_weight(graph, dropped)} ({error})") from error
         except MemoryError as error:
-            raise PGOError(
-                f"{graph} takes more memory than there is; raise the limit, or share it among machines: "
-                "pgo solve --robots K --address HOST:PORT"
-            ) from error
+            way_out = "share it among machines: pgo solve --robots K --address HOST:PORT"
+            raise PGOError(f"{graph} takes more memory than there is; raise the limit, or {way_out}") from error
 
     return explained
 

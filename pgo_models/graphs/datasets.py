@@ -80,9 +80,8 @@ def load(
         return graph
     truth = read_tum(beside, d=graph.d)
     if truth.num_poses != len(graph.in_files):
-        raise FileFormatError(
-            beside, None, f"{truth.num_poses} poses, but {path} has {len(graph.in_files)}; remove or redo it"
-        )
+        problem = f"{truth.num_poses} poses, but {path} has {len(graph.in_files)}; remove or redo it"
+        raise FileFormatError(beside, None, problem)
     return replace(graph, truth=truth)
 
 
@@ -108,10 +107,8 @@ def locate(name_or_path: str | Path, registry: Registry = SE_SYNC, *, download: 
         known = known_datasets(registry)
         close = difflib.get_close_matches(name, known, n=3)
         meant = f"did you mean {' or '.join(close)}? " if close else ""
-        raise DatasetError(
-            f"no file and no data set {name!r}; {meant}known are {', '.join(known)}; "
-            f"or give a path, or put {name}.g2o into the folder named by {DATA_VARIABLE}"
-        )
+        way_out = f"or give a path, or put {name}.g2o into the folder named by {DATA_VARIABLE}"
+        raise DatasetError(f"no file and no data set {name!r}; {meant}known are {', '.join(known)}; {way_out}")
     return _cached(name, registry, download)
 
 

@@ -105,9 +105,8 @@ def explore_graph(
     middles = 0.5 * (poses.t[graph.i[misfits]] + poses.t[graph.j[misfits]])
     traces.append(_dots(middles, _misfit_text(graph, misfits, residuals), "misfit", ALARM_COLOUR, 6.0))
     if covariances is not None:
-        outlines = np.pad(
-            confidence_ellipses(poses[named], covariances[named]), ((0, 0), (0, 1), (0, 0)), constant_values=np.nan
-        )
+        ellipses = confidence_ellipses(poses[named], covariances[named])
+        outlines = np.pad(ellipses, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
         gaps, line = outlines.reshape(-1, graph.d), {"color": QUIET_COLOUR, "width": 1.0}
         traces.append({**_points(gaps), "mode": "lines", "line": line, "name": "95 % of x, y", "hoverinfo": "skip"})
     figure = go.Figure(traces)

@@ -240,7 +240,5 @@ def _read(path: Path, mark: Mapping[str, str]) -> tuple[Saved, list[dict[str, ND
         raise FileFormatError(path, None, f"cannot be read: {error.strerror or error}; choose another name") from error
     except (ValueError, KeyError) as error:  # whole, but of another version
         raise FileFormatError(path, None, "a checkpoint of another version of this package; remove it") from error
-    raise SettingError(
-        f"{path} is the checkpoint of a run with another {' and another '.join(other)}; go on with the same ones, or "
-        "remove the file to start anew"
-    )
+    way_out = "go on with the same ones, or remove the file to start anew"
+    raise SettingError(f"{path} is the checkpoint of a run with another {' and another '.join(other)}; {way_out}")

@@ -228,9 +228,8 @@ def _check_connected(borders: Sequence[Border], without_edge: int, folder: Path)
         alone = without_edge + sum(int(border.alone[kind]) for border in borders)
         count = alone + (connected_components(tied)[0] if len(poses) else 0)
         if count > 1:
-            raise GraphError(
-                f"{folder}: the {what} of all robots fall into {count} parts, no edge between; {READ_HERE}"
-            )
+            problem = f"the {what} of all robots fall into {count} parts, no edge between"
+            raise GraphError(f"{folder}: {problem}; {READ_HERE}")
 
 
 def _runs(ids: IntArray) -> IntArray:

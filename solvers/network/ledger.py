@@ -25,10 +25,9 @@ class Traffic:
 
     def __post_init__(self) -> None:
         if not self.sender.shape == self.receiver.shape == self.num_bytes.shape:
-            raise SettingError(
-                f"senders, receivers and bytes have shapes {self.sender.shape}, {self.receiver.shape} and "
-                f"{self.num_bytes.shape}; give one of each for every message"
-            )
+            shapes = f"{self.sender.shape}, {self.receiver.shape} and {self.num_bytes.shape}"
+            way_out = "give one of each for every message"
+            raise SettingError(f"senders, receivers and bytes have shapes {shapes}; {way_out}")
 
 
 @dataclass(frozen=True, eq=False)

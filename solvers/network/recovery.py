@@ -113,10 +113,8 @@ class RecoveringPool(Generic[T]):
                 return self._order(robot, order, request)
             except RobotLostError as error:
                 lost = error
-        raise EngineError(
-            f"robot {robot} was lost {self.restarts[robot] + 1} times ({lost}); look at the memory of its machine, or "
-            "run in this process"
-        ) from lost
+        way_out = "look at the memory of its machine, or run in this process"
+        raise EngineError(f"robot {robot} was lost {self.restarts[robot] + 1} times ({lost}); {way_out}") from lost
 
     def _order(self, robot: int, order: AnyOrder, request: object) -> object:
         return self.place.receive(robot, self.place.send(robot, order, request))
