@@ -42,7 +42,7 @@ from solvers.soc.soc import SOC
 
 @dataclass(frozen=True, eq=False)
 class FolderSolution:
-    """What the driver knows of a solve by robots that have files of their own, and the poses; `sizes`: (2, num_robots)."""
+    """What the driver knows of a solve by robots that have own files, and the poses; `sizes` are (2, num_robots)."""
 
     name: str
     certificate: Certificate  # without poses and multipliers
