@@ -354,9 +354,8 @@ def generate_command(
     as_json: JsonOption = False,
 ) -> None:
     """Generate a scene with known truth, written beside it as NAME.truth.tum."""
-    made = choices.chosen_scene(
-        scene, np.random.default_rng(seed), poses, robots, dimension, translation_noise, rotation_noise
-    )
+    rng, noise = np.random.default_rng(seed), (translation_noise, rotation_noise)
+    made = choices.chosen_scene(scene, rng, poses, robots, dimension, *noise)
     truth = out.absolute().parent / f"{out.absolute().stem}.truth.tum"
     if out.suffix == "":
         # Symbols have 52 letters; poses of more robots are numbered, and the files alone say whose they are.

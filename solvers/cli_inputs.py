@@ -61,9 +61,8 @@ def with_times(graph: PoseGraph, path: Path | None) -> PoseGraph:
         return graph
     times = read_times(path)
     if len(times) != len(graph.bodies):
-        raise FileFormatError(
-            path, None, f"{len(times)} times, {graph.name} has {len(graph.bodies)} poses; give one each"
-        )
+        problem = f"{len(times)} times, {graph.name} has {len(graph.bodies)} poses; give one each"
+        raise FileFormatError(path, None, problem)
     return replace(graph, times=times)
 
 

@@ -84,17 +84,14 @@ GapOption = Annotated[float, typer.Option(callback=_finite_gap, help="Relative g
 
 def chosen_pipeline(
     method: FirstStage,
-    robots: Partition | None,
+    robots: Partition | None,  # for CONSENSUS and PAPER
     r_step: BackEndName | None,
     gap: float,
     max_iterations: int | None,
     tolerance: float | None,
-    driver_memory: float | None = None,
+    driver_memory: float | None = None,  # GB
 ) -> Pipeline:
-    """Pipeline of the options of `pgo solve`, a SettingError when they do not go together.
-
-    Robots are for CONSENSUS and PAPER, the driver's memory is in GB.
-    """
+    """Pipeline of the options of `pgo solve`, a SettingError when they do not go together."""
     if driver_memory is not None and method not in ON_ROBOTS:
         raise SettingError(f"--driver-memory is for methods that run on robots, got --method {method.value}")
     memory = DEFAULT_MEMORY if driver_memory is None else 1e9 * driver_memory
@@ -105,9 +102,8 @@ def chosen_pipeline(
         return Pipeline(soc=None, gap=gap, driver_memory=memory)
     r_step = BackEndName.FACTORIZED if r_step is None else r_step
     if method is FirstStage.SUBSTRUCTURED and r_step is not BackEndName.FACTORIZED:
-        raise SettingError(
-            f"--method substructured factors, got --r-step {r_step.value}; use joint, consensus or paper"
-        )
+        way_out = "use joint, consensus or paper"
+        raise SettingError(f"--method substructured factors, got --r-step {r_step.value}; {way_out}")
     usual = PaperSOC() if method is FirstStage.PAPER else HANDOVER if memory > 0 else SOC()
     chosen = replace(
         usual,
@@ -143,9 +139,8 @@ def chosen_engine(method: FirstStage, engine: Runner | None, address: str | None
     if method not in ON_ROBOTS:
         if asked:
             names = " or ".join(one.value for one in ON_ROBOTS)
-            raise SettingError(
-                f"{asked[0]} is for methods that run on robots, got --method {method.value}; use {names}"
-            )
+            what = f"{asked[0]} is for methods that run on robots"
+            raise SettingError(f"{what}, got --method {method.value}; use {names}")
         return None
     if address is not None and engine not in (None, Runner.RAY):
         raise SettingError(f"--address is that of a Ray cluster, got --engine {engine.value}; use --engine ray")

@@ -37,10 +37,8 @@ def explained_by_its_graph(command: Callable[P, T]) -> Callable[P, T]:
         except NotPositiveDefiniteError as error:
             raise NotPositiveDefiniteError(f"{place_of_weight(graph, dropped)} ({error})") from error
         except MemoryError as error:
-            raise PGOError(
-                f"{graph} takes more memory than there is; raise the limit, or share it among machines: "
-                "pgo solve --robots K --address HOST:PORT"
-            ) from error
+            way_out = "share it among machines: pgo solve --robots K --address HOST:PORT"
+            raise PGOError(f"{graph} takes more memory than there is; raise the limit, or {way_out}") from error
 
     return explained
 
@@ -59,10 +57,7 @@ def warn_of_weights(graph: str, problem: PGOProblem, certificate: Certificate, d
 
 
 def hint_of_chi2(problem: PGOProblem, poses: Poses) -> list[str]:
-    """A line that names `--information` where F was asked for, and chi2 can be lowered by more than it is worth.
-
-    A Newton step gives a bound from above on its minimum.
-    """
+    """A line that names `--information` where F was asked for, and chi2 can be lowered by more than it is worth."""
     graph = problem.graph
     if problem.weighting is not Weighting.ISOTROPIC or graph.information is None:
         return []
@@ -70,7 +65,7 @@ def hint_of_chi2(problem: PGOProblem, poses: Poses) -> list[str]:
     here = whole.objective(poses)
     if abs(here - problem.objective(poses)) <= 1e-9 * here:  # chi2 is F: no factorisation to find that out
         return []
-    below = whole.objective(polish(whole, poses, max_steps=1))
+    below = whole.objective(polish(whole, poses, max_steps=1))  # a bound from above on its minimum
     if not here > WORTH_SAYING * below:
         return []
     return [f"the file's own cost: chi2 {here:.4g} here; its minimum is at most {below:.4g}: --information"]

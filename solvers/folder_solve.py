@@ -27,7 +27,7 @@ from pgo_models.graphs.g2o import check_g2o_folder, g2o_files
 from pgo_models.graphs.measurements import IntArray
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.lower_bound import best_bound_distributed
-from solvers.distributed.own_files import READ_HERE, Answer, RobotFile, keep_answer, open_files, write_answer
+from solvers.distributed.own_files import READ_HERE, Answer, keep_answer, open_files, write_answer
 from solvers.distributed.stages import refine, start_robots
 from solvers.loop import Watch
 from solvers.network.counted_pool import Count
@@ -42,25 +42,15 @@ from solvers.soc.soc import SOC
 
 @dataclass(frozen=True, eq=False)
 class FolderSolution:
-    """What the driver knows of a solve by robots with files of their own, who have the poses.
-
-    Attributes
-    ----------
-    certificate : Certificate
-        Without poses and multipliers.
-    sizes : (2, num_robots)
-        How many poses, and edges, every robot has.
-    note, frame : str
-        What the certificate lacks, and why, or empty; the frame of the poses that were written.
-    """
+    """What the driver knows of a solve by robots that have own files, and the poses; `sizes` are (2, num_robots)."""
 
     name: str
-    certificate: Certificate
-    sizes: IntArray
+    certificate: Certificate  # without poses and multipliers
+    sizes: IntArray  # (2, num_robots): how many poses, and edges, every robot has
     stages: tuple[Stage, ...]
     ledger: Ledger
-    frame: str
-    note: str
+    frame: str  # of the poses that were written
+    note: str  # what the certificate lacks, and why, or empty
     seconds: float
 
     @property
@@ -103,22 +93,21 @@ def solve_folder(
     priors, landmarks and checkpoints take `solve`. A lost robot reads its file again, and is told all that it had been
     told. The frame is that of the first pose with a FIX line, or else the first of all, where its file has it.
 
-    Parameters
-    ----------
-    folder : Path
-        Its path, on every machine where robots run, or its name as of `load`. The calling process reads none of it.
-    engine : Engine, optional
-        Where the robots run: a `RayEngine`, or this process unless given.
-    out : Path, optional
-        Folder, there, to which every robot writes its poses and edges as 0.g2o, 1.g2o, .., each file whole or not.
-    pipeline, callback, time_limit, verbose, progress
-        As of `solve`, with its errors and those of `read_g2o`; a SettingError for another first stage.
+    `folder` is its path, on every machine where robots run, or its name as of `load`; the calling process reads none of
+    it. Robots run where `engine` says, a `RayEngine`, or in this process. To the folder `out`, there, every robot
+    writes its poses and edges as 0.g2o, 1.g2o, .., each file whole or not. The other settings, and errors, are as of
+    `solve`, with those of `read_g2o`; a SettingError for another first stage.
+
+    Examples
+    --------
+    >>> solve_folder("robots").certificate.verdict.name
+    'CERTIFIED'
     """
     watch, pipeline = Watch(time_limit, verbose, progress, callback), pipeline if pipeline is not None else Pipeline()
     folder, soc, gap = locate(folder).absolute(), pipeline.soc, pipeline.gap
     if soc is not None and (type(soc) is not SOC or soc.effective_coupling is Coupling.CONSENSUS):
         raise SettingError(f"robots with files of their own run SUBSTRUCTURED SOC, got {soc}; {READ_HERE}")
-    files = [RobotFile(robot, path) for robot, path in enumerate(g2o_files(folder))]
+    files = list(enumerate(g2o_files(folder)))
     if isinstance(engine, RayEngine):  # a process for every robot; snapshots would be here, of all that they have
         recovery = replace(engine.recovery, orders_between_snapshots=sys.maxsize)
         engine = replace(engine, recovery=recovery, actors=engine.actors or len(files))
@@ -126,7 +115,7 @@ def solve_folder(
         check_g2o_folder(out, len(files))
     stages: list[Stage] = []
     answers: list[Answer] = []
-    bounds, F, rounding, decrement = [NO_BOUND], math.inf, ObjectiveRounding(0.0, 0.0), math.inf
+    bound, F, rounding, decrement = NO_BOUND, math.inf, ObjectiveRounding(0.0, 0.0), math.inf
     driver, sizes = open_files(files, engine if engine is not None else InProcess(), pipeline.driver_memory)
     nowhere = Poses(np.zeros((0, driver.d, driver.d)), np.zeros((0, driver.d)))
     with closing(driver), closing(Journal(None, {}, stages)) as journal:
@@ -138,14 +127,13 @@ def solve_folder(
             try:
                 stages.append(start_robots(driver, None))
                 last = refine(driver, pipeline.newton, None, journal, watch, soc)
-                bounds.append(best_bound_distributed(driver, gap))
+                bound = max(bound, best_bound_distributed(driver, gap), key=lambda found: found.value)
             except NotPositiveDefiniteError as error:
                 raise PGOError(f"{folder}: weights too far apart for doubles ({error}); see pgo info FILE") from error
             if driver.at.objective < F or not answers:
                 answers = driver.network.ask(keep_answer, driver.poses_of_cover(), Count.ROUND)
                 F, decrement = driver.at.objective, last
                 rounding = ObjectiveRounding(driver.at.rounding_level, math.fsum(answer.error for answer in answers))
-            bound = max(bounds, key=lambda found: found.value)
             found = Certificate(
                 *(F, bound, math.nan, rounding.level, decrement, BoundSource.GIVEN, nowhere, F, nowhere.R, gap),
                 Verdict.TRIVIAL,

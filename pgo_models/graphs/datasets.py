@@ -73,7 +73,16 @@ def load(
     >>> load("sphere")
     PoseGraph('sphere', d=3, poses=50, edges=544, robots=1)
     """
-    return _read(locate(name_or_path, registry, download=download), weights, skip_unknown)
+    path = locate(name_or_path, registry, download=download)
+    graph = read_g2o(path, weights, skip_unknown=skip_unknown)
+    beside = path.absolute().parent / f"{graph.name}.truth.tum"
+    if not os.path.isfile(beside):
+        return graph
+    truth = read_tum(beside, d=graph.d)
+    if truth.num_poses != len(graph.in_files):
+        problem = f"{truth.num_poses} poses, but {path} has {len(graph.in_files)}; remove or redo it"
+        raise FileFormatError(beside, None, problem)
+    return replace(graph, truth=truth)
 
 
 def locate(name_or_path: str | Path, registry: Registry = SE_SYNC, *, download: bool = True) -> Path:
@@ -98,10 +107,8 @@ def locate(name_or_path: str | Path, registry: Registry = SE_SYNC, *, download: 
         known = known_datasets(registry)
         close = difflib.get_close_matches(name, known, n=3)
         meant = f"did you mean {' or '.join(close)}? " if close else ""
-        raise DatasetError(
-            f"no file and no data set {name!r}; {meant}known are {', '.join(known)}; "
-            f"or give a path, or put {name}.g2o into the folder named by {DATA_VARIABLE}"
-        )
+        way_out = f"or give a path, or put {name}.g2o into the folder named by {DATA_VARIABLE}"
+        raise DatasetError(f"no file and no data set {name!r}; {meant}known are {', '.join(known)}; {way_out}")
     return _cached(name, registry, download)
 
 
@@ -135,19 +142,6 @@ def _folders() -> list[Path]:
 
 def _holds_g2o(folder: Path) -> bool:
     return any(folder.glob("*.g2o"))
-
-
-def _read(path: Path, weights: RotationWeight, skip_unknown: bool) -> PoseGraph:
-    graph = read_g2o(path, weights, skip_unknown=skip_unknown)
-    beside = path.absolute().parent / f"{graph.name}.truth.tum"
-    if not os.path.isfile(beside):
-        return graph
-    truth = read_tum(beside, d=graph.d)
-    if truth.num_poses != len(graph.in_files):
-        raise FileFormatError(
-            beside, None, f"{truth.num_poses} poses, but {path} has {len(graph.in_files)}; remove or redo it"
-        )
-    return replace(graph, truth=truth)
 
 
 def _cached(name: str, registry: Registry, download: bool) -> Path:

@@ -78,9 +78,8 @@ def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
         problem = "a pose, or an edge of poses, with the id of a landmark, which is a point; renumber one of them"
         raise FileFormatError(path, int(min(posed)), problem)
     fixed, fixed_lines = np.array(source.fixed, dtype=np.int64).reshape(-1, 2).T
-    found = G2OLines(
-        path, d, vertex_ids[:, 1], vertex_lines, vertices, edge_ids, edges, edge_lines, fixed, fixed_lines, landmarks
-    )
+    of_poses, of_edges = (vertex_ids[:, 1], vertex_lines, vertices), (edge_ids, edges, edge_lines)
+    found = G2OLines(path, d, *of_poses, *of_edges, fixed, fixed_lines, landmarks)
     for rows, at in ((vertices, found.vertex_lines), (edges, found.edge_lines)):
         check_distances(path, at, rows[:, :d])
         if d == 3:
@@ -229,10 +228,8 @@ class _Source:
             expected = kind.num_ids + kind.num_numbers
             if len(words) != expected:
                 few = "the line is cut off" if len(words) < expected else "the line is too long"
-                needed = (
-                    f"{kind.num_ids} id{'s' * (kind.num_ids > 1)} and {kind.num_numbers} numbers, {expected} in all"
-                )
-                problem = f"{tag} needs {needed}, found {len(words)}; {few}: complete or remove it"
+                needed = f"{kind.num_ids} id{'s' * (kind.num_ids > 1)} and {kind.num_numbers} numbers"
+                problem = f"{tag} needs {needed}, {expected} in all, found {len(words)}; {few}: complete or remove it"
                 raise self._error(number, problem)
         raise self._error(at[0], f"the {tag} lines cannot be read; write numbers like 1.5e-3, separated by blanks")
 

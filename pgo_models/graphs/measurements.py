@@ -1,5 +1,6 @@
 """Measurements: the arrays of a pose graph, checked once, and which poses are the world's and landmarks'."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -37,22 +38,18 @@ class Measurements(ReadOnly):
     landmarks: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "num_poses", whole_number(self.num_poses, "num_poses"))
-        for name in ("i", "j", "ids", "robot", "fixed", "landmarks"):
-            value = getattr(self, name)
-            if value is not None:
-                object.__setattr__(self, name, whole_array(value, name))
-        for name in ("R_ij", "t_ij", "kappa", "tau", "information", "times"):
-            value = getattr(self, name)
-            if value is not None:
-                object.__setattr__(self, name, real_array(value, name))
-        if self.world is not None:
-            object.__setattr__(self, "world", whole_number(self.world, "world"))
+        checks: list[tuple[Callable[..., object], tuple[str, ...]]] = [
+            (whole_number, ("num_poses", "world")),
+            (whole_array, ("i", "j", "ids", "robot", "fixed", "landmarks")),
+            (real_array, ("R_ij", "t_ij", "kappa", "tau", "information", "times")),
+        ]
+        for checked, name in ((check, name) for check, names in checks for name in names):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, checked(getattr(self, name), name))
         self._check_shapes()
         self._check_values()
-        object.__setattr__(
-            self, "R_ij", rotations_to_rounding(self.R_ij, lambda edge: f"R_ij of {self.edge_label(edge)}")
-        )
+        turns = rotations_to_rounding(self.R_ij, lambda edge: f"R_ij of {self.edge_label(edge)}")
+        object.__setattr__(self, "R_ij", turns)
         for name, settled in self._settled_landmarks().items():
             object.__setattr__(self, name, settled)
         for name in ("initial", "truth"):
@@ -153,15 +150,12 @@ class Measurements(ReadOnly):
         d = self.R_ij.shape[-1]
         k = 3 if d == 2 else 6
         expected: dict[str, tuple[int, ...]] = {
-            "i": (m,),
-            "j": (m,),
+            **dict.fromkeys(("i", "j"), (m,)),
             "R_ij": (m, d, d),
             "t_ij": (m, d),
-            "kappa": (m,),
-            "tau": (m,),
+            **dict.fromkeys(("kappa", "tau"), (m,)),
             "information": (m, k, k),
-            "ids": (self.num_poses,),
-            "robot": (self.num_poses,),
+            **dict.fromkeys(("ids", "robot"), (self.num_poses,)),
             "fixed": (len(self.fixed),),
             "times": (len(self.bodies),),
         }
@@ -178,9 +172,8 @@ class Measurements(ReadOnly):
         both = np.stack([self.i, self.j])
         outside = ((both < 0) | (both >= self.num_poses)).any(axis=0)
         if outside.any():
-            raise GraphError(
-                f"{self.edge_label(int(np.argmax(outside)))} names a pose outside 0 .. {self.num_poses - 1}"
-            )
+            edge = self.edge_label(int(np.argmax(outside)))
+            raise GraphError(f"{edge} names a pose outside 0 .. {self.num_poses - 1}")
         loops = self.i == self.j
         if loops.any():
             raise GraphError(f"{self.edge_label(int(np.argmax(loops)))} leads from a pose to itself; remove it")

@@ -96,10 +96,7 @@ def partition(graph: PoseGraph, num_robots: int | None = None, method: Partition
 
 
 def suited_partition(graph: PoseGraph, num_robots: int) -> Partition:
-    """As the graph names its robots if they are as many, else with few cut edges where METIS is there, else contiguous.
-
-    Errors as of `partition`.
-    """
+    """GIVEN if the graph names as many robots, else METIS where it is there, else CONTIGUOUS; errors as `partition`."""
     if graph.robot is not None and num_robots == graph.num_robots:
         return partition(graph, num_robots, PartitionMethod.GIVEN)
     try:

@@ -33,36 +33,21 @@ class PoseGraph(Measurements):
     to it has R_ij = I and kappa = 0; but for the first, whose kappa is positive: R_l stands in that term alone, which
     is so zero at every optimum, R_l = R_i. F over the other unknowns is not changed by it, nor is its minimum.
 
-    Attributes
-    ----------
-    num_poses : int
-    i, j : (m,)
-        0-based poses of every edge. Repeated edges all count.
-    R_ij : (m, d, d)
-        Measured rotations; what is given is treated as by `Poses`.
-    t_ij : (m, d)
-        Measured translations, metres, in the frame of pose i.
-    kappa, tau : (m,)
-        Precisions of the rotation (per radian^2) and of the translation (per metre^2), at least one of them positive.
-        Of edges to landmarks kappa is settled here.
-    information : (m, k, k), optional
-        Information matrices as read, k = 3 in the plane (x, y, theta) and 6 in space (x, y, z, then rotation).
-    ids : (n,), optional
-        Names of the poses in the file, unique integers; 0 .. n-1 unless given.
-    robot : (n,), optional
-        Which robot, 0 .. num_robots - 1, owns the pose; all 0 unless given.
-    initial, truth : Poses, optional
-        The estimate that came with the file, and the ground truth of a generated scene.
-    fixed : (f,)
-        Poses that the file says are fixed. F does not depend on the gauge: the solution is moved so that the first of
-        them is where the file has it, and all are kept for writing.
-    times : (b,), optional
-        Seconds of the `bodies`, ascending, for the trajectories that are written.
-    world : int, optional
-        The world pose, where edges can only begin; no file names it, and `initial` and `truth` may leave it out.
-    landmarks : (l,)
-        Poses that are points, where edges can only end.
-    name : str
+    Of every edge: `i`, `j`, (m,), its 0-based poses, where repeated edges all count; `R_ij`, (m, d, d), the measured
+    rotation, treated as by `Poses`; `t_ij`, (m, d), the measured translation, metres, in the frame of pose i; `kappa`,
+    `tau`, (m,), precisions of the rotation (per radian^2) and of the translation (per metre^2), at least one of them
+    positive (of edges to landmarks kappa is settled here); optionally `information`, (m, k, k), matrices as read, k = 3
+    in the plane (x, y, theta) and 6 in space (x, y, z, then rotation).
+
+    Of every pose, each optional: `ids`, (n,), its name in the file, a unique integer, 0 .. n-1 unless given; `robot`,
+    (n,), which robot, 0 .. num_robots - 1, owns it, all 0 unless given; `initial`, the estimate that came with the
+    file, and `truth`, the ground truth of a generated scene; `times`, (b,), seconds of the `bodies`, ascending, for the
+    trajectories that are written.
+
+    Of some poses: `fixed`, (f,), those that the file says are fixed (F does not depend on the gauge: the solution is
+    moved so that the first of them is where the file has it, and all are kept for writing); `landmarks`, (l,), those
+    that are points, where edges can only end; `world`, optional, the world pose, where edges can only begin: no file
+    names it, and `initial` and `truth` may leave it out.
 
     All arrays are read-only copies: `dataclasses.replace` makes a graph with others. A GraphError on wrong shapes,
     entries that are no real or no whole numbers, an edge to itself or to no pose, nan or inf, no rotation, a negative
@@ -124,10 +109,9 @@ class PoseGraph(Measurements):
             sizes = ", ".join(str(len(part)) for part in parts[:5])
             more = f" and {len(parts) - 5} more" if len(parts) > 5 else ""
             firsts = ", ".join(self.pose_name(part[0]) for part in parts[:5])
-            raise GraphError(
-                f"pose graph has {len(parts)} components (sizes {sizes}{more}; with poses {firsts}{more}); "
-                "solve each on its own: PoseGraph.subgraph(PoseGraph.components()[k])"
-            )
+            found = f"{len(parts)} components (sizes {sizes}{more}; with poses {firsts}{more})"
+            way_out = "solve each on its own: PoseGraph.subgraph(PoseGraph.components()[k])"
+            raise GraphError(f"pose graph has {found}; {way_out}")
         self._check_determined()
 
     @property

@@ -105,9 +105,8 @@ def explore_graph(
     middles = 0.5 * (poses.t[graph.i[misfits]] + poses.t[graph.j[misfits]])
     traces.append(_dots(middles, _misfit_text(graph, misfits, residuals), "misfit", ALARM_COLOUR, 6.0))
     if covariances is not None:
-        outlines = np.pad(
-            confidence_ellipses(poses[named], covariances[named]), ((0, 0), (0, 1), (0, 0)), constant_values=np.nan
-        )
+        ellipses = confidence_ellipses(poses[named], covariances[named])
+        outlines = np.pad(ellipses, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
         gaps, line = outlines.reshape(-1, graph.d), {"color": QUIET_COLOUR, "width": 1.0}
         traces.append({**_points(gaps), "mode": "lines", "line": line, "name": "95 % of x, y", "hoverinfo": "skip"})
     figure = go.Figure(traces)
@@ -170,10 +169,7 @@ def lay_out(figure: Figure, title: str, legend_y: float) -> None:
 
 
 def save_page(figure: Figure, path: Path | str) -> None:
-    """Write a plotly figure as one HTML page that opens offline, plotly's own script inside (about 5 MB).
-
-    Errors as `replace_when_done`.
-    """
+    """Write a plotly figure as an HTML page that opens offline, about 5 MB more; errors as `replace_when_done`."""
     page = figure.to_html(
         include_plotlyjs=True, full_html=True, config=PAGE_CONFIG, auto_play=False, default_height="96vh"
     )

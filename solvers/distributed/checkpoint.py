@@ -57,15 +57,10 @@ class Checkpoint:
     If the file is there when a solve begins, the solve goes on from it. It is removed when the solve has converged, and
     stays when the solve was stopped, interrupted or out of time. While a solve runs it is locked for others. One that
     cannot be written, say on a full disk, is told once, and the solve goes on with the last one that could.
-
-    Attributes
-    ----------
-    rounds : int
-        A checkpoint is written when SOC and when Newton begins, and after so many rounds of communication.
     """
 
     path: Path | str
-    rounds: int = 10
+    rounds: int = 10  # of communication, after which one is written; also when SOC and when Newton begins
 
     def __post_init__(self) -> None:
         check_settings(self, at_least_one=["rounds"])
@@ -93,10 +88,7 @@ _CLASSES = (
 
 
 class Journal:
-    """Writes the checkpoints of one solve, and hands out the one that it goes on from; to be closed after the solve.
-
-    `stages` are the finished stages of the solve, those of the checkpoint to begin with.
-    """
+    """Writes the checkpoints of one solve, and hands out the one that it goes on from; to be closed after the solve."""
 
     def __init__(self, checkpoint: Checkpoint | None, mark: Mapping[str, str], stages: list[Stage]) -> None:
         """Read the checkpoint, if there is one.
@@ -104,7 +96,7 @@ class Journal:
         A FileFormatError when the file is no checkpoint, is damaged, or is where none can be written; a SettingError
         when it is one of another graph, partition or settings, or another run uses it.
         """
-        self.stages = stages
+        self.stages = stages  # finished ones of the solve, those of the checkpoint to begin with
         self._checkpoint, self._mark = checkpoint, mark
         self._finished: list[Attempt] = []
         self._saved: Saved | None = None
@@ -248,7 +240,5 @@ def _read(path: Path, mark: Mapping[str, str]) -> tuple[Saved, list[dict[str, ND
         raise FileFormatError(path, None, f"cannot be read: {error.strerror or error}; choose another name") from error
     except (ValueError, KeyError) as error:  # whole, but of another version
         raise FileFormatError(path, None, "a checkpoint of another version of this package; remove it") from error
-    raise SettingError(
-        f"{path} is the checkpoint of a run with another {' and another '.join(other)}; go on with the same ones, or "
-        "remove the file to start anew"
-    )
+    way_out = "go on with the same ones, or remove the file to start anew"
+    raise SettingError(f"{path} is the checkpoint of a run with another {' and another '.join(other)}; {way_out}")

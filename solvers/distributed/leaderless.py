@@ -1,10 +1,8 @@
 """CONSENSUS without a driver: robots alone find poses, from a start by rounds, and nothing is proved about them.
 
-In a solve by robots the driver solves for the separators in the chordal start, the best translations of given
-rotations, Newton and the certificate. Robots alone begin at a spanning tree, relax rotations and translations jointly,
-then find translations for the rotations, by rounds of CONSENSUS, or begin at given poses; they end with what they agree
-on: as near to the optimum as SOC's tolerance says, for there is no second stage. Sums, and so the tests, go along a
-tree.
+They begin at a spanning tree, relax rotations and translations jointly, then find translations for the rotations, by
+rounds, or begin at given poses; they end as near to the optimum as SOC's tolerance says: best translations of given
+rotations, Newton and certificate are a driver's. Sums, and so the tests, go along a tree.
 """
 
 import math

@@ -12,19 +12,9 @@ from functools import partial
 
 import numpy as np
 
+from pgo_models.certificates import lower_bound as central
 from pgo_models.certificates.definiteness import FIRST_SHIFT, LEAST_SHIFT, MARGIN, SHRINK
-from pgo_models.certificates.lower_bound import (
-    MOST_MOVES,
-    NO_BOUND,
-    SETTLED,
-    UNGROUNDED_SHIFT,
-    LowerBound,
-    bound_from,
-    quadratic_loss,
-    search_bound,
-    smallest_shift,
-    squared_distances,
-)
+from pgo_models.certificates.lower_bound import LowerBound
 from pgo_models.certificates.rounding_errors import evaluate_multipliers
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array, stack_transposes
@@ -33,6 +23,7 @@ from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, gamma
 from pgo_models.problem.matrices import columns_of
 from solvers.distributed.driver import Driver
 from solvers.distributed.interface import Interface
+from solvers.distributed.robots.proof import ProofSums
 from solvers.distributed.robots.proof_orders import move_proof, prove_interior
 from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep
 from solvers.network.counted_pool import Count
@@ -52,30 +43,30 @@ class InterfaceProof:
 def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
     """Grounded without eta where that goes through, else the better form with the smallest eta found; at the poses."""
     if driver.at.objective <= driver.at.rounding_level:
-        return NO_BOUND
+        return central.NO_BOUND
     if driver.is_final:
         driver.describe(Count.PIGGYBACKED)
         if not (driver.diagonal > 0.0).all():
-            return NO_BOUND
+            return central.NO_BOUND
     found = prove_grounded(driver, 0.0)
     if found is not None and found.value > 0.0:
         return found
     count = driver.num_poses * driver.d
-    smallest = smallest_shift(gap, driver.at.objective, count)
+    smallest = central.smallest_shift(gap, driver.at.objective, count)
     # At stationary poses tr(Lambda) is F; it only says where the search ends.
     forms = prove_with_eta, prove_grounded
-    bounds = [search_bound(partial(form, driver), smallest, driver.at.objective, count) for form in forms]
-    return max([NO_BOUND, *bounds], key=lambda bound: bound.value)
+    bounds = [central.search_bound(partial(form, driver), smallest, driver.at.objective, count) for form in forms]
+    return max([central.NO_BOUND, *bounds], key=lambda bound: bound.value)
 
 
 def prove_with_eta(driver: Driver, eta: float) -> LowerBound | None:
     """Bound tr(Lambda) - eta n d if S + eta blockdiag(0, I) without a translation is positive definite: one round."""
-    proof = _eliminate(driver, driver.ground(1).ravel(), eta, UNGROUNDED_SHIFT)
+    proof = _eliminate(driver, driver.ground(1).ravel(), eta, central.UNGROUNDED_SHIFT)
     if proof is None:
         return None
     lost = eta * driver.num_poses * driver.d
     rounding = OUTWARD * 4.0 * UNIT_ROUNDOFF * (sum(map(abs, proof.traces)) + lost)
-    return bound_from([*proof.traces, -lost], rounding, eta, is_grounded=False)
+    return central.bound_from([*proof.traces, -lost], rounding, eta, is_grounded=False)
 
 
 def prove_grounded(driver: Driver, eta: float) -> LowerBound | None:
@@ -96,38 +87,24 @@ def prove_grounded(driver: Driver, eta: float) -> LowerBound | None:
     free[fixed] = False
     steps = [answer.step for answer in proof.answers if answer.step is not None]
     at = _sum_up(driver, proof, X, steps, free)
-    for _ in range(MOST_MOVES):
-        if at.left <= SETTLED * abs(at.value):
+    for _ in range(central.MOST_MOVES):
+        if at.left <= central.SETTLED * abs(at.value):
             break
-        own = at.own.copy()
-        own[fixed] = 0.0  # as it is of the robots
-        step, parts, _ = proof.factor.solve([one.right.b for one in at.steps], own)
+        at.product[fixed] = 0.0  # as it is of the robots
+        step, parts, _ = proof.factor.solve([one.right.b for one in steps], at.product)
         steps = driver.ask_each(move_proof, parts, is_along=True)
-        X = X.copy()
-        X[g:] -= step[g:]  # the translations matter in the residuals alone, which the robots have
-        moved = _sum_up(driver, proof, X, steps, free)
+        there = X.copy()
+        there[g:] -= step[g:]  # the translations matter in the residuals alone, which the robots have
+        moved = _sum_up(driver, proof, there, steps, free)
         if not moved.left < at.left:
             break
-        at = moved
-    lost = OUTWARD * eta * (at.squared_distances + squared_distances(at.X[g:], start[g:]))
-    return bound_from([at.value, -lost], at.value_error + at.quadratic, eta, is_grounded=True)
+        X, at = there, moved
+    lost = OUTWARD * eta * (at.squared_distances + central.squared_distances(X[g:], start[g:]))
+    return central.bound_from([at.value, -lost], at.value_error + at.quadratic, eta, is_grounded=True)
 
 
-@dataclass(frozen=True, eq=False)
-class _Sums:
-    """What `pgo_models.certificates.lower_bound` needs at one X: sums over robots and driver."""
-
-    value: float
-    value_error: float
-    left: float
-    quadratic: float
-    squared_distances: float  # of the interiors
-    X: Array
-    own: Array  # the driver's part of S X
-    steps: Sequence[ProofStep]
-
-
-def _sum_up(driver: Driver, proof: InterfaceProof, X: Array, steps: Sequence[ProofStep], free: Array) -> _Sums:
+def _sum_up(driver: Driver, proof: InterfaceProof, X: Array, steps: Sequence[ProofStep], free: Array) -> ProofSums:
+    """Sums at X over robots and driver; of S X its own part, and the error of the whole."""
     g, d = len(driver.cover), driver.d
     space = driver.interface(1, d)
     blocks = evaluate_multipliers(proof.Lambda, X[g:].reshape(g, d, d))
@@ -140,20 +117,12 @@ def _sum_up(driver: Driver, proof: InterfaceProof, X: Array, steps: Sequence[Pro
     product = space.gather(parts) + own
     slack = proof.slack[free]
     values = [*(one.value for one in found), blocks.value]
-    value_error = (
-        math.fsum(one.value_error for one in found) + blocks.value_error + UNIT_ROUNDOFF * abs(math.fsum(values))
-    )
-    return _Sums(
-        value=math.fsum(values),
-        value_error=OUTWARD * value_error,
-        left=math.fsum(one.left for one in found) + quadratic_loss(product[free], 0.0, slack),
-        quadratic=OUTWARD
-        * (math.fsum(one.quadratic for one in found) + quadratic_loss(product[free], error[free], slack)),
-        squared_distances=math.fsum(one.squared_distances for one in found),
-        X=X,
-        own=own,
-        steps=steps,
-    )
+    value = math.fsum(values)
+    value_error = math.fsum(one.value_error for one in found) + blocks.value_error + UNIT_ROUNDOFF * abs(value)
+    left = math.fsum(one.left for one in found) + central.quadratic_loss(product[free], 0.0, slack)
+    quadratic = math.fsum(one.quadratic for one in found) + central.quadratic_loss(product[free], error[free], slack)
+    apart = math.fsum(one.squared_distances for one in found)
+    return ProofSums(value, OUTWARD * value_error, left, OUTWARD * quadratic, apart, own, error)
 
 
 def _eliminate(

@@ -99,18 +99,13 @@ class SubstructuredNewton:
 
     def _factorize(self, driver: Driver) -> Model:
         """Factor the Hessian if it is positive definite, else the Gauss-Newton matrix with the least damping."""
-        if self.newton.second_order:
-            model = model_at(driver, second_order=True, damping=0.0)
-            if model is not None:
-                return model
-        damping = 0.0
-        while True:
-            model = model_at(driver, second_order=False, damping=damping)
-            if model is not None:
-                return model
-            damping = max(central.DAMPING_START, central.DAMPING_GROWTH * damping)
+        second_order, damping = self.newton.second_order, 0.0
+        while (model := model_at(driver, second_order, damping)) is None:
+            damping = 0.0 if second_order else max(central.DAMPING_START, central.DAMPING_GROWTH * damping)
+            second_order = False
             if damping > central.DAMPING_MAX:
                 raise NotPositiveDefiniteError("the damped Gauss-Newton matrix is not positive definite")
+        return model
 
 
 def model_at(driver: Driver, second_order: bool, damping: float) -> Model | None:
@@ -176,9 +171,8 @@ def _backtrack(driver: Driver, model: Model) -> tuple[CoverPoses, list[TrialEval
             answers = driver.ask_each(Interior.evaluate_trial, parts, is_along=True)
         trial = driver.with_sums(CoverPoses(R, t, driver.at.force), [answer.at for answer in answers])
         objective, before = trial.objective, driver.at.objective
-        if objective <= before - central.SUFFICIENT * length * model.square:
-            return trial, answers
-        if length == 1.0 and objective <= before * (1.0 + central.ROUNDING):
+        is_within_rounding = is_first and objective <= before * (1.0 + central.ROUNDING)
+        if is_within_rounding or objective <= before - central.SUFFICIENT * length * model.square:
             return trial, answers
         length *= 0.5
     return None

@@ -34,14 +34,7 @@ from solvers.soc.subgraph import Outline, Placement, Subgraph, place_poses
 READ_HERE = "have the graph read in one process: --split given, or solve(read_g2o(folder), robots=..)"
 
 
-@dataclass(frozen=True)
-class RobotFile:
-    """The file of one robot, on the machine where the robot runs."""
-
-    robot: int
-    path: Path
-
-
+RobotFile = tuple[int, Path]  # a robot and its file, on the machine where the robot runs
 Claim = tuple[int, IntArray, IntArray]  # d, and ids of VERTEX lines, and of edges alone, as `_runs`
 
 
@@ -70,33 +63,25 @@ class Edges:
 
 @dataclass(frozen=True, eq=False)
 class Border:
-    """What a robot says of its edges to others, and how many poses it owns and edges it has, a shared one at one end.
+    """What a robot says of its edges to others."""
 
-    `pairs` and `owners`, (k, 2), are of the poses that they join, `poses`, (h,), all of these. `labels`, (3, h), are
-    the components that these are in by all edges, by those with tau > 0, and with kappa > 0; `alone`, (3,), counts the
-    components without one.
-    """
-
-    counts: tuple[int, int]
-    pairs: IntArray
-    owners: IntArray
-    poses: IntArray
-    labels: IntArray
-    alone: IntArray
+    counts: tuple[int, int]  # poses that it owns, and edges, a shared one at one end
+    pairs: IntArray  # (k, 2): poses that its edges to others join
+    owners: IntArray  # (k, 2): of these
+    poses: IntArray  # (h,): all of them
+    labels: IntArray  # (3, h): their components by all edges, by those with tau > 0, and with kappa > 0
+    alone: IntArray  # (3,): how many components have none of them
     middle: int  # its middle pose, where it has no such edge
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """How well a robot knows its part of F, and a pose that can hold the frame: a fixed one, or the first of its own.
-
-    Of that whether it is fixed, its number and id; its rows t and R^T as solved and in the file, nan if not there.
-    """
+    """How well a robot knows its part of F, and a pose to hold the frame: a fixed one, or the first of its own."""
 
     error: float
-    held: tuple[bool, int, int]
-    solved: Array
-    given: Array
+    held: tuple[bool, int, int]  # whether that pose is fixed, its number and id
+    solved: Array  # (d + 1, d): its rows t and R^T
+    given: Array  # (d + 1, d): the same in the file, nan if not there
 
 
 class FileAgent(Agent):
@@ -111,13 +96,13 @@ class FileAgent(Agent):
     answer: Poses
 
     def __init__(self, source: RobotFile) -> None:
-        self.source, self.backend = source, None
+        (self.robot, self.path), self.backend = source, None
         self.interior, self.copies, self.front = None, None, None
 
 
 def read_file(agent: FileAgent, _: None) -> Claim:
     """Read the file: the ids in it. Errors are those of `read_lines`; a GraphError for priors and landmarks."""
-    path = agent.source.path
+    path = agent.path
     agent.lines = lines = read_lines(path)
     if len(lines.landmarks) or (lines.edge_ids == WORLD_ID).any():
         raise GraphError(f"{path} has priors or landmarks, which all robots share; {READ_HERE}")
@@ -126,7 +111,7 @@ def read_file(agent: FileAgent, _: None) -> Claim:
 
 def number_poses(agent: FileAgent, runs: OwnedRuns) -> Mapping[int, Edges]:
     """Take numbers and owners for the ids; edges of the file with an end at another robot, by that robot."""
-    ids, robot = agent.lines.edge_ids, agent.source.robot
+    ids, robot = agent.lines.edge_ids, agent.robot
     at = np.searchsorted(runs.first, ids, side="right") - 1
     numbers, owners = runs.number[at] + ids - runs.first[at], runs.owner[at]
     edges = Edges(ids, agent.lines.edges, numbers, owners)
@@ -136,7 +121,7 @@ def number_poses(agent: FileAgent, runs: OwnedRuns) -> Mapping[int, Edges]:
 
 def join_neighbours(agent: FileAgent, received: Mapping[int, Edges]) -> Border:
     """Make the robot's graph of its edges and those that others have of its poses; FIX lines of its own poses count."""
-    lines, robot, path = agent.lines, agent.source.robot, agent.source.path
+    lines, robot, path = agent.lines, agent.robot, agent.path
     files = [one for _, one in sorted({**received, robot: agent.edges}.items())]
     joined = join_edges([(file.ids, file.rows) for file in files])
     parts = [vars(file.some(kept)).values() for file, kept in zip(files, joined, strict=True)]
@@ -165,7 +150,7 @@ def join_neighbours(agent: FileAgent, received: Mapping[int, Edges]) -> Border:
 
 def settle(agent: FileAgent, placement: Placement) -> Outline:
     """Learn which poses the driver solves for, and who else holds which: from now on an agent like any other."""
-    known = agent.source.robot, agent.graph, agent.numbers, agent.owners
+    known = agent.robot, agent.graph, agent.numbers, agent.owners
     of_edges = np.arange(agent.graph.num_edges), isotropic_weights(agent.graph)
     agent.subgraph = Subgraph(*known, *placement.of(*known), *of_edges)
     agent.interior = interior_of(agent.subgraph, agent.backend)
@@ -185,7 +170,7 @@ def write_answer(folder: Path, agent: FileAgent, motion: tuple[Array, Array]) ->
     """Write the poses that were kept, moved by (R, t), and the robot's edges."""
     make_folder(folder)
     poses = agent.answer.moved(*motion)
-    write_g2o(agent.graph, folder / f"{agent.source.robot}.g2o", poses, agent.subgraph.is_own)
+    write_g2o(agent.graph, folder / f"{agent.robot}.g2o", poses, agent.subgraph.is_own)
 
 
 def open_files(files: Sequence[RobotFile], engine: Engine, memory: float) -> tuple[Driver, IntArray]:
@@ -200,7 +185,7 @@ def open_files(files: Sequence[RobotFile], engine: Engine, memory: float) -> tup
         sent = network.ask(number_poses, runs, Count.PIGGYBACKED)
         borders = network.ask(join_neighbours, network.hand_on(sent), Count.PIGGYBACKED)
         sizes = np.array([border.counts for border in borders]).T
-        _check_connected(borders, num_poses - int(sizes[0].sum()), files[0].path.parent)
+        _check_connected(borders, num_poses - int(sizes[0].sum()), files[0][1].parent)
         pairs, owners = (np.concatenate([getattr(one, name) for one in borders]) for name in ("pairs", "owners"))
         outlines = network.ask(settle, place_poses(pairs, owners, len(files), borders[0].middle), Count.ROUND)
         most = max(int(outline.in_cover.max(initial=0)) for outline in outlines)
@@ -224,10 +209,10 @@ def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> tuple[lis
     has_vertex = np.stack([covered(vertices) for _, vertices, _ in claims])
     names = has_vertex | np.stack([covered(others) for _, _, others in claims])
     owner, known = np.where(has_vertex.any(axis=0), has_vertex, names).argmax(axis=0), np.flatnonzero(names.any(axis=0))
-    for file, (d, *_) in zip(files, claims, strict=True):
-        if d != claims[0][0] or file.robot not in owner[known]:
+    for (robot, path), (d, *_) in zip(files, claims, strict=True):
+        if d != claims[0][0] or robot not in owner[known]:
             problem = "no pose in it is of this robot" if d == claims[0][0] else "2D beside 3D"
-            raise FileFormatError(file.path, None, f"{problem}; take it away, or {READ_HERE}")
+            raise FileFormatError(path, None, f"{problem}; take it away, or {READ_HERE}")
     number = np.cumsum(np.where(names.any(axis=0), size, 0)) - size
     return [OwnedRuns(first[own], number[own], owner[own]) for own in names], int(size[known].sum())
 
@@ -243,9 +228,8 @@ def _check_connected(borders: Sequence[Border], without_edge: int, folder: Path)
         alone = without_edge + sum(int(border.alone[kind]) for border in borders)
         count = alone + (connected_components(tied)[0] if len(poses) else 0)
         if count > 1:
-            raise GraphError(
-                f"{folder}: the {what} of all robots fall into {count} parts, no edge between; {READ_HERE}"
-            )
+            problem = f"the {what} of all robots fall into {count} parts, no edge between"
+            raise GraphError(f"{folder}: {problem}; {READ_HERE}")
 
 
 def _runs(ids: IntArray) -> IntArray:

@@ -92,9 +92,8 @@ class SharedGNC:
 
     def _sums(self, driver: Driver, mu: float, scale: float) -> RatioSums:
         answers = driver.ask(sum_ratios, self._order(mu, scale))
-        sums = {
-            name: math.fsum(getattr(one, name) for one in answers) for name in ("count", "undecided", "kept", "cost")
-        }
+        names = ("count", "undecided", "kept", "cost")
+        sums = {name: math.fsum(getattr(one, name) for one in answers) for name in names}
         most = {name: max(getattr(one, name) for one in answers) for name in ("largest", "largest_kept")}
         return RatioSums(**sums, **most, least=min(one.least for one in answers))
 

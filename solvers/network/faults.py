@@ -16,24 +16,13 @@ class Faults:
     """What goes wrong between robots, for study; the same seed gives the same faults.
 
     `Pipeline(faults=..)` runs its CONSENSUS stage with them: robots then do not wait for each other.
-
-    Attributes
-    ----------
-    loss : float
-        Probability that a message is lost.
-    max_delay : int
-        A message arrives 0 to this many rounds late, each equally likely; one that a later one overtook is dropped.
-    silent_robot : int, optional
-        A robot that neither sends nor receives ..
-    silent_from, silent_rounds : int
-        .. from this round on, for so many rounds.
     """
 
-    loss: float = 0.0
-    max_delay: int = 0
-    silent_robot: int | None = None
-    silent_from: int = 0
-    silent_rounds: int = 0
+    loss: float = 0.0  # probability that a message is lost
+    max_delay: int = 0  # messages arrive 0 to so many rounds late, equally likely; an overtaken one is dropped
+    silent_robot: int | None = None  # a robot that neither sends nor receives ..
+    silent_from: int = 0  # .. from this round on ..
+    silent_rounds: int = 0  # .. for so many rounds
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -25,10 +25,9 @@ class Traffic:
 
     def __post_init__(self) -> None:
         if not self.sender.shape == self.receiver.shape == self.num_bytes.shape:
-            raise SettingError(
-                f"senders, receivers and bytes have shapes {self.sender.shape}, {self.receiver.shape} and "
-                f"{self.num_bytes.shape}; give one of each for every message"
-            )
+            shapes = f"{self.sender.shape}, {self.receiver.shape} and {self.num_bytes.shape}"
+            way_out = "give one of each for every message"
+            raise SettingError(f"senders, receivers and bytes have shapes {shapes}; {way_out}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,20 +36,13 @@ class Ledger:
 
     A round is one exchange that robots wait for: between neighbours, or to the driver and back, level by level where
     there is a tree of robots. An all-reduce, by which all come to know a sum of a few numbers, is counted apart.
-
-    Attributes
-    ----------
-    all_reduce_bytes : int
-        Payload of all all-reduces, once up and once down for every robot.
-    counted : tuple of (Traffic, int)
-        Exchanges, and how often each took place.
     """
 
     num_robots: int
     rounds: int = 0
     all_reduces: int = 0
-    all_reduce_bytes: int = 0
-    counted: tuple[tuple[Traffic, int], ...] = ()
+    all_reduce_bytes: int = 0  # payload of all all-reduces, once up and once down for every robot
+    counted: tuple[tuple[Traffic, int], ...] = ()  # exchanges, and how often each took place
 
     def after_round(self, *exchanged: Traffic) -> Ledger:
         """Return the ledger after one more round with these exchanges."""

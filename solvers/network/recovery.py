@@ -66,10 +66,7 @@ class RecoveringPool(Generic[T]):
         self.restarts = [0] * len(self.place.groups)
 
     def ask(self, order: Callable[[Any, Q], A], requests: Sequence[Q]) -> list[A]:
-        """Give every robot an order, each with its request, and wait for all answers.
-
-        An EngineError when a robot was lost more often than it may be.
-        """
+        """Answers of all robots to an order, each with its request; an EngineError when one is lost too often."""
         try:
             answers: list[Any] = self._asked(order, requests)
         finally:  # an order that failed on one robot was obeyed by the others

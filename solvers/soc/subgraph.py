@@ -63,9 +63,8 @@ class Subgraph:
             return None
         graph, kept, (poses, ends) = self.graph, self.is_counted, self.counted
         i, j = np.split(ends, 2)
-        counted = PoseGraph(
-            len(poses), i, j, graph.R_ij[kept], graph.t_ij[kept], graph.kappa[kept], graph.tau[kept], name=graph.name
-        )
+        measured = graph.R_ij[kept], graph.t_ij[kept], graph.kappa[kept], graph.tau[kept]
+        counted = PoseGraph(len(poses), i, j, *measured, name=graph.name)
         problem = PartProblem(counted, None, self.weights.of_edges(kept))
         final = None if self.final is None else PartProblem(counted, None, self.final.of_edges(kept))
         allowed = None if self.thresholds is None else self.thresholds[kept]

@@ -49,17 +49,13 @@ CLASSES = (
 
 
 class Agent:
-    """A robot that obeys orders: each replaces what it has by what the order makes of it.
-
-    Its `interior` is None when it counts no edge, its `copies` are None before CONSENSUS begins, its `front` is None
-    when it holds none of the separator tree.
-    """
+    """A robot that obeys orders: each replaces what it has by what the order makes of it."""
 
     def __init__(self, subgraph: Subgraph, backend: CholeskyBackend | None) -> None:
         self.subgraph, self.backend = subgraph, backend
-        self.interior = interior_of(subgraph, backend)
-        self.copies: ConsensusRobot | None = None
-        self.front: HeldFront | None = None
+        self.interior = interior_of(subgraph, backend)  # None when it counts no edge
+        self.copies: ConsensusRobot | None = None  # before CONSENSUS begins
+        self.front: HeldFront | None = None  # when it holds none of the separator tree
 
     def snapshot(self) -> Snapshot:
         """All that earlier orders left here, as arrays; matrices instead of their factors."""

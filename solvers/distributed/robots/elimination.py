@@ -152,10 +152,7 @@ class HeldFront:
     factors: Mapping[str, FrontFactor] = field(default_factory=dict)  # by widths
 
     def eliminate(self, order: FrontParts) -> tuple[HeldFront, Array]:
-        """Sum the parts and factor; F_BB - L_BE L_BE^T, packed.
-
-        A NotPositiveDefiniteError when F_EE is not positive definite.
-        """
+        """Sum the parts and factor; F_BB - L_BE L_BE^T, packed. A NotPositiveDefiniteError where F_EE is not."""
         width, fields = sum(order.widths), np.split(np.arange(sum(order.widths)), np.cumsum(order.widths)[:-1])
         kinds = [fields] * self.num_robots + [[np.arange(width)]] * (len(self.places) - self.num_robots)
         each = [

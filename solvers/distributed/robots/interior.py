@@ -344,10 +344,8 @@ class Interior:
 
     def _reduced_translations(self, R: Array) -> tuple[Interior, ReducedTranslations]:
         found = self.factors.laplacian
-        b = found.reduce(self._lever(R))[0]
-        return self.with_changes(has_laplacian=True), ReducedTranslations(
-            b, None if self.state.has_laplacian else found.schur
-        )
+        b, schur = found.reduce(self._lever(R))[0], None if self.state.has_laplacian else found.schur
+        return self.with_changes(has_laplacian=True), ReducedTranslations(b, schur)
 
     def _translations(self, R: Array, t: Array) -> Array:
         return self.factors.laplacian.back_substitute(self._lever(R), t)

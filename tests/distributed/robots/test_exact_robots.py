@@ -67,7 +67,7 @@ def test_no_bound_of_robots_is_above_F_on_long_roads(
 @pytest.mark.parametrize("d", [2, 3])
 def test_the_bound_of_robots_holds_wherever_it_is_grounded(d: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a move G is not rounding, and its quadratic terms are all that keeps the bound below F."""
-    monkeypatch.setattr(distributed_bound, "MOST_MOVES", 0)
+    monkeypatch.setattr(distributed_bound.central, "MOST_MOVES", 0)
     problem = PGOProblem(varied_graph(0, 12, d))
     best = polish(problem, chordal_start(problem))
     F = ExactGraph.of_doubles(problem.graph).objective_of(best)
