@@ -52,16 +52,9 @@ class IRLSState:
 class IRLS:
     """Settings of Huber's loss by reweighting.
 
-    Attributes
-    ----------
-    quantile : float
-        c_e^2 is this quantile of an edge's cost, if its information matrix is right.
-    inner : Newton or SOC
-        What lowers the weighted cost.
-    inner_steps : int
-        Most steps of it for one set of weights. SOC begins each time with B = 0, and wants as many as it takes.
-    tolerance : float
-        On the relative change of the cost.
+    c_e^2 is the `quantile` of an edge's cost, if its information matrix is right. `inner`, Newton or SOC, lowers the
+    weighted cost, by at most `inner_steps` for one set of weights: SOC begins each time with B = 0, and wants as many
+    as it takes. `tolerance` is on the relative change of the cost.
     """
 
     quantile: float = 0.99
