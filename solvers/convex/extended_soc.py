@@ -51,15 +51,8 @@ class ExtendedStep:
 class ExtendedSOC:
     """SOC on F plus convex terms under convex constraints, rotations in SO(d) as ever.
 
-    Attributes
-    ----------
-    changer : callable
-        Given `PoseVariables`, returns a `ModelChange`.
-    soc : SOC
-        Settings; JOINT. The penalty's multipliers are those of the unchanged problem at its start, and are not taken
-        anew.
-    solver : ConvexSolver or str
-        Of step (a).
+    `changer`, given `PoseVariables`, returns a `ModelChange`; `solver` is that of step (a). `soc` has the settings,
+    JOINT; the penalty's multipliers are those of the unchanged problem at its start, and are not taken anew.
 
     Notes
     -----
