@@ -2,8 +2,7 @@
 
     minimise J(X, y) over the convex constraints, with X in a set of orthonormal columns, rotations, unit columns, ..
 
-The split form is step (a) of the paper's Algorithm 1 for any J: the same cvxpy problem with the sets taken out and
-rho/2 ||X - V||^2 added, compiled once. The iteration is in solvers/convex/orthogonal.py.
+The split form is step (a) of the paper's Algorithm 1 for any J; the iteration is in solvers/convex/orthogonal.py.
 """
 
 from collections.abc import Sequence

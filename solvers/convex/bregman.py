@@ -194,12 +194,7 @@ class AlternatingBregman(BregmanSettings):
 
     T = 1 with two blocks is ADMM, also known as split Bregman (Goldstein & Osher 2009). T to infinity is
     `MethodOfMultipliers`. ADMM need not converge with three blocks or more. J must be a sum of terms of one variable
-    each. Further settings: `BregmanSettings`.
-
-    Attributes
-    ----------
-    passes : int
-        T.
+    each. `passes` is T; further settings: `BregmanSettings`.
     """
 
     passes: int = 1

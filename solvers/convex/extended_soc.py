@@ -54,8 +54,6 @@ class ExtendedSOC:
     `changer`, given `PoseVariables`, returns a `ModelChange`; `solver` is that of step (a). `soc` has the settings,
     JOINT; the penalty's multipliers are those of the unchanged problem at its start, and are not taken anew.
 
-    Notes
-    -----
     History and `cost` have the objective of the changed problem; `Run.objective` is F of the unchanged one. The poses
     of an iterate are omega with the translations of step (a) at its shift: constraints on translations hold at every
     iterate, those on rotations in the limit.
