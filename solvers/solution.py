@@ -35,27 +35,15 @@ if TYPE_CHECKING:
 class Solution(Solved):
     """The answer to a pose graph.
 
-    Attributes
-    ----------
-    problem, poses : PGOProblem, Poses
-    frame : str
-        Which frame the poses are in, which F leaves open.
-    objective : float
-        Cost of the poses: F, or chi2 with `Weighting.INFORMATION`.
-    certificate : Certificate
-        Lower bound on the global optimum, gap and verdict; `note` is what it lacks, and why, or empty.
-    status, stages : Status, tuple of Stage
-        How the last stage ended; the start and the iterative stages, in order.
-    seconds : float
-        Wall time of it all.
-    ledger, robots : Ledger, Partition, optional
-        Of a solve by many robots: what crossed the network, and who owned which pose.
-    anchor : int
-        Pose that it is held by, or 0: what `marginals` are relative to.
-    covariances : (n, p, p), optional
-        All `marginals()`, for ellipses in the report: `dataclasses.replace` puts them in.
-    robust : Rejection, optional
-        Of a robust solve: which edges it kept, of which alone all else here is, and what that leaves unproven.
+    `objective` is the cost of `poses`: F, or chi2 with `Weighting.INFORMATION`; F leaves their `frame` open, which says
+    which it is. `certificate` has the lower bound on the global optimum, gap and verdict; `note` is what it lacks, and
+    why, or empty. `status` says how the last stage ended; `stages` are the start and the iterative stages, in order,
+    and `seconds` the wall time of it all.
+
+    Of a solve by many robots, `ledger` says what crossed the network, and `robots` who owned which pose. `anchor` is
+    the pose that it is held by, or 0: what `marginals` are relative to; `covariances`, (n, p, p), are all
+    `marginals()`, for ellipses in the report: `dataclasses.replace` puts them in. Of a robust solve, `robust` says
+    which edges it kept, of which alone all else here is, and what that leaves unproven.
     """
 
     @property

@@ -51,26 +51,15 @@ class BoundSource(enum.Enum):
 class Certificate(ReadOnly):
     """A proven lower bound on the global optimum beside the cost of given poses.
 
-    Attributes
-    ----------
-    objective : float
-        F of the poses that were given.
-    bound : LowerBound
-        Proven: F(R, t) >= bound.value for every choice of poses, in exact arithmetic.
-    gap : float
-        (objective - lower_bound) / objective; 0 where F is at its rounding level.
-    rounding_level : float
-        F below it cannot be told from zero (`objective_rounding`).
-    stationarity : float
-        Half the squared Newton decrement of the given poses, over F: about the relative decrease of F down to the
-        stationary point beside them.
-    poses, poses_objective, source : Poses, float, BoundSource
-        Where the bound was found, F there, which is the best value known, and how these poses were come by.
-    Lambda : (n, d, d)
-        Multipliers, which with eta and the poses are the proof: anyone can check it with `prove_bound`.
-    wanted_gap, verdict : float, Verdict
-    weighting : Weighting
-        Which cost `objective` and the bound are of: F, or chi2.
+    `objective` is F of the poses that were given, or chi2, as `weighting` says; `bound` is proven: F(R, t) >=
+    bound.value for every choice of poses, in exact arithmetic; `gap` is (objective - lower_bound) / objective, and 0
+    where F is at its `rounding_level`, below which it cannot be told from zero (`objective_rounding`). `stationarity`
+    is half the squared Newton decrement of the given poses, over F: about the relative decrease of F down to the
+    stationary point beside them.
+
+    The bound was found at `poses`, where F is `poses_objective`, the best value known; `source` says how these poses
+    were come by. The multipliers `Lambda`, (n, d, d), are with eta and the poses the proof: anyone can check it with
+    `prove_bound`. `verdict` is for the gap `wanted_gap`.
     """
 
     objective: float

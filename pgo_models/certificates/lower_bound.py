@@ -210,11 +210,7 @@ def _prove_grounded(problem: PGOProblem, Lambda: Array, eta: float, ground: _Gro
 
 
 def _move(problem: PGOProblem, Lambda: Array, X: Array, proof: DefiniteProof) -> tuple[Array, Evaluation]:
-    """X - S_r^-1 S X, again while that helps, and the certificate there.
-
-    A second move that is longer than the first, tr(G^T S_r^-1 G) in its measure, shows that the shift takes most of the
-    softest energy: then the factor is only a preconditioner.
-    """
+    """X - S_r^-1 S X, again while that helps, and the certificate there."""
     n, d, free = problem.num_poses, problem.d, proof.free
     weight = (proof.shift * proof.diagonal)[free]
     low, left, gained, last, found = np.zeros((n, d)), math.inf, 0.0, math.inf, None
@@ -222,7 +218,7 @@ def _move(problem: PGOProblem, Lambda: Array, X: Array, proof: DefiniteProof) ->
     product[n:] -= (Lambda @ X[n:].reshape(n, d, d)).reshape(-1, d)
     for _ in range(MOST_MOVES):
         step = proof.solve(product)
-        if inner(step, product) > last:
+        if inner(step, product) > last:  # the shift takes most of the softest energy
             step = replace(proof, is_marginal=True).solve(product)
         last = inner(step, product)
         gained += last

@@ -1,8 +1,5 @@
 """Polish: from given poses to the stationary point nearby, by damped Riemannian Newton with sparse Cholesky.
 
-It stands with the problem because a certificate speaks of stationary points: judging anybody's poses needs the one
-beside them. `solvers.riemannian.newton` runs the same step in the common loop.
-
 One factorisation serves several moves. After the first, the factored matrix is the one that L-BFGS begins with
 (Nocedal & Wright 2006, algorithm 7.4), which learns from every move what has changed: sphere2500 needs one
 factorisation where moves with the factor alone need two.
@@ -191,10 +188,7 @@ def ground_pose(matrix: csc_array, problem: PGOProblem) -> None:
 
 
 def _apply_inverse(factor: CholeskyFactor, secants: list[tuple[Array, Array]], gradient: Array) -> Array:
-    """H^-1 g by the two loops of L-BFGS (Nocedal & Wright 2006, algorithm 7.4), from H the factored matrix.
-
-    A secant is a move and the change of the gradient along it.
-    """
+    """H^-1 g by the two loops of L-BFGS, from H the factored matrix; secants are moves and changes of g along them."""
     curved = [(move, change) for move, change in secants if inner(move, change) > 0.0]
     g, shares = gradient.copy(), []
     for move, change in reversed(curved):

@@ -51,14 +51,8 @@ class BregmanProblem:
     x stacks the variables, each flattened row by row; m is its length. Several variables are the blocks over which
     `AlternatingBregman` alternates.
 
-    Attributes
-    ----------
-    J : cp.Expression
-        One real number, convex in the variables. `cp.transforms.indicator(constraints)` adds constraints.
-    variables : cp.Variable or sequence of them
-        All variables of J.
-    K : (s, m), dense or sparse
-    f : (s,)
+    `J` is one real number, a cp.Expression convex in `variables`, a cp.Variable or several, all that it has;
+    `cp.transforms.indicator(constraints)` adds constraints. `K`, (s, m), is dense or sparse, `f` is (s,).
 
     A SettingError when J is not convex or not one real number, has a variable that is not named or one that is named is
     not continuous and real, or when K and f have other shapes or entries that are not finite.

@@ -80,15 +80,10 @@ def check_variable(variable: cp.Variable, name: str) -> None:
 class ConvexSolver:
     """Which solver of cvxpy a model is given to, and how: `problem.solve(solver=name, **options)`.
 
-    Attributes
-    ----------
-    name : str
-        One of `cp.installed_solvers()`: "CLARABEL", "MOSEK", "SCS", "OSQP", ..
-    options : mapping
-        For the solver. They win over what a model sets: tolerances, of first-order methods no finer than 1e-7, and a
-        limit of iterations; of solvers that are not known here nothing.
-    warm_start : bool
-        Go on from the last solution (SCS, OSQP), or factorisation pattern (Clarabel); last bits then depend on it.
+    `name` is one of `cp.installed_solvers()`: "CLARABEL", "MOSEK", "SCS", "OSQP", .. `options` win over what a model
+    sets: tolerances, of first-order methods no finer than 1e-7, and a limit of iterations; of solvers that are not
+    known here nothing. With `warm_start` it goes on from the last solution (SCS, OSQP), or factorisation pattern
+    (Clarabel); last bits then depend on it.
 
     A SettingError when it is not installed.
     """

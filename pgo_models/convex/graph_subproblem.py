@@ -85,14 +85,9 @@ class PoseVariables:
 class ModelChange:
     """What one's own model adds to the program, or takes out of it.
 
-    Attributes
-    ----------
-    terms : sequence of cp.Expression
-        Convex, in the variables that `PoseVariables` names and no others; added to F.
-    constraints : sequence of cp.Constraint
-        Convex, in the same variables.
-    replaced_edges : sequence of int, or (m,) mask
-        Edges whose squared residuals leave F, where terms have another loss for them.
+    `terms`, convex in the variables that `PoseVariables` names and no others, are added to F; `constraints` are convex
+    in the same variables. The squared residuals of `replaced_edges`, numbers or an (m,) mask, leave F, where terms have
+    another loss for them.
 
     A SettingError when a term is not one convex number, or a constraint not convex.
     """

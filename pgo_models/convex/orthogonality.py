@@ -2,8 +2,7 @@
 
     minimise J(X, y) over the convex constraints, with X in a set of orthonormal columns, rotations, unit columns, ..
 
-The split form is step (a) of the paper's Algorithm 1 for any J: the same cvxpy problem with the sets taken out and
-rho/2 ||X - V||^2 added, compiled once. The iteration is in solvers/convex/orthogonal.py.
+The split form is step (a) of the paper's Algorithm 1 for any J; the iteration is in solvers/convex/orthogonal.py.
 """
 
 from collections.abc import Sequence
@@ -57,18 +56,10 @@ class OrthogonalPoint:
 class OrthogonalProblem:
     """A convex cvxpy problem with non-convex sets for some of its variables.
 
-    Attributes
-    ----------
-    problem : cp.Problem
-        Minimise convex or maximise concave; J is the function that is minimised.
-    orthogonal : sequence of (n, p) variables, n >= p
-        X^T X = I.
-    rotations : sequence of (d, d) variables
-        X in SO(d).
-    unit_columns, unit_rows : sequence of variables
-        Every column, or row, has norm 1.
-    sparse : sequence of (variable, int)
-        At most so many nonzeros. A variable may be here and in one of the other lists too.
+    `problem` minimises convex or maximises concave; J is the function that is minimised. `orthogonal` are (n, p)
+    variables, n >= p, with X^T X = I, `rotations` (d, d) variables with X in SO(d); of `unit_columns` and `unit_rows`
+    every column, or row, has norm 1; `sparse` are pairs (variable, int) of variables with at most so many nonzeros. A
+    variable may be there and in one of the other lists too.
 
     A SettingError when J or a constraint is not convex, a variable is not in the problem, not real, or has the wrong
     shape, or no variable is named.

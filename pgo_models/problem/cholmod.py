@@ -1,7 +1,4 @@
-"""CHOLMOD and AMD as CVXOPT has them: imported on the kernels chosen, its options set for a while, its matrices.
-
-CVXOPT comes with the extra `fast`.
-"""
+"""CHOLMOD and AMD as CVXOPT has them: imported on the kernels chosen, its options set for a while, its matrices."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -29,14 +29,9 @@ class PGOProblem:
     all matrices of translations are multiples of the identity and nothing couples them with rotations; else M is the
     quadratic part, and `tangent_at` gives quadratic problems that touch chi2 from below (`problem.weighting`).
 
-    Attributes
-    ----------
-    graph : PoseGraph
-        Connected; its weights kappa, tau are the problem's. `graph.unit_weights()` gives the paper's equation.
-    backend : CholeskyBackend, optional
-        Which sparse Cholesky to use; `default_backend()` unless given.
-    weighting : Weighting or EdgeWeights
-        Which cost, F or chi2, or its weights themselves.
+    `graph` is connected, its weights kappa, tau are the problem's; `graph.unit_weights()` gives the paper's equation.
+    `backend` is the sparse Cholesky to use, `default_backend()` unless given; `weighting` is the cost, F or chi2, or
+    its weights themselves.
 
     A GraphError when the graph is not connected; a SettingError when weighting is none.
 

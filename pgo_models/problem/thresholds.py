@@ -23,23 +23,14 @@ FALSE_ALARM = 0.01  # probability that right measurements with errors as their m
 class EdgeResiduals:
     """How well every edge fits some poses, and whether its errors may be so large.
 
-    Attributes
-    ----------
-    translation : (m,)
-        ||t_j - t_i - R_i t_ij||, metres.
-    rotation : (m,)
-        Angle of R_ij^T R_i^T R_j, radians.
-    cost : (m,)
-        The edge's summand of F, or of chi2.
-    allowed : (m,)
-        What an edge may cost: `chi2_thresholds` at 1 - FALSE_ALARM / m (Bonferroni), times `scale`.
-    scale : float
-        Median of cost over its threshold at one half, at least 1: what the median edge contradicts is the matrices.
-    overall : float
-        Sum of the costs over the one expected, about 1 where errors are as the matrices say; 0 without redundancy.
-    overall_allowed : float
-        What `overall` exceeds with probability FALSE_ALARM. One wrong loop closure among few bends the odometry, with
-        no edge above its own threshold: this shows it.
+    Arrays are (m,): `translation` (m,) is ||t_j - t_i - R_i t_ij||, metres, `rotation` (m,) the angle of R_ij^T R_i^T
+    R_j, radians, `cost` (m,) the edge's summand of F, or of chi2, and `allowed` (m,) what it may cost:
+    `chi2_thresholds` at 1 - FALSE_ALARM / m (Bonferroni), times `scale`, the median of cost over its threshold at one
+    half, at least 1: what the median edge contradicts is the matrices.
+
+    `overall` is the sum of the costs over the one expected, about 1 where errors are as the matrices say; 0 without
+    redundancy. It exceeds `overall_allowed` with probability FALSE_ALARM. One wrong loop closure among few bends the
+    odometry, with no edge above its own threshold: this shows it.
     """
 
     translation: Array

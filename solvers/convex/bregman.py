@@ -79,16 +79,10 @@ class AlternatingState:
 class BregmanSettings:
     """Settings that all forms share.
 
-    Attributes
-    ----------
-    alpha : float
-        The penalty parameter of the paper's section 2; lam has the unit of alpha K x.
-    tolerance : float
-        On ||K x - f|| / max(1, ||f||) and on the distance from stationarity over max(1, ||K^T lam||).
-    subproblem_tolerance : float
-        The solver's. Loosen it to see that Bregman iteration forgets the errors of its subproblems (Yin & Osher 2013).
-    solver : ConvexSolver or str
-        For the subproblems: Clarabel, cold, unless given.
+    `alpha` is the penalty parameter of the paper's section 2; lam has the unit of alpha K x. `tolerance` is on
+    ||K x - f|| / max(1, ||f||) and on the distance from stationarity over max(1, ||K^T lam||). `subproblem_tolerance`
+    is the solver's: loosen it to see that Bregman iteration forgets the errors of its subproblems (Yin & Osher 2013).
+    `solver` is Clarabel, cold, unless given.
     """
 
     alpha: float = 1.0
@@ -200,12 +194,7 @@ class AlternatingBregman(BregmanSettings):
 
     T = 1 with two blocks is ADMM, also known as split Bregman (Goldstein & Osher 2009). T to infinity is
     `MethodOfMultipliers`. ADMM need not converge with three blocks or more. J must be a sum of terms of one variable
-    each. Further settings: `BregmanSettings`.
-
-    Attributes
-    ----------
-    passes : int
-        T.
+    each. `passes` is T; further settings: `BregmanSettings`.
     """
 
     passes: int = 1

@@ -51,18 +51,9 @@ class ExtendedStep:
 class ExtendedSOC:
     """SOC on F plus convex terms under convex constraints, rotations in SO(d) as ever.
 
-    Attributes
-    ----------
-    changer : callable
-        Given `PoseVariables`, returns a `ModelChange`.
-    soc : SOC
-        Settings; JOINT. The penalty's multipliers are those of the unchanged problem at its start, and are not taken
-        anew.
-    solver : ConvexSolver or str
-        Of step (a).
+    `changer`, given `PoseVariables`, returns a `ModelChange`; `solver` is that of step (a). `soc` has the settings,
+    JOINT; the penalty's multipliers are those of the unchanged problem at its start, and are not taken anew.
 
-    Notes
-    -----
     History and `cost` have the objective of the changed problem; `Run.objective` is F of the unchanged one. The poses
     of an iterate are omega with the translations of step (a) at its shift: constraints on translations hold at every
     iterate, those on rotations in the limit.

@@ -61,20 +61,13 @@ class OrthogonalSOC:
 
     The problem is not convex: a run ends at a stationary point that depends on the start, see `solve_orthogonal`.
 
-    Attributes
-    ----------
-    penalty : float, optional
-        rho, fixed, as in Algorithm 1. Unless given, rho starts at `safeguard` times the norm of the gradient at the
-        start and is adapted: residuals are balanced (Boyd et al. 2011, 3.4.1, as in the paper) and `safeguard` holds.
-    alpha : float
-        Over-relaxation, in (0, 2).
-    safeguard : float
-        The adapted rho is at least so many times the least penalty at which the copies are fixed points of their
-        projection: the largest eigenvalue of the multiplier Lambda. Near 1 the recursion may cycle.
-    tolerance : float
-        On the primal and the dual residual, both relative.
-    solver : ConvexSolver or str
-        Of step (a): Clarabel, cold, unless given.
+    `penalty` is rho, fixed, as in Algorithm 1. Unless given, rho starts at `safeguard` times the norm of the gradient
+    at the start and is adapted: residuals are balanced (Boyd et al. 2011, 3.4.1, as in the paper), and rho is at least
+    `safeguard` times the least penalty at which the copies are fixed points of their projection, the largest eigenvalue
+    of the multiplier Lambda. Near 1 the recursion may cycle.
+
+    `alpha` is the over-relaxation, in (0, 2), `tolerance` is on the primal and the dual residual, both relative, and
+    `solver` is that of step (a): Clarabel, cold, unless given.
     """
 
     penalty: float | None = None

@@ -26,15 +26,9 @@ class Newton:
 
     `dual_residual` is the relative Newton decrement: half its square, less the rounding level of F, over F.
 
-    Attributes
-    ----------
-    tolerance : float
-        On the relative decrement: about the relative decrease of F that is left.
-    second_order : bool
-        False is Gauss-Newton, the second layer of the paper's method.
-    secants : bool
-        Whether moves with one factorisation learn from those before (L-BFGS); robots do without, as each learned one
-        would cost them a reduction.
+    `tolerance` is on it: about the relative decrease of F that is left. Without `second_order` it is Gauss-Newton, the
+    second layer of the paper's method. With `secants` moves with one factorisation learn from those before (L-BFGS);
+    robots do without, as each learned one would cost them a reduction.
     """
 
     tolerance: float = STATIONARY_DECREMENT

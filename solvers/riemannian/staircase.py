@@ -83,14 +83,8 @@ class Staircase:
     decrement of `StaircaseState`. When it has converged, f is the optimum of the relaxation, within the gap: F of the
     poses can still be above it, where the relaxation is not tight.
 
-    Attributes
-    ----------
-    tolerance : float
-        On the decrement, at which a point counts as stationary.
-    gap : float
-        Relative gap between f and the bound that is proven at the end.
-    max_inner_iterations : int
-        Conjugate-gradient iterations of one trust-region step.
+    `tolerance` is on the decrement, at which a point counts as stationary, `gap` is the relative one between f and the
+    bound that is proven at the end; a trust-region step has at most `max_inner_iterations` of conjugate gradients.
     """
 
     tolerance: float = STATIONARY_DECREMENT

@@ -118,25 +118,14 @@ class GNC:
 
     `primal_residual` is the share of undecided edges, `dual_residual` the relative decrement of the weighted cost.
 
-    Attributes
-    ----------
-    quantile : float
-        c_e^2 is this quantile of an edge's cost, if its information matrix is right.
-    spread : float, optional
-        Thresholds are scaled to this times what the median of the edges kept says, at most to 2.5; None leaves them.
-    scale : float
-        Of the first thresholds: a small one takes but the edges that agree best before it is settled.
-    known : (m,), optional
-        Edges that are right, whose weight stays 1; unless given, odometry (poses of a robot whose ids are neighbours)
-        and priors.
-    growth : float
-        Factor on mu.
-    inner_steps : int
-        Most Newton steps for one set of weights.
-    consistent : bool
-        Whether loop closures that `pairwise_consistent` leaves out are rejected before.
-    tolerance : float
-        On the relative decrement of the last weighted cost.
+    c_e^2 is the `quantile` of an edge's cost, if its information matrix is right, times `scale`: a small one takes but
+    the edges that agree best before it is settled. Thresholds are then scaled to `spread` times what the median of the
+    edges kept says, at most to 2.5; None leaves them.
+
+    Edges `known`, (m,), are right, and their weight stays 1; unless given, odometry (poses of a robot whose ids are
+    neighbours) and priors. `consistent`: loop closures that `pairwise_consistent` leaves out are rejected before.
+    `growth` is the factor on mu, `inner_steps` are the most Newton steps for one set of weights, and `tolerance` is on
+    the relative decrement of the last weighted cost.
     """
 
     loss: RobustLoss = RobustLoss.TRUNCATED

@@ -6,10 +6,9 @@ with r_e^2 the share of edge e in the cost. h is concave in s: the cost with wei
 above it up to a constant and touches it, so that what lowers the weighted cost lowers this one. Unlike truncated losses
 it has no other minima than the rotations make, and it never lets go of a wrong edge altogether.
 
-Of a bound on this cost: on poses that cost at most H, as those at hand, every r_e is at most (H + c_e^2) / (2 c_e), and
-there a quadratic in the poses touches h from below. With it the certificate proved the minimum to 1e-12 of five public
-graphs without wrong edges (MIT, CSAIL, intel, kitti_07, parking-garage), and nothing where H is above some ten c_e^2,
-as with one wrong edge: the quadratic is then too weak to hold the certificate matrix up. So none is given.
+No bound is given: on poses that cost at most H every r_e is at most (H + c_e^2) / (2 c_e), where a quadratic touches h
+from below. Certificates with it proved the minimum to 1e-12 of five public graphs without wrong edges (MIT, CSAIL,
+intel, kitti_07, parking-garage), and nothing where H is above some ten c_e^2, as with one wrong edge.
 """
 
 from __future__ import annotations
@@ -52,16 +51,9 @@ class IRLSState:
 class IRLS:
     """Settings of Huber's loss by reweighting.
 
-    Attributes
-    ----------
-    quantile : float
-        c_e^2 is this quantile of an edge's cost, if its information matrix is right.
-    inner : Newton or SOC
-        What lowers the weighted cost.
-    inner_steps : int
-        Most steps of it for one set of weights. SOC begins each time with B = 0, and wants as many as it takes.
-    tolerance : float
-        On the relative change of the cost.
+    c_e^2 is the `quantile` of an edge's cost, if its information matrix is right. `inner`, Newton or SOC, lowers the
+    weighted cost, by at most `inner_steps` for one set of weights: SOC begins each time with B = 0, and wants as many
+    as it takes. `tolerance` is on the relative change of the cost.
     """
 
     quantile: float = 0.99

@@ -26,17 +26,10 @@ def over_relax(new: Array, old: Array, alpha: float) -> Array:
 class Anderson:
     """Settings of the acceleration.
 
-    Attributes
-    ----------
-    memory : int
-        How many past differences are combined.
-    regularization : float
-        Relative Tikhonov term of the least-squares problem.
-    restart_ratio : float
-        The memory is emptied when the residual exceeds this many times the smallest since it was last emptied.
-    per_robot : bool
-        Every robot extrapolates its own rows with its own inner products, and nothing is summed over the robots.
-        Otherwise each round has one all-reduce, of the products of the newest difference with all others.
+    `memory` past differences are combined, with a relative Tikhonov term, `regularization`; they are forgotten when the
+    residual exceeds `restart_ratio` times the smallest since they last were. With `per_robot` every robot extrapolates
+    its own rows with its own inner products, and nothing is summed over the robots; otherwise each round has one
+    all-reduce, of the products of the newest difference with all others.
     """
 
     memory: int = 60

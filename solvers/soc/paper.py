@@ -72,17 +72,10 @@ class PaperState:
 class PaperSOC:
     """Algorithm 1 to the letter (`algo1: SOC`): rotations only, every robot with its neighbours frozen.
 
-    Attributes
-    ----------
-    robots : Partition, optional
-        Who owns which pose; one pose a robot, as in the paper, unless given.
-    penalty : FixedPenalty, BalancedPenalty or BoydPenalty
-        One rho for all poses. BoydPenalty is the scheme that the paper names.
-    r_step : RStep
-        Back end of step (a).
-    tolerance : float
-        On the paper's KKT residual, the root mean square over poses of ||omega_i^T omega_i - I||^2 +
-        ||omega_i - R_i||^2, and on the gradient of the Lagrangian, over the scale of L.
+    `robots` own the poses, one each unless given, as in the paper. `penalty` is one rho for all poses; BoydPenalty is
+    the scheme that the paper names. `r_step` is the back end of step (a). `tolerance` is on the paper's KKT residual,
+    the root mean square over poses of ||omega_i^T omega_i - I||^2 + ||omega_i - R_i||^2, and on the gradient of the
+    Lagrangian, over the scale of L.
     """
 
     robots: Partition | None = None

@@ -165,8 +165,7 @@ class _Cvxpy:
 def _largest_eigenvalue_bound(H: csr_array) -> float:
     """max_i (|H| v)_i / v_i, at least the largest eigenvalue of a symmetric H for any v > 0 (Collatz 1942).
 
-    With v = 1 it is Gershgorin's; every multiplication of v by |H| lowers it. A Ritz value would be an estimate from
-    below, which misses what its first vector is orthogonal to.
+    With v = 1 it is Gershgorin's; every multiplication of v by |H| lowers it.
     """
     size = abs(H)
     v = np.ones(H.shape[0])

@@ -124,32 +124,21 @@ class SOC(SOCSettings):
 
     A SettingError when a setting is out of its range or does not go with the coupling.
 
-    Attributes
-    ----------
-    coupling : Coupling, optional
-        JOINT unless robots are given, then CONSENSUS. SUBSTRUCTURED has the iterates of JOINT: here it is run as JOINT
-        is, by `solve(.., robots=..)` on robots.
-    robots : Partition, optional
-        Who owns which pose.
-    alpha : float
-        Over-relaxation, in (0, 2).
-    acceleration : Anderson, optional
-        None is the plain recursion.
-    r_step : RStep or CustomRStep
-        Back end of step (a).
-    local_passes : int
-        CONSENSUS only: how often a robot does (a) to (c) in a round, on the poses that it alone knows in all but the
-        last of them. It costs no message. 1 is the plain recursion.
-    translation_penalty : float, optional
-        Penalty of separator translations in CONSENSUS, times their diagonal in M. Unless given, 0.6 times the stiffness
-        of the separators, the inverse of their mean compliance; lowered where the penalties are taken anew, if the
-        translations went far for what changed in their multipliers (`solvers.soc.separator_stiffness`).
-    separator_penalty : float, optional
-        Least penalty of separator rotations in CONSENSUS under a MultiplierPenalty, times their mean diagonal in M: on
-        graphs with little noise the multipliers alone would hold the copies too loosely together. Unless given, 0.7
-        times the root of the translation penalty, at most 0.3.
-    tolerance : float
-        On the primal and the dual residual, both relative.
+    `coupling` is JOINT unless `robots`, who own the poses, are given, then CONSENSUS. SUBSTRUCTURED has the iterates of
+    JOINT: here it is run as JOINT is, by `solve(.., robots=..)` on robots. `alpha` is the over-relaxation, in (0, 2);
+    `acceleration` None is the plain recursion; `r_step` is the back end of step (a), and `tolerance` is on the primal
+    and the dual residual, both relative. CONSENSUS alone has three more:
+
+    `local_passes`: how often a robot does (a) to (c) in a round, on the poses that it alone knows in all but the last
+    of them. It costs no message. 1 is the plain recursion.
+
+    `translation_penalty`: that of separator translations, times their diagonal in M. Unless given, 0.6 times the
+    stiffness of the separators, the inverse of their mean compliance; lowered where the penalties are taken anew, if
+    the translations went far for what changed in their multipliers (`solvers.soc.separator_stiffness`).
+
+    `separator_penalty`: the least of separator rotations under a MultiplierPenalty, times their mean diagonal in M: on
+    graphs with little noise the multipliers alone would hold the copies too loosely together. Unless given, 0.7 times
+    the root of the translation penalty, at most 0.3.
     """
 
     @property
