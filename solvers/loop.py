@@ -111,11 +111,9 @@ def run(
     The `start` is Poses, or the kind of point that the method starts at; its own unless given. The records `earlier`
     are those of a run that was broken off after them, whose next iterate is `start`: counted on from there. `callback`
     is called with every state and its record; a true answer ends the run (Status.STOPPED). `time_limit` is in seconds
-    of wall time, looked at between steps. `verbose` prints the table, `progress` shows a bar on long runs, which None
-    does in notebooks.
-
-    The state of the Run, or Outcome of a method that has no poses, is the last iterate after success, else the best
-    one: least infeasibility, then least objective. Ctrl-C ends it with Status.INTERRUPTED. A SettingError when
+    of wall time, looked at between steps. `verbose` prints the table, `progress` shows a bar on long runs (None: in
+    notebooks). The state of the Run, or Outcome of a method that has no poses, is the last iterate after success, else
+    the best one: least infeasibility, then least objective. Ctrl-C ends it with Status.INTERRUPTED. A SettingError when
     time_limit is not positive, or a Solver's problem is none.
 
     Examples

@@ -63,26 +63,13 @@ _FEW = 10  # Newton steps that show whether all edges fit, and finish where some
 class Pipeline:
     """Settings of a whole solve.
 
-    Attributes
-    ----------
-    soc : SOC, PaperSOC or ExtendedSOC, optional
-        First stage; None goes from the start straight to Newton. Its tolerance says when Newton takes over.
-    newton : Newton
-        Second stage.
-    gap : float
-        Relative gap to certify.
-    second_try : bool
-        Where the certificate is wider than asked for, run SOC to a fine tolerance and Newton again, and keep the better
-        poses and the better bound.
-    staircase : Staircase, optional
-        Where the certificate is still wider, solve the semidefinite relaxation from the best poses, with the gap of the
-        pipeline, then Newton from what it rounds to; None goes without.
-    faults : Faults, optional
-        What goes wrong between robots in a CONSENSUS stage, which then does not wait:
-        `solvers.distributed.asynchronous`. Only with `solve(.., robots=..)`.
-    driver_memory : float
-        Bytes that driver and fronts of a solve by robots may take; it is refused before they are spent. 0: no driver,
-        CONSENSUS alone, see `solvers.distributed.leaderless`, with poses and no certificate.
+    The first stage is `soc` (also PaperSOC, ExtendedSOC), whose tolerance says when Newton takes over; None goes from
+    the start straight to Newton. Where the certificate is wider than the relative `gap` to certify, a `second_try` runs
+    SOC to a fine tolerance and Newton again, and keeps the better poses and the better bound; where it is still wider,
+    the `staircase`, unless None, solves the semidefinite relaxation from the best poses, then Newton from what it
+    rounds to. By robots, `faults` are what goes wrong between them in a CONSENSUS stage, which then does not wait
+    (`solvers.distributed.asynchronous`), and `driver_memory` the bytes that driver and fronts may take, refused before
+    they are spent; 0: no driver, CONSENSUS alone (`solvers.distributed.leaderless`), poses and no certificate.
     """
 
     soc: SOC | PaperSOC | None = field(default_factory=lambda: HANDOVER)
@@ -133,31 +120,24 @@ def solve(
 
     Parameters
     ----------
-    problem : PGOProblem or PoseGraph
-    pipeline : Pipeline, optional
-        `Pipeline()` unless given.
-    start : Poses, optional
-        Instead of the method's own start.
+    pipeline, start : Pipeline, Poses, optional
+        `Pipeline()`, and the method's own start, unless given.
     robust : GNC or PCM, optional
         Find wrong edges and leave them out: `solvers.robust_solve`. The solution is then of the edges kept alone.
     robots : Partition or int, optional
         Robots that share the poses: start, SOC, Newton and certificate are run by them and a driver, each as if there
         were one, and what crosses the network is in `Solution.ledger`. A number stands for the robots of the pipeline's
         SOC if they are so many, else for the default partition. Without robots everything is run in one place.
-    engine : Engine, optional
-        Where the robots run; in this process unless given.
-    checkpoint : Checkpoint, optional
-        File from which a solve by robots that was broken off goes on, and to which it writes what that takes.
+    engine, checkpoint : Engine, Checkpoint, optional
+        Where the robots run, in this process unless given; and a file from which a solve by robots that was broken off
+        goes on, and to which it writes what that takes.
     anchor : int, optional
         Pose that stays where the graph's estimate has it, or at the identity if it has none. Unless given, the first of
         `graph.fixed`; without one the poses are aligned with the estimate, or pose 0 is at the identity. Priors say
         themselves where the poses are.
-    callback : callable, optional
-        Called with every state of SOC and Newton and its record; a true answer ends that stage.
-    time_limit : float
-        Seconds for the iterative stages together. The certificate is found all the same.
-    verbose, progress : bool
-        As in `solvers.loop.run`.
+    callback, time_limit, verbose, progress : optional
+        As in `solvers.loop.run`; of SOC and Newton a true answer ends that stage, and the seconds are those of the
+        iterative stages together. The certificate is found all the same.
 
     Returns
     -------

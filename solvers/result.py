@@ -34,26 +34,15 @@ OUT_OF_TIME = (Status.INTERRUPTED, Status.TIME_LIMIT)
 
 @dataclass(frozen=True)
 class Measurement:
-    """Figures of one iterate.
+    """Figures of one iterate; rounds, bytes and all-reduces so far where it is of many robots.
 
-    Attributes
-    ----------
-    objective : float
-        F of the feasible poses that the iterate stands for.
-    primal_residual : float
-        Distance from feasibility, relative; 0 for methods whose iterates are feasible.
-    dual_residual : float
-        Distance from stationarity, relative; each solver's docstring says which.
-    infeasibility : float
-        Distance of the point whose objective this is from the constraints; 0 where that point is feasible, as poses
-        are. The best iterate of a run has the least infeasibility, and among those the least objective.
-    rounds, num_bytes, all_reduces : int, optional
-        Communication so far, of methods that run by many robots.
+    `infeasibility` is the distance of the point whose objective this is from the constraints; 0 where that point is
+    feasible, as poses are. The best iterate of a run has the least infeasibility, and among those the least objective.
     """
 
-    objective: float
-    primal_residual: float
-    dual_residual: float
+    objective: float  # F of the feasible poses that the iterate stands for
+    primal_residual: float  # distance from feasibility, relative; 0 for methods whose iterates are feasible
+    dual_residual: float  # distance from stationarity, relative; each solver's docstring says which
     infeasibility: float = 0.0
     rounds: int | None = None
     num_bytes: int | None = None
@@ -128,10 +117,8 @@ class Outcome(Generic[S]):
 class Run(Outcome[S]):
     """A finished run of one solver on a pose graph.
 
-    Attributes
-    ----------
-    poses : Poses
-        Of the last iterate, or of the best one (lowest F) when the run did not succeed; `objective` is F of them.
+    `poses` are of the last iterate, or of the best one (lowest F) when the run did not succeed; `objective` is F of
+    them.
     """
 
     poses: Poses

@@ -50,10 +50,8 @@ def solve_robustly(
     the edges kept say; with the other loss. Of those certified, or of all if none is, that of the least truncated cost
     of all edges is kept.
 
-    By robots (`shared`, `plain`) the certificate of every attempt is theirs, and what crosses the network is added up.
-
-    A SettingError when robust is none, or PCM by robots, a GraphError when known inliers and the edges kept do not
-    connect the poses.
+    By robots (`shared`, `plain`) certificates are theirs, and what crosses the network is added up. A SettingError when
+    robust is none, or PCM by robots, a GraphError when known inliers and the edges kept do not connect the poses.
     """
     if not isinstance(robust, GNC | PCM):
         raise SettingError(f"robust is {robust!r:.60}; give GNC() or PCM()")

@@ -81,21 +81,11 @@ class GaussSeidel:
     the root of n d, then the larger of ||w - w_last|| over the root of n (radians) and ||v - v_last|| / ||v||. A run
     that ends early may hand back an iterate of the first stage with the best translations, which are off the ledger.
 
-    Attributes
-    ----------
-    robots : Partition, optional
-        Who owns which pose; one pose a robot unless given.
-    alpha : float
-        Over-relaxation, in (0, 2). Up to 1 every sweep converges; above, `Sweep.JACOBI` may not.
-    is_flagged : bool
-        Whether, without a start, the first sweep of a stage is flagged: a robot listens only to neighbours that already
-        have an estimate. Otherwise it begins at identity rotations and zero translations.
-    gauss_newton_steps : int
-        Linearisations of the second stage; one in the paper that the method is from.
-    tolerance : float
-        On the change of a sweep; it ends a stage.
-    max_iterations : int
-        Sweeps of all stages together.
+    `robots` say who owns which pose, one pose a robot unless given. Over-relaxation `alpha` is in (0, 2): up to 1 every
+    sweep converges; above, `Sweep.JACOBI` may not. Without a start the first sweep of a stage is flagged: a robot
+    listens only to neighbours that have an estimate (else, `is_flagged` False, it begins at identity rotations and zero
+    translations). `gauss_newton_steps` are the linearisations of the second stage, one in the paper that the method is
+    from. `tolerance`, on the change of a sweep, ends a stage; `max_iterations` are sweeps of all stages together.
     """
 
     robots: Partition | None = None

@@ -52,20 +52,11 @@ class LevenbergMarquardt:
     """Levenberg-Marquardt on the full poses, one factorisation a step, F never rises.
 
     `dual_residual` is the relative decrement of the damped step: half of -<g, h>, less the rounding level of F, over F.
-
-    Attributes
-    ----------
-    tolerance : float
-        On the decrement, once the damping is small.
-    max_iterations : int
-        Refused steps count.
-    damping : float
-        First mu, relative to the diagonal of the Gauss-Newton matrix.
     """
 
-    tolerance: float = STATIONARY_DECREMENT
-    max_iterations: int = 200
-    damping: float = 1e-3
+    tolerance: float = STATIONARY_DECREMENT  # on the decrement, once the damping is small
+    max_iterations: int = 200  # refused steps count
+    damping: float = 1e-3  # first mu, relative to the diagonal of the Gauss-Newton matrix
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["tolerance", "damping"], not_negative=["max_iterations"])

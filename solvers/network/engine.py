@@ -32,15 +32,9 @@ class Engine(Protocol):
 
 @dataclass(frozen=True)
 class InProcess:
-    """Robots in this process, one after the other, or in threads; the answers are the same.
+    """Robots in this process, one after the other, or in threads; the answers are the same."""
 
-    Attributes
-    ----------
-    threads : int
-        The factorisations of some back ends hold Python's lock: expect little of more than one.
-    """
-
-    threads: int = 1
+    threads: int = 1  # the factorisations of some back ends hold Python's lock: expect little of more than one
 
     def __post_init__(self) -> None:
         check_settings(self, at_least_one=["threads"])

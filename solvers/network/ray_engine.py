@@ -56,26 +56,15 @@ class RayEngine:
     """Robots in Ray actors.
 
     Ray is started on this machine, where it listens to this machine alone, and stopped when the robots are let go,
-    unless this process is connected already or an address is given. The package has to be installed wherever actors
-    run, in the same version.
-
-    Attributes
-    ----------
-    address : str, optional
-        Of a cluster, "host:port" as `ray start --head` prints it. This machine has to be one of the cluster's.
-    num_cpus : int, optional
-        CPUs of this machine to use, where Ray is started; all unless given.
-    actors : int, optional
-        Processes that the robots are dealt among by size, of 100 MB and more each: one for every CPU unless given. With
-        as many as robots each has a process of its own, and with it what no other may see.
-    patience : float
-        Seconds to wait for robots to start.
+    unless this process is connected already or an address is given. This package has to be wherever actors run.
+    `actors`: processes that the robots are dealt among by size, of 100 MB and more each, one for every CPU unless
+    given. With as many as robots each has a process of its own, and with it what no other may see.
     """
 
-    address: str | None = None
-    num_cpus: int | None = None
+    address: str | None = None  # of a cluster, "host:port" as `ray start --head` prints it, which this machine is in
+    num_cpus: int | None = None  # of this machine, where Ray is started; all unless given
     actors: int | None = None
-    patience: float = 120.0
+    patience: float = 120.0  # seconds to wait for robots to start
     recovery: Recovery = field(default_factory=Recovery)
     idle: list[Any] | None = field(default=None, repr=False)  # of `kept`: actors that no solve has now
 

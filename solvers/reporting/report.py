@@ -32,12 +32,9 @@ _PAGE_SUFFIXES = (".html", ".htm")
 def write_report(solution: Solved, path: Path | str, *, source: str | None = None) -> None:
     """Write the report of a solution as one HTML page, whole or not at all.
 
-    Verdict and gap in words, what to try next, the graph to turn and hover over, convergence, a table of robots, the
-    worst edges in a table that sorts, stages, settings and versions. Plotly's script is inside (about 5 MB). The path
-    ends in .html or .htm; `source` is what stands for the graph in commands: a file, folder or name, quoted where a
-    shell needs it, and options that change the problem; the graph's name unless given.
-
-    Errors as `check_report` and `replace_when_done`.
+    Plotly's script is inside (about 5 MB). The path ends in .html or .htm; `source` is what stands for the graph in
+    commands: a file, folder or name, quoted where a shell needs it, and options that change the problem; the graph's
+    name unless given. Errors as `check_report` and `replace_when_done`.
 
     Examples
     --------

@@ -67,11 +67,7 @@ class MultiplierPenalty(_Rule):
     m_i is the mean diagonal of M over the rotation rows of pose i and q a quantile of ||Lambda_i||_2 / m_i over all
     poses. The multipliers measure how far from convex the constraint makes each pose. They are taken at the start, and
     once more where the recursion stalls; B then restarts at its stationary value there, -2 Lambda_i R_i^T / rho_i.
-
-    Attributes
-    ----------
-    stall_window, stall_ratio : int, float
-        Stalled: the residual of the last `stall_window` iterations has not fallen below `stall_ratio` of what it was.
+    Stalled: the residual of the last `stall_window` iterations has not fallen below `stall_ratio` of what it was.
     """
 
     factor: float = 8.0
@@ -159,18 +155,11 @@ class BoydPenalty(_ScaledRule):
     rho <- growth rho where ||r|| > imbalance ||s||, rho / growth where ||s|| > imbalance ||r||, with r = R - omega and
     s = rho (omega - omega_last), and B is rescaled with it. There is no safeguard. s has the unit of the weights, so
     that other units make other iterates.
-
-    Attributes
-    ----------
-    scale : float
-        First rho over the mean of m_i; Boyd gives none, and the paper neither.
-    imbalance, growth : float
-        Boyd's mu and tau.
     """
 
-    scale: float = 1.0
-    imbalance: float = 10.0
-    growth: float = 2.0
+    scale: float = 1.0  # first rho over the mean of m_i; Boyd gives none, and the paper neither
+    imbalance: float = 10.0  # Boyd's mu
+    growth: float = 2.0  # Boyd's tau
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["scale"], above_one=["imbalance", "growth"])
