@@ -58,7 +58,7 @@ class Newton:
 
     def converged(self, state: NewtonState, measurement: Measurement) -> Status | None:
         """CONVERGED within tolerance or where the gradient is rounding; STALLED when the last step could not move."""
-        if measurement.dual_residual <= self.tolerance or state.polish.is_at_rounding:
+        if state.polish.is_stationary:
             return Status.CONVERGED
         return None if state.polish.moved else Status.STALLED
 
