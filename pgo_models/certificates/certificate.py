@@ -179,7 +179,7 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
     >>> certificate = certify(problem, chordal_start(problem))
     >>> certificate
-    Certificate(F=110.9926545, gap=0.126, NOT_CERTIFIED)
+    Certificate(F=118.6633297, gap=0.182, NOT_CERTIFIED)
     >>> certificate.source.name, bool(0 < certificate.lower_bound <= certificate.poses_objective)
     ('POLISHED', True)
     """

@@ -13,7 +13,7 @@ from pgo_models.geometry.rotations import stack_transposes
 from solvers.network.serialization import deserialize, serialize
 from solvers.result import Measurement, Record, Status
 from solvers.soc.anderson import AndersonShare
-from solvers.soc.recursion_block import StepSettings, block_at
+from solvers.soc.recursion_block import Rotations, StepSettings, block_at
 
 PLAIN = st.none() | st.booleans() | st.integers() | st.floats() | st.text()
 
@@ -34,7 +34,7 @@ def test_arrays_and_classes_come_back_bit_by_bit_and_apart_from_the_original(see
     poses = random_poses(3, 3, seed)
     start = block_at(stack_transposes(poses.R), np.ones(9), np.ones(9), StepSettings(memory=2))
     block, _ = start.after_solve(np.ones((9, 3)))
-    classes = (Poses, AndersonShare, StepSettings, type(block))
+    classes = (Poses, AndersonShare, StepSettings, Rotations, type(block))
     found = deserialize(serialize({"block": block, "poses": (poses, None)}), classes)
     assert found["block"].anderson.residual_differences == ()
     for name in ("penalty", "z", "s", "x", "best"):
