@@ -20,7 +20,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, is_dataclass, replace
 from functools import cached_property
 from ipaddress import ip_address
 from types import ModuleType
@@ -78,7 +78,9 @@ class RayEngine:
 
         A MissingExtraError without Ray, an EngineError when the address is no Ray cluster's, or there are too few CPUs.
         """
-        place = _RayPlace(_ray(), make, shares, self, connect(self.address, self.num_cpus))
+        # replace() leaves behind what a share has worked out of itself.
+        plain: list[Any] = [replace(share) if is_dataclass(share) else share for share in shares]  # type: ignore[type-var]
+        place = _RayPlace(_ray(), make, plain, self, connect(self.address, self.num_cpus))
         try:
             place.start(range(len(place.groups)))
         except RobotLostError as error:
@@ -163,8 +165,7 @@ class _RayPlace:
                 self.ray.kill(self.actors.pop(group))
         for group in groups:
             self.actors[group] = self._actor()
-        # replace() leaves behind what the share has worked out of itself.
-        mine = {group: [replace(self.shares[robot]) for robot in self.groups[group]] for group in groups}
+        mine = {group: [self.shares[robot] for robot in self.groups[group]] for group in groups}
         self._wait({group: self.actors[group].hold.remote(self.make, mine[group]) for group in groups})
 
     def send(self, group: int, order: AnyOrder, requests: Sequence[object]) -> ObjectRef[Any]:
@@ -200,7 +201,7 @@ class _RayPlace:
     @cached_property
     def groups(self) -> list[list[int]]:
         """Robots of every actor, dealt by size, the largest share first."""
-        sizes = [len(pickle.dumps(replace(share))) for share in self.shares]
+        sizes = [len(pickle.dumps(share)) for share in self.shares]
         ordered, count = np.argsort(sizes)[::-1].tolist(), min(self.engine.actors or self._cpus, len(sizes))
         return [sorted(ordered[first::count]) for first in range(count)]
 
