@@ -34,7 +34,7 @@ from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine, InProcess
 from solvers.network.ledger import Ledger
 from solvers.network.ray_engine import RayEngine
-from solvers.pipeline import SECOND_TRY_TOLERANCE, Pipeline
+from solvers.pipeline import Pipeline, finer
 from solvers.result import Record, Stage, Status
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
@@ -121,9 +121,7 @@ def solve_folder(
     with closing(driver), closing(Journal(None, {}, stages)) as journal:
         for is_second in (False, True)[: 1 + pipeline.second_try]:
             if is_second:
-                soc = soc if soc is not None else SOC()
-                tolerance = min(soc.tolerance, SECOND_TRY_TOLERANCE)
-                soc = replace(soc, tolerance=tolerance, max_iterations=SOC.max_iterations)
+                soc = finer(soc if soc is not None else SOC())
             try:
                 stages.append(start_robots(driver, None))
                 last = refine(driver, pipeline.newton, None, journal, watch, soc)

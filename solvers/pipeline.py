@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -55,7 +55,8 @@ from solvers.solution import Solution
 
 HANDOVER_TOLERANCE = 5e-3  # relative residual at which Newton needs one or two factorisations on all graphs tried
 HANDOVER = SOC(tolerance=HANDOVER_TOLERANCE, max_iterations=100)
-SECOND_TRY_TOLERANCE = 1e-6
+_SECOND_TRY_TOLERANCE = 1e-6
+AnySOC = TypeVar("AnySOC", bound=SOC | PaperSOC)
 _FEW = 10  # Newton steps that show whether all edges fit, and finish where some were left out
 
 
@@ -298,8 +299,7 @@ class _Job:
                 F = PGOProblem(self.problem.graph, self.problem.backend)
                 other = attempt(None, polish(F, chordal_start(F)))[1]
                 return _better(self.problem, poses, certificate, other)
-            soc = self.pipeline.soc if self.pipeline.soc is not None else SOC()
-            fine = replace(soc, tolerance=min(soc.tolerance, SECOND_TRY_TOLERANCE), max_iterations=SOC.max_iterations)
+            fine = finer(self.pipeline.soc if self.pipeline.soc is not None else SOC())
             poses, certificate = _better(self.problem, poses, certificate, attempt(fine, None)[1])
         return poses, certificate
 
@@ -367,6 +367,11 @@ class _Job:
     def interrupt(self, objective: float) -> None:
         """Note that what was under way was broken off."""
         self.stages.append(Stage("interruption", Status.INTERRUPTED, 0, objective, 0.0, History()))
+
+
+def finer(soc: AnySOC) -> AnySOC:
+    """SOC of a second try."""
+    return replace(soc, tolerance=min(soc.tolerance, _SECOND_TRY_TOLERANCE), max_iterations=SOC.max_iterations)
 
 
 def _better(

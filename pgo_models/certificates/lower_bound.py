@@ -218,10 +218,11 @@ def _move(problem: PGOProblem, Lambda: Array, X: Array, proof: DefiniteProof) ->
     product[n:] -= (Lambda @ X[n:].reshape(n, d, d)).reshape(-1, d)
     for _ in range(MOST_MOVES):
         step = proof.solve(product)
-        if inner(step, product) > last:  # the shift takes most of the softest energy
+        gain = inner(step, product)
+        if gain > last:  # the shift takes most of the softest energy
             step = replace(proof, is_marginal=True).solve(product)
-        last = inner(step, product)
-        gained += last
+            gain = inner(step, product)
+        last, gained = gain, gained + gain
         there = X.copy(), low - step[:n]
         there[0][n:] -= step[n:]
         moved = evaluate_certificate(problem, Lambda, *there)

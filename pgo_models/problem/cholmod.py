@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.errors import MissingExtraError
+from pgo_models.errors import extra_module
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.kernels import kernels_of_the_cpu
@@ -45,13 +45,8 @@ def set_option(cholmod: ModuleType, name: str, value: int) -> Iterator[None]:
 
 def import_cvxopt() -> tuple[ModuleType, ModuleType]:
     """CVXOPT and its CHOLMOD; a MissingExtraError without the extra `fast`."""
-    try:
-        with kernels_of_the_cpu():
-            import cvxopt
-            from cvxopt import cholmod
-    except ImportError as error:
-        raise MissingExtraError("cvxopt", "fast") from error
-    return cvxopt, cholmod
+    with kernels_of_the_cpu():
+        return extra_module("cvxopt", "fast"), extra_module("cvxopt.cholmod", "fast")
 
 
 def amd_order(pattern: csc_array) -> IntArray:

@@ -18,7 +18,7 @@ from pgo_models.geometry.rotations import (
 )
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 from pgo_models.problem.cholesky import factorize
-from pgo_models.problem.matrices import connection_laplacian, rotation_columns
+from pgo_models.problem.matrices import connection_laplacian, entry_positions, meets, rotation_columns
 from pgo_models.problem.ordering import row_order
 from pgo_models.problem.problem import PGOProblem
 
@@ -124,11 +124,8 @@ def relaxed_rotations(problem: PGOProblem, held: int | None) -> tuple[csc_array,
     if held is not None:
         fixed = rotation_columns(np.array([held]), 0, d)[0]
         b -= L[:, fixed].toarray()
-        is_out = np.zeros(len(b), dtype=bool)
-        is_out[fixed] = True
-        columns = np.repeat(np.arange(len(b)), np.diff(L.indptr))
-        L.data[is_out[L.indices] | is_out[columns]] = 0.0
-        L.data[is_out[columns] & (L.indices == columns)] = 1.0
+        L.data[meets(L, fixed)] = 0.0
+        L.data[entry_positions(L, fixed, fixed)] = 1.0
         b[fixed] = np.eye(d)
     return L, b
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csc_array, csr_array
 
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import factorize
 from pgo_models.problem.weighting import EdgeWeights
@@ -178,6 +178,13 @@ def entry_positions(matrix: csc_array, rows: IntArray, columns: IntArray) -> Int
     side = np.int64(matrix.shape[0])
     stored = np.repeat(np.arange(matrix.shape[1], dtype=np.int64), np.diff(matrix.indptr)) * side + matrix.indices
     return np.searchsorted(stored, columns.astype(np.int64) * side + rows)
+
+
+def meets(matrix: csc_array, rows: IntArray) -> BoolArray:
+    """Whether a stored entry of a square CSC matrix, (nnz,), is in one of the rows, (k,), or in the same columns."""
+    is_one = np.zeros(matrix.shape[0], dtype=bool)
+    is_one[rows] = True
+    return np.asarray(is_one[matrix.indices] | np.repeat(is_one, np.diff(matrix.indptr)))
 
 
 def block_entries(rows: IntArray, columns: IntArray) -> tuple[IntArray, IntArray]:

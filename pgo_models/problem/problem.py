@@ -183,9 +183,7 @@ class PGOProblem:
 
     def leave_out(self, data: Array, rows: IntArray, diagonal: Array | float) -> None:
         """Overwrite `data`, (nnz,), stored of a matrix as M: `rows` and columns, (k,), hold but a `diagonal`, (k,)."""
-        is_out = np.zeros(self.side, dtype=bool)
-        is_out[rows] = True
-        data[is_out[self.M.indices] | np.repeat(is_out, np.diff(self.M.indptr))] = 0.0
+        data[matrices.meets(self.M, rows)] = 0.0
         data[self.diagonal_positions[rows]] = diagonal
 
     # The cost and its derivatives.

@@ -234,5 +234,5 @@ def _check_connected(borders: Sequence[Border], without_edge: int, folder: Path)
 
 def _runs(ids: IntArray) -> IntArray:
     """First and last of all runs of consecutive ids, (k, 2), of ids in ascending order."""
-    runs = np.split(ids, np.flatnonzero(np.diff(ids) != 1) + 1) if len(ids) else []
-    return np.array([(run[0], run[-1]) for run in runs], dtype=np.int64).reshape(-1, 2)
+    first, last = np.diff(ids, prepend=ids[:1] - 2) != 1, np.diff(ids, append=ids[-1:] + 2) != 1
+    return np.stack([ids[first], ids[last]], axis=1)

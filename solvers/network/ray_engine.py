@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from pgo_models.errors import EngineError, MissingExtraError, SettingError, check_settings
+from pgo_models.errors import EngineError, SettingError, check_settings, extra_module
 from solvers.network.engine import WorkerPool
 from solvers.network.messages import Worker, obey
 from solvers.network.recovery import AnyOrder, RecoveringPool, Recovery, RobotLostError
@@ -280,12 +280,8 @@ class _Actor:
 
 
 def _ray() -> ModuleType:
-    try:
-        import ray
-        import ray.exceptions
-    except ImportError as error:
-        raise MissingExtraError("ray", "ray") from error
-    return ray
+    extra_module("ray.exceptions", "ray")
+    return extra_module("ray", "ray")
 
 
 def _check_address(address: str) -> None:

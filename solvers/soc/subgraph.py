@@ -204,13 +204,13 @@ def place_poses(pairs: IntArray, owners: IntArray, num_robots: int, middle: int)
     pose, robot = np.concatenate([np.arange(len(poses)), i, j]), np.concatenate([owner, owner[j], owner[i]])
     pose, robot = np.divmod(np.unique(pose * num_robots + robot), num_robots)
     holds = csr_array((np.ones(len(pose)), (pose, robot)), shape=(len(poses), num_robots))
-    found = []
-    for own, mine in enumerate(np.split(holds.tocsc().indices, holds.tocsc().indptr[1:-1])):
+    by_robot, copies, found = holds.tocsc(), np.diff(holds.indptr), []
+    for own, mine in enumerate(np.split(by_robot.indices, by_robot.indptr[1:-1])):
         mine.sort()
         held = holds[mine].tocsc()
         others = [other for other in np.flatnonzero(np.diff(held.indptr)).tolist() if other != own]
         common = tuple((other, np.sort(held.indices[held.indptr[other] : held.indptr[other + 1]])) for other in others)
-        found.append(Placement(poses[mine], in_cover[mine], np.diff(holds[mine].indptr), common))
+        found.append(Placement(poses[mine], in_cover[mine], copies[mine], common))
     return found
 
 
