@@ -174,8 +174,7 @@ def matrix_errors(problem: PGOProblem, diagonal: Array) -> Array:
 
     That of `matrix_error` for F. With information matrices the terms of an entry can be larger than the diagonal is:
     E = gamma_k (|A|^T |W| |A| + ..), entry by entry, k the factors of a term and the terms of an entry, and
-    v^T E v <= sum_a v_a^2 (E u)_a / u_a for any positive u; here u = diagonal^-1/2. Subtracting Lambda and what follows
-    is as in `matrix_error`.
+    v^T E v <= sum_a v_a^2 (E u)_a / u_a for any positive u; here u = diagonal^-1/2. The rest is as in `matrix_error`.
     """
     graph, weights, n, m, d = problem.graph, problem.weights, problem.num_poses, problem.graph.num_edges, problem.d
     if weights.W_error is None and weights.tangent is None:

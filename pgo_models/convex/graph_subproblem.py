@@ -123,8 +123,7 @@ class GraphQP:
         """X for the shift V = omega - B, both (N_a, d).
 
         For FROZEN, `neighbours` is X of the whole graph, (N, d): the shift becomes V - 2 D^-1 M_between X. A
-        SettingError when it is missing, a PGOError when there is no solution, as where constraints contradict each
-        other.
+        SettingError when it is missing, a PGOError when nothing solves it, as where constraints contradict each other.
         """
         if self.between.nnz:
             if neighbours is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -96,6 +97,12 @@ class Poses(ReadOnly):
     def stacked(self) -> Array:
         """X, ((d+1) n, d): first the n rows t_i, then the d rows of every R_i^T."""
         return np.concatenate([self.t, stack_transposes(self.R)])
+
+    def with_translations(self, t: Array) -> Poses:
+        """Return poses with the same rotations, not checked again, at t, (n, d), as it is."""
+        found = copy(self)
+        object.__setattr__(found, "t", real_array(t, "t"))
+        return found
 
     def moved(self, R: Array, t: Array) -> Poses:
         """Return the same poses seen from another world: (R R_i, R t_i + t), R (d, d) and t (d,)."""

@@ -5,6 +5,7 @@ that fails are the lines looked at one by one, to name the one that is wrong.
 """
 
 import warnings
+from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass
 from operator import methodcaller
@@ -29,6 +30,7 @@ from pgo_models.graphs.g2o_tags import ALIASES, TAGS
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
 from pgo_models.graphs.precisions import are_definite
 
+_LONG_RUN = 16  # lines of one tag, from which on they are not sorted by it one by one
 _SINGULAR = 1e-15  # an eigenvalue below it, of a matrix with ones on its diagonal, is rounding
 
 
@@ -114,12 +116,16 @@ class _Source:
 
     def take(self, first: int, lines: list[str]) -> int:
         """Parse lines, of which the first has that number, and return how many they are."""
-        tags = [line.split(None, 1)[:1] for line in (lines[0], lines[-1])]
-        plain = tags[0] == tags[1] and tags[0] and tags[0][0] in TAGS and not TAGS[tags[0][0]].has_offset
-        if plain and self._parse(tags[0][0], np.arange(first, first + len(lines)), lines):
-            return len(lines)
+        done = 0
+        while done < len(lines):  # runs of lines of one tag, whose ends are found by bisection
+            tag = "".join(lines[done].split(None, 1)[:1])
+            end = bisect_left(lines, True, done, key=lambda line: not line.startswith(tag))
+            is_run = tag in TAGS and not TAGS[tag].has_offset and end - done >= _LONG_RUN
+            if not (is_run and self._parse(tag, np.arange(first + done, first + end), lines[done:end])):
+                break
+            done = end
         groups: dict[str, list[int]] = {}
-        for place, line in enumerate(lines):
+        for place, line in enumerate(lines[done:], done):
             if words := line.split(None, 1):
                 groups.setdefault(words[0], []).append(place)
         for tag, at in groups.items():

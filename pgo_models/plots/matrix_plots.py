@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import csc_array, eye_array, tril
-from scipy.sparse.linalg import eigsh, splu
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import eigsh
 
 from pgo_models.certificates.certificate import Certificate
 from pgo_models.certificates.spectrum import rotation_inverse, smallest_definite_shift
@@ -76,37 +75,25 @@ def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12
     return figure
 
 
-@dataclass(frozen=True, eq=False)
-class FactorPattern:
-    """Where the Cholesky factor of M is not zero."""
-
-    order: IntArray  # (N,): fill-reducing order of the rows and columns of M
-    factor: csc_array  # (N, N): L, lower triangular, of M in that order; ones where it is stored
-    fill_in: int  # entries of L where the lower triangle of M in that order has none
-
-
-def factor_pattern(problem: PGOProblem) -> FactorPattern:
-    """Pattern of the Cholesky factor of M, in SuperLU's minimum degree order of M + M^T."""
-    ones = csc_array((np.ones(problem.M.nnz), problem.M.indices, problem.M.indptr), shape=problem.M.shape)
-    # Diagonally dominant with off-diagonal entries of one sign: nothing cancels, so the numbers show the pattern.
-    dominant = csc_array((2.0 * float(ones.sum(axis=0).max())) * eye_array(problem.side) - ones)
-    lu = splu(dominant, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    factor = csc_array(lu.L)
-    factor.data[:] = 1.0
-    return FactorPattern(np.argsort(lu.perm_c), factor, int(factor.nnz - tril(ones).nnz))
+def factor_of_M(problem: PGOProblem) -> tuple[csc_array, IntArray]:
+    """Cholesky factor L of M with its diagonal doubled, and the order, that of a solve; see `take_apart`."""
+    data = problem.M.data.copy()
+    data[problem.diagonal_positions] *= 2.0  # M itself is singular
+    return problem.analysis.factorize(problem.with_pattern_of_M(data)).take_apart()
 
 
 def plot_sparsity(problem: PGOProblem) -> Figure:
     """Figure of the patterns of M, in the order of the poses, and of its Cholesky factor, with the fill-in counted."""
-    pattern = factor_pattern(problem)
+    M, (L, _) = problem.M, factor_of_M(problem)
+    fill_in = L.nnz - (M.nnz + problem.side) // 2
     with column_figure(height=0.6) as figure:
         left, right = figure.subplots(1, 2)
-        _draw_pattern(left, problem.M)
-        _draw_pattern(right, pattern.factor)
-        left.set_title(f"M, {problem.side} x {problem.side}\n{problem.M.nnz:,} entries")
-        right.set_title(f"Cholesky factor\n{pattern.factor.nnz:,} entries")
-        share = 100.0 * pattern.fill_in / pattern.factor.nnz
-        figure.supxlabel(f"fill-in: {pattern.fill_in:,} entries, {share:.0f} % of the factor", fontsize=SMALL_POINTS)
+        _draw_pattern(left, M)
+        _draw_pattern(right, L)
+        left.set_title(f"M, {problem.side} x {problem.side}\n{M.nnz:,} entries")
+        right.set_title(f"Cholesky factor\n{L.nnz:,} entries")
+        share = 100.0 * fill_in / L.nnz
+        figure.supxlabel(f"fill-in: {fill_in:,} entries, {share:.0f} % of the factor", fontsize=SMALL_POINTS)
     return figure
 
 

@@ -56,8 +56,7 @@ class CholeskyFactor(ABC):
         R is the computed factor, so that A + diag(epsilon) diag(A) is positive definite. The argument
         (`pgo_models.problem.floating_point`) holds for diagonals between 1e-150 and 1e150, where nothing that counts
         underflows. `beside`, an int or (N,), are non-zeros of further columns of R in its rows, as of `half_solve`:
-        with them A is the leading block of a larger matrix, and their own columns' share of E is counted apart
-        (`column_error`).
+        with them A is the leading block of a larger matrix, their own columns' share of E is apart (`column_error`).
         """
 
     @abstractmethod

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from types import ModuleType
 from typing import Any
 
@@ -43,6 +44,7 @@ def set_option(cholmod: ModuleType, name: str, value: int) -> Iterator[None]:
         cholmod.options.update(saved)
 
 
+@cache
 def import_cvxopt() -> tuple[ModuleType, ModuleType]:
     """CVXOPT and its CHOLMOD; a MissingExtraError without the extra `fast`."""
     with kernels_of_the_cpu():

@@ -8,29 +8,12 @@ from scipy.sparse.csgraph import breadth_first_order
 
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import (
-    Array,
-    BoolArray,
-    exp_map,
-    project_to_rotations,
-    tangent_dimension,
-    unstack_transposes,
-)
+from pgo_models.geometry.rotations import Array, BoolArray, project_to_rotations, unstack_transposes
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 from pgo_models.problem.cholesky import factorize
 from pgo_models.problem.matrices import connection_laplacian, entry_positions, meets, rotation_columns
 from pgo_models.problem.ordering import row_order
 from pgo_models.problem.problem import PGOProblem
-
-
-def gps_imu_start(truth: Poses, translation_std: float, rotation_std: float, rng: np.random.Generator) -> Poses:
-    """Truth under noise: t_i + N(0, translation_std^2 I) and R_i Exp(N(0, rotation_std^2 I)) (paper: section `sec3`).
-
-    Standard deviations are in metres and radians.
-    """
-    n, d = truth.num_poses, truth.d
-    t = truth.t + rng.normal(0.0, translation_std, (n, d))
-    return Poses(truth.R @ exp_map(rng.normal(0.0, rotation_std, (n, tangent_dimension(d)))), t)
 
 
 def odometry_start(graph: PoseGraph) -> Poses:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import Any, cast
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array
@@ -107,18 +108,20 @@ class PGOProblem:
         excess = self.weights.excess
         if excess is None:
             return self
-        if self._touched and self._touched[0][0] is poses:  # multipliers, gradient and Hessian ask for the same one
-            return self._touched[0][1]
-        X = self.stacked(poses)
-        tangent = excess.tangent(self.edge_products(self.residuals(X), X))
+        kept = self._kept.get("tangent", (None, self))  # multipliers, gradient and Hessian ask for the same one
+        if kept[0] is poses:
+            return cast("PGOProblem", kept[1])
+        X, residuals = self._at(poses)
+        tangent = excess.tangent(self.edge_products(residuals, X))
         found = replace(self, weighting=replace(self.weights, excess=None, tangent=tangent))
         found.__dict__.update({name: value for name, value in self.__dict__.items() if name in _OF_THE_PATTERN})
-        self._touched[:] = [(poses, found)]
+        self._kept["tangent"] = poses, found
         return found
 
     @cached_property
-    def _touched(self) -> list[tuple[Poses, "PGOProblem"]]:
-        return []
+    def _kept(self) -> dict[str, tuple[Any, ...]]:
+        """What was found last, behind the poses it was found at."""
+        return {}
 
     # Matrices, each built when first asked for, read-only: what follows from them is kept, too.
 
@@ -192,36 +195,38 @@ class PGOProblem:
         """A X, ((d+1) m, d): translation residuals of the edges, then the rows of their rotation residuals."""
         return np.asarray(self.residual_matrix[0] @ X)
 
-    def objective_stacked(self, X: Array) -> float:
+    def objective_stacked(self, X: Array, residuals: Array | None = None) -> float:
         """F = tr(X^T M X), X (N, d), as a weighted sum of squared residuals: cancels nothing; X may be infeasible."""
-        residuals = self.residuals(X)
-        _, w = self.residual_matrix
+        residuals, (_, w) = self.residuals(X) if residuals is None else residuals, self.residual_matrix
         F = float(np.sum(w[:, None] * residuals**2))  # in pairs: off by a few dozen roundings, not by one an edge
         beyond = self.weights.excess or self.weights.tangent
         return F if beyond is None else F + float(np.sum(beyond.values(self.edge_products(residuals, X))))
 
     def objective(self, poses: Poses) -> float:
         """F at poses (paper: `min overall`, weighted)."""
-        return self.objective_stacked(self.stacked(poses))
+        return self.objective_stacked(*self._at(poses))
 
     def edge_costs(self, poses: Poses) -> Array:
         """Share of every edge in F, (m,)."""
-        m, X = self.graph.num_edges, self.stacked(poses)
-        residuals, (_, w) = self.residuals(X), self.residual_matrix
+        m, (X, residuals), (_, w) = self.graph.num_edges, self._at(poses), self.residual_matrix
         squares = w * np.sum(residuals**2, axis=1)
         costs = squares[:m] + squares[m:].reshape(m, self.d).sum(axis=1)
         beyond = self.weights.excess or self.weights.tangent
         return np.asarray(costs if beyond is None else costs + beyond.values(self.edge_products(residuals, X)))
 
-    def apply_M(self, X: Array) -> Array:
+    def apply_M_at(self, poses: Poses) -> Array:
+        """M X, (N, d), at poses, M that of the tangent there for chi2."""
+        return self.tangent_at(poses).apply_M(*self._at(poses))
+
+    def apply_M(self, X: Array, residuals: Array | None = None) -> Array:
         """M X = A^T (w A X), (N, d), through the residuals: accurate where edges fit well and coordinates are large."""
-        A, w = self.residual_matrix
-        residuals, tangent, n = A @ X, self.weights.tangent, self.num_poses
+        residuals, (_, w) = self.residuals(X) if residuals is None else residuals, self.residual_matrix
+        tangent, n = self.weights.tangent, self.num_poses
         if tangent is None:
-            return np.asarray(A.T @ (w[:, None] * residuals))
+            return np.asarray(self._adjoint @ (w[:, None] * residuals))
         C, axes = tangent.C, self.weights.axes
         pull = rows_of_blocks(C @ X[n:].reshape(n, self.d, self.d)[self.graph.i], axes)
-        product = A.T @ (w[:, None] * residuals + pull)
+        product = self._adjoint @ (w[:, None] * residuals + pull)
         product[n:] += self.incidence.at_beginning(
             np.swapaxes(C, 1, 2) @ blocks_of_rows(residuals, self.graph.num_edges, axes)
         )
@@ -237,7 +242,7 @@ class PGOProblem:
         With G = 2 M X it is (-2 vee(G_i R_i), G_{t_i}).
         """
         n, d = self.num_poses, self.d
-        G = 2.0 * self.tangent_at(poses).apply_M(self.stacked(poses))
+        G = 2.0 * self.apply_M_at(poses)
         return -2.0 * vee(G[n:].reshape(n, d, d) @ poses.R), G[:n]
 
     # Exact translations for given rotations.
@@ -258,17 +263,17 @@ class PGOProblem:
 
     def at_best_translations(self, poses: Poses) -> Poses:
         """Poses with the translations that are best for their rotations, t_0 where it is if chi2 is not quadratic."""
-        excess, d, X = self.weights.excess, self.d, self.stacked(poses)
+        excess, d = self.weights.excess, self.d
         if excess is None:
-            return self.with_best_translations(poses.R)
+            return poses.with_translations(self.recover_translations(poses.R))
+        X, residuals = self._at(poses)
         R_i, tau = poses.R[self.graph.i], self.weights.tau
         half = R_i @ (excess.J[:, :d, :d] + tau[:, None, None] * np.eye(d)) @ np.swapaxes(R_i, 1, 2)
-        residuals = self.residuals(X)
         u, _ = excess.arguments(self.edge_products(residuals, X))
         pull = tau[:, None] * residuals[: len(tau)] + (R_i @ (excess.J[:, :d] @ u[:, :, None]))[:, :, 0]
         factor = self._chi2_translations.factorize(block_laplacian(self.incidence, half))
         step = factor.solve((self.incidence.ends @ pull - self.incidence.begins @ pull).ravel()).reshape(-1, d)
-        return Poses(poses.R, poses.t - (step - step[0]))
+        return poses.with_translations(poses.t - (step - step[0]))
 
     def with_refined_translations(self, poses: Poses) -> Poses:
         """Poses after steps of iterative refinement of the translations, as many as lower F, with t_0 where it is.
@@ -278,8 +283,8 @@ class PGOProblem:
         objective = self.objective(poses)
         while True:
             t = poses.t.copy()
-            t[1:] -= self._translation_factor.solve(self.apply_M(self.stacked(poses))[1 : self.num_poses])
-            refined = Poses(poses.R, t)
+            t[1:] -= self._translation_factor.solve(self.apply_M_at(poses)[1 : self.num_poses])
+            refined = poses.with_translations(t)
             if not self.objective(refined) < 0.5 * objective:
                 return refined if self.objective(refined) < objective else poses
             poses, objective = refined, self.objective(refined)
@@ -293,6 +298,18 @@ class PGOProblem:
         if poses.t.shape != (self.num_poses, self.d):
             raise GraphError(f"{poses} beside {self}; give one pose for every pose of the graph, in its order")
         return poses.stacked()
+
+    def _at(self, poses: Poses) -> tuple[Array, Array]:
+        """X and its residuals, read-only, kept for the poses that were last asked for."""
+        if self._kept.get("X", (None,))[0] is not poses:
+            X = self.stacked(poses)
+            self._kept["X"] = poses, read_only(X), read_only(self.residuals(X))
+        _, X, residuals = self._kept["X"]
+        return X, residuals
+
+    @cached_property
+    def _adjoint(self) -> csc_array:
+        return self.residual_matrix[0].T
 
     @cached_property
     def incidence(self) -> Incidence:
@@ -325,8 +342,8 @@ class PGOProblem:
         return self.M[self.num_poses :].tocsr()
 
 
-_OF_THE_PATTERN = {"residual_matrix", "plain_residual_matrix", "analysis", "pose_order", "incidence"}
-_OF_THE_PATTERN |= {"diagonal_positions", "block_positions"}
+_OF_THE_PATTERN = {"residual_matrix", "plain_residual_matrix", "_adjoint", "_kept", "analysis", "pose_order"}
+_OF_THE_PATTERN |= {"incidence", "diagonal_positions", "block_positions"}
 
 
 def as_problem(given: object) -> PGOProblem:

@@ -11,6 +11,7 @@ from scipy.sparse import csc_array
 from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError
 from pgo_models.graphs.scenes import random_geometric
 from pgo_models.problem.cholesky import CholeskyBackend, _Cholmod, analyze, default_backend, factorize
+from pgo_models.problem.cholmod import import_cvxopt
 from pgo_models.problem.ordering import row_order
 from pgo_models.problem.problem import PGOProblem
 
@@ -222,6 +223,7 @@ def test_superlu_is_the_default_without_cvxopt(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_asking_for_cholmod_without_cvxopt_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    import_cvxopt.cache_clear()
     monkeypatch.setitem(sys.modules, "cvxopt", None)
     with pytest.raises(MissingExtraError, match=r"cvxopt is not installed; run: pip install .*\[fast\]") as caught:
         analyze(csc_array(np.eye(2)), CholeskyBackend.CHOLMOD)

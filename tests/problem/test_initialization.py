@@ -12,12 +12,12 @@ from pgo_models.certificates.certificate import certify_at
 from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import log_map, orthogonality_error, random_rotations, unstack_transposes
+from pgo_models.geometry.rotations import orthogonality_error, random_rotations, unstack_transposes
 from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, circle, grid, observe
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.initialization import chordal_start, gps_imu_start, odometry_start, spanning_tree_start
+from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
 from pgo_models.problem.matrices import residual_matrix
 from pgo_models.problem.problem import PGOProblem
 
@@ -147,21 +147,6 @@ def test_both_backends_start_alike(scene: object) -> None:
     graph = scene(np.random.default_rng(0))
     starts = [chordal_start(PGOProblem(graph, backend)) for backend in CholeskyBackend]
     np.testing.assert_allclose(starts[0].R, starts[1].R, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("d", [2, 3])
-def test_gps_imu_noise_has_its_standard_deviations(d: int) -> None:
-    n = 4000
-    truth = random_poses(n, d, 0)
-    start = gps_imu_start(truth, 0.2, 0.1, np.random.default_rng(0))
-    t = start.t - truth.t
-    w = log_map(np.swapaxes(truth.R, 1, 2) @ start.R)
-    for values, std in ((t, 0.2), (w, 0.1)):
-        assert values.std() == pytest.approx(std, rel=5 / np.sqrt(2 * values.size))
-        assert abs(values.mean()) < 5 * std / np.sqrt(values.size)
-    again = gps_imu_start(truth, 0.2, 0.1, np.random.default_rng(0))
-    np.testing.assert_array_equal(again.R, start.R)
-    np.testing.assert_array_equal(again.t, start.t)
 
 
 def test_a_spanning_tree_needs_a_connected_graph() -> None:
