@@ -196,7 +196,7 @@ class PGOProblem:
         return np.asarray(self.residual_matrix[0] @ X)
 
     def objective_stacked(self, X: Array, residuals: Array | None = None) -> float:
-        """F = tr(X^T M X), X (N, d), as a weighted sum of squared residuals: cancels nothing; X may be infeasible."""
+        """F = tr(X^T M X) as a weighted sum of squares of the `residuals`, ((d+1) m, d), of any X, (N, d)."""
         residuals, (_, w) = self.residuals(X) if residuals is None else residuals, self.residual_matrix
         F = float(np.sum(w[:, None] * residuals**2))  # in pairs: off by a few dozen roundings, not by one an edge
         beyond = self.weights.excess or self.weights.tangent
@@ -219,7 +219,7 @@ class PGOProblem:
         return self.tangent_at(poses).apply_M(*self._at(poses))
 
     def apply_M(self, X: Array, residuals: Array | None = None) -> Array:
-        """M X = A^T (w A X), (N, d), through the residuals: accurate where edges fit well and coordinates are large."""
+        """M X = A^T (w A X), (N, d), by `residuals`, ((d+1) m, d): accurate where edges fit, however large t."""
         residuals, (_, w) = self.residuals(X) if residuals is None else residuals, self.residual_matrix
         tangent, n = self.weights.tangent, self.num_poses
         if tangent is None:
