@@ -16,7 +16,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.thresholds import chi2_thresholds
+from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds
 from solvers.distributed.robust import SharedEstimate
 from solvers.loop import Watch
 from solvers.network.ledger import Ledger
@@ -29,6 +29,8 @@ from solvers.solution import Solution
 _CHEAP = 4000  # rows of a factor that may become dense: of so few, a factorisation takes a fraction of a second
 _CHEAP_ATTEMPTS = 3
 _PAIRED = 4000  # loop closures whose pairs are looked at within seconds
+_FAR, _FURTHER = 1.5, 3.0  # times T; three times it are one right set in a hundred, or fewer, of
+_MANY = 15  # edges on, whatever the scale of their matrices: so are the largest two of as many chi^2_3
 _TIGHT, _NARROW = (0.1, 0.01), 0.3  # of the thresholds at first, and of how far they are widened
 
 
@@ -48,7 +50,7 @@ def solve_robustly(
     non-convexity is run until the edges it keeps are certified, at least three times where that is cheap: as set; on
     the pairwise consistent edges; with more and smaller steps; with tight thresholds, which are then widened by what
     the edges kept say; with the other loss. Of those certified, or of all if none is, that of the least truncated cost
-    of all edges is kept.
+    of all edges is kept, less what `without_contradicted` takes out in one place.
 
     By robots (`shared`, `plain`) certificates are theirs, and what crosses the network is added up. A SettingError when
     robust is none, or PCM by robots, a GraphError when known inliers and the edges kept do not connect the poses.
@@ -83,21 +85,47 @@ def solve_robustly(
     for name, method, tested in _methods(robust, graph, known, shared is None):
         found = trials.run(name, method, tested) if shared is None else trials.share(name, method, plain, shared)
         attempts.append(found)
-        is_done = any(one.certificate.is_certified for one in attempts)
-        is_done = is_done and len(attempts) >= (_CHEAP_ATTEMPTS if is_cheap else 1)
-        if is_done or attempts[-1].stage.status in OUT_OF_TIME:
+        is_enough = len(attempts) >= (_CHEAP_ATTEMPTS if is_cheap else 1)
+        if found.stage.status in OUT_OF_TIME or (is_enough and any(one.certificate.is_certified for one in attempts)):
             break
     best = min(attempts, key=lambda one: (not one.certificate.is_certified, one.attempt.cost))
+    kept, name = best.kept, best.attempt.name
     if best.solution is None:
-        solution = plain(inlier_problem(problem, best.kept), start=best.certificate.poses, time_limit=watch.left)
+        if attempts[-1].stage.status not in OUT_OF_TIME:
+            kept = without_contradicted(problem, known, kept, best.certificate.poses)
+            name += f", less {gone} that all others contradict" if (gone := (best.kept & ~kept).sum()) else ""
+        solution = plain(inlier_problem(problem, kept), start=best.certificate.poses, time_limit=watch.left)
     else:
         ledgers += [one.solution.ledger for one in attempts if one.solution is not None]
         solution = replace(best.solution, ledger=reduce(Ledger.joined, filter(None, ledgers)))
     stages = (*(one.stage for one in attempts), *solution.stages)
     last = attempts[-1].stage.status
     solution = replace(solution, stages=stages, status=last if last in OUT_OF_TIME else solution.status)
-    made = tuple(one.attempt for one in attempts)
-    return result(solution, best.kept, best.scale * thresholds, best.attempt.name, made)
+    return result(solution, kept, best.scale * thresholds, name, tuple(one.attempt for one in attempts))
+
+
+def without_contradicted(problem: PGOProblem, known: BoolArray, kept: BoolArray, poses: Poses) -> BoolArray:
+    """Edges kept, (m,), but those that all others contradict: where few hold the map it bends, and residuals are small.
+
+    T_e is what the cost loses without edge e, over its quantile 0.99: e has the largest residual of those not known
+    (Baarda 1968, data snooping). Of the next one after it, T is the same. Edge e goes where T_e > 3 T of many, or
+    T_e > 1.5 T and the quantile at 1 - `FALSE_ALARM` over the number of edges tested; then the next one is judged.
+    """
+    allowed, tested = chi2_thresholds(problem), max(2, int((kept & ~known).sum()))
+    far = chi2_thresholds(problem, 1.0 - FALSE_ALARM / tested) / allowed
+    further = _FURTHER if tested >= _MANY else np.inf
+    passed, cost, T_e, most = kept, inlier_problem(problem, kept).objective(poses), np.inf, 0.0
+    while True:
+        ratio = np.where(kept & ~known, problem.edge_costs(poses) / allowed, 0.0)
+        e = int(ratio.argmax())
+        others = kept & (np.arange(len(kept)) != e)
+        if not ratio[e] or len(problem.graph.components(others)) > 1:
+            return passed
+        poses = polish(less := inlier_problem(problem, others), poses, max_steps=4)
+        T = (cost - less.objective(poses)) / allowed[e]
+        if not (T_e > further * T or T_e > max(_FAR * T, most)):
+            return passed
+        passed, kept, cost, T_e, most = kept, others, less.objective(poses), T, far[e]
 
 
 def inlier_problem(problem: PGOProblem, kept: BoolArray) -> PGOProblem:

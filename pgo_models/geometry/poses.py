@@ -11,14 +11,7 @@ import numpy as np
 
 from pgo_models.errors import GraphError
 from pgo_models.geometry.arrays import ReadOnly, read_only, real_array
-from pgo_models.geometry.rotations import (
-    Array,
-    log_map,
-    orthogonality_error,
-    project_to_rotations,
-    stack_transposes,
-    unstack_transposes,
-)
+from pgo_models.geometry.rotations import Array, log_map, orthogonality_error, project_to_rotations, stack_transposes
 
 ROTATION_TOLERANCE = 1e-6
 # One exponential, SVD, or product of two rotations leaves at most 5e-15 in a million draws, ten products 8e-15.
@@ -65,12 +58,6 @@ class Poses(ReadOnly):
     def identity(cls, n: int, d: int) -> Poses:
         """Return n poses at the origin, unrotated."""
         return cls(np.broadcast_to(np.eye(d), (n, d, d)).copy(), np.zeros((n, d)))
-
-    @classmethod
-    def from_stacked(cls, X: Array) -> Poses:
-        """Poses of X, ((d+1) n, d): first the n rows t_i, then the d rows of every R_i^T."""
-        n = len(X) // (X.shape[1] + 1)
-        return cls(unstack_transposes(X[n:]), X[:n])
 
     @classmethod
     def of_points(cls, t: Array) -> Poses:

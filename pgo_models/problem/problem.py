@@ -108,9 +108,8 @@ class PGOProblem:
         excess = self.weights.excess
         if excess is None:
             return self
-        kept = self._kept.get("tangent", (None, self))  # multipliers, gradient and Hessian ask for the same one
-        if kept[0] is poses:
-            return cast("PGOProblem", kept[1])
+        if "tangent" in self._kept and self._kept["tangent"][0] is poses:
+            return cast("PGOProblem", self._kept["tangent"][1])
         X, residuals = self._at(poses)
         tangent = excess.tangent(self.edge_products(residuals, X))
         found = replace(self, weighting=replace(self.weights, excess=None, tangent=tangent))
@@ -301,7 +300,7 @@ class PGOProblem:
 
     def _at(self, poses: Poses) -> tuple[Array, Array]:
         """X and its residuals, read-only, kept for the poses that were last asked for."""
-        if self._kept.get("X", (None,))[0] is not poses:
+        if "X" not in self._kept or self._kept["X"][0] is not poses:
             X = self.stacked(poses)
             self._kept["X"] = poses, read_only(X), read_only(self.residuals(X))
         _, X, residuals = self._kept["X"]

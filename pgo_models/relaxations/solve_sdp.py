@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import cvxpy as cp
 
-from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, certify_with, gap_text, relative_gap
+from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, certify_with, gap_text
 from pgo_models.convex.convex_solver import ConvexSolver
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.poses import Poses
@@ -73,10 +73,6 @@ class RelaxationSolution:
     def verdict(self) -> Verdict:
         """What the bound says of the rounded poses."""
         return self.certificate.verdict
-
-    def gap_to(self, poses: Poses) -> float:
-        """The same gap for anybody's poses of the graph."""
-        return relative_gap(self.relaxation.problem.objective(poses), self.lower_bound)
 
     def __str__(self) -> str:
         lines = [

@@ -96,11 +96,6 @@ class ReproducedRow:
         return self.published.name in SCENES
 
     @property
-    def is_missing(self) -> bool:
-        """Whether there is no graph to run on: not one draw has its certified optimum, and there are reasons."""
-        return not self.optima and bool(self.reasons)
-
-    @property
     def figures(self) -> PublishedFigures | None:
         """The paper's figures of this method."""
         of = {

@@ -67,8 +67,7 @@ def tables_as_text(tables: Reproduction) -> ResultTable:
     for row in tables.rows:
         is_first, before = row.published.name != before, row.published.name
         graph = _graph_cells(row) if is_first else ("",) * 5
-        if row.is_missing:
-            # One line says why a whole graph has no figures.
+        if row.reasons and not row.optima:  # one line says why a whole graph has no figures
             if is_first:
                 costs.append((*graph, *("-",) * 4, *_paper_cost_cells(tables.soc_row(row)), _remark(row)))
             continue

@@ -1,6 +1,8 @@
 """Prints the tables of many robots (README.md beside this file): rounds, bytes, seconds, faults, a world of 100 robots.
 
-    PGO_DATA=folder python tests/benchmarks/robots.py [substructured] [consensus] [seconds] [faults] [world] [ray]
+    PGO_DATA=folder python tests/benchmarks/robots.py [TABLE ..]
+
+TABLE is substructured, consensus, seconds, faults, driver, world or ray.
 
 Every line runs in a process of its own, one thread, robots in this process; those of `ray` in actors on two CPUs, too.
 """
@@ -12,8 +14,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[variable] = "1"
@@ -34,6 +37,7 @@ from solvers.loop import run
 from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine, InProcess
 from solvers.network.faults import Faults
+from solvers.network.messages import Idle
 from solvers.network.ray_engine import RayEngine
 from solvers.soc.consensus import ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
@@ -155,6 +159,60 @@ def world_job() -> dict[str, object]:
     }
 
 
+class TimedRobots:
+    """Robots in this process, whose CPU seconds are counted one by one."""
+
+    def __init__(self) -> None:
+        self.seconds = np.zeros(0)
+
+    def open(self, make: Callable[[Any], Any], shares: Sequence[Any]) -> "TimedRobots":
+        """Robots of these shares."""
+        self.seconds = np.zeros(len(shares))
+        self._robots = self._timed(make, shares)
+        return self
+
+    def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
+        """Answers of all to an order."""
+        return self._timed(lambda pair: order(*pair), list(zip(self._robots, requests, strict=True)), requests)
+
+    def close(self) -> None:
+        """Nothing to let go."""
+
+    def _timed(self, act: Callable[[Any], Any], on: Sequence[Any], requests: Sequence[Any] = ()) -> list[Any]:
+        answers: list[Any] = []
+        for robot, argument in enumerate(on):
+            began = time.process_time()
+            is_idle = len(requests) > 0 and requests[robot] is Idle.IDLE
+            answers.append(None if is_idle else act(argument))
+            self.seconds[robot] += time.process_time() - began
+        return answers
+
+
+def driver_job(robots: str, poses: str) -> dict[str, object]:
+    """CPU of the driver and of the busiest robot, in a world in the plane; METIS partition."""
+    with tempfile.TemporaryDirectory() as folder:
+        world = Path(folder) / "world.g2o"
+        shape = ["--robots", robots, "--poses", poses, "-d", "2"]
+        run_cli(["generate", "grid-world", *shape, "--out", str(world)])
+        graph = pgo.load(str(world))
+    shared, timed = pgo.partition(graph, int(robots), METIS), TimedRobots()
+    began = time.process_time()
+    solution = solvers.solve(graph, robots=shared, engine=timed)
+    total = time.process_time() - began
+    assert solution.ledger is not None
+    return {
+        "poses": graph.num_poses,
+        "cover": len(vertex_cover(shared, graph)),
+        "rounds": solution.ledger.rounds,
+        "driver": total - timed.seconds.sum(),
+        "busiest": timed.seconds.max(),
+        "levels": [round(1e-6 * one, 1) for one in solution.ledger.bytes_by_level],
+        "gap": solution.gap,
+        "verdict": solution.certificate.verdict.name,
+        "memory": memory(),
+    }
+
+
 def run_cli(arguments: list[str]) -> None:
     """`pgo` with these arguments."""
     code = "from solvers.cli import main; main()"
@@ -244,6 +302,24 @@ def faults_table() -> Table:
     return table
 
 
+def driver_table() -> Table:
+    """Driver and busiest robot of SUBSTRUCTURED solves in the plane: CPU seconds, MB sent on each level of the tree."""
+    heads = ("poses", "robots", "cover", "rounds", "driver, s", "busiest robot, s", "MB by level", "gap", "MB")
+    table = Table(*heads, box=MARKDOWN)
+    for robots, poses in ((100, 228), (144, 903)):
+        row = child("driver", str(robots), str(poses))
+        table.add_row(
+            str(row["poses"]),
+            str(robots),
+            *(str(row[key]) for key in ("cover", "rounds")),
+            *(f"{row[key]:.2f}" for key in ("driver", "busiest")),
+            " / ".join(map(str, row["levels"])),
+            f"{row['gap']:.1e} {row['verdict']}",
+            f"{row['memory']:.0f}",
+        )
+    return table
+
+
 def world_table() -> Table:
     """100 robots, 50,000 poses: read, solved and certified in this process."""
     row = child("world")
@@ -287,6 +363,7 @@ JOBS: dict[str, Callable[..., dict[str, object]]] = {
     "substructured": substructured_job,
     "consensus": consensus_job,
     "faults": faults_job,
+    "driver": driver_job,
     "world": world_job,
     "ray": ray_job,
 }
@@ -295,6 +372,7 @@ TABLES = {
     "consensus": consensus_table,
     "seconds": seconds_table,
     "faults": faults_table,
+    "driver": driver_table,
     "world": world_table,
     "ray": ray_table,
 }

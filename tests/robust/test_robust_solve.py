@@ -9,6 +9,8 @@ import pgo_models as pgo
 import solvers
 from pgo_models.errors import GraphError, SettingError
 from solvers import cli
+from solvers.robust.gnc import known_inliers
+from solvers.robust_solve import without_contradicted
 
 KINDS = pytest.mark.parametrize("kind", ["random", "aliased"])
 
@@ -180,3 +182,43 @@ def test_another_first_stage_is_refused(capsys):
     code, _, error = run_cli(capsys, "solve", "grid", "--robust", "gm", "--method", "joint")
     assert code == 1
     assert "--robust goes from its own start straight to Newton, got --method joint" in error
+
+
+def careful(n: int, seed: int) -> pgo.PoseGraph:
+    """A right graph whose matrices claim a tenth of its precision: no residual comes near its threshold."""
+    graph = pgo.grid_world(1, n, np.random.default_rng(seed), d=2)
+    return replace(graph, kappa=1e-2 * graph.kappa, tau=1e-2 * graph.tau, information=None)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_closure_within_its_threshold_that_all_others_contradict_is_taken_out(seed):
+    right = careful(100, seed)
+    i, j = next(pair for pair in zip(right.i, right.j, strict=True) if pair[1] - pair[0] > 30)
+    t = right.truth.R[i].T @ (right.truth.t[j + 5] - right.truth.t[i])
+    off = pgo.Poses((right.truth.R[i].T @ right.truth.R[j + 5])[None], t[None] + np.array([[1.5, 0.0]]))
+    graph = right.with_edges(np.array([i]), np.array([j + 5]), off, right.kappa[-1:], right.tau[-1:])
+    problem, known = pgo.PGOProblem(graph), known_inliers(graph, None)
+    everything = np.ones(graph.num_edges, dtype=bool)
+    poses = solvers.solve(problem).poses
+    assert problem.edge_costs(poses)[-1] < 0.5 * pgo.chi2_thresholds(problem)[-1]
+    kept = without_contradicted(problem, known, everything, poses)
+    np.testing.assert_array_equal(np.flatnonzero(~kept), [right.num_edges])
+
+
+def test_right_closures_are_hardly_ever_taken_out():
+    lost = 0
+    for seed in range(60):
+        problem = pgo.PGOProblem(careful(60, seed))
+        known, everything = known_inliers(problem.graph, None), np.ones(problem.graph.num_edges, dtype=bool)
+        lost += int((~without_contradicted(problem, known, everything, solvers.solve(problem).poses)).sum())
+    assert lost <= 3
+
+
+def test_few_closures_contradict_nothing_within_its_threshold():
+    right = pgo.grid_world(1, 60, np.random.default_rng(23), d=2, loop_closure_probability=0.03)
+    problem = pgo.PGOProblem(replace(right, kappa=1e-2 * right.kappa, tau=1e-2 * right.tau, information=None))
+    known = known_inliers(right, None)
+    assert 0 < (~known).sum() < 15
+    assert without_contradicted(
+        problem, known, np.ones(right.num_edges, dtype=bool), solvers.solve(problem).poses
+    ).all()
