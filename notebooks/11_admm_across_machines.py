@@ -70,7 +70,11 @@ b = [A_a @ model + 0.5 * rng.standard_normal(60) for A_a in A]
 everything = [np.arange(size)] * machines
 local = [ridge(A_a, b_a, rho) for A_a, b_a in zip(A, b, strict=True)]
 rounds = consensus(
-    local, everything, lambda v: soft_threshold(v, price / (rho * machines)), np.zeros(size), [np.zeros(size)] * machines
+    local,
+    everything,
+    lambda v: soft_threshold(v, price / (rho * machines)),
+    np.zeros(size),
+    [np.zeros(size)] * machines,
 )
 by_hand = list(itertools.islice(rounds, 60))
 

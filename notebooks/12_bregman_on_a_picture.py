@@ -59,7 +59,8 @@ def show(panels, height=2.3):
 # $$\begin{aligned}
 #   u &= (I + \alpha D^\top D)^{-1} \bigl(f + \alpha D^\top (d - b)\bigr) && \text{diagonal in Fourier space, if } D
 #     \text{ wraps round} \\
-#   d_p &= \max(1 - w / (\alpha \lVert v_p \rVert), 0) \, v_p, \quad v = D u + b && \text{a threshold on lengths, a prox} \\
+#   d_p &= \max(1 - w / (\alpha \lVert v_p \rVert), 0) \, v_p, \quad v = D u + b
+#     && \text{a threshold on lengths, a prox} \\
 #   b &\leftarrow b + D u - d
 # \end{aligned}$$
 
