@@ -379,9 +379,5 @@ app.command("figures")(figures_command)
 
 def main(arguments: list[str] | None = None) -> None:
     """Run `pgo` and leave with its exit code; every error and warning of ours is one line on stderr."""
-    warnings.showwarning = _say
+    warnings.showwarning = lambda message, *_, **__: print(f"pgo: warning: {message}", file=sys.stderr)
     raise SystemExit(run_command(app, sys.argv[1:] if arguments is None else arguments))
-
-
-def _say(message: Warning | str, *_: object, **__: object) -> None:
-    print(f"pgo: warning: {message}", file=sys.stderr)

@@ -26,6 +26,8 @@ from solvers.robust.gnc import GNC, RobustLoss, known_inliers
 from solvers.robust.rejection import Attempt, Rejection
 from solvers.solution import Solution
 
+Settle = Callable[[PGOProblem, Poses], Poses]  # to a stationary point nearby
+
 _CHEAP = 4000  # rows of a factor that may become dense: of so few, a factorisation takes a fraction of a second
 _CHEAP_ATTEMPTS = 3
 _PAIRED = 4000  # loop closures whose pairs are looked at within seconds
@@ -50,7 +52,7 @@ def solve_robustly(
     non-convexity is run until the edges it keeps are certified, at least three times where that is cheap: as set; on
     the pairwise consistent edges; with more and smaller steps; with tight thresholds, which are then widened by what
     the edges kept say; with the other loss. Of those certified, or of all if none is, that of the least truncated cost
-    of all edges is kept, less what `without_contradicted` takes out in one place.
+    of all edges is kept, less what the others contradict (`uncontradicted`).
 
     By robots (`shared`, `plain`) certificates are theirs, and what crosses the network is added up. A SettingError when
     robust is none, or PCM by robots, a GraphError when known inliers and the edges kept do not connect the poses.
@@ -89,31 +91,38 @@ def solve_robustly(
         if found.stage.status in OUT_OF_TIME or (is_enough and any(one.certificate.is_certified for one in attempts)):
             break
     best = min(attempts, key=lambda one: (not one.certificate.is_certified, one.attempt.cost))
-    kept, name = best.kept, best.attempt.name
+    kept, name, tries = best.kept, best.attempt.name, list[Solution]()
+
+    def settled(inliers: PGOProblem, poses: Poses) -> Poses:
+        if shared is None:
+            return polish(inliers, poses, max_steps=4)
+        tries.append(plain(inliers, start=poses, time_limit=watch.left))
+        return tries[-1].poses
+
+    if attempts[-1].stage.status not in OUT_OF_TIME:
+        kept = uncontradicted(problem, known, kept, best.certificate.poses, settled)
+        name += f", less {gone} that all others contradict" if (gone := (best.kept & ~kept).sum()) else ""
     if best.solution is None:
-        if attempts[-1].stage.status not in OUT_OF_TIME:
-            kept = without_contradicted(problem, known, kept, best.certificate.poses)
-            name += f", less {gone} that all others contradict" if (gone := (best.kept & ~kept).sum()) else ""
         solution = plain(inlier_problem(problem, kept), start=best.certificate.poses, time_limit=watch.left)
     else:
-        ledgers += [one.solution.ledger for one in attempts if one.solution is not None]
-        solution = replace(best.solution, ledger=reduce(Ledger.joined, filter(None, ledgers)))
+        ledgers += [one.solution.ledger for one in attempts if one.solution is not None] + [s.ledger for s in tries]
+        solution = next((s for s in tries if s.problem.graph.num_edges == kept.sum()), best.solution)
+        solution = replace(solution, ledger=reduce(Ledger.joined, filter(None, ledgers)))
     stages = (*(one.stage for one in attempts), *solution.stages)
     last = attempts[-1].stage.status
     solution = replace(solution, stages=stages, status=last if last in OUT_OF_TIME else solution.status)
     return result(solution, kept, best.scale * thresholds, name, tuple(one.attempt for one in attempts))
 
 
-def without_contradicted(problem: PGOProblem, known: BoolArray, kept: BoolArray, poses: Poses) -> BoolArray:
+def uncontradicted(problem: PGOProblem, known: BoolArray, kept: BoolArray, poses: Poses, settled: Settle) -> BoolArray:
     """Edges kept, (m,), but those that all others contradict: where few hold the map it bends, and residuals are small.
 
-    T_e is what the cost loses without edge e, over its quantile 0.99: e has the largest residual of those not known
-    (Baarda 1968, data snooping). Of the next one after it, T is the same. Edge e goes where T_e > 3 T of many, or
-    T_e > 1.5 T and the quantile at 1 - `FALSE_ALARM` over the number of edges tested; then the next one is judged.
+    T_e is what the cost loses without edge e, `settled` again, over its quantile 0.99: e has the largest residual of
+    those not known (Baarda 1968, data snooping). Of the next one after it, T is the same. Edge e goes where T_e > 3 T
+    of many, or T_e > 1.5 T and the quantile at 1 - `FALSE_ALARM` over their number; then the next one is judged.
     """
-    allowed, tested = chi2_thresholds(problem), max(2, int((kept & ~known).sum()))
-    far = chi2_thresholds(problem, 1.0 - FALSE_ALARM / tested) / allowed
-    further = _FURTHER if tested >= _MANY else np.inf
+    allowed, many = chi2_thresholds(problem), max(2, int((kept & ~known).sum()))
+    far, further = chi2_thresholds(problem, 1.0 - FALSE_ALARM / many) / allowed, _FURTHER if many >= _MANY else np.inf
     passed, cost, T_e, most = kept, inlier_problem(problem, kept).objective(poses), np.inf, 0.0
     while True:
         ratio = np.where(kept & ~known, problem.edge_costs(poses) / allowed, 0.0)
@@ -121,7 +130,7 @@ def without_contradicted(problem: PGOProblem, known: BoolArray, kept: BoolArray,
         others = kept & (np.arange(len(kept)) != e)
         if not ratio[e] or len(problem.graph.components(others)) > 1:
             return passed
-        poses = polish(less := inlier_problem(problem, others), poses, max_steps=4)
+        poses = settled(less := inlier_problem(problem, others), poses)
         T = (cost - less.objective(poses)) / allowed[e]
         if not (T_e > further * T or T_e > max(_FAR * T, most)):
             return passed

@@ -83,7 +83,8 @@ class OrthogonalSOC:
 
     def init(self, problem: OrthogonalProblem, start: OrthogonalPoint | None) -> OrthogonalState:
         """State 0: X = P = start, first columns of the identity unless given; a SettingError if it does not fit."""
-        point = start if start is not None else problem.point([_identity(v.shape) for v in problem.variables])
+        first = [np.eye(v.shape[0], v.size // v.shape[0]).reshape(v.shape) for v in problem.variables]
+        point = start if start is not None else problem.point(first)
         problem.check_point(point)
         split = problem.split(self.solver)
         rho, others = self._first_penalty(split, point)
@@ -237,10 +238,6 @@ def solve_orthogonal(
     problem.assign(values, best.state.others)
     objectives = tuple(outcome.objective if outcome.status.is_success else math.nan for outcome in outcomes)
     return OrthogonalSolution(problem, values, best.state.others, best.objective, kkt, best, objectives)
-
-
-def _identity(shape: tuple[int, ...]) -> Array:
-    return np.eye(shape[0], shape[1] if len(shape) == 2 else 1).reshape(shape)
 
 
 def _summed(problem: OrthogonalProblem, of_terms: Sequence[Array]) -> list[Array]:

@@ -122,11 +122,6 @@ class Reproduction:
     rows: tuple[ReproducedRow, ...]  # graph by graph, and for each SE-Sync, DGS, SOC as in the paper, SOC consensus
     is_complete: bool  # whether all was done; after Ctrl-C it was not
 
-    def soc_row(self, row: ReproducedRow) -> ReproducedRow:
-        """Row of the paper's own method on the same graph."""
-        of_graph = (other for other in self.rows if other.published is row.published)
-        return next(other for other in of_graph if other.contender is BenchmarkMethod.PAPER)
-
 
 def reproduce_tables(
     settings: ReproductionSettings | None = None,

@@ -69,7 +69,9 @@ def tables_as_text(tables: Reproduction) -> ResultTable:
         graph = _graph_cells(row) if is_first else ("",) * 5
         if row.reasons and not row.optima:  # one line says why a whole graph has no figures
             if is_first:
-                costs.append((*graph, *("-",) * 4, *_paper_cost_cells(tables.soc_row(row)), _remark(row)))
+                of_graph = (other for other in tables.rows if other.published is row.published)
+                soc = next(other for other in of_graph if other.contender is BenchmarkMethod.PAPER)
+                costs.append((*graph, *("-",) * 4, *_paper_cost_cells(soc), _remark(row)))
             continue
         costs.append((*graph, *_cost_cells(row), *_paper_cost_cells(row), _remark(row)))
         efforts.append((graph[0], *_effort_cells(row)))

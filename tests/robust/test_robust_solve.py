@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -7,11 +8,13 @@ from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
+from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import GraphError, SettingError
 from solvers import cli
 from solvers.robust.gnc import known_inliers
-from solvers.robust_solve import without_contradicted
+from solvers.robust_solve import uncontradicted
 
+SETTLED = partial(polish, max_steps=4)
 KINDS = pytest.mark.parametrize("kind", ["random", "aliased"])
 
 
@@ -190,18 +193,23 @@ def careful(n: int, seed: int) -> pgo.PoseGraph:
     return replace(graph, kappa=1e-2 * graph.kappa, tau=1e-2 * graph.tau, information=None)
 
 
+def with_shifted(right: pgo.PoseGraph) -> pgo.PoseGraph:
+    """The graph and one closure more, between true poses, one of which it has 1.5 m off."""
+    i, j = next((i, j + 5) for i, j in zip(right.i, right.j, strict=True) if j - i > 30)
+    R, t = right.truth.R, right.truth.t
+    off = pgo.Poses((R[i].T @ R[j])[None], (R[i].T @ (t[j] - t[i]) + np.array([1.5, 0.0]))[None])
+    return right.with_edges(np.array([i]), np.array([j]), off, right.kappa[-1:], right.tau[-1:])
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_closure_within_its_threshold_that_all_others_contradict_is_taken_out(seed):
     right = careful(100, seed)
-    i, j = next(pair for pair in zip(right.i, right.j, strict=True) if pair[1] - pair[0] > 30)
-    t = right.truth.R[i].T @ (right.truth.t[j + 5] - right.truth.t[i])
-    off = pgo.Poses((right.truth.R[i].T @ right.truth.R[j + 5])[None], t[None] + np.array([[1.5, 0.0]]))
-    graph = right.with_edges(np.array([i]), np.array([j + 5]), off, right.kappa[-1:], right.tau[-1:])
+    graph = with_shifted(right)
     problem, known = pgo.PGOProblem(graph), known_inliers(graph, None)
     everything = np.ones(graph.num_edges, dtype=bool)
     poses = solvers.solve(problem).poses
     assert problem.edge_costs(poses)[-1] < 0.5 * pgo.chi2_thresholds(problem)[-1]
-    kept = without_contradicted(problem, known, everything, poses)
+    kept = uncontradicted(problem, known, everything, poses, SETTLED)
     np.testing.assert_array_equal(np.flatnonzero(~kept), [right.num_edges])
 
 
@@ -210,7 +218,7 @@ def test_right_closures_are_hardly_ever_taken_out():
     for seed in range(60):
         problem = pgo.PGOProblem(careful(60, seed))
         known, everything = known_inliers(problem.graph, None), np.ones(problem.graph.num_edges, dtype=bool)
-        lost += int((~without_contradicted(problem, known, everything, solvers.solve(problem).poses)).sum())
+        lost += int((~uncontradicted(problem, known, everything, solvers.solve(problem).poses, SETTLED)).sum())
     assert lost <= 3
 
 
@@ -219,6 +227,19 @@ def test_few_closures_contradict_nothing_within_its_threshold():
     problem = pgo.PGOProblem(replace(right, kappa=1e-2 * right.kappa, tau=1e-2 * right.tau, information=None))
     known = known_inliers(right, None)
     assert 0 < (~known).sum() < 15
-    assert without_contradicted(
-        problem, known, np.ones(right.num_edges, dtype=bool), solvers.solve(problem).poses
-    ).all()
+    everything = np.ones(right.num_edges, dtype=bool)
+    assert uncontradicted(problem, known, everything, solvers.solve(problem).poses, SETTLED).all()
+
+
+def test_robots_take_out_what_one_place_does():
+    right = careful(100, 0)
+    graph, _ = spoiled(with_shifted(right), 0.3, "random", seed=0)
+    here = solvers.solve(graph, robust=solvers.GNC())
+    there = solvers.solve(graph, robust=solvers.GNC(), robots=3)
+    for solution in (here, there):
+        assert "less 1 that all others contradict" in solution.robust.start
+        assert solution.is_certified
+        assert solution.robust.rejected[right.num_edges]
+    np.testing.assert_array_equal(there.robust.kept, here.robust.kept)
+    assert there.objective == pytest.approx(here.objective, rel=1e-9)
+    assert there.problem.graph.num_edges == there.robust.kept.sum()
