@@ -48,8 +48,8 @@ def solve_robustly(
     """Solution of the edges that are kept; `Solution.robust` says which, and what is proven.
 
     Where a factor of all edges is cheap the plain solution comes first: if it is certified, no edge but known inliers
-    is beyond its threshold, and all together cost no more than they may, nothing is to be rejected. Else graduated
-    non-convexity is run until the edges it keeps are certified, at least three times where that is cheap: as set; on
+    is beyond its threshold or contradicted, and all cost no more than they may, nothing is to be rejected. Graduated
+    non-convexity is run else until the edges it keeps are certified, at least three times where it is cheap: as set; on
     the pairwise consistent edges; with more and smaller steps; with tight thresholds, which are then widened by what
     the edges kept say; with the other loss. Of those certified, or of all if none is, that of the least truncated cost
     of all edges is kept, less what the others contradict (`uncontradicted`).
@@ -65,49 +65,51 @@ def solve_robustly(
     thresholds = chi2_thresholds(problem, robust.quantile)
     is_cheap = (problem.d + 1) * min(problem.num_poses, int((~known).sum())) <= _CHEAP
 
+    solutions: list[Solution] = []  # all that were made, whose traffic is added up
+
+    def solved(inliers: PGOProblem, poses: Poses | None) -> Solution:
+        solutions.append(plain(inliers, start=poses, time_limit=watch.left))
+        return solutions[-1]
+
+    def settled(inliers: PGOProblem, poses: Poses) -> Poses:
+        return polish(inliers, poses, max_steps=4) if shared is None else solved(inliers, poses).poses
+
     def result(solution: Solution, kept: BoolArray, allowed: Array, name: str, made: tuple[Attempt, ...]) -> Solution:
         ratio = problem.edge_costs(solution.poses) / allowed
         found = Rejection(problem, known, kept, ratio, robust.quantile, name, made, solution.is_certified)
-        return replace(solution, robust=found, seconds=time.perf_counter() - began)
+        ledgers = [one.ledger for one in solutions if one.ledger is not None]
+        account = reduce(Ledger.joined, ledgers) if ledgers else None
+        return replace(solution, robust=found, ledger=account, seconds=time.perf_counter() - began)
 
-    ledgers: list[Ledger | None] = []
     if is_cheap and start is None:
-        solution = plain(problem, time_limit=watch.left)
-        everything, residuals = np.ones(graph.num_edges, dtype=bool), solution.edge_residuals
+        solution, everything = solved(problem, None), np.ones(graph.num_edges, dtype=bool)
+        residuals = solution.edge_residuals
         fits = (known | (residuals.cost <= thresholds)).all() and not residuals.is_overall_misfit
+        fits = fits and uncontradicted(problem, known, everything, solution.poses, settled).all()
         if (solution.is_certified and fits) or solution.status in OUT_OF_TIME:
             return result(solution, everything, thresholds, "the plain solution, which fits every edge", ())
-        ledgers.append(solution.ledger)
     if isinstance(robust, PCM):
         kept = known | pairwise_consistent(graph, known, robust.quantile)
-        solution = plain(inlier_problem(problem, kept), start=start, time_limit=watch.left)
-        return result(solution, kept, thresholds, "pairwise consistency alone", ())
+        return result(solved(inlier_problem(problem, kept), start), kept, thresholds, "pairwise consistency alone", ())
     attempts: list[_Estimate] = []
     trials = _Trials(problem, known, thresholds, gap, start, watch)
     for name, method, tested in _methods(robust, graph, known, shared is None):
         found = trials.run(name, method, tested) if shared is None else trials.share(name, method, plain, shared)
         attempts.append(found)
+        solutions += filter(None, [found.solution])
         is_enough = len(attempts) >= (_CHEAP_ATTEMPTS if is_cheap else 1)
         if found.stage.status in OUT_OF_TIME or (is_enough and any(one.certificate.is_certified for one in attempts)):
             break
     best = min(attempts, key=lambda one: (not one.certificate.is_certified, one.attempt.cost))
-    kept, name, tries = best.kept, best.attempt.name, list[Solution]()
-
-    def settled(inliers: PGOProblem, poses: Poses) -> Poses:
-        if shared is None:
-            return polish(inliers, poses, max_steps=4)
-        tries.append(plain(inliers, start=poses, time_limit=watch.left))
-        return tries[-1].poses
-
+    kept, name = best.kept, best.attempt.name
     if attempts[-1].stage.status not in OUT_OF_TIME:
         kept = uncontradicted(problem, known, kept, best.certificate.poses, settled)
         name += f", less {gone} that all others contradict" if (gone := (best.kept & ~kept).sum()) else ""
     if best.solution is None:
-        solution = plain(inlier_problem(problem, kept), start=best.certificate.poses, time_limit=watch.left)
+        solution = solved(inlier_problem(problem, kept), best.certificate.poses)
     else:
-        ledgers += [one.solution.ledger for one in attempts if one.solution is not None] + [s.ledger for s in tries]
-        solution = next((s for s in tries if s.problem.graph.num_edges == kept.sum()), best.solution)
-        solution = replace(solution, ledger=reduce(Ledger.joined, filter(None, ledgers)))
+        later = (one for one in reversed(solutions) if one.problem.graph.num_edges == kept.sum())
+        solution = best.solution if kept is best.kept else next(later)
     stages = (*(one.stage for one in attempts), *solution.stages)
     last = attempts[-1].stage.status
     solution = replace(solution, stages=stages, status=last if last in OUT_OF_TIME else solution.status)
@@ -124,17 +126,16 @@ def uncontradicted(problem: PGOProblem, known: BoolArray, kept: BoolArray, poses
     allowed, many = chi2_thresholds(problem), max(2, int((kept & ~known).sum()))
     far, further = chi2_thresholds(problem, 1.0 - FALSE_ALARM / many) / allowed, _FURTHER if many >= _MANY else np.inf
     passed, cost, T_e, most = kept, inlier_problem(problem, kept).objective(poses), np.inf, 0.0
-    while True:
-        ratio = np.where(kept & ~known, problem.edge_costs(poses) / allowed, 0.0)
-        e = int(ratio.argmax())
-        others = kept & (np.arange(len(kept)) != e)
-        if not ratio[e] or len(problem.graph.components(others)) > 1:
-            return passed
+    while (ratio := np.where(kept & ~known, problem.edge_costs(poses) / allowed, 0.0)).any():
+        others = kept & (np.arange(len(kept)) != (e := int(ratio.argmax())))
+        if len(problem.graph.components(others)) > 1:
+            break
         poses = settled(less := inlier_problem(problem, others), poses)
         T = (cost - less.objective(poses)) / allowed[e]
         if not (T_e > further * T or T_e > max(_FAR * T, most)):
-            return passed
+            break
         passed, kept, cost, T_e, most = kept, others, less.objective(poses), T, far[e]
+    return passed
 
 
 def inlier_problem(problem: PGOProblem, kept: BoolArray) -> PGOProblem:

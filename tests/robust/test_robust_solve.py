@@ -243,3 +243,16 @@ def test_robots_take_out_what_one_place_does():
     np.testing.assert_array_equal(there.robust.kept, here.robust.kept)
     assert there.objective == pytest.approx(here.objective, rel=1e-9)
     assert there.problem.graph.num_edges == there.robust.kept.sum()
+
+
+def test_a_contradicted_closure_is_found_where_every_residual_fits():
+    graph = with_shifted(careful(100, 1))
+    plain = solvers.solve(graph)
+    assert plain.is_certified
+    assert not plain.edge_residuals.is_doubtful
+    solution = solvers.solve(graph, robust=solvers.GNC())
+    np.testing.assert_array_equal(np.flatnonzero(solution.robust.rejected), [graph.num_edges - 1])
+    assert (
+        solution.robust.ratio[-1]
+        > solvers.solve(graph).edge_residuals.cost[-1] / pgo.chi2_thresholds(plain.problem)[-1]
+    )
