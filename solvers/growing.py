@@ -1,7 +1,6 @@
 """Graphs that grow: new poses start where their edges to the known ones put them, and Newton goes on from there.
 
-An update ends where the gap asked for is proven, not at rounding level: mostly one factorisation of the Hessian and the
-certificate, which alone takes a fifth (torus3D) to over a third (manhattan) of the time of a solve afresh.
+An update ends where the gap asked for is proven, not at rounding level: mostly one factorisation, and the certificate.
 """
 
 from dataclasses import replace

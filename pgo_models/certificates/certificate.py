@@ -216,8 +216,7 @@ def certify_at(
     >>> bool(0.9 * certificate.objective < certificate.lower_bound <= certificate.objective)
     True
     """
-    is_best = not problem.is_quadratic and stationarity <= STATIONARY_DECREMENT
-    best = poses if is_best else problem.at_best_translations(poses)
+    best = poses if stationarity <= STATIONARY_DECREMENT else problem.at_best_translations(poses)
     return certify_with(problem, poses, multipliers(problem, best), gap, stationarity, BoundSource.GIVEN, ground=best)
 
 

@@ -42,7 +42,7 @@ from pgo_models.problem.problem import PGOProblem
 _ETA_SHARE = 0.5  # of the wanted gap is spent on eta; the rest is for poses a little off the optimum
 UNGROUNDED_SHIFT = 1e-11  # of the diagonal: with eta, what is subtracted for rounding has to be made up for
 MOST_MOVES = 3
-SETTLED = 1e-13  # of the value: G adds less, and moving again would gain nothing
+SETTLED, HIDDEN = 1e-13, 0.1  # of the value, and of the loss with rounding: G adds less, moving again gains nothing
 NEGLIGIBLE = 0.01  # of what moving has gained, about the gap of the poses
 
 
@@ -230,7 +230,8 @@ def _move(problem: PGOProblem, Lambda: Array, X: Array, proof: DefiniteProof) ->
         if not after < left:
             break
         (X, low), found, product, left = there, moved, moved.product, after
-        if left <= max(SETTLED * abs(found.value), NEGLIGIBLE * gained):
+        hidden = HIDDEN * quadratic_loss(product[free], found.product_error[free], weight)
+        if left <= max(SETTLED * abs(found.value), NEGLIGIBLE * gained, hidden):
             break
     return X, found if found is not None else evaluate_certificate(problem, Lambda, X, low)
 
