@@ -131,10 +131,11 @@ def uncontradicted(problem: PGOProblem, known: BoolArray, kept: BoolArray, poses
         if len(problem.graph.components(others)) > 1:
             break
         poses = settled(less := inlier_problem(problem, others), poses)
-        T = (cost - less.objective(poses)) / allowed[e]
+        lower = less.objective(poses)
+        T = (cost - lower) / allowed[e]
         if not (T_e > further * T or T_e > max(_FAR * T, most)):
             break
-        passed, kept, cost, T_e, most = kept, others, less.objective(poses), T, far[e]
+        passed, kept, cost, T_e, most = kept, others, lower, T, far[e]
     return passed
 
 

@@ -220,8 +220,7 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     """
     graph, d, m, weights = problem.graph, problem.d, problem.graph.num_edges, problem.weights
     e_t, e_R = _residual_errors(problem, poses, np.linalg.norm(poses.t[graph.j] - poses.t[graph.i], axis=1))
-    X = problem.stacked(poses)
-    residuals, (_, w) = problem.residuals(X), problem.residual_matrix
+    (X, residuals), (_, w) = problem.evaluated(poses), problem.residual_matrix
     # Along the axes of W, which turn no norm, kappa weighs row by row.
     weighted = np.sum((w[:, None] * residuals) ** 2, axis=1)
     cross = float(np.sum(np.sqrt(weighted[:m]) * e_t))

@@ -110,7 +110,7 @@ class PGOProblem:
             return self
         if "tangent" in self._kept and self._kept["tangent"][0] is poses:
             return cast("PGOProblem", self._kept["tangent"][1])
-        X, residuals = self._at(poses)
+        X, residuals = self.evaluated(poses)
         tangent = excess.tangent(self.edge_products(residuals, X))
         found = replace(self, weighting=replace(self.weights, excess=None, tangent=tangent))
         found.__dict__.update({name: value for name, value in self.__dict__.items() if name in _OF_THE_PATTERN})
@@ -203,11 +203,11 @@ class PGOProblem:
 
     def objective(self, poses: Poses) -> float:
         """F at poses (paper: `min overall`, weighted)."""
-        return self.objective_stacked(*self._at(poses))
+        return self.objective_stacked(*self.evaluated(poses))
 
     def edge_costs(self, poses: Poses) -> Array:
         """Share of every edge in F, (m,)."""
-        m, (X, residuals), (_, w) = self.graph.num_edges, self._at(poses), self.residual_matrix
+        m, (X, residuals), (_, w) = self.graph.num_edges, self.evaluated(poses), self.residual_matrix
         squares = w * np.sum(residuals**2, axis=1)
         costs = squares[:m] + squares[m:].reshape(m, self.d).sum(axis=1)
         beyond = self.weights.excess or self.weights.tangent
@@ -215,7 +215,7 @@ class PGOProblem:
 
     def apply_M_at(self, poses: Poses) -> Array:
         """M X, (N, d), at poses, M that of the tangent there for chi2."""
-        return self.tangent_at(poses).apply_M(*self._at(poses))
+        return self.tangent_at(poses).apply_M(*self.evaluated(poses))
 
     def apply_M(self, X: Array, residuals: Array | None = None) -> Array:
         """M X = A^T (w A X), (N, d), by `residuals`, ((d+1) m, d): accurate where edges fit, however large t."""
@@ -265,7 +265,7 @@ class PGOProblem:
         excess, d = self.weights.excess, self.d
         if excess is None:
             return poses.with_translations(self.recover_translations(poses.R))
-        X, residuals = self._at(poses)
+        X, residuals = self.evaluated(poses)
         R_i, tau = poses.R[self.graph.i], self.weights.tau
         half = R_i @ (excess.J[:, :d, :d] + tau[:, None, None] * np.eye(d)) @ np.swapaxes(R_i, 1, 2)
         u, _ = excess.arguments(self.edge_products(residuals, X))
@@ -298,8 +298,8 @@ class PGOProblem:
             raise GraphError(f"{poses} beside {self}; give one pose for every pose of the graph, in its order")
         return poses.stacked()
 
-    def _at(self, poses: Poses) -> tuple[Array, Array]:
-        """X and its residuals, read-only, kept for the poses that were last asked for."""
+    def evaluated(self, poses: Poses) -> tuple[Array, Array]:
+        """X, (N, d), and its residuals, ((d+1) m, d), read-only, kept for the poses that were last asked for."""
         if "X" not in self._kept or self._kept["X"][0] is not poses:
             X = self.stacked(poses)
             self._kept["X"] = poses, read_only(X), read_only(self.residuals(X))
@@ -341,7 +341,7 @@ class PGOProblem:
         return self.M[self.num_poses :].tocsr()
 
 
-_OF_THE_PATTERN = {"residual_matrix", "plain_residual_matrix", "_adjoint", "_kept", "analysis", "pose_order"}
+_OF_THE_PATTERN = {"residual_matrix", "plain_residual_matrix", "_adjoint", "analysis", "pose_order"}
 _OF_THE_PATTERN |= {"incidence", "diagonal_positions", "block_positions"}
 
 

@@ -83,8 +83,9 @@ class OrthogonalSOC:
 
     def init(self, problem: OrthogonalProblem, start: OrthogonalPoint | None) -> OrthogonalState:
         """State 0: X = P = start, first columns of the identity unless given; a SettingError if it does not fit."""
-        first = [np.eye(v.shape[0], v.size // v.shape[0]).reshape(v.shape) for v in problem.variables]
-        point = start if start is not None else problem.point(first)
+        if (point := start) is None:
+            columns = [np.eye(v.shape[0], v.size // v.shape[0]).reshape(v.shape) for v in problem.variables]
+            point = problem.point(columns)
         problem.check_point(point)
         split = problem.split(self.solver)
         rho, others = self._first_penalty(split, point)

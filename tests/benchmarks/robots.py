@@ -37,7 +37,6 @@ from solvers.loop import run
 from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine, InProcess
 from solvers.network.faults import Faults
-from solvers.network.messages import Idle
 from solvers.network.ray_engine import RayEngine
 from solvers.soc.consensus import ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
@@ -168,24 +167,23 @@ class TimedRobots:
     def open(self, make: Callable[[Any], Any], shares: Sequence[Any]) -> "TimedRobots":
         """Robots of these shares."""
         self.seconds = np.zeros(len(shares))
-        self._robots = self._timed(make, shares)
+        robots = range(len(shares))
+        self._pool = InProcess().open(lambda robot: (robot, self._timed(robot, make, shares[robot])), robots)
         return self
 
     def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
         """Answers of all to an order."""
-        return self._timed(lambda pair: order(*pair), list(zip(self._robots, requests, strict=True)), requests)
+        return self._pool.ask(lambda held, request: self._timed(held[0], order, held[1], request), requests)
 
     def close(self) -> None:
-        """Nothing to let go."""
+        """Let them go."""
+        self._pool.close()
 
-    def _timed(self, act: Callable[[Any], Any], on: Sequence[Any], requests: Sequence[Any] = ()) -> list[Any]:
-        answers: list[Any] = []
-        for robot, argument in enumerate(on):
-            began = time.process_time()
-            is_idle = len(requests) > 0 and requests[robot] is Idle.IDLE
-            answers.append(None if is_idle else act(argument))
-            self.seconds[robot] += time.process_time() - began
-        return answers
+    def _timed(self, robot: int, act: Callable[..., Any], *arguments: object) -> Any:
+        began = time.process_time()
+        answer = act(*arguments)
+        self.seconds[robot] += time.process_time() - began
+        return answer
 
 
 def driver_job(robots: str, poses: str) -> dict[str, object]:

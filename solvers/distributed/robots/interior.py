@@ -358,7 +358,7 @@ class Interior:
     def evaluation(self, poses: Poses) -> CostParts:
         """Parts of F and of M X on the boundary, at poses."""
         problem = self.problem
-        force = problem.tangent_at(poses).apply_M(problem.stacked(poses))[self.boundary_rows]
+        force = problem.apply_M_at(poses)[self.boundary_rows]
         return CostParts(problem.objective(poses), rounding_level(problem, poses), force)
 
     def multipliers(self) -> Array:
