@@ -9,7 +9,7 @@ from pgo_models.errors import MissingExtraError, SettingError, extra_module
 from pgo_models.geometry.arrays import ReadOnly, whole_array, whole_number
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.measurements import has_no_gap
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 
 
 class PartitionMethod(enum.Enum):
@@ -107,7 +107,7 @@ def suited_partition(graph: PoseGraph, num_robots: int) -> Partition:
 
 def _metis(graph: PoseGraph, num_robots: int) -> IntArray:
     pymetis = extra_module("pymetis", "fast")
-    adjacency = edge_counts(graph.i, graph.j, graph.num_poses)
+    adjacency = graph.adjacency
     _, part = pymetis.part_graph(
         num_robots,
         adjacency=pymetis.CSRAdjacency(adjacency.indptr.tolist(), adjacency.indices.tolist()),

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from pgo_models.errors import GraphError
@@ -83,19 +83,15 @@ class PoseGraph(Measurements):
 
     @cached_property
     def adjacency(self) -> csr_array:
-        """Number of edges from pose to pose, (n, n)."""
-        edges = np.ones(self.num_edges), (self.i, self.j)
-        return read_only(coo_array(edges, shape=(self.num_poses, self.num_poses)).tocsr())
+        """Number of edges between every two poses, (n, n)."""
+        return read_only(edge_counts(self.i, self.j, self.num_poses))
 
     def components(self, edges: BoolArray | None = None) -> list[IntArray]:
         """Poses of every connected component, largest first; of some of the edges, (m,), or of all."""
-        if edges is None:
-            return list(self._components)
-        return _sorted_components(edge_counts(self.i[edges], self.j[edges], self.num_poses))
-
-    @cached_property
-    def _components(self) -> list[IntArray]:
-        return _sorted_components(self.adjacency)
+        between = self.adjacency if edges is None else edge_counts(self.i[edges], self.j[edges], self.num_poses)
+        count, label = connected_components(between, connection="strong")  # which is quick where symmetric
+        parts = [np.flatnonzero(label == c) for c in range(count)]
+        return sorted(parts, key=lambda part: (-len(part), int(part[0])))
 
     @property
     def is_connected(self) -> bool:
@@ -219,16 +215,16 @@ class PoseGraph(Measurements):
 def middle_pose(graph: PoseGraph) -> int:
     """A pose half-way along a long shortest path of a connected graph, found by two breadth-first searches."""
     end = poses_by_distance(graph, 0)[-1]
-    order, parent = breadth_first_order(graph.adjacency, end, directed=False)
-    path = [int(order[-1])]
+    order, parent = breadth_first_order(graph.adjacency, end)
+    path, before = [int(order[-1])], parent.tolist()
     while path[-1] != end:
-        path.append(int(parent[path[-1]]))
+        path.append(before[path[-1]])
     return path[len(path) // 2]
 
 
 def poses_by_distance(graph: PoseGraph, pose: int) -> IntArray:
     """Poses of a connected graph, (n,), by their number of edges to a pose, which is the first."""
-    return np.asarray(breadth_first_order(graph.adjacency, pose, directed=False, return_predecessors=False))
+    return np.asarray(breadth_first_order(graph.adjacency, pose, return_predecessors=False))
 
 
 def bridges(graph: PoseGraph, kept: BoolArray, ratio: Array) -> IntArray:
@@ -243,13 +239,7 @@ def bridges(graph: PoseGraph, kept: BoolArray, ratio: Array) -> IntArray:
     return np.asarray(order[tree.data.astype(np.int64) - 1])
 
 
-def _sorted_components(adjacency: csr_array) -> list[IntArray]:
-    count, label = connected_components(adjacency, directed=False)
-    parts = [np.flatnonzero(label == c) for c in range(count)]
-    return sorted(parts, key=lambda part: (-len(part), int(part[0])))
-
-
 def edge_counts(i: IntArray, j: IntArray, size: int) -> csr_array:
     """Symmetric matrix with the number of edges (i, j) between every two."""
     ends = np.concatenate([i, j]), np.concatenate([j, i])
-    return csr_array(coo_array((np.ones(2 * len(i)), ends), shape=(size, size)))
+    return csr_array((np.ones(2 * len(i)), ends), shape=(size, size))

@@ -138,9 +138,9 @@ def factorize(
 
 
 def minimum_degree(pattern: csc_array) -> IntArray:
-    """Order of elimination of a symmetric pattern, (N,): AMD with the extra `fast`, else the one SuperLU has."""
+    """Order of elimination, (N,), of a lower triangle: AMD with the extra `fast`, else the one SuperLU has."""
     if importlib.util.find_spec("cvxopt") is None:
-        return _SuperLU(pattern).order
+        return _SuperLU(csc_array(pattern + pattern.T)).order
     return amd_order(pattern)
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import csc_array
 
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
@@ -14,20 +14,17 @@ from pgo_models.problem.matrices import assemble, block_entries, rotation_column
 class Incidence:
     """Which edges begin and which end at a pose: sparse matrices of ones, (n, m); and these poses, (m,)."""
 
-    begins: csr_array
-    ends: csr_array
+    begins: csc_array
+    ends: csc_array
     i: IntArray
     j: IntArray
 
     @classmethod
     def of(cls, graph: PoseGraph) -> "Incidence":
         """Incidence of a graph."""
-
-        def ones(pose: IntArray) -> csr_array:
-            places = pose, np.arange(graph.num_edges)
-            return csr_array((np.ones(graph.num_edges), places), shape=(graph.num_poses, graph.num_edges))
-
-        return cls(ones(graph.i), ones(graph.j), graph.i, graph.j)
+        n, m, i, j = graph.num_poses, graph.num_edges, graph.i, graph.j
+        begins, ends = (csc_array((np.ones(m), pose, np.arange(m + 1)), shape=(n, m)) for pose in (i, j))
+        return cls(begins, ends, i, j)
 
     def at_beginning(self, blocks: Array) -> Array:
         """Sums of blocks (m, a, b) over the edges that begin at a pose, (n a, b)."""

@@ -11,9 +11,11 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, project_to_rotations, unstack_transposes
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 from pgo_models.problem.cholesky import factorize
-from pgo_models.problem.matrices import connection_laplacian, entry_positions, meets, rotation_columns
+from pgo_models.problem.matrices import edge_blocks, rotation_columns
 from pgo_models.problem.ordering import row_order
 from pgo_models.problem.problem import PGOProblem
+
+_SHARED = 10_000  # poses up to which the analysis of M, which others need, saves more than its larger factor costs
 
 
 def odometry_start(graph: PoseGraph) -> Poses:
@@ -95,22 +97,30 @@ def chordal_start(problem: PGOProblem) -> Poses:
         found = chordal_start(replace(problem, graph=graph.subgraph(inner), weighting=weights))
         poses = Poses(np.insert(found.R, world, np.eye(problem.d), axis=0), np.insert(found.t, world, 0.0, axis=0))
         return problem.with_best_translations(_with_world_fitted(graph, poses).R)
-    L, b = relaxed_rotations(problem, 0)
-    Y = factorize(L, problem.backend, row_order(problem.pose_order, problem.d)).solve(b)
+    n, (K, b) = problem.num_poses, relaxed_rotations(problem, 0)
+    if n <= _SHARED:
+        Y = problem.analysis.factorize(K).solve(b)[n:]
+    else:
+        Y = factorize(K[n:, n:].tocsc(), problem.backend, row_order(problem.pose_order, problem.d)).solve(b[n:])
     return problem.with_best_translations(project_to_rotations(unstack_transposes(Y)))
 
 
 def relaxed_rotations(problem: PGOProblem, held: int | None) -> tuple[csc_array, Array]:
-    """L, (dn, dn), and b, (dn, d), with L Y = b where tr(Y^T L Y) is least and the `held` pose, if any, has R = I."""
-    L, d = connection_laplacian(problem.graph, problem.weights), problem.d
-    b = np.zeros((len(L.indptr) - 1, d))
+    """K, (N, N), and b, (N, d): K X = b where tr(Y^T L Y) is least, and the `held` pose, if any, has R = I.
+
+    Y are the rotations of X. K has the pattern of M: L where that has rotations, and the identity for translations.
+    """
+    graph, n, d = problem.graph, problem.num_poses, problem.d
+    _, own_i, _, own_j = edge_blocks(graph.R_ij, np.zeros_like(graph.t_ij), problem.weights)
+    data, b = problem.M.data.copy(), np.zeros((problem.side, d))
+    data[problem.block_positions] = problem.incidence.at_both(own_i, own_j)
+    problem.leave_out(data, np.arange(n), 1.0)
     if held is not None:
-        fixed = rotation_columns(np.array([held]), 0, d)[0]
-        b -= L[:, fixed].toarray()
-        L.data[meets(L, fixed)] = 0.0
-        L.data[entry_positions(L, fixed, fixed)] = 1.0
+        fixed = rotation_columns(np.array([held]), n, d)[0]
+        b -= problem.with_pattern_of_M(data)[:, fixed].toarray()
+        problem.leave_out(data, fixed, 1.0)
         b[fixed] = np.eye(d)
-    return L, b
+    return problem.with_pattern_of_M(data), b
 
 
 def _with_world_fitted(graph: PoseGraph, poses: Poses) -> Poses:

@@ -4,6 +4,7 @@ Unknowns are stacked in X, (N, d) with N = (d+1) n: first the n rows t_i, then t
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array
@@ -26,18 +27,18 @@ def residual_matrix(graph: PoseGraph, weights: EdgeWeights | None = None) -> tup
     """
     n, m, d = graph.num_poses, graph.num_edges, graph.d
     weights = weights if weights is not None else isotropic_weights(graph)
-    edge = np.arange(m)
-    rotation_row = m + d * edge[:, None] + np.arange(d)
     block_i, block_j = rotation_columns(graph.i, n, d), rotation_columns(graph.j, n, d)
-    rows = [edge, edge, np.repeat(edge, d), rotation_row.ravel(), np.repeat(rotation_row, d)]
-    columns = [graph.j, graph.i, block_i.ravel(), block_j.ravel(), np.repeat(block_i[:, None], d, axis=1).ravel()]
-    at_j, at_i = np.ones(m * d), graph.R_ij
+    at_i, at_j, columns_j = graph.R_ij, np.ones((m, d, 1)), block_j[:, :, None]
     if weights.axes is not None:
-        rows[3], columns[3] = rows[4], np.repeat(block_j[:, None], d, axis=1).ravel()
-        at_j, at_i = np.swapaxes(weights.axes, 1, 2).ravel(), graph.R_ij @ weights.axes
-    values = [np.ones(m), -np.ones(m), -graph.t_ij.ravel(), at_j, -np.swapaxes(at_i, 1, 2).ravel()]
-    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-    return csr_array(entries, shape=((d + 1) * m, (d + 1) * n)), weights.of_rows(d)
+        at_i, at_j = graph.R_ij @ weights.axes, np.swapaxes(weights.axes, 1, 2)
+        columns_j = np.repeat(block_j[:, None], d, axis=1)
+    columns = [graph.i[:, None], graph.j[:, None], block_i], [np.repeat(block_i[:, None], d, axis=1), columns_j]
+    values = [np.full((m, 1), -1.0), np.ones((m, 1)), -graph.t_ij], [-np.swapaxes(at_i, 1, 2), at_j]
+    entries = (np.concatenate([np.concatenate(rows, axis=-1).ravel() for rows in of]) for of in (values, columns))
+    lengths = np.repeat([2 + d, d + at_j.shape[2]], [m, d * m])
+    A = csr_array((*entries, np.append(0, np.cumsum(lengths))), shape=((d + 1) * m, (d + 1) * n))
+    A.sum_duplicates()  # of which there are none, but rows are sorted, too
+    return A, weights.of_rows(d)
 
 
 def isotropic_weights(graph: PoseGraph) -> EdgeWeights:
@@ -107,18 +108,8 @@ def joint_matrix(graph: PoseGraph, weights: EdgeWeights | None = None) -> csc_ar
 
 def connection_laplacian(graph: PoseGraph, weights: EdgeWeights | None = None) -> csc_array:
     """L, (dn, dn), the rotation-only part of M: sum_e kappa ||R_j - R_i R_ij||_F^2 = tr(Y^T L Y), Y the rows R_i^T."""
-    weights = weights if weights is not None else isotropic_weights(graph)
-    n, d = graph.num_poses, graph.d
-    block_i, block_j = rotation_columns(graph.i, 0, d), rotation_columns(graph.j, 0, d)
-    _, own_i, between, own_j = edge_blocks(graph.R_ij, np.zeros_like(graph.t_ij), weights)
-    coupling = -between
-    blocks = [
-        (*block_entries(block_i, block_i), own_i),
-        (*block_entries(block_j, block_j), own_j),
-        (*block_entries(block_i, block_j), coupling),
-        (*block_entries(block_j, block_i), np.swapaxes(coupling, 1, 2)),
-    ]
-    return assemble(blocks, d * n)
+    M = joint_matrix(replace(graph, t_ij=np.zeros_like(graph.t_ij)), weights)
+    return M[graph.num_poses :, graph.num_poses :].tocsc()
 
 
 def marginalized_matrix(graph: PoseGraph, weights: EdgeWeights | None = None) -> Array:

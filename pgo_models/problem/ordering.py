@@ -8,9 +8,9 @@ serves all of them: minimum degree (Amestoy, Davis & Duff 2004), or on large gra
 import importlib.util
 
 import numpy as np
-from scipy.sparse import csc_array, eye_array
+from scipy.sparse import csc_array
 
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import CholeskyBackend, factorize, minimum_degree
 from pgo_models.problem.floating_point import FactorCounts
 
@@ -25,8 +25,8 @@ def pose_order(graph: PoseGraph) -> IntArray:
         return minimum_degree(_pattern(graph))
     import pymetis
 
-    adjacency = edge_counts(graph.i, graph.j, graph.num_poses)
-    order, _ = pymetis.nested_dissection(adjacency=pymetis.CSRAdjacency(adjacency.indptr, adjacency.indices))
+    neighbours = pymetis.CSRAdjacency(graph.adjacency.indptr, graph.adjacency.indices)
+    order, _ = pymetis.nested_dissection(adjacency=neighbours)
     return np.array(order, dtype=np.int64)  # a copy: CVXOPT takes no C long long
 
 
@@ -53,5 +53,7 @@ def most_counts(graph: PoseGraph, poses: IntArray, *widths: int) -> FactorCounts
 
 
 def _pattern(graph: PoseGraph) -> csc_array:
-    """Positive where two poses share an edge, and on the diagonal."""
-    return csc_array(edge_counts(graph.i, graph.j, graph.num_poses) + eye_array(graph.num_poses))
+    """Lower triangle, positive where two poses share an edge, and on the diagonal."""
+    i, j, every = graph.i, graph.j, np.arange(graph.num_poses)
+    places = np.append(np.maximum(i, j), every), np.append(np.minimum(i, j), every)
+    return csc_array((np.ones(len(places[0])), places), shape=(len(every), len(every)))

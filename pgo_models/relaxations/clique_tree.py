@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 
 _CLIQUE_OVERHEAD = 300.0
 
@@ -51,8 +51,7 @@ def clique_side(num_poses: int, d: int) -> int:
 
 def _eliminate(graph: PoseGraph) -> tuple[list[set[int]], list[int]]:
     """Cliques of the elimination of every pose, in order, and the place of every clique's parent."""
-    adjacency = edge_counts(graph.i, graph.j, graph.num_poses)
-    neighbours = [set(row.tolist()) for row in np.split(adjacency.indices, adjacency.indptr[1:-1])]
+    neighbours = [set(row.tolist()) for row in np.split(graph.adjacency.indices, graph.adjacency.indptr[1:-1])]
     heap = [(len(adjacent), pose) for pose, adjacent in enumerate(neighbours)]
     heapq.heapify(heap)
     place: dict[int, int] = {}

@@ -90,8 +90,8 @@ class Interior:
 
     def chordal(self, _: None) -> tuple[Interior, Reduced]:
         """Rotations without the constraints, that of pose 0 the identity."""
-        K, b = relaxed_rotations(self.part.problem, 0 if self.part.poses[0] == 0 else None)
-        return self._eliminate(K, (self.part.problem.d,), b)
+        p, (K, b) = len(self.part.poses), relaxed_rotations(self.part.problem, 0 if self.part.poses[0] == 0 else None)
+        return self._eliminate(K[p:, p:].tocsc(), (self.part.problem.d,), b[p:])
 
     def project(self, x: Array) -> tuple[Interior, ReducedTranslations]:
         """Back-substitute the relaxation and project its rotations; then `translations`."""
