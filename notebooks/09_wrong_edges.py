@@ -172,8 +172,9 @@ _ = right_axes.set(xlabel="solve", ylabel="weights of the closures")
 #
 # `solvers.GNC()` takes one Newton step per set of weights, scales the thresholds where the file's precisions do not fit
 # its residuals, and on a small graph is run three times or more, with other settings, for a second opinion. Closures
-# without which the others fit far better go in the end, small as their residuals are (data snooping, Baarda 1968). What
-# is kept is solved and certified as any graph.
+# without which the others fit far better go in the end, small as their residuals are (data snooping, Baarda 1968), and
+# on a small graph rejected ones come back, large as theirs are, that fit once the map may follow them. What is kept is
+# solved and certified as any graph.
 
 # %%
 robust = solvers.solve(graph, robust=solvers.GNC())

@@ -37,7 +37,6 @@ from solvers.distributed.leaderless import NO_CERTIFICATE, attempt_leaderless
 from solvers.distributed.robust import estimate_by_robots
 from solvers.distributed.stages import attempt_distributed, collect, open_driver
 from solvers.explanations import note_of_weights
-from solvers.frames import framed
 from solvers.loop import Watch
 from solvers.network.engine import Engine, InProcess
 from solvers.network.faults import Faults
@@ -51,7 +50,7 @@ from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
-from solvers.solution import Solution
+from solvers.solution import Solution, framed
 
 HANDOVER_TOLERANCE = 5e-3  # relative residual at which Newton needs one or two factorisations on all graphs tried
 HANDOVER = SOC(tolerance=HANDOVER_TOLERANCE, max_iterations=100)

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import reduce
+from heapq import heapify, heappop, heappush
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds
+from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds, edge_residuals
 from solvers.distributed.robust import SharedEstimate
 from solvers.loop import Watch
 from solvers.network.ledger import Ledger
@@ -32,6 +33,7 @@ _CHEAP = 4000  # rows of a factor that may become dense: of so few, a factorisat
 _CHEAP_ATTEMPTS = 3
 _PAIRED = 4000  # loop closures whose pairs are looked at within seconds
 _FAR, _FURTHER = 1.5, 3.0  # times T; three times it are one right set in a hundred, or fewer, of
+_TRIED = 50  # rejected edges at a time
 _MANY = 15  # edges on, whatever the scale of their matrices: so are the largest two of as many chi^2_3
 _TIGHT, _NARROW = (0.1, 0.01), 0.3  # of the thresholds at first, and of how far they are widened
 
@@ -52,7 +54,8 @@ def solve_robustly(
     non-convexity is run else until the edges it keeps are certified, at least three times where it is cheap: as set; on
     the pairwise consistent edges; with more and smaller steps; with tight thresholds, which are then widened by what
     the edges kept say; with the other loss. Of those certified, or of all if none is, that of the least truncated cost
-    of all edges is kept, less what the others contradict (`uncontradicted`).
+    of all edges is kept, less what the others contradict (`uncontradicted`) and, where it is cheap, with those that
+    they can follow (`reinstated`), if that is certified.
 
     By robots (`shared`, `plain`) certificates are theirs, and what crosses the network is added up. A SettingError when
     robust is none, or PCM by robots, a GraphError when known inliers and the edges kept do not connect the poses.
@@ -101,15 +104,20 @@ def solve_robustly(
         if found.stage.status in OUT_OF_TIME or (is_enough and any(one.certificate.is_certified for one in attempts)):
             break
     best = min(attempts, key=lambda one: (not one.certificate.is_certified, one.attempt.cost))
-    kept, name = best.kept, best.attempt.name
+    sets, poses, name = [best.kept], best.certificate.poses, best.attempt.name
     if attempts[-1].stage.status not in OUT_OF_TIME:
-        kept = uncontradicted(problem, known, kept, best.certificate.poses, settled)
-        name += f", less {gone} that all others contradict" if (gone := (best.kept & ~kept).sum()) else ""
-    if best.solution is None:
-        solution = solved(inlier_problem(problem, kept), best.certificate.poses)
-    else:
-        later = (one for one in reversed(solutions) if one.problem.graph.num_edges == kept.sum())
-        solution = best.solution if kept is best.kept else next(later)
+        sets = [uncontradicted(problem, known, best.kept, poses, settled)]
+        if is_cheap:
+            sets.insert(0, reinstated(problem, sets[0], poses, settled))
+    for kept in sets:
+        inliers, is_new = inlier_problem(problem, kept), not np.array_equal(kept, best.kept)
+        solution = (None if is_new else best.solution) or solved(inliers, poses)
+        if is_new and not solution.is_certified:
+            solution = min(solution, solved(inliers, None), key=lambda one: one.objective)
+        if solution.is_certified:
+            break
+    name += f", less {gone} that all others contradict" if (gone := (best.kept & ~kept).sum()) else ""
+    name += f", with {back} that they can follow" if (back := (kept & ~best.kept).sum()) else ""
     stages = (*(one.stage for one in attempts), *solution.stages)
     last = attempts[-1].stage.status
     solution = replace(solution, stages=stages, status=last if last in OUT_OF_TIME else solution.status)
@@ -137,6 +145,37 @@ def uncontradicted(problem: PGOProblem, known: BoolArray, kept: BoolArray, poses
             break
         passed, kept, cost, T_e, most = kept, others, lower, T, far[e]
     return passed
+
+
+def reinstated(problem: PGOProblem, kept: BoolArray, poses: Poses, settled: Settle) -> BoolArray:
+    """Edges kept, (m,), and rejected ones that fit once the others follow them, as in a map that few closures hold.
+
+    T_e is what the cost gains with edge e, `settled` again, over its quantile 0.99: below 1 the truncated cost, which
+    counts that quantile for a rejected edge, falls. Where errors are smaller than the matrices say, T_e has to be below
+    what the overall test allows for the edges kept (`EdgeResiduals.overall`). Of the `_TRIED` least residuals the least
+    T comes in, and so on; T is found again, at once where it was little, of all when none is left.
+    """
+    allowed, kept, count = chi2_thresholds(problem), kept.copy(), 0
+    poses = settled(inlier_problem(problem, kept), poses)
+
+    def tried(e: int) -> tuple[float, int, int, Poses]:
+        more = inlier_problem(problem, kept | (np.arange(len(kept)) == e))
+        there = settled(more, poses)
+        return (more.objective(there) - fit.cost.sum()) / allowed[e], int(kept.sum()), e, there
+
+    fit = edge_residuals(inlier_problem(problem, kept), poses)
+    while count < (count := int(kept.sum())):
+        away = np.flatnonzero(~kept)
+        nearest = away[np.argsort((problem.edge_costs(poses) / allowed)[away], kind="stable")][:_TRIED]
+        heapify(waiting := [tried(e) for e in nearest.tolist()])
+        while waiting and waiting[0][0] < min(1.0, fit.overall * fit.overall_allowed):
+            _, known, e, there = heappop(waiting)
+            if known < kept.sum():
+                heappush(waiting, tried(e))
+            else:
+                kept[e], poses = True, there
+                fit = edge_residuals(inlier_problem(problem, kept), poses)
+    return kept
 
 
 def inlier_problem(problem: PGOProblem, kept: BoolArray) -> PGOProblem:

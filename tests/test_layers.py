@@ -42,7 +42,6 @@ ORDER = {
         "solution",
         "cli_inputs",
         "explanations",
-        "frames",
         "robust_solve",
         "extended_solve",
         "pipeline",

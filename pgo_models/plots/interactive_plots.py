@@ -17,19 +17,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import pose_names
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.residuals import check_poses
-from pgo_models.plots.graph_plots import (
-    BETWEEN,
-    KIND_LABELS,
-    MISFIT,
-    MOST_LINES,
-    OWN,
-    SIGHTING,
-    UNCERTAIN,
-    confidence_ellipses,
-    edge_kinds,
-    lines_to_draw,
-    thinning_step,
-)
+from pgo_models.plots import graph_plots
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, plotly
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 
@@ -77,35 +65,37 @@ def explore_graph(
     """
     go = plotly("graph_objects")
     residuals = residuals or edge_residuals(graph, poses)
-    kind = edge_kinds(graph, poses, residuals=residuals)
+    kind = graph_plots.edge_kinds(graph, poses, residuals=residuals)
     names, several, named = np.array(pose_names(graph)), graph.num_robots > 1, graph.in_files
-    ends, kinds = lines_to_draw(graph, kind)
+    ends, kinds = graph_plots.lines_to_draw(graph, kind)
     traces = []
     if before is not None:
-        behind, _ = lines_to_draw(graph, np.where(kind < 0, kind, OWN), _MOST_BEHIND)
+        behind, _ = graph_plots.lines_to_draw(graph, np.where(kind < 0, kind, graph_plots.OWN), _MOST_BEHIND)
         traces.append(_lines(before.aligned_to(poses).t, behind, "before", QUIET_COLOUR, 0.7, "solid", True))
     part, labels = _parts(graph, names)
-    dots = named[:: thinning_step(len(named), MOST_DOTS)]
+    dots = named[:: graph_plots.thinning_step(len(named), MOST_DOTS)]
     for a, name in enumerate(labels):
-        mine, own, colour = dots[part[dots] == a], (kinds == OWN) & (part[ends[:, 0]] == a), COLOURS[a % len(COLOURS)]
+        mine, colour = dots[part[dots] == a], COLOURS[a % len(COLOURS)]
+        own = (kinds == graph_plots.OWN) & (part[ends[:, 0]] == a)
         own_lines = _lines(poses.t, ends[own], name, colour, 1.0, "solid", False)
         text = [f"pose {names[k]}, robot {graph.robots[k]}" if several else f"pose {names[k]}" for k in mine]
         # One entry of the legend shows and hides both; a robot may have no edge of its own, but has poses.
         for trace, shown in ((own_lines, False), (_dots(poses.t[mine], text, name, colour, 4.0), True)):
             traces.append({**trace, "legendgroup": name, "showlegend": shown})
     for one, colour, width, dash in (
-        (SIGHTING, QUIET_COLOUR, 0.3, "solid"),
-        (BETWEEN, QUIET_COLOUR, 1.0, "solid"),
-        (UNCERTAIN, QUIET_COLOUR, 1.5, "dot"),
-        (MISFIT, ALARM_COLOUR, 5.0, "solid"),
+        (graph_plots.SIGHTING, QUIET_COLOUR, 0.3, "solid"),
+        (graph_plots.BETWEEN, QUIET_COLOUR, 1.0, "solid"),
+        (graph_plots.UNCERTAIN, QUIET_COLOUR, 1.5, "dot"),
+        (graph_plots.MISFIT, ALARM_COLOUR, 5.0, "solid"),
     ):
         if (kinds == one).any():
-            traces.append(_lines(poses.t, ends[kinds == one], KIND_LABELS[one], colour, width, dash, True))
-    misfits = np.flatnonzero(kind == MISFIT)[:: thinning_step(int(np.sum(kind == MISFIT)), MOST_DOTS)]
+            traces.append(_lines(poses.t, ends[kinds == one], graph_plots.KIND_LABELS[one], colour, width, dash, True))
+    misfits = np.flatnonzero(kind == graph_plots.MISFIT)
+    misfits = misfits[:: graph_plots.thinning_step(len(misfits), MOST_DOTS)]
     middles = 0.5 * (poses.t[graph.i[misfits]] + poses.t[graph.j[misfits]])
     traces.append(_dots(middles, _misfit_text(graph, misfits, residuals), "misfit", ALARM_COLOUR, 6.0))
     if covariances is not None:
-        ellipses = confidence_ellipses(poses[named], covariances[named])
+        ellipses = graph_plots.confidence_ellipses(poses[named], covariances[named])
         outlines = np.pad(ellipses, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
         gaps, line = outlines.reshape(-1, graph.d), {"color": QUIET_COLOUR, "width": 1.0}
         traces.append({**_points(gaps), "mode": "lines", "line": line, "name": "95 % of x, y", "hoverinfo": "skip"})
@@ -179,7 +169,7 @@ def save_page(figure: Figure, path: Path | str) -> None:
 
 def _parts(graph: PoseGraph, names: NDArray[np.str_]) -> tuple[IntArray, list[str]]:
     """Part of every pose, (n,), that an entry of the legend shows and hides, and the entries: robots, or times."""
-    if graph.num_robots == 1 and graph.num_edges <= MOST_LINES:
+    if graph.num_robots == 1 and graph.num_edges <= graph_plots.MOST_LINES:
         return graph.robots, ["edges and poses"]
     owner, what = (graph.robots, "robot") if graph.num_robots > 1 else (np.arange(graph.num_poses), "pose")
     count = int(owner.max()) + 1

@@ -48,7 +48,10 @@ def set_option(cholmod: ModuleType, name: str, value: int) -> Iterator[None]:
 def import_cvxopt() -> tuple[ModuleType, ModuleType]:
     """CVXOPT and its CHOLMOD; a MissingExtraError without the extra `fast`."""
     with kernels_of_the_cpu():
-        return extra_module("cvxopt", "fast"), extra_module("cvxopt.cholmod", "fast")
+        found = extra_module("cvxopt", "fast"), extra_module("cvxopt.cholmod", "fast")
+    # Where OpenBLAS gets no memory for its buffer it crashes: it has it before a large matrix takes all.
+    extra_module("cvxopt.lapack", "fast").potrf(found[0].matrix(1.0))
+    return found
 
 
 def amd_order(pattern: csc_array) -> IntArray:

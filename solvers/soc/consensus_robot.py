@@ -18,23 +18,8 @@ from pgo_models.certificates.dual_variables import multiplier_norms, multipliers
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations, unstack_transposes
 from pgo_models.problem.matrices import inner
+from solvers.soc import copies
 from solvers.soc.anderson import AndersonShare, AndersonSums, over_relax
-from solvers.soc.copies import (
-    CopiesState,
-    CopyLayout,
-    Known,
-    Norms,
-    OwnPoses,
-    RescaleCopies,
-    Rows,
-    SeparatorPenalty,
-    Solved,
-    Started,
-    Stepped,
-    TurnAnswer,
-    TurnSettings,
-    Waiting,
-)
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.r_step import RotationStep, prepare
 from solvers.soc.recursion_block import Agreement, RecursionBlock, Rotations, block_at, nearest_rotations, stationary_B
@@ -45,22 +30,22 @@ from solvers.soc.separator_stiffness import GROUND, stiffness_of_separators, tra
 class ConsensusRobot:
     """A robot: its layout, what earlier orders left, and the back end of step (a), which follows from both."""
 
-    layout: CopyLayout
-    state: CopiesState
+    layout: copies.CopyLayout
+    state: copies.CopiesState
     step_a: RotationStep | None = None
 
     # Set-up: poses and penalties.
 
-    def begin(self, poses: Poses) -> tuple[ConsensusRobot, Rows]:
+    def begin(self, poses: Poses) -> tuple[ConsensusRobot, copies.Rows]:
         """Start at own poses, (n_a): rows of the others' copies come from their owners."""
         X = poses.stacked()
         return self._with(X=X), {robot: X[self.layout.rows(mine)] for robot, mine in self.layout.told.items()}
 
-    def begin_here(self, _: None) -> tuple[ConsensusRobot, Rows]:
+    def begin_here(self, _: None) -> tuple[ConsensusRobot, copies.Rows]:
         """Start at omega, with the translations agreed on, and of step (a) in the interior."""
         return self.begin(self.poses)
 
-    def multiplier_norms(self, rows: Rows) -> tuple[ConsensusRobot, Norms]:
+    def multiplier_norms(self, rows: copies.Rows) -> tuple[ConsensusRobot, copies.Norms]:
         """Take the owners' poses: ||Lambda_i||_2 and m_i of the robot's own."""
         layout, X = self.layout, self.state.X.copy()
         for robot, theirs in layout.heard.items():
@@ -70,9 +55,9 @@ class ConsensusRobot:
         every = whole.M.data[whole.diagonal_positions]
         diagonal = np.concatenate([every[:n, None], every[n:].reshape(n, d)], axis=1)
         following = self._with(X=X, Lambda=Lambda, diagonal=diagonal)
-        return following, Norms(multiplier_norms(Lambda[layout.own]), following._scale[layout.own])
+        return following, copies.Norms(multiplier_norms(Lambda[layout.own]), following._scale[layout.own])
 
-    def penalize(self, order: PenaltyOrder) -> tuple[ConsensusRobot, Mapping[int, Known]]:
+    def penalize(self, order: PenaltyOrder) -> tuple[ConsensusRobot, Mapping[int, copies.Known]]:
         """Set rho of own poses; what their holders must know of them, and the forces on the common ones."""
         layout, state = self.layout, self.state
         n, d = layout.problem.num_poses, layout.problem.d
@@ -83,13 +68,14 @@ class ConsensusRobot:
         force = -2.0 * layout.problem.apply_M(state.X)
         known = np.concatenate([rho[:, None], state.diagonal, pull], axis=1)
         none = np.zeros(0, dtype=np.int64)
-        told = {robot: Known(known[layout.told.get(robot, none)], force[rows]) for robot, rows in layout.common.items()}
+        own = {robot: known[layout.told.get(robot, none)] for robot in layout.common}
+        told = {robot: copies.Known(own[robot], force[rows]) for robot, rows in layout.common.items()}
         return self._with(rho=rho, pull=pull, force=force, settings=order.settings), told
 
-    def stiffness(self, known: Mapping[int, Known]) -> tuple[ConsensusRobot, float]:
+    def stiffness(self, known: Mapping[int, copies.Known]) -> tuple[ConsensusRobot, float]:
         """Take what the owners know, and the forces of others; the stiffness of the robot's separators."""
         layout, state = self.layout, self.state
-        n, d, copies = layout.problem.num_poses, layout.problem.d, layout.subgraph.copies
+        n, d, times = layout.problem.num_poses, layout.problem.d, layout.subgraph.copies
         rho, diagonal, pull, total = (v.copy() for v in (state.rho, state.diagonal, state.pull, state.force))
         for robot, theirs in layout.heard.items():
             of_own = known[robot].of_own
@@ -97,15 +83,15 @@ class ConsensusRobot:
         for robot, rows in layout.common.items():
             total[rows] += known[robot].force
         separators = layout.separators
-        half_scale = 0.5 * diagonal[separators, 0] / copies[separators]
-        penalty = np.concatenate([np.zeros(n), np.repeat(rho / copies, d)])
+        half_scale = 0.5 * diagonal[separators, 0] / times[separators]
+        penalty = np.concatenate([np.zeros(n), np.repeat(rho / times, d)])
         penalty[separators] = 2.0 * GROUND * half_scale
         components = connected_components(layout.subgraph.graph.adjacency, directed=False)[1]
         factor = layout.problem.analysis.factorize(layout.subproblem(penalty).K)
         stiffness = stiffness_of_separators(factor, (d + 1) * n, separators, half_scale, components[separators])
         return self._with(rho=rho, diagonal=diagonal, pull=pull, total_force=total), stiffness
 
-    def start(self, separators: SeparatorPenalty) -> tuple[ConsensusRobot, Started]:
+    def start(self, separators: copies.SeparatorPenalty) -> tuple[ConsensusRobot, copies.Started]:
         """Factor, with omega at the poses and B in balance; ||omega||_rho^2 and rho_i / m_i of the own poses."""
         layout, state = self.layout, self.state
         n, d, held, own = layout.problem.num_poses, layout.problem.d, layout.held, layout.own
@@ -120,13 +106,13 @@ class ConsensusRobot:
         z, B = np.where(held, state.X, 0.0), np.where(held, balanced + mean, 0.0)
         diagonal = np.concatenate([state.diagonal[:, 0], state.diagonal[:, 1:].ravel()]) / layout.copies[:, 0]
         block = block_at(z, penalty, diagonal, state.settings, B)
-        started = Started(d * float(rho[own].sum()), (rho / self._scale)[own])
+        started = copies.Started(d * float(rho[own].sum()), (rho / self._scale)[own])
         following = self._with(rho=rho, block=block, origin=(z, block.s), sums=AndersonSums(), heard={}, ahead=None)
         return following._prepared(), started
 
     # The recursion.
 
-    def solve(self, _: None) -> tuple[ConsensusRobot, Solved]:
+    def solve(self, _: None) -> tuple[ConsensusRobot, copies.Solved]:
         """Step (a): rows of s after it, and sums; of those the merit alone where robots accelerate alone."""
         X, z, _B, drift = self._solved_after_local_passes()
         block, sums = self.block.after_solve(np.where(self.layout.held, X, 0.0), z, drift)
@@ -139,9 +125,9 @@ class ConsensusRobot:
             s = block.s
         assert s is not None
         rows = {robot: s[rows] for robot, rows in self.layout.common.items()}
-        return self._with(ahead=(X, block, known)), Solved(sums, rows)
+        return self._with(ahead=(X, block, known)), copies.Solved(sums, rows)
 
-    def step(self, order: tuple[Agreement, Rows]) -> tuple[ConsensusRobot, Stepped]:
+    def step(self, order: tuple[Agreement, copies.Rows]) -> tuple[ConsensusRobot, copies.Stepped]:
         """Extrapolate what was solved, own rows and the neighbours'; (b) and (c) with them; and (a) of the next step.
 
         A neighbour extrapolates its rows with the same coefficients: nobody waits for them a second time.
@@ -161,14 +147,14 @@ class ConsensusRobot:
         block, squares = block.agreed(moved._mean(rows))
         moved = moved._with(block=block)
         following, solved = moved.solve(None)
-        return following, Stepped(squares, moved.cost(None)[1], solved)
+        return following, copies.Stepped(squares, moved.cost(None)[1], solved)
 
-    def announce(self, settings: TurnSettings) -> tuple[ConsensusRobot, Rows]:
+    def announce(self, settings: copies.TurnSettings) -> tuple[ConsensusRobot, copies.Rows]:
         """Return the robot's rows for every neighbour, before the first turn."""
-        waiting = Waiting(settings, {}, dict.fromkeys(self.layout.common, 0))
+        waiting = copies.Waiting(settings, {}, dict.fromkeys(self.layout.common, 0))
         return self._with(waiting=waiting)._sending(self.block)
 
-    def turn(self, rows: Rows) -> tuple[ConsensusRobot, TurnAnswer]:
+    def turn(self, rows: copies.Rows) -> tuple[ConsensusRobot, copies.TurnAnswer]:
         """One turn with the newest rows that have arrived: (b), (c) and (a), damped; rows for every neighbour.
 
         s <- s + damping (T(s) - s) with T the map of the synchronous recursion, the neighbours' rows being old ones: an
@@ -189,7 +175,7 @@ class ConsensusRobot:
         block = replace(block, s=block.s + waiting.settings.damping * moved)
         following = self._with(X=X, waiting=waiting.after(math.sqrt(sums[0])))
         robot, sent = following._sending(block)
-        return robot, TurnAnswer(sent, sums, max(waited.values(), default=0))
+        return robot, copies.TurnAnswer(sent, sums, max(waited.values(), default=0))
 
     def travel(self, _: None) -> tuple[ConsensusRobot, Array]:
         """How far separator translations, and their multipliers, went: see `solvers.soc.separator_stiffness`."""
@@ -198,11 +184,11 @@ class ConsensusRobot:
         pulled = block.penalty[at, None] * (block.B - s + z)[at]
         return self, travel((block.z - z)[at], pulled, block.diagonal[at])
 
-    def back_at_best(self, _: None) -> tuple[ConsensusRobot, Rows]:
+    def back_at_best(self, _: None) -> tuple[ConsensusRobot, copies.Rows]:
         """Return to the s of the smallest merit; its rows for every neighbour."""
         return self._sending(replace(self.block, s=self.block.best))
 
-    def rescale(self, order: RescaleCopies) -> tuple[ConsensusRobot, None]:
+    def rescale(self, order: copies.RescaleCopies) -> tuple[ConsensusRobot, None]:
         """Agree on what was sent, if all went back to their best, multiply rho and keep rho B."""
         block = self.block if order.rows is None else replace(self.block, z=self._mean(order.rows))
         rho = order.factor * self.state.rho
@@ -229,10 +215,10 @@ class ConsensusRobot:
         X = np.where(self.layout.held, self.block.z, self.state.X)
         return Poses(self.omega, X[: self.layout.problem.num_poses])
 
-    def own_poses(self, _: None) -> tuple[ConsensusRobot, OwnPoses]:
+    def own_poses(self, _: None) -> tuple[ConsensusRobot, copies.OwnPoses]:
         """Omega and the translations at hand of the own poses, for whoever may see them."""
         mine = self.poses[self.layout.own]
-        return self, OwnPoses(self.layout.subgraph.poses[self.layout.own], mine.R, mine.t)
+        return self, copies.OwnPoses(self.layout.subgraph.poses[self.layout.own], mine.R, mine.t)
 
     def cost(self, _: None) -> tuple[ConsensusRobot, float]:
         """Part of F at omega, the translations agreed on, and inside those of step (a)."""
@@ -241,7 +227,7 @@ class ConsensusRobot:
 
     # What the orders share.
 
-    def restored(self, state: CopiesState) -> ConsensusRobot:
+    def restored(self, state: copies.CopiesState) -> ConsensusRobot:
         """Return the robot with all that orders left with it elsewhere."""
         robot = replace(self, state=state)
         return robot if state.block is None else robot._prepared()
@@ -249,7 +235,7 @@ class ConsensusRobot:
     def _with(self, **changes: object) -> ConsensusRobot:
         return replace(self, state=replace(self.state, **changes))  # type: ignore[arg-type] # checked by the class
 
-    def _sending(self, block: RecursionBlock) -> tuple[ConsensusRobot, Rows]:
+    def _sending(self, block: RecursionBlock) -> tuple[ConsensusRobot, copies.Rows]:
         return self._with(block=block), {robot: block.s[rows] for robot, rows in self.layout.common.items()}
 
     @property
@@ -278,7 +264,7 @@ class ConsensusRobot:
             drift = z + B - block.s
         return self.step_a.solve(z - B), z, B, drift
 
-    def _mean(self, received: Rows) -> Array:
+    def _mean(self, received: copies.Rows) -> Array:
         """Rotations omega and the mean translations, from s and the neighbours' rows in the order of robots."""
         block, n = self.block, self.layout.problem.num_poses
         parts = {**received, self.layout.subgraph.robot: block.s}

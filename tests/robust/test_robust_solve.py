@@ -10,9 +10,10 @@ import pgo_models as pgo
 import solvers
 from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import GraphError, SettingError
+from pgo_models.graphs.scenes import NoiseModel
 from solvers import cli
 from solvers.robust.gnc import known_inliers
-from solvers.robust_solve import uncontradicted
+from solvers.robust_solve import inlier_problem, reinstated, uncontradicted
 
 SETTLED = partial(polish, max_steps=4)
 KINDS = pytest.mark.parametrize("kind", ["random", "aliased"])
@@ -252,3 +253,45 @@ def test_a_contradicted_closure_is_found_where_every_residual_fits():
     assert not plain.edge_residuals.is_doubtful
     solution = solvers.solve(graph, robust=solvers.GNC())
     np.testing.assert_array_equal(np.flatnonzero(solution.robust.rejected), [graph.num_edges - 1])
+
+
+def few_closures(seed: int, n: int = 300, **changes: object) -> pgo.PoseGraph:
+    return pgo.grid_world(1, n, np.random.default_rng(seed), d=2, loop_closure_probability=0.015, **changes)
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3, 5])
+@pytest.mark.parametrize("claim", [1.0, 1e-2])
+def test_closures_that_the_map_can_follow_come_back(seed, claim):
+    """Two thirds of the right ones, some far off in the map without them, and none of as many wrong ones."""
+    graph, wrong = spoiled(few_closures(seed), 0.5, "random", seed)
+    graph = replace(graph, kappa=claim * graph.kappa, tau=claim * graph.tau, information=None)
+    problem, known = pgo.PGOProblem(graph), known_inliers(graph, None)
+    kept = known.copy()
+    kept[np.flatnonzero(~known & ~wrong)[::3]] = True
+    poses = solvers.solve(inlier_problem(problem, kept)).poses
+    far = problem.edge_costs(poses) > 5.0 * pgo.chi2_thresholds(problem) * claim
+    assert (far & ~kept & ~wrong).any()
+    np.testing.assert_array_equal(reinstated(problem, kept, poses, SETTLED), ~wrong)
+
+
+def test_nothing_comes_back_into_a_map_without_redundancy():
+    graph, _ = spoiled(few_closures(0, 60), 0.5, "random", 0)
+    problem, known = pgo.PGOProblem(graph), known_inliers(graph, None)
+    poses = solvers.solve(inlier_problem(problem, known)).poses
+    np.testing.assert_array_equal(reinstated(problem, known, poses, SETTLED), known)
+
+
+def test_what_pairwise_consistency_left_out_comes_back():
+    graph, wrong = spoiled(few_closures(3, 200, noise=NoiseModel(0.02, 0.1)), 0.5, "random", 3)
+    solution = solvers.solve(graph, robust=solvers.GNC())
+    assert "that they can follow" in solution.robust.start
+    assert solution.is_certified
+    np.testing.assert_array_equal(solution.robust.kept, ~wrong)
+
+
+def test_robots_take_back_what_one_place_does():
+    graph, wrong = spoiled(few_closures(3, 200, noise=NoiseModel(0.02, 0.1)), 0.5, "random", 3)
+    solution = solvers.solve(graph, robust=solvers.GNC(), robots=3)
+    assert "with 1 that they can follow" in solution.robust.start
+    np.testing.assert_array_equal(solution.robust.kept, ~wrong)
+    assert solution.is_certified

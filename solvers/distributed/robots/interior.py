@@ -30,22 +30,10 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.initialization import relaxed_rotations
 from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.robots import records
 from solvers.distributed.robots.elimination import Widths
 from solvers.distributed.robots.factors import Eliminated, Factors
 from solvers.distributed.robots.proof import RobotProof
-from solvers.distributed.robots.records import (
-    Agree,
-    Agreed,
-    CostParts,
-    InteriorPoses,
-    ModelOrder,
-    Move,
-    Reduced,
-    ReducedTranslations,
-    RescaleInterior,
-    RightHandSide,
-    TrialEvaluation,
-)
 from solvers.soc.copies import Norms, thinned
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.recursion_block import RecursionBlock
@@ -88,16 +76,16 @@ class Interior:
         diagonal = problem.M.data[problem.diagonal_positions]
         return self, diagonal[self.boundary_rows]
 
-    def chordal(self, _: None) -> tuple[Interior, Reduced]:
+    def chordal(self, _: None) -> tuple[Interior, records.Reduced]:
         """Rotations without the constraints, that of pose 0 the identity."""
         p, (K, b) = len(self.part.poses), relaxed_rotations(self.part.problem, 0 if self.part.poses[0] == 0 else None)
         return self._eliminate(K[p:, p:].tocsc(), (self.part.problem.d,), b[p:])
 
-    def project(self, x: Array) -> tuple[Interior, ReducedTranslations]:
+    def project(self, x: Array) -> tuple[Interior, records.ReducedTranslations]:
         """Back-substitute the relaxation and project its rotations; then `translations`."""
         return self._at(project_to_rotations(unstack_transposes(self.back_substitute(x)))).translations(None)
 
-    def choose_cost(self, final: bool) -> tuple[Interior, CostParts]:
+    def choose_cost(self, final: bool) -> tuple[Interior, records.CostParts]:
         """Go over to the cost that is solved, or back: its parts at the poses at hand."""
         return self.with_changes(is_final=final).evaluate(None)
 
@@ -105,11 +93,11 @@ class Interior:
         """Take poses from elsewhere, (p,), as they are."""
         return self.with_changes(poses=poses), None
 
-    def evaluate(self, _: None) -> tuple[Interior, CostParts]:
+    def evaluate(self, _: None) -> tuple[Interior, records.CostParts]:
         """Parts of F and of M X on the boundary, at the poses at hand."""
         return self, self.evaluation(self.state.poses)
 
-    def adopt(self, z: Array) -> tuple[Interior, ReducedTranslations]:
+    def adopt(self, z: Array) -> tuple[Interior, records.ReducedTranslations]:
         """Take rotations of the cover's poses, rows (dg, d); then `translations`."""
         R = self.state.poses.R.copy()
         R[self.part.boundary] = unstack_transposes(z)
@@ -123,11 +111,11 @@ class Interior:
         """Return to the poses that were kept."""
         return self.with_changes(poses=self.state.kept), None
 
-    def translations(self, _: None) -> tuple[Interior, ReducedTranslations]:
+    def translations(self, _: None) -> tuple[Interior, records.ReducedTranslations]:
         """Right-hand side of the best translations, and once their matrix."""
         return self._reduced_translations(self.state.poses.R)
 
-    def set_translations(self, t: Array) -> tuple[Interior, CostParts]:
+    def set_translations(self, t: Array) -> tuple[Interior, records.CostParts]:
         """Take the best translations, from (g, d) on the boundary: parts of F and of M X on the boundary."""
         R = self.state.poses.R
         return self.with_changes(poses=Poses(R, self._translations(R, t))).evaluate(None)
@@ -138,13 +126,13 @@ class Interior:
 
     # SOC.
 
-    def penalize(self, order: PenaltyOrder) -> tuple[Interior, Reduced]:
+    def penalize(self, order: PenaltyOrder) -> tuple[Interior, records.Reduced]:
         """Set rho_i, factor M + D/2; omega is at the poses, B zero or stationary."""
         interior, problem = self.part.interior, self.part.problem
         diagonal = problem.M.data[problem.diagonal_positions][self._interior_rows]
         return self._penalized(order.block(self.state.poses.R[interior], self.multipliers()[interior], diagonal))
 
-    def rescale(self, order: RescaleInterior) -> tuple[Interior, Reduced]:
+    def rescale(self, order: records.RescaleInterior) -> tuple[Interior, records.Reduced]:
         """Multiply rho, from the best iterate on if asked to, and factor again."""
         block = self.block.back_at_best() if order.from_best else self.block
         return self._penalized(block.rescaled(order.factor * block.penalty))
@@ -155,11 +143,11 @@ class Interior:
         block, sums = self.block.after_solve(X[self._interior_rows])
         return self.with_changes(x=X, block=block), sums
 
-    def agree(self, order: Agree) -> tuple[Interior, Agreed]:
+    def agree(self, order: records.Agree) -> tuple[Interior, records.Agreed]:
         """Steps (b) and (c): sums of the residuals, and the right-hand side of the next step (a); with it `cost`."""
         block, sums = self.block.extrapolated(order.agreement).projected()
         following, right = self.with_changes(block=block).reduced(self._pull(block))
-        return following, Agreed(sums, right, following.cost(order.measured_at)[1])
+        return following, records.Agreed(sums, right, following.cost(order.measured_at)[1])
 
     def cost(self, z: Array) -> tuple[Interior, float]:
         """Part of F at omega, from its rows on the boundary, and the translations of step (a)."""
@@ -168,13 +156,13 @@ class Interior:
         X[problem.num_poses :] = stack_transposes(self._omega(z))
         return self, problem.objective_stacked(X)
 
-    def finish(self, z: Array) -> tuple[Interior, ReducedTranslations]:
+    def finish(self, z: Array) -> tuple[Interior, records.ReducedTranslations]:
         """Take omega for the rotations; then `translations`."""
         return self._at(self._omega(z)).translations(None)
 
     # Newton.
 
-    def model(self, order: ModelOrder) -> tuple[Interior, Reduced | None]:
+    def model(self, order: records.ModelOrder) -> tuple[Interior, records.Reduced | None]:
         """Hessian (Gauss-Newton where asked for), and the reduced gradient; None where K_II is not definite."""
         Lambda = None
         if order.second_order:
@@ -195,37 +183,37 @@ class Interior:
         except NotPositiveDefiniteError:
             return self, None
 
-    def move(self, order: Move) -> tuple[Interior, ReducedTranslations]:
+    def move(self, order: records.Move) -> tuple[Interior, records.ReducedTranslations]:
         """Direction -H^-1 g from H^-1 g on the boundary; then `turn`."""
         step = self._layout.split(-self.back_substitute(order.x)[:, 0])
         return self.with_changes(step=step).turn(order.length)
 
-    def move_straight(self, order: Move) -> tuple[Interior, TrialEvaluation]:
+    def move_straight(self, order: records.Move) -> tuple[Interior, records.TrialEvaluation]:
         """Direction -H^-1 g from H^-1 g on the boundary; then `go_straight`."""
         step = self._layout.split(-self.back_substitute(order.x)[:, 0])
         return self.with_changes(step=step).go_straight(order.length)
 
-    def go_straight(self, length: float) -> tuple[Interior, TrialEvaluation]:
+    def go_straight(self, length: float) -> tuple[Interior, records.TrialEvaluation]:
         """Trial a length along the direction, its translations as they come: F, force and reduced gradient there."""
         assert self.state.step is not None
         w, v = self.state.step
         trial = move_poses(self.state.poses, length * w, length * v)
         following, gradient = self.with_changes(trial=trial).reduced(self._gradient(trial))
-        return following, TrialEvaluation(self.evaluation(trial), gradient)
+        return following, records.TrialEvaluation(self.evaluation(trial), gradient)
 
-    def turn(self, length: float) -> tuple[Interior, ReducedTranslations]:
+    def turn(self, length: float) -> tuple[Interior, records.ReducedTranslations]:
         """Trial rotations a length along the direction, and the right-hand side of their best translations."""
         assert self.state.step is not None
         poses, (w, v) = self.state.poses, self.state.step
         trial = Poses(move_poses(poses, length * w, length * v).R, poses.t)
         return self.with_changes(trial=trial)._reduced_translations(trial.R)
 
-    def evaluate_trial(self, t: Array) -> tuple[Interior, TrialEvaluation]:
+    def evaluate_trial(self, t: Array) -> tuple[Interior, records.TrialEvaluation]:
         """Take the trial's best translations: F, force and reduced gradient there, by the factor at hand."""
         R = self.state.trial.R
         trial = Poses(R, self._translations(R, t))
         following, gradient = self.with_changes(trial=trial).reduced(self._gradient(trial))
-        return following, TrialEvaluation(self.evaluation(trial), gradient)
+        return following, records.TrialEvaluation(self.evaluation(trial), gradient)
 
     def accept(self, _: None) -> tuple[Interior, None]:
         """Go to the trial."""
@@ -233,23 +221,23 @@ class Interior:
 
     # The answer.
 
-    def result(self, _: None) -> tuple[Interior, InteriorPoses]:
+    def result(self, _: None) -> tuple[Interior, records.InteriorPoses]:
         """Interior poses and multipliers, for whoever may see them."""
         interior, poses = self.part.interior, self.state.poses
         Lambda = self.multipliers()[interior]
-        return self, InteriorPoses(self.part.poses[interior], poses.R[interior], poses.t[interior], Lambda)
+        return self, records.InteriorPoses(self.part.poses[interior], poses.R[interior], poses.t[interior], Lambda)
 
     # What is told again, to a driver that was started again.
 
-    def eliminated(self, _: None) -> tuple[Interior, Reduced]:
+    def eliminated(self, _: None) -> tuple[Interior, records.Reduced]:
         """Answer of the elimination at hand once more."""
         found = self.factors.of(self.state.eliminated)
-        return self, Reduced(found.schur, found.diagonal, RightHandSide(*found.reduce(self.state.b)))
+        return self, records.Reduced(found.schur, found.diagonal, records.RightHandSide(*found.reduce(self.state.b)))
 
-    def eliminated_translations(self, _: None) -> tuple[Interior, ReducedTranslations]:
+    def eliminated_translations(self, _: None) -> tuple[Interior, records.ReducedTranslations]:
         """Matrix of the translations once more, if there has been one."""
         schur = self.factors.laplacian.schur if self.state.has_laplacian else None
-        return self, ReducedTranslations(np.zeros((0, self.part.problem.d)), schur)
+        return self, records.ReducedTranslations(np.zeros((0, self.part.problem.d)), schur)
 
     # What the orders share.
 
@@ -306,21 +294,21 @@ class Interior:
         diagonal = self.part.problem.M.data[self.part.problem.diagonal_positions[self._interior_rows]]
         return np.asarray(diagonal.reshape(-1, self.part.problem.d).mean(axis=1))
 
-    def _eliminate(self, K: csc_array, widths: Widths, b: Array) -> tuple[Interior, Reduced]:
+    def _eliminate(self, K: csc_array, widths: Widths, b: Array) -> tuple[Interior, records.Reduced]:
         """Eliminate the interior of K x = b: what the driver needs of it."""
         eliminated, found = self.factors.eliminate(K, widths)
         following, right = self.with_changes(eliminated=eliminated).reduced(b)
-        return following, Reduced(found.schur, found.diagonal, right)
+        return following, records.Reduced(found.schur, found.diagonal, right)
 
-    def reduced(self, b: Array) -> tuple[Interior, RightHandSide]:
+    def reduced(self, b: Array) -> tuple[Interior, records.RightHandSide]:
         """Right-hand side on the boundary, and b_I . K_II^-1 b_I, by the elimination at hand."""
-        return self.with_changes(b=b), RightHandSide(*self.factors.of(self.state.eliminated).reduce(b))
+        return self.with_changes(b=b), records.RightHandSide(*self.factors.of(self.state.eliminated).reduce(b))
 
     def back_substitute(self, x: Array) -> Array:
         """Solution of the last elimination from its rows on the boundary."""
         return self.factors.of(self.state.eliminated).back_substitute(self.state.b, x)
 
-    def _penalized(self, block: RecursionBlock) -> tuple[Interior, Reduced]:
+    def _penalized(self, block: RecursionBlock) -> tuple[Interior, records.Reduced]:
         problem = self.part.problem
         data = problem.M.data.copy()
         data[problem.diagonal_positions[self._interior_rows]] += 0.5 * block.penalty
@@ -342,10 +330,10 @@ class Interior:
         R[self.part.boundary] = unstack_transposes(z)
         return R
 
-    def _reduced_translations(self, R: Array) -> tuple[Interior, ReducedTranslations]:
+    def _reduced_translations(self, R: Array) -> tuple[Interior, records.ReducedTranslations]:
         found = self.factors.laplacian
         b, schur = found.reduce(self._lever(R))[0], None if self.state.has_laplacian else found.schur
-        return self.with_changes(has_laplacian=True), ReducedTranslations(b, schur)
+        return self.with_changes(has_laplacian=True), records.ReducedTranslations(b, schur)
 
     def _translations(self, R: Array, t: Array) -> Array:
         return self.factors.laplacian.back_substitute(self._lever(R), t)
@@ -355,11 +343,11 @@ class Interior:
         p = self.part.problem.num_poses
         return np.asarray(-(self.part.problem.M[:p, p:] @ stack_transposes(R)))
 
-    def evaluation(self, poses: Poses) -> CostParts:
+    def evaluation(self, poses: Poses) -> records.CostParts:
         """Parts of F and of M X on the boundary, at poses."""
         problem = self.problem
         force = problem.apply_M_at(poses)[self.boundary_rows]
-        return CostParts(problem.objective(poses), rounding_level(problem, poses), force)
+        return records.CostParts(problem.objective(poses), rounding_level(problem, poses), force)
 
     def multipliers(self) -> Array:
         """Lambda_i, right in the interior alone, where the robot has every edge."""
