@@ -54,8 +54,8 @@ def solve_robustly(
     non-convexity is run else until the edges it keeps are certified, at least three times where it is cheap: as set; on
     the pairwise consistent edges; with more and smaller steps; with tight thresholds, which are then widened by what
     the edges kept say; with the other loss. Of those certified, or of all if none is, that of the least truncated cost
-    of all edges is kept, less what the others contradict (`uncontradicted`) and, where it is cheap, with those that
-    they can follow (`reinstated`), if that is certified.
+    of all edges is kept, less what the others contradict (`uncontradicted`) and, where it is cheap and attempts
+    differ, with those that they can follow (`reinstated`), if that is certified.
 
     By robots (`shared`, `plain`) certificates are theirs, and what crosses the network is added up. A SettingError when
     robust is none, or PCM by robots, a GraphError when known inliers and the edges kept do not connect the poses.
@@ -107,7 +107,7 @@ def solve_robustly(
     sets, poses, name = [best.kept], best.certificate.poses, best.attempt.name
     if attempts[-1].stage.status not in OUT_OF_TIME:
         sets = [uncontradicted(problem, known, best.kept, poses, settled)]
-        if is_cheap:
+        if is_cheap and any((one.kept != best.kept).any() for one in attempts):
             sets.insert(0, reinstated(problem, sets[0], poses, settled))
     for kept in sets:
         inliers, is_new = inlier_problem(problem, kept), not np.array_equal(kept, best.kept)
