@@ -108,7 +108,8 @@ def solve_robustly(
     if attempts[-1].stage.status not in OUT_OF_TIME:
         sets = [uncontradicted(problem, known, best.kept, poses, settled)]
         if is_cheap and any((one.kept != best.kept).any() for one in attempts):
-            sets.insert(0, reinstated(problem, sets[0], poses, settled))
+            more = reinstated(problem, sets[0], poses, settled)
+            sets = [more, *sets] if (more != sets[0]).any() else sets
     for kept in sets:
         inliers, is_new = inlier_problem(problem, kept), not np.array_equal(kept, best.kept)
         solution = (None if is_new else best.solution) or solved(inliers, poses)
@@ -156,21 +157,20 @@ def reinstated(problem: PGOProblem, kept: BoolArray, poses: Poses, settled: Sett
     T comes in, and so on; T is found again, at once where it was little, of all when none is left.
     """
     allowed, kept, count = chi2_thresholds(problem), kept.copy(), 0
-    poses = settled(inlier_problem(problem, kept), poses)
+    poses = settled(inliers := inlier_problem(problem, kept), poses)
+    fit = edge_residuals(inliers, poses)
 
     def tried(e: int) -> tuple[float, int, int, Poses]:
-        more = inlier_problem(problem, kept | (np.arange(len(kept)) == e))
-        there = settled(more, poses)
+        there = settled(more := inlier_problem(problem, kept | (np.arange(len(kept)) == e)), poses)
         return (more.objective(there) - fit.cost.sum()) / allowed[e], int(kept.sum()), e, there
 
-    fit = edge_residuals(inlier_problem(problem, kept), poses)
     while count < (count := int(kept.sum())):
         away = np.flatnonzero(~kept)
         nearest = away[np.argsort((problem.edge_costs(poses) / allowed)[away], kind="stable")][:_TRIED]
         heapify(waiting := [tried(e) for e in nearest.tolist()])
         while waiting and waiting[0][0] < min(1.0, fit.overall * fit.overall_allowed):
-            _, known, e, there = heappop(waiting)
-            if known < kept.sum():
+            _, before, e, there = heappop(waiting)
+            if before < kept.sum():
                 heappush(waiting, tried(e))
             else:
                 kept[e], poses = True, there

@@ -23,15 +23,15 @@ def project_to_tangent(Y: Array, V: Array) -> Array:
 def retract(Y: Array, V: Array) -> Array:
     """Nearest point to Y + V for V tangent at Y: the polar factors (A_i A_i^T)^(-1/2) A_i of A = Y + V.
 
-    A_i A_i^T = I + V_i V_i^T, so the inverse root exists for every V; blocks of V above 1e5 leave rounding in the
-    result. It agrees with the geodesic to second order.
+    A_i A_i^T = I + V_i V_i^T has a root for every V; rounding stays of blocks above 1e6. To second order a geodesic.
     """
     A = Y + V
     values, vectors = np.linalg.eigh(row_products(A, A))
     inverse_root = (vectors / np.sqrt(values)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
     moved = inverse_root @ A
-    # Long moves leave A_i A_i^T badly conditioned; one Newton-Schulz step takes the rounding out.
-    return np.asarray(1.5 * moved - 0.5 * (row_products(moved, moved) @ moved))
+    for _ in range(2):  # of Newton-Schulz: long moves leave A_i A_i^T badly conditioned, and rounding
+        moved = 1.5 * moved - 0.5 * (row_products(moved, moved) @ moved)
+    return np.asarray(moved)
 
 
 def append_rank(Y: Array, last: Array | None = None) -> Array:

@@ -29,7 +29,7 @@ def test_the_projection_is_the_nearest_tangent(seed: int, d: int, extra: int) ->
     assert np.sum((V - P) * other) == pytest.approx(0, abs=1e-11)
 
 
-@given(seed=SEEDS, d=DIMENSIONS, extra=EXTRA, length=st.sampled_from([1e-8, 1.0, 1e4]))
+@given(seed=SEEDS, d=DIMENSIONS, extra=EXTRA, length=st.sampled_from([1e-8, 1.0, 1e5]))
 def test_a_retraction_stays_on_the_manifold(seed: int, d: int, extra: int, length: float) -> None:
     Y, V = stacks(seed, d, extra)
     moved = retract(Y, length * project_to_tangent(Y, V))
