@@ -30,9 +30,7 @@ class FileFormatError(PGOError):
         """Say where (`path`, 1-based `line`) and what (`problem`, with the value and the way out)."""
         where = f"{path}" if line is None else f"{path}:{line}"
         super().__init__(f"{where}: {problem}")
-        self.path = Path(path)
-        self.line = line
-        self._given = path, line, problem
+        self.path, self.line, self._given = Path(path), line, (path, line, problem)
 
     def __reduce__(self) -> "tuple[type[FileFormatError], tuple[Path | str, int | None, str]]":
         return type(self), self._given
@@ -63,8 +61,7 @@ class MissingExtraError(PGOError):
     def __init__(self, package: str, extra: str) -> None:
         """Name the missing `package` and the `extra` that brings it."""
         super().__init__(f"{package} is not installed; run: pip install 'pgo-splitting[{extra}]'")
-        self.extra = extra
-        self._package = package
+        self.extra, self._package = extra, package
 
     def __reduce__(self) -> "tuple[type[MissingExtraError], tuple[str, str]]":
         return type(self), (self._package, self.extra)

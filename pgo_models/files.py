@@ -17,7 +17,7 @@ LARGEST = 1e100  # beyond it squares and determinants would overflow; no measure
 FARTHEST = 1e15  # metres: beyond it neighbouring doubles are more than 0.1 m apart
 _ZERO_QUATERNION = 1e-9  # a norm below this gives no direction: files hold about six digits
 _BLOCK = 2**24  # bytes of a file that are taken apart at a time
-LONGEST_LINE = 10_000  # characters; an edge in space with all its digits has 750
+LONGEST = 10_000  # characters of a line; an edge in space with all its digits has 750
 
 
 def read_text(path: Path | str) -> str:
@@ -52,19 +52,17 @@ def read_blocks(path: Path | str) -> Iterator[str]:
 
 
 def check_length(path: Path | str, line: int, text: str) -> None:
-    """Raise a FileFormatError when a line of numbers is longer than `LONGEST_LINE`: to take it apart takes minutes."""
-    if len(text) > LONGEST_LINE:
-        problem = f"{len(text)} characters, and no line of numbers has over {LONGEST_LINE}; break or remove it"
+    """Raise a FileFormatError when a line of numbers is longer than `LONGEST`: to take it apart takes minutes."""
+    if len(text) > LONGEST:
+        problem = f"{len(text)} characters, and no line of numbers has over {LONGEST}; break or remove it"
         raise FileFormatError(path, line, problem)
 
 
-def check_distances(path: Path | str, lines: Sequence[int] | NDArray[np.int64], t: NDArray[np.float64]) -> None:
+def check_metres(path: Path | str, lines: Sequence[int] | NDArray[np.int64], t: NDArray[np.float64]) -> None:
     """Raise a FileFormatError when a position or translation, (n, d), of these lines is beyond `FARTHEST`."""
     far = np.abs(t).max(axis=1, initial=0.0)
     if (far > FARTHEST).any():
-        problem = (
-            f"{far.max():.3g} m is beyond {FARTHEST:g} m, where doubles cannot tell metres apart; correct the line"
-        )
+        problem = f"{far.max():.3g} m is beyond {FARTHEST:g} m, where doubles tell no metres apart; correct the line"
         raise FileFormatError(path, int(lines[int(np.argmax(far))]), problem)
 
 
@@ -115,7 +113,7 @@ def read_table(path: Path | str, columns: int) -> tuple[NDArray[np.float64], lis
 
 def _sound_table(lines: list[str], columns: int) -> NDArray[np.float64] | None:
     """Numbers of lines where each is a row of them and nothing else, by one call, or None."""
-    if max(map(len, lines)) > LONGEST_LINE:
+    if max(map(len, lines)) > LONGEST:
         return None
     try:
         with warnings.catch_warnings(action="error"):  # of lines that are all blank

@@ -68,9 +68,8 @@ def with_times(graph: PoseGraph, path: Path | None) -> PoseGraph:
 
 def pose_named(graph: PoseGraph, name: int) -> int:
     """Pose with an id; a SettingError where there is none."""
-    found = np.flatnonzero(graph.pose_ids == name)
+    ids, found = graph.pose_ids, np.flatnonzero(graph.pose_ids == name)
     if not len(found):
-        ids = graph.pose_ids
         raise SettingError(f"{graph.name} has no pose {name} to anchor; its ids are from {ids.min()} to {ids.max()}")
     return int(found[0])
 

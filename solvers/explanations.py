@@ -89,8 +89,7 @@ def with_places(solution: Solution, graph: str, dropped: Dropped = None) -> Solu
     """The solution; a robust one with `file:line` of every edge of the graph that was asked for."""
     if solution.robust is None:
         return solution
-    places = tuple(kept_edges(graph, dropped)[1])
-    return replace(solution, robust=replace(solution.robust, places=places))
+    return replace(solution, robust=replace(solution.robust, places=tuple(kept_edges(graph, dropped)[1])))
 
 
 def place_of_weight(graph: str, dropped: Dropped = None) -> str:
@@ -102,8 +101,7 @@ def place_of_weight(graph: str, dropped: Dropped = None) -> str:
         loaded = load_graph(graph, False, True, dropped)
     _, edge, text = extreme_weight(loaded)
     place = kept_edges(graph, dropped)[1][edge]
-    return (
-        f"{place}: {text}; weights from {min(loaded.kappa.min(), loaded.tau.min()):.3g} to "
-        f"{max(loaded.kappa.max(), loaded.tau.max()):.3g} and lengths up to {np.abs(loaded.t_ij).max():.3g} m "
-        "are too far apart for doubles; correct the information matrix, or use --unit-weights"
-    )
+    weights, length = np.concatenate([loaded.kappa, loaded.tau]), np.abs(loaded.t_ij).max()
+    range_of = f"weights from {weights.min():.3g} to {weights.max():.3g} and lengths up to {length:.3g} m"
+    way_out = "correct the information matrix, or use --unit-weights"
+    return f"{place}: {text}; {range_of} are too far apart for doubles; {way_out}"

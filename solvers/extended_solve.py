@@ -2,7 +2,6 @@
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -15,16 +14,11 @@ from solvers.convex.extended_newton import ExtendedNewton, kinks
 from solvers.convex.extended_soc import with_priors
 from solvers.loop import Watch
 from solvers.result import OUT_OF_TIME, Stage
+from solvers.robust_solve import Plain
 from solvers.solution import Solution
 
 
-def solve_extended(
-    problem: PGOProblem,
-    pipeline: Any,  # noqa: ANN401 - a Pipeline, whose file imports this one
-    start: Poses | None,
-    watch: Watch,
-    plain: Callable[..., Solution],
-) -> Solution:
+def solve_extended(problem: PGOProblem, pipeline: Any, start: Poses | None, watch: Watch, plain: Plain) -> Solution:  # noqa: ANN401 - a Pipeline
     """Solve with priors for the terms that are such by `plain`, and where there is more run the ExtendedSOC, too.
 
     With priors alone the solution is that of the graph with them, whose last pose is the world. Else poses are of
@@ -38,12 +32,9 @@ def solve_extended(
         raise SettingError("a term may be negative, so there is no bound; use solvers.run(ExtendedSOC(..), problem)")
     first, start_of_it = replace(pipeline, soc=pipeline.soc.soc), None if start is None else graph.completed(start)
     solution = plain(replace(problem, graph=graph), first, start_of_it, time_limit=watch.left)
-    parts = {
-        "terms other than tau ||t - p||^2 and kappa ||R - P||_F^2": len(left),
-        "constraints": len(model.change.constraints),
-        "replaced edges": len(model.change.replaced_edges),
-    }
-    left_out = [f"{name} ({count})" for name, count in parts.items() if count]
+    change, terms = model.change, "terms other than tau ||t - p||^2 and kappa ||R - P||_F^2"
+    parts = (terms, left), ("constraints", change.constraints), ("replaced edges", change.replaced_edges)
+    left_out = [f"{name} ({len(several)})" for name, several in parts if several]
     if not left_out:
         return solution
     if solution.robots is not None or solution.robust is not None:
@@ -51,29 +42,25 @@ def solve_extended(
     run, certificate = watch.run(pipeline.soc, problem, start), solution.certificate
     level, stationarity, runs = certificate.rounding_level, math.nan, [run]
     model.variables.X.value = run.poses.stacked()
-    if not_smooth := sorted(
-        set(["constraints"] * bool(model.change.constraints)).union(*map(kinks, model.change.terms))
-    ):
-        left_out[-1] += (
-            f"; SOC is the last stage, as Newton needs smooth terms alone, and there are {', '.join(not_smooth)}"
-        )
+    if not_smooth := sorted(set(["constraints"] * bool(change.constraints)).union(*map(kinks, change.terms))):
+        why = f"as Newton needs smooth terms alone, and there are {', '.join(not_smooth)}"
+        left_out[-1] += f"; SOC is the last stage, {why}"
     elif run.status not in OUT_OF_TIME:
         newton = pipeline.newton
         second = ExtendedNewton(pipeline.soc.changer, newton.tolerance, newton.max_iterations)
         runs.append(run := watch.run(second, problem, run.poses))
         stationarity = run.state.decrement
     objective = model.cost(run.poses.stacked())
-    bound = NO_BOUND if model.change.replaced_edges else certificate.bound
+    bound = NO_BOUND if change.replaced_edges else certificate.bound
     gap = relative_gap(objective, bound.value, level)
     verdict = verdict_of(objective, level, gap, bound, certificate.wanted_gap)
+    found = replace(certificate, objective=objective, bound=bound, gap=gap, verdict=verdict, stationarity=stationarity)
     return replace(
         solution,
         problem=problem,
         poses=run.poses,
         objective=objective,
-        certificate=replace(
-            certificate, objective=objective, bound=bound, gap=gap, verdict=verdict, stationarity=stationarity
-        ),
+        certificate=found,
         status=run.status,
         stages=(*solution.stages, *(replace(Stage.of(r), objective=model.cost(r.poses.stacked())) for r in runs)),
         seconds=time.perf_counter() - watch.began,

@@ -26,8 +26,7 @@ def extend(solution: Solution, graph: PoseGraph, pipeline: Pipeline | None = Non
     """Solve a graph that has grown out of the solution's, from the solution.
 
     `graph` has poses of the solution, told by their ids, and new ones. Newton alone first; where its certificate fails,
-    the whole pipeline: the stages of the solution are those of both. A GraphError when the graph has none of the
-    solution's poses, or is not connected.
+    the whole pipeline: the stages are those of both. A GraphError when it has none of its poses, or is not connected.
 
     Examples
     --------

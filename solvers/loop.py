@@ -20,13 +20,11 @@ _TAKES_SECONDS = 20_000  # poses from which a factorisation is long enough to be
 P = TypeVar("P", contravariant=True)
 X = TypeVar("X", contravariant=True)
 S = TypeVar("S")
+Records = tuple[Record, ...]
 
 
 class Method(Protocol[P, X, S]):
-    """What the loop needs of an iterative method: settings, and these functions of them.
-
-    P is the kind of problem, X what a run can be started from, S the method's state.
-    """
+    """What the loop needs of a method for problems P, started at X, with states S: settings, and functions of them."""
 
     @property
     def max_iterations(self) -> int:
@@ -89,7 +87,7 @@ def run(
     problem: P,
     start: X | None = None,
     *,
-    earlier: tuple[Record, ...] = (),
+    earlier: Records = (),
     callback: Callable[[S, Record], bool | None] | None = None,
     time_limit: float = math.inf,
     verbose: bool = False,
@@ -100,7 +98,7 @@ def run(
     problem: Any,
     start: Any = None,
     *,
-    earlier: tuple[Record, ...] = (),
+    earlier: Records = (),
     callback: Callable[[S, Record], bool | None] | None = None,
     time_limit: float = math.inf,
     verbose: bool = False,
@@ -167,12 +165,8 @@ class Watch:
     @overload
     def run(self, method: Solver[S], problem: PGOProblem | PoseGraph, start: Poses | None = None) -> Run[S]: ...
     @overload
-    def run(
-        self, method: Method[P, X, S], problem: P, start: X | None = None, earlier: tuple[Record, ...] = ()
-    ) -> Outcome[S]: ...
-    def run(
-        self, method: Method[Any, Any, S], problem: Any, start: Any = None, earlier: tuple[Record, ...] = ()
-    ) -> Outcome[S]:
+    def run(self, method: Method[P, X, S], problem: P, start: X | None = None, earlier: Records = ()) -> Outcome[S]: ...
+    def run(self, method: Method[Any, Any, S], problem: Any, start: Any = None, earlier: Records = ()) -> Outcome[S]:
         """Run a method on a problem of its kind: the loop."""
         solver = cast(Solver[S], method) if hasattr(method, "poses") else None
         if solver is not None:
@@ -181,9 +175,8 @@ class Watch:
         began = time.perf_counter()
         state = method.init(problem, start)
         in_steps = time.perf_counter() - began + (earlier[-1].seconds if earlier else 0.0)
-        best: tuple[Measurement, S] | None = None
-        records = list(earlier)
-        k = len(earlier)
+        best: tuple[tuple[float, float], S] | None = None  # least infeasibility, then least objective
+        records, k = list(earlier), len(earlier)
         tolerance = getattr(method, "tolerance", 0.0)
         with Table(self._titled(name), method.max_iterations, self.verbose, self.progress, tolerance) as table:
             try:
@@ -191,8 +184,9 @@ class Watch:
                     measurement = method.measure(problem, state)
                     record = Record(k, in_steps, measurement)
                     records.append(record)
-                    if math.isfinite(measurement.objective) and (best is None or _is_better(measurement, best[0])):
-                        best = (measurement, state)
+                    rank = measurement.infeasibility, measurement.objective
+                    if math.isfinite(measurement.objective) and (best is None or rank < best[0]):
+                        best = (rank, state)
                     table.row(record, time.perf_counter() - began)
                     status = self._ending(method, state, record)
                     if status is not None:
@@ -211,11 +205,10 @@ class Watch:
             table.end(status, k)
         objective = records[-1].measurement.objective if records else math.nan
         if best is not None and not status.is_success:
-            objective, state = best[0].objective, best[1]
+            (_, objective), state = best
         history = History(tuple(records))
         if solver is None:
-            seconds = time.perf_counter() - began
-            return Outcome(name, objective, state, status, k, history, seconds, method=method)
+            return Outcome(name, objective, state, status, k, history, time.perf_counter() - began, method=method)
         poses = solver.poses(problem, state)
         self.found.append(poses)
         objective, seconds = problem.objective(poses), time.perf_counter() - began
@@ -227,13 +220,5 @@ class Watch:
             return Status.STOPPED
         if not math.isfinite(record.measurement.objective):
             return Status.NOT_FINITE
-        status = method.converged(state, record.measurement)
-        if status is not None:
-            return status
-        if is_late:
-            return Status.TIME_LIMIT
-        return Status.MAX_ITERATIONS if record.k >= method.max_iterations else None
-
-
-def _is_better(one: Measurement, other: Measurement) -> bool:
-    return (one.infeasibility, one.objective) < (other.infeasibility, other.objective)
+        limit = Status.MAX_ITERATIONS if record.k >= method.max_iterations else None
+        return method.converged(state, record.measurement) or (Status.TIME_LIMIT if is_late else limit)

@@ -5,7 +5,6 @@ import math
 import sys
 import time
 from importlib import import_module
-from types import TracebackType
 from typing import Any
 
 from solvers.result import Measurement, Record, Status
@@ -24,10 +23,8 @@ class Table:
     fall to a `tolerance`: the seconds until then, if their logarithm goes on falling as it did so far.
     """
 
-    def __init__(
-        self, name: str, max_iterations: int, verbose: bool, progress: bool | None, tolerance: float = 0.0
-    ) -> None:
-        self._name, self._max_iterations, self._tolerance = name, max_iterations, tolerance
+    def __init__(self, name: str, most: int, verbose: bool, progress: bool | None, tolerance: float = 0.0) -> None:
+        self._name, self._max_iterations, self._tolerance = name, most, tolerance
         self._first = math.inf  # residual
         self._in_notebook = "IPython" in sys.modules and import_module("rich.console").Console().is_jupyter
         self._verbose, self._progress = verbose, self._in_notebook if progress is None else progress
@@ -45,11 +42,9 @@ class Table:
             if record.k == 0:
                 robots = "" if figures.rounds is None else _HEADER_OF_ROBOTS
                 print(f"{self._name}\n{_HEADER}{robots}")
-            print(
-                f"{record.k:>5}  {figures.objective:>15.10g}  {_figure(figures.primal_residual)}  "
-                f"{_figure(figures.dual_residual)}  {record.seconds:>8.3f}{_communication(figures)}",
-                flush=True,
-            )
+            residuals = f"{_figure(figures.primal_residual)}  {_figure(figures.dual_residual)}"
+            row = f"{record.k:>5}  {figures.objective:>15.10g}  {residuals}  {record.seconds:>8.3f}"
+            print(row + _communication(figures), flush=True)
         elif self._progress:
             if self._bar is None and elapsed > _BAR_AFTER_SECONDS:
                 rich, name, most = import_module("solvers.progress_bars"), self._name, self._max_iterations
@@ -64,9 +59,7 @@ class Table:
         if self._verbose:
             print(f"{status.name} after {iterations} iterations: {status.value}", flush=True)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._bar is not None:
             self._bar.stop()
 
@@ -99,10 +92,8 @@ class _NotebookBar:
 
     def _page(self, k: int, text: str) -> str:
         seconds = time.perf_counter() - self._began + _BAR_AFTER_SECONDS
-        return (
-            f'{self._name} <progress value="{k}" max="{self._max_iterations}"></progress> '
-            f"{k}/{self._max_iterations} {html.escape(text)} {seconds:.0f} s"
-        )
+        bar = f'<progress value="{k}" max="{self._max_iterations}"></progress> {k}/{self._max_iterations}'
+        return f"{self._name} {bar} {html.escape(text)} {seconds:.0f} s"
 
 
 def _communication(figures: Measurement) -> str:

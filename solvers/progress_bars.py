@@ -7,10 +7,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 class JobBar(Progress):
-    """Progress over the parts of a job, or iterations of a run, None where there is one; on a terminal's stderr.
-
-    With `progress` given, it decides.
-    """
+    """Bar over parts of a job or iterations of a run, None for one; on a terminal's stderr, or as `progress` says."""
 
     def __init__(self, parts: int | None, progress: bool | None, name: str = "") -> None:
         is_shown = sys.stderr.isatty() if progress is None else progress

@@ -107,21 +107,15 @@ class Outcome(Generic[S]):
     method: object = field(default=None, kw_only=True)  # that ran, which is its settings
 
     def __repr__(self) -> str:
-        return (
-            f"{type(self).__name__}({self.name}: {self.status.name} after {self.iterations} iterations, "
-            f"F = {self.objective:.10g}, {self.seconds:.3g} s)"
-        )
+        ending = f"{self.status.name} after {self.iterations} iterations"
+        return f"{type(self).__name__}({self.name}: {ending}, F = {self.objective:.10g}, {self.seconds:.3g} s)"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Run(Outcome[S]):
-    """A finished run of one solver on a pose graph.
+    """A finished run of one solver on a pose graph; `objective` is F of its poses."""
 
-    `poses` are of the last iterate, or of the best one (lowest F) when the run did not succeed; `objective` is F of
-    them.
-    """
-
-    poses: Poses
+    poses: Poses  # of the last iterate, or of the best one (lowest F) when the run did not succeed
 
 
 @dataclass(frozen=True)

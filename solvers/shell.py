@@ -27,9 +27,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _SAME_SIGNAL = 0.5  # seconds: who hits Ctrl-C twice means it once, and the answer takes time
 _LONGEST_WORD = 300  # of an error message, which is to stay a line
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors and warnings alone.")]
-ThreadsOption = Annotated[
-    int | None, typer.Option(min=1, help="Threads of the linear algebra; one for every core unless given.")
-]
+ThreadsOption = Annotated[int | None, typer.Option(min=1, help="Threads of linear algebra; one a core unless given.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else on standard output.")]
 
 
@@ -175,8 +173,7 @@ def save_then_show(
 ) -> None:
     """Write every file that can be written, then print the result and their names, or nothing but a record.
 
-    Signals that come while files are written are too late: there is nothing left to break off. A PGOError comes at the
-    end, when a file could not be written.
+    Signals come too late while files are written, with nothing left to break off. A PGOError at the end: what failed.
     """
     written: list[Path] = []
     failures: list[str] = []

@@ -38,8 +38,7 @@ class Solution(Solved):
 
     `objective` is the cost of `poses`: F, or chi2 with `Weighting.INFORMATION`; F leaves their `frame` open, which says
     which it is. `certificate` has the lower bound on the global optimum, gap and verdict; `note` is what it lacks, and
-    why, or empty. `status` says how the last stage ended; `stages` are the start and the iterative stages, in order,
-    and `seconds` the wall time of it all.
+    why, or empty. `status` is that of the last of `stages`, start and iterative ones in order; `seconds` are wall time.
 
     Of a solve by many robots, `ledger` says what crossed the network, and `robots` who owned which pose. `anchor` is
     the pose that it is held by, or 0: what `marginals` are relative to; `covariances`, (n, p, p), are all
@@ -68,28 +67,23 @@ class Solution(Solved):
         return edge_residuals(self.problem, self.poses)
 
     def __repr__(self) -> str:
-        return (
-            f"Solution({self.problem.graph.name!r}, {self.certificate.cost}={self.objective:.10g}, gap={self.gap:.3g}, "
-            f"{self.certificate.verdict.name}{self._given})"
-        )
+        name, verdict = self.problem.graph.name, f"{self.certificate.verdict.name}{self._given}"
+        return f"Solution({name!r}, {self.certificate.cost}={self.objective:.10g}, gap={self.gap:.3g}, {verdict})"
 
     def __str__(self) -> str:
         rows = [f"{label:<12} {text}" for label, text in self._summary()]
-        lines = [self._stage_heads, *self._stage_rows()]
+        lines = self._stage_lines()
         rows += ["", *(f"{name:<14} {k:>10} {F:>16} {seconds:>9}  {ended}" for name, k, F, seconds, ended in lines)]
         return "\n".join(rows)
 
     def _repr_html_(self) -> str:
-        return facts_table(self._summary()) + rows_table(self._stage_heads, self._stage_rows())
+        heads, *rows = self._stage_lines()
+        return facts_table(self._summary()) + rows_table(heads, rows)
 
-    @property
-    def _stage_heads(self) -> tuple[str, str, str, str, str]:
-        return "stage", "iterations", self.certificate.cost, "seconds", "ended"
-
-    def _stage_rows(self) -> list[tuple[str, str, str, str, str]]:
-        return [
-            (s.name, str(s.iterations), f"{s.objective:.10g}", f"{s.seconds:.3f}", s.status.name) for s in self.stages
-        ]
+    def _stage_lines(self) -> list[tuple[str, str, str, str, str]]:
+        heads, stages = ("stage", "iterations", self.certificate.cost, "seconds", "ended"), self.stages
+        rows = [(s.name, str(s.iterations), f"{s.objective:.10g}", f"{s.seconds:.3f}", s.status.name) for s in stages]
+        return [heads, *rows]
 
     def marginals(self, *poses: int, anchor: int | None = None) -> Array:
         """Joint covariance of some poses, (k p, k p), or of every pose on its own, (n, p, p), when none is named.
@@ -106,9 +100,8 @@ class Solution(Solved):
         """Write the solution in the format that the suffix of `path` names.
 
         `.g2o`: the graph with the solved poses (a folder, when the name has no suffix: one file a robot); `.tum` or
-        `.txt`: a TUM trajectory; `.kitti`: a KITTI trajectory; `.json`: everything but the measurements; `.png`, `.svg`
-        or `.pdf`: the picture of `plot`. The file is written whole or not at all. A SettingError on another suffix, a
-        PGOError when the file cannot be written.
+        `.txt`: a TUM trajectory; `.kitti`: a KITTI one; `.json`: all but measurements; `.png`, `.svg` or `.pdf`: the
+        picture of `plot`. Whole or not at all: a SettingError on another suffix, a PGOError when it cannot be written.
         """
         path = Path(path)
         check_format(path)
@@ -129,8 +122,7 @@ class Solution(Solved):
     def report(self, path: Path | str) -> None:
         """Write one HTML page that opens offline: verdict, what to try next, pictures and tables; see `write_report`.
 
-        A MissingExtraError without plotly, a SettingError when `path` does not end in .html, a PGOError when the file
-        cannot be written.
+        A MissingExtraError without plotly, a SettingError but for .html, a PGOError when the file cannot be written.
         """
         from solvers.reporting.report import write_report
 
@@ -175,16 +167,10 @@ class Solution(Solved):
     def _network_json(self) -> dict[str, object]:
         if self.ledger is None or self.robots is None:
             return {}
-        ledger = self.ledger
-        figures = {
-            "rounds": ledger.rounds,
-            "all_reduces": ledger.all_reduces,
-            "messages": ledger.messages,
-            "bytes": ledger.num_bytes,
-            "bytes_sent": ledger.bytes_sent.tolist(),
-            "bytes_received": ledger.bytes_received.tolist(),
-        }
-        return {"robots": self.robots.robot.tolist(), "network": figures}
+        one = self.ledger
+        sums = {"rounds": one.rounds, "all_reduces": one.all_reduces, "messages": one.messages, "bytes": one.num_bytes}
+        of_robots = {"bytes_sent": one.bytes_sent.tolist(), "bytes_received": one.bytes_received.tolist()}
+        return {"robots": self.robots.robot.tolist(), "network": {**sums, **of_robots}}
 
     @property
     def _given(self) -> str:
@@ -248,9 +234,8 @@ def check_format(path: Path) -> None:
     """Raise what `Solution.save` would for the suffix of `path`: a SettingError, or if matplotlib is missing."""
     suffix = path.suffix.lower()
     if suffix not in ("", ".g2o", ".tum", ".txt", ".kitti", ".json") and not is_picture(path):
-        raise SettingError(
-            f"cannot write {path}: no format has suffix {suffix!r}; use .g2o, .tum, .kitti, .json, .png, .svg or .pdf"
-        )
+        known = ".g2o, .tum, .kitti, .json, .png, .svg or .pdf"
+        raise SettingError(f"cannot write {path}: no format has suffix {suffix!r}; use {known}")
     if is_picture(path) and importlib.util.find_spec("matplotlib") is None:
         raise MissingExtraError("matplotlib", "plot")
 

@@ -41,9 +41,7 @@ class BoundSource(enum.Enum):
     GIVEN = "at the poses given"
     POLISHED = "after polishing the poses given, which were not stationary"
     CHORDAL = "at the point that the chordal start polishes to, better than the one beside the poses given"
-    RELAXATION = (
-        "where the staircase solved the semidefinite relaxation, whose optimum is below F of all poses if not tight"
-    )
+    RELAXATION = "where the staircase solved the semidefinite relaxation, whose optimum is below F if it is not tight"
     SOFTENED = "where smaller information matrices, whose cost is below chi2 at all poses, have their minimum"
 
 
@@ -51,11 +49,10 @@ class BoundSource(enum.Enum):
 class Certificate(ReadOnly):
     """A proven lower bound on the global optimum beside the cost of given poses.
 
-    `objective` is F of the poses that were given, or chi2, as `weighting` says; `bound` is proven: F(R, t) >=
-    bound.value for every choice of poses, in exact arithmetic; `gap` is (objective - lower_bound) / objective, and 0
-    where F is at its `rounding_level`, below which it cannot be told from zero (`objective_rounding`). `stationarity`
-    is half the squared Newton decrement of the given poses, over F: about the relative decrease of F down to the
-    stationary point beside them.
+    `objective` is F of the given poses, or chi2, as `weighting` says; `bound` is proven: F(R, t) >= bound.value for all
+    poses, in exact arithmetic; `gap` is (objective - lower_bound) / objective, 0 where F is at its `rounding_level`,
+    below which it cannot be told from zero (`objective_rounding`). `stationarity` is half the squared Newton decrement
+    of the given poses, over F: about the relative decrease of F down to the stationary point beside them.
 
     The bound was found at `poses`, where F is `poses_objective`, the best value known; `source` says how these poses
     were come by. The multipliers `Lambda`, (n, d, d), are with eta and the poses the proof: anyone can check it with
@@ -255,20 +252,9 @@ def certify_with(
         ground = ground if ground is not None else problem.at_best_translations(poses)
         tangent = problem.tangent_at(ground)
         bound = NO_BOUND if is_exact else best_bound(tangent, Lambda, ground, gap, objective)
-    unjudged = Certificate(
-        objective=objective,
-        bound=bound,
-        gap=math.nan,
-        rounding_level=rounding.level,
-        stationarity=stationarity,
-        source=source,
-        poses=poses,
-        poses_objective=objective,
-        Lambda=Lambda,
-        wanted_gap=gap,
-        verdict=Verdict.TRIVIAL,
-        weighting=problem.weighting if isinstance(problem.weighting, Weighting) else Weighting.ISOTROPIC,
-    )
+    weighting = problem.weighting if isinstance(problem.weighting, Weighting) else Weighting.ISOTROPIC
+    figures = objective, bound, math.nan, rounding.level, stationarity  # the gap comes with the verdict
+    unjudged = Certificate(*figures, source, poses, objective, Lambda, gap, Verdict.TRIVIAL, weighting)
     return judge_cost(problem, unjudged, objective, rounding)
 
 
@@ -280,28 +266,17 @@ def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certif
     return judge_cost(problem, certificate, problem.objective(poses), objective_rounding(problem, poses))
 
 
-def judge_cost(
-    problem: PGOProblem | str, certificate: Certificate, objective: float, rounding: ObjectiveRounding
-) -> Certificate:
-    """Hold the cost of some poses against the bound of a certificate; errors as of `judge`."""
-    bound = certificate.bound
-    if bound.value > objective + rounding.error:
-        raise ProofError(
-            f"lower bound {bound.value!r} is above F = {objective!r} of {problem!r}, which is known to "
-            f"{rounding.error:.2g}: a defect of pgo_models; please report it with the graph"
-        )
+def judge_cost(problem: PGOProblem | str, given: Certificate, F: float, rounding: ObjectiveRounding) -> Certificate:
+    """The given certificate of poses that cost F instead, held against its bound; errors as of `judge`."""
+    bound, level = given.bound, rounding.level
+    if bound.value > F + rounding.error:
+        above = f"lower bound {bound.value!r} is above F = {F!r} of {problem!r}, which is known to {rounding.error:.2g}"
+        raise ProofError(f"{above}: a defect of pgo_models; please report it with the graph")
     # F may come out below a true bound by its own rounding, which is then what the gap is known to.
-    least = bound.value if bound.value < objective else objective - rounding.error
-    gap = relative_gap(objective, least, rounding.level)
-    bound = replace(bound, value=min(bound.value, objective))
-    return replace(
-        certificate,
-        objective=objective,
-        bound=bound,
-        gap=gap,
-        rounding_level=rounding.level,
-        verdict=verdict_of(objective, rounding.level, gap, bound, certificate.wanted_gap),
-    )
+    gap = relative_gap(F, bound.value if bound.value < F else F - rounding.error, level)
+    bound = replace(bound, value=min(bound.value, F))
+    verdict = verdict_of(F, level, gap, bound, given.wanted_gap)
+    return replace(given, objective=F, bound=bound, gap=gap, rounding_level=level, verdict=verdict)
 
 
 def verdict_of(objective: float, level: float, gap: float, bound: LowerBound, wanted_gap: float) -> Verdict:
@@ -319,6 +294,5 @@ def relative_gap(objective: float, lower_bound: float, rounding_level: float = 0
 
 
 def _bound_is_tight(certificate: Certificate) -> bool:
-    if certificate.poses_objective <= certificate.rounding_level:
-        return True
-    return relative_gap(certificate.poses_objective, certificate.lower_bound) <= certificate.wanted_gap
+    F, level = certificate.poses_objective, certificate.rounding_level
+    return relative_gap(F, certificate.lower_bound, level) <= certificate.wanted_gap

@@ -70,12 +70,10 @@ class DefiniteProof:
         free = self.free
         step = self.factor.solve(np.where(free[:, None], product, 0.0))
         if self.is_marginal:
-            preconditioner = LinearOperator(self.stored.shape, matvec=self.factor.solve, dtype=float)
+            inverse = LinearOperator(self.stored.shape, matvec=self.factor.solve, dtype=float)
             for column in range(step.shape[1]):
                 b, x0 = np.where(free, product[:, column], 0.0), step[:, column]
-                step[:, column], _ = cg(
-                    self.stored, b, x0, rtol=_CG_TOLERANCE, maxiter=_CG_ITERATIONS, M=preconditioner
-                )
+                step[:, column], _ = cg(self.stored, b, x0, rtol=_CG_TOLERANCE, maxiter=_CG_ITERATIONS, M=inverse)
         step[~free] = 0.0
         return step
 
@@ -166,8 +164,7 @@ def search_shift(
 
     A factor with the first shift whose error is not known before it is taken apart (`CholeskyFactor.known_error`) is
     returned as it is. `attempt` factors with shares, (N,), of the diagonal subtracted, or gives None when that does not
-    go through; `entries` and `expected`, (N,), are the shares that the rounding of the entries takes, and that the
-    factorisation is expected to take.
+    go through; `entries` and `expected`, (N,), are the shares that rounding the entries takes, and factoring may take.
     """
     uniform, is_marginal = first_shift, False
     while uniform >= LEAST_SHIFT:

@@ -22,7 +22,7 @@ def multipliers(problem: PGOProblem, poses: Poses) -> Array:
     (27, 3, 3)
     """
     n, d = problem.num_poses, problem.d
-    product = problem.apply_M_at(poses)[n:].reshape(n, d, d) @ poses.R
+    product = problem.apply_M_at(poses)[n:].reshape(n, d, -1) @ poses.R
     return 0.5 * (product + np.swapaxes(product, 1, 2))
 
 

@@ -83,7 +83,7 @@ def polish_step(
     for _ in range(1 + (SECANT_STEPS if secants else CHORD_STEPS)):
         if now.is_stationary:
             break
-        candidate = _backtrack(problem, layout, now, gradient, direction, level)
+        candidate = _backtrack(problem, now, direction, inner(gradient, direction), level)
         if candidate is None:
             break
         before, gradient = gradient, layout.join(*problem.riemannian_gradient(candidate.poses))
@@ -93,8 +93,7 @@ def polish_step(
         direction = -_apply_inverse(factor, learned, gradient)
         decrement = scaled_decrement(-inner(gradient, direction), candidate.objective, level)
         at_rounding = reached_rounding(now.decrement, decrement, is_newton and not now.moved)
-        tie = candidate.objective >= now.objective
-        if tie and decrement > 0.5 * now.decrement:
+        if candidate.objective >= now.objective and decrement > 0.5 * now.decrement:
             now = replace(now, is_at_rounding=at_rounding)
             break
         cut, left = decrement / now.decrement, SECANT_STEPS - len(learned)
@@ -170,11 +169,10 @@ def factorize_model(
         try:
             return analysis, analysis.factorize(gauss_newton), False
         except NotPositiveDefiniteError:
-            following = max(DAMPING_START, DAMPING_GROWTH * damping)
-            if following > DAMPING_MAX:
+            damping = max(DAMPING_START, DAMPING_GROWTH * damping)
+            if damping > DAMPING_MAX:
                 raise
-            gauss_newton.setdiag(diagonal * (1.0 + following))
-            damping = following
+            gauss_newton.setdiag(diagonal * (1.0 + damping))
 
 
 def ground_pose(matrix: csc_array, problem: PGOProblem) -> None:
@@ -206,12 +204,9 @@ def scaled_decrement(square: float, objective: float, rounding_level: float) -> 
     return left / objective if left > 0.0 else 0.0
 
 
-def _backtrack(
-    problem: PGOProblem, layout: TangentLayout, state: PolishState, gradient: Array, direction: Array, level: float
-) -> PolishState | None:
-    """First of the moves direction, direction/2, .. that lowers F enough; None when none does."""
-    slope = inner(gradient, direction)
-    w, v = layout.split(direction)
+def _backtrack(problem: PGOProblem, state: PolishState, step: Array, slope: float, level: float) -> PolishState | None:
+    """First of the moves step, step/2, .. that lowers F enough, for its slope along them; None when none does."""
+    w, v = TangentLayout(problem.num_poses, problem.d).split(step)
     length = 1.0
     for _ in range(HALVINGS):
         # The translations that are best for the turned rotations lie on the curved path that a straight move of both

@@ -2,8 +2,7 @@
 
 Every bound holds for any order of summation and with or without fused multiply-add (Higham 2002, *Accuracy and
 Stability of Numerical Algorithms*, sections 3.1 and 4.2): a sum of k products is off by at most gamma_k times the sum
-of their absolute values, gamma_k = k u / (1 - k u), u = 2^-53. Bounds are rounded up by `OUTWARD`; underflow is kept
-out by `has_safe_scale`.
+of their absolute values, gamma_k = k u / (1 - k u), u = 2^-53. `OUTWARD` rounds up, `has_safe_scale` bars underflow.
 """
 
 import math
@@ -86,9 +85,7 @@ def evaluate_edges(problem: PGOProblem, X: Array, low: Array) -> Evaluation:
         product[n:] += problem.incidence.at_beginning(bent.own)
         product_error[n:] += problem.incidence.at_beginning(bent.own_error + gamma(most) * np.abs(bent.own))
         product_error += UNIT_ROUNDOFF * np.abs(product)
-    return Evaluation(
-        math.fsum(of_edges), OUTWARD * value_error, np.asarray(product), OUTWARD * np.asarray(product_error)
-    )
+    return Evaluation(math.fsum(of_edges), OUTWARD * value_error, product, OUTWARD * product_error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,22 +124,17 @@ def evaluate_multipliers(Lambda: Array, P: Array) -> Evaluation:
     transposed = np.swapaxes(P, 1, 2)
     defect = np.eye(d) - P @ transposed
     sizes = gamma(d) * (np.abs(P) @ np.abs(transposed)) + UNIT_ROUNDOFF * np.abs(defect)
-    absolute = np.abs(Lambda)
-    terms = Lambda * defect
+    absolute, terms = np.abs(Lambda), Lambda * defect
+    value = math.fsum(terms.reshape(-1, d * d).sum(axis=1))
     value_error = float(np.sum(absolute * sizes)) + gamma(d * d + 3) * float(np.sum(np.abs(terms)))
-    return Evaluation(
-        value=math.fsum(terms.reshape(-1, d * d).sum(axis=1)),
-        value_error=OUTWARD * value_error,
-        product=-(Lambda @ P).reshape(-1, d),
-        product_error=OUTWARD * gamma(d) * (absolute @ np.abs(P)).reshape(-1, d),
-    )
+    product, product_error = -(Lambda @ P), OUTWARD * gamma(d) * (absolute @ np.abs(P))
+    return Evaluation(value, OUTWARD * value_error, product.reshape(-1, d), product_error.reshape(-1, d))
 
 
 def evaluate_certificate(problem: PGOProblem, Lambda: Array, X: Array, low: Array) -> Evaluation:
     """tr(X^T S X) + tr(Lambda) and S X, with S = M - blockdiag(0, Lambda), for any X; `low` as in `evaluate_edges`.
 
-    As tr(X^T S X) + tr(Lambda) = tr(X^T M X) + sum_i <Lambda_i, I - P_i P_i^T>, it is F where X is feasible, and
-    nothing cancels near there.
+    The value, tr(X^T M X) + sum_i <Lambda_i, I - P_i P_i^T>, is F where X is feasible; nothing cancels near there.
     """
     n, d = problem.num_poses, problem.d
     edges, blocks = evaluate_edges(problem, X, low), evaluate_multipliers(Lambda, X[n:].reshape(n, d, d))
@@ -208,8 +200,7 @@ class ObjectiveRounding:
 def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     """Rounding level of F at poses, and a bound on its error there.
 
-    As computed, a residual is off by its evaluation and by how far the stored R are from rotations
-    (`orthogonality_error`), at most
+    As computed, a residual is off by its evaluation and by the `orthogonality_error` of the stored R, at most
 
         e_t = (2 d + 3) u (||t_j - t_i|| + ||t_ij||) + omega ||t_ij||,   e_R = 2 sqrt(d) (2 d + 3) u + 2 omega
 
@@ -233,12 +224,10 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
         error += float(np.sum((weights.W_error + of_axes) * turning))
     if weights.excess is not None:
         touched = weights.excess.tangent(problem.edge_products(residuals, X))
-        moved = np.linalg.norm(touched.Z, axis=2)
+        C, moved = touched.C, np.linalg.norm(touched.Z, axis=2)
         slant = poses.orthogonality_error + d * gamma(d + 2)
-        error += 2.0 * float(np.sum(np.linalg.norm(touched.C[:, 0], axis=1) * (e_t + slant * moved[:, 0])))
-        error += 2.0 * float(
-            np.sum(np.linalg.norm(touched.C[:, 1:], axis=(1, 2)) * (e_R + slant * moved[:, 1:].sum(axis=1)))
-        )
+        error += 2.0 * float(np.sum(np.linalg.norm(C[:, 0], axis=1) * (e_t + slant * moved[:, 0])))
+        error += 2.0 * float(np.sum(np.linalg.norm(C[:, 1:], axis=(1, 2)) * (e_R + slant * moved[:, 1:].sum(axis=1))))
         error += float(np.sum(touched.value_error + _SUMMED * UNIT_ROUNDOFF * np.abs(touched.value)))
     return ObjectiveRounding(rounding_level(problem, poses), OUTWARD * error)
 

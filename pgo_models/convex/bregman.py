@@ -14,15 +14,8 @@ import cvxpy as cp
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
-from pgo_models.convex.convex_solver import (
-    COLD,
-    TOLERANCE,
-    ConvexSolver,
-    check_convex,
-    check_variable,
-    finite_array,
-    solve_compiled,
-)
+from pgo_models.convex import convex_solver
+from pgo_models.convex.convex_solver import COLD, ConvexSolver, finite_array
 from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import ReadOnly, read_only, real_array
 from pgo_models.geometry.rotations import Array
@@ -48,8 +41,7 @@ class BregmanPoint(ReadOnly):
 class BregmanProblem:
     """Minimise J(x) subject to K x = f (paper: `problem bregman`).
 
-    x stacks the variables, each flattened row by row; m is its length. Several variables are the blocks over which
-    `AlternatingBregman` alternates.
+    x, (m,), stacks the variables, each flattened row by row: the blocks over which `AlternatingBregman` alternates.
 
     `J` is one real number, a cp.Expression convex in `variables`, a cp.Variable or several, all that it has;
     `cp.transforms.indicator(constraints)` adds constraints. `K`, (s, m), is dense or sparse, `f` is (s,).
@@ -64,10 +56,10 @@ class BregmanProblem:
     f: Any
 
     def __post_init__(self) -> None:
-        check_convex(self.J, "J")
+        convex_solver.check_convex(self.J, "J")
         variables = (self.variables,) if isinstance(self.variables, cp.Variable) else tuple(self.variables)
         for position, variable in enumerate(variables):
-            check_variable(variable, f"variables[{position}]")
+            convex_solver.check_variable(variable, f"variables[{position}]")
         known = {variable.id for variable in variables}
         if not variables or len(known) < len(variables):
             raise SettingError(f"variables are {variables}; name at least one, each once")
@@ -101,9 +93,7 @@ class BregmanProblem:
 
     def unstacked(self, x: Array) -> tuple[Array, ...]:
         """One array for every variable, in its shape, of x, (m,); the inverse of `stacked`."""
-        return tuple(
-            x[block].reshape(variable.shape) for block, variable in zip(self.blocks, self.variables, strict=True)
-        )
+        return tuple(x[block].reshape(one.shape) for block, one in zip(self.blocks, self.variables, strict=True))
 
     def objective(self, x: Array) -> float:
         """J(x), x (m,); inf outside its domain."""
@@ -125,13 +115,13 @@ class Subproblem:
     variables: tuple[cp.Variable, ...]
     parameter: cp.Parameter  # p, (m,), or lam, (s,), or the scaled shift, (s,)
     scale: float  # the parameter's value is `scale` times what `solve` is given
-    tolerance: float = TOLERANCE  # the solver's
+    tolerance: float = convex_solver.TOLERANCE  # the solver's
     solver: ConvexSolver | str = COLD
 
     def solve(self, value: Array) -> Array:
         """Minimiser, stacked; a PGOError where there is none: J may be unbounded below on K x = const."""
         self.parameter.value = self.scale * value
-        solve_compiled(self.problem, "Bregman subproblem", self.tolerance, self.solver)
+        convex_solver.solve_compiled(self.problem, "Bregman subproblem", self.tolerance, self.solver)
         return np.concatenate([np.ravel(variable.value) for variable in self.variables])
 
 
@@ -165,10 +155,8 @@ def block_subproblems(problem: BregmanProblem, alpha: float) -> tuple[Subproblem
     Minimises the augmented Lagrangian over x_i when c = f + lam / alpha - sum of K_j x_j over the other blocks. A
     SettingError when J is not a sum of terms of one variable each.
     """
-    root = float(np.sqrt(alpha / 2))
-    separated = _terms_by_variable(problem)
-    compiled = []
-    for variable, block, J_i in zip(problem.variables, problem.blocks, separated, strict=True):
+    root, compiled = float(np.sqrt(alpha / 2)), []
+    for variable, block, J_i in zip(problem.variables, problem.blocks, _terms_by_variable(problem), strict=True):
         c = cp.Parameter(problem.K.shape[0], name="c")
         penalty = cp.sum_squares((root * problem.K[:, block]) @ _stack((variable,)) - c)
         compiled.append(Subproblem(cp.Problem(cp.Minimize(J_i + penalty)), (variable,), c, root))
@@ -183,11 +171,8 @@ def _terms_by_variable(problem: BregmanProblem) -> list[cp.Expression]:
     for term in problem.J.args if isinstance(problem.J, addition) else [problem.J]:
         owners = term.variables()
         if len(owners) > 1:
-            names = ", ".join(str(variable) for variable in owners)
-            raise SettingError(
-                f"the term {term} of J couples the variables {names}; write J as a sum of terms of one variable each, "
-                "with a copy of the shared variable and K x = f to tie the copies"
-            )
+            way_out = "write J as a sum of terms of one variable each, with copies of shared ones that K x = f ties"
+            raise SettingError(f"the term {term} of J couples the variables {', '.join(map(str, owners))}; {way_out}")
         if owners:
             separated[position[owners[0].id]] += term
     return separated

@@ -49,9 +49,7 @@ class Orthonormal(ConstraintSet):
     def check_shape(self, shape: tuple[int, ...], name: str) -> None:
         """Two dimensions, not more columns than rows."""
         if len(shape) != 2 or shape[1] > shape[0]:
-            raise SettingError(
-                f"{name} has shape {shape}; X^T X = I needs at least as many rows as columns, give the transpose"
-            )
+            raise SettingError(f"{name} has shape {shape}; X^T X = I needs at least as many rows as columns: transpose")
 
     def project(self, V: Array) -> Array:
         """U V^T of the SVD."""

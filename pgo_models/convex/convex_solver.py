@@ -30,10 +30,7 @@ _PRODUCT = (
 )
 _SHOWN = 120  # characters of an expression in a message
 _FIRST_ORDER = (cp.SCS, cp.OSQP)
-_MEANING = {
-    cp.INFEASIBLE: "its constraints contradict each other",
-    cp.UNBOUNDED: "its objective has no minimum; add a term or a bound",
-}
+_WHY = {cp.INFEASIBLE: "its constraints contradict each other", cp.UNBOUNDED: "its objective has no minimum: bound it"}
 
 
 def check_convex(expression: cp.Expression, name: str) -> None:
@@ -41,17 +38,13 @@ def check_convex(expression: cp.Expression, name: str) -> None:
     if not isinstance(expression, cp.Expression):
         raise SettingError(f"{name} is a {type(expression).__name__}; give a cvxpy expression")
     if expression.size != 1:
-        raise SettingError(
-            f"{name} has shape {expression.shape}; it must be one number: cp.sum(..), cp.sum_squares(..)"
-        )
+        raise SettingError(f"{name} has shape {expression.shape}; must be one number: cp.sum(..), cp.sum_squares(..)")
     if not expression.is_real():
         raise SettingError(f"{name} is complex; write it in real and imaginary parts")
     if not expression.is_convex():
-        factors = _product_of_unknowns(expression)
-        raise SettingError(
-            f"{name} is not convex: cvxpy finds it {expression.curvature.lower()}, {_short(expression)}; "
-            + (f"it multiplies unknowns, {_short(factors)}; {_PRODUCT}" if factors is not None else _DCP)
-        )
+        factors, found = _product_of_unknowns(expression), f"{expression.curvature.lower()}, {_short(expression)}"
+        way_out = _DCP if factors is None else f"it multiplies unknowns, {_short(factors)}; {_PRODUCT}"
+        raise SettingError(f"{name} is not convex: cvxpy finds it {found}; {way_out}")
 
 
 def check_terms(terms: Sequence[cp.Expression], constraints: Sequence[cp.Constraint]) -> None:
@@ -102,10 +95,8 @@ class ConvexSolver:
         """Whether its iterations are many, cheap and rough, or it is taken for an interior point."""
         return self.name in _FIRST_ORDER
 
-    def run(
-        self, problem: cp.Problem, tolerance: float, *, time_limit: float = math.inf, verbose: bool = False
-    ) -> None:
-        """Solve to a tolerance on the gap and on feasibility; `problem.status` says how it ended.
+    def run(self, model: cp.Problem, tolerance: float, *, time_limit: float = math.inf, verbose: bool = False) -> None:
+        """Solve to a tolerance on the gap and on feasibility; `model.status` says how it ended.
 
         A cp.SolverError when it ends without an iterate, a SettingError when it has no time limit that is known.
         """
@@ -123,7 +114,7 @@ class ConvexSolver:
             warnings.filterwarnings("ignore", message=said, category=UserWarning)
             given = {**options, **self.options}
             try:
-                problem.solve(solver=self.name, warm_start=self.warm_start, verbose=verbose, **given)
+                model.solve(solver=self.name, warm_start=self.warm_start, verbose=verbose, **given)
             except getattr(sys.modules.get("mosek"), "Error", cp.SolverError) as error:  # as of a missing licence
                 raise cp.SolverError(" ".join(str(error).split())) from error
 
@@ -137,31 +128,27 @@ def as_solver(given: ConvexSolver | str) -> ConvexSolver:
 
 
 def solve_compiled(
-    problem: cp.Problem,
-    name: str,
-    tolerance: float = TOLERANCE,
-    solver: ConvexSolver | str = COLD,
-    accepted: Sequence[str] = (cp.OPTIMAL,),
+    problem: cp.Problem, name: str, tolerance: float = TOLERANCE, solver: ConvexSolver | str = COLD, accepted: str = ""
 ) -> None:
     """Solve a compiled problem; `name` is for messages. The variables hold the solution afterwards.
 
     The tolerance is on the gap and on feasibility, absolute and relative. Where rounding does not allow it, 100 times
-    as much is tried, and so on up to LOOSEST_TOLERANCE, where another status than optimal may be accepted. A PGOError
+    as much is tried, and so on up to LOOSEST_TOLERANCE, where one status beside optimal may be accepted. A PGOError
     when the solver ends without a solution; the message has its status and what it means.
     """
     solver = as_solver(solver)
     while True:
-        meaning = "check its scaling"
+        why = "check its scaling"
         try:
             solver.run(problem, tolerance)
             status = str(problem.status)
         except cp.SolverError as error:
-            status, meaning = cp.SOLVER_ERROR, str(error)
+            status, why = cp.SOLVER_ERROR, str(error)
         is_last = tolerance >= LOOSEST_TOLERANCE or solver.is_first_order
-        if status == cp.OPTIMAL or (is_last and status in accepted):
+        if status == cp.OPTIMAL or (is_last and status == accepted):
             return
-        if status in _MEANING or is_last:
-            raise PGOError(f"{solver.name} ended with status {status} on the {name}: {_MEANING.get(status, meaning)}")
+        if status in _WHY or is_last:
+            raise PGOError(f"{solver.name} ended with status {status} on the {name}: {_WHY.get(status, why)}")
         tolerance = min(100.0 * tolerance, LOOSEST_TOLERANCE)
 
 
@@ -177,9 +164,8 @@ def finite_array(values: object, name: str) -> Array:
 
 def _product_of_unknowns(expression: cp.Expression) -> cp.Expression | None:
     """The first product in an expression both of whose factors have variables."""
-    if isinstance(expression, cp.atoms.affine.binary_operators.BinaryOperator) and all(
-        factor.variables() for factor in expression.args
-    ):
+    is_binary = isinstance(expression, cp.atoms.affine.binary_operators.BinaryOperator)
+    if is_binary and all(factor.variables() for factor in expression.args):
         return expression
     return next(filter(None, map(_product_of_unknowns, expression.args)), None)
 

@@ -86,8 +86,7 @@ class ModelChange:
     """What one's own model adds to the program, or takes out of it.
 
     `terms`, convex in the variables that `PoseVariables` names and no others, are added to F; `constraints` are convex
-    in the same variables. The squared residuals of `replaced_edges`, numbers or an (m,) mask, leave F, where terms have
-    another loss for them.
+    in the same variables. `replaced_edges`, numbers or an (m,) mask, leave F, where terms have another loss for them.
 
     A SettingError when a term is not one convex number, or a constraint not convex.
     """
@@ -129,8 +128,7 @@ class GraphQP:
             if neighbours is None:
                 raise SettingError("the neighbours are frozen; give X of the whole graph, whose rows say where")
             pull = 2.0 * (self.between @ neighbours)
-            held = self.qp.penalty > 0
-            V = V.copy()
+            held, V = self.qp.penalty > 0, V.copy()
             V[held] -= pull[held] / self.qp.penalty[held, None]
         return self.qp.solve(V)
 
@@ -164,8 +162,7 @@ def graph_qp(
 ) -> GraphQP:
     """Pose the R-subproblem of a whole graph, with penalties rho, (n,), of rotations, and rho_t, (n,), of translations.
 
-    Translations have none unless given. The changer, given the variables, returns the ModelChange: terms, constraints,
-    and edges whose loss they replace.
+    Translations have none unless given. The changer, given the variables, returns the `ModelChange`.
 
     Examples
     --------
@@ -202,11 +199,9 @@ def robot_qp(
         raise SettingError(f"robot {robot} owns no pose; the graph has robots 0 to {graph.num_robots - 1}")
     touches = owned[graph.i].astype(int) + owned[graph.j]
     if neighbours is Neighbours.FROZEN:
-        share = (touches > 0).astype(float)
-        unknown = owned
+        share, unknown = (touches > 0).astype(float), owned
     else:
-        share = 0.5 * touches
-        unknown = owned.copy()
+        share, unknown = 0.5 * touches, owned.copy()
         unknown[np.concatenate([graph.i[touches > 0], graph.j[touches > 0]])] = True
     return _posed(graph, unknown, share, rho, rho_t, unknowns, changer, solver)
 
@@ -222,8 +217,7 @@ def _posed(
     solver: ConvexSolver | str,
 ) -> GraphQP:
     n, m, d = graph.num_poses, graph.num_edges, graph.d
-    poses = np.flatnonzero(unknown)
-    joint = unknowns is Unknowns.POSES
+    poses, joint = np.flatnonzero(unknown), unknowns is Unknowns.POSES
     mine = np.concatenate([poses[: len(poses) * joint], rotation_columns(poses, n, d).ravel()])
     penalty_t = np.zeros(n) if rho_t is None else rho_t
     penalty = np.concatenate([penalty_t[poses] if joint else np.zeros(0), np.repeat(rho[poses], d)])

@@ -12,16 +12,9 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from pgo_models.convex import convex_solver
 from pgo_models.convex.constraint_sets import ConstraintSet, Orthonormal, Rotations, Sparse, UnitColumns, UnitRows
-from pgo_models.convex.convex_solver import (
-    COLD,
-    ConvexSolver,
-    check_convex,
-    check_terms,
-    check_variable,
-    finite_array,
-    solve_compiled,
-)
+from pgo_models.convex.convex_solver import COLD, ConvexSolver, check_variable, finite_array
 from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import real_array
 from pgo_models.geometry.rotations import Array
@@ -137,9 +130,7 @@ class OrthogonalProblem:
         for term, copy in zip(self.terms, point.copies, strict=True):
             distance = term.constraint.distance(copy)
             if distance > _IN_SET:
-                raise SettingError(
-                    f"a copy is {distance:.2g} away from {term.constraint}; OrthogonalProblem.point projects"
-                )
+                raise SettingError(f"a copy is {distance:.2g} away from {term.constraint}; problem.point projects it")
 
     def random_point(self, rng: np.random.Generator) -> OrthogonalPoint:
         """Point whose variables are random points of their first sets."""
@@ -169,11 +160,9 @@ class OrthogonalProblem:
 
     def infeasibility(self, copies: Sequence[Array], others: Sequence[Array] = ()) -> float:
         """Norm of what copies and others, of the shape of their variables, violate: sets, agreement, constraints."""
-        values = self.values(copies)
-        parts = [term.constraint.distance(copy) for term, copy in zip(self.terms, copies, strict=True)]
-        parts += [
-            float(np.linalg.norm(copy - values[term.variable])) for term, copy in zip(self.terms, copies, strict=True)
-        ]
+        values, given = self.values(copies), list(zip(self.terms, copies, strict=True))
+        parts = [term.constraint.distance(copy) for term, copy in given]
+        parts += [float(np.linalg.norm(copy - values[term.variable])) for term, copy in given]
         self.assign(values, others)
         parts += [float(np.linalg.norm(constraint.violation())) for constraint in self.problem.constraints]
         return float(np.linalg.norm(parts))
@@ -182,11 +171,9 @@ class OrthogonalProblem:
         """Compile the subproblem, for a solver."""
         root = cp.Parameter(nonneg=True, name="root")
         shifts = tuple(cp.Parameter(variable.shape, name="shift") for variable in self.variables)
-        counts = tuple(len(self.terms_of(place)) for place in range(len(self.variables)))
-        penalty = sum(
-            0.5 * count * cp.sum_squares(root * variable - shift)
-            for count, variable, shift in zip(counts, self.variables, shifts, strict=True)
-        )
+        counts = [len(self.terms_of(place)) for place in range(len(self.variables))]
+        shares = zip(counts, self.variables, shifts, strict=True)
+        penalty = sum(0.5 * count * cp.sum_squares(root * variable - shift) for count, variable, shift in shares)
         problem = cp.Problem(cp.Minimize(self.J + penalty), self.problem.constraints)
         if not problem.is_dcp(dpp=True):
             raise SettingError("a Parameter of the problem is not used by the rules of DPP; see cvxpy's manual")
@@ -220,7 +207,7 @@ class SplitProblem:
         for place, shift in enumerate(self.shifts):
             of_variable = [V_term for term, V_term in zip(self.terms, V, strict=True) if term.variable == place]
             shift.value = np.sqrt(rho) * np.mean(of_variable, axis=0)
-        solve_compiled(self.problem, "split subproblem", solver=self.solver)
+        convex_solver.solve_compiled(self.problem, "split subproblem", solver=self.solver)
         X, y = ([np.array(v.value, dtype=float) for v in group] for group in (self.variables, self.others))
         return tuple(X), tuple(y)
 
@@ -232,8 +219,7 @@ class KKTResiduals:
     feasibility: float  # norm of the violation of all constraints, and of the agreement of a variable's copies
     stationarity: float  # rho ||X - Z||_F, see `kkt_residuals`
     gradient_norm: float  # of the subgradient of J that the multipliers balance: the scale of `stationarity`
-    # For X^T X = I the symmetric Lambda, (p, p), with X Lambda in the subdifferential of J; for the other sets the
-    # normal vector itself, minus.
+    # For X^T X = I the symmetric Lambda, (p, p), with X Lambda in the subdifferential of J; else minus the normal.
     multipliers: tuple[Array, ...]
 
 
@@ -247,27 +233,18 @@ def kkt_residuals(
     Z = argmin J + sum rho/2 ||Z - (X - N / rho)||^2. In general -sum N + rho (X - Z) is a subgradient at Z (times the
     number of terms of the variable), so rho ||X - Z|| is what stationarity lacks.
     """
-    normals = [
-        term.constraint.normal_part(copy, normal)
-        for term, copy, normal in zip(problem.terms, point.copies, point.normals, strict=True)
-    ]
+    given = zip(problem.terms, point.copies, point.normals, strict=True)
+    normals = [term.constraint.normal_part(copy, normal) for term, copy, normal in given]
     V = [copy - normal / rho for copy, normal in zip(point.copies, normals, strict=True)]
     Z, others = problem.split(solver).solve(V, rho)
     values = problem.values(point.copies)
     gaps = [len(problem.terms_of(place)) * rho * (X - Z[place]) for place, X in enumerate(values)]
-    gradients = [np.zeros(X.shape) for X in values]
-    for term, normal in zip(problem.terms, normals, strict=True):
+    gradients, multipliers = [np.zeros(X.shape) for X in values], []
+    for term, copy, normal in zip(problem.terms, point.copies, normals, strict=True):
         gradients[term.variable] -= normal
-    multipliers = tuple(
-        -copy.T @ normal if isinstance(term.constraint, Orthonormal) else -normal
-        for term, copy, normal in zip(problem.terms, point.copies, normals, strict=True)
-    )
-    return KKTResiduals(
-        feasibility=problem.infeasibility(point.copies, others),
-        stationarity=norm_of_all(gaps),
-        gradient_norm=norm_of_all(gradients),
-        multipliers=multipliers,
-    )
+        multipliers.append(-copy.T @ normal if isinstance(term.constraint, Orthonormal) else -normal)
+    feasibility = problem.infeasibility(point.copies, others)
+    return KKTResiduals(feasibility, norm_of_all(gaps), norm_of_all(gradients), tuple(multipliers))
 
 
 def norm_of_all(arrays: Sequence[Array]) -> float:
@@ -279,11 +256,9 @@ def _minimised(problem: cp.Problem) -> cp.Expression:
     maximises = isinstance(problem.objective, cp.Maximize)
     expression = problem.objective.args[0]
     if maximises and not expression.is_concave():
-        raise SettingError(
-            f"the problem maximises {expression}, which is {expression.curvature.lower()}; only a concave function can "
-            "be maximised. On X^T X = I the constant c ||X||_F^2 may be subtracted to make it so"
-        )
+        way_out = "only a concave function can be: on X^T X = I the constant c ||X||_F^2 may be subtracted to get one"
+        raise SettingError(f"the problem maximises {expression}, which is {expression.curvature.lower()}; {way_out}")
     J = -expression if maximises else expression
-    check_convex(J, "the objective")
-    check_terms((), problem.constraints)
+    convex_solver.check_convex(J, "the objective")
+    convex_solver.check_terms((), problem.constraints)
     return J

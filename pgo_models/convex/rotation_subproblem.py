@@ -41,7 +41,7 @@ class RotationQP:
         key = self.shift.value.tobytes()
         if key not in self.last:  # SOC asks for the translations of an iterate, and in its next step for the rotations
             # The quadratic program reaches the tolerance; added cones may not, and stop where rounding lets them.
-            solve_compiled(self.problem, "R-subproblem", TOLERANCE, self.solver, (cp.OPTIMAL_INACCURATE,))
+            solve_compiled(self.problem, "R-subproblem", TOLERANCE, self.solver, cp.OPTIMAL_INACCURATE)
             self.last.clear()
             self.last[key] = np.asarray(self.X.value)
         return self.last[key].copy()
@@ -88,7 +88,5 @@ def rotation_qp(
     objective = cp.sum_squares(weighted @ X) + 0.5 * cp.sum_squares(select @ X - shift)
     problem = cp.Problem(cp.Minimize(sum(terms, objective)), list(constraints))
     if not problem.is_dcp(dpp=True):
-        raise SettingError(
-            "an added term or constraint is not convex by the rules of cvxpy (DCP, and DPP in Parameters)"
-        )
+        raise SettingError("an added term or constraint is not convex by cvxpy's rules (DCP, and DPP in Parameters)")
     return RotationQP(problem, X, shift, penalty, as_solver(solver))

@@ -1,6 +1,7 @@
 """Numbers as frozen objects hold them: checked, never cast silently, in read-only arrays of their own."""
 
 import operator
+from contextlib import suppress
 from typing import Any, TypeVar
 
 import numpy as np
@@ -61,11 +62,9 @@ def whole_array(values: object, name: str, error: type[PGOError] = GraphError) -
 
 def whole_number(value: object, name: str, error: type[PGOError] = GraphError) -> int:
     """Whole number that is given as an integer; raises `error` for a float, even a whole one, True, and all else."""
-    try:
+    with suppress(TypeError):  # which is the check
         if not isinstance(value, bool | np.bool_):
-            return operator.index(value)  # type: ignore[arg-type]  # the TypeError is the check
-    except TypeError:
-        pass
+            return operator.index(value)  # type: ignore[arg-type]
     raise error(f"{name} is {value!r:.60}; give a whole number")
 
 

@@ -79,7 +79,7 @@ class Poses(ReadOnly):
 
     def __getitem__(self, index: slice | np.ndarray) -> Poses:
         """Return the poses at the given indices."""
-        return Poses(self.R[index], self.t[index])
+        return type(self)(self.R[index], self.t[index])
 
     def stacked(self) -> Array:
         """X, ((d+1) n, d): first the n rows t_i, then the d rows of every R_i^T."""
@@ -137,10 +137,8 @@ def rotations_to_rounding(R: Array, name: Callable[[int], str]) -> Array:
         return R
     worst = int(np.argmax(error))
     if not error[worst] <= ROTATION_TOLERANCE:
-        raise GraphError(
-            f"{name(worst)} is no rotation: ||R^T R - I|| or 1 - det R is {error[worst]:.3g}; "
-            "see pgo_models.project_to_rotations()"
-        )
+        what = f"||R^T R - I|| or 1 - det R is {error[worst]:.3g}"
+        raise GraphError(f"{name(worst)} is no rotation: {what}; see pgo_models.project_to_rotations()")
     R = R.copy()
     R[rough] = project_to_rotations(R[rough])
     return read_only(R)

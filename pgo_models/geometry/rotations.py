@@ -18,10 +18,9 @@ _POLAR_MIN_DETERMINANT = 1e-2  # of the matrix scaled to Frobenius norm sqrt(3);
 def project_to_rotations(A: Array) -> Array:
     """Nearest rotations: argmin over omega in SO(d) of ||omega - A_i||_F for every A_i of A, (n, d, d).
 
-    With the SVD A = U D V^T the answer is U diag(1, .., 1, det(U V^T)) V^T. Well conditioned 3 x 3 matrices of
-    positive determinant take Newton's polar iteration X <- (X + cof(X) / det X) / 2 instead, which has the same limit.
-    Where the nearest one is not unique, one of the nearest (Ebrahimi & Deghat, Algorithm 1, steps 4 and 5; Higham,
-    Functions of Matrices, section 8.3).
+    With the SVD A = U D V^T it is U diag(1, .., 1, det(U V^T)) V^T. Well conditioned 3 x 3 matrices of positive
+    determinant take Newton's polar iteration X <- (X + cof(X) / det X) / 2, to the same limit. Where several are
+    nearest, one of them (Ebrahimi & Deghat, Algorithm 1, steps 4 and 5; Higham, Functions of Matrices, section 8.3).
 
     Examples
     --------
@@ -32,8 +31,7 @@ def project_to_rotations(A: Array) -> Array:
         return _project_2d(A)
     norm = np.sqrt(np.einsum("nab,nab->n", A, A) / 3.0)
     X = A / np.where(norm > 0, norm, 1.0)[:, None, None]
-    cofactors = _cofactors(X)
-    determinant = np.einsum("nb,nb->n", X[:, 0], cofactors[:, 0])
+    cofactors, determinant = _cofactors(X)
     good = determinant > _POLAR_MIN_DETERMINANT
     taken = slice(None) if good.all() else good  # a slice copies nothing
     omega, settled = np.empty_like(X), np.zeros(len(X), dtype=bool)
@@ -51,8 +49,7 @@ def project_by_svd(A: Array) -> Array:
 
 
 def _project_2d(A: Array) -> Array:
-    cosine = A[..., 0, 0] + A[..., 1, 1]
-    sine = A[..., 1, 0] - A[..., 0, 1]
+    cosine, sine = A[..., 0, 0] + A[..., 1, 1], A[..., 1, 0] - A[..., 0, 1]
     norm = np.hypot(cosine, sine)
     degenerate = norm == 0.0
     norm = np.where(degenerate, 1.0, norm)
@@ -72,8 +69,7 @@ def _polar(X: Array, cofactors: Array, determinant: Array) -> tuple[Array, BoolA
         X = following
         if change.max(initial=0.0) < _POLAR_TOLERANCE:
             break
-        cofactors = _cofactors(X)
-        determinant = np.einsum("nb,nb->n", X[:, 0], cofactors[:, 0])
+        cofactors, determinant = _cofactors(X)
     return X, change < _POLAR_TOLERANCE
 
 
@@ -86,15 +82,15 @@ def _determinants(X: Array) -> Array:
     return np.asarray(first + second + u[..., 2] * (v[..., 0] * w[..., 1] - v[..., 1] * w[..., 0]))
 
 
-def _cofactors(X: Array) -> Array:
-    """Cofactor matrices of (n, 3, 3): the rows are cross products of the other two rows."""
+def _cofactors(X: Array) -> tuple[Array, Array]:
+    """Cofactor matrices of (n, 3, 3), whose rows are cross products of the other two rows, and determinants, (n,)."""
     C = np.empty_like(X)
     for row in range(3):
         u, v = X[:, (row + 1) % 3], X[:, (row + 2) % 3]
         C[:, row, 0] = u[:, 1] * v[:, 2] - u[:, 2] * v[:, 1]
         C[:, row, 1] = u[:, 2] * v[:, 0] - u[:, 0] * v[:, 2]
         C[:, row, 2] = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
-    return C
+    return C, np.einsum("nb,nb->n", X[:, 0], C[:, 0])
 
 
 def tangent_dimension(d: int) -> int:
@@ -157,8 +153,7 @@ def random_rotations(count: int, d: int, rng: np.random.Generator) -> Array:
     """
     if d == 2:
         return exp_map(rng.uniform(-np.pi, np.pi, (count, 1)))
-    quaternions = rng.standard_normal((count, 4))
-    return np.asarray(scipy.spatial.transform.Rotation.from_quat(quaternions).as_matrix()).reshape(count, 3, 3)
+    return rotations_from_quaternions(rng.standard_normal((count, 4)))
 
 
 def rotations_from_quaternions(quaternions: Array) -> Array:
@@ -189,7 +184,7 @@ def _squared_defect(R: Array) -> Array:
 
 def stack_transposes(R: Array) -> Array:
     """The (d n, d) matrix whose rows d i .. d i + d - 1 are R_i^T."""
-    return np.swapaxes(R, -1, -2).reshape(-1, R.shape[-1])
+    return np.swapaxes(R, -1, -2).reshape(-1, R.shape[-2])
 
 
 def unstack_transposes(Y: Array) -> Array:

@@ -87,8 +87,7 @@ def load(
 
 def locate(name_or_path: str | Path, registry: Registry = SE_SYNC, *, download: bool = True) -> Path:
     """File or folder that `load` reads; parameters and errors as there."""
-    path = Path(name_or_path)
-    name = str(name_or_path)
+    path, name = Path(name_or_path), str(name_or_path)
     if not name:
         raise DatasetError("the name of the graph is empty; give a g2o file, a folder or a data set's name")
     # os.path, since a name too long for the system is no file, and no error; a pipe or a device is read like a file.
@@ -173,12 +172,9 @@ def _download(url: str, path: Path, name: str) -> None:
 
     console = Console(stderr=True)
     columns = (TextColumn("downloading {task.description}"), BarColumn(), DownloadColumn())
+    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
     try:
-        with (
-            Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress,
-            requests.get(url, stream=True, timeout=_TIMEOUT) as answer,
-            path.open("wb") as file,
-        ):
+        with bar as progress, requests.get(url, stream=True, timeout=_TIMEOUT) as answer, path.open("wb") as file:
             answer.raise_for_status()
             task = progress.add_task(name, total=int(answer.headers.get("content-length", 0)) or None)
             for chunk in answer.iter_content(2**16):

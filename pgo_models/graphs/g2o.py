@@ -33,9 +33,8 @@ def read_g2o(
     """Pose graph of a g2o file, or of a folder with one g2o file for each robot.
 
     Read are FIX lines and those of `g2o_tags`: poses, landmarks, priors. Poses are numbered by ascending id, the world
-    pose of priors last.
-    Quaternions are normalised, repeated edges all count. `initial` is set when every pose has a VERTEX line; edges to
-    poses without one are accepted, and leave it out.
+    pose of priors last. Quaternions are normalised, repeated edges all count. `initial` is set when every pose has a
+    VERTEX line; edges to poses without one are accepted, and leave it out.
 
     Robots. When every id is a GTSAM symbol (a letter in the top byte), the rank of its letter is the robot. Otherwise a
     pose of a folder belongs to the file with its VERTEX line, the first of them in the order 0, 1, .., 9, 10, or else
@@ -61,9 +60,8 @@ def read_g2o(
         if file.d != files[0].d:
             raise FileFormatError(file.path, None, f"{file.d}D, but {files[0].path} is {files[0].d}D; part the folder")
     d = files[0].d
-    edges = _join_edges(files)
-    edge_ids = np.concatenate([file.edge_ids[kept] for file, kept in zip(files, edges, strict=True)])
-    rows = np.concatenate([file.edges[kept] for file, kept in zip(files, edges, strict=True)])
+    parts = [(file.edge_ids[kept], file.edges[kept]) for file, kept in zip(files, _join_edges(files), strict=True)]
+    edge_ids, rows = map(np.concatenate, zip(*parts, strict=True))
     if not len(rows):
         raise FileFormatError(path, None, "no edges; a pose graph needs at least one EDGE_SE2 or EDGE_SE3:QUAT line")
     ids = np.sort(np.concatenate([edge_ids.ravel(), *(file.vertex_ids for file in files)]))
@@ -133,17 +131,15 @@ def write_g2o_folder(graph: PoseGraph, folder: Path | str, poses: Poses | None =
     """Write one file 0.g2o, 1.g2o, .. for each robot: its poses, and all edges that touch one of them.
 
     Edges between two robots stand in both files. Reading the folder gives the graph back, up to the order of its edges;
-    when there are no VERTEX lines, the owners come back only if the ids are symbols (see `symbol_ids`). Errors as of
-    `write_g2o`; also a PGOError when the folder, which is made if it is not there, holds other g2o files: reading it
-    would join them to this graph.
+    without VERTEX lines, the owners come back only if the ids are symbols (`symbol_ids`). Errors as of `write_g2o`, and
+    a PGOError when the folder, made if need be, holds other g2o files: reading it would join them to this graph.
     """
     chosen, folder = _poses_to_write(graph, poses), Path(folder)
-    names = [f"{robot}.g2o" for robot in range(graph.num_robots)]
     check_g2o_folder(folder, graph.num_robots)
     make_folder(folder)
-    for robot, name in enumerate(names):
+    for robot in range(graph.num_robots):
         mine = graph.robots == robot
-        _write(graph, folder / name, chosen, mine, (mine[graph.i] & ~graph.is_prior) | mine[graph.j])
+        _write(graph, folder / f"{robot}.g2o", chosen, mine, (mine[graph.i] & ~graph.is_prior) | mine[graph.j])
 
 
 def make_folder(folder: Path) -> None:
@@ -230,9 +226,8 @@ def _is_whole(whole: G2OLines, others: list[G2OLines]) -> bool:
         (whole.edges[:, exact] == file.edges[0, exact]).all(axis=1).any() for file in others if len(file.edges)
     ):
         return False
-    joined = _join_edges(others)
-    ids = np.concatenate([file.edge_ids[kept] for file, kept in zip(others, joined, strict=True)])
-    edges = np.concatenate([file.edges[kept] for file, kept in zip(others, joined, strict=True)])
+    parts = [(file.edge_ids[kept], file.edges[kept]) for file, kept in zip(others, _join_edges(others), strict=True)]
+    ids, edges = map(np.concatenate, zip(*parts, strict=True))
     if len(edges) != len(whole.edges):
         return False
     mine, theirs = (rows[np.lexsort(rows[:, exact].T)] for rows in (whole.edges, edges))
@@ -287,8 +282,7 @@ def _robots(ids: IntArray, files: list[G2OLines]) -> IntArray | None:
 
 def _initial(ids: IntArray, robot: IntArray | None, files: list[G2OLines]) -> Poses | None:
     numbers = np.zeros((len(ids), files[0].vertices.shape[1]))
-    known = np.zeros(len(ids), dtype=bool)
-    own = np.zeros(len(ids), dtype=bool)
+    known, own = np.zeros((2, len(ids)), dtype=bool)
     for file in files:
         if not len(file.vertex_ids):
             continue
@@ -297,8 +291,7 @@ def _initial(ids: IntArray, robot: IntArray | None, files: list[G2OLines]) -> Po
         mine = np.ones(len(at), dtype=bool) if robot is None else robot[at] == np.bincount(robot[at]).argmax()
         better = ~known[at] | (mine & ~own[at])
         numbers[at[better]] = file.vertices[better]
-        known[at] = True
-        own[at[better]] = mine[better]
+        known[at], own[at[better]] = True, mine[better]
     return Poses(*poses_of(files[0].d, numbers)) if known.all() else None
 
 
@@ -321,9 +314,7 @@ def _poses_to_write(graph: PoseGraph, poses: Poses | None) -> Poses | None:
 
 def _write(graph: PoseGraph, path: Path, poses: Poses | None, mine: BoolArray, edges: BoolArray) -> None:
     d, ids, is_point = graph.d, graph.pose_ids, np.isin(np.arange(graph.num_poses), graph.landmarks)
-    information = graph.information
-    if information is None:
-        information = isotropic_information(graph.kappa, graph.tau, d)
+    information = isotropic_information(graph.kappa, graph.tau, d) if graph.information is None else graph.information
     to_point, ends = is_point[graph.j], np.stack([ids[graph.i], ids[graph.j]], axis=1)
     no_turn = graph.is_prior & (graph.kappa == 0) & (graph.R_ij == np.eye(d)).all(axis=(1, 2))
     kinds = {tag: kind for tag, kind in TAGS.items() if kind.d == d and not kind.is_toro}

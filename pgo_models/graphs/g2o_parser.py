@@ -15,15 +15,7 @@ from typing import NoReturn
 import numpy as np
 
 from pgo_models.errors import FileFormatError, GraphWarning
-from pgo_models.files import (
-    LARGEST,
-    LONGEST_LINE,
-    check_distances,
-    check_length,
-    check_quaternions,
-    finite_number,
-    read_blocks,
-)
+from pgo_models.files import LARGEST, LONGEST, check_length, check_metres, check_quaternions, finite_number, read_blocks
 from pgo_models.geometry.arrays import triangle_places
 from pgo_models.geometry.rotations import Array, BoolArray, exp_map, rotations_from_quaternions
 from pgo_models.graphs.g2o_tags import ALIASES, TAGS
@@ -59,9 +51,8 @@ def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
     with file:line, for: a file that is missing, binary or without VERTEX and EDGE lines; an unknown tag; too few or too
     many numbers on a line, or thousands of them; a word, nan or inf where a number belongs; an id that is no integer of
     64 bits; a zero quaternion; a length beyond `FARTHEST`; an information matrix whose translation or rotation block is
-    not positive definite, nor zero, or both are zero; an edge to itself; a second VERTEX line of the same id; a
-    measurement in the frame of a sensor that is not that of the pose; an edge from a landmark, or of its rotation; 2D
-    and 3D in one file.
+    not positive definite, nor zero, or both are zero; an edge to itself; a second VERTEX line of an id; a measurement
+    in the frame of a sensor that is not that of the pose; an edge from a landmark, or of its rotation; 2D beside 3D.
     """
     path = Path(path)
     source, first = _Source(path, skip_unknown), 1
@@ -83,7 +74,7 @@ def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
     of_poses, of_edges = (vertex_ids[:, 1], vertex_lines, vertices), (edge_ids, edges, edge_lines)
     found = G2OLines(path, d, *of_poses, *of_edges, fixed, fixed_lines, landmarks)
     for rows, at in ((vertices, found.vertex_lines), (edges, found.edge_lines)):
-        check_distances(path, at, rows[:, :d])
+        check_metres(path, at, rows[:, :d])
         if d == 3:
             check_quaternions(path, at, rows[:, 3:7])
     for number, problem in _faults(found):
@@ -170,7 +161,7 @@ class _Source:
     def _parse(self, tag: str, at: IntArray, lines: list[str], written: str = "") -> bool:
         """Whether lines are all of one tag, which may be written as its alias, with ids and finite numbers; keep."""
         kind = TAGS[tag]
-        if max(map(len, lines)) > LONGEST_LINE:
+        if max(map(len, lines)) > LONGEST:
             return False
         shared = _shared_end(lines, kind.num_numbers - 1)
         own = kind.num_numbers - len(shared.split())
@@ -258,10 +249,8 @@ def _faults(found: G2OLines) -> Iterator[tuple[int, str]]:
     if again.size:
         earlier, later = order[again[0]], order[again[0] + 1]
         first = f"(the first is line {found.vertex_lines[earlier]})"
-        yield (
-            int(found.vertex_lines[later]),
-            f"a second VERTEX line of pose {found.vertex_ids[later]} {first}; remove one",
-        )
+        problem = f"a second VERTEX line of pose {found.vertex_ids[later]} {first}; remove one"
+        yield int(found.vertex_lines[later]), problem
     loops = found.edge_ids[:, 0] == found.edge_ids[:, 1]
     if loops.any():
         at = int(np.argmax(loops))

@@ -68,8 +68,7 @@ def _walks(num_robots: int, num_steps: int, d: int, rng: np.random.Generator) ->
     turns = _quarter_turns(d)
     likely = np.array([_STRAIGHT] + [(1 - _STRAIGHT) / (len(turns) - 1)] * (len(turns) - 1))
     everyone = np.arange(num_robots)
-    R = np.empty((num_steps, num_robots, d, d))
-    cell = np.empty((num_steps, num_robots, d))
+    R, cell = np.empty((num_steps, num_robots, d, d)), np.empty((num_steps, num_robots, d))
     R[0] = np.eye(d)
     for _ in range(3):  # after three turns every heading can be had
         R[0] = R[0] @ turns[rng.integers(0, len(turns), num_robots)]
@@ -87,11 +86,8 @@ def _walks(num_robots: int, num_steps: int, d: int, rng: np.random.Generator) ->
 
 def _quarter_turns(d: int) -> Array:
     """Going straight on, then the turns by 90 degrees, left and right, and in space up and down: (3 or 5, d, d)."""
-    if d == 2:
-        w = np.array([[0.0], [1.0], [-1.0]])
-    else:
-        w = np.array([[0, 0, 0], [0, 0, 1], [0, 0, -1], [0, 1, 0], [0, -1, 0]], dtype=float)
-    return np.rint(exp_map(np.pi / 2 * w))
+    axes = [[0], [1], [-1]] if d == 2 else [[0, 0, 0], [0, 0, 1], [0, 0, -1], [0, 1, 0], [0, -1, 0]]
+    return np.rint(exp_map(np.pi / 2 * np.array(axes)))
 
 
 def _loop_closures(t: Array, robot: IntArray, probability: float, rng: np.random.Generator) -> IntArray:
@@ -111,8 +107,7 @@ def _meetings(t: Array, robot: IntArray, closures: IntArray) -> IntArray:
     while count > 1:
         sizes = np.bincount(group)
         smallest = int(np.argmin(np.where(sizes > 0, sizes, num_robots + 1)))
-        mine = np.flatnonzero(group[robot] == smallest)
-        rest = np.flatnonzero(group[robot] != smallest)
+        mine, rest = np.flatnonzero(group[robot] == smallest), np.flatnonzero(group[robot] != smallest)
         distance, nearest = scipy.spatial.KDTree(t[rest]).query(t[mine])
         at = int(np.argmin(distance))
         edge = sorted((int(mine[at]), int(rest[nearest[at]])))

@@ -38,18 +38,15 @@ class Measurements(ReadOnly):
     landmarks: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
-        checks: list[tuple[Callable[..., object], tuple[str, ...]]] = [
-            (whole_number, ("num_poses", "world")),
-            (whole_array, ("i", "j", "ids", "robot", "fixed", "landmarks")),
-            (real_array, ("R_ij", "t_ij", "kappa", "tau", "information", "times")),
-        ]
-        for checked, name in ((check, name) for check, names in checks for name in names):
+        checks: dict[str, Callable[..., object]] = dict.fromkeys(("num_poses", "world"), whole_number)
+        checks |= dict.fromkeys(("i", "j", "ids", "robot", "fixed", "landmarks"), whole_array)
+        checks |= dict.fromkeys(("R_ij", "t_ij", "kappa", "tau", "information", "times"), real_array)
+        for name, checked in checks.items():
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, checked(getattr(self, name), name))
         self._check_shapes()
         self._check_values()
-        turns = rotations_to_rounding(self.R_ij, lambda edge: f"R_ij of {self.edge_label(edge)}")
-        object.__setattr__(self, "R_ij", turns)
+        object.__setattr__(self, "R_ij", rotations_to_rounding(self.R_ij, lambda e: f"R_ij of {self.edge_label(e)}"))
         for name, settled in self._settled_landmarks().items():
             object.__setattr__(self, name, settled)
         for name in ("initial", "truth"):
@@ -147,19 +144,10 @@ class Measurements(ReadOnly):
             raise GraphError(f"{self.name} has no edges; a pose graph needs at least one measurement")
         if self.R_ij.ndim != 3 or self.R_ij.shape[1:] not in ((2, 2), (3, 3)):
             raise GraphError(f"R_ij has shape {self.R_ij.shape}; give (m, 2, 2) or (m, 3, 3)")
-        d = self.R_ij.shape[-1]
-        k = 3 if d == 2 else 6
-        expected: dict[str, tuple[int, ...]] = {
-            **dict.fromkeys(("i", "j"), (m,)),
-            "R_ij": (m, d, d),
-            "t_ij": (m, d),
-            **dict.fromkeys(("kappa", "tau"), (m,)),
-            "information": (m, k, k),
-            **dict.fromkeys(("ids", "robot"), (self.num_poses,)),
-            "fixed": (len(self.fixed),),
-            "times": (len(self.bodies),),
-        }
-        for name, shape in expected.items():
+        d, k, of_poses = self.d, 3 * self.d - 3, (self.num_poses,)
+        of_edges = dict(i=(m,), j=(m,), R_ij=(m, d, d), t_ij=(m, d), kappa=(m,), tau=(m,), information=(m, k, k))
+        others = dict(ids=of_poses, robot=of_poses, fixed=(len(self.fixed),), times=(len(self.bodies),))
+        for name, shape in {**of_edges, **others}.items():
             value = getattr(self, name)
             if value is not None and value.shape != shape:
                 raise GraphError(f"{name} has shape {value.shape}; with {m} edges in {d}D give {shape}")

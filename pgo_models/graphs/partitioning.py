@@ -107,11 +107,7 @@ def suited_partition(graph: PoseGraph, num_robots: int) -> Partition:
 
 def _metis(graph: PoseGraph, num_robots: int) -> IntArray:
     pymetis = extra_module("pymetis", "fast")
-    adjacency = graph.adjacency
-    _, part = pymetis.part_graph(
-        num_robots,
-        adjacency=pymetis.CSRAdjacency(adjacency.indptr.tolist(), adjacency.indices.tolist()),
-        eweights=adjacency.data.astype(np.int64).tolist(),
-        options=pymetis.Options(contig=True, seed=0),
-    )
+    neighbours = pymetis.CSRAdjacency(graph.adjacency.indptr.tolist(), graph.adjacency.indices.tolist())
+    counts, options = graph.adjacency.data.astype(np.int64).tolist(), pymetis.Options(contig=True, seed=0)
+    _, part = pymetis.part_graph(num_robots, adjacency=neighbours, eweights=counts, options=options)
     return np.asarray(np.unique(np.asarray(part), return_inverse=True)[1], dtype=np.int64)

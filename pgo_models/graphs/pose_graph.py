@@ -40,9 +40,8 @@ class PoseGraph(Measurements):
     in the plane (x, y, theta) and 6 in space (x, y, z, then rotation).
 
     Of every pose, each optional: `ids`, (n,), its name in the file, a unique integer, 0 .. n-1 unless given; `robot`,
-    (n,), which robot, 0 .. num_robots - 1, owns it, all 0 unless given; `initial`, the estimate that came with the
-    file, and `truth`, the ground truth of a generated scene; `times`, (b,), seconds of the `bodies`, ascending, for the
-    trajectories that are written.
+    (n,), which robot, 0 .. num_robots - 1, owns it, all 0 unless given; `initial`, the estimate of the file, and
+    `truth`, that of a generated scene; `times`, (b,), seconds of the `bodies`, ascending, for trajectories written.
 
     Of some poses: `fixed`, (f,), those that the file says are fixed (F does not depend on the gauge: the solution is
     moved so that the first of them is where the file has it, and all are kept for writing); `landmarks`, (l,), those
@@ -123,18 +122,14 @@ class PoseGraph(Measurements):
             parts = [] if said.all() else self.components(said)
             parts = [part for part in parts if name == "tau" or not loose or part[0] != self.world]
             if len(parts) > 1:
-                raise GraphError(
-                    f"the {what} of {len(parts[1])} poses (with {self.pose_name(parts[1][0])}) is not tied to that of "
-                    f"the others: no edge between has {name} > 0; add one, or leave these poses out"
-                )
+                some = f"{len(parts[1])} poses (with {self.pose_name(parts[1][0])}) is not tied to that of the others"
+                raise GraphError(f"the {what} of {some}: no edge between has {name} > 0; add one, or leave these out")
         if loose:
             measured = self.t_ij[self.is_prior][np.unique(self.j[self.is_prior], return_index=True)[1]]
             spread = np.linalg.svd(measured - measured.mean(axis=0), compute_uv=False)
             if len(measured) < self.d or not spread[self.d - 2] > _COLLINEAR * max(spread[0], 1e-300):
-                raise GraphError(
-                    f"the priors do not fix the gauge: positions of {len(measured)} poses, in a point or on a line, "
-                    "leave turns of the world open; give positions of more poses, or a prior with a rotation"
-                )
+                few = f"positions of {len(measured)} poses, in a point or on a line, leave turns of the world open"
+                raise GraphError(f"the priors do not fix the gauge: {few}; give more, or a prior with a rotation")
 
     def subgraph(self, poses: IntArray) -> PoseGraph:
         """Return the graph of some poses, (k,), in ascending order, and of the edges among them."""
@@ -184,9 +179,7 @@ class PoseGraph(Measurements):
 
     def with_prior(self, poses: IntArray, measured: Poses, kappa: Weights, tau: Weights) -> PoseGraph:
         """Return the graph with poses (k,) measured in the frame of the world, in which the solution is then."""
-        graph = self
-        if self.world is None:
-            graph = self._with_node(poses[0], WORLD_ID, {"world": self.num_poses})
+        graph = self if self.world is not None else self._with_node(poses[0], WORLD_ID, {"world": self.num_poses})
         return graph.with_edges(np.full(len(poses), graph.world), poses, measured, kappa, tau)
 
     def with_position_prior(self, poses: IntArray, positions: Array, tau: Weights) -> PoseGraph:

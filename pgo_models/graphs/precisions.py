@@ -52,8 +52,7 @@ def proper_information(graph: PoseGraph) -> Array:
     if not information[:, : graph.d, graph.d :].any():
         return np.asarray(information)
     bad = ~are_definite(information, LEAST_SCALED)
-    information[bad, : graph.d, graph.d :] = 0.0
-    information[bad, graph.d :, : graph.d] = 0.0
+    information[bad, : graph.d, graph.d :], information[bad, graph.d :, : graph.d] = 0.0, 0.0
     return information
 
 

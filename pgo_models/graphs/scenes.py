@@ -91,8 +91,7 @@ def sphere(rng: np.random.Generator) -> PoseGraph:
     >>> sphere(np.random.default_rng(0))
     PoseGraph('sphere', d=3, poses=50, edges=544, robots=1)
     """
-    points = 3.0 * _equal_area_points(50)
-    return _network("sphere", points, 3.0, rng, left_out=_SPHERE_PAIR_LEFT_OUT)
+    return _network("sphere", 3.0 * _equal_area_points(50), 3.0, rng, _SPHERE_PAIR_LEFT_OUT)
 
 
 def random_geometric(
@@ -177,10 +176,8 @@ def observe(
     t_ij = np.einsum("mab,mb->ma", R_inverse, truth.t[j] - truth.t[i])
     t_ij += noise.translation_std * rng.standard_normal(t_ij.shape)
     R_ij = _random_turns(len(i), truth.d, noise, rng) @ R_inverse @ truth.R[j]
-    initial = Poses(
-        truth.R @ _random_turns(truth.num_poses, truth.d, noise, rng),
-        truth.t + noise.translation_std * rng.standard_normal(truth.t.shape),
-    )
+    turned = truth.R @ _random_turns(truth.num_poses, truth.d, noise, rng)
+    initial = Poses(turned, truth.t + noise.translation_std * rng.standard_normal(truth.t.shape))
     measured = R_ij, t_ij, np.full(len(i), kappa), np.full(len(i), tau)
     return PoseGraph(truth.num_poses, i, j, *measured, robot=robot, initial=initial, truth=truth, name=name)
 
@@ -195,13 +192,11 @@ def _random_turns(count: int, d: int, noise: NoiseModel, rng: np.random.Generato
     return exp_map(noise.rotation_std * rng.standard_normal((count, tangent_dimension(d))))
 
 
-def _network(
-    name: str, t: Array, radius: float, rng: np.random.Generator, left_out: tuple[int, int] | None = None
-) -> PoseGraph:
-    """Both directed edges between poses at most `radius` apart, each with noise of its own."""
+def _network(name: str, t: Array, radius: float, rng: np.random.Generator, left_out: tuple[int, ...] = ()) -> PoseGraph:
+    """Both directed edges between poses at most `radius` apart but a pair left out, each with noise of its own."""
     near: NDArray[np.bool_] = np.linalg.norm(t[:, None] - t[None], axis=2) <= radius + _SLACK
     np.fill_diagonal(near, False)
-    if left_out is not None:
+    if left_out:
         near[left_out] = near[left_out[::-1]] = False
     i, j = np.nonzero(near)
     truth = Poses(random_rotations(len(t), 3, rng), t)

@@ -90,12 +90,6 @@ def report_partition(partition: Partition, graph: PoseGraph) -> PartitionReport:
     cut = partition.cut_edges(graph)
     robot, i, j = partition.robot, graph.i[cut], graph.j[cut]
     held = np.unique(np.concatenate([robot[i] * graph.num_poses + j, robot[j] * graph.num_poses + i]))
-    return PartitionReport(
-        num_robots=partition.num_robots,
-        sizes=partition.sizes,
-        num_cut_edges=int(cut.sum()),
-        num_edges=graph.num_edges,
-        separators=np.bincount(robot[partition.separators(graph)], minlength=partition.num_robots),
-        cover=len(vertex_cover(partition, graph)),
-        copies=len(held),
-    )
+    separators = np.bincount(robot[partition.separators(graph)], minlength=partition.num_robots)
+    counts = partition.num_robots, partition.sizes, int(cut.sum()), graph.num_edges
+    return PartitionReport(*counts, separators, cover=len(vertex_cover(partition, graph)), copies=len(held))

@@ -9,15 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from pgo_models.errors import FileFormatError, GraphError
-from pgo_models.files import check_distances, check_quaternions, read_table, read_text, replace_when_done
+from pgo_models.files import check_metres, check_quaternions, read_table, read_text, replace_when_done
+from pgo_models.geometry import rotations
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import (
-    Array,
-    orthogonality_error,
-    project_to_rotations,
-    quaternions_from_rotations,
-    rotations_from_quaternions,
-)
+from pgo_models.geometry.rotations import Array, project_to_rotations
 
 _PLANE_TOLERANCE = 1e-6  # metres, and of the entries of R that vanish when a pose lies in the plane
 _MATRIX_TOLERANCE = 1e-3  # KITTI's own files have about seven digits; this tells digits from a wrong matrix
@@ -41,7 +36,7 @@ def write_tum(poses: Poses, path: Path | str, timestamps: Array | None = None) -
     if seconds.shape != (poses.num_poses,) or not np.isfinite(seconds).all() or (np.diff(seconds) <= 0).any():
         raise GraphError(f"timestamps of shape {seconds.shape} for {poses}; give {poses.num_poses} that ascend")
     R, t = _lifted(poses)
-    _write_rows(np.column_stack([seconds, t, quaternions_from_rotations(R)]), path)
+    _write_rows(np.column_stack([seconds, t, rotations.quaternions_from_rotations(R)]), path)
 
 
 def read_tum(path: Path | str, d: int = 3) -> Poses:
@@ -58,14 +53,13 @@ def read_tum(path: Path | str, d: int = 3) -> Poses:
     """
     rows, lines = read_table(path, 8)
     check_quaternions(path, lines, rows[:, 4:])
-    return _in_dimension(rotations_from_quaternions(rows[:, 4:]), rows[:, 1:4], d, path, lines)
+    return _in_dimension(rotations.rotations_from_quaternions(rows[:, 4:]), rows[:, 1:4], d, path, lines)
 
 
 def read_times(path: Path | str) -> Array:
     """Seconds, (n,), of a TUM file or of one with a number a line, ascending.
 
-    A FileFormatError with file:line, for a row that is not 8 finite numbers, or one, like the first; for a time that is
-    not after the one before.
+    A FileFormatError with file:line, for a row that is not 8 finite numbers, or 1, like the first, or does not ascend.
     """
     words = (line.split() for line in read_text(path).split("\n"))
     first = next((row for row in words if row and not row[0].startswith("#")), [])
@@ -94,7 +88,7 @@ def read_kitti(path: Path | str, d: int = 3) -> Poses:
     """
     rows, lines = read_table(path, 12)
     matrices = rows.reshape(-1, 3, 4)
-    error = orthogonality_error(matrices[:, :, :3])
+    error = rotations.orthogonality_error(matrices[:, :, :3])
     worst = int(np.argmax(error))
     if not error[worst] < _MATRIX_TOLERANCE:
         what = f"||R^T R - I|| or 1 - det R is {error[worst]:.3g}"
@@ -111,14 +105,13 @@ def _lifted(poses: Poses) -> tuple[Array, Array]:
 
 
 def _in_dimension(R: Array, t: Array, d: int, path: Path | str, lines: Sequence[int]) -> Poses:
-    check_distances(path, lines, t)
+    check_metres(path, lines, t)
     if d == 3:
         return Poses(R, t)
     out = np.maximum(np.abs(t[:, 2]), np.abs(R[:, 2, :] - [0.0, 0.0, 1.0]).max(axis=1))
     worst = int(np.argmax(out))
     if out[worst] > _PLANE_TOLERANCE:
-        problem = f"pose is out of the x-y plane by {out[worst]:.3g}; read it with d = 3"
-        raise FileFormatError(path, lines[worst], problem)
+        raise FileFormatError(path, lines[worst], f"pose is out of the x-y plane by {out[worst]:.3g}; read with d = 3")
     return Poses(project_to_rotations(R[:, :2, :2]), t[:, :2])
 
 

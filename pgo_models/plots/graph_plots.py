@@ -34,17 +34,14 @@ _ZOOM = 0.82  # leaves room for the labels of axes in space, which the layout do
 _MOST_NAMED_ROBOTS = len(COLOURS)
 
 
-def edge_kinds(
-    graph: PoseGraph, poses: Poses, mark_edges: bool = True, residuals: EdgeResiduals | None = None
-) -> IntArray:
+def edge_kinds(graph: PoseGraph, poses: Poses, mark: bool = True, residuals: EdgeResiduals | None = None) -> IntArray:
     """How every edge is drawn, (m,): OWN, BETWEEN (two robots), SIGHTING (a landmark's), marked UNCERTAIN or MISFIT.
 
-    The last that fits; priors are -1. Misfits are those of F unless `residuals` are given. A GraphError when the poses
-    are not those of the graph.
+    The last that fits; priors are -1. Misfits are of F unless `residuals` are given. A GraphError if sizes differ.
     """
     kind = np.where(graph.robots[graph.i] == graph.robots[graph.j], OWN, BETWEEN)
     kind[np.isin(graph.j, graph.landmarks)] = SIGHTING
-    if mark_edges:
+    if mark:
         kind[uncertain_edges(graph)] = UNCERTAIN
         kind[(residuals or edge_residuals(graph, poses)).is_misfit] = MISFIT
     kind[graph.is_prior] = -1
@@ -108,13 +105,9 @@ def draw_graph(
     palette = np.array([to_rgb(name) for name in (*COLOURS, QUIET_COLOUR, ALARM_COLOUR)])
     colour = np.where(graph.robots[i] == graph.robots[j], graph.robots[i] % len(COLOURS), len(COLOURS))
     colour[kind == SIGHTING], colour[kind == MISFIT] = len(COLOURS), len(COLOURS) + 1
-    lines = _line_collection(graph.d)(
-        list(np.stack([poses.t[i], poses.t[j]], axis=1)),
-        colors=palette[colour],
-        linewidths=_WIDTHS[kind],
-        linestyles=[(0, (1, 1.5)) if one == UNCERTAIN else "solid" for one in kind],
-        rasterized=graph.num_edges > MOST_LINES,
-    )
+    widths, dashes = _WIDTHS[kind], [(0, (1, 1.5)) if one == UNCERTAIN else "solid" for one in kind]
+    drawn, many = _line_collection(graph.d), graph.num_edges > MOST_LINES
+    lines = drawn(list(poses.t[ends]), colors=palette[colour], linewidths=widths, linestyles=dashes, rasterized=many)
     axes.add_collection(lines)
     _frame(axes, poses.t[graph.in_files])
 
@@ -182,11 +175,9 @@ def plot_panels(panels: list[list[tuple[str, PoseGraph, Poses]]], residuals: Edg
 def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = None) -> Figure:
     """Figure of an estimate on top of the truth, and of its errors pose by pose, in metres and degrees.
 
-    The estimate is aligned to the truth first, which is the graph's own unless given. A GraphError when there is no
-    truth, or the sizes differ.
+    The estimate is aligned to the truth, the graph's own unless given. A GraphError if there is none, or sizes differ.
     """
-    if truth is None:
-        truth = graph.truth
+    truth = graph.truth if truth is None else truth
     if truth is None:
         raise GraphError(f"{graph!r} came without a ground truth; give one as truth=")
     poses, truth = poses[graph.bodies], truth[graph.bodies]

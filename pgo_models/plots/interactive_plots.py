@@ -24,7 +24,6 @@ from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
-
 Trace = dict[str, object]  # a plotly trace is plain data
 
 _MOST_NAMED_ROBOTS = 12
@@ -33,12 +32,8 @@ _FILM_BYTES = 8_000_000
 _BYTES_PER_NUMBER = 7.5  # a float32 in base64, of which plotly writes every / as six characters
 _FRAME_MILLISECONDS = 150
 # Nothing on a page leaves it: plotly's button to share a chart uploads it.
-PAGE_CONFIG: dict[str, object] = {
-    "displaylogo": False,
-    "showSendToCloud": False,
-    "modeBarButtonsToRemove": ["sendChartToCloud"],
-    "responsive": True,
-}
+PAGE_CONFIG: dict[str, object] = {"displaylogo": False, "showSendToCloud": False, "responsive": True}
+PAGE_CONFIG |= {"modeBarButtonsToRemove": ["sendChartToCloud"]}
 
 
 def explore_graph(
@@ -52,7 +47,6 @@ def explore_graph(
     """Plotly figure of a graph by robot; poses and misfitting edges say who they are under the pointer.
 
     Of a large graph, what `lines_to_draw` leaves, and some of the poses; one of a single robot is parted by time.
-
     Positions are drawn to seven digits (float32); covariances, (n, p, p), as `confidence_ellipses`; poses `before` in
     grey, moved to fit. `residuals` are those of F unless given: give those of the problem that was solved.
 
@@ -149,20 +143,15 @@ def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[
 
 def lay_out(figure: Figure, title: str, legend_y: float) -> None:
     """White ground, narrow margins, the legend in a row at a height in figure heights, 0 at the foot of the axes."""
-    figure.update_layout(
-        template="none",
-        title={"text": html.escape(title), "font": {"size": 14}},
-        margin={"l": 80, "r": 10, "t": 40 if title else 10, "b": 50},
-        legend={"itemsizing": "constant", "orientation": "h", "y": legend_y},
-        hovermode="closest",
-    )
+    head = {"text": html.escape(title), "font": {"size": 14}}
+    margin = {"l": 80, "r": 10, "t": 40 if title else 10, "b": 50}
+    legend = {"itemsizing": "constant", "orientation": "h", "y": legend_y}
+    figure.update_layout(template="none", title=head, margin=margin, legend=legend, hovermode="closest")
 
 
 def save_page(figure: Figure, path: Path | str) -> None:
     """Write a plotly figure as an HTML page that opens offline, about 5 MB more; errors as `replace_when_done`."""
-    page = figure.to_html(
-        include_plotlyjs=True, full_html=True, config=PAGE_CONFIG, auto_play=False, default_height="96vh"
-    )
+    page = figure.to_html(include_plotlyjs=True, config=PAGE_CONFIG, auto_play=False, default_height="96vh")
     with replace_when_done(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
@@ -193,26 +182,15 @@ def _lines(t: Array, ends: IntArray, name: str, colour: str, width: float, dash:
     d = t.shape[1]
     points = np.full((len(ends), 3, d), np.nan)
     points[:, :2] = t[ends]
-    return {
-        **_points(points.reshape(-1, d)),
-        "mode": "lines",
-        "line": {"color": colour, "width": width if d == 2 else 2.0 * width, "dash": dash},
-        "name": name,
-        "hoverinfo": "skip",
-        "showlegend": in_legend,
-    }
+    line = {"color": colour, "width": width if d == 2 else 2.0 * width, "dash": dash}
+    shown = {"name": name, "hoverinfo": "skip", "showlegend": in_legend}
+    return {**_points(points.reshape(-1, d)), "mode": "lines", "line": line, **shown}
 
 
 def _dots(points: Array, text: list[str], name: str, colour: str, size: float) -> Trace:
-    return {
-        **_points(points),
-        "mode": "markers",
-        "marker": {"color": colour, "size": size if points.shape[1] == 2 else 0.6 * size},
-        "text": text,
-        "hovertemplate": "%{text}<extra></extra>",
-        "name": name,
-        "showlegend": False,
-    }
+    marker = {"color": colour, "size": size if points.shape[1] == 2 else 0.6 * size}
+    said = {"text": text, "hovertemplate": "%{text}<extra></extra>", "name": name, "showlegend": False}
+    return {**_points(points), "mode": "markers", "marker": marker, **said}
 
 
 def _misfit_text(graph: PoseGraph, edges: IntArray, residuals: EdgeResiduals) -> list[str]:
@@ -237,13 +215,10 @@ def _arrange(figure: Figure, points: Array, title: str) -> None:
         figure.update_yaxes(title_text="y (m)", range=[low, high], scaleanchor="x", **plain)
         return
     middle, half = (lower + upper) / 2, max(0.52 * float((upper - lower).max()), 1e-9)
-    figure.update_scenes(
-        aspectmode="cube",
-        **{
-            f"{letter}axis": {"title": {"text": f"{letter} (m)"}, "range": [centre - half, centre + half]}
-            for letter, centre in zip("xyz", middle.tolist(), strict=True)
-        },
-    )
+    for letter, centre in zip("xyz", middle.tolist(), strict=True):
+        axis = {"title": {"text": f"{letter} (m)"}, "range": [centre - half, centre + half]}
+        figure.update_scenes({f"{letter}axis": axis})
+    figure.update_scenes(aspectmode="cube")
 
 
 def _add_controls(figure: Figure, names: list[str]) -> None:
@@ -251,10 +226,8 @@ def _add_controls(figure: Figure, names: list[str]) -> None:
         return {"frame": {"duration": milliseconds, "redraw": True}, "mode": "immediate", "transition": {"duration": 0}}
 
     steps = [{"args": [[name], shown(0)], "label": name, "method": "animate"} for name in names]
-    buttons = [
-        {"label": "play", "method": "animate", "args": [None, {**shown(_FRAME_MILLISECONDS), "fromcurrent": True}]},
-        {"label": "pause", "method": "animate", "args": [[None], shown(0)]},
-    ]
+    presses = {"play": [None, {**shown(_FRAME_MILLISECONDS), "fromcurrent": True}], "pause": [[None], shown(0)]}
+    buttons = [{"label": label, "method": "animate", "args": args} for label, args in presses.items()]
     figure.update_layout(
         margin={"b": 20},
         legend={"orientation": "v", "x": 0.0, "y": 1.0, "yanchor": "top"},

@@ -30,9 +30,8 @@ def smallest_eigenvalues(problem: PGOProblem, Lambda: Array, count: int = 12) ->
 
     S_Q = S_RR - S_Rt S_tt^+ S_tR = Q - blockdiag(Lambda) acts on rotations alone, so that all its eigenvalues have the
     unit of kappa (per rad^2) and are those that eta shifts: S + eta blockdiag(0, I) is positive semidefinite if and
-    only if lambda_min(S_Q) >= -eta. At a global optimum whose relaxation is tight d of them are zero. Found by
-    shift-invert Lanczos below the spectrum: an estimate for the eye; the proof is `prove_bound`. A SettingError when
-    count is not 1 to d n.
+    only if lambda_min(S_Q) >= -eta. At a global optimum whose relaxation is tight d of them are zero. By shift-invert
+    Lanczos below the spectrum: an estimate; the proof is `prove_bound`. A SettingError unless 1 <= count <= d n.
     """
     side = problem.num_poses * problem.d
     if not 1 <= count <= side:
@@ -99,8 +98,7 @@ def plot_sparsity(problem: PGOProblem) -> Figure:
 
 def _draw_pattern(axes: Axes, matrix: csc_array) -> None:
     """Draw the share of stored entries cell by cell; a cell is an entry while the matrix is small."""
-    side = matrix.shape[0]
-    cells = min(side, _CELLS)
+    side, cells = matrix.shape[0], min(matrix.shape[0], _CELLS)
     columns = np.repeat(np.arange(side), np.diff(matrix.indptr))
     number = (matrix.indices * cells // side) * cells + columns * cells // side
     count = np.bincount(number, minlength=cells * cells).reshape(cells, cells)

@@ -35,18 +35,10 @@ MARKERS = ("o", "s", "D", "^", "v", "P")
 def column_figure(height: float, width: float = 1.0) -> Iterator[Figure]:
     """Context manager yielding a figure in the project's style, `width` columns wide, `height` of them high."""
     matplotlib = extra_module("matplotlib", "plot")
-    style = {
-        "font.size": LETTER_POINTS,
-        "axes.titlesize": LETTER_POINTS,
-        "axes.labelsize": LETTER_POINTS,
-        "legend.fontsize": SMALL_POINTS,
-        "xtick.labelsize": SMALL_POINTS,
-        "ytick.labelsize": SMALL_POINTS,
-        "lines.linewidth": 1.2,
-        "lines.markersize": 3.5,
-        "axes.grid": False,
-    }
-    with matplotlib.rc_context(style):
+    letters = dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize"), LETTER_POINTS)
+    small = dict.fromkeys(("legend.fontsize", "xtick.labelsize", "ytick.labelsize"), SMALL_POINTS)
+    lines = {"lines.linewidth": 1.2, "lines.markersize": 3.5, "axes.grid": False}
+    with matplotlib.rc_context({**letters, **small, **lines}):
         figure = _shown_figure()(figsize=(COLUMN_INCHES * width, COLUMN_INCHES * height), layout="constrained")
         yield figure
         for axes in figure.axes:

@@ -79,8 +79,7 @@ class CholeskyFactor(ABC):
 class SymbolicCholesky(ABC):
     """A sparsity pattern, ordered and analysed once.
 
-    Matrices passed to `factorize` are symmetric, in canonical CSC form, and have exactly the analysed pattern
-    (explicit zeros included).
+    Matrices passed to `factorize` are symmetric, canonical CSC, and have the analysed pattern, explicit zeros included.
     """
 
     def __init__(self, pattern: csc_array) -> None:
@@ -130,11 +129,9 @@ def analyze(
     return _Cholmod(pattern, order, most_counts) if chosen is CholeskyBackend.CHOLMOD else _SuperLU(pattern, order)
 
 
-def factorize(
-    matrix: csc_array, backend: CholeskyBackend | None = None, order: IntArray | None = None
-) -> CholeskyFactor:
+def factorize(A: csc_array, backend: CholeskyBackend | None = None, order: IntArray | None = None) -> CholeskyFactor:
     """Factor one symmetric positive definite matrix; see `analyze` and `SymbolicCholesky.factorize`."""
-    return analyze(matrix, backend, order).factorize(matrix)
+    return analyze(A, backend, order).factorize(A)
 
 
 def minimum_degree(pattern: csc_array) -> IntArray:
@@ -146,8 +143,7 @@ def minimum_degree(pattern: csc_array) -> IntArray:
 
 class _SuperLUFactor(CholeskyFactor):
     def __init__(self, lu: SuperLU, analysis: "_SuperLU", diagonal: Array) -> None:
-        self._lu = lu
-        self._analysis = analysis
+        self._lu, self._analysis = lu, analysis
         self._rows = analysis.order[np.argsort(lu.perm_c)]  # in the order of elimination
         self._diagonal = diagonal[self._rows]
 
@@ -206,9 +202,8 @@ class _SuperLU(SymbolicCholesky):
             self.order = order
             return
         # A dominant diagonal on the same pattern is factored once, only for its fill-reducing order.
-        n = pattern.shape[0]
         dominant = csc_array((np.zeros(pattern.nnz), pattern.indices, pattern.indptr), shape=pattern.shape)
-        dominant.setdiag(np.ones(n))
+        dominant.setdiag(1.0)
         lu = splu(dominant, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         self.order = np.argsort(lu.perm_c)
 
@@ -285,11 +280,9 @@ class _CholmodFactor(CholeskyFactor):
 class _Cholmod(SymbolicCholesky):
     """Supernodal L L^T of the lower triangle; AMD order unless another is given."""
 
-    def __init__(
-        self, pattern: csc_array, order: IntArray | None, most_counts: Callable[[], FactorCounts] | None = None
-    ) -> None:
+    def __init__(self, pattern: csc_array, order: IntArray | None, most: Callable[[], FactorCounts] | None) -> None:
         super().__init__(pattern)
-        self._order, self._most_counts = order, most_counts
+        self._order, self._most_counts = order, most
         self._error_before: Array | None = None
         self._matrix, self._lower, self._is_diagonal = lower_triangle(pattern)
         # Symbolic parts with the factor that uses each. No finaliser gives them back: Ctrl-C in one would be lost.

@@ -4,8 +4,7 @@ A factorisation that goes through proves something in exact arithmetic (Rump 200
 definiteness*; Demmel 1989; Higham 2002, theorem 10.3). The product R^T R of the computed factor, taken exactly, is
 A + E with |E_ij| <= gamma sum_k |R_ki| |R_kj|, gamma counting the non-zeros of column i or j of R, whichever has fewer,
 in any order of summation and with or without fused multiply-adds; the squares in column j of R sum to at most
-a_jj / (1 - gamma). With c_j non-zeros in column j of R, and at most p_j in a row that has one there, Cauchy-Schwarz
-in every row bounds
+a_jj / (1 - gamma). With c_j non-zeros in column j of R, and at most p_j in a row with one there, Cauchy-Schwarz by row:
 
     v^T |E| v <= sum_k (sum_j sqrt(gamma_(c_j)) |R_kj| |v_j|)^2 <= sum_j epsilon_j a_jj v_j^2,
     epsilon_j = p_j gamma_(c_j) / (1 - gamma_(c_j)).
@@ -23,8 +22,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 
 UNIT_ROUNDOFF = 2.0**-53
-# A bound is itself a sum of fewer than 2^22 non-negative terms, each of a few operations: this makes up for their
-# rounding.
+# A bound is a sum of fewer than 2^22 non-negative terms, each of a few operations: this makes up for their rounding.
 OUTWARD = 1.0 + 2.0**-30
 
 

@@ -20,15 +20,19 @@ from pgo_models.problem.problem import PGOProblem
 
 @dataclass(frozen=True, eq=False)
 class TangentLayout:
-    """Unknowns of a step: first v, d numbers a pose, then w, 1 or 3 numbers a pose."""
+    """Unknowns of a step: first v, d numbers a pose, then w, `turns` numbers a pose, 1 or 3 unless given."""
 
     num_poses: int
     d: int
+    turns: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "turns", self.turns or tangent_dimension(self.d))
 
     @property
     def side(self) -> int:
         """Number of unknowns."""
-        return self.num_poses * (self.d + tangent_dimension(self.d))
+        return self.num_poses * (self.d + self.turns)
 
     def join(self, w: Array, v: Array) -> Array:
         """Vector of a move (w, v)."""
@@ -37,16 +41,15 @@ class TangentLayout:
     def split(self, step: Array) -> tuple[Array, Array]:
         """Move (w, v) of a vector."""
         count = self.num_poses * self.d
-        w = step[count:].reshape(self.num_poses, tangent_dimension(self.d))
-        return w, step[:count].reshape(self.num_poses, self.d)
+        return step[count:].reshape(self.num_poses, self.turns), step[:count].reshape(self.num_poses, self.d)
 
     def translations(self, pose: IntArray) -> IntArray:
         """Columns (m, d) of v."""
         return rotation_columns(pose, 0, self.d)
 
     def rotations(self, pose: IntArray) -> IntArray:
-        """Columns (m, 1 or 3) of w."""
-        return rotation_columns(pose, self.num_poses * self.d, tangent_dimension(self.d))
+        """Columns (m, turns) of w."""
+        return rotation_columns(pose, self.num_poses * self.d, self.turns)
 
 
 def tangent_order(problem: PGOProblem) -> IntArray:

@@ -37,10 +37,8 @@ def odometry_start(graph: PoseGraph) -> Poses:
     edge[graph.i[forward][::-1]] = forward[::-1]
     if n > 1 and edge.min() < 0:
         missing = int(np.argmin(edge))
-        raise GraphError(
-            f"no odometry from pose {graph.pose_name(missing)} to {graph.pose_name(missing + 1)}; "
-            "use spanning_tree_start() or chordal_start()"
-        )
+        link = f"from pose {graph.pose_name(missing)} to {graph.pose_name(missing + 1)}"
+        raise GraphError(f"no odometry {link}; use spanning_tree_start() or chordal_start()")
     return _compose(graph, np.arange(n), np.arange(-1, n - 1), edge, np.ones(n - 1, dtype=bool))
 
 

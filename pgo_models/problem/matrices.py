@@ -79,16 +79,14 @@ def joint_matrix(graph: PoseGraph, weights: EdgeWeights | None = None) -> csc_ar
         R_i:  kappa I + tau t_ij t_ij^T           R_j: -kappa R_ij
         R_j:  kappa I
 
-    for W = kappa I; see `edge_blocks`. The pattern holds every diagonal d x d block in full, so that multipliers can be
-    subtracted in place.
+    for W = kappa I; see `edge_blocks`. Diagonal d x d blocks are stored in full: multipliers are subtracted in place.
     """
     n, d = graph.num_poses, graph.d
     weights = weights if weights is not None else isotropic_weights(graph)
     i, j, tau = graph.i, graph.j, weights.tau
     block_i, block_j = rotation_columns(i, n, d), rotation_columns(j, n, d)
     lever, own_i, between, own_j = edge_blocks(graph.R_ij, graph.t_ij, weights)
-    t_i = np.repeat(i[:, None], d, axis=1)
-    t_j = np.repeat(j[:, None], d, axis=1)
+    t_i, t_j = (np.repeat(end[:, None], d, axis=1) for end in (i, j))
     blocks = [
         (i, i, tau),
         (j, j, tau),
@@ -118,11 +116,9 @@ def marginalized_matrix(graph: PoseGraph, weights: EdgeWeights | None = None) ->
     Q = M_RR - M_Rt (M_tt)^+ M_tR, the Schur complement of the translations (SE-Sync: Rosen et al. 2019, equation 22).
     A SettingError when its side would exceed `MAX_DENSE_SIDE`; `PGOProblem.apply_Q` multiplies with it at any size.
     """
-    n, d = graph.num_poses, graph.d
-    if d * n > MAX_DENSE_SIDE:
-        raise SettingError(
-            f"Q is dense with side {d * n}, {8e-9 * (d * n) ** 2:.1f} GB; use PGOProblem.apply_Q, which forms no Q"
-        )
+    n, side = graph.num_poses, graph.d * graph.num_poses
+    if side > MAX_DENSE_SIDE:
+        raise SettingError(f"Q has side {side}, {8e-9 * side**2:.1f} GB; use PGOProblem.apply_Q, which forms no Q")
     M = joint_matrix(graph, weights)
     M_Rt, M_RR = M[n:, :n], M[n:, n:].toarray()
     grounded = factorize(M[1:n, 1:n].tocsc())  # columns of M_tR sum to zero, so t_0 = 0 loses nothing
@@ -136,11 +132,8 @@ def rotation_columns(pose: IntArray, first: int, d: int) -> IntArray:
 
 def columns_of(poses: IntArray, num_poses: int, widths: tuple[int, ...]) -> IntArray:
     """Unknowns of some poses when those of all poses are stacked field by field, `widths[f]` numbers a pose."""
-    found, first = [], 0
-    for width in widths:
-        found.append((first + width * poses[:, None] + np.arange(width)).ravel())
-        first += width * num_poses
-    return np.concatenate(found)
+    fields = zip(num_poses * np.cumsum((0, *widths[:-1])), widths, strict=True)
+    return np.concatenate([rotation_columns(poses, first, width).ravel() for first, width in fields])
 
 
 def inner(A: Array, B: Array) -> float:
@@ -158,9 +151,7 @@ def norm(A: Array) -> float:
 
 def assemble(blocks: list[tuple[IntArray, IntArray, Array]], side: int) -> csc_array:
     """Sum (rows, columns, values) triplets, each of one shape, into a canonical CSC matrix; its pattern keeps zeros."""
-    rows = np.concatenate([np.ravel(block[0]) for block in blocks])
-    columns = np.concatenate([np.ravel(block[1]) for block in blocks])
-    values = np.concatenate([np.ravel(block[2]) for block in blocks])
+    rows, columns, values = (np.concatenate([np.ravel(block[k]) for block in blocks]) for k in range(3))
     return csc_array((values, (rows, columns)), shape=(side, side))
 
 
@@ -180,7 +171,4 @@ def meets(matrix: csc_array, rows: IntArray) -> BoolArray:
 
 def block_entries(rows: IntArray, columns: IntArray) -> tuple[IntArray, IntArray]:
     """Rows and columns, (m, a, b) each, of the entries of blocks with these rows, (m, a), and columns, (m, b)."""
-    return (
-        np.repeat(rows[:, :, None], columns.shape[1], axis=2),
-        np.repeat(columns[:, None, :], rows.shape[1], axis=1),
-    )
+    return np.repeat(rows[:, :, None], columns.shape[1], axis=2), np.repeat(columns[:, None, :], rows.shape[1], axis=1)

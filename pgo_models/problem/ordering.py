@@ -46,9 +46,7 @@ def most_counts(graph: PoseGraph, poses: IntArray, *widths: int) -> FactorCounts
     pattern.setdiag(1.0)
     L, order = factorize(pattern, CholeskyBackend.CHOLMOD, poses).take_apart()
     found = FactorCounts.of(L.indptr, L.indices, order)
-    in_column, in_row, widest = (
-        np.repeat(width * count, width) for count in (found.in_column, found.in_row, found.widest)
-    )
+    in_column, in_row, widest = (np.repeat(width * one, width) for one in (found.in_column, found.in_row, found.widest))
     return FactorCounts(in_column, in_row, widest, row_order(order, *widths))
 
 

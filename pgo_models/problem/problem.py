@@ -31,8 +31,7 @@ class PGOProblem:
     quadratic part, and `tangent_at` gives quadratic problems that touch chi2 from below (`problem.weighting`).
 
     `graph` is connected, its weights kappa, tau are the problem's; `graph.unit_weights()` gives the paper's equation.
-    `backend` is the sparse Cholesky to use, `default_backend()` unless given; `weighting` is the cost, F or chi2, or
-    its weights themselves.
+    `backend` is the sparse Cholesky to use, `default_backend()` unless given; `weighting` is F or chi2, or the weights.
 
     A GraphError when the graph is not connected; a SettingError when weighting is none.
 
@@ -220,15 +219,13 @@ class PGOProblem:
     def apply_M(self, X: Array, residuals: Array | None = None) -> Array:
         """M X = A^T (w A X), (N, d), by `residuals`, ((d+1) m, d): accurate where edges fit, however large t."""
         residuals, (_, w) = self.residuals(X) if residuals is None else residuals, self.residual_matrix
-        tangent, n = self.weights.tangent, self.num_poses
+        tangent, n, m = self.weights.tangent, self.num_poses, self.graph.num_edges
         if tangent is None:
             return np.asarray(self._adjoint @ (w[:, None] * residuals))
         C, axes = tangent.C, self.weights.axes
         pull = rows_of_blocks(C @ X[n:].reshape(n, self.d, self.d)[self.graph.i], axes)
         product = self._adjoint @ (w[:, None] * residuals + pull)
-        product[n:] += self.incidence.at_beginning(
-            np.swapaxes(C, 1, 2) @ blocks_of_rows(residuals, self.graph.num_edges, axes)
-        )
+        product[n:] += self.incidence.at_beginning(np.swapaxes(C, 1, 2) @ blocks_of_rows(residuals, m, axes))
         return np.asarray(product)
 
     def apply_Q(self, Y: Array) -> Array:
@@ -291,10 +288,8 @@ class PGOProblem:
     def stacked(self, poses: Poses) -> Array:
         """X, (N, d), of poses; a GraphError when number or dimension are not the graph's, or they are no Poses."""
         if not isinstance(poses, Poses):
-            raise GraphError(
-                f"poses are a {type(poses).__name__}; give Poses(R, t), or problem.with_best_translations(R)"
-            )
-        if poses.t.shape != (self.num_poses, self.d):
+            raise GraphError(f"poses are a {type(poses).__name__}; give Poses(R, t), or use with_best_translations(R)")
+        if (poses.num_poses, poses.d) != (self.num_poses, self.d):
             raise GraphError(f"{poses} beside {self}; give one pose for every pose of the graph, in its order")
         return poses.stacked()
 

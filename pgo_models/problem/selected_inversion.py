@@ -4,8 +4,7 @@ For Z = (L L^T)^-1, J the columns of a supernode and I the rows below them (Taka
 
     G = L_IJ L_JJ^-1,    Z_IJ = -Z_II G,    Z_JJ = L_JJ^-T L_JJ^-1 - G^T Z_IJ.
 
-I is among the rows of the parent in the elimination tree, whose front, Z in all of its rows and columns, is known when
-one goes down from the roots.
+I is among the rows of the parent in the elimination tree, whose front, Z in these rows, is known from the roots down.
 """
 
 from functools import cache

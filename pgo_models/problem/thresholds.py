@@ -108,8 +108,7 @@ def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
 
     exact where the w are equal; else at the quantile 0.99 within 7 %, at 1 - 2e-6 within 2.5 times, of 1 - quantile. F
     of SE-Sync's kappa in the plane has w = 2 of the angle. Least squares fits the poses to the errors, so that the
-    residuals of an optimum are smaller than these where few edges say the same. A SettingError when quantile is not
-    between 0 and 1.
+    residuals of an optimum are smaller than these where few edges say the same. A SettingError unless 0 < quantile < 1.
 
     Examples
     --------

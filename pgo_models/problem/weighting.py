@@ -52,23 +52,18 @@ class EdgeWeights:
 
     def of_edges(self, chosen: IntArray | BoolArray) -> "EdgeWeights":
         """Weights of some of the edges; of a cost, not of a tangent."""
-        axes, W_given, W_error = (
-            None if one is None else one[chosen] for one in (self.axes, self.W_given, self.W_error)
-        )
+        given = self.axes, self.W_given, self.W_error
+        axes, W_given, W_error = (None if one is None else one[chosen] for one in given)
         excess = None if self.excess is None else self.excess.of_edges(chosen)
         return EdgeWeights(self.tau[chosen], self.kappa[chosen], axes, W_given, W_error, excess)
 
     def scaled(self, share: Array) -> "EdgeWeights":
         """Weights times shares, (m,); of a cost, not of a tangent."""
-        wide = share[:, None, None]
-        return EdgeWeights(
-            share * self.tau,
-            share * self.kappa if self.axes is None else share[:, None] * self.kappa,
-            self.axes,
-            None if self.W_given is None else wide * self.W_given,
-            None if self.W_error is None else share * self.W_error,
-            None if self.excess is None else self.excess.scaled(share),
-        )
+        kappa = share * self.kappa if self.axes is None else share[:, None] * self.kappa
+        W_given = None if self.W_given is None else share[:, None, None] * self.W_given
+        W_error = None if self.W_error is None else share * self.W_error
+        excess = None if self.excess is None else self.excess.scaled(share)
+        return EdgeWeights(share * self.tau, kappa, self.axes, W_given, W_error, excess)
 
     @property
     def is_convex(self) -> bool:
@@ -169,9 +164,8 @@ class Excess:
           = tau ||r||^2 + tr(W' (2 I - E - E^T)) + u^T J u + tr(H K H),  u = (r, s), J = [I_tt - tau I, I_tr; ., K]
 
     for W' that of I_rr - K, since 2 (1 - cos theta) a^T K a = s^T K s + (1 - cos theta)^2 a^T K a. K makes J positive
-    definite. Without coupling blocks u = r and there is no K. A tangent of this function is quadratic in the poses,
-    with the pattern of M: what a relaxation with matrix weights gains only by many redundant constraints (Holmes,
-    Duembgen & Barfoot 2024).
+    definite. Without coupling blocks u = r, no K. A tangent is quadratic in the poses, with the pattern of M: what a
+    relaxation with matrix weights gains only by many redundant constraints (Holmes, Duembgen & Barfoot 2024).
     """
 
     R_ij: Array  # (m, d, d)
@@ -266,13 +260,10 @@ def edge_weights(graph: PoseGraph, information: Array) -> EdgeWeights:
         return EdgeWeights(I_tt[:, 0, 0].copy(), *_rotation_weights(I_rr))
     if (silent := ~I_tt.any(axis=(1, 2))).any():
         edge = graph.edge_label(int(np.argmax(silent)))
-        raise GraphError(
-            f"chi2 of {edge}, of a rotation alone, is not known beside others' matrices; leave out one kind"
-        )
+        raise GraphError(f"chi2 of {edge}, of a rotation alone, is unknown beside others' matrices; leave out one kind")
     margin = np.repeat((_MARGIN * smallest + _ROUNDED * trace)[:, None], d, axis=1)
-    tau = np.where(
-        is_coupled, _COUPLED_SHARE * uncoupled_share(information, d) * smallest, smallest - 2.0 * margin[:, 0]
-    )
+    coupled = _COUPLED_SHARE * uncoupled_share(information, d) * smallest
+    tau = np.where(is_coupled, coupled, smallest - 2.0 * margin[:, 0])
     J, K, turn = I_tt - tau[:, None, None] * np.eye(d), None, graph.R_ij
     if is_coupled.any():
         bearing = np.swapaxes(I_tr, 1, 2) @ np.linalg.solve(J, I_tr)
@@ -318,10 +309,8 @@ def _rotation_weights(I_rr: Array, K: Array | None = None) -> tuple[Array, Array
 def _check(graph: PoseGraph, good: BoolArray) -> None:
     if not good.all():
         edge = graph.edge_label(int(np.argmin(good)))
-        raise GraphError(
-            f"the information matrix of {edge} is indefinite or spans more orders of magnitude than double precision "
-            "carries; give it a larger smallest eigenvalue, or solve without the information matrices"
-        )
+        what = f"the information matrix of {edge} is indefinite or spans more orders of magnitude than doubles carry"
+        raise GraphError(f"{what}; give it a larger smallest eigenvalue, or solve without the information matrices")
 
 
 def _bend(D: Array) -> Array:

@@ -1,8 +1,7 @@
 """The semidefinite relaxation of a sparse graph over the cliques of a chordal extension, in well-scaled coordinates.
 
 Every clique C of `pgo_models.relaxations.clique_tree` has a Gram matrix W_C of its own. With r its first pose among
-those it shares with its parent, and centre poses c_i = (R^_i, t^_i) that are near the optimum, the lifted vectors of
-W_C are
+those it shares with its parent, and centre poses c_i = (R^_i, t^_i) near the optimum, the lifted vectors of W_C are
 
     P_r,     sigma (P_u - P_r),     sigma_t (t_u - t_r - P_r (t^_u - t^_r))     for every other u in C,
 
@@ -103,9 +102,8 @@ def clique_relaxation(
     blocks = tuple(w_k[triangle_places(side)] >> 0 for side, w_k in zip(layout.sides, upper, strict=True))
     w = cp.hstack(upper)
     agree = A @ w == b
-    model = cp.Problem(cp.Minimize((_costs(layout) / scale) @ w), [agree, *blocks])
-    Lambda_of = equations.multiplier_matrix()
-    return CliqueRelaxation(problem, tree, centre, model, upper, agree, blocks, scale, layout, Lambda_of)
+    model, to_Lambda = cp.Problem(cp.Minimize((_costs(layout) / scale) @ w), [agree, *blocks]), equations.to_Lambda()
+    return CliqueRelaxation(problem, tree, centre, model, upper, agree, blocks, scale, layout, to_Lambda)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,11 +211,10 @@ class _Equations:
         shape = (len(self._right), self.layout.num_entries)
         return csr_array(coo_array((np.concatenate(self._values), entries), shape=shape)), np.array(self._right)
 
-    def multiplier_matrix(self) -> csr_array:
+    def to_Lambda(self) -> csr_array:
         """Multipliers of the equations to Lambda in the coordinates of the centre, (n d d, equations)."""
         rows, columns, values = (np.array(part) for part in zip(*self._multipliers, strict=True))
-        problem = self.layout.problem
-        shape = (problem.num_poses * problem.d**2, len(self._right))
+        shape = (self.layout.problem.num_poses * self.layout.problem.d**2, len(self._right))
         return csr_array(coo_array((values, (rows, columns)), shape=shape))
 
 
@@ -233,10 +230,8 @@ def _orthogonality(equations: _Equations) -> None:
             if layout.home[u] != k:
                 continue
             for a, b in _upper(d):
-                first, second = unit[column + a], unit[column + b]
-                equations.add(
-                    [(k, unit[a], second, 1.0), (k, first, unit[b], 1.0), (k, first, second, 1.0 / layout.sigma)], 0.0
-                )
+                first, second, share = unit[column + a], unit[column + b], 1.0 / layout.sigma
+                equations.add([(k, unit[a], second, 1.0), (k, first, unit[b], 1.0), (k, first, second, share)], 0.0)
                 equations.last_is(u, a, b, layout.sigma)
                 equations.last_is(r, a, b, -layout.sigma)
 
@@ -250,9 +245,7 @@ def _agreement(equations: _Equations) -> None:
         to_reference = layout.rotation_deviation(parent, r, np.eye(d))
         mine = list(range(d))
         theirs = [layout.reference_rotation(parent, np.eye(d)) + to_reference]
-        for u in tree.separator(k).tolist():
-            if u == r:
-                continue
+        for u in np.setdiff1d(tree.separator(k), r).tolist():
             mine += range(layout.columns[k][u], layout.columns[k][u] + d + 1)
             theirs.append(sigma * (layout.rotation_deviation(parent, u, np.eye(d)) - to_reference))
             turned = to_reference @ (t[u] - t[r])[:, None]
@@ -268,8 +261,7 @@ def _agreement(equations: _Equations) -> None:
 def _costs(layout: _Layout) -> Array:
     """Coefficients of w in F: every edge in the clique of its two poses that is nearest to the root.
 
-    With E = R^_i R_ij R^_j^T, the rotation residual of an edge is P_j - P_i E up to a rotation, and the translation
-    residual t_j - t_i - P_i R^_i t_ij.
+    With E = R^_i R_ij R^_j^T the residuals of an edge are P_j - P_i E, up to a rotation, and t_j - t_i - P_i R^_i t_ij.
     """
     graph, R, t, d = layout.problem.graph, layout.centre.R, layout.centre.t, layout.problem.d
     weights, W = layout.problem.weights, layout.problem.weights.W(layout.problem.d)

@@ -67,9 +67,7 @@ def _eliminate(graph: PoseGraph) -> tuple[list[set[int]], list[int]]:
             neighbours[other] |= remaining
             neighbours[other] -= {other, pose}
             heapq.heappush(heap, (len(neighbours[other]), other))
-    parent = [
-        min((place[other] for other in clique if place[other] > k), default=-1) for k, clique in enumerate(members)
-    ]
+    parent = [min((place[pose] for pose in clique if place[pose] > k), default=-1) for k, clique in enumerate(members)]
     return members, parent
 
 

@@ -57,16 +57,14 @@ def plan_relaxation(
 ) -> RelaxationPlan:
     """Choose what is not given: the cliques with Clarabel where they are small, else the dense primal with SCS.
 
-    Nothing larger than the clique tree is formed. A SettingError when the estimate exceeds `memory_limit`, in bytes, or
-    the limit is not positive.
+    Forms nothing larger than the clique tree. A SettingError when `memory_limit`, bytes, is exceeded or not positive.
     """
     if not memory_limit > 0:
         raise SettingError(f"memory_limit is {memory_limit}; give positive bytes")
     tree = build_clique_tree(problem.graph)
     largest = int(clique_side(int(tree.sizes.max()), problem.d))
-    shape = (
-        f"the largest of {len(tree.cliques)} cliques has side {largest}, the dense cone {problem.d * problem.num_poses}"
-    )
+    dense_side = problem.d * problem.num_poses
+    shape = f"the largest of {len(tree.cliques)} cliques has side {largest}, the dense cone {dense_side}"
     if form is None and solver is None:
         small = _seconds(problem, tree, RelaxationForm.CLIQUES, CLARABEL)
         dense = _seconds(problem, tree, RelaxationForm.PRIMAL, SCS)
@@ -80,11 +78,9 @@ def plan_relaxation(
         reason = f"{' and '.join(asked)} as asked for; {shape}"
     memory = _memory(problem, tree, form, chosen)
     if memory > memory_limit:
-        raise SettingError(
-            f"the relaxation of {problem!r} as {form.name} with {chosen.name} needs about {_bytes(memory)}, above the "
-            f"limit of {_bytes(memory_limit)} ({reason}); use certify(problem, poses), which proves the same bound by "
-            "one sparse factorisation, or raise memory_limit"
-        )
+        needs = f"needs about {_bytes(memory)}, above the limit of {_bytes(memory_limit)} ({reason})"
+        way_out = "use certify(problem, poses), which proves the same bound by one factorisation, or raise memory_limit"
+        raise SettingError(f"the relaxation of {problem!r} as {form.name} with {chosen.name} {needs}; {way_out}")
     return RelaxationPlan(form, chosen, tree, _seconds(problem, tree, form, chosen), memory, reason)
 
 
@@ -106,12 +102,9 @@ def _seconds(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm, solver
 def _memory(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm, solver: ConvexSolver) -> float:
     triangles = _triangle(_sides(problem, tree, form))
     cones = _CLARABEL_BYTES * np.sum(triangles**2) if not solver.is_first_order else 0.0
-    dense_side = {
-        RelaxationForm.PRIMAL: problem.d * problem.num_poses,
-        RelaxationForm.DUAL: problem.side,  # cvxpy vectorises the inequality as a whole
-        RelaxationForm.CLIQUES: 0,
-    }[form]
-    return float(cones + _SCS_BYTES * np.sum(triangles) + _CONE_BYTES * len(triangles) + _DENSE_BYTES * dense_side**2)
+    # Of the dual, cvxpy vectorises the inequality as a whole.
+    dense = {RelaxationForm.PRIMAL: problem.d * problem.num_poses, RelaxationForm.DUAL: problem.side}.get(form, 0)
+    return float(cones + _SCS_BYTES * np.sum(triangles) + _CONE_BYTES * len(triangles) + _DENSE_BYTES * dense**2)
 
 
 def _triangle(side: Array) -> Array:

@@ -91,7 +91,6 @@ def dual_relaxation(problem: PGOProblem) -> DualRelaxation:
     embed = csc_array((np.ones(entries.size), places), shape=(side * side, n * triangle))
     S = grounded / scale - cp.reshape(embed @ upper, (side, side), order="F")
     certificate = S >> 0
-    is_diagonal = np.equal(*np.triu_indices(d))
-    trace = np.tile(is_diagonal.astype(float), n)
+    trace = np.tile(np.equal(*np.triu_indices(d)).astype(float), n)
     model = cp.Problem(cp.Maximize(trace @ upper), [certificate])
     return DualRelaxation(problem, model, upper, certificate, scale)

@@ -27,9 +27,7 @@ class RelaxationStatus(enum.Enum):
     """How the solver ended."""
 
     OPTIMAL = "solved to the solver's tolerance"
-    INACCURATE = (
-        "stopped where rounding lets it go no further, short of the tolerance; the bound is proven all the same"
-    )
+    INACCURATE = "stopped where rounding lets it go no further, short of tolerance; the bound is proven all the same"
     LIMIT = "stopped by its limit of time or iterations; the bound is proven all the same, but may be wide"
 
 
@@ -143,10 +141,8 @@ def _solve(model: cp.Problem, solver: ConvexSolver, time_limit: float, verbose: 
     except cp.SolverError as error:
         raise PGOError(f"{solver.name} failed on the relaxation: {error}; try another solver or form") from error
     if model.value is None or not math.isfinite(model.value):
-        raise PGOError(
-            f"{solver.name} ended with status {model.status} on the relaxation and gave no iterate; "
-            "raise time_limit, or try another solver or form"
-        )
+        ended = f"{solver.name} ended with status {model.status} on the relaxation and gave no iterate"
+        raise PGOError(f"{ended}; raise time_limit, or try another solver or form")
     if model.status == cp.OPTIMAL:
         return RelaxationStatus.OPTIMAL
     # SCS calls inaccurate what its limits stopped.

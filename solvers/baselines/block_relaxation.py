@@ -8,8 +8,7 @@ each by the Cholesky factor of its own diagonal block; of the others' x they nee
 2017; Bertsekas & Tsitsiklis, Parallel and Distributed Computation, section 2.4). Turns of robots that are no neighbours
 converge for 0 < alpha < 2 and every positive definite H (SOR). All robots at once converge for 0 < alpha <= 1: with D
 the diagonal blocks, 2 D - H is the H of the problem in which one end of every edge between robots has its sign flipped.
-That is a sum of squares too, and on a connected graph with a fixed pose positive definite, as each end of an edge
-determines its pose.
+It is a sum of squares, positive definite if connected with a fixed pose, as each end of an edge determines its pose.
 """
 
 from dataclasses import dataclass
@@ -57,53 +56,43 @@ def take_turns(turns: tuple[Turn, ...], x: Array, alpha: float, ledger: Ledger) 
     return x, ledger
 
 
-def sweep_turns(
-    problem: LeastSquares, turns: Schedule, numbers: int, backend: CholeskyBackend | None
-) -> tuple[Turn, ...]:
-    """Prepare the turns of a sweep, `numbers` numbers a pose being what is sent."""
-    return _prepare(problem.J, problem, turns, turns.group, numbers, backend)
+def sweep_turns(linear: LeastSquares, turns: Schedule, count: int, backend: CholeskyBackend | None) -> tuple[Turn, ...]:
+    """Prepare the turns of a sweep, `count` numbers a pose being what is sent."""
+    return _prepare(linear.J, linear, turns, turns.group, count, backend)
 
 
 def flagged_turns(
-    problem: LeastSquares, graph: PoseGraph, turns: Schedule, numbers: int, backend: CholeskyBackend | None
+    linear: LeastSquares, graph: PoseGraph, turns: Schedule, count: int, backend: CholeskyBackend | None
 ) -> tuple[Turn, ...]:
     """Prepare the turns of a first sweep that needs no start.
 
     An edge between two robots counts for the end that comes later, which uses the estimate of the end before it.
     Between two of one turn it does not count yet.
     """
-    entries = problem.J.tocoo()
-    edge, pose = problem.edge[entries.row], problem.pose[entries.col]
+    entries = linear.J.tocoo()
+    edge, pose = linear.edge[entries.row], linear.pose[entries.col]
     other = graph.i[edge] + graph.j[edge] - pose
     counts = (turns.robot[pose] == turns.robot[other]) | (turns.first[pose] > turns.first[other])
     counted = coo_array((entries.data * counts, (entries.row, entries.col)), shape=entries.shape).tocsr()
-    return _prepare(counted, problem, turns, turns.first, numbers, backend)
+    return _prepare(counted, linear, turns, turns.first, count, backend)
 
 
 def _prepare(
-    left: csr_array,
-    problem: LeastSquares,
-    turns: Schedule,
-    turn_of_pose: IntArray,
-    numbers: int,
-    backend: CholeskyBackend | None,
+    left: csr_array, linear: LeastSquares, turns: Schedule, group: IntArray, count: int, backend: CholeskyBackend | None
 ) -> tuple[Turn, ...]:
-    """Turns of left^T diag(w) (J x + r) = 0."""
-    weighted = (left * problem.w[:, None]).T.tocsr()
-    H, b = (weighted @ problem.J).tocsr(), -(weighted @ problem.r)
-    turn_of_row, robot = turn_of_pose[problem.pose], turns.robot[problem.pose]
+    """Turns of left^T diag(w) (J x + r) = 0; `group`, (n,), is the turn of every pose."""
+    weighted = (left * linear.w[:, None]).T.tocsr()
+    H, b = (weighted @ linear.J).tocsr(), -(weighted @ linear.r)
+    turn_of_row, robot = group[linear.pose], turns.robot[linear.pose]
     number = np.zeros(H.shape[0], dtype=np.int64)
     prepared = []
-    for turn in range(int(turn_of_pose.max()) + 1):
+    for turn in range(int(group.max()) + 1):
         rows = np.flatnonzero(turn_of_row == turn)
-        traffic = turns.traffic(np.flatnonzero(turn_of_pose == turn), numbers)
-        H_rows = H[rows]
-        number[rows] = np.arange(len(rows))
+        traffic = turns.traffic(np.flatnonzero(group == turn), count)
+        H_rows, number[rows] = H[rows], np.arange(len(rows))
         entries = H_rows.tocoo()
         own = (robot[rows[entries.row]] == robot[entries.col]) & (turn_of_row[entries.col] == turn)
-        block = coo_array(
-            (entries.data[own], (entries.row[own], number[entries.col[own]])), shape=(len(rows), len(rows))
-        )
+        block = coo_array((entries.data[own], (entries.row[own], number[entries.col[own]])), shape=(len(rows),) * 2)
         factor = factorize(block.tocsc(), backend) if len(rows) else None
         prepared.append(Turn(rows, H_rows, b[rows], factor, traffic))
     return tuple(prepared)

@@ -17,14 +17,7 @@ from scipy.sparse import csr_array, vstack
 from pgo_models.certificates.newton_polish import move_poses
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import (
-    Array,
-    hat,
-    project_to_rotations,
-    stack_transposes,
-    tangent_dimension,
-    unstack_transposes,
-)
+from pgo_models.geometry.rotations import Array, hat, project_to_rotations, stack_transposes, unstack_transposes
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.problem.hessian import TangentLayout
 from pgo_models.problem.matrices import norm, rotation_columns
@@ -69,11 +62,10 @@ class GaussSeidel:
 
     One step is one sweep: every robot updates once. One round of the ledger is one exchange: the robots of a turn have
     updated and send their separators (d^2 numbers a pose in the first stage, 3 or 6 in the second) to their neighbours.
-    So a sweep of `Sweep.JACOBI` takes one round, of `COLORS` as many as there are colours, of `ROBOTS` as many as there
-    are robots, and the flagged first sweep of a stage as many as robots lie on the way from the robot of pose 0 to the
-    farthest (of `ROBOTS`: as there are robots). Whether a stage has ended all robots know from one all-reduce a sweep.
-    The projection between the stages costs nothing: neighbours project what they were sent. The order and the colours
-    are fixed beforehand, off the ledger.
+    So a sweep of `Sweep.JACOBI` takes one round, of `COLORS` one a colour, of `ROBOTS` one a robot, and the flagged
+    first sweep of a stage as many as robots lie on the way from the robot of pose 0 to the farthest (of `ROBOTS`: as
+    there are robots). Whether a stage has ended all robots know from one all-reduce a sweep. The projection between the
+    stages costs nothing: neighbours project what they were sent. Order and colours are fixed before, off the ledger.
 
     With one robot both systems are solved exactly: that is the centralised counterpart, which every choice of robots
     converges to. `primal_residual` is the distance of the relaxed rotations from orthogonality, ||Y - R||_F over the
@@ -109,8 +101,7 @@ class GaussSeidel:
         if problem.graph.is_world_loose:
             raise SettingError("rotations alone do not tell that of the world of position priors; use another method")
         turns = schedule(problem.graph, robots, self.sweep)
-        linear = rotation_problem(problem, poses.R[0])
-        numbers = problem.d**2
+        linear, numbers = rotation_problem(problem, poses.R[0]), problem.d**2
         is_flagged = start is None and self.is_flagged
         sweep = sweep_turns(linear, turns, numbers, problem.backend)
         first = flagged_turns(linear, problem.graph, turns, numbers, problem.backend) if is_flagged else ()
@@ -130,19 +121,16 @@ class GaussSeidel:
         """F at the state's poses, distance from orthogonality, and change of the last sweep."""
         if state.k > 0 and not math.isfinite(state.change):
             return Measurement(np.nan, np.nan, np.nan)
-        poses = self.poses(problem, state)
-        relaxed = 0.0
+        poses, relaxed = self.poses(problem, state), 0.0
         if state.stage is DGSStage.ROTATIONS:
             relaxed = norm(stack_transposes(poses.R[1:]) - state.x) / math.sqrt(problem.num_poses * problem.d)
         return Measurement(problem.objective(poses), relaxed, state.change, all_reduces=state.ledger.all_reduces)
 
     def poses(self, problem: PGOProblem, state: GaussSeidelState) -> Poses:
         """Rotations projected, in the first stage with the best translations for them: these no robot knows yet."""
-        if state.k == 0:
-            return problem.with_best_translations(state.R)
-        if state.stage is DGSStage.ROTATIONS:
-            return problem.with_best_translations(_projected(state))
-        return _moved(problem, state)
+        if state.stage is DGSStage.POSES:
+            return _moved(problem, state)
+        return problem.with_best_translations(_projected(state) if state.k > 0 else state.R)
 
     def converged(self, state: GaussSeidelState, measurement: Measurement) -> Status | None:
         """CONVERGED when the last stage's change is within tolerance."""
@@ -171,46 +159,35 @@ def pose_problem(problem: PGOProblem, R: Array) -> LeastSquares:
     `pgo_models.problem.hessian.riemannian_hessian` without multipliers. Unknowns are ordered as in `TangentLayout`.
     """
     n, m, d = problem.num_poses, problem.graph.num_edges, problem.d
-    layout = TangentLayout(n, d)
+    layout, every = TangentLayout(n, d), np.arange(n)
     A, w = problem.residual_matrix
-    every = np.arange(n)
-    rows = np.repeat(rotation_columns(every, n, d)[:, :, None], tangent_dimension(d), axis=2)
+    rows = np.repeat(rotation_columns(every, n, d)[:, :, None], layout.turns, axis=2)
     columns = np.repeat(layout.rotations(every)[:, None, :], d, axis=1)
     rows = np.concatenate([every, rows.ravel()])
     parts = []
     for c in range(d):
-        turned = np.einsum("nb,kba->nak", R[:, c], hat(np.eye(tangent_dimension(d))))  # d (R_i hat(w))_ca / d w_k
+        turned = np.einsum("nb,kba->nak", R[:, c], hat(np.eye(layout.turns)))  # d (R_i hat(w))_ca / d w_k
         entries = np.concatenate([np.ones(n), turned.ravel()])
         places = rows, np.concatenate([layout.translations(every)[:, c], columns.ravel()])
         parts.append(A @ csr_array((entries, places), shape=(problem.side, layout.side)))
     residuals = A @ Poses(R, np.zeros((n, d))).stacked()
     edge = np.concatenate([np.arange(m), np.repeat(np.arange(m), d)])
-    pose = np.concatenate([np.repeat(every, d), np.repeat(every, tangent_dimension(d))])
+    pose = np.concatenate([np.repeat(every, d), np.repeat(every, layout.turns)])
     J, r = vstack(parts, format="csr")[:, pose > 0], residuals.T.reshape(-1, 1)
     return LeastSquares(J, np.tile(w, d), r, np.tile(edge, d), pose[pose > 0])
 
 
 def _linearized(problem: PGOProblem, state: GaussSeidelState) -> GaussSeidelState:
     """State at the beginning of a linearised problem: the first, or one about the poses of the one before."""
-    n, d = problem.num_poses, problem.d
-    is_flagged = False
-    if state.stage is DGSStage.ROTATIONS:
-        poses, is_flagged = Poses(_projected(state), state.t), state.is_flagged
-    else:
-        poses = _moved(problem, state)
-    linear, numbers = pose_problem(problem, poses.R), d + tangent_dimension(d)
-    v, w = poses.t[1:] - poses.t[0], np.zeros((n - 1) * tangent_dimension(d))
-    return replace(
-        state,
-        stage=DGSStage.POSES,
-        R=poses.R,
-        t=poses.t,
-        x=np.concatenate([v.ravel(), w])[:, None],
-        turns=sweep_turns(linear, state.schedule, numbers, problem.backend),
-        first=flagged_turns(linear, problem.graph, state.schedule, numbers, problem.backend) if is_flagged else (),
-        gauss_newton_step=state.gauss_newton_step + 1,
-        change=np.inf,
-    )
+    is_first, layout = state.stage is DGSStage.ROTATIONS, TangentLayout(problem.num_poses - 1, problem.d)
+    is_flagged, order = is_first and state.is_flagged, state.schedule
+    poses = Poses(_projected(state), state.t) if is_first else _moved(problem, state)
+    linear, numbers = pose_problem(problem, poses.R), layout.d + layout.turns
+    x = layout.join(np.zeros((layout.num_poses, layout.turns)), poses.t[1:] - poses.t[0])[:, None]
+    turns = sweep_turns(linear, order, numbers, problem.backend)
+    first = flagged_turns(linear, problem.graph, order, numbers, problem.backend) if is_flagged else ()
+    after = replace(state, stage=DGSStage.POSES, R=poses.R, t=poses.t, x=x, turns=turns, first=first, change=np.inf)
+    return replace(after, gauss_newton_step=state.gauss_newton_step + 1)
 
 
 def _projected(state: GaussSeidelState) -> Array:
@@ -233,6 +210,5 @@ def _change(problem: PGOProblem, state: GaussSeidelState, x: Array) -> tuple[flo
     if state.stage is DGSStage.ROTATIONS:
         return norm(difference) / math.sqrt(n * d), 1
     split = (n - 1) * d
-    size = norm(x[:split])
-    moved = norm(difference[:split])
+    size, moved = norm(x[:split]), norm(difference[:split])
     return max(norm(difference[split:]) / math.sqrt(n), moved / size if size > 0.0 else moved), 3

@@ -100,8 +100,7 @@ def run_gtsam(problem: PGOProblem, settings: Gtsam | None = None, start: Poses |
 def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noqa: ANN401  GTSAM has no types
     """The `gtsam.NonlinearFactorGraph` of a problem, keys 0 .. n-1, with a prior on pose 0.
 
-    The prior, at pose 0 of `start` or at the identity, fixes the gauge, on which F does not depend. A MissingExtraError
-    without GTSAM.
+    The prior, at pose 0 of `start` or at the identity, fixes the gauge, open in F. A MissingExtraError without GTSAM.
     """
     gtsam, graph, d = extra_module("gtsam", "peers"), problem.graph, problem.d
     if not ((graph.kappa > 0) & (graph.tau > 0)).all():
@@ -114,15 +113,13 @@ def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noq
     if d == 3:  # a tangent vector of Pose3 begins with the rotation, one of Pose2 with the translation
         information = np.roll(information, 3, axis=(1, 2))
     between = gtsam.BetweenFactorPose3 if d == 3 else gtsam.BetweenFactorPose2
-    factors = gtsam.NonlinearFactorGraph()
+    factors, noise = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Gaussian.Information
     measured = _gtsam_poses(gtsam, Poses(graph.R_ij, graph.t_ij))
     for i, j, pose, weight in zip(graph.i.tolist(), graph.j.tolist(), measured, information, strict=True):
-        factors.add(between(i, j, pose, gtsam.noiseModel.Gaussian.Information(weight)))
+        factors.add(between(i, j, pose, noise(weight)))
     prior = gtsam.PriorFactorPose3 if d == 3 else gtsam.PriorFactorPose2
     at = _gtsam_poses(gtsam, Poses.identity(1, d) if start is None else start[:1])[0]
-    factors.add(
-        prior(0, at, gtsam.noiseModel.Gaussian.Information(np.diag(np.einsum("mkk->mk", information).max(axis=0))))
-    )
+    factors.add(prior(0, at, noise(np.diag(np.einsum("mkk->mk", information).max(axis=0)))))
     return factors
 
 

@@ -104,19 +104,14 @@ class LevenbergMarquardt:
 
 
 def _linearized(
-    problem: PGOProblem,
-    k: int,
-    poses: Poses,
-    objective: float,
-    damping: float,
-    analysis: SymbolicCholesky | None = None,
+    problem: PGOProblem, k: int, poses: Poses, objective: float, mu: float, analysis: SymbolicCholesky | None = None
 ) -> LevenbergMarquardtState:
     matrix = riemannian_hessian(problem, poses, None)
     ground_pose(matrix, problem)
     gradient = TangentLayout(problem.num_poses, problem.d).join(*problem.riemannian_gradient(poses))
     analysis = analysis if analysis is not None else analyze(matrix, problem.backend, tangent_order(problem))
     level = rounding_level(problem, poses)
-    return _with_step(LevenbergMarquardtState(k, poses, objective, level, matrix, gradient, analysis, damping, _GROWTH))
+    return _with_step(LevenbergMarquardtState(k, poses, objective, level, matrix, gradient, analysis, mu, _GROWTH))
 
 
 def _with_step(state: LevenbergMarquardtState) -> LevenbergMarquardtState:

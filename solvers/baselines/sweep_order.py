@@ -90,8 +90,7 @@ def schedule(graph: PoseGraph, robots: Partition, sweep: Sweep) -> Schedule:
 
 def _most_anchored_first(adjacency: csr_array, root: int) -> IntArray:
     """All members from `root` on, next always the one with the most edges to those before it."""
-    anchors = np.zeros(adjacency.shape[0])
-    done = np.zeros(adjacency.shape[0], dtype=bool)
+    anchors, done = np.zeros(adjacency.shape[0]), np.zeros(adjacency.shape[0], dtype=bool)
     order, waiting = [], [(0.0, root)]
     while waiting:
         _, member = heapq.heappop(waiting)

@@ -13,15 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pgo_models.convex.bregman import (
-    BregmanPoint,
-    BregmanProblem,
-    Subproblem,
-    augmented_lagrangian_subproblem,
-    block_subproblems,
-    bregman_subproblem,
-    two_line_subproblem,
-)
+from pgo_models.convex import bregman as forms
+from pgo_models.convex.bregman import BregmanPoint, BregmanProblem, Subproblem
 from pgo_models.convex.convex_solver import COLD, TOLERANCE, ConvexSolver, finite_array
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
@@ -79,10 +72,9 @@ class AlternatingState:
 class BregmanSettings:
     """Settings that all forms share.
 
-    `alpha` is the penalty parameter of the paper's section 2; lam has the unit of alpha K x. `tolerance` is on
-    ||K x - f|| / max(1, ||f||) and on the distance from stationarity over max(1, ||K^T lam||). `subproblem_tolerance`
-    is the solver's: loosen it to see that Bregman iteration forgets the errors of its subproblems (Yin & Osher 2013).
-    `solver` is Clarabel, cold, unless given.
+    `alpha` is the penalty of the paper's section 2; lam has the unit of alpha K x. `tolerance` is on ||K x - f|| over
+    max(1, ||f||) and the distance from stationarity over max(1, ||K^T lam||). `subproblem_tolerance` is the solver's:
+    loosen it to see errors of subproblems forgotten (Yin & Osher 2013). `solver` is Clarabel, cold, unless given.
     """
 
     alpha: float = 1.0
@@ -121,7 +113,7 @@ class Bregman(BregmanSettings):
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> BregmanState:
         """State 0 at `start`, else at x = 0 and p = 0."""
         point = _checked_start(problem, start)
-        subproblem = self.compiled(bregman_subproblem(problem, self.alpha))
+        subproblem = self.compiled(forms.bregman_subproblem(problem, self.alpha))
         return BregmanState(0, point.x, subproblem, np.asarray(problem.K.T @ point.lam))
 
     def step(self, problem: BregmanProblem, state: BregmanState) -> BregmanState:
@@ -145,7 +137,7 @@ class TwoLineBregman(BregmanSettings):
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> TwoLineState:
         """State 0 at `start`, else at x = 0 and b = 0."""
         point = _checked_start(problem, start)
-        subproblem = self.compiled(two_line_subproblem(problem, self.alpha))
+        subproblem = self.compiled(forms.two_line_subproblem(problem, self.alpha))
         return TwoLineState(0, point.x, subproblem, -point.lam / self.alpha)
 
     def step(self, problem: BregmanProblem, state: TwoLineState) -> TwoLineState:
@@ -171,7 +163,7 @@ class MethodOfMultipliers(BregmanSettings):
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> MultiplierState:
         """State 0 at `start`, else at x = 0 and lam = 0."""
         point = _checked_start(problem, start)
-        subproblem = self.compiled(augmented_lagrangian_subproblem(problem, self.alpha))
+        subproblem = self.compiled(forms.augmented_lagrangian_subproblem(problem, self.alpha))
         return MultiplierState(0, point.x, subproblem, point.lam)
 
     def step(self, problem: BregmanProblem, state: MultiplierState) -> MultiplierState:
@@ -206,21 +198,19 @@ class AlternatingBregman(BregmanSettings):
     def init(self, problem: BregmanProblem, start: BregmanPoint | None) -> AlternatingState:
         """State 0 at `start`, else at x = 0 and lam = 0."""
         point = _checked_start(problem, start)
-        subproblems = map(self.compiled, block_subproblems(problem, self.alpha))
+        subproblems = map(self.compiled, forms.block_subproblems(problem, self.alpha))
         return AlternatingState(0, point.x, point.lam, tuple(subproblems))
 
     def step(self, problem: BregmanProblem, state: AlternatingState) -> AlternatingState:
         """T passes and the multiplier."""
         x = state.x
         for _ in range(self.passes):
-            before = x
-            x = x.copy()
+            before, x = x, x.copy()
             for block, subproblem in zip(problem.blocks, state.subproblems, strict=True):
                 others = problem.K @ x - problem.K[:, block] @ x[block]
                 x[block] = subproblem.solve(problem.f + state.lam / self.alpha - others)
         lam = state.lam - self.alpha * problem.residual(x)
-        stationarity = self._stationarity(problem, x - before)
-        stationarity /= max(1.0, float(np.linalg.norm(problem.K.T @ lam)))
+        stationarity = self._stationarity(problem, x - before) / max(1.0, float(np.linalg.norm(problem.K.T @ lam)))
         return AlternatingState(state.k + 1, x, lam, state.subproblems, stationarity)
 
     def point(self, problem: BregmanProblem, state: AlternatingState) -> BregmanPoint:
@@ -232,8 +222,7 @@ class AlternatingBregman(BregmanSettings):
 
         Its optimality condition is K_i^T lam^{k+1} - r_i in the subdifferential of J_i at x_i (Boyd et al. 2011, 3.3).
         """
-        moved = problem.K @ change
-        squares = 0.0
+        moved, squares = problem.K @ change, 0.0
         for block in problem.blocks:
             K_i = problem.K[:, block]
             moved = moved - K_i @ change[block]
@@ -260,10 +249,8 @@ def feasibility_bound(initial_distance: float, alpha: float, k: int) -> float:
 def _checked_start(problem: BregmanProblem, start: BregmanPoint | None) -> BregmanPoint:
     """`start` or zeros, checked; J must be finite there."""
     s, m = problem.K.shape
-    if start is None:
-        point = BregmanPoint(np.zeros(m), np.zeros(s))
-    else:
-        point = BregmanPoint(finite_array(start.x, "the start's x"), finite_array(start.lam, "the start's lam"))
+    point = start if start is not None else BregmanPoint(np.zeros(m), np.zeros(s))
+    point = BregmanPoint(finite_array(point.x, "the start's x"), finite_array(point.lam, "the start's lam"))
     if point.x.shape != (m,) or point.lam.shape != (s,):
         raise SettingError(f"the start's x and lam have shapes {point.x.shape} and {point.lam.shape}; need {m} and {s}")
     if not math.isfinite(problem.objective(point.x)):

@@ -133,6 +133,5 @@ def _arrive(problem: PGOProblem, k: int, poses: Poses, model: GraphQP, factor: C
     found = truncated_conjugate_gradients(gradient, hessian, factor.solve, radius, _FORCING, floor, _MOST_PRODUCTS)
     slope = inner(gradient, found.step)
     decrement = polish.scaled_decrement(-slope, objective, rounding_level(problem, poses))
-    return ExtendedNewtonState(
-        k, poses, objective, found.step, slope, np.inf if found.is_at_boundary else decrement, model, factor
-    )
+    decrement = np.inf if found.is_at_boundary else decrement
+    return ExtendedNewtonState(k, poses, objective, found.step, slope, decrement, model, factor)

@@ -27,20 +27,14 @@ _SAME = 1e-9  # relative: values of one term
 
 @dataclass(frozen=True, eq=False)
 class ExtendedStep:
-    """Step (a) with the change, for `SOC(r_step=...)`; JOINT coupling only.
-
-    On its own it changes the iterates; `ExtendedSOC` changes what is reported with them.
-    """
+    """Step (a) with the change, for `SOC(r_step=..)`, JOINT: it changes iterates, `ExtendedSOC` what is reported."""
 
     graph: PoseGraph
     changer: Changer
     solver: ConvexSolver | str = "CLARABEL"
 
     def prepare(self, subproblem: RSubproblem) -> GraphQP:
-        """Compile the changed quadratic program with the subproblem's penalties.
-
-        A SettingError when the subproblem is not that of the whole graph, joint in (R, t).
-        """
+        """Changed program with a subproblem's penalties; a SettingError unless that is the whole graph's, in (R, t)."""
         n, d = self.graph.num_poses, self.graph.d
         if subproblem.num_translations != n or not subproblem.needs_ground:
             raise SettingError("a changed subproblem is that of the whole graph; use Coupling.JOINT")
@@ -54,9 +48,8 @@ class ExtendedSOC:
     `changer`, given `PoseVariables`, returns a `ModelChange`; `solver` is that of step (a). `soc` has the settings,
     JOINT; the penalty's multipliers are those of the unchanged problem at its start, and are not taken anew.
 
-    History and `cost` have the objective of the changed problem; `Run.objective` is F of the unchanged one. The poses
-    of an iterate are omega with the translations of step (a) at its shift: constraints on translations hold at every
-    iterate, those on rotations in the limit.
+    History and `cost` have the changed objective, `Run.objective` is F unchanged. Poses of an iterate are omega with
+    translations of step (a) at its shift: constraints on translations hold at each iterate, on rotations in the limit.
 
     The default start is the chordal one of the unchanged problem, moved as a whole to where the terms want it, which
     matters to terms that fix the gauge, as priors do: a pose turned by 180 degrees from its prior is stationary too.

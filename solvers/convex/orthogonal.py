@@ -13,15 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pgo_models.convex import orthogonality
 from pgo_models.convex.convex_solver import COLD, ConvexSolver
-from pgo_models.convex.orthogonality import (
-    KKTResiduals,
-    OrthogonalPoint,
-    OrthogonalProblem,
-    SplitProblem,
-    kkt_residuals,
-    norm_of_all,
-)
+from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem, SplitProblem, norm_of_all
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
 from solvers.loop import run
@@ -105,18 +99,10 @@ class OrthogonalSOC:
         G = _summed(problem, [rho * (v - x) for v, x in zip(V, spread, strict=True)])
         N = _summed(problem, [rho * b for b in B])
         scale = max(state.scale, norm_of_all(G), np.finfo(float).tiny)
-        return replace(
-            state,
-            k=state.k + 1,
-            X=X,
-            others=others,
-            copies=following,
-            B=B,
-            scale=scale,
-            primal_residual=norm_of_all([x - P for x, P in zip(spread, following, strict=True)])
-            / norm_of_all(following),
-            dual_residual=norm_of_all([g + n for g, n in zip(G, N, strict=True)]) / scale,
-        )
+        primal = norm_of_all([x - P for x, P in zip(spread, following, strict=True)]) / norm_of_all(following)
+        dual = norm_of_all([g + n for g, n in zip(G, N, strict=True)]) / scale
+        state = replace(state, k=state.k + 1, X=X, others=others, copies=following, B=B)
+        return replace(state, scale=scale, primal_residual=primal, dual_residual=dual)
 
     def measure(self, problem: OrthogonalProblem, state: OrthogonalState) -> Measurement:
         """J at the copies (in a variable's first set) and the other variables, and the residuals."""
@@ -131,10 +117,8 @@ class OrthogonalSOC:
 
     def point(self, problem: OrthogonalProblem, state: OrthogonalState) -> OrthogonalPoint:
         """Copies and multipliers of a state, from which a run can go on."""
-        normals = tuple(
-            term.constraint.normal_part(P, state.rho * B)
-            for term, P, B in zip(problem.terms, state.copies, state.B, strict=True)
-        )
+        terms = zip(problem.terms, state.copies, state.B, strict=True)
+        normals = tuple(term.constraint.normal_part(P, state.rho * B) for term, P, B in terms)
         return OrthogonalPoint(state.copies, normals)
 
     def _first_penalty(self, split: SplitProblem, point: OrthogonalPoint) -> tuple[float, tuple[Array, ...]]:
@@ -146,8 +130,7 @@ class OrthogonalSOC:
         multiplier = max(_spectral(N) for N in point.normals)
         if self.penalty is not None or multiplier > 0.0:
             rho = self.penalty if self.penalty is not None else self.safeguard * multiplier
-            V = [P - N / rho for P, N in zip(point.copies, point.normals, strict=True)]
-            return rho, split.solve(V, rho)[1]
+            return rho, split.solve([P - N / rho for P, N in zip(point.copies, point.normals, strict=True)], rho)[1]
         rho, was_far, gradient, distance = 1.0, False, 0.0, math.inf
         for _ in range(_PROBES):
             X, others = split.solve(point.copies, rho)
@@ -166,11 +149,8 @@ class OrthogonalSOC:
         """State with the rho that the rule of `penalty` wants from now on; mostly the state itself."""
         if self.penalty is not None:
             return state
-        rho = state.rho
-        least = self.safeguard * max(
-            term.constraint.least_penalty(P, rho * B)
-            for term, P, B in zip(problem.terms, state.copies, state.B, strict=True)
-        )
+        rho, terms = state.rho, zip(problem.terms, state.copies, state.B, strict=True)
+        least = self.safeguard * max(term.constraint.least_penalty(P, rho * B) for term, P, B in terms)
         wanted = max(rho, least)
         if state.k % _BALANCE_EVERY == 0 and 0 < state.k <= _BALANCE_UNTIL:
             if state.primal_residual > min(_NEAR, _BALANCE_RATIO * state.dual_residual):
@@ -179,8 +159,7 @@ class OrthogonalSOC:
                 wanted = max(0.5 * rho, least)
         if wanted == rho:
             return state
-        B = tuple(rho / wanted * scaled for scaled in state.B)
-        return replace(state, rho=wanted, B=B)
+        return replace(state, rho=wanted, B=tuple(rho / wanted * scaled for scaled in state.B))
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +171,7 @@ class OrthogonalSolution:
     values: tuple[Array, ...]
     others: tuple[Array, ...]
     objective: float  # J there
-    kkt: KKTResiduals  # computed afresh by one convex solve
+    kkt: orthogonality.KKTResiduals  # computed afresh by one convex solve
     outcome: Outcome[OrthogonalState]  # the run it came from: status, history, state
     objectives: tuple[float, ...]  # J of every start, nan where a run did not converge
 
@@ -202,10 +181,9 @@ class OrthogonalSolution:
         return self.outcome.status
 
     def __repr__(self) -> str:
-        return (
-            f"OrthogonalSolution({self.status.name}, J = {self.objective:.10g}, stationarity "
-            f"{self.kkt.stationarity:.1e}, feasibility {self.kkt.feasibility:.1e}, {len(self.objectives)} starts)"
-        )
+        best = f"J = {self.objective:.10g}, stationarity {self.kkt.stationarity:.1e}"
+        kkt = f"{best}, feasibility {self.kkt.feasibility:.1e}"
+        return f"OrthogonalSolution({self.status.name}, {kkt}, {len(self.objectives)} starts)"
 
 
 def solve_orthogonal(
@@ -235,7 +213,7 @@ def solve_orthogonal(
     outcomes = [run(method, problem, problem.random_point(rng), verbose=verbose) for _ in range(starts)]
     best = min(outcomes, key=lambda outcome: (not outcome.status.is_success, outcome.objective))
     values = problem.values(best.state.copies)
-    kkt = kkt_residuals(problem, method.point(problem, best.state), best.state.rho, method.solver)
+    kkt = orthogonality.kkt_residuals(problem, method.point(problem, best.state), best.state.rho, method.solver)
     problem.assign(values, best.state.others)
     objectives = tuple(outcome.objective if outcome.status.is_success else math.nan for outcome in outcomes)
     return OrthogonalSolution(problem, values, best.state.others, best.objective, kkt, best, objectives)

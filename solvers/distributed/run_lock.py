@@ -29,9 +29,7 @@ class RunLock:
                     return
                 os.close(self._file)
                 if not is_taken:
-                    raise SettingError(
-                        f"{path} is in use by another run; wait until that has ended, or choose another name"
-                    )
+                    raise SettingError(f"{path} is in use by another run; wait until that has ended, or name another")
         except OSError as error:
             problem = f"cannot be written ({error.strerror}); choose a place that can be written"
             raise FileFormatError(path, None, problem) from error

@@ -51,8 +51,7 @@ class CountedPool:
         answers = self.workers.ask(order, requests)
         if count is Count.OFF:
             return answers
-        if robots is None:
-            robots = np.arange(len(requests))
+        robots = np.arange(len(requests)) if robots is None else robots
         asked = requests if not (is_along and self.elsewhere) else [None] * len(requests)
         sizes = [count_numbers(asked[robot], self.elsewhere) for robot in robots.tolist()]
         sizes += [count_numbers(answers[robot], self.elsewhere) for robot in robots.tolist()]
@@ -68,10 +67,7 @@ class CountedPool:
         return answers
 
     def hand_on(self, sent: Sequence[Mapping[int, A]], channel: LossyChannel[A] | None = None) -> list[Mapping[int, A]]:
-        """What every worker receives, by its sender, of what each sent, by its receiver: one round.
-
-        What a faulty `channel` loses is counted, and not handed on.
-        """
+        """What all receive, by sender, of what each sent, by receiver: a round; what `channel` loses is counted too."""
         messages = by_link(sent)
         links = np.array(list(messages), dtype=np.int64).reshape(-1, 2)
         self.count(links[:, 0], links[:, 1], [count_numbers(value) for value in messages.values()], is_round=True)

@@ -26,8 +26,7 @@ class Traffic:
     def __post_init__(self) -> None:
         if not self.sender.shape == self.receiver.shape == self.num_bytes.shape:
             shapes = f"{self.sender.shape}, {self.receiver.shape} and {self.num_bytes.shape}"
-            way_out = "give one of each for every message"
-            raise SettingError(f"senders, receivers and bytes have shapes {shapes}; {way_out}")
+            raise SettingError(f"senders, receivers and bytes have shapes {shapes}; give one of each for every message")
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +119,5 @@ class Ledger:
 
     def __repr__(self) -> str:
         reduced = f", {self.all_reduces} all-reduces" if self.all_reduces else ""
-        return (
-            f"Ledger({self.num_robots} robots, {self.rounds} rounds{reduced}, {self.messages} messages, "
-            f"{self.num_bytes} bytes)"
-        )
+        sent = f"{self.messages} messages, {self.num_bytes} bytes"
+        return f"Ledger({self.num_robots} robots, {self.rounds} rounds{reduced}, {sent})"

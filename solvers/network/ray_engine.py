@@ -40,13 +40,8 @@ if TYPE_CHECKING:
 
 _SECONDS_TO_ANSWER, _SECONDS_TO_JOIN, _SECONDS_TO_COME_BACK = 3.0, 15.0, 10.0
 # Read by Ray when it starts: robots are the parallel part, and nothing is told to anybody.
-_ENVIRONMENT = {
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-}
+_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+_ENVIRONMENT |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 # Where Ray says why a cluster cannot be joined, best first; its last line often says that it failed, and no more.
 _REASONS = (r"^ray\.exceptions\.\w+: (.+)", r"^\w+Error: (?!Failed to connect to )([\s\S]+)", r"\.(?:cc|h):\d+: (.+)")
 
@@ -74,10 +69,7 @@ class RayEngine:
             raise SettingError(f"num_cpus is for Ray on this machine; the cluster at {self.address} has its own")
 
     def open(self, make: Callable[[T], Worker], shares: Sequence[T]) -> WorkerPool:
-        """Robots in actors.
-
-        A MissingExtraError without Ray, an EngineError when the address is no Ray cluster's, or there are too few CPUs.
-        """
+        """Robots in actors; MissingExtraError without Ray, EngineError without cluster at `address` or enough CPUs."""
         # replace() leaves behind what a share has worked out of itself.
         plain: list[Any] = [replace(share) if is_dataclass(share) else share for share in shares]  # type: ignore[type-var]
         place = _RayPlace(_ray(), make, plain, self, connect(self.address, self.num_cpus))
@@ -138,8 +130,8 @@ def connect(address: str | None = None, num_cpus: int | None = None) -> bool:
                     ray.init(address=address, **quiet)
                 else:
                     ray.init(address="local", num_cpus=num_cpus, include_dashboard=False, **quiet)
-        # Ray ends the process, where it does not raise, when its own patience is over.
-        except (RuntimeError, ValueError, OSError, SystemExit) as error:
+        # Ray ends the process, or raises an Exception of no kind of its own, when its patience is over.
+        except (Exception, SystemExit) as error:
             where = "Ray does not start here" if address is None else f"cannot join the Ray cluster at {address}"
             raise EngineError(f"{where}: {_reason(error)}; robots run without Ray too: --engine process") from error
     if address is None and not ip_address(found := ray.util.get_node_ip_address()).is_loopback:
@@ -234,11 +226,10 @@ class _RayPlace:
             _, missing = self.ray.wait(list(tickets.values()), num_returns=len(tickets), timeout=patience)
             self._look()
         if missing:
-            free, patience = self.ray.available_resources().get("CPU", 0.0), self.engine.patience
-            raise EngineError(
-                f"too few CPUs: {len(missing)} of {len(tickets)} actors have not started in {patience:g} s, {free:.3g} "
-                "CPUs are free; stop other work there, use fewer actors, or run in this process (--engine process)"
-            )
+            free, waited = self.ray.available_resources().get("CPU", 0.0), self.engine.patience
+            few = f"{len(missing)} of {len(tickets)} actors have not started in {waited:g} s, {free:.3g} CPUs are free"
+            way_out = "stop other work there, use fewer actors, or run in this process (--engine process)"
+            raise EngineError(f"too few CPUs: {few}; {way_out}")
         for group, ticket in tickets.items():
             self.receive(group, ticket)
 
@@ -261,10 +252,8 @@ class _RayPlace:
                 return
             if self._seen > deadline:
                 self.actors = {}
-                raise EngineError(
-                    f"the Ray cluster at {address} has died ({problem}); solve again when there is one: a run with "
-                    "--resume FILE goes on from its last checkpoint"
-                )
+                way_out = "solve again when there is one: a run with --resume FILE goes on from its last checkpoint"
+                raise EngineError(f"the Ray cluster at {address} has died ({problem}); {way_out}")
             time.sleep(0.2)
 
 
@@ -291,10 +280,8 @@ def _check_address(address: str) -> None:
     try:
         socket.create_connection((host, int(port)), timeout=_SECONDS_TO_ANSWER).close()
     except OSError as error:
-        raise EngineError(
-            f"no Ray cluster answers at {address} ({error.strerror or error}); start one with `ray start --head`, or "
-            "leave the address out"
-        ) from error
+        way_out = "start one with `ray start --head`, or leave the address out"
+        raise EngineError(f"no Ray cluster answers at {address} ({error.strerror or error}); {way_out}") from error
 
 
 @contextmanager
@@ -318,21 +305,17 @@ def _own_sigterm() -> Iterator[None]:
 
 def _check_cluster(address: str) -> None:
     """Refuse an address where no Ray cluster can be joined, in seconds; Ray itself would try for minutes, loudly."""
-    program = f"import ray; ray.init(address={address!r}, log_to_driver=False)"
+    command = [sys.executable, "-c", f"import ray; ray.init(address={address!r}, log_to_driver=False)"]
     environment = {**os.environ, **_ENVIRONMENT, "RAY_NUM_REDIS_GET_RETRIES": "3"}  # one a second
     try:
-        subprocess.run(
-            [sys.executable, "-c", program], env=environment, capture_output=True, timeout=_SECONDS_TO_JOIN, check=True
-        )
+        subprocess.run(command, env=environment, capture_output=True, timeout=_SECONDS_TO_JOIN, check=True)
     except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
         told = (error.stderr or b"").decode(errors="replace")
         reasons = (found[-1] for pattern in _REASONS if (found := re.findall(pattern, told, re.MULTILINE)))
         reason = textwrap.shorten(next(reasons, f"no answer in {_SECONDS_TO_JOIN:g} s"), 260, placeholder=" ..")
-        raise EngineError(
-            f"what answers at {address} is no Ray cluster that can be joined from here: {reason}; check the port (6379 "
-            "unless chosen), that this machine is one of the cluster's, and that Ray's version and RAY_AUTH_MODE are "
-            "the same"
-        ) from error
+        text = f"what answers at {address} is no Ray cluster that can be joined from here: {reason}"
+        checks = "port (6379 unless chosen), that this machine is in it, that Ray's version and RAY_AUTH_MODE agree"
+        raise EngineError(f"{text}; check the {checks}") from error
 
 
 @contextmanager
@@ -352,10 +335,8 @@ def _replaced(table: MutableMapping[str, Any], wanted: Mapping[str, object], add
 @contextmanager
 def _hushed(name: str) -> Iterator[None]:
     """Keep a library's log away from the terminal."""
-    known = [
-        logging.getLogger(key) for key in (name, *logging.Logger.manager.loggerDict) if f"{key}.".startswith(f"{name}.")
-    ]
-    heard = [logger for logger in known if not logger.disabled]
+    names = [key for key in (name, *logging.Logger.manager.loggerDict) if f"{key}.".startswith(f"{name}.")]
+    heard = [logger for logger in map(logging.getLogger, names) if not logger.disabled]
     for logger in heard:
         logger.disabled = True
     try:

@@ -1,7 +1,6 @@
 """Fault tolerance: a failed worker is restarted from its last snapshot, and the requests logged since are replayed.
 
-A worker is deterministic: its state follows from its subgraph and the requests it was given. What a replay sends again
-is not in the ledger.
+A worker is deterministic: its state follows from subgraph and requests. What a replay sends again is not in the ledger.
 """
 
 from collections.abc import Callable, Sequence
@@ -115,10 +114,9 @@ class RecoveringPool(Generic[T]):
                 return self._order(group, order, requests)
             except RobotLostError as error:
                 lost = error
-        raise EngineError(
-            f"the process of robots {', '.join(map(str, robots))} was lost {self.restarts[group] + 1} times ({lost}); "
-            "look at the memory of its machine, or run in this process"
-        ) from lost
+        times = f"{', '.join(map(str, robots))} was lost {self.restarts[group] + 1} times ({lost})"
+        way_out = "look at the memory of its machine, or run in this process"
+        raise EngineError(f"the process of robots {times}; {way_out}") from lost
 
     def _order(self, group: int, order: AnyOrder, requests: Sequence[object]) -> list[Any]:
         return self.place.receive(group, self.place.send(group, order, requests))

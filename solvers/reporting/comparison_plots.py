@@ -24,11 +24,9 @@ _MOST_POINTS = 400  # of a curve in a page: sweeps by the thousand would make it
 def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -> "Figure":
     """Figure of the gap of several methods over what they spent; a panel holds those whose effort is counted.
 
-    There is a panel for each effort, all but that of iterations with a logarithmic axis. A SettingError when there is
-    no curve with a gap above zero.
+    Each effort has a panel, all but that of iterations with a logarithmic axis. A SettingError without gaps above zero.
     """
-    panels = _panels(curves, efforts)
-    styles = _styles(curves, LINES)
+    panels, styles = _panels(curves, efforts), _styles(curves, LINES)
     with column_figure(height=0.95, width=max(1.0, 0.9 * len(panels))) as figure:
         handles = {}
         grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
@@ -50,8 +48,7 @@ def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -
 
 def explore_efforts(curves: Sequence[Curve], title: str = "") -> "PlotlyFigure":
     """Plotly figure of what `plot_efforts` shows; an entry of the legend shows and hides a method in all panels."""
-    panels = _panels(curves, _PANELS)
-    styles = _styles(curves, _DASHES)
+    panels, styles = _panels(curves, _PANELS), _styles(curves, _DASHES)
     figure = plotly("subplots").make_subplots(1, len(panels), shared_yaxes=True, horizontal_spacing=0.03)
     named: set[str] = set()
     for column, (effort, shown) in enumerate(panels, 1):
@@ -59,22 +56,14 @@ def explore_efforts(curves: Sequence[Curve], title: str = "") -> "PlotlyFigure":
             colour, _, dash = styles[curve.name]
             x, y = _points(curve, effort)
             kept = np.unique(np.linspace(0, len(x) - 1, min(len(x), _MOST_POINTS)).round().astype(int))
-            figure.add_scatter(
-                x=[float(f"{value:.5g}") for value in x[kept]],
-                y=[float(f"{value:.5g}") for value in y[kept]],
-                name=curve.name,
-                legendgroup=curve.name,
-                showlegend=curve.name not in named,
-                line={"color": colour, "dash": dash},
-                mode="lines",
-                row=1,
-                col=column,
-            )
+            across, up = ([float(f"{value:.5g}") for value in values[kept]] for values in (x, y))
+            entry = {"name": curve.name, "legendgroup": curve.name, "showlegend": curve.name not in named}
+            line = {"color": colour, "dash": dash}
+            figure.add_scatter(x=across, y=up, **entry, line=line, mode="lines", row=1, col=column)
             named.add(curve.name)
         figure.update_xaxes(title_text=effort.value, row=1, col=column)
-    axis = {**LOGARITHMIC, "dtick": 1}
-    figure.update_xaxes(**axis)
-    figure.update_yaxes(**axis)
+    figure.update_xaxes(**LOGARITHMIC, dtick=1)
+    figure.update_yaxes(**LOGARITHMIC, dtick=1)
     figure.update_yaxes(title_text="relative gap", row=1, col=1)
     lay_out(figure, title, legend_y=-0.16)
     return figure
@@ -83,8 +72,7 @@ def explore_efforts(curves: Sequence[Curve], title: str = "") -> "PlotlyFigure":
 def _panels(curves: Sequence[Curve], efforts: Sequence[Effort]) -> list[tuple[Effort, list[Curve]]]:
     panels = []
     for effort in efforts:
-        shown = [curve for curve in curves if curve.counts(effort) and len(_points(curve, effort)[0])]
-        if shown:
+        if shown := [curve for curve in curves if curve.counts(effort) and len(_points(curve, effort)[0])]:
             panels.append((effort, shown))
     if not panels:
         raise SettingError("no method has a gap above zero to be drawn; give runs that took at least a step")

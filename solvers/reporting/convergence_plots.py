@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from plotly.graph_objects import Figure as PlotlyFigure
 
+Stages = Sequence[tuple[str, History]]
 _MOST_MARKERS = 12
 _STAR_WITHIN = 3.0  # times our own iterations; a mark farther out is a line with its figures, lest it squeeze the rest
 LINES = ("-", "--", ":", "-.")
@@ -54,9 +55,8 @@ class Curve:
         for label in ("rounds", "num_bytes"):
             given: Array | None = getattr(self, label)
             if given is not None and len(given) != len(self.history):
-                raise SettingError(
-                    f"{label} of {self.name} has {len(given)} entries for {len(self.history)} records; give one each"
-                )
+                entries = f"{len(given)} entries for {len(self.history)} records"
+                raise SettingError(f"{label} of {self.name} has {entries}; give one each")
 
     @property
     def gap(self) -> Array:
@@ -75,27 +75,20 @@ class Curve:
 
     @property
     def _efforts(self) -> dict[Effort, Array | None]:
-        return {
-            Effort.ITERATIONS: self.history.k,
-            Effort.SECONDS: self.history.seconds,
-            Effort.ROUNDS: self.rounds,
-            Effort.BYTES: self.num_bytes,
-        }
+        sent = {Effort.ROUNDS: self.rounds, Effort.BYTES: self.num_bytes}
+        return {Effort.ITERATIONS: self.history.k, Effort.SECONDS: self.history.seconds, **sent}
 
 
-def plot_convergence(
-    stages: Sequence[tuple[str, History]], lower_bound: float, published: PublishedRun | None = None
-) -> Figure:
+def plot_convergence(stages: Stages, lower_bound: float, published: PublishedRun | None = None) -> Figure:
     """Figure of primal and dual residual, and of the gap (F - lower_bound) / F, over the iterations of stages in a row.
 
     Stages are for example `[(stage.name, stage.history) for stage in solution.stages]`; the later ones go on where the
     earlier ones end. The paper's gap and iterations, if given, are a star; a line with the figures where these are far
     to the right. A SettingError when no stage has a record.
     """
-    run = _with_records(stages)
+    run, begin = _with_records(stages), 0.0
     with column_figure(height=1.3) as figure:
         above, below = figure.subplots(2, 1, sharex=True)
-        begin = 0.0
         for (name, history), colour, line in zip(run, cycle(COLOURS), cycle(LINES), strict=False):
             curve = Curve(name, history, lower_bound)
             k, every = begin + history.k, max(1, len(history) // _MOST_MARKERS)
@@ -114,13 +107,10 @@ def plot_convergence(
     return figure
 
 
-def explore_convergence(
-    stages: Sequence[tuple[str, History]], lower_bound: float, published: PublishedRun | None = None
-) -> PlotlyFigure:
+def explore_convergence(stages: Stages, lower_bound: float, published: PublishedRun | None = None) -> PlotlyFigure:
     """Plotly figure of what `plot_convergence` shows: gap above, residuals below, figures under the pointer."""
-    run = _with_records(stages)
+    run, begin = _with_records(stages), 0.0
     figure = plotly("graph_objects").Figure()
-    begin = 0.0
     for (name, history), colour in zip(run, cycle(COLOURS), strict=False):
         k = begin + history.k
         for values, what, axis, dash, symbol in (
@@ -130,25 +120,15 @@ def explore_convergence(
         ):
             shown = np.isfinite(values) & (values > 0)
             if shown.any():
-                figure.add_scatter(
-                    x=k[shown].tolist(),
-                    y=[float(f"{value:.5g}") for value in values[shown]],
-                    name=f"{name}: {what}",
-                    yaxis=axis,
-                    line={"color": colour, "dash": dash},
-                    marker={"symbol": symbol, "size": 6},
-                    mode="lines+markers",
-                )
+                line, marker = {"color": colour, "dash": dash}, {"symbol": symbol, "size": 6}
+                points = {"x": k[shown].tolist(), "y": [float(f"{value:.5g}") for value in values[shown]]}
+                label, mode = f"{name}: {what}", "lines+markers"
+                figure.add_scatter(**points, name=label, yaxis=axis, line=line, marker=marker, mode=mode)
         begin = float(k[-1])
     if published is not None and published.gap > 0:
         text = f"paper's SOC: {published.gap:.1e} after {published.iterations} iterations"
-        figure.add_scatter(
-            x=[0.0, max(begin, 1.0)],
-            y=[published.gap, published.gap],
-            name=text,
-            mode="lines",
-            line={"color": ALARM_COLOUR, "dash": "dot"},
-        )
+        ends, line = [0.0, max(begin, 1.0)], {"color": ALARM_COLOUR, "dash": "dot"}
+        figure.add_scatter(x=ends, y=[published.gap, published.gap], name=text, mode="lines", line=line)
     lay_out(figure, "", legend_y=-0.14)
     counted = {"dtick": 1} if begin < 10 else {}  # else plotly puts ticks between iterations
     figure.update_layout(
@@ -159,7 +139,7 @@ def explore_convergence(
     return figure
 
 
-def _with_records(stages: Sequence[tuple[str, History]]) -> list[tuple[str, History]]:
+def _with_records(stages: Stages) -> list[tuple[str, History]]:
     run = [(name, history) for name, history in stages if len(history)]
     if not run:
         raise SettingError("no stage has a record; give histories of runs that took at least their start")

@@ -16,19 +16,15 @@ def describe_graph(graph: PoseGraph) -> list[tuple[str, str]]:
     """What `pgo info` says of a graph: label and text of every row."""
     degree = np.bincount(np.concatenate([graph.i, graph.j]), minlength=graph.num_poses)
     rows, sizes = graph.facts(), [str(len(part)) for part in graph.components()]
-    rows[4:5] = [
-        ("components", f"{len(sizes)} (sizes {', '.join(sizes[:5])})"),
-        ("degree", f"{degree.min()} to {degree.max()}, mean {degree.mean():.2f}"),
-    ]
+    parts, degrees = f"(sizes {', '.join(sizes[:5])})", f"{degree.min()} to {degree.max()}, mean {degree.mean():.2f}"
+    rows[4:5] = [("components", f"{len(sizes)} {parts}"), ("degree", degrees)]
     rows[8:8] = _information_facts(graph)
     if len(sizes) == 1:
-        problem = PGOProblem(graph)
-        if graph.initial is not None:
-            rows.append(("F, estimate", f"{problem.objective(graph.initial):.8g}"))
+        problem, estimate = PGOProblem(graph), graph.initial
+        if estimate is not None:
+            rows.append(("F, estimate", f"{problem.objective(estimate):.8g}"))
             if graph.information is not None:
-                rows += [
-                    (f"chi2, {one.name.lower()}", f"{chi2(graph, graph.initial, one):.8g}") for one in Chi2Convention
-                ]
+                rows += [(f"chi2, {one.name.lower()}", f"{chi2(graph, estimate, one):.8g}") for one in Chi2Convention]
         rows.append(("F, tree", f"{problem.objective(spanning_tree_start(graph)):.8g}"))
         note = memory_note(graph)
         rows.append(("memory", note) if note else ("F, chordal", f"{problem.objective(chordal_start(problem)):.8g}"))

@@ -67,6 +67,7 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
     graph = solution.problem.graph.with_robots(robots.robot)
     residuals = edge_residuals(solution.problem, solution.poses)
     before, before_name = solution.before()
+    truth = None if graph.truth is None else graph.truth[graph.bodies]
     picture = explore_graph(graph, solution.poses, covariances=solution.covariances, residuals=residuals, before=before)
     plots = {f"graph{graph.d}d": picture, "fit": explore_fit(residuals, graph.d)}
     names = _stage_names(solution)
@@ -76,16 +77,10 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
     figures = ",".join(f'"{name}":{figure.to_json()}' for name, figure in plots.items())
     suggested = advice(graph, certificate, solution.status, residuals, source, solution.robust is not None)
     content = {
-        "solution": solution,
-        "graph": graph,
-        "certificate": certificate,
-        "residuals": residuals,
         "headline": headline(certificate) + (f" {solution.robust.conditional}" if solution.robust else ""),
         "meaning": meaning(certificate),
         "gap": gap_text(certificate.gap),
-        "ate": None
-        if graph.truth is None
-        else absolute_trajectory_error(solution.poses[graph.bodies], graph.truth[graph.bodies]),
+        "ate": None if truth is None else absolute_trajectory_error(solution.poses[graph.bodies], truth),
         # Commands solve the graph without terms of one's own.
         "advice": [] if any(stage.name == "ExtendedSOC" for stage in solution.stages) else suggested,
         "before": before_name,
@@ -101,11 +96,10 @@ def report_page(solution: Solved, *, source: str | None = None) -> str:
         "plot_settings": PAGE_CONFIG,
         "library": plotly("offline").get_plotlyjs(),
     }
-    jinja2 = extra_module("jinja2", "plot")
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
-    )
-    return str(environment.get_template("report.html").render(content))
+    jinja2, here = extra_module("jinja2", "plot"), Path(__file__).parent
+    pages = jinja2.Environment(loader=jinja2.FileSystemLoader(here), autoescape=True, undefined=jinja2.StrictUndefined)
+    page = pages.get_template("report.html")
+    return str(page.render(content, solution=solution, graph=graph, certificate=certificate, residuals=residuals))
 
 
 @dataclass(frozen=True)
@@ -149,13 +143,8 @@ def _robots(solution: Solved, robots: Partition, residuals: EdgeResiduals) -> _T
     own = np.bincount(owner[graph.i[~cut]], minlength=count)
     between = np.bincount(owner[graph.i[cut]], minlength=count) + np.bincount(owner[graph.j[cut]], minlength=count)
     separators = np.bincount(owner[robots.separators(graph)], minlength=count)
-    columns: list[tuple[str, Sequence[float]]] = [
-        ("robot", range(count)),
-        ("poses", robots.sizes.tolist()),
-        ("own edges", own.tolist()),
-        ("edges to others", between.tolist()),
-        ("separators", separators.tolist()),
-    ]
+    heads = ["robot", "poses", "own edges", "edges to others", "separators"]
+    columns = [list(range(count)), *(column.tolist() for column in (robots.sizes, own, between, separators))]
     lines = [f"{count} robots, {robots.method.value}." if count > 1 else "One robot holds the whole graph."]
     ledger = solution.ledger
     if ledger is not None:
@@ -163,24 +152,20 @@ def _robots(solution: Solved, robots: Partition, residuals: EdgeResiduals) -> _T
         sums = f", {ledger.all_reduces} all-reduces ({ledger.all_reduce_bytes:,} bytes)" if ledger.all_reduces else ""
         lines.append(f"Communication: {sent}{sums}.")
         if ledger.num_robots == count:
-            columns.append(("bytes sent", ledger.bytes_sent.tolist()))
-            columns.append(("bytes received", ledger.bytes_received.tolist()))
+            heads += ["bytes sent", "bytes received"]
+            columns += [ledger.bytes_sent.tolist(), ledger.bytes_received.tolist()]
     shown = np.argsort(-share, kind="stable")[:_MOST_ROBOTS] if count > _MOST_ROBOTS else np.arange(count)
     if count > _MOST_ROBOTS:
         lines.append(f"Shown are the {_MOST_ROBOTS} with the largest share of {solution.certificate.cost}.")
-    rows = [
-        [*(_Cell(f"{values[a]:,}", values[a]) for _, values in columns), _Cell(f"{100 * share[a]:.3g} %", share[a])]
-        for a in shown.tolist()
-    ]
-    heads = [*(head for head, _ in columns), f"share of {solution.certificate.cost}"]
-    return _Table("robots", lines, heads, rows)
+    shares = [_Cell(f"{100 * one:.3g} %", one) for one in share]
+    rows = [[*(_Cell(f"{values[a]:,}", values[a]) for values in columns), shares[a]] for a in shown.tolist()]
+    return _Table("robots", lines, [*heads, f"share of {solution.certificate.cost}"], rows)
 
 
 def _worst_edges(solution: Solved, robots: Partition, residuals: EdgeResiduals) -> _Table:
     graph, names = solution.problem.graph, pose_names(solution.problem.graph)
     worst = np.argsort(-residuals.cost, kind="stable")[:_WORST_EDGES]
-    share = residuals.share
-    degrees = np.rad2deg(residuals.rotation)
+    share, degrees, name = residuals.share, np.rad2deg(residuals.rotation), solution.certificate.cost
     rows = []
     for e in worst.tolist():
         i, j = int(graph.i[e]), int(graph.j[e])
@@ -192,14 +177,11 @@ def _worst_edges(solution: Solved, robots: Partition, residuals: EdgeResiduals) 
         costs, others = ([_number(value, ".4g") for value in values] for values in (cost, errors))
         rows.append([*row, *costs, _Cell(f"{100 * share[e]:.3g} %", share[e]), *others])
     ends = ["from robot", "from pose", "to robot", "to pose"] if robots.num_robots > 1 else ["from pose", "to pose"]
-    share_of = f"share of {solution.certificate.cost}"
+    share_of = f"share of {name}"
     heads = ["edge", *ends, "cost", "allowed", share_of, "error (m)", "error (deg)", "kappa (1/rad^2)", "tau (1/m^2)"]
-    tested = fit(residuals, solution.certificate.cost)
-    text = (
-        f"The {len(rows)} of {graph.num_edges} edges that cost most, {100 * share[worst].sum():.3g} % "
-        f"of {solution.certificate.cost} together. {tested} Half of all edges fit to "
-        f"{np.median(residuals.translation):.3g} m and {np.median(degrees):.3g} degrees. Click on a head to sort."
-    )
+    most = f"{len(rows)} of {graph.num_edges} edges that cost most, {100 * share[worst].sum():.3g} % of {name} together"
+    half = f"{np.median(residuals.translation):.3g} m and {np.median(degrees):.3g} degrees"
+    text = f"The {most}. {fit(residuals, name)} Half of all edges fit to {half}. Click on a head to sort."
     return _Table("edges", [text], heads, rows, np.flatnonzero(residuals.is_misfit[worst]).tolist())
 
 

@@ -89,14 +89,11 @@ def meaning(certificate: Certificate) -> list[str]:
         return [first, exact]
     if certificate.verdict is Verdict.TRIVIAL:
         return [first, _TRIVIAL]
-    proven = (
-        f"It is proven that no choice of poses whatever costs less than {bound:.10g}, so the best possible cost is "
-        f"between the two: the gap is {gap_text(certificate.gap)}, and {certificate.wanted_gap:.3g} was asked for."
-    )
-    proof = (
-        f"The proof is a Cholesky factorisation that went through ({certificate.proof}; {certificate.source.value}). "
-        "It holds in exact arithmetic, however the poses were found."
-    )
+    how, gap = f"({certificate.proof}; {certificate.source.value})", gap_text(certificate.gap)
+    proven = f"It is proven that no choice of poses whatever costs less than {bound:.10g}, so the best possible cost is"
+    proven += f" between the two: the gap is {gap}, and {certificate.wanted_gap:.3g} was asked for."
+    proof = f"The proof is a Cholesky factorisation that went through {how}."
+    proof += " It holds in exact arithmetic, however the poses were found."
     if certificate.verdict is Verdict.CERTIFIED:
         last = "Certified means optimal for these measurements and weights; it cannot vouch for the measurements."
     elif certificate.gap <= _NEARLY:
@@ -185,10 +182,8 @@ def _uncertified(graph: PoseGraph, certificate: Certificate, solve: str) -> list
         finer = "The gap asked for is finer than what was proven here; ask for the one that was reached."
         return [Advice(finer, f"{solve} --gap {reached:g}")]
     better = "Look for better poses, which would close the gap from above: start from a spanning tree of the edges."
-    found = [
-        Advice(better, f"{solve} --start tree"),
-        Advice("Go straight from the chordal start to Newton.", f"{solve} --method newton"),
-    ]
+    straight = Advice("Go straight from the chordal start to Newton.", f"{solve} --method newton")
+    found = [Advice(better, f"{solve} --start tree"), straight]
     if graph.initial is not None:
         found.insert(1, Advice("Start from the estimate that came with the graph.", f"{solve} --start file"))
     if certificate.source is BoundSource.RELAXATION:

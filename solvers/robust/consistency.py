@@ -49,8 +49,7 @@ def pairwise_consistent(graph: PoseGraph, known: BoolArray | None = None, quanti
     found on smallGrid3D, 26 to 56 % on sphere2500. A single one between two robots is kept. What is kept is no proof.
 
     Edges `known` to be right, (m,), are `odometry` unless given; those that measure no whole motion (landmarks,
-    positions) are kept untested. `quantile` is the probability that two right loop closures agree; a SettingError when
-    it is not between 0 and 1.
+    positions) are kept untested. `quantile`, in (0, 1) or a SettingError, is the probability that two right ones agree.
 
     Examples
     --------

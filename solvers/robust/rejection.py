@@ -63,10 +63,8 @@ class Rejection:
         m, gone = len(self.kept), int(self.rejected.sum())
         if not gone:
             return f"All {m} edges are kept; that none of them is wrong is not proven."
-        return (
-            f"The bound is on the cost of the {m - gone} edges kept; {gone} of {m} were rejected, and that the "
-            "rejected edges are wrong is not proven, nor that all others are right."
-        )
+        bound = f"The bound is on the cost of the {m - gone} edges kept; {gone} of {m} were rejected"
+        return f"{bound}, and that the rejected edges are wrong is not proven, nor that all others are right."
 
     @property
     def warning(self) -> str:
@@ -77,13 +75,11 @@ class Rejection:
 
     def facts(self) -> list[tuple[str, str]]:
         """Label and text of every row of a summary."""
-        tried = "; ".join(
-            f"{one.name}: {one.rejected} rejected, cost {one.cost:.6g}, gap {one.gap:.1e}" for one in self.attempts
-        )
+        each = [f"{one.name}: {one.rejected} rejected, cost {one.cost:.6g}, gap {one.gap:.1e}" for one in self.attempts]
         gone = f"{self.named(self.rejected)}{'; written files are without them' if self.rejected.any() else ''}"
         rows = [("given", self.conditional), ("rejected", gone)]
         rows += [("doubtful", self.named(self.doubtful)), ("found by", self.start)]
-        rows += [("attempts", tried)] if len(self.attempts) > 1 else []
+        rows += [("attempts", "; ".join(each))] if len(each) > 1 else []
         return rows + ([("warning", self.warning)] if self.warning else [])
 
     def named(self, chosen: BoolArray) -> str:

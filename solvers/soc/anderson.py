@@ -88,17 +88,13 @@ class AndersonSums:
     smallest: float = np.inf
 
     def coefficients(self, settings: Anderson | None, sums: Array) -> tuple[Array | None, AndersonSums]:
-        """Coefficients gamma of the differences; None is a restart, after which the parties forget theirs.
-
-        Without settings there are none.
-        """
+        """Coefficients gamma of the differences, none without settings; None is a restart: parties forget theirs."""
         if settings is None:
             return np.zeros(0), self
         size = float(np.sqrt(sums[0]))
         if size > settings.restart_ratio * self.smallest:
             return None, AndersonSums(smallest=size)
-        count = len(sums) // 2
-        smallest = min(self.smallest, size)
+        count, smallest = len(sums) // 2, min(self.smallest, size)
         if not count:
             return np.zeros(0), AndersonSums(smallest=smallest)
         gram = np.empty((count, count))

@@ -74,27 +74,21 @@ class Consensus:
     rotations: Rotations = Rotations.PROJECTED
 
     def init(self, robots: Robots, before: ConsensusState | None = None) -> ConsensusState:
-        """State 0: omega = the rotations at hand, B in balance; two rounds for poses, penalties and forces.
-
-        Separators are held as in the state `before`, if there was one.
-        """
+        """State 0: omega at hand, B in balance, separators as `before`; two rounds for poses, penalties and forces."""
         rows = robots.hand_on(robots.begin(before is None))
         answers = robots.ask(ConsensusRobot.multiplier_norms, rows, Count.GATHER)
-        norms = np.concatenate([answer.norms for answer in answers])
-        scales = np.concatenate([answer.scale for answer in answers])
+        norms = np.concatenate([answer.norms / answer.scale for answer in answers])
         has_multipliers = isinstance(self.soc.penalty, MultiplierPenalty)
         is_stationary = (has_multipliers and robots.num_robots > 1) or before is not None
-        order = self.soc.penalty_order(norms / scales, is_stationary)
+        order = self.soc.penalty_order(norms, is_stationary)
         if self.rotations is not Rotations.PROJECTED:
             least = _RELAXED if self.rotations is Rotations.RELAXED else 1.0
             order = PenaltyOrder(0.0, least, 0.0, settings=replace(order.settings, rotations=self.rotations))
         known = robots.hand_on(ask_all(robots, ConsensusRobot.penalize, order, Count.PIGGYBACKED))
         stiffness = float(np.median(robots.ask(ConsensusRobot.stiffness, known, Count.GATHER)))
-        if before is not None:
-            separators = before.separators
-        else:
-            given = self.soc.translation_penalty
-            separators = self._separators(given if given is not None else TRANSLATION_PENALTY * stiffness)
+        given = self.soc.translation_penalty
+        translation = given if given is not None else TRANSLATION_PENALTY * stiffness
+        separators = before.separators if before is not None else self._separators(translation)
         started = ask_all(robots, ConsensusRobot.start, separators, Count.GATHER)
         size = math.sqrt(math.fsum(answer.size for answer in started))
         ratio = np.concatenate([answer.ratio for answer in started])
@@ -127,8 +121,7 @@ class Consensus:
         if due in (Due.REFRESH, Due.SECOND_LOOK):
             adapted = self._adapted(robots, state)
             if due is Due.REFRESH or fell_most(state.separators.translation, adapted.separators.translation):
-                fresh = self.init(robots, adapted)
-                return fresh.in_place_of(state)
+                return self.init(robots, adapted).in_place_of(state)
         if due is Due.RESCALE:
             return replace(self._rescaled(robots, state, factor, from_best=False), refreshes=state.refreshes + 1)
         return state

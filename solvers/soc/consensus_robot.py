@@ -173,8 +173,7 @@ class ConsensusRobot:
         primal, dual = weight * moved, weight * (block.z - before.z)
         sums = np.array([inner(primal, primal), inner(dual, dual)])
         block = replace(block, s=block.s + waiting.settings.damping * moved)
-        following = self._with(X=X, waiting=waiting.after(math.sqrt(sums[0])))
-        robot, sent = following._sending(block)
+        robot, sent = self._with(X=X, waiting=waiting.after(math.sqrt(sums[0])))._sending(block)
         return robot, copies.TurnAnswer(sent, sums, max(waited.values(), default=0))
 
     def travel(self, _: None) -> tuple[ConsensusRobot, Array]:
@@ -222,8 +221,7 @@ class ConsensusRobot:
 
     def cost(self, _: None) -> tuple[ConsensusRobot, float]:
         """Part of F at omega, the translations agreed on, and inside those of step (a)."""
-        counted = self.layout.subgraph.is_counted
-        return self, float(self.layout.whole.edge_costs(self.poses)[counted].sum())
+        return self, float(self.layout.whole.edge_costs(self.poses)[self.layout.subgraph.is_counted].sum())
 
     # What the orders share.
 

@@ -34,8 +34,7 @@ def minimize_with_fista(
     momentum = (1.0 - root) / (1.0 + root)
     size = max(float(np.linalg.norm(b)), np.finfo(float).tiny)
     limit = tolerance * size
-    x = start
-    y = x
+    x = y = start
     for _ in range(max_iterations):
         gradient = apply_H(y) - b
         if np.linalg.norm(gradient) <= limit:
@@ -46,10 +45,7 @@ def minimize_with_fista(
         x = following
     reached = float(np.linalg.norm(apply_H(x) - b))
     if not reached <= limit:
-        warnings.warn(
-            f"FISTA ended at its {max_iterations} iterations with ||H x - b|| = {reached / size:.0e} ||b||, asked for "
-            f"was {tolerance:.0e}; use RStep.FACTORIZED or a larger penalty",
-            RuntimeWarning,
-            stacklevel=2,
-        )
+        left = f"||H x - b|| = {reached / size:.0e} ||b||, asked for was {tolerance:.0e}"
+        text = f"FISTA ended at its {max_iterations} iterations with {left}; use RStep.FACTORIZED or a larger penalty"
+        warnings.warn(text, RuntimeWarning, stacklevel=2)
     return x

@@ -72,10 +72,9 @@ class PaperState:
 class PaperSOC:
     """Algorithm 1 to the letter (`algo1: SOC`): rotations only, every robot with its neighbours frozen.
 
-    `robots` own the poses, one each unless given, as in the paper. `penalty` is one rho for all poses; BoydPenalty is
-    the scheme that the paper names. `r_step` is the back end of step (a). `tolerance` is on the paper's KKT residual,
-    the root mean square over poses of ||omega_i^T omega_i - I||^2 + ||omega_i - R_i||^2, and on the gradient of the
-    Lagrangian, over the scale of L.
+    `robots` own the poses, one each unless given, as in the paper. `penalty` is one rho for all; BoydPenalty is the one
+    it names. `r_step` is the back end of (a). `tolerance` is on the paper's KKT residual, the root mean square over the
+    poses of ||omega_i^T omega_i - I||^2 + ||omega_i - R_i||^2, and on the Lagrangian's gradient, over the scale of L.
     """
 
     robots: Partition | None = None
@@ -87,8 +86,7 @@ class PaperSOC:
     def __post_init__(self) -> None:
         if not isinstance(self.penalty, PaperPenalty):
             raise SettingError(
-                f"the paper has one rho for all poses, got {self.penalty}; give a FixedPenalty, BalancedPenalty or "
-                "BoydPenalty"
+                f"PaperSOC has one rho for all, got {self.penalty}; give a FixedPenalty, BalancedPenalty or BoydPenalty"
             )
         check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
 
@@ -114,18 +112,11 @@ class PaperSOC:
         root = np.sqrt(R.shape[0] * R.shape[1])
         primal, change = norm(omega - R) / root, norm(omega - state.omega) / root
         gradient = 2.0 * (problem.L @ stack_transposes(R)) + state.rho * stack_transposes(B)
-        merit = float(np.hypot(primal, change))
-        smaller = merit < state.smallest_merit
-        following = replace(
-            state,
-            k=state.k + 1,
-            R=R,
-            omega=omega,
-            B=B,
-            dual_residual=norm(gradient) / (root * state.scale),
-            smallest_merit=merit if smaller else state.smallest_merit,
-            steps_since_smallest=0 if smaller else state.steps_since_smallest + 1,
-        )
+        dual, merit = norm(gradient) / (root * state.scale), float(np.hypot(primal, change))
+        smallest, since = state.smallest_merit, state.steps_since_smallest
+        smallest, since = (merit, 0) if merit < smallest else (smallest, since + 1)
+        following = replace(state, k=state.k + 1, R=R, omega=omega, B=B, dual_residual=dual)
+        following = replace(following, smallest_merit=smallest, steps_since_smallest=since)
         return _with_adapted_rho(problem, following, self.penalty, primal, change, self.r_step)
 
     def measure(self, problem: PGOProblem, state: PaperState) -> Measurement:
@@ -168,15 +159,8 @@ def _with_adapted_rho(
     if factor == 1.0 or (factor < 1.0 and not may_fall):
         return state
     rho = factor * state.rho
-    return replace(
-        state,
-        rho=rho,
-        B=state.B / factor,
-        r_step=_prepare(problem, state.blocks, rho, back_end),
-        smallest_merit=np.inf,
-        steps_since_smallest=0,
-        may_fall=may_fall,
-    )
+    state = replace(state, smallest_merit=np.inf, steps_since_smallest=0, may_fall=may_fall)
+    return replace(state, rho=rho, B=state.B / factor, r_step=_prepare(problem, state.blocks, rho, back_end))
 
 
 def _prepare(problem: PGOProblem, blocks: Blocks, rho: float, back_end: BackEnd) -> RotationStep:
@@ -201,5 +185,4 @@ def _split(problem: PGOProblem, robots: Partition) -> Blocks:
     zero = *block_entries(full_blocks, full_blocks), np.zeros((n, d, d))
     product = (A_own.T @ (A_own * w_own[:, None])).tocoo()
     own = assemble([(product.row, product.col, product.data), zero], n * d)
-    between = (problem.L - own).tocsr()
-    return Blocks(A_own, w_own, own, between, analyze(own, problem.backend))
+    return Blocks(A_own, w_own, own, (problem.L - own).tocsr(), analyze(own, problem.backend))

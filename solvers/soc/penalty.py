@@ -81,10 +81,8 @@ class MultiplierPenalty(_Rule):
         if not 0 <= self.quantile <= 1:
             raise SettingError(f"quantile must be in [0, 1], got {self.quantile}")
         if self.stall_window < 1 or not 0 < self.stall_ratio < 1:
-            raise SettingError(
-                "stall_window must be at least 1 and stall_ratio in (0, 1), "
-                f"got {self.stall_window} and {self.stall_ratio}"
-            )
+            got = f"got {self.stall_window} and {self.stall_ratio}"
+            raise SettingError(f"stall_window must be at least 1 and stall_ratio in (0, 1), {got}")
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
         """(per_norm, per_scale, least), from ||Lambda_i||_2 / m_i, the `ratio` of all poses, (n,)."""
@@ -143,9 +141,7 @@ class BalancedPenalty(_ScaledRule):
         worth_it = self.refactor_ratio**2
         if primal_residual > 0 and primal_residual >= worth_it * dual_residual:
             return self.refactor_ratio
-        if dual_residual > 0 and dual_residual >= worth_it * primal_residual:
-            return 1.0 / self.refactor_ratio
-        return 1.0
+        return 1.0 / self.refactor_ratio if dual_residual > 0 and dual_residual >= worth_it * primal_residual else 1.0
 
 
 @dataclass(frozen=True)
@@ -153,8 +149,7 @@ class BoydPenalty(_ScaledRule):
     """One rho for all poses that balances residuals as in Boyd et al. 2011, section 3.4.1, (3.13); for PaperSOC.
 
     rho <- growth rho where ||r|| > imbalance ||s||, rho / growth where ||s|| > imbalance ||r||, with r = R - omega and
-    s = rho (omega - omega_last), and B is rescaled with it. There is no safeguard. s has the unit of the weights, so
-    that other units make other iterates.
+    s = rho (omega - omega_last), and with it B. There is no safeguard. s has the weights' unit: iterates vary with it.
     """
 
     scale: float = 1.0  # first rho over the mean of m_i; Boyd gives none, and the paper neither

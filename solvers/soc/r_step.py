@@ -88,9 +88,7 @@ def prepare(subproblem: RSubproblem, back_end: BackEnd) -> RotationStep:
         return back_end.prepare(subproblem)
     if back_end is RStep.FACTORIZED:
         return _Factorized(subproblem.analysis.factorize(subproblem.K), 0.5 * subproblem.penalty[:, None])
-    if back_end is RStep.FISTA:
-        return _Fista(subproblem)
-    return CvxpyStep().prepare(subproblem)
+    return _Fista(subproblem) if back_end is RStep.FISTA else CvxpyStep().prepare(subproblem)
 
 
 @dataclass(frozen=True)

@@ -112,12 +112,10 @@ class RecursionBlock:
         return replace(self, s=self.best, z=nearest_rotations(self.best))
 
 
-def block_at(
-    z: Array, penalty: Array, diagonal: Array, settings: StepSettings, B: Array | float = 0.0
-) -> RecursionBlock:
+def block_at(z: Array, rho: Array, diagonal: Array, settings: StepSettings, B: Array | float = 0.0) -> RecursionBlock:
     """Block where all is agreed on z, with B."""
     s = z + B
-    return RecursionBlock(penalty, diagonal, z, s, z, s, settings)
+    return RecursionBlock(rho, diagonal, z, s, z, s, settings)
 
 
 def nearest_rotations(rows: Array) -> Array:

@@ -15,28 +15,24 @@ _LEAST_FACTOR, _ENOUGH = 0.1, 1.0 / 3.0  # by which the translation penalty is l
 _SECOND_LOOK, _FAR_AWAY = 20, 1e-3  # iterations after penalties were taken anew, and residual that is still large then
 
 
-def stiffness_of_separators(
-    factor: CholeskyFactor, side: int, held: IntArray, half_scale: Array, component: IntArray
-) -> float:
+def stiffness_of_separators(factor: CholeskyFactor, side: int, held: IntArray, D: Array, component: IntArray) -> float:
     """Stiffness of one robot's separators, relative to the diagonal of M.
 
     The robot pulls at its separator translations, which nothing else holds, while rho holds the rotations:
     C = D^(1/2) (E^T (M_a + rho/2)^-1 E) D^(1/2), with E the separators and D half their shares of the diagonal of M.
-    The stiffness is one over the mean of the diagonal of C, common shifts left out: near 1 where every separator is
-    held by its neighbourhood, far below where long soft chains join them. The mean is estimated (Hutchinson 1990) with
-    the same vectors of signs in every run.
-
-    `factor` is of M_a + rho/2, with `GROUND` times D on the separator translations, whose rows are `held`, (s,);
-    `half_scale`, (s,), is D, and `component`, (s,), says which hang together by edges that the robot knows.
+    The stiffness is one over the mean diagonal of C, common shifts left out: near 1 where each separator is held by its
+    neighbourhood, far below where long soft chains join them. The mean is estimated (Hutchinson 1990), always with the
+    same signs. `factor` is of M_a + rho/2, with `GROUND` times D, (s,), on the separator translations, whose rows are
+    `held`, (s,); `component`, (s,), says which of them hang together by edges that the robot knows.
     """
     degrees = len(held) - len(np.unique(component))
     if degrees == 0:  # alone in its component, each: nothing but shifts
         return 1.0
     probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(held), _PROBES))
-    pulled = _without_shifts(probes, half_scale, component)
+    pulled = _without_shifts(probes, D, component)
     force = np.zeros((side, _PROBES))
-    force[held] = np.sqrt(half_scale)[:, None] * pulled
-    moved = np.sqrt(half_scale)[:, None] * factor.solve(force)[held]
+    force[held] = np.sqrt(D)[:, None] * pulled
+    moved = np.sqrt(D)[:, None] * factor.solve(force)[held]
     return _PROBES * degrees / float(np.sum(pulled * moved))
 
 
@@ -83,9 +79,8 @@ def fell_most(before: float, after: float) -> bool:
     return after <= _LEAST_FACTOR * before
 
 
-def _without_shifts(vectors: Array, half_scale: Array, component: IntArray) -> Array:
+def _without_shifts(vectors: Array, D: Array, component: IntArray) -> Array:
     """Vectors, (s, k), less their share in common shifts of the translations of a component."""
-    shift = np.sqrt(half_scale)
-    size = np.bincount(component, weights=half_scale)
+    shift, size = np.sqrt(D), np.bincount(component, weights=D)
     along = np.stack([np.bincount(component, weights=shift * column) for column in vectors.T], axis=1)
     return np.asarray(vectors - shift[:, None] * (along / np.where(size > 0, size, 1.0)[:, None])[component])

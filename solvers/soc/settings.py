@@ -41,13 +41,8 @@ class SOCSettings:
     max_iterations: int = 500
 
     def __post_init__(self) -> None:
-        check_settings(
-            self,
-            relaxation=["alpha"],
-            positive=["translation_penalty", "tolerance"],
-            not_negative=["separator_penalty", "max_iterations"],
-            at_least_one=["local_passes"],
-        )
+        check_settings(self, relaxation=["alpha"], positive=["translation_penalty", "tolerance"])
+        check_settings(self, not_negative=["separator_penalty", "max_iterations"], at_least_one=["local_passes"])
         if self.coupling is Coupling.JOINT and self.robots is not None and self.robots.num_robots > 1:
             raise SettingError(f"JOINT has one robot, got {self.robots}; use Coupling.CONSENSUS")
         if self.coupling is Coupling.CONSENSUS and self.robots is None:

@@ -83,8 +83,7 @@ class Joint:
             return replace(state.broken(), block=block)
         gamma, anderson = state.sums.coefficients(self.soc.acceleration, sums)
         block, squares = block.extrapolated(Agreement(gamma, state.is_best(merit))).projected()  # (b), (c)
-        size = math.sqrt(block.penalty.sum())
-        return replace(state.after(merit, squares, size, anderson), block=block)
+        return replace(state.after(merit, squares, math.sqrt(block.penalty.sum()), anderson), block=block)
 
     def _penalized(self, problem: PGOProblem, poses: Poses, is_stationary: bool) -> SOCState:
         """State 0 at poses, B zero or stationary."""
@@ -146,10 +145,7 @@ class SOC(SOCSettings):
         return LocalConsensus(self) if self.is_split else Joint(self)
 
     def init(self, problem: PGOProblem, start: Poses | None) -> Any:  # noqa: ANN401
-        """State 0: omega = R = start, the chordal relaxation unless given.
-
-        B = 0, but for many robots under a MultiplierPenalty the stationary one, as after a refresh.
-        """
+        """State 0: omega = R = start, or chordal; B = 0, stationary for many robots under a MultiplierPenalty."""
         problem.check_quadratic("SOC", convex=True)
         return self._recursion.init(problem, start if start is not None else chordal_start(problem))
 

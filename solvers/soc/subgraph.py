@@ -155,24 +155,18 @@ class Part:
         return found[np.argsort(self.in_cover[found])]
 
 
-def split_graph(
-    given: PGOProblem | PoseGraph, partition: Partition, thresholds: Array | None = None
-) -> tuple[Subgraph, ...]:
-    """Give every robot its subgraph, for a robust solve with the thresholds, (m,), of its edges.
-
-    A SettingError when the partition is of another number of poses.
-    """
+def split_graph(given: PGOProblem | PoseGraph, parts: Partition, limits: Array | None = None) -> tuple[Subgraph, ...]:
+    """Subgraphs of all robots; `limits`, (m,): thresholds of a robust solve. A SettingError if `parts` does not fit."""
     problem = as_problem(given)
     graph, first = problem.graph, problem.convex_part
     costs = first.weights, None if first is problem else problem.weights
-    owner, cut = partition.robot, partition.cut_edges(graph)
+    owner, cut = parts.robot, parts.cut_edges(graph)
     pairs = np.stack([graph.i[cut], graph.j[cut]], axis=1)
-    middle = -1 if cut.any() else middle_pose(graph)
-    placements = place_poses(pairs, owner[pairs], partition.num_robots, middle)
-    m, robots = graph.num_edges, range(partition.num_robots)
+    placements = place_poses(pairs, owner[pairs], parts.num_robots, -1 if cut.any() else middle_pose(graph))
+    m, robots = graph.num_edges, range(parts.num_robots)
     robot, edge = np.divmod(np.unique(np.concatenate([owner[end] * m + np.arange(m) for end in (graph.i, graph.j)])), m)
     every_edge = np.split(edge, np.searchsorted(robot, robots[1:]))
-    own = np.split(np.argsort(owner, kind="stable"), np.cumsum(partition.sizes)[:-1])
+    own = np.split(np.argsort(owner, kind="stable"), np.cumsum(parts.sizes)[:-1])
 
     def subgraph_of(robot: int, edges: IntArray, placement: Placement) -> Subgraph:
         poses = np.union1d(own[robot], placement.poses)
@@ -181,8 +175,7 @@ def split_graph(
         name = f"{graph.name}, robot {robot}"
         local = PoseGraph(len(poses), i, j, *measured, ids=graph.pose_ids[poses], name=name)
         final = None if costs[1] is None else costs[1].of_edges(edges)
-        allowed = None if thresholds is None else thresholds[edges]
-        of_edges = edges, costs[0].of_edges(edges), final, allowed
+        of_edges = edges, costs[0].of_edges(edges), final, None if limits is None else limits[edges]
         return Subgraph(robot, local, poses, owner[poses], *placement.of(robot, local, poses, owner[poses]), *of_edges)
 
     return tuple(map(subgraph_of, robots, every_edge, placements))

@@ -39,10 +39,7 @@ class BenchmarkMethod(enum.Enum):
 
 @dataclass(frozen=True)
 class BenchmarkSettings:
-    """What all contenders share.
-
-    Who owns which pose says `suited_partition`; the first stage of PAPER has one pose a robot, as the paper has.
-    """
+    """What all contenders share; the first stage of PAPER has one pose a robot, as the paper has."""
 
     num_robots: int = 5  # of CONSENSUS, SUBSTRUCTURED, GAUSS_SEIDEL and the second stages; at most one a pose
     max_rounds: int | None = None  # of PAPER, both stages together
@@ -54,7 +51,7 @@ class BenchmarkSettings:
         check_settings(self, positive=["time_limit"], at_least_one=["num_robots"])
 
     def robots(self, graph: PoseGraph) -> Partition:
-        """Who owns which pose."""
+        """Who owns which pose, as `suited_partition` says."""
         return suited_partition(graph, min(self.num_robots, graph.num_poses))
 
 
@@ -131,8 +128,7 @@ class BenchmarkRun:
         """All legs in a row, to be plotted."""
         records, k, seconds = [], 0, 0.0
         for leg in self.legs:
-            for record in leg.history.records:
-                records.append(replace(record, k=k + record.k, seconds=seconds + record.seconds))
+            records += [replace(one, k=k + one.k, seconds=seconds + one.seconds) for one in leg.history.records]
             k, seconds = records[-1].k, records[-1].seconds
         rounds, num_bytes = _joined([leg.rounds for leg in self.legs]), _joined([leg.num_bytes for leg in self.legs])
         place = list(BenchmarkMethod).index(self.contender)
@@ -140,10 +136,8 @@ class BenchmarkRun:
 
     def __repr__(self) -> str:
         rounds = "" if self.rounds is None else f", {self.rounds} rounds"
-        return (
-            f"BenchmarkRun({self.contender.label}: {self.status.name} after {' + '.join(map(str, self.iterations))} "
-            f"iterations{rounds}, F = {self.objective:.10g}, {self.seconds:.3g} s)"
-        )
+        done = f"{self.status.name} after {' + '.join(map(str, self.iterations))} iterations{rounds}"
+        return f"BenchmarkRun({self.contender.label}: {done}, F = {self.objective:.10g}, {self.seconds:.3g} s)"
 
 
 def _joined(parts: list[Array | None]) -> Array | None:

@@ -3,14 +3,13 @@
 import importlib.util
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.errors import PGOError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.plots.interactive_plots import save_page
 from pgo_models.plots.style import is_picture, save_figure
@@ -20,7 +19,7 @@ from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
 from solvers.reporting.convergence_plots import Curve
 from solvers.reporting.result_table import ResultTable, TablePart, Value, gap_percent
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings
-from solvers.studies.benchmark_runs import run_benchmark, solve_whole
+from solvers.studies.benchmark_runs import FAILURES, reason_of, run_benchmark, solve_whole
 
 _COLUMNS: tuple[tuple[str, str, Callable[[Any], str]], ...] = (  # head, name in the record, how it is written
     ("F", "objective", "{:.9g}".format),
@@ -68,23 +67,18 @@ class Comparison:
 
     def table(self) -> ResultTable:
         """Return a row for every method, those without figures last, with their reasons."""
-        found: list[tuple[BenchmarkMethod, BenchmarkRun | None, str]] = [
-            *((trial.contender, trial, trial.remark) for trial in self.trials),
-            *((contender, None, reason) for contender, reason in self.reasons),
-        ]
         rows, records = [], []
-        for contender, trial, remark in found:
+        found = [(trial.contender, trial, trial.remark) for trial in self.trials]
+        for contender, trial, remark in [*found, *((one, None, reason) for one, reason in self.reasons)]:
             records.append(_record(contender, trial, self.lower_bound, remark))
             iterations = None if trial is None else " + ".join(map(str, trial.iterations))
             shown = {**records[-1], "iterations": iterations}
             figures = ("-" if shown[name] is None else write(shown[name]) for _, name, write in _COLUMNS)
             rows.append((contender.label, *figures, remark))
         graph = self.problem.graph
-        notes = [
-            f"{graph.name}: {graph.num_poses} poses, {graph.num_edges} edges; best F {self.optimum:.10g}, proven lower "
-            f"bound {self.lower_bound:.10g}; gaps are to the bound, over F",
-            "rounds, all-reduces and MB: where they are counted; seconds a robot: side by side",
-        ]
+        best = f"best F {self.optimum:.10g}, proven lower bound {self.lower_bound:.10g}; gaps are to the bound, over F"
+        notes = [f"{graph.name}: {graph.num_poses} poses, {graph.num_edges} edges; {best}"]
+        notes.append("rounds, all-reduces and MB: where they are counted; seconds a robot: side by side")
         if not self.is_complete:
             notes.append("interrupted: the methods left out were not run")
         heads = ("method", *(head for head, _, _ in _COLUMNS), "remark")
@@ -108,12 +102,12 @@ def compare_methods(
 ) -> Comparison:
     """Run methods on a graph, one after the other, and hold them against a proven lower bound.
 
-    A method that fails leaves its reason; Ctrl-C ends it with what was done until then. `progress` shows a bar on
-    stderr; where that is a terminal, unless given. A PGOError when the graph is not connected; KeyboardInterrupt after
-    Ctrl-C before the bound is there.
+    A method that fails leaves its reason, Ctrl-C what was done; before the bound is there it raises KeyboardInterrupt.
+    `progress` shows a bar on stderr, where that is a terminal unless given. A PGOError when the graph is not connected.
 
     Examples
     --------
+    >>> import numpy as np
     >>> from pgo_models.graphs.scenes import grid
     >>> comparison = compare_methods(grid(np.random.default_rng(0)), ComparisonSettings((BenchmarkMethod.STAIRCASE,)))
     >>> bool(comparison.optimum - comparison.lower_bound < 1e-3), len(comparison.trials)
@@ -124,18 +118,16 @@ def compare_methods(
     solution = solve_whole(problem)
     trials: list[BenchmarkRun] = []
     reasons: list[tuple[BenchmarkMethod, str]] = []
-    is_complete = True
-    with JobBar(len(settings.chosen), progress) as bar:
-        try:
-            for contender in settings.chosen:
-                bar.name_part(contender.label)
-                try:
-                    trials.append(run_benchmark(contender, problem, settings.trial))
-                except (PGOError, np.linalg.LinAlgError, MemoryError) as error:
-                    reasons.append((contender, str(error) or type(error).__name__))
-                bar.end_part()
-        except KeyboardInterrupt:
-            is_complete = False
+    is_complete = False
+    with JobBar(len(settings.chosen), progress) as bar, suppress(KeyboardInterrupt):
+        for contender in settings.chosen:
+            bar.name_part(contender.label)
+            try:
+                trials.append(run_benchmark(contender, problem, settings.trial))
+            except FAILURES as error:
+                reasons.append((contender, reason_of(error)))
+            bar.end_part()
+        is_complete = True
     known = [solution.objective, solution.certificate.poses_objective]
     known += [trial.objective for trial in trials if math.isfinite(trial.objective)]
     return Comparison(problem, min(known), solution.lower_bound, tuple(trials), tuple(reasons), is_complete)

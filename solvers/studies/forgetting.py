@@ -24,11 +24,9 @@ class ErrorForgetting:
 
     def curves(self) -> list[tuple[str, Array]]:
         """Labelled curves for `pgo_models.plot_decay`."""
-        return [
-            ("Bregman iteration", self.undisturbed),
-            (f"disturbed in its first {self.disturbed_steps} steps", self.disturbed),
-            ("quadratic penalty alone (b = 0)", self.not_added_back),
-        ]
+        disturbed = f"disturbed in its first {self.disturbed_steps} steps"
+        names = "Bregman iteration", disturbed, "quadratic penalty alone (b = 0)"
+        return list(zip(names, (self.undisturbed, self.disturbed, self.not_added_back), strict=True))
 
 
 def error_forgetting(
@@ -63,7 +61,7 @@ def error_forgetting(
     start = method.init(problem, None)
     distances = []
     for error_steps, keeps_b in ((0, True), (disturbed_steps, True), (0, False)):
-        state, distance = start, [_distance(start.x, solution)]
+        state, iterates = start, [start.x]
         for k in range(iterations):
             state = method.step(problem, state)
             if k < error_steps:
@@ -71,11 +69,7 @@ def error_forgetting(
                 state = replace(state, x=state.x + error, b=state.b + problem.K @ error)
             if not keeps_b:
                 state = replace(state, b=start.b)
-            distance.append(_distance(state.x, solution))
-        distances.append(np.array(distance))
+            iterates.append(state.x)
+        distances.append(np.array([np.linalg.norm(x - solution) for x in iterates]))
     undisturbed, disturbed, not_added_back = distances
     return ErrorForgetting(undisturbed, disturbed, not_added_back, disturbed_steps)
-
-
-def _distance(x: Array, solution: Array) -> float:
-    return float(np.linalg.norm(x - solution))

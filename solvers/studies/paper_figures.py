@@ -106,15 +106,10 @@ def draw_paper_figures(
 
 def explore_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> PlotlyFigure:
     """Plotly figure of what `plot_panels` shows of graphs in space, each picture to turn on its own."""
-    columns = max(len(row) for row in panels)
-    figure = plotly("subplots").make_subplots(
-        len(panels),
-        columns,
-        specs=[[{"type": "scene"} if c < len(row) else None for c in range(columns)] for row in panels],
-        subplot_titles=[html.escape(title).replace(": ", "<br>") for row in panels for title, _, _ in row],
-        horizontal_spacing=0.02,
-        vertical_spacing=0.1,
-    )
+    columns, spacing = max(len(row) for row in panels), {"horizontal_spacing": 0.02, "vertical_spacing": 0.1}
+    scenes = [[{"type": "scene"} if c < len(row) else None for c in range(columns)] for row in panels]
+    titles = [html.escape(title).replace(": ", "<br>") for row in panels for title, _, _ in row]
+    figure = plotly("subplots").make_subplots(len(panels), columns, specs=scenes, subplot_titles=titles, **spacing)
     named: set[str] = set()
     for r, row in enumerate(panels, 1):
         for c, (_, graph, poses) in enumerate(row, 1):
@@ -127,12 +122,8 @@ def explore_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> PlotlyFi
             figure.update_scenes(picture.layout.scene.to_plotly_json(), row=r, col=c)
     figure.update_scenes(camera={"eye": _EYE})
     figure.update_annotations(font_size=12)
-    figure.update_layout(
-        template="none",
-        margin={"l": 10, "r": 10, "t": 40, "b": 10},
-        height=480 * len(panels),
-        legend={"orientation": "h", "y": 0.0},
-    )
+    legend, margin = {"orientation": "h", "y": 0.0}, {"l": 10, "r": 10, "t": 40, "b": 10}
+    figure.update_layout(template="none", margin=margin, height=480 * len(panels), legend=legend)
     return figure
 
 

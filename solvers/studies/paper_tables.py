@@ -1,6 +1,7 @@
 """The paper's tables 1 to 4, row for row: its figures beside ours, each held against a proven lower bound."""
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -16,13 +17,11 @@ from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.problem.problem import PGOProblem
 from solvers.progress_bars import JobBar
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
-from solvers.studies.benchmark_runs import run_benchmark, solve_whole
+from solvers.studies.benchmark_runs import FAILURES, reason_of, run_benchmark, solve_whole
 from solvers.studies.results_cache import Entry, KeptResults, graph_fingerprint
 
 SCENES: dict[str, Callable[[np.random.Generator], PoseGraph]] = {"circle": circle, "grid": grid, "sphere": sphere}
 TABLE_CONTENDERS = tuple(BenchmarkMethod[name] for name in ("STAIRCASE", "GAUSS_SEIDEL", "PAPER", "CONSENSUS"))
-# What a method can fail with on a graph that it was not made for; anything else is a mistake of ours.
-_FAILURES = (PGOError, np.linalg.LinAlgError, MemoryError)
 
 
 @dataclass(frozen=True)
@@ -96,22 +95,17 @@ class ReproducedRow:
         return self.published.name in SCENES
 
     @property
-    def figures(self) -> PublishedFigures | None:
-        """The paper's figures of this method."""
-        of = {
-            BenchmarkMethod.STAIRCASE: self.published.se_sync,
-            BenchmarkMethod.GAUSS_SEIDEL: self.published.dgs,
-            BenchmarkMethod.PAPER: self.published.soc,
-        }
-        return of.get(self.contender)
+    def figures(self) -> PublishedFigures:
+        """The paper's figures of this method, all None where it has no such method."""
+        row = self.published
+        of = {"staircase": row.se_sync, "gauss-seidel": row.dgs, "paper": row.soc}
+        return of.get(self.contender.value, PublishedFigures(None, None, None))
 
     @property
     def published_gap(self) -> float | None:
         """Gap of the paper's figure to its F*."""
-        figures, optimum = self.figures, self.published.se_sync.objective
-        if figures is None or figures.objective is None or optimum is None:
-            return None
-        return relative_gap(figures.objective, optimum)
+        objective, optimum = self.figures.objective, self.published.se_sync.objective
+        return None if objective is None or optimum is None else relative_gap(objective, optimum)
 
 
 @dataclass(frozen=True)
@@ -136,9 +130,8 @@ def reproduce_tables(
     many rounds as the paper's SOC took iterations, for both its stages. All other methods start on their own. One that
     fails on a graph leaves its reason there; Ctrl-C ends all with what was done until then.
 
-    `keep` is a JSON file that holds every figure from the moment it is there; what it holds already is not run again
-    unless `is_fresh`. `progress` shows a bar on stderr; where that is a terminal, unless given. A PGOError when the
-    file cannot be read or written.
+    `keep` is a JSON file of every figure from the moment it is there, not run again unless `is_fresh`; a PGOError when
+    it cannot be read or written. `progress` shows a bar on stderr; where that is a terminal, unless given.
 
     Examples
     --------
@@ -148,18 +141,14 @@ def reproduce_tables(
     """
     settings = settings if settings is not None else ReproductionSettings()
     kept = KeptResults(keep, is_fresh)
-    results = {row.name: _RowResults() for row in settings.rows}
-    is_complete = True
-    draws = sum(len(settings.seeds(row.name)) for row in settings.rows)
-    with JobBar(draws * len(TABLE_CONTENDERS), progress) as bar:
-        try:
-            for row in settings.rows:
-                for seed in settings.seeds(row.name):
-                    _one_graph(row, seed, settings, kept, results[row.name], bar)
-        except KeyboardInterrupt:
-            is_complete = False
-    rows = tuple(row for published in settings.rows for row in results[published.name].rows(published, settings))
-    return Reproduction(settings, rows, is_complete)
+    results, is_complete = [_RowResults(row, settings) for row in settings.rows], False
+    num_parts = sum(len(row.seeds) for row in results) * len(TABLE_CONTENDERS)
+    with JobBar(num_parts, progress) as bar, suppress(KeyboardInterrupt):
+        for row in results:
+            for seed in row.seeds:
+                row.draw(seed, kept, bar)
+        is_complete = True
+    return Reproduction(settings, tuple(one for row in results for one in row.rows()), is_complete)
 
 
 def graph_of_row(row: PublishedRow, seed: int, download: bool) -> PoseGraph:
@@ -170,18 +159,17 @@ def graph_of_row(row: PublishedRow, seed: int, download: bool) -> PoseGraph:
     if row.name in SCENES:
         return SCENES[row.name](np.random.default_rng(seed))
     graph = load(row.name, download=download)
-    if (graph.num_poses, graph.num_edges) != (row.num_poses, row.num_edges):
-        raise PGOError(
-            f"the {row.name} that is here has {graph.num_poses} poses and {graph.num_edges} edges, the paper's has "
-            f"{row.num_poses} and {row.num_edges}: it is another graph"
-        )
+    n, m, wanted = graph.num_poses, graph.num_edges, f"the paper's has {row.num_poses} and {row.num_edges}"
+    if (n, m) != (row.num_poses, row.num_edges):
+        raise PGOError(f"the {row.name} that is here has {n} poses and {m} edges, {wanted}: it is another graph")
     return graph
 
 
 class _RowResults:
-    """What has been found for one graph, over its draws."""
+    """What has been found for one row of the paper's tables, over its draws."""
 
-    def __init__(self) -> None:
+    def __init__(self, row: PublishedRow, settings: ReproductionSettings) -> None:
+        self.row, self.settings, self.seeds = row, settings, settings.seeds(row.name)
         self.optima: list[Optimum] = []
         self.cells: dict[BenchmarkMethod, list[TableEntry]] = {contender: [] for contender in TABLE_CONTENDERS}
         self.reasons: dict[BenchmarkMethod, list[str]] = {contender: [] for contender in TABLE_CONTENDERS}
@@ -192,40 +180,46 @@ class _RowResults:
             self.reasons[contender].append(reason)
             bar.end_part()
 
-    def rows(self, published: PublishedRow, settings: ReproductionSettings) -> Iterator[ReproducedRow]:
-        draws = len(settings.seeds(published.name))
+    def rows(self) -> Iterator[ReproducedRow]:
         for contender in TABLE_CONTENDERS:
             cells, reasons = tuple(self.cells[contender]), tuple(self.reasons[contender])
-            yield ReproducedRow(published, contender, draws, tuple(self.optima), cells, reasons)
+            yield ReproducedRow(self.row, contender, len(self.seeds), tuple(self.optima), cells, reasons)
 
+    def draw(self, seed: int, kept: KeptResults, bar: JobBar) -> None:
+        """Optimum and all cells of one draw; what was kept is taken, what fails leaves its reason."""
+        bar.name_part(f"{self.row.name}: certified optimum")
+        try:
+            graph = graph_of_row(self.row, seed, self.settings.download)
+        except FAILURES as error:
+            self.fail(reason_of(error), bar)
+            return
+        problem, name = PGOProblem(graph), f"{self.row.name} {seed} {graph_fingerprint(graph)}"
+        found = _found(kept, f"{name} optimum", partial(_optimum, problem))
+        if isinstance(found, str):
+            self.fail(found, bar)
+            return
+        self.optima.append(Optimum(**found))
+        robots = BenchmarkSettings(self.settings.num_robots).robots(graph)
+        for contender in TABLE_CONTENDERS:
+            bar.name_part(f"{self.row.name}: {contender.label}")
+            key = f"{name} {contender.value}, {robots.num_robots} robots {robots.method.name}"
+            cell = _found(kept, key, partial(self._cell, contender, problem, self.optima[-1].lower_bound))
+            if isinstance(cell, str):
+                self.reasons[contender].append(cell)
+            else:
+                self.cells[contender].append(TableEntry(**{**cell, "iterations": tuple(cell["iterations"])}))
+            bar.end_part()
 
-def _one_graph(
-    row: PublishedRow, seed: int, settings: ReproductionSettings, kept: KeptResults, results: _RowResults, bar: JobBar
-) -> None:
-    """Optimum and all cells of one draw of a row; what was kept is taken, what fails leaves its reason."""
-    bar.name_part(f"{row.name}: certified optimum")
-    try:
-        graph = graph_of_row(row, seed, settings.download)
-    except _FAILURES as error:
-        results.fail(_reason(error), bar)
-        return
-    problem, name = PGOProblem(graph), f"{row.name} {seed} {graph_fingerprint(graph)}"
-    found = _found(kept, f"{name} optimum", partial(_optimum, problem))
-    if isinstance(found, str):
-        results.fail(found, bar)
-        return
-    optimum = Optimum(**found)
-    results.optima.append(optimum)
-    robots = BenchmarkSettings(settings.num_robots).robots(graph)
-    for contender in TABLE_CONTENDERS:
-        bar.name_part(f"{row.name}: {contender.label}")
-        key = f"{name} {contender.value}, {robots.num_robots} robots {robots.method.name}"
-        cell = _found(kept, key, partial(_cell, contender, problem, row, settings, optimum))
-        if isinstance(cell, str):
-            results.reasons[contender].append(cell)
-        else:
-            results.cells[contender].append(TableEntry(**{**cell, "iterations": tuple(cell["iterations"])}))
-        bar.end_part()
+    def _cell(self, contender: BenchmarkMethod, problem: PGOProblem, bound: float) -> Entry:
+        allowed = BenchmarkSettings(self.settings.num_robots, self.row.soc.iterations)
+        is_placed = contender is BenchmarkMethod.PAPER and self.row.name in SCENES
+        trial = run_benchmark(contender, problem, allowed, problem.graph.initial if is_placed else None)
+        if not trial.is_answer or not np.isfinite(trial.objective):
+            raise PGOError(trial.remark)
+        first, gap = trial.first_objective, float(relative_gap(trial.objective, bound))
+        first_gap = None if first is None else float(relative_gap(first, bound))
+        effort = trial.iterations, trial.rounds, trial.num_bytes, trial.seconds, trial.seconds_per_robot
+        return asdict(TableEntry(float(trial.objective), gap, first_gap, *effort, trial.remark))
 
 
 def _found(kept: KeptResults, key: str, find: Callable[[], Entry]) -> Entry | str:
@@ -234,8 +228,8 @@ def _found(kept: KeptResults, key: str, find: Callable[[], Entry]) -> Entry | st
     if entry is None:
         try:
             entry = find()
-        except _FAILURES as error:
-            return _reason(error)
+        except FAILURES as error:
+            return reason_of(error)
         kept.add(key, entry)
     return entry
 
@@ -244,21 +238,3 @@ def _optimum(problem: PGOProblem) -> Entry:
     solution = solve_whole(problem)
     best = min(solution.objective, solution.certificate.poses_objective)
     return asdict(Optimum(float(best), float(solution.lower_bound)))
-
-
-def _cell(
-    contender: BenchmarkMethod, problem: PGOProblem, row: PublishedRow, settings: ReproductionSettings, optimum: Optimum
-) -> Entry:
-    allowed = BenchmarkSettings(settings.num_robots, row.soc.iterations)
-    start = problem.graph.initial if contender is BenchmarkMethod.PAPER and row.name in SCENES else None
-    trial = run_benchmark(contender, problem, allowed, start)
-    if not trial.is_answer or not np.isfinite(trial.objective):
-        raise PGOError(trial.remark)
-    first, gap = trial.first_objective, float(relative_gap(trial.objective, optimum.lower_bound))
-    first_gap = None if first is None else float(relative_gap(first, optimum.lower_bound))
-    effort = trial.iterations, trial.rounds, trial.num_bytes, trial.seconds, trial.seconds_per_robot
-    return asdict(TableEntry(float(trial.objective), gap, first_gap, *effort, trial.remark))
-
-
-def _reason(error: BaseException) -> str:
-    return str(error) or type(error).__name__

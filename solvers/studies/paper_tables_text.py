@@ -10,14 +10,9 @@ from solvers.reporting.result_table import ResultTable, TablePart, Value, gap_pe
 from solvers.studies.benchmark import BenchmarkMethod
 from solvers.studies.paper_tables import ReproducedRow, Reproduction, TableEntry
 
-_COST_HEADS = (
-    *("graph", "poses", "edges", "F*", "proven to (%)", "method", "F", "gap (%)", "after SOC alone (%)"),
-    *("paper: F", "paper: gap (%)", "remark"),
-)
-_EFFORT_HEADS = (
-    *("graph", "method", "iterations", "rounds", "paper: iterations", "seconds"),
-    *("seconds a robot", "paper: seconds"),
-)
+_GRAPH_HEADS = ("graph", "poses", "edges", "F*", "proven to (%)")
+_COST_HEADS = ("method", "F", "gap (%)", "after SOC alone (%)", "paper: F", "paper: gap (%)", "remark")
+_EFFORT_HEADS = ("method", "iterations", "rounds", "paper: iterations", "seconds", "seconds a robot", "paper: seconds")
 _WANTED_GAP = 1e-4
 _SAME = 1e-3  # a spread below this part of the mean is not shown
 
@@ -38,12 +33,9 @@ class Finding:
 
 def findings(tables: Reproduction) -> tuple[Finding, ...]:
     """Return what the tables should show, and on which of their rows they do; rows without figures are left out."""
+    reached = "SOC as in the paper is at or below the paper's F (on random scenes: its gap, every draw)"
     claims: list[tuple[str, Callable[[ReproducedRow], bool | None]]] = [
-        (
-            "SOC as in the paper is at or below the paper's F (on random scenes: its gap, every draw) within the "
-            "paper's iterations",
-            _reaches_the_paper,
-        ),
+        (f"{reached} within the paper's iterations", _reaches_the_paper),
         ("SOC consensus and its second stage end within 0.01 % of the optimum", _is_within_the_wanted_gap),
         ("SOC consensus takes fewer rounds than the paper's SOC took iterations", _takes_fewer_rounds),
         ("DGS has a finite answer where the paper has none", _answers_where_the_paper_has_none),
@@ -81,26 +73,22 @@ def tables_as_text(tables: Reproduction) -> ResultTable:
             f"circle, grid and sphere: mean +- standard deviation over {tables.settings.num_seeds} draws; the paper's "
             "figures are of one draw of its own, so that gaps compare, and costs do not"
         )
-    notes.append(
+    notes += [
         "F*: certified optimum; gap: of F to the lower bound that is proven with it, over F; iterations: of the stages "
-        "in turn; rounds: all exchanges, chordal start and second stage included; seconds a robot: side by side"
-    )
-    notes.append(
+        "in turn; rounds: all exchanges, chordal start and second stage included; seconds a robot: side by side",
         "SOC as in the paper has the paper's iterations as rounds: at most half for its first stage, the rest for "
-        "Gauss-Newton, which the paper names as its second layer without saying how far it runs"
-    )
+        "Gauss-Newton, which the paper names as its second layer without saying how far it runs",
+    ]
     if not tables.is_complete:
         notes.append("interrupted: the same command goes on where it was")
-    parts = (
-        TablePart(_COST_HEADS, tuple(costs), "Cost (tables 1 and 3 of the paper)"),
-        TablePart(_EFFORT_HEADS, tuple(efforts), "Effort (tables 2 and 4 of the paper)"),
-    )
-    return ResultTable(parts, tuple(map(_record, tables.rows)), tuple(notes))
+    cost = TablePart((*_GRAPH_HEADS, *_COST_HEADS), tuple(costs), "Cost (tables 1 and 3 of the paper)")
+    effort = TablePart(("graph", *_EFFORT_HEADS), tuple(efforts), "Effort (tables 2 and 4 of the paper)")
+    return ResultTable((cost, effort), tuple(map(_record, tables.rows)), tuple(notes))
 
 
 def _reaches_the_paper(row: ReproducedRow) -> bool | None:
     figures, gap = row.figures, row.published_gap
-    if row.contender is not BenchmarkMethod.PAPER or figures is None or figures.objective is None or gap is None:
+    if row.contender is not BenchmarkMethod.PAPER or figures.objective is None or gap is None:
         return None
     rounds = [cell.rounds for cell in row.cells if cell.rounds is not None]
     is_in_time = figures.iterations is None or max(rounds, default=0) <= figures.iterations
@@ -110,9 +98,8 @@ def _reaches_the_paper(row: ReproducedRow) -> bool | None:
 
 
 def _is_within_the_wanted_gap(row: ReproducedRow) -> bool | None:
-    if row.contender is not BenchmarkMethod.CONSENSUS:
-        return None
-    return max(cell.gap for cell in row.cells) < _WANTED_GAP
+    is_ours = row.contender is BenchmarkMethod.CONSENSUS
+    return max(cell.gap for cell in row.cells) < _WANTED_GAP if is_ours else None
 
 
 def _takes_fewer_rounds(row: ReproducedRow) -> bool | None:
@@ -136,34 +123,21 @@ def _graph_cells(row: ReproducedRow) -> tuple[str, ...]:
 
 
 def _cost_cells(row: ReproducedRow) -> tuple[str, ...]:
-    cells = row.cells
-    return (
-        row.contender.label,
-        _spread([cell.objective for cell in cells], 8),
-        _gaps([cell.gap for cell in cells]),
-        _gaps([cell.first_gap for cell in cells if cell.first_gap is not None]),
-    )
+    objectives, gaps = [cell.objective for cell in row.cells], [cell.gap for cell in row.cells]
+    first_gaps = [cell.first_gap for cell in row.cells if cell.first_gap is not None]
+    return row.contender.label, _spread(objectives, 8), _gaps(gaps), _gaps(first_gaps)
 
 
 def _paper_cost_cells(row: ReproducedRow) -> tuple[str, ...]:
-    figures, gap = row.figures, row.published_gap
-    return (
-        "-" if figures is None or figures.objective is None else f"{figures.objective:.8g}",
-        "-" if gap is None or row.contender is BenchmarkMethod.STAIRCASE else gap_percent(gap),
-    )
+    objective, gap = row.figures.objective, None if row.contender is BenchmarkMethod.STAIRCASE else row.published_gap
+    return "-" if objective is None else f"{objective:.8g}", "-" if gap is None else gap_percent(gap)
 
 
 def _effort_cells(row: ReproducedRow) -> tuple[str, ...]:
-    figures, cells = row.figures, row.cells
-    return (
-        row.contender.label,
-        _iterations(cells),
-        _spread([float(cell.rounds) for cell in cells if cell.rounds is not None], 8),
-        "-" if figures is None or figures.iterations is None else str(figures.iterations),
-        _seconds([cell.seconds for cell in cells]),
-        _seconds([cell.seconds_per_robot for cell in cells]),
-        "-" if figures is None or figures.seconds is None else f"{figures.seconds:g}",
-    )
+    paper, rounds = row.figures, [float(cell.rounds) for cell in row.cells if cell.rounds is not None]
+    iterations = _iterations(row.cells), _spread(rounds, 8), "-" if paper.iterations is None else str(paper.iterations)
+    each = _seconds([cell.seconds for cell in row.cells]), _seconds([cell.seconds_per_robot for cell in row.cells])
+    return row.contender.label, *iterations, *each, "-" if paper.seconds is None else f"{paper.seconds:g}"
 
 
 def _remark(row: ReproducedRow) -> str:
@@ -244,10 +218,10 @@ def _record(row: ReproducedRow) -> dict[str, Value]:
         "bytes": _mean([cell.num_bytes for cell in cells if cell.num_bytes is not None]),
         "seconds": _mean([cell.seconds for cell in cells]),
         "seconds_per_robot": _mean([cell.seconds_per_robot for cell in cells]),
-        "paper_objective": None if figures is None else figures.objective,
+        "paper_objective": figures.objective,
         "paper_optimum": published.se_sync.objective,
         "paper_gap": row.published_gap,
-        "paper_iterations": None if figures is None else figures.iterations,
-        "paper_seconds": None if figures is None else figures.seconds,
+        "paper_iterations": figures.iterations,
+        "paper_seconds": figures.seconds,
         "remark": _remark(row),
     }

@@ -59,8 +59,7 @@ def noisy_scene(scene: SweptScene, rotation_std: float, rng: np.random.Generator
 def noise_sweep(scene: SweptScene, rotation_std: Array, graphs: int, rng: np.random.Generator) -> NoiseSweep:
     """Solve and certify `graphs` random graphs at every noise level.
 
-    `rotation_std`, (levels,), are standard deviations in radians. A SettingError when they are not positive and
-    ascending, or graphs is not positive.
+    `rotation_std`, (levels,), in radians; a SettingError unless positive and ascending, or when graphs is not positive.
 
     Examples
     --------

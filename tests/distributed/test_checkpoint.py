@@ -332,9 +332,7 @@ def test_a_killed_process_goes_on_where_it_was(tmp_path):
         [*PGO, "solve", "circle", *options], env=environment, capture_output=True, text=True, check=False
     )
     assert (second.returncode, second.stdout) == (1, "")
-    assert second.stderr == (
-        f"pgo: {path} is in use by another run; wait until that has ended, or choose another name\n"
-    )
+    assert second.stderr == (f"pgo: {path} is in use by another run; wait until that has ended, or name another\n")
     assert process.poll() is None
     os.kill(process.pid, signal.SIGKILL)
     process.wait()

@@ -155,9 +155,8 @@ class HeldFront:
         """Sum the parts and factor; F_BB - L_BE L_BE^T, packed. A NotPositiveDefiniteError where F_EE is not."""
         width, fields = sum(order.widths), np.split(np.arange(sum(order.widths)), np.cumsum(order.widths)[:-1])
         kinds = [fields] * self.num_robots + [[np.arange(width)]] * (len(self.places) - self.num_robots)
-        each = [
-            [(width * at[:, None] + one).ravel() for one in kind] for at, kind in zip(self.places, kinds, strict=True)
-        ]
+        places = zip(self.places, kinds, strict=True)
+        each = [[(width * at[:, None] + one).ravel() for one in kind] for at, kind in places]
         rows, e = tuple(map(np.concatenate, each)), width * self.num_eliminated
         F = np.zeros((width * self.num_separators, width * self.num_separators))
         for at, part in zip(rows, order.parts, strict=True):
