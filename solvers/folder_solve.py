@@ -28,14 +28,15 @@ from pgo_models.graphs.measurements import IntArray
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.lower_bound import best_bound_distributed
 from solvers.distributed.own_files import READ_HERE, Answer, keep_answer, open_files, write_answer
-from solvers.distributed.stages import refine, start_robots
+from solvers.distributed.stages import climb_distributed, refine, start_robots
 from solvers.loop import Watch
 from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine, InProcess
 from solvers.network.ledger import Ledger
 from solvers.network.ray_engine import RayEngine
 from solvers.pipeline import Pipeline, finer
-from solvers.result import Record, Stage, Status
+from solvers.result import OUT_OF_TIME, Record, Stage, Status
+from solvers.riemannian.staircase import Staircase
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
 
@@ -50,7 +51,6 @@ class FolderSolution:
     stages: tuple[Stage, ...]
     ledger: Ledger
     frame: str  # of the poses that were written
-    note: str  # what the certificate lacks, and why, or empty
     seconds: float
 
     @property
@@ -64,7 +64,6 @@ class FolderSolution:
             ("graph", f"{self.name}: {poses.sum()} poses, {edges.sum()} edges, {self.certificate.poses.d}D"),
             ("status", f"{self.status.name}: {self.status.value}"),
             *self.certificate.facts(),
-            ("note", self.note),
             ("frame", self.frame),
             ("seconds", f"{self.seconds:.3g}"),
             ("robots", f"{len(poses)}, {poses.min()} to {poses.max()} poses each, as their own files have them"),
@@ -88,10 +87,10 @@ def solve_folder(
     """Solve and certify F of a folder with one g2o file a robot, of which every robot reads its own, and nobody more.
 
     A pose belongs to the first file with a VERTEX line of it, else to the first that names it; an edge between two
-    robots may stand in the file of either, or of both. Start, SOC, Newton and certificate are those of
-    `solve(.., robots=..)`, but for the staircase, which is left out and said so. CONSENSUS, robust losses, chi2,
-    priors, landmarks and checkpoints take `solve`. A lost robot reads its file again, and is told all that it had been
-    told. The frame is that of the first pose with a FIX line, or else the first of all, where its file has it.
+    robots may stand in the file of either, or of both. Start, SOC, Newton, certificate and staircase are those of
+    `solve(.., robots=..)`. CONSENSUS, robust losses, chi2, priors, landmarks and checkpoints take `solve`. A lost robot
+    reads its file again, and is told all that it had been told. The frame is that of the first pose with a FIX line, or
+    else the first of all, where its file has it.
 
     `folder` is its path, on every machine where robots run, or its name as of `load`; the calling process reads none of
     it. Robots run where `engine` says, a `RayEngine`, or in this process. To the folder `out`, there, every robot
@@ -119,33 +118,37 @@ def solve_folder(
     driver, sizes = open_files(files, engine if engine is not None else InProcess(), pipeline.driver_memory)
     nowhere = Poses(np.zeros((0, driver.d, driver.d)), np.zeros((0, driver.d)))
     with closing(driver), closing(Journal(None, {}, stages)) as journal:
-        for is_second in (False, True)[: 1 + pipeline.second_try]:
-            if is_second:
-                soc = finer(soc if soc is not None else SOC())
+        tries = [soc, finer(soc or SOC())][: 1 + pipeline.second_try]
+        for attempt in (*tries, *([pipeline.staircase] if pipeline.staircase is not None else [])):
+            is_climb = isinstance(attempt, Staircase)
+            if stages and (stages[-1].status in OUT_OF_TIME if is_climb else not stages[-1].status.is_success):
+                continue
+            relaxed = NO_BOUND
             try:
-                stages.append(start_robots(driver, None))
-                last = refine(driver, pipeline.newton, None, journal, watch, soc)
-                bound = max(bound, best_bound_distributed(driver, gap), key=lambda found: found.value)
+                if isinstance(attempt, Staircase):
+                    last, dual = climb_distributed(driver, replace(attempt, gap=gap), pipeline.newton, watch, stages)
+                    relaxed = dual.bound
+                else:
+                    stages.append(start_robots(driver, None))
+                    last = refine(driver, pipeline.newton, journal, watch, attempt)
+                bound = max(bound, best_bound_distributed(driver, gap), relaxed, key=lambda found: found.value)
+                source = BoundSource.RELAXATION if bound is relaxed else BoundSource.GIVEN
             except NotPositiveDefiniteError as error:
                 raise PGOError(f"{folder}: weights too far apart for doubles ({error}); see pgo info FILE") from error
             if driver.at.objective < F or not answers:
                 answers = driver.network.ask(keep_answer, driver.poses_of_cover(), Count.ROUND)
                 F, decrement = driver.at.objective, last
                 rounding = ObjectiveRounding(driver.at.rounding_level, math.fsum(answer.error for answer in answers))
-            found = Certificate(
-                *(F, bound, math.nan, rounding.level, decrement, BoundSource.GIVEN, nowhere, F, nowhere.R, gap),
-                Verdict.TRIVIAL,
-            )
+            figures = F, bound, math.nan, rounding.level, decrement, source
+            found = Certificate(*figures, nowhere, F, nowhere.R, gap, Verdict.TRIVIAL)
             certificate = judge_cost(folder.name, found, F, rounding)
-            if not (certificate.can_improve and stages[-1].status.is_success):
+            if not certificate.can_improve:
                 break
         turn, shift, frame = _frame(answers)
         if out is not None:
             to = partial(write_answer, Path(out).absolute())
             driver.network.ask(to, [(turn, shift)] * len(files), Count.ROUND)
-    needs_more = pipeline.staircase is not None and certificate.can_improve
-    note = f"the staircase was left out, which takes the whole graph in one process; {READ_HERE}" if needs_more else ""
-    told = tuple(stages), driver.network.ledger, frame, note, time.perf_counter() - watch.began
+    told = tuple(stages), driver.network.ledger, frame, time.perf_counter() - watch.began
     return FolderSolution(folder.name, certificate, sizes, *told)
 
 

@@ -31,11 +31,11 @@ from pgo_models.graphs.partitioning import Partition, partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem, as_problem
-from solvers.distributed.checkpoint import Checkpoint, Journal, run_fingerprint
-from solvers.distributed.driver import DEFAULT_MEMORY
+from solvers.distributed.checkpoint import Attempt, Checkpoint, Journal, run_fingerprint
+from solvers.distributed.driver import DEFAULT_MEMORY, Driver
 from solvers.distributed.leaderless import NO_CERTIFICATE, attempt_leaderless
 from solvers.distributed.robust import estimate_by_robots
-from solvers.distributed.stages import attempt_distributed, collect, open_driver
+from solvers.distributed.stages import attempt_distributed, climb_distributed, collect, judge_collected, open_driver
 from solvers.explanations import note_of_weights
 from solvers.loop import Watch
 from solvers.network.engine import Engine, InProcess
@@ -89,9 +89,7 @@ class Pipeline:
         if not self.driver_memory >= 0:
             raise SettingError(f"driver_memory must not be negative, got {self.driver_memory}; 0 is no driver")
         if self.driver_memory == 0 and not is_consensus:
-            raise SettingError(
-                "without a driver there is CONSENSUS alone; use SOC(robots=.., ..), or give driver_memory"
-            )
+            raise SettingError("without a driver there is CONSENSUS alone; use SOC(robots=..), or give driver_memory")
 
 
 def solve(
@@ -191,9 +189,7 @@ def solve(
         pipeline = replace(pipeline, second_try=False, staircase=None)
     if robust is not None:
         if checkpoint is not None or pipeline.driver_memory == 0:
-            raise SettingError(
-                "a robust solve needs the driver, and writes no checkpoint; leave out the one or the other"
-            )
+            raise SettingError("a robust solve needs a driver, and writes no checkpoint; leave out one of the two")
         few, short = replace(pipeline.newton, max_iterations=_FEW), replace(pipeline, soc=None, second_try=False)
         plain = partial(shown, pipeline=replace(short, newton=few, staircase=None))
         shared = None
@@ -206,7 +202,7 @@ def solve(
     ledger = None
     if robots is None:
         try:
-            poses, certificate = job.tries(job.attempt, start)
+            poses, certificate = job.improve(*job.tries(job.attempt, start))
         except KeyboardInterrupt:  # between the loops, which answer it themselves
             if not watch.found:
                 raise
@@ -232,16 +228,10 @@ def solve(
                     raise
                 watch.found.append(collect(driver)[0])
                 poses, certificate = job.broken_off()
+            poses, certificate = job.improve(poses, certificate, driver)
             if job.stages[-1].status.is_success:
                 journal.end()
         ledger = driver.network.ledger
-    if pipeline.staircase is not None and certificate.can_improve and job.stages[-1].status not in OUT_OF_TIME:
-        try:
-            if problem.is_quadratic:
-                poses, certificate = job.climb(pipeline.staircase, poses, certificate)
-            certificate = soften(problem, certificate)
-        except KeyboardInterrupt:
-            job.interrupt(problem.objective(poses))
     poses, frame, held = framed(poses, problem.graph, anchor)
     return Solution(
         problem=problem,
@@ -283,11 +273,7 @@ class _Job:
     watch: Watch
     stages: list[Stage] = field(default_factory=list)
 
-    def tries(
-        self,
-        attempt: Callable[[SOC | PaperSOC | None, Poses | None], tuple[Poses, Certificate]],
-        start: Poses | None,
-    ) -> tuple[Poses, Certificate]:
+    def tries(self, attempt: Callable[[SOC | PaperSOC | None, Poses | None], Attempt], start: Poses | None) -> Attempt:
         """One attempt, and where its certificate is wider than asked for a second one.
 
         That is with a finer SOC, or, of a cost that is not quadratic, from the optimum of F.
@@ -302,7 +288,7 @@ class _Job:
             poses, certificate = _better(self.problem, poses, certificate, attempt(fine, None)[1])
         return poses, certificate
 
-    def attempt(self, soc: SOC | PaperSOC | None, start: Poses | None) -> tuple[Poses, Certificate]:
+    def attempt(self, soc: SOC | PaperSOC | None, start: Poses | None) -> Attempt:
         """SOC, Newton and certificate from a start; the first on the convex part of chi2 where that is not convex."""
         began, first_problem = time.perf_counter(), self.problem.convex_part
         no_nearer = first_problem is not self.problem  # the minimum of chi2's convex part, than the chordal start
@@ -328,7 +314,7 @@ class _Job:
             del first  # its factor is the next one's to take over
         return self.polish(poses)
 
-    def polish(self, poses: Poses) -> tuple[Poses, Certificate]:
+    def polish(self, poses: Poses) -> Attempt:
         """Newton, unless the stage before was cut short, and certificate."""
         decrement = math.inf
         if self.stages[-1].status not in OUT_OF_TIME:
@@ -339,24 +325,42 @@ class _Job:
         with self.watch.showing("certificate", self.problem):
             return poses, certify_at(self.problem, poses, self.pipeline.gap, decrement)
 
-    def climb(self, staircase: Staircase, poses: Poses, certificate: Certificate) -> tuple[Poses, Certificate]:
+    def improve(self, poses: Poses, certificate: Certificate, driver: Driver | None = None) -> Attempt:
+        """Staircase, in one place or by a driver and robots, where the certificate can still improve."""
+        staircase, problem = self.pipeline.staircase, self.problem
+        if staircase is None or not certificate.can_improve or self.stages[-1].status in OUT_OF_TIME:
+            return poses, certificate
+        try:
+            if problem.is_quadratic:
+                poses, certificate = self.climb(replace(staircase, gap=self.pipeline.gap), poses, certificate, driver)
+            certificate = soften(problem, certificate)
+        except KeyboardInterrupt:
+            self.interrupt(problem.objective(poses))
+        return poses, certificate
+
+    def climb(self, staircase: Staircase, poses: Poses, certificate: Certificate, driver: Driver | None) -> Attempt:
         """Staircase from the best poses, Newton from what it rounds to, and the relaxation's bound if still needed."""
         problem, gap = self.problem, self.pipeline.gap
-        bounds: list[DualBound | None] = []
-        # Of a run that was cut short the state with the best poses is kept, not the one with the best bound.
-        watching = replace(self.watch, callback=lambda state, record: bounds.append(state.bound))
-        climb = watching.run(replace(staircase, gap=gap), problem, poses)
-        self.stages.append(Stage.of(climb))
-        poses, certificate = _better(problem, poses, certificate, self.polish(climb.poses)[1])
-        bound = bounds[-1] if bounds else None
+        bound: DualBound | None
+        if driver is not None:
+            driver.set_poses(poses)
+            decrement, bound = climb_distributed(driver, staircase, self.pipeline.newton, self.watch, self.stages)
+            other = judge_collected(driver, problem, gap, decrement)[1]
+        else:
+            bounds: list[DualBound | None] = [None]
+            # Of a run that was cut short the state with the best poses is kept, not the one with the best bound.
+            watching = replace(self.watch, callback=lambda state, record: bounds.append(state.bound))
+            climb = watching.run(staircase, problem, poses)
+            self.stages.append(Stage.of(climb))
+            other, bound = self.polish(climb.poses)[1], bounds[-1]
+        poses, certificate = _better(problem, poses, certificate, other)
         if bound is not None and not certificate.is_certified:
-            relaxed = certify_with(
-                problem, poses, bound.Lambda, gap, certificate.stationarity, BoundSource.RELAXATION, bound.bound
-            )
+            found = gap, certificate.stationarity, BoundSource.RELAXATION, bound.bound
+            relaxed = certify_with(problem, poses, bound.Lambda, *found)
             certificate = max(certificate, relaxed, key=lambda found: found.lower_bound)
         return poses, certificate
 
-    def broken_off(self) -> tuple[Poses, Certificate]:
+    def broken_off(self) -> Attempt:
         """Best poses found before an interruption, with the bound 0, which needs no proof."""
         poses = min(self.watch.found, key=self.problem.objective)
         self.interrupt(self.problem.objective(poses))
@@ -373,9 +377,7 @@ def finer(soc: AnySOC) -> AnySOC:
     return replace(soc, tolerance=min(soc.tolerance, _SECOND_TRY_TOLERANCE), max_iterations=SOC.max_iterations)
 
 
-def _better(
-    problem: PGOProblem, poses: Poses, certificate: Certificate, other: Certificate
-) -> tuple[Poses, Certificate]:
+def _better(problem: PGOProblem, poses: Poses, certificate: Certificate, other: Certificate) -> Attempt:
     """The better of `poses`, which `certificate` judges, and the poses of `other`, held against the better bound."""
     stationarity = certificate.stationarity
     if other.poses_objective < certificate.objective:

@@ -16,18 +16,14 @@ import numpy as np
 
 from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import (
-    Array,
-    project_to_rotations,
-    stack_transposes,
-    tangent_dimension,
-    unstack_transposes,
-)
+from pgo_models.geometry.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.matrices import columns_of
+from pgo_models.relaxations.low_rank import poses_from, tangent_widths
 from solvers.distributed.interface import Interface
 from solvers.distributed.multifrontal import FrontOwners
 from solvers.distributed.robots.agent import order_interior
+from solvers.distributed.robots.elimination import Widths
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import CostParts, ReducedTranslations, Reweigh, RightHandSide
 from solvers.distributed.robots.reweighting import reweigh
@@ -42,6 +38,7 @@ from solvers.soc.subgraph import Outline
 DEFAULT_MEMORY = 4e9
 Q = TypeVar("Q")
 A = TypeVar("A")
+Order = Callable[[Interior, Q], tuple[Interior, A]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +54,8 @@ class CoverPoses:
     @property
     def multipliers(self) -> Array:
         """Lambda_i of the cover, (g, d, d)."""
-        g, d = self.t.shape
-        product = self.force[g:].reshape(g, d, d) @ self.R
+        g, _, d = self.R.shape
+        product = self.force[g:].reshape(g, d, -1) @ self.R
         return 0.5 * (product + np.swapaxes(product, 1, 2))
 
 
@@ -95,19 +92,18 @@ class Driver:
         self.cover: IntArray = np.zeros(len(np.unique(place)), dtype=np.int64)
         self.cover[place] = np.concatenate([robot.cover for robot in outlines])
         g, d = len(self.cover), self.d
-        self.tangent = (d, tangent_dimension(d))
         touched = tuple(robot.touched for robot in outlines if robot.touched is not None)
-        kinds: tuple[tuple[int, ...], ...] = ((1,), (d,), (1, d), self.tangent)
         fronts = FrontOwners(touched if memory else (), g)
-        self._interfaces = {widths: Interface(g, widths, touched, fronts) for widths in kinds}
+        self.memory, self._any_widths = memory, Interface(g, (), touched, fronts)
+        self._interfaces: dict[Widths, Interface] = {}
+        R = np.broadcast_to(np.eye(d), (g, d, d)).copy()
+        self.at = self.kept = CoverPoses(R, np.zeros((g, d)), np.zeros(((d + 1) * g, d)))
         if memory:
-            self._interfaces[self.tangent].check_memory(memory)
+            self.interface(*self.tangent).check_memory(memory)
         self._held_cover = [robot.in_cover for robot in outlines]
         self._parts = [robot.part for robot in outlines if robot.touched is not None]
         self.has_whole = all(robot.part is not None for robot in outlines)  # the process has the graph, too
         self.robots = np.array([robot.robot for robot in outlines if robot.touched is not None])
-        R = np.broadcast_to(np.eye(d), (g, d, d)).copy()
-        self.at = self.kept = CoverPoses(R, np.zeros((g, d)), np.zeros(((d + 1) * g, d)))
         self.block: RecursionBlock | None = None  # rotations of the cover in SOC's recursion
         self.right: list[RightHandSide] = []  # the robots', for its next step (a)
         self._has_two_costs = any(robot.has_two_costs for robot in outlines)
@@ -118,18 +114,12 @@ class Driver:
         fronts.hand_out(self.network, self.robots)
         self.describe(Count.OFF)
 
-    def ask(
-        self, order: Callable[[Interior, Q], tuple[Interior, A]], request: Q, count: Count = Count.ROUND
-    ) -> list[A]:
+    def ask(self, order: Order[Q, A], request: Q, count: Count = Count.ROUND) -> list[A]:
         """Answers of all interiors to an order with one request."""
         return self.ask_each(order, [request] * len(self.robots), count)
 
     def ask_each(
-        self,
-        order: Callable[[Interior, Q], tuple[Interior, A]],
-        requests: Sequence[Q],
-        count: Count = Count.ROUND,
-        is_along: bool = False,
+        self, order: Order[Q, A], requests: Sequence[Q], count: Count = Count.ROUND, is_along: bool = False
     ) -> list[A]:
         """Answers of all interiors to an order, each with its request, of a solve along the tree or of the driver."""
         to_all: list[Q | None] = [None] * self.network.ledger.num_robots
@@ -162,7 +152,18 @@ class Driver:
 
     def interface(self, *widths: int) -> Interface:
         """Interface of unknowns with so many numbers a pose, field by field."""
+        if widths not in self._interfaces:
+            self._interfaces[widths] = replace(self._any_widths, widths=widths)
         return self._interfaces[widths]
+
+    @property
+    def tangent(self) -> tuple[int, int]:
+        """Widths of the tangent space at the poses at hand."""
+        return tangent_widths(self.at.R)
+
+    def fits(self, rank: int) -> bool:
+        """Whether the interface of poses of a rank is within the memory allowed."""
+        return self.interface(*tangent_widths(np.zeros((0, rank, self.d)))).num_bytes <= self.memory
 
     def measured(self, measurement: Measurement) -> Measurement:
         """Figures of an iterate, with the account so far."""
@@ -233,16 +234,14 @@ class Driver:
 
     def hand_out(self, poses: Poses) -> None:
         """Give driver and robots all poses, as they are; a GraphError when they are not of the graph's size."""
-        if poses.t.shape != (self.num_poses, self.d):
-            raise GraphError(
-                f"{poses} for {self.num_poses} poses in {self.d}D; give one pose for every pose of the graph"
-            )
+        if (poses.num_poses, poses.d) != (self.num_poses, self.d):
+            raise GraphError(f"{poses} for {self.num_poses} poses in {self.d}D; give one pose for every pose there")
         self.at = replace(self.at, R=poses.R[self.cover], t=poses.t[self.cover])
         self.ask_each(Interior.set_poses, [poses[part] for part in self._parts if part is not None], Count.OFF)
 
     def poses_of_cover(self) -> list[Poses]:
         """What every robot is sent of the cover's poses that it holds."""
-        return [Poses(self.at.R[held], self.at.t[held]) for held in self._held_cover]
+        return [poses_from(self.at.R[held], self.at.t[held]) for held in self._held_cover]
 
     def save_poses(self) -> None:
         """Remember the poses at hand, here and on the robots."""

@@ -61,7 +61,7 @@ def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
 
 def prove_with_eta(driver: Driver, eta: float) -> LowerBound | None:
     """Bound tr(Lambda) - eta n d if S + eta blockdiag(0, I) without a translation is positive definite: one round."""
-    proof = _eliminate(driver, driver.ground(1).ravel(), eta, central.UNGROUNDED_SHIFT)
+    proof = eliminate_S(driver, driver.ground(1).ravel(), eta, central.UNGROUNDED_SHIFT)
     if proof is None:
         return None
     lost = eta * driver.num_poses * driver.d
@@ -80,7 +80,7 @@ def prove_grounded(driver: Driver, eta: float) -> LowerBound | None:
     while proof is None:
         if share < LEAST_SHIFT:
             return None
-        proof = _eliminate(driver, fixed, eta, share, X)
+        proof = eliminate_S(driver, fixed, eta, share, X)
         share *= SHRINK
     start = X
     free = np.ones(len(X), dtype=bool)
@@ -125,7 +125,7 @@ def _sum_up(driver: Driver, proof: InterfaceProof, X: Array, steps: Sequence[Pro
     return ProofSums(value, OUTWARD * value_error, left, OUTWARD * quadratic, apart, own, error)
 
 
-def _eliminate(
+def eliminate_S(
     driver: Driver, fixed: IntArray, eta: float, share: float, X: Array | None = None
 ) -> InterfaceProof | None:
     """One elimination of S + eta blockdiag(0, I) less a share of its diagonal; None when it is not shown definite."""

@@ -2,16 +2,16 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pgo_models.certificates import newton_polish as central
 from pgo_models.errors import NotPositiveDefiniteError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.hessian import TangentLayout
+from pgo_models.relaxations.low_rank import LiftedPoses, move_poses, poses_from
 from solvers.distributed.driver import CoverPoses, Driver
 from solvers.distributed.interface import Interface
 from solvers.distributed.robots.interior import Interior
@@ -19,6 +19,8 @@ from solvers.distributed.robots.records import ModelOrder, Move, Reduced, RightH
 from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Status
 from solvers.riemannian.newton import Newton
+
+_FIRST_ETA, _SHRINK, _GROWTH = 1e-3, 0.25, 4.0  # of F / (n d), of the last one, and in turn
 
 
 @dataclass(frozen=True)
@@ -31,13 +33,15 @@ class SubstructuredNewtonState:
     moved: bool = True
     is_at_rounding: bool = False
     tolerance: float = central.STATIONARY_DECREMENT
+    eta: float = 0.0  # last one that was added to S
+    is_convex: bool = True  # whether the last step needed none
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
     """A factored model at the poses at hand, Newton's or another, and the solution y = H^-1 g on the cover."""
 
-    is_newton: bool
+    order: ModelOrder
     factor: Interface
     y: Array
     parts: list[Array]  # of y, at every robot
@@ -46,9 +50,14 @@ class Model:
 
 @dataclass(frozen=True)
 class SubstructuredNewton:
-    """Newton by a driver and its robots, from the poses that they hold; `newton` has the settings."""
+    """Newton by a driver and its robots, from the poses that they hold; `newton` has the settings.
+
+    Where the Hessian is not positive definite it is that of S + eta blockdiag(0, I), with a small eta that makes it so,
+    if the model `is_shifted`, which follows negative curvature; else the damped Gauss-Newton matrix.
+    """
 
     newton: Newton = field(default_factory=Newton)
+    is_shifted: bool = False
 
     @property
     def max_iterations(self) -> int:
@@ -61,7 +70,7 @@ class SubstructuredNewton:
 
     def step(self, driver: Driver, state: SubstructuredNewtonState) -> SubstructuredNewtonState:
         """One factorisation and the moves it serves, two rounds each."""
-        model = self._factorize(driver)
+        model = self._factorize(driver, state.eta)
         at_rounding = False
         decrement = central.scaled_decrement(model.square, driver.at.objective, driver.at.rounding_level)
         moved, tolerance = False, central.STATIONARY_FOR_TANGENTS if driver.is_final else central.STATIONARY_DECREMENT
@@ -73,9 +82,9 @@ class SubstructuredNewton:
                 break
             trial, answers = found
             gradients = [answer.gradient for answer in answers]
-            following = _solved(model.is_newton, model.factor, gradients)
+            following = _solved(model.order, model.factor, gradients)
             after = central.scaled_decrement(following.square, trial.objective, trial.rounding_level)
-            at_rounding = central.reached_rounding(decrement, after, model.is_newton and not moved)
+            at_rounding = central.reached_rounding(decrement, after, model.order.is_newton and not moved)
             if trial.objective >= driver.at.objective and after > 0.5 * decrement:
                 break
             driver.ask(Interior.accept, None, Count.PIGGYBACKED)
@@ -84,7 +93,8 @@ class SubstructuredNewton:
             model, decrement, moved = following, after, True
             if not enough:
                 break
-        return SubstructuredNewtonState(state.k + 1, driver.at.objective, decrement, moved, at_rounding, tolerance)
+        figures = driver.at.objective, decrement, moved, at_rounding, tolerance, model.order.eta or state.eta
+        return SubstructuredNewtonState(state.k + 1, *figures, not model.order.eta)
 
     def measure(self, driver: Driver, state: SubstructuredNewtonState) -> Measurement:
         """F and the relative decrement."""
@@ -97,69 +107,71 @@ class SubstructuredNewton:
             return Status.CONVERGED
         return None if state.moved else Status.STALLED
 
-    def _factorize(self, driver: Driver) -> Model:
-        """Factor the Hessian if it is positive definite, else the Gauss-Newton matrix with the least damping."""
-        second_order, damping = self.newton.second_order, 0.0
-        while (model := model_at(driver, second_order, damping)) is None:
-            damping = 0.0 if second_order else max(central.DAMPING_START, central.DAMPING_GROWTH * damping)
-            second_order = False
-            if damping > central.DAMPING_MAX:
+    def _factorize(self, driver: Driver, eta: float) -> Model:
+        """Factor the Hessian if it is positive definite, else with the least shift or damping; `eta` was the last."""
+        order = ModelOrder(self.newton.second_order, 0.0)
+        first = _SHRINK * eta or _FIRST_ETA * driver.at.objective / (driver.num_poses * driver.d)
+        while (model := model_at(driver, order)) is None:
+            if self.is_shifted:
+                order = replace(order, eta=max(first, _GROWTH * order.eta))
+            elif order.second_order:
+                order = replace(order, second_order=False)
+            else:
+                order = replace(order, damping=max(central.DAMPING_START, central.DAMPING_GROWTH * order.damping))
+            if order.damping > central.DAMPING_MAX or math.isinf(order.eta):
                 raise NotPositiveDefiniteError("the damped Gauss-Newton matrix is not positive definite")
         return model
 
 
-def model_at(driver: Driver, second_order: bool, damping: float) -> Model | None:
+def model_at(driver: Driver, order: ModelOrder) -> Model | None:
     """Model at the poses at hand; None when a robot's interior, or the sum, is not positive definite."""
-    answers = driver.ask(Interior.model, ModelOrder(second_order, damping), Count.PIGGYBACKED)
+    answers = driver.ask(Interior.model, order, Count.PIGGYBACKED)
     reduced = [answer for answer in answers if answer is not None]
     if len(reduced) < len(answers):
         return None
     interface = driver.interface(*driver.tangent)
     try:
-        own = _own(driver, reduced, second_order, damping)
+        own = _own(driver, reduced, order)
         factor = interface.factorize([answer.schur for answer in reduced], own)
     except NotPositiveDefiniteError:
         return None
-    return _solved(second_order, factor, [answer.right for answer in reduced])
+    return _solved(order, factor, [answer.right for answer in reduced])
 
 
-def _own(
-    driver: Driver, reduced: Sequence[Reduced], second_order: bool, damping: float
-) -> list[tuple[IntArray, Array]]:
+def _own(driver: Driver, reduced: Sequence[Reduced], order: ModelOrder) -> list[tuple[IntArray, Array]]:
     """What the driver adds: the multipliers of the cover, the ground, the damping."""
-    g, d = len(driver.cover), driver.d
-    interface, layout = driver.interface(*driver.tangent), TangentLayout(g, d)
+    g, at = len(driver.cover), LiftedPoses(driver.at.R, driver.at.t)
+    interface, layout = driver.interface(*driver.tangent), at.layout
     own: list[tuple[IntArray, Array]] = []
     diagonal = interface.gather([answer.diagonal[:, None] for answer in reduced])[:, 0]
     columns = layout.rotations(np.arange(g))
-    if second_order:
-        Lambda = driver.at.multipliers
-        trace = np.einsum("naa->n", Lambda)[:, None, None]
-        curvature = -2.0 * trace if d == 2 else -2.0 * (trace * np.eye(3) - Lambda)
+    if order.second_order:
+        curvature = -at.curvature(driver.at.multipliers - order.eta * np.eye(driver.d))
         own.append((columns, curvature))
         diagonal[columns] += np.einsum("naa->na", curvature)
     extra = np.zeros_like(diagonal)
     zero = driver.ground(*driver.tangent)
     extra[zero] = abs(diagonal[zero])
-    extra += damping * (diagonal + extra)
+    extra += order.damping * (diagonal + extra)
     own.append((np.arange(interface.side)[:, None], extra[:, None, None]))
     return own
 
 
-def _solved(is_newton: bool, factor: Interface, right: Sequence[RightHandSide]) -> Model:
+def _solved(order: ModelOrder, factor: Interface, right: Sequence[RightHandSide]) -> Model:
     """Solution y = H^-1 g on the cover, and g^T H^-1 g."""
     y, parts, energy = factor.solve([part.b for part in right])
-    return Model(is_newton, factor, y, parts, math.fsum(part.energy for part in right) + energy)
+    return Model(order, factor, y, parts, math.fsum(part.energy for part in right) + energy)
 
 
 def _backtrack(driver: Driver, model: Model) -> tuple[CoverPoses, list[TrialEvaluation]] | None:
     """First of the moves -y, -y/2, .. that lowers F enough, and the robots' answers there; None when none does."""
-    now, layout = Poses(driver.at.R, driver.at.t), TangentLayout(len(driver.cover), driver.d)
+    now = poses_from(driver.at.R, driver.at.t)
+    layout = TangentLayout(len(driver.cover), *driver.tangent)
     w, v = layout.split(-model.y[:, 0])
     length = 1.0
     moves = [Move(part, length) for part in model.parts]
     for _ in range(central.HALVINGS):
-        there = central.move_poses(now, length * w, length * v)
+        there = move_poses(now, length * w, length * v)
         R, t, is_first = there.R, there.t, length == 1.0
         if driver.is_final:  # chi2, whose best translations have another matrix at all rotations
             straight, further = Interior.move_straight, Interior.go_straight

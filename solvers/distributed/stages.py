@@ -13,6 +13,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.relaxations.low_rank import poses_from
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
@@ -21,6 +22,7 @@ from solvers.distributed.lower_bound import best_bound_distributed
 from solvers.distributed.newton import SubstructuredNewton
 from solvers.distributed.robots.agent import Agent
 from solvers.distributed.robots.interior import Interior
+from solvers.distributed.staircase import SubstructuredStaircase, round_lifted
 from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
 from solvers.loop import Watch
 from solvers.network.counted_pool import Count
@@ -28,6 +30,7 @@ from solvers.network.engine import Engine
 from solvers.network.faults import Faults
 from solvers.result import OUT_OF_TIME, History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
+from solvers.riemannian.staircase import DualBound, Staircase
 from solvers.soc.consensus import ConsensusState
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
@@ -73,16 +76,21 @@ def attempt_distributed(
             stages.append(replace(start_robots(driver, chordal_start(problem)), name="chordal start, in one place"))
         else:
             stages.append(start_robots(driver, start))
-    decrement = refine(driver, newton, faults, journal, watch, soc)
-    bound = best_bound_distributed(driver, gap)
-    poses, Lambda = collect(driver)
-    outcome = poses, certify_with(problem, poses, Lambda, gap, decrement, BoundSource.GIVEN, bound)
+    decrement = refine(driver, newton, journal, watch, soc, faults)
+    outcome = judge_collected(driver, problem, gap, decrement)
     journal.end_attempt(outcome)
     return outcome
 
 
+def judge_collected(driver: Driver, problem: PGOProblem, gap: float, decrement: float) -> tuple[Poses, Certificate]:
+    """All poses, and their certificate with a bound that driver and robots find."""
+    bound = best_bound_distributed(driver, gap)
+    poses, Lambda = collect(driver)
+    return poses, certify_with(problem, poses, Lambda, gap, decrement, BoundSource.GIVEN, bound)
+
+
 def refine(
-    driver: Driver, newton: Newton, faults: Faults | None, journal: Journal, watch: Watch, soc: SOC | None
+    driver: Driver, newton: Newton, journal: Journal, watch: Watch, soc: SOC | None = None, faults: Faults | None = None
 ) -> float:
     """SOC and Newton from the poses at hand; the last relative decrement."""
     stages = journal.stages
@@ -96,6 +104,18 @@ def refine(
         figures = second.status, second.iterations, driver.at.objective, second.seconds, second.history, newton
         stages.append(Stage("Newton", *figures))
     return decrement
+
+
+def climb_distributed(
+    driver: Driver, staircase: Staircase, newton: Newton, watch: Watch, stages: list[Stage]
+) -> tuple[float, DualBound]:
+    """Staircase from the poses at hand, rounding, and Newton: the last decrement, and the bound of the relaxation."""
+    climb = watch.run(SubstructuredStaircase(staircase), driver)
+    bound = DualBound(climb.state.bound, collect(driver)[1] if driver.has_whole else np.zeros((0, driver.d, driver.d)))
+    round_lifted(driver)
+    figures = climb.status, climb.iterations, driver.at.objective, climb.seconds, climb.history, staircase
+    stages.append(Stage("Staircase", *figures))
+    return refine(driver, newton, Journal(None, {}, stages), watch), bound
 
 
 def start_robots(driver: Driver, start: Poses | None) -> Stage:
@@ -142,9 +162,9 @@ def _run_soc(driver: Driver, soc: SOC, faults: Faults | None, journal: Journal, 
 
 def collect(driver: Driver) -> tuple[Poses, Array]:
     """All poses and multipliers, for whoever asked for the solution; off the ledger."""
-    n, d = driver.num_poses, driver.d
-    R, t, Lambda = np.empty((n, d, d)), np.empty((n, d)), np.empty((n, d, d))
+    n, (_, r, d) = driver.num_poses, driver.at.R.shape
+    R, t, Lambda = np.empty((n, r, d)), np.empty((n, r)), np.empty((n, d, d))
     R[driver.cover], t[driver.cover], Lambda[driver.cover] = driver.at.R, driver.at.t, driver.at.multipliers
     for own in driver.ask(Interior.result, None, Count.OFF):
         R[own.poses], t[own.poses], Lambda[own.poses] = own.R, own.t, own.Lambda
-    return Poses(R, t), Lambda
+    return poses_from(R, t), Lambda

@@ -36,8 +36,8 @@ _SHRINK, _GROW = 0.25, 2.0
 _LONGEST = 10.0  # norm of a block of the step, which saturates at about 1: beyond, the model says nothing
 _FORCING = 0.1
 _FLOOR = 0.01  # of the tolerance: conjugate gradients go no deeper
-_ROUNDING = 1e-14  # relative change of f that is not told apart from none
-_SUFFICIENT, _HALVINGS = 0.25, 40
+ROUNDING = 1e-14  # relative change of f that is not told apart from none
+SUFFICIENT, HALVINGS = 0.25, 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ class Staircase:
             return replace(state, k=state.k + 1, radius=radius, inner_iterations=spent)
         candidate = lifted_point(problem, retract(point.Y, trial.step))
         # Near the end both decreases are below rounding, and their ratio is made to tend to one (Conn et al., 17.4.2).
-        rounding = _ROUNDING * scale + state.rounding_level
+        rounding = ROUNDING * scale + state.rounding_level
         ratio = (point.value - candidate.value + rounding) / (trial.decrease + rounding)
         radius = state.radius
         if not ratio >= _POOR:
@@ -215,12 +215,12 @@ def _escape(problem: PGOProblem, point: LiftedPoint, found: NegativeCurvature, l
     """
     Y, column = append_rank(point.Y), append_rank(np.zeros_like(point.Y), found.v)
     length = 1.0 / float(np.linalg.norm(found.v, axis=1).max())
-    for _ in range(_HALVINGS):
+    for _ in range(HALVINGS):
         promised = -(length**2) * found.value
-        if promised <= _ROUNDING * point.value + level:
+        if promised <= ROUNDING * point.value + level:
             return None
         candidate = lifted_point(problem, retract(Y, length * column))
-        if candidate.value <= point.value - _SUFFICIENT * promised:
+        if candidate.value <= point.value - SUFFICIENT * promised:
             return candidate
         length *= 0.5
     return None

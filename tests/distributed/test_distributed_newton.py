@@ -23,8 +23,10 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.relaxations.low_rank import LiftedPoses, append_dimension
 from solvers.distributed.driver import Driver
 from solvers.distributed.newton import SubstructuredNewton, model_at
+from solvers.distributed.robots.records import ModelOrder
 from solvers.distributed.stages import collect
 from solvers.loop import iterate, run
 from solvers.result import Status
@@ -138,7 +140,7 @@ def test_a_model_is_the_central_matrix_with_its_ground_and_damping(
     layout = TangentLayout(n, d)
     gradient = layout.join(*problem.riemannian_gradient(poses))
     values = np.linalg.eigvalsh(dense)
-    model = model_at(driver, second_order, damping)
+    model = model_at(driver, ModelOrder(second_order, damping))
     if abs(values[0]) <= 1e-10 * values[-1]:
         return  # either answer is right
     assert (model is not None) == (values[0] > 0)
@@ -153,14 +155,38 @@ def test_a_model_is_the_central_matrix_with_its_ground_and_damping(
     assert model.square == pytest.approx(square, rel=1e3 * EPS * condition + 1e-9)
 
 
+@settings(max_examples=examples(25))
+@given(seed=SEEDS, n=st.integers(2, 12), d=DIMENSIONS, extra=st.integers(0, 2), partitioner=PARTITIONERS)
+def test_a_shifted_model_at_lifted_poses_is_the_central_matrix(
+    seed: int, n: int, d: int, extra: int, partitioner: Partitioner
+) -> None:
+    problem, rng = varied_problem(seed, n, d), np.random.default_rng(seed)
+    poses: Poses = near(problem, seed, 0.3)
+    for _ in range(extra):
+        flat = append_dimension(poses)
+        poses = flat.moved_along(*flat.layout.split(0.1 * rng.standard_normal(flat.layout.side)))
+    driver = driver_at(problem, partitioner(problem.graph, seed), poses)
+    at, Lambda = LiftedPoses(poses.R, poses.t), multipliers(problem, poses)
+    eta = float(np.abs(Lambda).max()) * 2.0 * n
+    H, layout, zero = at.hessian(problem, Lambda - eta * np.eye(d)).toarray(), at.layout, np.zeros(1, dtype=np.int64)
+    ground = np.concatenate([layout.translations(zero)[0], layout.rotations(zero)[0]])
+    H[ground, ground] *= 2.0
+    model = model_at(driver, ModelOrder(True, 0.0, eta))
+    assert model is not None
+    w, v = layout.split(np.linalg.solve(H, layout.join(*at.gradient(problem))))
+    expected = np.concatenate([v[driver.cover].ravel(), w[driver.cover].ravel()])
+    allowed = 1e3 * EPS * np.linalg.cond(H) * (1e-9 + np.abs(expected).max())
+    np.testing.assert_allclose(model.y[:, 0], expected, rtol=0, atol=allowed)
+
+
 @pytest.mark.parametrize("d", [2, 3])
 def test_where_the_hessian_is_not_positive_definite_gauss_newton_takes_over(d: int) -> None:
     problem = varied_problem(4, 20, d, LOUD_NOISE)
     start = random_poses(20, d, 4)  # far from any minimum
     parts = metis(problem.graph, 4)
     driver = driver_at(problem, parts, start)
-    assert model_at(driver, second_order=True, damping=0.0) is None
-    assert model_at(driver, second_order=False, damping=0.0) is not None
+    assert model_at(driver, ModelOrder(True, 0.0)) is None
+    assert model_at(driver, ModelOrder(False, 0.0)) is not None
     check(problem, parts, start, Newton(), 4)
 
 
@@ -170,9 +196,9 @@ def test_damping_grows_until_the_matrix_is_positive_definite(monkeypatch: pytest
     driver = driver_at(problem, metis(problem.graph, 2), near(problem, 0, 0.2))
     tried = []
 
-    def spoiled(driver: Driver, second_order: bool, damping: float) -> object:
-        tried.append((second_order, damping))
-        return model_at(driver, second_order, damping) if damping >= 1e-3 else None
+    def spoiled(driver: Driver, order: ModelOrder) -> object:
+        tried.append((order.second_order, order.damping))
+        return model_at(driver, order) if order.damping >= 1e-3 else None
 
     monkeypatch.setattr("solvers.distributed.newton.model_at", spoiled)
     before = driver.at.objective

@@ -15,13 +15,15 @@ from robots import PARTITIONERS, Partitioner, Recording, arrays_in
 
 import pgo_models as pgo
 import solvers
+from pgo_models.certificates.certificate import BoundSource
 from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map
 from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, observe
-from solvers.distributed import substructured
+from solvers.distributed import staircase, substructured
+from solvers.distributed.robots import climbing
 from solvers.folder_solve import FolderSolution, solve_folder
 
 ROBOTS = Path(pgo.__file__).parent.parent / "data" / "robots"
@@ -121,22 +123,27 @@ def test_the_frame_is_that_of_a_fixed_pose(tmp_path: Path) -> None:
 # What crosses.
 
 
-def test_messages_do_not_grow_with_the_interiors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor do requests and answers that are off the ledger."""
+@pytest.mark.parametrize("climbs", [False, True])
+def test_messages_do_not_grow_with_the_interiors(climbs: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor do requests and answers that are off the ledger, in the staircase or before."""
     monkeypatch.setattr(substructured, "ENOUGH_NORMS", 60)
-    largest = []
+    pipeline, largest, width = solvers.Pipeline(), [], 6
+    if climbs:  # no bound is good enough for it, and so it goes up a dimension, where it finds no way down
+        monkeypatch.setattr(staircase, "smallest_shift", lambda *_: 1e-30)
+        pipeline, width = replace(pipeline, newton=solvers.Newton(max_iterations=0), second_try=False), 10
     for poses_each in (100, 800):
         graph, engine, folder = tower(3, poses_each), Recording(), tmp_path / str(poses_each)
         write_g2o_folder(graph, folder)
-        found = solve_folder(folder, engine=engine, out=folder / "out")
+        found = solve_folder(folder, pipeline, engine=engine, out=folder / "out")
         assert found.certificate.is_certified
+        assert (engine.times(climbing.climb) > 0) == climbs
         assert max(agent.subgraph.graph.num_edges for agent in engine.agents) >= 2 * poses_each - 10
         on_ledger = max(int(traffic.num_bytes.max(initial=0)) for traffic, _ in found.ledger.counted)
         sizes = [np.size(value) for _, *both in engine.log for one in both for _, value in arrays_in(tuple(one))]
         largest.append((on_ledger, max(sizes)))
     # Of 12 poses in the cover, 6 at most with one robot twice: a triangle of 72 rows. Norms are at most 60 + 3.
     assert largest[0] == largest[1]
-    assert largest[1][1] <= 72 * 73 // 2
+    assert largest[1][1] <= 12 * width * (12 * width + 1) // 2
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_DATA counts private memory on Linux alone")
@@ -193,12 +200,27 @@ def test_files_that_are_no_robots_are_named(tmp_path: Path) -> None:
         solve_folder(ROBOTS, out=tmp_path / "in")
 
 
-def test_the_staircase_is_left_out_and_said_so() -> None:
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_staircase_is_run_by_the_robots(d: int, tmp_path: Path) -> None:
+    graph = varied_graph(1, 30, d, NoiseModel(translation_std=1.0, rotation_std=1.5))
+    graph = graph.with_robots(pgo.partition(graph, 4).robot)
+    write_g2o_folder(graph, tmp_path / "in")
+    found = solve_folder(tmp_path / "in", out=tmp_path / "out")
+    central = solvers.solve(graph, robots=pgo.partition(graph, 4))
+    assert [stage.name for stage in found.stages] == [stage.name for stage in central.stages]
+    assert "Staircase" in [stage.name for stage in found.stages]
+    assert found.certificate.source is central.certificate.source is BoundSource.RELAXATION
+    assert found.certificate.lower_bound == pytest.approx(central.lower_bound, rel=1e-6)
+    written = read_g2o(tmp_path / "out")
+    assert written.initial is not None
+    assert pgo.PGOProblem(written).objective(written.initial) == pytest.approx(found.certificate.objective, rel=1e-9)
+
+
+def test_the_staircase_follows_where_newton_has_had_no_step() -> None:
     unfinished = solvers.Pipeline(soc=None, newton=solvers.Newton(max_iterations=0), second_try=False)
-    found = solve_folder(ROBOTS, unfinished)
-    assert not found.certificate.is_certified
-    assert "the staircase was left out" in str(found)
-    assert solve_folder(ROBOTS, replace(unfinished, staircase=None)).note == ""
+    found, without = solve_folder(ROBOTS, unfinished), solve_folder(ROBOTS, replace(unfinished, staircase=None))
+    assert not without.certificate.is_certified
+    assert found.certificate.gap < without.certificate.gap
 
 
 def test_a_second_try_keeps_the_better(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.geometry.rotations import Array
 from pgo_models.geometry.stiefel import append_rank, project_to_tangent, retract
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.relaxations.low_rank import hessian_product, lifted_point
+from pgo_models.relaxations.low_rank import LiftedPoses, append_dimension, hessian_product, lifted_point
 from pgo_models.relaxations.rounding import round_factor, round_gram
 
 SIZES, EXTRA = st.integers(2, 8), st.integers(0, 3)
@@ -94,3 +94,40 @@ def test_a_factor_of_higher_rank_is_reported() -> None:
     problem, Y, _ = drawn(0, 8, 3, 2)
     report = round_factor(problem, Y)[1]
     assert (report.rank, report.is_tight) == (5, False)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, extra=EXTRA)
+def test_gradient_and_hessian_of_lifted_poses_are_the_derivatives(seed: int, n: int, d: int, extra: int) -> None:
+    problem, Y, _ = drawn(seed, n, d, extra)
+    rng, h = np.random.default_rng(seed), 1e-4
+    poses = LiftedPoses(np.swapaxes(Y, 1, 2), rng.standard_normal((n, d + extra)))
+    layout, S_sum = poses.layout, float(abs(problem.M).sum())
+    step = rng.standard_normal(layout.side)
+    step /= np.linalg.norm(step)
+    w, v = layout.split(step)
+    here = problem.objective(poses)
+    forth, back = (problem.objective(poses.moved_along(sign * h * w, sign * h * v)) for sign in (1, -1))
+    slope = layout.join(*poses.gradient(problem)) @ step
+    assert (forth - back) / (2 * h) == pytest.approx(slope, abs=1e-6 * (here + S_sum))
+    H = poses.hessian(problem, multipliers(problem, poses))
+    assert (forth - 2 * here + back) / h**2 == pytest.approx(step @ (H @ step), abs=1e-5 * (here + S_sum))
+    assert abs(H - H.T).max() <= 1e-12 * S_sum
+    # What multipliers take of it are its diagonal blocks.
+    less = (poses.hessian(problem, None) - H).toarray()
+    columns = layout.rotations(np.arange(n))
+    blocks = less[columns[:, :, None], columns[:, None, :]]
+    np.testing.assert_allclose(blocks, poses.curvature(multipliers(problem, poses)), rtol=0, atol=1e-11 * S_sum)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_a_new_dimension_costs_nothing_and_a_way_up_begins_flat(seed: int, n: int, d: int) -> None:
+    problem, poses = varied_problem(seed, n, d), random_poses(n, d, seed)
+    lifted, x = append_dimension(poses), np.random.default_rng(seed).standard_normal((d + 1) * n)
+    assert problem.objective(lifted) == pytest.approx(problem.objective(poses), rel=1e-12)
+    np.testing.assert_allclose(multipliers(problem, lifted), multipliers(problem, poses), rtol=1e-9, atol=1e-9)
+    w, v = lifted.upwards(x)
+    step = np.einsum("nrak,nk->nra", lifted.basis, w)
+    np.testing.assert_allclose(step[:, -1].ravel(), x[n:], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.abs(step[:, :-1]).max(), 0.0, atol=1e-12)
+    np.testing.assert_array_equal(v[:, -1], x[:n])
+    np.testing.assert_allclose(lifted.layout.join(*lifted.gradient(problem)) @ lifted.layout.join(w, v), 0.0, atol=1e-9)

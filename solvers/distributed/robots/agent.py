@@ -9,6 +9,7 @@ import numpy as np
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
+from pgo_models.relaxations.low_rank import LiftedPoses
 from solvers.distributed.robots.elimination import FrontFactor, HeldFront
 from solvers.distributed.robots.factors import Eliminated
 from solvers.distributed.robots.interior import Interior, InteriorState, interior_of
@@ -43,7 +44,7 @@ class CoverRotations:
 
 
 CLASSES = (
-    *(AgentRecord, InteriorState, CopiesState, Poses, RecursionBlock, StepSettings, Rotations, Anderson),
+    *(AgentRecord, InteriorState, CopiesState, Poses, LiftedPoses, RecursionBlock, StepSettings, Rotations, Anderson),
     *(AndersonShare, AndersonSums, RobotProof, Eliminated, Waiting, TurnSettings, HeldFront, FrontFactor),
 )
 

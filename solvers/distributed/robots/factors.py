@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from scipy.sparse import csc_array
 
-from pgo_models.geometry.rotations import Array, tangent_dimension
+from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.matrices import columns_of
@@ -31,12 +31,8 @@ class Factors:
     """Factors of what is in a state: they are found again when they are not those of the state that asks."""
 
     def __init__(self, part: Part, backend: CholeskyBackend | None) -> None:
-        p, d = part.problem.num_poses, part.problem.d
         self.part, self.backend = part, backend
-        self.cuts: dict[Widths, Cut] = {
-            widths: Cut(columns_of(part.interior, p, widths), columns_of(part.boundary, p, widths), None)
-            for widths in ((1,), (d,), (1, d), (d, tangent_dimension(d)))
-        }
+        self._cuts: dict[Widths, Cut] = {}
         self._of: tuple[Eliminated, Elimination] | None = None
         self._laplacian: Elimination | None = None
 
@@ -45,23 +41,31 @@ class Factors:
         """Whether pose 0 is in the interior; else another robot or the driver holds it down."""
         return bool(self.part.poses[0] == 0) and bool(self.part.in_cover[0] < 0)
 
+    def cut(self, *widths: int) -> Cut:
+        """Where unknowns with so many numbers a pose are cut."""
+        if widths not in self._cuts:
+            part, p = self.part, self.part.problem.num_poses
+            own, boundary = columns_of(part.interior, p, widths), columns_of(part.boundary, p, widths)
+            self._cuts[widths] = Cut(own, boundary, None)
+        return self._cuts[widths]
+
     def eliminate(self, K: csc_array, widths: Widths) -> tuple[Eliminated, Elimination]:
         """Eliminate the interior of K x = b."""
         self._of = None  # its memory may be needed
-        found = eliminate(K, self.cuts[widths], self.backend)
+        found = eliminate(K, self.cut(*widths), self.backend)
         return self.keep(K, widths, found), found
 
     def keep(self, K: csc_array, widths: Widths, found: Elimination) -> Eliminated:
         """Remember an elimination of K; its analysis is the same the next time."""
         eliminated = Eliminated(K.data, K.indices, K.indptr, widths)
-        self.cuts[widths], self._of = found.cut, (eliminated, found)
+        self._cuts[widths], self._of = found.cut, (eliminated, found)
         return eliminated
 
     def of(self, eliminated: Eliminated | None) -> Elimination:
         """Elimination of a matrix that was eliminated."""
         assert eliminated is not None
         if self._of is None or self._of[0] is not eliminated:
-            self._of = eliminated, eliminate(eliminated.matrix, self.cuts[eliminated.widths], self.backend)
+            self._of = eliminated, eliminate(eliminated.matrix, self.cut(*eliminated.widths), self.backend)
         return self._of[1]
 
     @property
@@ -72,5 +76,5 @@ class Factors:
             M_tt = problem.M[: problem.num_poses, : problem.num_poses].tocsc()
             if self.grounds:
                 M_tt[0, 0] *= 2.0
-            self._laplacian = eliminate(M_tt, self.cuts[(1,)], self.backend)
+            self._laplacian = eliminate(M_tt, self.cut(1), self.backend)
         return self._laplacian

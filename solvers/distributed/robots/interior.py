@@ -14,22 +14,16 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from pgo_models.certificates.dual_variables import multiplier_norms, multipliers
-from pgo_models.certificates.newton_polish import move_poses
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import (
-    Array,
-    project_to_rotations,
-    stack_transposes,
-    tangent_dimension,
-    unstack_transposes,
-)
+from pgo_models.geometry.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
+from pgo_models.problem.hessian import TangentLayout
 from pgo_models.problem.initialization import relaxed_rotations
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.relaxations.low_rank import gradient_at, hessian_at, move_poses, tangent_widths
 from solvers.distributed.robots import records
 from solvers.distributed.robots.elimination import Widths
 from solvers.distributed.robots.factors import Eliminated, Factors
@@ -117,8 +111,8 @@ class Interior:
 
     def set_translations(self, t: Array) -> tuple[Interior, records.CostParts]:
         """Take the best translations, from (g, d) on the boundary: parts of F and of M X on the boundary."""
-        R = self.state.poses.R
-        return self.with_changes(poses=Poses(R, self._translations(R, t))).evaluate(None)
+        poses = self.state.poses
+        return self.with_changes(poses=poses.with_translations(self._translations(poses.R, t))).evaluate(None)
 
     def multiplier_norms(self, step: int | None) -> tuple[Interior, Norms]:
         """||Lambda_i||_2 and m_i of the interior poses, `thinned`."""
@@ -129,7 +123,7 @@ class Interior:
     def penalize(self, order: PenaltyOrder) -> tuple[Interior, records.Reduced]:
         """Set rho_i, factor M + D/2; omega is at the poses, B zero or stationary."""
         interior, problem = self.part.interior, self.part.problem
-        diagonal = problem.M.data[problem.diagonal_positions][self._interior_rows]
+        diagonal = problem.M.data[problem.diagonal_positions][self.interior_rows]
         return self._penalized(order.block(self.state.poses.R[interior], self.multipliers()[interior], diagonal))
 
     def rescale(self, order: records.RescaleInterior) -> tuple[Interior, records.Reduced]:
@@ -140,7 +134,7 @@ class Interior:
     def solve(self, x: Array) -> tuple[Interior, Array]:
         """Step (a) in the interior, from x on the boundary; this robot's sums for the acceleration."""
         X = self.back_substitute(x)
-        block, sums = self.block.after_solve(X[self._interior_rows])
+        block, sums = self.block.after_solve(X[self.interior_rows])
         return self.with_changes(x=X, block=block), sums
 
     def agree(self, order: records.Agree) -> tuple[Interior, records.Agreed]:
@@ -166,15 +160,15 @@ class Interior:
         """Hessian (Gauss-Newton where asked for), and the reduced gradient; None where K_II is not definite."""
         Lambda = None
         if order.second_order:
-            Lambda = self.multipliers()
+            Lambda = self.multipliers() - order.eta * np.eye(self.part.problem.d)
             Lambda[self.part.boundary] = 0.0  # the driver knows the whole force there
-        H, layout = riemannian_hessian(self.problem, self.state.poses, Lambda), self._layout
+        H, layout = hessian_at(self.problem, self.state.poses, Lambda), self._layout
         scale = np.ones(layout.side)
         if self.factors.grounds:
             zero = np.zeros(1, dtype=np.int64)
             scale[np.concatenate([layout.translations(zero)[0], layout.rotations(zero)[0]])] = 2.0
         own = np.zeros(layout.side, dtype=bool)
-        own[self.factors.cuts[self._tangent].interior] = True
+        own[self.factors.cut(*self._tangent).interior] = True
         diagonal = H.diagonal()
         grounded = np.where(scale > 1.0, diagonal + abs(diagonal), diagonal)
         H.setdiag(np.where(own, grounded * (1.0 + order.damping), diagonal))
@@ -205,13 +199,13 @@ class Interior:
         """Trial rotations a length along the direction, and the right-hand side of their best translations."""
         assert self.state.step is not None
         poses, (w, v) = self.state.poses, self.state.step
-        trial = Poses(move_poses(poses, length * w, length * v).R, poses.t)
+        trial = move_poses(poses, length * w, length * v).with_translations(poses.t)
         return self.with_changes(trial=trial)._reduced_translations(trial.R)
 
     def evaluate_trial(self, t: Array) -> tuple[Interior, records.TrialEvaluation]:
         """Take the trial's best translations: F, force and reduced gradient there, by the factor at hand."""
-        R = self.state.trial.R
-        trial = Poses(R, self._translations(R, t))
+        trial = self.state.trial
+        trial = trial.with_translations(self._translations(trial.R, t))
         following, gradient = self.with_changes(trial=trial).reduced(self._gradient(trial))
         return following, records.TrialEvaluation(self.evaluation(trial), gradient)
 
@@ -272,26 +266,26 @@ class Interior:
 
     @property
     def _layout(self) -> TangentLayout:
-        return TangentLayout(self.part.problem.num_poses, self.part.problem.d)
+        return TangentLayout(self.part.problem.num_poses, *self._tangent)
 
     @property
     def _tangent(self) -> Widths:
-        return (self.part.problem.d, tangent_dimension(self.part.problem.d))
+        return tangent_widths(self.state.poses.R)
 
     @property
     def boundary_rows(self) -> IntArray:
         """Rows of X of the boundary."""
-        return self.factors.cuts[(1, self.part.problem.d)].boundary
+        return self.factors.cut(1, self.part.problem.d).boundary
 
     @property
-    def _interior_rows(self) -> IntArray:
+    def interior_rows(self) -> IntArray:
         """Rows of X of the interior's rotations."""
-        return self.factors.cuts[(1, self.part.problem.d)].interior[len(self.part.interior) :]
+        return self.factors.cut(1, self.part.problem.d).interior[len(self.part.interior) :]
 
     @property
     def _scale(self) -> Array:
         """m_i of the interior."""
-        diagonal = self.part.problem.M.data[self.part.problem.diagonal_positions[self._interior_rows]]
+        diagonal = self.part.problem.M.data[self.part.problem.diagonal_positions[self.interior_rows]]
         return np.asarray(diagonal.reshape(-1, self.part.problem.d).mean(axis=1))
 
     def _eliminate(self, K: csc_array, widths: Widths, b: Array) -> tuple[Interior, records.Reduced]:
@@ -311,7 +305,7 @@ class Interior:
     def _penalized(self, block: RecursionBlock) -> tuple[Interior, records.Reduced]:
         problem = self.part.problem
         data = problem.M.data.copy()
-        data[problem.diagonal_positions[self._interior_rows]] += 0.5 * block.penalty
+        data[problem.diagonal_positions[self.interior_rows]] += 0.5 * block.penalty
         if self.factors.grounds:
             data[problem.diagonal_positions[0]] *= 2.0
         K = problem.with_pattern_of_M(data)
@@ -320,7 +314,7 @@ class Interior:
     def _pull(self, block: RecursionBlock) -> Array:
         """D/2 (omega - B), (side, d)."""
         b = np.zeros((self.part.problem.side, self.part.problem.d))
-        b[self._interior_rows] = (0.5 * block.penalty)[:, None] * block.shift
+        b[self.interior_rows] = (0.5 * block.penalty)[:, None] * block.shift
         return b
 
     def _omega(self, z: Array) -> Array:
@@ -354,7 +348,7 @@ class Interior:
         return multipliers(self.problem, self.state.poses)
 
     def _gradient(self, poses: Poses) -> Array:
-        return self._layout.join(*self.problem.riemannian_gradient(poses))[:, None]
+        return self._layout.join(*gradient_at(self.problem, poses))[:, None]
 
 
 def interior_of(subgraph: Subgraph, backend: CholeskyBackend | None) -> Interior | None:

@@ -19,7 +19,7 @@ def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofA
     constant, constant_error = problem.weights.constant
     trace = math.fsum([*np.einsum("naa->na", Lambda).ravel(), constant, -constant_error])
     widths = (1, problem.d)
-    cut = factors.cuts[widths]
+    cut = factors.cut(*widths)
     fixed = cut.boundary[order.fixed > 0]
     fixed = np.append(fixed, 0) if order.point is None and factors.grounds else fixed
     found = verify_interior(problem, Lambda, order.eta, cut, fixed, order.share, factors.backend)

@@ -110,10 +110,16 @@ class Agreed:
 
 @dataclass(frozen=True)
 class ModelOrder:
-    """Newton's matrix, or the Gauss-Newton matrix, with a share of its diagonal added."""
+    """Newton's matrix, that of S + eta blockdiag(0, I), or the Gauss-Newton one with a share of its diagonal added."""
 
     second_order: bool
     damping: float
+    eta: float = 0.0
+
+    @property
+    def is_newton(self) -> bool:
+        """Whether it is the Hessian."""
+        return self.second_order and not self.eta
 
 
 @dataclass(frozen=True, eq=False)

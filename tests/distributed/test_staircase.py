@@ -1,0 +1,110 @@
+"""The staircase by driver and robots: the optimum of the relaxation that one place finds, by robots of every kind."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from budget import examples
+from graphs import DIMENSIONS, MILD_NOISE, SEEDS, random_poses, varied_problem, wound_ring
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robots import PARTITIONERS, Partitioner, contiguous, metis, singletons
+
+import solvers
+from pgo_models.certificates.certificate import BoundSource
+from pgo_models.certificates.lower_bound import prove_bound
+from pgo_models.graphs.partitioning import partition
+from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.driver import Driver
+from solvers.distributed.stages import collect, open_driver
+from solvers.distributed.staircase import SubstructuredStaircase, round_lifted
+from solvers.loop import run
+from solvers.network.engine import InProcess
+from solvers.result import Status
+from solvers.riemannian.staircase import Staircase
+
+LOOSE = NoiseModel(translation_std=1.0, rotation_std=1.5)  # the relaxation of most such graphs is not tight
+
+
+def driver_at(problem: PGOProblem, partitioner: Partitioner, seed: int, start: object, memory: float = 4e9) -> Driver:
+    driver = open_driver(problem, partitioner(problem.graph, seed), InProcess(), memory)
+    driver.set_poses(start)
+    return driver
+
+
+@settings(max_examples=examples(12))
+@given(seed=SEEDS, n=st.integers(4, 14), d=DIMENSIONS, loud=st.booleans(), partitioner=PARTITIONERS)
+def test_it_solves_the_relaxation_as_one_place_does(
+    seed: int, n: int, d: int, loud: bool, partitioner: Partitioner
+) -> None:
+    problem = varied_problem(seed, n, d, LOOSE if loud else MILD_NOISE)
+    start = problem.with_best_translations(random_poses(n, d, seed).R)
+    central = run(Staircase(), problem, start)
+    driver = driver_at(problem, partitioner, seed, start)
+    found = run(SubstructuredStaircase(), driver)
+    assert found.status is Status.CONVERGED
+    value = central.state.point.value
+    assert driver.at.objective == pytest.approx(value, rel=1e-7, abs=driver.at.rounding_level)
+    lifted, Lambda = collect(driver)
+    assert problem.objective(lifted) == pytest.approx(driver.at.objective, rel=1e-9, abs=driver.at.rounding_level)
+    if found.state.bound.value > 0.0:
+        assert found.state.bound.value <= value * (1 + 1e-9)
+        proven = prove_bound(problem, Lambda, found.state.bound.eta)
+        assert proven is not None
+        assert proven == pytest.approx(found.state.bound.value, rel=1e-6)
+    round_lifted(driver)
+    poses, _ = collect(driver)
+    assert poses.R.shape == (n, d, d)
+    assert driver.at.objective == pytest.approx(problem.objective(poses), rel=1e-9, abs=driver.at.rounding_level)
+    assert driver.at.objective >= value * (1 - 1e-9) - driver.at.rounding_level
+
+
+@pytest.mark.parametrize("partitioner", [contiguous, metis, singletons])
+@pytest.mark.parametrize("d", [2, 3])
+def test_robots_climb_out_of_a_wound_ring(d: int, partitioner: Partitioner) -> None:
+    problem, wound = wound_ring(20, d)
+    robots = partitioner(problem.graph, 3)
+    short = solvers.Pipeline(soc=None, second_try=False)
+    stuck = solvers.solve(problem, replace(short, staircase=None), wound, robots=robots)
+    rescued, central = (solvers.solve(problem, short, wound, robots=who) for who in (robots, None))
+    assert stuck.objective > 100 * rescued.objective
+    assert rescued.is_certified
+    assert rescued.objective == pytest.approx(central.objective, rel=1e-9)
+    assert [stage.name for stage in rescued.stages] == [stage.name for stage in central.stages]
+    assert rescued.ledger.rounds < 40 * sum(stage.iterations for stage in rescued.stages)
+
+
+def test_where_the_relaxation_is_loose_its_bound_is_reported() -> None:
+    problem = varied_problem(1, 30, 2, LOOSE)
+    by_robots, central = solvers.solve(problem, robots=4), solvers.solve(problem)
+    assert by_robots.certificate.source is central.certificate.source is BoundSource.RELAXATION
+    assert by_robots.lower_bound == pytest.approx(central.lower_bound, rel=2e-6)
+    assert by_robots.objective == pytest.approx(central.objective, rel=1e-6)
+    assert by_robots.lower_bound < 0.999 * by_robots.objective
+
+
+def test_a_climb_goes_on_from_a_snapshot() -> None:
+    problem, wound = wound_ring(20, 3)
+    method = SubstructuredStaircase()
+    first, second = (driver_at(problem, contiguous, 3, wound) for _ in range(2))
+    state = method.init(first, None)
+    while first.at.R.shape[1] == problem.d:
+        state = method.step(first, state)
+    second.resume(first.state, first.snapshots())
+    for driver in (first, second):
+        other = method.step(driver, state)
+        assert np.isfinite(other.newton.objective)
+    np.testing.assert_array_equal(first.at.R, second.at.R)
+    np.testing.assert_array_equal(collect(first)[0].t, collect(second)[0].t)
+
+
+def test_a_rank_that_the_drivers_memory_does_not_hold_is_not_climbed_to() -> None:
+    problem, wound = wound_ring(20, 3)
+    enough = open_driver(problem, partition(problem.graph, 4), InProcess()).interface(3, 3).num_bytes
+    driver = driver_at(problem, contiguous, 3, wound, enough)
+    assert driver.fits(3)
+    assert not driver.fits(4)
+    found = run(SubstructuredStaircase(), driver)
+    assert found.status is Status.STALLED
+    assert driver.at.R.shape[1] == 3
