@@ -27,10 +27,12 @@ from solvers.robust.gnc import GNC, RobustLoss, known_inliers
 from solvers.robust.rejection import Attempt, Rejection
 from solvers.solution import Solution
 
+Plain = Callable[..., Solution]  # `solve` of the edges that are kept
 Settle = Callable[[PGOProblem, Poses], Poses]  # to a stationary point nearby
 
 _CHEAP = 4000  # rows of a factor that may become dense: of so few, a factorisation takes a fraction of a second
 _CHEAP_ATTEMPTS = 3
+_FEW = 10  # Newton steps to a certificate: where an attempt has ended at a minimum, two are enough
 _PAIRED = 4000  # loop closures whose pairs are looked at within seconds
 _FAR, _FURTHER = 1.5, 3.0  # times T; three times it are one right set in a hundred, or fewer, of
 _TRIED = 50  # rejected edges at a time
@@ -44,7 +46,7 @@ def solve_robustly(
     gap: float,
     start: Poses | None,
     watch: Watch,
-    plain: Callable[..., Solution],
+    plain: Plain,
     shared: Callable[..., SharedEstimate] | None = None,
 ) -> Solution:
     """Solution of the edges that are kept; `Solution.robust` says which, and what is proven.
@@ -96,7 +98,7 @@ def solve_robustly(
         return result(solved(inlier_problem(problem, kept), start), kept, thresholds, "pairwise consistency alone", ())
     attempts: list[_Estimate] = []
     trials = _Trials(problem, known, thresholds, gap, start, watch)
-    for name, method, tested in _methods(robust, graph, known, shared is None):
+    for name, method, tested in _methods(robust, graph, known, shared is None, is_cheap):
         found = trials.run(name, method, tested) if shared is None else trials.share(name, method, plain, shared)
         attempts.append(found)
         solutions += filter(None, [found.solution])
@@ -119,8 +121,7 @@ def solve_robustly(
             break
     name += f", less {gone} that all others contradict" if (gone := (best.kept & ~kept).sum()) else ""
     name += f", with {back} that they can follow" if (back := (kept & ~best.kept).sum()) else ""
-    stages = (*(one.stage for one in attempts), *solution.stages)
-    last = attempts[-1].stage.status
+    stages, last = (*(one.stage for one in attempts), *solution.stages), attempts[-1].stage.status
     solution = replace(solution, stages=stages, status=last if last in OUT_OF_TIME else solution.status)
     return result(solution, kept, best.scale * thresholds, name, tuple(one.attempt for one in attempts))
 
@@ -183,10 +184,8 @@ def inlier_problem(problem: PGOProblem, kept: BoolArray) -> PGOProblem:
     graph = problem.graph
     parts = graph.components(kept)
     if len(parts) > 1:
-        raise GraphError(
-            f"known inliers and the edges kept leave {graph.name} in {len(parts)} parts (one with pose "
-            f"{graph.pose_name(int(parts[1][0]))}); name more known inliers, or raise the quantile"
-        )
+        left = f"leave {graph.name} in {len(parts)} parts (one with pose {graph.pose_name(int(parts[1][0]))})"
+        raise GraphError(f"known inliers and the edges kept {left}; name more known inliers, or raise the quantile")
     return replace(problem, graph=graph.without_edges(~kept))
 
 
@@ -217,14 +216,12 @@ class _Trials:
         run = self.watch.run(replace(method, known=self.known[kept]), inlier_problem(self.problem, kept), self.start)
         kept[kept] = run.state.inliers
         inliers = inlier_problem(self.problem, kept)
-        certificate = certify_at(inliers, polish(inliers, run.poses), self.gap)
+        certificate = certify_at(inliers, polish(inliers, run.poses, max_steps=_FEW), self.gap)
         stage = replace(Stage.of(run), name=f"GNC, {name}", objective=run.state.objective)
         attempt = self._attempt(name, kept, certificate, began)
         return _Estimate(attempt, kept, run.state.schedule.scale, certificate, stage)
 
-    def share(
-        self, name: str, method: GNC, plain: Callable[..., Solution], shared: Callable[..., SharedEstimate]
-    ) -> _Estimate:
+    def share(self, name: str, method: GNC, plain: Plain, shared: Callable[..., SharedEstimate]) -> _Estimate:
         """The same by robots."""
         began = time.perf_counter()
         found = shared(self.problem, method, self.thresholds, self.start, self.watch)
@@ -241,7 +238,9 @@ class _Trials:
         return Attempt(name, cost, int((~kept).sum()), certificate.gap, certificate.is_certified, seconds)
 
 
-def _methods(robust: GNC, graph: PoseGraph, known: BoolArray, is_central: bool) -> Iterator[tuple[str, GNC, BoolArray]]:
+def _methods(
+    robust: GNC, graph: PoseGraph, known: BoolArray, is_central: bool, is_cheap: bool
+) -> Iterator[tuple[str, GNC, BoolArray]]:
     """Attempts and the edges, (m,), that they begin with, the most promising first."""
     every = known | pairwise_consistent(graph, known) if robust.consistent else np.ones(len(known), dtype=bool)
     yield "as set", robust, every
@@ -249,11 +248,11 @@ def _methods(robust: GNC, graph: PoseGraph, known: BoolArray, is_central: bool) 
         agreed = known | pairwise_consistent(graph, known)
         if len(graph.components(agreed)) == 1:
             yield "pairwise consistent edges", replace(robust, consistent=True), agreed
-    slow = replace(robust, growth=min(robust.growth, 1.4), inner_steps=max(robust.inner_steps, 5))
-    yield "smaller steps", slow, every
-    spread = None if robust.spread is None else _NARROW * robust.spread
-    for scale in _TIGHT:
-        tight = replace(robust, scale=scale * robust.scale, spread=spread)
-        yield f"thresholds times {scale:g} at first", tight, every
+    slower = replace(robust, growth=min(robust.growth, 1.4), inner_steps=max(robust.inner_steps, 5))
+    narrow = replace(robust, spread=None if robust.spread is None else _NARROW * robust.spread)
+    slow = [("smaller steps", slower)]
+    tight = [(f"thresholds times {one:g} at first", replace(narrow, scale=one * robust.scale)) for one in _TIGHT]
+    for name, method in slow + tight if is_cheap else tight + slow:  # with fewer edges a large graph is faster
+        yield name, method, every
     other = RobustLoss.GEMAN_MCCLURE if robust.loss is RobustLoss.TRUNCATED else RobustLoss.TRUNCATED
     yield f"{other.name.lower().replace('_', '-')} loss", replace(robust, loss=other), every

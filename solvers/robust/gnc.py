@@ -33,7 +33,7 @@ from solvers.result import Measurement, Status
 from solvers.robust.consistency import odometry
 
 _LEFT_OUT = 1e-2  # weight under which an edge is left out where there are as many as poses: its fill-in costs
-_HARD = 1e3  # mu from which on weights are 0 and 1
+_HARD, _MOST_HARD = 1e3, 10  # mu from which on weights are 0 and 1, and most steps with it: those that end take none
 _NEARLY_STATIONARY = 1e-2  # relative decrement at which the poses follow the weights well enough
 _LARGEST_SCALE = 2.5  # of the quantile 0.99: then 1 - quantile is about 1e-6
 _LEAST_SCALE = 1e-12
@@ -84,6 +84,7 @@ class GNCSchedule:
     undecided: float = 1.0  # share of edges, known ones aside, that the surrogate counts neither in full nor as wrong
     decrement: float = math.inf  # what the last weighted cost has lost and could still lose, relative
     moved: bool = True  # whether the poses have moved in the last step
+    hard: int = 0  # steps since weights are 0 or 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +208,7 @@ class GNC:
             return None
         if schedule.decrement <= self.tolerance:
             return Status.CONVERGED
-        return None if schedule.moved else Status.STALLED
+        return None if schedule.moved and schedule.hard < _MOST_HARD else Status.STALLED
 
     def _cost(self, state: GNCState) -> float:
         loss = np.where(state.known, state.ratio, self.loss.values(state.ratio))
@@ -227,8 +228,9 @@ class GNC:
     def following(self, schedule: GNCSchedule, undecided: float, decrement: float, moved: bool) -> GNCSchedule:
         """The schedule after a step, with the next control."""
         mu, grown = schedule.mu, self.loss is RobustLoss.TRUNCATED
+        hard = schedule.hard + 1 if grown and mu >= _HARD else 0
         mu = min(mu * self.growth, _HARD) if grown else max(mu / self.growth, 1.0)
-        return GNCSchedule(mu, schedule.scale, schedule.rescaled, undecided, decrement, moved)
+        return GNCSchedule(mu, schedule.scale, schedule.rescaled, undecided, decrement, moved, hard)
 
     def rescaled(self, d: int, schedule: GNCSchedule, of_kept: tuple[float, float] | None) -> GNCSchedule:
         """Schedule with thresholds scaled by the median of the edges kept beside that of chi2, and the first control.

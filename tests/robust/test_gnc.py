@@ -13,7 +13,8 @@ import pgo_models as pgo
 import solvers
 from pgo_models.errors import SettingError
 from pgo_models.problem.thresholds import chi2_thresholds
-from solvers.robust.gnc import bridges, first_poses, known_inliers, weighted_problem
+from solvers.result import Status
+from solvers.robust.gnc import GNCSchedule, bridges, first_poses, known_inliers, weighted_problem
 
 TLS, GM = solvers.RobustLoss.TRUNCATED, solvers.RobustLoss.GEMAN_MCCLURE
 RATIOS = st.floats(1e-6, 1e6)
@@ -143,3 +144,18 @@ def test_known_inliers_of_another_size_are_refused():
     graph = clean()
     with pytest.raises(SettingError, match=r"known has shape \(3,\); give one for each of the 134 edges"):
         solvers.run(solvers.GNC(known=np.ones(3, dtype=bool)), pgo.PGOProblem(graph))
+
+
+def test_a_run_ends_where_weights_of_0_and_1_do_not_settle():
+    gnc, schedule = solvers.GNC(), GNCSchedule(500.0, 1.0, 0, undecided=0.0, decrement=1e-3)
+    endings = []
+    for _ in range(13):
+        schedule = gnc.following(schedule, 0.0, 1e-3, moved=True)  # never within the tolerance
+        endings.append(gnc.ending(schedule))
+    # One step at a softer control, ten at the hardest.
+    assert endings == [None] * 10 + [Status.STALLED] * 3
+    assert gnc.ending(gnc.following(schedule, 0.0, 1e-7, moved=True)) is Status.CONVERGED
+    softer = gnc.following(replace(schedule, mu=1.0), 0.0, 1e-3, moved=True)
+    assert softer.hard == 0
+    geman = solvers.GNC(loss=solvers.RobustLoss.GEMAN_MCCLURE)
+    assert geman.following(replace(schedule, hard=0), 0.0, 1e-3, moved=True).hard == 0

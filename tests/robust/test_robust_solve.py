@@ -11,7 +11,7 @@ import solvers
 from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.graphs.scenes import NoiseModel
-from solvers import cli
+from solvers import cli, robust_solve
 from solvers.robust.gnc import known_inliers
 from solvers.robust_solve import inlier_problem, reinstated, uncontradicted
 
@@ -104,6 +104,18 @@ def test_where_the_certificate_fails_other_attempts_are_made(clean, share):
     assert [stage.name for stage in solution.stages[: len(solution.robust.attempts)]] == [
         f"GNC, {one.name}" for one in solution.robust.attempts
     ]
+
+
+@pytest.mark.parametrize("is_large", [False, True])
+def test_on_large_graphs_smaller_steps_come_last(clean, is_large, monkeypatch):
+    graph, _ = spoiled(clean, 0.3, "random", seed=0)
+    if is_large:
+        monkeypatch.setattr(robust_solve, "_CHEAP", -1)  # no edge but known ones
+    given = solvers.GNC(known=np.ones(graph.num_edges, dtype=bool))  # wrong ones, too: no attempt is certified
+    tried = [one.name for one in solvers.solve(graph, robust=given).robust.attempts]
+    slow, tight = ["smaller steps"], ["thresholds times 0.1 at first", "thresholds times 0.01 at first"]
+    middle = tight + slow if is_large else slow + tight
+    assert tried == ["as set", "pairwise consistent edges", *middle, "geman-mcclure loss"]
 
 
 def test_doubtful_edges_are_within_a_factor_of_two_of_their_threshold(clean):
