@@ -235,7 +235,8 @@ class Driver:
     def hand_out(self, poses: Poses) -> None:
         """Give driver and robots all poses, as they are; a GraphError when they are not of the graph's size."""
         if (poses.num_poses, poses.d) != (self.num_poses, self.d):
-            raise GraphError(f"{poses} for {self.num_poses} poses in {self.d}D; give one pose for every pose there")
+            n, d = self.num_poses, self.d
+            raise GraphError(f"{poses} for {n} poses in {d}D; give one pose for every pose of the graph")
         self.at = replace(self.at, R=poses.R[self.cover], t=poses.t[self.cover])
         self.ask_each(Interior.set_poses, [poses[part] for part in self._parts if part is not None], Count.OFF)
 

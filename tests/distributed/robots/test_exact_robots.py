@@ -102,7 +102,7 @@ def test_what_a_driver_says_to_be_definite_is(
         g, r = len(driver.cover), driver.grounded
         fixed = columns_of(np.array([r]), g, (1, d))
         X = Poses(driver.at.R, driver.at.t).stacked()
-        proof = distributed_bound._eliminate(driver, fixed, 0.0, 1e-9, X)
+        proof = distributed_bound.eliminate_S(driver, fixed, 0.0, 1e-9, X)
         _, Lambda = collect(driver)
         rows = columns_of(driver.cover, n, (1, d))
         left_out = pose_rows(int(driver.cover[r]), n, d)
@@ -161,7 +161,7 @@ def test_every_term_of_a_driver_s_errors_is_there(monkeypatch: pytest.MonkeyPatc
         assert sums.value_error >= enough * (blocks.value_error + u * abs(sums.value)) > 0.0
         monkeypatch.setattr(Interface, "rounding", lambda self, sizes, own, diagonal: 0.0 * diagonal)
         fixed = driver.ground(1).ravel()
-        found = distributed_bound._eliminate(driver, fixed, 1.0, 1e-13, None)
+        found = distributed_bound.eliminate_S(driver, fixed, 1.0, 1e-13, None)
         assert found is not None
         diagonal = driver.diagonal.copy()
         rows = driver.rotation_rows
