@@ -110,10 +110,11 @@ def verify_interior(
     is_fixed = np.isin(inside, fixed)
     problem.leave_out(S.data, fixed, 0.0)
     S.data[problem.diagonal_positions[inside[is_fixed]]] = 2.0 * diagonal[inside[is_fixed]]
-    positive = np.maximum(diagonal, np.abs(problem.M.data[problem.diagonal_positions]))
-    if not (positive > 0.0).all() or not (diagonal[inside] > 0.0).all():
+    if not (diagonal[inside] > 0.0).all():
         return None
-    of_separators = matrix_errors(problem, positive) * positive
+    size = np.maximum(diagonal, np.abs(problem.M.data[problem.diagonal_positions]))
+    # A landmark that others turn has no entry in the rows of its rotation, and so no error.
+    of_separators = matrix_errors(problem, np.where(size > 0.0, size, 1.0)) * size
     entries, of_separators = of_separators[inside] / diagonal[inside], of_separators[cut.boundary]
     expected = cut.analysis.expected_error(len(cut.boundary)) if cut.analysis is not None else None
     error = entries + (expected if expected is not None else np.zeros(len(inside)))
