@@ -127,7 +127,7 @@ def solve_folder(
             try:
                 if isinstance(attempt, Staircase):
                     last, dual = climb_distributed(driver, replace(attempt, gap=gap), pipeline.newton, watch, stages)
-                    relaxed = dual.bound
+                    relaxed = dual.bound if dual is not None else NO_BOUND
                 else:
                     stages.append(start_robots(driver, None))
                     last = refine(driver, pipeline.newton, journal, watch, attempt)

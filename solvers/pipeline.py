@@ -32,10 +32,10 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem, as_problem
 from solvers.distributed.checkpoint import Attempt, Checkpoint, Journal, run_fingerprint
-from solvers.distributed.driver import DEFAULT_MEMORY, Driver
+from solvers.distributed.driver import DEFAULT_MEMORY, Driver, collect
 from solvers.distributed.leaderless import NO_CERTIFICATE, attempt_leaderless
 from solvers.distributed.robust import estimate_by_robots
-from solvers.distributed.stages import attempt_distributed, climb_distributed, collect, judge_collected, open_driver
+from solvers.distributed.stages import attempt_distributed, climb_distributed, judge_collected, open_driver
 from solvers.explanations import note_of_weights
 from solvers.loop import Watch
 from solvers.network.engine import Engine, InProcess
@@ -45,7 +45,7 @@ from solvers.riemannian.newton import Newton, needs_no_soc
 from solvers.riemannian.staircase import DualBound, Staircase
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
-from solvers.robust_solve import solve_robustly
+from solvers.robust_solve import FEW, solve_robustly
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
@@ -56,7 +56,6 @@ HANDOVER_TOLERANCE = 5e-3  # relative residual at which Newton needs one or two 
 HANDOVER = SOC(tolerance=HANDOVER_TOLERANCE, max_iterations=100)
 _SECOND_TRY_TOLERANCE = 1e-6
 AnySOC = TypeVar("AnySOC", bound=SOC | PaperSOC)
-_FEW = 10  # Newton steps that show whether all edges fit, and finish where some were left out
 
 
 @dataclass(frozen=True)
@@ -190,7 +189,7 @@ def solve(
     if robust is not None:
         if checkpoint is not None or pipeline.driver_memory == 0:
             raise SettingError("a robust solve needs a driver, and writes no checkpoint; leave out one of the two")
-        few, short = replace(pipeline.newton, max_iterations=_FEW), replace(pipeline, soc=None, second_try=False)
+        few, short = replace(pipeline.newton, max_iterations=FEW), replace(pipeline, soc=None, second_try=False)
         plain = partial(shown, pipeline=replace(short, newton=few, staircase=None))
         shared = None
         if robots is not None:

@@ -32,7 +32,9 @@ Settle = Callable[[PGOProblem, Poses], Poses]  # to a stationary point nearby
 
 _CHEAP = 4000  # rows of a factor that may become dense: of so few, a factorisation takes a fraction of a second
 _CHEAP_ATTEMPTS = 3
-_FEW = 10  # Newton steps to a certificate: where an attempt has ended at a minimum, two are enough
+# Newton steps that show whether all edges fit, and finish where some were left out: an attempt that has ended at a
+# minimum needs two.
+FEW = 10
 _PAIRED = 4000  # loop closures whose pairs are looked at within seconds
 _FAR, _FURTHER = 1.5, 3.0  # times T; three times it are one right set in a hundred, or fewer, of
 _TRIED = 50  # rejected edges at a time
@@ -216,7 +218,7 @@ class _Trials:
         run = self.watch.run(replace(method, known=self.known[kept]), inlier_problem(self.problem, kept), self.start)
         kept[kept] = run.state.inliers
         inliers = inlier_problem(self.problem, kept)
-        certificate = certify_at(inliers, polish(inliers, run.poses, max_steps=_FEW), self.gap)
+        certificate = certify_at(inliers, polish(inliers, run.poses, max_steps=FEW), self.gap)
         stage = replace(Stage.of(run), name=f"GNC, {name}", objective=run.state.objective)
         attempt = self._attempt(name, kept, certificate, began)
         return _Estimate(attempt, kept, run.state.schedule.scale, certificate, stage)

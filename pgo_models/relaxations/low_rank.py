@@ -14,11 +14,11 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from pgo_models.certificates import newton_polish
-from pgo_models.certificates.dual_variables import certificate_matrix, multipliers
+from pgo_models.certificates.dual_variables import certificate_matrix
 from pgo_models.geometry.arrays import read_only, real_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, hat, tangent_dimension
-from pgo_models.geometry.stiefel import project_to_tangent, retract
+from pgo_models.geometry.stiefel import project_to_tangent, retract, row_products
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.matrices import assemble, block_entries, rotation_columns
 from pgo_models.problem.problem import PGOProblem
@@ -153,7 +153,8 @@ def lifted_point(problem: PGOProblem, Y: Array) -> LiftedPoint:
     Y = real_array(Y, "Y")
     n, d, r = Y.shape
     poses = LiftedPoses(np.swapaxes(Y, 1, 2), problem.translations_for(Y.reshape(n * d, r)))
-    QY, Lambda = problem.apply_M_at(poses)[n:].reshape(n, d, r), multipliers(problem, poses)
+    QY = problem.apply_M_at(poses)[n:].reshape(n, d, r)
+    Lambda = row_products(QY, Y)
     return LiftedPoint(Y, problem.objective(poses), read_only(Lambda), read_only(2.0 * (QY - Lambda @ Y)))
 
 

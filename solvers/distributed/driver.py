@@ -282,3 +282,13 @@ class Driver:
         """What every robot is sent of rotation rows on the cover."""
         rows = np.concatenate([np.zeros((len(self.cover), self.d)), z])
         return [part[len(part) // (self.d + 1) :] for part in self.interface(1, self.d).scatter(rows)]
+
+
+def collect(driver: Driver) -> tuple[Poses, Array]:
+    """All poses and multipliers, for whoever asked for the solution; off the ledger."""
+    n, (_, r, d) = driver.num_poses, driver.at.R.shape
+    R, t, Lambda = np.empty((n, r, d)), np.empty((n, r)), np.empty((n, d, d))
+    R[driver.cover], t[driver.cover], Lambda[driver.cover] = driver.at.R, driver.at.t, driver.at.multipliers
+    for own in driver.ask(Interior.result, None, Count.OFF):
+        R[own.poses], t[own.poses], Lambda[own.poses] = own.R, own.t, own.Lambda
+    return poses_from(R, t), Lambda

@@ -119,7 +119,7 @@ class SubstructuredNewton:
             else:
                 order = replace(order, damping=max(central.DAMPING_START, central.DAMPING_GROWTH * order.damping))
             if order.damping > central.DAMPING_MAX or math.isinf(order.eta):
-                raise NotPositiveDefiniteError("the damped Gauss-Newton matrix is not positive definite")
+                raise NotPositiveDefiniteError("no damping or shift makes Newton's matrix positive definite")
         return model
 
 

@@ -12,12 +12,12 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed.driver import Driver
+from solvers.distributed.driver import Driver, collect
 from solvers.distributed.leaderless import tree_traffic
 from solvers.distributed.newton import SubstructuredNewton
 from solvers.distributed.robots.records import RatioSums, Reweigh
 from solvers.distributed.robots.reweighting import count_below, kept_edges, sum_ratios
-from solvers.distributed.stages import collect, open_driver
+from solvers.distributed.stages import open_driver
 from solvers.loop import Watch
 from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine

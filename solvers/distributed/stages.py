@@ -5,27 +5,22 @@ import time
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
-
 from pgo_models.certificates.certificate import BoundSource, Certificate, certify_with
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.relaxations.low_rank import poses_from
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
-from solvers.distributed.driver import DEFAULT_MEMORY, Driver
+from solvers.distributed.driver import DEFAULT_MEMORY, Driver, collect
 from solvers.distributed.lower_bound import best_bound_distributed
 from solvers.distributed.newton import SubstructuredNewton
 from solvers.distributed.robots.agent import Agent
-from solvers.distributed.robots.interior import Interior
 from solvers.distributed.staircase import SubstructuredStaircase, round_lifted
 from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
 from solvers.loop import Watch
-from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine
 from solvers.network.faults import Faults
 from solvers.result import OUT_OF_TIME, History, Outcome, Stage, Status
@@ -108,14 +103,13 @@ def refine(
 
 def climb_distributed(
     driver: Driver, staircase: Staircase, newton: Newton, watch: Watch, stages: list[Stage]
-) -> tuple[float, DualBound]:
+) -> tuple[float, DualBound | None]:
     """Staircase from the poses at hand, rounding, and Newton: the last decrement, and the bound of the relaxation."""
     climb = watch.run(SubstructuredStaircase(staircase), driver)
-    bound = DualBound(climb.state.bound, collect(driver)[1] if driver.has_whole else np.zeros((0, driver.d, driver.d)))
     round_lifted(driver)
     figures = climb.status, climb.iterations, driver.at.objective, climb.seconds, climb.history, staircase
     stages.append(Stage("Staircase", *figures))
-    return refine(driver, newton, Journal(None, {}, stages), watch), bound
+    return refine(driver, newton, Journal(None, {}, stages), watch), climb.state.bound
 
 
 def start_robots(driver: Driver, start: Poses | None) -> Stage:
@@ -158,13 +152,3 @@ def _run_soc(driver: Driver, soc: SOC, faults: Faults | None, journal: Journal, 
     objective, seconds = _of_the_problem(driver), time.perf_counter() - began
     name = "SOC, convex" if driver.is_final else "SOC"
     return Stage(name, first.status, first.iterations, objective, seconds, first.history, soc)
-
-
-def collect(driver: Driver) -> tuple[Poses, Array]:
-    """All poses and multipliers, for whoever asked for the solution; off the ledger."""
-    n, (_, r, d) = driver.num_poses, driver.at.R.shape
-    R, t, Lambda = np.empty((n, r, d)), np.empty((n, r)), np.empty((n, d, d))
-    R[driver.cover], t[driver.cover], Lambda[driver.cover] = driver.at.R, driver.at.t, driver.at.multipliers
-    for own in driver.ask(Interior.result, None, Count.OFF):
-        R[own.poses], t[own.poses], Lambda[own.poses] = own.R, own.t, own.Lambda
-    return poses_from(R, t), Lambda

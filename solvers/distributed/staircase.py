@@ -11,10 +11,10 @@ from functools import partial
 import numpy as np
 
 from pgo_models.certificates.definiteness import smallest_eta
-from pgo_models.certificates.lower_bound import NO_BOUND, UNGROUNDED_SHIFT, LowerBound, smallest_shift
+from pgo_models.certificates.lower_bound import UNGROUNDED_SHIFT, smallest_shift
 from pgo_models.geometry.rotations import Array, project_to_rotations
 from pgo_models.relaxations.low_rank import append_dimension, gram_matrix, move_poses, poses_from
-from solvers.distributed.driver import Driver
+from solvers.distributed.driver import Driver, collect
 from solvers.distributed.lower_bound import eliminate_S, prove_with_eta
 from solvers.distributed.newton import SubstructuredNewton, SubstructuredNewtonState
 from solvers.distributed.robots import climbing
@@ -23,7 +23,7 @@ from solvers.distributed.robots.records import Move
 from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Status
 from solvers.riemannian.newton import Newton
-from solvers.riemannian.staircase import HALVINGS, ROUNDING, SUFFICIENT, Staircase
+from solvers.riemannian.staircase import HALVINGS, ROUNDING, SUFFICIENT, DualBound, Staircase
 
 # Decrement at which an indefinite Hessian is left by a climb, not by descent, while the rank is below d + _LOW: a ring
 # wound up has plateaus that take 50 steps, and every further rank costs.
@@ -37,7 +37,7 @@ class SubstructuredStaircaseState:
 
     k: int
     newton: SubstructuredNewtonState  # at the rank at hand
-    bound: LowerBound = NO_BOUND  # the best that was proven at a stationary point so far
+    bound: DualBound | None = None  # the best that was proven so far; with multipliers where this process has the graph
     is_solved: bool = False
     stalled: bool = False
 
@@ -92,7 +92,9 @@ class SubstructuredStaircase:
         if found is None:
             return replace(state, stalled=True)
         eta, proven = found
-        state = replace(state, bound=max(state.bound, proven, key=lambda bound: bound.value))
+        if state.bound is None or proven.value > state.bound.lower_bound:
+            Lambda = collect(driver)[1] if driver.has_whole else np.zeros((0, d, d))
+            state = replace(state, bound=DualBound(proven, Lambda))
         if eta <= smallest:
             return replace(state, is_solved=True)
         if not driver.fits(r + 1):
@@ -153,7 +155,7 @@ def _direction(driver: Driver, eta: float) -> tuple[Array, list[Move], float]:
     assert proof is not None  # it has just been proven
     g, d = len(driver.cover), driver.d
     own = np.concatenate([np.zeros((g, 1)), np.random.default_rng(g).standard_normal((d * g, 1))])
-    answers, value, scale = driver.ask(climbing.begin_direction, 0), math.inf, 1.0
+    answers, value, scale = driver.ask(climbing.begin_direction, None), math.inf, 1.0
     for _ in range(_MOST_POWERS):
         norm = math.sqrt(math.fsum([float(np.sum(own**2)), *(answer.square for answer in answers)]))
         x, parts, energy = proof.factor.solve([answer.right.b for answer in answers], own)

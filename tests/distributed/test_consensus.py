@@ -33,9 +33,8 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
-from solvers.distributed.driver import Driver
+from solvers.distributed.driver import Driver, collect
 from solvers.distributed.robots.interior import Interior
-from solvers.distributed.stages import collect
 from solvers.loop import iterate, run
 from solvers.pipeline import Pipeline, solve
 from solvers.result import Status

@@ -24,10 +24,9 @@ from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.low_rank import LiftedPoses, append_dimension
-from solvers.distributed.driver import Driver
+from solvers.distributed.driver import Driver, collect
 from solvers.distributed.newton import SubstructuredNewton, model_at
 from solvers.distributed.robots.records import ModelOrder
-from solvers.distributed.stages import collect
 from solvers.loop import iterate, run
 from solvers.result import Status
 from solvers.riemannian.newton import Newton

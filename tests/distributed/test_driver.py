@@ -18,9 +18,10 @@ from pgo_models.graphs.scenes import NoiseModel, grid
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.driver import collect
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.proof_orders import move_proof, prove_interior
-from solvers.distributed.stages import collect, open_driver
+from solvers.distributed.stages import open_driver
 from solvers.network.engine import InProcess
 from solvers.pipeline import Pipeline, solve
 from solvers.soc.subgraph import split_graph

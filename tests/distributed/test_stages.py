@@ -35,8 +35,8 @@ from pgo_models.graphs.scenes import NoiseModel, grid
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.driver import collect
 from solvers.distributed.lower_bound import best_bound_distributed, prove_with_eta
-from solvers.distributed.stages import collect
 from solvers.network.engine import InProcess
 from solvers.network.faults import Faults
 from solvers.pipeline import HANDOVER, Pipeline, solve

@@ -27,8 +27,7 @@ from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed.driver import Driver
-from solvers.distributed.stages import collect
+from solvers.distributed.driver import Driver, collect
 from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
 from solvers.loop import iterate, run
 from solvers.result import Status

@@ -9,7 +9,7 @@ import numpy as np
 
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations
-from pgo_models.relaxations.low_rank import append_dimension, gram_matrix, move_poses
+from pgo_models.relaxations.low_rank import append_dimension, gram_matrix
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import CostParts, Move, ReducedTranslations, RightHandSide
 
@@ -23,10 +23,10 @@ class PowerStep:
     largest: float
 
 
-def begin_direction(robot: Interior, seed: int) -> tuple[Interior, PowerStep]:
+def begin_direction(robot: Interior, _: None) -> tuple[Interior, PowerStep]:
     """Begin inverse iteration at a random direction of the interior's rotations."""
-    rows = robot.interior_rows
-    return _power_step(robot, np.random.default_rng([seed, *robot.part.poses[:1]]).standard_normal(len(rows)))
+    rng = np.random.default_rng(robot.part.poses[0])
+    return _power_step(robot, rng.standard_normal(len(robot.interior_rows)))
 
 
 def follow_direction(robot: Interior, order: Move) -> tuple[Interior, PowerStep]:
@@ -50,9 +50,7 @@ def pulled(Lambda: Array, x: Array) -> float:
 
 def try_climb(robot: Interior, length: float) -> tuple[Interior, CostParts]:
     """Trial a length along the direction: parts of F there."""
-    assert robot.state.step is not None
-    w, v = robot.state.step
-    trial = move_poses(robot.state.poses, length * w, length * v)
+    trial = robot.moved(length)
     return robot.with_changes(trial=trial), robot.evaluation(trial)
 
 

@@ -189,17 +189,13 @@ class Interior:
 
     def go_straight(self, length: float) -> tuple[Interior, records.TrialEvaluation]:
         """Trial a length along the direction, its translations as they come: F, force and reduced gradient there."""
-        assert self.state.step is not None
-        w, v = self.state.step
-        trial = move_poses(self.state.poses, length * w, length * v)
+        trial = self.moved(length)
         following, gradient = self.with_changes(trial=trial).reduced(self._gradient(trial))
         return following, records.TrialEvaluation(self.evaluation(trial), gradient)
 
     def turn(self, length: float) -> tuple[Interior, records.ReducedTranslations]:
         """Trial rotations a length along the direction, and the right-hand side of their best translations."""
-        assert self.state.step is not None
-        poses, (w, v) = self.state.poses, self.state.step
-        trial = move_poses(poses, length * w, length * v).with_translations(poses.t)
+        trial = self.moved(length).with_translations(self.state.poses.t)
         return self.with_changes(trial=trial)._reduced_translations(trial.R)
 
     def evaluate_trial(self, t: Array) -> tuple[Interior, records.TrialEvaluation]:
@@ -250,6 +246,12 @@ class Interior:
     def tangent_problem(self) -> PGOProblem:
         """A quadratic cost that touches the one at hand at the poses at hand, or is it."""
         return self.problem.tangent_at(self.state.poses)
+
+    def moved(self, length: float) -> Poses:
+        """The poses at hand, moved a length along the direction."""
+        assert self.state.step is not None
+        w, v = self.state.step
+        return move_poses(self.state.poses, length * w, length * v)
 
     @property
     def block(self) -> RecursionBlock:

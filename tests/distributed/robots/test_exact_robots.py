@@ -25,11 +25,11 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed import lower_bound as distributed_bound
+from solvers.distributed.driver import collect
 from solvers.distributed.interface import Interface
 from solvers.distributed.lower_bound import InterfaceProof, best_bound_distributed, prove_grounded, prove_with_eta
 from solvers.distributed.robots.proof import ProofSums
 from solvers.distributed.robots.records import ProofStep, RightHandSide
-from solvers.distributed.stages import collect
 
 
 @settings(max_examples=examples(12))
