@@ -59,7 +59,7 @@ class FolderSolution:
         return self.stages[-1].status
 
     def __str__(self) -> str:
-        (poses, edges), ledger = self.sizes, self.ledger
+        poses, edges = self.sizes
         facts = [
             ("graph", f"{self.name}: {poses.sum()} poses, {edges.sum()} edges, {self.certificate.poses.d}D"),
             ("status", f"{self.status.name}: {self.status.value}"),
@@ -67,8 +67,7 @@ class FolderSolution:
             ("frame", self.frame),
             ("seconds", f"{self.seconds:.3g}"),
             ("robots", f"{len(poses)}, {poses.min()} to {poses.max()} poses each, as their own files have them"),
-            ("network", f"{ledger.rounds} rounds, {ledger.all_reduces} all-reduces, {ledger.messages} messages"),
-            ("bytes", f"{ledger.num_bytes:,}"),
+            *self.ledger.facts(),
         ]
         return "\n".join(f"{label:<12} {text}" for label, text in facts if text)
 
@@ -131,8 +130,9 @@ def solve_folder(
                 else:
                     stages.append(start_robots(driver, None))
                     last = refine(driver, pipeline.newton, journal, watch, attempt)
-                bound = max(bound, best_bound_distributed(driver, gap), relaxed, key=lambda found: found.value)
-                source = BoundSource.RELAXATION if bound is relaxed else BoundSource.GIVEN
+                bound = max(bound, best_bound_distributed(driver, gap), key=lambda found: found.value)
+                source = BoundSource.RELAXATION if relaxed.value > bound.value else BoundSource.GIVEN
+                bound = relaxed if source is BoundSource.RELAXATION else bound
             except NotPositiveDefiniteError as error:
                 raise PGOError(f"{folder}: weights too far apart for doubles ({error}); see pgo info FILE") from error
             if driver.at.objective < F or not answers:

@@ -199,13 +199,9 @@ class Solution(Solved):
     def _network(self) -> list[tuple[str, str]]:
         if self.ledger is None or self.robots is None:
             return []
-        ledger, sizes = self.ledger, self.robots.sizes
-        both_ways = ledger.bytes_sent + ledger.bytes_received
-        return [
-            ("robots", f"{len(sizes)}, {sizes.min()} to {sizes.max()} poses each, {self.robots.method.value}"),
-            ("network", f"{ledger.rounds} rounds, {ledger.all_reduces} all-reduces, {ledger.messages} messages"),
-            ("bytes", f"{ledger.num_bytes:,}; of one robot {both_ways.min():,} to {both_ways.max():,}"),
-        ]
+        sizes = self.robots.sizes
+        robots = f"{len(sizes)}, {sizes.min()} to {sizes.max()} poses each, {self.robots.method.value}"
+        return [("robots", robots), *self.ledger.facts()]
 
 
 def both_costs(problem: PGOProblem, poses: Poses) -> dict[str, float | str | None]:

@@ -112,6 +112,14 @@ class Ledger:
         payload = np.bincount(position, weights=num_bytes, minlength=len(link)).astype(np.int64)
         return link // side - 1, link % side - 1, messages, payload
 
+    def facts(self) -> list[tuple[str, str]]:
+        """Labels and figures, as they are printed."""
+        both_ways = self.bytes_sent + self.bytes_received
+        return [
+            ("network", f"{self.rounds} rounds, {self.all_reduces} all-reduces, {self.messages} messages"),
+            ("bytes", f"{self.num_bytes:,}; of one robot {both_ways.min():,} to {both_ways.max():,}"),
+        ]
+
     def _per_robot(self, robot: IntArray, num_bytes: IntArray) -> IntArray:
         of_robots = robot != DRIVER
         total = np.bincount(robot[of_robots], weights=num_bytes[of_robots], minlength=self.num_robots)

@@ -214,6 +214,10 @@ def test_the_staircase_is_run_by_the_robots(d: int, tmp_path: Path) -> None:
     written = read_g2o(tmp_path / "out")
     assert written.initial is not None
     assert pgo.PGOProblem(written).objective(written.initial) == pytest.approx(found.certificate.objective, rel=1e-9)
+    unfinished = solvers.Pipeline(soc=None, newton=solvers.Newton(max_iterations=0), second_try=False, staircase=None)
+    without = solve_folder(tmp_path / "in", unfinished).certificate
+    assert without.lower_bound == 0.0  # none was found, so it is no relaxation's
+    assert without.source is BoundSource.GIVEN
 
 
 def test_the_staircase_follows_where_newton_has_had_no_step() -> None:
