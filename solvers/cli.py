@@ -237,7 +237,7 @@ def solve_command(
         targets.append((report, partial(write_report, solution, source=source)))
 
     def show() -> None:
-        hints = [*hint_of_chi2(problem, solution.poses), *hint_of_misfits(solution, graph, drop_edge)]
+        hints = [*hint_of_chi2(solution.problem, solution.poses), *hint_of_misfits(solution, graph, drop_edge)]
         typer.echo("\n\n".join([wrapped(text, 13), *map(wrapped, hints)]))
 
     save_then_show(targets, show, solution.as_json if as_json else None, quiet)

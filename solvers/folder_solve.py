@@ -27,7 +27,15 @@ from pgo_models.graphs.g2o import check_g2o_folder, g2o_files
 from pgo_models.graphs.measurements import IntArray
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.lower_bound import best_bound_distributed
-from solvers.distributed.own_files import READ_HERE, Answer, keep_answer, open_files, write_answer
+from solvers.distributed.own_files import (
+    READ_HERE,
+    Answer,
+    keep_answer,
+    move_answer,
+    open_files,
+    return_to_answer,
+    write_answer,
+)
 from solvers.distributed.stages import climb_distributed, refine, start_robots
 from solvers.loop import Watch
 from solvers.network.counted_pool import Count
@@ -37,6 +45,7 @@ from solvers.network.ray_engine import RayEngine
 from solvers.pipeline import Pipeline, finer
 from solvers.result import OUT_OF_TIME, Record, Stage, Status
 from solvers.riemannian.staircase import Staircase
+from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
 
@@ -105,6 +114,8 @@ def solve_folder(
     folder, soc, gap = locate(folder).absolute(), pipeline.soc, pipeline.gap
     if soc is not None and (type(soc) is not SOC or soc.effective_coupling is Coupling.CONSENSUS):
         raise SettingError(f"robots with files of their own run SUBSTRUCTURED SOC, got {soc}; {READ_HERE}")
+    if soc is not None and (soc.robots is not None or soc.r_step is not RStep.FACTORIZED):
+        raise SettingError(f"robots are those of the files, and factor their subproblems, got {soc}; {READ_HERE}")
     files = list(enumerate(g2o_files(folder)))
     if isinstance(engine, RayEngine):  # a process for every robot; snapshots would be here, of all that they have
         recovery = replace(engine.recovery, orders_between_snapshots=sys.maxsize)
@@ -113,18 +124,26 @@ def solve_folder(
         check_g2o_folder(out, len(files))
     stages: list[Stage] = []
     answers: list[Answer] = []
-    bound, F, rounding, decrement = NO_BOUND, math.inf, ObjectiveRounding(0.0, 0.0), math.inf
+    bound, source, F, rounding, decrement = NO_BOUND, BoundSource.GIVEN, math.inf, ObjectiveRounding(0.0, 0.0), math.inf
     driver, sizes = open_files(files, engine if engine is not None else InProcess(), pipeline.driver_memory)
     nowhere = Poses(np.zeros((0, driver.d, driver.d)), np.zeros((0, driver.d)))
     with closing(driver), closing(Journal(None, {}, stages)) as journal:
-        tries = [soc, finer(soc or SOC())][: 1 + pipeline.second_try]
-        for attempt in (*tries, *([pipeline.staircase] if pipeline.staircase is not None else [])):
-            is_climb = isinstance(attempt, Staircase)
-            if stages and (stages[-1].status in OUT_OF_TIME if is_climb else not stages[-1].status.is_success):
-                continue
-            relaxed = NO_BOUND
-            try:
+        best, tries = driver.at, [soc, finer(soc or SOC())][: 1 + pipeline.second_try]
+
+        def judged() -> Certificate:
+            figures = F, bound, math.nan, rounding.level, decrement, source
+            unjudged = Certificate(*figures, nowhere, F, nowhere.R, gap, Verdict.TRIVIAL)
+            return judge_cost(folder.name, unjudged, F, rounding)
+
+        try:
+            for attempt in (*tries, *([pipeline.staircase] if pipeline.staircase is not None else [])):
+                is_climb = isinstance(attempt, Staircase)
+                if stages and (stages[-1].status in OUT_OF_TIME if is_climb else not stages[-1].status.is_success):
+                    continue
+                relaxed = NO_BOUND
                 if isinstance(attempt, Staircase):
+                    driver.network.ask(return_to_answer, [None] * len(files), Count.PIGGYBACKED)
+                    driver.at = best
                     last, dual = climb_distributed(driver, replace(attempt, gap=gap), pipeline.newton, watch, stages)
                     relaxed = dual.bound if dual is not None else NO_BOUND
                 else:
@@ -133,21 +152,26 @@ def solve_folder(
                 bound = max(bound, best_bound_distributed(driver, gap), key=lambda found: found.value)
                 source = BoundSource.RELAXATION if relaxed.value > bound.value else BoundSource.GIVEN
                 bound = relaxed if source is BoundSource.RELAXATION else bound
-            except NotPositiveDefiniteError as error:
-                raise PGOError(f"{folder}: weights too far apart for doubles ({error}); see pgo info FILE") from error
-            if driver.at.objective < F or not answers:
-                answers = driver.network.ask(keep_answer, driver.poses_of_cover(), Count.ROUND)
-                F, decrement = driver.at.objective, last
-                rounding = ObjectiveRounding(driver.at.rounding_level, math.fsum(answer.error for answer in answers))
-            figures = F, bound, math.nan, rounding.level, decrement, source
-            found = Certificate(*figures, nowhere, F, nowhere.R, gap, Verdict.TRIVIAL)
-            certificate = judge_cost(folder.name, found, F, rounding)
-            if not certificate.can_improve:
-                break
+                if driver.at.objective < F or not answers:
+                    answers, best = driver.network.ask(keep_answer, driver.poses_of_cover(), Count.ROUND), driver.at
+                    F, decrement = best.objective, last
+                    rounding = ObjectiveRounding(best.rounding_level, math.fsum(answer.error for answer in answers))
+                if not judged().can_improve:
+                    break
+        except NotPositiveDefiniteError as error:
+            raise PGOError(f"{folder}: weights too far apart for doubles ({error}); see pgo info FILE") from error
+        except KeyboardInterrupt:  # between the loops, which answer it themselves
+            if not answers:
+                raise
+            stages.append(Stage.interruption(F))
         turn, shift, frame = _frame(answers)
+        # A frame far away rounds the poses; what is said is of those that are written.
+        parts = driver.network.ask(move_answer, [(turn, shift)] * len(files), Count.ROUND)
+        F, *rest = map(math.fsum, zip(*parts, strict=True))
+        rounding = ObjectiveRounding(*rest)
+        certificate = judged()
         if out is not None:
-            to = partial(write_answer, Path(out).absolute())
-            driver.network.ask(to, [(turn, shift)] * len(files), Count.ROUND)
+            driver.network.ask(partial(write_answer, Path(out).absolute()), [None] * len(files), Count.PIGGYBACKED)
     told = tuple(stages), driver.network.ledger, frame, time.perf_counter() - watch.began
     return FolderSolution(folder.name, certificate, sizes, *told)
 

@@ -42,7 +42,7 @@ from solvers.network.engine import Engine, InProcess
 from solvers.network.faults import Faults
 from solvers.result import OUT_OF_TIME, History, Record, Run, Stage, Status
 from solvers.riemannian.newton import Newton, needs_no_soc
-from solvers.riemannian.staircase import DualBound, Staircase
+from solvers.riemannian.staircase import DualBound, Staircase, StaircaseState
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust_solve import FEW, solve_robustly
@@ -88,7 +88,9 @@ class Pipeline:
         if not self.driver_memory >= 0:
             raise SettingError(f"driver_memory must not be negative, got {self.driver_memory}; 0 is no driver")
         if self.driver_memory == 0 and not is_consensus:
-            raise SettingError("without a driver there is CONSENSUS alone; use SOC(robots=..), or give driver_memory")
+            raise SettingError(
+                "without a driver robots run CONSENSUS alone; take it (--method consensus), or give driver_memory"
+            )
 
 
 def solve(
@@ -120,7 +122,8 @@ def solve(
     pipeline, start : Pipeline, Poses, optional
         `Pipeline()`, and the method's own start, unless given.
     robust : GNC or PCM, optional
-        Find wrong edges and leave them out: `solvers.robust_solve`. The solution is then of the edges kept alone.
+        Find wrong edges and leave them out: `solvers.robust_solve`. The solution is then of the edges kept alone, by
+        Newton from where they were found: of the pipeline the other stages are not run.
     robots : Partition or int, optional
         Robots that share the poses: start, SOC, Newton and certificate are run by them and a driver, each as if there
         were one, and what crosses the network is in `Solution.ledger`. A number stands for the robots of the pipeline's
@@ -133,8 +136,8 @@ def solve(
         `graph.fixed`; without one the poses are aligned with the estimate, or pose 0 is at the identity. Priors say
         themselves where the poses are.
     callback, time_limit, verbose, progress : optional
-        As in `solvers.loop.run`; of SOC and Newton a true answer ends that stage, and the seconds are those of the
-        iterative stages together. The certificate is found all the same.
+        As in `solvers.loop.run`; a true answer ends the stage, SOC, Newton or staircase, and the seconds are those of
+        the iterative stages together. The certificate is found all the same.
 
     Returns
     -------
@@ -158,8 +161,10 @@ def solve(
     """
     watch = Watch(time_limit, verbose, progress, callback)
     problem = as_problem(problem)
-    if anchor is not None and not 0 <= anchor < problem.num_poses:
+    if anchor is not None and not 0 <= whole_number(anchor, "anchor", SettingError) < problem.num_poses:
         raise SettingError(f"anchor is {anchor}; give a pose, 0 to {problem.num_poses - 1}")
+    if anchor is not None and anchor in problem.graph.landmarks:
+        raise SettingError(f"anchor is {anchor}, a landmark, which has no rotation; give a pose")
     if anchor is not None and problem.graph.world is not None:
         raise SettingError("the priors of the graph say where its poses are; leave out the anchor")
     graph, sights = problem.graph, np.bincount(problem.graph.j, minlength=problem.num_poses)
@@ -187,10 +192,11 @@ def solve(
     if pipeline.driver_memory == 0:
         pipeline = replace(pipeline, second_try=False, staircase=None)
     if robust is not None:
-        if checkpoint is not None or pipeline.driver_memory == 0:
-            raise SettingError("a robust solve needs a driver, and writes no checkpoint; leave out one of the two")
-        few, short = replace(pipeline.newton, max_iterations=FEW), replace(pipeline, soc=None, second_try=False)
-        plain = partial(shown, pipeline=replace(short, newton=few, staircase=None))
+        if checkpoint is not None or pipeline.driver_memory == 0 or pipeline.faults is not None:
+            raise SettingError("a robust solve needs a driver without faults, and writes no checkpoint; leave that out")
+        newton = replace(pipeline.newton, max_iterations=FEW) if isinstance(robust, GNC) else pipeline.newton
+        short = replace(pipeline, soc=None, newton=newton, second_try=False, staircase=None)
+        plain = partial(shown, pipeline=short)
         shared = None
         if robots is not None:
             robots, engine = _robots_for(pipeline.soc, robots, problem.graph), engine or InProcess()
@@ -225,13 +231,15 @@ def solve(
             except KeyboardInterrupt:
                 if not job.stages:
                     raise
-                watch.found.append(collect(driver)[0])
+                watch.found.extend([collect(driver)[0]] if has_driver else [])
                 poses, certificate = job.broken_off()
             poses, certificate = job.improve(poses, certificate, driver)
             if job.stages[-1].status.is_success:
                 journal.end()
         ledger = driver.network.ledger
     poses, frame, held = framed(poses, problem.graph, anchor)
+    # A frame far away rounds the poses; what is said is of those that are returned.
+    certificate = replace(judge(problem, poses, certificate), stationarity=certificate.stationarity)
     return Solution(
         problem=problem,
         poses=poses,
@@ -290,8 +298,8 @@ class _Job:
     def attempt(self, soc: SOC | PaperSOC | None, start: Poses | None) -> Attempt:
         """SOC, Newton and certificate from a start; the first on the convex part of chi2 where that is not convex."""
         began, first_problem = time.perf_counter(), self.problem.convex_part
-        no_nearer = first_problem is not self.problem  # the minimum of chi2's convex part, than the chordal start
-        if soc is not None and soc == HANDOVER and (no_nearer or (start is None and needs_no_soc(self.problem))):
+        has_convex_part = first_problem is not self.problem  # whose minimum is no nearer to chi2's than the start is
+        if soc is not None and soc == HANDOVER and (has_convex_part or (start is None and needs_no_soc(self.problem))):
             soc = None
         is_paper = isinstance(soc, PaperSOC)
         name = ("spanning tree" if is_paper else "chordal start") if start is None else "given start"
@@ -307,7 +315,7 @@ class _Job:
             # A start that is better than SOC's best iterate is kept: CSAIL's chordal start is within 1e-4.
             poses = first.poses if first.objective <= first_problem.objective(poses) else poses
             stage = Stage.of(first)
-            if no_nearer:
+            if has_convex_part:
                 stage = replace(stage, name=f"{stage.name}, convex", objective=self.problem.objective(poses))
             self.stages.append(stage)
             del first  # its factor is the next one's to take over
@@ -330,7 +338,7 @@ class _Job:
         if staircase is None or not certificate.can_improve or self.stages[-1].status in OUT_OF_TIME:
             return poses, certificate
         try:
-            if problem.is_quadratic:
+            if problem.convex_part is problem:  # quadratic and convex
                 poses, certificate = self.climb(replace(staircase, gap=self.pipeline.gap), poses, certificate, driver)
             certificate = soften(problem, certificate)
         except KeyboardInterrupt:
@@ -348,7 +356,13 @@ class _Job:
         else:
             bounds: list[DualBound | None] = [None]
             # Of a run that was cut short the state with the best poses is kept, not the one with the best bound.
-            watching = replace(self.watch, callback=lambda state, record: bounds.append(state.bound))
+            told = self.watch.callback
+
+            def watched(state: StaircaseState, record: Record) -> bool | None:
+                bounds.append(state.bound)
+                return told(state, record) if told is not None else None
+
+            watching = replace(self.watch, callback=watched)
             climb = watching.run(staircase, problem, poses)
             self.stages.append(Stage.of(climb))
             other, bound = self.polish(climb.poses)[1], bounds[-1]
@@ -368,7 +382,7 @@ class _Job:
 
     def interrupt(self, objective: float) -> None:
         """Note that what was under way was broken off."""
-        self.stages.append(Stage("interruption", Status.INTERRUPTED, 0, objective, 0.0, History()))
+        self.stages.append(Stage.interruption(objective))
 
 
 def finer(soc: AnySOC) -> AnySOC:

@@ -134,3 +134,8 @@ class Stage:
     def of(cls, run: Run[S]) -> "Stage":
         """Stage of a finished run."""
         return cls(run.name, run.status, run.iterations, run.objective, run.seconds, run.history, run.method)
+
+    @classmethod
+    def interruption(cls, objective: float) -> "Stage":
+        """Note that what was under way was broken off."""
+        return cls("interruption", Status.INTERRUPTED, 0, objective, 0.0, History())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import partial, reduce
 from heapq import heapify, heappop, heappush
 
 import numpy as np
@@ -21,7 +21,7 @@ from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds, edge_res
 from solvers.distributed.robust import SharedEstimate
 from solvers.loop import Watch
 from solvers.network.ledger import Ledger
-from solvers.result import OUT_OF_TIME, Stage
+from solvers.result import OUT_OF_TIME, Stage, Status
 from solvers.robust.consistency import PCM, pairwise_consistent
 from solvers.robust.gnc import GNC, RobustLoss, known_inliers
 from solvers.robust.rejection import Attempt, Rejection
@@ -36,9 +36,12 @@ _CHEAP_ATTEMPTS = 3
 # minimum needs two.
 FEW = 10
 _PAIRED = 4000  # loop closures whose pairs are looked at within seconds
-_FAR, _FURTHER = 1.5, 3.0  # times T; three times it are one right set in a hundred, or fewer, of
+_WORSE = 2.0  # times the least truncated cost: 1.2 at most where a certified attempt of more was right, 3 where wrong
+# Times T; three times it are one right set in a hundred, or fewer, of `_MANY` edges on, whatever the scale of their
+# matrices: so are the largest two of as many chi^2_3.
+_FAR, _FURTHER = 1.5, 3.0
+_MANY = 15
 _TRIED = 50  # rejected edges at a time
-_MANY = 15  # edges on, whatever the scale of their matrices: so are the largest two of as many chi^2_3
 _TIGHT, _NARROW = (0.1, 0.01), 0.3  # of the thresholds at first, and of how far they are widened
 
 
@@ -59,7 +62,8 @@ def solve_robustly(
     the pairwise consistent edges; with more and smaller steps; with tight thresholds, which are then widened by what
     the edges kept say; with the other loss. Of those certified, or of all if none is, that of the least truncated cost
     of all edges is kept, less what the others contradict (`uncontradicted`) and, where it is cheap and attempts
-    differ, with those that they can follow (`reinstated`), if that is certified.
+    differ, with those that they can follow (`reinstated`), if that is certified. Of few closures anything is certified,
+    a tree exactly: where another attempt costs less than half of that, it is kept, and there is no certificate.
 
     By robots (`shared`, `plain`) certificates are theirs, and what crosses the network is added up. A SettingError when
     robust is none, or PCM by robots, a GraphError when known inliers and the edges kept do not connect the poses.
@@ -90,30 +94,50 @@ def solve_robustly(
 
     if is_cheap and start is None:
         solution, everything = solved(problem, None), np.ones(graph.num_edges, dtype=bool)
+        if solution.status in OUT_OF_TIME:
+            return result(solution, everything, thresholds, "the plain solution: there was no time for others", ())
         residuals = solution.edge_residuals
-        fits = (known | (residuals.cost <= thresholds)).all() and not residuals.is_overall_misfit
-        fits = fits and uncontradicted(problem, known, everything, solution.poses, settled).all()
-        if (solution.is_certified and fits) or solution.status in OUT_OF_TIME:
+        fits = solution.is_certified and not residuals.is_overall_misfit
+        fits = fits and bool((known | (residuals.cost <= thresholds)).all())
+        if fits and uncontradicted(problem, known, everything, solution.poses, settled).all():
             return result(solution, everything, thresholds, "the plain solution, which fits every edge", ())
     if isinstance(robust, PCM):
         kept = known | pairwise_consistent(graph, known, robust.quantile)
         return result(solved(inlier_problem(problem, kept), start), kept, thresholds, "pairwise consistency alone", ())
     attempts: list[_Estimate] = []
     trials = _Trials(problem, known, thresholds, gap, start, watch)
-    for name, method, tested in _methods(robust, graph, known, shared is None, is_cheap):
-        found = trials.run(name, method, tested) if shared is None else trials.share(name, method, plain, shared)
-        attempts.append(found)
-        solutions += filter(None, [found.solution])
-        is_enough = len(attempts) >= (_CHEAP_ATTEMPTS if is_cheap else 1)
-        if found.stage.status in OUT_OF_TIME or (is_enough and any(one.certificate.is_certified for one in attempts)):
-            break
+    attempt = trials.run if shared is None else partial(trials.share, plain=plain, shared=shared)
+    apart, last = GraphError(), Status.CONVERGED
+    try:
+        for name, method, tested in _methods(robust, graph, known, shared is None, is_cheap):
+            try:
+                found = attempt(name, method, tested)
+            except GraphError as error:  # the edges that it keeps do not connect the poses; those of another may
+                apart = error
+                continue
+            attempts.append(found)
+            solutions += filter(None, [found.solution])
+            is_enough = len(attempts) >= (_CHEAP_ATTEMPTS if is_cheap else 1)
+            last, is_certified = found.stage.status, any(one.certificate.is_certified for one in attempts)
+            if last in OUT_OF_TIME or (is_enough and is_certified):
+                break
+    except KeyboardInterrupt:  # between the loops, which answer it themselves
+        if not attempts:
+            raise
+        last = Status.INTERRUPTED
+    if not attempts:
+        raise apart
     best = min(attempts, key=lambda one: (not one.certificate.is_certified, one.attempt.cost))
-    sets, poses, name = [best.kept], best.certificate.poses, best.attempt.name
-    if attempts[-1].stage.status not in OUT_OF_TIME:
-        sets = [uncontradicted(problem, known, best.kept, poses, settled)]
-        if is_cheap and any((one.kept != best.kept).any() for one in attempts):
-            more = reinstated(problem, sets[0], poses, settled)
-            sets = [more, *sets] if (more != sets[0]).any() else sets
+    least = min(attempts, key=lambda one: one.attempt.cost)
+    sets, poses = [best.kept], best.certificate.poses
+    if last not in OUT_OF_TIME:
+        try:
+            sets = [uncontradicted(problem, known, best.kept, poses, settled)]
+            if is_cheap and any((one.kept != best.kept).any() for one in attempts):
+                more = reinstated(problem, sets[0], poses, settled)
+                sets = [more, *sets] if (more != sets[0]).any() else sets
+        except KeyboardInterrupt:
+            last = Status.INTERRUPTED
     for kept in sets:
         inliers, is_new = inlier_problem(problem, kept), not np.array_equal(kept, best.kept)
         solution = (None if is_new else best.solution) or solved(inliers, poses)
@@ -121,9 +145,13 @@ def solve_robustly(
             solution = min(solution, solved(inliers, None), key=lambda one: one.objective)
         if solution.is_certified:
             break
+    if min(best.attempt.cost, trials.truncated_cost(solution.poses)) > _WORSE * least.attempt.cost:
+        best, kept = least, least.kept
+        solution = least.solution or solved(inlier_problem(problem, kept), least.certificate.poses)
+    name = best.attempt.name
     name += f", less {gone} that all others contradict" if (gone := (best.kept & ~kept).sum()) else ""
     name += f", with {back} that they can follow" if (back := (kept & ~best.kept).sum()) else ""
-    stages, last = (*(one.stage for one in attempts), *solution.stages), attempts[-1].stage.status
+    stages = *(one.stage for one in attempts), *solution.stages
     solution = replace(solution, stages=stages, status=last if last in OUT_OF_TIME else solution.status)
     return result(solution, kept, best.scale * thresholds, name, tuple(one.attempt for one in attempts))
 
@@ -223,8 +251,10 @@ class _Trials:
         attempt = self._attempt(name, kept, certificate, began)
         return _Estimate(attempt, kept, run.state.schedule.scale, certificate, stage)
 
-    def share(self, name: str, method: GNC, plain: Plain, shared: Callable[..., SharedEstimate]) -> _Estimate:
-        """The same by robots."""
+    def share(
+        self, name: str, method: GNC, _: BoolArray, plain: Plain, shared: Callable[..., SharedEstimate]
+    ) -> _Estimate:
+        """The same by robots, who test no edges before."""
         began = time.perf_counter()
         found = shared(self.problem, method, self.thresholds, self.start, self.watch)
         kept, stage = found.kept, replace(found.stage, name=f"GNC, {name}")
@@ -235,9 +265,13 @@ class _Trials:
         return _Estimate(attempt, kept, found.scale, solution.certificate, stage, solution)
 
     def _attempt(self, name: str, kept: BoolArray, certificate: Certificate, began: float) -> Attempt:
-        seconds, costs = time.perf_counter() - began, self.problem.edge_costs(certificate.poses)
-        cost = float(np.sum(np.where(self.known, costs, np.minimum(costs, self.thresholds))))
+        seconds, cost = time.perf_counter() - began, self.truncated_cost(certificate.poses)
         return Attempt(name, cost, int((~kept).sum()), certificate.gap, certificate.is_certified, seconds)
+
+    def truncated_cost(self, poses: Poses) -> float:
+        """Cost of all edges, of which those that are not known count their threshold at most."""
+        costs = self.problem.edge_costs(poses)
+        return float(np.sum(np.where(self.known, costs, np.minimum(costs, self.thresholds))))
 
 
 def _methods(

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -107,3 +108,16 @@ def test_its_marginals_are_of_poses_it_names_beside_its_anchor(solution):
     assert solvers.solve(solution.problem, anchor=9).anchor == 9
     with pytest.raises(SettingError, match="there is no pose 25; give one of 0 to 24"):
         solution.marginals(25)
+
+
+@pytest.mark.parametrize("robots", [None, 3])
+@pytest.mark.parametrize("away", [1e6, 1e12, 1e15])
+def test_what_is_certified_are_the_poses_that_are_returned_however_far_their_frame(away, robots):
+    graph = pgo.grid_world(2, 15, np.random.default_rng(0), d=2)
+    far = replace(graph, initial=graph.truth.moved(np.eye(2), np.array([away, -away])), truth=None)
+    near, found = (solvers.solve(one, robots=robots) for one in (graph, far))
+    F = pgo.PGOProblem(far).objective(found.poses)
+    assert found.certificate.objective == found.objective == F
+    assert found.gap == pytest.approx((F - near.lower_bound) / F, rel=1e-6, abs=1e-12)
+    assert found.is_certified == (found.gap <= 1e-6)
+    assert away < 1e15 or not found.is_certified

@@ -289,7 +289,9 @@ def verdict_of(objective: float, level: float, gap: float, bound: LowerBound, wa
 
 
 def relative_gap(objective: float, lower_bound: float, rounding_level: float = 0.0) -> float:
-    """(objective - lower_bound) / objective; 0 where F is at its rounding level, and so as good as zero."""
+    """(objective - lower_bound) / objective; 0 where F is at its rounding level, 1 where it overflows."""
+    if not math.isfinite(objective):
+        return 1.0
     return (objective - lower_bound) / objective if objective > rounding_level else 0.0
 
 

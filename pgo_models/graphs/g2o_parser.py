@@ -210,7 +210,9 @@ class _Source:
         except ValueError:
             raise self._error(line, f"id {word[:40]!r} is no integer; number the poses") from None
         if not -(2**63) <= value < WORLD_ID:
-            raise self._error(line, f"id {word[:40]} does not fit 64 bits; renumber the poses")
+            raise self._error(
+                line, f"id {word[:40]} does not fit 64 bits, less one that stands for the world; renumber the poses"
+            )
         return value
 
     def _diagnose(self, tag: str, at: list[int], lines: list[str]) -> NoReturn:

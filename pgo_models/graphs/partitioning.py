@@ -68,7 +68,7 @@ def partition(graph: PoseGraph, num_robots: int | None = None, method: Partition
 
     The number of robots is needed unless the graph names its robots or every pose is its own; the method is GIVEN when
     the graph names as many robots as asked for, else CONTIGUOUS, unless another is given. A SettingError when the
-    number is not a whole one of 1 to n, or GIVEN does not fit; a MissingExtraError for METIS without the extra `fast`.
+    number is no whole one of 1 to n, or not the method's; a MissingExtraError for METIS without the extra `fast`.
 
     Examples
     --------
@@ -83,10 +83,13 @@ def partition(graph: PoseGraph, num_robots: int | None = None, method: Partition
     if method is None:
         method = PartitionMethod.GIVEN if named else PartitionMethod.CONTIGUOUS
     if method is PartitionMethod.SINGLETONS:
+        if num_robots not in (None, n):
+            raise SettingError(f"one robot a pose makes {n}, asked for {num_robots}; leave out the number")
         return Partition(np.arange(n), method)
     if method is PartitionMethod.GIVEN:
         if not named:
-            raise SettingError(f"{graph!r} names {graph.num_robots} robots, asked for {num_robots}; use CONTIGUOUS")
+            names = f"{graph!r} names {'no' if graph.robot is None else graph.num_robots} robots"
+            raise SettingError(f"{names}, asked for {num_robots}; use another method, or leave out the number")
         return Partition(graph.robots, method)
     if num_robots is None or not 1 <= num_robots <= n:
         raise SettingError(f"num_robots is {num_robots}; give 1 to {n}, the number of poses")
@@ -109,5 +112,13 @@ def _metis(graph: PoseGraph, num_robots: int) -> IntArray:
     pymetis = extra_module("pymetis", "fast")
     neighbours = pymetis.CSRAdjacency(graph.adjacency.indptr.tolist(), graph.adjacency.indices.tolist())
     counts, options = graph.adjacency.data.astype(np.int64).tolist(), pymetis.Options(contig=True, seed=0)
-    _, part = pymetis.part_graph(num_robots, adjacency=neighbours, eweights=counts, options=options)
-    return np.asarray(np.unique(np.asarray(part), return_inverse=True)[1], dtype=np.int64)
+    for in_halves in (False, True):  # k parts at once are better balanced, but of a few poses each some are empty
+        _, found = pymetis.part_graph(
+            num_robots, adjacency=neighbours, eweights=counts, options=options, recursive=in_halves
+        )
+        part = np.unique(np.asarray(found), return_inverse=True)[1].astype(np.int64)
+        if part.max() == num_robots - 1:
+            break
+    for robot in range(int(part.max()) + 1, num_robots):  # the largest gives a pose
+        part[np.flatnonzero(part == np.bincount(part).argmax())[-1]] = robot
+    return part

@@ -105,7 +105,7 @@ class PoseGraph(Measurements):
             more = f" and {len(parts) - 5} more" if len(parts) > 5 else ""
             firsts = ", ".join(self.pose_name(part[0]) for part in parts[:5])
             found = f"{len(parts)} components (sizes {sizes}{more}; with poses {firsts}{more})"
-            way_out = "solve each on its own: PoseGraph.subgraph(PoseGraph.components()[k])"
+            way_out = "add edges between them, or solve each on its own (PoseGraph.components, PoseGraph.subgraph)"
             raise GraphError(f"pose graph has {found}; {way_out}")
         self._check_determined()
 
@@ -166,11 +166,18 @@ class PoseGraph(Measurements):
 
     def without_edges(self, mask: BoolArray) -> PoseGraph:
         """Return the graph without the edges of a mask, (m,); with the last prior goes the world pose."""
-        kept = replace(self, **self._rows(~np.asarray(mask, dtype=bool)))
+        mask = np.asarray(mask, dtype=bool)
+        if mask.shape != (self.num_edges,):
+            raise GraphError(
+                f"the mask has shape {mask.shape}; give one truth value for each of {self.num_edges} edges"
+            )
+        kept = replace(self, **self._rows(~mask))
         return kept if self.world is None or kept.is_prior.any() else kept.subgraph(self.in_files)
 
     def with_edges(self, i: IntArray, j: IntArray, measured: Poses, kappa: Weights, tau: Weights) -> PoseGraph:
         """Return the graph with more edges (i, j), (k,), of precisions (k,) or the same; information as they say."""
+        if measured.d != self.d or not len(i) == len(j) == measured.num_poses:
+            raise GraphError(f"{measured} for {len(i)} edges in {self.d}D; give one measured pose for every edge")
         kappa, tau = (np.array(np.broadcast_to(one, np.shape(i)), dtype=float) for one in (kappa, tau))
         more = i, j, measured.R, measured.t, kappa, tau, isotropic_information(kappa, tau, self.d)
         rows = zip(self._rows(np.ones(self.num_edges, dtype=bool)).items(), more, strict=False)

@@ -44,7 +44,6 @@ class CliqueRelaxation:
     upper: tuple[cp.Variable, ...]  # upper triangle of every W_C, row by row
     # A w = b for w all of these, clique after clique: R_i^T R_i = I and agreement on separators; its dual gives Lambda.
     equalities: cp.Constraint
-    semidefinite: tuple[cp.Constraint, ...]  # W_C PSD, one for every clique
     scale: float  # of the objective: F at the centre, or for noise-free graphs a share of L
     _layout: "_Layout"
     _to_Lambda: csr_array
@@ -103,7 +102,7 @@ def clique_relaxation(
     w = cp.hstack(upper)
     agree = A @ w == b
     model, to_Lambda = cp.Problem(cp.Minimize((_costs(layout) / scale) @ w), [agree, *blocks]), equations.to_Lambda()
-    return CliqueRelaxation(problem, tree, centre, model, upper, agree, blocks, scale, layout, to_Lambda)
+    return CliqueRelaxation(problem, tree, centre, model, upper, agree, scale, layout, to_Lambda)
 
 
 @dataclass(frozen=True, eq=False)

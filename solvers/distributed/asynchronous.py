@@ -24,7 +24,7 @@ from solvers.soc.soc import SOC
 
 @dataclass(frozen=True, eq=False)
 class AsynchronousState:
-    """Round k: what the robots reported, and the channel with messages under way."""
+    """Round k: what the robots reported, and the channel with messages under way, which a step replaces in place."""
 
     k: int
     size: float  # ||omega||_rho

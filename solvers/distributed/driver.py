@@ -2,8 +2,8 @@
 
 It holds the poses G of a vertex cover of the edges between robots, and never an interior pose or a private edge. One
 gather of the robots' reduced right-hand sides, one solve and one scatter are a round; a solve of M x = b, a step (a), a
-Newton direction, the best translations of given rotations and a proof of the certificate take one each. Where robots
-hold fronts of the separator tree gather and scatter go along it, level by level (`Ledger.bytes_by_level`).
+Newton direction and the best translations of given rotations take one each, a proof of the certificate two. Where
+robots hold fronts of the separator tree gather and scatter go along it, level by level (`Ledger.bytes_by_level`).
 """
 
 import math
@@ -111,8 +111,12 @@ class Driver:
         self._laplacian: Interface | None = None
         pool = start()
         self.network = pool if isinstance(pool, CountedPool) else CountedPool(pool, len(outlines))
-        fronts.hand_out(self.network, self.robots)
-        self.describe(Count.OFF)
+        try:
+            fronts.hand_out(self.network, self.robots)
+            self.describe(Count.OFF)
+        except BaseException:  # also Ctrl-C: nothing stays behind
+            self.network.workers.close()
+            raise
 
     def ask(self, order: Order[Q, A], request: Q, count: Count = Count.ROUND) -> list[A]:
         """Answers of all interiors to an order with one request."""
@@ -254,6 +258,16 @@ class Driver:
         self.at = self.kept
         self.ask(Interior.restore_poses, None, Count.PIGGYBACKED)
 
+    def accept(self, trial: CoverPoses) -> None:
+        """Go to the trial, here and on the robots; all of them, also where Ctrl-C comes between."""
+        try:
+            self.ask(Interior.accept, None, Count.PIGGYBACKED)
+        except KeyboardInterrupt:
+            self.ask(Interior.accept, None, Count.OFF)
+            self.at = trial
+            raise
+        self.at = trial
+
     def adopt(self, R: Array) -> None:
         """Give the robots rotations of the cover, (g, d, d), and all the best translations for them: two rounds."""
         self.at = replace(self.at, R=R)
@@ -268,7 +282,9 @@ class Driver:
     def best_translations(self, answers: Sequence[ReducedTranslations]) -> tuple[Array, list[Array]]:
         """Translations of the cover, and what every robot is sent of them."""
         if self._laplacian is None:
-            matrices = [answer.schur for answer in answers if answer.schur is not None]
+            is_new = all(answer.schur is not None for answer in answers)  # else the first factorisation has failed
+            told = answers if is_new else self.ask(Interior.eliminated_translations, None, Count.PIGGYBACKED)
+            matrices = [answer.schur for answer in told if answer.schur is not None]
             self._laplacian = self.interface(1).factorize(matrices, self.grounded_translation())
         return self._laplacian.solve([answer.b for answer in answers])[:2]
 

@@ -59,8 +59,8 @@ class Interface:
         """Refuse before the memory is spent: a SettingError when `num_bytes` is above `limit`."""
         if self.num_bytes > limit:
             raise SettingError(
-                f"the driver, and robots that hold fronts for it, would need {1e-9 * self.num_bytes:.1f} GB for "
-                f"{self.num_separators} separators, more than {1e-9 * limit:.1f} GB: they are solved for in the start, "
+                f"the driver, and robots that hold fronts for it, would need {1e-9 * self.num_bytes:.2g} GB for "
+                f"{self.num_separators} separators, more than {1e-9 * limit:.2g} GB: they are solved for in the start, "
                 "Newton and the certificate, whatever the coupling; use a METIS partition or fewer robots, raise "
                 "driver_memory (--driver-memory), or set it to 0: CONSENSUS without a driver, which gives poses and no "
                 "certificate"
@@ -68,6 +68,8 @@ class Interface:
 
     def factorize(self, contributions: Sequence[Array], own: Sequence[tuple[IntArray, Array]] = ()) -> Interface:
         """Sum the robots' Schur complements and the driver's own blocks, and factor, front by front; for `solve`.
+
+        The factor takes the place of the one before: a driver has one `Interface` for all unknowns of these widths.
 
         The contributions, (g (g + 1) / 2,) for a robot with g columns, are as `Elimination.schur`; the driver's own are
         pairs of columns (q, w) and values (q, w, w), each block on unknowns of one separator. A

@@ -24,11 +24,11 @@ from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.distributed.driver import Driver
-from solvers.loop import Watch, run
+from solvers.loop import Watch
 from solvers.network.counted_pool import Count
 from solvers.network.faults import Faults
 from solvers.network.ledger import BYTES_PER_NUMBER, Traffic
-from solvers.result import History, Outcome, Stage, Status
+from solvers.result import OUT_OF_TIME, History, Outcome, Stage, Status
 from solvers.soc.consensus import ConsensusState, ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.recursion_block import Rotations
@@ -63,8 +63,9 @@ def attempt_leaderless(
         for traffic in tree_traffic(problem, robots):
             driver.network.ledger = driver.network.ledger.after_round(traffic)
         few = replace(soc, local_passes=1, tolerance=_TOLERANCE, max_iterations=_MOST_ROUNDS)
+        unseen = replace(watch, callback=None, verbose=False, progress=False)
         for rotations in (Rotations.RELAXED, Rotations.FIXED):
-            rounds = run(ConsensusSOC(few, False, rotations is Rotations.FIXED, rotations), driver)
+            rounds = unseen.run(ConsensusSOC(few, False, rotations is Rotations.FIXED, rotations), driver)
             iterations, status, history = iterations + rounds.iterations, rounds.status, rounds.history
             if not status.is_success:
                 break
@@ -75,17 +76,19 @@ def attempt_leaderless(
         name = "chordal start, by rounds" if goes_on else "given start" if start is not None else "spanning tree"
         objective, seconds = problem.objective(before), time.perf_counter() - began
         journal.stages.append(Stage(name, status, iterations, objective, seconds, history))
-    began = time.perf_counter()
-    first: Outcome[AsynchronousState] | Outcome[ConsensusState]
-    if faults is not None:
-        first = watch.run(AsynchronousSOC(soc, faults, has_driver=False, goes_on=goes_on), driver)
-    else:
-        first = journal.run(ConsensusSOC(soc, has_driver=False, goes_on=goes_on), driver, watch)
-    poses = collect_copies(driver)
-    if not problem.objective(poses) <= problem.objective(before):
-        poses = before
-    objective, seconds = problem.objective(poses), time.perf_counter() - began
-    journal.stages.append(Stage("SOC", first.status, first.iterations, objective, seconds, first.history, soc))
+    poses = before
+    watch.found.append(before)
+    if status not in OUT_OF_TIME:
+        began = time.perf_counter()
+        first: Outcome[AsynchronousState] | Outcome[ConsensusState]
+        if faults is not None:
+            first = watch.run(AsynchronousSOC(soc, faults, has_driver=False, goes_on=goes_on), driver)
+        else:
+            first = journal.run(ConsensusSOC(soc, has_driver=False, goes_on=goes_on), driver, watch)
+        poses = min(before, collect_copies(driver), key=problem.objective)
+        watch.found.append(poses)
+        objective, seconds = problem.objective(poses), time.perf_counter() - began
+        journal.stages.append(Stage("SOC", first.status, first.iterations, objective, seconds, first.history, soc))
     nothing = np.zeros((problem.num_poses, problem.d, problem.d))
     return poses, certify_with(problem, poses, nothing, gap, math.inf, BoundSource.GIVEN, NO_BOUND)
 

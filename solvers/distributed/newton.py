@@ -87,8 +87,7 @@ class SubstructuredNewton:
             at_rounding = central.reached_rounding(decrement, after, model.order.is_newton and not moved)
             if trial.objective >= driver.at.objective and after > 0.5 * decrement:
                 break
-            driver.ask(Interior.accept, None, Count.PIGGYBACKED)
-            driver.at = trial
+            driver.accept(trial)
             enough = after <= central.PROGRESS * decrement
             model, decrement, moved = following, after, True
             if not enough:

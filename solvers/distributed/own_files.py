@@ -25,8 +25,8 @@ from pgo_models.graphs.pose_graph import WORLD_ID, PoseGraph, edge_counts, middl
 from pgo_models.graphs.precisions import edge_precisions
 from pgo_models.problem.matrices import isotropic_weights
 from solvers.distributed.driver import Driver
-from solvers.distributed.robots.agent import Agent, held_poses
-from solvers.distributed.robots.interior import interior_of
+from solvers.distributed.robots.agent import Agent, held_poses, order_interior
+from solvers.distributed.robots.interior import Interior, interior_of
 from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import Engine
 from solvers.soc.subgraph import Outline, Placement, Subgraph, place_poses
@@ -166,11 +166,26 @@ def keep_answer(agent: FileAgent, cover: Poses) -> Answer:
     return Answer(error, held, agent.answer[np.array([first])].stacked(), agent.given)
 
 
-def write_answer(folder: Path, agent: FileAgent, motion: tuple[Array, Array]) -> None:
-    """Write the poses that were kept, moved by (R, t), and the robot's edges."""
+def return_to_answer(agent: FileAgent, _: None) -> None:
+    """Go back to the poses that were kept; the driver does likewise."""
+    if agent.interior is not None:
+        order_interior(Interior.set_poses, agent, agent.answer[_places(agent, agent.interior)])
+
+
+def move_answer(agent: FileAgent, motion: tuple[Array, Array]) -> Array:
+    """Move the poses that were kept by (R, t); parts of F there, of its rounding level and of its error, (3,)."""
+    agent.answer = agent.answer.moved(*motion)
+    if agent.interior is None:
+        return np.zeros(3)
+    problem, poses = agent.interior.problem, agent.answer[_places(agent, agent.interior)]
+    rounding = objective_rounding(problem, poses)
+    return np.array([problem.objective(poses), rounding.level, rounding.error])
+
+
+def write_answer(folder: Path, agent: FileAgent, _: None) -> None:
+    """Write the poses that were kept, and the robot's edges."""
     make_folder(folder)
-    poses = agent.answer.moved(*motion)
-    write_g2o(agent.graph, folder / f"{agent.robot}.g2o", poses, agent.subgraph.is_own)
+    write_g2o(agent.graph, folder / f"{agent.robot}.g2o", agent.answer, agent.subgraph.is_own)
 
 
 def open_files(files: Sequence[RobotFile], engine: Engine, memory: float) -> tuple[Driver, IntArray]:
@@ -215,6 +230,11 @@ def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> tuple[lis
             raise FileFormatError(path, None, f"{problem}; take it away, or {READ_HERE}")
     number = np.cumsum(np.where(names.any(axis=0), size, 0)) - size
     return [OwnedRuns(first[own], number[own], owner[own]) for own in names], int(size[known].sum())
+
+
+def _places(agent: FileAgent, interior: Interior) -> IntArray:
+    """Places of the interior's poses among those that the robot holds."""
+    return np.searchsorted(agent.subgraph.poses, interior.part.poses)
 
 
 def _check_connected(borders: Sequence[Border], without_edge: int, folder: Path) -> None:

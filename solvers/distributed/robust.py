@@ -11,6 +11,7 @@ import numpy as np
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.partitioning import Partition
+from pgo_models.graphs.pose_graph import bridges
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.leaderless import tree_traffic
@@ -25,7 +26,7 @@ from solvers.network.ledger import Ledger
 from solvers.result import Measurement, Stage, Status
 from solvers.robust.gnc import GNC, GNCSchedule, RobustLoss, first_poses, known_inliers, left_out
 
-_HALVINGS = 24  # of an interval of 24 factors of ten, for a median to 1e-6 of itself
+_HALVINGS = 26  # of an interval of 24 factors of ten, for a median to 1e-6 of itself
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,10 @@ def estimate_by_robots(
     engine: Engine,
     memory: float,
 ) -> SharedEstimate:
-    """Graduated non-convexity by robots, from `start` or along a tree of known inliers."""
+    """Graduated non-convexity by robots, from `start` or along a tree of known inliers.
+
+    Edges that connect what those kept leave apart are kept, too; as all that is handed back they are off the ledger.
+    """
     known = known_inliers(problem.graph, gnc.known)
     allowed = np.where(known, np.inf, thresholds)
     with closing(open_driver(problem, robots, engine, memory, allowed)) as driver:
@@ -141,5 +145,7 @@ def estimate_by_robots(
         scale = run.state.schedule.scale
         kept = np.zeros(problem.graph.num_edges, dtype=bool)
         kept[np.concatenate(driver.ask(kept_edges, scale, Count.OFF))] = True
+        poses = collect(driver)[0]
+        kept[bridges(problem.graph, kept, problem.edge_costs(poses) / thresholds)] = True
         stage = Stage("GNC", run.status, run.iterations, run.objective, run.seconds, run.history, gnc)
-        return SharedEstimate(collect(driver)[0], kept, scale, stage, driver.network.ledger)
+        return SharedEstimate(poses, kept, scale, stage, driver.network.ledger)

@@ -68,7 +68,9 @@ def attempt_distributed(
     if not journal.goes_on_with():
         driver.choose_cost(final=False)
         if start is None and problem.graph.is_world_loose:
-            stages.append(replace(start_robots(driver, chordal_start(problem)), name="chordal start, in one place"))
+            stages.append(
+                replace(start_robots(driver, chordal_start(problem.convex_part)), name="chordal start, in one place")
+            )
         else:
             stages.append(start_robots(driver, start))
     decrement = refine(driver, newton, journal, watch, soc, faults)
@@ -105,8 +107,12 @@ def climb_distributed(
     driver: Driver, staircase: Staircase, newton: Newton, watch: Watch, stages: list[Stage]
 ) -> tuple[float, DualBound | None]:
     """Staircase from the poses at hand, rounding, and Newton: the last decrement, and the bound of the relaxation."""
+    driver.save_poses()
     climb = watch.run(SubstructuredStaircase(staircase), driver)
-    round_lifted(driver)
+    if climb.status is Status.INTERRUPTED:  # some robots may have one dimension more than others
+        driver.restore_poses()
+    else:
+        round_lifted(driver)
     figures = climb.status, climb.iterations, driver.at.objective, climb.seconds, climb.history, staircase
     stages.append(Stage("Staircase", *figures))
     return refine(driver, newton, Journal(None, {}, stages), watch), climb.state.bound

@@ -18,9 +18,7 @@ from solvers.distributed.driver import Driver, collect
 from solvers.distributed.lower_bound import eliminate_S, prove_with_eta
 from solvers.distributed.newton import SubstructuredNewton, SubstructuredNewtonState
 from solvers.distributed.robots import climbing
-from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import Move
-from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Status
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.staircase import HALVINGS, ROUNDING, SUFFICIENT, DualBound, Staircase
@@ -138,8 +136,7 @@ def _escape(driver: Driver, eta: float, least: float) -> bool | None:
         answers, there = driver.ask(climbing.try_climb, length), move_poses(flat, length * w, length * v)
         trial = driver.with_sums(replace(at, R=there.R, t=there.t), answers)
         if trial.objective <= at.objective - SUFFICIENT * promised:
-            driver.ask(Interior.accept, None, Count.PIGGYBACKED)
-            driver.at = trial
+            driver.accept(trial)
             return True
         length *= 0.5
     return False

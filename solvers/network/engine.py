@@ -1,12 +1,12 @@
 """Where robots run: the seam, and robots in this process, in order or in threads."""
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 from pgo_models.errors import check_settings
-from solvers.network.messages import Idle, Worker
+from solvers.network.messages import Worker, obey, raised
 
 T = TypeVar("T")
 Q = TypeVar("Q")
@@ -50,10 +50,14 @@ class _LocalPool:
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def ask(self, order: Callable[[Any, Q], A], requests: Sequence[Q]) -> list[A]:
-        def obeyed(worker: Worker, request: Any) -> Any:  # noqa: ANN401 - as the order has it
-            return None if request is Idle.IDLE else order(worker, request)
-
-        return list((map if self._pool is None else self._pool.map)(obeyed, self._workers, requests))
+        if self._pool is None:
+            return raised(obey(self._workers, order, requests))
+        pairs = zip(self._workers, requests, strict=True)
+        tasks = [self._pool.submit(obey, [worker], order, [request]) for worker, request in pairs]
+        try:
+            return raised([task.result()[0] for task in tasks])
+        finally:  # whatever has happened: the next order must not meet this one
+            wait(tasks)
 
     def close(self) -> None:
         if self._pool is not None:

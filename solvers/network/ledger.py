@@ -40,7 +40,7 @@ class Ledger:
     num_robots: int
     rounds: int = 0
     all_reduces: int = 0
-    all_reduce_bytes: int = 0  # payload of all all-reduces, once up and once down for every robot
+    all_reduce_bytes: int = 0  # of all-reduces that no messages are counted of, up and down for every robot
     counted: tuple[tuple[Traffic, int], ...] = ()  # exchanges, and how often each took place
 
     def after_round(self, *exchanged: Traffic) -> Ledger:
@@ -70,12 +70,12 @@ class Ledger:
 
     @property
     def messages(self) -> int:
-        """Messages in all, all-reduces left out."""
+        """Messages in all, with those by which a driver sums; of other all-reduces `all_reduce_bytes` are counted."""
         return sum(times * len(traffic.sender) for traffic, times in self.counted)
 
     @property
     def num_bytes(self) -> int:
-        """Payload in all, all-reduces left out."""
+        """Payload of all messages."""
         return int(self.by_link()[3].sum())
 
     @property

@@ -50,6 +50,14 @@ def obey(workers: Sequence[Worker], order: Callable[[Any, Any], Any], requests: 
     return list(map(obeyed, workers, requests))
 
 
+def raised(answers: list[Any]) -> list[Any]:
+    """The answers; the first PGOError among them is raised."""
+    for answer in answers:
+        if isinstance(answer, PGOError):
+            raise answer
+    return answers
+
+
 def count_numbers(record: object, elsewhere: Collection[str] = ()) -> int:
     """Numbers in a request or an answer; a mapping is between workers, and counted where it is handed on.
 

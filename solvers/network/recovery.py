@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
-from pgo_models.errors import EngineError, PGOError, check_settings
-from solvers.network.messages import Idle, Snapshot, restore, take_snapshot
+from pgo_models.errors import EngineError, check_settings
+from solvers.network.messages import Idle, Snapshot, raised, restore, take_snapshot
 
 T = TypeVar("T")
 Q = TypeVar("Q")
@@ -94,10 +94,7 @@ class RecoveringPool(Generic[T]):
                 found = self._recovered(group, order, working[group], lost)
             for robot, answer in zip(self.place.groups[group], found, strict=True):
                 answers[robot] = answer
-        for answer in answers:
-            if isinstance(answer, PGOError):
-                raise answer
-        return answers
+        return raised(answers)
 
     def _recovered(self, group: int, order: AnyOrder, requests: Sequence[object], lost: RobotLostError) -> list[Any]:
         """Answers of a group that was lost before it gave them; what robots refused they refuse again."""

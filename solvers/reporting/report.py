@@ -149,7 +149,8 @@ def _robots(solution: Solved, robots: Partition, residuals: EdgeResiduals) -> _T
     ledger = solution.ledger
     if ledger is not None:
         sent = f"{ledger.rounds} rounds, {ledger.messages:,} messages, {ledger.num_bytes:,} bytes"
-        sums = f", {ledger.all_reduces} all-reduces ({ledger.all_reduce_bytes:,} bytes)" if ledger.all_reduces else ""
+        sums = f", {ledger.all_reduces} all-reduces" if ledger.all_reduces else ""
+        sums += f" ({ledger.all_reduce_bytes:,} bytes)" if ledger.all_reduce_bytes else ""
         lines.append(f"Communication: {sent}{sums}.")
         if ledger.num_robots == count:
             heads += ["bytes sent", "bytes received"]
@@ -173,15 +174,19 @@ def _worst_edges(solution: Solved, robots: Partition, residuals: EdgeResiduals) 
         if robots.num_robots > 1:
             row[1:] = [_number(robots.robot[i], "d"), row[1], _number(robots.robot[j], "d"), row[2]]
         cost = residuals.cost[e], residuals.allowed[e]
-        errors = residuals.translation[e], degrees[e], graph.kappa[e], graph.tau[e]
-        costs, others = ([_number(value, ".4g") for value in values] for values in (cost, errors))
-        rows.append([*row, *costs, _Cell(f"{100 * share[e]:.3g} %", share[e]), *others])
+        errors = [(residuals.translation[e], graph.tau[e]), (degrees[e], graph.kappa[e])]
+        fits = [_number(value, ".4g") if precision > 0 else _Cell("-", -1.0) for value, precision in errors]
+        costs, weights = (
+            [_number(value, ".4g") for value in values] for values in (cost, (graph.kappa[e], graph.tau[e]))
+        )
+        rows.append([*row, *costs, _Cell(f"{100 * share[e]:.3g} %", share[e]), *fits, *weights])
     ends = ["from robot", "from pose", "to robot", "to pose"] if robots.num_robots > 1 else ["from pose", "to pose"]
     share_of = f"share of {name}"
     heads = ["edge", *ends, "cost", "allowed", share_of, "error (m)", "error (deg)", "kappa (1/rad^2)", "tau (1/m^2)"]
     most = f"{len(rows)} of {graph.num_edges} edges that cost most, {100 * share[worst].sum():.3g} % of {name} together"
-    half = f"{np.median(residuals.translation):.3g} m and {np.median(degrees):.3g} degrees"
-    text = f"The {most}. {fit(residuals, name)} Half of all edges fit to {half}. Click on a head to sort."
+    halves = [("m", residuals.translation[graph.tau > 0]), ("degrees", degrees[graph.kappa > 0])]
+    half = " and ".join(f"{np.median(error):.3g} {unit}" for unit, error in halves if error.size)
+    text = f"The {most}. {fit(residuals, name)} Half of what was measured fits to {half}. Click on a head to sort."
     return _Table("edges", [text], heads, rows, np.flatnonzero(residuals.is_misfit[worst]).tolist())
 
 

@@ -127,7 +127,7 @@ def advice(
         found.append(Advice("Keep the poses, for example as g2o.", f"{solve} --out solved.g2o"))
         judged = "solved.g2o" if is_robust else f"{name} --estimate solved.g2o"
         found.append(Advice("Check them independently of this solve.", f"pgo certify {judged}"))
-        if certificate.wanted_gap > _SMALL_GAP:
+        if certificate.gap > _SMALL_GAP:
             found.append(Advice("Ask for a tighter proof.", f"{solve} --gap {_FINER_GAP:g}"))
     else:
         found += _uncertified(graph, certificate, solve)

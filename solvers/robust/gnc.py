@@ -59,7 +59,7 @@ class RobustLoss(enum.Enum):
         return np.where(ratio >= (mu + 1.0) / mu, 1.0, np.where(ratio <= mu / (mu + 1.0), ratio, between))
 
     def weights(self, ratio: Array, mu: float) -> Array:
-        """Its slope, (m,), which is the weight: equations 14 and 12; from a large mu on 0 or 1."""
+        """Its slope, (m,), which is the weight: their equations 14 and 12; from a large mu on 0 or 1."""
         if self is RobustLoss.GEMAN_MCCLURE:
             return np.asarray((mu / (ratio + mu)) ** 2)
         if mu >= _HARD:
@@ -124,7 +124,7 @@ class GNC:
     edges kept says, at most to 2.5; None leaves them.
 
     Edges `known`, (m,), are right, and their weight stays 1; unless given, odometry (poses of a robot whose ids are
-    neighbours) and priors. `consistent`: loop closures that `pairwise_consistent` leaves out are rejected before.
+    neighbours) and priors. `consistent`: `solve` rejects loop closures that `pairwise_consistent` leaves out before.
     `growth` is the factor on mu, `inner_steps` are the most Newton steps for one set of weights, and `tolerance` is on
     the relative decrement of the last weighted cost.
     """
@@ -220,7 +220,7 @@ class GNC:
         return 0 if self.spread is None else _SCALINGS
 
     def first_control(self, largest: float, least: float) -> float:
-        """Remark 5 of the paper: the surrogate is convex up to the largest ratio; no less, where all were left out."""
+        """Remark 5 of Yang et al.: convex up to the largest ratio; no less, where all were left out."""
         if self.loss is RobustLoss.TRUNCATED:
             return max(1.0 / max(2.0 * largest - 1.0, 1.0), least)
         return max(2.0 * largest, 1.0)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.errors import SettingError
+from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.plots.interactive_plots import save_page
 from pgo_models.plots.style import is_picture, save_figure
@@ -77,7 +77,7 @@ class Comparison:
             rows.append((contender.label, *figures, remark))
         graph = self.problem.graph
         best = f"best F {self.optimum:.10g}, proven lower bound {self.lower_bound:.10g}; gaps are to the bound, over F"
-        notes = [f"{graph.name}: {graph.num_poses} poses, {graph.num_edges} edges; {best}"]
+        notes = [f"{graph.name}: {len(graph.bodies)} poses, {graph.num_edges} edges{graph.extras}; {best}"]
         notes.append("rounds, all-reduces and MB: where they are counted; seconds a robot: side by side")
         if not self.is_complete:
             notes.append("interrupted: the methods left out were not run")
@@ -134,9 +134,12 @@ def compare_methods(
 
 
 def check_plot_format(path: Path) -> None:
-    """Raise a SettingError when `Comparison.save_plot` knows no format for the suffix of `path`."""
+    """Raise what `Comparison.save_plot` would for the suffix of `path`: a SettingError, or if its extra is missing."""
     if path.suffix.lower() != ".html" and not is_picture(path):
         raise SettingError(f"cannot write {path}: no plot has suffix {path.suffix!r}; use .html, .png, .svg or .pdf")
+    module = "matplotlib" if is_picture(path) else "plotly"
+    if importlib.util.find_spec(module) is None:
+        raise MissingExtraError(module, "plot")
 
 
 def _record(contender: BenchmarkMethod, trial: BenchmarkRun | None, bound: float, remark: str) -> dict[str, Value]:

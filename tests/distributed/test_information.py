@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from budget import examples
-from graphs import DIMENSIONS, SEEDS, informed
+from graphs import DIMENSIONS, SEEDS, informed, varied_graph
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from robots import driver_at
@@ -165,3 +165,22 @@ def test_without_a_driver_chi2_is_refused() -> None:
     soc = solvers.SOC(coupling=Coupling.CONSENSUS, robots=partition(problem.graph, 2))
     with pytest.raises(SettingError, match="without a driver"):
         solvers.solve(problem, solvers.Pipeline(soc=soc, driver_memory=0), robots=soc.robots, progress=False)
+
+
+@pytest.mark.parametrize("robots", [None, 3])
+@pytest.mark.parametrize("has_positions", [False, True])
+def test_quadratic_chi2_that_is_not_convex_has_an_answer_and_a_bound(has_positions: bool, robots: int | None) -> None:
+    graph = varied_graph(0, 20, 3)
+    information = np.tile(
+        np.diag([4.0, 4.0, 5.0 if has_positions else 4.0, 40.0, 40.0, 100.0]), (graph.num_edges, 1, 1)
+    )
+    graph = replace(graph, information=information)
+    if has_positions:
+        assert graph.truth is not None
+        graph = graph.with_position_prior(np.arange(0, 20, 4), graph.truth.t[::4], 4.0)
+    problem = PGOProblem(graph, weighting=Weighting.INFORMATION)
+    assert not problem.weights.is_convex
+    solution = solvers.solve(problem, robots=robots)
+    assert solution.certificate.verdict is Verdict.NOT_CERTIFIED  # the relaxation is not tight
+    assert 0.5 * solution.objective < solution.lower_bound < solution.objective
+    assert solution.objective <= problem.objective(polish(problem, graph.truth)) * (1 + 1e-9)

@@ -1,6 +1,8 @@
 """CONSENSUS without a driver: the optimum to SOC's tolerance, nothing sent to a driver, and nothing claimed."""
 
+import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,6 +44,26 @@ ALONE = ("in_cover", "force", "schur", "b")  # what only a driver is told
 
 def alone(soc: SOC, faults: Faults | None = None) -> Pipeline:
     return Pipeline(soc=soc, faults=faults, driver_memory=0)
+
+
+@pytest.mark.parametrize(("at", "status"), [(3, Status.INTERRUPTED), (None, Status.TIME_LIMIT)])
+def test_a_start_that_is_cut_short_is_the_end(at: int | None, status: Status, monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, steps, step = varied_graph(3, 30, 3), list[int](), ConsensusSOC.step
+    parts = metis(graph, 4)
+
+    def counted(self: ConsensusSOC, *args: Any) -> Any:
+        steps.append(len(steps))
+        if len(steps) == at:
+            raise KeyboardInterrupt
+        return step(self, *args)
+
+    monkeypatch.setattr(ConsensusSOC, "step", counted)
+    limit = math.inf if at is not None else 1e-6
+    solution = solve(graph, alone(SOC(coupling=Coupling.CONSENSUS, robots=parts)), robots=parts, time_limit=limit)
+    assert [stage.name for stage in solution.stages] == ["spanning tree"]
+    assert solution.status is status
+    assert len(steps) == (at or 0)
+    assert solution.objective == pytest.approx(solution.stages[0].objective, rel=1e-9)
 
 
 @settings(max_examples=examples(15))
@@ -179,7 +201,7 @@ def test_the_memory_of_the_driver_is_a_setting_and_the_refusal_says_the_way_out(
         solve(graph, Pipeline(soc=soc, driver_memory=1e3), robots=parts)
     assert solve(graph, Pipeline(soc=soc, driver_memory=1e9), robots=parts).is_certified
     for other in (None, SOC(), SOC(coupling=Coupling.SUBSTRUCTURED), PaperSOC(robots=parts)):
-        with pytest.raises(SettingError, match="without a driver there is CONSENSUS alone"):
+        with pytest.raises(SettingError, match="without a driver robots run CONSENSUS alone"):
             Pipeline(soc=other, driver_memory=0)
     for value in (-1.0, np.nan):
         with pytest.raises(SettingError, match="driver_memory must not be negative"):

@@ -1,9 +1,11 @@
 """Robots with files of their own: the answer of the whole graph, and what the driver's process learns of it."""
 
+import math
 import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,13 +20,19 @@ import solvers
 from pgo_models.certificates.certificate import BoundSource
 from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import exp_map
+from pgo_models.geometry.rotations import exp_map, project_to_rotations
 from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, observe
+from solvers import folder_solve
 from solvers.distributed import staircase, substructured
+from solvers.distributed.driver import Driver
 from solvers.distributed.robots import climbing
+from solvers.distributed.robots.interior import Interior
 from solvers.folder_solve import FolderSolution, solve_folder
+from solvers.pipeline import HANDOVER
+from solvers.result import Status
+from solvers.soc.settings import Coupling
 
 ROBOTS = Path(pgo.__file__).parent.parent / "data" / "robots"
 LIMIT = 27.0  # MB beside the program itself
@@ -79,6 +87,20 @@ def test_folders_are_solved_as_the_whole_graph(
                 seen |= set(lines)
     assert read_g2o(folder).num_edges == graph.num_edges
     check_same(solve_folder(folder, out=folder / "out"), graph, folder / "out")
+
+
+@pytest.mark.parametrize("away", [1e6, 1e12, 9e14])
+def test_what_is_certified_is_what_is_written_however_far_its_frame(away: float, tmp_path: Path) -> None:
+    graph = varied_graph(1, 20, 2).with_robots(np.arange(20) // 7)
+    assert graph.truth is not None
+    write_g2o_folder(graph, tmp_path / "in", graph.truth.moved(np.eye(2), np.array([away, -away])))
+    certificate = solve_folder(tmp_path / "in", out=tmp_path / "out").certificate
+    written = read_g2o(tmp_path / "out")
+    assert written.initial is not None
+    F, level = pgo.PGOProblem(written).objective(written.initial), certificate.rounding_level
+    assert certificate.objective == pytest.approx(F, rel=1e-9, abs=level)
+    assert certificate.gap == pytest.approx((F - certificate.lower_bound) / F, rel=1e-6, abs=1e-9)
+    assert certificate.is_certified == (certificate.gap <= certificate.wanted_gap)
 
 
 def test_an_edge_that_no_end_has_counts_all_the_same(tmp_path: Path) -> None:
@@ -175,6 +197,9 @@ def test_what_takes_the_whole_graph_is_refused(tmp_path: Path) -> None:
     for soc in (solvers.SOC(robots=robots), solvers.PaperSOC()):
         with pytest.raises(SettingError, match="own run SUBSTRUCTURED SOC"):
             solve_folder(ROBOTS, solvers.Pipeline(soc=soc))
+    for soc in (solvers.SOC(robots=robots, coupling=Coupling.SUBSTRUCTURED), solvers.SOC(r_step=solvers.RStep.FISTA)):
+        with pytest.raises(SettingError, match="are those of the files, and factor"):
+            solve_folder(ROBOTS, solvers.Pipeline(soc=soc))
     shutil.copytree(ROBOTS, tmp_path / "in")
     graph = read_g2o(ROBOTS)
     write_g2o_folder(graph.with_position_prior(np.arange(5), np.eye(3)[np.arange(5) % 3], 1.0), tmp_path / "in")
@@ -225,6 +250,51 @@ def test_the_staircase_follows_where_newton_has_had_no_step() -> None:
     found, without = solve_folder(ROBOTS, unfinished), solve_folder(ROBOTS, replace(unfinished, staircase=None))
     assert not without.certificate.is_certified
     assert found.certificate.gap < without.certificate.gap
+
+
+def test_the_staircase_climbs_from_the_best(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = varied_graph(1, 30, 2, NoiseModel(translation_std=1.0, rotation_std=1.5))
+    graph = graph.with_robots(pgo.partition(graph, 4).robot)
+    write_g2o_folder(graph, tmp_path / "in")
+    began: list[float] = []
+    climb = folder_solve.climb_distributed
+    away = np.random.default_rng(0).standard_normal((2, 2))
+
+    def noted(driver: Driver, *args: Any) -> Any:
+        began.extend([driver.at.objective, math.fsum(part.objective for part in driver.ask(Interior.evaluate, None))])
+        return climb(driver, *args)
+
+    def worse(driver: Driver, *args: Any) -> float:
+        decrement = refine(driver, *args)
+        if len(began) == 0 and args[-1].tolerance < HANDOVER.tolerance:  # of the second try
+            driver.adopt(np.broadcast_to(project_to_rotations(away), driver.at.R.shape))
+        return decrement
+
+    refine = folder_solve.refine
+    monkeypatch.setattr(folder_solve, "climb_distributed", noted)
+    monkeypatch.setattr(folder_solve, "refine", worse)
+    found = solve_folder(tmp_path / "in")
+    best = min(stage.objective for stage in found.stages if stage.name == "Newton")
+    assert began == pytest.approx([best, best], rel=1e-9)
+
+
+def test_ctrl_c_between_the_loops_keeps_what_was_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = varied_graph(1, 30, 2, NoiseModel(translation_std=1.0, rotation_std=1.5))
+    write_g2o_folder(graph.with_robots(pgo.partition(graph, 4).robot), tmp_path / "in")
+    bound, calls = folder_solve.best_bound_distributed, list[int]()
+
+    def interrupted(*args: Any) -> Any:
+        calls.append(len(calls))
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return bound(*args)
+
+    monkeypatch.setattr(folder_solve, "best_bound_distributed", interrupted)
+    found = solve_folder(tmp_path / "in", out=tmp_path / "out")
+    assert found.status is Status.INTERRUPTED
+    written = read_g2o(tmp_path / "out")
+    assert written.initial is not None
+    assert pgo.PGOProblem(written).objective(written.initial) == pytest.approx(found.certificate.objective, rel=1e-9)
 
 
 def test_a_second_try_keeps_the_better(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from graphs import MILD_NOISE, varied_graph
 from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
 from pgo_models.errors import SettingError
 from pgo_models.graphs.partitioning import partition
+from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.thresholds import chi2_thresholds
 from solvers.distributed.checkpoint import Checkpoint
 from solvers.distributed.robots.agent import CLASSES, Agent, order_interior
@@ -151,3 +154,18 @@ def test_the_driver_counts_the_orders(wrong) -> None:
         driver.ask(sum_ratios, Reweigh(True, 0.1, 1.0, 1e-9), Count.ROUND)
         driver.reweigh(Reweigh(True, 0.1, 1.0, 1e-9))
         assert driver.network.ledger.rounds == rounds + 2
+
+
+def test_edges_that_alone_connect_poses_are_kept_as_in_one_place() -> None:
+    rng = np.random.default_rng(90039)
+    d, n = int(rng.integers(2, 4)), int(rng.integers(4, 12))
+    noise = [MILD_NOISE, NoiseModel(0.3, 0.3), NoiseModel(1.0, 1.5)][rng.integers(3)]
+    graph = varied_graph(39, n, d, noise)
+    bad = (rng.random(graph.num_edges) < 0.2) & (np.abs(graph.i - graph.j) != 1)
+    t_ij = graph.t_ij.copy()
+    t_ij[bad] += 5.0 * rng.standard_normal((bad.sum(), d))
+    wrong = replace(graph, t_ij=t_ij, truth=None, initial=None)
+    for robots in (None, 2):
+        solution = solvers.solve(wrong, robust=solvers.GNC(), robots=robots)
+        assert solution.robust is not None
+        assert len(wrong.components(solution.robust.kept)) == 1

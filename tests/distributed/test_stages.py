@@ -17,6 +17,7 @@ from graphs import (
     rounding_of_objective,
     varied_graph,
     varied_problem,
+    wound_ring,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -31,12 +32,13 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.g2o import read_g2o
 from pgo_models.graphs.partitioning import Partition, partition
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel, grid
+from pgo_models.graphs.scenes import NoiseModel, grid, victoria_park
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import collect
 from solvers.distributed.lower_bound import best_bound_distributed, prove_with_eta
+from solvers.distributed.robots.interior import Interior
 from solvers.network.engine import InProcess
 from solvers.network.faults import Faults
 from solvers.pipeline import HANDOVER, Pipeline, solve
@@ -216,12 +218,47 @@ def test_a_number_of_robots_stands_for_the_default_partition() -> None:
         solve(graph, robots=28)
 
 
+@pytest.mark.parametrize("robots", [None, 3])
+def test_the_staircase_is_watched_wherever_it_runs(robots: int | None) -> None:
+    (problem, wound), seen = wound_ring(20, 2), list[str]()
+    short = Pipeline(soc=None, second_try=False)
+    solve(problem, short, wound, robots=robots, callback=lambda state, _: seen.append(type(state).__name__))
+    assert {name for name in seen if "Staircase" in name}
+
+
+def test_an_anchor_is_a_pose() -> None:
+    graph = victoria_park(np.random.default_rng(0), num_poses=30)
+    for anchor, said in ((1.5, "whole number"), (True, "whole number"), (int(graph.landmarks[0]), "a landmark")):
+        with pytest.raises(SettingError, match=said):
+            solve(graph, anchor=anchor)
+
+
 def test_a_start_or_a_partition_of_another_graph_is_refused() -> None:
     graph = grid(np.random.default_rng(0))
     with pytest.raises(GraphError, match="give one pose for every pose"):
         solve(graph, start=Poses(np.eye(3)[None], np.zeros((1, 3))), robots=3)
     with pytest.raises(SettingError, match="give one robot for every pose"):
         solve(graph, robots=Partition(np.array([0, 1]), partition(graph, 3).method))
+
+
+@pytest.mark.parametrize("robot", [0, 2])
+def test_ctrl_c_while_robots_go_to_a_trial_leaves_none_behind(robot: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    accept, calls = Interior.accept, list[int]()
+
+    def interrupted(interior: Interior, request: None) -> tuple[Interior, None]:
+        calls.append(len(calls))
+        if len(calls) == 4 + robot:  # of the second trial of four robots
+            raise KeyboardInterrupt
+        return accept(interior, request)
+
+    problem = varied_problem(6, 25, 3, LOUD_NOISE)
+    parts = metis(problem.graph, 4)
+    monkeypatch.setattr(Interior, "accept", interrupted)
+    solution = solve(problem, Pipeline(soc=None, staircase=None, second_try=False), robots=parts)
+    newton = solution.stages[-1]
+    assert newton.status is Status.INTERRUPTED
+    assert solution.objective == pytest.approx(problem.objective(solution.poses), rel=1e-12)
+    assert solution.objective <= newton.history.objective[-1] * (1 + 1e-12)
 
 
 def stop_at(k: int) -> Callable[[object, Record], bool]:

@@ -25,9 +25,8 @@ def test_every_robot_owns_a_pose(seed: int, n: int, d: int, share: float, method
     assert parts.robot.shape == (n,)
     assert parts.sizes.sum() == n
     assert parts.sizes.min() > 0
-    assert 1 <= parts.num_robots <= num_robots
+    assert parts.num_robots == num_robots
     if method is PartitionMethod.CONTIGUOUS:
-        assert parts.num_robots == num_robots
         assert (np.diff(parts.robot) >= 0).all()
         assert parts.sizes.max() - parts.sizes.min() <= 1
 
@@ -41,6 +40,13 @@ def test_metis_gives_the_robots_asked_for_and_balances_them(num_robots: int) -> 
     contiguous = partition(graph, num_robots, PartitionMethod.CONTIGUOUS)
     assert metis.cut_edges(graph).sum() < contiguous.cut_edges(graph).sum()
     np.testing.assert_array_equal(partition(graph, num_robots, PartitionMethod.METIS).robot, metis.robot)
+
+
+@pytest.mark.parametrize("num_robots", [20, 26, 27])
+def test_metis_leaves_no_robot_out_on_a_dense_graph(num_robots: int) -> None:
+    parts = partition(grid(np.random.default_rng(0)), num_robots, PartitionMethod.METIS)
+    assert parts.num_robots == num_robots
+    assert parts.sizes.max() <= 3
 
 
 @given(seed=SEEDS, n=st.integers(2, 40), share=st.floats(0, 1), method=METHODS)
@@ -64,6 +70,8 @@ def test_one_robot_owns_all() -> None:
 def test_singletons_need_no_number() -> None:
     graph = grid(np.random.default_rng(0))
     parts = partition(graph, method=PartitionMethod.SINGLETONS)
+    with pytest.raises(SettingError, match="one robot a pose makes 27, asked for 3"):
+        partition(graph, 3, PartitionMethod.SINGLETONS)
     np.testing.assert_array_equal(parts.robot, np.arange(27))
     assert parts.cut_edges(graph).all()
 
@@ -79,9 +87,9 @@ def test_robots_that_the_graph_names_are_the_default() -> None:
 
 def test_a_number_that_the_graph_does_not_name_is_refused() -> None:
     graph = grid_world(3, 10, np.random.default_rng(0))
-    with pytest.raises(SettingError, match="names 3 robots, asked for 4; use CONTIGUOUS"):
+    with pytest.raises(SettingError, match="names 3 robots, asked for 4; use another method"):
         partition(graph, 4, PartitionMethod.GIVEN)
-    with pytest.raises(SettingError, match="names 1 robots"):
+    with pytest.raises(SettingError, match="names no robots"):
         partition(grid(np.random.default_rng(0)), method=PartitionMethod.GIVEN)
 
 

@@ -56,6 +56,60 @@ def test_what_is_proven_is_said_wherever_the_verdict_is(clean):
     assert solution.robust.warning == ""
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_right_closures_stay_where_noise_leaves_no_certificate(seed):
+    noise = NoiseModel(0.1, np.deg2rad(40))
+    graph = pgo.grid_world(3, 15, np.random.default_rng(seed), d=3, loop_closure_probability=0.2, noise=noise)
+    solution = solvers.solve(graph, robust=solvers.GNC())
+    assert any(one.is_certified for one in solution.robust.attempts)  # with hardly a closure left
+    assert not solution.robust.rejected.any()
+    assert not solution.is_certified
+    assert "not certified after all attempts" in str(solution)
+
+
+def test_an_attempt_that_leaves_poses_apart_is_passed_over(clean, monkeypatch):
+    graph, is_wrong = spoiled(clean, 0.3, "random", seed=0)
+    run = robust_solve._Trials.run
+
+    def without(names):
+        def tried(self, name, *args):
+            if name in names:
+                raise GraphError("apart")
+            return run(self, name, *args)
+
+        monkeypatch.setattr(robust_solve._Trials, "run", tried)
+        return solvers.solve(graph, robust=solvers.GNC())
+
+    solution = without(["as set", "smaller steps"])
+    np.testing.assert_array_equal(solution.robust.rejected, is_wrong)
+    assert {"as set", "smaller steps"}.isdisjoint(one.name for one in solution.robust.attempts)
+    monkeypatch.undo()
+    monkeypatch.setattr(robust_solve, "_methods", lambda *_: [("as set", solvers.GNC(), np.ones(len(is_wrong), bool))])
+    with pytest.raises(GraphError, match="apart"):
+        without(["as set"])
+
+
+@pytest.mark.parametrize("where", ["uncontradicted", "reinstated", "pairwise_consistent"])
+def test_ctrl_c_between_the_loops_keeps_the_best_attempt(clean, where, monkeypatch):
+    graph, is_wrong = spoiled(clean, 0.3, "random", seed=0)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(robust_solve, where, interrupted)
+    solution = solvers.solve(graph, robust=solvers.GNC())
+    assert solution.status is solvers.Status.INTERRUPTED
+    assert not solution.robust.rejected[~is_wrong].any()
+    assert solution.robust.rejected.sum() >= 0.9 * is_wrong.sum()
+
+
+def test_of_a_solve_out_of_time_nothing_is_said_to_fit(clean):
+    graph, _ = spoiled(clean, 0.3, "random", seed=0)
+    solution = solvers.solve(graph, robust=solvers.GNC(), time_limit=1e-6)
+    assert solution.status is solvers.Status.TIME_LIMIT
+    assert "no time" in solution.robust.start
+
+
 @pytest.mark.parametrize(("n", "seed", "ends"), [(60, 23, (1, 28)), (80, 19, (29, 59)), (80, 27, (7, 77))])
 def test_a_wrong_closure_that_only_bends_the_odometry_is_found(n, seed, ends):
     """Its own residual is within its threshold at the plain optimum, which is certified."""

@@ -179,13 +179,14 @@ class Interior:
 
     def move(self, order: records.Move) -> tuple[Interior, records.ReducedTranslations]:
         """Direction -H^-1 g from H^-1 g on the boundary; then `turn`."""
-        step = self._layout.split(-self.back_substitute(order.x)[:, 0])
-        return self.with_changes(step=step).turn(order.length)
+        return self._directed(order).turn(order.length)
 
     def move_straight(self, order: records.Move) -> tuple[Interior, records.TrialEvaluation]:
         """Direction -H^-1 g from H^-1 g on the boundary; then `go_straight`."""
-        step = self._layout.split(-self.back_substitute(order.x)[:, 0])
-        return self.with_changes(step=step).go_straight(order.length)
+        return self._directed(order).go_straight(order.length)
+
+    def _directed(self, order: records.Move) -> Interior:
+        return self.with_changes(step=self._layout.split(-self.back_substitute(order.x)[:, 0]))
 
     def go_straight(self, length: float) -> tuple[Interior, records.TrialEvaluation]:
         """Trial a length along the direction, its translations as they come: F, force and reduced gradient there."""

@@ -77,7 +77,7 @@ class RatioSums:
 
 @dataclass(frozen=True, eq=False)
 class TrialEvaluation:
-    """The same at a trial, and the reduced gradient there."""
+    """`CostParts` at a trial, and the reduced gradient there."""
 
     at: CostParts
     gradient: RightHandSide
