@@ -129,6 +129,8 @@ def chosen_method(method: FirstStage | None, robots: int | None, is_shared: bool
 
 def chosen_partition(graph: PoseGraph, number: int | None, split: Split | None) -> Partition:
     """Partition of the options, by default among as many robots as the file names; errors are those of `partition`."""
+    if split is Split.SINGLETONS and number not in (None, graph.num_poses):
+        raise SettingError(f"--split singletons makes {graph.num_poses} robots, got --robots {number}; leave one out")
     number = graph.num_robots if number is None else number
     return suited_partition(graph, number) if split is None else partition(graph, number, PartitionMethod[split.name])
 

@@ -8,18 +8,16 @@ from typing import ParamSpec, TypeVar, cast
 
 import numpy as np
 
-from pgo_models.certificates.certificate import Certificate, Verdict
+from pgo_models.certificates.certificate import Certificate
 from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import GraphWarning, NotPositiveDefiniteError, PGOError
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.datasets import locate
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import extreme_weight
-from pgo_models.problem.floating_point import UNIT_ROUNDOFF
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.cli_inputs import Dropped, kept_edges, load_graph
-from solvers.solution import Solution
+from solvers.solution import Solution, note_of_weights
 
 WORTH_SAYING = 1.01  # times its minimum: what chi2 has to be for a hint
 P = ParamSpec("P")
@@ -41,13 +39,6 @@ def explained_by_its_graph(command: Callable[P, T]) -> Callable[P, T]:
             raise PGOError(f"{graph} takes more memory than there is; raise the limit, or {way_out}") from error
 
     return explained
-
-
-def note_of_weights(graph: PoseGraph, certificate: Certificate) -> str:
-    """Sentence on the weight beside which rounding hides more than the gap asked for, where no bound was found."""
-    spread, _, text = extreme_weight(graph) if certificate.verdict is Verdict.TRIVIAL else (0.0, 0, "")
-    is_cause = spread * UNIT_ROUNDOFF > certificate.wanted_gap
-    return f"{text}, too far from others for a proof; correct it, or solve graph.unit_weights()" if is_cause else ""
 
 
 def warn_of_weights(graph: str, problem: PGOProblem, certificate: Certificate, dropped: Dropped = None) -> None:

@@ -31,12 +31,11 @@ from pgo_models.graphs.partitioning import Partition, partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem, as_problem
-from solvers.distributed.checkpoint import Attempt, Checkpoint, Journal, run_fingerprint
+from solvers.distributed.checkpoint import Checkpoint, Journal, JudgedPoses, run_fingerprint
 from solvers.distributed.driver import DEFAULT_MEMORY, Driver, collect
 from solvers.distributed.leaderless import NO_CERTIFICATE, attempt_leaderless
 from solvers.distributed.robust import estimate_by_robots
 from solvers.distributed.stages import attempt_distributed, climb_distributed, judge_collected, open_driver
-from solvers.explanations import note_of_weights
 from solvers.loop import Watch
 from solvers.network.engine import Engine, InProcess
 from solvers.network.faults import Faults
@@ -50,7 +49,7 @@ from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
-from solvers.solution import Solution, framed
+from solvers.solution import Solution, framed, note_of_weights
 
 HANDOVER_TOLERANCE = 5e-3  # relative residual at which Newton needs one or two factorisations on all graphs tried
 HANDOVER = SOC(tolerance=HANDOVER_TOLERANCE, max_iterations=100)
@@ -280,7 +279,9 @@ class _Job:
     watch: Watch
     stages: list[Stage] = field(default_factory=list)
 
-    def tries(self, attempt: Callable[[SOC | PaperSOC | None, Poses | None], Attempt], start: Poses | None) -> Attempt:
+    def tries(
+        self, attempt: Callable[[SOC | PaperSOC | None, Poses | None], JudgedPoses], start: Poses | None
+    ) -> JudgedPoses:
         """One attempt, and where its certificate is wider than asked for a second one.
 
         That is with a finer SOC, or, of a cost that is not quadratic, from the optimum of F.
@@ -295,7 +296,7 @@ class _Job:
             poses, certificate = _better(self.problem, poses, certificate, attempt(fine, None)[1])
         return poses, certificate
 
-    def attempt(self, soc: SOC | PaperSOC | None, start: Poses | None) -> Attempt:
+    def attempt(self, soc: SOC | PaperSOC | None, start: Poses | None) -> JudgedPoses:
         """SOC, Newton and certificate from a start; the first on the convex part of chi2 where that is not convex."""
         began, first_problem = time.perf_counter(), self.problem.convex_part
         has_convex_part = first_problem is not self.problem  # whose minimum is no nearer to chi2's than the start is
@@ -321,7 +322,7 @@ class _Job:
             del first  # its factor is the next one's to take over
         return self.polish(poses)
 
-    def polish(self, poses: Poses) -> Attempt:
+    def polish(self, poses: Poses) -> JudgedPoses:
         """Newton, unless the stage before was cut short, and certificate."""
         decrement = math.inf
         if self.stages[-1].status not in OUT_OF_TIME:
@@ -332,7 +333,7 @@ class _Job:
         with self.watch.showing("certificate", self.problem):
             return poses, certify_at(self.problem, poses, self.pipeline.gap, decrement)
 
-    def improve(self, poses: Poses, certificate: Certificate, driver: Driver | None = None) -> Attempt:
+    def improve(self, poses: Poses, certificate: Certificate, driver: Driver | None = None) -> JudgedPoses:
         """Staircase, in one place or by a driver and robots, where the certificate can still improve."""
         staircase, problem = self.pipeline.staircase, self.problem
         if staircase is None or not certificate.can_improve or self.stages[-1].status in OUT_OF_TIME:
@@ -345,7 +346,7 @@ class _Job:
             self.interrupt(problem.objective(poses))
         return poses, certificate
 
-    def climb(self, staircase: Staircase, poses: Poses, certificate: Certificate, driver: Driver | None) -> Attempt:
+    def climb(self, staircase: Staircase, poses: Poses, certificate: Certificate, driver: Driver | None) -> JudgedPoses:
         """Staircase from the best poses, Newton from what it rounds to, and the relaxation's bound if still needed."""
         problem, gap = self.problem, self.pipeline.gap
         bound: DualBound | None
@@ -373,7 +374,7 @@ class _Job:
             certificate = max(certificate, relaxed, key=lambda found: found.lower_bound)
         return poses, certificate
 
-    def broken_off(self) -> Attempt:
+    def broken_off(self) -> JudgedPoses:
         """Best poses found before an interruption, with the bound 0, which needs no proof."""
         poses = min(self.watch.found, key=self.problem.objective)
         self.interrupt(self.problem.objective(poses))
@@ -390,7 +391,7 @@ def finer(soc: AnySOC) -> AnySOC:
     return replace(soc, tolerance=min(soc.tolerance, _SECOND_TRY_TOLERANCE), max_iterations=SOC.max_iterations)
 
 
-def _better(problem: PGOProblem, poses: Poses, certificate: Certificate, other: Certificate) -> Attempt:
+def _better(problem: PGOProblem, poses: Poses, certificate: Certificate, other: Certificate) -> JudgedPoses:
     """The better of `poses`, which `certificate` judges, and the poses of `other`, held against the better bound."""
     stationarity = certificate.stationarity
     if other.poses_objective < certificate.objective:

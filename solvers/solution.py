@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pgo_models.certificates.certificate import BoundSource, Certificate, gap_text
+from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, gap_text
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.files import check_writable, replace_when_done
@@ -14,11 +14,13 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import check_g2o_folder, write_g2o, write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.precisions import extreme_weight
 from pgo_models.graphs.residuals import chi2
 from pgo_models.graphs.trajectories import write_kitti, write_tum
 from pgo_models.html_tables import facts_table, rows_table
 from pgo_models.plots.graph_plots import compare_poses
 from pgo_models.plots.style import is_picture, save_figure
+from pgo_models.problem.floating_point import UNIT_ROUNDOFF
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
@@ -38,7 +40,8 @@ class Solution(Solved):
 
     `objective` is the cost of `poses`: F, or chi2 with `Weighting.INFORMATION`; F leaves their `frame` open, which says
     which it is. `certificate` has the lower bound on the global optimum, gap and verdict; `note` is what it lacks, and
-    why, or empty. `status` is that of the last of `stages`, start and iterative ones in order; `seconds` are wall time.
+    why, or empty. `status` is that of the last of `stages`, start and iterative ones in order, or of the last attempt
+    of a robust solve that had no time left; `seconds` are wall time.
 
     Of a solve by many robots, `ledger` says what crossed the network, and `robots` who owned which pose. `anchor` is
     the pose that it is held by, or 0: what `marginals` are relative to; `covariances`, (n, p, p), are all
@@ -264,6 +267,13 @@ def certificate_json(certificate: Certificate) -> dict[str, object]:
         "stationarity": finite_or_none(certificate.stationarity),  # inf where it was not measured
         "verdict": certificate.verdict.name,
     }
+
+
+def note_of_weights(graph: PoseGraph, certificate: Certificate) -> str:
+    """Sentence on the weight beside which rounding hides more than the gap asked for, where no bound was found."""
+    spread, _, text = extreme_weight(graph) if certificate.verdict is Verdict.TRIVIAL else (0.0, 0, "")
+    is_cause = spread * UNIT_ROUNDOFF > certificate.wanted_gap
+    return f"{text}, too far from others for a proof; correct it, or solve graph.unit_weights()" if is_cause else ""
 
 
 def framed(poses: Poses, graph: PoseGraph, anchor: int | None) -> tuple[Poses, str, int]:

@@ -270,6 +270,7 @@ def test_info_names_the_components(pgo_command, tmp_path):
         ("solve", "sphere", "--robots", "2", "--engine", "process", "--address", "localhost:6379"),
         ("solve", "sphere", "--robots", "2", "--address", "localhost"),
         ("solve", "sphere", "--robots", "2", "--split", "given"),
+        ("solve", "sphere", "--robots", "3", "--split", "singletons"),
         ("solve", "sphere", "--robots", "2", "--resume", "no/such/folder/run.ckpt"),
         ("info", "sphere", "--robots", "51"),
         ("info", "--robots", "2"),

@@ -66,9 +66,10 @@ class Partition(ReadOnly):
 def partition(graph: PoseGraph, num_robots: int | None = None, method: PartitionMethod | None = None) -> Partition:
     """Give the poses of a graph to robots.
 
-    The number of robots is needed unless the graph names its robots or every pose is its own; the method is GIVEN when
-    the graph names as many robots as asked for, else CONTIGUOUS, unless another is given. A SettingError when the
-    number is no whole one of 1 to n, or not the method's; a MissingExtraError for METIS without the extra `fast`.
+    The number of robots is needed unless the graph names its robots; where every pose is a robot it is not minded. The
+    method is GIVEN when the graph names as many robots as asked for, else CONTIGUOUS, unless another is given. A
+    SettingError when the number is no whole one of 1 to n, or GIVEN does not fit; a MissingExtraError for METIS without
+    the extra `fast`.
 
     Examples
     --------
@@ -83,8 +84,6 @@ def partition(graph: PoseGraph, num_robots: int | None = None, method: Partition
     if method is None:
         method = PartitionMethod.GIVEN if named else PartitionMethod.CONTIGUOUS
     if method is PartitionMethod.SINGLETONS:
-        if num_robots not in (None, n):
-            raise SettingError(f"one robot a pose makes {n}, asked for {num_robots}; leave out the number")
         return Partition(np.arange(n), method)
     if method is PartitionMethod.GIVEN:
         if not named:

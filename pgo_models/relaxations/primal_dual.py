@@ -3,8 +3,8 @@
     primal   min tr(Q Z)         Z_ii = I for every pose, Z PSD          Z = Y Y^T, Y the rows R_i^T
     dual     max sum tr Lambda_i     M - blockdiag(0, Lambda) PSD
 
-Their common value is a lower bound on F, the relaxation being exact where Z has rank d (Rosen et al. 2019, problems 8
-and 9; Carlone et al. 2015). `pgo_models.relaxations.solve_sdp` chooses a form, solves, rounds and proves the bound;
+Their common value is a lower bound on F, the relaxation being exact where Z has rank d (Rosen et al. 2019; Carlone
+et al. 2015). `pgo_models.relaxations.solve_sdp` chooses a form, solves, rounds and proves the bound;
 `pgo_models.relaxations.clique_decomposition` has the form for large sparse graphs.
 """
 

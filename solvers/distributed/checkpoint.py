@@ -43,7 +43,7 @@ from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
 
 S = TypeVar("S")
-Attempt = tuple[Poses, Certificate]
+JudgedPoses = tuple[Poses, Certificate]
 _FORMAT = b"pgo-splitting checkpoint 4\n"  # first line of a file; the second is the SHA-256 of all that follows
 _DIGEST_SIZE = 65
 _LOG = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ class Checkpoint:
 class Saved:
     """What a checkpoint holds beside the robots' snapshots."""
 
-    attempts: tuple[Attempt, ...]  # outcome of the attempts before the one under way
+    attempts: tuple[JudgedPoses, ...]  # outcome of the attempts before the one under way
     stages: tuple[Stage, ...]  # finished stages of all attempts
     method: str  # name of the method that runs
     state: object  # its state
@@ -98,7 +98,7 @@ class Journal:
         """
         self.stages = stages  # finished ones of the solve, those of the checkpoint to begin with
         self._checkpoint, self._mark = checkpoint, mark
-        self._finished: list[Attempt] = []
+        self._finished: list[JudgedPoses] = []
         self._saved: Saved | None = None
         self._snapshots: list[dict[str, NDArray[Any]]] = []
         self._has_warned = False
@@ -117,14 +117,14 @@ class Journal:
             self._lock.release()
             self._lock = None
 
-    def outcome_of_attempt(self) -> Attempt | None:
+    def outcome_of_attempt(self) -> JudgedPoses | None:
         """Outcome of the attempt that begins, if the checkpoint is of a later one."""
         if self._saved is None or len(self._finished) >= len(self._saved.attempts):
             return None
         self._finished.append(self._saved.attempts[len(self._finished)])
         return self._finished[-1]
 
-    def end_attempt(self, outcome: Attempt) -> None:
+    def end_attempt(self, outcome: JudgedPoses) -> None:
         """Remember the outcome of an attempt."""
         self._finished.append(outcome)
 

@@ -38,7 +38,7 @@ from solvers.soc.subgraph import Outline
 DEFAULT_MEMORY = 4e9
 Q = TypeVar("Q")
 A = TypeVar("A")
-Order = Callable[[Interior, Q], tuple[Interior, A]]
+InteriorOrder = Callable[[Interior, Q], tuple[Interior, A]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,12 +118,12 @@ class Driver:
             self.network.workers.close()
             raise
 
-    def ask(self, order: Order[Q, A], request: Q, count: Count = Count.ROUND) -> list[A]:
+    def ask(self, order: InteriorOrder[Q, A], request: Q, count: Count = Count.ROUND) -> list[A]:
         """Answers of all interiors to an order with one request."""
         return self.ask_each(order, [request] * len(self.robots), count)
 
     def ask_each(
-        self, order: Order[Q, A], requests: Sequence[Q], count: Count = Count.ROUND, is_along: bool = False
+        self, order: InteriorOrder[Q, A], requests: Sequence[Q], count: Count = Count.ROUND, is_along: bool = False
     ) -> list[A]:
         """Answers of all interiors to an order, each with its request, of a solve along the tree or of the driver."""
         to_all: list[Q | None] = [None] * self.network.ledger.num_robots

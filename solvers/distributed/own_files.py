@@ -148,7 +148,7 @@ def join_neighbours(agent: FileAgent, received: Mapping[int, Edges]) -> Border:
     return Border(counts, agent.numbers[pairs], agent.owners[pairs], *tied, alone, middle)
 
 
-def settle(agent: FileAgent, placement: Placement) -> Outline:
+def place_cover(agent: FileAgent, placement: Placement) -> Outline:
     """Learn which poses the driver solves for, and who else holds which: from now on an agent like any other."""
     known = agent.robot, agent.graph, agent.numbers, agent.owners
     of_edges = np.arange(agent.graph.num_edges), isotropic_weights(agent.graph)
@@ -202,7 +202,7 @@ def open_files(files: Sequence[RobotFile], engine: Engine, memory: float) -> tup
         sizes = np.array([border.counts for border in borders]).T
         _check_connected(borders, num_poses - int(sizes[0].sum()), files[0][1].parent)
         pairs, owners = (np.concatenate([getattr(one, name) for one in borders]) for name in ("pairs", "owners"))
-        outlines = network.ask(settle, place_poses(pairs, owners, len(files), borders[0].middle), Count.ROUND)
+        outlines = network.ask(place_cover, place_poses(pairs, owners, len(files), borders[0].middle), Count.ROUND)
         most = max(int(outline.in_cover.max(initial=0)) for outline in outlines)
         return Driver(outlines, num_poses, lambda: network, memory, grounded=(most + 1) // 2), sizes
     except BaseException:  # also Ctrl-C: nothing stays behind

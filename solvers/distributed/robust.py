@@ -17,7 +17,7 @@ from solvers.distributed.driver import Driver, collect
 from solvers.distributed.leaderless import tree_traffic
 from solvers.distributed.newton import SubstructuredNewton
 from solvers.distributed.robots.records import RatioSums, Reweigh
-from solvers.distributed.robots.reweighting import count_below, kept_edges, sum_ratios
+from solvers.distributed.robots.reweighting import count_below, edges_within, sum_ratios
 from solvers.distributed.stages import open_driver
 from solvers.loop import Watch
 from solvers.network.counted_pool import Count
@@ -144,7 +144,7 @@ def estimate_by_robots(
         run = watch.run(SharedGNC(gnc, left_out(problem.graph, known)), driver)
         scale = run.state.schedule.scale
         kept = np.zeros(problem.graph.num_edges, dtype=bool)
-        kept[np.concatenate(driver.ask(kept_edges, scale, Count.OFF))] = True
+        kept[np.concatenate(driver.ask(edges_within, scale, Count.OFF))] = True
         poses = collect(driver)[0]
         kept[bridges(problem.graph, kept, problem.edge_costs(poses) / thresholds)] = True
         stage = Stage("GNC", run.status, run.iterations, run.objective, run.seconds, run.history, gnc)

@@ -26,8 +26,8 @@ class WorkerPool(Protocol):
 class Engine(Protocol):
     """Settings of a place where robots can run."""
 
-    def open(self, make: Callable[[T], Worker], shares: Sequence[T]) -> WorkerPool:
-        """Start an agent, made of it, for every share; each is sent its own and no other."""
+    def open(self, make: Callable[[T], Worker], parts: Sequence[T]) -> WorkerPool:
+        """Start an agent, made of it, for every part; each is sent its own and no other."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class InProcess:
     def __post_init__(self) -> None:
         check_settings(self, at_least_one=["threads"])
 
-    def open(self, make: Callable[[T], Worker], shares: Sequence[T]) -> WorkerPool:
+    def open(self, make: Callable[[T], Worker], parts: Sequence[T]) -> WorkerPool:
         """Agents as objects of this process."""
-        return _LocalPool([make(share) for share in shares], self.threads)
+        return _LocalPool([make(part) for part in parts], self.threads)
 
 
 class _LocalPool:

@@ -1,4 +1,4 @@
-"""Robots in Ray actors, on this machine or on a cluster; each is a process that is sent its own robots' shares alone.
+"""Robots in Ray actors, on this machine or on a cluster; each is a process that is sent its own robots' parts alone.
 
 An exchange is one call of every actor, and robots are dealt among as many actors as there are CPUs: their answers are
 waited for once an actor, not once a robot. What a lost actor held is made anew by `solvers.network.recovery`.
@@ -68,10 +68,10 @@ class RayEngine:
         if self.address is not None and self.num_cpus is not None:
             raise SettingError(f"num_cpus is for Ray on this machine; the cluster at {self.address} has its own")
 
-    def open(self, make: Callable[[T], Worker], shares: Sequence[T]) -> WorkerPool:
+    def open(self, make: Callable[[T], Worker], parts: Sequence[T]) -> WorkerPool:
         """Robots in actors; MissingExtraError without Ray, EngineError without cluster at `address` or enough CPUs."""
-        # replace() leaves behind what a share has worked out of itself.
-        plain: list[Any] = [replace(share) if is_dataclass(share) else share for share in shares]  # type: ignore[type-var]
+        # replace() leaves behind what a part has worked out of itself.
+        plain: list[Any] = [replace(part) if is_dataclass(part) else part for part in parts]  # type: ignore[type-var]
         place = _RayPlace(_ray(), make, plain, self, connect(self.address, self.num_cpus))
         try:
             place.start(range(len(place.groups)))
@@ -144,20 +144,20 @@ def connect(address: str | None = None, num_cpus: int | None = None) -> bool:
 class _RayPlace:
     ray: ModuleType
     make: Callable[[Any], Worker]
-    shares: Sequence[Any]
+    parts: Sequence[Any]
     engine: RayEngine
     is_ours: bool
     actors: dict[int, Any] = field(init=False, default_factory=dict)  # by group
     _seen: float = field(init=False, default=-math.inf)
 
     def start(self, groups: Sequence[int]) -> None:
-        self._look()
+        self._check_alive()
         for group in groups:
             if group in self.actors:
                 self.ray.kill(self.actors.pop(group))
         for group in groups:
             self.actors[group] = self._actor()
-        mine = {group: [self.shares[robot] for robot in self.groups[group]] for group in groups}
+        mine = {group: [self.parts[robot] for robot in self.groups[group]] for group in groups}
         self._wait({group: self.actors[group].hold.remote(self.make, mine[group]) for group in groups})
 
     def send(self, group: int, order: AnyOrder, requests: Sequence[object]) -> ObjectRef[Any]:
@@ -170,7 +170,7 @@ class _RayPlace:
         errors = self.ray.exceptions
         while True:
             if time.monotonic() > self._seen + _SECONDS_TO_ANSWER:
-                self._look()
+                self._check_alive()
             try:
                 answers: list[Any] = pickle.loads(self.ray.get(ticket, timeout=_SECONDS_TO_ANSWER))
             except errors.GetTimeoutError:
@@ -192,8 +192,8 @@ class _RayPlace:
 
     @cached_property
     def groups(self) -> list[list[int]]:
-        """Robots of every actor, dealt by size, the largest share first."""
-        sizes = [len(pickle.dumps(share)) for share in self.shares]
+        """Robots of every actor, dealt by size, the largest part first."""
+        sizes = [len(pickle.dumps(part)) for part in self.parts]
         ordered, count = np.argsort(sizes)[::-1].tolist(), min(self.engine.actors or self._cpus, len(sizes))
         return [sorted(ordered[first::count]) for first in range(count)]
 
@@ -224,7 +224,7 @@ class _RayPlace:
         while missing and (left := deadline - time.monotonic()) > 0:
             patience = min(left, _SECONDS_TO_ANSWER)
             _, missing = self.ray.wait(list(tickets.values()), num_returns=len(tickets), timeout=patience)
-            self._look()
+            self._check_alive()
         if missing:
             free, waited = self.ray.available_resources().get("CPU", 0.0), self.engine.patience
             few = f"{len(missing)} of {len(tickets)} actors have not started in {waited:g} s, {free:.3g} CPUs are free"
@@ -233,7 +233,7 @@ class _RayPlace:
         for group, ticket in tickets.items():
             self.receive(group, ticket)
 
-    def _look(self) -> None:
+    def _check_alive(self) -> None:
         """Whether the cluster is there: a minute after it has gone Ray would end this process, with words of its own.
 
         An EngineError when it has died; its actors are not asked for any more.
@@ -260,8 +260,8 @@ class _RayPlace:
 class _Actor:
     """A process, and the robots that it holds; answers are pickled."""
 
-    def hold(self, make: Callable[[T], Worker], shares: Sequence[T]) -> bytes:
-        self._workers = [make(share) for share in shares]
+    def hold(self, make: Callable[[T], Worker], parts: Sequence[T]) -> bytes:
+        self._workers = [make(part) for part in parts]
         return pickle.dumps([])
 
     def obey(self, pickled: bytes) -> bytes:

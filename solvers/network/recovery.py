@@ -28,7 +28,7 @@ class Place(Protocol[T]):
         """Robots of every group."""
 
     def start(self, groups: Sequence[int]) -> None:
-        """Start groups, or start them again, from their shares; a RobotLostError when one was lost meanwhile."""
+        """Start groups, or start them again, from their parts; a RobotLostError when one was lost meanwhile."""
 
     def send(self, group: int, order: AnyOrder, requests: Sequence[object]) -> T:
         """Give the robots of a group an order, each with its request."""

@@ -26,7 +26,7 @@ def serialize(value: object) -> dict[str, NDArray[Any]]:
     return {_TREE: np.array(tree), **{str(number): array for number, array in enumerate(arrays)}}
 
 
-def deserialize(arrays: Mapping[str, NDArray[Any]], classes: Sequence[type]) -> Any:  # noqa: ANN401 - whatever was packed
+def deserialize(arrays: Mapping[str, NDArray[Any]], classes: Sequence[type]) -> Any:  # noqa: ANN401 - whatever was serialized
     """Object that `serialize` made the arrays of, of these dataclasses and enums; nothing else is ever made.
 
     A ValueError when the arrays are not those of `serialize`, or hold a class that is not among `classes`.
@@ -35,7 +35,7 @@ def deserialize(arrays: Mapping[str, NDArray[Any]], classes: Sequence[type]) -> 
     try:
         return _value(json.loads(str(arrays[_TREE])), arrays, known)
     except (KeyError, TypeError, IndexError) as error:
-        raise ValueError(f"arrays that were not packed here: {error!r}") from error
+        raise ValueError(f"arrays that were not serialized here: {error!r}") from error
 
 
 def _tree(value: object, arrays: list[NDArray[Any]]) -> object:
@@ -53,11 +53,11 @@ def _tree(value: object, arrays: list[NDArray[Any]]) -> object:
         return {"class": type(value).__name__, "fields": fields}
     if isinstance(value, Mapping):
         if not all(isinstance(key, str | int) for key in value):
-            raise TypeError(f"cannot pack the keys {list(value)!r}")
+            raise TypeError(f"cannot serialize the keys {list(value)!r}")
         return {"keys": list(value), "values": [_tree(item, arrays) for item in value.values()]}
     if isinstance(value, Sequence):
         return {"items": [_tree(item, arrays) for item in value]}
-    raise TypeError(f"cannot pack {value!r}")
+    raise TypeError(f"cannot serialize {value!r}")
 
 
 def _value(tree: Any, arrays: Mapping[str, NDArray[Any]], known: Mapping[str, type]) -> Any:  # noqa: ANN401

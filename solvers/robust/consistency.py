@@ -67,33 +67,36 @@ def pairwise_consistent(graph: PoseGraph, known: BoolArray | None = None, quanti
     chain, (R, t), spread = _chains(graph, is_whole & is_known, covariance)
     i, j = graph.i[tested], graph.j[tested]
     end = _product((R[i], t[i]), (graph.R_ij[tested], graph.t_ij[tested]))
-    T = _product(end, _inverse((R[j], t[j])))
-    S = _carried(end, covariance[tested])
+    cycle = _product(end, _inverse((R[j], t[j])))
+    uncertainty = _carried(end, covariance[tested])
     back = (chain[i] > chain[j]) | ((chain[i] == chain[j]) & (i > j))
-    reverse = _inverse((T[0][back], T[1][back]))
-    S[back] = _carried(reverse, S[back])
-    T[0][back], T[1][back] = reverse
+    reverse = _inverse((cycle[0][back], cycle[1][back]))
+    uncertainty[back] = _carried(reverse, uncertainty[back])
+    cycle[0][back], cycle[1][back] = reverse
     i, j = np.where(back, j, i), np.where(back, i, j)
-    threshold = float(scipy.special.chdtri(S.shape[1], 1.0 - quantile))
+    threshold = float(scipy.special.chdtri(uncertainty.shape[1], 1.0 - quantile))
     kept = np.ones(graph.num_edges, dtype=bool)
     kept[tested] = False
     groups = chain[i] * np.int64(graph.num_poses) + chain[j]
     for group in np.unique(groups):
         mine = np.flatnonzero(groups == group)
         if chain[i[mine[0]]] == chain[j[mine[0]]]:
-            alone = _squared_distances((T[0][mine], T[1][mine]), S[mine] + spread[j[mine]] - spread[i[mine]])
+            both = uncertainty[mine] + spread[j[mine]] - spread[i[mine]]
+            alone = _squared_distances((cycle[0][mine], cycle[1][mine]), both)
             mine = mine[alone <= threshold]
-        agree = _agreement((T[0][mine], T[1][mine]), S[mine], spread, i[mine], j[mine], threshold)
+        agree = _agreement((cycle[0][mine], cycle[1][mine]), uncertainty[mine], spread, i[mine], j[mine], threshold)
         kept[tested[mine[maximum_clique(agree)[0]]]] = True
     return kept
 
 
-def _agreement(T: Motions, S: Array, spread: Array, i: IntArray, j: IntArray, threshold: float) -> BoolArray:
+def _agreement(
+    cycle: Motions, uncertainty: Array, spread: Array, i: IntArray, j: IntArray, threshold: float
+) -> BoolArray:
     """Whether every two of k loop closures are consistent, (k, k), none with itself."""
-    (R, t), d, k = T, T[1].shape[1], len(i)
+    (R, t), d, k = cycle, cycle[1].shape[1], len(i)
     agree = np.zeros((k, k), dtype=bool)
     turns = R.reshape(k, d * d)
-    own, grown = (np.einsum("maa->m", C[:, d:, d:]) for C in (S, spread))
+    own, grown = (np.einsum("maa->m", C[:, d:, d:]) for C in (uncertainty, spread))
     for a in range(k - 1):
         # ||w||^2 / tr(covariance of w) is no more than the distance, and the chord no more than w.
         b = np.arange(a + 1, k)
@@ -101,7 +104,7 @@ def _agreement(T: Motions, S: Array, spread: Array, i: IntArray, j: IntArray, th
         b = b[0.5 * np.sum((turns[a] - turns[b]) ** 2, axis=1) <= threshold * trace]
         along_i = np.sign(i[b] - i[a])[:, None, None] * (spread[i[b]] - spread[i[a]])
         along_j = np.sign(j[b] - j[a])[:, None, None] * (spread[j[b]] - spread[j[a]])
-        covariance = S[a] + S[b] + along_i + _carried((R[[a]], t[[a]]), along_j)
+        covariance = uncertainty[a] + uncertainty[b] + along_i + _carried((R[[a]], t[[a]]), along_j)
         relative = _product((R[[a]], t[[a]]), _inverse((R[b], t[b])))
         agree[a, b[_squared_distances(relative, covariance) <= threshold]] = True
     return agree | agree.T

@@ -60,9 +60,9 @@ def test_a_class_that_is_not_expected_is_not_made():
     class Other:
         value: int
 
-    with pytest.raises(ValueError, match="not packed here"):
+    with pytest.raises(ValueError, match="not serialized here"):
         deserialize(serialize(Other(1)), (Poses,))
-    with pytest.raises(ValueError, match="not packed here"):
+    with pytest.raises(ValueError, match="not serialized here"):
         deserialize({"0": np.zeros(2)}, ())
 
 
@@ -87,14 +87,14 @@ def test_what_is_packed_and_what_is_unpacked_are_copies():
     ],
 )
 def test_a_tree_of_another_version_is_a_value_error(tree):
-    with pytest.raises(ValueError, match=r"not packed here|zip"):
+    with pytest.raises(ValueError, match=r"not serialized here|zip"):
         deserialize({"tree": np.array(json.dumps(tree))}, (Poses, Status))
 
 
 def test_what_is_no_data_is_refused():
-    with pytest.raises(TypeError, match="cannot pack"):
+    with pytest.raises(TypeError, match="cannot serialize"):
         serialize({"function": print})
-    with pytest.raises(TypeError, match="cannot pack the key"):
+    with pytest.raises(TypeError, match="cannot serialize the key"):
         serialize({(1, 2): 3})
 
 

@@ -68,7 +68,7 @@ class Elimination:
 def eliminate(K: csc_array, cut: Cut, backend: CholeskyBackend | None, is_verified: bool = False) -> Elimination:
     """Factor the interior of a robot's matrix and form its Schur complement.
 
-    K_GG - Z^T Z with Z = R^-T K_IG, R^T R = K_II, by forward substitution alone: [R, Z] are rows of the Cholesky
+    K_GG - Z^T Z with Z = U^-T K_IG, U^T U = K_II, by forward substitution alone: [U, Z] are rows of the Cholesky
     factor of the whole. So its rounding is that of one (`pgo_models.problem.floating_point`), and with `is_verified`
     what rounding can take of the separators' part is subtracted from the diagonal of the Schur complement: for the
     given K, exactly,
@@ -139,10 +139,10 @@ class FrontFactor:
 
 @dataclass(frozen=True, eq=False)
 class HeldFront:
-    """A front F with its factors; its methods are orders, as those of `Interior`.
+    """A front K with its factors; its methods are orders, as those of `Interior`.
 
-    With its unknowns split into those that it eliminates, E, and those of the fronts above, B, L_EE L_EE^T = F_EE and
-    L_BE = F_BE L_EE^-T (the multifrontal method, Liu 1992).
+    With its unknowns split into those that it eliminates, E, and those of the fronts above, B, L_EE L_EE^T = K_EE and
+    L_BE = K_BE L_EE^-T (the multifrontal method, Liu 1992).
     """
 
     num_eliminated: int  # separators; those of the boundary come after them
@@ -152,22 +152,22 @@ class HeldFront:
     factors: Mapping[str, FrontFactor] = field(default_factory=dict)  # by widths
 
     def eliminate(self, order: FrontParts) -> tuple[HeldFront, Array]:
-        """Sum the parts and factor; F_BB - L_BE L_BE^T, packed. A NotPositiveDefiniteError where F_EE is not."""
+        """Sum the parts and factor; K_BB - L_BE L_BE^T, packed. A NotPositiveDefiniteError where K_EE is not."""
         width, fields = sum(order.widths), np.split(np.arange(sum(order.widths)), np.cumsum(order.widths)[:-1])
         kinds = [fields] * self.num_robots + [[np.arange(width)]] * (len(self.places) - self.num_robots)
         places = zip(self.places, kinds, strict=True)
         each = [[(width * at[:, None] + one).ravel() for one in kind] for at, kind in places]
         rows, e = tuple(map(np.concatenate, each)), width * self.num_eliminated
-        F = np.zeros((width * self.num_separators, width * self.num_separators))
+        K = np.zeros((width * self.num_separators, width * self.num_separators))
         for at, part in zip(rows, order.parts, strict=True):
-            F[np.ix_(at, at)] += unpacked(part, len(at))
+            K[np.ix_(at, at)] += unpacked(part, len(at))
         if order.own is not None:
             inside = np.arange(e).reshape(-1, width)
-            F[inside[:, :, None], inside[:, None, :]] += order.own
-        L_EE = _cholesky(F[:e, :e])
-        L_BE = np.ascontiguousarray(_solved(L_EE, F[:e, e:]).T)
-        F = F[e:, e:] - L_BE @ L_BE.T  # the front itself is let go before its complement is packed
-        return self._with(order.widths, FrontFactor(L_EE, L_BE, rows)), packed(F)
+            K[inside[:, :, None], inside[:, None, :]] += order.own
+        L_EE = _cholesky(K[:e, :e])
+        L_BE = np.ascontiguousarray(_solved(L_EE, K[:e, e:]).T)
+        K = K[e:, e:] - L_BE @ L_BE.T  # the front itself is let go before its complement is packed
+        return self._with(order.widths, FrontFactor(L_EE, L_BE, rows)), packed(K)
 
     def reduce(self, order: FrontParts) -> tuple[HeldFront, tuple[Array, float]]:
         """b_B - L_BE y, (unknowns, k), y = L_EE^-1 b_E; and |y|^2, of which b^T K^-1 b is the sum over all fronts."""

@@ -46,7 +46,7 @@ def count_below(interior: Interior, bounds: tuple[float, float]) -> tuple[Interi
     return interior, float(np.sum(ratio[~is_known] <= bounds[1]))
 
 
-def kept_edges(interior: Interior, scale: float) -> tuple[Interior, IntArray]:
+def edges_within(interior: Interior, scale: float) -> tuple[Interior, IntArray]:
     """Numbers of the edges within their scaled thresholds, for whoever may see them."""
     assert interior.whole.edges is not None
     return interior, interior.whole.edges[_ratios(interior, scale)[1] <= 1.0]
