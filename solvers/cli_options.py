@@ -193,6 +193,8 @@ def chosen_scene(
             raise SettingError(f"{name} does nothing for {scene.value}, of which it is a part; leave it out")
     if scene in paper:
         return paper[scene](rng)
+    if rotation_noise is not None and not 0 < rotation_noise < math.inf:  # before it is turned into radians
+        raise SettingError(f"--rotation-noise must be positive and finite, got {rotation_noise}")
     poses, d = poses if poses is not None else 300 if scene is Scene.VICTORIA_PARK else 100, d if d is not None else 3
     noise = NoiseModel(
         MILD_NOISE.translation_std if translation_noise is None else translation_noise,

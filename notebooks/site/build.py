@@ -22,6 +22,7 @@ sys.path.insert(0, str(ROOT))
 
 import pgo_models  # noqa: E402 - found above
 import solvers  # noqa: E402
+from pgo_models.errors import MissingExtraError, extra_module  # noqa: E402
 
 PACKAGES = {"pgo_models": pgo_models, "solvers": solvers}
 # What a page of the repository becomes here; links between them follow.
@@ -134,8 +135,10 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=SITE / "_build", help="folder to build in; it is emptied first")
     arguments = parser.parse_args()
     sys.path.insert(0, str(SITE))
-    from sphinx.cmd.build import build_main
-
+    try:
+        build_main = extra_module("sphinx.cmd.build", "docs").build_main
+    except MissingExtraError as error:
+        parser.error(str(error))
     out = arguments.out.resolve()
     for part in ("source", "html", "doctrees"):
         shutil.rmtree(out / part, ignore_errors=True)
