@@ -37,7 +37,7 @@ def test_the_first_command_prints_what_the_readme_shows(monkeypatch, capsys):
         cli.main(words[words.index(".venv/bin/pgo") + 1 :])
     assert end.value.code == 0
     printed = capsys.readouterr().out
-    shown = re.search(r"The first ends with\n\n((?: {4}.*\n)+)", README)[1]
+    shown = re.search(r"The first says, with what it took,\n\n((?: {4}.*\n)+)", README)[1]
     for expected in shown.splitlines():
         line = expected.strip()
         if line.startswith("gap"):  # what rounding leaves is the machine's

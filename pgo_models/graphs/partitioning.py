@@ -111,7 +111,7 @@ def _metis(graph: PoseGraph, num_robots: int) -> IntArray:
     pymetis = extra_module("pymetis", "fast")
     neighbours = pymetis.CSRAdjacency(graph.adjacency.indptr.tolist(), graph.adjacency.indices.tolist())
     counts, options = graph.adjacency.data.astype(np.int64).tolist(), pymetis.Options(contig=True, seed=0)
-    for in_halves in (False, True):  # k parts at once are better balanced, but of a few poses each some are empty
+    for in_halves in (None, True):  # METIS makes more than 8 at once, some of them empty where poses are few
         _, found = pymetis.part_graph(
             num_robots, adjacency=neighbours, eweights=counts, options=options, recursive=in_halves
         )

@@ -112,8 +112,9 @@ def solve_relaxation(
     >>> solution.status.name, solution.verdict.name, solution.rank.rank
     ('OPTIMAL', 'CERTIFIED', 3)
     """
-    if not (0 < gap < math.inf and time_limit > 0):
-        raise SettingError(f"gap is {gap}, time_limit {time_limit}; both must be positive, and the gap finite")
+    for name, given in (("gap", gap), ("time_limit", time_limit)):
+        if not given > 0 or (name == "gap" and math.isinf(given)):
+            raise SettingError(f"{name} is {given}; it must be positive, the gap finite")
     problem.check_quadratic("the relaxation")
     began = time.perf_counter()
     plan = plan_relaxation(problem, form, solver, memory_limit)

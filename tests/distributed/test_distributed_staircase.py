@@ -44,7 +44,8 @@ def test_it_solves_the_relaxation_as_one_place_does(
     driver = driver_at(problem, partitioner, seed, start)
     found = run(SubstructuredStaircase(), driver)
     assert found.status is Status.CONVERGED
-    value, rounding = central.state.point.value, central.state.rounding_level + driver.at.rounding_level
+    # Where no noise is, F is zero: both are near it, above the level of rounding or below.
+    value, rounding = central.state.point.value, 10.0 * (central.state.rounding_level + driver.at.rounding_level)
     assert driver.at.objective == pytest.approx(value, rel=1e-7, abs=rounding)
     lifted, Lambda = collect(driver)
     assert problem.objective(lifted) == pytest.approx(driver.at.objective, rel=1e-9, abs=driver.at.rounding_level)

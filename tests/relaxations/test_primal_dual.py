@@ -207,7 +207,7 @@ def test_what_is_beyond_reach_is_refused_with_an_estimate() -> None:
 
 def test_settings_are_checked() -> None:
     problem = varied_problem(0, 3, 2)
-    for name, value in (("gap", 0.0), ("time_limit", -1.0), ("memory_limit", math.nan)):
+    for name, value in (("gap", 0.0), ("gap", math.inf), ("time_limit", -1.0), ("memory_limit", math.nan)):
         with pytest.raises(SettingError, match=f"{name} is"):
             solve_relaxation(problem, **{name: value})
 
