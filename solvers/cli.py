@@ -237,8 +237,9 @@ def solve_command(
         targets.append((report, partial(write_report, solution, source=source)))
 
     def show() -> None:
-        hints = [*hint_of_chi2(solution.problem, solution.poses), *hint_of_misfits(solution, graph, drop_edge)]
-        typer.echo("\n\n".join([wrapped(text, 13), *map(wrapped, hints)]))
+        typer.echo(wrapped(text, 13))
+        for hint in (*hint_of_chi2(solution.problem, solution.poses), *hint_of_misfits(solution, graph, drop_edge)):
+            typer.echo(f"\n{wrapped(hint)}")
 
     save_then_show(targets, show, solution.as_json if as_json else None, quiet)
     warn_of_weights(graph, problem, solution.certificate, drop_edge)
@@ -286,8 +287,11 @@ def certify_command(
     targets = [(out, partial(write_json, record))] if out is not None else []
     rows = [f"{label:<12} {text}" for label, text in other_cost(problem, poses)]
     text = wrapped("\n".join([str(certificate), *rows]), 13)
-    hints = map(wrapped, hint_of_chi2(problem, poses))
-    save_then_show(targets, lambda: typer.echo("\n".join([text, *hints])), (lambda: record) if as_json else None, quiet)
+
+    def show() -> None:
+        typer.echo("\n".join([text, *map(wrapped, hint_of_chi2(problem, poses))]))
+
+    save_then_show(targets, show, (lambda: record) if as_json else None, quiet)
     warn_of_weights(graph, problem, certificate, drop_edge)
     raise typer.Exit(DONE if certificate.is_certified else NOT_CERTIFIED)
 

@@ -56,7 +56,10 @@ def hint_of_chi2(problem: PGOProblem, poses: Poses) -> list[str]:
     here = whole.objective(poses)
     if abs(here - problem.objective(poses)) <= 1e-9 * here:  # chi2 is F: no factorisation to find that out
         return []
-    below = whole.objective(polish(whole, poses, max_steps=1))  # a bound from above on its minimum
+    try:
+        below = whole.objective(polish(whole, poses, max_steps=1))  # a bound from above on its minimum
+    except NotPositiveDefiniteError:
+        return []
     if not here > WORTH_SAYING * below:
         return []
     return [f"the file's own cost: chi2 {here:.4g} here; its minimum is at most {below:.4g}: --information"]

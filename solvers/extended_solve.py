@@ -13,7 +13,7 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.convex.extended_newton import ExtendedNewton, kinks
 from solvers.convex.extended_soc import with_priors
 from solvers.loop import Watch
-from solvers.result import OUT_OF_TIME, Stage
+from solvers.result import OUT_OF_TIME, Run, Stage
 from solvers.robust_solve import Plain
 from solvers.solution import Solution
 
@@ -39,18 +39,21 @@ def solve_extended(problem: PGOProblem, pipeline: Any, start: Poses | None, watc
         return solution
     if solution.robots is not None or solution.robust is not None:
         raise SettingError(f"robots and robust go with priors alone, and there are {left_out[0]}; leave them out")
-    run, certificate = watch.run(pipeline.soc, problem, start), solution.certificate
-    level, stationarity, runs = certificate.rounding_level, math.nan, [run]
-    model.variables.X.value = run.poses.stacked()
+    certificate, poses, status = solution.certificate, solution.poses, solution.status
+    level, stationarity, runs = certificate.rounding_level, math.nan, list[Run[Any]]()
+    if status not in OUT_OF_TIME:
+        runs.append(watch.run(pipeline.soc, problem, start))
+        poses, status = runs[0].poses, runs[0].status
+    model.variables.X.value = poses.stacked()
     if not_smooth := sorted(set(["constraints"] * bool(change.constraints)).union(*map(kinks, change.terms))):
         why = f"as Newton needs smooth terms alone, and there are {', '.join(not_smooth)}"
         left_out[-1] += f"; SOC is the last stage, {why}"
-    elif run.status not in OUT_OF_TIME:
+    elif status not in OUT_OF_TIME:
         newton = pipeline.newton
         second = ExtendedNewton(pipeline.soc.changer, newton.tolerance, newton.max_iterations)
-        runs.append(run := watch.run(second, problem, run.poses))
-        stationarity = run.state.decrement
-    objective = model.cost(run.poses.stacked())
+        runs.append(watch.run(second, problem, poses))
+        poses, status, stationarity = runs[1].poses, runs[1].status, runs[1].state.decrement
+    objective = model.cost(poses.stacked())
     bound = NO_BOUND if change.replaced_edges else certificate.bound
     gap = relative_gap(objective, bound.value, level)
     verdict = verdict_of(objective, level, gap, bound, certificate.wanted_gap)
@@ -58,10 +61,10 @@ def solve_extended(problem: PGOProblem, pipeline: Any, start: Poses | None, watc
     return replace(
         solution,
         problem=problem,
-        poses=run.poses,
+        poses=poses,
         objective=objective,
         certificate=found,
-        status=run.status,
+        status=status,
         stages=(*solution.stages, *(replace(Stage.of(r), objective=model.cost(r.poses.stacked())) for r in runs)),
         seconds=time.perf_counter() - watch.began,
         note=f"the bound leaves out {', '.join(left_out)}",

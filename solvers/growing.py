@@ -40,6 +40,8 @@ def extend(solution: Solution, graph: PoseGraph, pipeline: Pipeline | None = Non
     known = weighting if isinstance(weighting, Weighting) else Weighting.ISOTROPIC
     problem = PGOProblem(graph, solution.problem.backend, known)
     start = extended_poses(problem, solution.problem.graph.pose_ids, solution.poses)
+    if getattr(pipeline.soc, "changer", None) is not None:  # Newton alone would leave out its terms
+        return solve(problem, pipeline, start)
     newton = replace(pipeline.newton, tolerance=max(pipeline.newton.tolerance, _SHARE * pipeline.gap))
     update = solve(problem, replace(pipeline, soc=None, newton=newton, second_try=False, staircase=None), start)
     if update.status in OUT_OF_TIME or not update.certificate.can_improve:

@@ -203,7 +203,7 @@ class Watch:
                     raise
                 status = Status.NOT_FINITE
             table.end(status, k)
-        objective = records[-1].measurement.objective if records else math.nan
+        objective = records[-1].measurement.objective if len(records) > len(earlier) else math.nan
         if best is not None and not status.is_success:
             (_, objective), state = best
         history = History(tuple(records))

@@ -37,9 +37,10 @@ class Table:
         """Show one record; `elapsed` seconds of wall time have passed."""
         figures = record.measurement
         residual = max(figures.primal_residual, figures.dual_residual)
-        self._first = residual if math.isinf(self._first) else self._first
+        is_first = math.isinf(self._first)
+        self._first = residual if is_first else self._first
         if self._verbose:
-            if record.k == 0:
+            if is_first:
                 robots = "" if figures.rounds is None else _HEADER_OF_ROBOTS
                 print(f"{self._name}\n{_HEADER}{robots}")
             residuals = f"{_figure(figures.primal_residual)}  {_figure(figures.dual_residual)}"

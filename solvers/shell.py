@@ -12,6 +12,7 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
+from io import TextIOWrapper
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, TextIO, cast
@@ -148,7 +149,11 @@ def outlets() -> Iterator[Outlet]:
     """Put outlets before standard output, which is lent, and standard error."""
     with ExitStack() as stack:
         # A stream that the shell has closed is None.
-        out, err = (Outlet(stream or stack.enter_context(open(os.devnull, "w"))) for stream in (sys.stdout, sys.stderr))
+        streams = [stream or stack.enter_context(open(os.devnull, "w")) for stream in (sys.stdout, sys.stderr)]
+        for stream in streams:
+            if isinstance(stream, TextIOWrapper):  # a name that the terminal has no letters for
+                stream.reconfigure(errors="backslashreplace")
+        out, err = map(Outlet, streams)
         stack.enter_context(redirect_stdout(cast("TextIO", out)))
         stack.enter_context(redirect_stderr(cast("TextIO", err)))
         try:

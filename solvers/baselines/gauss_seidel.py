@@ -100,6 +100,8 @@ class GaussSeidel:
         problem.stacked(poses)  # raises unless the poses fit
         if problem.graph.is_world_loose:
             raise SettingError("rotations alone do not tell that of the world of position priors; use another method")
+        if len(problem.graph.landmarks):
+            raise SettingError("rotations alone do not tell those of landmarks, which have none; use another method")
         turns = schedule(problem.graph, robots, self.sweep)
         linear, numbers = rotation_problem(problem, poses.R[0]), problem.d**2
         is_flagged = start is None and self.is_flagged

@@ -220,7 +220,7 @@ class AlternatingBregman(BregmanSettings):
     def _stationarity(self, problem: BregmanProblem, change: Array) -> float:
         """||r||, r_i = alpha K_i^T sum_{j > i} K_j dx_j: block i was minimised with the old x_j of the last pass.
 
-        Its optimality condition is K_i^T lam^{k+1} - r_i in the subdifferential of J_i at x_i (Boyd et al. 2011, 3.3).
+        Its optimality condition is K_i^T lam^{k+1} + r_i in the subdifferential of J_i at x_i (Boyd et al. 2011, 3.3).
         """
         moved, squares = problem.K @ change, 0.0
         for block in problem.blocks:

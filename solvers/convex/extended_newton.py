@@ -15,7 +15,8 @@ from cvxpy.atoms.pnorm import Pnorm
 
 from pgo_models.certificates import newton_polish as polish
 from pgo_models.certificates.rounding_errors import rounding_level
-from pgo_models.convex.graph_subproblem import Changer, GraphQP, graph_qp
+from pgo_models.convex.graph_subproblem import Changer, GraphQP
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, hat, vee
 from pgo_models.problem.cholesky import CholeskyFactor
@@ -23,6 +24,7 @@ from pgo_models.problem.hessian import TangentLayout
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
+from solvers.convex.extended_soc import ExtendedSOC
 from solvers.result import Measurement, Status
 from solvers.riemannian.truncated_cg import truncated_conjugate_gradients
 
@@ -59,10 +61,15 @@ class ExtendedNewton:
     tolerance: float = polish.STATIONARY_DECREMENT
     max_iterations: int = 100
 
+    def __post_init__(self) -> None:
+        check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
+
     def init(self, problem: PGOProblem, start: Poses | None) -> ExtendedNewtonState:
-        """State 0, at `start`, or the chordal relaxation."""
+        """State 0, at `start`, or the chordal relaxation; a SettingError unless the cost is F, and for constraints."""
         start = start if start is not None else chordal_start(problem)
-        model = graph_qp(problem.graph, np.ones(problem.num_poses), changer=self.changer)
+        model = ExtendedSOC(self.changer).model(problem)
+        if model.change.constraints:
+            raise SettingError("Newton takes terms without constraints; use ExtendedSOC, or write them as terms")
         factor = polish.factorize_model(problem, polish.start_polish(problem, start), second_order=False)[1]
         return _arrive(problem, 0, start, model, factor)
 
@@ -71,7 +78,9 @@ class ExtendedNewton:
         w, v = TangentLayout(problem.num_poses, problem.d).split(state.direction)
         for length in 0.5 ** np.arange(polish.HALVINGS):
             poses = polish.move_poses(state.poses, length * w, length * v)
-            enough = polish.SUFFICIENT * length * state.slope if length < 1.0 else polish.ROUNDING * state.objective
+            enough = (
+                polish.SUFFICIENT * length * state.slope if length < 1.0 else polish.ROUNDING * abs(state.objective)
+            )
             if state.model.cost(poses.stacked()) - state.objective <= enough:
                 return _arrive(problem, state.k + 1, poses, state.model, state.factor)
         return replace(state, k=state.k + 1, moved=False)
@@ -94,7 +103,7 @@ class ExtendedNewton:
 def kinks(term: cp.Expression, is_flat: bool = False) -> set[str]:
     """Names of the atoms that may have a kink at the value of the variables; `is_flat` says that it is inside a square.
 
-    A square is what is flat at zero, as huber and powers from 2 on: norms are smooth in it.
+    A square is what is flat at zero, as huber and even powers: norms are smooth in it. Others need x >= 0.
     """
     if term.is_affine():
         return set()
@@ -102,7 +111,7 @@ def kinks(term: cp.Expression, is_flat: bool = False) -> set[str]:
         is_smooth = term.p == 2 and term.args[0].is_affine() and (is_flat or np.min(term.value) > _KINK)
         return set() if is_smooth else {"norm"}
     is_square = isinstance(term, cp.quad_over_lin) and term.args[1].is_constant()
-    is_square |= isinstance(term, cp.huber) or (isinstance(term, Power) and term.p.value >= 2)
+    is_square |= isinstance(term, cp.huber) or (isinstance(term, Power) and term.p.value >= 2 and term.p.value % 2 == 0)
     if not (is_square or isinstance(term, _SMOOTH)):
         return {type(term).__name__}
     inside = is_square or (is_flat and isinstance(term, cp.multiply | cp.reshape | index))
@@ -129,9 +138,9 @@ def _arrive(problem: PGOProblem, k: int, poses: Poses, model: GraphQP, factor: C
 
     gradient = adjoint(G)
     radius = _RADIUS * np.sqrt(inner(gradient, factor.solve(gradient)))
-    floor = 0.1 * polish.STATIONARY_DECREMENT * objective
+    floor = 0.1 * polish.STATIONARY_DECREMENT * abs(objective)
     found = truncated_conjugate_gradients(gradient, hessian, factor.solve, radius, _FORCING, floor, _MOST_PRODUCTS)
     slope = inner(gradient, found.step)
-    decrement = polish.scaled_decrement(-slope, objective, rounding_level(problem, poses))
+    decrement = polish.scaled_decrement(-slope, abs(objective), rounding_level(problem, poses))
     decrement = np.inf if found.is_at_boundary else decrement
     return ExtendedNewtonState(k, poses, objective, found.step, slope, decrement, model, factor)

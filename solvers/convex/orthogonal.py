@@ -210,7 +210,11 @@ def solve_orthogonal(
     if starts < 1:
         raise SettingError(f"starts must be at least 1, got {starts}")
     method = soc if soc is not None else OrthogonalSOC()
-    outcomes = [run(method, problem, problem.random_point(rng), verbose=verbose) for _ in range(starts)]
+    outcomes = list[Outcome[OrthogonalState]]()
+    for _ in range(starts):
+        outcomes.append(run(method, problem, problem.random_point(rng), verbose=verbose))
+        if outcomes[-1].status is Status.INTERRUPTED:
+            break
     best = min(outcomes, key=lambda outcome: (not outcome.status.is_success, outcome.objective))
     values = problem.values(best.state.copies)
     kkt = orthogonality.kkt_residuals(problem, method.point(problem, best.state), best.state.rho, method.solver)

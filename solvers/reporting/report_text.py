@@ -13,6 +13,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals
+from pgo_models.problem.weighting import Weighting
 from solvers.network.ledger import Ledger
 from solvers.result import Stage, Status
 from solvers.robust.rejection import Rejection
@@ -118,7 +119,8 @@ def advice(
     Of a robust solve, which has written a graph without the edges that it rejected, that graph is checked.
     """
     file = graph.name if graph.name in known_datasets() else f"{graph.name}.g2o"
-    name = source if source is not None else shlex.quote(file)
+    is_chi2 = certificate.weighting is Weighting.INFORMATION
+    name = source if source is not None else f"{shlex.quote(file)}{' --information' * is_chi2}"
     solve = f"pgo solve {name}"
     found = []
     if not status.is_success:

@@ -12,7 +12,7 @@ from pgo_models.problem.matrices import inner
 
 @dataclass(frozen=True, eq=False)
 class TruncatedStep:
-    """What `truncated_cg` found."""
+    """What `truncated_conjugate_gradients` found."""
 
     step: Array  # of the shape of the gradient
     decrease: float  # what the model promises: -<g, s> - <s, H s> / 2, positive

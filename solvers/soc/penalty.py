@@ -255,7 +255,7 @@ def next_penalty(rule: PenaltyRule, ratio: Array, steps: Steps) -> tuple[Due, fl
 
 
 def has_stalled(rule: MultiplierPenalty, merits: tuple[float, ...]) -> bool:
-    """Whether the last `stall_window` steps have not brought the merit below `stall_ratio` of what it was."""
+    """Whether the last of `stall_window` merits is not below `stall_ratio` of the first of them."""
     window = rule.stall_window
     return len(merits) >= window and merits[-1] > rule.stall_ratio * merits[-window]
 

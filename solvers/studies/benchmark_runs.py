@@ -72,7 +72,7 @@ def reason_of(error: BaseException) -> str:
     return str(error) or type(error).__name__
 
 
-def solve_whole(problem: PGOProblem, *args: Any, **settings: Any) -> Solution:  # noqa: ANN401 - those of `solve`
+def solve_whole(problem: PGOProblem | PoseGraph, *args: Any, **settings: Any) -> Solution:  # noqa: ANN401 - those of `solve`
     """Return what `solve` finds, without a bar; KeyboardInterrupt after Ctrl-C: half a solve is none."""
     solution = solve(problem, *args, **settings, progress=False)
     if any(stage.status is Status.INTERRUPTED for stage in solution.stages):

@@ -17,13 +17,12 @@ from pgo_models.plots.graph_plots import plot_panels
 from pgo_models.plots.interactive_plots import explore_graph, save_page
 from pgo_models.plots.style import column_figure, plotly, save_figure
 from pgo_models.problem.problem import PGOProblem
-from solvers.pipeline import solve
 from solvers.progress_bars import JobBar
 from solvers.reporting.convergence_plots import explore_convergence, plot_convergence
 from solvers.reporting.result_table import gap_percent
 from solvers.result import History
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings, StageRecord
-from solvers.studies.benchmark_runs import run_benchmark
+from solvers.studies.benchmark_runs import run_benchmark, solve_whole
 from solvers.studies.paper_tables import SCENES, graph_of_row
 
 if TYPE_CHECKING:
@@ -145,7 +144,7 @@ def _run_all(names: tuple[str, ...], download: bool, progress: bool | None) -> t
 def _run(row: PublishedRow, download: bool) -> Shown:
     graph = graph_of_row(row, 0, download)
     problem = PGOProblem(graph)
-    bound = solve(problem, progress=False).lower_bound
+    bound = solve_whole(problem).lower_bound
     start, settings = graph.initial if row.name in SCENES else None, BenchmarkSettings(max_rounds=row.soc.iterations)
     return Shown(graph, run_benchmark(BenchmarkMethod.PAPER, problem, settings, start), bound)
 

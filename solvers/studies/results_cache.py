@@ -48,7 +48,9 @@ class KeptResults(dict[str, Entry]):
             raise FileFormatError(path, None, f"no results of pgo; {way_out}")
         if content.get("versions") != self._header["versions"]:
             return {}
-        results: dict[str, Entry] = content.get("results", {})
+        results = content.get("results", {})
+        if not isinstance(results, dict) or not all(isinstance(entry, dict) for entry in results.values()):
+            raise FileFormatError(path, None, f"no results of pgo; {way_out}")
         return results
 
 

@@ -9,7 +9,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NETWORK_KAPPA, NETWORK_TAU, NoiseModel, circle, grid, observe
-from solvers.pipeline import solve
+from solvers.studies.benchmark_runs import solve_whole
 
 
 class SweptScene(enum.Enum):
@@ -76,6 +76,6 @@ def noise_sweep(scene: SweptScene, rotation_std: Array, graphs: int, rng: np.ran
     gap = np.zeros((len(levels), graphs))
     for level, std in enumerate(levels):
         for number in range(graphs):
-            solution = solve(noisy_scene(scene, float(std), rng))
+            solution = solve_whole(noisy_scene(scene, float(std), rng))
             certified[level, number], gap[level, number] = solution.is_certified, solution.gap
     return NoiseSweep(scene, levels, certified, gap)
