@@ -56,7 +56,7 @@ class Certificate(ReadOnly):
 
     The bound was found at `poses`, where F is `poses_objective`, the best value known; `source` says how these poses
     were come by. The multipliers `Lambda`, (n, d, d), are with eta and the poses the proof: anyone can check it with
-    `prove_bound`. `verdict` is for the gap `wanted_gap`.
+    `prove_bound`; those of `BoundSource.SOFTENED` are of the smaller matrices. `verdict` is for the gap `wanted_gap`.
     """
 
     objective: float

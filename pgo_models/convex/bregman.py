@@ -5,6 +5,7 @@ three forms of the iteration whose subproblems are compiled here, each with one 
 alternates over the blocks of x. The iterations themselves are in solvers/convex/bregman.py.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -100,7 +101,8 @@ class BregmanProblem:
         for variable, value in zip(self.variables, self.unstacked(x), strict=True):
             variable.save_value(value)
         with np.errstate(all="ignore"):  # outside the domain of J the value says so
-            return float(self.J.value)
+            found = float(self.J.value)
+        return math.inf if math.isnan(found) else found
 
     def residual(self, x: Array) -> Array:
         """K x - f, (s,)."""

@@ -119,8 +119,9 @@ class Measurements(ReadOnly):
 
     @cached_property
     def first_sights(self) -> IntArray:
-        """The first edge to every landmark that has one."""
+        """The first edge to every landmark that has one, from a pose if there is such an edge, not from the world."""
         ends = np.flatnonzero(np.isin(self.j, self.landmarks))
+        ends = ends[np.argsort(self.is_prior[ends], kind="stable")]
         return read_only(ends[np.unique(self.j[ends], return_index=True)[1]])
 
     def _settled_landmarks(self) -> dict[str, Array]:
@@ -142,6 +143,8 @@ class Measurements(ReadOnly):
         m = len(self.i)
         if m == 0:
             raise GraphError(f"{self.name} has no edges; a pose graph needs at least one measurement")
+        if len(self.landmarks) and not (self.landmarks.min() >= 0 and self.landmarks.max() < self.num_poses):
+            raise GraphError(f"landmarks are poses {self.landmarks}, not all of them of 0 .. {self.num_poses - 1}")
         if self.R_ij.ndim != 3 or self.R_ij.shape[1:] not in ((2, 2), (3, 3)):
             raise GraphError(f"R_ij has shape {self.R_ij.shape}; give (m, 2, 2) or (m, 3, 3)")
         d, k, of_poses = self.d, 3 * self.d - 3, (self.num_poses,)
@@ -195,7 +198,7 @@ class Measurements(ReadOnly):
 
 
 def isotropic_information(kappa: Array, tau: Array, d: int) -> Array:
-    """Diagonal information matrices, (m, 3, 3) or (m, 6, 6), whose `precisions` are kappa and tau."""
+    """Diagonal information matrices, (m, 3, 3) or (m, 6, 6), whose `edge_precisions` are kappa and tau."""
     diagonal = [tau, tau, kappa] if d == 2 else [tau, tau, tau, 2 * kappa, 2 * kappa, 2 * kappa]
     return np.asarray(np.stack(diagonal, axis=1)[:, :, None] * np.eye(len(diagonal)))
 

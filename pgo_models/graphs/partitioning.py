@@ -68,8 +68,8 @@ def partition(graph: PoseGraph, num_robots: int | None = None, method: Partition
 
     The number of robots is needed unless the graph names its robots; where every pose is a robot it is not minded. The
     method is GIVEN when the graph names as many robots as asked for, else CONTIGUOUS, unless another is given. A
-    SettingError when the number is no whole one of 1 to n, or GIVEN does not fit; a MissingExtraError for METIS without
-    the extra `fast`.
+    SettingError when the number is no whole one of 1 to n, or the method is none or does not fit; a MissingExtraError
+    for METIS without the extra `fast`.
 
     Examples
     --------
@@ -80,6 +80,8 @@ def partition(graph: PoseGraph, num_robots: int | None = None, method: Partition
     n = graph.num_poses
     if num_robots is not None:
         num_robots = whole_number(num_robots, "num_robots", SettingError)
+    if not isinstance(method, PartitionMethod | None):
+        raise SettingError(f"method is {method!r:.60}; give one of {', '.join(map(str, PartitionMethod))}")
     named = graph.robot is not None and num_robots in (None, graph.num_robots)
     if method is None:
         method = PartitionMethod.GIVEN if named else PartitionMethod.CONTIGUOUS
@@ -110,7 +112,7 @@ def suited_partition(graph: PoseGraph, num_robots: int) -> Partition:
 def _metis(graph: PoseGraph, num_robots: int) -> IntArray:
     pymetis = extra_module("pymetis", "fast")
     neighbours = pymetis.CSRAdjacency(graph.adjacency.indptr.tolist(), graph.adjacency.indices.tolist())
-    counts, options = graph.adjacency.data.astype(np.int64).tolist(), pymetis.Options(contig=True, seed=0)
+    counts, options = graph.adjacency.data.astype(np.int64).tolist(), pymetis.Options(contig=graph.is_connected, seed=0)
     for in_halves in (None, True):  # METIS makes more than 8 at once, some of them empty where poses are few
         _, found = pymetis.part_graph(
             num_robots, adjacency=neighbours, eweights=counts, options=options, recursive=in_halves

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from pgo_models.errors import GraphError
-from pgo_models.geometry.arrays import read_only
+from pgo_models.geometry.arrays import read_only, whole_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.measurements import IntArray as IntArray  # others have it from here
@@ -21,6 +21,7 @@ from pgo_models.html_tables import facts_table
 Weights = Array | float
 WORLD_ID = 2**63 - 1  # of the world pose, which no file names
 _COLLINEAR = 1e-9  # spread of positions across a line, over that along it
+_ROUNDING = 1e-14  # of coordinates, relative: what the mean of equal ones may differ from them by
 _OF_EDGES = ("i", "j", "R_ij", "t_ij", "kappa", "tau", "information")
 
 
@@ -112,7 +113,8 @@ class PoseGraph(Measurements):
     @property
     def is_world_loose(self) -> bool:
         """Whether all priors are of positions, so that the rotation of the world hangs on all of them together."""
-        return self.world is not None and not self.kappa[self.is_prior].any()
+        to_poses = self.is_prior & ~np.isin(self.j, self.landmarks)
+        return self.world is not None and not self.kappa[to_poses].any()
 
     def _check_determined(self) -> None:
         """Raise a GraphError when no edge with a positive precision ties some poses, or the world, to the others."""
@@ -127,13 +129,16 @@ class PoseGraph(Measurements):
         if loose:
             measured = self.t_ij[self.is_prior][np.unique(self.j[self.is_prior], return_index=True)[1]]
             spread = np.linalg.svd(measured - measured.mean(axis=0), compute_uv=False)
-            if len(measured) < self.d or not spread[self.d - 2] > _COLLINEAR * max(spread[0], 1e-300):
+            least = max(_COLLINEAR * spread[0], _ROUNDING * np.abs(measured).max(initial=0.0), 1e-300)
+            if len(measured) < self.d or not spread[self.d - 2] > least:
                 few = f"positions of {len(measured)} poses, in a point or on a line, leave turns of the world open"
                 raise GraphError(f"the priors do not fix the gauge: {few}; give more, or a prior with a rotation")
 
     def subgraph(self, poses: IntArray) -> PoseGraph:
         """Return the graph of some poses, (k,), in ascending order, and of the edges among them."""
-        chosen = np.unique(poses)
+        chosen = np.unique(whole_array(poses, "poses"))
+        if not len(chosen) or chosen[0] < 0 or chosen[-1] >= self.num_poses:
+            raise GraphError(f"poses of a subgraph are some of 0 .. {self.num_poses - 1}, got {chosen}")
         number = np.full(self.num_poses, -1, dtype=np.int64)
         number[chosen] = np.arange(len(chosen))
         edges = (number[self.i] >= 0) & (number[self.j] >= 0)

@@ -78,9 +78,10 @@ def chi2(graph: PoseGraph, poses: Poses, convention: Chi2Convention = Chi2Conven
     r_r = chord if convention is Chi2Convention.CHORDAL else w
     if d == 3 and convention is Chi2Convention.G2O:
         r_r = 0.5 * chord
-    if convention is Chi2Convention.GTSAM:
-        r_t = logarithm_translation(w, r_t)
     information = proper_information(graph)
+    if convention is Chi2Convention.GTSAM:  # of a position alone the error is r_t
+        turns = ~np.isin(j, graph.landmarks) & information[:, d:, d:].any(axis=(1, 2))
+        r_t = logarithm_translation(np.where(turns[:, None], w, 0.0), r_t)
     I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
     coupled = np.cos(half) * chord if convention is Chi2Convention.CHORDAL else r_r
     terms = ((r_t, I_tt, r_t), (2.0 * r_t, I_tr, coupled), (r_r, I_rr, r_r))

@@ -43,7 +43,7 @@ class NoiseModel:
     def kappa(self, d: int) -> float:
         """Rotation precision, per radian^2: 1 / rotation_std^2 in the plane, 1 / (2 rotation_std^2) in space.
 
-        They are what the information matrix I / rotation_std^2 becomes on reading (`g2o.precisions`), as in SE-Sync.
+        They are what the information matrix I / rotation_std^2 becomes on reading (`edge_precisions`), as in SE-Sync.
         """
         return self.rotation_std**-2 / (d - 1)
 

@@ -52,7 +52,7 @@ def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12
     Eigenvalues stand on a logarithmic axis, negative ones as vermilion triangles. The shaded band, where the
     proof needs an eta, is what that leaves open, |lambda| <= eta.
     """
-    eigenvalues = smallest_eigenvalues(problem, certificate.Lambda, count)
+    eigenvalues = smallest_eigenvalues(problem.tangent_at(certificate.poses), certificate.Lambda, count)
     k, negative = np.arange(1, count + 1), eigenvalues < 0
     with column_figure(height=0.8) as figure:
         axes = figure.add_subplot()

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from threading import RLock
 from types import ModuleType
 from typing import Any
 
@@ -13,6 +14,8 @@ from pgo_models.errors import extra_module
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.kernels import kernels_of_the_cpu
+
+_OPTIONS = RLock()
 
 
 def lower_triangle(pattern: csc_array) -> tuple[Any, IntArray, BoolArray]:
@@ -34,14 +37,15 @@ def supernodal() -> Iterator[ModuleType]:
 
 @contextmanager
 def set_option(cholmod: ModuleType, name: str, value: int) -> Iterator[None]:
-    """An option of CHOLMOD for a while."""
-    saved = dict(cholmod.options)
-    cholmod.options[name] = value
-    try:
-        yield
-    finally:
-        cholmod.options.clear()
-        cholmod.options.update(saved)
+    """An option of CHOLMOD for a while, in which other threads wait: there is one set of them."""
+    with _OPTIONS:
+        saved = dict(cholmod.options)
+        cholmod.options[name] = value
+        try:
+            yield
+        finally:
+            cholmod.options.clear()
+            cholmod.options.update(saved)
 
 
 @cache

@@ -57,6 +57,8 @@ def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
     graph.check_connected()
     if not 0 <= root < graph.num_poses:
         raise SettingError(f"root is {root}; give a pose, 0 to {graph.num_poses - 1}")
+    if root == graph.world and graph.is_world_loose:
+        raise SettingError("root is the world, of which positions alone are known; give a pose")
     order, parent, edge = spanning_tree(graph, root)
     return _with_world_fitted(graph, _compose(graph, order, parent, edge, graph.j[edge] == order[1:]))
 

@@ -50,6 +50,8 @@ class PGOProblem:
     def __post_init__(self) -> None:
         if not isinstance(self.weighting, Weighting | EdgeWeights):
             raise SettingError(f"weighting is {self.weighting!r}; give one of {', '.join(map(str, Weighting))}")
+        if self.backend is not None and not isinstance(self.backend, CholeskyBackend):
+            raise SettingError(f"backend is {self.backend!r}; give one of {', '.join(map(str, CholeskyBackend))}")
         self.graph.check_connected()
 
     def __repr__(self) -> str:

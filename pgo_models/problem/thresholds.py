@@ -137,7 +137,11 @@ def _chi2_weights(problem: PGOProblem | PoseGraph) -> Array:
         graph, weights = problem.graph, problem.weights
         is_chi2 = problem.weighting is Weighting.INFORMATION or (weights.excess or weights.tangent) is not None
     d = graph.d
-    scaled, scale = scaled_blocks(proper_information(graph))
+    information = proper_information(graph)
+    if len(graph.first_sights):  # what ties a landmark's rotation measures nothing
+        information = information.copy()
+        information[graph.first_sights, d:], information[graph.first_sights, :, d:] = 0.0, 0.0
+    scaled, scale = scaled_blocks(information)
     values, axes = np.linalg.eigh(scaled)
     is_known = values > LEAST_SCALED
     if is_chi2:
