@@ -36,7 +36,7 @@ _CHEAP_ATTEMPTS = 3
 # minimum needs two.
 FEW = 10
 _PAIRED = 4000  # loop closures whose pairs are looked at within seconds
-_WORSE = 2.0  # times the least truncated cost: 1.2 at most where a certified attempt of more was right, 3 where wrong
+_WORSE = 2.0  # times the least truncated cost: 1.1 at most where a certified attempt of more was right, 3 where wrong
 # Times T; three times it are one right set in a hundred, or fewer, of `_MANY` edges on, whatever the scale of their
 # matrices: so are the largest two of as many chi^2_3.
 _FAR, _FURTHER = 1.5, 3.0

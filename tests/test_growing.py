@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cvxpy as cp
 import numpy as np
 import pytest
 from graphs import informed
 
 import solvers
 from pgo_models.certificates.certificate import DEFAULT_GAP
+from pgo_models.convex.graph_subproblem import ModelChange
 from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, orthogonality_error
@@ -91,3 +93,13 @@ def test_another_graph_is_refused() -> None:
     graph = grid(np.random.default_rng(0))
     with pytest.raises(GraphError, match="none of the 9 poses solved before"):
         extend(solvers.solve(first_poses(graph, 9)), graph.subgraph(np.arange(9, 27)))
+
+
+def test_terms_of_an_extended_model_stay() -> None:
+    graph = grid(np.random.default_rng(0))
+    pipeline = solvers.Pipeline(
+        soc=solvers.ExtendedSOC(lambda u: ModelChange(terms=[50.0 * cp.sum_squares(u.t(3) - 9.0)]))
+    )
+    before = solvers.solve(first_poses(graph, 18), pipeline)
+    grown, afresh = extend(before, graph, pipeline), solvers.solve(graph, pipeline)
+    assert grown.objective == pytest.approx(afresh.objective, rel=1e-6)

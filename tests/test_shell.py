@@ -273,3 +273,12 @@ def test_the_linear_algebra_has_the_threads_that_are_asked_for():
         return int(subprocess.run(run, env=env, capture_output=True, text=True, check=True).stderr)
 
     assert 1 <= threads(1) < threads(2)
+
+
+def test_a_name_that_the_terminal_has_no_letters_for_is_shown_all_the_same(tmp_path, monkeypatch):
+    path = tmp_path / "граф.g2o"
+    path.write_text(Path(ROOT / "data" / "grid.g2o").read_text())
+    monkeypatch.setenv("PYTHONIOENCODING", "latin-1")
+    code, out, err = ended(started("info", path))
+    assert (code, err) == (0, "")
+    assert r"\u0433" in out

@@ -12,15 +12,18 @@ from scipy.optimize import least_squares, minimize
 
 from pgo_models.convex.graph_subproblem import Changer, ModelChange, PoseVariables
 from pgo_models.convex.huber import huber_change
+from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, tangent_dimension
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.convex.extended_newton import ExtendedNewton, kinks
 from solvers.convex.extended_soc import ExtendedSOC
 from solvers.loop import run
 from solvers.pipeline import Pipeline, solve
 from solvers.result import Status
+from solvers.riemannian.newton import Newton
 from solvers.soc.penalty import MultiplierPenalty
 from solvers.soc.soc import SOC
 
@@ -189,7 +192,7 @@ def test_what_has_a_kink() -> None:
         cp.norm(x, "fro"),
         cp.square(cp.norm(x[0] - np.array([0.0, 1.0]))),
         cp.sum(cp.huber(cp.multiply(np.ones(3), cp.norm(x - x.value, 2, axis=1)), 0.1)),
-        cp.sum(cp.power(x, 3.5)),
+        cp.sum(cp.power(x, 4)),
         cp.log_sum_exp(2.0 * x),
     ]
     assert [kinks(term) for term in smooth] == [set()] * len(smooth)
@@ -204,6 +207,45 @@ def test_what_has_a_kink() -> None:
     }
     for name, terms in kinked.items():
         assert [kinks(term) for term in terms] == [{name}] * len(terms)
+    for exponent in (3, 3.5):  # of cvxpy's power the argument is never negative
+        power = cp.power(x, exponent)
+        assert kinks(cp.sum(power)) == {type(power).__name__}
+
+
+def test_odd_powers_are_left_to_SOC() -> None:
+    solution = solve(problem(2), Pipeline(soc=ExtendedSOC(lambda u: ModelChange(terms=[cp.power(u.t(3)[0], 3)]))))
+    assert solution.stages[-1].name == "ExtendedSOC"
+    assert np.isfinite(solution.objective)
+
+
+def test_what_it_does_not_minimise_is_refused() -> None:
+    for settings in ({"tolerance": -1.0}, {"max_iterations": -3}):
+        with pytest.raises(SettingError, match="must"):
+            ExtendedNewton(lambda u: ModelChange(), **settings)
+    bound = ExtendedNewton(lambda u: ModelChange(constraints=[u.t(3) >= 1]))
+    with pytest.raises(SettingError, match="without constraints"):
+        run(bound, problem(2))
+    other = PGOProblem(problem(2).graph, weighting=Weighting.INFORMATION)
+    with pytest.raises(SettingError, match=r"use Weighting\.ISOTROPIC"):
+        run(ExtendedNewton(lambda u: ModelChange(terms=[cp.sum_squares(u.t(0))])), other)
+
+
+def test_where_the_objective_is_negative_it_goes_on_to_the_minimum() -> None:
+    plain = run(ExtendedNewton(lambda u: ModelChange(terms=robust_positions(u))), problem(2))
+    lower = run(ExtendedNewton(lambda u: ModelChange(terms=[*robust_positions(u), -1e4 + 0 * u.t(0)[0]])), problem(2))
+    assert lower.state.objective + 1e4 == pytest.approx(plain.state.objective, abs=1e-6)
+
+
+def test_ctrl_c_before_the_terms_are_added_is_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken_off(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Newton, "step", broken_off)
+    solution = solve(problem(2), Pipeline(soc=ExtendedSOC(lambda u: ModelChange(terms=robust_positions(u)))))
+    assert solution.status is Status.INTERRUPTED
+    assert "ExtendedSOC" not in [stage.name for stage in solution.stages]
+    objective = problem(2).objective(solution.poses) + of_robust_positions(solution.poses)
+    assert solution.objective == pytest.approx(objective, rel=1e-9)
 
 
 def test_it_keeps_the_contract_of_solvers() -> None:

@@ -300,3 +300,20 @@ def test_rotation_start_of_a_graph_may_be_given() -> None:
     start = problem.point(list(random_rotations(graph.num_poses, 3, rng_of(1))))
     problem.check_point(start)
     assert len(start.copies) == graph.num_poses
+
+
+def test_ctrl_c_ends_all_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    step, calls = OrthogonalSOC.step, list[int]()
+
+    def interrupted(self: OrthogonalSOC, *args: object) -> object:
+        calls.append(len(calls))
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return step(self, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(OrthogonalSOC, "step", interrupted)
+    x = cp.Variable(2)
+    problem = OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(x - [3.0, 4.0]))), unit_columns=[x])
+    solution = solve_orthogonal(problem, np.random.default_rng(0), starts=5)
+    assert len(solution.objectives) == 1
+    assert solution.outcome.status is Status.INTERRUPTED

@@ -58,6 +58,15 @@ def test_a_file_of_something_else_is_never_written_over(text, tmp_path):
     assert path.read_text() == text
 
 
+def test_results_that_are_no_entries_are_refused(tmp_path):
+    path = tmp_path / "own.json"
+    KeptResults(path).add("a", {"x": 1})
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({**content, "results": [1, 2]}))
+    with pytest.raises(FileFormatError, match="no results of pgo"):
+        KeptResults(path)
+
+
 @given(SEEDS)
 def test_the_fingerprint_is_that_of_the_measurements(seed):
     graph = varied_graph(seed, 6, 3)

@@ -3,6 +3,7 @@ import pytest
 
 from pgo_models.errors import SettingError
 from pgo_models.plots.curves import plot_tightness
+from solvers.riemannian.newton import Newton
 from solvers.studies.tightness import NoiseSweep, SweptScene, noise_sweep, noisy_scene
 
 QUIET, LOUD = np.deg2rad(10.0), np.deg2rad(90.0)
@@ -52,3 +53,12 @@ def test_the_picture_has_a_curve_for_every_sweep() -> None:
     assert [line.get_label() for line in axes.lines] == ["circle", "grid"]
     np.testing.assert_allclose(axes.lines[0].get_xydata(), [[30.0, 100.0], [60.0, 50.0]], rtol=1e-12, atol=0)
     assert "degrees" in axes.get_xlabel()
+
+
+def test_ctrl_c_counts_no_graph(monkeypatch):
+    def broken_off(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Newton, "step", broken_off)
+    with pytest.raises(KeyboardInterrupt):
+        noise_sweep(SweptScene.GRID, np.array([0.1]), 2, np.random.default_rng(0))
