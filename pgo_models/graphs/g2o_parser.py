@@ -191,7 +191,7 @@ class _Source:
             elif not self._skip_unknown and not tag.startswith("PARAMS_"):
                 problem = f"unknown tag {tag[:40]!r}; supported are {', '.join(TAGS)} and FIX: remove the line"
                 raise self._error(number, f"{problem}, or have such lines skipped with --skip-unknown")
-        if self._skip_unknown and tag not in ("FIX", "PARAMS_SE3OFFSET"):
+        if self._skip_unknown and tag != "FIX" and not tag.startswith("PARAMS_"):
             count, earliest = self.unknown.get(tag[:40], (0, at[0]))
             self.unknown[tag[:40]] = count + len(at), earliest
 

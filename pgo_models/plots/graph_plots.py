@@ -10,7 +10,7 @@ from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses, absolute_trajectory_error
 from pgo_models.geometry.rotations import Array, log_map
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.graphs.residuals import uncertain_edges
+from pgo_models.graphs.residuals import check_poses, uncertain_edges
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, column_figure, count_along_x
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 
@@ -39,6 +39,7 @@ def edge_kinds(graph: PoseGraph, poses: Poses, mark: bool = True, residuals: Edg
 
     The last that fits; priors are -1. Misfits are of F unless `residuals` are given. A GraphError if sizes differ.
     """
+    check_poses(graph, poses)
     kind = np.where(graph.robots[graph.i] == graph.robots[graph.j], OWN, BETWEEN)
     kind[np.isin(graph.j, graph.landmarks)] = SIGHTING
     if mark:
@@ -180,6 +181,8 @@ def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = Non
     truth = graph.truth if truth is None else truth
     if truth is None:
         raise GraphError(f"{graph!r} came without a ground truth; give one as truth=")
+    for given in (poses, truth):
+        check_poses(graph, given)
     poses, truth = poses[graph.bodies], truth[graph.bodies]
     aligned = poses.aligned_to(truth)
     metres = np.linalg.norm(aligned.t - truth.t, axis=1)

@@ -199,7 +199,8 @@ def _misfit_text(graph: PoseGraph, edges: IntArray, residuals: EdgeResiduals) ->
     return [
         f"edge {e}: {names[graph.i[e]]} to {names[graph.j[e]]}<br>{times[e]:.3g} times what it may cost, "
         f"{100 * share[e]:.3g} % of all<br>"
-        f"{residuals.translation[e]:.3g} m, {np.rad2deg(residuals.rotation[e]):.3g} deg"
+        f"{residuals.translation[e]:.3g} m"
+        + (f", {np.rad2deg(residuals.rotation[e]):.3g} deg" if graph.kappa[e] > 0 else "")
         for e in edges
     ]
 

@@ -59,6 +59,7 @@ class Comparison:
     trials: tuple[BenchmarkRun, ...]
     reasons: tuple[tuple[BenchmarkMethod, str], ...]  # methods without figures, and why
     is_complete: bool = True  # whether all were run; after Ctrl-C they were not
+    rounding_level: float = 0.0  # F below it is as good as zero
 
     @property
     def curves(self) -> list[Curve]:
@@ -70,7 +71,7 @@ class Comparison:
         rows, records = [], []
         found = [(trial.contender, trial, trial.remark) for trial in self.trials]
         for contender, trial, remark in [*found, *((one, None, reason) for one, reason in self.reasons)]:
-            records.append(_record(contender, trial, self.lower_bound, remark))
+            records.append(_record(contender, trial, self, remark))
             iterations = None if trial is None else " + ".join(map(str, trial.iterations))
             shown = {**records[-1], "iterations": iterations}
             figures = ("-" if shown[name] is None else write(shown[name]) for _, name, write in _COLUMNS)
@@ -130,7 +131,8 @@ def compare_methods(
         is_complete = True
     known = [solution.objective, solution.certificate.poses_objective]
     known += [trial.objective for trial in trials if math.isfinite(trial.objective)]
-    return Comparison(problem, min(known), solution.lower_bound, tuple(trials), tuple(reasons), is_complete)
+    level = solution.certificate.rounding_level
+    return Comparison(problem, min(known), solution.lower_bound, tuple(trials), tuple(reasons), is_complete, level)
 
 
 def check_plot_format(path: Path) -> None:
@@ -142,13 +144,16 @@ def check_plot_format(path: Path) -> None:
         raise MissingExtraError(module, "plot")
 
 
-def _record(contender: BenchmarkMethod, trial: BenchmarkRun | None, bound: float, remark: str) -> dict[str, Value]:
+def _record(
+    contender: BenchmarkMethod, trial: BenchmarkRun | None, beside: Comparison, remark: str
+) -> dict[str, Value]:
     answer = trial if trial is not None and trial.is_answer else None
     iterations = trial.iterations if trial is not None else ()
+    level = beside.lower_bound, beside.rounding_level
     return {
         "method": contender.value,
         "objective": answer.objective if answer is not None else None,
-        "gap": relative_gap(answer.objective, bound) if answer is not None else None,
+        "gap": relative_gap(answer.objective, *level) if answer is not None else None,
         "iterations_first_stage": iterations[0] if iterations else None,
         "iterations_second_stage": iterations[1] if len(iterations) > 1 else None,
         "rounds": trial.rounds if trial is not None else None,
