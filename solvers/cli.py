@@ -77,7 +77,7 @@ def solve_command(
         typer.Option(
             help="First stage: joint SOC (one robot), substructured SOC (robots and a driver, the same iterates), "
             "consensus SOC (robots alone), SOC as in the paper, or none before Newton. Joint unless given, or "
-            "substructured where an option is about robots."
+            "substructured where an option is about robots; joint is left out where Newton alone is faster."
         ),
     ] = None,
     robots: Annotated[
