@@ -25,7 +25,7 @@ class Table:
 
     def __init__(self, name: str, most: int, verbose: bool, progress: bool | None, tolerance: float = 0.0) -> None:
         self._name, self._max_iterations, self._tolerance = name, most, tolerance
-        self._first = math.inf  # residual
+        self._first, self._has_head = math.inf, False  # residual; whether the head was printed
         self._in_notebook = "IPython" in sys.modules and import_module("rich.console").Console().is_jupyter
         self._verbose, self._progress = verbose, self._in_notebook if progress is None else progress
         self._bar: Any = None  # a _NotebookBar, or the JobBar of rich
@@ -37,10 +37,10 @@ class Table:
         """Show one record; `elapsed` seconds of wall time have passed."""
         figures = record.measurement
         residual = max(figures.primal_residual, figures.dual_residual)
-        is_first = math.isinf(self._first)
-        self._first = residual if is_first else self._first
+        self._first = residual if math.isinf(self._first) else self._first
         if self._verbose:
-            if is_first:
+            if not self._has_head:
+                self._has_head = True
                 robots = "" if figures.rounds is None else _HEADER_OF_ROBOTS
                 print(f"{self._name}\n{_HEADER}{robots}")
             residuals = f"{_figure(figures.primal_residual)}  {_figure(figures.dual_residual)}"

@@ -55,6 +55,14 @@ def test_rows_of_a_run_by_robots_fill_80_columns(capsys: pytest.CaptureFixture[s
     ]
 
 
+def test_a_run_that_goes_on_has_a_head_too(capsys: pytest.CaptureFixture[str]) -> None:
+    with Table("SOC", 100, verbose=True, progress=False) as table:
+        table.row(Record(7, 0.0, Measurement(1.0, 1e-3, 1e-3)), 0.0)
+        table.row(Record(8, 0.0, Measurement(1.0, 1e-4, 1e-4)), 0.0)
+    name, head, *rows = capsys.readouterr().out.splitlines()
+    assert (name, "primal" in head, len(rows)) == ("SOC", True, 2)
+
+
 def test_a_residual_that_is_not_yet_known_is_a_dash(capsys: pytest.CaptureFixture[str]) -> None:
     with Table("SOC", 100, verbose=True, progress=False) as table:
         table.row(Record(0, 0.0, Measurement(1.0, float("inf"), float("inf"))), 0.0)

@@ -180,7 +180,7 @@ class PoseGraph(Measurements):
         return kept if self.world is None or kept.is_prior.any() else kept.subgraph(self.in_files)
 
     def with_edges(self, i: IntArray, j: IntArray, measured: Poses, kappa: Weights, tau: Weights) -> PoseGraph:
-        """Return the graph with more edges (i, j), (k,), of precisions (k,) or the same; information as SE-Sync has it."""
+        """Return the graph with more edges (i, j), (k,), of precisions (k,) or the same; information as they say."""
         if measured.d != self.d or not len(i) == len(j) == measured.num_poses:
             raise GraphError(f"{measured} for {len(i)} edges in {self.d}D; give one measured pose for every edge")
         kappa, tau = (np.array(np.broadcast_to(one, np.shape(i)), dtype=float) for one in (kappa, tau))
