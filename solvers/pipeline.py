@@ -238,11 +238,11 @@ def solve(
         ledger = driver.network.ledger
     poses, frame, held = framed(poses, problem.graph, anchor)
     # A frame far away rounds the poses; what is said is of those that are returned.
-    certificate = replace(judge(problem, poses, certificate), stationarity=certificate.stationarity)
+    certificate = judge(problem, poses, certificate)
     return Solution(
         problem=problem,
         poses=poses,
-        objective=problem.objective(poses),
+        objective=certificate.objective,
         certificate=certificate,
         status=job.stages[-1].status,
         stages=tuple(job.stages),

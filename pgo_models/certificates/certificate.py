@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, best_bound
 from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, polish, relative_decrement
-from pgo_models.certificates.rounding_errors import ObjectiveRounding, objective_rounding
+from pgo_models.certificates.rounding_errors import ObjectiveRounding, objective_rounding, rounding_level
 from pgo_models.certificates.tangent import softened_bound
 from pgo_models.errors import ProofError, SettingError
 from pgo_models.geometry.arrays import ReadOnly, real_array
@@ -263,7 +263,11 @@ def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certif
 
     A ProofError when F of the poses is below it by more than the rounding of F: then one of the two is wrong.
     """
-    return judge_cost(problem, certificate, problem.objective(poses), objective_rounding(problem, poses))
+    F = problem.objective(poses)
+    is_below = certificate.lower_bound < F  # then nobody asks for the error of F, which takes longer than F
+    level = ObjectiveRounding(rounding_level(problem, poses), 0.0)
+    rounding = level if is_below else objective_rounding(problem, poses)
+    return judge_cost(problem, certificate, F, rounding)
 
 
 def judge_cost(problem: PGOProblem | str, given: Certificate, F: float, rounding: ObjectiveRounding) -> Certificate:
