@@ -276,7 +276,7 @@ def test_the_linear_algebra_has_the_threads_that_are_asked_for():
 
 
 def test_a_name_that_the_terminal_has_no_letters_for_is_shown_all_the_same(tmp_path, monkeypatch):
-    path = tmp_path / "граф.g2o"
+    path = tmp_path / "\u0433\u0440\u0430\u0444.g2o"
     path.write_text(Path(ROOT / "data" / "grid.g2o").read_text())
     monkeypatch.setenv("PYTHONIOENCODING", "latin-1")
     code, out, err = ended(started("info", path))
