@@ -1,6 +1,5 @@
 """Solution: poses, cost, certificate and what each stage did; prints well, and saves itself."""
 
-import importlib.util
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, gap_text
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.files import check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -19,7 +18,7 @@ from pgo_models.graphs.residuals import chi2
 from pgo_models.graphs.trajectories import write_kitti, write_tum
 from pgo_models.html_tables import facts_table, rows_table
 from pgo_models.plots.graph_plots import compare_poses
-from pgo_models.plots.style import is_picture, save_figure
+from pgo_models.plots.style import check_installed, is_picture, save_figure
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.marginals import Marginals
@@ -235,8 +234,8 @@ def check_format(path: Path) -> None:
     if suffix not in ("", ".g2o", ".tum", ".txt", ".kitti", ".json") and not is_picture(path):
         known = ".g2o, .tum, .kitti, .json, .png, .svg or .pdf"
         raise SettingError(f"cannot write {path}: no format has suffix {suffix!r}; use {known}")
-    if is_picture(path) and importlib.util.find_spec("matplotlib") is None:
-        raise MissingExtraError("matplotlib", "plot")
+    if is_picture(path):
+        check_installed(path)
 
 
 def check_target(path: Path, num_robots: int) -> None:

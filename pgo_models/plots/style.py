@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -10,7 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from pgo_models.errors import extra_module
+from pgo_models.errors import MissingExtraError, extra_module
 from pgo_models.files import replace_when_done
 
 if TYPE_CHECKING:
@@ -61,6 +62,13 @@ def count_along_x(axes: Axes) -> None:
 def is_picture(path: Path) -> bool:
     """Whether the suffix names a picture format that `save_figure` writes."""
     return path.suffix.lower() in PICTURE_SUFFIXES
+
+
+def check_installed(path: Path) -> None:
+    """Raise a MissingExtraError where what draws a file of this suffix, a picture or else a page, is not installed."""
+    module = "matplotlib" if is_picture(path) else "plotly"
+    if importlib.util.find_spec(module) is None:
+        raise MissingExtraError(module, "plot")
 
 
 def save_figure(figure: Figure, path: Path | str) -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.plots.interactive_plots import save_page
-from pgo_models.plots.style import is_picture, save_figure
+from pgo_models.plots.style import check_installed, is_picture, save_figure
 from pgo_models.problem.problem import PGOProblem
 from solvers.progress_bars import JobBar
 from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
@@ -139,9 +139,7 @@ def check_plot_format(path: Path) -> None:
     """Raise what `Comparison.save_plot` would for the suffix of `path`: a SettingError, or if its extra is missing."""
     if path.suffix.lower() != ".html" and not is_picture(path):
         raise SettingError(f"cannot write {path}: no plot has suffix {path.suffix!r}; use .html, .png, .svg or .pdf")
-    module = "matplotlib" if is_picture(path) else "plotly"
-    if importlib.util.find_spec(module) is None:
-        raise MissingExtraError(module, "plot")
+    check_installed(path)
 
 
 def _record(
