@@ -1,10 +1,17 @@
 """The errors of the project: one tree, each message with what was wrong, where, the value and the way out."""
 
+import dataclasses
 import importlib
 import math
+import typing
 from collections.abc import Callable, Sequence
+from enum import Enum
+from numbers import Integral, Real
 from pathlib import Path
 from types import ModuleType
+from typing import Any, cast
+
+_NUMBERS: dict[type, type] = {float: Real, int: Integral}  # numpy's, too
 
 
 class PGOError(Exception):
@@ -92,8 +99,13 @@ def check_settings(
     at_least_one: Sequence[str] = (),
     above_one: Sequence[str] = (),
     relaxation: Sequence[str] = (),
+    of_any_type: Sequence[str] = (),
 ) -> None:
-    """Raise a SettingError for the first of the named fields that is out of its range; one that is None passes."""
+    """Raise a SettingError for the first field of another type, or of those named out of its range unless None."""
+    for field in dataclasses.fields(cast(Any, settings)):
+        value = getattr(settings, field.name)
+        if field.name not in of_any_type and type(value) not in (type(field.default), field.default_factory):
+            _check_type(type(settings), field.name, value)
     rules: tuple[tuple[Sequence[str], str, Callable[[float], bool]], ...] = (
         (positive, "be positive", lambda value: value > 0),
         (finite, "be positive and finite", lambda value: 0 < value < math.inf),
@@ -107,3 +119,18 @@ def check_settings(
             value = getattr(settings, name)
             if value is not None and not holds(value):
                 raise SettingError(f"{name} must {rule}, got {value}")
+
+
+def _check_type(settings: type, name: str, value: object) -> None:
+    """Raise a SettingError unless a value has the annotated type, where that can be told: of arrays and protocols not.
+
+    Annotations are slow to read, a millisecond for all of a class: not for a value of the default's type.
+    """
+    annotated = typing.get_type_hints(settings)[name]
+    kinds = typing.get_args(annotated) or (annotated,)
+    if not all(isinstance(kind, type) and not getattr(kind, "_is_protocol", False) for kind in kinds):
+        return
+    if not isinstance(value, tuple(_NUMBERS.get(kind, kind) for kind in kinds)):
+        choices = [str(one) for kind in kinds if issubclass(kind, Enum) for one in kind]
+        choices += [kind.__name__.removesuffix("Type") for kind in kinds if not issubclass(kind, Enum)]
+        raise SettingError(f"{name} must be {' or '.join(choices)}, got {value!r:.60}")

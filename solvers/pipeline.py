@@ -24,7 +24,7 @@ from pgo_models.certificates.certificate import (
 )
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.certificates.newton_polish import polish
-from pgo_models.errors import GraphWarning, SettingError
+from pgo_models.errors import GraphWarning, SettingError, check_settings
 from pgo_models.geometry.arrays import whole_number
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition, partition
@@ -79,13 +79,10 @@ class Pipeline:
     driver_memory: float = DEFAULT_MEMORY
 
     def __post_init__(self) -> None:
-        if not 0 < self.gap < math.inf:
-            raise SettingError(f"gap must be positive and finite, got {self.gap}; 1e-6 is usual")
+        check_settings(self, finite=["gap"], not_negative=["driver_memory"], of_any_type=["soc"])  # ExtendedSOC, too
         is_consensus = isinstance(self.soc, SOC) and self.soc.effective_coupling is Coupling.CONSENSUS
         if self.faults is not None and not is_consensus:
             raise SettingError("faults are of messages between robots; use SOC(robots=.., coupling=Coupling.CONSENSUS)")
-        if not self.driver_memory >= 0:
-            raise SettingError(f"driver_memory must not be negative, got {self.driver_memory}; 0 is no driver")
         if self.driver_memory == 0 and not is_consensus:
             raise SettingError(
                 "without a driver robots run CONSENSUS alone; take it (--method consensus), or give driver_memory"

@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import issparse
 
+import solvers
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import orthogonality_error
@@ -25,6 +26,8 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.baselines.gauss_seidel import GaussSeidel
 from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
 from solvers.baselines.sweep_order import Sweep
+from solvers.convex.extended_soc import ExtendedSOC
+from solvers.distributed.checkpoint import Checkpoint
 from solvers.loop import Solver, iterate, run
 from solvers.result import Record, Status
 from solvers.riemannian.newton import Newton, gauss_newton
@@ -302,3 +305,19 @@ def test_settings_are_frozen_and_checked(make: Make, problem: PGOProblem) -> Non
 def test_a_start_of_another_size_is_refused(make: Make, poses: Poses, problem: PGOProblem) -> None:
     with pytest.raises(GraphError, match="give one pose for every pose of the graph"):
         run(make(problem), problem, poses)
+
+
+def fields_of_settings() -> list[Any]:
+    """Fields of public settings that can be made without any, but for what takes protocols and arrays."""
+    kinds = [getattr(solvers, name) for name in solvers.__all__]
+    kinds = [kind for kind in kinds if dataclasses.is_dataclass(kind) and hasattr(kind, "__post_init__")]
+    every = [(kind, field) for kind in kinds for field in dataclasses.fields(kind)]
+    open_ones = ("r_step", "known", "idle", "soc", "changer")
+    return [pytest.param(k, f.name, id=f"{k.__name__}-{f.name}") for k, f in every if f.name not in open_ones]
+
+
+@pytest.mark.parametrize(("kind", "field"), fields_of_settings())
+def test_a_setting_of_another_type_is_named_where_it_is_made(kind: Any, field: str) -> None:
+    others: dict[str, Any] = {Checkpoint: {"path": "there.json"}, ExtendedSOC: {"changer": None}}.get(kind, {})
+    with pytest.raises(SettingError, match=f"^{field} must be .*, got <object"):
+        kind(**{**others, field: object()})

@@ -18,6 +18,7 @@ from pgo_models.geometry.arrays import ReadOnly, real_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.residuals import check_poses
 from pgo_models.html_tables import facts_table
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem, as_problem
@@ -213,6 +214,7 @@ def certify_at(
     >>> bool(0.9 * certificate.objective < certificate.lower_bound <= certificate.objective)
     True
     """
+    check_poses(problem.graph, poses)
     best = poses if stationarity <= STATIONARY_DECREMENT else problem.at_best_translations(poses)
     return certify_with(problem, poses, multipliers(problem, best), gap, stationarity, BoundSource.GIVEN, ground=best)
 

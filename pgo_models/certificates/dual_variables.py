@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.sparse import csc_array
 
+from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.cholesky import CholeskyFactor
@@ -26,6 +27,13 @@ def multipliers(problem: PGOProblem, poses: Poses) -> Array:
     return 0.5 * (product + np.swapaxes(product, 1, 2))
 
 
+def check_multipliers(problem: PGOProblem, Lambda: Array) -> None:
+    """Raise a SettingError unless there is one block for every pose, (n, d, d)."""
+    shape = (problem.num_poses, problem.d, problem.d)
+    if Lambda.shape != shape:
+        raise SettingError(f"Lambda has shape {Lambda.shape}; give one block for every pose, {shape}")
+
+
 def multiplier_norms(Lambda: Array) -> Array:
     """||Lambda_i||_2, (n,), of symmetric (n, d, d)."""
     return np.asarray(np.abs(np.linalg.eigvalsh(Lambda)).max(axis=1, initial=0.0))
@@ -42,6 +50,7 @@ def certificate_matrix(problem: PGOProblem, Lambda: Array, eta: float = 0.0) -> 
     >>> bool(abs(S - S.T).max() < 1e-12)
     True
     """
+    check_multipliers(problem, Lambda)
     data = problem.M.data.copy()
     data[problem.block_positions] -= Lambda
     data[problem.diagonal_positions[problem.num_poses :]] += eta

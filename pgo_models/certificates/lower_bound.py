@@ -30,6 +30,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pgo_models.certificates.definiteness import DefiniteProof, is_definite_in_doubles, prove_definite, smallest_eta
+from pgo_models.certificates.dual_variables import check_multipliers
 from pgo_models.certificates.rounding_errors import Evaluation, evaluate_certificate, has_safe_scale
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
@@ -243,9 +244,7 @@ def bound_from(terms: list[float], rounding: float, eta: float, is_grounded: boo
 
 
 def _symmetric(problem: PGOProblem, Lambda: Array) -> Array:
-    shape = (problem.num_poses, problem.d, problem.d)
-    if Lambda.shape != shape:
-        raise SettingError(f"Lambda has shape {Lambda.shape}; give one block for every pose, {shape}")
+    check_multipliers(problem, Lambda)
     return np.asarray(0.5 * (Lambda + np.swapaxes(Lambda, 1, 2)))
 
 

@@ -7,6 +7,8 @@ import numpy as np
 import scipy  # and scipy.spatial when it is used
 from numpy.typing import NDArray
 
+from pgo_models.errors import SettingError
+
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
@@ -27,6 +29,7 @@ def project_to_rotations(A: Array) -> Array:
     >>> project_to_rotations(np.array([[[0.0, -2.0], [2.0, 0.0]]]))[0].round(3).tolist()
     [[0.0, -1.0], [1.0, 0.0]]
     """
+    _check_ends(A, (2, 2), (3, 3))
     if A.shape[-1] == 2:
         return _project_2d(A)
     norm = np.sqrt(np.einsum("nab,nab->n", A, A) / 3.0)
@@ -123,6 +126,7 @@ def exp_map(w: Array) -> Array:
     >>> exp_map(np.array([[np.pi / 2]])).round(6).tolist()
     [[[0.0, -1.0], [1.0, 0.0]]]
     """
+    _check_ends(w, (1,), (3,))
     if w.shape[-1] == 1:
         return _from_cosine_sine(np.cos(w[..., 0]), np.sin(w[..., 0]))
     return np.asarray(scipy.spatial.transform.Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix()).reshape((*w.shape, 3))
@@ -136,10 +140,16 @@ def log_map(R: Array) -> Array:
     >>> log_map(exp_map(np.array([[0.1, 0.2, 0.3]]))).round(6).tolist()
     [[0.1, 0.2, 0.3]]
     """
+    _check_ends(R, (2, 2), (3, 3))
     if R.shape[-1] == 2:
         return np.arctan2(R[..., 1, 0] - R[..., 0, 1], R[..., 0, 0] + R[..., 1, 1])[..., None]
     turns = scipy.spatial.transform.Rotation.from_matrix(R.reshape(-1, 3, 3))
     return np.asarray(turns.as_rotvec()).reshape(R.shape[:-1])
+
+
+def _check_ends(A: Array, *ends: tuple[int, ...]) -> None:
+    if not isinstance(A, np.ndarray) or A.shape[-len(ends[0]) :] not in ends:
+        raise SettingError(f"{type(A).__name__} of shape {np.shape(A)}; give an array whose last axes are {ends}")
 
 
 def random_rotations(count: int, d: int, rng: np.random.Generator) -> Array:

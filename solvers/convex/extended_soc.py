@@ -8,7 +8,7 @@ import numpy as np
 
 from pgo_models.convex.convex_solver import ConvexSolver, solve_compiled
 from pgo_models.convex.graph_subproblem import Changer, GraphQP, graph_qp
-from pgo_models.errors import GraphError, PGOError, SettingError
+from pgo_models.errors import GraphError, PGOError, SettingError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import project_to_rotations, unstack_transposes
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -60,6 +60,7 @@ class ExtendedSOC:
     solver: ConvexSolver | str = "CLARABEL"
 
     def __post_init__(self) -> None:
+        check_settings(self)
         if self.soc.effective_coupling is not Coupling.JOINT:
             raise SettingError(f"a changed problem is solved by Coupling.JOINT, got {self.soc.effective_coupling.name}")
         if self.soc.r_step is not RStep.FACTORIZED:

@@ -26,9 +26,9 @@ class Faults:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        check_settings(self, not_negative=["max_delay", "silent_robot", "silent_from", "silent_rounds"])
         if not 0 <= self.loss < 1:
             raise SettingError(f"loss must be in [0, 1), got {self.loss}")
-        check_settings(self, not_negative=["max_delay", "silent_robot", "silent_from", "silent_rounds"])
 
     def is_silent(self, robot: int, number: int) -> bool:
         """Whether a robot is cut off in a round."""

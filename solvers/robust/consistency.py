@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # and scipy.special when it is used
 
-from pgo_models.errors import check_quantile
+from pgo_models.errors import check_quantile, check_settings
 from pgo_models.geometry.rotations import Array, BoolArray, hat, log_map, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.precisions import proper_information
@@ -29,6 +29,10 @@ class PCM:
 
     known: BoolArray | None = None
     quantile: float = 0.99
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+        check_quantile(self.quantile)
 
 
 def pairwise_consistent(graph: PoseGraph, known: BoolArray | None = None, quantile: float = 0.99) -> BoolArray:

@@ -141,9 +141,9 @@ class GNC:
     max_iterations: int = 300
 
     def __post_init__(self) -> None:
-        check_quantile(self.quantile)
         check_settings(self, positive=["tolerance", "spread", "scale"], not_negative=["max_iterations"])
         check_settings(self, above_one=["growth"], at_least_one=["inner_steps"])
+        check_quantile(self.quantile)
 
     def init(self, problem: PGOProblem, start: Poses | None) -> GNCState:
         """State 0: at `start`, or where known inliers lead along a tree."""

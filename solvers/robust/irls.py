@@ -63,10 +63,10 @@ class IRLS:
     max_iterations: int = 500
 
     def __post_init__(self) -> None:
-        check_quantile(self.quantile)
         if isinstance(self.inner, SOC) and self.inner.robots is not None:
             raise SettingError("weights are found in one place; leave out the robots of SOC")
         check_settings(self, positive=["tolerance"], at_least_one=["inner_steps"], not_negative=["max_iterations"])
+        check_quantile(self.quantile)
 
     def init(self, problem: PGOProblem, start: Poses | None) -> IRLSState:
         """State 0: `start`, or the chordal relaxation."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.sparse import csc_array, csr_array, vstack
 
-from pgo_models.errors import SettingError, check_settings
+from pgo_models.errors import check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
@@ -84,10 +84,6 @@ class PaperSOC:
     max_iterations: int = 500
 
     def __post_init__(self) -> None:
-        if not isinstance(self.penalty, PaperPenalty):
-            raise SettingError(
-                f"PaperSOC has one rho for all, got {self.penalty}; give a FixedPenalty, BalancedPenalty or BoydPenalty"
-            )
         check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> PaperState:

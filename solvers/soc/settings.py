@@ -9,7 +9,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition
 from solvers.result import Measurement, Status
 from solvers.soc.anderson import Anderson
-from solvers.soc.penalty import MultiplierPenalty, PenaltyOrder, PenaltyRule
+from solvers.soc.penalty import BoydPenalty, MultiplierPenalty, PenaltyOrder, PenaltyRule
 from solvers.soc.r_step import BackEnd, RStep
 from solvers.soc.recursion_block import StepSettings
 
@@ -41,14 +41,14 @@ class SOCSettings:
     max_iterations: int = 500
 
     def __post_init__(self) -> None:
+        if isinstance(self.penalty, BoydPenalty):
+            raise SettingError(f"{self.penalty} has one rho for all poses; use it with PaperSOC, or a BalancedPenalty")
         check_settings(self, relaxation=["alpha"], positive=["translation_penalty", "tolerance"])
         check_settings(self, not_negative=["separator_penalty", "max_iterations"], at_least_one=["local_passes"])
         if self.coupling is Coupling.JOINT and self.robots is not None and self.robots.num_robots > 1:
             raise SettingError(f"JOINT has one robot, got {self.robots}; use Coupling.CONSENSUS")
         if self.coupling is Coupling.CONSENSUS and self.robots is None:
             raise SettingError("CONSENSUS needs robots; see pgo_models.partition()")
-        if not isinstance(self.penalty, PenaltyRule):
-            raise SettingError(f"{self.penalty} has one rho for all poses; use it with PaperSOC, or a BalancedPenalty")
 
     @property
     def effective_coupling(self) -> Coupling:
