@@ -1,10 +1,14 @@
 """Prints the tables of one robot (README.md beside this file): the whole job beside SE-Sync, and SOC's iterations.
 
     PGO_DATA=folder python tests/benchmarks/tables.py [solve] [iterations]
+    PGO_DATA=folder python tests/benchmarks/tables.py --beside CHECKOUT
 
 Every graph of the first table runs in a process of its own, one thread: a first job, then five more; imports are apart.
 Where the environment variable SE_SYNC names the binary of SE-Sync (C++), which takes a g2o file, it runs on every file
 as often, and the last columns have its CPU seconds, from the file, and ours over them, beside the published ones.
+
+Without the binary: it was timed once in one run with commit 032ba88 of this project (data/reference.json). `--beside`
+runs a checkout of that commit (`git worktree add CHECKOUT 032ba88`) in turn with this tree, which gives SE-Sync's.
 """
 
 import json
@@ -29,9 +33,11 @@ import solvers
 REFERENCE = json.loads((Path(__file__).parents[2] / "data" / "reference.json").read_text())
 OPTIMUM = {name: value for name, value in REFERENCE["certified_optimum"].items() if name != "source"}
 SE_SYNC = REFERENCE["peers"]["se_sync_units"]
+TIMED_ONCE = {name: row for name, row in REFERENCE["peers"]["se_sync_cpu"].items() if name != "source"}
 ITERATIONS = REFERENCE["peers"]["prototype_iterations_to_1e-6"]
 BINARY = os.environ.get("SE_SYNC")
 REPEATS = 5
+ROUNDS = 4  # of a process of each tree
 MAX_ITERATIONS = 400
 
 
@@ -108,6 +114,33 @@ def solve_table() -> Table:
     return table
 
 
+def cpu_seconds(name: str) -> float:
+    """CPU seconds from file to certificate, the least of 1 + 2 REPEATS."""
+    least = float("inf")
+    for _ in range(1 + 2 * REPEATS):
+        began = time.process_time()
+        solvers.solve(pgo.read_g2o(Path(os.environ["PGO_DATA"]) / f"{name}.g2o"))
+        least = min(least, time.process_time() - began)
+    return least
+
+
+def beside_table(checkout: str) -> Table:
+    """CPU seconds, file to certificate, and over those of SE-Sync, by those of commit 032ba88 beside both."""
+    table, ratios = Table("graph", "CPU s", "032ba88, CPU s", "over SE-Sync's"), []
+    for name, (before, theirs) in TIMED_ONCE.items():
+        least = dict.fromkeys((str(Path(__file__).parents[2]), checkout), float("inf"))
+        for tree in [*least] * ROUNDS:
+            run = [sys.executable, __file__, "--cpu", name]
+            paths = {**os.environ, "PYTHONPATH": tree}
+            child = subprocess.run(run, capture_output=True, text=True, check=True, env=paths)
+            least[tree] = min(least[tree], float(child.stdout))
+        here, then = least.values()
+        ratios.append(here / then * before / theirs)
+        table.add_row(name, f"{here:.4f}", f"{then:.4f}", f"{ratios[-1]:.2f}")
+    table.caption = f"geometric mean over SE-Sync's: {statistics.geometric_mean(ratios):.3f}"
+    return table
+
+
 def iterations_table() -> Table:
     """Iterations of JOINT SOC from the chordal start, default settings, to three relative gaps."""
     table = Table("graph", "start", "1e-3", "1e-6", "1e-8", "prototype, 1e-6")
@@ -125,6 +158,10 @@ TABLES = {"solve": solve_table, "iterations": iterations_table}
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--job"]:
         one_job(sys.argv[2])
+    elif sys.argv[1:2] == ["--cpu"]:
+        print(cpu_seconds(sys.argv[2]))
+    elif sys.argv[1:2] == ["--beside"]:
+        Console(width=130).print(beside_table(sys.argv[2]))
     else:
         for chosen in sys.argv[1:] or TABLES:
             print(TABLES[chosen].__doc__)
