@@ -19,6 +19,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[variable] = "1"
@@ -37,7 +38,7 @@ TIMED_ONCE = {name: row for name, row in REFERENCE["peers"]["se_sync_cpu"].items
 ITERATIONS = REFERENCE["peers"]["prototype_iterations_to_1e-6"]
 BINARY = os.environ.get("SE_SYNC")
 REPEATS = 5
-ROUNDS = 4  # of a process of each tree
+ROUNDS = 7  # of a process of each tree
 MAX_ITERATIONS = 400
 
 
@@ -66,6 +67,13 @@ def one_job(name: str) -> None:
     print(json.dumps(figures))
 
 
+def figures_of(name: str, **variables: str) -> dict[str, Any]:
+    """What `one_job` prints in a process of its own, with these environment variables besides."""
+    run = [sys.executable, __file__, "--job", name]
+    child = subprocess.run(run, capture_output=True, text=True, check=True, env={**os.environ, **variables})
+    return json.loads(child.stdout)
+
+
 def se_sync_seconds(path: Path) -> float:
     """CPU seconds of SE-Sync's binary on a file, the least of `REPEATS`: parsing and matrices included."""
     assert BINARY is not None
@@ -85,10 +93,7 @@ def solve_table() -> Table:
     ratios = []
     for name in OPTIMUM:
         unit = seconds_of_unit()
-        child = subprocess.run(
-            [sys.executable, __file__, "--job", name], capture_output=True, text=True, check=True, env=os.environ
-        )
-        row = json.loads(child.stdout)
+        row = figures_of(name)
         peer = SE_SYNC.get(name)
         beside = []
         if BINARY is not None:
@@ -114,26 +119,13 @@ def solve_table() -> Table:
     return table
 
 
-def cpu_seconds(name: str) -> float:
-    """CPU seconds from file to certificate, the least of 1 + 2 REPEATS."""
-    least = float("inf")
-    for _ in range(1 + 2 * REPEATS):
-        began = time.process_time()
-        solvers.solve(pgo.read_g2o(Path(os.environ["PGO_DATA"]) / f"{name}.g2o"))
-        least = min(least, time.process_time() - began)
-    return least
-
-
 def beside_table(checkout: str) -> Table:
     """CPU seconds, file to certificate, and over those of SE-Sync, by those of commit 032ba88 beside both."""
     table, ratios = Table("graph", "CPU s", "032ba88, CPU s", "over SE-Sync's"), []
     for name, (before, theirs) in TIMED_ONCE.items():
         least = dict.fromkeys((str(Path(__file__).parents[2]), checkout), float("inf"))
         for tree in [*least] * ROUNDS:
-            run = [sys.executable, __file__, "--cpu", name]
-            paths = {**os.environ, "PYTHONPATH": tree}
-            child = subprocess.run(run, capture_output=True, text=True, check=True, env=paths)
-            least[tree] = min(least[tree], float(child.stdout))
+            least[tree] = min(least[tree], figures_of(name, PYTHONPATH=tree)["cpu"])
         here, then = least.values()
         ratios.append(here / then * before / theirs)
         table.add_row(name, f"{here:.4f}", f"{then:.4f}", f"{ratios[-1]:.2f}")
@@ -158,8 +150,6 @@ TABLES = {"solve": solve_table, "iterations": iterations_table}
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--job"]:
         one_job(sys.argv[2])
-    elif sys.argv[1:2] == ["--cpu"]:
-        print(cpu_seconds(sys.argv[2]))
     elif sys.argv[1:2] == ["--beside"]:
         Console(width=130).print(beside_table(sys.argv[2]))
     else:
