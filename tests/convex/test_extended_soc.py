@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import cvxpy as cp
@@ -35,6 +36,7 @@ SETTINGS = SOC(penalty=MultiplierPenalty(max_refreshes=0), tolerance=TOLERANCE)
 ACCURACY = 1e-6  # of the objective: scipy's gradients are differences
 
 
+@cache
 def problem() -> PGOProblem:
     return varied_problem(4, N, D)
 
