@@ -91,12 +91,13 @@ class RecursionBlock:
     def agreed(self, z: Array) -> tuple[RecursionBlock, Array]:
         """Block after step (b), which gives z, and (c): B = s - z = B + x - z.
 
-        With it sums, (2,): ||x - z||_rho^2 and ||c (z - z_before)||_rho^2, c as in `solvers.soc.penalty.Steps`.
+        With it sums, (2,): the squares of the residuals times ||omega||_rho, as in `solvers.soc.penalty.Steps`.
         """
-        weight = np.sqrt(self.penalty)
-        primal = weight[:, None] * (self.x - z)
-        dual = (weight * np.maximum(1.0, self.penalty / self.diagonal))[:, None] * (z - self.z)
-        return replace(self, z=z), np.array([inner(primal, primal), inner(dual, dual)])
+        weight, ratio = np.sqrt(self.penalty)[:, None], (self.penalty / self.diagonal)[:, None]
+        primal, change = weight * (self.x - z), weight * np.maximum(1.0, ratio) * (z - self.z)
+        taken_back = np.where(ratio > 1.0, ratio, 0.0) * primal
+        squares = [inner(primal, primal), inner(change, change) + inner(taken_back, taken_back)]
+        return replace(self, z=z), np.array(squares)
 
     def projected(self) -> tuple[RecursionBlock, Array]:
         """Block after (b) and (c) where all rows are rotations that no other party holds."""

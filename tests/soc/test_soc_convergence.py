@@ -15,7 +15,7 @@ from graphs import (
     varied_graph,
     varied_problem,
 )
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from pgo_models.certificates.newton_polish import polish
@@ -315,6 +315,8 @@ def test_the_plain_recursion_never_ends_above_its_start(seed: int, n: int, d: in
 
 @settings(max_examples=examples(30))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, rotation_std=st.sampled_from([0.05, 1.0, 2.0]))
+@example(seed=1988, n=5, d=2, rotation_std=2.0)  # under a penalty far above M, and accelerated
+@example(seed=1191, n=4, d=3, rotation_std=2.0)
 def test_what_converges_is_stationary(seed: int, n: int, d: int, rotation_std: float) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, NoiseModel(0.1, rotation_std)))
     result = run(SOC(tolerance=1e-9, max_iterations=2000), problem)
