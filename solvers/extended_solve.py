@@ -18,27 +18,35 @@ from solvers.robust_solve import Plain
 from solvers.solution import Solution
 
 
-def solve_extended(problem: PGOProblem, pipeline: Any, start: Poses | None, watch: Watch, plain: Plain) -> Solution:  # noqa: ANN401 - a Pipeline
+def solve_extended(
+    problem: PGOProblem,
+    pipeline: Any,  # noqa: ANN401 - a Pipeline
+    start: Poses | None,
+    watch: Watch,
+    plain: Plain,
+    asked: list[str],
+) -> Solution:
     """Solve with priors for the terms that are such by `plain`, and where there is more run the ExtendedSOC, too.
 
     With priors alone the solution is that of the graph with them, whose last pose is the world. Else poses are of
     ExtendedSOC and, where that leaves all terms smooth and there are no constraints, of ExtendedNewton; the objective
     has all terms, and the bound leaves out what its note says: terms that are never negative (a SettingError where one
-    might be) and constraints, which can only raise it. Replaced edges leave none.
+    might be) and constraints, which can only raise it. Replaced edges leave none. What is `asked` of `plain`, robots
+    and robust, goes with priors alone: a SettingError else.
     """
     model = pipeline.soc.model(problem)
     graph, left = with_priors(model)
     if not all(term.is_nonneg() for term in left):
         raise SettingError("a term may be negative, so there is no bound; use solvers.run(ExtendedSOC(..), problem)")
-    first, start_of_it = replace(pipeline, soc=pipeline.soc.soc), None if start is None else graph.completed(start)
-    solution = plain(replace(problem, graph=graph), first, start_of_it, time_limit=watch.left)
     change, terms = model.change, "terms other than tau ||t - p||^2 and kappa ||R - P||_F^2"
     parts = (terms, left), ("constraints", change.constraints), ("replaced edges", change.replaced_edges)
     left_out = [f"{name} ({len(several)})" for name, several in parts if several]
+    if left_out and asked:
+        raise SettingError(f"{' and '.join(asked)} go with priors alone, and there are {left_out[0]}; leave that out")
+    first, start_of_it = replace(pipeline, soc=pipeline.soc.soc), None if start is None else graph.completed(start)
+    solution = plain(replace(problem, graph=graph), first, start_of_it, time_limit=watch.left)
     if not left_out:
         return solution
-    if solution.robots is not None or solution.robust is not None:
-        raise SettingError(f"robots and robust go with priors alone, and there are {left_out[0]}; leave them out")
     certificate, poses, status = solution.certificate, solution.poses, solution.status
     level, stationarity, runs = certificate.rounding_level, math.nan, list[Run[Any]]()
     if status not in OUT_OF_TIME:

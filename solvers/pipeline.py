@@ -178,7 +178,8 @@ def solve(
         from solvers.extended_solve import solve_extended  # cvxpy, which is slow to import
 
         plain = partial(shown, robust=robust, robots=robots, engine=engine, checkpoint=checkpoint)
-        return solve_extended(problem, pipeline, start, watch, plain)
+        asked = [name for name, given in (("robots", robots), ("robust", robust)) if given is not None]
+        return solve_extended(problem, pipeline, start, watch, plain, asked)
     if robots is None and pipeline.faults is not None:
         raise SettingError("faults are of messages between robots; give solve() the robots of SOC, too")
     if robots is None and pipeline.driver_memory != DEFAULT_MEMORY:

@@ -191,6 +191,7 @@ class PoseGraph(Measurements):
 
     def with_prior(self, poses: IntArray, measured: Poses, kappa: Weights, tau: Weights) -> PoseGraph:
         """Return the graph with poses (k,) measured in the frame of the world, in which the solution is then."""
+        poses = self._checked(poses)
         graph = self if self.world is not None else self._with_node(poses[0], WORLD_ID, {"world": self.num_poses})
         return graph.with_edges(np.full(len(poses), graph.world), poses, measured, kappa, tau)
 
@@ -200,13 +201,23 @@ class PoseGraph(Measurements):
 
     def with_landmark(self, seen_from: IntArray, positions: Array, tau: Weights, name: int | None = None) -> PoseGraph:
         """The graph, without truth, with a landmark `seen_from` poses, (k,), at `positions` in their frames, (k, d)."""
+        seen_from = self._checked(seen_from)
         points, n, first, initial = Poses.of_points(positions), self.num_poses, seen_from[0], self.initial
+        if (points.num_poses, points.d) != (len(seen_from), self.d):
+            raise GraphError(f"{points.t.shape} positions seen from {len(seen_from)} poses in {self.d}D; give one each")
         name = int(self.pose_ids[self.in_files].max()) + 1 if name is None else name
         if initial is not None:
             there = initial.t[first] + initial.R[first] @ points.t[0]
             initial = Poses(initial.R[[*range(n), first]], np.append(initial.t, there[None], axis=0))
         others = {"landmarks": np.append(self.landmarks, n), "initial": initial, "truth": None}
         return self._with_node(first, name, others).with_edges(seen_from, np.full(len(seen_from), n), points, 0.0, tau)
+
+    def _checked(self, poses: IntArray) -> IntArray:
+        """Poses (k,), k > 0, as whole numbers; a GraphError unless the graph has them."""
+        poses = whole_array(poses, "poses")
+        if not (poses.size and 0 <= poses.min() <= poses.max() < self.num_poses):
+            raise GraphError(f"measured poses are {poses}; give one or more, 0 to {self.num_poses - 1}")
+        return poses
 
     def _rows(self, edges: BoolArray) -> dict[str, Any]:
         return {name: getattr(self, name)[edges] for name in _OF_EDGES if getattr(self, name) is not None}

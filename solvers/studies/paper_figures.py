@@ -42,10 +42,11 @@ class FigureSet(enum.Enum):
     CONVERGENCE = "convergence"
 
     @property
-    def graphs(self) -> tuple[str, ...]:
-        """What it shows, in the paper's order."""
+    def groups(self) -> tuple[tuple[str, ...], ...]:
+        """Graphs of each of its figures, in the paper's order."""
         scenes, benchmarks = ("circle", "sphere", "grid"), ("parking-garage", "cubicle", "torus3D")
-        return {"scenes": scenes, "benchmarks": benchmarks, "convergence": (*scenes, *benchmarks)}[self.value]
+        alone = tuple((name,) for name in (*scenes, *benchmarks))
+        return {"scenes": (scenes,), "benchmarks": (benchmarks,), "convergence": alone}[self.value]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +77,7 @@ def draw_paper_figures(
 
     Files written, and why graphs were left out: those that are not here, unless `download` fetches them. The folder is
     made if it is not there; `only` are all sets unless given; `progress` shows a bar on stderr, where that is a
-    terminal unless given. A PGOError when a file cannot be written.
+    terminal unless given. A figure is written once its graphs are run. A PGOError when a file cannot be written.
 
     Examples
     --------
@@ -93,14 +94,19 @@ def draw_paper_figures(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise PGOError(f"cannot make the folder {folder}: {error.strerror}; choose another") from error
-    wanted = tuple(dict.fromkeys(name for one in sets for name in one.graphs))
-    shown, reasons = _run_all(wanted, download, progress)
-    written: list[Path] = []
-    for one in sets:
-        here = [shown[name] for name in one.graphs if name in shown]
-        if here:
-            written += (_write_convergence if one is FigureSet.CONVERGENCE else _write_grid)(one, here, folder)
-    return written, reasons
+    rows, runs, written = {row.name: row for row in published_rows()}, dict[str, Shown | str](), list[Path]()
+    groups = [(one, group) for one in sets for group in one.groups]
+    with JobBar(len({name for _, group in groups for name in group}), progress) as bar:
+        for one, group in groups:
+            for name in group:
+                if name not in runs:
+                    bar.name_part(name)
+                    runs[name] = _run(rows[name], download)
+                    bar.end_part()
+            here = [run for name in group if isinstance(run := runs[name], Shown)]
+            if here:
+                written += (_write_convergence if one is FigureSet.CONVERGENCE else _write_grid)(one, here, folder)
+    return written, [run for run in runs.values() if isinstance(run, str)]
 
 
 def explore_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> PlotlyFigure:
@@ -126,23 +132,12 @@ def explore_panels(panels: list[list[tuple[str, PoseGraph, Poses]]]) -> PlotlyFi
     return figure
 
 
-def _run_all(names: tuple[str, ...], download: bool, progress: bool | None) -> tuple[dict[str, Shown], list[str]]:
-    shown: dict[str, Shown] = {}
-    reasons: list[str] = []
-    rows = {row.name: row for row in published_rows()}
-    with JobBar(len(names), progress) as bar:
-        for name in names:
-            bar.name_part(name)
-            try:
-                shown[name] = _run(rows[name], download)
-            except PGOError as error:
-                reasons.append(str(error))
-            bar.end_part()
-    return shown, reasons
-
-
-def _run(row: PublishedRow, download: bool) -> Shown:
-    graph = graph_of_row(row, 0, download)
+def _run(row: PublishedRow, download: bool) -> Shown | str:
+    """The paper's method on a graph, or why it is left out."""
+    try:
+        graph = graph_of_row(row, 0, download)
+    except PGOError as error:
+        return str(error)
     problem = PGOProblem(graph)
     bound = solve_whole(problem).lower_bound
     start, settings = graph.initial if row.name in SCENES else None, BenchmarkSettings(max_rounds=row.soc.iterations)
@@ -156,13 +151,11 @@ def _write_grid(one: FigureSet, here: list[Shown], folder: Path) -> list[Path]:
 
 
 def _write_convergence(one: FigureSet, here: list[Shown], folder: Path) -> list[Path]:
-    written = []
-    for shown in here:
-        stages = [(name, _from_step_one(leg)) for name, leg in zip(_STAGES, shown.trial.legs, strict=True)]
-        curves = stages, shown.lower_bound, published_run(shown.graph)
-        name = f"{one.value}-{shown.graph.name}"
-        written += _write_both(folder, name, plot_convergence(*curves), explore_convergence(*curves))
-    return written
+    (shown,) = here
+    stages = [(name, _from_step_one(leg)) for name, leg in zip(_STAGES, shown.trial.legs, strict=True)]
+    curves = stages, shown.lower_bound, published_run(shown.graph)
+    name = f"{one.value}-{shown.graph.name}"
+    return _write_both(folder, name, plot_convergence(*curves), explore_convergence(*curves))
 
 
 def _write_both(folder: Path, name: str, picture: Figure, page: PlotlyFigure) -> list[Path]:

@@ -275,7 +275,9 @@ def test_a_position_alone_costs_nothing_so_that_the_bound_without_it_is_tight() 
     np.testing.assert_allclose(solution.poses.t[2], 3.0, rtol=0, atol=1e-3)
 
 
-def test_replaced_edges_leave_no_bound_and_terms_that_may_be_negative_are_refused() -> None:
+def test_replaced_edges_leave_no_bound_and_terms_that_may_be_negative_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def absolute(unknown: PoseVariables) -> ModelChange:
         return ModelChange(terms=[cp.sum(cp.abs(unknown.translation_residual[:2]))], replaced_edges=range(2))
 
@@ -285,8 +287,9 @@ def test_replaced_edges_leave_no_bound_and_terms_that_may_be_negative_are_refuse
     linear = ExtendedSOC(lambda unknown: ModelChange(terms=[cp.sum(unknown.t(0))]))
     with pytest.raises(SettingError, match="a term may be negative"):
         solve(problem(), Pipeline(soc=linear))
+    monkeypatch.setattr("solvers.pipeline.certify_at", lambda *_: pytest.fail("solved before it was refused"))
     for more in ({"robots": 2}, {"robust": GNC()}):
-        with pytest.raises(SettingError, match=r"go with priors alone, and there are terms other .* \(1\)"):
+        with pytest.raises(SettingError, match=f"^{next(iter(more))} go with priors alone, and there are terms other "):
             solve(problem(), Pipeline(soc=ExtendedSOC(absolute, SETTINGS)), **more)
     information = PGOProblem(varied_problem(4, N, D).graph, weighting=Weighting.INFORMATION)
     with pytest.raises(SettingError, match="terms are added to F"):

@@ -148,6 +148,25 @@ def test_what_is_not_determined_is_said(graph, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("add", "message"),
+    [
+        (lambda graph: graph.with_prior([], Poses.identity(0, 3), 1.0, 1.0), r"are \[\]; give one or more, 0 to 3"),
+        (lambda graph: graph.with_position_prior([9], np.ones((1, 3)), 1.0), r"are \[9\]; give one or more, 0 to 3"),
+        (lambda graph: graph.with_position_prior([0.5], np.ones((1, 3)), 1.0), "poses has 0.5 among them"),
+        (lambda graph: graph.with_landmark([-1], np.ones((1, 3)), 1.0), r"are \[-1\]; give one or more"),
+        (
+            lambda graph: graph.with_landmark([0, 1], np.ones((1, 3)), 1.0),
+            r"\(1, 3\) positions seen from 2 poses in 3D",
+        ),
+        (lambda graph: graph.with_landmark([0], np.ones((1, 2)), 1.0), r"\(1, 2\) positions seen from 1 poses in 3D"),
+    ],
+)
+def test_poses_that_are_not_there_cannot_be_measured(add, message):
+    with pytest.raises(GraphError, match=message):
+        add(chain(3))
+
+
 @pytest.mark.parametrize("d", [2, 3])
 def test_as_few_positions_as_fix_the_world_do(d):
     positions = line(4, d)

@@ -61,9 +61,25 @@ def test_truth_stands_above_the_result():
 
 def test_without_plotly_nothing_is_run(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "plotly", None)
-    monkeypatch.setattr(paper_figures, "_run_all", lambda *_: pytest.fail("ran all the same"))
+    monkeypatch.setattr(paper_figures, "_run", lambda *_: pytest.fail("ran all the same"))
     with pytest.raises(MissingExtraError, match=r"plotly is not installed"):
         draw_paper_figures(tmp_path)
+
+
+def test_what_is_drawn_before_an_interruption_is_there(monkeypatch, tmp_path):
+    shown, names = paper_figures._run(next(row for row in published_rows() if row.name == "grid"), False), []
+
+    def run(row, download):
+        names.append(row.name)
+        if len(names) == 5:
+            raise KeyboardInterrupt
+        return shown
+
+    monkeypatch.setattr(paper_figures, "_run", run)
+    with pytest.raises(KeyboardInterrupt):
+        draw_paper_figures(tmp_path, (FigureSet.SCENES, FigureSet.BENCHMARKS))
+    assert names == ["circle", "sphere", "grid", "parking-garage", "cubicle"]
+    assert {path.name for path in tmp_path.iterdir()} == {"scenes.png", "scenes.html"}
 
 
 def test_a_folder_that_cannot_be_made_is_said(tmp_path):
