@@ -193,7 +193,7 @@ class Steps:
     sums: AndersonSums = field(default_factory=AndersonSums)  # what all parties know of the acceleration
     # primal_residual, dual_residual: ||x - z||_rho and ||c (z - z_before)||_rho, both over ||omega||_rho, with c =
     # max(1, rho / diagonal of M): a penalty far above M makes short steps anywhere. It also takes extrapolated z back
-    # to z_before, so that where c > 1 the dual residual has c (x - z), too.
+    # to z_before, so that the dual residual has (c - 1) (x - z), too.
     primal_residual: float = np.inf
     dual_residual: float = np.inf
     merits: tuple[float, ...] = ()  # fixed-point residual ||x - z_before||_rho of the steps since rho last changed

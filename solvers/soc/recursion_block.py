@@ -93,9 +93,9 @@ class RecursionBlock:
 
         With it sums, (2,): the squares of the residuals times ||omega||_rho, as in `solvers.soc.penalty.Steps`.
         """
-        weight, ratio = np.sqrt(self.penalty)[:, None], (self.penalty / self.diagonal)[:, None]
-        primal, change = weight * (self.x - z), weight * np.maximum(1.0, ratio) * (z - self.z)
-        taken_back = np.where(ratio > 1.0, ratio, 0.0) * primal
+        weight, c = np.sqrt(self.penalty)[:, None], np.maximum(1.0, self.penalty / self.diagonal)[:, None]
+        primal, change = weight * (self.x - z), c * weight * (z - self.z)
+        taken_back = (c - 1.0) * primal
         squares = [inner(primal, primal), inner(change, change) + inner(taken_back, taken_back)]
         return replace(self, z=z), np.array(squares)
 
