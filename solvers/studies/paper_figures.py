@@ -136,12 +136,13 @@ def _run(row: PublishedRow, download: bool) -> Shown | str:
     """The paper's method on a graph, or why it is left out."""
     try:
         graph = graph_of_row(row, 0, download)
+        problem = PGOProblem(graph)
+        bound = solve_whole(problem).lower_bound
+        start = graph.initial if row.name in SCENES else None
+        settings = BenchmarkSettings(max_rounds=row.soc.iterations)
+        return Shown(graph, run_benchmark(BenchmarkMethod.PAPER, problem, settings, start), bound)
     except PGOError as error:
         return str(error)
-    problem = PGOProblem(graph)
-    bound = solve_whole(problem).lower_bound
-    start, settings = graph.initial if row.name in SCENES else None, BenchmarkSettings(max_rounds=row.soc.iterations)
-    return Shown(graph, run_benchmark(BenchmarkMethod.PAPER, problem, settings, start), bound)
 
 
 def _write_grid(one: FigureSet, here: list[Shown], folder: Path) -> list[Path]:
