@@ -15,12 +15,15 @@ BoolArray = NDArray[np.bool_]
 _POLAR_TOLERANCE = 1e-8  # the iteration is quadratic: a last change below this leaves an error below 1e-15
 _POLAR_ITERATIONS = 10
 _POLAR_MIN_DETERMINANT = 1e-2  # of the matrix scaled to Frobenius norm sqrt(3); below, the SVD is used
+_FEW, _MANY = 20, 4000  # matrices for which the SVD is faster, and of which the iteration stays in the cache
+_ROW, _COLUMN = np.divmod(np.arange(9), 3)  # of the entries of a 3 x 3 matrix, and those after them, cyclically:
+_UP, _DOWN, _AHEAD, _BACK = (3 * ((_ROW + a) % 3) + (_COLUMN + b) % 3 for a, b in ((1, 1), (2, 2), (1, 2), (2, 1)))
 
 
 def project_to_rotations(A: Array) -> Array:
     """Nearest rotations: argmin over omega in SO(d) of ||omega - A_i||_F for every A_i of A, (n, d, d).
 
-    With the SVD A = U D V^T it is U diag(1, .., 1, det(U V^T)) V^T. Well conditioned 3 x 3 matrices of positive
+    With the SVD A = U D V^T it is U diag(1, .., 1, det(U V^T)) V^T. Many well conditioned 3 x 3 matrices of positive
     determinant take Newton's polar iteration X <- (X + cof(X) / det X) / 2, to the same limit. Where several are
     nearest, one of them (Ebrahimi & Deghat, Algorithm 1, steps 4 and 5; Higham, Functions of Matrices, section 8.3).
 
@@ -32,13 +35,19 @@ def project_to_rotations(A: Array) -> Array:
     _check_ends(A, (2, 2), (3, 3))
     if A.shape[-1] == 2:
         return _project_2d(A)
-    norm = np.sqrt(np.einsum("nab,nab->n", A, A) / 3.0)
-    X = A / np.where(norm > 0, norm, 1.0)[:, None, None]
+    if len(A) < _FEW:
+        return project_by_svd(A)
+    if len(A) >= 2 * _MANY:
+        return np.concatenate([project_to_rotations(some) for some in np.array_split(A, len(A) // _MANY)])
+    X = np.ascontiguousarray(A.reshape(-1, 9).T)
+    norm = np.sqrt(np.einsum("en,en->n", X, X) / 3.0)
+    X /= np.where(norm > 0, norm, 1.0)
     cofactors, determinant = _cofactors(X)
     good = determinant > _POLAR_MIN_DETERMINANT
     taken = slice(None) if good.all() else good  # a slice copies nothing
-    omega, settled = np.empty_like(X), np.zeros(len(X), dtype=bool)
-    omega[taken], settled[taken] = _polar(X[taken], cofactors[taken], determinant[taken])
+    settled = np.zeros(len(A), dtype=bool)
+    X[:, taken], settled[taken] = _polar(X[:, taken], cofactors[:, taken], determinant[taken])
+    omega = np.ascontiguousarray(X.T).reshape(A.shape)
     if not settled.all():
         omega[~settled] = project_by_svd(A[~settled])
     return omega
@@ -64,11 +73,11 @@ def _from_cosine_sine(cosine: Array, sine: Array) -> Array:
 
 
 def _polar(X: Array, cofactors: Array, determinant: Array) -> tuple[Array, BoolArray]:
-    """Newton's polar iteration on matrices of positive determinant; second, which of them have settled."""
-    change = np.full(len(X), np.inf)
+    """Newton's polar iteration on matrices (9, n) of positive determinant; second, which of them have settled."""
+    change = np.full(X.shape[1], np.inf)
     for _ in range(_POLAR_ITERATIONS):
-        following = 0.5 * (X + cofactors / determinant[:, None, None])
-        change = np.abs(following - X).max(axis=(1, 2), initial=0.0)
+        following = 0.5 * (X + cofactors / determinant)
+        change = np.abs(following - X).max(axis=0, initial=0.0)
         X = following
         if change.max(initial=0.0) < _POLAR_TOLERANCE:
             break
@@ -86,14 +95,9 @@ def _determinants(X: Array) -> Array:
 
 
 def _cofactors(X: Array) -> tuple[Array, Array]:
-    """Cofactor matrices of (n, 3, 3), whose rows are cross products of the other two rows, and determinants, (n,)."""
-    C = np.empty_like(X)
-    for row in range(3):
-        u, v = X[:, (row + 1) % 3], X[:, (row + 2) % 3]
-        C[:, row, 0] = u[:, 1] * v[:, 2] - u[:, 2] * v[:, 1]
-        C[:, row, 1] = u[:, 2] * v[:, 0] - u[:, 0] * v[:, 2]
-        C[:, row, 2] = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
-    return C, np.einsum("nb,nb->n", X[:, 0], C[:, 0])
+    """Cofactor matrices and determinants, (9, n) and (n,), of n matrices, the nine entries of all behind each other."""
+    C = X[_UP] * X[_DOWN] - X[_AHEAD] * X[_BACK]
+    return C, X[0] * C[0] + X[1] * C[1] + X[2] * C[2]
 
 
 def tangent_dimension(d: int) -> int:
@@ -183,13 +187,14 @@ def orthogonality_error(R: Array) -> Array:
 
 
 def _squared_defect(R: Array) -> Array:
-    """||R^T R - I||_F^2, entry by entry: twice as fast as with a product of stacked matrices."""
-    total = np.zeros(R.shape[:-2])
-    for a in range(R.shape[-1]):
-        for b in range(a, R.shape[-1]):
-            entry = sum(R[..., k, a] * R[..., k, b] for k in range(R.shape[-2]))
-            total += (entry - 1.0) ** 2 if a == b else 2.0 * entry**2
-    return total
+    """||R^T R - I||_F^2, by entries of all matrices: many times as fast as with a product of stacked ones."""
+    d = R.shape[-1]
+    X = np.ascontiguousarray(np.moveaxis(R.reshape(-1, d, d), 0, -1))
+    E = X[0, :, None] * X[0]
+    for row in X[1:]:
+        E += row[:, None] * row
+    E.reshape(d * d, -1)[:: d + 1] -= 1.0
+    return np.asarray(np.einsum("abn,abn->n", E, E)).reshape(R.shape[:-2])
 
 
 def stack_transposes(R: Array) -> Array:

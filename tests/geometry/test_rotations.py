@@ -24,7 +24,7 @@ from pgo_models.geometry.rotations import (
 EPS = np.finfo(float).eps
 SEEDS = st.integers(0, 2**32 - 1)
 DIMENSIONS = st.sampled_from([2, 3])
-COUNTS = st.integers(1, 6)
+COUNTS = st.integers(1, 6) | st.integers(rotations._FEW, rotations._FEW + 10)  # few by the SVD, more by iteration
 
 
 def distance(A: Array, R: Array) -> Array:
@@ -102,6 +102,13 @@ def test_well_conditioned_matrices_take_the_fast_way(monkeypatch: pytest.MonkeyP
     assert handed_on == []
     project_to_rotations(-A)
     assert [len(bad) for bad in handed_on] == [1000]
+
+
+def test_many_matrices_are_projected_some_at_a_time() -> None:
+    rng, count = np.random.default_rng(0), 5 * rotations._MANY // 2
+    A = rng.standard_normal((count, 3, 3))  # half of them of negative determinant
+    np.testing.assert_allclose(project_to_rotations(A), project_by_svd(A), rtol=0, atol=1e-9)
+    assert is_rotation(project_to_rotations(A))
 
 
 def test_projection_of_nothing_is_nothing() -> None:
