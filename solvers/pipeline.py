@@ -305,7 +305,8 @@ class _Job:
         self.watch.plan[:] = [name, *([] if soc is None else [type(soc).__name__]), "Newton", "certificate"]
         with self.watch.showing(name, self.problem):
             if (poses := start) is None:
-                poses = spanning_tree_start(first_problem.graph) if is_paper else chordal_start(first_problem)
+                graph, averaged = first_problem.graph, soc is None
+                poses = spanning_tree_start(graph) if is_paper else chordal_start(first_problem, averaged)
         seconds = time.perf_counter() - began
         self.stages.append(Stage(name, Status.CONVERGED, 0, self.problem.objective(poses), seconds, History()))
         self.watch.found.append(poses)

@@ -251,8 +251,12 @@ class PGOProblem:
 
     def translations_for(self, Y: Array) -> Array:
         """t, (n, k), with t_0 = 0, that minimises tr(X^T M X) over t for X the rows of t and of given Y, (dn, k)."""
-        t = np.zeros((self.num_poses, Y.shape[1]))
-        t[1:] = self._translation_factor.solve(-(self._M_tR @ Y)[1:])
+        return self.solve_translations(-(self._M_tR @ Y))
+
+    def solve_translations(self, b: Array) -> Array:
+        """t, (n, k), with M_tt t = b but for the row of pose 0, and t_0 = 0; b of shape (n, k)."""
+        t = np.zeros(b.shape)
+        t[1:] = self._translation_factor.solve(b[1:])
         return t
 
     def with_best_translations(self, R: Array) -> Poses:
@@ -280,9 +284,8 @@ class PGOProblem:
         """
         objective = self.objective(poses)
         while True:
-            t = poses.t.copy()
-            t[1:] -= self._translation_factor.solve(self.apply_M_at(poses)[1 : self.num_poses])
-            refined = poses.with_translations(t)
+            step = self.solve_translations(self.apply_M_at(poses)[: self.num_poses])
+            refined = poses.with_translations(poses.t - step)
             if not self.objective(refined) < 0.5 * objective:
                 return refined if self.objective(refined) < objective else poses
             poses, objective = refined, self.objective(refined)

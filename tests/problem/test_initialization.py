@@ -161,6 +161,34 @@ def test_a_root_must_be_a_pose(root: int) -> None:
         spanning_tree_start(chain(0, 5, 2), root)
 
 
+def rotation_cost(problem: PGOProblem, poses: Poses) -> float:
+    """sum_e kappa ||R_j - R_i R_ij||^2."""
+    off = poses.R[problem.graph.j] - poses.R[problem.graph.i] @ problem.graph.R_ij
+    return float(np.sum(problem.weights.kappa[:, None, None] * off**2))
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, std=st.sampled_from([0.05, 0.5, 3.0]))
+def test_averaging_never_costs_rotations(seed: int, n: int, d: int, std: float) -> None:
+    problem = varied_problem(seed, n, d, NoiseModel(1.0, std))  # kappa / tau differs from edge to edge
+    before, after = chordal_start(problem), chordal_start(problem, averaged=True)
+    assert rotation_cost(problem, after) <= rotation_cost(problem, before) + 1e-12 * problem.weights.kappa.sum()
+    np.testing.assert_array_equal(after.t, problem.recover_translations(after.R))
+    np.testing.assert_allclose(after.R[0], before.R[0], rtol=0, atol=1e-14)
+    if d == 3:
+        np.testing.assert_array_equal(after.R, before.R)
+
+
+def test_averaging_is_near_the_least_cost_of_rotations_and_nearer_the_optimum() -> None:
+    problem = PGOProblem(grid_world(100, 100, np.random.default_rng(1), d=2))
+    chordal, averaged = chordal_start(problem), chordal_start(problem, averaged=True)
+    without = replace(problem.graph, tau=1e-9 * problem.graph.tau, t_ij=0.0 * problem.graph.t_ij)
+    least = rotation_cost(problem, polish(PGOProblem(without), replace(chordal, t=0.0 * chordal.t)))
+    assert least <= rotation_cost(problem, averaged) <= least + 0.01 * (rotation_cost(problem, chordal) - least)
+    F, starts = problem.objective(polish(problem, averaged)), (averaged, chordal)
+    near, far = (problem.objective(start) / F - 1.0 for start in starts)
+    assert near <= 0.9 * far
+
+
 def test_the_chordal_start_of_a_large_grid_world_is_near_the_optimum() -> None:
     # Relaxed jointly with the translations it costs 2.9 times as much, and more the larger the world is.
     problem = PGOProblem(grid_world(25, 600, np.random.default_rng(0), d=2))
