@@ -14,9 +14,9 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import CholeskyBackend, factorize, minimum_degree
 from pgo_models.problem.floating_point import FactorCounts
 
-# Poses, by the dimension of space, from which METIS pays: it takes ten times as long as minimum degree, 0.03 s for
-# 10,000 poses, and what it saves grows faster in space than in the plane.
-DISSECTED_FROM = {2: 50_000, 3: 10_000}
+# Poses, by the dimension of space, from which METIS pays: it takes six to ten times as long as minimum degree, 0.25 s
+# for 50,000 poses in the plane, and what it saves grows faster in space.
+DISSECTED_FROM = {2: 75_000, 3: 10_000}
 
 
 def pose_order(graph: PoseGraph) -> IntArray:
