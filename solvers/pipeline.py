@@ -109,9 +109,9 @@ def solve(
     Start (chordal relaxation; a spanning tree for the paper's coupling), SOC until Newton can take over, Newton to
     rounding level, then the dual certificate at the result. Where it is wider than asked for, a second try and then
     the Riemannian staircase, whose optimum is the best bound that the relaxation has. In one place, SOC as `HANDOVER`
-    is left out where Newton alone is faster: in the plane, on small graphs, and of chi2 that is not quadratic and
-    convex, where SOC runs on its `convex_part`. There the second try starts at the optimum of F, and smaller
-    information matrices take the place of the staircase.
+    is left out where Newton alone is faster: in the plane, where the start is averaged, on small graphs, and of chi2
+    that is not quadratic and convex, where SOC runs on its `convex_part`. There the second try starts at the optimum of
+    F, and smaller information matrices take the place of the staircase.
 
     Parameters
     ----------
@@ -298,14 +298,14 @@ class _Job:
         """SOC, Newton and certificate from a start; the first on the convex part of chi2 where that is not convex."""
         began, first_problem = time.perf_counter(), self.problem.convex_part
         has_convex_part = first_problem is not self.problem  # whose minimum is no nearer to chi2's than the start is
-        if soc is not None and soc == HANDOVER and (has_convex_part or (start is None and needs_no_soc(self.problem))):
-            soc = None
+        averaged = soc == HANDOVER and (has_convex_part or (start is None and needs_no_soc(self.problem)))
+        soc = None if averaged else soc
         is_paper = isinstance(soc, PaperSOC)
         name = ("spanning tree" if is_paper else "chordal start") if start is None else "given start"
         self.watch.plan[:] = [name, *([] if soc is None else [type(soc).__name__]), "Newton", "certificate"]
         with self.watch.showing(name, self.problem):
             if (poses := start) is None:
-                graph, averaged = first_problem.graph, soc is None
+                graph = first_problem.graph
                 poses = spanning_tree_start(graph) if is_paper else chordal_start(first_problem, averaged)
         seconds = time.perf_counter() - began
         self.stages.append(Stage(name, Status.CONVERGED, 0, self.problem.objective(poses), seconds, History()))
