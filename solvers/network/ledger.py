@@ -76,7 +76,7 @@ class Ledger:
     @property
     def num_bytes(self) -> int:
         """Payload of all messages."""
-        return int(self.by_link()[3].sum())
+        return int(self.bytes_by_level.sum())
 
     @property
     def bytes_by_level(self) -> IntArray:

@@ -16,6 +16,8 @@ from pgo_models.errors import check_settings
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.matrices import inner
 
+_SMALL = 3000  # numbers of a share up to which its differences are taken at once, from a copy
+
 
 def over_relax(new: Array, old: Array, alpha: float) -> Array:
     """Alpha new + (1 - alpha) old (Boyd et al. 2011, section 3.4.3)."""
@@ -58,8 +60,12 @@ class AndersonShare:
         """
         share = self.after(residual, image, keep)
         known = share.residual_differences
-        sums = [inner(known[-1], other) for other in known] + [inner(other, residual) for other in known]
-        return np.array([inner(residual, residual), *sums]), share
+        if known and residual.size <= _SMALL:
+            ends = np.array([known[-1], residual]).reshape(2, -1)
+            sums = np.einsum("kr,er->ek", np.array(known).reshape(len(known), -1), ends).ravel()
+        else:
+            sums = np.array([inner(other, end) for end in (*known[-1:], residual) for other in known])
+        return np.append(inner(residual, residual), sums), share
 
     def after(self, residual: Array, image: Array, keep: int) -> AndersonShare:
         """Return the share with the newest of at most `keep` differences."""
@@ -74,8 +80,10 @@ class AndersonShare:
         assert self.image is not None
         if gamma is None or not len(gamma):
             return self.image, self if gamma is not None else AndersonShare(residual=self.residual, image=self.image)
-        following = self.image.copy()
-        for coefficient, difference in zip(gamma, self.image_differences[-len(gamma) :], strict=True):
+        following, known = self.image.copy(), self.image_differences[-len(gamma) :]
+        if following.size <= _SMALL:
+            return following - np.einsum("k,krd->rd", gamma, np.array(known)), self
+        for coefficient, difference in zip(gamma, known, strict=True):
             following -= coefficient * difference
         return following, self
 
