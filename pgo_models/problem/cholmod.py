@@ -21,7 +21,7 @@ _OPTIONS = RLock()
 def lower_triangle(pattern: csc_array) -> tuple[Any, IntArray, BoolArray]:
     """CVXOPT's matrix of ones, the positions of its entries in the pattern, and which of them are on the diagonal."""
     cvxopt, _ = import_cvxopt()
-    columns = np.repeat(np.arange(pattern.shape[1]), np.diff(pattern.indptr))
+    columns = np.repeat(np.arange(pattern.shape[1], dtype=np.int32), np.diff(pattern.indptr))
     lower = np.flatnonzero(pattern.indices >= columns)
     places = [of_all[lower].astype(np.int64) for of_all in (pattern.indices, columns)]
     return cvxopt.spmatrix(1.0, *map(cvxopt.matrix, places), pattern.shape), lower, places[0] == places[1]

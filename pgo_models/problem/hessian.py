@@ -13,7 +13,7 @@ from scipy.sparse import csc_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, hat, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.matrices import assemble, block_entries, edge_blocks, rotation_columns
+from pgo_models.problem.matrices import assemble, block_entries, edge_blocks, rotation_columns, short
 from pgo_models.problem.ordering import row_order
 from pgo_models.problem.problem import PGOProblem
 
@@ -66,28 +66,28 @@ def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) 
     graph, d = problem.graph, problem.d
     layout = TangentLayout(problem.num_poses, d)
     i, j, R = graph.i, graph.j, poses.R
-    v_i, v_j, w_i, w_j = layout.translations(i), layout.translations(j), layout.rotations(i), layout.rotations(j)
+    v_i, v_j, w_i, w_j = (columns(short(end)) for columns in (layout.translations, layout.rotations) for end in (i, j))
     weights = problem.weights if Lambda is None else problem.tangent_at(poses).weights
-    tau = np.repeat(2.0 * weights.tau[:, None], d, axis=1)
+    tau, at_both = np.repeat(2.0 * weights.tau[:, None], d, axis=1), problem.incidence.at_both
     arm, own_i, between, own_j = edge_blocks(graph.R_ij, graph.t_ij, weights)
     lever = 2.0 * R[i] @ _lever(arm)
     relative = np.swapaxes(R[i], 1, 2) @ R[j]
     coupling = -2.0 * double_cross(relative, between)
-    S_ii = problem.incidence.at_both(own_i, own_j)
+    S_ii, levers = at_both(own_i, own_j), problem.incidence.at_beginning(lever).reshape(-1, *lever.shape[1:])
     own = _of_turns(S_ii if Lambda is None else S_ii - Lambda)
-    poses_w = layout.rotations(np.arange(problem.num_poses))
+    every = short(np.arange(problem.num_poses))
+    v, w = layout.translations(every), layout.rotations(every)
     blocks = [
-        (v_i, v_i, tau),
-        (v_j, v_j, tau),
+        (v, v, at_both(tau[:, None], tau[:, None])[:, 0]),
         (v_i, v_j, -tau),
         (v_j, v_i, -tau),
-        (*block_entries(v_i, w_i), -lever),
-        (*block_entries(w_i, v_i), -np.swapaxes(lever, 1, 2)),
+        (*block_entries(v, w), -levers),
+        (*block_entries(w, v), -np.swapaxes(levers, 1, 2)),
         (*block_entries(v_j, w_i), lever),
         (*block_entries(w_i, v_j), np.swapaxes(lever, 1, 2)),
         (*block_entries(w_i, w_j), coupling),
         (*block_entries(w_j, w_i), np.swapaxes(coupling, 1, 2)),
-        (*block_entries(poses_w, poses_w), own),
+        (*block_entries(w, w), own),
     ]
     excess = problem.weights.excess
     if excess is not None:

@@ -7,7 +7,7 @@ from scipy.sparse import csc_array
 
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.problem.matrices import assemble, block_entries, rotation_columns
+from pgo_models.problem.matrices import assemble, block_entries, incidence_matrices, rotation_columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,9 +22,7 @@ class Incidence:
     @classmethod
     def of(cls, graph: PoseGraph) -> "Incidence":
         """Incidence of a graph."""
-        n, m, i, j = graph.num_poses, graph.num_edges, graph.i, graph.j
-        begins, ends = (csc_array((np.ones(m), pose, np.arange(m + 1)), shape=(n, m)) for pose in (i, j))
-        return cls(begins, ends, i, j)
+        return cls(*incidence_matrices(graph), graph.i, graph.j)
 
     def at_beginning(self, blocks: Array) -> Array:
         """Sums of blocks (m, a, b) over the edges that begin at a pose, (n a, b)."""

@@ -5,6 +5,7 @@ Unknowns are stacked in X, (N, d) with N = (d+1) n: first the n rows t_i, then t
 
 import math
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array
@@ -83,21 +84,22 @@ def joint_matrix(graph: PoseGraph, weights: EdgeWeights | None = None) -> csc_ar
     """
     n, d = graph.num_poses, graph.d
     weights = weights if weights is not None else isotropic_weights(graph)
-    i, j, tau = graph.i, graph.j, weights.tau
+    i, j, t, tau = *map(short, (graph.i, graph.j, np.arange(n))), weights.tau
     block_i, block_j = rotation_columns(i, n, d), rotation_columns(j, n, d)
     lever, own_i, between, own_j = edge_blocks(graph.R_ij, graph.t_ij, weights)
-    t_i, t_j = (np.repeat(end[:, None], d, axis=1) for end in (i, j))
+    begins, ends = incidence_matrices(graph)
+    block, levers = rotation_columns(t, n, d), begins @ lever
+    own = begins @ own_i.reshape(-1, d * d) + ends @ own_j.reshape(-1, d * d)
+    t_own, t_j = (np.repeat(pose[:, None], d, axis=1) for pose in (t, j))
     blocks = [
-        (i, i, tau),
-        (j, j, tau),
+        (t, t, begins @ tau + ends @ tau),
         (i, j, -tau),
         (j, i, -tau),
-        (t_i, block_i, lever),
-        (block_i, t_i, lever),
+        (t_own, block, levers),
+        (block, t_own, levers),
         (t_j, block_i, -lever),
         (block_i, t_j, -lever),
-        (*block_entries(block_i, block_i), own_i),
-        (*block_entries(block_j, block_j), own_j),
+        (*block_entries(block, block), own),
         (*block_entries(block_i, block_j), -between),
         (*block_entries(block_j, block_i), -np.swapaxes(between, 1, 2)),
     ]
@@ -125,9 +127,16 @@ def marginalized_matrix(graph: PoseGraph, weights: EdgeWeights | None = None) ->
     return np.asarray(M_RR - M_Rt[:, 1:] @ grounded.solve(M_Rt[:, 1:].toarray().T))
 
 
+def incidence_matrices(graph: PoseGraph) -> tuple[csc_array, csc_array]:
+    """Matrices of ones, (n, m): which edges begin, and which end, at a pose."""
+    shape, ones = (graph.num_poses, graph.num_edges), np.ones(graph.num_edges)
+    begins, ends = (csc_array((ones, pose, np.arange(len(ones) + 1)), shape=shape) for pose in (graph.i, graph.j))
+    return begins, ends
+
+
 def rotation_columns(pose: IntArray, first: int, d: int) -> IntArray:
     """Columns (m, d) that the rows of R_i^T have in X when rotations begin at `first`."""
-    return np.asarray(first + d * pose[:, None] + np.arange(d))
+    return np.asarray(first + d * pose[:, None] + np.arange(d, dtype=pose.dtype))
 
 
 def columns_of(poses: IntArray, num_poses: int, widths: tuple[int, ...]) -> IntArray:
@@ -151,8 +160,14 @@ def norm(A: Array) -> float:
 
 def assemble(blocks: list[tuple[IntArray, IntArray, Array]], side: int) -> csc_array:
     """Sum (rows, columns, values) triplets, each of one shape, into a canonical CSC matrix; its pattern keeps zeros."""
-    rows, columns, values = (np.concatenate([np.ravel(block[k]) for block in blocks]) for k in range(3))
+    rows, columns = (np.concatenate([short(np.ravel(block[k])) for block in blocks]) for k in range(2))
+    values = np.concatenate([np.ravel(block[2]) for block in blocks])
     return csc_array((values, (rows, columns)), shape=(side, side))
+
+
+def short(indices: IntArray) -> IntArray:
+    """The same numbers in 32 bits, as scipy has them in matrices: triplets take most of the memory of `assemble`."""
+    return cast("IntArray", indices.astype(np.int32, copy=False))
 
 
 def entry_positions(matrix: csc_array, rows: IntArray, columns: IntArray) -> IntArray:
