@@ -9,7 +9,7 @@ from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.reporting.versions import installed_versions
 
-_MUCH = 1e9  # bytes that are worth a word
+_MUCH = 5e8  # bytes that are worth a word
 
 
 def describe_graph(graph: PoseGraph) -> list[tuple[str, str]]:
@@ -35,13 +35,13 @@ def describe_graph(graph: PoseGraph) -> list[tuple[str, str]]:
 def memory_note(graph: PoseGraph) -> str:
     """How much memory a solve will take, in words; nothing where it is little.
 
-    About 1000 (n + m) bytes and the Cholesky factor: 600 k log2 k bytes in the plane, 2200 k^(4/3) in space, as nested
+    About 600 (n + m) bytes and the Cholesky factor: 390 k log2 k bytes in the plane, 1250 k^(4/3) in space, as nested
     dissection fills lattices, with k = min(n, 2 (m - n + 1)), the poses that are left where chains are eliminated. To
-    20 % on grid worlds of 10,000 to 300,000 poses in the plane, 2,000 to 50,000 in space; narrow graphs take less.
+    20 % on grid worlds of 10,000 to a million poses in the plane, to 50,000 in space; narrow graphs take less.
     """
     n, m = graph.num_poses, graph.num_edges
     k = max(2, min(n, 2 * (m - n + 1)))
-    needed = 1000.0 * (n + m) + (600.0 * k * np.log2(k) if graph.d == 2 else 2200.0 * k ** (4 / 3))
+    needed = 600.0 * (n + m) + (390.0 * k * np.log2(k) if graph.d == 2 else 1250.0 * k ** (4 / 3))
     return f"a solve takes about {1e-9 * needed:.2g} GB of memory" if needed > _MUCH else ""
 
 

@@ -18,7 +18,7 @@ def chain(n, closures, d):
 # Peaks of `pgo solve` on grid worlds of so many poses and edges, less 80 MB of the program, in GB.
 @pytest.mark.parametrize(
     ("d", "n", "m", "measured"),
-    [(2, 100_000, 178_131, 1.33), (2, 300_000, 539_903, 4.2), (3, 30_000, 51_499, 2.1), (3, 50_000, 84_277, 4.5)],
+    [(2, 100_000, 167_400, 0.70), (2, 300_000, 518_997, 2.22), (3, 30_000, 50_927, 1.19), (3, 50_000, 84_830, 2.36)],
 )
 def test_the_memory_of_a_large_graph_is_said_as_it_was_measured(d, n, m, measured):
     words = memory_note(chain(n, m - n + 1, d)).split()
