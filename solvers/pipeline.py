@@ -301,7 +301,8 @@ class _Job:
         averaged = soc == HANDOVER and (has_convex_part or (start is None and needs_no_soc(self.problem)))
         soc = None if averaged else soc
         is_paper = isinstance(soc, PaperSOC)
-        name = ("spanning tree" if is_paper else "chordal start") if start is None else "given start"
+        name = "averaged start" if averaged and self.problem.d == 2 else "chordal start"
+        name = ("spanning tree" if is_paper else name) if start is None else "given start"
         self.watch.plan[:] = [name, *([] if soc is None else [type(soc).__name__]), "Newton", "certificate"]
         with self.watch.showing(name, self.problem):
             if (poses := start) is None:
