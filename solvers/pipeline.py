@@ -298,10 +298,10 @@ class _Job:
         """SOC, Newton and certificate from a start; the first on the convex part of chi2 where that is not convex."""
         began, first_problem = time.perf_counter(), self.problem.convex_part
         has_convex_part = first_problem is not self.problem  # whose minimum is no nearer to chi2's than the start is
-        averaged = soc == HANDOVER and (has_convex_part or (start is None and needs_no_soc(self.problem)))
-        soc = None if averaged else soc
+        without_soc = soc == HANDOVER and (has_convex_part or (start is None and needs_no_soc(self.problem)))
+        soc, averaged = None if without_soc else soc, without_soc and self.problem.d == 2
         is_paper = isinstance(soc, PaperSOC)
-        name = "averaged start" if averaged and self.problem.d == 2 else "chordal start"
+        name = "averaged start" if averaged else "chordal start"
         name = ("spanning tree" if is_paper else name) if start is None else "given start"
         self.watch.plan[:] = [name, *([] if soc is None else [type(soc).__name__]), "Newton", "certificate"]
         with self.watch.showing(name, self.problem):

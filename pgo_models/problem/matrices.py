@@ -14,6 +14,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import factorize
+from pgo_models.problem.incidence import Incidence
 from pgo_models.problem.weighting import EdgeWeights
 
 MAX_DENSE_SIDE = 6000  # a dense Q of this side takes 288 MB
@@ -87,19 +88,18 @@ def joint_matrix(graph: PoseGraph, weights: EdgeWeights | None = None) -> csc_ar
     i, j, t, tau = *map(short, (graph.i, graph.j, np.arange(n))), weights.tau
     block_i, block_j = rotation_columns(i, n, d), rotation_columns(j, n, d)
     lever, own_i, between, own_j = edge_blocks(graph.R_ij, graph.t_ij, weights)
-    begins, ends = incidence_matrices(graph)
-    block, levers = rotation_columns(t, n, d), begins @ lever
-    own = begins @ own_i.reshape(-1, d * d) + ends @ own_j.reshape(-1, d * d)
+    incidence, block = Incidence.of(graph), rotation_columns(t, n, d)
+    levers = incidence.begins @ lever
     t_own, t_j = (np.repeat(pose[:, None], d, axis=1) for pose in (t, j))
     blocks = [
-        (t, t, begins @ tau + ends @ tau),
+        (t, t, incidence.begins @ tau + incidence.ends @ tau),
         (i, j, -tau),
         (j, i, -tau),
         (t_own, block, levers),
         (block, t_own, levers),
         (t_j, block_i, -lever),
         (block_i, t_j, -lever),
-        (*block_entries(block, block), own),
+        (*block_entries(block, block), incidence.at_both(own_i, own_j)),
         (*block_entries(block_i, block_j), -between),
         (*block_entries(block_j, block_i), -np.swapaxes(between, 1, 2)),
     ]
@@ -127,11 +127,14 @@ def marginalized_matrix(graph: PoseGraph, weights: EdgeWeights | None = None) ->
     return np.asarray(M_RR - M_Rt[:, 1:] @ grounded.solve(M_Rt[:, 1:].toarray().T))
 
 
-def incidence_matrices(graph: PoseGraph) -> tuple[csc_array, csc_array]:
-    """Matrices of ones, (n, m): which edges begin, and which end, at a pose."""
-    shape, ones = (graph.num_poses, graph.num_edges), np.ones(graph.num_edges)
-    begins, ends = (csc_array((ones, pose, np.arange(len(ones) + 1)), shape=shape) for pose in (graph.i, graph.j))
-    return begins, ends
+def block_laplacian(incidence: Incidence, of_edges: Array) -> csc_array:
+    """Laplacian with weights (m, d, d), the matrix of translations with such information; grounded at pose 0."""
+    own, d = incidence.at_both(of_edges, of_edges), of_edges.shape[1]
+    own[0] *= 2.0
+    t_i, t_j, t = (rotation_columns(k, 0, d) for k in (incidence.i, incidence.j, np.arange(len(own))))
+    signed = ((t, t, own), (t_i, t_j, -of_edges), (t_j, t_i, -of_edges))
+    blocks = [(*block_entries(rows, columns), values) for rows, columns, values in signed]
+    return assemble(blocks, d * len(own))
 
 
 def rotation_columns(pose: IntArray, first: int, d: int) -> IntArray:

@@ -15,7 +15,7 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.precisions import proper_information
 from pgo_models.problem import matrices
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, analyze, factorize
-from pgo_models.problem.incidence import Incidence, block_laplacian, blocks_of_rows, rows_of_blocks
+from pgo_models.problem.incidence import Incidence, blocks_of_rows, rows_of_blocks
 from pgo_models.problem.ordering import most_counts, pose_order, row_order
 from pgo_models.problem.weighting import EdgeWeights, Weighting, convex_weights, edge_weights
 
@@ -273,7 +273,7 @@ class PGOProblem:
         half = R_i @ (excess.J[:, :d, :d] + tau[:, None, None] * np.eye(d)) @ np.swapaxes(R_i, 1, 2)
         u, _ = excess.arguments(self.edge_products(residuals, X))
         pull = tau[:, None] * residuals[: len(tau)] + (R_i @ (excess.J[:, :d] @ u[:, :, None]))[:, :, 0]
-        factor = self._chi2_translations.factorize(block_laplacian(self.incidence, half))
+        factor = self._chi2_translations.factorize(matrices.block_laplacian(self.incidence, half))
         step = factor.solve((self.incidence.ends @ pull - self.incidence.begins @ pull).ravel()).reshape(-1, d)
         return poses.with_translations(poses.t - (step - step[0]))
 
@@ -330,7 +330,7 @@ class PGOProblem:
     def _chi2_translations(self) -> SymbolicCholesky:
         """Of the matrix of `at_best_translations`, whose pattern the graph alone gives."""
         ones = np.broadcast_to(np.eye(self.d), self.graph.R_ij.shape)
-        return analyze(block_laplacian(self.incidence, ones), self.backend, row_order(self.pose_order, self.d))
+        return analyze(matrices.block_laplacian(self.incidence, ones), self.backend, row_order(self.pose_order, self.d))
 
     @cached_property
     def _M_tR(self) -> csr_array:

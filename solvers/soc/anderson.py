@@ -80,9 +80,10 @@ class AndersonShare:
         assert self.image is not None
         if gamma is None or not len(gamma):
             return self.image, self if gamma is not None else AndersonShare(residual=self.residual, image=self.image)
-        following, known = self.image.copy(), self.image_differences[-len(gamma) :]
-        if following.size <= _SMALL:
-            return following - np.einsum("k,krd->rd", gamma, np.array(known)), self
+        known = self.image_differences[-len(gamma) :]
+        if self.image.size <= _SMALL:
+            return self.image - np.einsum("k,krd->rd", gamma, np.array(known)), self
+        following = self.image.copy()
         for coefficient, difference in zip(gamma, known, strict=True):
             following -= coefficient * difference
         return following, self
