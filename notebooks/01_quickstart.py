@@ -1,11 +1,13 @@
 # %% [markdown]
 # # 1. How far from the best possible is an answer?
 #
-# Open with `jupyter lab notebooks/01_quickstart.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+# Open with `jupyter lab notebooks/01_quickstart.ipynb`; `pip install -e '.[notebooks,fast]'`
+# installs it.
 #
-# A robot measures how it moved between poses, and recognises places it has seen. Every measurement is a little
-# wrong, and together they contradict each other. *Pose graph optimisation* looks for the poses that contradict
-# them least. Many methods give an answer; this notebook is about knowing how good the answer is.
+# A robot measures its motion between poses, and it recognises places that it has seen before. Every
+# measurement has a small error, so the measurements contradict each other. *Pose graph
+# optimisation* finds the poses that contradict them least. Many methods return an answer; this
+# notebook shows how to find out how good the answer is.
 
 # %%
 import numpy as np
@@ -17,9 +19,10 @@ from pgo_models.plots.graph_plots import plot_against_truth
 # %% [markdown]
 # ## A graph and its picture
 #
-# `sphere` is one of the three networks of the paper's section *Simulation results*: 50 poses on a sphere, 544
-# relative measurements with noise of 0.5 m and 30 degrees. It came with an estimate of each pose (GPS and an
-# IMU, as noisy as the measurements), and since it is a simulation we also know the truth.
+# `sphere` is one of the three networks of the paper's section *Simulation results*: 50 poses on a
+# sphere, 544 relative measurements with noise of 0.5 m and 30 degrees. It came with an estimate of
+# each pose (GPS and an IMU, as noisy as the measurements), and since it is a simulation we also
+# know the truth.
 
 # %%
 graph = pgo.load("sphere")
@@ -32,17 +35,18 @@ pgo.compare_poses(graph, [("truth", graph.truth), ("GPS and IMU", graph.initial)
 # %% [markdown]
 # ## The cost
 #
-# An edge $(i, j)$ measures $R_{ij} \approx R_i^\top R_j$ and $t_{ij} \approx R_i^\top (t_j - t_i)$. The cost of
-# poses is what the paper's equation (16), `min overall` says, each edge with its weights $\kappa_{ij}, \tau_{ij}$:
+# An edge $(i, j)$ measures $R_{ij} \approx R_i^\top R_j$ and $t_{ij} \approx R_i^\top (t_j - t_i)$.
+# The cost of poses is the paper's equation (16), `min overall`, with weights
+# $\kappa_{ij}, \tau_{ij}$ for each edge:
 #
 # $$F(R, t) = \sum_{(i,j)} \kappa_{ij} \lVert R_j - R_i R_{ij} \rVert_F^2
 #   + \tau_{ij} \lVert t_j - t_i - R_i t_{ij} \rVert_2^2, \qquad R_i \in \mathrm{SO}(d).$$
 #
-# It is quadratic in $(R, t)$; what makes it hard is only that $R_i$ must be rotations. The weights should be
-# precisions: for this noise $\tau = 1 / \sigma_t^2 = 4$ and, in space,
-# $\kappa = 1 / (2 \sigma_R^2) = 1.8$. In this scene they are 0.5 and 0.5236, which are the *standard deviations*
-# (in metres and radians) themselves: so its source has it (Cristofalo et al. 2020), and so we keep it. Here is
-# $F$ by hand.
+# The cost is quadratic in $(R, t)$; the problem is hard only because the $R_i$ must be rotations.
+# The weights should be precisions: for this noise $\tau = 1 / \sigma_t^2 = 4$ and, in space,
+# $\kappa = 1 / (2 \sigma_R^2) = 1.8$. In this scene they are 0.5 and 0.5236, which are the
+# *standard deviations* (in metres and radians) themselves. We keep these values, because the source
+# of the scene uses them (Cristofalo et al. 2020). Here is $F$ by hand.
 
 
 # %%
@@ -57,13 +61,16 @@ def cost(graph, poses):
 
 
 for name, poses in (("GPS and IMU", graph.initial), ("truth", graph.truth)):
-    print(f"{name:12} F = {cost(graph, poses):9.3f} by hand, {problem.objective(poses):9.3f} by the library")
+    print(
+        f"{name:12} F = {cost(graph, poses):9.3f} by hand, {problem.objective(poses):9.3f} by the library"
+    )
 
 # %% [markdown]
 # ## Solve
 #
-# `solve` finds a start, runs SOC (the paper's method, [notebook 4](04_splitting_orthogonality.ipynb)), lets
-# Newton finish, and then certifies what it found.
+# `solve` computes an initial estimate, runs SOC (the paper's method,
+# [notebook 4](04_splitting_orthogonality.ipynb)) where it is faster than Newton's method alone,
+# ends with Newton's method, and then certifies the result.
 
 # %%
 solution = solvers.solve(problem)
@@ -73,41 +80,45 @@ solution
 plot_against_truth(graph, solution.poses)
 
 # %% [markdown]
-# Surprising at first: the solution costs *less* than the truth. The truth does not fit the noise; the optimum
-# does, as far as 50 poses can. So "F is as low as at the truth" proves nothing. What does?
+# This may be surprising: the solution costs *less* than the truth. The truth does not fit the
+# noise; the optimum does, as far as 50 poses can. So "F is as low as at the truth" proves nothing.
+# What does prove that an answer is good?
 #
 # ## The certificate
 #
-# A *lower bound* $b$ with $b \le F(R, t)$ for **all** rotations and translations. Then
+# The proof is a *lower bound* $b$ with $b \le F(R, t)$ for **all** rotations and translations. Then
 #
 # $$\text{gap} = \frac{F(\text{answer}) - b}{F(\text{answer})}$$
 #
-# is the most, as a share of $F$, that any other answer could save; neither the units nor the number of
-# measurements change it. Where does $b$ come from? Stack all $t_i$ and the rows of all $R_i^\top$ in a matrix
-# $X$, so that $F = \operatorname{tr}(X^\top M X)$. For any symmetric matrices $\Lambda_i$, as
-# $R_i R_i^\top = I$,
+# is the largest share of $F$ that any other answer could save. It depends neither on the units nor
+# on the number of measurements. Where does $b$ come from? Stack all $t_i$ and the rows of all
+# $R_i^\top$ in a matrix $X$, so that $F = \operatorname{tr}(X^\top M X)$. For any symmetric
+# matrices $\Lambda_i$, as $R_i R_i^\top = I$,
 #
 # $$F(X) = \operatorname{tr}(X^\top S X) + \sum_i \operatorname{tr} \Lambda_i, \qquad
 #   S = M - \operatorname{blockdiag}(0, \Lambda).$$
 #
-# Were $S$ positive definite, we could minimise the right side over all $X$ whatsoever. It cannot be: turning or
-# shifting all poses together changes nothing. So **ground one pose** $r$. Turn and shift the answer, call it
-# $\hat X$, so that pose $r$ is $(0, I)$; let $G = S \hat X$, and let $S_r$ and $G_r$ be $S$ and $G$ without the
-# rows of pose $r$. If $S_r$ is positive definite, then for **all** poses $X$
+# If $S$ were positive definite, we could minimise the right side over all matrices $X$. It cannot
+# be positive definite, because rotating and shifting all poses together does not change $F$. So
+# **ground one pose** $r$: rotate and shift the answer, call it $\hat X$, so that pose $r$ is
+# $(0, I)$. Let $G = S \hat X$, and let $S_r$ and $G_r$ be $S$ and $G$ without the rows of pose $r$.
+# If $S_r$ is positive definite, then for **all** poses $X$
 #
 # $$F(X) \ge b = F(\hat X) - \operatorname{tr}(G_r^\top S_r^{-1} G_r).$$
 #
 # The proof has three lines:
 #
-# * Turn and shift $X$ too until its pose $r$ is $(0, I)$; $F(X)$ stays. So $Z = X - \hat X$ is zero at pose $r$.
+# * Rotate and shift $X$ as well, so that its pose $r$ is $(0, I)$; $F(X)$ does not change. So
+#   $Z = X - \hat X$ is zero at pose $r$.
 # * $F(X) - F(\hat X) = 2 \operatorname{tr}(G^\top Z) + \operatorname{tr}(Z^\top S Z)
 #   = 2 \operatorname{tr}(G_r^\top Z_r) + \operatorname{tr}(Z_r^\top S_r Z_r)$.
-# * Over *all* matrices $Z_r$ that is smallest at $Z_r = -S_r^{-1} G_r$, where it is
+# * Over *all* matrices $Z_r$ the minimum is at $Z_r = -S_r^{-1} G_r$, with the value
 #   $-\operatorname{tr}(G_r^\top S_r^{-1} G_r)$.
 #
-# Cholesky's factorisation exists exactly for positive definite matrices: **that it goes through is the proof.**
-# A good choice of $\Lambda$ are the multipliers of the constraints at the answer, $\operatorname{sym}((M X)_i R_i)$;
-# with them $G = 0$ at an optimum, and $b$ is $F$ itself.
+# A Cholesky factorisation exists if and only if the matrix is positive definite: **a successful
+# factorisation is the proof.** A good choice of $\Lambda$ are the multipliers of the constraints at
+# the answer, $\operatorname{sym}((M X)_i R_i)$; with them $G = 0$ at an optimum, and $b$ is $F$
+# itself.
 
 
 # %%
@@ -137,33 +148,38 @@ for name, poses in (("the solution", solution.poses), ("0.1 degrees off", nearby
     print("{:16} F {:.10f}   b {:.10f} by hand, {:.10f} by the library".format(name, *rows[name]))
 
 # %% [markdown]
-# Even poses that are a little off give a bound that is nearly sharp: both $F$ and $b$ are off by the *square* of
-# the error. (Then $b$ depends a little on which pose is grounded; the library takes one in the middle.)
+# Even slightly inaccurate poses give a nearly sharp bound: the errors of both $F$ and $b$ are of
+# the order of the *square* of the error of the poses. (In that case $b$ depends slightly on which
+# pose is grounded; the library takes one in the middle of the graph.)
 #
-# By hand, the numbers come from a computer that rounds, and the proof is for exact ones. The library bounds
-# every rounding error, in the entries of $S_r$, its factorisation, $G$ and $F$, and subtracts them all: its
-# bound is a little smaller, and holds *in exact arithmetic* for the measurements as they are stored.
+# The computation above rounds its numbers, but the proof holds for exact numbers. The library
+# bounds every rounding error, in the entries of $S_r$, in its factorisation, in $G$ and in $F$, and
+# subtracts all of them. Its bound is slightly smaller, and holds *in exact arithmetic* for the
+# measurements as they are stored.
 
 # %%
 certificate = solution.certificate
 print(f"F - b {solution.objective - solution.lower_bound:.1e}, about tr(G^T S^-1 G)", end=" ")
-print(f"{loss_by_hand(problem, solution.poses):.1e} and, for rounding, {certificate.bound.rounding:.1e}")
-print(f"gap   {solution.gap:.1e}: {certificate.digits} digits of F are proven")
+print(
+    f"{loss_by_hand(problem, solution.poses):.1e} and, for rounding, {certificate.bound.rounding:.1e}"
+)
+print(f"gap   {certificate.gap_text}")
 
 # %% [markdown]
-# So nobody will ever find poses for these measurements with $F$ below that bound. `certify` does the same for
-# *anybody's* poses (it first looks for the optimum beside them). Here for the truth: 7.6 % of its $F$ could be
-# saved.
+# So there are no poses for these measurements with $F$ below this bound. `certify` does the same
+# for poses from *any* source (it first computes the optimum near them). For the ground truth it
+# finds that 7.6 % of its $F$ could be saved.
 
 # %%
 pgo.certify(problem, graph.truth)
 
 # %% [markdown]
-# ## Where a method fails and the certificate says so
+# ## Where a method fails and the certificate shows it
 #
-# Thirty poses on a ring, each 12 degrees further round; every measurement nearly exact. Start a descent method
-# at random poses: it may stop where the chain of poses winds round once too often. There the gradient is zero
-# and every small change makes $F$ larger; nothing that is *local* can tell.
+# Thirty poses lie on a ring, each 12 degrees further along than the one before, and every
+# measurement is nearly exact. A descent method that starts at random poses may stop at a chain of
+# poses that winds around the ring once too often. The gradient is zero there, and every small
+# change increases $F$. No *local* test can detect this.
 
 # %%
 rng = np.random.default_rng(0)
@@ -197,23 +213,28 @@ for seed, (poses, certificate) in enumerate(zip(descents, certificates, strict=T
 worst = max(certificates, key=lambda certificate: certificate.objective)
 stuck, best = descents[certificates.index(worst)], solvers.solve(ring)
 pgo.compare_poses(
-    ring, [(f"stuck, F = {worst.objective:.4g}", stuck), (f"optimal, F = {best.objective:.4g}", best.poses)]
+    ring,
+    [
+        (f"stuck, F = {worst.objective:.4g}", stuck),
+        (f"optimal, F = {best.objective:.4g}", best.poses),
+    ],
 )
 
 # %% [markdown]
-# The gap of such an answer is nearly 1: almost all of its cost could be saved. A gap is not always a verdict on
-# the answer, though. If the noise is very strong, $S_r$ is not positive definite even at the optimum. The library
-# then adds a shift $\eta$ to make it so, pays for that, and an optimal answer keeps a gap: [notebook
-# 5](05_sdp_and_certificates.ipynb) looks for the noise at which that begins.
+# The gap of such an answer is nearly 1: almost all of its cost could be saved. But a large gap does
+# not always mean that the answer is bad. If the noise is very strong, $S_r$ is not positive
+# definite even at the optimum. The library then adds a shift $\eta$ that makes it positive
+# definite. The shift lowers the bound, so that even an optimal answer has a gap.
+# [Notebook 5](05_sdp_and_certificates.ipynb) finds the noise level at which this begins.
 
 # %% [markdown]
 # ## Exercises
 #
-# **1.** All weights are multiplied by 100. What becomes of $F$, of the bound, of the gap?
+# **1.** All weights are multiplied by 100. How do $F$, the bound and the gap change?
 #
 # <details><summary>Answer</summary>
 #
-# $F$, $M$, $\Lambda$ and the bound are multiplied by 100; the gap, a share, stays.
+# $F$, $M$, $\Lambda$ and the bound are multiplied by 100. The gap is a ratio and does not change.
 #
 # ```python
 # heavy = solvers.solve(graph.with_weights(100 * graph.kappa, 100 * graph.tau))
@@ -227,8 +248,8 @@ pgo.compare_poses(
 #
 # <details><summary>Answer</summary>
 #
-# $S = M$, and the bound is the minimum of $\operatorname{tr}(X^\top M X)$ over all matrices with pose $r$ held at
-# $(0, I)$: least squares without the constraints. It holds, and it is a poor one.
+# $S = M$, and the bound is the minimum of $\operatorname{tr}(X^\top M X)$ over all matrices with
+# pose $r$ held at $(0, I)$: least squares without the constraints. The bound is valid, but poor.
 #
 # ```python
 # without_multipliers = pgo.prove_bound(problem, np.zeros((n, d, d)), poses=solution.poses)
@@ -237,12 +258,13 @@ pgo.compare_poses(
 #
 # </details>
 #
-# **3.** How often does the worst of the eight rings wind round? Add up its angles.
+# **3.** How often does the chain of the worst of the eight answers wind around the ring? Add up its
+# angles.
 #
 # <details><summary>Answer</summary>
 #
-# Twice or more, or the wrong way: any number but once. Changing it means tearing the chain open, so that no small
-# move does.
+# Twice or more, or in the wrong direction: any number except once. To change this number the chain
+# would have to be cut open, which no small change of the poses does.
 #
 # ```python
 # angles = pgo.log_map(np.swapaxes(stuck.R, 1, 2) @ np.roll(stuck.R, -1, axis=0))[:, 0]

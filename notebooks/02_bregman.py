@@ -1,15 +1,16 @@
 # %% [markdown]
 # # 2. Why does adding the residual back make a penalty exact?
 #
-# Open with `jupyter lab notebooks/02_bregman.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+# Open with `jupyter lab notebooks/02_bregman.ipynb`; `pip install -e '.[notebooks,fast]'` installs
+# it.
 #
 # The paper's section *Background of Bregman iteration* starts from equation (1), `problem bregman`,
 #
 # $$\min_x J(x) \quad \text{subject to} \quad \mathcal{K} x = f,$$
 #
-# with $J$ convex. A penalty $\frac\alpha2 \lVert \mathcal{K} x - f \rVert^2$ instead of the constraint gives an
-# easier problem with a wrong solution. Bregman iteration solves that easier problem a few times and ends at the
-# right one.
+# with $J$ convex. A penalty $\frac\alpha2 \lVert \mathcal{K} x - f \rVert^2$ instead of the
+# constraint gives an easier problem with a wrong solution. Bregman iteration solves the easier
+# problem a few times and converges to the right solution.
 
 # %%
 import itertools
@@ -28,8 +29,8 @@ plt.rcParams["figure.dpi"] = 150
 # %% [markdown]
 # ## A problem whose answer we know
 #
-# *Basis pursuit*: $J(x) = \lVert x \rVert_1$ finds the sparsest $x$ with $\mathcal{K} x = f$, if it is sparse
-# enough. Here 60 unknowns, 25 equations, 5 nonzeros.
+# *Basis pursuit*: $J(x) = \lVert x \rVert_1$ finds the sparsest $x$ with $\mathcal{K} x = f$, if it
+# is sparse enough. Here there are 60 unknowns, 25 equations and 5 nonzeros.
 
 # %%
 rng = np.random.default_rng(0)
@@ -39,28 +40,31 @@ truth[rng.choice(60, 5, replace=False)] = rng.normal(0.0, 1.0, 5) + np.sign(rng.
 f = K @ truth
 
 # %% [markdown]
-# The penalty alone: every $\alpha$ gives a shrunken $x$, and a hundred times the penalty buys a ninth of the
-# error.
+# With the penalty alone, every $\alpha$ gives an $x$ that is too small. A penalty that is a hundred
+# times larger reduces the error only to a ninth.
 
 # %%
 x = cp.Variable(60)
 for alpha in (1.0, 10.0, 100.0):
-    cp.Problem(cp.Minimize(cp.norm1(x) + alpha / 2 * cp.sum_squares(K @ x - f))).solve(solver=cp.CLARABEL)
+    cp.Problem(cp.Minimize(cp.norm1(x) + alpha / 2 * cp.sum_squares(K @ x - f))).solve(
+        solver=cp.CLARABEL
+    )
     print(f"alpha = {alpha:5.0f}   ||x - truth|| = {np.linalg.norm(x.value - truth):.4f}")
 
 # %% [markdown]
 # ## The iteration by hand
 #
-# Equation (2), `update B`: let $p^k$ be a subgradient of $J$ at $x^k$, and replace $J$ by the *Bregman distance*
-# $\mathcal{B}_J^{p^k}(x, x^k) = J(x) - J(x^k) - \langle p^k, x - x^k \rangle$, by how much $J$ rises above its
-# tangent at $x^k$:
+# Equation (2), `update B`: let $p^k$ be a subgradient of $J$ at $x^k$, and replace $J$ by the
+# *Bregman distance* $\mathcal{B}_J^{p^k}(x, x^k) = J(x) - J(x^k) - \langle p^k, x - x^k \rangle$,
+# the height of $J$ above its tangent at $x^k$:
 #
 # $$x^{k+1} = \arg\min_x \mathcal{B}_J^{p^k}(x, x^k) + \tfrac\alpha2 \lVert \mathcal{K} x - f \rVert^2, \qquad
 #   p^{k+1} = p^k - \alpha \mathcal{K}^\top (\mathcal{K} x^{k+1} - f).$$
 #
-# The second line is the optimality condition of the first, so $p^{k+1}$ is a subgradient at $x^{k+1}$ again.
-# What is constant in $x$ can be dropped: only $-\langle p, x \rangle$ stays. $p$ is a cvxpy `Parameter`, so the
-# problem is compiled once.
+# The second line is the optimality condition of the first, so $p^{k+1}$ is a subgradient at
+# $x^{k+1}$ again. Terms that do not depend on $x$ can be dropped, so that only
+# $-\langle p, x \rangle$ remains. $p$ is a cvxpy `Parameter`, so that cvxpy compiles the problem
+# once.
 
 # %%
 alpha = 5.0
@@ -80,21 +84,22 @@ for k in range(12):
     )
 
 # %% [markdown]
-# For eight steps $x$ hardly comes closer; two steps later the error is at the solver's tolerance. $J$ is
-# piecewise linear: there are finitely many signs and supports that $x$ can have, and once the right one is
-# found the equations fix the rest. Until then it is $p$ that moves, at every step.
+# For eight steps $x$ hardly approaches the solution; two steps later the error is at the solver's
+# tolerance. $J$ is piecewise linear, so $x$ can have only finitely many sign patterns. Once the
+# right pattern is found, the equations determine the rest. Until then, each step changes $p$.
 #
 # ## Two lines
 #
-# Equation (4), `bregman update`, has no subgradient in it. Put $p^k = -\alpha \mathcal{K}^\top b^k$ and complete the
-# square: $-\langle p^k, x \rangle = \alpha \langle b^k, \mathcal{K} x \rangle$ moves into the penalty,
+# Equation (4), `bregman update`, needs no subgradient. Put $p^k = -\alpha \mathcal{K}^\top b^k$ and
+# complete the square: $-\langle p^k, x \rangle = \alpha \langle b^k, \mathcal{K} x \rangle$ moves
+# into the penalty,
 #
 # $$x^{k+1} = \arg\min_x J(x) + \tfrac\alpha2 \lVert \mathcal{K} x - f + b^k \rVert^2, \qquad
 #   b^{k+1} = b^k + \mathcal{K} x^{k+1} - f.$$
 #
-# Whatever residual is left is *added back* to the data: next time $x$ is asked to overshoot by as much as it
-# fell short. That is all of it. The $B$ of the paper's Algorithm 1 is this $b$, with $\mathcal{K} x = f$ there
-# being $R - \omega = 0$.
+# The remaining residual is *added back* to the data: the next subproblem asks $x$ to overshoot by
+# the amount by which it fell short. This is the whole method. The $B$ of the paper's Algorithm 1 is
+# this $b$, and its constraint $\mathcal{K} x = f$ is $R - \omega = 0$.
 
 # %%
 shift = cp.Parameter(25)
@@ -114,17 +119,22 @@ for x_bregman, p_bregman in by_hand:
 
 # %%
 problem = basis_pursuit(K, f)
-for name, method in (("update B", solvers.Bregman(alpha=alpha)), ("two lines", solvers.TwoLineBregman(alpha=alpha))):
+for name, method in (
+    ("update B", solvers.Bregman(alpha=alpha)),
+    ("two lines", solvers.TwoLineBregman(alpha=alpha)),
+):
     states = list(itertools.islice(solvers.iterate(method, problem), len(by_hand) + 1))
-    worst = max(np.abs(state.x - mine).max() for state, (mine, _) in zip(states[1:], by_hand, strict=True))
+    worst = max(
+        np.abs(state.x - mine).max() for state, (mine, _) in zip(states[1:], by_hand, strict=True)
+    )
     print(f"{name:10} differs from ours by at most {worst:.0e}")
 result = solvers.run(solvers.TwoLineBregman(alpha=alpha), problem)
 result
 
 # %% [markdown]
-# How fast is it guaranteed to be? With $D_0 = J(\tilde x) - \min J$ for any feasible $\tilde x$, Osher et al.
-# show $\lVert \mathcal{K} x^k - f \rVert \le \sqrt{2 D_0 / (\alpha k)}$: slow, and holding for every convex
-# $J$.
+# Which rate of convergence is guaranteed? With $D_0 = J(\tilde x) - \min J$ for any feasible
+# $\tilde x$, Osher et al. show $\lVert \mathcal{K} x^k - f \rVert \le \sqrt{2 D_0 / (\alpha k)}$.
+# This rate is slow, but it holds for every convex $J$.
 
 # %%
 D_0 = np.abs(truth).sum()
@@ -133,31 +143,35 @@ bounds = [feasibility_bound(D_0, alpha, k) for k in range(1, len(residuals))]
 plot_decay([("||K x - f||", residuals), ("its bound", np.array([np.nan, *bounds]))], "residual")
 
 # %% [markdown]
-# ## It forgets its errors
+# ## Errors of earlier steps are corrected
 #
-# Yin and Osher noticed that errors made in the subproblems do not add up. The step adds back whatever residual
-# there is, so an error of step $k$ is part of what step $k + 1$ corrects. Below, noise of 0.1 is added to every
-# entry of $x$ in the first three steps. The curve with $b = 0$ throughout is the penalty alone, whose error has
-# nothing to do with the accuracy of its subproblems and stays.
+# Yin and Osher noticed that errors made in the subproblems do not accumulate. Each step adds the
+# current residual back, so step $k + 1$ corrects an error that step $k$ made. Below, noise of 0.1
+# is added to every entry of $x$ in the first three steps. The curve with $b = 0$ throughout is the
+# penalty alone. Its error does not depend on the accuracy of its subproblems and remains.
 
 # %%
-study = solvers.error_forgetting(problem, truth, np.random.default_rng(1), method=solvers.TwoLineBregman(alpha=alpha))
+study = solvers.error_forgetting(
+    problem, truth, np.random.default_rng(1), method=solvers.TwoLineBregman(alpha=alpha)
+)
 plot_decay(study.curves(), "||x - truth||")
 
 # %% [markdown]
 # ## When the iterates are what we want
 #
-# *Total variation*, $J(u) = \sum_i |u_{i+1} - u_i|$, with $\mathcal{K} = I$ and $f$ a noisy signal. The
-# solution is $u = f$, the noise itself: useless. But on the way there the iterates start from a constant and
-# take back large jumps first, noise last (Osher et al. 2005). Stop where $\lVert u - f \rVert$ reaches the size
-# of the noise.
+# *Total variation*, $J(u) = \sum_i |u_{i+1} - u_i|$, with $\mathcal{K} = I$ and $f$ a noisy signal.
+# The solution is $u = f$, the noisy signal itself, which is useless. But the iterates start from a
+# constant, then recover large jumps, and recover the noise last (Osher et al. 2005). Stop where
+# $\lVert u - f \rVert$ reaches the size of the noise.
 
 # %%
 signal = np.repeat([0.0, 1.0, -0.5, 0.0, 2.0, 0.0], [20, 25, 25, 10, 10, 10])
 noise_std = 0.2
 noisy = signal + rng.normal(0.0, noise_std, 100)
 scale_space = total_variation_scale_space(noisy)
-states = list(itertools.islice(solvers.iterate(solvers.TwoLineBregman(alpha=0.05), scale_space), 151))
+states = list(
+    itertools.islice(solvers.iterate(solvers.TwoLineBregman(alpha=0.05), scale_space), 151)
+)
 iterates = np.array([state.x for state in states[1:]])
 to_data = np.linalg.norm(iterates - noisy, axis=1) / 10.0
 to_truth = np.linalg.norm(iterates - signal, axis=1) / 10.0
@@ -180,16 +194,19 @@ _ = right.legend(fontsize=8)
 # %% [markdown]
 # ## Where it fails
 #
-# 1. Just seen: run on, and it converges to the noise. With a noisy $f$, *converged* is not what you want.
-# 2. An error in the **last** step is not forgotten; there is no later step to correct it.
-# 3. If no $x$ has $\mathcal{K} x = f$, what is added back never ends: $b$ grows without bound, by the same
-#    amount at every step, while $x$ stands still.
-# 4. All of this is proven for convex $J$ and linear constraints. In SOC the constraint is not convex: [notebook
-#    4](04_splitting_orthogonality.ipynb) shows what is left then.
+# 1. As just shown, the iteration converges to the noisy signal. With a noisy $f$, the limit is not
+#    what you want.
+# 2. An error in the **last** step is not corrected, because no later step follows.
+# 3. If no $x$ satisfies $\mathcal{K} x = f$, the residual never vanishes: $b$ grows without bound,
+#    by the same amount in every step, while $x$ stays constant.
+# 4. All of this is proven for convex $J$ and linear constraints. In SOC the constraint is not
+#    convex; [notebook 4](04_splitting_orthogonality.ipynb) shows what still holds.
 
 # %%
 impossible = basis_pursuit(np.vstack([K[:3], K[:1]]), np.append(f[:3], f[0] + 1.0))
-states = list(itertools.islice(solvers.iterate(solvers.TwoLineBregman(alpha=alpha), impossible), 41))
+states = list(
+    itertools.islice(solvers.iterate(solvers.TwoLineBregman(alpha=alpha), impossible), 41)
+)
 growth = [float(np.linalg.norm(state.b)) for state in states]
 print("||b|| at k = 10, 20, 30, 40:", np.round(growth[10::10], 2))
 
@@ -200,8 +217,8 @@ print("||b|| at k = 10, 20, 30, 40:", np.round(growth[10::10], 2))
 #
 # <details><summary>Answer</summary>
 #
-# The penalty's answer: $\mathcal{B}_J^0(x, x^0)$ is $J(x)$ plus a constant. All that is gained comes from the second
-# step on.
+# The minimiser of the penalty problem, because $\mathcal{B}_J^0(x, x^0)$ is $J(x)$ plus a constant.
+# The improvement begins with the second step.
 #
 # ```python
 # first = cp.Problem(cp.Minimize(cp.norm1(x) + alpha / 2 * cp.sum_squares(K @ x - f)))
@@ -215,7 +232,7 @@ print("||b|| at k = 10, 20, 30, 40:", np.round(growth[10::10], 2))
 #
 # <details><summary>Answer</summary>
 #
-# Ten times the old one: every subproblem is multiplied by 10, $p$ too, and $b$ stays.
+# Ten times the old one: every subproblem and $p$ are multiplied by 10, and $b$ does not change.
 #
 # ```python
 # y = cp.Variable(60)
@@ -229,12 +246,13 @@ print("||b|| at k = 10, 20, 30, 40:", np.round(growth[10::10], 2))
 #
 # </details>
 #
-# **3.** Take only the first 12 of the 25 equations. Does the iteration still converge? To the truth?
+# **3.** Take only the first 12 of the 25 equations. Does the iteration still converge? To the
+# truth?
 #
 # <details><summary>Answer</summary>
 #
-# It converges, to a smallest 1-norm under 12 equations, and that is not the truth: too few for five nonzeros. Nothing
-# in the residual tells.
+# It converges to the smallest 1-norm under 12 equations, which is not the truth: 12 equations are
+# too few for five nonzeros. The residual does not show this.
 #
 # ```python
 # fewer = solvers.run(solvers.TwoLineBregman(alpha=alpha), basis_pursuit(K[:12], f[:12])).state.x

@@ -1,10 +1,12 @@
 # %% [markdown]
 # # 3. What does it cost to minimise only a little before the multiplier moves?
 #
-# Open with `jupyter lab notebooks/03_bregman_is_admm.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+# Open with `jupyter lab notebooks/03_bregman_is_admm.ipynb`; `pip install -e '.[notebooks,fast]'`
+# installs it.
 #
-# The paper's subsection *Equivalence to ADMM* says: iterate the minimisation of the augmented Lagrangian $T$
-# times, then update the multiplier; with $T = 1$ this is ADMM. Is $T = 1$ a sacrifice? This notebook counts.
+# The paper's subsection *Equivalence to ADMM* iterates the minimisation of the augmented Lagrangian
+# $T$ times and then updates the multiplier; with $T = 1$ this is ADMM. Does $T = 1$ cost
+# iterations? This notebook counts them.
 
 # %%
 import itertools
@@ -28,10 +30,10 @@ plt.rcParams["figure.dpi"] = 150
 #
 # and the *method of multipliers* (equation (8), `minbregman`) is
 # $x^{k+1} = \arg\min_x \mathcal{L}_\alpha(x, \lambda^k)$,
-# $\lambda^{k+1} = \lambda^k + \alpha (f - \mathcal{K} x^{k+1})$. Complete the square with
-# $b = -\lambda / \alpha$: it is the two-line form (4), `bregman update`, of [notebook 2](02_bregman.ipynb). Put
-# $p = \mathcal{K}^\top \lambda$: it is (2), `update B`. No approximation is involved, as the same numbers in all
-# three show.
+# $\lambda^{k+1} = \lambda^k + \alpha (f - \mathcal{K} x^{k+1})$. Completing the square with
+# $b = -\lambda / \alpha$ gives the two-line form (4), `bregman update`, of
+# [notebook 2](02_bregman.ipynb). With $p = \mathcal{K}^\top \lambda$ it is (2), `update B`. The
+# forms are equivalent without any approximation, so all three give the same numbers.
 
 # %%
 rng = np.random.default_rng(0)
@@ -41,18 +43,20 @@ runs = [list(itertools.islice(solvers.iterate(form, pursuit), 6)) for form in fo
 for bregman, two_line, multiplier in zip(*runs, strict=True):
     p = [bregman.p, -pursuit.K.T @ two_line.b, pursuit.K.T @ multiplier.lam]
     x = [bregman.x, two_line.x, multiplier.x]
-    print(f"k = {multiplier.k}   x differs by {np.ptp(x, axis=0).max():.0e}, p by {np.ptp(p, axis=0).max():.0e}")
+    print(
+        f"k = {multiplier.k}   x differs by {np.ptp(x, axis=0).max():.0e}, p by {np.ptp(p, axis=0).max():.0e}"
+    )
 
 # %% [markdown]
 # ## Two blocks
 #
-# The minimisation over all of $x$ at once can be as hard as the problem. Split $x$ into blocks that are easy
-# one by one. *Total variation denoising* of a signal $f$:
+# The minimisation over all of $x$ at once can be as hard as the original problem. Split $x$ into
+# blocks for which it is easy. *Total variation denoising* of a signal $f$:
 #
 # $$\min_{u, d} \tfrac12 \lVert u - f \rVert^2 + w \lVert d \rVert_1 \quad \text{subject to} \quad D u - d = 0.$$
 #
-# Over $u$ alone it is a linear system, over $d$ alone soft thresholding. $T$ passes over both, then the
-# multiplier, in its scaled form $b$:
+# The minimisation over $u$ alone is a linear system, and over $d$ alone it is soft thresholding.
+# The code does $T$ passes over both blocks, and then updates the multiplier in its scaled form $b$:
 
 
 # %%
@@ -76,30 +80,36 @@ def alternate(alpha, passes, iterations):
 
 
 # %% [markdown]
-# The last two numbers are the residuals (Boyd et al. 2011, section 3.3). The *primal* one says how far the
-# constraint is from holding. The *dual* one says how far $(u, d)$ is from minimising the Lagrangian: $u$ was
-# found with the old $d$.
+# The last two numbers are the residuals (Boyd et al. 2011, section 3.3). The *primal* residual
+# measures the violation of the constraint. The *dual* residual measures how far $(u, d)$ is from
+# minimising the Lagrangian, because $u$ was computed with the old $d$.
 #
 # ## The library agrees
 #
-# `AlternatingBregman` knows nothing of thresholds: it gives each block to cvxpy and Clarabel. Its states are
-# the same.
+# `AlternatingBregman` does not use soft thresholding: it solves each block with cvxpy and Clarabel.
+# Its states are the same.
 
 # %%
 denoising = total_variation_denoising(noisy, weight)
 worst_difference = {}
 for T in (1, 3):
-    states = list(itertools.islice(solvers.iterate(solvers.AlternatingBregman(alpha=1.0, passes=T), denoising), 16))
+    states = list(
+        itertools.islice(
+            solvers.iterate(solvers.AlternatingBregman(alpha=1.0, passes=T), denoising), 16
+        )
+    )
     ours = list(alternate(1.0, T, 15))
     worst_difference[T] = max(
-        np.abs(state.x - np.concatenate([u, d])).max() for state, (u, d, *_) in zip(states[1:], ours, strict=True)
+        np.abs(state.x - np.concatenate([u, d])).max()
+        for state, (u, d, *_) in zip(states[1:], ours, strict=True)
     )
     print(f"T = {T}: the same to {worst_difference[T]:.0e} in 15 iterations")
 
 # %% [markdown]
 # ## T against alpha
 #
-# Count outer iterations, and inner passes in all, until both residuals are below $10^{-4}$.
+# Count the outer iterations, and the total number of inner passes, until both residuals are below
+# $10^{-4}$.
 
 
 # %%
@@ -113,7 +123,9 @@ def residuals(alpha, passes, most=3000):
 
 
 penalties, all_passes = [0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0], (1, 2, 5, 20)
-counts = np.array([[len(residuals(alpha, T)) for alpha in penalties] for T in all_passes], dtype=float)
+counts = np.array(
+    [[len(residuals(alpha, T)) for alpha in penalties] for T in all_passes], dtype=float
+)
 counts[counts == 3000] = np.nan  # not within the limit
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(7.5, 2.8), layout="constrained", sharey=True)
@@ -127,15 +139,17 @@ for axes, title in ((left, "outer iterations"), (right, "passes over the blocks"
 _ = left.legend(fontsize=8)
 
 # %% [markdown]
-# Two regimes, and in neither is a large $T$ worth it:
+# There are two regimes, and a large $T$ does not pay in either of them:
 #
-# * **small penalty** (left of the valley): the multiplier moves by $\alpha$ times the residual, and that is
-#   what takes long. One pass already minimises well enough; more passes change nothing but the bill.
-# * **large penalty** (right of it): the blocks hold each other fast, and the passes are what takes long. $T$
-#   passes save a factor $T$ of outer iterations, so the number of passes is the same.
+# * **small penalty** (left of the minimum): each iteration changes the multiplier by $\alpha$ times
+#   the residual, and this limits the speed. One pass already minimises well enough, and more passes
+#   only add work.
+# * **large penalty** (right of the minimum): the penalty couples the blocks strongly, and the
+#   passes limit the speed. $T$ passes save a factor $T$ of outer iterations, so the number of
+#   passes is the same.
 #
-# $T = 1$ is no sacrifice then, and for robots, where a pass means a round of messages, it is the natural
-# choice. What matters is $\alpha$. Here are the residuals for three of them.
+# So $T = 1$ costs nothing. For robots, where a pass is a round of messages, it is the natural
+# choice. The choice of $\alpha$ matters more. Here are the residuals for three values of it.
 
 # %%
 figure, panels = plt.subplots(1, 3, figsize=(7.5, 2.6), layout="constrained", sharey=True)
@@ -152,11 +166,11 @@ _ = panels[0].legend(fontsize=8)
 # %% [markdown]
 # ## The adaptive penalty
 #
-# The picture holds the rule that the paper takes from Boyd et al. (section 3.4.1) in its subsection *The SOC
-# Algorithm*: with a small penalty the primal residual is far above the dual one, with a large penalty far
-# below. So double $\alpha$ when $r > \mu s$ and halve it when $s > \mu r$. One line is easily forgotten:
-# $b = -\lambda / \alpha$ is *scaled*. When $\alpha$ changes and $\lambda$ is not to jump, $b$ must be rescaled
-# by the inverse.
+# The picture explains the rule that the paper takes from Boyd et al. (section 3.4.1) in its
+# subsection *The SOC Algorithm*: with a small penalty the primal residual is far above the dual
+# one, with a large penalty far below. So the rule doubles $\alpha$ when $r > \mu s$ and halves it
+# when $s > \mu r$. One line is easily forgotten: $b = -\lambda / \alpha$ is *scaled*. When $\alpha$
+# changes, $b$ must be divided by the same factor, so that $\lambda$ does not change.
 
 
 # %%
@@ -183,31 +197,38 @@ for alpha, (k, last) in rescaled.items():
     print(f"{alpha:14g} {len(residuals(alpha, 1)):9} {k:10} ({last:.3g}) {not_rescaled[alpha]:20}")
 
 # %% [markdown]
-# From any start 70 to 80 iterations, and without the rescaling none of the runs ends within the limit of 1000:
-# every change of $\alpha$ throws the multiplier off, which changes the residuals, which changes $\alpha$.
+# From every initial $\alpha$ the rule needs 70 to 80 iterations. Without the rescaling, no run ends
+# within the limit of 1000: every change of $\alpha$ changes the multiplier, which changes the
+# residuals, which change $\alpha$ again.
 #
-# The library has this rule to the letter as `BoydPenalty`, for SOC as in the paper. Its dual residual carries the
-# unit of the weights, and so does its answer. `BalancedPenalty` compares relative residuals instead, without the
-# factor $\rho$, as OSQP does, and moves by a factor of five only when they differ by 25, because every new $\rho$
-# costs a factorisation. (A fixed
-# $\rho$ that is too small for SOC to converge at all, as 1 is here, is raised by a safeguard: [notebook
-# 4](04_splitting_orthogonality.ipynb).)
+# The library has exactly this rule as `BoydPenalty`, for SOC as in the paper. Its dual residual has
+# the unit of the weights, so its result depends on that unit. `BalancedPenalty` compares relative
+# residuals instead, without the factor $\rho$, as OSQP does, and changes $\rho$ by a factor of
+# five, but only when they differ by a factor of 25, because every new $\rho$ costs a factorisation.
+# (A safeguard raises a fixed $\rho$ that is too small for SOC to converge, as 1 is here:
+# [notebook 4](04_splitting_orthogonality.ipynb).)
 
 # %%
 problem = pgo.PGOProblem(pgo.load("grid"))
 for start in (1.0, 10.0, 100.0, 1000.0):
-    fixed = solvers.run(solvers.SOC(penalty=solvers.FixedPenalty(start), acceleration=None), problem)
-    balanced = solvers.BalancedPenalty(scale=start / problem.M.diagonal()[problem.num_poses :].mean())
+    fixed = solvers.run(
+        solvers.SOC(penalty=solvers.FixedPenalty(start), acceleration=None), problem
+    )
+    balanced = solvers.BalancedPenalty(
+        scale=start / problem.M.diagonal()[problem.num_poses :].mean()
+    )
     adapted = solvers.run(solvers.SOC(penalty=balanced, acceleration=None), problem)
-    print(f"rho = {start:6.0f}   fixed: {fixed.status.name} after {fixed.iterations}   adaptive: {adapted.iterations}")
+    print(
+        f"rho = {start:6.0f}   fixed: {fixed.status.name} after {fixed.iterations}   adaptive: {adapted.iterations}"
+    )
 
 # %% [markdown]
 # ## Where it fails
 #
-# With two blocks and convex terms ADMM converges for every $\alpha > 0$. **With three it need not**, however
-# simple the problem. Chen, He, Ye and Yuan (2016) take $J = 0$ and $\mathcal{K} x = 0$, where $\mathcal{K}$ is
-# an invertible 3 by 3 matrix, so that the answer is zero. One pass over $x_1, x_2, x_3$ and the multiplier: it
-# spirals outwards.
+# With two blocks and convex terms ADMM converges for every $\alpha > 0$. **With three it need
+# not**, however simple the problem. Chen, He, Ye and Yuan (2016) take $J = 0$ and
+# $\mathcal{K} x = 0$, where $\mathcal{K}$ is an invertible 3 by 3 matrix, so that the answer is
+# zero. With one pass over $x_1, x_2, x_3$ and the multiplier, the iterates spiral outwards.
 
 # %%
 K = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 2.0], [1.0, 2.0, 2.0]])
@@ -229,20 +250,21 @@ for T, size in spiral.items():
     print(f"T = {T:2}   ||x|| after 400 iterations {size:.1e}")
 
 # %% [markdown]
-# Here, for once, $T$ decides: with enough passes it is the method of multipliers, which converges. SOC has two
-# blocks, $R$ and $\omega$, so this does not hit it; what can hit it is that $\omega$'s set is not convex
-# ([notebook 4](04_splitting_orthogonality.ipynb)).
+# Here $T$ decides: with enough passes the iteration is the method of multipliers, which converges.
+# SOC has two blocks, $R$ and $\omega$, so this failure does not affect it. But the set of $\omega$
+# is not convex, which can affect it ([notebook 4](04_splitting_orthogonality.ipynb)).
 
 # %% [markdown]
 # ## Exercises
 #
-# **1.** The signal is measured in millivolts in place of volts: $f$ and $w$ are 1000 times as large. Which $\alpha$
-# gives the same run?
+# **1.** The signal is measured in millivolts in place of volts: $f$ and $w$ are 1000 times as
+# large. Which $\alpha$ gives the same run?
 #
 # <details><summary>Answer</summary>
 #
-# The same $\alpha$: it weighs $D u$ against $u$, both in millivolts now. All iterates are multiplied by 1000. Where
-# the penalty has a unit, as $\rho$ in SOC has that of the weights, it changes with it.
+# The same $\alpha$: it weighs $D u$ against $u$, and both are in millivolts now. All iterates are
+# multiplied by 1000. Where the penalty has a unit, as $\rho$ in SOC has the unit of the weights, it
+# must change with the unit.
 #
 # ```python
 # millivolts = total_variation_denoising(1000 * noisy, 1000 * weight)
@@ -253,13 +275,13 @@ for T, size in spiral.items():
 #
 # </details>
 #
-# **2.** *Over-relaxation*: in the update of $d$ and of $b$ put $\beta D u + (1 - \beta) d$ for $D u$. What does
-# $\beta = 1.6$ bring at $\alpha = 1$?
+# **2.** *Over-relaxation*: in the updates of $d$ and of $b$, replace $D u$ by
+# $\beta D u + (1 - \beta) d$. How many iterations does $\beta = 1.6$ save at $\alpha = 1$?
 #
 # <details><summary>Answer</summary>
 #
-# About a third of the iterations, for no work. The library's `over_relaxation` and `alpha` of its methods are this
-# $\beta$.
+# About a third of the iterations, without additional work. The library's `over_relaxation` and
+# `alpha` of its methods are this $\beta$.
 #
 # ```python
 # def relaxed(alpha, beta):
@@ -279,12 +301,12 @@ for T, size in spiral.items():
 #
 # </details>
 #
-# **3.** The pass over three blocks is a linear map of $(x, b)$. Which number of it decides between spiral and
-# convergence?
+# **3.** The pass over three blocks is a linear map of $(x, b)$. Which property of this map decides
+# between divergence and convergence?
 #
 # <details><summary>Answer</summary>
 #
-# Its spectral radius: above 1 it spirals outwards.
+# Its spectral radius: if it is above 1, the iterates spiral outwards.
 #
 # ```python
 # def one_pass(x, b):

@@ -1,12 +1,13 @@
 # %% [markdown]
 # # 4. How can a convex solver be made to return rotations, and how large must rho be?
 #
-# Open with `jupyter lab notebooks/04_splitting_orthogonality.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+# Open with `jupyter lab notebooks/04_splitting_orthogonality.ipynb`;
+# `pip install -e '.[notebooks,fast]'` installs it.
 #
-# The constraint $R^\top R = I$ is the whole difficulty of pose graph optimisation: without it, equation
-# (16), `min overall`, of the paper is a least-squares problem. *Splitting of orthogonality constraints* (SOC, Lai and
-# Osher 2014; the paper's Algorithm 1, `algo1: SOC`) gives every $R$ a copy $\omega$ that carries the
-# constraint, and lets Bregman iteration pull the two together.
+# The constraint $R^\top R = I$ is the only difficulty of pose graph optimisation: without it,
+# equation (16), `min overall`, of the paper is a least-squares problem. *Splitting of orthogonality
+# constraints* (SOC, Lai and Osher 2014; the paper's Algorithm 1, `algo1: SOC`) gives every $R$ a
+# copy $\omega$ that carries the constraint, and Bregman iteration makes the two equal.
 
 # %%
 import itertools
@@ -25,13 +26,14 @@ plt.rcParams["figure.dpi"] = 150
 # %% [markdown]
 # ## The one problem with orthogonality that is easy
 #
-# The rotation nearest to a matrix $Y$:
-# $\lVert \omega - Y \rVert_F^2 = \text{const} - 2 \operatorname{tr}(\omega^\top Y)$. With the singular value
-# decomposition $Y = U D V^\top$ it is
+# The rotation nearest to a matrix $Y$ has a closed form:
+# $\lVert \omega - Y \rVert_F^2 = \text{const} - 2 \operatorname{tr}(\omega^\top Y)$. With the
+# singular value decomposition $Y = U D V^\top$ we have
 # $\operatorname{tr}(\omega^\top Y) = \operatorname{tr}(D \, V^\top \omega^\top U)$, where
-# $V^\top \omega^\top U$ is orthogonal and no diagonal entry of it is above one. So $\omega = U V^\top$ is best:
-# step (b), and what the paper writes as $U I_{n \times n} V^\top$. If its determinant is $-1$ it is a
-# reflection; then the smallest singular value pays: $\omega = U \operatorname{diag}(1, 1, -1) V^\top$.
+# $V^\top \omega^\top U$ is orthogonal and none of its diagonal entries is above one. So
+# $\omega = U V^\top$ is optimal. This is step (b), which the paper writes as
+# $U I_{n \times n} V^\top$. If its determinant is $-1$, it is a reflection; then the sign of the
+# smallest singular value changes: $\omega = U \operatorname{diag}(1, 1, -1) V^\top$.
 
 
 # %%
@@ -46,8 +48,9 @@ by_svd = np.array([nearest_rotation(matrix) for matrix in Y])
 print("differs from the library by", np.abs(by_svd - pgo.project_to_rotations(Y)).max())
 
 # %% [markdown]
-# *Procrustes' problem*, $\min \lVert A X - C \rVert_F^2$ s.t. $X^\top X = I$, has the same closed form, with
-# $Y = A^\top C$. SOC does not know that: it needs the objective to be convex and no more. It finds the same.
+# *Procrustes' problem*, $\min \lVert A X - C \rVert_F^2$ s.t. $X^\top X = I$, has the same closed
+# form, with $Y = A^\top C$. SOC does not use this: it only needs a convex objective. It finds the
+# same solution.
 
 # %%
 A, C = rng.standard_normal((8, 3)), rng.standard_normal((8, 3))
@@ -65,10 +68,11 @@ print(f"closed form {closed_form:.8f}, SOC {found.objective:.8f}")
 #   \text{(b)}\; \omega = \text{nearest rotation to } R + B, \qquad
 #   \text{(c)}\; B \leftarrow B + R - \omega.$$
 #
-# $f$ is the whole of equation (16), `min overall` here, in rotations *and* translations. (The paper's step (a) has
-# rotations only, each robot with its neighbours frozen; [notebook 7](07_the_papers_tables.ipynb) runs that
-# one.) Its residuals are linear in $X$, which stacks the $t_i$ and the rows of all $R_i^\top$. (a) is a convex
-# quadratic program; cvxpy compiles it once, with $V = \omega - B$ as a parameter.
+# Here $f$ is the complete cost of equation (16), `min overall`, in rotations *and* translations.
+# (The paper's step (a) has rotations only, and each robot keeps its neighbours fixed;
+# [notebook 7](07_the_papers_tables.ipynb) runs this version.) Its residuals are linear in $X$,
+# which stacks the $t_i$ and the rows of all $R_i^\top$. (a) is a convex quadratic program; cvxpy
+# compiles it once, with $V = \omega - B$ as a parameter.
 
 # %%
 boxes = [
@@ -84,7 +88,15 @@ axes.set(xlim=(-1.0, 6.0), ylim=(-0.5, 5.5))
 axes.axis("off")
 for row, (name, text) in zip(range(5, -1, -1), boxes, strict=True):
     colour = "#FDE9D9" if name == "done?" else "#DCEBF7"
-    axes.text(3.0, row, text, ha="center", va="center", fontsize=8, bbox={"boxstyle": "round,pad=0.45", "fc": colour})
+    axes.text(
+        3.0,
+        row,
+        text,
+        ha="center",
+        va="center",
+        fontsize=8,
+        bbox={"boxstyle": "round,pad=0.45", "fc": colour},
+    )
     axes.text(-0.9, row, name, va="center", fontsize=9, weight="bold")
     if row > 0:
         axes.annotate("", (3.0, row - 0.67), (3.0, row - 0.33), arrowprops={"arrowstyle": "->"})
@@ -116,9 +128,9 @@ for _ in range(20):
 # %% [markdown]
 # ## The library agrees, with three back ends
 #
-# A convex QP without constraints is a linear system: $(M + \tfrac\rho2 D) X = \tfrac\rho2 D V$, with the same
-# matrix at every iteration. So factor it once (`FACTORIZED`); or use accelerated gradients as the paper does
-# (`FISTA`); or an interior-point method (`CLARABEL`).
+# A convex QP without constraints is a linear system: $(M + \tfrac\rho2 D) X = \tfrac\rho2 D V$,
+# with the same matrix at every iteration. One can factor it once (`FACTORIZED`), use accelerated
+# gradients as the paper does (`FISTA`), or use an interior-point method (`CLARABEL`).
 
 # %%
 best = solvers.solve(problem)
@@ -126,33 +138,37 @@ plain = {"penalty": solvers.FixedPenalty(rho), "acceleration": None}
 differences, seconds = {}, {}
 for back_end in solvers.RStep:
     began = time.perf_counter()
-    states = list(itertools.islice(solvers.iterate(solvers.SOC(r_step=back_end, **plain), problem), 21))
+    states = list(
+        itertools.islice(solvers.iterate(solvers.SOC(r_step=back_end, **plain), problem), 21)
+    )
     seconds[back_end] = time.perf_counter() - began
     pairs = zip(states[1:], by_hand, strict=True)
     differences[back_end] = max(np.abs(state.omega - mine).max() for state, mine in pairs)
-    print(f"{back_end.name:10}  differs from ours by {differences[back_end]:.0e}   {1e3 * seconds[back_end]:.0f} ms")
+    print(
+        f"{back_end.name:10}  differs from ours by {differences[back_end]:.0e}   {1e3 * seconds[back_end]:.0f} ms"
+    )
 
 # %% [markdown]
-# The iterates do not depend on the back end, the time does: two triangular solves beat everything else, because
-# the matrix never changes. FISTA pays where nothing can be factored; Clarabel where step (a) has constraints or
-# terms of one's own (`solvers.ExtendedSOC`).
+# The iterates do not depend on the back end, but the time does. Two triangular solves are the
+# fastest, because the matrix never changes. FISTA is useful where the matrix cannot be factored,
+# and Clarabel where you add constraints or terms to step (a) (`solvers.ExtendedSOC`).
 #
 # ## How large must rho be?
 #
-# At a stationary point (a) says $2 (M X)_i + \rho (R_i - \omega_i + B_i)^\top = 0$ for the rows of pose $i$,
-# and $(M X)_i = \Lambda_i R_i^\top$ with the symmetric multipliers $\Lambda_i$ of $R_i R_i^\top = I$. With
-# $R = \omega$:
+# At a stationary point, (a) gives $2 (M X)_i + \rho (R_i - \omega_i + B_i)^\top = 0$ for the rows
+# of pose $i$, and $(M X)_i = \Lambda_i R_i^\top$ with the symmetric multipliers $\Lambda_i$ of
+# $R_i R_i^\top = I$. With $R = \omega$:
 #
 # $$B_i = -\tfrac{2}{\rho} R_i \Lambda_i, \qquad R_i + B_i = R_i \left( I - \tfrac2\rho \Lambda_i \right).$$
 #
-# Step (b) must give back $R_i$. A symmetric 3 by 3 matrix has $I$ as its nearest rotation if and only if its
-# two smallest eigenvalues have a sum $\ge 0$. With $\lambda_1 \ge \lambda_2$ the largest of $\Lambda_i$ that
-# reads
+# Step (b) must return $R_i$. The rotation nearest to a symmetric 3 by 3 matrix is $I$ if and only
+# if the sum of its two smallest eigenvalues is $\ge 0$. With $\lambda_1 \ge \lambda_2$, the two
+# largest eigenvalues of $\Lambda_i$, this condition is
 #
 # $$\rho \ge \lambda_1(\Lambda_i) + \lambda_2(\Lambda_i) \quad \text{for every pose } i.$$
 #
-# **With a smaller $\rho$ the optimum is not even a fixed point**: the recursion cannot stay there. Let us put
-# it there and take one step.
+# **With a smaller $\rho$ the optimum is not even a fixed point**: the recursion cannot stay there.
+# To see this, start at the optimum and take one step.
 
 
 # %%
@@ -180,8 +196,8 @@ for factor in (0.5, 0.9, 0.99, 1.01, 1.1, 2.0):
     )
 
 # %% [markdown]
-# The condition is sharp. It is necessary, not sufficient: a fixed point need not attract. From the chordal
-# start:
+# The condition is sharp. It is necessary but not sufficient, because a fixed point need not be
+# attractive. From the chordal initial estimate:
 
 
 # %%
@@ -196,24 +212,28 @@ def gaps(rho, iterations=120):
 factors = (0.5, 1.0, 1.5, 2.0, 4.0, 16.0, 64.0)
 curves = {factor: gaps(factor * threshold) for factor in factors}
 figure, axes = plt.subplots(figsize=(6.0, 3.4), layout="constrained")
-for (factor, gap), colour in zip(curves.items(), plt.cm.viridis(np.linspace(0.0, 0.9, len(factors))), strict=True):
+for (factor, gap), colour in zip(
+    curves.items(), plt.cm.viridis(np.linspace(0.0, 0.9, len(factors))), strict=True
+):
     axes.semilogy(np.arange(1, len(gap) + 1), gap, color=colour, label=f"{factor:g}")
 axes.set_xlabel("iteration")
 axes.set_ylabel("F(omega) / F* - 1")
-_ = figure.legend(title="rho over\nlambda_1 + lambda_2", fontsize=8, title_fontsize=8, loc="outside right upper")
+_ = figure.legend(
+    title="rho over\nlambda_1 + lambda_2", fontsize=8, title_fontsize=8, loc="outside right upper"
+)
 
 # %% [markdown]
 # On this graph:
 #
-# * Up to 1.5 the run never settles at the optimum. At 1.5 it first comes within $10^{-5}$ of it, and is then
-#   thrown out again: *a small residual on the way is no proof of convergence.*
-# * At 2 the convergence is fastest of those shown; from there on a larger $\rho$ only makes the steps shorter,
-#   and the iterations grow about as $\rho$ does.
+# * Up to 1.5 the run never converges to the optimum. At 1.5 it first comes within $10^{-5}$ of it
+#   and then moves away again: *a small residual during the run does not prove convergence.*
+# * At 2 the convergence is the fastest of those shown. A larger $\rho$ only makes the steps
+#   shorter, and the number of iterations grows about as $\rho$ does.
 #
-# The multipliers, which cost one product with $M$, tell where that valley is. The library's default,
-# `MultiplierPenalty`, takes $\rho_i = 8 \max(\lVert \Lambda_i \rVert, q\, m_i)$ at the chordal start: somewhat
-# to the safe side, and one $\rho$ for every pose, as the multipliers differ. Anderson acceleration then makes
-# up for what it costs.
+# The multipliers, which cost one product with $M$, tell where the best $\rho$ is. The library's
+# default, `MultiplierPenalty`, takes $\rho_i = 8 \max(\lVert \Lambda_i \rVert, q\, m_i)$ at the
+# chordal initial estimate. This is somewhat larger than necessary, for safety, and each pose has
+# its own $\rho$, because the multipliers differ. Anderson acceleration compensates for the cost.
 
 # %%
 everyday = {
@@ -224,18 +244,21 @@ everyday = {
 }
 runs = {name: solvers.run(soc, problem) for name, soc in everyday.items()}
 for name, run in runs.items():
-    print(f"{name:30} {run.status.name:15} {run.iterations:4} iterations, rho at the end {run.state.rho.mean():.3g}")
+    print(
+        f"{name:30} {run.status.name:15} {run.iterations:4} iterations, rho at the end {run.state.rho.mean():.3g}"
+    )
 
 # %% [markdown]
-# The last line asked for $\rho = 1$ and got 8: where the residual grows far above its smallest, the library
-# goes back to the best iterate and doubles $\rho$, keeping $\rho B$.
+# The last line requested $\rho = 1$ and ended with 8: where the residual grows far above its
+# smallest value, the library returns to the best iterate and doubles $\rho$, keeping $\rho B$.
 #
 # ## Where it fails
 #
-# 1. $\rho$ below the threshold, as above.
-# 2. A limit of SOC is a *stationary point*. Convexity would make that a minimum; rotations are not convex. On
-#    the ring of [notebook 1](01_quickstart.ipynb), started where the ring winds round twice, SOC stays there,
-#    with residuals as small as anywhere.
+# 1. $\rho$ is below the threshold, as above.
+# 2. A limit of SOC is a *stationary point*. In a convex problem that would be a minimum, but the
+#    set of rotations is not convex. On the ring of [notebook 1](01_quickstart.ipynb), started where
+#    the chain winds around the ring twice, SOC stays there, and its residuals become as small as
+#    anywhere else.
 
 # %%
 count = 30
@@ -250,7 +273,9 @@ ring = pgo.PoseGraph(
     name="ring",
 )
 ring_problem = pgo.PGOProblem(ring)
-twice = ring_problem.with_best_translations(pgo.exp_map(4 * np.pi / count * np.arange(count)[:, None]))
+twice = ring_problem.with_best_translations(
+    pgo.exp_map(4 * np.pi / count * np.arange(count)[:, None])
+)
 stuck = solvers.run(solvers.SOC(acceleration=None), ring_problem, twice)
 print(stuck)
 pgo.certify(ring_problem, stuck.poses)
@@ -258,13 +283,13 @@ pgo.certify(ring_problem, stuck.poses)
 # %% [markdown]
 # ## Exercises
 #
-# **1.** $Y = \operatorname{diag}(1, 1, -0.1)$. Which rotation is nearest, and how much farther is it than the nearest
-# orthogonal matrix?
+# **1.** $Y = \operatorname{diag}(1, 1, -0.1)$. Which rotation is nearest, and how much farther away
+# is it than the nearest orthogonal matrix?
 #
 # <details><summary>Answer</summary>
 #
-# $I$, at a distance of 1.1: the smallest singular value pays. The nearest orthogonal matrix is the reflection
-# $\operatorname{diag}(1, 1, -1)$, at 0.9.
+# $I$, at a distance of 1.1, because the sign of the smallest singular value changes. The nearest
+# orthogonal matrix is the reflection $\operatorname{diag}(1, 1, -1)$, at a distance of 0.9.
 #
 # ```python
 # flipped = np.diag([1.0, 1.0, -0.1])
@@ -279,8 +304,9 @@ pgo.certify(ring_problem, stuck.poses)
 #
 # <details><summary>Answer</summary>
 #
-# 100 times the old one: (a) is multiplied by 100, $B$ stays. So $\rho$ has the unit of the weights, and a fixed
-# default must be wrong for some graph; the multipliers scale with them.
+# 100 times the old one: (a) is multiplied by 100 and $B$ does not change. So $\rho$ has the unit of
+# the weights, and a fixed default value must be wrong for some graph. The multipliers scale with
+# the weights.
 #
 # ```python
 # light = problem.graph
@@ -298,8 +324,8 @@ pgo.certify(ring_problem, stuck.poses)
 #
 # <details><summary>Answer</summary>
 #
-# No: it begins with $B = 0$, and what holds an optimum in place is its multiplier, $\rho B$. It moves off and comes
-# back.
+# No. It begins with $B = 0$, but the optimum is a fixed point only with its multiplier, $\rho B$.
+# The iterates move away and return.
 #
 # ```python
 # film = list(itertools.islice(solvers.iterate(solvers.SOC(**plain), problem, best.poses), 200))

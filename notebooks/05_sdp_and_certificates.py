@@ -1,15 +1,20 @@
 # %% [markdown]
 # # 5. When does a convex relaxation prove that a local answer is the global one?
 #
-# Open with `jupyter lab notebooks/05_sdp_and_certificates.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+# Open with `jupyter lab notebooks/05_sdp_and_certificates.ipynb`;
+# `pip install -e '.[notebooks,fast]'` installs it.
 #
-# SE-Sync, which the paper compares with, finds certified global optima of a problem that is not convex. The
-# reason is a semidefinite relaxation that is *tight* as long as the noise is not too strong. This notebook
-# writes the relaxation and its dual in a few lines, shows which number is the certificate and which only looks
-# like one, watches the proven bound close in on $F$, and finds the noise at which tightness ends.
+# SE-Sync, with which the paper compares its results, finds certified global optima of a problem
+# that is not convex. The reason is a semidefinite relaxation that is *tight* as long as the noise
+# is not too strong. This notebook writes the relaxation and its dual in a few lines, and shows
+# which number is the certificate and which only looks like one. It follows the proven bound as it
+# approaches $F$, and finds the noise level at which tightness ends.
 
 # %%
 import itertools
+import json
+import tempfile
+from pathlib import Path
 
 import cvxpy as cp
 import matplotlib.pyplot as plt
@@ -27,13 +32,15 @@ plt.rcParams["figure.dpi"] = 150
 # %% [markdown]
 # ## The relaxation
 #
-# Given rotations, the best translations solve a linear system. Put them in: what is left of equation
-# (16), `min overall`, is a quadratic form in the rotations alone. With $Y$ the rows of all $R_i^\top$,
+# Given rotations, the best translations solve a linear system. With these translations, equation
+# (16), `min overall`, becomes a quadratic form in the rotations alone. With $Y$ the rows of all
+# $R_i^\top$,
 #
 # $$\min_t F(R, t) = \operatorname{tr}(Y^\top Q Y) = \operatorname{tr}(Q Z), \qquad Z = Y Y^\top.$$
 #
-# This $Z$ is positive semidefinite, has blocks $Z_{ii} = R_i^\top R_i = I$, and has rank $d$. **Drop the rank**
-# (and the determinants): a convex problem is left, whose value cannot be larger.
+# This $Z$ is positive semidefinite, has blocks $Z_{ii} = R_i^\top R_i = I$, and has rank $d$.
+# **Drop the rank constraint** (and the determinants): the remaining problem is convex, and its
+# value cannot be larger.
 
 # %%
 graph = pgo.random_geometric(8, np.random.default_rng(1), noise=NoiseModel(0.3, 0.3))
@@ -52,22 +59,24 @@ print(f"F of the poses `solve` found  {answer.objective:.6f}")
 print("largest eigenvalues of Z     ", np.linalg.eigvalsh(Z.value)[::-1][:5].round(6))
 
 # %% [markdown]
-# The two values agree although one problem is a relaxation of the other, and $Z$ has rank 3 although nobody
-# asked it to. So nothing was lost: the relaxation is *tight*, and the rotations can be read off $Z$.
+# The two values agree although one problem is a relaxation of the other, and $Z$ has rank 3
+# although no constraint requires it. So the relaxation loses nothing: it is *tight*, and $Z$
+# contains the rotations.
 #
 # ## The dual
 #
 # Multipliers $\Lambda_i$ (symmetric, one for every $Z_{ii} = I$) give the Lagrangian
-# $\operatorname{tr}(Q Z) - \sum_i \operatorname{tr}(\Lambda_i (Z_{ii} - I))$. Minimised over all positive
-# semidefinite $Z$ it is $\sum_i \operatorname{tr} \Lambda_i$ if $Q - \operatorname{blockdiag}(\Lambda)$ is
-# positive semidefinite, and $-\infty$ if not:
+# $\operatorname{tr}(Q Z) - \sum_i \operatorname{tr}(\Lambda_i (Z_{ii} - I))$. Its minimum over all
+# positive semidefinite $Z$ is $\sum_i \operatorname{tr} \Lambda_i$ if
+# $Q - \operatorname{blockdiag}(\Lambda)$ is positive semidefinite, and $-\infty$ if not:
 #
 # $$\max_\Lambda \sum_i \operatorname{tr} \Lambda_i \quad \text{subject to} \quad
 #   Q - \operatorname{blockdiag}(\Lambda) \succeq 0.$$
 #
-# Every feasible $\Lambda$ is a proof of a lower bound. cvxpy returns the best one with the primal (its sign is
-# the other way round), and it is what the formula of [notebook 1](01_quickstart.ipynb),
-# $\Lambda_i = \operatorname{sym}((M X)_i R_i)$, gives at the optimal poses **without solving any SDP**.
+# Every feasible $\Lambda$ is a proof of a lower bound. cvxpy returns the best $\Lambda$ with the
+# primal solution (with the opposite sign). The formula of [notebook 1](01_quickstart.ipynb),
+# $\Lambda_i = \operatorname{sym}((M X)_i R_i)$, gives the same multipliers at the optimal poses
+# **without solving any SDP**.
 
 # %%
 from_sdp = -np.array([constraint.dual_value for constraint in orthogonal])
@@ -76,19 +85,22 @@ print("largest difference of the two Lambda", np.abs(from_sdp - from_poses).max(
 
 Lambda = cp.Variable((n * d, n * d), symmetric=True)
 mask = np.kron(np.eye(n), np.ones((d, d)))
-dual = cp.Problem(cp.Maximize(cp.trace(Lambda)), [problem.Q - Lambda >> 0, cp.multiply(1 - mask, Lambda) == 0])
+dual = cp.Problem(
+    cp.Maximize(cp.trace(Lambda)), [problem.Q - Lambda >> 0, cp.multiply(1 - mask, Lambda) == 0]
+)
 dual.solve(solver=cp.CLARABEL)
 print(f"value of the dual {dual.value:.6f}")
 
 # %% [markdown]
 # ## The library agrees
 #
-# The value of the dual that Clarabel just returned lies a little *above* $F$ of poses that we hold in our
-# hands. A bound it is not: a solver stops a little before or beyond feasibility.
+# The dual value that Clarabel has just returned is slightly *above* $F$ of poses that we know. So
+# it is not a bound: a solver stops slightly before or beyond feasibility.
 #
-# `solve_relaxation` chooses the form (primal, dual, or decomposed over cliques) and the solver by size. Its
-# `lower_bound` is proven in exact arithmetic from the multipliers that the solver returned, as in notebook 1,
-# whatever the solver did: a worse $\Lambda$ gives a smaller bound, never a wrong one.
+# `solve_relaxation` chooses the form (primal, dual, or decomposed over cliques) and the solver by
+# size. Its `lower_bound` is proven in exact arithmetic from the multipliers that the solver
+# returned, as in notebook 1. It holds whatever the solver did: a worse $\Lambda$ gives a smaller
+# bound, never a wrong one.
 
 # %%
 relaxed = pgo.solve_relaxation(problem)
@@ -97,9 +109,9 @@ print(relaxed)
 # %% [markdown]
 # ## A number that looks like a certificate
 #
-# It is tempting to report the duality gap $F - \operatorname{tr} \Lambda$ at the poses found. It is about zero
-# at the optimum. Look at it elsewhere: at random rotations, and on the ring of [notebook
-# 1](01_quickstart.ipynb) in the local minimum that winds round once too often.
+# It is tempting to report the duality gap $F - \operatorname{tr} \Lambda$ at the computed poses. It
+# is about zero at the optimum. Evaluate it elsewhere: at random rotations, and on the ring of
+# [notebook 1](01_quickstart.ipynb) in the local minimum that winds around once too often.
 
 # %%
 rng = np.random.default_rng(0)
@@ -116,7 +128,9 @@ ring = pgo.PGOProblem(
         name="ring",
     )
 )
-twice_round = ring.with_best_translations(pgo.exp_map(4 * np.pi / count * np.arange(count)[:, None]))
+twice_round = ring.with_best_translations(
+    pgo.exp_map(4 * np.pi / count * np.arange(count)[:, None])
+)
 candidates = [
     ("8 poses, optimum", problem, answer.poses),
     ("8 poses, random", problem, problem.with_best_translations(pgo.random_rotations(n, d, rng))),
@@ -134,24 +148,27 @@ for name, judged, poses in candidates:
         S[rows_i, rows_i] -= Lambda_here[i]
     lambda_min = np.linalg.eigvalsh(S)[0]
     rows[name] = (objective, difference, lambda_min)
-    print(f"{name:20} F {objective:9.4f}   F - tr(Lambda) {difference:8.0e}   lambda_min(S) {lambda_min:9.1e}")
+    print(
+        f"{name:20} F {objective:9.4f}   F - tr(Lambda) {difference:8.0e}   lambda_min(S) {lambda_min:9.1e}"
+    )
 
 # %% [markdown]
-# $F - \operatorname{tr} \Lambda$ is zero *everywhere*, even at random rotations. Of course:
-# $\operatorname{tr} \Lambda = \sum_i \operatorname{tr}((M X)_i R_i) = \operatorname{tr}(X^\top M X) = F$ by the
-# definition of $\Lambda$, as soon as the translations are the best ones. It says nothing at all.
+# $F - \operatorname{tr} \Lambda$ is zero *everywhere*, even at random rotations. The reason is that
+# $\operatorname{tr} \Lambda = \sum_i \operatorname{tr}((M X)_i R_i) = \operatorname{tr}(X^\top M X)$,
+# which is $F$ if the translations are the best ones. So this number contains no information.
 #
-# What distinguishes the optimum is whether that $\Lambda$ is *feasible*: $\lambda_{\min}(S) \ge 0$. At the
-# optimum of a tight problem, $d$ eigenvalues are exactly zero ($S Y = 0$), so in floating point the smallest
-# comes out as $\pm 10^{-15}$ or so, and double precision cannot tell on which side of zero it is.
+# What distinguishes the optimum is that its $\Lambda$ is *feasible*: $\lambda_{\min}(S) \ge 0$. At
+# the optimum of a tight problem, $d$ eigenvalues are exactly zero ($S Y = 0$), so in floating point
+# the smallest is computed as about $\pm 10^{-15}$, and double precision cannot decide its sign.
 
 # %%
 plot_spectrum(problem, answer.certificate, count=10)
 
 # %% [markdown]
-# But we know what those $d$ directions are: all poses turned together, the *gauge*. **Ground one pose**, as in
-# [notebook 1](01_quickstart.ipynb), and they are gone. What is left is positive definite by a wide margin, so
-# that its Cholesky factorisation goes through with room for every rounding error.
+# But we know these $d$ directions: they rotate all poses together, which is the *gauge*.
+# **Grounding one pose**, as in [notebook 1](01_quickstart.ipynb), removes them. The remaining
+# matrix is positive definite by a wide margin, so that its Cholesky factorisation succeeds with
+# room for all rounding errors.
 
 # %%
 S = problem.Q.copy()
@@ -162,8 +179,9 @@ print("smallest eigenvalues, whole:       ", *(f"{value:8.0e}" for value in smal
 print("smallest eigenvalues, one grounded:", *(f"{value:8.2g}" for value in smallest[1]))
 
 # %% [markdown]
-# In the local minimum the negative eigenvalues are no rounding errors; each is a direction in which a *lifted*
-# $Y$, with more than $d$ columns, could descend. SE-Sync's staircase does that.
+# In the local minimum the negative eigenvalues are not rounding errors. Each belongs to a direction
+# in which the cost of a *lifted* $Y$, with more than $d$ columns, decreases. SE-Sync's staircase
+# follows such directions.
 
 # %%
 stuck = pgo.certify(ring, candidates[3][2])
@@ -173,11 +191,12 @@ print("smallest eigenvalues there:", eigenvalues.round(2))
 print(f"F in the local minimum {stuck.objective:.4f}, after the staircase {climbed.objective:.4f}")
 
 # %% [markdown]
-# ## Two bounds that close in
+# ## Two bounds that approach each other
 #
-# The proof asks nothing of the poses: any multipliers give a bound that holds, and the margin is so wide that
-# those of a method *on its way* will do. Every iterate of SOC gives an upper bound on the optimum, its own $F$,
-# and `certify_at` a lower one for the price of a factorisation and a solve.
+# The proof requires nothing of the poses: any multipliers give a valid bound. The margin is so wide
+# that the multipliers of a method *during its run* suffice. Every iterate of SOC gives an upper
+# bound on the optimum, its own $F$, and `certify_at` gives a lower bound at the cost of one
+# factorisation and one solve.
 
 
 # %%
@@ -202,7 +221,11 @@ for (name, certificates), colour in zip(on_the_way.items(), ("#0072B2", "#E69F00
     axes.plot(iterations, above, "v-", iterations, below, "^-", color=colour, markersize=4)
     axes.fill_between(iterations, below, above, color=colour, alpha=0.3, label=name)
     shifted = sum(item.eta > 0 for item in certificates)
-    print(f"{name:22} gap after 0, 6, 12, 18, 24:", *(f"{item.gap:.0e}" for item in certificates[::6]), end="")
+    print(
+        f"{name:22} gap after 0, 6, 12, 18, 24:",
+        *(f"{item.gap:.0e}" for item in certificates[::6]),
+        end="",
+    )
     print(f"; {shifted} iterates needed a shift")
 axes.set_yscale("symlog", linthresh=1e-15, linscale=0.5)
 axes.set_yticks([sign * 10.0**power for sign in (-1, 1) for power in (-12, -8, -4, 0)] + [0.0])
@@ -212,50 +235,84 @@ axes.set_title("above: F of the poses; below: the bound proven there", fontsize=
 _ = axes.legend(fontsize=8)
 
 # %% [markdown]
-# The optimum is in the shaded wedge, proven, at every iteration; what is shaded is the gap, and nobody needs to
-# know the optimum for it: one may stop as soon as it is small enough. Both sides close in at the same pace, on
-# the sphere down to the rounding level, without Newton. Its first three iterates are too far off for $S_r$ to be
-# positive definite. There is a bound even then, with the shift of the next section, but a poorer one.
+# In every iteration the optimum is proven to lie in the shaded region. The shaded region is the
+# gap, which needs no knowledge of the optimum: one can stop as soon as the gap is small enough.
+# Both bounds converge at the same rate, on the sphere down to the rounding level, without Newton's
+# method. The first three iterates are too far from the optimum for $S_r$ to be positive definite.
+# They also have a bound, with the shift of the next section, but a poorer one.
+
+# %% [markdown]
+# ## A proof that does not need trust
+#
+# A proof consists of a few numbers: poses, multipliers, and the pose that is grounded. Written to a
+# file, it can be checked by somebody who trusts neither the solver nor floating point.
+# `verify_proof` reads the g2o file with its own parser, every number as the rational number that
+# its digits denote. It completes the square pose by pose in *ball arithmetic*, where every number
+# carries a bound on its error, and imports nothing from the rest of the library. It does not trust
+# the proof either: if a multiplier is changed, it proves another bound, which is also valid.
+
+# %%
+folder = Path(tempfile.mkdtemp())
+pgo.write_g2o(graph, folder / "graph.g2o")
+answer.save_proof(folder / "proof.json")
+verified = pgo.verify_proof(folder / "graph.g2o", folder / "proof.json")
+for label, text in verified.facts()[1:]:
+    print(f"{label:12}", text)
+
+# %%
+tampered = json.loads((folder / "proof.json").read_text())
+for pose in tampered["poses"]:
+    pose["Lambda"] = [0.9 * number for number in pose["Lambda"]]
+(folder / "tampered.json").write_text(json.dumps(tampered))
+changed = pgo.verify_proof(folder / "graph.g2o", folder / "tampered.json")
+print("lower bound ", changed.bound.str(20))
+print("verdict     ", changed.verdict)
 
 # %% [markdown]
 # ## Where it fails: the end of tightness
 #
-# A proof needs $Z$ to have rank $d$ without being asked to. `noise_sweep` solves and certifies graphs with the
-# geometry of the paper's circle and grid and more and more rotation noise (the paper's is 30 degrees).
+# The bound is sharp only if $Z$ has rank $d$ although no constraint requires it. `noise_sweep`
+# solves and certifies graphs with the geometry of the paper's circle and grid and increasing
+# rotation noise (the paper's noise is 30 degrees).
 
 # %%
 degrees = np.array([30.0, 40.0, 45.0, 50.0, 55.0, 60.0, 70.0])
 sweeps = {
-    scene.value: solvers.noise_sweep(scene, np.deg2rad(degrees), 4, np.random.default_rng(0)) for scene in SweptScene
+    scene.value: solvers.noise_sweep(scene, np.deg2rad(degrees), 4, np.random.default_rng(0))
+    for scene in SweptScene
 }
 plot_tightness([(name, sweep.rotation_std, sweep.fraction) for name, sweep in sweeps.items()])
 
 # %% [markdown]
-# Four graphs at every level, so that a step is 25 %: enough for the picture, not for the third digit. The
-# circle, with 12 measurements from every pose, holds out longer than the grid with 4 on average, some of whose
-# graphs are lost at 40 degrees, not far above the paper's 30. Beyond the end, what is left? Here is one graph
-# of the grid with 60 degrees.
+# There are four graphs at every level, so one graph is 25 %: enough for the picture, but not for
+# the third digit. The circle, with 12 measurements from every pose, remains tight longer than the
+# grid with 4 on average. Some graphs of the grid are not certified at 40 degrees, not far above the
+# paper's 30. What remains beyond this limit? Here is one graph of the grid with 60 degrees.
 
 # %%
-loose_problem = pgo.PGOProblem(noisy_scene(SweptScene.GRID, np.deg2rad(60), np.random.default_rng(3)))
+loose_problem = pgo.PGOProblem(
+    noisy_scene(SweptScene.GRID, np.deg2rad(60), np.random.default_rng(3))
+)
 loose = solvers.solve(loose_problem)
 loose
 
 # %%
 loose_relaxed = pgo.solve_relaxation(loose_problem)
 print("rank of Z:", loose_relaxed.rank)
-print(f"{loose_relaxed.lower_bound:.3f} <= optimum <= {loose.objective:.3f}; Z rounded: {loose_relaxed.objective:.3f}")
+print(
+    f"{loose_relaxed.lower_bound:.3f} <= optimum <= {loose.objective:.3f}; Z rounded: {loose_relaxed.objective:.3f}"
+)
 
 # %% [markdown]
-# $Z$ has rank 4, no rotations have that Gram matrix, and rounding it costs something. Now $S$ has *four* zero
-# eigenvalues at the best $\Lambda$, and grounding a pose takes out only three. What is left is on the verge of
-# being definite, and the library needs a shift after all: if $S + \eta \operatorname{blockdiag}(0, I)$ is
-# positive definite without one translation, then $\operatorname{tr}(X^\top S X) \ge -\eta\, n d$, because
-# $R_i R_i^\top = I$, and
+# $Z$ has rank 4. No rotations have this Gram matrix, and rounding it to rotations increases the
+# cost. Now $S$ has *four* zero eigenvalues at the best $\Lambda$, and grounding a pose removes only
+# three. The remaining matrix is not safely positive definite, so the library needs a shift: if
+# $S + \eta \operatorname{blockdiag}(0, I)$ is positive definite without one translation, then
+# $\operatorname{tr}(X^\top S X) \ge -\eta\, n d$, because $R_i R_i^\top = I$, and
 #
 # $$F(X) \ge \operatorname{tr} \Lambda - \eta\, n d.$$
 #
-# It looks for a small $\eta$ that goes through. The shaded band is what that leaves open,
+# The library searches for a small $\eta$ with which the factorisation succeeds. The shaded band is
 # $|\lambda| \le \eta$; all four zeros are in it.
 
 # %%
@@ -263,18 +320,18 @@ print(f"eta {loose.certificate.eta:.2g}: {loose.certificate.source.value}")
 plot_spectrum(loose_problem, loose.certificate, count=10)
 
 # %% [markdown]
-# The verdict is `NOT_CERTIFIED`, **which does not mean that the poses are wrong**: they may be optimal. What is
-# known is the gap, 0.2 %: no poses whatever are better by more. A bound remains useful when tightness is gone; a
-# yes or no would not.
+# The verdict is `NOT_CERTIFIED`, **which does not mean that the poses are wrong**: they may be
+# optimal. The gap of 0.2 % is proven: no poses are better by more than that. A bound remains useful
+# when the relaxation is not tight, where a yes-or-no answer would not.
 
 # %% [markdown]
 # ## Exercises
 #
-# **1.** Take $0.9 \Lambda$ for $\Lambda$. Is what it proves still a lower bound?
+# **1.** Replace $\Lambda$ by $0.9 \Lambda$. Is the result still a lower bound?
 #
 # <details><summary>Answer</summary>
 #
-# Yes, as with any multipliers; it is a smaller one.
+# Yes, as with any multipliers, but a smaller one.
 #
 # ```python
 # weaker = pgo.prove_bound(problem, 0.9 * from_poses, poses=answer.poses)
@@ -283,12 +340,13 @@ plot_spectrum(loose_problem, loose.certificate, count=10)
 #
 # </details>
 #
-# **2.** Take two sets of rotations and the mean of their $Z = Y Y^\top$. Is it feasible for the relaxation? Is there
-# a set of rotations behind it?
+# **2.** Take two sets of rotations and the mean of their $Z = Y Y^\top$. Is it feasible for the
+# relaxation? Does a set of rotations have this Gram matrix?
 #
 # <details><summary>Answer</summary>
 #
-# Feasible it is: the relaxation is convex. Its rank is $2 d$, so that no rotations have it.
+# It is feasible, because the relaxation is convex. Its rank is $2 d$, so no set of rotations has
+# it.
 #
 # ```python
 # grams = []
@@ -303,12 +361,14 @@ plot_spectrum(loose_problem, loose.certificate, count=10)
 #
 # </details>
 #
-# **3.** In the ring's local minimum, what bound do its own multipliers prove? Compare it with the optimum.
+# **3.** Which bound do the multipliers of the ring's local minimum prove? Compare it with the
+# optimum.
 #
 # <details><summary>Answer</summary>
 #
-# A true one, and far below: the shift that makes $S_r$ definite costs more than the optimum is worth. `certify` also
-# looks elsewhere, at the point that the chordal start polishes to.
+# A valid one, far below the optimum: the shift that makes $S_r$ positive definite costs more than
+# the optimum itself. `certify` also tries another point, the stationary point that Newton's method
+# reaches from the chordal initial estimate.
 #
 # ```python
 # own = pgo.certify_at(ring, candidates[3][2])
@@ -323,6 +383,10 @@ assert np.isclose(primal.value, answer.objective, rtol=1e-5)
 assert np.isclose(dual.value, answer.objective, rtol=1e-4)
 assert np.abs(from_sdp - from_poses).max() < 1e-2
 assert relaxed.verdict is pgo.Verdict.CERTIFIED
+assert verified.is_verified
+assert float(verified.gap) < 1e-10
+assert not changed.is_verified
+assert float(changed.bound) < answer.lower_bound
 assert relaxed.rank.rank == 3
 assert all(abs(difference) < 1e-8 * objective for objective, difference, _ in rows.values())
 assert rows["8 poses, optimum"][2] > -1e-6
@@ -333,7 +397,10 @@ assert climbed.objective < 0.02 * stuck.objective
 assert answer.certificate.eta == 0
 assert np.abs(smallest[0][:d]).max() < 1e-9 < 1e-2 < smallest[1][0]
 for name, certificates in on_the_way.items():
-    assert all(item.lower_bound <= optima[name].objective <= item.objective * (1 + 1e-12) for item in certificates)
+    assert all(
+        item.lower_bound <= optima[name].objective <= item.objective * (1 + 1e-12)
+        for item in certificates
+    )
     assert certificates[0].gap > 0.05
     assert all(item.eta == 0 for item in certificates[5:])
     assert certificates[-1].gap < 1e-8

@@ -1,12 +1,13 @@
 # %% [markdown]
 # # 7. Where do the last few percent of the paper's tables come from?
 #
-# Open with `jupyter lab notebooks/07_the_papers_tables.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+# Open with `jupyter lab notebooks/07_the_papers_tables.ipynb`; `pip install -e '.[notebooks,fast]'`
+# installs it.
 #
-# In the paper's tables 1 and 3 SOC ends a few percent above the certified optimum: 3.9 % on the circle, 7.6 %
-# on the grid, 6.0 % on the sphere (as a share of its own $F$). Are those iterations that were not done, a local
-# minimum, or the model? This notebook runs the paper's experiment on its three networks, and then takes the
-# answer apart.
+# In the paper's tables 1 and 3 SOC ends a few percent above the certified optimum: 3.9 % on the
+# circle, 7.6 % on the grid, 6.0 % on the sphere (as a share of its own $F$). Is the reason too few
+# iterations, a local minimum, or the model? This notebook runs the paper's experiment on its three
+# networks, and then analyses the result.
 
 # %%
 import itertools
@@ -30,15 +31,18 @@ NAMES = ("circle", "grid", "sphere")
 def shown(frame, **formats):
     """The frame with its numbers as text, a dash where there is none."""
     for column, form in formats.items():
-        frame = frame.assign(**{column: [form.format(x) if pd.notna(x) else "-" for x in frame[column]]})
+        frame = frame.assign(
+            **{column: [form.format(x) if pd.notna(x) else "-" for x in frame[column]]}
+        )
     return frame
 
 
 # %% [markdown]
 # ## What the paper reports
 #
-# `published_rows` has the paper's figures, from `data/reference.json`. The noise of its graphs is not
-# published, only its size, so ours are other draws of the same scenes: compare gaps, not costs.
+# `published_rows` contains the paper's figures, from `data/reference.json`. The paper publishes the
+# size of the noise of its graphs, but not the noise itself, so our graphs are other draws of the
+# same scenes: compare gaps, not costs.
 
 # %%
 published = {row.name: row for row in published_rows()}
@@ -56,24 +60,32 @@ report = pd.DataFrame(columns, index=NAMES)
 one = "{:.1f}"
 shown(
     report,
-    **{"F*, paper": one, "DGS, paper": one, "SOC, paper": one, "gap of SOC, paper": "{:.1%}", "F*, here": one},
+    **{
+        "F*, paper": one,
+        "DGS, paper": one,
+        "SOC, paper": one,
+        "gap of SOC, paper": "{:.1%}",
+        "F*, here": one,
+    },
     **{"certified to": "{:.0e}"},
 )
 
 # %% [markdown]
-# ## Algorithm 1 to the letter
+# ## Algorithm 1 by hand
 #
-# Rotations only; one pose is one robot; every robot minimises step (a) over its own $R_i$ while its neighbours
-# stay where they were at the last iterate (the superscripts $k - 1$ in `algo1: SOC`). With one unknown matrix
-# the minimum can be written down. An edge $(i, j)$ pulls $R_i$ to $R_j R_{ij}^\top$, an edge $(j, i)$ to
-# $R_j R_{ji}$, so
+# The algorithm has rotations only, and each pose is a robot. Every robot minimises step (a) over
+# its own $R_i$ while its neighbours keep the values of the last iterate (the superscripts $k - 1$
+# in `algo1: SOC`). With one unknown matrix the minimum has a closed form. An edge $(i, j)$ pulls
+# $R_i$ to $R_j R_{ij}^\top$, an edge $(j, i)$ to $R_j R_{ji}$, so
 #
 # $$R_i = \frac{2 \sum_{(i,j)} \kappa_{ij} R_j R_{ij}^\top + 2 \sum_{(j,i)} \kappa_{ji} R_j R_{ji}
 #   + \rho (\omega_i - B_i)}
 #   {2 \sum \kappa + \rho},$$
 #
-# an average of what the neighbours say, and of $\omega_i - B_i$. The start is the estimate by GPS and IMU, as
-# in the paper.
+# an average of the neighbours' estimates and of $\omega_i - B_i$. The initial estimate comes from
+# GPS and IMU, as in the paper. Three things differ from the paper: $\rho$ is constant, the edges
+# have weights, and $\omega$ is a rotation, where `algo1: SOC` takes any orthogonal matrix.
+# `PaperSOC` lists all differences.
 
 
 # %%
@@ -81,7 +93,9 @@ def algorithm_1(graph, rho, iterations):
     R = omega = graph.initial.R
     B = np.zeros_like(R)
     kappa = graph.kappa[:, None, None]
-    total = np.bincount(graph.i, graph.kappa, graph.num_poses) + np.bincount(graph.j, graph.kappa, graph.num_poses)
+    total = np.bincount(graph.i, graph.kappa, graph.num_poses) + np.bincount(
+        graph.j, graph.kappa, graph.num_poses
+    )
     for _ in range(iterations):
         pull = rho * (omega - B)
         np.add.at(pull, graph.i, 2 * kappa * R[graph.j] @ graph.R_ij.transpose(0, 2, 1))
@@ -98,7 +112,9 @@ def gap(name, rotations):
     return problem.objective(problem.with_best_translations(rotations)) / optima[name].objective - 1
 
 
-rho = 20.0  # ours: the smallest of 1, 5, 10, 20 and 50 with which all three graphs settle, see below
+rho = (
+    20.0  # ours: the smallest of 1, 5, 10, 20 and 50 with which all three graphs settle, see below
+)
 by_hand = {name: list(algorithm_1(graph, rho, 150)) for name, graph in graphs.items()}
 
 # %% [markdown]
@@ -120,7 +136,9 @@ for name, graph in graphs.items():
 curves = {name: np.array([gap(name, omega) for omega in by_hand[name]]) for name in NAMES}
 adaptive, adaptive_curves = solvers.PaperSOC(), {}
 for name, graph in graphs.items():
-    states = itertools.islice(solvers.iterate(adaptive, optima[name].problem, graph.initial), 1, 151)
+    states = itertools.islice(
+        solvers.iterate(adaptive, optima[name].problem, graph.initial), 1, 151
+    )
     adaptive_curves[name] = np.array([gap(name, state.omega) for state in states])
 
 figure, axes = plt.subplots(figsize=(5.6, 3.2), layout="constrained")
@@ -135,15 +153,16 @@ axes.set_title("rho = 20; dashed: adaptive rho; stars: the paper's SOC", fontsiz
 _ = axes.legend(fontsize=8)
 
 # %% [markdown]
-# All curves become flat at 4 to 9 %, the height of the stars. Read no more into where the solid ones pass the
-# stars: the paper gives no $\rho$ and adapts it, and our 20 was chosen after looking at such curves. With the
-# library's adaptive rule (dashed) the same height is reached, but the circle and the sphere are far above it
-# when the paper's iterations are over. *How soon* depends on $\rho$; *where* does not, and that is the question
+# All curves become flat at 4 to 9 %, the height of the stars. The positions at which the solid
+# curves pass the stars mean little: the paper states no $\rho$ and adapts it, and we chose our
+# value of 20 after looking at such curves. With the library's adaptive rule (dashed) the curves
+# reach the same height, but the circle and the sphere are far above it after the number of
+# iterations of the paper. *How soon* depends on $\rho$; *where* does not, and that is the question
 # here.
 #
-# So the last percents are not a matter of iterations. Is it a local minimum, then? Let us find the *certified
-# global* optimum of what Algorithm 1 minimises, which is the rotation part of $F$ alone: give the translations
-# next to no weight.
+# So the last few percent are not a matter of iterations. Is the reason a local minimum, then?
+# Compute the *certified global* optimum of what Algorithm 1 minimises, which is the rotation part
+# of $F$ alone: give the translations almost no weight.
 
 # %%
 rotation_gaps = {}
@@ -157,24 +176,30 @@ for name, graph in graphs.items():
     )
 
 # %% [markdown]
-# Neither. **Algorithm 1 finds the global optimum of its own problem, and it is the problem that is a few
-# percent off**: the translation measurements $t_{ij} \approx R_i^\top (t_j - t_i)$ say something of $R_i$ too,
-# and rotations that were estimated without them fit them worse. The published gaps, of other draws of the
-# noise, are of the same size, so on these three scenes they *may* be those of the first stage alone. That is
-# our guess, not the paper's statement, and the full table below speaks against it for the cubicle and the
-# torus.
+# Neither. **Algorithm 1 finds the global optimum of its own problem, and this problem differs from
+# the full one by a few percent**: the translation measurements
+# $t_{ij} \approx R_i^\top (t_j - t_i)$ also contain information on $R_i$, and rotations that were
+# estimated without them fit them worse. The published gaps, of other draws of the noise, are of the
+# same size, so on these three scenes they *may* be those of the first stage alone. This is our
+# guess, not a statement of the paper, and the full table below contradicts it for the cubicle and
+# the torus.
 #
-# Two ways to close the gap: the second stage that the paper proposes, Gauss-Newton on the full poses; or step
-# (a) over rotations and translations together from the beginning, as in [notebook
-# 4](04_splitting_orthogonality.ipynb).
+# There are two ways to close the gap: the second stage that the paper proposes, Gauss-Newton on the
+# full poses; or step (a) over rotations and translations together from the beginning, as in
+# [notebook 4](04_splitting_orthogonality.ipynb).
 
 # %%
 endings = {}
 for name in NAMES:
     problem = optima[name].problem
-    second = solvers.run(solvers.gauss_newton(), problem, problem.with_best_translations(by_hand[name][-1]))
+    second = solvers.run(
+        solvers.gauss_newton(), problem, problem.with_best_translations(by_hand[name][-1])
+    )
     joint = solvers.run(solvers.SOC(), problem)
-    endings[name] = (second.objective / optima[name].objective - 1, joint.objective / optima[name].objective - 1)
+    endings[name] = (
+        second.objective / optima[name].objective - 1,
+        joint.objective / optima[name].objective - 1,
+    )
     print(
         f"{name:8} Gauss-Newton after it: {endings[name][0]:8.0e} in {second.iterations} steps;"
         f" joint SOC: {endings[name][1]:8.0e} in {joint.iterations} iterations"
@@ -183,9 +208,9 @@ for name in NAMES:
 # %% [markdown]
 # ## The tables
 #
-# `reproduce_tables` runs the methods of the tables as the paper does, SOC with as many rounds as the paper took
-# iterations, both its stages together. Here two draws of each scene; `pgo tables` on the command line takes
-# twenty, and the benchmark graphs.
+# `reproduce_tables` runs the methods of the tables as the paper does. The two stages of SOC
+# together get as many rounds as the paper took iterations. Here the table has two draws of each
+# scene; `pgo tables` on the command line takes twenty, and the benchmark graphs.
 
 # %%
 tables = solvers.reproduce_tables(ReproductionSettings(only=NAMES, num_seeds=2), progress=False)
@@ -195,7 +220,9 @@ records = [
         "method": row.contender.label,
         "gap": np.mean([cell.gap for cell in row.cells]),
         "gap, paper": row.published_gap,
-        "rounds": np.mean([cell.rounds for cell in row.cells if cell.rounds is not None] or [np.nan]),
+        "rounds": np.mean(
+            [cell.rounds for cell in row.cells if cell.rounds is not None] or [np.nan]
+        ),
     }
     for row in tables.rows
 ]
@@ -209,17 +236,26 @@ for finding in findings(tables):
 # %% [markdown]
 # ## The full table
 #
-# The cubicle and the torus take longer than a notebook should. Their figures are in `tables.json` beside this
-# notebook, made by
+# The cubicle and the torus take longer than a notebook should. Their figures are in `tables.json`
+# beside this notebook, made by
 #
 #     PGO_DATA=folder-with-the-graphs pgo tables --out notebooks/tables.json
 #
-# A row without figures has its reason as `remark` in the file: `rim` was not at hand when it was made.
+# For a row without figures, `remark` in the file gives the reason: `rim` was not available when the
+# file was made.
 
 # %%
 full = json.loads(Path("tables.json").read_text(encoding="utf-8"))
 table = pd.DataFrame(full["rows"])
-figures = ["objective", "gap", "gap_after_first_stage", "paper_objective", "paper_gap", "rounds", "paper_iterations"]
+figures = [
+    "objective",
+    "gap",
+    "gap_after_first_stage",
+    "paper_objective",
+    "paper_gap",
+    "rounds",
+    "paper_iterations",
+]
 shown(
     table.set_index(["graph", "method"])[figures],
     **dict.fromkeys(("objective", "paper_objective"), "{:.6g}"),
@@ -229,36 +265,49 @@ shown(
 )
 
 # %% [markdown]
-# Compare like with like. Within the paper's iterations `SOC as in the paper` ends far below the paper's $F$,
-# but it is Gauss-Newton that brings it there, in those rounds that the first stage leaves over, and the paper
-# does not say how far it runs its own. After SOC alone (its own column, as a gap; at most half of the rounds)
-# our figures are below the paper's on the grid, the sphere and the garage and *above* them on the circle, the
-# cubicle and the torus. On the last two it is no matter of rounds. As on the scenes above, the rotations alone
-# have a certified optimum, and $F$ of it, with the best translations, is above the paper's 724.56 and 24449.94:
+# Compare like with like. Within the paper's iterations `SOC as in the paper` ends far below the
+# paper's $F$, but Gauss-Newton reaches this value, in the rounds that the first stage leaves, and
+# the paper does not state how long it runs its own Gauss-Newton. After SOC alone (its own column,
+# as a gap; at most half of the rounds) our figures are below the paper's on the grid, the sphere
+# and the garage, and *above* them on the circle, the cubicle and the torus. On the last two graphs,
+# the reason is not the number of rounds. As on the scenes above, the rotations alone have a
+# certified optimum, and its $F$, with the best translations, is above the paper's 724.56 and
+# 24449.94:
 
 # %%
-reference = json.loads(Path("../data/reference.json").read_text(encoding="utf-8"))["rotations_only_optimum"]
+reference = json.loads(Path("../data/reference.json").read_text(encoding="utf-8"))[
+    "rotations_only_optimum"
+]
 for name in ("cubicle", "torus3D"):
     theirs = published[name].soc.objective
-    print(f"{name:8} certified optimum of the rotations alone: F = {reference[name]}; paper: {theirs}")
+    print(
+        f"{name:8} certified optimum of the rotations alone: F = {reference[name]}; paper: {theirs}"
+    )
 
 # %% [markdown]
-# So those figures are not where a first stage ends that finds the optimum of its own problem. What they are of,
-# the paper does not say.
+# So these figures cannot be the end of a first stage that finds the optimum of its own problem. The
+# paper does not say what they are.
 
 # %% [markdown]
 # ## Where it fails
 #
-# The paper's coupling has its price: with its neighbours frozen, a robot sees their old rotations. Too small a
-# $\rho$ and the run never settles, as in [notebook 4](04_splitting_orthogonality.ipynb), but here it needs a
-# larger one; and information travels one edge an iteration: on the torus 1587 of them are not enough for
-# residuals of 1e-5.
+# The paper's coupling has a price: since a robot keeps its neighbours fixed, it uses their old
+# rotations. With too small a $\rho$ the run never converges, as in
+# [notebook 4](04_splitting_orthogonality.ipynb), but here $\rho$ has to be larger. And information
+# travels only one edge per iteration: on the torus, 1587 iterations are not enough for residuals of
+# 1e-5.
 
 # %%
 never = {name: list(algorithm_1(graph, 1.0, 150))[-1] for name, graph in graphs.items()}
 for name in NAMES:
-    ends = {value: gap(name, list(algorithm_1(graphs[name], value, 150))[-1]) for value in (1.0, 5.0, 10.0, 20.0, 50.0)}
-    print(f"{name:8} above F* after 150 iterations:", *(f"rho {value:g}: {end:.3f} " for value, end in ends.items()))
+    ends = {
+        value: gap(name, list(algorithm_1(graphs[name], value, 150))[-1])
+        for value in (1.0, 5.0, 10.0, 20.0, 50.0)
+    }
+    print(
+        f"{name:8} above F* after 150 iterations:",
+        *(f"rho {value:g}: {end:.3f} " for value, end in ends.items()),
+    )
 
 # %% [markdown]
 # ## Exercises
@@ -267,7 +316,8 @@ for name in NAMES:
 #
 # <details><summary>Answer</summary>
 #
-# No: it is that of the best rotations by rotation measurements alone, which know nothing of $\rho$. Only the time does.
+# No. The height is that of the best rotations by rotation measurements alone, which does not depend
+# on $\rho$. Only the number of iterations does.
 #
 # ```python
 # later = list(algorithm_1(graphs["grid"], 50.0, 600))[-1]
@@ -276,13 +326,13 @@ for name in NAMES:
 #
 # </details>
 #
-# **2.** Split $F$ into its rotation and its translation part, at the end of Algorithm 1 and at the optimum. Which of
-# the two is worse in which?
+# **2.** Split $F$ into its rotation and its translation part, at the end of Algorithm 1 and at the
+# optimum. Which of the two is worse in which part?
 #
 # <details><summary>Answer</summary>
 #
-# Algorithm 1 fits the rotation measurements better than the optimum does, and the translations worse: by more than it
-# wins.
+# Algorithm 1 fits the rotation measurements better than the optimum does, and the translation
+# measurements worse; the loss is larger than the gain.
 #
 # ```python
 # def parts(name, poses):
@@ -299,8 +349,8 @@ for name in NAMES:
 #
 # </details>
 #
-# **3.** From the frame `table`: in which rows of SOC as in the paper do the first stage's rotations alone end above
-# the gap of the paper?
+# **3.** From the frame `table`: in which rows of SOC as in the paper do the first stage's rotations
+# alone end above the gap of the paper?
 #
 # <details><summary>Answer</summary>
 #

@@ -1,10 +1,11 @@
 # %% [markdown]
 # # 8. You have a pose graph, and perhaps a solution: what now?
 #
-# Open with `jupyter lab notebooks/08_your_own_graph.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+# Open with `jupyter lab notebooks/08_your_own_graph.ipynb`; `pip install -e '.[notebooks,fast]'`
+# installs it.
 #
-# This notebook starts from a `.g2o` file, as SLAM front ends write it, judges a solution that came from
-# elsewhere, looks for the measurement that is to blame, and hands the result on to
+# This notebook starts from a `.g2o` file, as SLAM front ends write it. It judges a solution that
+# came from elsewhere, looks for the measurement that caused an error, and passes the result on to
 # [evo](https://github.com/MichaelGrupp/evo).
 
 # %%
@@ -17,16 +18,15 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
-from pgo_models.graphs.trajectories import read_kitti
 
 # %% [markdown]
 # ## A graph in text
 #
-# A line is a pose or a measurement. In the plane a pose is `VERTEX_SE2 id x y theta`, a measurement
-# `EDGE_SE2 i j dx dy dtheta` with the upper triangle of its information matrix, the inverse of its covariance.
-# (In space they are `VERTEX_SE3:QUAT` and `EDGE_SE3:QUAT`, with quaternions `qx qy qz qw`.) Let us write one by
-# hand: a robot drives three times round a square of 8 m, and whenever it passes a place again, it measures
-# where it was the round before.
+# Each line is a pose or a measurement. In the plane a pose is `VERTEX_SE2 id x y theta`, a
+# measurement `EDGE_SE2 i j dx dy dtheta` with the upper triangle of its information matrix, the
+# inverse of its covariance. (In space they are `VERTEX_SE3:QUAT` and `EDGE_SE3:QUAT`, with
+# quaternions `qx qy qz qw`.) Here is a file written by hand: a robot drives three times around a
+# square of 8 m, and whenever it passes a place again, it measures where it was one lap earlier.
 
 # %%
 rng = np.random.default_rng(3)
@@ -55,21 +55,24 @@ print(*lines[:2], lines[-1], sep="\n")
 # %% [markdown]
 # ## Read it
 #
-# The cost $F$ of the paper's equation (16), `min overall` has one number for the rotation and one for the translation
-# of an edge. An information matrix becomes the precisions $\kappa$ and $\tau$ as in SE-Sync: in the plane
-# $\kappa = I_{\theta\theta}$, $\tau = 2 / \operatorname{tr}(I_{tt}^{-1})$; in space
-# $\kappa = 3 / (2 \operatorname{tr}(I_{rr}^{-1}))$, $\tau = 3 / \operatorname{tr}(I_{tt}^{-1})$. In the plane that is
-# twice what a Gaussian says of a rotation; `weights=pgo.RotationWeight.GAUSSIAN` takes
-# $\kappa = I_{\theta\theta} / 2$.
+# The cost $F$ of the paper's equation (16), `min overall` has one number for the rotation and one
+# for the translation of an edge. An information matrix becomes the precisions $\kappa$ and $\tau$
+# as in SE-Sync: in the plane $\kappa = I_{\theta\theta}$,
+# $\tau = 2 / \operatorname{tr}(I_{tt}^{-1})$; in space
+# $\kappa = 3 / (2 \operatorname{tr}(I_{rr}^{-1}))$, $\tau = 3 / \operatorname{tr}(I_{tt}^{-1})$. In
+# the plane, this $\kappa$ is twice the weight of a rotation in a Gaussian model;
+# `weights=pgo.RotationWeight.GAUSSIAN` takes $\kappa = I_{\theta\theta} / 2$.
 
 # %%
 graph = pgo.read_g2o(path)
 problem = pgo.PGOProblem(graph)
 print(graph)
-print(f"tau of a step {graph.tau[0]:.1f} = 0.05^-2 per m^2, kappa {graph.kappa[0]:.1f} = 0.03^-2 per rad^2")
+print(
+    f"tau of a step {graph.tau[0]:.1f} = 0.05^-2 per m^2, kappa {graph.kappa[0]:.1f} = 0.03^-2 per rad^2"
+)
 
 # %% [markdown]
-# A file that is wrong is refused in one line that says where, what, and what to do.
+# A wrong file is refused with one line that names the place, the error and the remedy.
 
 # %%
 broken = Path(folder.name) / "broken.g2o"
@@ -84,22 +87,25 @@ print(message.replace(folder.name, "..."))
 # %% [markdown]
 # ## Solve it
 #
-# There were no `VERTEX` lines, so there is no estimate to start from; none is needed. Composing the odometry,
-# which is what one would have without loop closures, drifts.
+# The file has no `VERTEX` lines, so there is no estimate to start from; none is needed. Composing
+# the odometry, the only possibility without loop closures, drifts.
 
 # %%
 odometry = pgo.odometry_start(graph)
 solution = solvers.solve(graph)
 print(solution)
-names = (f"odometry, F = {problem.objective(odometry):.0f}", f"solved, F = {solution.objective:.1f}")
+names = (
+    f"odometry, F = {problem.objective(odometry):.0f}",
+    f"solved, F = {solution.objective:.1f}",
+)
 pgo.compare_poses(graph, list(zip(names, (odometry, solution.poses), strict=True)))
 
 # %% [markdown]
 # ## Certify someone else's solution
 #
-# Somebody hands over a trajectory in a TUM file (`time x y z qx qy qz qw`). Say it is the chordal relaxation,
-# rounded, which many programs start from and some stop at. Its gap is the most that it leaves on the table,
-# proven, whoever made it and however.
+# Somebody gives you a trajectory in a TUM file (`time x y z qx qy qz qw`). In this example it is
+# the rounded chordal relaxation, from which many programs start and at which some stop. Its gap is
+# a proven limit on what can still be saved, whichever program made it.
 
 # %%
 theirs_path = Path(folder.name) / "theirs.tum"
@@ -110,15 +116,15 @@ certificate = pgo.certify(problem, theirs)
 print(certificate)
 
 # %% [markdown]
-# By hand that needs nothing but $F$ and somebody's proof of a bound:
+# By hand, this needs only $F$ and a proven bound:
 #
 # $$\text{gap} = \frac{F(\text{theirs}) - b}{F(\text{theirs})},$$
 #
-# and the proof can be checked by anyone: the certificate has the multipliers $\Lambda$ and the poses where they
-# were taken, and with one of these grounded, one Cholesky factorisation of $S$ that goes through and one solve
-# are all there is to it ([notebook 1](01_quickstart.ipynb)). `prove_bound` does the same, and subtracts all
-# rounding errors. (Both also need $\eta$, which is 0 here; on a graph with a loose relaxation it is not, and
-# then only `prove_bound` knows what the bound loses by it.)
+# and anyone can check the proof: the certificate has the multipliers $\Lambda$ and the poses where
+# they were taken. With one of these poses grounded, the proof is one successful Cholesky
+# factorisation of $S$ and one solve ([notebook 1](01_quickstart.ipynb)). `prove_bound` does the
+# same, and subtracts all rounding errors. (Both also need $\eta$, which is 0 here; on a graph with
+# a loose relaxation it is not, and then only `prove_bound` accounts for what the bound loses.)
 
 # %%
 n, d = problem.num_poses, problem.d
@@ -134,25 +140,30 @@ print(f"bound {bound:.10f} by hand, {proved:.10f} by the library")
 print(f"gap   {gap_by_hand:.10f} by hand, {certificate.gap:.10f} by the library")
 
 # %% [markdown]
-# ## What the file says: its own cost
+# ## The file's own cost
 #
-# $F$ replaces every information matrix by two numbers. Where the matrices are far from isotropic, that is another
-# problem. The file's own cost is
+# $F$ replaces every information matrix by two numbers. Where the matrices are far from isotropic,
+# this changes the problem. The file's own cost is
 #
 # $$\chi^2 = \sum_e r_t^\top I_{tt}\, r_t + 2\, r_t^\top I_{tr}\, s + 2 (1 - \cos\theta)\, a^\top I_{rr}\, a, \qquad
 # r_t = R_{ij}^\top \bigl( R_i^\top (t_j - t_i) - t_{ij} \bigr),$$
 #
-# for a rotation error by $\theta$ about $a$, with $s = a \sin\theta$. The rotation term is quadratic in the rotations
-# already. The rest is a convex function of $r_t$ and the turn, and so it lies above its tangent at any point; the
-# tangent is quadratic in the poses. At the minimum of $\chi^2$ both have one value, so that the certificate of the
-# quadratic function proves the minimum of $\chi^2$. Say our robot closes its loops with a camera that sees depth
-# ten times worse than what is sideways (and where `PGO_DATA` names the folder of the public graphs, take a real
-# file instead):
+# for a rotation error by the angle $\theta$ about the axis $a$, with $s = a \sin\theta$. The
+# rotation term is already quadratic in the rotations. The rest is a convex function of $r_t$ and
+# the rotation error, and so it lies above its tangent at any point; the tangent is quadratic in the
+# poses. At the minimum of $\chi^2$ both have the same value, so the certificate of the quadratic
+# function proves the minimum of $\chi^2$. As an example, the robot closes its loops with a camera
+# whose errors are ten times larger in depth than sideways (where `PGO_DATA` names the folder of the
+# public graphs, the example is a real file instead):
 
 # %%
 information = graph.information.copy()
 information[num_poses - 1 :, 0, 0] /= 100.0
-real = pgo.load("MIT") if "PGO_DATA" in os.environ else replace(graph, information=information, name="camera")
+real = (
+    pgo.load("MIT")
+    if "PGO_DATA" in os.environ
+    else replace(graph, information=information, name="camera")
+)
 
 by_F = solvers.solve(real)
 whole = pgo.PGOProblem(real, weighting=pgo.Weighting.INFORMATION)
@@ -160,34 +171,45 @@ by_chi2 = solvers.solve(whole)
 print(f"{real.name:22} {'F':>12} {'chi2':>12}   bound on it")
 for name, found in (("optimum of F", by_F), ("optimum of chi2", by_chi2)):
     costs = pgo.PGOProblem(real).objective(found.poses), pgo.chi2(real, found.poses)
-    print(f"{name:22} {costs[0]:12.6g} {costs[1]:12.6g}   {found.lower_bound:.9g}, gap {found.gap:.0e}")
+    proven = found.certificate
+    print(
+        f"{name:22} {costs[0]:12.6g} {costs[1]:12.6g}   {proven.bound_text}, gap {proven.gap_text}"
+    )
 
 # %% [markdown]
-# The tangent at work: below $\chi^2$ everywhere, equal to it at its minimum.
+# The picture shows the tangent: it is below $\chi^2$ everywhere, and equal to it at the minimum.
 
 # %%
 tangent = whole.tangent_at(by_chi2.poses)
 for step in (0.0, 1e-3, 1e-2, 1e-1):
-    moved = pgo.Poses(by_chi2.poses.R, by_chi2.poses.t + rng.normal(0.0, step, by_chi2.poses.t.shape))
-    print(f"{step:5.0e} m away: chi2 {whole.objective(moved):14.6f}, tangent {tangent.objective(moved):14.6f}")
+    moved = pgo.Poses(
+        by_chi2.poses.R, by_chi2.poses.t + rng.normal(0.0, step, by_chi2.poses.t.shape)
+    )
+    print(
+        f"{step:5.0e} m away: chi2 {whole.objective(moved):14.6f}, tangent {tangent.objective(moved):14.6f}"
+    )
     assert tangent.objective(moved) <= whole.objective(moved) * (1 + 1e-9)
 
 # %% [markdown]
-# Anyone's answer is judged by the same cost: `pgo certify FILE --information --estimate theirs.g2o`. On MIT, GTSAM's
-# Levenberg-Marquardt ends at 770 from the file's estimate, and nothing in its answer says that 41.16 is possible
-# (`tests/benchmarks/information.py`). How sure are the poses? The inverse of half the Hessian of $\chi^2$ is their
-# covariance, as far as the measurements are Gaussian:
+# The same cost judges any answer: `pgo certify FILE --information --estimate theirs.g2o`. On MIT,
+# GTSAM's Levenberg-Marquardt ends from the file's estimate at poses whose chi2 is 2919 (770 of its
+# own cost, whose residual is the logarithm in SE(2)), and nothing in its answer says that 41.16 is
+# possible. How uncertain are the poses? The inverse of half the Hessian of $\chi^2$ is their
+# covariance to first order, if the errors of the measurements are Gaussian:
 
 # %%
 blocks = by_chi2.marginals()
 widest = int(np.argmax(np.linalg.eigvalsh(blocks[:, :2, :2])[:, -1]))
-print(f"beside pose 0, pose {widest} is known to {np.sqrt(np.linalg.eigvalsh(blocks[widest, :2, :2])[-1]):.3f} m")
+print(
+    f"beside pose 0, pose {widest} is known to {np.sqrt(np.linalg.eigvalsh(blocks[widest, :2, :2])[-1]):.3f} m"
+)
 figure = pgo.plot_graph(real, by_chi2.poses, covariances=blocks)
 
 # %% [markdown]
-# A prior is an edge from one more pose, the world; GPS has no rotation, $\kappa = 0$. A landmark is a pose whose
-# rotation nobody asks for. Both stay inside the same problem, so the certificate is what it was (in a file:
-# `EDGE_PRIOR_SE2_XY`, `VERTEX_XY`, `EDGE_SE2_XY` and their likes in space):
+# A prior is an edge from an additional pose, the world; GPS has no rotation, so $\kappa = 0$. A
+# landmark is a pose whose rotation has no measurement. Both fit into the same problem, so the
+# certificate does not change (in a file: `EDGE_PRIOR_SE2_XY`, `VERTEX_XY`, `EDGE_SE2_XY` and the
+# corresponding tags in space):
 
 # %%
 fixes = rng.choice(real.num_poses, 6, replace=False)
@@ -195,18 +217,22 @@ quarter_turn = np.array([[0.0, -1.0], [1.0, 0.0]])
 there = by_chi2.poses.t[fixes] @ quarter_turn.T + [500.0, 300.0]  # the world, as a receiver has it
 located = real.with_position_prior(fixes, there + rng.normal(0.0, 0.5, there.shape), tau=0.5**-2)
 tree = by_chi2.poses.t[0] + np.array([2.0, 1.0])
-seen = np.einsum("nba,nb->na", by_chi2.poses.R[:3], tree - by_chi2.poses.t[:3]) + rng.normal(0.0, 0.1, (3, 2))
+seen = np.einsum("nba,nb->na", by_chi2.poses.R[:3], tree - by_chi2.poses.t[:3]) + rng.normal(
+    0.0, 0.1, (3, 2)
+)
 located = located.with_landmark([0, 1, 2], seen, tau=0.1**-2)
 in_the_world = solvers.solve(pgo.PGOProblem(located, weighting=pgo.Weighting.INFORMATION))
 print(in_the_world)
-print(f"first position: {in_the_world.poses.t[fixes[0]].round(2)}, its receiver said {there[0].round(2)}")
+print(
+    f"first position: {in_the_world.poses.t[fixes[0]].round(2)}, its receiver said {there[0].round(2)}"
+)
 
 # %% [markdown]
 # ## Where it fails: a wrong loop closure
 #
-# The certificate says that no poses fit *these measurements* better. It does not say that the measurements are
-# right. Put in one wrong loop closure, a place taken for another 2 m further on that looks the same: the
-# solution is certified, and wrong.
+# The certificate says that no poses fit *these measurements* better. It does not say that the
+# measurements are right. Add one wrong loop closure, which takes a place for a similar one 2 m
+# further on: the solution is certified, and wrong.
 
 # %%
 wrong = f"EDGE_SE2 10 {12 + 4 * side} 0.000000 0.000000 0.000000 100 0 0 100 0 400"
@@ -218,13 +244,18 @@ print(f"{fooled!r}; F was {solution.objective:.1f} without that edge")
 times = suspect.cost[worst] / suspect.allowed[worst]
 print(f"worst: {fooled.problem.graph.edge_label(worst)}, {times:.1f} times its threshold")
 print("edges that cost more than they may:", np.flatnonzero(suspect.is_misfit))
-print(f"together {suspect.overall:.2f} times what is expected; over {suspect.overall_allowed:.2f} in one graph of 100")
-print(f"without it {solution.edge_residuals.overall:.2f}; over what they may:", solution.edge_residuals.is_misfit.sum())
+print(
+    f"together {suspect.overall:.2f} times what is expected; over {suspect.overall_allowed:.2f} in one graph of 100"
+)
+print(
+    f"without it {solution.edge_residuals.overall:.2f}; over what they may:",
+    solution.edge_residuals.is_misfit.sum(),
+)
 pgo.plot_graph(fooled.problem.graph, fooled.poses, "certified, and wrong")
 
 # %% [markdown]
-# (A grosser mistake may show itself: below, an edge that is wrong by 9 m leaves a gap, because the relaxation
-# is no longer tight. Do not count on it.)
+# (A larger error may be visible: below, an edge that is wrong by 9 m leaves a gap, because the
+# relaxation is no longer tight. Do not rely on it.)
 
 # %%
 gross = f"EDGE_SE2 10 {10 + 2 * side} 0.000000 0.000000 0.000000 100 0 0 100 0 400"
@@ -233,15 +264,17 @@ shown = solvers.solve(pgo.read_g2o(path))
 print(repr(shown))
 
 # %% [markdown]
-# What helps is to look at the residuals: of 118 edges one costs several times what errors with its information
-# matrix cost (the chi-square quantile that right edges exceed in one graph of 100), and the picture marks it;
-# without it no edge does. All together cost four times what is expected. That sum shows a wrong closure also where
-# few others contradict it, so that it bends the odometry and no edge stands out; and the worst edge need not be the
-# wrong one. `pgo solve square.g2o --robust gnc` looks for wrong measurements and solves without them.
+# The residuals help. Of 118 edges, one costs several times as much as errors with its information
+# matrix would (the threshold is the chi-square quantile that right edges exceed in one graph of
+# 100), and the picture marks it; without this edge, none exceeds the threshold. All edges together
+# cost four times what is expected. This sum detects a wrong closure also where few others
+# contradict it, so that the odometry deforms and no single edge stands out. But the edge with the
+# largest cost need not be the wrong one. `pgo solve square.g2o --robust gnc` looks for wrong
+# measurements and solves without them.
 
 # %% [markdown]
-# The same wrong closure, where only three of the 22 right ones contradict it. Take out the closure that costs most,
-# as one would:
+# Now the same wrong closure, where only three of the 22 right closures contradict it. The obvious
+# step is to remove the closure that costs most:
 
 # %%
 few = [*lines[: num_poses - 1], *(lines[num_poses - 1 + k] for k in (0, 9, 18)), wrong]
@@ -252,35 +285,48 @@ is_closure = np.arange(sparse_graph.num_edges) >= num_poses - 1
 ranking = np.where(is_closure, misled.edge_residuals.cost / misled.edge_residuals.allowed, 0.0)
 blamed, guilty = int(np.argmax(ranking)), sparse_graph.num_edges - 1
 relieved = solvers.solve(sparse_graph.without_edges(np.arange(sparse_graph.num_edges) == blamed))
-print(f"blamed {sparse_graph.edge_label(blamed)}; the wrong one is {sparse_graph.edge_label(guilty)}")
+print(
+    f"blamed {sparse_graph.edge_label(blamed)}; the wrong one is {sparse_graph.edge_label(guilty)}"
+)
 for name, found in (("before", misled), ("after", relieved)):
     costs = found.edge_residuals
-    print(f"{name:7} costs {costs.overall:.1f} times what is expected, {costs.overall_allowed:.1f} may be;", end=" ")
+    print(
+        f"{name:7} costs {costs.overall:.1f} times what is expected, {costs.overall_allowed:.1f} may be;",
+        end=" ",
+    )
     print(f"beyond their own threshold {costs.is_misfit.sum()}; {found!r}")
 
 # %% [markdown]
-# A right closure went, the wrong one stays, and now everything looks well: no edge is beyond its threshold, nor is
-# the sum, and the certificate holds, for these edges. [Notebook 9](09_wrong_edges.ipynb) says why, and what can be
-# done.
+# A right closure is removed, the wrong one remains, and now everything looks right: no edge exceeds
+# its threshold, nor does the sum, and the certificate holds for these edges.
+# [Notebook 9](09_wrong_edges.ipynb) explains why, and what can be done.
 
 # %%
 truth = pgo.Poses(pgo.exp_map(heading[:, None]), position)
-for name, poses in (("odometry", odometry), ("with the wrong edge", fooled.poses), ("without it", solution.poses)):
+for name, poses in (
+    ("odometry", odometry),
+    ("with the wrong edge", fooled.poses),
+    ("without it", solution.poses),
+):
     metres, radians = pgo.relative_pose_error(poses, truth)
-    print(f"{name:20} ATE {pgo.absolute_trajectory_error(poses, truth):.3f} m   RPE {metres:.3f} m, {radians:.3f} rad")
+    print(
+        f"{name:20} ATE {pgo.absolute_trajectory_error(poses, truth):.3f} m   RPE {metres:.3f} m, {radians:.3f} rad"
+    )
 
 # %% [markdown]
-# ## Hand it on
+# ## Pass it on
 #
-# `Solution.save` writes what the suffix says: `.g2o` for the next optimiser, TUM and KITTI for evo, `.json` for
-# everything else. In the plane the trajectories are lifted to $z = 0$.
+# The suffix selects the format that `Solution.save` writes: `.g2o` for the next optimiser, TUM and
+# KITTI for evo, `.json` for everything else. In the plane the trajectories are lifted to $z = 0$.
 
 # %%
 for name in ("solved.g2o", "solved.tum", "solved.kitti", "solved.json"):
     solution.save(Path(folder.name) / name)
 pgo.write_tum(truth, Path(folder.name) / "truth.tum")
 for name in ("solved.tum", "solved.kitti"):
-    print(f"{name:13} {(Path(folder.name) / name).read_text(encoding='utf-8').splitlines()[1][:90]}")
+    print(
+        f"{name:13} {(Path(folder.name) / name).read_text(encoding='utf-8').splitlines()[1][:90]}"
+    )
 
 # %% [markdown]
 # On the command line:
@@ -289,25 +335,28 @@ for name in ("solved.tum", "solved.kitti"):
 #     pgo certify square.g2o --estimate theirs.tum
 #     evo_ape tum truth.tum solved.tum --align --plot
 #
-# What was written comes back:
+# Reading the file returns the same poses:
 
 # %%
 returned = pgo.read_tum(Path(folder.name) / "solved.tum", d=2)
 again = pgo.read_g2o(Path(folder.name) / "solved.g2o")
-kitti = read_kitti(Path(folder.name) / "solved.kitti", d=2)
-print(f"F of the poses: solved {solution.objective:.9f}, TUM {problem.objective(returned):.9f}, ", end="")
+kitti = pgo.read_kitti(Path(folder.name) / "solved.kitti", d=2)
+print(
+    f"F of the poses: solved {solution.objective:.9f}, TUM {problem.objective(returned):.9f}, ",
+    end="",
+)
 print(f"KITTI {problem.objective(kitti):.9f}, g2o {problem.objective(again.initial):.9f}")
 
 # %% [markdown]
 # ## Exercises
 #
-# **1.** A colleague says that all sensors are twice as exact as the file has it. What becomes of the poses, of the
-# covariances, of the test of the edges?
+# **1.** A colleague says that all sensors are twice as accurate as the file states. How do the
+# poses, the covariances and the test of the edges change?
 #
 # <details><summary>Answer</summary>
 #
-# Information is four times as large. The poses stay; covariances are a quarter; every cost is four times as large, so
-# that edges fail the test which passed it.
+# The information is four times as large. The poses do not change, the covariances are a quarter,
+# and every cost is four times as large, so that some edges now fail the test.
 #
 # ```python
 # confident = graph.with_weights(4 * graph.kappa, 4 * graph.tau)
@@ -319,11 +368,12 @@ print(f"KITTI {problem.objective(kitti):.9f}, g2o {problem.objective(again.initi
 #
 # </details>
 #
-# **2.** Turn the whole trajectory by a degree and shift it by a kilometre. What does the certificate say?
+# **2.** Rotate the whole trajectory by a degree and shift it by a kilometre. What does the
+# certificate say?
 #
 # <details><summary>Answer</summary>
 #
-# The same: $F$ does not know the frame.
+# The same, because $F$ does not depend on the frame.
 #
 # ```python
 # R = pgo.exp_map(np.array([[np.deg2rad(1.0)]]))[0]
@@ -333,12 +383,13 @@ print(f"KITTI {problem.objective(kitti):.9f}, g2o {problem.objective(again.initi
 #
 # </details>
 #
-# **3.** With one closure that is wrong and no other, can any test of residuals find it?
+# **3.** If the only closure is wrong, can any test of residuals find it?
 #
 # <details><summary>Answer</summary>
 #
-# No. Without a second closure nothing contradicts it: the odometry bends by as much as the closure asks, spread over
-# all its edges, and every one of them stays below its threshold.
+# No. Without a second closure nothing contradicts it. The odometry deforms by as much as the
+# closure requires, the deformation is spread over all its edges, and every edge stays below its
+# threshold.
 #
 # ```python
 # alone = Path(tempfile.mkdtemp()) / "alone.g2o"
@@ -374,7 +425,9 @@ assert blamed != guilty
 assert misled.edge_residuals.is_doubtful
 assert relieved.is_certified
 assert not relieved.edge_residuals.is_doubtful
-assert pgo.absolute_trajectory_error(solution.poses, truth) < 0.8 * pgo.absolute_trajectory_error(fooled.poses, truth)
+assert pgo.absolute_trajectory_error(solution.poses, truth) < 0.8 * pgo.absolute_trajectory_error(
+    fooled.poses, truth
+)
 assert np.isclose(problem.objective(returned), solution.objective, rtol=1e-9)
 assert np.isclose(problem.objective(kitti), solution.objective, rtol=1e-9)
 assert np.isclose(problem.objective(again.initial), solution.objective, rtol=1e-9)

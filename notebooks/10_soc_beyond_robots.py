@@ -1,12 +1,14 @@
 # %% [markdown]
 # # 10. What else does splitting solve, where orthogonality is the only difficulty?
 #
-# Open with `jupyter lab notebooks/10_soc_beyond_robots.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+# Open with `jupyter lab notebooks/10_soc_beyond_robots.ipynb`; `pip install -e '.[notebooks,fast]'`
+# installs it.
 #
-# Nothing in the paper's equation (19), its three steps, knows of robots: (a) is any convex problem, (b) a projection,
-# (c) a sum. Four problems from elsewhere, each with a rival that is usually taken: modes of a vibrating plate that
-# live somewhere, a rotation fitted to points of which some are wrong, principal components that can be read, and the
-# sparse low-rank approximation that the paper's second remark names for compressing what robots send.
+# The three steps of the paper's equation (19) do not depend on robots: (a) is any convex problem,
+# (b) a projection, (c) a sum. This notebook solves four problems from other fields, each beside the
+# usual method: localised modes of a vibrating plate, a rotation fitted to points of which some are
+# wrong, interpretable principal components, and the sparse low-rank approximation that the paper's
+# second remark names for compressing what robots send.
 
 # %%
 import itertools
@@ -27,14 +29,15 @@ plt.rcParams["figure.dpi"] = 110
 # %% [markdown]
 # ## Compressed modes
 #
-# The eigenvectors of a Laplacian are waves: each is everywhere. Ozolins, Lai, Caflisch and Osher (2013) asked for
-# orthonormal columns that are local instead, by a price on the 1-norm:
+# The eigenvectors of a Laplacian are waves that extend over the whole plate. Ozolins, Lai, Caflisch
+# and Osher (2013) compute orthonormal columns that are local instead, by a penalty on the 1-norm:
 #
 # $$\min_X \; \operatorname{tr}(X^\top A X) + w \sum |X_{ij}| \quad \text{subject to} \quad X^\top X = I.$$
 #
-# Convex but for the constraint. Split twice: a copy $P$ carries the constraint, a copy $Q$ the 1-norm. Then (a) is a
-# linear system with one matrix for all iterations, (b) two proximal operators in closed form, an SVD and a soft
-# threshold ($\operatorname{sign}(v) \max(|v| - s, 0)$, in `pgo_models.convex.prox`), (c) two sums.
+# The problem is convex except for the constraint. Split it twice: a copy $P$ carries the
+# constraint, and a copy $Q$ the 1-norm. Then (a) is a linear system with one matrix for all
+# iterations, (b) two proximal operators in closed form, an SVD and a soft threshold
+# ($\operatorname{sign}(v) \max(|v| - s, 0)$, in `pgo_models.convex.prox`), (c) two sums.
 
 
 # %%
@@ -64,38 +67,51 @@ plate = np.kron(line, np.eye(side)) + np.kron(np.eye(side), line)
 waves = np.linalg.eigh(plate)[1][:, :4]
 modes, thresholded, residual = compressed_modes(plate, 4, 0.2, 8.0, 800, np.random.default_rng(0))
 print(f"residual {residual:.0e}; nonzeros of {side**2}: {(np.abs(thresholded) > 1e-9).sum(axis=0)}")
-print(f"objective: compressed {price(plate, 0.2, modes):.3f}, eigenvectors {price(plate, 0.2, waves):.3f}")
+print(
+    f"objective: compressed {price(plate, 0.2, modes):.3f}, eigenvectors {price(plate, 0.2, waves):.3f}"
+)
 
 figure, panels = plt.subplots(2, 4, figsize=(7.0, 3.6), layout="constrained")
 for row, (name, columns) in enumerate((("eigenvector", waves), ("compressed mode", modes))):
     for k in range(4):
         field = columns[:, k].reshape(side, side)
-        panels[row, k].imshow(field, cmap="RdBu", vmin=-np.abs(field).max(), vmax=np.abs(field).max())
+        panels[row, k].imshow(
+            field, cmap="RdBu", vmin=-np.abs(field).max(), vmax=np.abs(field).max()
+        )
         panels[row, k].set_title(f"{name} {k + 1}", fontsize=8)
         panels[row, k].axis("off")
 
 # %% [markdown]
-# Above the eigenvectors, below the compressed modes: each has a place of its own, and is exactly zero elsewhere. They
-# are no eigenvectors; as $w$ goes to zero they span the same space.
+# The upper row shows the eigenvectors, the lower row the compressed modes. Each mode is local, and
+# exactly zero elsewhere. The modes are not eigenvectors; as $w$ goes to zero they span the same
+# space.
 #
 # ## The library agrees
 #
-# `sparse_components` is the same problem for `solve_orthogonal`, whose step (a) is cvxpy and Clarabel with the 1-norm
-# left in it: another splitting, the same stationary points. Started at ours it stays there.
+# `sparse_components` is the same problem for `solve_orthogonal`, whose step (a) uses cvxpy and
+# Clarabel and keeps the 1-norm. This is another splitting with the same stationary points. Started
+# at our solution, it stays there.
 
 # %%
 string = path_laplacian(20)
 by_hand, _, _ = compressed_modes(string, 2, 0.2, 8.0, 1500, np.random.default_rng(1))
 small = sparse_components(string, 2, 0.2)
-run = solvers.run(solvers.OrthogonalSOC(penalty=8.0, tolerance=1e-4, max_iterations=300), small, small.point([by_hand]))
-print(f"objective by hand {price(string, 0.2, by_hand):.6f}, by the library {run.objective:.6f}, {run.status.name}")
+run = solvers.run(
+    solvers.OrthogonalSOC(penalty=8.0, tolerance=1e-4, max_iterations=300),
+    small,
+    small.point([by_hand]),
+)
+print(
+    f"objective by hand {price(string, 0.2, by_hand):.6f}, by the library {run.objective:.6f}, {run.status.name}"
+)
 
 # %% [markdown]
 # ## A rotation, and points of which some are wrong
 #
-# Two scans of the same points, turned against each other: Procrustes' problem. The sum of *squares* has the closed
-# form of [notebook 4](04_splitting_orthogonality.ipynb), and one point that was matched to the wrong partner turns
-# it. The sum of *distances* has no closed form, and is just as convex.
+# Two scans of the same points are rotated relative to each other: this is Procrustes' problem. The
+# sum of *squares* has the closed form of [notebook 4](04_splitting_orthogonality.ipynb), but one
+# point that is matched to the wrong partner changes the rotation. The sum of *distances* has no
+# closed form, and is also convex.
 
 # %%
 rng = np.random.default_rng(1)
@@ -123,33 +139,54 @@ for share in shares:
     fit = pgo.OrthogonalProblem(distances, rotations=[X])
     found = solvers.run(solvers.OrthogonalSOC(tolerance=1e-4), fit, fit.point([squares]))
     errors[share] = degrees(squares), degrees(found.state.copies[0])
-    print("{:.0%} wrong: off by {:5.2f} degrees by squares, {:.2f} by distances".format(share, *errors[share]))
-assert np.isclose(procrustes(points, seen, rotation=True).objective([squares]), np.sum((points @ squares - seen) ** 2))
+    print(
+        "{:.0%} wrong: off by {:5.2f} degrees by squares, {:.2f} by distances".format(
+            share, *errors[share]
+        )
+    )
+assert np.isclose(
+    procrustes(points, seen, rotation=True).objective([squares]),
+    np.sum((points @ squares - seen) ** 2),
+)
 
 # %% [markdown]
-# ## Principal components that can be read
+# ## Interpretable principal components
 #
-# Thirty sensors, three hidden causes, each of which moves eight sensors. Principal components mix the causes, since
-# whatever rotates them explains the same variance. With a price on the 1-norm the mixing costs something.
+# There are thirty sensors and three hidden causes, each of which affects eight sensors. Principal
+# components mix the causes, since every rotation of them explains the same variance. With a penalty
+# on the 1-norm, mixing has a cost.
 
 # %%
 causes = np.zeros((30, 3))
 for k in range(3):
     causes[10 * k : 10 * k + 8, k] = 8**-0.5
-readings = rng.standard_normal((80, 3)) @ np.diag([3.0, 2.8, 2.6]) @ causes.T + 0.5 * rng.standard_normal((80, 30))
+readings = rng.standard_normal((80, 3)) @ np.diag(
+    [3.0, 2.8, 2.6]
+) @ causes.T + 0.5 * rng.standard_normal((80, 30))
 covariance = readings.T @ readings / 80
 values, vectors = np.linalg.eigh(covariance)
 principal = vectors[:, -3:]
-sparse = sparse_components(values[-1] * np.eye(30) - covariance, 3, 0.6)  # largest of C: smallest of c I - C
-components = solvers.run(solvers.OrthogonalSOC(tolerance=1e-4), sparse, sparse.point([principal])).state.X[0]
+sparse = sparse_components(
+    values[-1] * np.eye(30) - covariance, 3, 0.6
+)  # largest of C: smallest of c I - C
+components = solvers.run(
+    solvers.OrthogonalSOC(tolerance=1e-4), sparse, sparse.point([principal])
+).state.X[0]
 
 
 def likeness(X):
     return np.abs(X.T @ causes).max(axis=1)
 
 
-explained = [np.trace(X.T @ covariance @ X) / values.sum() for X in (principal, project_stiefel(components))]
-print("likeness to a cause: principal", likeness(principal).round(2), " sparse", likeness(components).round(2))
+explained = [
+    np.trace(X.T @ covariance @ X) / values.sum() for X in (principal, project_stiefel(components))
+]
+print(
+    "likeness to a cause: principal",
+    likeness(principal).round(2),
+    " sparse",
+    likeness(components).round(2),
+)
 print("variance explained: principal {:.1%}, sparse {:.1%}".format(*explained))
 figure, panels = plt.subplots(1, 2, figsize=(7.0, 1.8), layout="constrained", sharey=True)
 for axes, title, X in zip(panels, ("principal", "sparse"), (principal, components), strict=True):
@@ -159,20 +196,25 @@ for axes, title, X in zip(panels, ("principal", "sparse"), (principal, component
 # %% [markdown]
 # ## Sparse low-rank approximation
 #
-# The paper's remark: robots send samples that are alike among each other (*low rank*) and smooth in time (*sparse* in
-# a cosine transform). SLRMA (Hou, Chau, Magnenat-Thalmann and He 2017) wants both at once:
+# The paper's remark: robots send samples that are similar to each other (*low rank*) and smooth in
+# time (*sparse* in a cosine transform). SLRMA (Hou, Chau, Magnenat-Thalmann and He 2017) uses both
+# properties:
 #
 # $$\min_{B, C} \lVert Y - B C \rVert_F^2 \quad \text{subject to} \quad B^\top B = I, \quad \lVert B \rVert_0 \le s.$$
 #
-# For a given $B$ the best $C$ is $B^\top Y$, which leaves $\lVert Y \rVert^2 - \lVert B^\top Y \rVert^2$: concave. On
-# $B^\top B = I$ it is $\operatorname{tr}(B^\top (c I - Y Y^\top) B)$ plus a constant, convex for $c = \lVert Y
-# \rVert_2^2$. Now $B$ is in *two* sets, neither convex, and has a copy in each.
+# For a given $B$ the best $C$ is $B^\top Y$, and the remaining cost
+# $\lVert Y \rVert^2 - \lVert B^\top Y \rVert^2$ is concave. On $B^\top B = I$ it is
+# $\operatorname{tr}(B^\top (c I - Y Y^\top) B)$ plus a constant, convex for
+# $c = \lVert Y \rVert_2^2$. Now $B$ must be in *two* sets, neither of which is convex, and it has a
+# copy in each.
 
 # %%
 rng = np.random.default_rng(2)
 time_steps, robots, rank, rho_share = 64, 24, 4, 3.0
 paths = np.cumsum(np.cumsum(rng.standard_normal((time_steps, robots)), axis=0), axis=0)
-paths = (paths - paths.mean(axis=0)) @ (0.3 * np.eye(robots) + rng.standard_normal((robots, robots)) / robots)
+paths = (paths - paths.mean(axis=0)) @ (
+    0.3 * np.eye(robots) + rng.standard_normal((robots, robots)) / robots
+)
 paths /= np.linalg.norm(paths, 2)  # in units in which c = 1
 Y = dct(paths, axis=0, norm="ortho")
 U, spectrum, _ = np.linalg.svd(Y, full_matrices=False)
@@ -203,16 +245,23 @@ curves = {
 figure, axes = plt.subplots(figsize=(5.0, 2.8), layout="constrained")
 for (name, curve), marker in zip(curves.items(), "os", strict=True):
     axes.plot(kept, curve, f"{marker}-", label=name)
-axes.axhline(relative_error(U[:, :rank]), color="#999999", linestyle=":", label=f"SVD, all {rank * time_steps} entries")
+axes.axhline(
+    relative_error(U[:, :rank]),
+    color="#999999",
+    linestyle=":",
+    label=f"SVD, all {rank * time_steps} entries",
+)
 axes.set(xlabel="nonzeros of B", ylabel="relative error")
 _ = axes.legend(fontsize=8)
 
 # %% [markdown]
-# The library takes the same steps: one copy for each set, the same penalty.
+# The library takes the same steps, with one copy for each set and the same penalty.
 
 # %%
 problem = sparse_low_rank(Y, rank, 24)
-states = solvers.iterate(solvers.OrthogonalSOC(penalty=rho_share * c), problem, problem.point([U[:, :rank]]))
+states = solvers.iterate(
+    solvers.OrthogonalSOC(penalty=rho_share * c), problem, problem.point([U[:, :rank]])
+)
 library = next(itertools.islice(states, 20, None)).copies
 difference = max(np.abs(a - b).max() for a, b in zip(library, slrma(24, 20), strict=True))
 print(f"after 20 iterations the copies differ by {difference:.0e}")
@@ -223,22 +272,26 @@ decoded = idct(restored @ np.linalg.lstsq(restored, Y, rcond=None)[0], axis=0, n
 figure, axes = plt.subplots(figsize=(5.0, 2.4), layout="constrained")
 axes.plot(paths[:, :4], color="#999999", linewidth=2.5)
 axes.plot(decoded[:, :4], color="#0072B2", linewidth=1.0)
-axes.set(xlabel="time", ylabel="position", title="four of the robots, and from 24 numbers and 4 a robot")
+axes.set(
+    xlabel="time", ylabel="position", title="four of the robots, and from 24 numbers and 4 a robot"
+)
 sent = np.count_nonzero(restored) + rank * robots
 print(f"{sent} numbers in place of {Y.size}; error {relative_error(restored):.1%}")
 
 # %% [markdown]
 # ## Where it fails
 #
-# 1. $\rho$ has a threshold, as with robots: the multipliers of the constraint decide. Below it the modes never
-#    settle.
-# 2. What is found is a *stationary point*. The compressed modes of another start sit elsewhere; with two sets that
-#    are not convex, as in SLRMA, a random start mostly ends worse than that of the SVD.
+# 1. As with robots, $\rho$ has a threshold, which the multipliers of the constraint determine.
+#    Below it the modes do not converge.
+# 2. The result is a *stationary point*. The compressed modes of another initial estimate are
+#    elsewhere. With two sets that are not convex, as in SLRMA, a random initial estimate mostly
+#    gives a worse result than that of the SVD.
 
 # %%
 never = compressed_modes(plate, 4, 0.2, 1.0, 800, np.random.default_rng(0))[2]
 objectives = [
-    price(plate, 0.2, compressed_modes(plate, 4, 0.2, 8.0, 800, np.random.default_rng(k))[0]) for k in range(5)
+    price(plate, 0.2, compressed_modes(plate, 4, 0.2, 8.0, 800, np.random.default_rng(k))[0])
+    for k in range(5)
 ]
 print(f"rho = 1: residual {never:.1f} after 800 iterations")
 print("rho = 8, other starts: objectives", np.round(sorted(objectives), 3))
@@ -246,13 +299,13 @@ print("rho = 8, other starts: objectives", np.round(sorted(objectives), 3))
 # %% [markdown]
 # ## Exercises
 #
-# **1.** Which $\rho$ does a larger price need? Find by trial one with which the modes settle at $w = 0.5$, where 8 is
-# too small.
+# **1.** Which $\rho$ does a larger $w$ need? Find by trial a value with which the modes converge at
+# $w = 0.5$, where 8 is too small.
 #
 # <details><summary>Answer</summary>
 #
-# The subgradient of $w \sum |X|$ grows with $w$, and with it the multiplier of $X^\top X = I$ that has to balance it.
-# The threshold of $\rho$ grows in proportion.
+# The subgradient of $w \sum |X|$ grows with $w$, and with it the multiplier of $X^\top X = I$ that
+# has to balance it. The threshold of $\rho$ grows in proportion.
 #
 # ```python
 # settled = {rho: compressed_modes(plate, 4, 0.5, rho, 800, np.random.default_rng(0))[2] for rho in (8.0, 20.0)}
@@ -261,12 +314,13 @@ print("rho = 8, other starts: objectives", np.round(sorted(objectives), 3))
 #
 # </details>
 #
-# **2.** No answer of `sparse_components` is below the sum of the smallest eigenvalues plus $w$ times the number of
-# columns. Why?
+# **2.** No answer of `sparse_components` is below the sum of the smallest eigenvalues plus $w$
+# times the number of columns. Why?
 #
 # <details><summary>Answer</summary>
 #
-# The two terms are bounded one by one: the trace by Ky Fan, the 1-norm of a unit column by its 2-norm, which is 1.
+# Each of the two terms is bounded: the trace by Ky Fan, the 1-norm of a unit column by its 2-norm,
+# which is 1.
 #
 # ```python
 # least = np.linalg.eigvalsh(plate)[:4].sum() + 0.2 * 4
@@ -275,13 +329,15 @@ print("rho = 8, other starts: objectives", np.round(sorted(objectives), 3))
 #
 # </details>
 #
-# **3.** Fit the rotation with half of the points wrong, and then with the wrong ones *agreeing*: all moved by one other
-# rotation. Which of the two does the sum of distances survive?
+# **3.** Fit the rotation with half of the points wrong, and then with the wrong ones *agreeing*:
+# all rotated by the same other rotation. In which case does the sum of distances still find the
+# rotation?
 #
 # <details><summary>Answer</summary>
 #
-# Random errors cancel, so half of them do little. Errors that agree are a second rotation, and the majority wins:
-# with 60 % of them the fit is theirs. Wrong loop closures behave alike ([notebook 9](09_wrong_edges.ipynb)).
+# In the first. Random errors cancel, so half of the points change little. Errors that agree define
+# a second rotation, and the majority wins: with 60 % of such errors the fit finds their rotation.
+# Wrong loop closures behave in the same way ([notebook 9](09_wrong_edges.ipynb)).
 #
 # ```python
 # def fitted(seen):

@@ -1,12 +1,14 @@
 # %% [markdown]
 # # 11. How do machines agree on an answer when none shows its data?
 #
-# Open with `jupyter lab notebooks/11_admm_across_machines.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+# Open with `jupyter lab notebooks/11_admm_across_machines.ipynb`;
+# `pip install -e '.[notebooks,fast]'` installs it.
 #
-# The paper's section *Equivalence to ADMM* ends where ADMM becomes useful for robots: with one pass ($T = 1$) the
-# blocks of $x$ are minimised one by one, and blocks that share no term can be minimised *at the same time*, on
-# different machines. Boyd et al. (2011, chapter 7) know three patterns of it. This notebook codes them, and then does
-# with two robots, line for line, what it did with five hospitals.
+# The paper's section *Equivalence to ADMM* ends where ADMM becomes useful for robots: with one pass
+# ($T = 1$) the blocks of $x$ are minimised one by one, and blocks that share no term can be
+# minimised *at the same time*, on different machines. Boyd et al. (2011, chapter 7) describe three
+# patterns for this. This notebook codes them for machines that are not robots, and then runs the
+# same code, line for line, for two robots.
 
 # %%
 import itertools
@@ -26,21 +28,23 @@ rng = np.random.default_rng(0)
 # %% [markdown]
 # ## Consensus: one model, data in five places
 #
-# Five hospitals have measured different patients. Together they want the sparse model that all data ask for,
+# Five hospitals have measured different patients. Together they want the sparse model that fits all
+# data,
 #
 # $$\min_x \sum_a \tfrac12 \lVert A_a x - b_a \rVert^2 + w \lVert x \rVert_1 .$$
 #
-# Give each its own $x_a$, and one $z$ that all must equal: $x_a - z = 0$ is the constraint $\mathcal{K} x = f$ of
-# equation (1), `problem bregman`. Minimise over all $x_a$ (they share no term), then over $z$, then add the residual
-# back:
+# Give each hospital its own $x_a$, and one $z$ to which all must be equal: $x_a - z = 0$ is the
+# constraint $\mathcal{K} x = f$ of equation (1), `problem bregman`. Minimise over all $x_a$ (they
+# share no term), then over $z$, then add the residual back:
 #
 # $$\begin{aligned}
 #   x_a &= \arg\min_x f_a(x) + \tfrac\rho2 \lVert x - z + u_a \rVert^2 && \text{each machine alone} \\
-#   z &= \operatorname{prox}\bigl(\text{mean of } x_a + u_a\bigr) && \text{what all have to know} \\
+#   z &= \operatorname{prox}\bigl(\text{mean of } x_a + u_a\bigr) && \text{known to all} \\
 #   u_a &\leftarrow u_a + x_a - z && \text{each machine alone}
 # \end{aligned}$$
 #
-# A machine need not hold all of $z$ (Boyd's *general form*, 7.2): `held[a]` says which rows it has copies of.
+# A machine need not hold all of $z$ (Boyd's *general form*, 7.2): `held[a]` lists the rows of which
+# it has copies.
 
 
 # %%
@@ -83,37 +87,48 @@ loss = 0.5 * cp.sum_squares(np.vstack(A) @ x - np.concatenate(b))
 accurate = {"solver": cp.CLARABEL, "tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12, "tol_feas": 1e-12}
 cp.Problem(cp.Minimize(loss + price * cp.norm1(x))).solve(**accurate)
 distance = [np.linalg.norm(z - x.value) for z in by_hand]
-print("distance to the model from pooled data, after 10, 30, 60 rounds:", *(f"{distance[k]:.0e}" for k in (9, 29, 59)))
-print(f"nonzeros: {np.count_nonzero(by_hand[-1])} of {size}, the truth has {np.count_nonzero(model)}")
+print(
+    "distance to the model from pooled data, after 10, 30, 60 rounds:",
+    *(f"{distance[k]:.0e}" for k in (9, 29, 59)),
+)
+print(
+    f"nonzeros: {np.count_nonzero(by_hand[-1])} of {size}, the truth has {np.count_nonzero(model)}"
+)
 
 # %% [markdown]
 # ## The library agrees
 #
-# `AlternatingBregman` with $T = 1$ is equation (9), `bregman ADMM`, over the blocks that the problem names: five
-# $x_a$ and $z$.
+# `AlternatingBregman` with $T = 1$ is equation (9), `bregman ADMM`, over the blocks that the
+# problem names: five $x_a$ and $z$.
 
 # %%
 blocks = [cp.Variable(size, name=f"x_{a}") for a in range(machines)]
 z = cp.Variable(size, name="z")
 losses = [0.5 * cp.sum_squares(A_a @ x_a - b_a) for A_a, x_a, b_a in zip(A, blocks, b, strict=True)]
 K = np.hstack([np.eye(machines * size), -np.tile(np.eye(size), (machines, 1))])
-lasso = pgo.BregmanProblem(sum(losses, price * cp.norm1(z)), [*blocks, z], K, np.zeros(machines * size))
-states = itertools.islice(solvers.iterate(solvers.AlternatingBregman(alpha=rho, passes=1), lasso), 1, 11)
-difference = max(np.abs(state.x[-size:] - mine).max() for state, mine in zip(states, by_hand, strict=False))
+lasso = pgo.BregmanProblem(
+    sum(losses, price * cp.norm1(z)), [*blocks, z], K, np.zeros(machines * size)
+)
+states = itertools.islice(
+    solvers.iterate(solvers.AlternatingBregman(alpha=rho, passes=1), lasso), 1, 11
+)
+difference = max(
+    np.abs(state.x[-size:] - mine).max() for state, mine in zip(states, by_hand, strict=False)
+)
 print(f"differs from ours by {difference:.0e} in 10 rounds")
 
 # %% [markdown]
 # ## Sharing: many plans, one total
 #
-# Twelve power stations plan 24 hours. Each has its own cost and its own limits, and what counts for all is the *sum*:
-# how far it is from the demand,
+# Twelve power stations plan 24 hours. Each has its own cost and its own limits, and a common cost
+# depends on the distance of the *sum* from the demand,
 #
 # $$\min \sum_a f_a(x_a) + g\Bigl(\sum_a x_a\Bigr), \qquad
 #   f_a(x) = \tfrac{q_a}2 \lVert x \rVert^2 \text{ on } [0, c_a], \quad
 #   g(s) = \tfrac w2 \lVert s - \text{demand} \rVert^2 .$$
 #
-# Nobody needs to see another's plan, only the *mean* (7.3): with $\bar x$ the mean of the plans and $\bar z$ what it
-# should be,
+# No station needs to see the plan of another one, only the *mean* (7.3): with $\bar x$ the mean of
+# the plans and $\bar z$ its target value,
 #
 # $$x_a \leftarrow \operatorname{prox}_{f_a / \rho}\bigl(x_a + \bar z - \bar x - u\bigr), \qquad
 #   \bar z \leftarrow \arg\min_{\bar z} g(N \bar z) + \tfrac{N \rho}2 \lVert \bar z - u - \bar x \rVert^2, \qquad
@@ -122,7 +137,9 @@ print(f"differs from ours by {difference:.0e} in 10 rounds")
 # %%
 stations, hours, w, rho = 12, 24, 4.0, 1.0
 q, cap = rng.uniform(0.5, 3.0, (stations, 1)), rng.uniform(0.5, 2.0, (stations, 1))
-demand = 8.0 + 3.0 * np.sin(2 * np.pi * (np.arange(hours) - 8) / 24) + 0.5 * rng.standard_normal(hours)
+demand = (
+    8.0 + 3.0 * np.sin(2 * np.pi * (np.arange(hours) - 8) / 24) + 0.5 * rng.standard_normal(hours)
+)
 
 
 def sharing(rounds):
@@ -139,7 +156,9 @@ def sharing(rounds):
 
 X = cp.Variable((stations, hours))
 cost = cp.sum(cp.multiply(q / 2, cp.square(X))) + w / 2 * cp.sum_squares(cp.sum(X, axis=0) - demand)
-central = cp.Problem(cp.Minimize(cost), [X >= 0, cp.multiply(np.ones((1, hours)), X) <= np.tile(cap, (1, hours))])
+central = cp.Problem(
+    cp.Minimize(cost), [X >= 0, cp.multiply(np.ones((1, hours)), X) <= np.tile(cap, (1, hours))]
+)
 central.solve(**accurate)
 film = list(sharing(200))
 shared_distance = [np.abs(plans - X.value).max() for plans, _ in film]
@@ -149,14 +168,14 @@ print(*(f"{shared_distance[k]:.0e}" for k in (19, 59, 199)))
 # %% [markdown]
 # ## Exchange: a price that nobody sets
 #
-# Special case: $g$ says that the sum *is* zero. Buyers want $x_a > 0$, sellers $x_a < 0$; each knows only what it is
-# worth to itself, $f_a(x) = \tfrac{q_a}2 \lVert x - \text{wish}_a \rVert^2$. Then $\bar z = 0$ and two lines are
-# left,
+# In a special case, $g$ requires that the sum *is* zero. Buyers want $x_a > 0$ and sellers
+# $x_a < 0$. Each knows only its own cost,
+# $f_a(x) = \tfrac{q_a}2 \lVert x - \text{wish}_a \rVert^2$. Then $\bar z = 0$ and two lines remain,
 #
 # $$x_a \leftarrow \operatorname{prox}_{f_a / \rho}(x_a - \bar x - u), \qquad u \leftarrow u + \bar x .$$
 #
-# $\rho u$ goes up where more is wanted than offered and down where less is: it is the price, and its limit is the
-# multiplier of $\sum_a x_a = 0$.
+# $\rho u$ increases where demand exceeds supply, and decreases where supply exceeds demand: it is
+# the price, and its limit is the multiplier of $\sum_a x_a = 0$.
 
 # %%
 traders, goods = 20, 3
@@ -177,7 +196,9 @@ def exchange(rounds, share=1.0):
 
 T = cp.Variable((traders, goods))
 balance = cp.sum(T, axis=0) == 0
-cp.Problem(cp.Minimize(cp.sum(cp.multiply(q_a / 2, cp.square(T - wish)))), [balance]).solve(solver=cp.CLARABEL)
+cp.Problem(cp.Minimize(cp.sum(cp.multiply(q_a / 2, cp.square(T - wish)))), [balance]).solve(
+    solver=cp.CLARABEL
+)
 trades, prices = exchange(60)
 figure, (left, right) = plt.subplots(1, 2, figsize=(7.5, 2.6), layout="constrained")
 left.semilogy(distance, label="consensus")
@@ -194,10 +215,12 @@ _ = right.set(xlabel="round", ylabel="price", title="dotted: cvxpy's multiplier"
 # %% [markdown]
 # ## The bridge: two robots
 #
-# Now the machines are robots and $z$ is poses. $f_a$ are the edges that robot $a$ knows, half of those it shares with
-# the other; it holds its own poses and copies of the other's separators (`held`). In place of the soft threshold $z$
-# goes through the projection to rotations: the constraint of equation (18), `relaxation rotation`, on the consensus
-# variable. Everything else is the function `consensus` from above, unchanged. That is the coupling `CONSENSUS`.
+# Now the machines are robots and $z$ is poses. The cost $f_a$ contains the edges that robot $a$
+# knows, with half of those that it shares with the other robot. The robot holds its own poses and
+# copies of the other's separators (`held`). Instead of the soft threshold, $z$ is projected to
+# rotations, which is the constraint of equation (18), `relaxation rotation`, on the consensus
+# variable. The rest is the function `consensus` from above, unchanged. This is the coupling
+# `CONSENSUS`.
 
 # %%
 graph = pgo.load("grid")
@@ -212,8 +235,12 @@ knows = [(owner[graph.i] == a) | (owner[graph.j] == a) for a in range(2)]
 poses = [np.unique(np.concatenate([graph.i[edges], graph.j[edges]])) for edges in knows]
 held = [np.concatenate([p, (n + d * p[:, None] + np.arange(d)).ravel()]) for p in poses]
 is_shared = np.bincount(np.concatenate(poses), minlength=n) > 1
-penalty = np.concatenate([relative_rho_t * problem.M.diagonal()[:n] * is_shared, np.full(n * d, rho)])
-penalty /= np.concatenate([1.0 + is_shared, np.repeat(1.0 + is_shared, d)])  # shared equally by the copies
+penalty = np.concatenate(
+    [relative_rho_t * problem.M.diagonal()[:n] * is_shared, np.full(n * d, rho)]
+)
+penalty /= np.concatenate(
+    [1.0 + is_shared, np.repeat(1.0 + is_shared, d)]
+)  # shared equally by the copies
 
 
 def robot_step(a):
@@ -223,7 +250,9 @@ def robot_step(a):
     D = penalty[held[a]][:, None]
     inverse = np.linalg.inv(M_a + np.diag(D[:, 0]) / 2)
     balance = -2 * M_a @ start.stacked()[held[a]]  # forces of the start, which u is to hold
-    return lambda v: inverse @ (D / 2 * v), np.divide(balance, D, out=np.zeros_like(balance), where=D > 0)
+    return lambda v: inverse @ (D / 2 * v), np.divide(
+        balance, D, out=np.zeros_like(balance), where=D > 0
+    )
 
 
 def rotations(z):
@@ -247,36 +276,48 @@ soc = solvers.SOC(
 )
 library = [state.omega for state in itertools.islice(solvers.iterate(soc, problem), 1, 26)]
 bridge = max(
-    np.abs(z[n:].reshape(n, d, d).transpose(0, 2, 1) - omega).max() for z, omega in zip(ours, library, strict=True)
+    np.abs(z[n:].reshape(n, d, d).transpose(0, 2, 1) - omega).max()
+    for z, omega in zip(ours, library, strict=True)
 )
 best = solvers.solve(problem)
-gaps = [problem.objective(problem.with_best_translations(omega)) / best.objective - 1 for omega in library]
-print(f"two robots: differs from the library by {bridge:.0e} in 25 rounds; gap {gaps[0]:.0e} -> {gaps[-1]:.0e}")
+gaps = [
+    problem.objective(problem.with_best_translations(omega)) / best.objective - 1
+    for omega in library
+]
+print(
+    f"two robots: differs from the library by {bridge:.0e} in 25 rounds; gap {gaps[0]:.0e} -> {gaps[-1]:.0e}"
+)
 
 # %% [markdown]
 # ## Where it fails
 #
-# 1. *Everybody corrects the whole error.* In the exchange each trader takes back the *mean* excess. If each took back
-#    the whole of it, twenty would correct it twentyfold.
-# 2. *Bytes.* Each round of consensus sends two vectors a machine. Here it would have been cheaper to send the data.
-# 3. Nothing is secret: from $x_a + u_a$ over the rounds others can infer much of $A_a$ and $b_a$. Privacy needs more
-#    than ADMM.
+# 1. *Everybody corrects the whole error.* In the exchange each trader corrects the *mean* excess.
+#    If each corrected the whole excess, twenty traders would correct it twentyfold.
+# 2. *Bytes.* Each round of consensus sends two vectors per machine. In this example it would have
+#    been cheaper to send the data.
+# 3. *Nothing is secret.* From $x_a + u_a$ over the rounds, others can infer much of $A_a$ and
+#    $b_a$. Privacy needs more than ADMM.
 
 # %%
 with np.errstate(over="ignore", invalid="ignore"):
     _, wild = exchange(60, share=float(traders))
-sent, data = 60 * machines * 2 * size, sum(A_a.size + b_a.size for A_a, b_a in zip(A, b, strict=True))
+sent, data = (
+    60 * machines * 2 * size,
+    sum(A_a.size + b_a.size for A_a, b_a in zip(A, b, strict=True)),
+)
 print(f"everybody corrects the whole excess: price {np.abs(wild[-1]).max():.0e} after 60 rounds")
 print(f"numbers sent in 60 rounds: {sent}; the data: {data}")
 
 # %% [markdown]
 # ## Exercises
 #
-# **1.** A sixth hospital has no patients at all, $f_6 = 0$. Does it change the answer? Does it change the rounds?
+# **1.** A sixth hospital has no patients at all, $f_6 = 0$. Does it change the answer? Does it
+# change the number of rounds?
 #
 # <details><summary>Answer</summary>
 #
-# Not the answer: the sum is the same. But it votes in the mean, for what it last heard, and so slows the others down.
+# It does not change the answer, because the sum is the same. But the mean includes its $x_6$, which
+# is what it last received, and this slows the others down.
 #
 # ```python
 # with_sixth = consensus(
@@ -289,12 +330,13 @@ print(f"numbers sent in 60 rounds: {sent}; the data: {data}")
 #
 # </details>
 #
-# **2.** What is the price in the exchange when every trader has the same $q$? Derive it, and check.
+# **2.** What is the price in the exchange when every trader has the same $q$? Derive it and check
+# it.
 #
 # <details><summary>Answer</summary>
 #
-# At the price $p$ trader $a$ takes $x_a = \text{wish}_a - p / q_a$. The sum is zero for $p \sum_a 1 / q_a = \sum_a
-# \text{wish}_a$; with one $q$ the price is $q$ times the mean wish.
+# At the price $p$ trader $a$ takes $x_a = \text{wish}_a - p / q_a$. The sum is zero for
+# $p \sum_a 1 / q_a = \sum_a \text{wish}_a$; with one $q$ the price is $q$ times the mean wish.
 #
 # ```python
 # assert np.allclose(prices[-1], wish.sum(axis=0) / (1 / q_a).sum(), atol=1e-5)
@@ -302,12 +344,13 @@ print(f"numbers sent in 60 rounds: {sent}; the data: {data}")
 #
 # </details>
 #
-# **3.** In the bridge, leave out the projection: `prox` is the identity. What do the robots then agree on?
+# **3.** Leave out the projection in the bridge, so that `prox` is the identity. On what do the
+# robots then agree?
 #
 # <details><summary>Answer</summary>
 #
-# On the minimum of $F$ over all matrices, without orthogonality: that is zero, with all poses in one point and all
-# $R_i = 0$. The constraint is what holds the graph open.
+# On the minimum of $F$ over all matrices, without orthogonality. It is zero, with all poses at one
+# point and all $R_i = 0$. The constraint excludes this solution.
 #
 # ```python
 # loose = itertools.islice(consensus(steps, held, lambda v: v, start.stacked(), u), 400)

@@ -1,12 +1,13 @@
 # %% [markdown]
 # # 12. What does Bregman iteration do to a picture?
 #
-# Open with `jupyter lab notebooks/12_bregman_on_a_picture.ipynb`; `pip install -e '.[notebooks,fast]'` brings it.
+# Open with `jupyter lab notebooks/12_bregman_on_a_picture.ipynb`;
+# `pip install -e '.[notebooks,fast]'` installs it.
 #
-# The paper says where Bregman iteration comes from: total variation, in images. This notebook goes there. It takes
-# noise out of a photograph, gives it back the contrast that this costs, fills in pixels that are missing, and ends
-# with a matrix of which a quarter of the entries is unknown. In all four the work of an iteration is a Fourier
-# transform, a threshold or an SVD.
+# The paper traces Bregman iteration to total variation in images, which is the subject of this
+# notebook. It removes noise from a photograph, recovers the contrast that this costs, fills in
+# missing pixels, and ends with a matrix of which a quarter of the entries is unknown. In all four
+# problems the work of an iteration is a Fourier transform, a threshold or an SVD.
 
 # %%
 import itertools
@@ -47,14 +48,14 @@ def show(panels, height=2.3):
 # %% [markdown]
 # ## Split Bregman, isotropic
 #
-# Rudin, Osher and Fatemi (1992): the picture $u$ near $f$ with the smallest total variation, the sum over the pixels
-# of the *length* of the gradient,
+# Rudin, Osher and Fatemi (1992) compute the picture $u$ near $f$ with the smallest total variation,
+# the sum over the pixels of the *length* of the gradient,
 #
 # $$\min_{u, d} \; \tfrac12 \lVert u - f \rVert^2 + w \sum_p \lVert d_p \rVert_2
 #   \quad \text{subject to} \quad D u - d = 0.$$
 #
-# That is equation (1), `problem bregman`, and one pass over its two blocks before $b$ moves, equation (9), `bregman
-# ADMM`, is the *split Bregman* method of Goldstein and Osher (2009):
+# This is equation (1), `problem bregman`. One pass over its two blocks before each update of $b$,
+# equation (9), `bregman ADMM`, is the *split Bregman* method of Goldstein and Osher (2009):
 #
 # $$\begin{aligned}
 #   u &= (I + \alpha D^\top D)^{-1} \bigl(f + \alpha D^\top (d - b)\bigr) && \text{diagonal in Fourier space, if } D
@@ -97,12 +98,15 @@ def denoised(f, weight, iterations=40):
 
 
 smooth, residual = denoised(noisy, 0.08)
-print(f"noisy {decibel(noisy):.1f} dB, denoised {decibel(smooth):.1f} dB; ||D u - d|| = {residual:.0e}, 40 iterations")
+print(
+    f"noisy {decibel(noisy):.1f} dB, denoised {decibel(smooth):.1f} dB; ||D u - d|| = {residual:.0e}, 40 iterations"
+)
 
 # %% [markdown]
 # ## The library agrees
 #
-# On a small patch, with $D$ as a matrix, cvxpy for both blocks, and no Fourier transform anywhere.
+# The comparison uses a small patch, with $D$ as a matrix, cvxpy for both blocks, and no Fourier
+# transform.
 
 # %%
 patch = noisy[96:108, 96:108]
@@ -110,21 +114,25 @@ basis = np.eye(patch.size).reshape(-1, *patch.shape)
 matrix = np.column_stack([D(column).ravel() for column in basis])
 u, d = cp.Variable(patch.size), cp.Variable((patch.size, 2))
 J = 0.5 * cp.sum_squares(u - patch.ravel()) + 0.08 * cp.sum(cp.norm(d, axis=1))
-problem = pgo.BregmanProblem(J, (u, d), np.hstack([matrix, -np.eye(2 * patch.size)]), np.zeros(2 * patch.size))
-states = itertools.islice(solvers.iterate(solvers.AlternatingBregman(alpha=2.0, passes=1), problem), 1, 11)
+problem = pgo.BregmanProblem(
+    J, (u, d), np.hstack([matrix, -np.eye(2 * patch.size)]), np.zeros(2 * patch.size)
+)
+states = itertools.islice(
+    solvers.iterate(solvers.AlternatingBregman(alpha=2.0, passes=1), problem), 1, 11
+)
 pairs = zip(states, split_bregman(patch, 0.08, 2.0), strict=False)
 difference = max(np.abs(state.x[: patch.size] - mine.ravel()).max() for state, (mine, _) in pairs)
 print(f"differs from ours by {difference:.0e} in 10 iterations")
 
 # %% [markdown]
-# ## What total variation takes, and Bregman iteration gives back
+# ## The contrast that total variation removes
 #
-# The denoised picture is paler than the original: a patch that stands out loses contrast, since that is what makes
-# its edge shorter. In $f - u$ one can see the face. Osher et al. (2005) added it back, equation (4), `bregman
-# update`, with $\mathcal{K} = I$: denoise $f + b$ with too *large* a weight, add $b \leftarrow b + f - u$, and stop
-# when $\lVert f - u \rVert$ is the size of the noise. (The 0.08 above was chosen with the truth in view, and no other
-# weight does better. Here any weight that is too large will do, and the size of the noise is all that has to be
-# known.)
+# The denoised picture has less contrast than the original, because a lower contrast reduces the
+# total variation of an edge. In $f - u$ one can see the face. Osher et al. (2005) add it back, by
+# equation (4), `bregman update`, with $\mathcal{K} = I$: denoise $f + b$ with too *large* a weight,
+# add $b \leftarrow b + f - u$, and stop when $\lVert f - u \rVert$ is the size of the noise. (The
+# weight 0.08 above was chosen with knowledge of the truth, and no other weight does better. Here
+# any weight that is too large works, and only the size of the noise has to be known.)
 
 # %%
 b, film = np.zeros_like(noisy), []
@@ -135,8 +143,16 @@ for _ in range(6):
 to_data = np.array([np.sqrt(np.mean((u - noisy) ** 2)) for u in film])
 stop = int(np.argmax(to_data <= noise_std))
 quality = [decibel(u) for u in film]
-print("||f - u|| a pixel:", *(f"{distance:.3f}" for distance in to_data), f"; noise {noise_std}: stop at {stop + 1}")
-print("dB:               ", *(f"{value:.1f} " for value in quality), "; the stop needed no look at the truth")
+print(
+    "||f - u|| a pixel:",
+    *(f"{distance:.3f}" for distance in to_data),
+    f"; noise {noise_std}: stop at {stop + 1}",
+)
+print(
+    "dB:               ",
+    *(f"{value:.1f} " for value in quality),
+    "; the stop needed no look at the truth",
+)
 show(
     [
         (f"noisy, {decibel(noisy):.1f} dB", noisy),
@@ -149,16 +165,18 @@ show(
 # %% [markdown]
 # ## Missing pixels: linearised Bregman beside ISTA and FISTA
 #
-# Half of the pixels are lost. A photograph has few large coefficients $x$ in a cosine transform, so look for the
-# smallest $\lVert x \rVert_1$ with $\mathcal{K} x = f$: $\mathcal{K}$ is the inverse transform, then the pixels that
-# are there. Two ways:
+# Half of the pixels are lost. A photograph has few large coefficients $x$ in a cosine transform, so
+# look for the smallest $\lVert x \rVert_1$ with $\mathcal{K} x = f$: $\mathcal{K}$ is the inverse
+# transform, restricted to the known pixels. There are two ways:
 #
-# * *A penalty*, $\min w \lVert x \rVert_1 + \tfrac12 \lVert \mathcal{K} x - f \rVert^2$: ISTA takes a gradient step
-#   and a soft threshold, FISTA (which the paper names for its step (a)) from an extrapolated point.
-# * *The constraint*: Bregman iteration with the quadratic term linearised (Yin, Osher, Goldfarb, Darbon 2008) is two
-#   lines, $v \leftarrow v + \mathcal{K}^\top (f - \mathcal{K} x)$, $x = \delta\, \operatorname{soft}(v, \mu)$. The
-#   residual is *added up* in $v$, as in $b$. It ends at the minimum of $\mu \lVert x \rVert_1 + \tfrac1{2 \delta}
-#   \lVert x \rVert^2$ on $\mathcal{K} x = f$.
+# * *A penalty*, $\min w \lVert x \rVert_1 + \tfrac12 \lVert \mathcal{K} x - f \rVert^2$: ISTA takes
+#   a gradient step and a soft threshold, FISTA (which the paper names for its step (a)) from an
+#   extrapolated point.
+# * *The constraint*: Bregman iteration with the quadratic term linearised (Yin, Osher, Goldfarb,
+#   Darbon 2008) is two lines, $v \leftarrow v + \mathcal{K}^\top (f - \mathcal{K} x)$,
+#   $x = \delta\, \operatorname{soft}(v, \mu)$. The residuals are *summed* in $v$, as in $b$. It
+#   converges to the minimum of $\mu \lVert x \rVert_1 + \tfrac1{2 \delta} \lVert x \rVert^2$ on
+#   $\mathcal{K} x = f$.
 
 
 # %%
@@ -218,20 +236,27 @@ left.set(xlabel="iteration", ylabel="penalised cost over the lowest, minus 1")
 right.set(xlabel="iteration", ylabel="dB to the true picture")
 left.legend(fontsize=8)
 filled = {name: idctn(xs[-1], norm="ortho") for name, xs in runs.items()}
-show([("half of the pixels", f), *((f"{name}, {decibel(u, part):.1f} dB", u) for name, u in filled.items())])
+show(
+    [
+        ("half of the pixels", f),
+        *((f"{name}, {decibel(u, part):.1f} dB", u) for name, u in filled.items()),
+    ]
+)
 
 # %% [markdown]
-# All three do the same work a step: two transforms and a threshold. With so small a weight ISTA crawls, and FISTA
-# needs fifty steps. Linearised Bregman has no weight that must go to zero, as whatever it has missed so far is still
-# in $v$: it begins with the few largest coefficients and lets in smaller ones as they are called for, as the scale
-# space of [notebook 2](02_bregman.ipynb) does, and shows a face after ten. FISTA ends higher: the $\lVert x \rVert^2$
-# in what the other minimises has its price, less with a larger $\mu$ and more steps.
+# All three methods do the same work per step: two transforms and a threshold. With such a small
+# weight ISTA is very slow, and FISTA needs fifty steps. Linearised Bregman has no weight that must
+# go to zero, because $v$ still contains everything that $x$ has not yet fitted. It begins with the
+# few largest coefficients and adds smaller ones when they are needed, as the scale space of
+# [notebook 2](02_bregman.ipynb) does, and shows a face after ten steps. FISTA ends with a better
+# picture: linearised Bregman minimises an additional $\lVert x \rVert^2$, whose effect is smaller
+# with a larger $\mu$ and more steps.
 #
 # ## A matrix of which a quarter is missing
 #
-# Replace coefficients by singular values, and linearised Bregman is *singular value thresholding* (Cai, Candes and
-# Shen 2010). What it ends at is the smallest nuclear norm, if $\mu$ is large: so says cvxpy, for which it is a
-# semidefinite program.
+# Replace coefficients by singular values, and linearised Bregman is *singular value thresholding*
+# (Cai, Candes and Shen 2010). For large $\mu$ it converges to the matrix of smallest nuclear norm.
+# cvxpy, for which this is a semidefinite program, confirms it.
 
 
 # %%
@@ -249,16 +274,24 @@ completed = complete(low_rank, known, 100.0, 1.5, 3000)
 X = cp.Variable(low_rank.shape)
 nuclear = cp.Problem(cp.Minimize(cp.normNuc(X)), [cp.multiply(known, X) == known * low_rank])
 nuclear.solve(solver=cp.CLARABEL)
-print(f"nuclear norm: thresholding {np.linalg.norm(completed, 'nuc'):.5f}, cvxpy {nuclear.value:.5f},", end=" ")
+print(
+    f"nuclear norm: thresholding {np.linalg.norm(completed, 'nuc'):.5f}, cvxpy {nuclear.value:.5f},",
+    end=" ",
+)
 print(f"truth {np.linalg.norm(low_rank, 'nuc'):.5f}")
-print(f"largest error in the entries that were missing: {np.abs(completed - low_rank)[~known].max():.1e}")
+print(
+    f"largest error in the entries that were missing: {np.abs(completed - low_rank)[~known].max():.1e}"
+)
 
 # %% [markdown]
 # ## Where it fails
 #
-# 1. Go on, and Bregman iteration ends at $f$, noise and all: its iterates are what is wanted, not its limit.
-# 2. Total variation knows flat patches with sharp edges. Where the truth is a ramp, it makes stairs.
-# 3. Too few entries, and the smallest nuclear norm is not the truth. Nothing in the run says so.
+# 1. If it continues, Bregman iteration converges to the noisy $f$: its iterates are useful, not its
+#    limit.
+# 2. Total variation favours flat patches with sharp edges. Where the truth is a ramp, it produces
+#    steps.
+# 3. With too few entries, the smallest nuclear norm is not the truth. Nothing in the run shows
+#    this.
 
 # %%
 ramp = np.tile(np.linspace(0.0, 1.0, 64), (16, 1))
@@ -273,12 +306,12 @@ print(f"off by {np.abs(guessed - low_rank)[~fewer].max():.1f} elsewhere")
 # %% [markdown]
 # ## Exercises
 #
-# **1.** In the denoiser, what does $\alpha$ change: the answer, the number of iterations, or both?
+# **1.** What does $\alpha$ change in the denoiser: the answer, the number of iterations, or both?
 #
 # <details><summary>Answer</summary>
 #
-# The number of iterations. The problem has one solution, being strictly convex, and the fixed points do not depend on
-# $\alpha$.
+# The number of iterations. The problem is strictly convex and has one solution, and the fixed
+# points do not depend on $\alpha$.
 #
 # ```python
 # answers = [next(itertools.islice(split_bregman(patch, 0.08, alpha), 4000, None))[0] for alpha in (0.5, 2.0)]
@@ -287,13 +320,15 @@ print(f"off by {np.abs(guessed - low_rank)[~fewer].max():.1f} elsewhere")
 #
 # </details>
 #
-# **2.** Why may linearised Bregman take steps of length 1 here? What must be known of $\mathcal{K}$ otherwise?
+# **2.** Why can linearised Bregman take steps of length 1 here? What must be known of $\mathcal{K}$
+# otherwise?
 #
 # <details><summary>Answer</summary>
 #
-# Rows of $\mathcal{K}$ are rows of an orthogonal matrix, so $\lVert \mathcal{K} \mathcal{K}^\top \rVert = 1$. It is
-# gradient ascent on a dual whose gradient has the Lipschitz constant $\delta \lVert \mathcal{K} \mathcal{K}^\top
-# \rVert$: the step is to be below 2 over that.
+# The rows of $\mathcal{K}$ are rows of an orthogonal matrix, so
+# $\lVert \mathcal{K} \mathcal{K}^\top \rVert = 1$. The method is gradient ascent on a dual function
+# whose gradient has the Lipschitz constant $\delta \lVert \mathcal{K} \mathcal{K}^\top \rVert$; the
+# step must be below 2 divided by this constant.
 #
 # ```python
 # y = rng.standard_normal(f.shape) * seen
@@ -304,12 +339,12 @@ print(f"off by {np.abs(guessed - low_rank)[~fewer].max():.1f} elsewhere")
 #
 # </details>
 #
-# **3.** What is left in $f - u$ after the first Bregman step, and what after the one where we stopped? Measure how
-# much of it is noise.
+# **3.** What does $f - u$ contain after the first Bregman step, and what after the step at which we
+# stopped? Measure how much of it is noise.
 #
 # <details><summary>Answer</summary>
 #
-# After the first step there is a lot of the picture in it; where we stopped it is nearly all noise.
+# After the first step it contains much of the picture; after the last step it is nearly all noise.
 #
 # ```python
 # noise = noisy - clean

@@ -1,4 +1,4 @@
-"""Models of pose graph optimisation: graphs, the problem, its convex models, starts and certificates.
+"""Models of pose graph optimisation: graphs, the problem, convex models, starts, certificates.
 
 Nothing here iterates; methods are in `solvers`.
 """

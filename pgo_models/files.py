@@ -1,4 +1,4 @@
-"""Text and tables read with our errors; files written whole or not at all, through a temporary one."""
+"""Text and tables that are read with our errors, and files that are written whole or not at all."""
 
 import os
 import secrets
@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,147 +16,261 @@ from pgo_models.errors import FileFormatError, PGOError
 
 LARGEST = 1e100  # beyond it squares and determinants would overflow; no measured number is near
 FARTHEST = 1e15  # metres: beyond it neighbouring doubles are more than 0.1 m apart
+LONGEST = 10_000  # characters of a line of numbers; an edge in space with all its digits has 750
+LONGEST_OF_ALL = 2**16  # bytes of any line, comments included
 _ZERO_QUATERNION = 1e-9  # a norm below this gives no direction: files hold about six digits
-_BLOCK = 2**24  # bytes of a file that are taken apart at a time
-LONGEST = 10_000  # characters of a line; an edge in space with all its digits has 750
+_BLOCK = 2**24  # bytes of a file that are split into lines at a time
+_SHOWN = 40  # characters of a wrong word that a message shows
+_LF, _CR = b"\n\r"
 
 
 def read_text(path: Path | str) -> str:
-    """Text of a UTF-8 file, a pipe or a device; its lines end with LF, whatever they end with there (CRLF, CR).
+    """Text of a UTF-8 file, a pipe or a device, with lines that end with LF.
 
-    A FileFormatError when the file is missing, cannot be opened, or is not text.
+    Lines of the file may end with CR LF or CR, too. A FileFormatError when the file is missing,
+    cannot be opened, or is not text.
     """
     return "".join(read_blocks(path))
 
 
 def read_blocks(path: Path | str) -> Iterator[str]:
-    """Yield what `read_text` reads, with its errors, in blocks of whole lines: a large file is never held as text."""
-    path, before, encoding = Path(path), 0, "utf-8-sig"
+    """Yield what `read_text` reads in blocks of whole lines, so that no large file is held as text.
+
+    Errors are those of `read_text`. A FileFormatError, too, where a line is longer than
+    `LONGEST_OF_ALL`, as no line of a text file is.
+    """
+    path = Path(path)
+    encoding = "utf-8-sig"  # the first block may open with a byte order mark
+    num_lines = 0  # lines of the blocks so far
     try:
         with path.open("rb") as file:
-            while data := file.read(_BLOCK):
-                data += file.readline()
-                wrong = data.find(b"\0")
+            for data in _whole_lines(file, path):
+                _check_lines(path, num_lines, data)
                 try:
                     text = data.decode(encoding)
                 except UnicodeDecodeError as error:
-                    wrong = error.start
-                if wrong >= 0:
-                    problem = "bytes that are no text; give a text file, unpacked if it was compressed"
-                    raise FileFormatError(path, before + data.count(b"\n", 0, wrong) + 1, problem)
-                before, encoding = before + data.count(b"\n"), "utf-8"
-                yield text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+                    raise _no_text(path, num_lines, data[: error.start]) from None
+                encoding = "utf-8"
+                num_lines += _count_lines(data)
+                if "\r" in text:
+                    text = text.replace("\r\n", "\n").replace("\r", "\n")
+                yield text
     except FileNotFoundError:
         raise FileFormatError(path, None, "no such file; check the path") from None
     except OSError as error:
-        raise FileFormatError(path, None, f"cannot be read: {error.strerror}; give a readable file") from error
+        raise FileFormatError(
+            path, None, f"cannot be read: {error.strerror}; give a readable file"
+        ) from error
+
+
+def _whole_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
+    """Yield blocks of a file that end where a line ends, except perhaps the last one.
+
+    Little more than one block is held at a time.
+    """
+    begun_line = b""
+    num_lines = 0  # lines of the blocks so far
+    while chunk := file.read(_BLOCK):
+        data = begun_line + chunk
+        # A CR at the very end may be the first half of CR LF.
+        end = max(data.rfind(b"\n"), data.rfind(b"\r", 0, len(data) - 1)) + 1
+        whole_lines = data[:end]
+        begun_line = data[end:]
+        if len(begun_line) > LONGEST_OF_ALL:
+            _check_lines(path, num_lines, data)  # raises the error of the first wrong line
+        num_lines += _count_lines(whole_lines)
+        if whole_lines:
+            yield whole_lines
+    if begun_line:
+        yield begun_line
+
+
+def _check_lines(path: Path, num_lines: int, data: bytes) -> None:
+    """Raise a FileFormatError when bytes of a file are no text, or a line is too long.
+
+    `num_lines` is how many lines of the file come before them.
+    """
+    zero = data.find(b"\0")
+    if zero >= 0:
+        raise _no_text(path, num_lines, data[:zero])
+    codes = np.frombuffer(data, dtype=np.uint8)
+    line_ends = np.flatnonzero((codes == _LF) | (codes == _CR))
+    ends = np.concatenate([[-1], line_ends, [len(codes)]])
+    lengths = np.diff(ends) - 1
+    if lengths.max() > LONGEST_OF_ALL:
+        start = int(ends[np.argmax(lengths > LONGEST_OF_ALL)]) + 1
+        line = num_lines + _count_lines(data[:start]) + 1
+        raise FileFormatError(
+            path,
+            line,
+            f"a line of more than {LONGEST_OF_ALL} bytes; give a text file, with its line ends",
+        )
+
+
+def _no_text(path: Path, num_lines: int, bytes_before: bytes) -> FileFormatError:
+    """Error of a byte that is no text, with the lines and bytes that come before it."""
+    problem = "bytes that are no text; give a text file, unpacked if it was compressed"
+    return FileFormatError(path, num_lines + _count_lines(bytes_before) + 1, problem)
+
+
+def _count_lines(data: bytes) -> int:
+    """How many lines end in the data: with LF, CR or both."""
+    return data.count(b"\n") + data.count(b"\r") - data.count(b"\r\n")
 
 
 def check_length(path: Path | str, line: int, text: str) -> None:
-    """Raise a FileFormatError when a line of numbers is longer than `LONGEST`: to take it apart takes minutes."""
+    """Raise a FileFormatError when a line of numbers is longer than `LONGEST`.
+
+    Minutes pass before a line of some megabytes is split into numbers.
+    """
     if len(text) > LONGEST:
-        problem = f"{len(text)} characters, and no line of numbers has over {LONGEST}; break or remove it"
+        problem = (
+            f"{len(text)} characters, and no line of numbers has over {LONGEST}; break or remove it"
+        )
         raise FileFormatError(path, line, problem)
 
 
-def check_metres(path: Path | str, lines: Sequence[int] | NDArray[np.int64], t: NDArray[np.float64]) -> None:
-    """Raise a FileFormatError when a position or translation, (n, d), of these lines is beyond `FARTHEST`."""
-    far = np.abs(t).max(axis=1, initial=0.0)
-    if (far > FARTHEST).any():
-        problem = f"{far.max():.3g} m is beyond {FARTHEST:g} m, where doubles tell no metres apart; correct the line"
-        raise FileFormatError(path, int(lines[int(np.argmax(far))]), problem)
+def check_metres(
+    path: Path | str, lines: Sequence[int] | NDArray[np.integer[Any]], t: NDArray[np.float64]
+) -> None:
+    """Raise a FileFormatError when a position or translation, (n, d), is beyond `FARTHEST`.
+
+    Row k of t stands on line `lines[k]`.
+    """
+    farthest = np.abs(t).max(axis=1, initial=0.0)
+    if (farthest > FARTHEST).any():
+        problem = (
+            f"{farthest.max():.3g} m is beyond {FARTHEST:g} m, "
+            "where doubles tell no metres apart; correct the line"
+        )
+        raise FileFormatError(path, int(lines[int(np.argmax(farthest))]), problem)
 
 
-def check_quaternions(path: Path | str, lines: Sequence[int] | NDArray[np.int64], q: NDArray[np.float64]) -> None:
+def check_quaternions(
+    path: Path | str, lines: Sequence[int] | NDArray[np.integer[Any]], q: NDArray[np.float64]
+) -> None:
     """Raise a FileFormatError when a quaternion, (n, 4), of these lines is zero."""
-    zero = np.linalg.norm(q, axis=1) < _ZERO_QUATERNION
-    if zero.any():
+    is_zero = np.linalg.norm(q, axis=1) < _ZERO_QUATERNION
+    if is_zero.any():
         problem = "zero quaternion; it is no rotation: 0 0 0 1 is the unrotated one"
-        raise FileFormatError(path, int(lines[int(np.argmax(zero))]), problem)
+        raise FileFormatError(path, int(lines[int(np.argmax(is_zero))]), problem)
 
 
 def finite_number(path: Path | str, line: int, word: str) -> float:
-    """Value of a word like -1.5e-3; a FileFormatError when it is no number, or is nan, inf or beyond `LARGEST`."""
+    """Value of a word like -1.5e-3.
+
+    A FileFormatError when it is no number, or is nan, inf or beyond `LARGEST`.
+    """
+    way_out = "correct or remove the line"
+    shown = word[:_SHOWN]
     try:
         # float() also takes 1_000 and the digits of other scripts; number files do not.
         value = float(word if word.isascii() and "_" not in word else "")
     except ValueError:
-        raise FileFormatError(path, line, f"{word[:40]!r} is no number; correct or remove the line") from None
+        raise FileFormatError(path, line, f"{shown!r} is no number; {way_out}") from None
     if not np.isfinite(value):
-        raise FileFormatError(path, line, f"{word[:40]} is not finite; correct or remove the line")
+        raise FileFormatError(path, line, f"{shown} is not finite; {way_out}")
     if abs(value) > LARGEST:
-        raise FileFormatError(path, line, f"{word[:40]} is beyond {LARGEST:g}; correct or remove the line")
+        raise FileFormatError(path, line, f"{shown} is beyond {LARGEST:g}; {way_out}")
     return value
 
 
 def read_table(path: Path | str, columns: int) -> tuple[NDArray[np.float64], list[int]]:
     """Numbers (n, columns) of a text file with one row a line, and the line of every row, from 1.
 
-    Blank lines and comments (#) are skipped. A FileFormatError with file:line, when a line has too few or too many
-    numbers or is not all numbers; when there is no row.
+    Blank lines and comments (#) are skipped. A FileFormatError with file:line, when a line has too
+    few or too many numbers or is not all numbers; also when there is no row.
     """
-    text, rows, lines = read_text(path).removesuffix("\n").split("\n"), [], []
-    if (table := _sound_table(text, columns)) is not None:
-        return table, list(range(1, len(text) + 1))
-    for number, line in enumerate(text, 1):
+    lines = read_text(path).removesuffix("\n").split("\n")
+    table = _sound_table(lines, columns)
+    if table is not None:
+        return table, list(range(1, len(lines) + 1))
+    rows = []
+    row_lines = []
+    for number, line in enumerate(lines, 1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
         check_length(path, number, line)
         rows.append([finite_number(path, number, word) for word in words])
-        lines.append(number)
+        row_lines.append(number)
         if len(words) != columns:
-            raise FileFormatError(path, number, f"{len(words)} numbers where {columns} belong; complete or remove it")
+            raise FileFormatError(
+                path, number, f"{len(words)} numbers where {columns} belong; complete or remove it"
+            )
     if not rows:
         raise FileFormatError(path, None, f"no rows; give lines of {columns} numbers")
-    return np.array(rows), lines
+    return np.array(rows), row_lines
 
 
 def _sound_table(lines: list[str], columns: int) -> NDArray[np.float64] | None:
-    """Numbers of lines where each is a row of them and nothing else, by one call, or None."""
+    """Numbers of lines by one call; None unless every line is a row of them and nothing else."""
     if max(map(len, lines)) > LONGEST:
         return None
     try:
-        with warnings.catch_warnings(action="error"):  # of lines that are all blank
+        # NumPy warns where all lines are blank.
+        with warnings.catch_warnings(action="error"):
             table = np.loadtxt(lines, comments=None, ndmin=2)
     except (ValueError, UserWarning):
         return None
-    return table if table.shape == (len(lines), columns) and (np.abs(table) <= LARGEST).all() else None
+    if table.shape != (len(lines), columns) or not (np.abs(table) <= LARGEST).all():
+        return None
+    return table
 
 
 @contextmanager
 def replace_when_done(path: Path | str) -> Iterator[Path]:
-    """Lend a temporary path in the same folder, and move it over `path` when the block ends without an error.
+    """Yield a temporary path, and move its file over `path` when the block ends without an error.
 
-    A reader sees the old file or the whole new one, never a part; after an error nothing is left behind. A PGOError
-    when the folder or the file cannot be written, or `path` is there and is no regular file.
+    A reader sees the old file or the whole new one, never a part; after an error nothing is left
+    behind. A PGOError when the folder or the file cannot be written, or `path` exists and is no
+    regular file. A file that exists keeps its mode; of a link, what it points to is written.
     """
     with _temporary_beside(path) as (temporary, target):
         yield temporary
+        with suppress(FileNotFoundError):
+            temporary.chmod(stat.S_IMODE(target.stat().st_mode))
         os.replace(temporary, target)
 
 
 def check_writable(path: Path | str) -> None:
-    """Raise the PGOError that `replace_when_done` would for this path, before there is anything to write."""
+    """Raise what `replace_when_done` would for this path, before there is anything to write."""
     with _temporary_beside(path) as (temporary, _):
         temporary.touch()
 
 
+def _without_links(path: Path | str) -> Path:
+    """Where a path leads; a PGOError where links lead in a circle."""
+    try:
+        return Path(path).resolve()
+    except RuntimeError as error:  # of Python before 3.13
+        raise PGOError(
+            f"cannot write {path}: its links lead in a circle; choose another name"
+        ) from error
+
+
 @contextmanager
 def _temporary_beside(path: Path | str) -> Iterator[tuple[Path, Path]]:
-    """A new name in the folder of `path`, gone when the block ends, and `path` without links; errors become ours."""
+    """Yield a new name in the folder of `path`, and `path` without links; errors become ours.
+
+    A file of the new name is removed when the block ends.
+    """
     try:
-        target = Path(path).resolve()
+        target = _without_links(path)
         with suppress(FileNotFoundError):
             if not stat.S_ISREG(target.stat().st_mode):
-                raise PGOError(f"cannot write {path}: it is not a regular file; choose another name")
-        # Of a long name the beginning, so that a name as long as the system allows can be written.
+                raise PGOError(
+                    f"cannot write {path}: it is not a regular file; choose another name"
+                )
+        # A long name is cut, so that a name as long as the system allows can be written.
         temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(4)}.part")
         try:
             yield temporary, target
         finally:
-            # An error of clearing up would hide the one that brought us here.
+            # unlink() of a missing file would raise, and hide an error of the block.
             if temporary.exists():
                 temporary.unlink()
     except OSError as error:
-        raise PGOError(f"cannot write {path}: {error.strerror}; choose a place that can be written") from error
+        raise PGOError(
+            f"cannot write {path}: {error.strerror}; choose a place that can be written"
+        ) from error

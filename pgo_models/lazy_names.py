@@ -1,4 +1,7 @@
-"""Public names of a package, each imported from its module when it is first used: its stub says from which."""
+"""Public names of a package, each imported from its module when it is first used.
+
+The stub of the package says from which module.
+"""
 
 import ast
 import importlib
@@ -6,15 +9,29 @@ from collections.abc import Callable
 from pathlib import Path
 
 
-def names_of_stub(package: str, file: str) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
-    """`__getattr__`, `__dir__` and `__all__` of a package whose `__init__.py`, `file`, has a stub beside it."""
-    stub = ast.parse(Path(file).with_suffix(".pyi").read_text(encoding="utf-8")).body
-    modules = {one.name: node.module for node in stub if isinstance(node, ast.ImportFrom) for one in node.names}
-    lists = [ast.literal_eval(node.value) for node in stub if isinstance(node, ast.Assign | ast.AugAssign)]
+def names_of_stub(
+    package: str, file: str
+) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
+    """`__getattr__`, `__dir__` and `__all__` of a package.
 
-    def attribute(name: str) -> object:
-        if name not in modules:
+    `file` is its `__init__.py`, which has a stub beside it.
+    """
+    stub = ast.parse(Path(file).with_suffix(".pyi").read_text(encoding="utf-8"))
+    module_of: dict[str, str] = {}
+    public_names: list[str] = []
+    for statement in stub.body:
+        if isinstance(statement, ast.ImportFrom):
+            for alias in statement.names:
+                module_of[alias.name] = str(statement.module)
+        elif isinstance(statement, ast.Assign | ast.AugAssign):  # a part of __all__
+            public_names += ast.literal_eval(statement.value)
+
+    def get_attribute(name: str) -> object:
+        if name not in module_of:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(str(modules[name])), name)
+        return getattr(importlib.import_module(module_of[name]), name)
 
-    return attribute, lambda: sorted(modules), [name for names in lists for name in names]
+    def list_names() -> list[str]:
+        return sorted(module_of)
+
+    return get_attribute, list_names, public_names

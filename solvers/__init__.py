@@ -1,4 +1,7 @@
-"""Methods on the problems of `pgo_models`: every one is settings with init, step, measure and converged."""
+"""Solvers for the problems of `pgo_models`.
+
+A solver is a settings object with the methods `init`, `step`, `measure` and `converged`.
+"""
 
 from pgo_models.lazy_names import names_of_stub
 

@@ -1,40 +1,119 @@
-from solvers.baselines.gauss_seidel import GaussSeidel
-from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
-from solvers.convex.bregman import AlternatingBregman, Bregman, MethodOfMultipliers, TwoLineBregman
-from solvers.convex.extended_soc import ExtendedSOC
-from solvers.convex.orthogonal import OrthogonalSOC, solve_orthogonal
-from solvers.distributed.checkpoint import Checkpoint
-from solvers.folder_solve import FolderSolution, solve_folder
-from solvers.growing import extend
-from solvers.loop import Method, Solver, iterate, run
-from solvers.network.engine import InProcess
-from solvers.network.faults import Faults
-from solvers.network.ledger import Ledger
-from solvers.network.ray_engine import RayEngine
-from solvers.pipeline import Pipeline, solve
-from solvers.reporting.report import write_report
-from solvers.result import History, Measurement, Record, Run, Stage, Status
-from solvers.riemannian.newton import Newton, gauss_newton
-from solvers.riemannian.staircase import Staircase
-from solvers.robust.consistency import PCM, pairwise_consistent
-from solvers.robust.gnc import GNC, RobustLoss
-from solvers.robust.irls import IRLS
-from solvers.soc.anderson import Anderson
-from solvers.soc.paper import PaperSOC
-from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty, MultiplierPenalty
-from solvers.soc.r_step import CvxpyStep, RStep
-from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
-from solvers.solution import Solution
-from solvers.studies.comparison import compare_methods
-from solvers.studies.forgetting import error_forgetting
-from solvers.studies.paper_figures import draw_paper_figures
-from solvers.studies.paper_tables import reproduce_tables
-from solvers.studies.tightness import noise_sweep
+from solvers.baselines.gauss_seidel import GaussSeidel as GaussSeidel
+from solvers.baselines.levenberg_marquardt import LevenbergMarquardt as LevenbergMarquardt
+from solvers.baselines.sweep_order import Sweep as Sweep
+from solvers.convex.bregman import (
+    AlternatingBregman as AlternatingBregman,
+    Bregman as Bregman,
+    MethodOfMultipliers as MethodOfMultipliers,
+    TwoLineBregman as TwoLineBregman,
+)
+from solvers.convex.extended_soc import ExtendedSOC as ExtendedSOC
+from solvers.convex.orthogonal import (
+    OrthogonalSOC as OrthogonalSOC,
+    OrthogonalSolution as OrthogonalSolution,
+    solve_orthogonal as solve_orthogonal,
+)
+from solvers.distributed.checkpoint import Checkpoint as Checkpoint
+from solvers.folder_solve import FolderSolution as FolderSolution, solve_folder as solve_folder
+from solvers.growing import extend as extend
+from solvers.loop import Method as Method, Solver as Solver, iterate as iterate, run as run
+from solvers.network.engine import (
+    Engine as Engine,
+    InProcess as InProcess,
+    WorkerPool as WorkerPool,
+)
+from solvers.network.faults import Faults as Faults
+from solvers.network.ledger import Ledger as Ledger, Traffic as Traffic
+from solvers.network.messages import Worker as Worker
+from solvers.network.ray_engine import RayEngine as RayEngine
+from solvers.network.recovery import Recovery as Recovery
+from solvers.pipeline import Pipeline as Pipeline, solve as solve
+from solvers.reporting.edge_fit import EdgeFit as EdgeFit
+from solvers.reporting.report import write_report as write_report
+from solvers.result import (
+    History as History,
+    Measurement as Measurement,
+    Outcome as Outcome,
+    Record as Record,
+    Run as Run,
+    Stage as Stage,
+    Status as Status,
+)
+from solvers.riemannian.newton import Newton as Newton, gauss_newton as gauss_newton
+from solvers.riemannian.staircase import Staircase as Staircase
+from solvers.robust.consistency import PCM as PCM, pairwise_consistent as pairwise_consistent
+from solvers.robust.gnc import GNC as GNC
+from solvers.robust.irls import IRLS as IRLS
+from solvers.robust.losses import RobustLoss as RobustLoss
+from solvers.robust.rejection import Rejection as Rejection, Support as Support
+from solvers.soc.anderson import Anderson as Anderson
+from solvers.soc.paper import PaperSOC as PaperSOC, PaperStop as PaperStop
+from solvers.soc.penalty import (
+    BalancedPenalty as BalancedPenalty,
+    BoydPenalty as BoydPenalty,
+    FixedPenalty as FixedPenalty,
+    MultiplierPenalty as MultiplierPenalty,
+)
+from solvers.soc.r_step import (
+    CustomRStep as CustomRStep,
+    CvxpyStep as CvxpyStep,
+    RotationStep as RotationStep,
+    RStep as RStep,
+    RSubproblem as RSubproblem,
+)
+from solvers.soc.settings import Coupling as Coupling
+from solvers.soc.soc import SOC as SOC
+from solvers.solution import Solution as Solution
+from solvers.studies.benchmark import (
+    BenchmarkMethod as BenchmarkMethod,
+    BenchmarkSettings as BenchmarkSettings,
+)
+from solvers.studies.comparison import (
+    Comparison as Comparison,
+    ComparisonSettings as ComparisonSettings,
+    compare_methods as compare_methods,
+)
+from solvers.studies.forgetting import (
+    ErrorForgetting as ErrorForgetting,
+    error_forgetting as error_forgetting,
+)
+from solvers.studies.paper_figures import (
+    FigureSet as FigureSet,
+    draw_paper_figures as draw_paper_figures,
+)
+from solvers.studies.paper_tables import (
+    Reproduction as Reproduction,
+    ReproductionSettings as ReproductionSettings,
+    reproduce_tables as reproduce_tables,
+)
+from solvers.studies.tightness import (
+    NoiseSweep as NoiseSweep,
+    SweptScene as SweptScene,
+    noise_sweep as noise_sweep,
+)
 
-__all__ = ["History", "Measurement", "Method", "Record", "Run", "Solver", "Stage", "Status", "iterate", "run"]
-__all__ += ["FolderSolution", "Pipeline", "Solution", "extend", "solve", "solve_folder", "write_report"]
-__all__ += ["SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "RStep"]
+__all__ = [
+    "History",
+    "Measurement",
+    "Method",
+    "Record",
+    "Run",
+    "Solver",
+    "Stage",
+    "Status",
+    "iterate",
+    "run",
+]
+__all__ += [
+    "FolderSolution",
+    "Pipeline",
+    "Solution",
+    "extend",
+    "solve",
+    "solve_folder",
+    "write_report",
+]
+__all__ += ["SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "PaperStop", "RStep"]
 __all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty"]
 __all__ += ["Newton", "Staircase", "gauss_newton"]
 __all__ += ["GNC", "IRLS", "PCM", "RobustLoss", "pairwise_consistent"]
@@ -42,4 +121,18 @@ __all__ += ["GaussSeidel", "LevenbergMarquardt"]
 __all__ += ["Checkpoint", "Faults", "InProcess", "Ledger", "RayEngine"]
 __all__ += ["AlternatingBregman", "Bregman", "MethodOfMultipliers", "TwoLineBregman"]
 __all__ += ["ExtendedSOC", "OrthogonalSOC", "solve_orthogonal"]
-__all__ += ["compare_methods", "draw_paper_figures", "error_forgetting", "noise_sweep", "reproduce_tables"]
+__all__ += [
+    "compare_methods",
+    "draw_paper_figures",
+    "error_forgetting",
+    "noise_sweep",
+    "reproduce_tables",
+]
+# Types in the signatures of the names above.
+__all__ += ["EdgeFit", "Outcome", "Rejection", "Support"]
+__all__ += ["CustomRStep", "RSubproblem", "RotationStep"]
+__all__ += ["OrthogonalSolution", "Sweep"]
+__all__ += ["Engine", "Recovery", "Traffic", "Worker", "WorkerPool"]
+__all__ += ["BenchmarkMethod", "BenchmarkSettings", "Comparison", "ComparisonSettings"]
+__all__ += ["ErrorForgetting", "FigureSet", "NoiseSweep", "SweptScene"]
+__all__ += ["Reproduction", "ReproductionSettings"]

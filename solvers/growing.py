@@ -1,6 +1,7 @@
-"""Graphs that grow: new poses start where their edges to the known ones put them, and Newton goes on from there.
+"""Graphs that grow: new poses start where their edges put them, and Newton goes on from there.
 
-An update ends where the gap asked for is proven, not at rounding level: mostly one factorisation, and the certificate.
+An update ends where the gap that is asked for is proven, not at rounding level. It mostly takes one
+factorisation and the certificate.
 """
 
 from dataclasses import replace
@@ -19,14 +20,35 @@ from solvers.pipeline import Pipeline, solve
 from solvers.result import OUT_OF_TIME
 from solvers.solution import Solution
 
-_SHARE = 0.01  # of the gap that Newton may leave F above its minimum: the bound can be ten times as far below it
+# Share of the gap by which Newton may leave F above its minimum: the bound can be ten times as far
+# below it.
+_SHARE = 0.01
 
 
 def extend(solution: Solution, graph: PoseGraph, pipeline: Pipeline | None = None) -> Solution:
-    """Solve a graph that has grown out of the solution's, from the solution.
+    """Solve a graph that has grown out of another one, from the solution of that.
 
-    `graph` has poses of the solution, told by their ids, and new ones. Newton alone first; where its certificate fails,
-    the whole pipeline: the stages are those of both. A GraphError when it has none of its poses, or is not connected.
+    Newton alone comes first. Where its certificate is wider than asked for, the whole pipeline
+    follows, and the stages of the solution are those of both.
+
+    Parameters
+    ----------
+    solution : Solution
+        Of the graph before it has grown.
+    graph : PoseGraph
+        Poses of the solution, recognised by their ids, and new ones.
+    pipeline : Pipeline, optional
+        Settings of the stages; `Pipeline()` unless given.
+
+    Returns
+    -------
+    Solution
+        Of the whole graph.
+
+    Raises
+    ------
+    GraphError
+        When the graph has no pose of the solution, or is not connected.
 
     Examples
     --------
@@ -36,35 +58,54 @@ def extend(solution: Solution, graph: PoseGraph, pipeline: Pipeline | None = Non
     >>> extend(solution, graph).is_certified
     True
     """
-    weighting, pipeline = solution.problem.weighting, pipeline if pipeline is not None else Pipeline()
-    known = weighting if isinstance(weighting, Weighting) else Weighting.ISOTROPIC
-    problem = PGOProblem(graph, solution.problem.backend, known)
+    pipeline = pipeline if pipeline is not None else Pipeline()
+    weighting = solution.problem.weighting
+    if not isinstance(weighting, Weighting):
+        weighting = Weighting.ISOTROPIC
+    problem = PGOProblem(graph, solution.problem.backend, weighting)
     start = extended_poses(problem, solution.problem.graph.pose_ids, solution.poses)
-    if getattr(pipeline.soc, "changer", None) is not None:  # Newton alone would leave out its terms
+    if pipeline.has_added_terms:  # Newton alone would leave them out
         return solve(problem, pipeline, start)
-    newton = replace(pipeline.newton, tolerance=max(pipeline.newton.tolerance, _SHARE * pipeline.gap))
-    update = solve(problem, replace(pipeline, soc=None, newton=newton, second_try=False, staircase=None), start)
+    tolerance = max(pipeline.newton.tolerance, _SHARE * pipeline.gap)
+    newton = replace(pipeline.newton, tolerance=tolerance)
+    newton_alone = replace(pipeline, soc=None, newton=newton, second_try=False, staircase=None)
+    update = solve(problem, newton_alone, start)
     if update.status in OUT_OF_TIME or not update.certificate.can_improve:
         return update
     whole = solve(problem, pipeline, start)
-    return replace(whole, stages=update.stages + whole.stages, seconds=update.seconds + whole.seconds)
+    stages = update.stages + whole.stages
+    return replace(whole, stages=stages, seconds=update.seconds + whole.seconds)
 
 
 def extended_poses(problem: PGOProblem, ids: IntArray, poses: Poses) -> Poses:
-    """Rotations of poses with ids stay, X of the others minimises tr(X^T M X), then all translations are the best.
+    """Poses of a graph that has grown, from the `poses` with these ids before.
 
-    A GraphError when no pose of the problem has one of the ids.
+    Rotations of known poses stay. The stacked X of the others minimises tr(X^T M X), and their
+    rotations are projected. Then all translations are the best for the rotations. A GraphError when
+    no pose of the problem has one of the ids.
     """
-    n, d, convex = problem.num_poses, problem.d, problem.convex_part
-    _, old, place = np.intersect1d(problem.graph.pose_ids, ids, return_indices=True)
-    if not len(old):
-        raise GraphError(f"{problem.graph.name} has none of the {len(ids)} poses solved before; solve it on its own")
-    R, t = np.broadcast_to(np.eye(d), (n, d, d)).copy(), np.zeros((n, d))
-    R[old], t[old] = poses.R[place], poses.t[place]
-    X, new = Poses(R, t).stacked(), np.setdiff1d(np.arange(n), old)
+    n = problem.num_poses
+    d = problem.d
+    M = problem.convex_part.M
+    _, known, place = np.intersect1d(problem.graph.pose_ids, ids, return_indices=True)
+    if not len(known):
+        raise GraphError(
+            f"{problem.graph.name} has none of the {len(ids)} poses solved before; "
+            "solve it on its own"
+        )
+    R = np.broadcast_to(np.eye(d), (n, d, d)).copy()
+    t = np.zeros((n, d))
+    R[known] = poses.R[place]
+    t[known] = poses.t[place]
+    new = np.setdiff1d(np.arange(n), known)
     if len(new):
+        # M_new,new X_new = -M_new,known X_known
+        X = Poses(R, t).stacked()
         rows = columns_of(new, n, (1, d))
-        X[rows], columns = 0.0, convex.M[:, rows]
-        X[rows] = factorize(columns[rows].tocsc(), problem.backend).solve(-(columns.T @ X))
-        R[new], t[new] = project_to_rotations(unstack_transposes(X[n:])[new]), X[new]
+        X[rows] = 0.0
+        columns = M[:, rows]
+        factor = factorize(columns[rows].tocsc(), problem.backend)
+        X[rows] = factor.solve(-(columns.T @ X))
+        R[new] = project_to_rotations(unstack_transposes(X[n:])[new])
+        t[new] = X[new]
     return problem.at_best_translations(Poses(R, t))

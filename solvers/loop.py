@@ -1,12 +1,15 @@
-"""The one loop: steps a solver, keeps the clock, the history and the best iterate, prints, and knows when to end."""
+"""The one loop: it steps a solver, keeps the clock, the history and the best iterate, and prints.
+
+It ends a run where the method has converged, a limit is reached, or the callback says so.
+"""
 
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any, Protocol, TypeVar, cast, overload
+from typing import Any, Generic, Protocol, TypeVar, cast, overload
 
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
 from pgo_models.geometry.poses import Poses
@@ -15,7 +18,8 @@ from pgo_models.problem.problem import PGOProblem, as_problem
 from solvers.progress import Table
 from solvers.result import History, Measurement, Outcome, Record, Run, Status
 
-_TAKES_SECONDS = 20_000  # poses from which a factorisation is long enough to be told of
+# Poses from which a factorisation takes seconds, so that a bar is shown.
+_TAKES_SECONDS = 20_000
 
 P = TypeVar("P", contravariant=True)
 X = TypeVar("X", contravariant=True)
@@ -24,34 +28,116 @@ Records = tuple[Record, ...]
 
 
 class Method(Protocol[P, X, S]):
-    """What the loop needs of a method for problems P, started at X, with states S: settings, and functions of them."""
+    """What the loop needs of a method: settings, and four functions of them.
+
+    P is the type of its problems, X of its starts and S of its states.
+    """
 
     @property
     def max_iterations(self) -> int:
         """Most steps of a run."""
 
     def init(self, problem: P, start: X | None) -> S:
-        """State 0, at `start` or at the method's own start."""
+        """Return state 0.
+
+        Parameters
+        ----------
+        problem : P
+            What is to be solved.
+        start : X or None
+            Where to start; None stands for the start of the method.
+
+        Returns
+        -------
+        S
+            The state at the start, factorisations included.
+        """
 
     def step(self, problem: P, state: S) -> S:
-        """Return the next state; `state` stays as it is."""
+        """Return the next state; the given one stays as it is.
+
+        Parameters
+        ----------
+        problem : P
+            What is to be solved.
+        state : S
+            State k.
+
+        Returns
+        -------
+        S
+            State k + 1.
+        """
 
     def measure(self, problem: P, state: S) -> Measurement:
-        """Figures of a state."""
+        """Return figures of a state.
+
+        Parameters
+        ----------
+        problem : P
+            What is to be solved.
+        state : S
+            Any state.
+
+        Returns
+        -------
+        Measurement
+            Objective and residuals, all of one iterate.
+        """
 
     def converged(self, state: S, measurement: Measurement) -> Status | None:
-        """CONVERGED or STALLED when the run is done, else None."""
+        """Return how the run ended, if the method is done.
+
+        Parameters
+        ----------
+        state : S
+            The current state.
+        measurement : Measurement
+            Its figures.
+
+        Returns
+        -------
+        Status or None
+            CONVERGED or STALLED when the run is done, else None.
+        """
 
 
 class Solver(Method[PGOProblem, Poses, S], Protocol[S]):
     """A method for pose graphs: every state stands for feasible poses."""
 
     def poses(self, problem: PGOProblem, state: S) -> Poses:
-        """Feasible poses of a state, those whose F `measure` reports."""
+        """Return the feasible poses of a state.
+
+        Parameters
+        ----------
+        problem : PGOProblem
+            What is to be solved.
+        state : S
+            Any state.
+
+        Returns
+        -------
+        Poses
+            Those whose F `measure` reports.
+        """
 
 
 def iterate(method: Method[P, X, S], problem: P, start: X | None = None) -> Iterator[S]:
-    """Yield state 0, state 1, .. without end; take what you need with itertools.islice.
+    """Yield state 0, state 1, .. without end.
+
+    Parameters
+    ----------
+    method : Method
+        Settings with `init` and `step`.
+    problem : P
+        A problem of the kind that the method solves.
+    start : X, optional
+        Where it starts; at its own start unless given.
+
+    Yields
+    ------
+    S
+        The next state; take as many as you need with `itertools.islice`.
 
     Examples
     --------
@@ -104,15 +190,41 @@ def run(
     verbose: bool = False,
     progress: bool | None = None,
 ) -> Outcome[S]:
-    """Run a method on a problem of its kind to its end; a Solver on a PGOProblem or PoseGraph.
+    """Run a method on a problem of its kind, to its end.
 
-    The `start` is Poses, or the kind of point that the method starts at; its own unless given. The records `earlier`
-    are those of a run that was broken off after them, whose next iterate is `start`: counted on from there. `callback`
-    is called with every state and its record; a true answer ends the run (Status.STOPPED). `time_limit` is in seconds
-    of wall time, looked at between steps. `verbose` prints the table, `progress` shows a bar on long runs (None: in
-    notebooks). The state of the Run, or Outcome of a method that has no poses, is the last iterate after success, else
-    the best one: least infeasibility, then least objective. Ctrl-C ends it with Status.INTERRUPTED. A SettingError when
-    time_limit is not positive, or a Solver's problem is none.
+    The state that is returned is the last iterate after success, else the best one: that with the
+    least infeasibility and, among those, the least objective. Ctrl-C ends the run with
+    `Status.INTERRUPTED`.
+
+    Parameters
+    ----------
+    method : Solver or Method
+        What to run: a Solver on pose graphs, or a Method on problems of another kind.
+    problem : PGOProblem, PoseGraph or P
+        What to run it on; a PGOProblem or a PoseGraph for a Solver.
+    start : Poses or X, optional
+        Where it starts; at its own start unless given.
+    earlier : tuple of Record, optional
+        Records of a run that was broken off after them, and whose next iterate is `start`. The run
+        goes on counting from there.
+    callback : callable, optional
+        Called with every state and its Record. A true answer ends the run with `Status.STOPPED`.
+    time_limit : float, optional
+        Seconds of wall time, compared between steps; unlimited unless given.
+    verbose : bool, optional
+        Whether a table with a line an iterate is printed.
+    progress : bool, optional
+        Whether a bar is shown on long runs; in notebooks alone unless given.
+
+    Returns
+    -------
+    Run or Outcome
+        A Run of a Solver, which has poses; an Outcome of another Method.
+
+    Raises
+    ------
+    SettingError
+        When the time limit is not positive, or a Solver is given another problem.
 
     Examples
     --------
@@ -126,20 +238,24 @@ def run(
     >>> run(Newton(), problem, callback=lambda state, record: record.k == 2).status.name
     'STOPPED'
     """
-    return Watch(time_limit, verbose, progress, callback).run(method, problem, start, earlier)
+    return RunMonitor(time_limit, verbose, progress, callback).run(method, problem, start, earlier)
 
 
 @dataclass(frozen=True)
-class Watch:
-    """How runs are watched: for how long together, and who is shown what; see `run`. Their poses are kept."""
+class RunMonitor:
+    """For how long several runs may go on together, and what is shown of them; see `run`.
+
+    The seconds count from `began`. `poses_found` are those that the runs have ended at. `plan` has
+    the names of all stages in order, so that bars show which are still to come.
+    """
 
     time_limit: float = math.inf
     verbose: bool = False
     progress: bool | None = None
     callback: Callable[[Any, Record], bool | None] | None = None
-    began: float = field(default_factory=time.perf_counter)
-    found: list[Poses] = field(default_factory=list)
-    plan: list[str] = field(default_factory=list)  # names of the stages, in turn: bars say what is still to come
+    began: float = field(default_factory=lambda: time.perf_counter())
+    poses_found: list[Poses] = field(default_factory=list)
+    plan: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if not self.time_limit > 0:
@@ -147,78 +263,152 @@ class Watch:
 
     @property
     def left(self) -> float:
-        """Seconds that are left, never none: a run looks at the clock after its first state."""
+        """Seconds that are left, always positive.
+
+        A run compares them with the clock after its first state.
+        """
         return max(self.time_limit - (time.perf_counter() - self.began), 1e-9)
 
     @contextmanager
     def showing(self, name: str, problem: PGOProblem) -> Iterator[None]:
-        """Show what is done outside of `run`, a stage without iterations, on graphs where that takes seconds."""
-        is_shown = bool(self.progress) and not self.verbose and problem.num_poses >= _TAKES_SECONDS
-        bar = import_module("solvers.progress_bars").JobBar(None, True, self._titled(name)) if is_shown else None
-        with bar if bar is not None else nullcontext():
+        """Show a bar for a stage without iterations, on graphs where it takes seconds."""
+        is_long = problem.num_poses >= _TAKES_SECONDS
+        if not self.progress or self.verbose or not is_long:
+            yield
+            return
+        bars = import_module("solvers.progress_bars")  # rich is slow to import
+        with bars.JobBar(None, True, self._titled(name)):
             yield
 
     def _titled(self, name: str) -> str:
-        left = self.plan[self.plan.index(name) + 1 :] if name in self.plan and not self.verbose else []
-        return f"{name}, then {', '.join(left)}" if left else name
+        """Name of a stage and, unless a table is printed, of those that follow it."""
+        if self.verbose or name not in self.plan:
+            return name
+        following = self.plan[self.plan.index(name) + 1 :]
+        return f"{name}, then {', '.join(following)}" if following else name
 
     @overload
-    def run(self, method: Solver[S], problem: PGOProblem | PoseGraph, start: Poses | None = None) -> Run[S]: ...
+    def run(
+        self, method: Solver[S], problem: PGOProblem | PoseGraph, start: Poses | None = None
+    ) -> Run[S]: ...
     @overload
-    def run(self, method: Method[P, X, S], problem: P, start: X | None = None, earlier: Records = ()) -> Outcome[S]: ...
-    def run(self, method: Method[Any, Any, S], problem: Any, start: Any = None, earlier: Records = ()) -> Outcome[S]:
+    def run(
+        self, method: Method[P, X, S], problem: P, start: X | None = None, earlier: Records = ()
+    ) -> Outcome[S]: ...
+    def run(
+        self, method: Method[Any, Any, S], problem: Any, start: Any = None, earlier: Records = ()
+    ) -> Outcome[S]:
         """Run a method on a problem of its kind: the loop."""
         solver = cast(Solver[S], method) if hasattr(method, "poses") else None
         if solver is not None:
             problem = as_problem(problem)
         name = type(method).__name__
-        began = time.perf_counter()
-        state = method.init(problem, start)
-        in_steps = time.perf_counter() - began + (earlier[-1].seconds if earlier else 0.0)
-        best: tuple[tuple[float, float], S] | None = None  # least infeasibility, then least objective
-        records, k = list(earlier), len(earlier)
         tolerance = getattr(method, "tolerance", 0.0)
-        with Table(self._titled(name), method.max_iterations, self.verbose, self.progress, tolerance) as table:
+        course = _Course[S](lambda: method.init(problem, start), earlier)
+        with Table(
+            self._titled(name), method.max_iterations, self.verbose, self.progress, tolerance
+        ) as table:
             try:
-                while True:
-                    measurement = method.measure(problem, state)
-                    record = Record(k, in_steps, measurement)
-                    records.append(record)
-                    rank = measurement.infeasibility, measurement.objective
-                    if math.isfinite(measurement.objective) and (best is None or rank < best[0]):
-                        best = (rank, state)
-                    table.row(record, time.perf_counter() - began)
-                    status = self._ending(method, state, record)
-                    if status is not None:
-                        break
-                    before = time.perf_counter()
-                    state = method.step(problem, state)
-                    in_steps += time.perf_counter() - before
-                    k += 1
+                status = self._iterate(method, problem, course, table)
             except KeyboardInterrupt:
                 status = Status.INTERRUPTED
             except NotPositiveDefiniteError:
                 # Its matrices were positive definite at state 0: an iterate has overflowed.
-                if best is None:
+                if course.best is None:
                     raise
                 status = Status.NOT_FINITE
-            table.end(status, k)
-        objective = records[-1].measurement.objective if len(records) > len(earlier) else math.nan
-        if best is not None and not status.is_success:
-            (_, objective), state = best
-        history = History(tuple(records))
+            table.end(status, course.k)
+        state, objective = course.result(status)
+        history = History(tuple(course.records))
         if solver is None:
-            return Outcome(name, objective, state, status, k, history, time.perf_counter() - began, method=method)
+            seconds = course.elapsed
+            return Outcome(
+                name, objective, state, status, course.k, history, seconds, method=method
+            )
         poses = solver.poses(problem, state)
-        self.found.append(poses)
-        objective, seconds = problem.objective(poses), time.perf_counter() - began
-        return Run(name, objective, state, status, k, history, seconds, poses, method=method)
+        self.poses_found.append(poses)
+        objective = problem.objective(poses)
+        seconds = course.elapsed
+        return Run(name, objective, state, status, course.k, history, seconds, poses, method=method)
+
+    def _iterate(
+        self, method: Method[P, X, S], problem: P, course: "_Course[S]", table: Table
+    ) -> Status:
+        """Take steps until the method, the callback or a limit ends the run, and return why."""
+        while True:
+            record = course.add(method.measure(problem, course.state))
+            table.row(record, course.elapsed)
+            status = self._ending(method, course.state, record)
+            if status is not None:
+                return status
+            course.advance(lambda: method.step(problem, course.state))
 
     def _ending(self, method: Method[P, X, S], state: S, record: Record) -> Status | None:
+        """Why the run ends at a state, or None where it goes on."""
         is_late = time.perf_counter() - self.began > self.time_limit
         if self.callback is not None and self.callback(state, record):
             return Status.STOPPED
         if not math.isfinite(record.measurement.objective):
             return Status.NOT_FINITE
-        limit = Status.MAX_ITERATIONS if record.k >= method.max_iterations else None
-        return method.converged(state, record.measurement) or (Status.TIME_LIMIT if is_late else limit)
+        status = method.converged(state, record.measurement)
+        if status is not None:
+            return status
+        if is_late:
+            return Status.TIME_LIMIT
+        return Status.MAX_ITERATIONS if record.k >= method.max_iterations else None
+
+
+class _Course(Generic[S]):
+    """A run under way: its current and its best state, its records and its clock.
+
+    It begins with the state that `init` returns, and goes on counting from the records of an
+    earlier run. Measuring and printing are off the clock.
+    """
+
+    def __init__(self, init: Callable[[], S], earlier: Records) -> None:
+        self.records = list(earlier)
+        self.k = len(earlier)
+        self.best: tuple[tuple[float, float], S] | None = None  # rank and state
+        self._num_earlier = len(earlier)
+        self._seconds = earlier[-1].seconds if earlier else 0.0  # in steps
+        self._began = time.perf_counter()
+        self.state = self._timed(init)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds of wall time since the run began."""
+        return time.perf_counter() - self._began
+
+    def advance(self, step: Callable[[], S]) -> None:
+        """Go on to the next state."""
+        self.state = self._timed(step)
+        self.k += 1
+
+    def add(self, measurement: Measurement) -> Record:
+        """Record the current state, and remember it if it is the best so far.
+
+        The best one has the least infeasibility and, among those, the least objective.
+        """
+        record = Record(self.k, self._seconds, measurement)
+        self.records.append(record)
+        rank = (measurement.infeasibility, measurement.objective)
+        is_better = self.best is None or rank < self.best[0]
+        if math.isfinite(measurement.objective) and is_better:
+            self.best = (rank, self.state)
+        return record
+
+    def result(self, status: Status) -> tuple[S, float]:
+        """The last state after success, else the best one, and its objective."""
+        if self.best is not None and not status.is_success:
+            (_, objective), state = self.best
+            return state, objective
+        if len(self.records) == self._num_earlier:
+            return self.state, math.nan
+        return self.state, self.records[-1].measurement.objective
+
+    def _timed(self, act: Callable[[], S]) -> S:
+        """What a step returns, its time on the clock."""
+        before = time.perf_counter()
+        state = act()
+        self._seconds += time.perf_counter() - before
+        return state

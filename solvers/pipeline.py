@@ -1,76 +1,123 @@
-"""solve(problem): start, SOC, Newton, certificate, and where that fails the staircase, in one Solution."""
+"""solve(problem): a list of stages, from the start to the certificate, in one Solution."""
 
 from __future__ import annotations
 
 import math
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from pgo_models.certificates.certificate import (
-    DEFAULT_GAP,
-    BoundSource,
-    Certificate,
-    certify_at,
-    certify_with,
-    judge,
-    soften,
-)
-from pgo_models.certificates.lower_bound import NO_BOUND
-from pgo_models.certificates.newton_polish import polish
-from pgo_models.errors import GraphWarning, SettingError, check_settings
+from pgo_models.certificates.certificate import DEFAULT_GAP, judge
+from pgo_models.errors import GraphWarning, NotPositiveDefiniteError, SettingError, check_settings
 from pgo_models.geometry.arrays import whole_number
 from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.partitioning import Partition, partition
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem, as_problem
-from solvers.distributed.checkpoint import Checkpoint, Journal, JudgedPoses, run_fingerprint
-from solvers.distributed.driver import DEFAULT_MEMORY, Driver, collect
-from solvers.distributed.leaderless import NO_CERTIFICATE, attempt_leaderless
-from solvers.distributed.robust import estimate_by_robots
-from solvers.distributed.stages import attempt_distributed, climb_distributed, judge_collected, open_driver
-from solvers.loop import Watch
+from solvers.distributed.checkpoint import Checkpoint, Journal, run_fingerprint
+from solvers.distributed.chosen_robots import robots_of_solve
+from solvers.distributed.driver import DEFAULT_MEMORY, collect
+from solvers.distributed.leaderless import NO_CERTIFICATE
+from solvers.distributed.robust import SharedEstimate, estimate_by_robots
+from solvers.distributed.stages import (
+    CertifyByRobots,
+    ClimbByRobots,
+    ConsensusAlone,
+    NewtonByRobots,
+    RecallAttempt,
+    RobotJob,
+    SetPoses,
+    SOCByRobots,
+    StartByRobots,
+    open_driver,
+)
+from solvers.loop import RunMonitor
 from solvers.network.engine import Engine, InProcess
 from solvers.network.faults import Faults
-from solvers.result import OUT_OF_TIME, History, Record, Run, Stage, Status
+from solvers.network.ledger import Ledger
+from solvers.result import Record, Stage
 from solvers.riemannian.newton import Newton, needs_no_soc
-from solvers.riemannian.staircase import DualBound, Staircase, StaircaseState
+from solvers.riemannian.staircase import Staircase
 from solvers.robust.consistency import PCM
-from solvers.robust.gnc import GNC
-from solvers.robust_solve import FEW, solve_robustly
+from solvers.robust.gnc import GNC, LAST_STEPS
+from solvers.robust_solves.robust_solve import solve_robustly
 from solvers.soc.paper import PaperSOC
-from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
-from solvers.solution import Solution, framed, note_of_weights
+from solvers.solution import Solution, choose_gauge, note_of
+from solvers.stages import (
+    Answer,
+    FindCertificate,
+    FindStart,
+    ImproveBound,
+    Job,
+    Plan,
+    PlannedStage,
+    RunNewton,
+    RunSOC,
+    RunStaircase,
+    SecondAttempt,
+    run_stages,
+)
 
-HANDOVER_TOLERANCE = 5e-3  # relative residual at which Newton needs one or two factorisations on all graphs tried
-HANDOVER = SOC(tolerance=HANDOVER_TOLERANCE, max_iterations=100)
-_SECOND_TRY_TOLERANCE = 1e-6
-AnySOC = TypeVar("AnySOC", bound=SOC | PaperSOC)
+# Relative residual from which Newton needs one or two factorisations, on all graphs tried.
+WARM_START_TOLERANCE = 5e-3
+WARM_START = SOC(tolerance=WARM_START_TOLERANCE, max_iterations=100)
+_NUM_NAMED = 5  # landmarks that a warning names
 
 
 @dataclass(frozen=True)
 class Pipeline:
-    """Settings of a whole solve.
+    """Settings of a whole solve: which stages it has, and the settings of each.
 
-    The first stage is `soc` (also PaperSOC, ExtendedSOC), whose tolerance says when Newton takes over; None goes from
-    the start straight to Newton. Where the certificate is wider than the relative `gap` to certify, a `second_try` runs
-    SOC to a fine tolerance and Newton again, and keeps the better poses and the better bound; where it is still wider,
-    the `staircase`, unless None, solves the semidefinite relaxation from the best poses, then Newton from what it
-    rounds to. By robots, `faults` are what goes wrong between them in a CONSENSUS stage, which then does not wait
-    (`solvers.distributed.asynchronous`), and `driver_memory` the bytes that driver and fronts may take, refused before
-    they are spent; 0: no driver, CONSENSUS alone (`solvers.distributed.leaderless`), poses and no certificate.
+    The first stage is SOC, from which Newton takes over. Where the certificate is wider than the
+    relative `gap`, a second attempt runs SOC to a fine tolerance and Newton again, and the solve
+    keeps the better poses and the better bound. Where it is still wider, the staircase solves the
+    semidefinite relaxation from the best poses, and Newton starts from what it rounds to.
+
+    Parameters
+    ----------
+    soc : SOC, PaperSOC, ExtendedSOC or None
+        The first stage, whose tolerance says when Newton takes over. None goes from the start
+        straight to Newton. The default is `WARM_START`, a SOC with a coarse tolerance.
+    newton : Newton
+        The second stage, which goes down to rounding level.
+    gap : float
+        Relative gap to certify, (objective - lower_bound) / objective; positive.
+    second_try : bool
+        Whether a second attempt is made where the certificate of the first is wider than `gap`.
+    staircase : Staircase or None
+        The last stage, where the certificate is still wider; None leaves it out.
+    faults : Faults, optional
+        What goes wrong between the robots of a CONSENSUS stage, which then does not wait
+        (`solvers.distributed.asynchronous`).
+    driver_memory : float
+        Bytes that the driver of a solve by robots may take with its fronts. A solve that needs more
+        is refused before it begins. 0 stands for no driver: CONSENSUS alone
+        (`solvers.distributed.leaderless`), which finds poses and no certificate.
+
+    Raises
+    ------
+    SettingError
+        When a setting is out of its range, or faults or no driver are asked for without a CONSENSUS
+        stage.
+
+    Examples
+    --------
+    >>> from pgo_models import load
+    >>> pipeline = Pipeline(soc=SOC(tolerance=1e-4), gap=1e-8)
+    >>> [stage.name for stage in solve(load("grid"), pipeline).stages]
+    ['chordal start', 'SOC', 'Newton']
     """
 
-    soc: SOC | PaperSOC | None = field(default_factory=lambda: HANDOVER)
+    soc: SOC | PaperSOC | None = field(default_factory=lambda: WARM_START)
     newton: Newton = field(default_factory=Newton)
     gap: float = DEFAULT_GAP
     second_try: bool = True
@@ -79,14 +126,31 @@ class Pipeline:
     driver_memory: float = DEFAULT_MEMORY
 
     def __post_init__(self) -> None:
-        check_settings(self, finite=["gap"], not_negative=["driver_memory"], of_any_type=["soc"])  # ExtendedSOC, too
-        is_consensus = isinstance(self.soc, SOC) and self.soc.effective_coupling is Coupling.CONSENSUS
+        # soc may also be an ExtendedSOC, which this module does not import.
+        check_settings(self, finite=["gap"], not_negative=["driver_memory"], of_any_type=["soc"])
+        is_consensus = (
+            isinstance(self.soc, SOC) and self.soc.effective_coupling is Coupling.CONSENSUS
+        )
         if self.faults is not None and not is_consensus:
-            raise SettingError("faults are of messages between robots; use SOC(robots=.., coupling=Coupling.CONSENSUS)")
-        if self.driver_memory == 0 and not is_consensus:
             raise SettingError(
-                "without a driver robots run CONSENSUS alone; take it (--method consensus), or give driver_memory"
+                "faults are of messages between robots; "
+                "use SOC(robots=.., coupling=Coupling.CONSENSUS)"
             )
+        if not self.has_driver and not is_consensus:
+            raise SettingError(
+                "without a driver robots run CONSENSUS alone; "
+                "take it (--method consensus), or give driver_memory"
+            )
+
+    @property
+    def has_driver(self) -> bool:
+        """Whether a solve by robots has a driver."""
+        return self.driver_memory > 0
+
+    @property
+    def has_added_terms(self) -> bool:
+        """Whether the first stage is an ExtendedSOC, which adds terms and constraints to F."""
+        return getattr(self.soc, "changer", None) is not None
 
 
 def solve(
@@ -104,139 +168,484 @@ def solve(
     verbose: bool = False,
     progress: bool | None = None,
 ) -> Solution:
-    """Solve a pose graph and certify the answer.
+    """Solve a pose graph, and certify how far the answer is from the global optimum.
 
-    Start (chordal relaxation; a spanning tree for the paper's coupling), SOC until Newton can take over, Newton to
-    rounding level, then the dual certificate at the result. Where it is wider than asked for, a second try and then
-    the Riemannian staircase, whose optimum is the best bound that the relaxation has. In one place, SOC as `HANDOVER`
-    is left out where Newton alone is faster: in the plane, where the start is averaged, on small graphs, and of chi2
-    that is not quadratic and convex, where SOC runs on its `convex_part`. There the second try starts at the optimum of
-    F, and smaller information matrices take the place of the staircase.
+    A solve runs a list of stages. Each begins with the poses of the one before:
+
+    1. a start: the chordal relaxation, or a spanning tree for the coupling of the paper;
+    2. SOC, until Newton can take over;
+    3. Newton, down to rounding level;
+    4. the dual certificate at the result: a proven lower bound on the cost of all poses;
+    5. where the certificate is wider than asked for, a second attempt from the start on;
+    6. where it is still wider, the Riemannian staircase, whose optimum is the best bound that the
+       semidefinite relaxation has.
+
+    In one place, SOC with its default settings is left out where Newton alone is faster: in the
+    plane, where the start is averaged; on small graphs; and for chi2 that is not quadratic and
+    convex, where SOC would run on its `convex_part`. For such a chi2 the second attempt starts at
+    the optimum of F, and smaller information matrices take the place of the staircase.
 
     Parameters
     ----------
-    pipeline, start : Pipeline, Poses, optional
-        `Pipeline()`, and the method's own start, unless given.
+    problem : PGOProblem or PoseGraph
+        What to solve. The cost of a PoseGraph is F, with two precisions an edge.
+    pipeline : Pipeline, optional
+        Settings of the stages; `Pipeline()` unless given.
+    start : Poses, optional
+        Poses to start at; the start of the method unless given.
     robust : GNC or PCM, optional
-        Find wrong edges and leave them out: `solvers.robust_solve`. The solution is then of the edges kept alone, by
-        Newton from where they were found: of the pipeline the other stages are not run.
+        How to find wrong edges, which are left out (`solvers.robust_solves.robust_solve`). The
+        solution is then of the edges kept alone, by Newton from where these were found: the other
+        stages of the pipeline are not run.
     robots : Partition or int, optional
-        Robots that share the poses: start, SOC, Newton and certificate are run by them and a driver, each as if there
-        were one, and what crosses the network is in `Solution.ledger`. A number stands for the robots of the pipeline's
-        SOC if they are so many, else for the default partition. Without robots everything is run in one place.
-    engine, checkpoint : Engine, Checkpoint, optional
-        Where the robots run, in this process unless given; and a file from which a solve by robots that was broken off
-        goes on, and to which it writes what that takes.
+        Robots that share the poses. Start, SOC, Newton and certificate are run by them and a
+        driver, with the same result as in one place, and `Solution.ledger` says what crosses the
+        network. A number stands for the robots of the pipeline's SOC if they are so many, else for
+        the default partition. Without robots everything is run in one place.
+    engine : Engine, optional
+        Where the robots run; in this process unless given.
+    checkpoint : Checkpoint, optional
+        File to which a solve by robots writes what it needs to go on after it was broken off, and
+        from which it goes on.
     anchor : int, optional
-        Pose that stays where the graph's estimate has it, or at the identity if it has none. Unless given, the first of
-        `graph.fixed`; without one the poses are aligned with the estimate, or pose 0 is at the identity. Priors say
-        themselves where the poses are.
-    callback, time_limit, verbose, progress : optional
-        As in `solvers.loop.run`; a true answer ends the stage, SOC, Newton or staircase, and the seconds are those of
-        the iterative stages together. The certificate is found all the same.
+        Pose that stays where the graph's estimate has it, or at the identity if it has none. Unless
+        given, the first of `graph.fixed`; without one the poses are aligned with the estimate, or
+        pose 0 is at the identity. An anchor cannot be combined with priors.
+    callback : callable, optional
+        Called with every state and its `Record`. A true answer ends the stage: SOC, Newton or the
+        staircase. The certificate is found all the same.
+    time_limit : float, optional
+        Seconds of the iterative stages together; unlimited unless given.
+    verbose : bool, optional
+        Whether a table with a line an iterate is printed.
+    progress : bool, optional
+        Whether bars are shown on long stages; in notebooks alone unless given.
 
     Returns
     -------
     Solution
-        Also of a run that was interrupted or did not converge: look at its `status`.
+        Poses, cost, certificate and stages. There is also one of a solve that was interrupted or
+        did not converge, or whose weights are so far apart that a matrix has no Cholesky factor in
+        doubles: look at its `status`.
 
     Raises
     ------
     PGOError
-        When the problem or the pipeline is something else; when the graph is not connected, the start does not fit it,
-        the time limit is not positive, or the checkpoint is of another run; when the robots cannot be started, are not
-        those of the pipeline's SOC, or cannot run it.
+        When the problem or the pipeline is something else; when the graph is not connected, the
+        start does not fit it, the time limit is not positive, or the checkpoint is of another run;
+        when the robots cannot be started, are not those of the pipeline's SOC, or cannot run it.
+
+    See Also
+    --------
+    certify : Judge poses from anywhere.
+    solvers.run : Run one method alone.
+    extend : Solve a graph that has grown, from its solution.
+
+    References
+    ----------
+    M. Ebrahimi and M. Deghat, "Pose graph optimisation by splitting orthogonality constraints",
+    Algorithm 1 (stage 2); D. M. Rosen, L. Carlone, A. S. Bandeira and J. J. Leonard, "SE-Sync: A
+    certifiably correct algorithm for synchronization over the special Euclidean group", IJRR 2019
+    (stages 4 and 6).
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from pgo_models import grid
-    >>> solution = solve(grid(np.random.default_rng(0)))
+    Solve a graph of 27 poses, and ask whether the poses are the best there are:
+
+    >>> from pgo_models import load
+    >>> solution = solve(load("grid"))
     >>> solution.status.name, solution.is_certified
     ('CONVERGED', True)
-    """
-    watch = Watch(time_limit, verbose, progress, callback)
-    problem = as_problem(problem)
-    if anchor is not None and not 0 <= whole_number(anchor, "anchor", SettingError) < problem.num_poses:
-        raise SettingError(f"anchor is {anchor}; give a pose, 0 to {problem.num_poses - 1}")
-    if anchor is not None and anchor in problem.graph.landmarks:
-        raise SettingError(f"anchor is {anchor}, a landmark, which has no rotation; give a pose")
-    if anchor is not None and problem.graph.world is not None:
-        raise SettingError("the priors of the graph say where its poses are; leave out the anchor")
-    graph, sights = problem.graph, np.bincount(problem.graph.j, minlength=problem.num_poses)
-    if (seen_once := graph.landmarks[sights[graph.landmarks] == 1]).size:
-        named = ", ".join(map(graph.pose_name, seen_once[:5])) + ", .." * (len(seen_once) > 5)
-        message = f"{len(seen_once)} landmarks seen once, of no use to the poses ({named}); look at them again"
-        warnings.warn(f"{graph.name}: {message}", GraphWarning, stacklevel=2)
-    if robots is None and (engine is not None or checkpoint is not None):
-        raise SettingError("engine and checkpoint are for solves by robots; give robots, a number or a Partition")
-    pipeline = pipeline if pipeline is not None else Pipeline()
-    if not isinstance(pipeline, Pipeline):
-        raise SettingError(f"the pipeline is a {type(pipeline).__name__}; give Pipeline(soc=SOC(..)), or run(SOC(..))")
-    shown = partial(solve, anchor=anchor, callback=callback, verbose=verbose, progress=progress)
-    if getattr(pipeline.soc, "changer", None) is not None:
-        from solvers.extended_solve import solve_extended  # cvxpy, which is slow to import
 
-        plain = partial(shown, robust=robust, robots=robots, engine=engine, checkpoint=checkpoint)
-        asked = [name for name, given in (("robots", robots), ("robust", robust)) if given is not None]
-        return solve_extended(problem, pipeline, start, watch, plain, asked)
-    if robots is None and pipeline.faults is not None:
-        raise SettingError("faults are of messages between robots; give solve() the robots of SOC, too")
-    if robots is None and pipeline.driver_memory != DEFAULT_MEMORY:
-        raise SettingError("driver_memory is for solves by robots; give solve() the robots, too")
-    if pipeline.driver_memory == 0 and problem.convex_part is not problem:
-        raise SettingError("without a driver robots run SOC alone, which needs a convex quadratic cost: F, not chi2")
-    if pipeline.driver_memory == 0:
-        pipeline = replace(pipeline, second_try=False, staircase=None)
+    No poses cost less than the lower bound, and `gap` is how far the solution may be above it:
+
+    >>> print(f"{solution.objective:.6f} {solution.lower_bound:.6f} {solution.gap < 1e-9}")
+    97.014021 97.014021 True
+
+    Each stage says how it ended:
+
+    >>> [(stage.name, stage.status.name) for stage in solution.stages]
+    [('chordal start', 'CONVERGED'), ('Newton', 'CONVERGED')]
+
+    Three robots that exchange messages find the same:
+
+    >>> shared = solve(load("grid"), robots=3)
+    >>> shared.is_certified, abs(shared.objective - solution.objective) < 1e-9
+    (True, True)
+    >>> shared.ledger.num_robots, shared.ledger.num_bytes > 0
+    (3, True)
+    """
+    request = _Request(
+        problem=as_problem(problem),
+        pipeline=Pipeline() if pipeline is None else pipeline,
+        start=start,
+        robust=robust,
+        robots=robots,
+        engine=engine,
+        checkpoint=checkpoint,
+        anchor=anchor,
+        monitor=RunMonitor(time_limit, verbose, progress, callback),
+    )
+    _warn_of_landmarks_seen_once(request.problem.graph)
+    if request.pipeline.has_added_terms:
+        return _solve_with_added_terms(request)
     if robust is not None:
-        if checkpoint is not None or pipeline.driver_memory == 0 or pipeline.faults is not None:
-            raise SettingError("a robust solve needs a driver without faults, and writes no checkpoint; leave that out")
-        newton = replace(pipeline.newton, max_iterations=FEW) if isinstance(robust, GNC) else pipeline.newton
-        short = replace(pipeline, soc=None, newton=newton, second_try=False, staircase=None)
-        plain = partial(shown, pipeline=short)
-        shared = None
-        if robots is not None:
-            robots, engine = _robots_for(pipeline.soc, robots, problem.graph), engine or InProcess()
-            plain = partial(plain, robots=robots, engine=engine)
-            shared = partial(estimate_by_robots, robots=robots, engine=engine, memory=pipeline.driver_memory)
-        return solve_robustly(problem, robust, pipeline.gap, start, watch, plain, shared)
-    job = _Job(problem, pipeline, watch)
-    ledger = None
-    if robots is None:
+        return _solve_without_wrong_edges(request, robust)
+    if robots is not None:
+        return _solve_by_robots(request, robots)
+    return _solve_in_one_place(request)
+
+
+@dataclass(frozen=True, eq=False)
+class _Request:
+    """What `solve` was asked for, once it is known to go together."""
+
+    problem: PGOProblem
+    pipeline: Pipeline
+    start: Poses | None
+    robust: GNC | PCM | None
+    robots: Partition | int | None
+    engine: Engine | None
+    checkpoint: Checkpoint | None
+    anchor: int | None
+    monitor: RunMonitor
+
+    def __post_init__(self) -> None:
+        if self.anchor is not None:
+            self._check_anchor(self.anchor)
+        if not isinstance(self.pipeline, Pipeline):
+            raise SettingError(
+                f"the pipeline is a {type(self.pipeline).__name__}; "
+                "give Pipeline(soc=SOC(..)), or run(SOC(..))"
+            )
+        if self.robots is None:
+            self._check_in_one_place()
+        self._check_driver()
+
+    def _check_anchor(self, anchor: int) -> None:
+        """Raise a SettingError unless the anchor is a pose with a rotation.
+
+        It cannot be combined with priors, which hold the frame themselves.
+        """
+        graph = self.problem.graph
+        num_poses = self.problem.num_poses
+        if not 0 <= whole_number(anchor, "anchor", SettingError) < num_poses:
+            raise SettingError(f"anchor is {anchor}; give a pose, 0 to {num_poses - 1}")
+        if anchor in graph.landmarks:
+            raise SettingError(
+                f"anchor is {anchor}, a landmark, which has no rotation; give a pose"
+            )
+        if graph.world is not None:
+            raise SettingError("an anchor cannot be combined with priors; leave out the anchor")
+
+    def _check_in_one_place(self) -> None:
+        """Raise a SettingError for what only a solve by robots has."""
+        if self.engine is not None or self.checkpoint is not None:
+            raise SettingError(
+                "engine and checkpoint are for solves by robots; "
+                "give robots, a number or a Partition"
+            )
+        if self.pipeline.faults is not None:
+            raise SettingError(
+                "faults are of messages between robots; give solve() the robots of SOC, too"
+            )
+        if self.pipeline.driver_memory != DEFAULT_MEMORY:
+            raise SettingError(
+                "driver_memory is for solves by robots; give solve() the robots, too"
+            )
+
+    def _check_driver(self) -> None:
+        """Raise a SettingError where the cost or a robust solve needs a driver, and has none."""
+        pipeline = self.pipeline
+        if not pipeline.has_driver and self.problem.convex_part is not self.problem:
+            raise SettingError(
+                "without a driver robots run SOC alone, "
+                "which needs a convex quadratic cost: F, not chi2"
+            )
+        is_plain = self.checkpoint is None and pipeline.has_driver and pipeline.faults is None
+        if self.robust is not None and not is_plain:
+            raise SettingError(
+                "a robust solve needs a driver without faults, "
+                "and writes no checkpoint; leave that out"
+            )
+
+    def solve_once(self) -> Callable[..., Solution]:
+        """`solve` with the anchor, callback and output of this request; the rest is to be given."""
+        monitor = self.monitor
+        return partial(
+            solve,
+            anchor=self.anchor,
+            callback=monitor.callback,
+            verbose=monitor.verbose,
+            progress=monitor.progress,
+        )
+
+
+def _warn_of_landmarks_seen_once(graph: PoseGraph) -> None:
+    """Warn of landmarks with one edge, which tell nothing about the poses."""
+    num_sights = np.bincount(graph.j, minlength=graph.num_poses)
+    seen_once = graph.landmarks[num_sights[graph.landmarks] == 1]
+    if not seen_once.size:
+        return
+    names = ", ".join(graph.pose_name(landmark) for landmark in seen_once[:_NUM_NAMED])
+    if len(seen_once) > _NUM_NAMED:
+        names += ", .."
+    message = (
+        f"{graph.name}: {len(seen_once)} landmarks seen once, of no use to the poses ({names}); "
+        "look at them again"
+    )
+    warnings.warn(message, GraphWarning, stacklevel=3)
+
+
+def _solve_with_added_terms(request: _Request) -> Solution:
+    """Solution of F with the terms and constraints of an ExtendedSOC."""
+    from solvers.extended_solve import solve_extended  # cvxpy is slow to import
+
+    pipeline = request.pipeline
+    soc: Any = pipeline.soc  # an ExtendedSOC
+    given = {"robots": request.robots, "robust": request.robust}
+    asked = [name for name, value in given.items() if value is not None]
+    solve_once = partial(
+        request.solve_once(),
+        pipeline=replace(pipeline, soc=soc.soc),
+        robust=request.robust,
+        robots=request.robots,
+        engine=request.engine,
+        checkpoint=request.checkpoint,
+    )
+    return solve_extended(
+        request.problem,
+        soc,
+        pipeline.newton,
+        request.start,
+        request.monitor,
+        solve_once,
+        asked,
+    )
+
+
+def _solve_without_wrong_edges(request: _Request, robust: GNC | PCM) -> Solution:
+    """Solution of the edges that a robust solve keeps: Newton from the poses that it finds."""
+    pipeline = request.pipeline
+    newton = pipeline.newton
+    if isinstance(robust, GNC):
+        newton = replace(newton, max_iterations=LAST_STEPS)
+    newton_alone = replace(pipeline, soc=None, newton=newton, second_try=False, staircase=None)
+    solve_once = partial(request.solve_once(), pipeline=newton_alone)
+    estimate: Callable[..., SharedEstimate] | None = None
+    if request.robots is not None:
+        robots = robots_of_solve(pipeline.soc, request.robots, request.problem.graph)
+        engine = request.engine if request.engine is not None else InProcess()
+        solve_once = partial(solve_once, robots=robots, engine=engine)
+        estimate = partial(
+            estimate_by_robots, robots=robots, engine=engine, memory=pipeline.driver_memory
+        )
+    return solve_robustly(
+        request.problem,
+        robust,
+        pipeline.gap,
+        request.start,
+        request.monitor,
+        solve_once,
+        estimate,
+    )
+
+
+def _solve_in_one_place(request: _Request) -> Solution:
+    """Solution by the stages of `solvers.stages`."""
+    pipeline = request.pipeline
+    monitor = request.monitor
+    job = Job(request.problem, pipeline.gap, monitor)
+    plan = partial(_plan_attempt, job, pipeline.newton)
+    climb = _plan_climb(job, pipeline)
+    try:
+        first = plan(pipeline.soc, request.start)
+        further = _plan_improvements(pipeline, job, plan, climb)
+        answer = run_stages([*first, *further], Answer())
+    except KeyboardInterrupt:  # between two loops: the loops answer it themselves
+        if not monitor.poses_found:
+            raise
+        answer = job.broken_off(Stage.interruption)
+    except NotPositiveDefiniteError:
+        answer = job.broken_off(Stage.without_factor)
+    return _solution(request, job, answer)
+
+
+def _solve_by_robots(request: _Request, robots: Partition | int) -> Solution:
+    """Solution by the stages of `solvers.distributed.stages`.
+
+    Without a driver these are the start and CONSENSUS alone.
+    """
+    pipeline = request.pipeline
+    problem = request.problem
+    monitor = request.monitor
+    if not pipeline.has_driver:
+        pipeline = replace(pipeline, second_try=False, staircase=None)
+    partition = robots_of_solve(pipeline.soc, robots, problem.graph)
+    settings = (
+        pipeline.soc,
+        pipeline.newton,
+        pipeline.gap,
+        pipeline.second_try,
+        pipeline.faults,
+        pipeline.has_driver,
+    )
+    mark = run_fingerprint(problem, partition, settings, request.start)
+    engine = request.engine if request.engine is not None else InProcess()
+    job = Job(problem, pipeline.gap, monitor)
+    with (
+        closing(Journal(request.checkpoint, mark, job.stages)) as journal,
+        closing(open_driver(problem, partition, engine, pipeline.driver_memory)) as driver,
+    ):
+        shared = RobotJob(driver, journal, monitor)
+        plan: Plan = partial(_plan_attempt_by_robots, job, shared, pipeline)
+        if not pipeline.has_driver:
+            plan = partial(_plan_attempt_alone, job, shared, pipeline, partition)
+        climb = _plan_climb_by_robots(job, shared.without_checkpoints(), pipeline)
         try:
-            poses, certificate = job.improve(*job.tries(job.attempt, start))
-        except KeyboardInterrupt:  # between the loops, which answer it themselves
-            if not watch.found:
+            first = plan(pipeline.soc, request.start)
+            further = _plan_improvements(pipeline, job, plan, climb)
+            answer = run_stages([*first, *further], Answer())
+        except KeyboardInterrupt:
+            if not job.stages:
                 raise
-            poses, certificate = job.broken_off()
+            if pipeline.has_driver:
+                monitor.poses_found.append(collect(driver)[0])
+            answer = job.broken_off(Stage.interruption)
+        except NotPositiveDefiniteError:
+            answer = job.broken_off(Stage.without_factor)
+        if job.stages[-1].status.is_success:
+            journal.end()
+    return _solution(request, job, answer, driver.network.ledger, partition)
+
+
+def _plan_attempt(
+    job: Job, newton: Newton, soc: SOC | PaperSOC | None, start: Poses | None
+) -> list[PlannedStage]:
+    """Stages of an attempt in one place, without SOC where Newton alone is faster."""
+    began = time.perf_counter()
+    problem = job.problem
+    is_convex = problem.convex_part is problem
+    # The minimum of the convex part is no nearer to that of chi2 than the start is.
+    newton_alone = not is_convex or (start is None and needs_no_soc(problem))
+    is_averaged = False
+    if soc == WARM_START and newton_alone:
+        soc = None
+        is_averaged = problem.d == 2
+    name, find = _choose_start(problem, soc, start, is_averaged)
+    planned: list[PlannedStage] = [FindStart(job, name, find, began)]
+    if soc is not None:
+        planned.append(RunSOC(job, soc))
+    planned += [RunNewton(job, newton), FindCertificate(job)]
+    job.monitor.plan[:] = [stage.name for stage in planned]
+    return planned
+
+
+def _plan_climb(job: Job, pipeline: Pipeline) -> list[PlannedStage]:
+    """Stages of a climb in one place."""
+    if pipeline.staircase is None:
+        return []
+    return [
+        RunStaircase(job, replace(pipeline.staircase, gap=pipeline.gap)),
+        RunNewton(job, pipeline.newton),
+        FindCertificate(job),
+    ]
+
+
+def _choose_start(
+    problem: PGOProblem, soc: SOC | PaperSOC | None, start: Poses | None, is_averaged: bool
+) -> tuple[str, Callable[[], Poses]]:
+    """Name of a start, and the function that finds its poses."""
+    if start is not None:
+        return "given start", lambda: start
+    if isinstance(soc, PaperSOC):
+        return "spanning tree", partial(spanning_tree_start, problem.convex_part.graph)
+    name = "averaged start" if is_averaged else "chordal start"
+    return name, partial(chordal_start, problem.convex_part, is_averaged)
+
+
+def _plan_improvements(
+    pipeline: Pipeline, job: Job, plan: Plan, climb: Sequence[PlannedStage]
+) -> list[PlannedStage]:
+    """Stages that follow the first attempt.
+
+    They leave an answer as it is whose certificate has the gap that was asked for.
+    """
+    planned: list[PlannedStage] = []
+    if pipeline.second_try:
+        planned.append(SecondAttempt(job, plan, pipeline.soc))
+    if pipeline.staircase is not None:
+        planned.append(ImproveBound(job, climb))
+    return planned
+
+
+def _plan_attempt_by_robots(
+    job: Job,
+    shared: RobotJob,
+    pipeline: Pipeline,
+    soc: SOC | PaperSOC | None,
+    start: Poses | None,
+) -> list[PlannedStage]:
+    """Stages of an attempt by robots, or its outcome where a checkpoint is of a later attempt."""
+    outcome = shared.journal.take_outcome()
+    if outcome is not None:
+        return [RecallAttempt(*outcome)]
+    assert not isinstance(soc, PaperSOC)  # `robots_of_solve` refuses it
+    problem = job.problem
+    planned: list[PlannedStage] = []
+    if start is not None:
+        planned.append(StartByRobots(shared, "given start", lambda: start))
+    elif problem.graph.is_world_loose:
+        # The rotation of the world depends on positions alone.
+        find = partial(chordal_start, problem.convex_part)
+        planned.append(StartByRobots(shared, "chordal start, in one place", find))
     else:
-        robots = _robots_for(pipeline.soc, robots, problem.graph)
-        settings = pipeline.soc, pipeline.newton, pipeline.gap, pipeline.second_try, pipeline.faults
-        has_driver = pipeline.driver_memory > 0
-        mark = run_fingerprint(problem, robots, (*settings, has_driver), start)
-        engine = engine if engine is not None else InProcess()
-        with (
-            closing(Journal(checkpoint, mark, job.stages)) as journal,
-            closing(open_driver(problem, robots, engine, pipeline.driver_memory)) as driver,
-        ):
-            common = pipeline.gap, pipeline.faults, journal, watch
-            attempt = partial(attempt_distributed, driver, problem, pipeline.newton, *common)
-            if not has_driver:
-                attempt = partial(attempt_leaderless, driver, problem, robots, *common)
-            try:
-                poses, certificate = job.tries(attempt, start)
-            except KeyboardInterrupt:
-                if not job.stages:
-                    raise
-                watch.found.extend([collect(driver)[0]] if has_driver else [])
-                poses, certificate = job.broken_off()
-            poses, certificate = job.improve(poses, certificate, driver)
-            if job.stages[-1].status.is_success:
-                journal.end()
-        ledger = driver.network.ledger
-    poses, frame, held = framed(poses, problem.graph, anchor)
-    # A frame far away rounds the poses; what is said is of those that are returned.
-    certificate = judge(problem, poses, certificate)
+        planned.append(StartByRobots(shared))
+    if soc is not None:
+        planned.append(SOCByRobots(shared, soc, pipeline.faults))
+    newton = NewtonByRobots(shared, pipeline.newton)
+    return [*planned, newton, CertifyByRobots(shared, problem, job.gap)]
+
+
+def _plan_climb_by_robots(job: Job, shared: RobotJob, pipeline: Pipeline) -> list[PlannedStage]:
+    """Stages of a climb by robots from poses that the driver has."""
+    if pipeline.staircase is None:
+        return []
+    return [
+        SetPoses(shared),
+        ClimbByRobots(shared, replace(pipeline.staircase, gap=pipeline.gap)),
+        NewtonByRobots(shared, pipeline.newton),
+        CertifyByRobots(shared, job.problem, job.gap),
+    ]
+
+
+def _plan_attempt_alone(
+    job: Job,
+    shared: RobotJob,
+    pipeline: Pipeline,
+    robots: Partition,
+    soc: SOC | PaperSOC | None,
+    start: Poses | None,
+) -> list[PlannedStage]:
+    """The one stage of robots without a driver: start and CONSENSUS."""
+    assert isinstance(soc, SOC)  # as `Pipeline` has checked
+    faults = pipeline.faults
+    return [ConsensusAlone(shared, job.problem, job.gap, robots, soc, faults, start)]
+
+
+def _solution(
+    request: _Request,
+    job: Job,
+    answer: Answer,
+    ledger: Ledger | None = None,
+    robots: Partition | None = None,
+) -> Solution:
+    """Solution with the answer in the frame that was asked for."""
+    problem = request.problem
+    poses, frame, held = choose_gauge(answer.current_poses, problem.graph, request.anchor)
+    # A frame far away rounds the poses: the certificate is of those that are returned.
+    certificate = judge(problem, poses, answer.current_certificate)
+    missing = "" if request.pipeline.has_driver else NO_CERTIFICATE
     return Solution(
         problem=problem,
         poses=poses,
@@ -244,157 +653,10 @@ def solve(
         certificate=certificate,
         status=job.stages[-1].status,
         stages=tuple(job.stages),
-        seconds=time.perf_counter() - watch.began,
+        seconds=time.perf_counter() - request.monitor.began,
         ledger=ledger,
         robots=robots,
-        note=NO_CERTIFICATE if pipeline.driver_memory == 0 else note_of_weights(problem.graph, certificate),
+        note=note_of(problem, certificate, missing),
         frame=frame,
         anchor=held,
     )
-
-
-def _robots_for(soc: SOC | PaperSOC | None, robots: Partition | int, graph: PoseGraph) -> Partition:
-    """Robots of a solve, who are also those of its SOC; a SettingError when that is of others, or not for robots."""
-    own = soc.robots if soc is not None else None
-    if not isinstance(robots, Partition):
-        robots = whole_number(robots, "robots", SettingError)
-        robots = own if own is not None and own.num_robots == robots else partition(graph, robots)
-    if own is not None and not np.array_equal(own.robot, robots.robot):
-        raise SettingError(f"solve() has {robots}, SOC has {own}; give both the same robots, or SOC none")
-    if isinstance(soc, PaperSOC):
-        raise SettingError("PaperSOC is run in one place; leave out the robots of solve(), or use SOC(robots=..)")
-    if soc is not None and soc.r_step is not RStep.FACTORIZED:
-        raise SettingError(f"robots factor their subproblems, got r_step {soc.r_step}; use RStep.FACTORIZED")
-    return robots
-
-
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """What all parts of a solve share: its problem and settings, how it is watched, and what was done so far."""
-
-    problem: PGOProblem
-    pipeline: Pipeline
-    watch: Watch
-    stages: list[Stage] = field(default_factory=list)
-
-    def tries(
-        self, attempt: Callable[[SOC | PaperSOC | None, Poses | None], JudgedPoses], start: Poses | None
-    ) -> JudgedPoses:
-        """One attempt, and where its certificate is wider than asked for a second one.
-
-        That is with a finer SOC, or, of a cost that is not quadratic, from the optimum of F.
-        """
-        poses, certificate = attempt(self.pipeline.soc, start)
-        if self.pipeline.second_try and certificate.can_improve and self.stages[-1].status.is_success:
-            if not self.problem.is_quadratic:
-                F = PGOProblem(self.problem.graph, self.problem.backend)
-                other = attempt(None, polish(F, chordal_start(F)))[1]
-                return _better(self.problem, poses, certificate, other)
-            fine = finer(self.pipeline.soc if self.pipeline.soc is not None else SOC())
-            poses, certificate = _better(self.problem, poses, certificate, attempt(fine, None)[1])
-        return poses, certificate
-
-    def attempt(self, soc: SOC | PaperSOC | None, start: Poses | None) -> JudgedPoses:
-        """SOC, Newton and certificate from a start; the first on the convex part of chi2 where that is not convex."""
-        began, first_problem = time.perf_counter(), self.problem.convex_part
-        has_convex_part = first_problem is not self.problem  # whose minimum is no nearer to chi2's than the start is
-        without_soc = soc == HANDOVER and (has_convex_part or (start is None and needs_no_soc(self.problem)))
-        soc, averaged = None if without_soc else soc, without_soc and self.problem.d == 2
-        is_paper = isinstance(soc, PaperSOC)
-        name = "averaged start" if averaged else "chordal start"
-        name = ("spanning tree" if is_paper else name) if start is None else "given start"
-        self.watch.plan[:] = [name, *([] if soc is None else [type(soc).__name__]), "Newton", "certificate"]
-        with self.watch.showing(name, self.problem):
-            if (poses := start) is None:
-                graph = first_problem.graph
-                poses = spanning_tree_start(graph) if is_paper else chordal_start(first_problem, averaged)
-        seconds = time.perf_counter() - began
-        self.stages.append(Stage(name, Status.CONVERGED, 0, self.problem.objective(poses), seconds, History()))
-        self.watch.found.append(poses)
-        if soc is not None:
-            first: Run[Any] = self.watch.run(soc, first_problem, poses)
-            # A start that is better than SOC's best iterate is kept: CSAIL's chordal start is within 1e-4.
-            poses = first.poses if first.objective <= first_problem.objective(poses) else poses
-            stage = Stage.of(first)
-            if has_convex_part:
-                stage = replace(stage, name=f"{stage.name}, convex", objective=self.problem.objective(poses))
-            self.stages.append(stage)
-            del first  # its factor is the next one's to take over
-        return self.polish(poses)
-
-    def polish(self, poses: Poses) -> JudgedPoses:
-        """Newton, unless the stage before was cut short, and certificate."""
-        decrement = math.inf
-        if self.stages[-1].status not in OUT_OF_TIME:
-            second = self.watch.run(self.pipeline.newton, self.problem, poses)
-            self.stages.append(Stage.of(second))
-            poses, decrement = second.poses, second.state.polish.decrement
-            del second
-        with self.watch.showing("certificate", self.problem):
-            return poses, certify_at(self.problem, poses, self.pipeline.gap, decrement)
-
-    def improve(self, poses: Poses, certificate: Certificate, driver: Driver | None = None) -> JudgedPoses:
-        """Staircase, in one place or by a driver and robots, where the certificate can still improve."""
-        staircase, problem = self.pipeline.staircase, self.problem
-        if staircase is None or not certificate.can_improve or self.stages[-1].status in OUT_OF_TIME:
-            return poses, certificate
-        try:
-            if problem.convex_part is problem:  # quadratic and convex
-                poses, certificate = self.climb(replace(staircase, gap=self.pipeline.gap), poses, certificate, driver)
-            certificate = soften(problem, certificate)
-        except KeyboardInterrupt:
-            self.interrupt(problem.objective(poses))
-        return poses, certificate
-
-    def climb(self, staircase: Staircase, poses: Poses, certificate: Certificate, driver: Driver | None) -> JudgedPoses:
-        """Staircase from the best poses, Newton from what it rounds to, and the relaxation's bound if still needed."""
-        problem, gap = self.problem, self.pipeline.gap
-        bound: DualBound | None
-        if driver is not None:
-            driver.set_poses(poses)
-            decrement, bound = climb_distributed(driver, staircase, self.pipeline.newton, self.watch, self.stages)
-            other = judge_collected(driver, problem, gap, decrement)[1]
-        else:
-            bounds: list[DualBound | None] = [None]
-            # Of a run that was cut short the state with the best poses is kept, not the one with the best bound.
-            told = self.watch.callback
-
-            def watched(state: StaircaseState, record: Record) -> bool | None:
-                bounds.append(state.bound)
-                return told(state, record) if told is not None else None
-
-            watching = replace(self.watch, callback=watched)
-            climb = watching.run(staircase, problem, poses)
-            self.stages.append(Stage.of(climb))
-            other, bound = self.polish(climb.poses)[1], bounds[-1]
-        poses, certificate = _better(problem, poses, certificate, other)
-        if bound is not None and not certificate.is_certified:
-            found = gap, certificate.stationarity, BoundSource.RELAXATION, bound.bound
-            relaxed = certify_with(problem, poses, bound.Lambda, *found)
-            certificate = max(certificate, relaxed, key=lambda found: found.lower_bound)
-        return poses, certificate
-
-    def broken_off(self) -> JudgedPoses:
-        """Best poses found before an interruption, with the bound 0, which needs no proof."""
-        poses = min(self.watch.found, key=self.problem.objective)
-        self.interrupt(self.problem.objective(poses))
-        nothing, source = np.zeros_like(poses.R), BoundSource.GIVEN
-        return poses, certify_with(self.problem, poses, nothing, self.pipeline.gap, math.inf, source, NO_BOUND)
-
-    def interrupt(self, objective: float) -> None:
-        """Note that what was under way was broken off."""
-        self.stages.append(Stage.interruption(objective))
-
-
-def finer(soc: AnySOC) -> AnySOC:
-    """SOC of a second try."""
-    return replace(soc, tolerance=min(soc.tolerance, _SECOND_TRY_TOLERANCE), max_iterations=SOC.max_iterations)
-
-
-def _better(problem: PGOProblem, poses: Poses, certificate: Certificate, other: Certificate) -> JudgedPoses:
-    """The better of `poses`, which `certificate` judges, and the poses of `other`, held against the better bound."""
-    stationarity = certificate.stationarity
-    if other.poses_objective < certificate.objective:
-        poses, stationarity = other.poses, other.stationarity
-    bound = max(certificate, other, key=lambda found: found.lower_bound)
-    return poses, replace(judge(problem, poses, bound), stationarity=stationarity)

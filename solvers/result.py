@@ -6,6 +6,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 
@@ -21,7 +22,12 @@ class Status(enum.Enum):
     STALLED = "no further decrease is possible in double precision"
     STOPPED = "stopped by the callback"
     INTERRUPTED = "interrupted; the best iterate so far is returned"
+    START_KEPT = (
+        "it ended at poses that cost more than its start, which is returned; "
+        "give another start or tolerance"
+    )
     NOT_FINITE = "the iterate contains nan or inf; raise the penalty"
+    NOT_FACTORED = "a matrix has no Cholesky factor in doubles; its weights are too far apart"
 
     @property
     def is_success(self) -> bool:
@@ -34,15 +40,32 @@ OUT_OF_TIME = (Status.INTERRUPTED, Status.TIME_LIMIT)
 
 @dataclass(frozen=True)
 class Measurement:
-    """Figures of one iterate; rounds, bytes and all-reduces so far where it is of many robots.
+    """Figures of one iterate.
 
-    `infeasibility` is the distance of the point whose objective this is from the constraints; 0 where that point is
-    feasible, as poses are. The best iterate of a run has the least infeasibility, and among those the least objective.
+    The best iterate of a run has the least infeasibility and, among those, the least objective.
+
+    Parameters
+    ----------
+    objective : float
+        F of the feasible poses that the iterate stands for.
+    primal_residual : float
+        Relative distance from feasibility; 0 for methods whose iterates are feasible.
+    dual_residual : float
+        Relative distance from stationarity; the docstring of each solver says which.
+    infeasibility : float
+        Distance from the constraints of the point whose objective this is; 0 where that point is
+        feasible, as poses are.
+    rounds : int, optional
+        Rounds of communication so far, where it is a run of many robots.
+    num_bytes : int, optional
+        Bytes that robots have sent so far.
+    all_reduces : int, optional
+        Sums over all robots so far.
     """
 
-    objective: float  # F of the feasible poses that the iterate stands for
-    primal_residual: float  # distance from feasibility, relative; 0 for methods whose iterates are feasible
-    dual_residual: float  # distance from stationarity, relative; each solver's docstring says which
+    objective: float
+    primal_residual: float
+    dual_residual: float
     infeasibility: float = 0.0
     rounds: int | None = None
     num_bytes: int | None = None
@@ -51,7 +74,17 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Record:
-    """One row of a history: iterate k, seconds spent in steps up to it, and its figures."""
+    """One row of a history: an iterate and its figures.
+
+    Parameters
+    ----------
+    k : int
+        Number of the iterate; 0 is the start.
+    seconds : float
+        Seconds spent in steps up to it.
+    measurement : Measurement
+        Its figures.
+    """
 
     k: int
     seconds: float
@@ -60,7 +93,21 @@ class Record:
 
 @dataclass(frozen=True)
 class History:
-    """Records of all measured iterates, in order."""
+    """Records of all measured iterates, in order.
+
+    Parameters
+    ----------
+    records : tuple of Record
+        A row for every iterate.
+
+    Examples
+    --------
+    >>> from pgo_models import load
+    >>> from solvers import Newton, run
+    >>> history = run(Newton(), load("grid")).history
+    >>> len(history) == len(history.objective), bool(history.objective[-1] < history.objective[0])
+    (True, True)
+    """
 
     records: tuple[Record, ...] = ()
 
@@ -95,32 +142,93 @@ class History:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Outcome(Generic[S]):
-    """A finished run of one method, on a problem of any kind."""
+    """A finished run of one method, on a problem of any kind.
 
-    name: str  # of the method
-    objective: float  # of `state`
-    state: S  # the last iterate, or the best one when the run did not succeed
+    Parameters
+    ----------
+    name : str
+        Name of the method.
+    objective : float
+        Objective of `state`.
+    state : S
+        The last iterate, or the best one when the run did not succeed.
+    status : Status
+        Why the run ended.
+    iterations : int
+        Number of finished steps.
+    history : History
+        Figures of all iterates.
+    seconds : float
+        Wall time of the whole run.
+    method : object
+        The method that ran, which is its settings.
+    """
+
+    name: str
+    objective: float
+    state: S
     status: Status
-    iterations: int  # finished steps
+    iterations: int
     history: History
-    seconds: float  # wall time of the whole run
-    method: object = field(default=None, kw_only=True)  # that ran, which is its settings
+    seconds: float
+    method: object = field(default=None, kw_only=True)
 
     def __repr__(self) -> str:
         ending = f"{self.status.name} after {self.iterations} iterations"
-        return f"{type(self).__name__}({self.name}: {ending}, F = {self.objective:.10g}, {self.seconds:.3g} s)"
+        cost = f"F = {rounded_up(self.objective)}"
+        return f"{type(self).__name__}({self.name}: {ending}, {cost}, {self.seconds:.3g} s)"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Run(Outcome[S]):
-    """A finished run of one solver on a pose graph; `objective` is F of its poses."""
+    """A finished run of one solver on a pose graph.
 
-    poses: Poses  # of the last iterate, or of the best one (lowest F) when the run did not succeed
+    Parameters
+    ----------
+    name : str
+        Name of the solver.
+    objective : float
+        F of `poses`.
+    state : S
+        The last iterate, or the best one (lowest F) when the run did not succeed.
+    status : Status
+        Why the run ended.
+    iterations : int
+        Number of finished steps.
+    history : History
+        Figures of all iterates.
+    seconds : float
+        Wall time of the whole run.
+    poses : Poses
+        Poses of `state`.
+    method : object
+        The solver that ran, which is its settings.
+    """
+
+    poses: Poses
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What one stage of a solve did."""
+    """What one stage of a solve did.
+
+    Parameters
+    ----------
+    name : str
+        Name of the stage.
+    status : Status
+        Why it ended.
+    iterations : int
+        Number of finished steps; 0 for a start.
+    objective : float
+        Cost of the poses that it ended at.
+    seconds : float
+        Wall time.
+    history : History
+        Figures of all iterates; empty for a start.
+    method : object
+        The method that ran, which is its settings; None for a start.
+    """
 
     name: str
     status: Status
@@ -128,14 +236,60 @@ class Stage:
     objective: float
     seconds: float
     history: History
-    method: object = None  # the method that ran, which is its settings; None for a start
+    method: object = None
 
     @classmethod
     def of(cls, run: Run[S]) -> "Stage":
-        """Stage of a finished run."""
-        return cls(run.name, run.status, run.iterations, run.objective, run.seconds, run.history, run.method)
+        """Return the stage of a finished run.
+
+        Parameters
+        ----------
+        run : Run
+            A run of a solver.
+
+        Returns
+        -------
+        Stage
+            Its figures.
+        """
+        return cls(
+            run.name,
+            run.status,
+            run.iterations,
+            run.objective,
+            run.seconds,
+            run.history,
+            run.method,
+        )
+
+    @classmethod
+    def without_factor(cls, objective: float) -> "Stage":
+        """Return a stage that says that a matrix had no Cholesky factor.
+
+        Parameters
+        ----------
+        objective : float
+            Cost of the poses that are returned.
+
+        Returns
+        -------
+        Stage
+            With `Status.NOT_FACTORED`.
+        """
+        return cls("factorisation", Status.NOT_FACTORED, 0, objective, 0.0, History())
 
     @classmethod
     def interruption(cls, objective: float) -> "Stage":
-        """Note that what was under way was broken off."""
+        """Return a stage that says that the solve was broken off.
+
+        Parameters
+        ----------
+        objective : float
+            Cost of the poses that are returned.
+
+        Returns
+        -------
+        Stage
+            With `Status.INTERRUPTED`.
+        """
         return cls("interruption", Status.INTERRUPTED, 0, objective, 0.0, History())

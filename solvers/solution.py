@@ -1,19 +1,22 @@
-"""Solution: poses, cost, certificate and what each stage did; prints well, and saves itself."""
+"""Solution: poses, cost, certificate and what each stage did; it prints and saves itself."""
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, gap_text
+from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict
 from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.proof_file import save_proof
 from pgo_models.errors import SettingError
+from pgo_models.figures import rounded_up
 from pgo_models.files import check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import check_g2o_folder, write_g2o, write_g2o_folder
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import extreme_weight
+from pgo_models.graphs.precisions import extreme_weight, indefinite_edges
 from pgo_models.graphs.residuals import chi2
 from pgo_models.graphs.trajectories import write_kitti, write_tum
 from pgo_models.html_tables import facts_table, rows_table
@@ -21,32 +24,88 @@ from pgo_models.plots.graph_plots import compare_poses
 from pgo_models.plots.style import check_installed, is_picture, save_figure
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
+from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from pgo_models.problem.weighting import Weighting
-from solvers.reporting.report_text import Solved
+from solvers.network.ledger import Ledger
 from solvers.reporting.result_table import finite_or_none
 from solvers.reporting.versions import installed_versions
+from solvers.result import Stage, Status
+from solvers.robust.rejection import Rejection, Support
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+Facts = list[tuple[str, str]]  # labels and texts, as they are printed
+_SAME_COST = 1e-9  # relative difference below which two costs are one
+
 
 @dataclass(frozen=True, eq=False)
-class Solution(Solved):
+class Solution:
     """The answer to a pose graph.
 
-    `objective` is the cost of `poses`: F, or chi2 with `Weighting.INFORMATION`; F leaves their `frame` open, which says
-    which it is. `certificate` has the lower bound on the global optimum, gap and verdict; `note` is what it lacks, and
-    why, or empty. `status` is that of the last of `stages`, start and iterative ones in order, or of the last attempt
-    of a robust solve that had no time left; `seconds` are wall time.
+    What is printed of the cost, the bound and the gap holds of the exact cost of the poses, as
+    `Certificate` says. Costs of stages are as computed, and rounded up.
 
-    Of a solve by many robots, `ledger` says what crossed the network, and `robots` who owned which pose. `anchor` is
-    the pose that it is held by, or 0: what `marginals` are relative to; `covariances`, (n, p, p), are all
-    `marginals()`, for ellipses in the report: `dataclasses.replace` puts them in. Of a robust solve, `robust` says
-    which edges it kept, of which alone all else here is, and what that leaves unproven.
+    Parameters
+    ----------
+    problem : PGOProblem
+        What was solved; of a robust solve, the edges that were kept.
+    poses : Poses
+        The answer, in the frame that `frame` says: F leaves it open.
+    objective : float
+        Cost of the poses: F, or chi2 with `Weighting.INFORMATION`.
+    certificate : Certificate
+        Lower bound on the global optimum, gap and verdict.
+    status : Status
+        How the last of `stages` ended, or the last attempt of a robust solve that had no time left.
+    stages : tuple of Stage
+        Start and iterative stages, in order.
+    seconds : float
+        Wall time.
+    ledger : Ledger, optional
+        What crossed the network, of a solve by robots.
+    robots : Partition, optional
+        Which robot owned which pose, of a solve by robots.
+    note : str, optional
+        What the certificate lacks, and why; empty where it lacks nothing.
+    frame : str, optional
+        The frame of the poses.
+    anchor : int, optional
+        Pose that the frame is held by, or 0: what `marginals` are relative to.
+    covariances : Array, shape (n, p, p), optional
+        All `marginals()`, for ellipses in the report; `dataclasses.replace` puts them in.
+    robust : Rejection, optional
+        Of a robust solve, which edges it kept, and what that leaves unproven. All else here is of
+        these edges alone.
+
+    Examples
+    --------
+    >>> from pgo_models import load
+    >>> from solvers import solve
+    >>> solution = solve(load("grid"))
+    >>> solution.poses, solution.certificate.cost_text
+    (Poses(n=27, d=3), '97.01402086')
+    >>> print(str(solution).splitlines()[0])
+    graph        grid: 27 poses, 108 edges, 3D
     """
+
+    problem: PGOProblem
+    poses: Poses
+    objective: float
+    certificate: Certificate
+    status: Status
+    stages: tuple[Stage, ...]
+    seconds: float
+    ledger: Ledger | None = None
+    robots: Partition | None = None
+    note: str = ""
+    frame: str = ""
+    anchor: int = 0
+    covariances: Array | None = None
+    robust: Rejection | None = None
 
     @property
     def lower_bound(self) -> float:
@@ -55,65 +114,112 @@ class Solution(Solved):
 
     @property
     def gap(self) -> float:
-        """(objective - lower_bound) / objective; 0 where F is at its rounding level."""
+        """(objective - lower_bound) / objective; 0 where every edge fits to its rounding."""
         return self.certificate.gap
 
     @property
     def is_certified(self) -> bool:
-        """Whether the gap is within the one asked for."""
-        return self.certificate.is_certified
+        """Whether the gap is within the one asked for.
+
+        Of a robust solve, also whether nothing speaks against the edges kept.
+        """
+        is_held = self.robust is None or self.robust.support is Support.CHECKED
+        return is_held and self.certificate.is_certified
+
+    @property
+    def verdict(self) -> Verdict | Support:
+        """The verdict of the certificate.
+
+        Of a robust solve, what stands behind the edges kept, where that is not enough.
+        """
+        return self.certificate.verdict if self.robust is None else self.robust.standing
 
     @property
     def edge_residuals(self) -> EdgeResiduals:
-        """How well every edge fits the poses, and whether its errors may be so large, in the cost that was solved."""
+        """How well every edge fits the poses, in the cost that was solved, and whether it may."""
         return edge_residuals(self.problem, self.poses)
 
-    def __repr__(self) -> str:
-        name, verdict = self.problem.graph.name, f"{self.certificate.verdict.name}{self._given}"
-        return f"Solution({name!r}, {self.certificate.cost}={self.objective:.10g}, gap={self.gap:.3g}, {verdict})"
+    def before(self) -> tuple[Poses, str]:
+        """Return the poses before the solve, to compare with.
 
-    def __str__(self) -> str:
-        rows = [f"{label:<12} {text}" for label, text in self._summary()]
-        lines = self._stage_lines()
-        rows += ["", *(f"{name:<14} {k:>10} {F:>16} {seconds:>9}  {ended}" for name, k, F, seconds, ended in lines)]
-        return "\n".join(rows)
-
-    def _repr_html_(self) -> str:
-        heads, *rows = self._stage_lines()
-        return facts_table(self._summary()) + rows_table(heads, rows)
-
-    def _stage_lines(self) -> list[tuple[str, str, str, str, str]]:
-        heads, stages = ("stage", "iterations", self.certificate.cost, "seconds", "ended"), self.stages
-        rows = [(s.name, str(s.iterations), f"{s.objective:.10g}", f"{s.seconds:.3f}", s.status.name) for s in stages]
-        return [heads, *rows]
+        Returns
+        -------
+        poses : Poses
+            Those that the graph came with, else those along a spanning tree.
+        name : str
+            What these poses are.
+        """
+        graph = self.problem.graph
+        if graph.initial is not None:
+            return graph.initial, "estimate that came with the graph"
+        return spanning_tree_start(graph), "spanning tree"
 
     def marginals(self, *poses: int, anchor: int | None = None) -> Array:
-        """Joint covariance of some poses, (k p, k p), or of every pose on its own, (n, p, p), when none is named.
+        """Return the joint covariance of some poses, or of every pose on its own.
 
-        Blocks of (Hess F / 2)^-1 relative to an anchor, the solution's unless given; `Marginals`, which answers many
+        These are blocks of (Hess F / 2)^-1 relative to an anchor. `Marginals`, which answers many
         such questions with one factorisation, has units, axes and errors.
+
+        Parameters
+        ----------
+        *poses : int
+            Poses of a joint covariance; every pose on its own when none is given.
+        anchor : int, optional
+            Pose that the covariance is relative to; the anchor of the solution unless given.
+
+        Returns
+        -------
+        Array
+            Shape (k p, k p) for k poses, or (n, p, p) for every pose, with p = d(d+1)/2.
         """
-        hessian = riemannian_hessian(self.problem, self.poses, multipliers(self.problem, self.poses))
+        hessian = riemannian_hessian(
+            self.problem, self.poses, multipliers(self.problem, self.poses)
+        )
         layout = TangentLayout(self.problem.num_poses, self.problem.d)
-        found = Marginals(hessian, layout, self.anchor if anchor is None else anchor, self.problem.backend)
-        return found.joint(*poses) if poses else found.diagonal
+        anchor = self.anchor if anchor is None else anchor
+        marginals = Marginals(hessian, layout, anchor, self.problem.backend)
+        return marginals.joint(*poses) if poses else marginals.diagonal
 
     def save(self, path: Path | str) -> None:
-        """Write the solution in the format that the suffix of `path` names.
+        """Write the solution in the format that the suffix of the path names.
 
-        `.g2o`: the graph with the solved poses (a folder, when the name has no suffix: one file a robot); `.tum` or
-        `.txt`: a TUM trajectory; `.kitti`: a KITTI one; `.json`: all but measurements; `.png`, `.svg` or `.pdf`: the
-        picture of `plot`. Whole or not at all: a SettingError on another suffix, a PGOError when it cannot be written.
+        A file is written whole or not at all.
+
+        Parameters
+        ----------
+        path : Path or str
+            `.g2o`: the graph with the solved poses; without a suffix: a folder with one such file a
+            robot. `.tum` or `.txt`: a TUM trajectory. `.kitti`: a KITTI one. `.json`: all but the
+            measurements. `.png`, `.svg` or `.pdf`: the picture of `plot`.
+
+        Raises
+        ------
+        SettingError
+            For another suffix.
+        PGOError
+            When the file cannot be written.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from pgo_models import load, read_g2o
+        >>> from solvers import solve
+        >>> path = Path(tempfile.mkdtemp()) / "solved.g2o"
+        >>> solve(load("circle")).save(path)
+        >>> read_g2o(path).initial
+        Poses(n=25, d=3)
         """
         path = Path(path)
         check_format(path)
-        suffix, bodies = path.suffix.lower(), self.problem.graph.bodies
+        graph = self.problem.graph
+        bodies = graph.bodies
+        suffix = path.suffix.lower()
         if suffix == ".g2o":
-            write_g2o(self.problem.graph, path, self.poses)
+            write_g2o(graph, path, self.poses)
         elif suffix == "":
-            write_g2o_folder(self.problem.graph, path, self.poses)
+            write_g2o_folder(graph, path, self.poses)
         elif suffix in (".tum", ".txt"):
-            write_tum(self.poses[bodies], path, self.problem.graph.times)
+            write_tum(self.poses[bodies], path, graph.times)
         elif suffix == ".kitti":
             write_kitti(self.poses[bodies], path)
         elif suffix == ".json":
@@ -121,44 +227,97 @@ class Solution(Solved):
         else:
             save_figure(self.plot(), path)
 
-    def report(self, path: Path | str) -> None:
-        """Write one HTML page that opens offline: verdict, what to try next, pictures and tables; see `write_report`.
+    def save_proof(self, path: Path | str) -> None:
+        """Write what proves the lower bound, for `pgo verify` and `verify_proof`.
 
-        A MissingExtraError without plotly, a SettingError but for .html, a PGOError when the file cannot be written.
+        Of a robust solve it is for the edges kept, which `save` writes as `.g2o`. Errors are those
+        of `pgo_models.save_proof`.
+
+        Parameters
+        ----------
+        path : Path or str
+            A file, written as JSON.
+        """
+        save_proof(self.problem, self.certificate, path)
+
+    def report(self, path: Path | str) -> None:
+        """Write one HTML page that opens offline: verdict, what to try next, pictures and tables.
+
+        Parameters
+        ----------
+        path : Path or str
+            A name that ends in `.html`.
+
+        Raises
+        ------
+        MissingExtraError
+            Without plotly or Jinja2.
+        SettingError
+            For another suffix.
+        PGOError
+            When the file cannot be written.
+
+        See Also
+        --------
+        solvers.write_report : The same, with more to set.
         """
         from solvers.reporting.report import write_report
 
         write_report(self, path)
 
     def plot(self) -> "Figure":
-        """Figure of the graph as it came (its own estimate, else a spanning tree) and as solved; needs matplotlib."""
-        graph, (before, name) = self.problem.graph, self.before()
+        """Draw the graph as it came and as it was solved; this needs matplotlib.
+
+        As it came is its own estimate, or a spanning tree where it has none.
+
+        Returns
+        -------
+        Figure
+            Two pictures side by side.
+        """
+        graph = self.problem.graph
         if self.robots is not None:
             graph = graph.with_robots(self.robots.robot)
-        verdict, cost = self.certificate.verdict.name.lower().replace("_", " "), self.certificate.cost
-        space = "\n" if self._given else " "
-        solved = f"{verdict}{self._given}:{space}{cost} = {self.objective:.6g}, gap {self.gap:.1e}"
-        given = f"{name}: {cost} = {self.problem.objective(before):.4g}"
+        before, name = self.before()
+        certificate = self.certificate
+        cost = certificate.cost
+        given = f"{name}: {cost} = {rounded_up(self.problem.objective(before), 4)}"
+        verdict = self.verdict.name.lower().replace("_", " ")
+        objective = rounded_up(certificate.objective_at_most, 6)
+        figures = f"{cost} = {objective}, gap {rounded_up(certificate.proven_gap, 2)}"
+        if self.robust is None:
+            solved = f"{verdict}: {figures}"
+        else:
+            solved = f"{verdict}, {self.robust.held}:\n{figures}"
         return compare_poses(graph, [(given, before), (solved, self.poses)], self.edge_residuals)
 
     def as_json(self) -> dict[str, object]:
-        """Return what `.json` files hold: figures, stages, versions, and the poses by id."""
-        graph, certificate, named = self.problem.graph, self.certificate, self.problem.graph.in_files
-        stages = [
-            dict(name=s.name, status=s.status.name, iterations=s.iterations, objective=s.objective, seconds=s.seconds)
-            for s in self.stages
-        ]
+        """Return what `.json` files hold: figures, stages, versions, and the poses by id.
+
+        Returns
+        -------
+        dict
+            Numbers, texts and lists alone, as `json.dumps` takes them.
+        """
+        graph = self.problem.graph
+        named = graph.in_files
         return {
-            "graph": {"name": graph.name, "d": graph.d, "poses": len(named), "edges": graph.num_edges},
+            "graph": {
+                "name": graph.name,
+                "d": graph.d,
+                "poses": len(named),
+                "edges": graph.num_edges,
+            },
             "objective": self.objective,
             **both_costs(self.problem, self.poses),
-            **certificate_json(certificate),
+            **certificate_json(self.certificate),
+            "verdict": self.verdict.name,
             **({} if self.robust is None else self.robust.as_json()),
             "note": self.note,
             "frame": self.frame,
             "status": self.status.name,
             "seconds": self.seconds,
-            "stages": stages,
+            "stages": [_stage_json(stage) for stage in self.stages],
             **self._network_json(),
             "versions": installed_versions(self.problem.backend),
             "ids": graph.pose_ids[named].tolist(),
@@ -166,80 +325,157 @@ class Solution(Solved):
             "t": self.poses.t[named].tolist(),
         }
 
-    def _network_json(self) -> dict[str, object]:
-        if self.ledger is None or self.robots is None:
-            return {}
-        one = self.ledger
-        sums = {"rounds": one.rounds, "all_reduces": one.all_reduces, "messages": one.messages, "bytes": one.num_bytes}
-        of_robots = {"bytes_sent": one.bytes_sent.tolist(), "bytes_received": one.bytes_received.tolist()}
-        return {"robots": self.robots.robot.tolist(), "network": {**sums, **of_robots}}
+    def __repr__(self) -> str:
+        name = self.problem.graph.name
+        verdict = self.verdict.name if self.robust is None else self.robust.headline
+        cost = f"{self.certificate.cost}={self.certificate.cost_text}"
+        gap = rounded_up(self.certificate.proven_gap, 3)
+        return f"Solution({name!r}, {cost}, gap={gap}, {verdict})"
 
-    @property
-    def _given(self) -> str:
-        """What stands behind the verdict of a robust solve that rejected edges."""
-        gone = 0 if self.robust is None else int(self.robust.rejected.sum())
-        return f" given that {gone} edges are wrong" if gone else ""
+    def __str__(self) -> str:
+        rows = [f"{label:<12} {text}" for label, text in self._summary()]
+        rows.append("")
+        for name, iterations, cost, seconds, ending in self._stage_lines():
+            rows.append(f"{name:<14} {iterations:>10} {cost:>16} {seconds:>9}  {ending}")
+        return "\n".join(rows)
 
-    def _summary(self) -> list[tuple[str, str]]:
-        graph, certificate = self.problem.graph, self.certificate
-        relaxed = "   (the semidefinite relaxation's)" if certificate.source is BoundSource.RELAXATION else ""
-        return [
-            ("graph", f"{graph.name}: {len(graph.bodies)} poses, {graph.num_edges} edges{graph.extras}, {graph.d}D"),
+    def _repr_html_(self) -> str:
+        heads, *rows = self._stage_lines()
+        return facts_table(self._summary()) + rows_table(heads, rows)
+
+    def _stage_lines(self) -> list[tuple[str, str, str, str, str]]:
+        """Heads and rows of the table of stages."""
+        lines = [("stage", "iterations", self.certificate.cost, "seconds", "ended")]
+        for stage in self.stages:
+            cost = rounded_up(stage.objective)
+            seconds = f"{stage.seconds:.3f}"
+            lines.append((stage.name, str(stage.iterations), cost, seconds, stage.status.name))
+        return lines
+
+    def _summary(self) -> Facts:
+        """What is printed above the stages."""
+        graph = self.problem.graph
+        certificate = self.certificate
+        size = f"{len(graph.bodies)} poses, {graph.num_edges} edges{graph.extras}, {graph.d}D"
+        bound = certificate.bound_text
+        if certificate.source is BoundSource.RELAXATION:
+            bound += "   (the semidefinite relaxation's)"
+        facts = [
+            ("graph", f"{graph.name}: {size}"),
             ("status", f"{self.status.name}: {self.status.value}"),
-            (certificate.cost, f"{self.objective:.10g}"),
-            ("lower bound", f"{certificate.lower_bound:.10g}{relaxed}"),
-            ("gap", gap_text(certificate.gap)),
-            ("verdict", f"{certificate.verdict.name}{self._given}: {certificate.verdict.value}"),
-            *([] if self.robust is None else self.robust.facts()),
-            *other_cost(self.problem, self.poses),
-            *([("note", self.note)] if self.note else []),
-            *([("frame", self.frame)] if self.frame else []),
-            ("seconds", f"{self.seconds:.3g}"),
-            *self._network(),
+            (certificate.cost, certificate.cost_text),
+            ("lower bound", bound),
+            ("gap", certificate.gap_text),
+            ("verdict", self._verdict_text()),
         ]
+        if self.robust is not None:
+            facts += self.robust.facts()
+        if self.note:
+            facts.append(("note", self.note))
+        facts += other_cost(self.problem, self.poses)
+        if self.frame:
+            facts.append(("frame", self.frame))
+        facts.append(("seconds", f"{self.seconds:.3g}"))
+        return facts + self._network_facts()
 
-    def _network(self) -> list[tuple[str, str]]:
+    def _verdict_text(self) -> str:
+        if self.robust is not None:
+            return self.robust.headline
+        return f"{self.verdict.name}: {self.verdict.value}"
+
+    def _network_facts(self) -> Facts:
+        """What is printed of robots and of what they sent."""
         if self.ledger is None or self.robots is None:
             return []
         sizes = self.robots.sizes
-        robots = f"{len(sizes)}, {sizes.min()} to {sizes.max()} poses each, {self.robots.method.value}"
+        range_of_sizes = f"{sizes.min()} to {sizes.max()} poses each"
+        robots = f"{len(sizes)}, {range_of_sizes}, {self.robots.method.value}"
         return [("robots", robots), *self.ledger.facts()]
 
+    def _network_json(self) -> dict[str, object]:
+        """What `.json` files hold of robots and of what they sent."""
+        ledger = self.ledger
+        if ledger is None or self.robots is None:
+            return {}
+        network = {
+            "rounds": ledger.rounds,
+            "all_reduces": ledger.all_reduces,
+            "messages": ledger.messages,
+            "bytes": ledger.num_bytes,
+            "snapshot_bytes": ledger.snapshot_bytes,
+            "bytes_sent": ledger.bytes_sent.tolist(),
+            "bytes_received": ledger.bytes_received.tolist(),
+        }
+        return {"robots": self.robots.robot.tolist(), "network": network}
 
-def both_costs(problem: PGOProblem, poses: Poses) -> dict[str, float | str | None]:
-    """What `.json` files hold of the costs of poses: F, chi2 (chordal; None without a file's matrices), which is it."""
-    graph = problem.graph
-    isotropic = problem if problem.weighting is Weighting.ISOTROPIC else PGOProblem(graph, problem.backend)
+
+def _stage_json(stage: Stage) -> dict[str, object]:
+    """What `.json` files hold of a stage."""
     return {
-        "weighting": problem.weighting.name if isinstance(problem.weighting, Weighting) else "GIVEN",
-        "F": isotropic.objective(poses),
-        "chi2": None if graph.information is None else chi2(graph, poses),
+        "name": stage.name,
+        "status": stage.status.name,
+        "iterations": stage.iterations,
+        "objective": stage.objective,
+        "seconds": stage.seconds,
     }
 
 
-def other_cost(problem: PGOProblem, poses: Poses) -> list[tuple[str, str]]:
+def both_costs(problem: PGOProblem, poses: Poses) -> dict[str, float | str | None]:
+    """What `.json` files hold of the costs of poses: F, chi2 (chordal), which of them is the cost.
+
+    chi2 is None without a file's matrices, or where these are indefinite; `edges_without_coupling`
+    counts those whose coupling blocks it leaves out, and `note` says so if it is the cost.
+    """
+    graph = problem.graph
+    weighting = problem.weighting
+    isotropic = problem
+    if weighting is not Weighting.ISOTROPIC:
+        isotropic = PGOProblem(graph, problem.backend)
+    has_chi2 = graph.information is not None and not indefinite_edges(graph).any()
+    num_uncoupled = 0 if graph.uncoupled is None else int(graph.uncoupled.sum())
+    return {
+        "weighting": weighting.name if isinstance(weighting, Weighting) else "GIVEN",
+        "F": isotropic.objective(poses),
+        "chi2": chi2(graph, poses) if has_chi2 else None,
+        "edges_without_coupling": num_uncoupled,
+        "note": note_of_coupling(problem),
+    }
+
+
+def other_cost(problem: PGOProblem, poses: Poses) -> Facts:
     """What a summary says of the cost that is not bounded, where it is another."""
-    costs, objective = both_costs(problem, poses), problem.objective(poses)
-    is_chi2 = costs["weighting"] == "INFORMATION"
-    name, what = ("F", "two precisions an edge") if is_chi2 else ("chi2", "the file's information matrices")
-    found = costs[name]
-    if not isinstance(found, float) or abs(found - objective) <= 1e-9 * objective:
+    costs = both_costs(problem, poses)
+    bounded = "F"
+    name = "chi2"
+    weights = "the file's information matrices"
+    if costs["edges_without_coupling"]:
+        weights += f", without the coupling blocks of {costs['edges_without_coupling']} edges"
+    if costs["weighting"] == "INFORMATION":
+        bounded = "chi2"
+        name = "F"
+        weights = "two precisions an edge"
+    other = costs[name]
+    objective = problem.objective(poses)
+    if not isinstance(other, float) or abs(other - objective) <= _SAME_COST * objective:
         return []
-    return [(name, f"{found:.10g} with {what}; the bound is on {'chi2' if is_chi2 else 'F'} alone")]
+    return [(name, f"{rounded_up(other)} with {weights}; the bound is on {bounded} alone")]
 
 
 def check_format(path: Path) -> None:
-    """Raise what `Solution.save` would for the suffix of `path`: a SettingError, or if matplotlib is missing."""
+    """Raise what `Solution.save` would for the suffix of a path.
+
+    That is a SettingError for an unknown one, or an error where matplotlib is missing.
+    """
     suffix = path.suffix.lower()
-    if suffix not in ("", ".g2o", ".tum", ".txt", ".kitti", ".json") and not is_picture(path):
-        known = ".g2o, .tum, .kitti, .json, .png, .svg or .pdf"
-        raise SettingError(f"cannot write {path}: no format has suffix {suffix!r}; use {known}")
     if is_picture(path):
         check_installed(path)
+    elif suffix not in ("", ".g2o", ".tum", ".txt", ".kitti", ".json"):
+        known = ".g2o, .tum, .kitti, .json, .png, .svg or .pdf"
+        raise SettingError(f"cannot write {path}: no format has suffix {suffix!r}; use {known}")
 
 
 def check_target(path: Path, num_robots: int) -> None:
-    """Raise what `Solution.save` would for `path`, before there is a solution of so many robots to write."""
+    """Raise what `Solution.save` would for a path, before there is a solution of these robots."""
     check_format(path)
     if path.suffix == "":
         check_g2o_folder(path, num_robots)
@@ -254,41 +490,85 @@ def write_json(record: dict[str, object], path: Path) -> None:
 
 
 def certificate_json(certificate: Certificate) -> dict[str, object]:
-    """What `.json` files hold of a certificate."""
+    """What `.json` files hold of a certificate; None stands for what is not known.
+
+    That is eta where none was proved, the error of the objective where no bound on it is known, and
+    the stationarity where it was not measured.
+    """
     return {
         "lower_bound": certificate.lower_bound,
         "gap": certificate.gap,
+        "proven_gap": certificate.proven_gap,
         "wanted_gap": certificate.wanted_gap,
-        "eta": finite_or_none(certificate.eta),  # nan where none was proved
+        "eta": finite_or_none(certificate.eta),
         "grounded": certificate.bound.is_grounded,
         "rounding": certificate.bound.rounding,
+        "objective_error": finite_or_none(certificate.objective_error),
         "digits": certificate.digits,
-        "stationarity": finite_or_none(certificate.stationarity),  # inf where it was not measured
+        "stationarity": finite_or_none(certificate.stationarity),
         "verdict": certificate.verdict.name,
     }
 
 
+def note_of(problem: PGOProblem, certificate: Certificate, lacks: str = "") -> str:
+    """Note of a solution: coupling that chi2 leaves out, and what the certificate lacks.
+
+    The latter is `lacks`, or unless given what `note_of_weights` says.
+    """
+    notes = (note_of_coupling(problem), lacks or note_of_weights(problem.graph, certificate))
+    return "; ".join(note for note in notes if note)
+
+
 def note_of_weights(graph: PoseGraph, certificate: Certificate) -> str:
-    """Sentence on the weight beside which rounding hides more than the gap asked for, where no bound was found."""
-    spread, _, text = extreme_weight(graph) if certificate.verdict is Verdict.TRIVIAL else (0.0, 0, "")
-    is_cause = spread * UNIT_ROUNDOFF > certificate.wanted_gap
-    return f"{text}, too far from others for a proof; correct it, or solve graph.unit_weights()" if is_cause else ""
+    """Sentence on a weight that is too far from the others for a bound, or "".
+
+    That is so where no bound was found, and beside this weight rounding hides more than the gap
+    that was asked for.
+    """
+    if certificate.verdict is not Verdict.TRIVIAL:
+        return ""
+    spread, _, text = extreme_weight(graph)
+    if spread * UNIT_ROUNDOFF <= certificate.wanted_gap:
+        return ""
+    return f"{text}, too far from others for a proof; correct it, or solve graph.unit_weights()"
 
 
-def framed(poses: Poses, graph: PoseGraph, anchor: int | None) -> tuple[Poses, str, int]:
-    """Poses in the frame of priors, anchor, first FIX line, estimate or pose 0; which it is; the pose held, or 0."""
-    ids, reference = graph.pose_ids, graph.initial
+def note_of_coupling(problem: PGOProblem) -> str:
+    """Sentence on the coupling blocks that chi2 leaves out, or ""."""
+    graph = problem.graph
+    if problem.weighting is not Weighting.INFORMATION or graph.uncoupled is None:
+        return ""
+    if not graph.uncoupled.any():
+        return ""
+    count = f"coupling blocks of {graph.uncoupled.sum()} of {graph.num_edges} edges left out"
+    return f"{count}, as their information matrices are indefinite"
+
+
+def choose_gauge(poses: Poses, graph: PoseGraph, anchor: int | None) -> tuple[Poses, str, int]:
+    """Poses in the frame of priors, anchor, first FIX line, estimate or pose 0.
+
+    Returned are the moved poses, a sentence on their frame, and the pose that it is held by, 0
+    where there is none.
+    """
+    reference = graph.initial
     if graph.world is not None:
-        unheeded = "; FIX lines are not minded beside them" if len(graph.fixed) else ""
-        return poses.with_gauge_at(graph.world), f"that of the priors{unheeded}", graph.world
-    held = anchor if anchor is not None else int(graph.fixed[0]) if len(graph.fixed) else None
-    if held is None and reference is not None:
-        return poses.aligned_to(reference), "aligned with the estimate that came with the graph", 0
-    why = "as asked for" if anchor is not None else "by its FIX line"
-    if anchor is None and len(graph.fixed) > 1:
-        why += f"; those of {len(graph.fixed) - 1} other poses are not minded, F leaves one frame open"
-    if held is not None and reference is not None:
-        return poses.anchored_to(reference, held), f"pose {ids[held]} where the estimate has it, {why}", held
-    if held is not None:
-        return poses.with_gauge_at(held), f"pose {ids[held]} at the identity, {why}", held
-    return poses.with_gauge_at(0), f"pose {ids[0]} at the identity", 0
+        ignored = "; FIX lines are ignored beside them" if len(graph.fixed) else ""
+        return poses.with_gauge_at(graph.world), f"that of the priors{ignored}", graph.world
+    held = anchor
+    why = "as asked for"
+    if anchor is None and len(graph.fixed):
+        held = int(graph.fixed[0])
+        why = "by its FIX line"
+        num_others = len(graph.fixed) - 1
+        if num_others:
+            why += f"; those of {num_others} other poses are ignored, F leaves one frame open"
+    if held is None:
+        if reference is not None:
+            frame = "aligned with the estimate that came with the graph"
+            return poses.aligned_to(reference), frame, 0
+        return poses.with_gauge_at(0), f"pose {graph.pose_ids[0]} at the identity", 0
+    name = f"pose {graph.pose_ids[held]}"
+    if reference is not None:
+        moved = poses.anchored_to(reference, held)
+        return moved, f"{name} where the estimate has it, {why}", held
+    return poses.with_gauge_at(held), f"{name} at the identity, {why}", held

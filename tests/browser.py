@@ -1,7 +1,8 @@
-"""A headless Chromium, driven over its DevTools pipe: opens a page, runs scripts, clicks, and hears the console.
+"""A headless Chromium, driven over its DevTools pipe: opens a page, runs scripts, clicks, and hears
+the console.
 
-Needs nothing but the browser: JSON messages that end in a zero byte go to its file descriptor 3 and come from 4
-(https://chromedevtools.github.io/devtools-protocol).
+Needs nothing but the browser: JSON messages that end in a zero byte go to its file descriptor 3 and
+come from 4 (https://chromedevtools.github.io/devtools-protocol).
 """
 
 import base64
@@ -32,7 +33,8 @@ FLAGS = (
     "--remote-debugging-pipe",
 )
 
-# Puts the pipe where Chromium looks for it, and becomes Chromium. The copies above 9 are out of each other's way.
+# Puts the pipe where Chromium looks for it, and becomes Chromium. The copies above 9 are out of
+# each other's way.
 LAUNCHER = """
 import fcntl, os, sys
 ours = [fcntl.fcntl(int(number), fcntl.F_DUPFD, 10) for number in sys.argv[1:3]]
@@ -48,21 +50,38 @@ def find_browser() -> str | None:
     return next((found for name in NAMES if (found := shutil.which(name))), None)
 
 
+class Navigated(Exception):
+    """The browser went to another page before it had answered."""
+
+
 class Browser:
-    """One page of a browser of its own; `errors` is all that the console said in anger, `requests` what was fetched."""
+    """One page of a browser of its own; `errors` is all that the console said in anger, `requests`
+    what was fetched.
+    """
 
     def __init__(self, profile: Path, timeout: float = 60.0) -> None:
         executable = find_browser()
         assert executable is not None
         self._timeout = timeout
-        self._count, self._received, self._buffer = 0, [], b""
+        self._count = 0
+        self._received = []
+        self._buffer = b""
         self.errors: list[str] = []
         self.requests: list[str] = []
         theirs_in, self._out = os.pipe()
         self._in, theirs_out = os.pipe()
         folder = f"--user-data-dir={profile}"
         self._process = subprocess.Popen(
-            [sys.executable, "-c", LAUNCHER, str(theirs_in), str(theirs_out), executable, *FLAGS, folder],
+            [
+                sys.executable,
+                "-c",
+                LAUNCHER,
+                str(theirs_in),
+                str(theirs_out),
+                executable,
+                *FLAGS,
+                folder,
+            ],
             pass_fds=(theirs_in, theirs_out),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -72,7 +91,9 @@ class Browser:
         os.close(theirs_out)
         self._session = None
         target = self.call("Target.createTarget", {"url": "about:blank"})["targetId"]
-        self._session = self.call("Target.attachToTarget", {"targetId": target, "flatten": True})["sessionId"]
+        self._session = self.call("Target.attachToTarget", {"targetId": target, "flatten": True})[
+            "sessionId"
+        ]
         for domain in ("Runtime", "Log", "Page", "Network"):
             self.call(f"{domain}.enable", {})
 
@@ -102,7 +123,10 @@ class Browser:
         """Show pages in a window so wide, on a system whose colours are light or dark."""
         metrics = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
         self.call("Emulation.setDeviceMetricsOverride", metrics)
-        self.call("Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]})
+        self.call(
+            "Emulation.setEmulatedMedia",
+            {"features": [{"name": "prefers-color-scheme", "value": scheme}]},
+        )
         try:
             yield
         finally:
@@ -112,19 +136,30 @@ class Browser:
     def wait_for(self, condition: str) -> None:
         """Wait until a JavaScript expression is true."""
         end = time.monotonic() + self._timeout
-        while not self.value(condition):
+        while not self._is_true(condition):
             assert time.monotonic() < end, f"{condition} did not come true; console: {self.errors}"
             time.sleep(0.05)
 
+    def _is_true(self, condition: str) -> bool:
+        try:
+            return bool(self.value(condition))
+        except Navigated:  # the page was left while it was asked; the next one will answer
+            return False
+
     def value(self, expression: str) -> object:
         """Value of a JavaScript expression."""
-        answer = self.call("Runtime.evaluate", {"expression": expression, "returnByValue": True, "awaitPromise": True})
+        answer = self.call(
+            "Runtime.evaluate",
+            {"expression": expression, "returnByValue": True, "awaitPromise": True},
+        )
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
     def click(self, selector: str) -> None:
         """Press and release the mouse in the middle of an element."""
-        self.value(f"document.querySelector({json.dumps(selector)}).scrollIntoView({{block: 'center'}})")
+        self.value(
+            f"document.querySelector({json.dumps(selector)}).scrollIntoView({{block: 'center'}})"
+        )
         x, y = self.value(
             f"(b => [b.x + b.width / 2, b.y + b.height / 2])"
             f"(document.querySelector({json.dumps(selector)}).getBoundingClientRect())"
@@ -148,6 +183,8 @@ class Browser:
         while True:
             answer = self._next(end, method)
             if answer.get("id") == self._count:
+                if "navigated" in answer.get("error", {}).get("message", ""):
+                    raise Navigated(method)
                 assert "error" not in answer, answer["error"]
                 return answer["result"]
             self._note(answer)
@@ -162,7 +199,8 @@ class Browser:
         return json.loads(message)
 
     def _note(self, event: dict) -> None:
-        kind, about = event.get("method"), event.get("params", {})
+        kind = event.get("method")
+        about = event.get("params", {})
         if kind == "Runtime.exceptionThrown":
             self.errors.append(json.dumps(about["exceptionDetails"]))
         elif kind == "Runtime.consoleAPICalled" and about["type"] in ("error", "assert"):

@@ -1,4 +1,6 @@
-"""How many examples hypothesis draws: all of them under HYPOTHESIS_PROFILE=thorough, a quarter else."""
+"""How many examples hypothesis draws: all of them under HYPOTHESIS_PROFILE=thorough, a quarter
+else.
+"""
 
 import os
 

@@ -1,4 +1,6 @@
-"""Exact arithmetic for tests: numbers of 300 bits, in which doubles and their products lose nothing that counts."""
+"""Exact arithmetic for tests: numbers of 300 bits, in which doubles and their products lose nothing
+that counts.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,9 @@ class ExactGraph:
     @classmethod
     def of_text(cls, path: Path, graph: PoseGraph) -> ExactGraph:
         """The graph of the decimals in a g2o file, `graph` being what was read of it."""
-        lines = [line.split() for line in path.read_text().splitlines() if line.startswith("EDGE_SE")]
+        lines = [
+            line.split() for line in path.read_text().splitlines() if line.startswith("EDGE_SE")
+        ]
         ids = np.array([[int(name) for name in words[1:3]] for words in lines])
         i, j = np.searchsorted(graph.pose_ids, ids).T
         numbers = np.array([[MP.mpf(word) for word in words[3:]] for words in lines], dtype=object)
@@ -75,29 +79,45 @@ class ExactGraph:
             c = np.array([MP.cos(angle) for angle in numbers[:, 2]], dtype=object)
             s = np.array([MP.sin(angle) for angle in numbers[:, 2]], dtype=object)
             R_ij = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
-            I_xx, I_xy, I_yy = numbers[:, 3], numbers[:, 4], numbers[:, 6]
+            I_xx = numbers[:, 3]
+            I_xy = numbers[:, 4]
+            I_yy = numbers[:, 6]
             tau = 2 * (I_xx * I_yy - I_xy**2) / (I_xx + I_yy)
             return cls(graph.num_poses, i, j, R_ij, numbers[:, :2], numbers[:, 8], tau)
         R_ij = _rotations_of_quaternions(numbers[:, 3:7])
         upper = np.zeros((len(lines), 6, 6), dtype=object)
         upper[:, *np.triu_indices(6)] = numbers[:, 7:]
         kappa = MP.mpf(3) / 2 / _trace_of_inverse(upper[:, 3:, 3:])
-        return cls(graph.num_poses, i, j, R_ij, numbers[:, :3], kappa, 3 / _trace_of_inverse(upper[:, :3, :3]))
+        return cls(
+            graph.num_poses,
+            i,
+            j,
+            R_ij,
+            numbers[:, :3],
+            kappa,
+            3 / _trace_of_inverse(upper[:, :3, :3]),
+        )
 
     def objective(self, R: Exact, t: Exact) -> Exact:
         """F at exact poses."""
         shift = t[self.j] - t[self.i] - (R[self.i] @ self.t_ij[:, :, None])[:, :, 0]
         turn = R[self.j] - R[self.i] @ self.R_ij
-        return total(self.tau * (shift**2).sum(axis=1)) + total(self.kappa * (turn**2).sum(axis=(1, 2)))
+        return total(self.tau * (shift**2).sum(axis=1)) + total(
+            self.kappa * (turn**2).sum(axis=(1, 2))
+        )
 
     def objective_of(self, poses: Poses) -> Exact:
         """F at the exact rotations nearest to those of poses."""
         return self.objective(nearest_rotations(poses.R), exact(poses.t))
 
     def residual_rows(self) -> list[tuple[Any, dict[int, Any]]]:
-        """Weight and entries of every row of A, in the order of `pgo_models.problem.matrices.residual_matrix`."""
-        n, d = self.num_poses, self.d
-        columns_i, columns_j = rotation_columns(self.i, n, d), rotation_columns(self.j, n, d)
+        """Weight and entries of every row of A, in the order of
+        `pgo_models.problem.matrices.residual_matrix`.
+        """
+        n = self.num_poses
+        d = self.d
+        columns_i = rotation_columns(self.i, n, d)
+        columns_j = rotation_columns(self.j, n, d)
         rows = []
         for e, (i, j) in enumerate(zip(self.i.tolist(), self.j.tolist(), strict=True)):
             turned = {int(c): -self.t_ij[e, a] for a, c in enumerate(columns_i[e])}
@@ -110,7 +130,8 @@ class ExactGraph:
 
     def certificate_matrix(self, Lambda: Array, eta: float = 0.0) -> Rows:
         """S + eta blockdiag(0, I) = A^T diag(w) A - blockdiag(0, Lambda - eta I)."""
-        n, d = self.num_poses, self.d
+        n = self.num_poses
+        d = self.d
         S: Rows = [{} for _ in range((d + 1) * n)]
         for weight, row in self.residual_rows():
             for k, value in row.items():
@@ -125,7 +146,9 @@ class ExactGraph:
 
 
 def nearest_rotations(R: Array) -> Exact:
-    """Exact rotations nearest to ones in double precision: Newton's iteration X <- (X + X^-T) / 2 to the end."""
+    """Exact rotations nearest to ones in double precision: Newton's iteration X <- (X + X^-T) / 2
+    to the end.
+    """
     X = exact(R)
     while True:
         inverse_transposed = _cofactors(X) / determinants(X)[:, None, None]
@@ -146,7 +169,10 @@ def _cofactors(X: Exact) -> Exact:
     found = np.empty_like(X)
     for a in range(3):
         for b in range(3):
-            p, q, r, s = (a + 1) % 3, (a + 2) % 3, (b + 1) % 3, (b + 2) % 3
+            p = (a + 1) % 3
+            q = (a + 2) % 3
+            r = (b + 1) % 3
+            s = (b + 2) % 3
             found[:, a, b] = X[:, p, r] * X[:, q, s] - X[:, p, s] * X[:, q, r]
     return found
 
@@ -174,7 +200,9 @@ def _rotations_of_quaternions(q: Exact) -> Exact:
 
 def times(matrix: Rows, X: Exact) -> Exact:
     """Product with a dense matrix, (N, k)."""
-    return np.array([sum(value * X[column] for column, value in row.items()) for row in matrix], dtype=object)
+    return np.array(
+        [sum(value * X[column] for column, value in row.items()) for row in matrix], dtype=object
+    )
 
 
 def rows_of(matrix: csc_array | Array) -> Rows:
@@ -193,7 +221,10 @@ def without(matrix: Rows, left_out: IntArray) -> Rows:
     """The same matrix with rows and columns left out, the others renumbered."""
     kept = np.setdiff1d(np.arange(len(matrix)), left_out).tolist()
     place = {row: k for k, row in enumerate(kept)}
-    return [{place[column]: value for column, value in matrix[row].items() if column in place} for row in kept]
+    return [
+        {place[column]: value for column, value in matrix[row].items() if column in place}
+        for row in kept
+    ]
 
 
 def less_diagonal(matrix: Rows, diagonal: Exact) -> Rows:
@@ -204,12 +235,15 @@ def less_diagonal(matrix: Rows, diagonal: Exact) -> Rows:
 def is_positive_definite(matrix: Rows) -> bool:
     """Whether sparse Cholesky in 300 bits goes through, in an order of small bandwidth.
 
-    A pivot counts as positive when it is above 2^-200 of its diagonal entry, far above the rounding of 300 bits.
+    A pivot counts as positive when it is above 2^-200 of its diagonal entry, far above the rounding
+    of 300 bits.
     """
     side = len(matrix)
     rows = np.repeat(np.arange(side), [len(row) for row in matrix])
     columns = np.concatenate([np.fromiter(row, dtype=np.int64) for row in matrix])
-    order = reverse_cuthill_mckee(csr_array((np.ones(len(rows)), (rows, columns)), shape=(side, side)), True)
+    order = reverse_cuthill_mckee(
+        csr_array((np.ones(len(rows)), (rows, columns)), shape=(side, side)), True
+    )
     place = np.empty(side, dtype=np.int64)
     place[order] = np.arange(side)
     # Of every column of the factor-to-be the entries at and below the diagonal.
@@ -223,20 +257,24 @@ def is_positive_definite(matrix: Rows) -> bool:
     least = MP.mpf(2) ** -200
     first = [column[k] for k, column in enumerate(left)]
     for k in range(side):
-        column, left[k] = left[k], {}
+        column = left[k]
+        left[k] = {}
         pivot = column.pop(k)
         if not pivot > least * abs(first[k]):
             return False
         entries = sorted(column.items())
         for a, (row, value) in enumerate(entries):
-            share, target = value / pivot, left[row]
+            share = value / pivot
+            target = left[row]
             for below, other in entries[a:]:
                 target[below] = target.get(below, 0) - share * other
     return True
 
 
 def largest_share(difference: Exact, diagonal: Array) -> float:
-    """Largest eigenvalue of D^-1/2 difference D^-1/2, the difference being known exactly and then rounded."""
+    """Largest eigenvalue of D^-1/2 difference D^-1/2, the difference being known exactly and then
+    rounded.
+    """
     root = np.sqrt(diagonal)
     scaled = np.asarray(difference / exact(np.outer(root, root)), dtype=float)
     return float(np.linalg.eigvalsh(0.5 * (scaled + scaled.T)).max())

@@ -24,7 +24,9 @@ DIMENSIONS = st.sampled_from([2, 3])
 LOUD_NOISE = NoiseModel(translation_std=0.3, rotation_std=0.3)
 
 REFERENCE = json.loads((Path(__file__).parent.parent / "data" / "reference.json").read_text())
-OPTIMUM: dict[str, float] = {k: v for k, v in REFERENCE["certified_optimum"].items() if k != "source"}
+OPTIMUM: dict[str, float] = {
+    k: v for k, v in REFERENCE["certified_optimum"].items() if k != "source"
+}
 
 
 def optimum_tolerance(name: str) -> float:
@@ -32,13 +34,22 @@ def optimum_tolerance(name: str) -> float:
     return max(1e-7 * OPTIMUM[name], 0.5e-9)
 
 
-def varied_graph(seed: int, n: int, d: int, noise: NoiseModel = MILD_NOISE, weights: float = 1.0) -> PoseGraph:
-    """Random geometric graph, some edges reversed, some repeated, with log-normal factors on kappa and tau."""
+def varied_graph(
+    seed: int, n: int, d: int, noise: NoiseModel = MILD_NOISE, weights: float = 1.0
+) -> PoseGraph:
+    """Random geometric graph, some edges reversed, some repeated, with log-normal factors on kappa
+    and tau.
+    """
     rng = np.random.default_rng(seed)
     graph = random_geometric(n, rng, d=d, mean_degree=rng.uniform(1.0, 6.0), noise=noise)
-    edges = np.concatenate([np.arange(graph.num_edges), rng.integers(0, graph.num_edges, graph.num_edges // 4)])
+    edges = np.concatenate(
+        [np.arange(graph.num_edges), rng.integers(0, graph.num_edges, graph.num_edges // 4)]
+    )
     back = rng.random(len(edges)) < 0.5
-    i, j, R_ij, t_ij = graph.i[edges], graph.j[edges], graph.R_ij[edges], graph.t_ij[edges]
+    i = graph.i[edges]
+    j = graph.j[edges]
+    R_ij = graph.R_ij[edges]
+    t_ij = graph.t_ij[edges]
     i[back], j[back] = j[back], i[back]
     R_ij[back] = np.swapaxes(R_ij[back], 1, 2)
     t_ij[back] = -np.einsum("mab,mb->ma", R_ij[back], t_ij[back])
@@ -57,7 +68,8 @@ def informed(
     seed: int, n: int, d: int, coupled: bool, spread: float = 1.0, noise: NoiseModel = MILD_NOISE
 ) -> PoseGraph:
     """A graph with random information matrices, of conditions up to about exp(4 spread)."""
-    graph, rng = varied_graph(seed, n, d, noise), np.random.default_rng(seed)
+    graph = varied_graph(seed, n, d, noise)
+    rng = np.random.default_rng(seed)
     k = d + tangent_dimension(d)
     axes = np.linalg.qr(rng.standard_normal((graph.num_edges, k, k)))[0]
     values = np.exp(spread * rng.uniform(-2.0, 2.0, (graph.num_edges, 1, k)))
@@ -74,7 +86,7 @@ def varied_problem(seed: int, n: int, d: int, noise: NoiseModel = MILD_NOISE) ->
 
 
 def exact_graph(seed: int, n: int, d: int) -> PoseGraph:
-    """Connected graph of edges in both directions whose measurements are the true relative poses."""
+    """Connected graph of edges in both directions that measure the true relative poses."""
     pattern = varied_graph(seed, n, d)
     assert pattern.truth is not None
     silence = NoiseModel(1e-300, 1e-300)
@@ -83,13 +95,26 @@ def exact_graph(seed: int, n: int, d: int) -> PoseGraph:
     return replace(graph, kappa=pattern.kappa, tau=pattern.tau)
 
 
+def spread_graph(seed: int, n: int, d: int) -> PoseGraph:
+    """A noisy random geometric graph whose weights are up to twenty orders of magnitude apart."""
+    rng = np.random.default_rng(seed)
+    graph = random_geometric(n, rng, d=d, mean_degree=2.0, noise=NoiseModel(0.1, 0.5))
+    kappa, tau = (10.0 ** rng.uniform(-8, 12, graph.num_edges) for _ in range(2))
+    return replace(graph, kappa=kappa, tau=tau)
+
+
 def wound_ring(n: int, d: int) -> tuple[PGOProblem, Poses]:
-    """A ring of unrotated poses, and a start whose headings wind around once: a local minimum of its own."""
+    """A ring of unrotated poses, and a start whose headings wind around once: a local minimum of
+    its own.
+    """
     angle = 2 * np.pi * np.arange(n) / n
     t = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(n)])[:, :d]
     truth = Poses(np.broadcast_to(np.eye(d), (n, d, d)), t)
-    i, j = np.arange(n), (np.arange(n) + 1) % n
-    graph = observe("ring", truth, i, j, NoiseModel(0.01, 0.01), 100.0, 1.0, np.random.default_rng(0))
+    i = np.arange(n)
+    j = (np.arange(n) + 1) % n
+    graph = observe(
+        "ring", truth, i, j, NoiseModel(0.01, 0.01), 100.0, 1.0, np.random.default_rng(0)
+    )
     w = angle[:, None] if d == 2 else np.column_stack([np.zeros((n, 2)), angle])
     return PGOProblem(graph), Poses(exp_map(w), t)
 
@@ -98,13 +123,23 @@ def still_ring(n: int, d: int) -> PoseGraph:
     """A ring of poses measured in one place, unturned, with kappa 0.7 and tau 1."""
     i = np.arange(n)
     return PoseGraph(
-        n, i, (i + 1) % n, np.broadcast_to(np.eye(d), (n, d, d)), np.zeros((n, d)), np.full(n, 0.7), np.ones(n)
+        n,
+        i,
+        (i + 1) % n,
+        np.broadcast_to(np.eye(d), (n, d, d)),
+        np.zeros((n, d)),
+        np.full(n, 0.7),
+        np.ones(n),
     )
 
 
 def turned_away(problem: PGOProblem, poses: Poses, size: float, seed: int) -> Poses:
-    """The poses, every rotation turned at random by about so many radians, with their best translations."""
-    w = size * np.random.default_rng(seed).standard_normal((problem.num_poses, tangent_dimension(problem.d)))
+    """The poses, every rotation turned at random by about so many radians, with their best
+    translations.
+    """
+    w = size * np.random.default_rng(seed).standard_normal(
+        (problem.num_poses, tangent_dimension(problem.d))
+    )
     return problem.with_best_translations(poses.R @ exp_map(w))
 
 
@@ -120,16 +155,25 @@ def rounding_of_objective(problem: PGOProblem, X: Array) -> float:
 
 
 def median_slope(
-    error: Callable[[Array, Array, float], float], moves: list[tuple[Array, Array]], exponents: tuple[float, float]
+    error: Callable[[Array, Array, float], float],
+    moves: list[tuple[Array, Array]],
+    exponents: tuple[float, float],
 ) -> float:
-    """Median over moves (w, v) of the order in h of error(w, v, h), for h from 10^first to 10^last."""
+    """Median over moves (w, v) of the order in h of error(w, v, h), h from 10^first to 10^last."""
     h = np.logspace(*exponents, 5)
-    return float(np.median([np.polyfit(np.log(h), np.log([error(w, v, x) for x in h]), 1)[0] for w, v in moves]))
+    return float(
+        np.median(
+            [np.polyfit(np.log(h), np.log([error(w, v, x) for x in h]), 1)[0] for w, v in moves]
+        )
+    )
 
 
 def best_known(problem: PGOProblem, seed: int = 0) -> float:
-    """An upper bound on the global optimum, rounding included: the best of what several starts polish to."""
-    n, d = problem.num_poses, problem.d
+    """An upper bound on the global optimum, rounding included: the best of what several starts
+    polish to.
+    """
+    n = problem.num_poses
+    d = problem.d
     starts = [chordal_start(problem), *(random_poses(n, d, seed + k) for k in range(3))]
     if problem.graph.truth is not None:
         starts.append(problem.graph.truth)

@@ -8,11 +8,18 @@ EMPTY = {"meta", "link", "br", "input", "img", "hr"}
 
 
 class Page(HTMLParser):
-    """What a reader finds: texts, tables by id, tags that ask for something; fails on tags that do not match."""
+    """What a reader finds: texts, tables by id, tags that ask for something; fails on tags that do
+    not match.
+    """
 
     def __init__(self, text):
         super().__init__()
-        self.texts, self.tables, self.asked, self.open_tags, self.row, self.table = [], {}, [], [], None, None
+        self.texts = []
+        self.tables = {}
+        self.asked = []
+        self.open_tags = []
+        self.row = None
+        self.table = None
         self.scripts = 0
         self.feed(text)
         self.close()
@@ -20,7 +27,9 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag, attributes):
         named = dict(attributes)
-        self.asked += [named[name] for name in ("src", "href", "srcset", "data", "action") if name in named]
+        self.asked += [
+            named[name] for name in ("src", "href", "srcset", "data", "action") if name in named
+        ]
         self.scripts += tag == "script"
         if tag not in EMPTY:
             self.open_tags.append(tag)

@@ -30,7 +30,9 @@ def allow(megabytes: float) -> None:
 
 
 def under_limit(megabytes: float, act: Callable[..., Any], *arguments: object) -> Any:
-    """What a function returns, or the error that it raises, in a process that may take so much memory."""
+    """What a function returns, or the error that it raises, in a process that may take so much
+    memory.
+    """
     with LimitedProcesses(megabytes).open(_Act, [(act, arguments)]) as pool:
         return pool.ask(_Act.run, [None])[0]
 
@@ -45,7 +47,9 @@ class _Act:
 
 
 class LimitedProcesses:
-    """An engine: every robot is a process that may take so many megabytes beside what its imports take."""
+    """An engine: every robot is a process that may take so many megabytes beside what its imports
+    take.
+    """
 
     def __init__(self, megabytes: float) -> None:
         self.megabytes = megabytes
@@ -58,7 +62,8 @@ class _Processes:
     def __init__(self, megabytes: float, make: Callable[[Any], Any], shares: Sequence[Any]) -> None:
         spawning = multiprocessing.get_context("forkserver")
         spawning.set_forkserver_preload([__name__])
-        self.links, self.processes = [], []
+        self.links = []
+        self.processes = []
         for share in shares:
             here, there = spawning.Pipe()
             process = spawning.Process(target=_serve, args=(there, megabytes, make, share))
@@ -68,7 +73,11 @@ class _Processes:
             self.processes.append(process)
 
     def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
-        asked = [link for link, request in zip(self.links, requests, strict=True) if request is not Idle.IDLE]
+        asked = [
+            link
+            for link, request in zip(self.links, requests, strict=True)
+            if request is not Idle.IDLE
+        ]
         for link, request in zip(self.links, requests, strict=True):
             if request is not Idle.IDLE:
                 link.send((order, request))
@@ -83,7 +92,8 @@ class _Processes:
             link.close()
             process.join()
             process.close()
-        self.links, self.processes = [], []
+        self.links = []
+        self.processes = []
 
     def __enter__(self) -> "_Processes":
         return self
@@ -93,7 +103,8 @@ class _Processes:
 
 
 def _serve(link: Connection, megabytes: float, make: Callable[[Any], Any], share: Any) -> None:
-    solve(grid(np.random.default_rng(0)), robots=2)  # what is imported late, and the buffers of BLAS
+    # what is imported late, and the buffers of BLAS
+    solve(grid(np.random.default_rng(0)), robots=2)
     allow(megabytes)
     worker = make(share)
     while True:

@@ -1,4 +1,6 @@
-"""Partitions of every kind, and robots whose messages are written down, that several test files share."""
+"""Partitions of every kind, and robots whose messages are written down, that several test files
+share.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
@@ -39,7 +41,8 @@ def metis(graph: PoseGraph, seed: int) -> Partition:
 
 def scattered(graph: PoseGraph, seed: int) -> Partition:
     """Poses to robots at random, every robot with at least one."""
-    number, rng = _number(graph, seed), np.random.default_rng(seed)
+    number = _number(graph, seed)
+    rng = np.random.default_rng(seed)
     robot = np.concatenate([np.arange(number), rng.integers(0, number, graph.num_poses - number)])
     return Partition(rng.permutation(robot), PartitionMethod.GIVEN)
 
@@ -70,19 +73,23 @@ def graph_of(pairs: Sequence[tuple[int, int]], d: int, seed: int = 0) -> PoseGra
 
 
 def star(center: int, d: int) -> tuple[PoseGraph, Partition]:
-    """Six robots of one pose around a center: the cover is the center, whose robot counts no edge."""
+    """Six robots of one pose around a center, which is the cover; its robot counts no edge."""
     graph = graph_of([(min(center, k), max(center, k)) for k in range(7) if k != center], d)
     return graph, partition(graph, method=PartitionMethod.SINGLETONS)
 
 
 def complete(d: int) -> tuple[PoseGraph, Partition]:
-    """Five robots of one pose, all joined: four poses in the cover, so robots without an interior count edges."""
+    """Five robots of one pose, all joined: four poses in the cover, so robots without an interior
+    count edges.
+    """
     graph = graph_of([(i, j) for i in range(5) for j in range(i + 1, 5)], d)
     return graph, partition(graph, method=PartitionMethod.SINGLETONS)
 
 
 def corner_cases() -> list[tuple[PoseGraph, Partition]]:
-    """Pose 0 as the cover and inside an interior; parts without edges; interiors without poses; repeated edges."""
+    """Pose 0 as the cover and inside an interior; parts without edges; interiors without poses;
+    repeated edges.
+    """
     found = []
     for d in (2, 3):
         found += [star(0, d), star(6, d), complete(d)]
@@ -91,7 +98,9 @@ def corner_cases() -> list[tuple[PoseGraph, Partition]]:
     return found
 
 
-def driver_at(problem: PGOProblem, parts: Partition, poses: Poses | None, engine: Engine | None = None) -> Driver:
+def driver_at(
+    problem: PGOProblem, parts: Partition, poses: Poses | None, engine: Engine | None = None
+) -> Driver:
     """Driver and robots, in this process, at poses, or at their own chordal start."""
     driver = open_driver(problem, parts, engine if engine is not None else InProcess())
     if poses is None:
@@ -109,7 +118,9 @@ def spoil(agent: Agent, factor: float) -> None:
     agent.copies = replace(agent.copies, state=state)
 
 
-def interface_of(touched: tuple[IntArray, ...], num_separators: int, widths: tuple[int, ...]) -> Interface:
+def interface_of(
+    touched: tuple[IntArray, ...], num_separators: int, widths: tuple[int, ...]
+) -> Interface:
     """Interface of robots that touch these separators, all fronts with the driver."""
     fronts = FrontOwners(touched, num_separators)
     return Interface(num_separators, widths, touched, fronts)
@@ -122,7 +133,9 @@ def name_of(order: object) -> str:
 
 
 def arrays_in(record: object, name: str = "value") -> Iterator[tuple[str, Array]]:
-    """Numbers and arrays of a request or an answer, each with the name of its field; between robots with `>`."""
+    """Numbers and arrays of a request or an answer, each with the name of its field; between robots
+    with `>`.
+    """
     if isinstance(record, Mapping):
         for robot, value in record.items():
             yield from ((f"{field}>{robot}", array) for field, array in arrays_in(value, name))
@@ -152,7 +165,9 @@ class Recording:
 
     def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
         pairs = zip(self.agents, requests, strict=True)
-        answers = [None if request is Idle.IDLE else order(agent, request) for agent, request in pairs]
+        answers = [
+            None if request is Idle.IDLE else order(agent, request) for agent, request in pairs
+        ]
         self.log.append((name_of(order), list(requests), answers))
         return answers
 
@@ -165,5 +180,14 @@ class Recording:
 
     def crossed(self, *orders: object) -> list[tuple[str, Array]]:
         """Names and numbers of all arrays that crossed in orders other than these."""
-        both = [m for name, sent, got in self.log if name not in map(name_of, orders) for m in (*sent, *got)]
-        return [(name, np.ravel(value).astype(float)) for record in both for name, value in arrays_in(record)]
+        both = [
+            m
+            for name, sent, got in self.log
+            if name not in map(name_of, orders)
+            for m in (*sent, *got)
+        ]
+        return [
+            (name, np.ravel(value).astype(float))
+            for record in both
+            for name, value in arrays_in(record)
+        ]

@@ -1,4 +1,6 @@
-"""Every public name is a class or a function, and a function shows an example (pytest runs them all)."""
+"""Every public name is a class or a function, and a function shows an example (pytest runs them
+all).
+"""
 
 import importlib
 import inspect
@@ -32,8 +34,8 @@ def test_a_public_function_has_an_example(package: ModuleType, name: str) -> Non
 
 @pytest.mark.parametrize("package", PACKAGES, ids=label)
 def test_no_file_hides_a_public_name(package: ModuleType) -> None:
-    # Importing pkg.name sets the attribute `name` of pkg to the file: a function of that name, loaded on demand, would
-    # be hidden by it from then on.
+    # Importing pkg.name sets the attribute `name` of pkg to the file: a function of that name,
+    # loaded on demand, would be hidden by it from then on.
     folder = Path(package.__file__).parent
     for path in sorted(folder.glob("[!_]*.py")):
         importlib.import_module(f"{package.__name__}.{path.stem}")
@@ -41,18 +43,22 @@ def test_no_file_hides_a_public_name(package: ModuleType) -> None:
     assert hidden == []
 
 
-SYMBOL = r"(?:\(d ?\+ ?1\)|[A-Za-z]{1,2}|nnz|count|num_robots|\d|[+ ])+"
-SHAPE = re.compile(rf"\({SYMBOL},(?:{SYMBOL},?)*\)|\bshapes?\b")  # (n, d, d), (m,), ((d+1) n, d), or that of a variable
+SYMBOL = r"(?:\(d ?\+ ?1\)|[A-Za-z]{1,2}(?:_[A-Za-z])?|nnz|count|num_robots|\d|[+ ])+"
+# (n, d, d), (m,), ((d+1) n, d), or that of a variable
+SHAPE = re.compile(rf"\({SYMBOL},(?:{SYMBOL},?)*\)|\bshapes?\b")
 
 
 ARRAYS = re.compile("Array|ndarray")
 
 
 def callables_with_arrays(package: ModuleType) -> Iterator[tuple[str, dict[str, object], str]]:
-    """Name, types and docstring (with its class's) of public functions, methods and classes that have arrays."""
+    """Name, types and docstring (with its class's) of public functions, methods and classes that
+    have arrays.
+    """
     for name in package.__all__:
         thing = getattr(package, name)
-        found, outer = {name: thing}, ""
+        found = {name: thing}
+        outer = ""
         if inspect.isclass(thing):
             outer = inspect.getdoc(thing) or ""
             for member, value in vars(thing).items():
@@ -60,11 +66,19 @@ def callables_with_arrays(package: ModuleType) -> Iterator[tuple[str, dict[str, 
                     inner = getattr(value, "fget", None) or getattr(value, "func", None) or value
                     found[f"{name}.{member}"] = getattr(inner, "__func__", inner)
         for label, one in found.items():
-            hints = inspect.get_annotations(one) if inspect.isclass(one) or inspect.isfunction(one) else {}
+            hints = (
+                inspect.get_annotations(one)
+                if inspect.isclass(one) or inspect.isfunction(one)
+                else {}
+            )
             hints = {what: hint for what, hint in hints.items() if ARRAYS.search(str(hint))}
             if hints:
                 own = inspect.getdoc(one) or ""
-                yield label, {} if inspect.isclass(one) else hints, own if one is thing else f"{own}\n\n{outer}"
+                yield (
+                    label,
+                    {} if inspect.isclass(one) else hints,
+                    own if one is thing else f"{own}\n\n{outer}",
+                )
 
 
 @pytest.mark.parametrize("package", PACKAGES, ids=label)
@@ -87,10 +101,13 @@ def test_fields_with_arrays_say_their_shapes(package: ModuleType) -> None:
     for name in package.__all__:
         thing = getattr(package, name)
         if inspect.isclass(thing):
-            text, source = inspect.getdoc(thing) or "", inspect.getsource(thing)
+            text = inspect.getdoc(thing) or ""
+            source = inspect.getsource(thing)
             for field, hint in inspect.get_annotations(thing).items():
                 if re.search("Array|ndarray", str(hint)) and not field.startswith("_"):
-                    beside = re.findall(rf"^ *{field}:.*#(.*)$|^[^\n]*\b{field}\b(.*)$", f"{source}\n{text}", re.M)
+                    beside = re.findall(
+                        rf"^ *{field}:.*#(.*)$|^[^\n]*\b{field}\b(.*)$", f"{source}\n{text}", re.M
+                    )
                     assert any(SHAPE.search("".join(words)) for words in beside), f"{name}.{field}"
 
 

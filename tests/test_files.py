@@ -51,7 +51,11 @@ def test_table_skips_comments_and_keeps_lines(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("1 2\n3\n", "a:2: 1 numbers where 2 belong"), ("1 2 3\n", "a:1: 3 numbers"), ("#\n", "a: no rows")],
+    [
+        ("1 2\n3\n", "a:2: 1 numbers where 2 belong"),
+        ("1 2 3\n", "a:1: 3 numbers"),
+        ("#\n", "a: no rows"),
+    ],
 )
 def test_bad_tables_are_refused(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "a").write_text(text)
@@ -102,3 +106,24 @@ def test_a_link_stays_a_link(tmp_path: Path) -> None:
     write_one(tmp_path / "link")
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "a").read_text() == "1"
+
+
+def test_a_file_keeps_its_mode_and_a_new_one_has_the_usual(tmp_path: Path) -> None:
+    (tmp_path / "plain").touch()
+    for mode in (0o600, 0o664, 0o755, 0o444):
+        (tmp_path / "a").touch()
+        (tmp_path / "a").chmod(mode)
+        write_one(tmp_path / "a")
+        assert (tmp_path / "a").stat().st_mode & 0o7777 == mode
+    write_one(tmp_path / "new")
+    assert (tmp_path / "new").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_a_link_to_nothing_makes_its_file_and_a_circle_of_links_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "a")
+    (tmp_path / "circle").symlink_to(tmp_path / "other")
+    (tmp_path / "other").symlink_to(tmp_path / "circle")
+    write_one(tmp_path / "link")
+    assert (tmp_path / "a").read_text() == "1"
+    with pytest.raises(PGOError, match=r"cannot write .*circle: "):
+        write_one(tmp_path / "circle")

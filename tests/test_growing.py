@@ -35,7 +35,8 @@ def test_it_is_the_solution_of_the_whole_graph(d: int, weighting: Weighting) -> 
     afresh = solvers.solve(PGOProblem(graph, weighting=weighting))
     assert grown.is_certified
     assert grown.problem.weighting is weighting
-    # F - bound is within the gap for both, so that the two F are no further apart, nor is a bound above the other F.
+    # F - bound is within the gap for both, so that the two F are no further apart, nor is a bound
+    # above the other F.
     assert grown.objective == pytest.approx(afresh.objective, rel=DEFAULT_GAP)
     assert grown.lower_bound <= afresh.objective
     assert [stage.name for stage in grown.stages] == ["given start", "Newton"]
@@ -50,13 +51,23 @@ def test_the_gap_asked_for_is_the_one_that_is_proven() -> None:
 
 
 def test_where_newton_ends_elsewhere_the_whole_pipeline_follows_and_its_stages_say_so() -> None:
-    n, rng = 20, np.random.default_rng(1)
-    turns, steps = exp_map(rng.normal(0.0, 0.01, (n, 1))), np.tile([1.0, 0.0], (n, 1))
-    ring = PoseGraph(n, np.arange(n), (np.arange(n) + 1) % n, turns, steps, np.full(n, 100.0), np.ones(n))
+    n = 20
+    rng = np.random.default_rng(1)
+    turns = exp_map(rng.normal(0.0, 0.01, (n, 1)))
+    steps = np.tile([1.0, 0.0], (n, 1))
+    ring = PoseGraph(
+        n, np.arange(n), (np.arange(n) + 1) % n, turns, steps, np.full(n, 100.0), np.ones(n)
+    )
     before = solvers.solve(ring.without_edges(np.arange(n) == n - 1))
-    wound = before.poses.R @ exp_map(2.0 * np.pi * np.arange(n)[:, None] / n)  # a local minimum of the ring
+    # a local minimum of the ring
+    wound = before.poses.R @ exp_map(2.0 * np.pi * np.arange(n)[:, None] / n)
     grown = extend(replace(before, poses=Poses(wound, before.poses.t)), ring)
-    assert [stage.name for stage in grown.stages][:4] == ["given start", "Newton", "given start", "SOC"]
+    assert [stage.name for stage in grown.stages][:4] == [
+        "given start",
+        "Newton",
+        "given start",
+        "SOC",
+    ]
     assert grown.is_certified
     assert grown.stages[1].objective > (1.0 + DEFAULT_GAP) * grown.objective
     assert grown.seconds >= sum(stage.seconds for stage in grown.stages)
@@ -65,15 +76,19 @@ def test_where_newton_ends_elsewhere_the_whole_pipeline_follows_and_its_stages_s
 def test_known_rotations_stay_and_new_poses_are_where_exact_measurements_put_them() -> None:
     graph = random_geometric(20, np.random.default_rng(0))
     assert graph.truth is not None
-    i, j, (R, t) = graph.i, graph.j, (graph.truth.R, graph.truth.t)
+    i = graph.i
+    j = graph.j
+    (R, t) = (graph.truth.R, graph.truth.t)
     back = np.swapaxes(R[i], 1, 2)
     graph = replace(graph, R_ij=back @ R[j], t_ij=np.einsum("mab,mb->ma", back, t[j] - t[i]))
     assert graph.truth is not None
-    moved = graph.subgraph(np.random.default_rng(1).permutation(20))  # poses are told by their ids, not by their place
+    # poses are told by their ids, not by their place
+    moved = graph.subgraph(np.random.default_rng(1).permutation(20))
     known = first_poses(graph, 12)
     start = extended_poses(PGOProblem(moved), known.pose_ids, graph.truth[np.arange(12)])
     expected = graph.truth[moved.pose_ids]
-    np.testing.assert_allclose(start.t, expected.t - expected.t[0], rtol=0, atol=1e-8)  # best ones, of pose 0 at 0
+    # best ones, of pose 0 at 0
+    np.testing.assert_allclose(start.t, expected.t - expected.t[0], rtol=0, atol=1e-8)
     np.testing.assert_allclose(start.R, expected.R, rtol=0, atol=1e-8)
     is_known = moved.pose_ids < 12
     np.testing.assert_array_equal(start.R[is_known], expected.R[is_known])
@@ -101,5 +116,6 @@ def test_terms_of_an_extended_model_stay() -> None:
         soc=solvers.ExtendedSOC(lambda u: ModelChange(terms=[50.0 * cp.sum_squares(u.t(3) - 9.0)]))
     )
     before = solvers.solve(first_poses(graph, 18), pipeline)
-    grown, afresh = extend(before, graph, pipeline), solvers.solve(graph, pipeline)
+    grown = extend(before, graph, pipeline)
+    afresh = solvers.solve(graph, pipeline)
     assert grown.objective == pytest.approx(afresh.objective, rel=1e-6)

@@ -1,11 +1,18 @@
-"""The pages of the documentation: they show what is printed, and the notebooks and files they name are there."""
+"""The pages of the documentation show what is printed, and name what exists.
+
+Their commands and examples are run; notebooks, files and names of the code are looked up.
+"""
 
 import doctest
+import importlib
 import re
 import shlex
 from pathlib import Path
 
 import pytest
+import typer
+
+from solvers.cli import app as cli, options as cli_options
 
 ROOT = Path(__file__).parent.parent
 SITE = ROOT / "notebooks" / "site"
@@ -17,15 +24,38 @@ each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 
 
 def test_there_is_a_page_for_every_task():
-    assert {page.stem for page in PAGES} >= {"my_file", "certify", "outliers", "robots", "change_the_model", "teach"}
+    assert {page.stem for page in PAGES} >= {
+        "install",
+        "my_file",
+        "own_cost",
+        "certify",
+        "outliers",
+        "robots",
+        "change_the_model",
+        "teach",
+        "commands",
+        "method",
+        "one_iteration",
+        "rooms",
+        "letters",
+        "contributing",
+    }
 
 
+def test_every_page_of_the_guide_is_in_its_table_of_contents():
+    index = (SITE / "guide" / "index.md").read_text(encoding="utf-8")
+    pages = {page.stem for page in SITE.glob("guide/*.md")} - {"index"}
+    assert set(re.findall(r"^\w+$", index, re.M)) - {"Guide"} == pages
+
+
+@pytest.mark.slow
 @each_page
 def test_a_page_shows_what_is_printed(page, pgo_command, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("PGO_DATA", raising=False)
     names: dict[str, object] = {}
-    checker, report = doctest.OutputChecker(), []
+    checker = doctest.OutputChecker()
+    report = []
     runner = doctest.DocTestRunner(optionflags=FLAGS, verbose=False)
     for kind, text in BLOCK.findall(page.read_text(encoding="utf-8")):
         if kind == "python":
@@ -53,3 +83,96 @@ def test_what_a_page_links_to_is_there(page):
             assert at_home.exists() or path in made, target
     for path in re.findall(r"`((?:pgo_models|solvers|tests|notebooks|data)/[\w./-]+)`", text):
         assert (ROOT / path).exists(), path
+
+
+COMMANDS = typer.main.get_command(cli.app).commands
+CHOICES = {
+    "--method": cli_options.FirstStage,
+    "--split": cli_options.Split,
+    "--engine": cli_options.Runner,
+    "--start": cli_options.Start,
+    "--r-step": cli_options.BackEndName,
+    "--robust": cli_options.Robust,
+}
+
+
+def section_of(command: str) -> str:
+    page = (SITE / "guide" / "commands.md").read_text(encoding="utf-8")
+    return re.search(rf"^## pgo {command}\n(.*?)(?=^## |\Z)", page, re.M | re.S)[1]
+
+
+def shown_options(command: str) -> dict[str, tuple[set[str], str]]:
+    """All names of every option of a command, and its effect, by its long name."""
+    shown = {}
+    for names, effect in re.findall(r"^\| (`-.*?) \| (.*) \|$", section_of(command), re.M):
+        words = [re.split("[ `]", name)[1] for name in names.split(", ")]
+        shown[words[0]] = (set(words), effect)
+    return shown
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_page_of_the_command_line_has_every_option_with_its_choices(name):
+    shown = shown_options(name)
+    options = [one for one in COMMANDS[name].params if one.opts[0].startswith("-")]
+    assert sorted(shown) == sorted(option.opts[0] for option in options)
+    for option in options:
+        names, effect = shown[option.opts[0]]
+        assert names == set(option.opts)
+        for choice in CHOICES.get(option.opts[0], ()):
+            assert f"`{choice.value}`" in effect, f"{option.opts[0]} {choice.value}"
+
+
+def test_the_page_of_the_command_line_has_every_command_and_scene():
+    page = (SITE / "guide" / "commands.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^## pgo (\w+)$", page, re.M)) == set(COMMANDS)
+    for scene in cli_options.Scene:
+        assert f"`{scene.value}`" in section_of("generate")
+
+
+MESSAGES = (SITE / "guide" / "one_iteration.md").read_text(encoding="utf-8")
+ROOMS_OF_AN_ITERATION = (
+    "solvers.distributed.consensus",
+    "solvers.distributed.driver",
+    "solvers.distributed.interface",
+    "solvers.distributed.robots.agent",
+    "solvers.distributed.robots.interior",
+    "solvers.distributed.robots.records",
+    "solvers.distributed.stages",
+    "solvers.distributed.substructured",
+    "solvers.network.counted_pool",
+    "solvers.network.engine",
+    "solvers.network.ledger",
+    "solvers.network.messages",
+    "solvers.network.ray_engine",
+    "solvers.soc.anderson",
+    "solvers.soc.consensus",
+    "solvers.soc.consensus_robot",
+    "solvers.soc.copies",
+    "solvers.soc.safeguard",
+    "solvers.soc.settings",
+    "solvers.soc.soc",
+    "solvers.soc.subgraph",
+)
+# Fields that `__init__` sets, which a class does not show, and which the examples below them read.
+SET_AT_WORK = {"Driver.block", "Driver.right", "Agent.interior", "Agent.copies"}
+DATA_SETS = {"robots"}
+
+
+def test_every_name_on_the_page_of_messages_is_in_the_code():
+    known = {}
+    for module in map(importlib.import_module, ROOMS_OF_AN_ITERATION):
+        known |= vars(module)
+    text = re.sub(r"^```.*?^```$", "", MESSAGES, flags=re.M | re.S)
+    names = set(re.findall(r"`([^`\n]+)`", text)) - DATA_SETS
+    assert len(names) > 50
+    for name in names:
+        owner, _, attribute = name.partition(".")
+        assert owner in known, name
+        if name in SET_AT_WORK:
+            source = Path(importlib.import_module(known[owner].__module__).__file__)
+            assert f"self.{attribute}:" in source.read_text(encoding="utf-8") or (
+                f"self.{attribute} =" in source.read_text(encoding="utf-8")
+            ), name
+        elif attribute:
+            fields = getattr(known[owner], "__dataclass_fields__", {})
+            assert hasattr(known[owner], attribute) or attribute in fields, name

@@ -1,6 +1,8 @@
-"""The notebooks: their sources run, use public names only and end with asserts; every .ipynb is built from its source.
+"""The sources of the notebooks run, use public names only and end with asserts.
 
-`python notebooks/build.py` builds them. Neither Jupyter nor jupytext is needed here: a percent script is Python.
+Every .ipynb is built from its source.
+`python notebooks/build.py` builds them. Neither Jupyter nor jupytext is needed here: a percent
+script is Python.
 """
 
 import ast
@@ -58,7 +60,9 @@ def cells(source: Path) -> list[tuple[str, str]]:
 
 def text_of(kind: str, lines: list[str]) -> str:
     if kind == "markdown":
-        assert all(line.startswith("#") or not line for line in lines), f"markdown without a comment sign: {lines}"
+        assert all(line.startswith("#") or not line for line in lines), (
+            f"markdown without a comment sign: {lines}"
+        )
         lines = [line.removeprefix("#").removeprefix(" ") for line in lines]
     return "\n".join(lines).strip("\n")
 
@@ -67,7 +71,11 @@ def with_answers(source: Path) -> str:
     """The code of a notebook, with that of the answers to its exercises where they stand."""
     parts = []
     for kind, text in cells(source):
-        parts += [text] if kind == "code" else [code for answer in ANSWER.findall(text) for code in code_of(answer)]
+        parts += (
+            [text]
+            if kind == "code"
+            else [code for answer in ANSWER.findall(text) for code in code_of(answer)]
+        )
     return "\n\n".join(parts)
 
 
@@ -80,6 +88,7 @@ def test_there_is_a_notebook_for_every_topic():
     assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == NAMES
 
 
+@pytest.mark.slow
 @each_source
 def test_a_source_runs_with_its_answers_and_leaves_nothing_behind(source):
     before = sorted(FOLDER.iterdir())
@@ -105,7 +114,9 @@ def test_a_source_runs_with_its_answers_and_leaves_nothing_behind(source):
 def test_a_notebook_is_in_step_with_its_source(source):
     notebook = json.loads(source.with_suffix(".ipynb").read_text(encoding="utf-8"))
     built = [(cell["cell_type"], "".join(cell["source"])) for cell in notebook["cells"]]
-    assert built == cells(source), f"{source.name} has changed: run `python notebooks/build.py {source.name[:2]}`"
+    assert built == cells(source), (
+        f"{source.name} has changed: run `python notebooks/build.py {source.name[:2]}`"
+    )
 
 
 @each_source
@@ -115,7 +126,11 @@ def test_a_notebook_was_run_to_its_end_and_is_small(source):
     code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
     assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
     outputs = [output for cell in code for output in cell["outputs"]]
-    assert not [output for output in outputs if output["output_type"] == "error" or output.get("name") == "stderr"]
+    assert not [
+        output
+        for output in outputs
+        if output["output_type"] == "error" or output.get("name") == "stderr"
+    ]
     assert sum("image/png" in output.get("data", {}) for output in outputs) >= 1
     assert path.stat().st_size <= MOST_BYTES
 
@@ -135,8 +150,12 @@ def test_a_source_asks_a_question_and_ends_with_asserts(source):
 def test_a_source_says_how_to_open_it_and_has_exercises_with_hidden_answers(source):
     parts = cells(source)
     assert f"Open with `jupyter lab notebooks/{source.stem}.ipynb`" in parts[0][1]
-    (exercises,) = (text for kind, text in parts if kind == "markdown" and text.startswith("## Exercises"))
-    assert re.findall(r"^\*\*(\d)\.\*\*", exercises, re.M) == [str(k) for k in range(1, EXERCISES + 1)]
+    (exercises,) = (
+        text for kind, text in parts if kind == "markdown" and text.startswith("## Exercises")
+    )
+    assert re.findall(r"^\*\*(\d)\.\*\*", exercises, re.M) == [
+        str(k) for k in range(1, EXERCISES + 1)
+    ]
     answers = ANSWER.findall(exercises)
     assert len(answers) == exercises.count("<details>") == EXERCISES
     assert all(any("assert " in code for code in code_of(answer)) for answer in answers)
@@ -146,7 +165,9 @@ def test_a_source_says_how_to_open_it_and_has_exercises_with_hidden_answers(sour
 def test_equations_of_the_paper_have_their_numbers(source):
     text = "\n".join(text for kind, text in cells(source) if kind == "markdown")
     for label, number in EQUATIONS.items():
-        assert text.count(f"`{label}`") == len(re.findall(rf"\({number}\),\s`{label}`", text)), label
+        assert text.count(f"`{label}`") == len(re.findall(rf"\({number}\),\s`{label}`", text)), (
+            label
+        )
 
 
 @each_source
@@ -157,7 +178,9 @@ def test_no_sentence_turns_into_a_list(source):
         assert not [
             line
             for before, line in pairwise(lines)
-            if before and line.startswith(("1. ", "- ", "+ ", "* ")) and not before.startswith(("- ", "+ ", "* ", "  "))
+            if before
+            and line.startswith(("1. ", "- ", "+ ", "* "))
+            and not before.startswith(("- ", "+ ", "* ", "  "))
         ]
 
 
@@ -173,10 +196,15 @@ def test_a_source_uses_public_names_only(source):
                 else:
                     assert alias.name.split(".")[0] in LIBRARIES | sys.stdlib_module_names
         elif isinstance(node, ast.ImportFrom):
-            assert node.module.split(".")[0] in LIBRARIES | {"pgo_models", "solvers"} | sys.stdlib_module_names
+            assert (
+                node.module.split(".")[0]
+                in LIBRARIES | {"pgo_models", "solvers"} | sys.stdlib_module_names
+            )
             assert node.module not in ("pgo_models", "solvers"), f"import all of {node.module}"
             assert not [alias.name for alias in node.names if alias.name.startswith("_")]
         elif isinstance(node, ast.Attribute):
             assert not node.attr.startswith("_"), f"{node.attr} is private"
             if isinstance(node.value, ast.Name) and node.value.id in packages:
-                assert node.attr in packages[node.value.id], f"{node.value.id}.{node.attr} is not public"
+                assert node.attr in packages[node.value.id], (
+                    f"{node.value.id}.{node.attr} is not public"
+                )

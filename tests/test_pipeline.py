@@ -3,24 +3,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from budget import examples
-from graphs import OPTIMUM, informed, wound_ring
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from graphs import OPTIMUM, informed, spread_graph, wound_ring
+from hypothesis import example, given, settings, strategies as st
 
 import pgo_models as pgo
 import solvers
 from pgo_models.certificates import definiteness
 from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, Verdict
-from pgo_models.errors import GraphError, SettingError
+from pgo_models.errors import GraphError, NotPositiveDefiniteError, SettingError
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.graphs.trajectories import read_times
 from pgo_models.problem.weighting import Weighting
-from solvers.pipeline import HANDOVER_TOLERANCE
+from solvers.pipeline import WARM_START_TOLERANCE
 from solvers.studies.tightness import SweptScene, noisy_scene
 
 
 @pytest.mark.parametrize("name", OPTIMUM)
-def test_every_benchmark_file_is_solved_to_the_published_optimum_and_certified(name, benchmark_data):
+def test_every_benchmark_file_is_solved_to_the_published_optimum_and_certified(
+    name, benchmark_data
+):
     solution = solvers.solve(pgo.read_g2o(benchmark_data / f"{name}.g2o"))
     assert solution.status is solvers.Status.CONVERGED
     assert solution.certificate.verdict is Verdict.CERTIFIED
@@ -34,13 +35,17 @@ def test_folders_of_robots_are_solved_as_they_are(name, benchmark_data):
     graph = pgo.read_g2o(benchmark_data / name)
     robots = pgo.partition(graph)
     assert robots.num_robots == int("".join(filter(str.isdigit, name)))
-    solution = solvers.solve(graph, solvers.Pipeline(soc=solvers.SOC(robots=robots, tolerance=HANDOVER_TOLERANCE)))
+    solution = solvers.solve(
+        graph, solvers.Pipeline(soc=solvers.SOC(robots=robots, tolerance=WARM_START_TOLERANCE))
+    )
     assert solution.is_certified
 
 
 @settings(deadline=None, max_examples=examples(15))
 @given(seed=st.integers(0, 10**6), d=st.sampled_from([2, 3]), rotation_std=st.floats(0.01, 2.0))
-def test_the_bound_holds_and_the_solution_is_no_worse_than_the_start_at_any_noise(seed, d, rotation_std):
+def test_the_bound_holds_and_the_solution_is_no_worse_than_the_start_at_any_noise(
+    seed, d, rotation_std
+):
     rng = np.random.default_rng(seed)
     graph = pgo.random_geometric(20, rng, d=d, noise=NoiseModel(0.3, rotation_std))
     problem = pgo.PGOProblem(graph)
@@ -79,7 +84,9 @@ def test_newton_alone_and_the_papers_coupling_find_the_same_optimum():
 
 def test_a_bad_start_is_rescued_by_the_second_try():
     problem, wound = wound_ring(20, 2)
-    stuck = solvers.solve(problem, solvers.Pipeline(soc=None, second_try=False, staircase=None), wound)
+    stuck = solvers.solve(
+        problem, solvers.Pipeline(soc=None, second_try=False, staircase=None), wound
+    )
     rescued = solvers.solve(problem, solvers.Pipeline(soc=None, staircase=None), wound)
     assert not stuck.is_certified
     assert rescued.is_certified
@@ -91,7 +98,12 @@ def test_a_bad_start_is_rescued_by_the_second_try():
 def test_a_bad_start_is_rescued_by_the_staircase(d):
     problem, wound = wound_ring(20, d)
     solution = solvers.solve(problem, solvers.Pipeline(soc=None, second_try=False), wound)
-    assert [stage.name for stage in solution.stages] == ["given start", "Newton", "Staircase", "Newton"]
+    assert [stage.name for stage in solution.stages] == [
+        "given start",
+        "Newton",
+        "Staircase",
+        "Newton",
+    ]
     assert solution.is_certified
     assert solution.certificate.source is BoundSource.GIVEN
     assert solution.objective < 0.1 * solution.stages[1].objective
@@ -100,14 +112,18 @@ def test_a_bad_start_is_rescued_by_the_staircase(d):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_where_the_relaxation_is_not_tight_its_bound_is_reported(seed):
-    problem = pgo.PGOProblem(noisy_scene(SweptScene.GRID, np.deg2rad(90.0), np.random.default_rng(seed)))
+    problem = pgo.PGOProblem(
+        noisy_scene(SweptScene.GRID, np.deg2rad(90.0), np.random.default_rng(seed))
+    )
     without = solvers.solve(problem, solvers.Pipeline(staircase=None))
     solution = solvers.solve(problem)
     assert solution.certificate.source is BoundSource.RELAXATION
     assert solution.certificate.verdict is Verdict.NOT_CERTIFIED
     assert solution.objective <= without.objective
     assert without.lower_bound < solution.lower_bound < solution.objective
-    assert solution.gap == pytest.approx((solution.objective - solution.lower_bound) / solution.objective)
+    assert solution.gap == pytest.approx(
+        (solution.objective - solution.lower_bound) / solution.objective
+    )
     relaxed = solvers.run(solvers.Staircase(), problem)
     assert solution.lower_bound == pytest.approx(relaxed.state.point.value, rel=2 * DEFAULT_GAP)
     certificate = solution.certificate
@@ -116,7 +132,9 @@ def test_where_the_relaxation_is_not_tight_its_bound_is_reported(seed):
 
 def test_a_staircase_that_is_cut_short_gives_a_valid_bound():
     problem, wound = wound_ring(20, 3)
-    cut = solvers.Pipeline(soc=None, second_try=False, staircase=solvers.Staircase(max_iterations=8))
+    cut = solvers.Pipeline(
+        soc=None, second_try=False, staircase=solvers.Staircase(max_iterations=8)
+    )
     solution = solvers.solve(problem, cut, wound)
     assert solution.stages[2].status is solvers.Status.MAX_ITERATIONS
     assert solution.objective <= solution.stages[1].objective
@@ -124,7 +142,9 @@ def test_a_staircase_that_is_cut_short_gives_a_valid_bound():
 
 
 def test_a_time_limit_ends_the_run_with_its_status_and_a_valid_bound():
-    problem = pgo.PGOProblem(pgo.random_geometric(300, np.random.default_rng(0), noise=NoiseModel(0.3, 0.3)))
+    problem = pgo.PGOProblem(
+        pgo.random_geometric(300, np.random.default_rng(0), noise=NoiseModel(0.3, 0.3))
+    )
     optimum = solvers.solve(problem).objective
     solution = solvers.solve(problem, time_limit=1e-9)
     assert solution.status is solvers.Status.TIME_LIMIT
@@ -132,7 +152,8 @@ def test_a_time_limit_ends_the_run_with_its_status_and_a_valid_bound():
 
 
 def test_a_disconnected_graph_is_refused_with_its_components_named():
-    R, t = np.broadcast_to(np.eye(2), (2, 2, 2)), np.ones((2, 2))
+    R = np.broadcast_to(np.eye(2), (2, 2, 2))
+    t = np.ones((2, 2))
     graph = pgo.PoseGraph(4, np.array([0, 2]), np.array([1, 3]), R, t, np.ones(2), np.ones(2))
     with pytest.raises(GraphError, match="2 components"):
         solvers.solve(graph)
@@ -146,14 +167,35 @@ def test_settings_out_of_range_are_refused():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda problem: solvers.solve("grid"), r"the problem is 'grid'; give a PGOProblem or a PoseGraph: .*load\(\)"),
-        (lambda problem: solvers.run(solvers.Newton(), "grid"), "the problem is 'grid'; give a PGOProblem"),
-        (lambda problem: solvers.solve(problem, solvers.SOC()), r"pipeline is a SOC; give Pipeline\(soc=SOC\(..\)\)"),
-        (lambda problem: solvers.solve(problem, robots=True), "robots is True; give a whole number"),
-        (lambda problem: solvers.solve(problem, robots=2.5), r"robots is 2\.5; give a whole number"),
+        (
+            lambda problem: solvers.solve("grid"),
+            r"the problem is 'grid'; give a PGOProblem or a PoseGraph: .*load\(\)",
+        ),
+        (
+            lambda problem: solvers.run(solvers.Newton(), "grid"),
+            "the problem is 'grid'; give a PGOProblem",
+        ),
+        (
+            lambda problem: solvers.solve(problem, solvers.SOC()),
+            r"pipeline is a SOC; give Pipeline\(soc=SOC\(..\)\)",
+        ),
+        (
+            lambda problem: solvers.solve(problem, robots=True),
+            "robots is True; give a whole number",
+        ),
+        (
+            lambda problem: solvers.solve(problem, robots=2.5),
+            r"robots is 2\.5; give a whole number",
+        ),
         (lambda problem: solvers.solve(problem, robots="2"), "robots is '2'; give a whole number"),
-        (lambda problem: pgo.certify(problem, problem.graph.truth.R), r"poses are a ndarray; give Poses\(R, t\), or"),
-        (lambda problem: solvers.solve(problem, start=problem.graph.truth.R), "poses are a ndarray; give Poses"),
+        (
+            lambda problem: pgo.certify(problem, problem.graph.truth.R),
+            r"poses are a ndarray; give Poses\(R, t\), or",
+        ),
+        (
+            lambda problem: solvers.solve(problem, start=problem.graph.truth.R),
+            "poses are a ndarray; give Poses",
+        ),
         (lambda problem: problem.objective(None), "poses are a NoneType; give Poses"),
     ],
 )
@@ -176,10 +218,14 @@ def test_poses_that_are_nearly_rotations_are_not_below_the_optimum(factor):
     shrunk = factor * optimum.poses.R
     near = pgo.Poses(shrunk, optimum.poses.t)
     # In the equation itself, at the matrices as they are given, F is lower by about that factor.
-    X = np.concatenate([problem.recover_translations(shrunk), np.swapaxes(shrunk, 1, 2).reshape(-1, 3)])
+    X = np.concatenate(
+        [problem.recover_translations(shrunk), np.swapaxes(shrunk, 1, 2).reshape(-1, 3)]
+    )
     assert problem.objective_stacked(X) < optimum.objective * (1 - 1e-11)
     assert problem.objective(near) >= optimum.objective * (1 - 1e-14)
-    assert problem.objective(problem.with_best_translations(shrunk)) >= optimum.objective * (1 - 1e-14)
+    assert problem.objective(problem.with_best_translations(shrunk)) >= optimum.objective * (
+        1 - 1e-14
+    )
 
 
 @pytest.mark.parametrize("robots", [None, 3])
@@ -188,7 +234,10 @@ def test_a_gap_beyond_doubles_is_not_looked_for_in_other_poses(robots):
     solution = solvers.solve(graph, solvers.Pipeline(gap=1e-18), robots=robots)
     by_soc = ["SOC"] if robots else []  # a small graph in one place is left to Newton
     assert [stage.name for stage in solution.stages] == ["chordal start", *by_soc, "Newton"]
-    assert (solution.certificate.verdict, solution.certificate.is_best_in_doubles) == (Verdict.NOT_CERTIFIED, True)
+    assert (solution.certificate.verdict, solution.certificate.is_best_in_doubles) == (
+        Verdict.NOT_CERTIFIED,
+        True,
+    )
     assert solution.gap < 1e-13
 
 
@@ -204,11 +253,17 @@ UNITS = {
 @given(**UNITS)
 def test_units_change_neither_verdict_nor_iterations_nor_digits(seed, weights, metres, d):
     graph = pgo.random_geometric(30, np.random.default_rng(seed), d=d)
-    kappa, tau = weights * graph.kappa, weights * graph.tau / metres**2
-    scaled = replace(graph, kappa=kappa, tau=tau, t_ij=metres * graph.t_ij, initial=None, truth=None)
-    one, other = solvers.solve(replace(graph, initial=None, truth=None)), solvers.solve(scaled)
+    kappa = weights * graph.kappa
+    tau = weights * graph.tau / metres**2
+    scaled = replace(
+        graph, kappa=kappa, tau=tau, t_ij=metres * graph.t_ij, initial=None, truth=None
+    )
+    one = solvers.solve(replace(graph, initial=None, truth=None))
+    other = solvers.solve(scaled)
     assert other.certificate.verdict is one.certificate.verdict
-    assert [stage.iterations for stage in other.stages] == [stage.iterations for stage in one.stages]
+    assert [stage.iterations for stage in other.stages] == [
+        stage.iterations for stage in one.stages
+    ]
     assert other.objective == pytest.approx(weights * one.objective, rel=1e-9)
     assert abs(other.certificate.digits - one.certificate.digits) <= 1
     for poses in (pgo.spanning_tree_start(graph), pgo.chordal_start(one.problem)):
@@ -219,17 +274,25 @@ def test_units_change_neither_verdict_nor_iterations_nor_digits(seed, weights, m
 
 
 @settings(max_examples=examples(20))
-@given(**UNITS, coupled=st.booleans(), spread=st.sampled_from([0.1, 0.3, 1.0]), robots=st.sampled_from([None, 2]))
+@given(
+    **UNITS,
+    coupled=st.booleans(),
+    spread=st.sampled_from([0.1, 0.3, 1.0]),
+    robots=st.sampled_from([None, 2]),
+)
 @example(seed=3173635, weights=1e-9, metres=1e-3, d=3, coupled=False, spread=1.0, robots=2)
 def test_units_change_nothing_of_chi2_either(seed, weights, metres, d, coupled, spread, robots):
-    graph = replace(informed(seed, 15, d, coupled, spread, NoiseModel(0.01, 0.01)), initial=None, truth=None)
+    graph = replace(
+        informed(seed, 15, d, coupled, spread, NoiseModel(0.01, 0.01)), initial=None, truth=None
+    )
     unit = np.ones(graph.information.shape[1])
     unit[:d] = 1.0 / metres
     information = weights * unit[:, None] * graph.information * unit
     precisions = {"kappa": weights * graph.kappa, "tau": weights * graph.tau / metres**2}
     scaled = replace(graph, information=information, t_ij=metres * graph.t_ij, **precisions)
     one, other = (
-        solvers.solve(pgo.PGOProblem(g, weighting=Weighting.INFORMATION), robots=robots) for g in (graph, scaled)
+        solvers.solve(pgo.PGOProblem(g, weighting=Weighting.INFORMATION), robots=robots)
+        for g in (graph, scaled)
     )
     assert other.certificate.verdict is one.certificate.verdict
     assert [stage.name for stage in other.stages] == [stage.name for stage in one.stages]
@@ -244,7 +307,9 @@ def test_units_change_nothing_of_chi2_either(seed, weights, metres, d, coupled, 
 def test_a_solution_says_in_which_frame_it_is():
     graph = pgo.grid(np.random.default_rng(0))
     bare = replace(graph, initial=None)
-    near = graph.truth.moved(pgo.random_rotations(1, 3, np.random.default_rng(1))[0], np.array([1.0, 2.0, 3.0]))
+    near = graph.truth.moved(
+        pgo.random_rotations(1, 3, np.random.default_rng(1))[0], np.array([1.0, 2.0, 3.0])
+    )
     known = replace(graph, initial=near)
     for start, anchor, frame, held in (
         (bare, None, "pose 0 at the identity", 0),
@@ -252,12 +317,19 @@ def test_a_solution_says_in_which_frame_it_is():
         (replace(bare, fixed=np.array([7])), None, "pose 7 at the identity, by its FIX line", 7),
         (known, None, "aligned with the estimate that came with the graph", None),
         (known, 5, "pose 5 where the estimate has it, as asked for", 5),
-        (replace(known, fixed=np.array([7])), 5, "pose 5 where the estimate has it, as asked for", 5),
+        (
+            replace(known, fixed=np.array([7])),
+            5,
+            "pose 5 where the estimate has it, as asked for",
+            5,
+        ),
         (
             replace(known, fixed=np.array([7, 3])),
             None,
-            "pose 7 where the estimate has it, by its FIX line; those of 1 other poses are not minded, F leaves one "
-            "frame open",
+            (
+                "pose 7 where the estimate has it, by its FIX line; those of 1 other poses are"
+                " ignored, F leaves one frame open"
+            ),
             7,
         ),
     ):
@@ -267,7 +339,11 @@ def test_a_solution_says_in_which_frame_it_is():
         assert solution.as_json()["frame"] == frame
         assert solution.objective == pytest.approx(solution.certificate.objective, rel=1e-12)
         if held is not None:
-            pose = start.initial[np.array([held])] if start.initial is not None else pgo.Poses.identity(1, 3)
+            pose = (
+                start.initial[np.array([held])]
+                if start.initial is not None
+                else pgo.Poses.identity(1, 3)
+            )
             np.testing.assert_allclose(solution.poses.R[held], pose.R[0], rtol=0, atol=1e-14)
             np.testing.assert_allclose(solution.poses.t[held], pose.t[0], rtol=0, atol=1e-14)
     for anchor in (-1, 27):
@@ -281,7 +357,9 @@ def test_times_go_along_and_are_written(tmp_path):
     solution = solvers.solve(replace(graph, times=times))
     solution.save(tmp_path / "poses.tum")
     np.testing.assert_array_equal(read_times(tmp_path / "poses.tum"), times)
-    np.testing.assert_array_equal(replace(graph, times=times).subgraph(np.array([3, 1])).times, times[[1, 3]])
+    np.testing.assert_array_equal(
+        replace(graph, times=times).subgraph(np.array([3, 1])).times, times[[1, 3]]
+    )
     with pytest.raises(GraphError, match="times do not ascend"):
         replace(graph, times=times[::-1])
     with pytest.raises(GraphError, match="times has shape"):
@@ -289,10 +367,45 @@ def test_times_go_along_and_are_written(tmp_path):
 
 
 def test_where_rounding_alone_is_in_the_way_no_other_poses_are_looked_for(monkeypatch):
-    """As on planes of 360,000 poses: S_r has a factor, whose rounding may be more than what it is definite by."""
+    """As on planes of 360,000 poses: S_r has a factor, whose rounding may be more than what it is
+    definite by.
+    """
     monkeypatch.setattr(definiteness, "MARGIN", 1e16)
     solution = solvers.solve(pgo.grid(np.random.default_rng(0)))
     assert [stage.name for stage in solution.stages] == ["chordal start", "Newton"]
     certificate = solution.certificate
-    assert (certificate.verdict, certificate.can_improve, certificate.lower_bound) == (Verdict.TRIVIAL, False, 0.0)
+    assert (certificate.verdict, certificate.can_improve, certificate.lower_bound) == (
+        Verdict.TRIVIAL,
+        False,
+        0.0,
+    )
     assert "definite in doubles" in str(certificate)
+
+
+@pytest.mark.parametrize(
+    ("robots", "d", "seed"),
+    [(None, 2, 5), (None, 2, 16), (None, 3, 4), (None, 3, 8), (2, 2, 5), (2, 2, 16), (2, 3, 8)],
+)
+def test_weights_too_far_apart_for_doubles_end_in_a_solution(robots, d, seed):
+    problem = pgo.PGOProblem(spread_graph(seed, 9, d))
+    solution = solvers.solve(problem, robots=robots, progress=False)
+    assert solution.objective == problem.objective(solution.poses)
+    assert solution.objective <= 1e18  # of poses, not of what overflowed
+    assert solution.lower_bound <= solution.objective
+
+
+def test_a_matrix_without_a_factor_is_a_status(monkeypatch):
+    """Nothing is claimed of the poses then, and the best that were found are returned."""
+    problem = pgo.PGOProblem(spread_graph(0, 9, 3))
+
+    def refuse(*_):
+        raise NotPositiveDefiniteError("no")
+
+    monkeypatch.setattr("solvers.pipeline.chordal_start", refuse)
+    solution = solvers.solve(problem, progress=False)
+    assert solution.status is solvers.Status.NOT_FACTORED
+    assert not solution.status.is_success
+    assert (solution.certificate.verdict, solution.lower_bound) == (Verdict.TRIVIAL, 0.0)
+    tree = problem.objective(pgo.spanning_tree_start(problem.graph))
+    assert solution.objective == pytest.approx(tree, rel=1e-6)
+    assert "has no Cholesky factor" in str(solution)

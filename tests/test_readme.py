@@ -1,5 +1,7 @@
+import os
 import re
 import shlex
+import shutil
 import tomllib
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -7,19 +9,34 @@ from urllib.parse import urlsplit
 import pytest
 
 from pgo_models.graphs.published_results import published_rows
-from solvers import cli
+from solvers.cli import app as cli
 
 ROOT = Path(__file__).parent.parent
 BENCHMARKS_PAGE = ROOT / "tests" / "benchmarks" / "README.md"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+ROOMS = (ROOT / "notebooks" / "site" / "guide" / "rooms.md").read_text(encoding="utf-8")
+MOST_LINES = 160
+WORDS_A_MINUTE = 100
 BENCHMARKS = BENCHMARKS_PAGE.read_text(encoding="utf-8")
 
 
-def results(page: str) -> list[dict[str, str]]:
-    """Rows of the table from file to certificate, by the heads of its columns."""
-    table = re.search(r"^\| graph \| poses / edges \| F \| gap .*\n(?:\|.*\n)+", page, re.M)[0]
-    heads, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines())
+def rows_of(page: str, head: str) -> list[dict[str, str]]:
+    """Rows of the table whose line of heads begins with `head`, by the heads of its columns."""
+    table = re.search(rf"^{re.escape(head)}.*\n(?:\|.*\n)+", page, re.M)[0]
+    heads, _, *rows = (
+        [cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()
+    )
     return [dict(zip(heads, row, strict=True)) for row in rows]
+
+
+def results(page: str) -> list[dict[str, str]]:
+    """Rows of the table from file to certificate."""
+    return rows_of(page, "| graph | poses / edges | F | gap ")
+
+
+def test_the_readme_is_short_and_begins_with_a_picture():
+    assert len(README.splitlines()) <= MOST_LINES
+    assert re.match(r"# [\w-]+\n\n!\[[^\]]+\]\(notebooks/pictures/[\w.-]+\)\n", README)
 
 
 def test_the_python_of_the_readme_runs_as_it_stands(monkeypatch, capsys):
@@ -37,13 +54,38 @@ def test_the_first_command_prints_what_the_readme_shows(monkeypatch, capsys):
         cli.main(words[words.index(".venv/bin/pgo") + 1 :])
     assert end.value.code == 0
     printed = capsys.readouterr().out
-    shown = re.search(r"The first says, with what it took,\n\n((?: {4}.*\n)+)", README)[1]
+    shown = re.search(r"It prints, among other lines,\n\n((?: {4}.*\n)+)", README)[1]
     for expected in shown.splitlines():
         line = expected.strip()
         if line.startswith("gap"):  # what rounding leaves is the machine's
             line = re.sub(r"[\d.e-]+, proven to \d+ digits", "", line).strip()
             assert re.search(r"gap +\d.*e-1[2-6], proven to 1[1-6] digits", printed)
         assert line in printed
+
+
+def test_every_line_of_the_table_works_as_typed_and_prints_what_it_says(
+    pgo_command, monkeypatch, tmp_path
+):
+    for name in ("plotly", "jinja2", "flint"):  # of the second command's extras
+        pytest.importorskip(name)
+    shutil.copytree(ROOT / "data", tmp_path / "data", ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.chdir(tmp_path)
+    lines = rows_of(README, "| you want | you type | you get |")
+    assert len(lines) > 10
+    for line in lines:
+        typed = re.match(r"`([^`]+)`", line["you type"])[1]
+        if match := re.fullmatch(r"echo (.*) >> (\S+)", typed):
+            with Path(match[2]).open("a", encoding="utf-8") as file:
+                file.write(f"{match[1]}\n")
+            continue
+        if "downloaded" in line["you type"] and not os.environ.get("PGO_DATA"):
+            continue
+        program, *words = shlex.split(typed)
+        assert program == "pgo"
+        code, out, err = pgo_command(*words)
+        assert code == (3 if words[0] == "certify" else 0), f"{typed}\n{out}\n{err}"
+        for printed in re.findall(r"`([^`]+)`", line["you get"]):
+            assert printed in out, f"{typed}\n{out}"
 
 
 @pytest.mark.parametrize("marker", ["ci:solve", "ci:tests"])
@@ -59,11 +101,23 @@ def test_pictures_and_files_that_the_benchmarks_name_are_there():
 
 
 def test_the_readme_reads_the_same_where_no_other_file_is():
-    # It is the description of the package as well, where links to files of the repository lead nowhere.
-    for target in re.findall(r"\]\(([^)]+)\)", README):
-        assert target.startswith("https://"), target
-    for notebook in ROOT.glob("notebooks/*.ipynb"):
-        assert f"`{notebook.name}`" in README
+    # It is the description of the package as well, where links to files of the repository lead
+    # nowhere. Its one picture is a file of the repository: no address is known where it lies.
+    for mark, target in re.findall(r"(!?)\[[^\]]*\]\(([^)]+)\)", README):
+        if mark:
+            assert (ROOT / target).exists(), target
+        else:
+            assert target.startswith("https://"), target
+
+
+def test_the_readme_has_every_notebook_with_its_question_and_minutes():
+    rows = rows_of(README, "| notebook | question | minutes |")
+    sources = sorted(ROOT.glob("notebooks/[0-9][0-9]_*.py"))
+    assert [row["notebook"] for row in rows] == [f"`{source.stem}.ipynb`" for source in sources]
+    for row, source in zip(rows, sources, strict=True):
+        text = source.read_text(encoding="utf-8")
+        assert re.search(r"^# # \d+\. (.*)$", text, re.M)[1] == row["question"]
+        assert abs(len(text.split()) / WORDS_A_MINUTE - float(row["minutes"])) <= 5
 
 
 ADDRESS = re.compile(r"https?://[^\s)>\]\"'`;]+")
@@ -71,14 +125,24 @@ ADDRESS = re.compile(r"https?://[^\s)>\]\"'`;]+")
 
 def test_addresses_outside_are_well_formed():
     # Whether they answer takes a network: `python notebooks/site/build.py --links`.
-    kinds = ("*.md", "*.cff", "*.toml", "notebooks/**/*.md", "notebooks/*.py", "notebooks/*.ipynb", "data/*.md")
+    kinds = (
+        "*.md",
+        "*.cff",
+        "*.toml",
+        "notebooks/**/*.md",
+        "notebooks/*.py",
+        "notebooks/*.ipynb",
+        "data/*.md",
+    )
     pages = [
         path
         for kind in (*kinds, "tests/benchmarks/*.md", "pgo_models/**/*.py", "solvers/**/*.py")
         for path in ROOT.glob(kind)
         if "_build" not in path.parts
     ]
-    found = {address for path in pages for address in ADDRESS.findall(path.read_text(encoding="utf-8"))}
+    found = {
+        address for path in pages for address in ADDRESS.findall(path.read_text(encoding="utf-8"))
+    }
     assert found
     for address in found:
         parts = urlsplit(address)
@@ -95,6 +159,9 @@ def test_the_release_is_the_same_everywhere():
     assert re.search(r"^version: (.*)$", citation, re.M)[1] == project["version"]
     changes = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)
     assert f"{project['version']} ({released})" in changes[:2]
+    entry = re.search(r"```bibtex\n(.*?)```", README, re.S)[1]
+    assert re.search(r"version += \{(.*)\}", entry)[1] == project["version"]
+    assert re.search(r"year += \{(.*)\}", entry)[1] == released[:4]
 
 
 @pytest.mark.parametrize("page", [README, BENCHMARKS], ids=["readme", "benchmarks"])
@@ -106,7 +173,7 @@ def test_paths_and_files_that_a_page_names_in_code_are_there(page):
 def test_every_room_is_on_the_map():
     doors = [*ROOT.glob("pgo_models/*/__init__.py"), *ROOT.glob("solvers/*/__init__.py")]
     rooms = {door.parent.relative_to(ROOT).as_posix() for door in doors} - {"solvers/command"}
-    assert set(re.findall(r"^\| `((?:pgo_models|solvers)/\w+)` \|", README, re.M)) == rooms
+    assert set(re.findall(r"^\| `((?:pgo_models|solvers)/\w+)` \|", ROOMS, re.M)) == rooms
 
 
 def test_the_results_of_the_readme_are_those_of_the_benchmarks():

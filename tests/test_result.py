@@ -8,7 +8,12 @@ from solvers.riemannian.newton import Newton
 
 
 def history() -> History:
-    return History(tuple(Record(k, 0.5 * k, Measurement(10.0 - k, 1.0 / (k + 1), 2.0 / (k + 1))) for k in range(3)))
+    return History(
+        tuple(
+            Record(k, 0.5 * k, Measurement(10.0 - k, 1.0 / (k + 1), 2.0 / (k + 1)))
+            for k in range(3)
+        )
+    )
 
 
 def test_a_history_is_its_records_column_by_column() -> None:

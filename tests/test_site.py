@@ -1,4 +1,7 @@
-"""The documentation: it builds without a warning, all links lead somewhere, a browser opens and searches it offline."""
+"""The documentation builds without a warning, its links lead somewhere, and it works offline.
+
+A browser opens and searches it from the disk.
+"""
 
 import os
 import re
@@ -34,26 +37,34 @@ class Page(HTMLParser):
         self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag, attrs):
-        found = {name: value for name, value in attrs if value}
-        self.anchors |= {found[name] for name in ("id", "name") if name in found}
-        if tag == "a" and "href" in found:
-            self.links.add(found["href"])
-        if tag in FETCHED and FETCHED[tag] in found:
-            self.fetched.add(found[FETCHED[tag]])
+        given = {name: value for name, value in attrs if value}
+        self.anchors |= {given[name] for name in ("id", "name") if name in given}
+        if tag == "a" and "href" in given:
+            self.links.add(given["href"])
+        if tag in FETCHED and FETCHED[tag] in given:
+            self.fetched.add(given[FETCHED[tag]])
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The folder of the pages: the one that is built already where it is newer than all it is made of, or a new one."""
+    """The folder of the pages: an earlier one if it is newer than all sources, or a new one."""
     built = BUILD.parent / "_build" / "html"
-    sources = [path for folder in ("notebooks", "pgo_models", "solvers", "tests/benchmarks") for path in files(folder)]
+    sources = [
+        path
+        for folder in ("notebooks", "pgo_models", "solvers", "tests/benchmarks")
+        for path in files(folder)
+    ]
     newest = max(path.stat().st_mtime for path in [*sources, ROOT / "CHANGELOG.md"])
     if (built / "index.html").exists() and (built / "index.html").stat().st_mtime > newest:
         return built
     out = tmp_path_factory.mktemp("site")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     ended = subprocess.run(
-        [sys.executable, str(BUILD), "--out", str(out)], capture_output=True, text=True, env=environment, check=False
+        [sys.executable, str(BUILD), "--out", str(out)],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=False,
     )
     assert ended.returncode == 0, ended.stderr
     return out / "html"
@@ -70,9 +81,11 @@ def files(folder: str) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def pages(site):
-    found = {path: Page(path) for path in sorted(site.rglob("*.html")) if "_static" not in path.parts}
-    assert len(found) > 40
-    return found
+    by_path = {
+        path: Page(path) for path in sorted(site.rglob("*.html")) if "_static" not in path.parts
+    }
+    assert len(by_path) > 40
+    return by_path
 
 
 def test_every_link_within_the_site_leads_to_a_page_and_to_a_place_on_it(pages):
@@ -84,7 +97,9 @@ def test_every_link_within_the_site_leads_to_a_page_and_to_a_place_on_it(pages):
                 continue
             target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
             if not target.exists() or (
-                parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].anchors
+                parts.fragment
+                and target in pages
+                and unquote(parts.fragment) not in pages[target].anchors
             ):
                 lost.append(f"{path.name}: {link}")
     assert lost == []
@@ -96,9 +111,13 @@ def test_nothing_is_fetched_from_elsewhere(pages, site):
             parts = urlsplit(fetched)
             assert parts.scheme in ("", "data"), f"{path.name} fetches {fetched}"
             if parts.path and not parts.scheme:
-                assert (path.parent / unquote(parts.path)).exists(), f"{path.name}: {fetched} is not there"
+                assert (path.parent / unquote(parts.path)).exists(), (
+                    f"{path.name}: {fetched} is not there"
+                )
     for style in site.rglob("*.css"):
-        assert not re.search(r"(?:url\(|@import\s+)[\"']?(?:https?:)?//", style.read_text(encoding="utf-8")), style.name
+        assert not re.search(
+            r"(?:url\(|@import\s+)[\"']?(?:https?:)?//", style.read_text(encoding="utf-8")
+        ), style.name
 
 
 def test_the_reference_has_every_public_name_and_every_notebook_is_there(pages, site):
@@ -111,7 +130,9 @@ def test_the_reference_has_every_public_name_and_every_notebook_is_there(pages, 
         assert site / "notebooks" / f"{notebook.stem}.html" in pages
 
 
-ENTRY = re.compile(r'<dl class="py (property|method|function)">\s*<dt[^>]*id="([^"]+)">(.*?)</dt>', re.S)
+ENTRY = re.compile(
+    r'<dl class="py (property|method|function)">\s*<dt[^>]*id="([^"]+)">(.*?)</dt>', re.S
+)
 
 
 def test_every_property_and_function_of_the_reference_has_its_type_in_the_projects_words(site):
@@ -127,30 +148,43 @@ def test_every_property_and_function_of_the_reference_has_its_type_in_the_projec
 
 def opened_without_complaint(browser: Browser) -> None:
     assert browser.errors == []
-    assert [request for request in browser.requests if not request.startswith(("file:", "data:", "about:"))] == []
+    assert [
+        request
+        for request in browser.requests
+        if not request.startswith(("file:", "data:", "about:"))
+    ] == []
 
 
 def test_a_browser_searches_it_from_the_disk(browser, site):
     browser.open(site / "index.html")
     browser.wait_for("document.readyState === 'complete'")
-    browser.value("location.href = 'search.html?q=grounded'")
-    found = "[...document.querySelectorAll('#search-results li a')].find(a => a.textContent === 'What is proved')"
-    browser.wait_for(f"{found} !== undefined")
-    target = browser.value(f"{found}.href")
+    browser.value("setTimeout(() => { location.href = 'search.html?q=grounded' })")
+    results = "[...document.querySelectorAll('#search-results li a')]"
+    result = f"{results}.find(a => a.textContent === 'What is proved')"
+    browser.wait_for(f"{result} !== undefined")
+    target = browser.value(f"{result}.href")
     assert target.startswith((site / "proved.html").as_uri())
     opened_without_complaint(browser)
-    browser.value(f"{found}.click()")
+    browser.value(f"setTimeout(() => {result}.click())")
     browser.wait_for("document.querySelector('h1')?.textContent.startsWith('What is proved')")
 
 
 @pytest.mark.parametrize(
-    "page", ["proved.html", "notebooks/01_quickstart.html", "reference/pgo_models.certificates.html"]
+    "page",
+    ["proved.html", "notebooks/01_quickstart.html", "reference/pgo_models.certificates.html"],
 )
 def test_a_browser_shows_formulas_and_pictures_without_a_complaint(page, browser, site):
     browser.open(site / page)
     if "reference" not in page:
         browser.wait_for("document.querySelectorAll('mjx-container svg').length > 10")
-        assert browser.value("document.querySelectorAll('mjx-merror, [data-mjx-error]').length") == 0
-    assert browser.value("[...document.images].filter(i => !i.complete || i.naturalWidth === 0).length") == 0
+        assert (
+            browser.value("document.querySelectorAll('mjx-merror, [data-mjx-error]').length") == 0
+        )
+    assert (
+        browser.value(
+            "[...document.images].filter(i => !i.complete || i.naturalWidth === 0).length"
+        )
+        == 0
+    )
     assert browser.value("document.querySelector('h1').textContent.length") > 0
     opened_without_complaint(browser)

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, SEEDS, random_poses, varied_graph, varied_problem
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.sparse import issparse
 
+import pgo_models
 import solvers
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
@@ -32,9 +32,11 @@ from solvers.loop import Solver, iterate, run
 from solvers.result import Record, Status
 from solvers.riemannian.newton import Newton, gauss_newton
 from solvers.riemannian.staircase import Staircase
-from solvers.robust.gnc import GNC, GNCState, RobustLoss
+from solvers.robust.consistency import PCM
+from solvers.robust.gnc import GNC, GNCState
+from solvers.robust.losses import RobustLoss
 from solvers.soc.paper import PaperSOC
-from solvers.soc.penalty import BalancedPenalty
+from solvers.soc.penalty import BalancedPenalty, FixedPenalty
 from solvers.soc.soc import SOC
 
 Make = Callable[..., Any]
@@ -55,18 +57,26 @@ SOLVERS: dict[str, Make] = {
     "soc_consensus": three_robots,
     "soc_consensus_singletons": singletons,
     "soc_paper": lambda problem, **changes: PaperSOC(**changes),
-    "soc_paper_one_robot": lambda problem, **changes: PaperSOC(robots=partition(problem.graph, 1), **changes),
+    "soc_paper_one_robot": lambda problem, **changes: PaperSOC(
+        robots=partition(problem.graph, 1), **changes
+    ),
     "gauss_seidel": lambda problem, **changes: GaussSeidel(
         robots=partition(problem.graph, min(3, problem.num_poses)), **changes
     ),
-    "gauss_seidel_singletons": lambda problem, **changes: GaussSeidel(sweep=Sweep.ROBOTS, alpha=1.2, **changes),
-    "jacobi": lambda problem, **changes: GaussSeidel(sweep=Sweep.JACOBI, gauss_newton_steps=3, **changes),
+    "gauss_seidel_singletons": lambda problem, **changes: GaussSeidel(
+        sweep=Sweep.ROBOTS, alpha=1.2, **changes
+    ),
+    "jacobi": lambda problem, **changes: GaussSeidel(
+        sweep=Sweep.JACOBI, gauss_newton_steps=3, **changes
+    ),
     "newton": lambda problem, **changes: Newton(**changes),
     "gauss_newton": lambda problem, **changes: dataclasses.replace(gauss_newton(), **changes),
     "levenberg_marquardt": lambda problem, **changes: LevenbergMarquardt(**changes),
     "staircase": lambda problem, **changes: Staircase(**changes),
     "gnc": lambda problem, **changes: GNC(spread=None, **changes),
-    "gnc_geman_mcclure": lambda problem, **changes: GNC(RobustLoss.GEMAN_MCCLURE, spread=None, **changes),
+    "gnc_geman_mcclure": lambda problem, **changes: GNC(
+        RobustLoss.GEMAN_MCCLURE, spread=None, **changes
+    ),
 }
 EVERY = pytest.mark.parametrize("make", SOLVERS.values(), ids=SOLVERS)
 SIZES = st.integers(3, 10)
@@ -81,7 +91,9 @@ def snapshot(value: Any) -> Any:
     if isinstance(value, PGOProblem | enum.Enum):
         return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: snapshot(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {
+            field.name: snapshot(getattr(value, field.name)) for field in dataclasses.fields(value)
+        }
     if isinstance(value, tuple | list):
         return [snapshot(item) for item in value]
     return value
@@ -126,15 +138,21 @@ def test_a_step_leaves_its_state_alone(make: Make, seed: int, n: int, d: int) ->
 @EVERY
 @settings(max_examples=examples(10))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, backend=st.sampled_from(CholeskyBackend))
-def test_a_list_of_states_is_a_film(make: Make, seed: int, n: int, d: int, backend: CholeskyBackend) -> None:
-    # Stepping again from an old state gives the frame that followed it, whatever was done meanwhile.
+def test_a_list_of_states_is_a_film(
+    make: Make, seed: int, n: int, d: int, backend: CholeskyBackend
+) -> None:
+    # Stepping again from an old state gives the frame that followed it, whatever was done
+    # meanwhile.
     problem = PGOProblem(varied_graph(seed, n, d), backend)
     solver: Solver[Any] = make(problem)
     film = list(islice(iterate(solver, problem, random_poses(n, d, seed)), 8))
     for state, following in pairwise(film):
         again = solver.step(problem, state)
-        np.testing.assert_array_equal(solver.poses(problem, again).R, solver.poses(problem, following).R)
-        one, other = solver.measure(problem, again), solver.measure(problem, following)
+        np.testing.assert_array_equal(
+            solver.poses(problem, again).R, solver.poses(problem, following).R
+        )
+        one = solver.measure(problem, again)
+        other = solver.measure(problem, following)
         assert one == other or np.isnan(one.objective)
 
 
@@ -142,7 +160,8 @@ def test_a_list_of_states_is_a_film(make: Make, seed: int, n: int, d: int, backe
 @settings(max_examples=examples(10))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_a_start_is_left_alone_and_is_state_zero(make: Make, seed: int, n: int, d: int) -> None:
-    problem, start = varied_problem(seed, n, d), random_poses(n, d, seed)
+    problem = varied_problem(seed, n, d)
+    start = random_poses(n, d, seed)
     kept = copy.deepcopy(start)
     solver: Solver[Any] = make(problem, max_iterations=5)
     np.testing.assert_array_equal(solver.poses(problem, solver.init(problem, start)).R, start.R)
@@ -155,14 +174,20 @@ def test_a_start_is_left_alone_and_is_state_zero(make: Make, seed: int, n: int, 
 @EVERY
 @settings(max_examples=examples(10))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
-def test_every_state_stands_for_feasible_poses_whose_F_is_measured(make: Make, seed: int, n: int, d: int) -> None:
+def test_every_state_stands_for_feasible_poses_whose_F_is_measured(
+    make: Make, seed: int, n: int, d: int
+) -> None:
     problem = varied_problem(seed, n, d)
     solver: Solver[Any] = make(problem)
     for k, state in enumerate(islice(iterate(solver, problem, random_poses(n, d, seed)), 6)):
         assert state.k == k
         poses = solver.poses(problem, state)
         assert orthogonality_error(poses.R).max() <= 1e-12
-        expected = solver.init(problem, poses).objective if isinstance(solver, GNC) else problem.objective(poses)
+        expected = (
+            solver.init(problem, poses).objective
+            if isinstance(solver, GNC)
+            else problem.objective(poses)
+        )
         assert solver.measure(problem, state).objective == pytest.approx(expected, rel=1e-14)
 
 
@@ -188,11 +213,15 @@ def test_a_warm_start_at_the_solution_ends_there(make: Make) -> None:
     again = run(solver, problem, solution.poses)
     assert again.status is Status.CONVERGED
     assert again.objective == pytest.approx(solution.objective, rel=1e-6)
-    np.testing.assert_allclose(again.poses.with_gauge_at(0).R, solution.poses.with_gauge_at(0).R, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(
+        again.poses.with_gauge_at(0).R, solution.poses.with_gauge_at(0).R, rtol=0, atol=1e-4
+    )
 
 
 def tight(make: Make, problem: PGOProblem) -> Solver[Any]:
-    """A solver that leaves about 1e-7 in the rotations: residuals are steps, decrements squared ones."""
+    """A solver that leaves about 1e-7 in the rotations: residuals are steps, decrements squared
+    ones.
+    """
     solver = make(problem)
     tolerance = 1e-13 if isinstance(solver, Newton | Staircase | GNC) else 1e-8
     if isinstance(solver, LevenbergMarquardt):
@@ -237,9 +266,15 @@ def assert_best(result: Any) -> None:
 
 @EVERY
 @pytest.mark.parametrize("limit", [0, 1, 3])
-def test_max_iterations_is_reported(make: Make, limit: int, problem: PGOProblem, start: Poses) -> None:
+def test_max_iterations_is_reported(
+    make: Make, limit: int, problem: PGOProblem, start: Poses
+) -> None:
     result = run(make(problem, max_iterations=limit), problem, start)
-    assert (result.status, result.iterations, len(result.history)) == (Status.MAX_ITERATIONS, limit, limit + 1)
+    assert (result.status, result.iterations, len(result.history)) == (
+        Status.MAX_ITERATIONS,
+        limit,
+        limit + 1,
+    )
     assert_best(result)
 
 
@@ -294,7 +329,12 @@ def test_settings_are_frozen_and_checked(make: Make, problem: PGOProblem) -> Non
     solver = make(problem)
     with pytest.raises(dataclasses.FrozenInstanceError):
         solver.tolerance = 1.0
-    for changes in ({"max_iterations": -1}, {"tolerance": 0.0}, {"tolerance": -1.0}, {"tolerance": float("nan")}):
+    for changes in (
+        {"max_iterations": -1},
+        {"tolerance": 0.0},
+        {"tolerance": -1.0},
+        {"tolerance": float("nan")},
+    ):
         with pytest.raises(SettingError):
             make(problem, **changes)
     assert dataclasses.replace(solver, max_iterations=3).max_iterations == 3
@@ -308,16 +348,64 @@ def test_a_start_of_another_size_is_refused(make: Make, poses: Poses, problem: P
 
 
 def fields_of_settings() -> list[Any]:
-    """Fields of public settings that can be made without any, but for what takes protocols and arrays."""
-    kinds = [getattr(solvers, name) for name in solvers.__all__]
-    kinds = [kind for kind in kinds if dataclasses.is_dataclass(kind) and hasattr(kind, "__post_init__")]
+    """Fields of public settings that have defaults, without those of protocols and arrays."""
+    records = {"Traffic"}  # not settings, although they check what they are made of
+    kinds = [getattr(solvers, name) for name in solvers.__all__ if name not in records]
+    kinds = [
+        kind for kind in kinds if dataclasses.is_dataclass(kind) and hasattr(kind, "__post_init__")
+    ]
     every = [(kind, field) for kind in kinds for field in dataclasses.fields(kind)]
-    open_ones = ("r_step", "known", "idle", "soc", "changer")
-    return [pytest.param(k, f.name, id=f"{k.__name__}-{f.name}") for k, f in every if f.name not in open_ones]
+    open_ones = ("r_step", "known", "idle", "soc", "changer", "only")
+    return [
+        pytest.param(k, f.name, id=f"{k.__name__}-{f.name}")
+        for k, f in every
+        if f.name not in open_ones
+    ]
 
 
 @pytest.mark.parametrize(("kind", "field"), fields_of_settings())
 def test_a_setting_of_another_type_is_named_where_it_is_made(kind: Any, field: str) -> None:
-    others: dict[str, Any] = {Checkpoint: {"path": "there.json"}, ExtendedSOC: {"changer": None}}.get(kind, {})
+    others: dict[str, Any] = {
+        Checkpoint: {"path": "there.json"},
+        ExtendedSOC: {"changer": None},
+    }.get(kind, {})
     with pytest.raises(SettingError, match=f"^{field} must be .*, got <object"):
         kind(**{**others, field: object()})
+
+
+def default_settings() -> list[Any]:
+    """Public settings that can be made without arguments."""
+    kinds = [getattr(door, name) for door in (pgo_models, solvers) for name in door.__all__]
+    kinds = [kind for kind in kinds if isinstance(kind, type) and dataclasses.is_dataclass(kind)]
+    # A change of the model holds expressions of cvxpy, whose equality is a constraint.
+    kinds = [kind for kind in kinds if kind is not pgo_models.ModelChange]
+    return [kind for kind in kinds if all(map(has_default, dataclasses.fields(kind)))]
+
+
+def has_default(field: dataclasses.Field[Any]) -> bool:
+    has_value = field.default is not dataclasses.MISSING
+    return has_value or field.default_factory is not dataclasses.MISSING
+
+
+@pytest.mark.parametrize("kind", default_settings())
+def test_settings_compare_by_value(kind: Any) -> None:
+    assert kind() == kind()
+    assert hash(kind()) == hash(kind())
+    assert kind() != object()
+    assert copy.deepcopy(kind()) == kind()
+
+
+@pytest.mark.parametrize("kind", [GNC, PCM])
+def test_settings_with_an_array_compare_by_value(kind: Any) -> None:
+    known = np.array([True, False, True])
+    settings_ = kind(known=known)
+    assert settings_ == kind(known=known.copy())
+    assert hash(settings_) == hash(kind(known=known.copy()))
+    for other in (kind(), kind(known=~known), kind(known=known[:2])):
+        assert settings_ != other
+    assert settings_ != dataclasses.replace(settings_, quantile=0.5)
+
+
+def test_settings_of_two_classes_differ() -> None:
+    assert GNC() != PCM()
+    assert FixedPenalty(2.0) == FixedPenalty(2.0) != FixedPenalty(3.0)

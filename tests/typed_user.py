@@ -1,4 +1,6 @@
-"""What a user of the packages may write, checked by mypy --strict with the packages, and run by a test."""
+"""What a user of the packages may write, checked by mypy --strict with the packages, and run by a
+test.
+"""
 
 from pathlib import Path
 from typing import assert_type

@@ -5,24 +5,61 @@ import numpy as np
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray, random_rotations
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import NoiseModel, observe
 from solvers.robust.consistency import odometry
 
 
 def spoiled(graph: PoseGraph, share: float, kind: str, seed: int) -> tuple[PoseGraph, BoolArray]:
-    """The graph with wrong loop closures, `share` of all, and which edges they are.
+    """The graph with wrong loop closures, `share` of all, and which edges these are.
 
-    random: any two poses and any motion; aliased: runs of 5 that agree with each other.
+    Of the kind "random" they join any two poses by any motion; those of the kind "aliased" are runs
+    of five that agree with each other.
     """
-    rng, loops = np.random.default_rng(seed), np.flatnonzero(~odometry(graph))
-    count, run = round(share / (1 - share) * len(loops)), 1 if kind == "random" else 5
-    pairs, n = [], graph.num_poses
+    rng = np.random.default_rng(seed)
+    closures = np.flatnonzero(~odometry(graph))
+    count = round(share / (1 - share) * len(closures))
+    run = 1 if kind == "random" else 5
+    pairs = []
+    n = graph.num_poses
     while len(pairs) < count:
         a, b = rng.integers(0, n - run, 2)
         if abs(a - b) > 10 + run:
-            pairs += [(a + k, b + k, len(pairs) // run) for k in range(run)]
+            group = len(pairs) // run
+            pairs += [(a + k, b + k, group) for k in range(run)]
     i, j, group = np.array(pairs[:count]).T
     reach = 3.0 * np.abs(graph.t_ij).max()
-    R, t = random_rotations(count, graph.d, rng), rng.uniform(-reach, reach, (count, graph.d))
-    like = rng.choice(loops, count)
-    more = graph.with_edges(i, j, Poses(R[group], t[group]), graph.kappa[like], graph.tau[like])
-    return more, np.arange(more.num_edges) >= graph.num_edges
+    R = random_rotations(count, graph.d, rng)
+    t = rng.uniform(-reach, reach, (count, graph.d))
+    motions = Poses(R[group], t[group])
+    like = rng.choice(closures, count)
+    kappa = graph.kappa[like]
+    tau = graph.tau[like]
+    spoiled_graph = graph.with_edges(i, j, motions, kappa, tau)
+    is_wrong = np.arange(spoiled_graph.num_edges) >= graph.num_edges
+    return spoiled_graph, is_wrong
+
+
+def noisy_sphere(num_poses: int, per_turn: int, noise: NoiseModel, seed: int) -> PoseGraph:
+    """Poses a metre apart along a spiral on a sphere, each joined to three of the turn before.
+
+    Errors are as large as the matrices claim. Where they are large, odometry is of no use as a
+    start.
+    """
+    rng = np.random.default_rng(seed)
+    num_turns = num_poses / per_turn
+    share = (np.arange(num_poses) + 0.5) / num_poses
+    polar = np.pi * share
+    azimuth = 2.0 * np.pi * num_turns * share
+    radius = per_turn / (2.0 * np.pi)
+    ring = np.sin(polar)
+    x = ring * np.cos(azimuth)
+    y = ring * np.sin(azimuth)
+    z = np.cos(polar)
+    t = radius * np.stack([x, y, z], axis=1)
+    pairs = []
+    for step in (1, per_turn - 1, per_turn, per_turn + 1):
+        later = np.arange(step, num_poses)
+        pairs.append(np.column_stack([later - step, later]))
+    i, j = np.concatenate(pairs).T
+    truth = Poses(random_rotations(num_poses, 3, rng), t)
+    return observe("noisy_sphere", truth, i, j, noise, noise.kappa(3), noise.tau, rng)

@@ -1,10 +1,11 @@
-"""Assemble the documentation's pages, notebooks and reference, and build them as HTML that opens offline.
+"""Assemble pages, notebooks and reference, and build them as HTML that opens offline.
 
-    python notebooks/site/build.py            # notebooks/site/_build/html/index.html; a warning is an error
-    python notebooks/site/build.py --links    # also asks every address outside whether it answers
+    python notebooks/site/build.py            # writes notebooks/site/_build/html/index.html
+    python notebooks/site/build.py --links    # also checks that every external address answers
 
-Needs the extra `docs`. Pages are the .md files beside this; the notebooks are those of the folder above, with the
-outputs they were committed with; benchmarks and changelog are those of the repository; the reference is made from the
+The command needs the extra `docs`, and treats a warning as an error. The pages are the .md files
+beside this file. The notebooks are those of the folder above, with their committed outputs.
+Benchmarks and changelog are the files of the repository, and the reference is made from the
 docstrings.
 """
 
@@ -20,23 +21,27 @@ SITE = Path(__file__).parent
 ROOT = SITE.parent.parent
 sys.path.insert(0, str(ROOT))
 
-import pgo_models  # noqa: E402 - found above
+import pgo_models  # noqa: E402 - on the path that is set above
 import solvers  # noqa: E402
 from pgo_models.errors import MissingExtraError, extra_module  # noqa: E402
 
 PACKAGES = {"pgo_models": pgo_models, "solvers": solvers}
-# What a page of the repository becomes here; links between them follow.
+# Pages of the repository, and their names on the site; links between them are adapted.
 PAGES = {
     "tests/benchmarks/README.md": "benchmarks.md",
     "CHANGELOG.md": "changelog.md",
     "data/README.md": "data.md",
 }
-# Where links of those pages go that mean a file of the repository that is no page here.
-INSTEAD = {"README.md": "index.md"}
+# Files of the repository that are no page of the site, and the page that a link to them opens.
+INSTEAD = {"README.md": "index.md", "notebooks/site/proved.md": "proved.md"}
 
 
 def relinked(text: str, page: str) -> str:
-    """A page of the repository with its links to other pages as they are here, those to other files as plain words."""
+    """Return the text of a page of the repository with its links adapted to the site.
+
+    A link to another page leads to its name on the site. A link to another file becomes its label,
+    followed by the path as code.
+    """
 
     def link(match: re.Match[str]) -> str:
         label, target = match.groups()
@@ -53,75 +58,112 @@ def relinked(text: str, page: str) -> str:
 
 
 def first_sentence(text: str) -> str:
-    """Of a docstring, on one line."""
+    """Return the first sentence of a docstring, on one line and without its period."""
     line = " ".join(text.strip().split("\n\n")[0].split())
     return re.split(r"(?<=[^.])\.(?:\s|$)", line)[0]
 
 
 def rooms(package: str) -> list[Path]:
-    """Folders of a package that hold modules, `distributed/robots` after `distributed`."""
-    doors = sorted((ROOT / package).glob("*/**/__init__.py"))
-    return [door.parent for door in doors if door.parent.name != "command"]
+    """Return the folders of a package that hold modules, `distributed/robots` after its parent."""
+    packages = sorted((ROOT / package).glob("*/**/__init__.py"))
+    return [path.parent for path in packages if path.parent.name != "command"]
 
 
 def docstring_of(path: Path) -> str:
-    """Of a file, without importing it."""
+    """Return the docstring of a file, without importing the file."""
     return ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
 
 
 def reference_of_modules(paths: list[Path]) -> list[str]:
-    """Sections of a page, one for every module."""
+    """Return the lines of a reference page: one section per module."""
     lines = []
     for path in paths:
         module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-        lines += [path.stem, "-" * len(path.stem), "", f".. automodule:: {module}", "   :members:", ""]
+        lines += [
+            path.stem,
+            "-" * len(path.stem),
+            "",
+            f".. automodule:: {module}",
+            "   :members:",
+            "",
+        ]
     return lines
 
 
-def write_reference(folder: Path) -> None:
-    """A page for every room, and one for each package with its public names."""
+def modules_of(folder: Path) -> list[Path]:
+    """Return the modules of a folder, without its `__init__.py`."""
+    return [path for path in sorted(folder.glob("*.py")) if path.stem != "__init__"]
+
+
+def underlined(title: str) -> list[str]:
+    """Return a title in reStructuredText, and an empty line."""
+    return [title, "=" * len(title), ""]
+
+
+def table_of_names(package: str) -> list[str]:
+    """Return a Markdown table of the public names of a package, with the first sentence of each."""
     import docstrings  # beside this file; needs the packages
 
+    module = PACKAGES[package]
+    lines = ["| name | what it is |", "|---|---|"]
+    for name in module.__all__:
+        target = docstrings.NAMES[f"{package}.{name}"]
+        sentence = table_text(first_sentence(getattr(module, name).__doc__))
+        lines.append(f"| {{py:obj}}`{name} <{target}>` | {sentence} |")
+    return lines
+
+
+def write_room(folder: Path, room: Path) -> str:
+    """Write the page of one room, and return the name of the room."""
+    import docstrings
+
+    name = ".".join(room.relative_to(ROOT).parts)
+    summary = docstrings.escaped(docstring_of(room / "__init__.py"))
+    lines = [*underlined(name), summary, "", *reference_of_modules(modules_of(room))]
+    (folder / f"{name}.rst").write_text("\n".join(lines), encoding="utf-8")
+    return name
+
+
+def write_reference(folder: Path) -> None:
+    """Write a page for every room, one for the modules of each package, and their index."""
     folder.mkdir()
-    index = ["# Reference", "", "Room by room: a file imports only from its own room and from earlier ones.", ""]
+    index = [
+        "# Reference",
+        "",
+        "The reference is ordered by rooms. A file imports only from its own room and from earlier",
+        "rooms.",
+        "",
+    ]
     for package, module in PACKAGES.items():
-        index += [f"## {package}", "", first_sentence(module.__doc__) + ".", "", "| name | what it is |", "|---|---|"]
-        for name in module.__all__:
-            target = docstrings.NAMES[f"{package}.{name}"]
-            sentence = table_text(first_sentence(getattr(module, name).__doc__))
-            index.append(f"| {{py:obj}}`{name} <{target}>` | {sentence} |")
-        names = []
-        for room in rooms(package):
-            name = ".".join(room.relative_to(ROOT).parts)
-            sentence = docstring_of(room / "__init__.py")
-            paths = [path for path in sorted(room.glob("*.py")) if path.stem != "__init__"]
-            lines = [name, "=" * len(name), "", docstrings.escaped(sentence), "", *reference_of_modules(paths)]
-            (folder / f"{name}.rst").write_text("\n".join(lines), encoding="utf-8")
-            names.append(name)
-        door = [path for path in sorted((ROOT / package).glob("*.py")) if path.stem != "__init__"]
-        lines = [package, "=" * len(package), "", "What lies at the door of the package.", ""]
-        lines += reference_of_modules(door)
+        index += [f"## {package}", "", first_sentence(module.__doc__) + ".", ""]
+        index += table_of_names(package)
+        names = [write_room(folder, room) for room in rooms(package)]
+        lines = [*underlined(package), "Modules of the package that are in no room.", ""]
+        lines += reference_of_modules(modules_of(ROOT / package))
         (folder / f"{package}.rst").write_text("\n".join(lines), encoding="utf-8")
         index += ["", "```{toctree}", ":maxdepth: 1", "", package, *names, "```", ""]
     (folder / "index.md").write_text("\n".join(index), encoding="utf-8")
 
 
 def table_text(text: str) -> str:
-    """Plain words in a cell of a Markdown table."""
+    """Return text in which nothing outside code is markup, for a cell of a Markdown table."""
     pieces = re.split(r"(`[^`]+`)", text)
-    return "".join(piece if k % 2 else re.sub(r"([|*_])", r"\\\1", piece) for k, piece in enumerate(pieces))
+    return "".join(
+        piece if k % 2 else re.sub(r"([|*_])", r"\\\1", piece) for k, piece in enumerate(pieces)
+    )
 
 
 def assemble(source: Path) -> None:
-    """Write all pages to a folder."""
-    shutil.copytree(SITE, source, ignore=shutil.ignore_patterns("_build", "*.py", "static", "__pycache__"))
+    """Write all pages, notebooks and pictures to a folder."""
+    shutil.copytree(
+        SITE, source, ignore=shutil.ignore_patterns("_build", "*.py", "static", "__pycache__")
+    )
     (source / "notebooks").mkdir()
     notebooks = sorted((ROOT / "notebooks").glob("[0-9][0-9]_*.ipynb"))
     for notebook in notebooks:
         shutil.copy(notebook, source / "notebooks")
-    for extra in ("pictures", "tables.json"):
-        found = ROOT / "notebooks" / extra
-        (shutil.copytree if found.is_dir() else shutil.copy)(found, source / "notebooks" / extra)
+    shutil.copytree(ROOT / "notebooks" / "pictures", source / "notebooks" / "pictures")
+    shutil.copy(ROOT / "notebooks" / "tables.json", source / "notebooks")
     for page, name in PAGES.items():
         text = (ROOT / page).read_text(encoding="utf-8")
         (source / name).write_text(relinked(text, page), encoding="utf-8")
@@ -129,10 +171,14 @@ def assemble(source: Path) -> None:
 
 
 def main() -> int:
-    """Assemble and build; the exit code of Sphinx."""
+    """Assemble and build the site, and return the exit code of Sphinx."""
     parser = argparse.ArgumentParser(description="Build the documentation.")
-    parser.add_argument("--links", action="store_true", help="also ask addresses outside whether they answer")
-    parser.add_argument("--out", type=Path, default=SITE / "_build", help="folder to build in; it is emptied first")
+    parser.add_argument(
+        "--links", action="store_true", help="also check that external addresses answer"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=SITE / "_build", help="folder to build in; it is emptied first"
+    )
     arguments = parser.parse_args()
     sys.path.insert(0, str(SITE))
     try:
@@ -143,7 +189,17 @@ def main() -> int:
     for part in ("source", "html", "doctrees"):
         shutil.rmtree(out / part, ignore_errors=True)
     assemble(out / "source")
-    options = ["-c", str(SITE), "-d", str(out / "doctrees"), "-W", "--keep-going", "-q", "-j", "auto"]
+    options = [
+        "-c",
+        str(SITE),
+        "-d",
+        str(out / "doctrees"),
+        "-W",
+        "--keep-going",
+        "-q",
+        "-j",
+        "auto",
+    ]
     options.append(str(out / "source"))
     code = build_main(["-b", "html", *options, str(out / "html")])
     if code == 0 and arguments.links:

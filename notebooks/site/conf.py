@@ -1,4 +1,7 @@
-"""Settings of Sphinx for the site that `build.py` assembles: nothing is run, and nothing fetched from elsewhere."""
+"""Settings of Sphinx for the site that `build.py` assembles.
+
+Nothing is run, and no page fetches anything from another server.
+"""
 
 import sys
 from importlib.util import find_spec
@@ -12,9 +15,15 @@ import docstrings  # noqa: E402 - beside this file
 project = "pgo-splitting"
 author = "The pgo-splitting authors"
 project_copyright = author
-extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "sphinx.ext.mathjax", "myst_nb"]
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx.ext.mathjax",
+    "myst_nb",
+]
 
-# Pages and notebooks. The notebooks are committed with their outputs; nothing is run here.
+# Pages and notebooks. The notebooks are committed with their outputs, so they are not run here.
 nb_execution_mode = "off"
 nb_render_markdown_format = "myst"
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "attrs_inline"]
@@ -35,14 +44,15 @@ highlight_language = "none"  # formulas and tables in docstrings; examples say w
 python_maximum_signature_line_length = 100
 toc_object_entries_show_parents = "hide"
 
-# Appearance. All scripts, fonts and styles lie beside the pages.
+# Appearance. All scripts, fonts and styles are files beside the pages.
 html_theme = "pydata_sphinx_theme"
 html_title = project
 html_static_path = [str(SITE / "static")]
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
-html_show_search_summary = False  # for which a browser would have to read other files, which it does not from the disk
+# Summaries need other files, which a browser does not read when pages are opened from the disk.
+html_show_search_summary = False
 html_context = {"default_mode": "auto"}
 html_theme_options = {
     "navbar_end": ["theme-switcher"],
@@ -58,7 +68,10 @@ html_sidebars = {"benchmarks": [], "changelog": [], "proved": []}
 
 
 def setup(app: object) -> None:
-    """Take MathJax from the package of the extra `docs`, as one file without fonts, and docstrings as plain text."""
+    """Take MathJax from a package of the extra `docs`, and convert the docstrings.
+
+    MathJax is one file without fonts.
+    """
     (folder,) = find_spec("sphinx-mathjax-offline").submodule_search_locations
     app.config.html_static_path.append(f"{folder}/static/mathjax/tex-svg.js")
     app.config.mathjax_path = "tex-svg.js"

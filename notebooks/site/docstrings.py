@@ -1,8 +1,10 @@
-"""Docstrings as reStructuredText: prose is literal but for `code` and **bold**, indented lines are formulas.
+"""Docstrings as reStructuredText, for the reference of the site.
 
-The docstrings are written to be read as they stand. What reStructuredText would take for markup (|x|, R_i, a * b) is
-escaped; a block that is indented against the prose around it becomes a literal block; examples stay examples. Names in
-backticks that are public become links. The words beside the fields of a dataclass become its attributes.
+The docstrings are written as plain text, with `code` and **bold** as the only markup. Everything
+else that reStructuredText would take for markup (|x|, R_i, a * b) is escaped. A block that is
+indented relative to the prose around it is a formula and becomes a literal block. Examples stay
+examples. A public name in backticks becomes a link. The comments beside the fields of a dataclass
+become its attributes.
 """
 
 import dataclasses
@@ -17,32 +19,50 @@ from sphinx.addnodes import desc_annotation, pending_xref
 import pgo_models
 import solvers
 
-SECTIONS = ("Parameters", "Returns", "Yields", "Raises", "Examples", "Attributes", "Notes", "References", "See Also")
+SECTIONS = (
+    "Parameters",
+    "Returns",
+    "Yields",
+    "Raises",
+    "Examples",
+    "Attributes",
+    "Notes",
+    "References",
+    "See Also",
+)
 LIST_ITEM = re.compile(r"(?:[-*+]|\d+\.|\([a-z]\)) ")
 ARRAY = re.compile(
     r"~?(?:numpy\.)?ndarray\[~?tuple\[~?(?:typing\.)?Any, \.\.\.\], "
-    r"~?(?:numpy\.)?dtype\[~?(?:numpy\.|typing\.)?(\w+)\]\]"
+    r"~?(?:numpy\.)?dtype\[~?(?:numpy\.|typing\.)?(\w+)(?:\[~?(?:typing\.)?Any\])?\]\]"
 )
-ARRAYS = {"float64": "Array", "int64": "IntArray", "bool": "BoolArray", "bool_": "BoolArray", "Any": "ndarray"}
+ARRAYS = {
+    "float64": "Array",
+    "integer": "IntArray",
+    "int64": "IntArray",
+    "bool": "BoolArray",
+    "bool_": "BoolArray",
+    "Any": "ndarray",
+}
 FIELD = re.compile(r"^    (\w+): ([^=#]+?)(?: = .*?)?  # (.+)$")
 
 
 def public_names() -> dict[str, str]:
-    """Where each public name is defined, by the ways of writing it."""
-    found = {}
+    """Return the full name of each public name, by the ways in which docstrings write it."""
+    full_names = {}
     for package, short in ((pgo_models, "pgo"), (solvers, "solvers")):
         for name in package.__all__:
             thing = getattr(package, name)
-            where = f"{thing.__module__}.{thing.__qualname__}"
-            found |= {name: where, f"{short}.{name}": where, f"{package.__name__}.{name}": where}
-    return found
+            full = f"{thing.__module__}.{thing.__qualname__}"
+            spellings = (name, f"{short}.{name}", f"{package.__name__}.{name}")
+            full_names |= dict.fromkeys(spellings, full)
+    return full_names
 
 
 NAMES = public_names()
 
 
 def as_code(text: str) -> str:
-    """A link to a public name, else a literal."""
+    """Return a link to a public name, or else a literal."""
     name = text.removesuffix("()").removesuffix("(..)")
     if name in NAMES:
         return f":py:obj:`{text} <{NAMES[name]}>`"
@@ -50,45 +70,51 @@ def as_code(text: str) -> str:
 
 
 def escaped(line: str) -> str:
-    """One line of prose."""
+    """Return one line of prose in which only code, bold and links are markup."""
     pieces = re.split(r"(``[^`]+``|`[^`]+`|\*\*[^*\s](?:[^*]*[^*\s])?\*\*)", line)
     for k, piece in enumerate(pieces):
         if k % 2 == 0:
-            pieces[k] = re.sub(r"([*|_\\`]|(?<=\bfile):)", r"\\\1", piece)  # file:line is no address
+            # "file:" would be taken for the beginning of an address.
+            pieces[k] = re.sub(r"([*|_\\`]|(?<=\bfile):)", r"\\\1", piece, flags=re.I)
         elif piece.startswith("`") and not piece.startswith("``"):
             pieces[k] = as_code(piece.strip("`"))
-            before, after = pieces[k - 1], re.sub(r"^\\?", "", pieces[k + 1])
+            before = pieces[k - 1]
+            after = re.sub(r"^\\?", "", pieces[k + 1])
             pieces[k] = ("" if re.search(r"(^|[\s('\"\[{</:-])$", before) else "\\ ") + pieces[k]
             pieces[k] += "" if re.match(r"[\s'\")\]}>/:.,;!?-]|$", after) else "\\ "
     return "".join(pieces)
 
 
 def parameter(line: str) -> str:
-    """A line of a section: "name : type" with a literal type, or prose."""
+    """Return a line of a section: "name : type" with the type as a literal, or prose."""
     if match := re.match(r"(\w+(?:, \w+)*) : (.+)$", line):
         return f"{match[1]} : ``{match[2].replace('`', '')}``"
     return escaped(line)
 
 
 def attributes(block: list[str]) -> list[str]:
-    """Lines of the section Attributes, as a list: names and type, and what they are."""
+    """Return the lines of the section Attributes as a list of names, types and meanings."""
     out = []
     for line in block:
         if line.startswith(" "):
             out.append("  " + escaped(line.strip()))
         else:
             names, _, kind = line.partition(" : ")
-            out += ["", f"* **{names.strip().rstrip(',')}**" + (f" (``{kind.replace('`', '')}``)" if kind else "")]
+            out += [
+                "",
+                f"* **{names.strip().rstrip(',')}**"
+                + (f" (``{kind.replace('`', '')}``)" if kind else ""),
+            ]
     return out
 
 
 def indentation(line: str) -> int:
-    """Blanks at its beginning."""
+    """Return the number of blanks at the beginning of a line."""
     return len(line) - len(line.lstrip())
 
 
 def blocks(lines: list[str]) -> Iterator[list[str]]:
-    """Lines between empty ones."""
+    """Yield the blocks of lines that empty lines separate."""
     block: list[str] = []
     for line in [*lines, ""]:
         if line.strip():
@@ -99,7 +125,7 @@ def blocks(lines: list[str]) -> Iterator[list[str]]:
 
 
 def split_formulas(block: list[str], base: int) -> Iterator[list[str]]:
-    """A block of prose with indented lines in it, taken apart; what belongs to a list item stays with it."""
+    """Split a block of prose at its indented lines; the lines of a list item stay together."""
     if LIST_ITEM.match(block[0].strip()):
         yield block
         return
@@ -113,7 +139,7 @@ def split_formulas(block: list[str], base: int) -> Iterator[list[str]]:
 
 
 def as_rest(lines: list[str]) -> list[str]:
-    """A numpydoc docstring, ready for napoleon."""
+    """Return a numpydoc docstring in the form that napoleon reads."""
     out: list[str] = []
     in_section = is_attributes = False
     for block in blocks(lines):
@@ -140,7 +166,7 @@ def as_rest(lines: list[str]) -> list[str]:
 
 
 def items_apart(block: list[str]) -> list[str]:
-    """Prose; where it is a list, with its items apart and what follows them indented as the first line."""
+    """Return prose; in a list, separate the items and indent their continuation lines."""
     if not LIST_ITEM.match(block[0].strip()):
         return [escaped(line) for line in block]
     out: list[str] = []
@@ -155,67 +181,84 @@ def items_apart(block: list[str]) -> list[str]:
 
 
 def described_fields(thing: type) -> list[str]:
-    """The words beside the fields of a dataclass, as a section of its docstring."""
+    """Return the comments beside the fields of a dataclass as a section of its docstring."""
     try:
         source = inspect.getsource(thing).splitlines()
     except OSError:
         return []
-    found = [match.groups() for line in source if (match := FIELD.match(line))]
     names = {field.name for field in dataclasses.fields(thing)}
     lines = []
-    for name, kind, words in found:
-        if name in names:
-            lines += [f"{name} : {kind.strip()}", f"    {words}"]
+    for line in source:
+        match = FIELD.match(line)
+        if match and match[1] in names:
+            name, kind, meaning = match.groups()
+            lines += [f"{name} : {kind.strip()}", f"    {meaning}"]
     return ["Attributes", "----------", *lines, ""] if lines else []
 
 
-def process(app: object, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
-    """Hook of autodoc, before napoleon's."""
+def process(
+    app: object, what: str, name: str, thing: object, options: object, lines: list[str]
+) -> None:
+    """Convert a docstring in place; autodoc calls this before napoleon."""
     if what in ("attribute", "data") and not inspect.getdoc(thing):
         return
-    found = as_rest(lines)
+    converted = as_rest(lines)
     is_described = any(line.strip() in ("Parameters", "Attributes") for line in lines)
     if what == "class" and dataclasses.is_dataclass(thing) and not is_described:
-        fields = as_rest(described_fields(thing))
-        where = next((k for k, line in enumerate(found) if line.strip() in SECTIONS), len(found))
-        found = [*found[:where], "", *fields, *found[where:]]
+        converted = with_fields(converted, thing)
     if what == "class" and issubclass(thing, enum.Enum):
-        found += ["", *(f"* **{member.name}**: {escaped(str(member.value))}" for member in thing), ""]
-    lines[:] = found
+        members = [f"* **{member.name}**: {escaped(str(member.value))}" for member in thing]
+        converted += ["", *members, ""]
+    lines[:] = converted
+
+
+def with_fields(lines: list[str], thing: type) -> list[str]:
+    """Insert the fields of a dataclass before the first section of its docstring."""
+    sections = [k for k, line in enumerate(lines) if line.strip() in SECTIONS]
+    first = sections[0] if sections else len(lines)
+    return [*lines[:first], "", *as_rest(described_fields(thing)), *lines[first:]]
 
 
 def link_types(app: object, tree: nodes.document) -> None:
-    """Types in signatures: public names become links, all others words, for which Sphinx would search all classes."""
-    for found in list(tree.findall(pending_xref)):
-        if found.get("refdomain") == "py" and found.get("refspecific"):
-            target = NAMES.get(found["reftarget"].removeprefix("~").rpartition(".")[2])
-            if target is None:
-                found.replace_self(found.children)
-            else:
-                found["reftarget"], found["refspecific"] = target, False
+    """Make public names in signatures links, and all other types plain words.
+
+    Sphinx would search all classes for the other types.
+    """
+    for reference in list(tree.findall(pending_xref)):
+        if reference.get("refdomain") != "py" or not reference.get("refspecific"):
+            continue
+        target = NAMES.get(reference["reftarget"].removeprefix("~").rpartition(".")[2])
+        if target is None:
+            reference.replace_self(reference.children)
+        else:
+            reference["reftarget"] = target
+            reference["refspecific"] = False
 
 
 def short_types(app: object, tree: nodes.document) -> None:
-    """Types of properties, which no hook on signatures sees, with the project's names for arrays."""
-    for found in tree.findall(desc_annotation):
-        text = found.astext()
-        if (short := with_names(text)) != text:
-            found.children = []
-            found += nodes.Text(short)
+    """Use the project's names for arrays in the types of properties, which have no signature."""
+    for annotation in tree.findall(desc_annotation):
+        text = annotation.astext()
+        short = with_names(text)
+        if short != text:
+            annotation.children = []
+            annotation += nodes.Text(short)
 
 
 def with_names(text: str) -> str:
-    """A type with the project's names for arrays in place of what they stand for."""
+    """Return a type with the project's names for arrays instead of their definitions."""
     return ARRAY.sub(lambda match: ARRAYS.get(match[1], match[0]), text)
 
 
-def with_array_names(app: object, what: str, name: str, thing: object, options: object, *texts: str | None) -> tuple:
-    """Signature and what is returned, with the project's names for arrays in place of what they stand for."""
+def with_array_names(
+    app: object, what: str, name: str, thing: object, options: object, *texts: str | None
+) -> tuple:
+    """Return a signature and its return type with the project's names for arrays."""
     return tuple(text and with_names(text) for text in texts)
 
 
 def connect(app: object) -> None:
-    """Ask Sphinx to call these on every docstring, before napoleon reads it, on every signature and on every page."""
+    """Register the hooks for docstrings, before napoleon reads them, signatures and pages."""
     app.connect("autodoc-process-docstring", process, priority=400)
     app.connect("autodoc-process-signature", with_array_names)
     app.connect("doctree-read", link_types)

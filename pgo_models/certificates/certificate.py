@@ -1,7 +1,10 @@
-"""Certificate: poses held against a lower bound on the global optimum that holds in exact arithmetic.
+"""Certificate: poses held against a lower bound on the global optimum.
 
-The bound and its proof are in `pgo_models.certificates.lower_bound`; here it is decided where to find it, and what it
-says of poses. gap = (F - lower_bound) / F: neither the units nor the number of measurements change it.
+The bound holds in exact arithmetic.
+
+The bound and its proof are in `pgo_models.certificates.lower_bound`; here it is decided where to
+find it, and what it says of poses. gap = (F - lower_bound) / F: neither the units nor the number of
+measurements change it.
 """
 
 import enum
@@ -10,10 +13,16 @@ from dataclasses import dataclass, replace
 
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, best_bound
-from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, polish, relative_decrement
-from pgo_models.certificates.rounding_errors import ObjectiveRounding, objective_rounding, rounding_level
-from pgo_models.certificates.tangent import softened_bound
+from pgo_models.certificates.newton_polish import polish, relative_decrement
+from pgo_models.certificates.newton_step import STATIONARY_DECREMENT
+from pgo_models.certificates.rounding_errors import (
+    ObjectiveRounding,
+    fits_to_rounding,
+    objective_rounding,
+)
+from pgo_models.certificates.tangent import bound_by_shrinking
 from pgo_models.errors import ProofError, SettingError
+from pgo_models.figures import gap_above, proven_digits, rounded_down, rounded_up, sum_above
 from pgo_models.geometry.arrays import ReadOnly, real_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -31,7 +40,7 @@ class Verdict(enum.Enum):
     """What the certificate says of the poses."""
 
     CERTIFIED = "globally optimal within the gap asked for"
-    EXACT = "globally optimal, exact to rounding: F cannot be told from zero"
+    EXACT = "globally optimal, exact to rounding: every edge fits to its last bits"
     NOT_CERTIFIED = "not shown to be optimal: the bound holds, but the gap is wider than asked for"
     TRIVIAL = "not shown to be optimal: no bound better than zero was found"
 
@@ -41,23 +50,60 @@ class BoundSource(enum.Enum):
 
     GIVEN = "at the poses given"
     POLISHED = "after polishing the poses given, which were not stationary"
-    CHORDAL = "at the point that the chordal start polishes to, better than the one beside the poses given"
-    RELAXATION = "where the staircase solved the semidefinite relaxation, whose optimum is below F if it is not tight"
-    SOFTENED = "where smaller information matrices, whose cost is below chi2 at all poses, have their minimum"
+    CHORDAL = (
+        "at the point that the chordal start polishes to, "
+        "better than the one beside the poses given"
+    )
+    RELAXATION = (
+        "where the staircase solved the semidefinite relaxation, "
+        "whose optimum is below F if it is not tight"
+    )
+    SOFTENED = (
+        "where smaller information matrices, whose cost is below chi2 at all poses, "
+        "have their minimum"
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Certificate(ReadOnly):
     """A proven lower bound on the global optimum beside the cost of given poses.
 
-    `objective` is F of the given poses, or chi2, as `weighting` says; `bound` is proven: F(R, t) >= bound.value for all
-    poses, in exact arithmetic; `gap` is (objective - lower_bound) / objective, 0 where F is at its `rounding_level`,
-    below which it cannot be told from zero (`objective_rounding`). `stationarity` is half the squared Newton decrement
-    of the given poses, over F: about the relative decrease of F down to the stationary point beside them.
+    `lower_bound` is proven: F(R, t) >= lower_bound for all poses, in exact arithmetic. What is
+    printed holds of the exact cost: `objective_at_most` rounded up, `lower_bound` rounded down, and
+    `proven_gap` rounded up.
 
-    The bound was found at `poses`, where F is `poses_objective`, the best value known; `source` says how these poses
-    were come by. The multipliers `Lambda`, (n, d, d), are with eta and the poses the proof: anyone can check it with
-    `prove_bound`; those of `BoundSource.SOFTENED` are of the smaller matrices. `verdict` is for the gap `wanted_gap`.
+    Parameters
+    ----------
+    objective : float
+        F of the given poses, or chi2, as `weighting` says, as computed.
+    bound : LowerBound
+        The proven bound.
+    gap : float
+        (objective - lower_bound) / objective; 0 where the verdict is EXACT.
+    rounding_level : float
+        F of poses whose residuals are as large as rounding can make each. Where the verdict is
+        EXACT, F of the poses is at most four times that, in exact arithmetic (`fits_to_rounding`).
+    stationarity : float
+        Half the squared Newton decrement of the given poses, over F: about the relative decrease of
+        F down to the stationary point beside them.
+    source : BoundSource
+        How the poses were come by that the bound was found at.
+    poses : Poses
+        The poses that the bound was found at.
+    poses_objective : float
+        F of these, the best value known.
+    Lambda : (n, d, d) array
+        Multipliers, which with eta and these poses are the proof: anyone can check it with
+        `prove_bound`. Those of `BoundSource.SOFTENED` are of the smaller matrices.
+    wanted_gap : float
+        The gap that was asked for.
+    verdict : Verdict
+        What is proven of the given poses, for that gap.
+    weighting : Weighting
+        Which cost this is.
+    objective_error : float
+        Bound on the distance of the objective from the exact cost of the poses (of the rotations
+        nearest to theirs); nan where none is known.
     """
 
     objective: float
@@ -72,6 +118,7 @@ class Certificate(ReadOnly):
     wanted_gap: float
     verdict: Verdict
     weighting: Weighting = Weighting.ISOTROPIC
+    objective_error: float = math.nan
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "Lambda", real_array(self.Lambda, "Lambda", SettingError))
@@ -83,12 +130,18 @@ class Certificate(ReadOnly):
 
     @property
     def eta(self) -> float:
-        """Shift of the proof: 0 where the certificate grounded at a pose needs none, nan when only F >= 0 is left."""
+        """Shift of the proof, nan when nothing better than F >= 0 is proven.
+
+        It is 0 where the certificate grounded at a pose needs none.
+        """
         return self.bound.eta
 
     @property
     def is_best_in_doubles(self) -> bool:
-        """Whether S_r is definite and the gap below 1e-6: a smaller one takes precision, not other poses."""
+        """Whether S_r is definite and the gap below 1e-6.
+
+        A smaller gap takes more precision, not other poses.
+        """
         return self.bound.is_grounded and self.eta == 0.0 and self.gap <= DEFAULT_GAP
 
     @property
@@ -98,8 +151,64 @@ class Certificate(ReadOnly):
 
     @property
     def digits(self) -> int:
-        """Digits of F that are proven: those in which it agrees with the bound."""
-        return proven_digits(self.gap)
+        """Number of digits that are proven.
+
+        It is the largest k with lower_bound >= (1 - 10^-k) objective_at_most, exactly.
+
+        None where the verdict is EXACT.
+        """
+        return (
+            0
+            if self.verdict is Verdict.EXACT
+            else proven_digits(self.objective_at_most, self.lower_bound)
+        )
+
+    @property
+    def objective_at_most(self) -> float:
+        """What the poses cost at most: the objective and the bound on its error.
+
+        It is the objective as computed where no such bound is known.
+        """
+        return (
+            self.objective
+            if math.isnan(self.objective_error)
+            else sum_above(self.objective, self.objective_error)
+        )
+
+    @property
+    def proven_gap(self) -> float:
+        """What the gap of the exact cost is at most.
+
+        No poses cost less than (1 - proven_gap) of what these do.
+
+        (C - lower_bound) / C of C = objective_at_most, rounded up; 0 where the verdict is EXACT.
+        """
+        return (
+            0.0
+            if self.verdict is Verdict.EXACT
+            else gap_above(self.objective_at_most, self.lower_bound)
+        )
+
+    @property
+    def cost_text(self) -> str:
+        """What the poses cost, as it is printed: rounded up."""
+        return rounded_up(self.objective_at_most)
+
+    @property
+    def bound_text(self) -> str:
+        """The lower bound as it is printed: rounded down."""
+        return rounded_down(self.lower_bound)
+
+    @property
+    def gap_text(self) -> str:
+        """The proven gap as it is printed, rounded up.
+
+        From four digits on, it says how many are proven.
+        """
+        if self.verdict is Verdict.EXACT:
+            return "0: every edge fits to its rounding"
+        text = rounded_up(self.proven_gap, 3)
+        return f"{text}, proven to {self.digits} digits" if self.digits > 3 else text
 
     @property
     def is_certified(self) -> bool:
@@ -107,7 +216,8 @@ class Certificate(ReadOnly):
         return self.verdict in (Verdict.CERTIFIED, Verdict.EXACT)
 
     def __repr__(self) -> str:
-        return f"Certificate({self.cost}={self.objective:.10g}, gap={self.gap:.3g}, {self.verdict.name})"
+        gap = rounded_up(self.proven_gap, 3)
+        return f"Certificate({self.cost}={self.cost_text}, gap={gap}, {self.verdict.name})"
 
     def __str__(self) -> str:
         return "\n".join(f"{label:<12} {text}" for label, text in self.facts())
@@ -116,17 +226,23 @@ class Certificate(ReadOnly):
         return facts_table(self.facts())
 
     def facts(self) -> list[tuple[str, str]]:
-        """Labels and figures, as they are printed."""
+        """Return the figures as they are printed, with their labels.
+
+        Returns
+        -------
+        list of (str, str)
+            Pairs of a label and a figure.
+        """
         measured = not math.isnan(self.stationarity)
         stationary = f"   (stationary to {self.stationarity:.2g})" if measured else ""
         facts = [
-            (self.cost, f"{self.objective:.10g}{stationary}"),
-            ("lower bound", f"{self.lower_bound:.10g}   ({self.proof}; {self.source.value})"),
-            ("gap", f"{gap_text(self.gap)}   (asked for: {self.wanted_gap:.3g})"),
+            (self.cost, f"{self.cost_text}{stationary}"),
+            ("lower bound", f"{self.bound_text}   ({self.proof}; {self.source.value})"),
+            ("gap", f"{self.gap_text}   (asked for: {self.wanted_gap:.3g})"),
             ("verdict", f"{self.verdict.name}: {self.verdict.value}"),
         ]
         if self.source is not BoundSource.GIVEN:
-            facts.insert(1, (f"best known {self.cost}", f"{self.poses_objective:.10g}"))
+            facts.insert(1, (f"best known {self.cost}", rounded_up(self.poses_objective)))
         return facts
 
     @property
@@ -138,37 +254,48 @@ class Certificate(ReadOnly):
     def proof(self) -> str:
         """How the bound was proved, in a few words."""
         if math.isnan(self.eta):
-            why = "; S_r is definite in doubles, by less than rounding can take" if self.bound.is_definite else ""
+            why = (
+                "; S_r is definite in doubles, by less than rounding can take"
+                if self.bound.is_definite
+                else ""
+            )
             return f"{self.cost} is never negative{why}"
         form = "grounded at a pose" if self.bound.is_grounded else "with a shift"
-        shift = f", eta = {self.eta:.3g}" if self.eta > 0 else ""
+        shift = f", eta = {rounded_up(self.eta, 3)}" if self.eta > 0 else ""
         cap = f", conditions cut to {self.bound.cap:.3g}" if self.bound.cap < math.inf else ""
-        return f"proved {form}{shift}{cap}, less {self.bound.rounding:.2g} for rounding"
-
-
-def proven_digits(gap: float) -> int:
-    """Digits of F that a relative gap leaves no doubt of; none where it is 0, as F is rounding then."""
-    return max(0, math.floor(-math.log10(gap))) if gap > 0 else 0
-
-
-def gap_text(gap: float) -> str:
-    """A relative gap for tables, with the digits that it proves."""
-    if gap == 0.0:
-        return "0: F is at its rounding level"
-    digits = proven_digits(gap)
-    return f"{gap:.3g}, proven to {digits} digits" if digits > 3 else f"{gap:.3g}"
+        return f"proved {form}{shift}{cap}, less {rounded_up(self.bound.rounding, 2)} for rounding"
 
 
 def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_GAP) -> Certificate:
-    """Judge anybody's poses: a proven lower bound on the global optimum, and how far F is above it.
+    """Judge anybody's poses by a proven lower bound on the global optimum.
 
-    The bound is found at a stationary point. Poses that are not stationary are polished first (damped Newton,
-    `polish`); where that point does not give the gap, the one that the chordal start polishes to is tried, and the
-    better bound is taken. `source` says what was done; the gap is always that of the poses given. `certify_at` bounds
-    at the poses as they are. Of a problem with `Weighting.INFORMATION` all of this is chi2 instead of F, bounded by its
-    tangent at the stationary point, and where that fails by smaller information matrices (`softened_bound`).
+    The bound is found at a stationary point. Poses that are not stationary are polished first
+    (damped Newton, `polish`); where that point does not give the gap, the one that the chordal
+    start polishes to is tried, and the better bound is taken. `source` says what was done; the gap
+    is always that of the poses given. `certify_at` bounds at the poses as they are. Of a problem
+    with `Weighting.INFORMATION` all of this is chi2 instead of F, bounded by its tangent at the
+    stationary point, and where that fails by smaller information matrices (`bound_by_shrinking`).
 
-    A SettingError unless gap, the relative one to certify, is positive and finite; a GraphError when poses do not fit.
+    Parameters
+    ----------
+    problem : PGOProblem or PoseGraph
+        The problem; of a graph it is F.
+    poses : Poses
+        The poses to judge.
+    gap : float
+        The relative gap to certify.
+
+    Returns
+    -------
+    Certificate
+        The bound, and how far the cost of the poses is above it.
+
+    Raises
+    ------
+    SettingError
+        Unless the gap is positive and finite.
+    GraphError
+        When the poses do not fit the graph.
 
     Examples
     --------
@@ -177,7 +304,7 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
     >>> certificate = certify(problem, chordal_start(problem))
     >>> certificate
-    Certificate(F=118.6633297, gap=0.182, NOT_CERTIFIED)
+    Certificate(F=118.6633298, gap=0.183, NOT_CERTIFIED)
     >>> certificate.source.name, bool(0 < certificate.lower_bound <= certificate.poses_objective)
     ('POLISHED', True)
     """
@@ -188,22 +315,46 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     else:
         polished = certify_at(problem, polish(problem, poses), gap, stationarity)
         certificate = judge(problem, poses, replace(polished, source=BoundSource.POLISHED))
-    if not _bound_is_tight(certificate):
+    if not _bound_is_tight(problem, certificate):
         start = polish(problem.convex_part, chordal_start(problem.convex_part))
         other = certify_at(problem, polish(problem, start), gap, stationarity)
         # Of equal bounds, as two zeros, the one with the better poses.
-        if (other.lower_bound, -other.poses_objective) > (certificate.lower_bound, -certificate.poses_objective):
+        if (other.lower_bound, -other.poses_objective) > (
+            certificate.lower_bound,
+            -certificate.poses_objective,
+        ):
             certificate = judge(problem, poses, replace(other, source=BoundSource.CHORDAL))
-        certificate = soften(problem, certificate)
+        certificate = with_shrunk_information(problem, certificate)
     return certificate
 
 
 def certify_at(
     problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP, stationarity: float = math.nan
 ) -> Certificate:
-    """Certificate from the multipliers at the poses as they are: valid anywhere, and sharp near an optimum.
+    """Judge poses by the bound of the multipliers at these poses as they are.
 
-    `stationarity`, the relative decrement there, is reported as it is; nan where not measured. Errors as of `certify`.
+    It is valid anywhere, and sharp near an optimum.
+
+    Parameters
+    ----------
+    problem : PGOProblem
+        The problem.
+    poses : Poses
+        The poses to judge.
+    gap : float
+        The relative gap to certify.
+    stationarity : float
+        The relative decrement there, which is reported as it is; nan where it was not measured.
+
+    Returns
+    -------
+    Certificate
+        The bound, and how far the cost of the poses is above it.
+
+    Raises
+    ------
+    SettingError, GraphError
+        As of `certify`.
 
     Examples
     --------
@@ -216,18 +367,31 @@ def certify_at(
     """
     check_poses(problem.graph, poses)
     best = poses if stationarity <= STATIONARY_DECREMENT else problem.at_best_translations(poses)
-    return certify_with(problem, poses, multipliers(problem, best), gap, stationarity, BoundSource.GIVEN, ground=best)
+    return certify_with(
+        problem,
+        poses,
+        multipliers(problem, best),
+        gap,
+        stationarity,
+        BoundSource.GIVEN,
+        ground=best,
+    )
 
 
-def soften(problem: PGOProblem, certificate: Certificate) -> Certificate:
-    """The certificate, or where it grants but a loose bound on chi2 the better one of `softened_bound`."""
-    if problem.weighting is not Weighting.INFORMATION or _bound_is_tight(certificate):
+def with_shrunk_information(problem: PGOProblem, certificate: Certificate) -> Certificate:
+    """The certificate, or a better one by `bound_by_shrinking` where its bound on chi2 is loose."""
+    if problem.weighting is not Weighting.INFORMATION or _bound_is_tight(problem, certificate):
         return certificate
-    bound, _, Lambda = softened_bound(problem, certificate.poses)
-    if bound.value <= certificate.lower_bound:
+    shrunk = bound_by_shrinking(problem, certificate.poses)
+    if shrunk.bound.value <= certificate.lower_bound:
         return certificate
-    softer = replace(certificate, bound=bound, Lambda=Lambda, source=BoundSource.SOFTENED)
-    return judge_cost(problem, softer, certificate.objective, objective_rounding(problem, certificate.poses))
+    by_smaller_cost = replace(
+        certificate, bound=shrunk.bound, Lambda=shrunk.Lambda, source=BoundSource.SOFTENED
+    )
+    is_exact = certificate.verdict is Verdict.EXACT
+    # Of the poses given, which need not be those that the bound was found at.
+    rounding = ObjectiveRounding(certificate.rounding_level, certificate.objective_error, is_exact)
+    return judge_cost(problem, by_smaller_cost, certificate.objective, rounding)
 
 
 def certify_with(
@@ -242,65 +406,92 @@ def certify_with(
 ) -> Certificate:
     """Certificate of poses with multipliers from anywhere: the proof asks nothing of them.
 
-    Unless a bound is given that was proved with these multipliers already, it is found here, grounded at one of the
-    poses `ground`: the given ones with their best translations, unless given. A SettingError when gap is not positive
-    and finite, or Lambda has the wrong shape.
+    Unless a bound is given that was proved with these multipliers already, it is found here,
+    grounded at one of the poses `ground`: the given ones with their best translations, unless
+    given. A SettingError when gap is not positive and finite, or Lambda has the wrong shape.
     """
     if not 0 < gap < math.inf:
         raise SettingError(f"gap is {gap}; give a positive relative gap, as 1e-6")
-    objective, rounding = problem.objective(poses), objective_rounding(problem, poses)
+    objective = problem.objective(poses)
+    rounding = objective_rounding(problem, poses)
     if bound is None:
-        is_exact = objective <= rounding.level
         ground = ground if ground is not None else problem.at_best_translations(poses)
         tangent = problem.tangent_at(ground)
-        bound = NO_BOUND if is_exact else best_bound(tangent, Lambda, ground, gap, objective)
-    weighting = problem.weighting if isinstance(problem.weighting, Weighting) else Weighting.ISOTROPIC
-    figures = objective, bound, math.nan, rounding.level, stationarity  # the gap comes with the verdict
-    unjudged = Certificate(*figures, source, poses, objective, Lambda, gap, Verdict.TRIVIAL, weighting)
+        bound = (
+            NO_BOUND if rounding.is_exact else best_bound(tangent, Lambda, ground, gap, objective)
+        )
+    weighting = (
+        problem.weighting if isinstance(problem.weighting, Weighting) else Weighting.ISOTROPIC
+    )
+    # the gap comes with the verdict
+    figures = objective, bound, math.nan, rounding.level, stationarity
+    unjudged = Certificate(
+        *figures, source, poses, objective, Lambda, gap, Verdict.TRIVIAL, weighting
+    )
     return judge_cost(problem, unjudged, objective, rounding)
 
 
 def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
     """Hold other poses of the same problem against the bound of a certificate.
 
-    A ProofError when F of the poses is below it by more than the rounding of F: then one of the two is wrong.
+    A ProofError when F of the poses is below it by more than the rounding of F: then one of the two
+    is wrong.
     """
-    F = problem.objective(poses)
-    is_below = certificate.lower_bound < F  # then nobody asks for the error of F, which takes longer than F
-    level = ObjectiveRounding(rounding_level(problem, poses), 0.0)
-    rounding = level if is_below else objective_rounding(problem, poses)
-    return judge_cost(problem, certificate, F, rounding)
+    return judge_cost(
+        problem, certificate, problem.objective(poses), objective_rounding(problem, poses)
+    )
 
 
-def judge_cost(problem: PGOProblem | str, given: Certificate, F: float, rounding: ObjectiveRounding) -> Certificate:
-    """The given certificate of poses that cost F instead, held against its bound; errors as of `judge`."""
-    bound, level = given.bound, rounding.level
+def judge_cost(
+    problem: PGOProblem | str, given: Certificate, F: float, rounding: ObjectiveRounding
+) -> Certificate:
+    """The given certificate of poses that cost F instead, held against its bound.
+
+    Errors are those of `judge`.
+    """
+    bound = given.bound
     if bound.value > F + rounding.error:
-        above = f"lower bound {bound.value!r} is above F = {F!r} of {problem!r}, which is known to {rounding.error:.2g}"
-        raise ProofError(f"{above}: a defect of pgo_models; please report it with the graph")
+        raise ProofError(
+            f"lower bound {bound.value!r} is above F = {F!r} of {problem!r}, "
+            f"which is known to {rounding.error:.2g}: "
+            "a defect of pgo_models; please report it with the graph"
+        )
     # F may come out below a true bound by its own rounding, which is then what the gap is known to.
-    gap = relative_gap(F, bound.value if bound.value < F else F - rounding.error, level)
-    bound = replace(bound, value=min(bound.value, F))
-    verdict = verdict_of(F, level, gap, bound, given.wanted_gap)
-    return replace(given, objective=F, bound=bound, gap=gap, rounding_level=level, verdict=verdict)
+    gap = relative_gap(F, bound.value if bound.value < F else F - rounding.error, rounding.is_exact)
+    # chi2, which is never negative, may come out below zero.
+    bound = replace(bound, value=min(bound.value, max(F, 0.0)))
+    verdict = verdict_of(rounding.is_exact, gap, bound, given.wanted_gap)
+    return replace(
+        given,
+        objective=F,
+        objective_error=rounding.error,
+        rounding_level=rounding.level,
+        bound=bound,
+        gap=gap,
+        verdict=verdict,
+    )
 
 
-def verdict_of(objective: float, level: float, gap: float, bound: LowerBound, wanted_gap: float) -> Verdict:
-    """Verdict on poses: F, its rounding level, their gap, and the bound."""
-    if objective <= level:
+def verdict_of(is_exact: bool, gap: float, bound: LowerBound, wanted_gap: float) -> Verdict:
+    """Verdict on poses that are exact or not (`fits_to_rounding`), with their gap and the bound."""
+    if is_exact:
         return Verdict.EXACT
     if math.isnan(bound.eta):
         return Verdict.TRIVIAL
     return Verdict.CERTIFIED if gap <= wanted_gap else Verdict.NOT_CERTIFIED
 
 
-def relative_gap(objective: float, lower_bound: float, rounding_level: float = 0.0) -> float:
-    """(objective - lower_bound) / objective; 0 where F is at its rounding level, 1 where it overflows."""
-    if not math.isfinite(objective):
-        return 1.0
-    return (objective - lower_bound) / objective if objective > rounding_level else 0.0
+def relative_gap(objective: float, lower_bound: float, is_exact: bool = False) -> float:
+    """(objective - lower_bound) / objective; 0 of exact poses, 1 where F is not finite or positive.
+
+    Of other poses an F that comes out as zero, or chi2 below zero, is unknown to its last digit.
+    """
+    if is_exact:
+        return 0.0
+    return (objective - lower_bound) / objective if 0.0 < objective < math.inf else 1.0
 
 
-def _bound_is_tight(certificate: Certificate) -> bool:
-    F, level = certificate.poses_objective, certificate.rounding_level
-    return relative_gap(F, certificate.lower_bound, level) <= certificate.wanted_gap
+def _bound_is_tight(problem: PGOProblem, certificate: Certificate) -> bool:
+    """Whether the poses that the bound was found at have the gap asked for, or are exact."""
+    gap = relative_gap(certificate.poses_objective, certificate.lower_bound)
+    return gap <= certificate.wanted_gap or fits_to_rounding(problem, certificate.poses)

@@ -1,10 +1,11 @@
-"""A proof in exact arithmetic that the certificate matrix, some rows left out, is positive definite.
+"""A proof in exact arithmetic that the certificate matrix, without some rows, is definite.
 
-S without the rows of one translation, or of one whole pose, is stored and factored in double precision with a share
-`shift` of its diagonal subtracted. When that factorisation goes through, R^T R of the computed factor is positive
-definite, and what it differs by from the exact S, the rounding of the entries (`matrix_error`) and of the factorisation
-(`CholeskyFactor.backward_error`), is at most `error` times the diagonal. So S - (shift - error) diag is positive
-definite (Rump 2006, *Verification of positive definiteness*; Jansson, Chaykin & Keil 2007, VSDP).
+S without the rows of one translation, or of one whole pose, is stored and factored in double
+precision with a share `shift` of its diagonal subtracted. When that factorisation goes through, R^T
+R of the computed factor is positive definite, and what it differs by from the exact S, the rounding
+of the entries (`matrix_error`) and of the factorisation (`CholeskyFactor.backward_error`), is at
+most `error` times the diagonal. So S - (shift - error) diag is positive definite (Rump 2006,
+*Verification of positive definiteness*; Jansson, Chaykin & Keil 2007, VSDP).
 """
 
 import math
@@ -32,22 +33,29 @@ SHRINK = 1.0 / 32.0
 ROOM = 1.0 / 8.0  # share of the softest energy that may be subtracted at once
 LEAST_SHIFT = 1e-15  # below the rounding of any matrix with a few non-zeros in a row
 MARGIN = 2.125  # twice the rounding, and what the estimate of it may be off by
-ETA_GROWTH, ETA_BISECTIONS = 10.0, 3
-_CG_TOLERANCE, _CG_ITERATIONS = 1e-4, 50
-_SMALLEST, _LARGEST = 1e-150, 1e150  # of diagonal entries: nothing that counts underflows
+ETA_GROWTH = 10.0
+ETA_BISECTIONS = 3
+_CG_TOLERANCE = 1e-4
+_CG_ITERATIONS = 50
+# of diagonal entries: nothing that counts underflows
+_SMALLEST = 1e-150
+_LARGEST = 1e150
 
 
 @dataclass(frozen=True, eq=False)
 class DefiniteProof:
-    """S + eta blockdiag(0, I), without some rows, factored with a share of its diagonal subtracted."""
+    """S + eta blockdiag(0, I), without some rows, factored less a share of its diagonal."""
 
-    stored: csc_array  # the matrix in double precision, (N, N); only its diagonal in the rows left out
+    # the matrix in double precision, (N, N); only its diagonal in the rows left out
+    stored: csc_array
     factor: CholeskyFactor  # of `stored` with the shift subtracted
     diagonal: Array  # that it is a share of, (N,); 0 in the rows left out
     shift: Array  # share that is subtracted, (N,)
     entries: Array  # share that the rounding of the entries takes, (N,)
-    is_marginal: bool  # whether a larger shift failed: the factor may be far from one of the matrix without a shift
-    error: Array | None = None  # share that the rounding of the factorisation takes, where the factor need not be asked
+    # whether a larger shift failed: the factor may be far from one of the matrix without a shift
+    is_marginal: bool
+    # share that the rounding of the factorisation takes, where the factor need not be asked
+    error: Array | None = None
 
     @property
     def free(self) -> BoolArray:
@@ -55,25 +63,39 @@ class DefiniteProof:
         return np.asarray(self.diagonal > 0.0)
 
     def slack(self) -> Array | None:
-        """Diagonal that the exact matrix is at least, (N,), positive in free rows; None if rounding takes over half.
+        """Diagonal that the exact matrix is at least, (N,), positive in free rows.
 
-        The factor may be taken apart for it: solve before.
+        It is None if rounding takes over half of the shift.
+
+        The stored matrix without the shift is at least (shift - factor's error) diag, and the exact
+        one differs from it by at most entries diag. The factor may be taken apart for it, so that
+        solving first is cheaper.
         """
-        error = OUTWARD * (self.entries + (self.error if self.error is not None else self.factor.last_error()))
-        return (self.shift - error) / OUTWARD * self.diagonal if (2.0 * error <= self.shift).all() else None
+        error = OUTWARD * (self.entries + self.factor_error())
+        if (2.0 * error <= self.shift).all():
+            return (self.shift - error) / OUTWARD * self.diagonal
+        return None
+
+    def factor_error(self) -> Array:
+        """Share of the diagonal that the rounding of the factorisation takes, (N,)."""
+        return self.error if self.error is not None else self.factor.last_error()
 
     def solve(self, product: Array) -> Array:
         """About S^-1 product, (N, d), in the rows that are not left out, and zero in those.
 
-        By the factor, or where that is marginal by conjugate gradients with the factor as preconditioner.
+        By the factor, or where that is marginal by conjugate gradients with the factor as
+        preconditioner.
         """
         free = self.free
         step = self.factor.solve(np.where(free[:, None], product, 0.0))
         if self.is_marginal:
             inverse = LinearOperator(self.stored.shape, matvec=self.factor.solve, dtype=float)
             for column in range(step.shape[1]):
-                b, x0 = np.where(free, product[:, column], 0.0), step[:, column]
-                step[:, column], _ = cg(self.stored, b, x0, rtol=_CG_TOLERANCE, maxiter=_CG_ITERATIONS, M=inverse)
+                b = np.where(free, product[:, column], 0.0)
+                x0 = step[:, column]
+                step[:, column], _ = cg(
+                    self.stored, b, x0, rtol=_CG_TOLERANCE, maxiter=_CG_ITERATIONS, M=inverse
+                )
         step[~free] = 0.0
         return step
 
@@ -85,18 +107,22 @@ def prove_definite(
     fixed: IntArray,
     first_shift: float = FIRST_SHIFT,
     turned: Array | None = None,
+    factor_error: Array | None = None,
 ) -> DefiniteProof | None:
-    """Proof that S + eta blockdiag(0, I) is positive definite without the rows `fixed`; None when none is found.
+    """Proof that S + eta blockdiag(0, I) is definite without the rows `fixed`, or None.
 
-    The share `first_shift` of the diagonal is subtracted first; less where the matrix is not definite with it, more
-    where rounding needs more. `turned`, (N, d), are moves that leave F almost as it is, as a turn of all poses but
-    those left out, which S then holds but weakly: what is subtracted takes but little of their energy. Where that is
-    enough for rounding whatever the factor's non-zeros are, or as many as they can be, they are not counted.
+    The share `first_shift` of the diagonal is subtracted first; less where the matrix is not
+    definite with it, more where rounding needs more. `turned`, (N, d), are moves that leave F
+    almost as it is, as a turn of all poses but those left out, which S then holds but weakly: what
+    is subtracted takes but little of their energy. Where that is enough for rounding whatever the
+    factor's non-zeros are, or as many as they can be, they are not counted. `factor_error`, (N,),
+    is the share that the rounding of the factorisation takes, as of `DefiniteProof.factor_error`,
+    where it is known from another factor of the same pattern.
     """
     shifts = np.zeros(problem.side)
     shifts[problem.num_poses :] = eta
     stored, diagonal = shifted_certificate(problem, Lambda, shifts)
-    if not (np.isfinite(stored.data).all() and diagonal.min() >= _SMALLEST and diagonal.max() <= _LARGEST):
+    if not is_in_range(stored.data, diagonal):
         return None
     problem.leave_out(stored.data, fixed, 2.0 * diagonal[fixed])
 
@@ -107,27 +133,46 @@ def prove_definite(
 
     free = diagonal.copy()
     free[fixed] = 0.0
-    entries, analysis = matrix_errors(problem, diagonal), problem.analysis
-    expected = analysis.expected_error()
+    entries = matrix_errors(problem, diagonal)
+    analysis = problem.analysis
+    expected = factor_error if factor_error is not None else analysis.expected_error()
     if turned is not None:
         energies, weights = _softness(stored, free, turned)
-        first_shift = min(first_shift, max(float(np.min(SHRINK * energies / weights.sum(axis=0))), LEAST_SHIFT))
-        for bound in (analysis.crude_error, analysis.error_before) if expected is None else ():
-            error = bound()
-            enough = np.maximum(first_shift, MARGIN * (entries + error))
-            if np.isfinite(enough).all() and (enough @ weights <= ROOM * energies).all():
-                factor = attempt(enough)
-                if factor is not None:
-                    return DefiniteProof(stored, factor, free, enough, entries, False, error)
-    found = search_shift(attempt, entries, expected if expected is not None else 0.0 * entries, first_shift)
-    if found is None:
+        # A uniform share takes share * weights of the energies: little of the softest one.
+        softest = float(np.min(SHRINK * energies / weights.sum(axis=0)))
+        first_shift = min(first_shift, max(softest, LEAST_SHIFT))
+    if turned is not None and expected is None:
+        for bound_error in (analysis.crude_error, analysis.error_before):
+            error = bound_error()
+            shift = np.maximum(first_shift, MARGIN * (entries + error))
+            is_small = np.isfinite(shift).all() and (shift @ weights <= ROOM * energies).all()
+            factor = attempt(shift) if is_small else None
+            if factor is not None:
+                return DefiniteProof(stored, factor, free, shift, entries, False, error)
+    if expected is None:
+        expected = np.zeros_like(entries)
+    chosen = search_shift(attempt, entries, expected, first_shift)
+    if chosen is None:
         return None
-    factor, shift, is_marginal = found
+    factor, shift, is_marginal = chosen
     return DefiniteProof(stored, factor, free, shift, entries, is_marginal)
 
 
+def is_in_range(entries: Array, diagonal: Array) -> bool:
+    """Whether entries are at most 1e150 in size, and diagonal ones at least 1e-150.
+
+    Bounds on rounding are made for such (`pgo_models.problem.floating_point`). False where an entry
+    is nan.
+    """
+    is_diagonal_in_range = diagonal.min() >= _SMALLEST and diagonal.max() <= _LARGEST
+    return bool(is_diagonal_in_range and entries.min() >= -_LARGEST and entries.max() <= _LARGEST)
+
+
 def is_definite_in_doubles(problem: PGOProblem, Lambda: Array, fixed: IntArray) -> bool:
-    """Whether S without the rows `fixed` has a Cholesky factor in floating point, which proves nothing."""
+    """Whether S without the rows `fixed` has a Cholesky factor in floating point.
+
+    That proves nothing.
+    """
     stored, diagonal = shifted_certificate(problem, Lambda, np.zeros(problem.side))
     problem.leave_out(stored.data, fixed, 2.0 * diagonal[fixed])
     return _factor(problem, stored) is not None
@@ -140,8 +185,12 @@ def _factor(problem: PGOProblem, matrix: csc_array) -> CholeskyFactor | None:
         return None
 
 
-def shifted_certificate(problem: PGOProblem, Lambda: Array, shifts: Array) -> tuple[csc_array, Array]:
-    """S + diag(shifts) in double precision, (N, N), and a diagonal, (N,), no smaller than any its rounding comes from.
+def shifted_certificate(
+    problem: PGOProblem, Lambda: Array, shifts: Array
+) -> tuple[csc_array, Array]:
+    """S + diag(shifts) in double precision, (N, N), and a diagonal to measure rounding by.
+
+    The diagonal, (N,), is no smaller than any that the rounding of an entry comes from.
 
     M - Lambda was rounded before the shifts were added, and can be as large.
     """
@@ -152,26 +201,37 @@ def shifted_certificate(problem: PGOProblem, Lambda: Array, shifts: Array) -> tu
 
 
 def _softness(stored: csc_array, free: Array, moves: Array) -> tuple[Array, Array]:
-    """Energies of the moves, (d,), zero where a row is left out, and what a share of the diagonal takes, (N, d)."""
+    """Energies of the moves, (d,), and what a share of the diagonal takes of each, (N, d).
+
+    Both count no row that is left out.
+    """
     moves = np.where(free[:, None] > 0.0, moves, 0.0)
     return np.einsum("rc,rc->c", moves, stored @ moves), free[:, None] * moves**2
 
 
 def search_shift(
-    attempt: Callable[[Array], CholeskyFactor | None], entries: Array, expected: Array, first_shift: float
+    attempt: Callable[[Array], CholeskyFactor | None],
+    entries: Array,
+    expected: Array,
+    first_shift: float,
 ) -> tuple[CholeskyFactor, Array, bool] | None:
-    """First factor found that leaves at least half of its shift over, the shift, and whether a larger one failed.
+    """First factor found that leaves at least half of its shift over, or None.
 
-    A factor with the first shift whose error is not known before it is taken apart (`CholeskyFactor.known_error`) is
-    returned as it is. `attempt` factors with shares, (N,), of the diagonal subtracted, or gives None when that does not
-    go through; `entries` and `expected`, (N,), are the shares that rounding the entries takes, and factoring may take.
+    Returned with it are the shift, (N,), and whether a larger one failed.
+
+    A factor with the first shift whose error is not known before it is taken apart
+    (`CholeskyFactor.known_error`) is returned as it is. `attempt` factors with shares, (N,), of the
+    diagonal subtracted, or gives None when that does not go through; `entries` and `expected`,
+    (N,), are the shares that rounding the entries takes, and factoring may take.
     """
-    uniform, is_marginal = first_shift, False
+    uniform = first_shift
+    is_marginal = False
     while uniform >= LEAST_SHIFT:
         shift = np.maximum(uniform, MARGIN * (entries + expected))
         factor = attempt(shift)
         if factor is None:
-            uniform, is_marginal = SHRINK * uniform, True
+            uniform = SHRINK * uniform
+            is_marginal = True
             continue
         known = factor.backward_error() if is_marginal else factor.known_error()
         if known is None:
@@ -184,20 +244,29 @@ def search_shift(
 
 
 def smallest_eta(
-    attempt: Callable[[float], T | None], eta: float, below: float = math.inf, too_small: float | None = None
+    attempt: Callable[[float], T | None],
+    eta: float,
+    below: float = math.inf,
+    too_small: float | None = None,
 ) -> tuple[float, T] | None:
-    """Smallest shift eta found for which `attempt` does not give None, and what it gives; None when none is `below`.
+    """Smallest shift eta found for which `attempt` does not give None, and what it gives.
 
-    It grows from the eta given, and the last step is bisected: to within a third of the smallest that would do.
-    `too_small` is an eta below the first for which there is known to be none.
+    The result is None when no such eta is `below` the limit.
+
+    It grows from the eta given, and the last step is bisected: to within a third of the smallest
+    that would do. An eta of zero cannot grow, so that nothing but zero is tried. `too_small` is an
+    eta below the first for which there is known to be none.
     """
-    found = None
-    while found is None:
+    proof = None
+    while proof is None:
         if not eta < below:
             return None
-        found = attempt(eta)
-        if found is None:
-            too_small, eta = eta, ETA_GROWTH * eta
+        proof = attempt(eta)
+        if proof is None:
+            if not eta > 0.0:
+                return None
+            too_small = eta
+            eta = ETA_GROWTH * eta
     for _ in range(ETA_BISECTIONS):
         if too_small is None:
             break
@@ -206,5 +275,6 @@ def smallest_eta(
         if better is None:
             too_small = middle
         else:
-            eta, found = middle, better
-    return eta, found
+            eta = middle
+            proof = better
+    return eta, proof

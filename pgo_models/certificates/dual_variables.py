@@ -11,9 +11,22 @@ from pgo_models.problem.problem import PGOProblem
 
 
 def multipliers(problem: PGOProblem, poses: Poses) -> Array:
-    """Lambda_i = sym((M X)_i R_i), (n, d, d): the multipliers of R_i R_i^T = I at poses.
+    """Return the multipliers of R_i R_i^T = I at poses, Lambda_i = sym((M X)_i R_i).
 
-    At a stationary point (M X)_i = Lambda_i R_i^T exactly, and tr(Lambda) = F. M is that of the tangent for chi2.
+    At a stationary point (M X)_i = Lambda_i R_i^T exactly, and tr(Lambda) = F. M is that of the
+    tangent for chi2.
+
+    Parameters
+    ----------
+    problem : PGOProblem
+        The problem.
+    poses : Poses
+        One pose for every pose of the graph.
+
+    Returns
+    -------
+    (n, d, d) array
+        Symmetric blocks Lambda_i.
 
     Examples
     --------
@@ -22,7 +35,8 @@ def multipliers(problem: PGOProblem, poses: Poses) -> Array:
     >>> multipliers(problem, problem.graph.truth).shape
     (27, 3, 3)
     """
-    n, d = problem.num_poses, problem.d
+    n = problem.num_poses
+    d = problem.d
     product = problem.apply_M_at(poses)[n:].reshape(n, d, -1) @ poses.R
     return 0.5 * (product + np.swapaxes(product, 1, 2))
 
@@ -31,7 +45,9 @@ def check_multipliers(problem: PGOProblem, Lambda: Array) -> None:
     """Raise a SettingError unless there is one block for every pose, (n, d, d)."""
     shape = (problem.num_poses, problem.d, problem.d)
     if Lambda.shape != shape:
-        raise SettingError(f"Lambda has shape {Lambda.shape}; give one block for every pose, {shape}")
+        raise SettingError(
+            f"Lambda has shape {Lambda.shape}; give one block for every pose, {shape}"
+        )
 
 
 def multiplier_norms(Lambda: Array) -> Array:
@@ -40,7 +56,26 @@ def multiplier_norms(Lambda: Array) -> Array:
 
 
 def certificate_matrix(problem: PGOProblem, Lambda: Array, eta: float = 0.0) -> csc_array:
-    """S + eta blockdiag(0, I), (N, N), with S = M - blockdiag(0, Lambda), Lambda (n, d, d); the pattern is that of M.
+    """Return S + eta blockdiag(0, I), with S = M - blockdiag(0, Lambda).
+
+    Parameters
+    ----------
+    problem : PGOProblem
+        The problem.
+    Lambda : (n, d, d) array
+        Multipliers of R_i R_i^T = I.
+    eta : float
+        Shift of the rows of rotations.
+
+    Returns
+    -------
+    (N, N) csc_array
+        It has the pattern of M.
+
+    Raises
+    ------
+    SettingError
+        When there is not one block of Lambda for every pose.
 
     Examples
     --------
@@ -60,10 +95,11 @@ def certificate_matrix(problem: PGOProblem, Lambda: Array, eta: float = 0.0) -> 
 def factorize_certificate(problem: PGOProblem, Lambda: Array, eta: float) -> CholeskyFactor:
     """Cholesky factor of S + eta blockdiag(0, I) with t_0 grounded.
 
-    Grounding loses nothing: S maps a common shift of all translations to zero, so the matrix is positive semidefinite
-    if it is positive definite with its (t_0, t_0) entry doubled. For a right-hand side that is zero on translations,
-    the rotation part of the solution is that of (Q - blockdiag(Lambda) + eta I) y = b: elimination marginalises them. A
-    NotPositiveDefiniteError when it has a negative eigenvalue, or a zero one beside that of the common shift.
+    Grounding loses nothing: S maps a common shift of all translations to zero, so the matrix is
+    positive semidefinite if it is positive definite with its (t_0, t_0) entry doubled. For a
+    right-hand side that is zero on translations, the rotation part of the solution is that of (Q -
+    blockdiag(Lambda) + eta I) y = b: elimination marginalises them. A NotPositiveDefiniteError when
+    it has a negative eigenvalue, or a zero one beside that of the common shift.
     """
     shifted = certificate_matrix(problem, Lambda, eta)
     shifted.data[problem.diagonal_positions[0]] *= 2.0

@@ -1,4 +1,7 @@
-"""Where Q - Lambda is not positive semidefinite: a direction that shows it, by inverse Lanczos on a proven shift."""
+"""Where Q - Lambda is not positive semidefinite: a direction that shows it.
+
+It is found by inverse Lanczos on a proven shift.
+"""
 
 from dataclasses import dataclass
 
@@ -13,27 +16,35 @@ from pgo_models.problem.cholesky import CholeskyFactor
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
 
-_ACCURACY = 1e-3  # relative, of the eigenvalue: any direction that goes down will do, a steep one is better
+# relative, of the eigenvalue: any direction that goes down will do, a steep one is better
+_ACCURACY = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class NegativeCurvature:
     """Smallest eigenvalue of Q - blockdiag(Lambda), which is negative."""
 
-    value: float  # v^T (Q - blockdiag(Lambda)) v: an upper bound on the eigenvalue, evidence but no proof
+    # v^T (Q - blockdiag(Lambda)) v: an upper bound on the eigenvalue, evidence but no proof
+    value: float
     v: Array  # (n, d), of norm 1
     shift: float  # a little more than the eigenvalue is below zero
     factor: CholeskyFactor  # of S + shift blockdiag(0, I), positive definite
 
 
-def negative_curvature(problem: PGOProblem, Lambda: Array, eta: float, rng: np.random.Generator) -> NegativeCurvature:
-    """Smallest eigenvalue of Q - blockdiag(Lambda), where it is below -eta < 0, with its eigenvector.
+def negative_curvature(
+    problem: PGOProblem, Lambda: Array, eta: float, rng: np.random.Generator
+) -> NegativeCurvature:
+    """Smallest eigenvalue of Q - blockdiag(Lambda), with its eigenvector.
 
-    With eta about the smallest for which S + eta blockdiag(0, I) has a Cholesky factor, the inverse of Q - Lambda +
-    eta I has the wanted eigenvalue far above all others, so that Lanczos needs a handful of solves. The eta given does
-    not make the matrix positive definite; `rng` draws the first Lanczos vector.
+    It is below -eta < 0.
+
+    With eta about the smallest for which S + eta blockdiag(0, I) has a Cholesky factor, the inverse
+    of Q - Lambda + eta I has the wanted eigenvalue far above all others, so that Lanczos needs a
+    handful of solves. The eta given does not make the matrix positive definite; `rng` draws the
+    first Lanczos vector.
     """
-    n, d = problem.num_poses, problem.d
+    n = problem.num_poses
+    d = problem.d
     shift, factor = smallest_definite_shift(problem, Lambda, ETA_GROWTH * eta, too_small=eta)
     first = rng.standard_normal(n * d)
     _, vectors = eigsh(rotation_inverse(problem, factor), k=1, which="LA", v0=first, tol=_ACCURACY)
@@ -47,7 +58,10 @@ def negative_curvature(problem: PGOProblem, Lambda: Array, eta: float, rng: np.r
 def smallest_definite_shift(
     problem: PGOProblem, Lambda: Array, eta: float, too_small: float | None = None
 ) -> tuple[float, CholeskyFactor]:
-    """About the smallest shift from eta on for which `factorize_certificate` has a factor, and the factor."""
+    """About the smallest shift from eta on that gives a positive definite matrix, and its factor.
+
+    The matrix is that of `factorize_certificate`.
+    """
 
     def attempt(shift: float) -> CholeskyFactor | None:
         try:
@@ -57,13 +71,19 @@ def smallest_definite_shift(
 
     found = smallest_eta(attempt, eta, too_small=too_small)
     if found is None:
-        raise NotPositiveDefiniteError("no shift makes the certificate matrix positive definite; check Lambda for nan")
+        raise NotPositiveDefiniteError(
+            "no shift makes the certificate matrix positive definite; check Lambda for nan"
+        )
     return found
 
 
 def rotation_inverse(problem: PGOProblem, factor: CholeskyFactor) -> LinearOperator:
-    """(Q - blockdiag(Lambda) + eta I)^-1, (dn, dn), by solves with a factor of `factorize_certificate`."""
-    n, side = problem.num_poses, problem.num_poses * problem.d
+    """Inverse of Q - blockdiag(Lambda) + eta I, (dn, dn), as an operator.
+
+    Each product is a solve with a factor of `factorize_certificate`.
+    """
+    n = problem.num_poses
+    side = problem.num_poses * problem.d
 
     def invert(vectors: Array) -> Array:
         whole = np.zeros((problem.side, *vectors.shape[1:]))

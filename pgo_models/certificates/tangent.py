@@ -1,16 +1,19 @@
-"""Bounds on chi2 of information matrices that are too far from isotropic for the tangent at its minimum.
+"""Bounds on chi2 of information matrices for which the tangent at its minimum proves little.
 
-For smaller information matrices, I' <= I, the cost is below chi2 at all poses, so that a bound on it is one on chi2.
-Two things stand in the way of the tangent. Where the largest eigenvalue of I_rr is above the sum of the others, W is
-indefinite, and a reflection, which the relaxation cannot tell from a rotation, costs less than nothing: the largest
-eigenvalue of I'_rr is at most the second and half the smallest. And the tangent leaves of I_tt but its smallest
-eigenvalue: those of I'_tt are at most `cap` times that. The largest cap is sought with which the tangent at the minimum
-gives a bound without a shift.
+Such matrices are too far from isotropic.
+
+For smaller information matrices, I' <= I, the cost is below chi2 at all poses, so that a bound on
+it is one on chi2. Two things stand in the way of the tangent. Where the largest eigenvalue of I_rr
+is above the sum of the others, W is indefinite, and a reflection, which the relaxation cannot tell
+from a rotation, costs less than nothing: the largest eigenvalue of I'_rr is at most the second and
+half the smallest. And the tangent leaves of I_tt but its smallest eigenvalue: those of I'_tt are at
+most `cap` times that. The largest cap is sought with which the tangent at the minimum gives a bound
+without a shift.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,63 +24,106 @@ from pgo_models.errors import GraphError, NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import are_definite, filled, proper_information, uncoupled_share
+from pgo_models.graphs.precisions import (
+    LEAST_SCALED,
+    are_definite,
+    filled,
+    proper_information,
+    uncoupled_share,
+)
 from pgo_models.problem.problem import PGOProblem
 
 BISECTIONS = 5
 _SHOWN = 2.0**-45  # smallest eigenvalue of a matrix with ones on its diagonal that is not rounding
-_MARGIN = 2.0**-40  # of the trace: above the rounding of a block, so that I' is below I all the same
+_HALVINGS = 60  # of a share that rounding makes too large: nothing is left of the matrix then
+# of the trace: above the rounding of a block, so that I' is below I all the same
+_MARGIN = 2.0**-40
 
 
-def soften(graph: PoseGraph, cap: float) -> PoseGraph:
-    """Return the graph with information matrices below its own: condition of I_tt at most `cap`, W convex.
+def shrink_information(graph: PoseGraph, cap: float) -> PoseGraph:
+    """Return the graph with information matrices below its own that are easier to bound.
 
-    Coupling blocks are taken out first, with what they can take from the others: with C = I_tt^-1/2 I_tr I_rr^-1/2,
-    I >= (1 - ||C||) blockdiag(I_tt, I_rr), or a smaller share where rounding hides that.
+    The condition of their I_tt is at most `cap`, and their W is convex.
+
+    Coupling blocks are taken out first, with what they can take from the others: with C = I_tt^-1/2
+    I_tr I_rr^-1/2, I >= (1 - ||C||) blockdiag(I_tt, I_rr), or a smaller share where rounding hides
+    that. Edges whose coupled matrix is only semidefinite, where that share is zero, are left out:
+    they cost zero or more. A GraphError where rounding hides it for every share.
     """
-    information, d = proper_information(graph), graph.d
-    I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
-    share, limit = uncoupled_share(information, d) - 2.0**-20, np.array([0.5, 1.0]) if d == 3 else np.ones(1)
-    share, is_below = np.where(I_tr.any(axis=(1, 2)), np.maximum(share, 0.0), 1.0), ~I_tr.any(axis=(1, 2))
-    while True:
+    information = proper_information(graph)
+    d = graph.d
+    I_tt = information[:, :d, :d]
+    I_tr = information[:, :d, d:]
+    I_rr = information[:, d:, d:]
+    is_singular = I_tr.any(axis=(1, 2)) & ~are_definite(information, LEAST_SCALED)
+    share = uncoupled_share(information, d) - 2.0**-20
+    # W is convex if the largest eigenvalue of I_rr is at most the second and half the smallest.
+    limit = np.array([0.5, 1.0]) if d == 3 else np.ones(1)
+    share = np.where(I_tr.any(axis=(1, 2)), np.maximum(share, 0.0), 1.0)
+    is_below = ~I_tr.any(axis=(1, 2))
+    for _ in range(_HALVINGS):
         smaller = np.zeros_like(information)
-        smaller[:, :d, :d] = _clipped(share[:, None, None] * I_tt, lambda values: cap * values[:, 0])
-        smaller[:, d:, d:] = _clipped(share[:, None, None] * I_rr, lambda values: values[:, :2] @ limit)
-        is_below = is_below | are_definite(information - smaller, _SHOWN)
+        smaller[:, :d, :d] = _clipped(
+            share[:, None, None] * I_tt, lambda values: cap * values[:, 0]
+        )
+        smaller[:, d:, d:] = _clipped(
+            share[:, None, None] * I_rr, lambda values: values[:, :2] @ limit
+        )
+        is_below = is_below | are_definite(information - smaller, _SHOWN) | is_singular
         if is_below.all():
-            return replace(graph, information=smaller)
+            shrunk = replace(graph, information=smaller)
+            return shrunk.without_edges(is_singular) if is_singular.any() else shrunk
         share = np.where(is_below, share, 0.5 * share)  # was rounded
+    raise GraphError("rounding hides that smaller information matrices are below the graph's own")
 
 
-def softened_bound(problem: PGOProblem, poses: Poses) -> tuple[LowerBound, Poses, Array]:
-    """Bound on chi2 with the largest cap found, and the poses and multipliers that it was found at.
+@dataclass(frozen=True, eq=False)
+class ShrunkBound:
+    """A bound on chi2 by smaller information matrices, and where it was found."""
+
+    bound: LowerBound
+    poses: Poses  # the minimum of the smaller cost
+    Lambda: Array  # (n, d, d): the multipliers there
+
+
+def bound_by_shrinking(problem: PGOProblem, poses: Poses) -> ShrunkBound:
+    """Bound on chi2 with the largest cap that gives one, by bisection of its logarithm.
 
     The search for the minima of the smaller costs begins at the poses given.
     """
-    best = NO_BOUND, poses, np.zeros_like(poses.R)
-
-    def attempt(log_cap: float) -> bool:
-        nonlocal best, poses
-        cap = math.exp(log_cap)
-        try:
-            softer = PGOProblem(soften(problem.graph, cap), problem.backend, problem.weighting)
-            there = polish(softer, poses)
-        except (GraphError, NotPositiveDefiniteError):
-            return False
-        Lambda = multipliers(softer, there)
-        bound = prove_at(softer.tangent_at(there), Lambda, there)
-        if bound is None or bound.value <= best[0].value:
-            return bound is not None
-        best, poses = (replace(bound, cap=cap), there, Lambda), there
-        return True
-
-    d = problem.d
-    low, high = 0.0, math.log(1.0 + float(np.linalg.cond(filled(proper_information(problem.graph)[:, :d, :d])).max()))
-    if attempt(low):
-        for _ in range(BISECTIONS):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if attempt(middle) else (low, middle)
+    best = ShrunkBound(NO_BOUND, poses, np.zeros_like(poses.R))
+    I_tt = filled(proper_information(problem.graph)[:, : problem.d, : problem.d])
+    low = 0.0
+    high = math.log(1.0 + float(np.linalg.cond(I_tt).max()))
+    has_bound, best = _try_cap(problem, math.exp(low), best)
+    if not has_bound:
+        return best
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        has_bound, best = _try_cap(problem, math.exp(middle), best)
+        if has_bound:
+            low = middle
+        else:
+            high = middle
     return best
+
+
+def _try_cap(problem: PGOProblem, cap: float, best: ShrunkBound) -> tuple[bool, ShrunkBound]:
+    """Whether a cap gives a bound without a shift, and the better one of it and the best so far."""
+    try:
+        smaller = PGOProblem(
+            shrink_information(problem.graph, cap), problem.backend, problem.weighting
+        )
+        minimum = polish(smaller, best.poses)
+    except (GraphError, NotPositiveDefiniteError):
+        return False, best
+    Lambda = multipliers(smaller, minimum)
+    bound = prove_at(smaller.tangent_at(minimum), Lambda, minimum)
+    if bound is None:
+        return False, best
+    if bound.value <= best.bound.value:
+        return True, best
+    return True, ShrunkBound(replace(bound, cap=cap), minimum, Lambda)
 
 
 def _clipped(block: Array, limit: Callable[[Array], Array]) -> Array:
@@ -85,5 +131,5 @@ def _clipped(block: Array, limit: Callable[[Array], Array]) -> Array:
     values, axes = np.linalg.eigh(block)
     margin = _MARGIN * np.einsum("mkk->m", block)[:, None]
     smaller = np.minimum(values, limit(values)[:, None]) - margin
-    found = (axes * smaller[:, None, :]) @ np.swapaxes(axes, 1, 2)
-    return np.asarray(0.5 * (found + np.swapaxes(found, 1, 2)))
+    product = (axes * smaller[:, None, :]) @ np.swapaxes(axes, 1, 2)
+    return np.asarray(0.5 * (product + np.swapaxes(product, 1, 2)))

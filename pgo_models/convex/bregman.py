@@ -1,22 +1,23 @@
-"""min J(x) s.t. K x = f for any convex cvxpy J, and the subproblems of Bregman iteration on it (paper, section 2).
+"""Minimise a convex cvxpy J(x) subject to K x = f, and the subproblems of Bregman iteration on it.
 
-Equations of the paper by label: `problem bregman` is the problem; `update B`, `bregman update` and `minbregman` are the
-three forms of the iteration whose subproblems are compiled here, each with one Parameter (DPP); `bregman ADMM`
-alternates over the blocks of x. The iterations themselves are in solvers/convex/bregman.py.
+Equations of the paper's section 2 by label: `problem bregman` is the problem; `update B`, `bregman
+update` and `minbregman` are the three forms of the iteration whose subproblems are compiled here,
+each with one Parameter (DPP); `bregman ADMM` alternates over the blocks of x. The iterations
+themselves are in solvers/convex/bregman.py.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import cvxpy as cp
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
 from pgo_models.convex import convex_solver
-from pgo_models.convex.convex_solver import COLD, ConvexSolver, finite_array
+from pgo_models.convex.convex_solver import COLD, ConvexSolver, HoldsModel, finite_array
 from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import ReadOnly, read_only, real_array
 from pgo_models.geometry.rotations import Array
@@ -24,10 +25,15 @@ from pgo_models.geometry.rotations import Array
 
 @dataclass(frozen=True, eq=False)
 class BregmanPoint(ReadOnly):
-    """Where an iteration starts or ends: x, (m,), and the multiplier lam, (s,), of K x = f.
+    """Where an iteration starts or ends.
 
-    `lam` is the paper's lambda: the Lagrangian is J(x) + <lam, f - K x>, so that p = K^T lam is a subgradient of J at
-    a solution, and b = -lam / alpha.
+    Parameters
+    ----------
+    x : (m,) array
+        All variables, stacked.
+    lam : (s,) array
+        Multiplier of K x = f, the paper's lambda: the Lagrangian is J(x) + <lam, f - K x>, so that
+        p = K^T lam is a subgradient of J at a solution, and b = -lam / alpha.
     """
 
     x: Array
@@ -39,16 +45,39 @@ class BregmanPoint(ReadOnly):
 
 
 @dataclass(frozen=True, eq=False)
-class BregmanProblem:
+class BregmanProblem(HoldsModel):
     """Minimise J(x) subject to K x = f (paper: `problem bregman`).
 
-    x, (m,), stacks the variables, each flattened row by row: the blocks over which `AlternatingBregman` alternates.
+    x, (m,), stacks the variables, each flattened row by row: the blocks over which
+    `AlternatingBregman` alternates.
 
-    `J` is one real number, a cp.Expression convex in `variables`, a cp.Variable or several, all that it has;
-    `cp.transforms.indicator(constraints)` adds constraints. `K`, (s, m), is dense or sparse, `f` is (s,).
+    Parameters
+    ----------
+    J : cp.Expression
+        One real number, convex in `variables`. `cp.transforms.indicator(constraints)` adds
+        constraints.
+    variables : cp.Variable or sequence of them
+        All variables that J has.
+    K : (s, m) array, dense or sparse
+        Matrix of the constraint.
+    f : (s,) array
+        Right-hand side.
 
-    A SettingError when J is not convex or not one real number, has a variable that is not named or one that is named is
-    not continuous and real, or when K and f have other shapes or entries that are not finite.
+    Raises
+    ------
+    SettingError
+        If J is not convex or not one real number, if J has a variable that is not named, if a
+        variable is not continuous and real, or if K and f have other shapes or entries that are not
+        finite.
+
+    Examples
+    --------
+    >>> x = cp.Variable(3)
+    >>> problem = BregmanProblem(cp.norm1(x), x, np.array([[1.0, 1.0, 2.0]]), [4.0])
+    >>> problem
+    BregmanProblem(m=3, s=1, blocks=1)
+    >>> problem.residual(np.array([0.0, 0.0, 2.0])).tolist()
+    [0.0]
     """
 
     J: Any
@@ -57,30 +86,21 @@ class BregmanProblem:
     f: Any
 
     def __post_init__(self) -> None:
-        convex_solver.check_convex(self.J, "J")
-        variables = (self.variables,) if isinstance(self.variables, cp.Variable) else tuple(self.variables)
-        for position, variable in enumerate(variables):
-            convex_solver.check_variable(variable, f"variables[{position}]")
-        known = {variable.id for variable in variables}
-        if not variables or len(known) < len(variables):
-            raise SettingError(f"variables are {variables}; name at least one, each once")
-        for variable in self.J.variables():
-            if variable.id not in known:
-                raise SettingError(f"J has the variable {variable}, which is not among the variables named; add it")
+        variables = _checked_variables(self.J, self.variables)
         f = np.atleast_1d(finite_array(self.f, "f"))
-        if issparse(self.K):
-            K = csr_array(self.K, copy=True)
-            K.data = finite_array(K.data, "the entries of K")
-        else:
-            K = csr_array(np.atleast_2d(finite_array(self.K, "K")))
+        K = _sparse_matrix(self.K)
         m = sum(int(variable.size) for variable in variables)
         if f.ndim != 1 or K.shape != (len(f), m):
-            raise SettingError(f"K has shape {K.shape} and f {f.shape}; with m = {m} they must be (s, {m}) and (s,)")
+            raise SettingError(
+                f"K has shape {K.shape} and f {f.shape}; "
+                f"with m = {m} they must be (s, {m}) and (s,)"
+            )
         for name, value in (("variables", variables), ("K", read_only(K)), ("f", read_only(f))):
             object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:
-        return f"BregmanProblem(m={self.K.shape[1]}, s={self.K.shape[0]}, blocks={len(self.variables)})"
+        s, m = self.K.shape
+        return f"BregmanProblem(m={m}, s={s}, blocks={len(self.variables)})"
 
     @property
     def blocks(self) -> tuple[slice, ...]:
@@ -89,28 +109,99 @@ class BregmanProblem:
         return tuple(slice(int(start), int(end)) for start, end in pairwise(ends))
 
     def stacked(self, values: Sequence[Array]) -> Array:
-        """x, (m,), of `values`, one array for every variable, in its shape."""
+        """Stack the values of all variables.
+
+        Parameters
+        ----------
+        values : sequence of arrays
+            One array for every variable, in its shape.
+
+        Returns
+        -------
+        (m,) array
+            x.
+        """
         return np.concatenate([np.ravel(value) for value in values])
 
     def unstacked(self, x: Array) -> tuple[Array, ...]:
-        """One array for every variable, in its shape, of x, (m,); the inverse of `stacked`."""
-        return tuple(x[block].reshape(one.shape) for block, one in zip(self.blocks, self.variables, strict=True))
+        """Split x into the values of the variables; the inverse of `stacked`.
+
+        Parameters
+        ----------
+        x : (m,) array
+            All variables, stacked.
+
+        Returns
+        -------
+        tuple of arrays
+            One array for every variable, in its shape.
+        """
+        blocks_and_variables = zip(self.blocks, self.variables, strict=True)
+        return tuple(x[block].reshape(variable.shape) for block, variable in blocks_and_variables)
 
     def objective(self, x: Array) -> float:
-        """J(x), x (m,); inf outside its domain."""
+        """Evaluate J.
+
+        Parameters
+        ----------
+        x : (m,) array
+            All variables, stacked.
+
+        Returns
+        -------
+        float
+            J(x); inf outside the domain of J.
+        """
         for variable, value in zip(self.variables, self.unstacked(x), strict=True):
             variable.save_value(value)
-        with np.errstate(all="ignore"):  # outside the domain of J the value says so
-            found = float(self.J.value)
-        return math.inf if math.isnan(found) else found
+        with np.errstate(all="ignore"):  # outside the domain the value is nan or inf
+            value_of_J = float(self.J.value)
+        return math.inf if math.isnan(value_of_J) else value_of_J
 
     def residual(self, x: Array) -> Array:
-        """K x - f, (s,)."""
+        """Return how far x is from satisfying the constraint.
+
+        Parameters
+        ----------
+        x : (m,) array
+            All variables, stacked.
+
+        Returns
+        -------
+        (s,) array
+            K x - f.
+        """
         return np.asarray(self.K @ x - self.f)
 
 
+def _checked_variables(J: Any, given: Any) -> tuple[cp.Variable, ...]:  # noqa: ANN401 - checked here
+    """The given variables as a tuple; a SettingError unless J is convex and has no others."""
+    convex_solver.check_convex(J, "J")
+    variables = (given,) if isinstance(given, cp.Variable) else tuple(given)
+    for position, variable in enumerate(variables):
+        convex_solver.check_variable(variable, f"variables[{position}]")
+    ids = {variable.id for variable in variables}
+    if not variables or len(ids) < len(variables):
+        raise SettingError(f"variables are {variables}; name at least one, each once")
+    for variable in J.variables():
+        if variable.id not in ids:
+            raise SettingError(
+                f"J has the variable {variable}, which is not among the variables named; add it"
+            )
+    return variables
+
+
+def _sparse_matrix(given: Any) -> csr_array:  # noqa: ANN401 - dense or sparse
+    """A sparse copy of a matrix, whose entries are finite."""
+    if not issparse(given):
+        return csr_array(np.atleast_2d(finite_array(given, "K")))
+    K = csr_array(cast(Any, given), copy=True)
+    K.data = finite_array(K.data, "the entries of K")
+    return K
+
+
 @dataclass(frozen=True, eq=False)
-class Subproblem:
+class Subproblem(HoldsModel):
     """A compiled minimisation over x, or over one block of it."""
 
     problem: cp.Problem
@@ -121,48 +212,64 @@ class Subproblem:
     solver: ConvexSolver | str = COLD
 
     def solve(self, value: Array) -> Array:
-        """Minimiser, stacked; a PGOError where there is none: J may be unbounded below on K x = const."""
+        """Minimiser, stacked.
+
+        A PGOError where there is none: J may be unbounded below on K x = const.
+        """
         self.parameter.value = self.scale * value
-        convex_solver.solve_compiled(self.problem, "Bregman subproblem", self.tolerance, self.solver)
+        convex_solver.solve_compiled(
+            self.problem, "Bregman subproblem", self.tolerance, self.solver
+        )
         return np.concatenate([np.ravel(variable.value) for variable in self.variables])
 
 
 def bregman_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
-    """Solve p -> argmin J(x) - <p, x> + alpha/2 ||K x - f||^2 (paper: `update B`, constants dropped)."""
+    """Compile p -> argmin J(x) - <p, x> + alpha/2 ||K x - f||^2 (paper: `update B`).
+
+    The constants J(x^k) and <p, x^k> are dropped.
+    """
     p = cp.Parameter(problem.K.shape[1], name="p")
     x = _stack(problem.variables)
     penalty = cp.sum_squares(np.sqrt(alpha / 2) * (problem.K @ x - problem.f))
-    return Subproblem(cp.Problem(cp.Minimize(problem.J - p @ x + penalty)), problem.variables, p, 1.0)
+    model = cp.Problem(cp.Minimize(problem.J - p @ x + penalty))
+    return Subproblem(model, problem.variables, p, 1.0)
 
 
 def two_line_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
-    """Solve f - b -> argmin J(x) + alpha/2 ||K x - f + b||^2 (paper: `bregman update`)."""
+    """Compile f - b -> argmin J(x) + alpha/2 ||K x - f + b||^2 (paper: `bregman update`)."""
     root = float(np.sqrt(alpha / 2))
     shift = cp.Parameter(problem.K.shape[0], name="shift")
     penalty = cp.sum_squares((root * problem.K) @ _stack(problem.variables) - shift)
-    return Subproblem(cp.Problem(cp.Minimize(problem.J + penalty)), problem.variables, shift, root)
+    model = cp.Problem(cp.Minimize(problem.J + penalty))
+    return Subproblem(model, problem.variables, shift, root)
 
 
 def augmented_lagrangian_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
-    """Solve lam -> argmin J(x) + <lam, f - K x> + alpha/2 ||f - K x||^2 (paper: `minbregman`)."""
+    """Compile lam -> argmin J(x) + <lam, f - K x> + alpha/2 ||f - K x||^2 (paper: `minbregman`)."""
     lam = cp.Parameter(problem.K.shape[0], name="lam")
     residual = problem.f - problem.K @ _stack(problem.variables)
     penalty = cp.sum_squares(np.sqrt(alpha / 2) * residual)
-    return Subproblem(cp.Problem(cp.Minimize(problem.J + lam @ residual + penalty)), problem.variables, lam, 1.0)
+    model = cp.Problem(cp.Minimize(problem.J + lam @ residual + penalty))
+    return Subproblem(model, problem.variables, lam, 1.0)
 
 
 def block_subproblems(problem: BregmanProblem, alpha: float) -> tuple[Subproblem, ...]:
-    """Solve, for block i, c -> argmin J_i(x_i) + alpha/2 ||K_i x_i - c||^2 (paper: `bregman ADMM`).
+    """Compile c -> argmin J_i(x_i) + alpha/2 ||K_i x_i - c||^2 for every block i.
 
-    Minimises the augmented Lagrangian over x_i when c = f + lam / alpha - sum of K_j x_j over the other blocks. A
-    SettingError when J is not a sum of terms of one variable each.
+    This is the x-step of the paper's `bregman ADMM`: it minimises the augmented Lagrangian over x_i
+    when c = f + lam / alpha - sum of K_j x_j over the other blocks. A SettingError when J is not a
+    sum of terms of one variable each.
     """
-    root, compiled = float(np.sqrt(alpha / 2)), []
-    for variable, block, J_i in zip(problem.variables, problem.blocks, _terms_by_variable(problem), strict=True):
+    root = float(np.sqrt(alpha / 2))
+    terms = _terms_by_variable(problem)
+    subproblems = []
+    for variable, block, J_i in zip(problem.variables, problem.blocks, terms, strict=True):
         c = cp.Parameter(problem.K.shape[0], name="c")
-        penalty = cp.sum_squares((root * problem.K[:, block]) @ _stack((variable,)) - c)
-        compiled.append(Subproblem(cp.Problem(cp.Minimize(J_i + penalty)), (variable,), c, root))
-    return tuple(compiled)
+        K_i = problem.K[:, block]
+        penalty = cp.sum_squares((root * K_i) @ _stack((variable,)) - c)
+        model = cp.Problem(cp.Minimize(J_i + penalty))
+        subproblems.append(Subproblem(model, (variable,), c, root))
+    return tuple(subproblems)
 
 
 def _terms_by_variable(problem: BregmanProblem) -> list[cp.Expression]:
@@ -173,8 +280,11 @@ def _terms_by_variable(problem: BregmanProblem) -> list[cp.Expression]:
     for term in problem.J.args if isinstance(problem.J, addition) else [problem.J]:
         owners = term.variables()
         if len(owners) > 1:
-            way_out = "write J as a sum of terms of one variable each, with copies of shared ones that K x = f ties"
-            raise SettingError(f"the term {term} of J couples the variables {', '.join(map(str, owners))}; {way_out}")
+            names = ", ".join(map(str, owners))
+            raise SettingError(
+                f"the term {term} of J couples the variables {names}; write J as a sum of terms of "
+                "one variable each, with copies of shared ones that K x = f ties"
+            )
         if owners:
             separated[position[owners[0].id]] += term
     return separated

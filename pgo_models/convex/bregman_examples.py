@@ -1,8 +1,11 @@
-"""Worked models of the form min J(x) s.t. K x = f, for the Bregman iterations of solvers/convex/bregman.py."""
+"""Worked models of the form min J(x) subject to K x = f, for the Bregman iterations.
+
+The iterations are in solvers/convex/bregman.py.
+"""
 
 import cvxpy as cp
 import numpy as np
-from scipy.sparse import csr_array, diags_array, eye_array, hstack, kron, vstack
+from scipy.sparse import csr_array, eye_array, hstack, kron, vstack
 
 from pgo_models.convex.bregman import BregmanProblem
 from pgo_models.convex.convex_solver import finite_array
@@ -11,55 +14,145 @@ from pgo_models.geometry.rotations import Array
 
 
 def basis_pursuit(K: Array, f: Array) -> BregmanProblem:
-    """Minimise ||x||_1 s.t. K x = f: the sparsest x, when K is incoherent and x sparse enough.
+    """Minimise ||x||_1 subject to K x = f.
 
-    Bregman iteration ends after finitely many steps, and forgets errors on the way (Yin et al. 2008; Yin & Osher 2013).
+    The solution is the sparsest x, when K is incoherent and x sparse enough. Bregman iteration ends
+    after finitely many steps, and forgets errors on the way (Yin et al. 2008; Yin & Osher 2013).
+
+    Parameters
+    ----------
+    K : (s, m) array
+        Measurement matrix, mostly with fewer rows than columns.
+    f : (s,) array
+        Measurements.
+
+    Returns
+    -------
+    BregmanProblem
+        The model; its x are the m unknowns.
+
+    Examples
+    --------
+    >>> basis_pursuit(np.array([[1.0, 1.0, 2.0]]), np.array([4.0]))
+    BregmanProblem(m=3, s=1, blocks=1)
     """
-    x = cp.Variable(np.shape(K)[-1], name="x")
+    num_unknowns = np.shape(K)[-1]
+    x = cp.Variable(num_unknowns, name="x")
     return BregmanProblem(cp.norm1(x), x, K, f)
 
 
 def differences(shape: tuple[int, ...]) -> csr_array:
-    """Forward differences of a signal or an image, flattened row by row: down the rows first, then across the columns.
+    """Matrix of the forward differences of a signal or an image, which is flattened row by row.
 
-    A SettingError when the shape has not one or two dimensions, or only one entry.
+    Parameters
+    ----------
+    shape : (length,) or (height, width)
+        Of the signal or the image.
+
+    Returns
+    -------
+    sparse array
+        One row for every difference: of an image those down the rows first, then those across the
+        columns.
+
+    Raises
+    ------
+    SettingError
+        If the shape has not one or two dimensions, or only one entry.
+
+    Examples
+    --------
+    >>> differences((3,)).toarray().tolist()
+    [[-1.0, 1.0, 0.0], [0.0, -1.0, 1.0]]
     """
     if len(shape) not in (1, 2) or int(np.prod(shape)) < 2:
         raise SettingError(f"shape is {shape}; give a signal or an image of two entries or more")
     if len(shape) == 1:
-        return _forward(shape[0])
+        return _forward_differences(shape[0])
     height, width = shape
-    down, across = kron(_forward(height), eye_array(width)), kron(eye_array(height), _forward(width))
+    down = kron(_forward_differences(height), eye_array(width))
+    across = kron(eye_array(height), _forward_differences(width))
     return csr_array(vstack([down, across]))
 
 
 def total_variation_denoising(noisy: Array, weight: float) -> BregmanProblem:
-    """Minimise 1/2 ||u - noisy||^2 + weight ||d||_1 s.t. D u - d = 0: ROF, anisotropic in two dimensions.
+    """Minimise 1/2 ||u - noisy||^2 + weight ||d||_1 subject to D u - d = 0.
 
-    D are the forward differences. The variables are u and d, so that AlternatingBregman with T = 1 is split Bregman:
-    a least-squares step in u and soft thresholding in d (Rudin, Osher, Fatemi 1992; Goldstein & Osher 2009).
+    D are the forward differences, so that this is the ROF model, anisotropic in two dimensions. The
+    variables are u and d: AlternatingBregman with T = 1 is split Bregman, with a least-squares step
+    in u and soft thresholding in d (Rudin, Osher, Fatemi 1992; Goldstein & Osher 2009).
+
+    Parameters
+    ----------
+    noisy : (length,) or (height, width) array
+        Signal or image.
+    weight : float
+        Weight of the total variation.
+
+    Returns
+    -------
+    BregmanProblem
+        The model; its x are u and d.
+
+    Raises
+    ------
+    SettingError
+        If `noisy` is not finite or the weight is negative.
+
+    Examples
+    --------
+    >>> total_variation_denoising(np.array([0.0, 1.0, 5.0]), weight=0.5)
+    BregmanProblem(m=5, s=2, blocks=2)
     """
     noisy = finite_array(noisy, "noisy")
     if not 0 <= weight < np.inf:
         raise SettingError(f"weight must not be negative, got {weight}")
     D = differences(noisy.shape)
-    u, d = cp.Variable(noisy.shape, name="u"), cp.Variable(D.shape[0], name="d")
-    J = 0.5 * cp.sum_squares(u - noisy) + weight * cp.norm1(d)
-    return BregmanProblem(J, (u, d), hstack([D, -eye_array(D.shape[0])]), np.zeros(D.shape[0]))
+    num_differences = D.shape[0]
+    u = cp.Variable(noisy.shape, name="u")
+    d = cp.Variable(num_differences, name="d")
+    misfit = 0.5 * cp.sum_squares(u - noisy)
+    total_variation = weight * cp.norm1(d)
+    K = hstack([D, -eye_array(num_differences)])
+    f = np.zeros(num_differences)
+    return BregmanProblem(misfit + total_variation, (u, d), K, f)
 
 
 def total_variation_scale_space(noisy: Array) -> BregmanProblem:
-    """Minimise TV(u) s.t. u = noisy: K = I, whose Bregman iterates are what is wanted, not its solution.
+    """Minimise TV(u) subject to u = noisy.
 
-    They begin over-smoothed and take detail back, large contrasts first and noise last: stop when
-    ||u - noisy|| falls below the norm of the noise (Osher et al. 2005).
+    Its solution is known; its Bregman iterates are what is wanted. They begin over-smoothed and
+    take detail back, large contrasts first and noise last: stop when ||u - noisy|| falls below the
+    norm of the noise (Osher et al. 2005).
+
+    Parameters
+    ----------
+    noisy : (length,) or (height, width) array
+        Signal or image.
+
+    Returns
+    -------
+    BregmanProblem
+        The model, with K = I.
+
+    Raises
+    ------
+    SettingError
+        If `noisy` is not finite.
+
+    Examples
+    --------
+    >>> total_variation_scale_space(np.array([0.0, 1.0, 5.0]))
+    BregmanProblem(m=3, s=3, blocks=1)
     """
     noisy = finite_array(noisy, "noisy")
     u = cp.Variable(noisy.shape, name="u")
-    J = cp.norm1(differences(noisy.shape) @ cp.vec(u, order="C"))
-    return BregmanProblem(J, u, eye_array(noisy.size), noisy.ravel())
+    flat_u = cp.vec(u, order="C")
+    total_variation = cp.norm1(differences(noisy.shape) @ flat_u)
+    return BregmanProblem(total_variation, u, eye_array(noisy.size), noisy.ravel())
 
 
-def _forward(length: int) -> csr_array:
-    ones = np.ones(max(length - 1, 0))
-    return csr_array(diags_array([-ones, ones], offsets=[0, 1], shape=(len(ones), length)))
+def _forward_differences(length: int) -> csr_array:
+    num_differences = max(length - 1, 0)
+    following = eye_array(num_differences, length, k=1)
+    return csr_array(following - eye_array(num_differences, length))

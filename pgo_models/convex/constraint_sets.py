@@ -1,6 +1,8 @@
-"""The sets of SOC: orthonormal columns, SO(d), unit columns and rows, few nonzeros, each with its projection.
+"""The sets of SOC, each with its projection.
 
-The projection onto orthonormal columns is Theorem 1 of Lai & Osher 2014 and step (b) of the paper's Algorithm 1.
+They are orthonormal columns, SO(d), unit columns or rows, and arrays with few nonzeros. The
+projection onto orthonormal columns is Theorem 1 of Lai & Osher 2014 and step (b) of the paper's
+Algorithm 1.
 """
 
 from abc import ABC, abstractmethod
@@ -17,13 +19,13 @@ class ConstraintSet(ABC):
     """A closed set of matrices with a closed-form projection."""
 
     def check_shape(self, shape: tuple[int, ...], name: str) -> None:
-        """Raise SettingError unless the set has matrices of this shape; `name` is for the message."""
+        """Raise a SettingError, which has the `name`, unless the set has matrices of this shape."""
         if len(shape) not in (1, 2):
             raise SettingError(f"{name} has shape {shape}; give a vector or a matrix")
 
     @abstractmethod
     def project(self, V: Array) -> Array:
-        """One nearest point of the set to V."""
+        """A point of the set that is nearest to V."""
 
     @abstractmethod
     def normal_part(self, P: Array, G: Array) -> Array:
@@ -38,7 +40,10 @@ class ConstraintSet(ABC):
         """How far P is from satisfying the equations of the set."""
 
     def random(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-        """Random point of the set: the projection of normal entries, for norms and determinants the uniform one."""
+        """Random point of the set: the projection of normal entries.
+
+        Its distribution is uniform for orthonormal columns, rotations and unit vectors.
+        """
         return self.project(rng.standard_normal(shape))
 
 
@@ -49,7 +54,10 @@ class Orthonormal(ConstraintSet):
     def check_shape(self, shape: tuple[int, ...], name: str) -> None:
         """Two dimensions, not more columns than rows."""
         if len(shape) != 2 or shape[1] > shape[0]:
-            raise SettingError(f"{name} has shape {shape}; X^T X = I needs at least as many rows as columns: transpose")
+            raise SettingError(
+                f"{name} has shape {shape}; "
+                "X^T X = I needs at least as many rows as columns: transpose"
+            )
 
     def project(self, V: Array) -> Array:
         """U V^T of the SVD."""
@@ -60,8 +68,12 @@ class Orthonormal(ConstraintSet):
         return np.asarray(P @ _symmetric(P.T @ G))
 
     def least_penalty(self, P: Array, N: Array) -> float:
-        """Largest eigenvalue of -Lambda, N = P Lambda: the polar factor of P (I + Lambda / rho) must be P."""
-        return max(0.0, float(-np.linalg.eigvalsh(_symmetric(P.T @ N))[0]))
+        """Largest eigenvalue of -Lambda, with N = P Lambda.
+
+        The polar factor of P (I + Lambda / rho) must be P.
+        """
+        eigenvalues = np.linalg.eigvalsh(_symmetric(P.T @ N))
+        return max(0.0, float(-eigenvalues[0]))
 
     def distance(self, P: Array) -> float:
         """||P^T P - I||_F."""
@@ -70,24 +82,35 @@ class Orthonormal(ConstraintSet):
 
 @dataclass(frozen=True)
 class Rotations(Orthonormal):
-    """X^T X = I and det X = 1: SO(d), for square X of any side; a part of O(d), with its normal spaces."""
+    """X^T X = I and det X = 1: SO(d), for square X of any side.
+
+    It is a part of O(d), and has the same normal spaces.
+    """
 
     def check_shape(self, shape: tuple[int, ...], name: str) -> None:
         """Square."""
         if len(shape) != 2 or shape[0] != shape[1]:
-            raise SettingError(f"{name} has shape {shape}; a rotation must be square, use `orthogonal` for X^T X = I")
+            raise SettingError(
+                f"{name} has shape {shape}; "
+                "a rotation must be square, use `orthogonal` for X^T X = I"
+            )
 
     def project(self, V: Array) -> Array:
         """U diag(1, .., 1, det(U V^T)) V^T of the SVD."""
         return project_by_svd(V)
 
     def least_penalty(self, P: Array, N: Array) -> float:
-        """Minus half the sum of Lambda's two smallest eigenvalues: one may be negative in a nearest rotation."""
-        return max(0.0, float(-np.mean(np.linalg.eigvalsh(_symmetric(P.T @ N))[:2])))
+        """Minus the mean of Lambda's two smallest eigenvalues.
+
+        P (I + Lambda / rho) may have one negative singular value and still be nearest to P.
+        """
+        eigenvalues = np.linalg.eigvalsh(_symmetric(P.T @ N))
+        return max(0.0, float(-np.mean(eigenvalues[:2])))
 
     def distance(self, P: Array) -> float:
         """max(||P^T P - I||_F, 1 - det P)."""
-        return max(float(np.linalg.norm(P.T @ P - np.eye(len(P)))), 1.0 - float(np.linalg.det(P)))
+        not_orthogonal = super().distance(P)
+        return max(not_orthogonal, 1.0 - float(np.linalg.det(P)))
 
 
 @dataclass(frozen=True)
@@ -95,19 +118,21 @@ class UnitColumns(ConstraintSet):
     """||x_j|| = 1 for every column x_j; a vector is one column."""
 
     def _columns(self, V: Array) -> Array:
-        """The vectors of unit norm as columns; of those again, V but for its shape."""
+        """V with the vectors that have unit norm as its columns; applied twice it gives V again."""
         return V
 
     def project(self, V: Array) -> Array:
-        """Each over its norm; zero becomes the first unit vector."""
-        return self._columns(project_unit_columns(self._columns(V))).reshape(V.shape)
+        """Every column over its norm; a zero column becomes the first unit vector."""
+        projected = project_unit_columns(self._columns(V))
+        return self._columns(projected).reshape(V.shape)
 
     def normal_part(self, P: Array, G: Array) -> Array:
         """P diag(Lambda), with Lambda_j = <p_j, g_j>."""
-        return self._columns(self._columns(P) * self._products(P, G)).reshape(P.shape)
+        columns = self._columns(P) * self._products(P, G)
+        return self._columns(columns).reshape(P.shape)
 
     def least_penalty(self, P: Array, N: Array) -> float:
-        """Largest -Lambda_j, N = P diag(Lambda)."""
+        """Largest -Lambda_j, with N = P diag(Lambda)."""
         return max(0.0, float(-np.min(self._products(P, N))))
 
     def distance(self, P: Array) -> float:
@@ -115,6 +140,7 @@ class UnitColumns(ConstraintSet):
         return float(np.linalg.norm(self._products(P, P) - 1.0))
 
     def _products(self, P: Array, G: Array) -> Array:
+        """<p_j, g_j> of all columns."""
         return np.asarray(np.sum(self._columns(P) * self._columns(G), axis=0))
 
 
@@ -146,7 +172,11 @@ class Sparse(ConstraintSet):
         return np.where(P == 0, G, 0.0)
 
     def least_penalty(self, P: Array, N: Array) -> float:
-        """Return 0: largest |N| off the support over smallest |P| on it is no scale to hold rho by, both can jump."""
+        """Return 0, which bounds nothing.
+
+        The bound would be the largest |N| off the support over the smallest |P| on it. Both can
+        jump from one iterate to the next, so that rho cannot follow it.
+        """
         return 0.0
 
     def distance(self, P: Array) -> float:

@@ -1,23 +1,26 @@
-"""How cvxpy models are given to a solver, Clarabel unless another is named, and checked: convex, solved tightly."""
+"""How cvxpy models are checked for convexity, and given to a solver (Clarabel by default)."""
 
 import math
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import cvxpy as cp
 import numpy as np
+from cvxpy.lin_ops.lin_utils import get_id
 
 from pgo_models.errors import PGOError, SettingError
-from pgo_models.geometry.arrays import real_array
+from pgo_models.geometry.arrays import ReadOnly, real_array
 from pgo_models.geometry.rotations import Array
 
-TOLERANCE = 1e-14  # an interior-point iterate errs by about the square root of the gap where the objective is flat
+# An interior-point iterate errs by about the square root of the gap where the objective is flat.
+TOLERANCE = 1e-14
 LOOSEST_TOLERANCE = 1e-8  # what still counts as solved where rounding allows no more
 FIRST_ORDER_TOLERANCE = 1e-7  # finer ones take SCS and OSQP too long
-# What solvers call tolerance and time limit, and what is set besides. One thread: solves are many and small.
+# What solvers call their tolerances and their time limit, and the options set besides. One thread:
+# solves are many and small.
 _OPTIONS: dict[str, tuple[tuple[str, ...], str | None, dict[str, int]]] = {
     cp.CLARABEL: (("tol_gap_abs", "tol_gap_rel", "tol_feas"), "time_limit", {"max_threads": 1}),
     cp.SCS: (("eps_abs", "eps_rel"), "time_limit_secs", {"max_iters": 20_000}),
@@ -28,23 +31,65 @@ _PRODUCT = (
     "put in the best one for the other, as C = D^T Y in Y - D C where D^T D = I "
     "(orthogonality_examples.sparse_low_rank), or hold one as a cp.Parameter"
 )
-_SHOWN = 120  # characters of an expression in a message
+_LAST_NUMBER = "last number of a variable"
+_MAX_SHOWN = 120  # characters of an expression in a message
 _FIRST_ORDER = (cp.SCS, cp.OSQP)
-_WHY = {cp.INFEASIBLE: "its constraints contradict each other", cp.UNBOUNDED: "its objective has no minimum: bound it"}
+_WHY = {
+    cp.INFEASIBLE: "its constraints contradict each other",
+    cp.UNBOUNDED: "its objective has no minimum: bound it",
+}
+
+
+class HoldsModel(ReadOnly):
+    """Base of frozen objects with cvxpy variables, which can be pickled and copied.
+
+    A pickle or a deep copy has their problems as posed, not compiled. cvxpy tells variables apart
+    by numbers, which it counts anew in every process. Where an object comes out of a pickle,
+    counting goes on from where it was in the process that wrote it, so that no two variables have
+    the same number.
+    """
+
+    def __getstate__(self) -> dict[str, object]:
+        state = {name: _as_posed(value) for name, value in super().__getstate__().items()}
+        return {**state, _LAST_NUMBER: get_id()}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        last = cast("int", state[_LAST_NUMBER])
+        while get_id() < last:
+            pass
+        super().__setstate__({name: value for name, value in state.items() if name != _LAST_NUMBER})
+
+
+def _as_posed(value: object) -> object:
+    """The same problem, not compiled; anything else as it is."""
+    if isinstance(value, cp.Problem):
+        return cp.Problem(value.objective, value.constraints)
+    return value
 
 
 def check_convex(expression: cp.Expression, name: str) -> None:
-    """Raise a SettingError unless an expression is one real number, convex by the rules of cvxpy; how it is not."""
+    """Raise a SettingError unless an expression is one real number, convex by cvxpy's rules.
+
+    The message says in which way it is not.
+    """
     if not isinstance(expression, cp.Expression):
         raise SettingError(f"{name} is a {type(expression).__name__}; give a cvxpy expression")
     if expression.size != 1:
-        raise SettingError(f"{name} has shape {expression.shape}; must be one number: cp.sum(..), cp.sum_squares(..)")
+        raise SettingError(
+            f"{name} has shape {expression.shape}; "
+            "must be one number: cp.sum(..), cp.sum_squares(..)"
+        )
     if not expression.is_real():
         raise SettingError(f"{name} is complex; write it in real and imaginary parts")
     if not expression.is_convex():
-        factors, found = _product_of_unknowns(expression), f"{expression.curvature.lower()}, {_short(expression)}"
-        way_out = _DCP if factors is None else f"it multiplies unknowns, {_short(factors)}; {_PRODUCT}"
-        raise SettingError(f"{name} is not convex: cvxpy finds it {found}; {way_out}")
+        product = _product_of_unknowns(expression)
+        way_out = _DCP
+        if product is not None:
+            way_out = f"it multiplies unknowns, {_short(product)}; {_PRODUCT}"
+        raise SettingError(
+            f"{name} is not convex: cvxpy finds it {expression.curvature.lower()}, "
+            f"{_short(expression)}; {way_out}"
+        )
 
 
 def check_terms(terms: Sequence[cp.Expression], constraints: Sequence[cp.Constraint]) -> None:
@@ -52,11 +97,13 @@ def check_terms(terms: Sequence[cp.Expression], constraints: Sequence[cp.Constra
     for name, given in (("terms", terms), ("constraints", constraints)):
         if isinstance(given, cp.Expression | cp.Constraint):
             raise SettingError(f"{name} is one {type(given).__name__}; give a list: {name}=[..]")
-    for place, term in enumerate(terms):
-        check_convex(term, f"terms[{place}]")
-    for place, constraint in enumerate(constraints):
+    for position, term in enumerate(terms):
+        check_convex(term, f"terms[{position}]")
+    for position, constraint in enumerate(constraints):
         if not (isinstance(constraint, cp.Constraint) and constraint.is_dcp()):
-            raise SettingError(f"constraints[{place}], {_short(constraint)}, is not convex by the rules of DCP")
+            raise SettingError(
+                f"constraints[{position}], {_short(constraint)}, is not convex by the rules of DCP"
+            )
 
 
 def check_variable(variable: cp.Variable, name: str) -> None:
@@ -66,19 +113,39 @@ def check_variable(variable: cp.Variable, name: str) -> None:
     if not variable.is_real():
         raise SettingError(f"{name} ({variable}) is complex; write it in real and imaginary parts")
     if variable.attributes["boolean"] or variable.attributes["integer"]:
-        raise SettingError(f"{name} ({variable}) is boolean or integer; only continuous variables are convex")
+        raise SettingError(
+            f"{name} ({variable}) is boolean or integer; only continuous variables are convex"
+        )
 
 
 @dataclass(frozen=True)
 class ConvexSolver:
     """Which solver of cvxpy a model is given to, and how: `problem.solve(solver=name, **options)`.
 
-    `name` is one of `cp.installed_solvers()`: "CLARABEL", "MOSEK", "SCS", "OSQP", .. `options` win over what a model
-    sets: tolerances, of first-order methods no finer than 1e-7, and a limit of iterations; of solvers that are not
-    known here nothing. With `warm_start` it goes on from the last solution (SCS, OSQP), or factorisation pattern
-    (Clarabel); last bits then depend on it.
+    Parameters
+    ----------
+    name : str
+        One of `cp.installed_solvers()`: "CLARABEL", "MOSEK", "SCS", "OSQP", ..
+    options : mapping
+        Options of the solver. They win over those that a model sets: tolerances, of first-order
+        methods no finer than 1e-7, and a limit of iterations for Clarabel, SCS and OSQP; none for
+        other solvers.
+    warm_start : bool
+        Whether a solve goes on from the last solution (SCS, OSQP), or uses the last pattern of the
+        factorisation (Clarabel). The last bits then depend on the solves before.
 
-    A SettingError when it is not installed.
+    Raises
+    ------
+    SettingError
+        If the solver is not installed.
+
+    Examples
+    --------
+    >>> x = cp.Variable()
+    >>> model = cp.Problem(cp.Minimize(cp.square(x - 2.0)))
+    >>> ConvexSolver("SCS", options={"max_iters": 1000}).run(model, tolerance=1e-7)
+    >>> model.status, round(float(x.value), 3)
+    ('optimal', 2.0)
     """
 
     name: str = cp.CLARABEL
@@ -87,36 +154,77 @@ class ConvexSolver:
 
     def __post_init__(self) -> None:
         if self.name not in cp.installed_solvers():
-            found = ", ".join(cp.installed_solvers())
-            raise SettingError(f"solver {self.name!r} is not installed; cvxpy finds {found}; see cvxpy's manual")
+            installed = ", ".join(cp.installed_solvers())
+            raise SettingError(
+                f"solver {self.name!r} is not installed; "
+                f"cvxpy finds {installed}; see cvxpy's manual"
+            )
 
     @property
     def is_first_order(self) -> bool:
-        """Whether its iterations are many, cheap and rough, or it is taken for an interior point."""
+        """Whether it is a first-order method: SCS or OSQP, with many cheap and rough iterations."""
         return self.name in _FIRST_ORDER
 
-    def run(self, model: cp.Problem, tolerance: float, *, time_limit: float = math.inf, verbose: bool = False) -> None:
-        """Solve to a tolerance on the gap and on feasibility; `model.status` says how it ended.
+    def run(
+        self,
+        model: cp.Problem,
+        tolerance: float,
+        *,
+        time_limit: float = math.inf,
+        verbose: bool = False,
+    ) -> None:
+        """Solve a model; `model.status` says how it ended.
 
-        A cp.SolverError when it ends without an iterate, a SettingError when it has no time limit that is known.
+        Parameters
+        ----------
+        model : cp.Problem
+            What is solved. Its variables hold the solution afterwards.
+        tolerance : float
+            On the gap and on feasibility.
+        time_limit : float
+            Seconds at most.
+        verbose : bool
+            Whether the solver prints its log.
+
+        Raises
+        ------
+        cp.SolverError
+            If it ends without an iterate.
+        SettingError
+            If a time limit is given and the solver's name for it is not known.
         """
-        names, clock, known = _OPTIONS.get(self.name, ((), None, {}))
+        options = self._options(tolerance, time_limit)
+        with warnings.catch_warnings():
+            # Callers check the status, which says whether the solution is inaccurate. Stacks of
+            # matrices have three dimensions.
+            expected = "Solution may be inaccurate|.* expression with dimension greater than 2"
+            warnings.filterwarnings("ignore", message=expected, category=UserWarning)
+            try:
+                model.solve(
+                    solver=self.name, warm_start=self.warm_start, verbose=verbose, **options
+                )
+            except _solver_error() as error:
+                raise cp.SolverError(" ".join(str(error).split())) from error
+
+    def _options(self, tolerance: float, time_limit: float) -> dict[str, Any]:
+        """The options of a solve, in the names of this solver."""
+        tolerance_names, time_limit_name, others = _OPTIONS.get(self.name, ((), None, {}))
         if self.is_first_order:
             tolerance = max(tolerance, FIRST_ORDER_TOLERANCE)
-        options = {**dict.fromkeys(names, tolerance), **known}
+        options: dict[str, Any] = {**dict.fromkeys(tolerance_names, tolerance), **others}
         if math.isfinite(time_limit):
-            if clock is None:
-                raise SettingError(f"time_limit: what {self.name} calls it is not known; give it in its options")
-            options[clock] = time_limit
-        with warnings.catch_warnings():
-            # The status says so too, and every caller minds it; stacks of matrices have three dimensions.
-            said = "Solution may be inaccurate|.* expression with dimension greater than 2"
-            warnings.filterwarnings("ignore", message=said, category=UserWarning)
-            given = {**options, **self.options}
-            try:
-                model.solve(solver=self.name, warm_start=self.warm_start, verbose=verbose, **given)
-            except getattr(sys.modules.get("mosek"), "Error", cp.SolverError) as error:  # as of a missing licence
-                raise cp.SolverError(" ".join(str(error).split())) from error
+            if time_limit_name is None:
+                raise SettingError(
+                    f"time_limit: what {self.name} calls it is not known; give it in its options"
+                )
+            options[time_limit_name] = time_limit
+        return {**options, **self.options}
+
+
+def _solver_error() -> type[Exception]:
+    """The error of a solve: cvxpy's, or MOSEK's own, which it raises for a missing licence."""
+    error: type[Exception] = getattr(sys.modules.get("mosek"), "Error", cp.SolverError)
+    return error
 
 
 COLD = ConvexSolver(warm_start=False)  # equal parameters give equal bits
@@ -128,13 +236,18 @@ def as_solver(given: ConvexSolver | str) -> ConvexSolver:
 
 
 def solve_compiled(
-    problem: cp.Problem, name: str, tolerance: float = TOLERANCE, solver: ConvexSolver | str = COLD, accepted: str = ""
+    problem: cp.Problem,
+    name: str,
+    tolerance: float = TOLERANCE,
+    solver: ConvexSolver | str = COLD,
+    accepted: str = "",
 ) -> None:
-    """Solve a compiled problem; `name` is for messages. The variables hold the solution afterwards.
+    """Solve a compiled problem; its variables hold the solution afterwards.
 
-    The tolerance is on the gap and on feasibility, absolute and relative. Where rounding does not allow it, 100 times
-    as much is tried, and so on up to LOOSEST_TOLERANCE, where one status beside optimal may be accepted. A PGOError
-    when the solver ends without a solution; the message has its status and what it means.
+    The tolerance is on the gap and on feasibility, absolute and relative. Where rounding does not
+    allow it, 100 times as much is tried, and so on up to LOOSEST_TOLERANCE. At the last of these
+    the status `accepted` is accepted beside optimal. A PGOError when the solver ends without a
+    solution; the message has the `name` of the problem, the status and what it means.
     """
     solver = as_solver(solver)
     while True:
@@ -143,22 +256,28 @@ def solve_compiled(
             solver.run(problem, tolerance)
             status = str(problem.status)
         except cp.SolverError as error:
-            status, why = cp.SOLVER_ERROR, str(error)
+            status = cp.SOLVER_ERROR
+            why = str(error)
         is_last = tolerance >= LOOSEST_TOLERANCE or solver.is_first_order
         if status == cp.OPTIMAL or (is_last and status == accepted):
             return
         if status in _WHY or is_last:
-            raise PGOError(f"{solver.name} ended with status {status} on the {name}: {_WHY.get(status, why)}")
+            raise PGOError(
+                f"{solver.name} ended with status {status} on the {name}: {_WHY.get(status, why)}"
+            )
         tolerance = min(100.0 * tolerance, LOOSEST_TOLERANCE)
 
 
 def finite_array(values: object, name: str) -> Array:
-    """Read-only copy of `values` as doubles; a SettingError when they are no real numbers, or not finite."""
+    """Read-only copy of `values` as doubles; a SettingError unless they are real and finite."""
     array = real_array(values, name, SettingError)
-    bad = np.argwhere(~np.isfinite(array))
-    if len(bad):
-        where = tuple(int(index) for index in bad[0])
-        raise SettingError(f"{name} has {len(bad)} entries that are not finite, the first at {where}: {array[where]}")
+    not_finite = np.argwhere(~np.isfinite(array))
+    if len(not_finite):
+        first = tuple(int(index) for index in not_finite[0])
+        raise SettingError(
+            f"{name} has {len(not_finite)} entries that are not finite, "
+            f"the first at {first}: {array[first]}"
+        )
     return array
 
 
@@ -167,8 +286,9 @@ def _product_of_unknowns(expression: cp.Expression) -> cp.Expression | None:
     is_binary = isinstance(expression, cp.atoms.affine.binary_operators.BinaryOperator)
     if is_binary and all(factor.variables() for factor in expression.args):
         return expression
-    return next(filter(None, map(_product_of_unknowns, expression.args)), None)
+    products_inside = map(_product_of_unknowns, expression.args)
+    return next(filter(None, products_inside), None)
 
 
 def _short(expression: cp.Expression | cp.Constraint) -> str:
-    return " ".join(str(expression).split())[:_SHOWN]
+    return " ".join(str(expression).split())[:_MAX_SHOWN]

@@ -1,8 +1,10 @@
-"""The R-subproblem of a graph or of one robot as a cvxpy model on named poses and edges, open to terms of one's own.
+"""The R-subproblem of a graph or of one robot as a cvxpy model, to which terms can be added.
 
-    minimise   sum_e kappa ||R_j - R_i R_ij||_F^2 + tau ||t_j - t_i - R_i t_ij||^2  +  rho/2 ||R - omega + B||^2
+    minimise   sum_e kappa ||R_j - R_i R_ij||_F^2 + tau ||t_j - t_i - R_i t_ij||^2
+               + rho/2 ||R - omega + B||^2
 
-Step (a) of the paper's Algorithm 1 (`algo1: SOC`): rotations only as the paper has it, or joint in (R, t).
+Step (a) of the paper's Algorithm 1 (`algo1: SOC`): rotations only as the paper has it, or joint in
+(R, t). Terms and constraints are written on poses and edges by their numbers.
 """
 
 import enum
@@ -14,7 +16,7 @@ import cvxpy as cp
 import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array
 
-from pgo_models.convex.convex_solver import ConvexSolver, check_terms
+from pgo_models.convex.convex_solver import ConvexSolver, HoldsModel, check_terms
 from pgo_models.convex.rotation_subproblem import RotationQP, rotation_qp
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, BoolArray
@@ -30,7 +32,7 @@ class Unknowns(enum.Enum):
 
 
 class Neighbours(enum.Enum):
-    """What a robot's program does with the poses of others that its edges lead to."""
+    """What the program of a robot does with the poses of others that its edges lead to."""
 
     COPIES = "copies of them are unknowns too, and an edge between robots counts half"
     FROZEN = "they stay where they are, and enter the shift"
@@ -38,57 +40,113 @@ class Neighbours(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Expressions by number: `[3]` or `(3)` is one; `[ids]`, `[mask]` and `[10:20]` are many, compiled as one."""
+    """Expressions by number, of all poses or all edges.
 
-    whole: csr_array  # (count side, (d + 1) n): their rows in terms of t_i and R_i^T of the whole graph
-    columns: IntArray  # which of these the program has
+    `[3]` or `(3)` is one of them; `[ids]`, `[mask]` and `[10:20]` are many, compiled as one
+    expression.
+
+    Parameters
+    ----------
+    whole : (count side, (d + 1) n) sparse array
+        Their rows in terms of the t_i and R_i^T of the whole graph.
+    columns : array of int
+        Which of these t and R the program has.
+    X : cp.Variable
+        The variable of the program.
+    side : int
+        1 for vectors, d for matrices, which are transposed in X.
+    """
+
+    whole: csr_array
+    columns: IntArray
     X: cp.Variable
-    side: int  # 1 of vectors, d of matrices, which are transposed in X
+    side: int
 
-    def __getitem__(self, which: int | slice | IntArray | BoolArray | Sequence[int]) -> cp.Expression:
-        """(d,) or (d, d) of a number, (k, d) or (k, d, d) of k of them."""
-        numbers: Any = np.arange(self.whole.shape[0] // self.side)[which]
+    def __getitem__(
+        self, which: int | slice | IntArray | BoolArray | Sequence[int]
+    ) -> cp.Expression:
+        """Expression of shape (d,) or (d, d) for a number, (k, d) or (k, d, d) for k numbers."""
+        count = self.whole.shape[0] // self.side
+        numbers: Any = np.arange(count)[which]
         rows = self.whole[rotation_columns(np.atleast_1d(numbers), 0, self.side).ravel()]
-        ours = rows[:, self.columns]
-        if ours.nnz < rows.nnz:
-            has = f"which has {len(self.columns)} of {rows.shape[1]}; ask for its own poses, or Unknowns.POSES for t"
-            raise SettingError(f"[{which!r:.60}] needs rows of t or R that are not unknown in this program, {has}")
-        found = ours @ self.X
+        rows_of_program = rows[:, self.columns]
+        if rows_of_program.nnz < rows.nnz:
+            raise SettingError(
+                f"[{which!r:.60}] needs rows of t or R that are not unknown in this program, which "
+                f"has {len(self.columns)} of {rows.shape[1]}; ask for its own poses, or "
+                "Unknowns.POSES for t"
+            )
+        stacked = rows_of_program @ self.X
         if np.ndim(numbers) == 0:
-            return found[0] if self.side == 1 else found.T
+            return stacked[0] if self.side == 1 else stacked.T
         if self.side == 1:
-            return found
+            return stacked
         shape = (len(numbers), self.side, self.side)
-        return cp.transpose(cp.reshape(found, shape, order="C"), axes=(0, 2, 1))
+        transposed = cp.reshape(stacked, shape, order="C")
+        return cp.transpose(transposed, axes=(0, 2, 1))
 
     __call__ = __getitem__
 
 
 @dataclass(frozen=True, eq=False)
-class PoseVariables:
-    """The unknowns of a program by the numbers of the graph: R, t, and residuals of edges, each a `Stack`.
+class PoseVariables(HoldsModel):
+    """The unknowns of a program, and the residuals of its edges, by the numbers of the graph.
 
-    Norms of many matrices are those of rows: `cp.norm(cp.reshape(R[ids], (len(ids), d * d), order="C"), axis=1)`.
+    The norms of many matrices are those of rows: `cp.norm(cp.reshape(R[ids], (len(ids), d * d),
+    order="C"), axis=1)`.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        The whole graph.
+    unknowns : Unknowns
+        Whether translations are unknown too.
+    poses : (n_a,) array
+        Poses of the graph that are unknown, ascending.
+    X : cp.Variable
+        Rows t_i (not for ROTATIONS), then the rows of every R_i^T.
+    t : Stack
+        t_i, (d,), by pose.
+    R : Stack
+        R_i, (d, d), by pose.
+    translation_residual : Stack
+        t_j - t_i - R_i t_ij, (d,), by edge.
+    rotation_residual : Stack
+        R_j - R_i R_ij, (d, d), by edge.
     """
 
     graph: PoseGraph
     unknowns: Unknowns
-    poses: IntArray  # (n_a,): poses of the graph that are unknown, ascending
-    X: cp.Variable  # rows t_i (not for ROTATIONS), then the rows of every R_i^T
-    t: Stack  # t_i, (d,)
-    R: Stack  # R_i, (d, d)
-    translation_residual: Stack  # t_j - t_i - R_i t_ij of edge e, (d,)
-    rotation_residual: Stack  # R_j - R_i R_ij of edge e, (d, d)
+    poses: IntArray
+    X: cp.Variable
+    t: Stack
+    R: Stack
+    translation_residual: Stack
+    rotation_residual: Stack
 
 
 @dataclass(frozen=True, eq=False)
-class ModelChange:
-    """What one's own model adds to the program, or takes out of it.
+class ModelChange(HoldsModel):
+    """What a user's model adds to the program, or takes out of it.
 
-    `terms`, convex in the variables that `PoseVariables` names and no others, are added to F; `constraints` are convex
-    in the same variables. `replaced_edges`, numbers or an (m,) mask, leave F, where terms have another loss for them.
+    Parameters
+    ----------
+    terms : sequence of cp.Expression
+        Added to F; convex in the variables that `PoseVariables` names and no others.
+    constraints : sequence of cp.Constraint
+        Convex in the same variables.
+    replaced_edges : sequence of int, or (m,) mask
+        Edges that leave F, where terms have another loss for them.
 
-    A SettingError when a term is not one convex number, or a constraint not convex.
+    Raises
+    ------
+    SettingError
+        If a term is not one convex number, or a constraint is not convex.
+
+    Examples
+    --------
+    >>> def low(x: PoseVariables) -> ModelChange:
+    ...     return ModelChange(constraints=[x.t(0)[2] <= 0.5])
     """
 
     terms: Sequence[cp.Expression] = ()
@@ -107,49 +165,117 @@ Changer = Callable[[PoseVariables], ModelChange]
 
 @dataclass(frozen=True, eq=False)
 class GraphQP:
-    """A compiled R-subproblem on the poses of a graph."""
+    """A compiled R-subproblem on the poses of a graph.
+
+    Parameters
+    ----------
+    variables : PoseVariables
+        The unknowns.
+    qp : RotationQP
+        The cvxpy problem and its Parameter.
+    change : ModelChange
+        What the user's model adds.
+    A : (rows, N_a) sparse array
+        Residuals of the edges that count, in the rows of X.
+    w : (rows,) array
+        Weights of the residuals.
+    between : (N_a, N) sparse array
+        A^T diag(w) A_whole on the frozen neighbours' rows of the whole graph; empty unless FROZEN.
+    """
 
     variables: PoseVariables
-    qp: RotationQP  # the cvxpy problem and its Parameter
+    qp: RotationQP
     change: ModelChange
-    # A, w: residuals and weights of the edges that count, in the rows of X.
     A: csr_array
     w: Array
-    # Sparse (N_a, N): A_a^T diag(w) A on the frozen neighbours' rows of the whole graph; empty unless FROZEN.
     between: csr_array
 
     def solve(self, V: Array, neighbours: Array | None = None) -> Array:
-        """X for the shift V = omega - B, both (N_a, d).
+        """Solve the subproblem for a shift.
 
-        For FROZEN, `neighbours` is X of the whole graph, (N, d): the shift becomes V - 2 D^-1 M_between X. A
-        SettingError when it is missing, a PGOError when nothing solves it, as where constraints contradict each other.
+        Parameters
+        ----------
+        V : Array, (N_a, d)
+            The shift omega - B.
+        neighbours : Array, (N, d), optional
+            X of the whole graph, needed where the neighbours are frozen: the shift becomes V - 2
+            D^-1 M_between X.
+
+        Returns
+        -------
+        Array, (N_a, d)
+            The minimiser X.
+
+        Raises
+        ------
+        SettingError
+            When the neighbours are missing.
+        PGOError
+            When nothing solves it, as where constraints contradict each other.
         """
         if self.between.nnz:
             if neighbours is None:
-                raise SettingError("the neighbours are frozen; give X of the whole graph, whose rows say where")
+                raise SettingError(
+                    "the neighbours are frozen; give X of the whole graph, whose rows say where"
+                )
             pull = 2.0 * (self.between @ neighbours)
-            held, V = self.qp.penalty > 0, V.copy()
+            held = self.qp.penalty > 0
+            V = V.copy()
             V[held] -= pull[held] / self.qp.penalty[held, None]
         return self.qp.solve(V)
 
     def cost(self, X: Array) -> float:
-        """F of the edges that count plus the added terms, without the penalty; X need not be feasible."""
+        """Compute F of the edges that count plus the added terms, without the penalty.
+
+        Parameters
+        ----------
+        X : Array, (N_a, d)
+            Any point; it need not be feasible.
+
+        Returns
+        -------
+        float
+            The cost.
+        """
         residuals = self.A @ X
         self.variables.X.value = X
         added = sum(float(term.value) for term in self.change.terms)
         return float(self.w @ np.einsum("rc,rc->r", residuals, residuals)) + added
 
     def gradient(self, X: Array) -> Array:
-        """Gradient of `cost` in X, (N, d), of terms that have one there."""
+        """Compute the gradient of `cost`.
+
+        Parameters
+        ----------
+        X : Array, (N_a, d)
+            A point where all added terms have a gradient.
+
+        Returns
+        -------
+        Array, (N_a, d)
+            The gradient in X.
+        """
         self.variables.X.value = X
-        of_edges = np.asarray(self.A.T @ (2.0 * self.w[:, None] * (self.A @ X)))
-        return sum(map(self.gradient_of, self.change.terms), of_edges)
+        weighted_residuals = 2.0 * self.w[:, None] * (self.A @ X)
+        gradient_of_edges = np.asarray(self.A.T @ weighted_residuals)
+        return sum(map(self.gradient_of, self.change.terms), gradient_of_edges)
 
     def gradient_of(self, term: cp.Expression) -> Array:
-        """Gradient of a term, (N, d), at the value of X."""
+        """Compute the gradient of a term at the value of X.
+
+        Parameters
+        ----------
+        term : cvxpy.Expression
+            One of the added terms.
+
+        Returns
+        -------
+        Array, (N_a, d)
+            The gradient in X; zeros where the term does not depend on X.
+        """
         X = self.variables.X
-        found = term.grad.get(X, csr_array((X.size, 1)))
-        return np.asarray(found.toarray().reshape(X.shape, order="F"))
+        gradient = term.grad.get(X, csr_array((X.size, 1)))
+        return np.asarray(gradient.toarray().reshape(X.shape, order="F"))
 
 
 def graph_qp(
@@ -160,22 +286,47 @@ def graph_qp(
     rho_t: Array | None = None,
     solver: ConvexSolver | str = "CLARABEL",
 ) -> GraphQP:
-    """Pose the R-subproblem of a whole graph, with penalties rho, (n,), of rotations, and rho_t, (n,), of translations.
+    """Pose the R-subproblem of a whole graph.
 
-    Translations have none unless given. The changer, given the variables, returns the `ModelChange`.
+    Parameters
+    ----------
+    graph : PoseGraph
+        The graph.
+    rho : (n,) array
+        Penalties of the rotations.
+    unknowns : Unknowns
+        Whether translations are unknown too.
+    changer : callable or None
+        Given the `PoseVariables`, it returns the `ModelChange`.
+    rho_t : (n,) array or None
+        Penalties of the translations; none unless given.
+    solver : ConvexSolver or str
+        What solves the program.
+
+    Returns
+    -------
+    GraphQP
+        The compiled program, which is solved for every shift.
+
+    Raises
+    ------
+    SettingError
+        If a penalty is negative or all are zero, or the change is not convex.
 
     Examples
     --------
     >>> from pgo_models.graphs.scenes import grid
     >>> graph = grid(np.random.default_rng(0))
     >>> def prior(unknown: PoseVariables) -> ModelChange:
-    ...     return ModelChange(terms=[10.0 * cp.sum_squares(unknown.t(3) - np.array([1.0, 0.0, 0.0]))])
+    ...     position = np.array([1.0, 0.0, 0.0])
+    ...     return ModelChange(terms=[10.0 * cp.sum_squares(unknown.t(3) - position)])
     >>> qp = graph_qp(graph, np.full(27, 5.0), changer=prior)
     >>> qp.qp.problem.is_dcp(dpp=True), len(qp.qp.problem.parameters())
     (True, 1)
     """
-    everyone = np.ones(graph.num_poses, dtype=bool)
-    return _posed(graph, everyone, np.ones(graph.num_edges), rho, rho_t, unknowns, changer, solver)
+    all_poses = np.ones(graph.num_poses, dtype=bool)
+    shares = np.ones(graph.num_edges)
+    return _posed(graph, all_poses, shares, rho, rho_t, unknowns, changer, solver)
 
 
 def robot_qp(
@@ -188,60 +339,106 @@ def robot_qp(
     rho_t: Array | None = None,
     solver: ConvexSolver | str = "CLARABEL",
 ) -> GraphQP:
-    """Pose the R-subproblem of one robot of `graph.robots` with its neighbours' terms; parameters as `graph_qp`.
+    """Pose the R-subproblem of one robot of `graph.robots`, with the edges to its neighbours.
 
-    With COPIES and `rho_t` on the separators it is the subproblem of SOC's CONSENSUS coupling, whose penalties are the
-    shares of the copies; with FROZEN and ROTATIONS it is the paper's. A SettingError when the robot owns no pose, or
-    frozen neighbours pull on translations that have no penalty.
+    The parameters are those of `graph_qp`. With COPIES and `rho_t` on the separators it is the
+    subproblem of SOC's CONSENSUS coupling, whose penalties are the shares of the copies; with
+    FROZEN and ROTATIONS it is the paper's. A SettingError when the robot owns no pose, or frozen
+    neighbours pull on translations that have no penalty.
     """
     owned = graph.robots == robot
     if not owned.any():
-        raise SettingError(f"robot {robot} owns no pose; the graph has robots 0 to {graph.num_robots - 1}")
-    touches = owned[graph.i].astype(int) + owned[graph.j]
+        raise SettingError(
+            f"robot {robot} owns no pose; the graph has robots 0 to {graph.num_robots - 1}"
+        )
+    num_own_ends = owned[graph.i].astype(int) + owned[graph.j]
+    touches = num_own_ends > 0
     if neighbours is Neighbours.FROZEN:
-        share, unknown = (touches > 0).astype(float), owned
+        shares = touches.astype(float)
+        unknown = owned
     else:
-        share, unknown = 0.5 * touches, owned.copy()
-        unknown[np.concatenate([graph.i[touches > 0], graph.j[touches > 0]])] = True
-    return _posed(graph, unknown, share, rho, rho_t, unknowns, changer, solver)
+        shares = 0.5 * num_own_ends
+        unknown = owned.copy()
+        unknown[graph.i[touches]] = True
+        unknown[graph.j[touches]] = True
+    return _posed(graph, unknown, shares, rho, rho_t, unknowns, changer, solver)
 
 
 def _posed(
     graph: PoseGraph,
     unknown: BoolArray,
-    share: Array,
+    shares: Array,
     rho: Array,
     rho_t: Array | None,
     unknowns: Unknowns,
     changer: Changer | None,
     solver: ConvexSolver | str,
 ) -> GraphQP:
-    n, m, d = graph.num_poses, graph.num_edges, graph.d
-    poses, joint = np.flatnonzero(unknown), unknowns is Unknowns.POSES
-    mine = np.concatenate([poses[: len(poses) * joint], rotation_columns(poses, n, d).ravel()])
-    penalty_t = np.zeros(n) if rho_t is None else rho_t
-    penalty = np.concatenate([penalty_t[poses] if joint else np.zeros(0), np.repeat(rho[poses], d)])
+    """The program of the `unknown` poses, with `shares`, (m,), of the edges."""
+    n = graph.num_poses
+    m = graph.num_edges
+    d = graph.d
+    poses = np.flatnonzero(unknown)
+    # Which rows t_i and R_i^T of the whole graph are unknown, and their penalties.
+    columns = rotation_columns(poses, n, d).ravel()
+    penalty = np.repeat(rho[poses], d)
+    has_translations = unknowns is Unknowns.POSES
+    if has_translations:
+        penalty_t = np.zeros(len(poses)) if rho_t is None else rho_t[poses]
+        columns = np.concatenate([poses, columns])
+        penalty = np.concatenate([penalty_t, penalty])
 
-    X = cp.Variable((len(mine), d), name="X")
-    whole, weights = residual_matrix(graph)
-    each = csr_array(eye_array(whole.shape[1]))
-    stacks = ((each[:n], 1), (each[n:], d), (whole[:m], 1), (whole[m:], d))
-    variables = PoseVariables(graph, unknowns, poses, X, *(Stack(rows, mine, X, side) for rows, side in stacks))
+    A_whole, weights = residual_matrix(graph)
+    variables = _variables(graph, unknowns, poses, columns, A_whole)
+    change = _checked_change(changer, variables)
+    shares = shares.copy()
+    shares[np.array(change.replaced_edges, dtype=int)] = 0.0
+    shares_of_translations = shares if has_translations else np.zeros(m)
+    weights = weights * np.concatenate([shares_of_translations, np.repeat(shares, d)])
+    is_counted = weights > 0
+    w = weights[is_counted]
+    A_counted = A_whole[is_counted]
+    A = A_counted[:, columns].tocsr()
+
+    is_frozen = np.ones((d + 1) * n)
+    is_frozen[columns] = 0.0
+    between = csr_array(A.T @ diags_array(w) @ A_counted @ diags_array(is_frozen))
+    between.eliminate_zeros()
+    is_pulled = np.diff(between.indptr) > 0
+    if (penalty[is_pulled] == 0).any():
+        raise SettingError(
+            "frozen neighbours enter the shift, so every row they pull on needs a penalty; "
+            "give rho_t"
+        )
+    qp = rotation_qp(A, w, penalty, d, variables.X, change.terms, change.constraints, solver)
+    return GraphQP(variables, qp, change, A, w, between)
+
+
+def _variables(
+    graph: PoseGraph, unknowns: Unknowns, poses: IntArray, columns: IntArray, A_whole: csr_array
+) -> PoseVariables:
+    """The unknowns, in the `columns` of the whole graph; `A_whole` gives the residuals."""
+    n = graph.num_poses
+    m = graph.num_edges
+    d = graph.d
+    X = cp.Variable((len(columns), d), name="X")
+    identity = csr_array(eye_array(A_whole.shape[1]))
+    return PoseVariables(
+        graph,
+        unknowns,
+        poses,
+        X,
+        t=Stack(identity[:n], columns, X, 1),
+        R=Stack(identity[n:], columns, X, d),
+        translation_residual=Stack(A_whole[:m], columns, X, 1),
+        rotation_residual=Stack(A_whole[m:], columns, X, d),
+    )
+
+
+def _checked_change(changer: Changer | None, variables: PoseVariables) -> ModelChange:
     change = changer(variables) if changer is not None else ModelChange()
     if not isinstance(change, ModelChange):
-        raise SettingError(f"the changer returned a {type(change).__name__}; return ModelChange(terms=[..])")
-    share = share.copy()
-    share[np.array(change.replaced_edges, dtype=int)] = 0.0
-    weights = weights * np.concatenate([share if joint else np.zeros(m), np.repeat(share, d)])
-    counted = weights > 0
-    whole, w = whole[counted], weights[counted]
-    A = whole[:, mine].tocsr()
-    frozen = np.ones((d + 1) * n)
-    frozen[mine] = 0.0
-    between = csr_array(A.T @ diags_array(w) @ whole @ diags_array(frozen))
-    between.eliminate_zeros()
-    pulled = np.diff(between.indptr) > 0
-    if (penalty[pulled] == 0).any():
-        raise SettingError("frozen neighbours enter the shift, so every row they pull on needs a penalty; give rho_t")
-    qp = rotation_qp(A, w, penalty, d, X, change.terms, change.constraints, solver)
-    return GraphQP(variables, qp, change, A, w, between)
+        raise SettingError(
+            f"the changer returned a {type(change).__name__}; return ModelChange(terms=[..])"
+        )
+    return change

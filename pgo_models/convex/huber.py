@@ -1,4 +1,4 @@
-"""Huber's loss of whole edges as a change of the cvxpy model: squares up to a threshold, straight on beyond."""
+"""Huber's loss of whole edges as a change of a model: square up to a threshold, linear beyond."""
 
 import cvxpy as cp
 import numpy as np
@@ -9,19 +9,38 @@ from pgo_models.graphs.pose_graph import IntArray
 
 
 def huber_change(edges: IntArray, thresholds: Array) -> Changer:
-    """Changer for `graph_qp` and `ExtendedSOC`: r_e^2 becomes 2 c_e r_e - c_e^2 beyond r_e^2 = c_e^2 (Huber 1964).
+    """Changer for `graph_qp` and `ExtendedSOC` that gives edges Huber's loss (Huber 1964).
 
-    For `edges`, (k,); the others keep their squares. `thresholds`, (m,), are c_e^2 of all edges, as of
-    `chi2_thresholds`. A SettingError when the program lacks unknowns of these edges.
+    The cost r_e^2 of an edge becomes 2 c_e r_e - c_e^2 where r_e > c_e.
+
+    Parameters
+    ----------
+    edges : (k,) array
+        Numbers of the edges; the others keep their squares.
+    thresholds : (m,) array
+        c_e^2 of all edges, as of `chi2_thresholds`.
+
+    Returns
+    -------
+    Changer
+        It raises a SettingError when the program lacks unknowns of these edges.
     """
 
     def change(unknown: PoseVariables) -> ModelChange:
         graph = unknown.graph
-        turned = cp.reshape(unknown.rotation_residual[edges], (len(edges), graph.d**2), order="C")
-        weighted = zip((graph.tau, graph.kappa), (unknown.translation_residual[edges], turned), strict=True)
-        rho = cp.hstack([cp.multiply(np.sqrt(precision[edges])[:, None], rows) for precision, rows in weighted])
+        t_residuals = unknown.translation_residual[edges]
+        R_residuals = cp.reshape(
+            unknown.rotation_residual[edges], (len(edges), graph.d**2), order="C"
+        )
+        root_tau = np.sqrt(graph.tau[edges])[:, None]
+        root_kappa = np.sqrt(graph.kappa[edges])[:, None]
+        weighted = cp.hstack(
+            [cp.multiply(root_tau, t_residuals), cp.multiply(root_kappa, R_residuals)]
+        )
+        r = cp.norm(weighted, 2, axis=1)
         c = np.sqrt(thresholds[edges])
-        loss = cp.sum(cp.multiply(c**2, cp.huber(cp.multiply(1.0 / c, cp.norm(rho, 2, axis=1)))))
-        return ModelChange(terms=[loss], replaced_edges=edges.tolist())
+        # cp.huber(x) is x^2, and 2 |x| - 1 beyond 1.
+        losses = cp.multiply(c**2, cp.huber(cp.multiply(1.0 / c, r)))
+        return ModelChange(terms=[cp.sum(losses)], replaced_edges=edges.tolist())
 
     return change

@@ -2,8 +2,9 @@
 
     minimise over X   sum_rows w ||A X||^2 + 1/2 ||sqrt(D) (X - V)||_F^2
 
-joint in rotations and translations, for a whole graph or for one robot's share of it. V, the shift omega - B, is the
-only Parameter (DPP), so that the problem is compiled once and solved again for every shift.
+joint in rotations and translations, for a whole graph or for one robot's share of it. V, the shift
+omega - B, is the only Parameter (DPP), so that the problem is compiled once and solved again for
+every shift.
 """
 
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ import cvxpy as cp
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
-from pgo_models.convex.convex_solver import ConvexSolver, as_solver, solve_compiled
+from pgo_models.convex.convex_solver import ConvexSolver, HoldsModel, as_solver, solve_compiled
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 
@@ -21,27 +22,61 @@ TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class RotationQP:
-    """A compiled R-subproblem."""
+class RotationQP(HoldsModel):
+    """A compiled R-subproblem.
+
+    Parameters
+    ----------
+    problem : cp.Problem
+        The quadratic program.
+    X : (N, d) cp.Variable
+        Rows t_i, then the rows of every R_i^T, of the poses concerned.
+    shift : (N_D, d) cp.Parameter
+        sqrt(D) V on the rows whose penalty is not zero.
+    penalty : (N,) array
+        Diagonal of D.
+    solver : ConvexSolver
+        What solves it.
+    last : dict of (N, d) arrays
+        The solution X of the shift that was solved for last, by the bytes of the shift.
+    """
 
     problem: cp.Problem
-    X: cp.Variable  # (N, d): rows t_i, then the rows of every R_i^T, of the poses concerned
-    shift: cp.Parameter  # (N_D, d): sqrt(D) V on the rows whose penalty is not zero
-    penalty: Array  # (N,): the diagonal of D
+    X: cp.Variable
+    shift: cp.Parameter
+    penalty: Array
     solver: ConvexSolver
-    last: dict[bytes, Array] = field(default_factory=dict)  # X, (N, d), of the shift that was solved for last
+    last: dict[bytes, Array] = field(default_factory=dict)
 
     def solve(self, V: Array) -> Array:
-        """X, (N, d), for the shift V, (N, d); rows of V without a penalty do not matter.
+        """Solve the subproblem for a shift.
 
-        A PGOError when the solver does not end with a solution; the message has its status.
+        Parameters
+        ----------
+        V : Array, (N, d)
+            The shift; rows without a penalty are ignored.
+
+        Returns
+        -------
+        Array, (N, d)
+            The minimiser X.
+
+        Raises
+        ------
+        PGOError
+            When the solver does not end with a solution; the message has its status.
         """
         held = self.penalty > 0
         self.shift.value = np.sqrt(self.penalty[held])[:, None] * V[held]
         key = self.shift.value.tobytes()
-        if key not in self.last:  # SOC asks for the translations of an iterate, and in its next step for the rotations
-            # The quadratic program reaches the tolerance; added cones may not, and stop where rounding lets them.
-            solve_compiled(self.problem, "R-subproblem", TOLERANCE, self.solver, cp.OPTIMAL_INACCURATE)
+        # SOC solves twice for the same shift: it wants the translations of an iterate, and in its
+        # next step the rotations.
+        if key not in self.last:
+            # The quadratic program reaches the tolerance. With added cones it may not, and what
+            # rounding allows is accepted.
+            solve_compiled(
+                self.problem, "R-subproblem", TOLERANCE, self.solver, cp.OPTIMAL_INACCURATE
+            )
             self.last.clear()
             self.last[key] = np.asarray(self.X.value)
         return self.last[key].copy()
@@ -57,17 +92,43 @@ def rotation_qp(
     constraints: Sequence[cp.Constraint] = (),
     solver: ConvexSolver | str = "CLARABEL",
 ) -> RotationQP:
-    """Pose the R-subproblem.
+    """Pose the R-subproblem as a compiled cvxpy quadratic program.
 
-    A, sparse (rows, N), gives the residuals A X, as from `pgo_models.problem.matrices.residual_matrix`, and w, (rows,),
-    their weights; `penalty`, (N,), is the diagonal of D: rho on the rows of penalised rotations (and translations),
-    else 0. X, (N, d), is given where `terms`, which are convex and added to the objective, or constraints are already
-    written in it; `pgo_models.convex.graph_subproblem` writes them on poses and edges.
+    Parameters
+    ----------
+    A : (rows, N) sparse array
+        Gives the residuals A X, as from `pgo_models.problem.matrices.residual_matrix`.
+    w : (rows,) array
+        Weights of the residuals.
+    penalty : (N,) array
+        Diagonal of D: rho on the rows of penalised rotations (and translations), else 0.
+    d : int
+        Dimension, 2 or 3.
+    X : (N, d) cp.Variable or None
+        Given where `terms` or `constraints` are already written in it;
+        `pgo_models.convex.graph_subproblem` writes them on poses and edges.
+    terms : sequence of cp.Expression
+        Convex, added to the objective.
+    constraints : sequence of cp.Constraint
+        Convex, added to the program.
+    solver : ConvexSolver or str
+        What solves it.
 
-    A SettingError when a penalty is negative or all are zero, or a term or a constraint is not convex.
+    Returns
+    -------
+    RotationQP
+        The compiled program, which is solved for every shift V.
 
-    rho is data, not a Parameter: as one it is DPP too, and small problems re-solve as fast with it, but compiling holds
-    the product of all parameters with all entries, tens of gigabytes on 2500 poses.
+    Raises
+    ------
+    SettingError
+        If a penalty is negative or all are zero, or a term or a constraint is not convex.
+
+    Notes
+    -----
+    rho is data, not a Parameter: as one it is DPP too, and small problems re-solve as fast with it,
+    but compiling holds the product of all parameters with all entries, tens of gigabytes on 2500
+    poses.
 
     Examples
     --------
@@ -88,5 +149,8 @@ def rotation_qp(
     objective = cp.sum_squares(weighted @ X) + 0.5 * cp.sum_squares(select @ X - shift)
     problem = cp.Problem(cp.Minimize(sum(terms, objective)), list(constraints))
     if not problem.is_dcp(dpp=True):
-        raise SettingError("an added term or constraint is not convex by cvxpy's rules (DCP, and DPP in Parameters)")
+        raise SettingError(
+            "an added term or constraint is not convex by cvxpy's rules "
+            "(DCP, and DPP in Parameters)"
+        )
     return RotationQP(problem, X, shift, penalty, as_solver(solver))

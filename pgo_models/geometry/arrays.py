@@ -1,7 +1,8 @@
-"""Numbers as frozen objects hold them: checked, never cast silently, in read-only arrays of their own."""
+"""Numbers as frozen objects hold them: checked, never cast silently, in read-only arrays."""
 
 import operator
 from contextlib import suppress
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,11 +14,23 @@ from pgo_models.geometry.rotations import Array
 
 T = TypeVar("T", bound="NDArray[Any] | csc_array | csr_array")
 
-_EXACT = 2.0**53  # from here on a float may stand for another whole number than the one that was meant
+# From here on a float may stand for another whole number than the one that was meant.
+_EXACT = 2.0**53
 
 
 class ReadOnly:
-    """Base of frozen objects with arrays: out of a pickle or a deep copy, these come back read-only, too."""
+    """Base of frozen objects with arrays, which stay read-only in a pickle or a deep copy.
+
+    Cached properties are not copied: the copy computes them when they are asked for.
+    """
+
+    def __getstate__(self) -> dict[str, object]:
+        owner = type(self)
+        state = {}
+        for name, value in self.__dict__.items():
+            if not isinstance(getattr(owner, name, None), cached_property):
+                state[name] = value
+        return state
 
     def __setstate__(self, state: dict[str, object]) -> None:
         for value in state.values():
@@ -27,49 +40,64 @@ class ReadOnly:
 
 
 def read_only(values: T) -> T:
-    """The same array or sparse matrix, whose entries cannot be changed from now on."""
-    arrays = (values,) if isinstance(values, np.ndarray) else (values.data, values.indices, values.indptr)
-    for array in arrays:
+    """Return the array or sparse matrix, whose entries cannot be changed from now on."""
+    if isinstance(values, np.ndarray):
+        values.flags.writeable = False
+        return values
+    for array in (values.data, values.indices, values.indptr):
         array.flags.writeable = False
     return values
 
 
 def real_array(values: object, name: str, error: type[PGOError] = GraphError) -> Array:
-    """Real numbers as doubles, in a read-only array of their own; one that is such an array already is not copied.
+    """Real numbers as doubles, in a read-only array of their own.
 
-    Raises `error` when they are complex, booleans or words, or are no array.
+    An array that is so already is not copied. Raises `error` when the numbers are complex, booleans
+    or words, or are no array.
     """
     array = _numbers(values, name, "real numbers", error)
-    return read_only(np.array(array, dtype=np.float64, order="C")) if _is_shared(array, np.float64) else array
+    if not _needs_copy(array, np.float64):
+        return array
+    return read_only(np.array(array, dtype=np.float64, order="C"))
 
 
 def whole_array(values: object, name: str, error: type[PGOError] = GraphError) -> NDArray[np.int64]:
     """Whole numbers of 64 bits, in a read-only array of their own; floats must hold them exactly.
 
-    Raises `error` as `real_array`; also for a fraction, nan, or a float so large that it may stand for several numbers.
+    Raises `error` as `real_array`; also for a fraction, nan, or a float so large that it may stand
+    for several numbers.
     """
     array = _numbers(values, name, "whole numbers", error)
     if not array.ndim:
         raise error(f"{name} is the number {array}; give an array")
     with np.errstate(invalid="ignore"):
-        wrong = array.astype(np.int64) != array
+        is_wrong = array.astype(np.int64) != array
     if array.dtype.kind == "f":
-        wrong |= ~(np.abs(array) < _EXACT)
-    if wrong.any():
-        raise error(f"{name} has {array[wrong][0]!s} among them; give whole numbers, as integers of 64 bits")
-    return read_only(np.array(array, dtype=np.int64, order="C")) if _is_shared(array, np.int64) else array
+        is_wrong |= ~(np.abs(array) < _EXACT)
+    if is_wrong.any():
+        first = array[is_wrong][0]
+        raise error(f"{name} has {first!s} among them; give whole numbers, as integers of 64 bits")
+    if not _needs_copy(array, np.int64):
+        return array
+    return read_only(np.array(array, dtype=np.int64, order="C"))
 
 
 def whole_number(value: object, name: str, error: type[PGOError] = GraphError) -> int:
-    """Whole number that is given as an integer; raises `error` for a float, even a whole one, True, and all else."""
-    with suppress(TypeError):  # which is the check
+    """Whole number that is given as an integer.
+
+    Raises `error` for a float, even a whole one, for True and False, and for all else.
+    """
+    with suppress(TypeError):  # which operator.index raises for what is no integer
         if not isinstance(value, bool | np.bool_):
             return operator.index(value)  # type: ignore[arg-type]
     raise error(f"{name} is {value!r:.60}; give a whole number")
 
 
 def triangle_places(side: int) -> NDArray[np.int64]:
-    """Place of every entry of a symmetric matrix in its upper triangle, row by row, (side, side)."""
+    """Place of every entry of a symmetric matrix in its upper triangle, read row by row.
+
+    The places are a symmetric matrix, (side, side).
+    """
     place = np.zeros((side, side), dtype=np.int64)
     rows, columns = np.triu_indices(side)
     place[rows, columns] = place[columns, rows] = np.arange(len(rows))
@@ -77,6 +105,7 @@ def triangle_places(side: int) -> NDArray[np.int64]:
 
 
 def _numbers(values: object, name: str, wanted: str, error: type[PGOError]) -> NDArray[Any]:
+    """Array of integers or real numbers; raises `error` for others."""
     try:
         array = np.asarray(values)
     except ValueError as reason:  # rows of several lengths
@@ -86,6 +115,6 @@ def _numbers(values: object, name: str, wanted: str, error: type[PGOError]) -> N
     return array
 
 
-def _is_shared(array: NDArray[Any], dtype: type[np.generic]) -> bool:
-    """Whether an array must be copied: someone else may write to it, or it has another type."""
+def _needs_copy(array: NDArray[Any], dtype: type[np.generic]) -> bool:
+    """Whether an array has another type, or others may write to it."""
     return array.dtype != dtype or array.flags.writeable or not array.flags.owndata

@@ -1,4 +1,4 @@
-"""Poses(R, t): n poses in SE(d), world from body; gauge, alignment, and the ATE and RPE of trajectories."""
+"""Poses(R, t): n poses in SE(d), world from body; gauge, alignment, and errors of trajectories."""
 
 from __future__ import annotations
 
@@ -11,58 +11,102 @@ import numpy as np
 
 from pgo_models.errors import GraphError
 from pgo_models.geometry.arrays import ReadOnly, read_only, real_array
-from pgo_models.geometry.rotations import Array, log_map, orthogonality_error, project_to_rotations, stack_transposes
+from pgo_models.geometry.rotations import (
+    Array,
+    log_map,
+    orthogonality_error,
+    project_to_rotations,
+    stack_transposes,
+)
 
+# Bounds on max(||R^T R - I||_F, 1 - det R). A matrix above the first is no rotation. A matrix below
+# the second is one to rounding: one exponential, SVD, or product of two rotations leaves at most
+# 5e-15 in a million draws, ten products 8e-15.
 ROTATION_TOLERANCE = 1e-6
-# One exponential, SVD, or product of two rotations leaves at most 5e-15 in a million draws, ten products 8e-15.
 _ROUNDING = 64.0 * float(np.finfo(float).eps)
+_COLLINEAR = 1e-9  # spread of positions across a line, over that along it
 
 
 @dataclass(frozen=True, eq=False)
 class Poses(ReadOnly):
-    """n poses x_i = (R_i, t_i) in SE(d).
+    """Poses x_i = (R_i, t_i) in SE(d), n of them, in the plane (d = 2) or in space (d = 3).
 
-    Attributes
+    Parameters
     ----------
-    R : (n, d, d)
-        Rotations, world from body, orthogonal with det +1 to rounding. What is given must be so to
-        `ROTATION_TOLERANCE`, and is projected where it is not so to rounding: off SO(d), F can be below its minimum.
-    t : (n, d)
-        Positions in the world, metres.
+    R : Array, (n, d, d)
+        Rotations, world from body, kept as a read-only copy. They must be orthogonal with det +1 to
+        1e-6. Where they are not so to rounding, they are projected: off SO(d), F can be below its
+        minimum.
+    t : Array, (n, d)
+        Positions in the world, metres, kept as a read-only copy.
 
-    Both are read-only copies. A GraphError on wrong shapes, entries that are not real or finite, or no rotation.
+    Raises
+    ------
+    GraphError
+        For a wrong shape, entries that are not real or finite, or a matrix that is no rotation.
+
+    Examples
+    --------
+    >>> Poses(np.array([np.eye(2), np.eye(2)]), np.array([[0.0, 0.0], [1.0, 0.0]]))
+    Poses(n=2, d=2)
     """
 
     R: Array
     t: Array
 
     def __post_init__(self) -> None:
-        R, t = real_array(self.R, "R"), real_array(self.t, "t")
-        if R.ndim != 3 or R.shape[1] != R.shape[2] or R.shape[1] not in (2, 3):
+        R = real_array(self.R, "R")
+        t = real_array(self.t, "t")
+        if R.ndim != 3 or R.shape[1:] not in ((2, 2), (3, 3)):
             raise GraphError(f"R has shape {R.shape}; give (n, 2, 2) or (n, 3, 3)")
         if t.shape != R.shape[:2]:
-            raise GraphError(f"t has shape {t.shape} beside R of shape {R.shape}; give {R.shape[:2]}")
-        for name, array in (("R", R), ("t", t)):
-            if not np.isfinite(array).all():
-                finite = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
-                raise GraphError(f"{name} of pose {int(np.argmin(finite))} has nan or inf; poses must be finite")
+            raise GraphError(
+                f"t has shape {t.shape} beside R of shape {R.shape}; give {R.shape[:2]}"
+            )
+        _check_finite(R, "R")
+        _check_finite(t, "t")
         object.__setattr__(self, "R", rotations_to_rounding(R, "R of pose {}".format))
         object.__setattr__(self, "t", t)
 
     @cached_property
     def orthogonality_error(self) -> float:
-        """Largest distance of a stored R_i from a rotation (`pgo_models.geometry.rotations.orthogonality_error`)."""
+        """Largest max(||R_i^T R_i - I||_F, 1 - det R_i) of the stored rotations."""
         return float(orthogonality_error(self.R).max(initial=0.0))
 
     @classmethod
     def identity(cls, n: int, d: int) -> Poses:
-        """Return n poses at the origin, unrotated."""
+        """Return poses at the origin, unrotated.
+
+        Parameters
+        ----------
+        n : int
+            Number of poses.
+        d : int
+            Dimension of space: 2 or 3.
+
+        Returns
+        -------
+        Poses
+            The identity of SE(d), n times.
+        """
         return cls(np.broadcast_to(np.eye(d), (n, d, d)).copy(), np.zeros((n, d)))
 
     @classmethod
     def of_points(cls, t: Array) -> Poses:
-        """Return unrotated poses at points t, (n, d), in metres."""
-        return cls(np.broadcast_to(np.eye(np.shape(t)[1]), (len(t), np.shape(t)[1], np.shape(t)[1])), t)
+        """Return unrotated poses at points.
+
+        Parameters
+        ----------
+        t : Array, (n, d)
+            Points, metres.
+
+        Returns
+        -------
+        Poses
+            A pose with R_i = I at every point.
+        """
+        d = np.shape(t)[1]
+        return cls(np.broadcast_to(np.eye(d), (len(t), d, d)), t)
 
     @property
     def num_poses(self) -> int:
@@ -78,74 +122,188 @@ class Poses(ReadOnly):
         return f"Poses(n={self.num_poses}, d={self.d})"
 
     def __getitem__(self, index: slice | np.ndarray) -> Poses:
-        """Return the poses at the given indices."""
+        """Return the poses with the given numbers."""
         return type(self)(self.R[index], self.t[index])
 
     def stacked(self) -> Array:
-        """X, ((d+1) n, d): first the n rows t_i, then the d rows of every R_i^T."""
+        """Return translations and rotations as one matrix X.
+
+        Returns
+        -------
+        Array, ((d+1) n, d)
+            First the n rows t_i, then the d rows of every R_i^T.
+        """
         return np.concatenate([self.t, stack_transposes(self.R)])
 
     def with_translations(self, t: Array) -> Poses:
-        """Return poses with the same rotations, not checked again, at t, (n, d), as it is."""
-        found = copy(self)
-        object.__setattr__(found, "t", real_array(t, "t"))
-        return found
+        """Return poses with the same rotations at other positions.
+
+        Parameters
+        ----------
+        t : Array, (n, d)
+            Positions, metres. Their shape is not checked, nor are the rotations again.
+
+        Returns
+        -------
+        Poses
+            The poses (R_i, t_i).
+        """
+        poses = copy(self)
+        object.__setattr__(poses, "t", real_array(t, "t"))
+        return poses
 
     def moved(self, R: Array, t: Array) -> Poses:
-        """Return the same poses seen from another world: (R R_i, R t_i + t), R (d, d) and t (d,)."""
+        """Return the same poses seen from another world: (R R_i, R t_i + t).
+
+        Parameters
+        ----------
+        R : Array, (d, d)
+            Rotation, new world from old world.
+        t : Array, (d,)
+            Origin of the old world in the new one, metres.
+
+        Returns
+        -------
+        Poses
+            The moved poses. F of them is the same.
+        """
         return Poses(R @ self.R, self.t @ R.T + t)
 
     def with_gauge_at(self, index: int = 0) -> Poses:
-        """Move the world so that pose `index` is the identity; F does not change."""
+        """Move the world so that one pose is the identity.
+
+        Parameters
+        ----------
+        index : int
+            Number of the pose.
+
+        Returns
+        -------
+        Poses
+            The moved poses. F of them is the same.
+        """
         R = self.R[index].T
         return self.moved(R, -R @ self.t[index])
 
     def anchored_to(self, other: Poses, index: int) -> Poses:
-        """Move the world so that pose `index` is exactly where `other` has it; a GraphError where sizes differ."""
+        """Move the world so that one pose is exactly where others have it.
+
+        Parameters
+        ----------
+        other : Poses
+            Poses of the same number and dimension.
+        index : int
+            Number of the pose that is the same in both afterwards.
+
+        Returns
+        -------
+        Poses
+            The moved poses. F of them is the same up to rounding.
+
+        Raises
+        ------
+        GraphError
+            When the number of poses or the dimension differs.
+        """
         _check_same_size(self, other)
         turn = other.R[index] @ self.R[index].T
         moved = self.moved(turn, other.t[index] - turn @ self.t[index])
-        R, t = moved.R.copy(), moved.t.copy()
-        R[index], t[index] = other.R[index], other.t[index]
+        R = moved.R.copy()
+        t = moved.t.copy()
+        R[index] = other.R[index]
+        t[index] = other.t[index]
         return Poses(R, t)
 
     def aligned_to(self, other: Poses) -> Poses:
-        """Move the world so that positions, then rotations where they leave it open, fit `other` best.
+        """Move the world so that the poses fit others best.
 
-        The rigid motion (R, t) minimises sum_i ||R t_i + t - t_i'||^2 (Arun et al. 1987). When the positions do not fix
-        the rotation (all in one point or on a line, in space), sum_i ||R R_i - R_i'||^2 decides instead. A GraphError
-        when the two have not the same number of poses and dimension.
+        The rigid motion (R, t) minimises sum_i ||R t_i + t - t_i'||^2. When the positions do not
+        fix the rotation (all in one point or, in space, on a line), R minimises sum_i ||R R_i -
+        R_i'||^2 instead.
+
+        Parameters
+        ----------
+        other : Poses
+            Poses (R_i', t_i') of the same number and dimension.
+
+        Returns
+        -------
+        Poses
+            The moved poses.
+
+        Raises
+        ------
+        GraphError
+            When the number of poses or the dimension differs.
+
+        References
+        ----------
+        Arun, Huang & Blostein, Least-squares fitting of two 3-D point sets, 1987.
         """
         _check_same_size(self, other)
-        mine, theirs = self.t - self.t.mean(axis=0), other.t - other.t.mean(axis=0)
-        covariance = theirs.T @ mine
-        singular = np.linalg.svd(covariance, compute_uv=False)
-        if singular[self.d - 2] <= 1e-9 * max(float(singular[0]), 1e-300):
+        centre = self.t.mean(axis=0)
+        other_centre = other.t.mean(axis=0)
+        covariance = (other.t - other_centre).T @ (self.t - centre)
+        singular_values = np.linalg.svd(covariance, compute_uv=False)
+        threshold = _COLLINEAR * max(float(singular_values[0]), 1e-300)
+        if singular_values[self.d - 2] <= threshold:
             covariance = np.einsum("nab,ncb->ac", other.R, self.R)
         R = project_to_rotations(covariance[None])[0]
-        return self.moved(R, other.t.mean(axis=0) - R @ self.t.mean(axis=0))
+        return self.moved(R, other_centre - R @ centre)
+
+
+def _check_finite(array: Array, name: str) -> None:
+    """Raise a GraphError that names the first pose with nan or inf."""
+    if not np.isfinite(array).all():
+        is_finite = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
+        pose = int(np.argmin(is_finite))
+        raise GraphError(f"{name} of pose {pose} has nan or inf; poses must be finite")
 
 
 def rotations_to_rounding(R: Array, name: Callable[[int], str]) -> Array:
-    """R, (n, d, d), with the rotations among them that are so only to `ROTATION_TOLERANCE` projected; read-only.
+    """R, (n, d, d), with matrices projected that are rotations to `ROTATION_TOLERANCE` alone.
 
-    A GraphError for a matrix beyond that; `name` gives the k-th one a name.
+    Matrices that are rotations to rounding are kept. The result is read-only. A GraphError for a
+    matrix that is no rotation; `name` gives the k-th matrix a name.
     """
     error = orthogonality_error(R)
-    rough = ~(error <= _ROUNDING)
-    if not rough.any():
+    is_rough = ~(error <= _ROUNDING)
+    if not is_rough.any():
         return R
     worst = int(np.argmax(error))
     if not error[worst] <= ROTATION_TOLERANCE:
-        what = f"||R^T R - I|| or 1 - det R is {error[worst]:.3g}"
-        raise GraphError(f"{name(worst)} is no rotation: {what}; see pgo_models.project_to_rotations()")
+        raise GraphError(
+            f"{name(worst)} is no rotation: ||R^T R - I|| or 1 - det R is {error[worst]:.3g}; "
+            "see pgo_models.project_to_rotations()"
+        )
     R = R.copy()
-    R[rough] = project_to_rotations(R[rough])
+    R[is_rough] = project_to_rotations(R[is_rough])
     return read_only(R)
 
 
 def absolute_trajectory_error(estimate: Poses, truth: Poses) -> float:
-    """ATE: root mean square of ||t_i - t_i'|| in metres, after `estimate` is aligned to `truth`.
+    """Compute the ATE: the root mean square of ||t_i - t_i'||, after the estimate is aligned.
+
+    Parameters
+    ----------
+    estimate : Poses
+        Poses to judge.
+    truth : Poses
+        True poses, with the positions t_i'.
+
+    Returns
+    -------
+    float
+        Error, metres.
+
+    Raises
+    ------
+    GraphError
+        When the number of poses or the dimension differs.
+
+    References
+    ----------
+    Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012.
 
     Examples
     --------
@@ -155,14 +313,39 @@ def absolute_trajectory_error(estimate: Poses, truth: Poses) -> float:
     0.0
     """
     difference = estimate.aligned_to(truth).t - truth.t
-    return float(np.sqrt(np.mean(np.sum(difference**2, axis=1))))
+    squared_distance = np.sum(difference**2, axis=1)
+    return float(np.sqrt(np.mean(squared_distance)))
 
 
 def relative_pose_error(estimate: Poses, truth: Poses, step: int = 1) -> tuple[float, float]:
-    """RPE over pairs (i, i + step): root mean square of the translation error (metres) and rotation error (radians).
+    """Compute the RPE over all pairs (i, i + step), without alignment.
 
-    The error of a pair is (x_i'^-1 x_{i+step}')^-1 (x_i^-1 x_{i+step}), with ' for the truth; no alignment is needed. A
-    GraphError when the sizes differ or there is no such pair.
+    The error of a pair is (x_i'^-1 x_{i+step}')^-1 (x_i^-1 x_{i+step}), with ' for the truth.
+
+    Parameters
+    ----------
+    estimate : Poses
+        Poses to judge.
+    truth : Poses
+        True poses.
+    step : int
+        Distance of the two poses of a pair.
+
+    Returns
+    -------
+    translation : float
+        Root mean square of the translation error, metres.
+    rotation : float
+        Root mean square of the rotation error, radians.
+
+    Raises
+    ------
+    GraphError
+        When the number of poses or the dimension differs, or there is no such pair.
+
+    References
+    ----------
+    Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012.
 
     Examples
     --------
@@ -173,21 +356,25 @@ def relative_pose_error(estimate: Poses, truth: Poses, step: int = 1) -> tuple[f
     """
     _check_same_size(estimate, truth)
     if not 0 < step < truth.num_poses:
-        raise GraphError(f"step is {step}, with {truth.num_poses} poses; give 1 to {truth.num_poses - 1}")
-    R_est, t_est = _relative(estimate, step)
-    R_true, t_true = _relative(truth, step)
-    R_error = np.swapaxes(R_true, 1, 2) @ R_est
-    translation = np.sum((t_est - t_true) ** 2, axis=1)
-    rotation = np.sum(log_map(R_error) ** 2, axis=1)
-    return float(np.sqrt(translation.mean())), float(np.sqrt(rotation.mean()))
+        raise GraphError(
+            f"step is {step}, with {truth.num_poses} poses; give 1 to {truth.num_poses - 1}"
+        )
+    R, t = _relative(estimate, step)
+    true_R, true_t = _relative(truth, step)
+    R_error = np.swapaxes(true_R, 1, 2) @ R
+    squared_translation = np.sum((t - true_t) ** 2, axis=1)
+    squared_rotation = np.sum(log_map(R_error) ** 2, axis=1)
+    return float(np.sqrt(squared_translation.mean())), float(np.sqrt(squared_rotation.mean()))
 
 
 def _relative(poses: Poses, step: int) -> tuple[Array, Array]:
+    """Rotations and translations of x_i^-1 x_{i+step}, for every such pair."""
     R_inverse = np.swapaxes(poses.R[:-step], 1, 2)
     t = np.einsum("nab,nb->na", R_inverse, poses.t[step:] - poses.t[:-step])
     return R_inverse @ poses.R[step:], t
 
 
 def _check_same_size(a: Poses, b: Poses) -> None:
+    """Raise a GraphError unless both have the same number of poses and dimension."""
     if a.R.shape != b.R.shape:
         raise GraphError(f"{a} and {b} have different sizes; give two estimates of the same poses")

@@ -1,4 +1,4 @@
-"""SO(d), d = 2 or 3, vectorised over poses: projection, exponential, logarithm, random draws, stacking.
+"""SO(d), d = 2 or 3, for many poses at once: projection, exponential, logarithm, random draws.
 
 The projection is step (b) of the paper's Algorithm 1 (`algo1: SOC`), with det = +1 enforced.
 """
@@ -12,20 +12,58 @@ from pgo_models.errors import SettingError
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-_POLAR_TOLERANCE = 1e-8  # the iteration is quadratic: a last change below this leaves an error below 1e-15
+# The polar iteration is quadratic: a last change below this leaves an error below 1e-15.
+_POLAR_TOLERANCE = 1e-8
 _POLAR_ITERATIONS = 10
-_POLAR_MIN_DETERMINANT = 1e-2  # of the matrix scaled to Frobenius norm sqrt(3); below, the SVD is used
-_FEW, _MANY = 20, 4000  # matrices for which the SVD is faster, and of which the iteration stays in the cache
-_ROW, _COLUMN = np.divmod(np.arange(9), 3)  # of the entries of a 3 x 3 matrix, and those after them, cyclically:
-_UP, _DOWN, _AHEAD, _BACK = (3 * ((_ROW + a) % 3) + (_COLUMN + b) % 3 for a, b in ((1, 1), (2, 2), (1, 2), (2, 1)))
+# Below this determinant, of a matrix scaled to Frobenius norm sqrt(3), the SVD is used.
+_POLAR_MIN_DETERMINANT = 1e-2
+_FEWEST_FOR_POLAR = 20  # fewer matrices than these are projected faster by the SVD
+_BATCH = 4000  # about as many matrices stay in the cache during the polar iteration
+
+_ROW, _COLUMN = np.divmod(np.arange(9), 3)  # of the entries of a 3 x 3 matrix, row by row
+
+
+def _entries(rows_on: int, columns_on: int) -> NDArray[np.int64]:
+    """Place of the entry that is so many rows and columns further, cyclically, of every entry."""
+    row = (_ROW + rows_on) % 3
+    column = (_COLUMN + columns_on) % 3
+    return np.asarray(3 * row + column)
+
+
+# The cofactor of an entry is X[next row, next column] X[row after next, column after next] - X[next
+# row, column after next] X[row after next, next column].
+_NEXT_NEXT = _entries(1, 1)
+_AFTER_AFTER = _entries(2, 2)
+_NEXT_AFTER = _entries(1, 2)
+_AFTER_NEXT = _entries(2, 1)
 
 
 def project_to_rotations(A: Array) -> Array:
-    """Nearest rotations: argmin over omega in SO(d) of ||omega - A_i||_F for every A_i of A, (n, d, d).
+    """Project matrices to the nearest rotations: argmin over omega in SO(d) of ||omega - A_i||_F.
 
-    With the SVD A = U D V^T it is U diag(1, .., 1, det(U V^T)) V^T. Many well conditioned 3 x 3 matrices of positive
-    determinant take Newton's polar iteration X <- (X + cof(X) / det X) / 2, to the same limit. Where several are
-    nearest, one of them (Ebrahimi & Deghat, Algorithm 1, steps 4 and 5; Higham, Functions of Matrices, section 8.3).
+    With the SVD A = U D V^T the projection is U diag(1, .., 1, det(U V^T)) V^T. Many well
+    conditioned 3 x 3 matrices of positive determinant are projected by Newton's polar iteration X
+    <- (X + cof(X) / det X) / 2, which has the same limit. Where several rotations are nearest, the
+    result is one of them.
+
+    Parameters
+    ----------
+    A : Array, (n, d, d)
+        Matrices, d = 2 or 3.
+
+    Returns
+    -------
+    Array, (n, d, d)
+        Rotations.
+
+    Raises
+    ------
+    SettingError
+        When A is no array of this shape.
+
+    References
+    ----------
+    Ebrahimi & Deghat, Algorithm 1, steps 4 and 5; Higham, Functions of Matrices, 2008, section 8.3.
 
     Examples
     --------
@@ -35,50 +73,67 @@ def project_to_rotations(A: Array) -> Array:
     _check_ends(A, (2, 2), (3, 3))
     if A.shape[-1] == 2:
         return _project_2d(A)
-    if len(A) < _FEW:
+    if len(A) < _FEWEST_FOR_POLAR:
         return project_by_svd(A)
-    if len(A) >= 2 * _MANY:
-        return np.concatenate([project_to_rotations(some) for some in np.array_split(A, len(A) // _MANY)])
+    if len(A) < 2 * _BATCH:
+        return _project_3d(A)
+    batches = np.array_split(A, len(A) // _BATCH)
+    return np.concatenate([project_to_rotations(batch) for batch in batches])
+
+
+def _project_3d(A: Array) -> Array:
+    """Projection of 3 x 3 matrices by the polar iteration where it converges, else by the SVD."""
     X = np.ascontiguousarray(A.reshape(-1, 9).T)
     norm = np.sqrt(np.einsum("en,en->n", X, X) / 3.0)
     X /= np.where(norm > 0, norm, 1.0)
     cofactors, determinant = _cofactors(X)
-    good = determinant > _POLAR_MIN_DETERMINANT
-    taken = slice(None) if good.all() else good  # a slice copies nothing
-    settled = np.zeros(len(A), dtype=bool)
-    X[:, taken], settled[taken] = _polar(X[:, taken], cofactors[:, taken], determinant[taken])
+    is_regular = determinant > _POLAR_MIN_DETERMINANT
+    chosen = slice(None) if is_regular.all() else is_regular  # a slice copies nothing
+    has_converged = np.zeros(len(A), dtype=bool)
+    X[:, chosen], has_converged[chosen] = _polar(
+        X[:, chosen], cofactors[:, chosen], determinant[chosen]
+    )
     omega = np.ascontiguousarray(X.T).reshape(A.shape)
-    if not settled.all():
-        omega[~settled] = project_by_svd(A[~settled])
+    if not has_converged.all():
+        omega[~has_converged] = project_by_svd(A[~has_converged])
     return omega
 
 
 def project_by_svd(A: Array) -> Array:
     """Nearest rotations of (n, d, d) matrices through the SVD, whatever their determinant."""
     U, _, Vt = np.linalg.svd(A)
-    U[..., :, -1] *= np.where(np.linalg.det(U @ Vt) < 0, -1.0, 1.0)[..., None]
+    is_reflection = np.linalg.det(U @ Vt) < 0
+    U[..., :, -1] *= np.where(is_reflection, -1.0, 1.0)[..., None]
     return np.asarray(U @ Vt)
 
 
 def _project_2d(A: Array) -> Array:
-    cosine, sine = A[..., 0, 0] + A[..., 1, 1], A[..., 1, 0] - A[..., 0, 1]
+    """Nearest rotations of (.., 2, 2) matrices; the identity where every rotation is nearest."""
+    cosine = A[..., 0, 0] + A[..., 1, 1]
+    sine = A[..., 1, 0] - A[..., 0, 1]
     norm = np.hypot(cosine, sine)
-    degenerate = norm == 0.0
-    norm = np.where(degenerate, 1.0, norm)
-    return _from_cosine_sine(np.where(degenerate, 1.0, cosine / norm), sine / norm)
+    is_degenerate = norm == 0.0
+    norm = np.where(is_degenerate, 1.0, norm)
+    cosine = np.where(is_degenerate, 1.0, cosine / norm)
+    return _from_cosine_sine(cosine, sine / norm)
 
 
 def _from_cosine_sine(cosine: Array, sine: Array) -> Array:
-    return np.stack([np.stack([cosine, -sine], -1), np.stack([sine, cosine], -1)], -2)
+    first_row = np.stack([cosine, -sine], -1)
+    second_row = np.stack([sine, cosine], -1)
+    return np.stack([first_row, second_row], -2)
 
 
 def _polar(X: Array, cofactors: Array, determinant: Array) -> tuple[Array, BoolArray]:
-    """Newton's polar iteration on matrices (9, n) of positive determinant; second, which of them have settled."""
+    """Newton's polar iteration on matrices (9, n) of positive determinant.
+
+    Returned are the last iterates, and which of them have converged, (n,).
+    """
     change = np.full(X.shape[1], np.inf)
     for _ in range(_POLAR_ITERATIONS):
-        following = 0.5 * (X + cofactors / determinant)
-        change = np.abs(following - X).max(axis=0, initial=0.0)
-        X = following
+        next_X = 0.5 * (X + cofactors / determinant)
+        change = np.abs(next_X - X).max(axis=0, initial=0.0)
+        X = next_X
         if change.max(initial=0.0) < _POLAR_TOLERANCE:
             break
         cofactors, determinant = _cofactors(X)
@@ -86,18 +141,21 @@ def _polar(X: Array, cofactors: Array, determinant: Array) -> tuple[Array, BoolA
 
 
 def _determinants(X: Array) -> Array:
+    """Determinants of (.., d, d) matrices, expanded along the first row."""
     if X.shape[-1] == 2:
         return np.asarray(X[..., 0, 0] * X[..., 1, 1] - X[..., 0, 1] * X[..., 1, 0])
     u, v, w = np.moveaxis(X, -2, 0)  # rows; numpy's cross product takes twice as long
-    first = u[..., 0] * (v[..., 1] * w[..., 2] - v[..., 2] * w[..., 1])
-    second = u[..., 1] * (v[..., 2] * w[..., 0] - v[..., 0] * w[..., 2])
-    return np.asarray(first + second + u[..., 2] * (v[..., 0] * w[..., 1] - v[..., 1] * w[..., 0]))
+    minor_0 = v[..., 1] * w[..., 2] - v[..., 2] * w[..., 1]
+    minor_1 = v[..., 2] * w[..., 0] - v[..., 0] * w[..., 2]
+    minor_2 = v[..., 0] * w[..., 1] - v[..., 1] * w[..., 0]
+    return np.asarray(u[..., 0] * minor_0 + u[..., 1] * minor_1 + u[..., 2] * minor_2)
 
 
 def _cofactors(X: Array) -> tuple[Array, Array]:
-    """Cofactor matrices and determinants, (9, n) and (n,), of n matrices, the nine entries of all behind each other."""
-    C = X[_UP] * X[_DOWN] - X[_AHEAD] * X[_BACK]
-    return C, X[0] * C[0] + X[1] * C[1] + X[2] * C[2]
+    """Cofactor matrices, (9, n), and determinants, (n,), of n matrices X, (9, n)."""
+    C = X[_NEXT_NEXT] * X[_AFTER_AFTER] - X[_NEXT_AFTER] * X[_AFTER_NEXT]
+    determinant = X[0] * C[0] + X[1] * C[1] + X[2] * C[2]
+    return C, determinant
 
 
 def tangent_dimension(d: int) -> int:
@@ -106,24 +164,49 @@ def tangent_dimension(d: int) -> int:
 
 
 def hat(w: Array) -> Array:
-    """Skew matrices of (n, 1) or (n, 3) tangent vectors: hat(w) v = w x v in space, the turn by w in the plane."""
+    """Skew matrices of (n, 1) or (n, 3) tangent vectors.
+
+    In space hat(w) v = w x v; in the plane hat(w) is w times the rotation by 90 degrees.
+    """
     if w.shape[-1] == 1:
         return _from_cosine_sine(np.zeros_like(w[..., 0]), w[..., 0])
     W = np.zeros((*w.shape, 3))
-    W[..., 2, 1], W[..., 0, 2], W[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
-    W[..., 1, 2], W[..., 2, 0], W[..., 0, 1] = -w[..., 0], -w[..., 1], -w[..., 2]
+    W[..., 2, 1] = w[..., 0]
+    W[..., 0, 2] = w[..., 1]
+    W[..., 1, 0] = w[..., 2]
+    W[..., 1, 2] = -w[..., 0]
+    W[..., 2, 0] = -w[..., 1]
+    W[..., 0, 1] = -w[..., 2]
     return W
 
 
 def vee(W: Array) -> Array:
     """Tangent vectors (n, 1) or (n, 3) of the skew part of (n, d, d) matrices; vee(hat(w)) = w."""
+    z = W[..., 1, 0] - W[..., 0, 1]
     if W.shape[-1] == 2:
-        return 0.5 * (W[..., 1, 0] - W[..., 0, 1])[..., None]
-    return 0.5 * np.stack([W[..., 2, 1] - W[..., 1, 2], W[..., 0, 2] - W[..., 2, 0], W[..., 1, 0] - W[..., 0, 1]], -1)
+        return 0.5 * z[..., None]
+    x = W[..., 2, 1] - W[..., 1, 2]
+    y = W[..., 0, 2] - W[..., 2, 0]
+    return 0.5 * np.stack([x, y, z], -1)
 
 
 def exp_map(w: Array) -> Array:
-    """Rotations Exp(hat(w)) of tangent vectors w, (n, 1) or (n, 3), in radians.
+    """Compute the rotations Exp(hat(w)) of tangent vectors.
+
+    Parameters
+    ----------
+    w : Array, (n, 1) or (n, 3)
+        Angles in the plane, or rotation vectors in space, radians.
+
+    Returns
+    -------
+    Array, (n, d, d)
+        Rotations.
+
+    Raises
+    ------
+    SettingError
+        When w is no array of this shape.
 
     Examples
     --------
@@ -133,11 +216,29 @@ def exp_map(w: Array) -> Array:
     _check_ends(w, (1,), (3,))
     if w.shape[-1] == 1:
         return _from_cosine_sine(np.cos(w[..., 0]), np.sin(w[..., 0]))
-    return np.asarray(scipy.spatial.transform.Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix()).reshape((*w.shape, 3))
+    if w.size == 0:
+        return np.empty((*w.shape, 3))
+    turns = scipy.spatial.transform.Rotation.from_rotvec(_writable(w.reshape(-1, 3)))
+    return np.asarray(turns.as_matrix()).reshape((*w.shape, 3))
 
 
 def log_map(R: Array) -> Array:
-    """Tangent vectors w, (n, 1) or (n, 3), in radians, with Exp(hat(w)) = R, (n, d, d), and ||w|| <= pi.
+    """Compute the tangent vectors w of rotations, with Exp(hat(w)) = R and ||w|| <= pi.
+
+    Parameters
+    ----------
+    R : Array, (n, d, d)
+        Rotations, d = 2 or 3.
+
+    Returns
+    -------
+    Array, (n, 1) or (n, 3)
+        Angles in the plane, or rotation vectors in space, radians.
+
+    Raises
+    ------
+    SettingError
+        When R is no array of this shape.
 
     Examples
     --------
@@ -146,18 +247,48 @@ def log_map(R: Array) -> Array:
     """
     _check_ends(R, (2, 2), (3, 3))
     if R.shape[-1] == 2:
-        return np.arctan2(R[..., 1, 0] - R[..., 0, 1], R[..., 0, 0] + R[..., 1, 1])[..., None]
-    turns = scipy.spatial.transform.Rotation.from_matrix(R.reshape(-1, 3, 3))
+        sine = R[..., 1, 0] - R[..., 0, 1]
+        cosine = R[..., 0, 0] + R[..., 1, 1]
+        return np.arctan2(sine, cosine)[..., None]
+    if R.size == 0:
+        return np.empty(R.shape[:-1])
+    turns = scipy.spatial.transform.Rotation.from_matrix(_writable(R.reshape(-1, 3, 3)))
     return np.asarray(turns.as_rotvec()).reshape(R.shape[:-1])
 
 
+def _writable(A: Array) -> Array:
+    """Return the array, or a copy where it is read-only.
+
+    The arrays of poses are read-only, and SciPy 1.14 refuses such arrays. It refuses empty arrays,
+    too.
+    """
+    return A if A.flags.writeable else A.copy()
+
+
 def _check_ends(A: Array, *ends: tuple[int, ...]) -> None:
+    """Raise a SettingError unless the shape of an array ends in one of these."""
     if not isinstance(A, np.ndarray) or A.shape[-len(ends[0]) :] not in ends:
-        raise SettingError(f"{type(A).__name__} of shape {np.shape(A)}; give an array whose last axes are {ends}")
+        raise SettingError(
+            f"{type(A).__name__} of shape {np.shape(A)}; give an array whose last axes are {ends}"
+        )
 
 
 def random_rotations(count: int, d: int, rng: np.random.Generator) -> Array:
-    """Rotations (count, d, d) drawn uniformly (by the Haar measure) from SO(d).
+    """Draw rotations uniformly (by the Haar measure) from SO(d).
+
+    Parameters
+    ----------
+    count : int
+        Number of rotations.
+    d : int
+        Dimension of space: 2 or 3.
+    rng : numpy.random.Generator
+        Source of the draws.
+
+    Returns
+    -------
+    Array, (count, d, d)
+        Rotations.
 
     Examples
     --------
@@ -172,28 +303,43 @@ def random_rotations(count: int, d: int, rng: np.random.Generator) -> Array:
 
 def rotations_from_quaternions(quaternions: Array) -> Array:
     """Rotations of (n, 4) quaternions (x, y, z, w), normalised first; none may be zero."""
-    return np.asarray(scipy.spatial.transform.Rotation.from_quat(quaternions).as_matrix()).reshape(-1, 3, 3)
+    if quaternions.size == 0:
+        return np.empty((0, 3, 3))
+    turns = scipy.spatial.transform.Rotation.from_quat(_writable(quaternions))
+    return np.asarray(turns.as_matrix()).reshape(-1, 3, 3)
 
 
 def quaternions_from_rotations(R: Array) -> Array:
     """Unit quaternions (n, 4), ordered (x, y, z, w) with w >= 0, of (n, 3, 3) rotations."""
-    return np.asarray(scipy.spatial.transform.Rotation.from_matrix(R).as_quat(canonical=True)).reshape(-1, 4)
+    if R.size == 0:
+        return np.empty((0, 4))
+    turns = scipy.spatial.transform.Rotation.from_matrix(_writable(R))
+    return np.asarray(turns.as_quat(canonical=True)).reshape(-1, 4)
 
 
 def orthogonality_error(R: Array) -> Array:
-    """max(||R_i^T R_i - I||_F, 1 - det R_i) of every (n, d, d) matrix; nan or inf stay what they are."""
+    """max(||R_i^T R_i - I||_F, 1 - det R_i) of every (n, d, d) matrix, (n,).
+
+    The error of a matrix with nan or inf is nan or inf.
+    """
     with np.errstate(invalid="ignore", over="ignore"):
-        return np.asarray(np.maximum(np.sqrt(_squared_defect(R)), 1.0 - _determinants(R)))
+        defect = np.sqrt(_squared_defect(R))
+        return np.asarray(np.maximum(defect, 1.0 - _determinants(R)))
 
 
 def _squared_defect(R: Array) -> Array:
-    """||R^T R - I||_F^2, by entries of all matrices: of thousands much faster than a product of stacked ones."""
+    """||R^T R - I||_F^2 of every matrix.
+
+    It is summed entry by entry of all matrices at once, which is much faster for thousands of them
+    than a product of stacked matrices.
+    """
     d = R.shape[-1]
-    X = np.ascontiguousarray(np.moveaxis(R.reshape(-1, d, d), 0, -1))
-    E = X[0, :, None] * X[0]
-    for row in X[1:]:
+    entries = np.ascontiguousarray(np.moveaxis(R.reshape(-1, d, d), 0, -1))
+    E = entries[0, :, None] * entries[0]
+    for row in entries[1:]:
         E += row[:, None] * row
-    E.reshape(d * d, -1)[:: d + 1] -= 1.0
+    diagonal = E.reshape(d * d, -1)[:: d + 1]
+    diagonal -= 1.0
     return np.asarray(np.einsum("abn,abn->n", E, E)).reshape(R.shape[:-2])
 
 

@@ -1,16 +1,19 @@
-"""Pose graphs by name: from data/, from the folder named by PGO_DATA, or by a download that is checked."""
+"""Pose graphs by name, from the data folders or by a download that is checked.
+
+The data folders are the project's, ./data, and the folder that PGO_DATA names.
+"""
 
 import difflib
 import hashlib
 import os
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 
 from pgo_models.errors import DatasetError, FileFormatError
 from pgo_models.files import replace_when_done
-from pgo_models.graphs.g2o import read_g2o
+from pgo_models.graphs.g2o import name_of, read_g2o
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.graphs.trajectories import read_tum
@@ -21,33 +24,42 @@ _TIMEOUT = 30.0  # seconds without an answer
 
 @dataclass(frozen=True)
 class Registry:
-    """A public folder of g2o files with their checksums."""
+    """A public folder of g2o files with their checksums.
 
-    base_url: str  # the file of a name is at `base_url/name.g2o`
-    # `sha256:` and the digest of the file, or `blob:` and its git blob id: SHA-1 of "blob <size>", zero byte, file.
+    Parameters
+    ----------
+    base_url : str
+        Address of the folder: the file of a name is at `base_url/name.g2o`.
+    checksums : mapping of str to str
+        Name of a data set to `sha256:` and the digest of its file, or to `blob:` and its git blob
+        id, which is the SHA-1 of "blob <size>", a zero byte, and the file.
+    cache : Path, optional
+        Folder for downloads; the cache folder of the user unless given.
+    """
+
+    base_url: str
     checksums: Mapping[str, str]
-    cache: Path | None = None  # folder for downloads; the user's cache unless given
+    cache: Path | None = None
 
 
+_SE_SYNC_CHECKSUMS: Mapping[str, str] = {
+    "CSAIL": "sha256:66d99ac857a9849d814d214a9ebd0d4876d5d40f0a37be9330c1ff6e6e9daaa6",
+    "city10000": "sha256:df5988994339e990be198a36e7f640e31a5a1b26df3ed400363fafc49d5ca630",
+    "cubicle": "sha256:f7781d485383cec86d47d7650970132c36d6f3a1f4e5d62a49b7f8245c0a6465",
+    "grid3D": "blob:0dee46a9e43e1f51b9d4466ac6119e5bb6966954",
+    "intel": "sha256:3e0724c048e0ba524be9dd268a8b78e19a2497043143584cbb61310638b15c4b",
+    "kitti_00": "sha256:8a9807f604852a44254910100917918def94d7357748c633e1fd7ce73dd17468",
+    "manhattan": "sha256:6ae8d30971720c1af24a00c4b2dd5c5ddafbbbe488bfc771145c47decbffb248",
+    "parking-garage": "sha256:3ac0a31bfb601d7455d451e2546655cb5dececf51a7823f57c8a7e0fe1ca6527",
+    "rim": "blob:0c2f783b9d71012a612f09673f5aed87ae65f954",
+    "smallGrid3D": "sha256:9ea56c2ad1ebcc322560eb2f8d83cb3a60f99e2e2acc35e097b1162cdbafd649",
+    "sphere2500": "sha256:104ab57593394f24351d9f692f3b923f8b98fff1eb638c64356cf5049e06cf3c",
+    "tinyGrid3D": "sha256:c341eb0d09f7556b337be5a62b9354384885333a25fa718fd699fafb19620493",
+    "torus3D": "sha256:1ef8831023b372188d33ca63ce0da079d51df89364df71f2bce1c5c7c69ed5ec",
+}
 SE_SYNC = Registry(
     base_url="https://raw.githubusercontent.com/david-m-rosen/SE-Sync/master/data",
-    checksums=MappingProxyType(
-        {
-            "CSAIL": "sha256:66d99ac857a9849d814d214a9ebd0d4876d5d40f0a37be9330c1ff6e6e9daaa6",
-            "city10000": "sha256:df5988994339e990be198a36e7f640e31a5a1b26df3ed400363fafc49d5ca630",
-            "cubicle": "sha256:f7781d485383cec86d47d7650970132c36d6f3a1f4e5d62a49b7f8245c0a6465",
-            "grid3D": "blob:0dee46a9e43e1f51b9d4466ac6119e5bb6966954",
-            "intel": "sha256:3e0724c048e0ba524be9dd268a8b78e19a2497043143584cbb61310638b15c4b",
-            "kitti_00": "sha256:8a9807f604852a44254910100917918def94d7357748c633e1fd7ce73dd17468",
-            "manhattan": "sha256:6ae8d30971720c1af24a00c4b2dd5c5ddafbbbe488bfc771145c47decbffb248",
-            "parking-garage": "sha256:3ac0a31bfb601d7455d451e2546655cb5dececf51a7823f57c8a7e0fe1ca6527",
-            "rim": "blob:0c2f783b9d71012a612f09673f5aed87ae65f954",
-            "smallGrid3D": "sha256:9ea56c2ad1ebcc322560eb2f8d83cb3a60f99e2e2acc35e097b1162cdbafd649",
-            "sphere2500": "sha256:104ab57593394f24351d9f692f3b923f8b98fff1eb638c64356cf5049e06cf3c",
-            "tinyGrid3D": "sha256:c341eb0d09f7556b337be5a62b9354384885333a25fa718fd699fafb19620493",
-            "torus3D": "sha256:1ef8831023b372188d33ca63ce0da079d51df89364df71f2bce1c5c7c69ed5ec",
-        }
-    ),
+    checksums=_SE_SYNC_CHECKSUMS,
 )
 
 
@@ -59,14 +71,42 @@ def load(
     weights: RotationWeight = RotationWeight.SE_SYNC,
     skip_unknown: bool = False,
 ) -> PoseGraph:
-    """Pose graph of a file, a folder with one file for each robot, or a data set's name.
+    """Load a pose graph by the name of a data set, or from a file or folder.
 
-    A name is looked for in the project's data folder, in ./data, in the folder named by the environment variable
-    PGO_DATA, and in the user's cache; then it is downloaded, unless `download` is false. What the cache holds is
-    checked against its checksum. `weights` and `skip_unknown` as for `read_g2o`. Beside `x.g2o`, or the folder `x`, a
-    file `x.truth.tum` gives the ground truth, in the order of the poses. A DatasetError when the name is unknown, the
-    download fails or is not wanted, or what came does not have the right checksum; a FileFormatError as of `read_g2o`;
-    also when the truth has not one pose for each of the graph.
+    A name is looked for in the project's data folder, in ./data, in the folder that the environment
+    variable PGO_DATA names, and in the user's cache; then it is downloaded. What the cache holds is
+    checked against its checksum. Beside `x.g2o`, or the folder `x`, a file `x.truth.tum` gives the
+    ground truth, in the order of the poses.
+
+    Parameters
+    ----------
+    name_or_path : str or Path
+        Name of a data set (`known_datasets`), a g2o file, or a folder with one for each robot.
+    registry : Registry
+        Public data sets; those of SE-Sync unless given.
+    download : bool
+        Whether a data set that is not there is downloaded.
+    weights : RotationWeight
+        As for `read_g2o`.
+    skip_unknown : bool
+        As for `read_g2o`.
+
+    Returns
+    -------
+    PoseGraph
+        Graph with estimate and truth, where there are files of them.
+
+    Raises
+    ------
+    DatasetError
+        When the name is unknown, the download fails or is not wanted, or its checksum is wrong.
+    FileFormatError
+        As for `read_g2o`; also when the truth has not one pose for each of the graph.
+
+    References
+    ----------
+    Rosen, Carlone, Bandeira & Leonard, SE-Sync: a certifiably correct algorithm for synchronization
+    over the special Euclidean group, IJRR 2019.
 
     Examples
     --------
@@ -75,44 +115,81 @@ def load(
     """
     path = locate(name_or_path, registry, download=download)
     graph = read_g2o(path, weights, skip_unknown=skip_unknown)
-    beside = path.absolute().parent / f"{graph.name}.truth.tum"
-    if not os.path.isfile(beside):
+    truth_path = path.absolute().parent / f"{name_of(path)}.truth.tum"
+    if not os.path.isfile(truth_path):
         return graph
-    truth = read_tum(beside, d=graph.d)
+    truth = read_tum(truth_path, d=graph.d)
     if truth.num_poses != len(graph.in_files):
-        problem = f"{truth.num_poses} poses, but {path} has {len(graph.in_files)}; remove or redo it"
-        raise FileFormatError(beside, None, problem)
+        problem = (
+            f"{truth.num_poses} poses, but {path} has {len(graph.in_files)}; remove or redo it"
+        )
+        raise FileFormatError(truth_path, None, problem)
     return replace(graph, truth=truth)
 
 
-def locate(name_or_path: str | Path, registry: Registry = SE_SYNC, *, download: bool = True) -> Path:
+def locate(
+    name_or_path: str | Path, registry: Registry = SE_SYNC, *, download: bool = True
+) -> Path:
     """File or folder that `load` reads; parameters and errors as there."""
-    path, name = Path(name_or_path), str(name_or_path)
+    path = Path(name_or_path)
+    name = str(name_or_path)
     if not name:
-        raise DatasetError("the name of the graph is empty; give a g2o file, a folder or a data set's name")
-    # os.path, since a name too long for the system is no file, and no error; a pipe or a device is read like a file.
+        raise DatasetError(
+            "the name of the graph is empty; give a g2o file, a folder or a data set's name"
+        )
+    # os.path, for which a name too long for the system is no file, and no error. A pipe or a device
+    # is read like a file.
     if os.path.isdir(path):
         if _holds_g2o(path) or name not in known_datasets(registry):
             return path
     elif os.path.exists(path):
         return path
     if isinstance(name_or_path, Path) or path.suffix == ".g2o" or name != path.name:
-        raise FileFormatError(path, None, "no such file or folder; check the path, or give a data set's name")
+        raise FileFormatError(
+            path, None, "no such file or folder; check the path, or give a data set's name"
+        )
+    in_folder = _in_folders(name)
+    if in_folder is not None:
+        return in_folder
+    if name not in registry.checksums:
+        raise _unknown(name, registry)
+    return _cached(name, registry, download)
+
+
+def _in_folders(name: str) -> Path | None:
+    """File or folder of a data set in the data folders."""
     for folder in _folders():
         for candidate in (folder / f"{name}.g2o", folder / name):
             if os.path.isfile(candidate) or (os.path.isdir(candidate) and _holds_g2o(candidate)):
                 return candidate
-    if name not in registry.checksums:
-        known = known_datasets(registry)
-        close = difflib.get_close_matches(name, known, n=3)
-        meant = f"did you mean {' or '.join(close)}? " if close else ""
-        way_out = f"or give a path, or put {name}.g2o into the folder named by {DATA_VARIABLE}"
-        raise DatasetError(f"no file and no data set {name!r}; {meant}known are {', '.join(known)}; {way_out}")
-    return _cached(name, registry, download)
+    return None
+
+
+def _unknown(name: str, registry: Registry) -> DatasetError:
+    """Error of a name that is no data set, with those that are spelled alike."""
+    known = known_datasets(registry)
+    similar = difflib.get_close_matches(name, known, n=3)
+    suggestion = f"did you mean {' or '.join(similar)}? " if similar else ""
+    return DatasetError(
+        f"no file and no data set {name!r}; {suggestion}known are {', '.join(known)}; "
+        f"or give a path, or put {name}.g2o into the folder named by {DATA_VARIABLE}"
+    )
 
 
 def known_datasets(registry: Registry = SE_SYNC) -> tuple[str, ...]:
-    """Names that `load` takes: what is in the data folders, and what the registry can download.
+    """Return the names that `load` takes.
+
+    They are those of the files in the data folders, and of those that can be downloaded.
+
+    Parameters
+    ----------
+    registry : Registry
+        Public data sets; those of SE-Sync unless given.
+
+    Returns
+    -------
+    tuple of str
+        Names in alphabetical order.
 
     Examples
     --------
@@ -121,18 +198,24 @@ def known_datasets(registry: Registry = SE_SYNC) -> tuple[str, ...]:
     """
     names = set(registry.checksums)
     for folder in _folders():
-        names |= {file.stem for file in folder.glob("*.g2o") if file.is_file()}
-        names |= {file.name for file in folder.iterdir() if file.is_dir() and _holds_g2o(file)}
+        files = [file for file in folder.glob("*.g2o") if file.is_file()]
+        folders = [entry for entry in folder.iterdir() if entry.is_dir() and _holds_g2o(entry)]
+        names.update(file.stem for file in files)
+        names.update(entry.name for entry in folders)
     return tuple(sorted(names, key=lambda name: (name.lower(), name)))
 
 
 def project_folders() -> list[Path]:
-    """Where the project's own data can be: inside an installed package, beside the packages in a checkout."""
+    """Where the project's own data can be.
+
+    It is inside an installed package, and beside the packages in a checkout.
+    """
     package = Path(__file__).resolve().parents[1]
     return [package / "data", package.parent / "data"]
 
 
 def _folders() -> list[Path]:
+    """Data folders that exist, in the order in which they are searched."""
     folders = [*project_folders(), Path("data")]
     if os.environ.get(DATA_VARIABLE):
         folders.append(Path(os.environ[DATA_VARIABLE]))
@@ -144,56 +227,87 @@ def _holds_g2o(folder: Path) -> bool:
 
 
 def _cached(name: str, registry: Registry, download: bool) -> Path:
+    """File of a data set in the cache, downloaded if it is not there."""
     import pooch  # here, since it and requests take longer to import than all the rest
 
-    cache = Path(pooch.os_cache("pgo-splitting")) if registry.cache is None else registry.cache
+    cache = registry.cache
+    if cache is None:
+        cache = Path(pooch.os_cache("pgo-splitting"))
     path = cache / f"{name}.g2o"
-    if path.is_file() and _fits(path, registry.checksums[name]):
+    checksum = registry.checksums[name]
+    if path.is_file() and _fits(path, checksum):
         return path
     if not download:
-        raise DatasetError(f"{name} is not here; download it with: pgo info {name}, or {_by_hand(name)}")
+        raise DatasetError(
+            f"{name} is not here; download it with: pgo info {name}, or {_by_hand(name)}"
+        )
     try:
         cache.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DatasetError(f"cannot make the cache folder {cache}: {error.strerror}; {_by_hand(name)}") from error
+        raise DatasetError(
+            f"cannot make the cache folder {cache}: {error.strerror}; {_by_hand(name)}"
+        ) from error
     url = f"{registry.base_url}/{name}.g2o"
     with replace_when_done(path) as temporary:
         _download(url, temporary, name)
-        if not _fits(temporary, registry.checksums[name]):
-            wanted = registry.checksums[name]
-            raise DatasetError(f"{url} does not have the checksum {wanted}; try again, or {_by_hand(name)}")
+        if not _fits(temporary, checksum):
+            raise DatasetError(
+                f"{url} does not have the checksum {checksum}; try again, or {_by_hand(name)}"
+            )
     return path
 
 
 def _download(url: str, path: Path, name: str) -> None:
+    """Download a file, with a progress bar on a terminal."""
     import requests
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
 
     console = Console(stderr=True)
     columns = (TextColumn("downloading {task.description}"), BarColumn(), DownloadColumn())
-    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    bar = Progress(*columns, console=console, transient=True)
+    # The bar is not entered where nobody sees it: rich before 14.3 prints an empty line even for a
+    # bar that is disabled.
+    shown_bar = bar if console.is_terminal else nullcontext()
     try:
-        with bar as progress, requests.get(url, stream=True, timeout=_TIMEOUT) as answer, path.open("wb") as file:
-            answer.raise_for_status()
-            task = progress.add_task(name, total=int(answer.headers.get("content-length", 0)) or None)
-            for chunk in answer.iter_content(2**16):
+        with (
+            shown_bar,
+            requests.get(url, stream=True, timeout=_TIMEOUT) as response,
+            path.open("wb") as file,
+        ):
+            response.raise_for_status()
+            size = int(response.headers.get("content-length", 0))
+            task = bar.add_task(name, total=size or None)
+            for chunk in response.iter_content(2**16):
                 file.write(chunk)
-                progress.advance(task, len(chunk))
+                bar.advance(task, len(chunk))
     except requests.RequestException as error:
-        reason = "no answer in time" if isinstance(error, requests.Timeout) else "no connection"
         if error.response is not None:
             reason = f"status {error.response.status_code}"
-        raise DatasetError(f"{name} is not here, and {url} cannot be had ({reason}); {_by_hand(name)}") from error
+        elif isinstance(error, requests.Timeout):
+            reason = "no answer in time"
+        else:
+            reason = "no connection"
+        raise DatasetError(
+            f"{name} is not here, and {url} cannot be had ({reason}); {_by_hand(name)}"
+        ) from error
 
 
 def _by_hand(name: str) -> str:
-    return f"get {name}.g2o in another way and put it into ./data or the folder named by {DATA_VARIABLE}"
+    """Way out where a download is not possible."""
+    return (
+        f"get {name}.g2o in another way and put it into ./data "
+        f"or the folder named by {DATA_VARIABLE}"
+    )
 
 
 def _fits(path: Path, checksum: str) -> bool:
+    """Whether a file has a checksum of a `Registry`."""
     kind, _, expected = checksum.partition(":")
     data = path.read_bytes()
     if kind == "blob":
-        return hashlib.sha1(b"blob %d\0" % len(data) + data, usedforsecurity=False).hexdigest() == expected
-    return hashlib.sha256(data).hexdigest() == expected
+        blob = b"blob %d\0" % len(data) + data
+        digest = hashlib.sha1(blob, usedforsecurity=False).hexdigest()
+    else:
+        digest = hashlib.sha256(data).hexdigest()
+    return digest == expected

@@ -1,89 +1,134 @@
-"""The lines of one g2o file as arrays, every fault named by file:line; their tags are in `g2o_tags`.
+"""The lines of one g2o file as arrays, every fault named by file:line.
 
-The way through a sound file is short: blocks of some megabytes, whose lines of a tag are parsed by one call. Only when
-that fails are the lines looked at one by one, to name the one that is wrong.
+Tags are in `g2o_tags`.
+
+A sound file takes a short way: blocks of some megabytes, in which all lines of a tag are parsed by
+one call. Only when that call fails are the lines looked at one by one, to name the wrong one.
 """
 
 import warnings
 from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass
-from operator import methodcaller
+from itertools import islice
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 
-from pgo_models.errors import FileFormatError, GraphWarning
-from pgo_models.files import LARGEST, LONGEST, check_length, check_metres, check_quaternions, finite_number, read_blocks
+from pgo_models.errors import FileFormatError, GraphWarning, printable
+from pgo_models.files import (
+    LARGEST,
+    LONGEST,
+    check_length,
+    check_metres,
+    check_quaternions,
+    finite_number,
+    read_blocks,
+)
 from pgo_models.geometry.arrays import triangle_places
 from pgo_models.geometry.rotations import Array, BoolArray, exp_map, rotations_from_quaternions
-from pgo_models.graphs.g2o_tags import ALIASES, TAGS
+from pgo_models.graphs.g2o_tags import ALIASES, TAGS, Tag
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
 from pgo_models.graphs.precisions import are_definite
 
-_LONG_RUN = 16  # lines of one tag, from which on they are not sorted by it one by one
-_SINGULAR = 1e-15  # an eigenvalue below it, of a matrix with ones on its diagonal, is rounding
+_LONG_RUN = 16  # lines of one tag in a row, from which on they need not be sorted by tag
+_NAMED_TAGS = 10  # unknown tags that a warning names
+_SHOWN = 40  # characters of a wrong word that a message shows
+# An eigenvalue below this, of a matrix with ones on its diagonal, is rounding.
+_SINGULAR = 1e-15
 
 
 @dataclass(frozen=True, eq=False)
 class G2OLines:
-    """What one g2o file says, in the order of its lines, which count from 1."""
+    """What one g2o file holds, in the order of its lines, which count from 1."""
 
     path: Path
     d: int  # 2 or 3
     vertex_ids: IntArray  # (v,): of the VERTEX lines
     vertex_lines: IntArray  # (v,): lines that they stand on
     vertices: Array  # (v, 3) or (v, 7): x y theta, or x y z qx qy qz qw
-    edge_ids: IntArray  # (m, 2): `WORLD_ID` and the pose, of a prior
-    # (m, 9) or (m, 28): the measurement like a vertex, then the upper triangle of its information matrix, row by row.
+    edge_ids: IntArray  # (m, 2): the two poses; `WORLD_ID` and the pose, of a prior
+    # (m, 9) or (m, 28): the measurement like a vertex, then the upper triangle of its information
+    # matrix, row by row.
     edges: Array
     edge_lines: IntArray  # (m,)
     fixed: IntArray  # (f,): ids of the FIX lines
     fixed_lines: IntArray  # (f,)
-    landmarks: IntArray  # (l,): ids that some line says are of a point
+    landmarks: IntArray  # (l,): ids that some line uses for a point
+
+
+class _ParsedLines(NamedTuple):
+    """Lines of one tag: their numbers in the file, and what stands on them."""
+
+    lines: IntArray  # (n,)
+    ids: IntArray  # (n, num_ids)
+    numbers: Array  # (n, num_numbers)
+
+
+class _Rows(NamedTuple):
+    """All VERTEX or all EDGE lines of a file."""
+
+    ids: IntArray  # (n, 2): the second id alone counts for a vertex
+    numbers: Array  # (n, width)
+    lines: IntArray  # (n,)
+    is_point: BoolArray  # (n,): whether the last id is that of a landmark
 
 
 def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
-    """Read and check the lines of one g2o file; blank lines, comments (#) and PARAMS_ lines are skipped.
+    """Read and check the lines of one g2o file.
 
-    With `skip_unknown`, so are lines with unknown tags, and a `GraphWarning` says how many of each. A FileFormatError
-    with file:line, for: a file that is missing, binary or without VERTEX and EDGE lines; an unknown tag; too few or too
-    many numbers on a line, or thousands of them; a word, nan or inf where a number belongs; an id that is no integer of
-    64 bits; a zero quaternion; a length beyond `FARTHEST`; an information matrix whose translation or rotation block is
-    not positive definite, nor zero, or both are zero; an edge to itself; a second VERTEX line of an id; a measurement
-    in the frame of a sensor that is not that of the pose; an edge from a landmark, or of its rotation; 2D beside 3D.
+    Blank lines, comments (#) and PARAMS_ lines are skipped. With `skip_unknown`, so are lines with
+    unknown tags, and a `GraphWarning` gives the number of each.
+
+    A FileFormatError with file:line, for: a file that is missing, binary or without VERTEX and EDGE
+    lines; an unknown tag; too few or too many numbers on a line, or thousands of them; a word, nan
+    or inf where a number belongs; an id that is no integer of 64 bits; a zero quaternion; a length
+    beyond `FARTHEST`; an information matrix whose translation or rotation block is neither positive
+    definite nor zero, or both of whose blocks are zero; an edge to itself; a second VERTEX line of
+    an id; a measurement in the frame of a sensor that is not at its pose; an edge that begins at a
+    landmark, or measures its rotation; lines in 2D beside lines in 3D.
     """
     path = Path(path)
-    source, first = _Source(path, skip_unknown), 1
+    source = _Source(path, skip_unknown)
+    first_line = 1
     for block in read_blocks(path):
-        first += source.take(first, block.removesuffix("\n").split("\n"))
+        lines = block.removesuffix("\n").split("\n")
+        source.take(first_line, lines)
+        first_line += len(lines)
     if source.unknown:
-        said = ", ".join(f"{count} of {tag} (first: line {at})" for tag, (count, at) in source.unknown.items())
-        warnings.warn(f"{path}: lines with unknown tags were skipped: {said}", GraphWarning, stacklevel=2)
+        warnings.warn(source.text_of_unknown(), GraphWarning, stacklevel=2)
     d = source.dimension()
-    vertex_ids, vertices, vertex_lines, is_point = source.joined(d, is_edge=False)
-    edge_ids, edges, edge_lines, to_point = source.joined(d, is_edge=True)
-    landmarks = np.unique(np.concatenate([vertex_ids[is_point, 1], edge_ids[to_point, 1]]))
-    is_posed = np.isin(edge_ids, landmarks) & ~np.stack([np.zeros_like(to_point), to_point], axis=1)
-    posed = [*vertex_lines[np.isin(vertex_ids[:, 1], landmarks) & ~is_point], *edge_lines[is_posed.any(axis=1)]]
-    if posed:
-        problem = "a pose, or an edge of poses, with the id of a landmark, which is a point; renumber one of them"
-        raise FileFormatError(path, int(min(posed)), problem)
+    vertices = source.joined(d, is_edge=False)
+    edges = source.joined(d, is_edge=True)
     fixed, fixed_lines = np.array(source.fixed, dtype=np.int64).reshape(-1, 2).T
-    of_poses, of_edges = (vertex_ids[:, 1], vertex_lines, vertices), (edge_ids, edges, edge_lines)
-    found = G2OLines(path, d, *of_poses, *of_edges, fixed, fixed_lines, landmarks)
-    for rows, at in ((vertices, found.vertex_lines), (edges, found.edge_lines)):
-        check_metres(path, at, rows[:, :d])
+    file = G2OLines(
+        path,
+        d,
+        vertex_ids=vertices.ids[:, 1],
+        vertex_lines=vertices.lines,
+        vertices=vertices.numbers,
+        edge_ids=edges.ids,
+        edges=edges.numbers,
+        edge_lines=edges.lines,
+        fixed=fixed,
+        fixed_lines=fixed_lines,
+        landmarks=_landmarks(path, vertices, edges),
+    )
+    for rows in (vertices, edges):
+        check_metres(path, rows.lines, rows.numbers[:, :d])
         if d == 3:
-            check_quaternions(path, at, rows[:, 3:7])
-    for number, problem in _faults(found):
-        raise FileFormatError(path, number, problem)
-    return found
+            check_quaternions(path, rows.lines, rows.numbers[:, 3:7])
+    for line, problem in _faults(file):
+        raise FileFormatError(path, line, problem)
+    return file
 
 
 def poses_of(d: int, numbers: Array) -> tuple[Array, Array]:
-    """Rotations (n, d, d) and translations (n, d) of rows that open with x y theta, or x y z qx qy qz qw."""
+    """Rotations (n, d, d) and translations (n, d) of rows of `G2OLines`.
+
+    The rows open with x y theta, or x y z qx qy qz qw.
+    """
     if d == 2:
         return exp_map(numbers[:, 2:3]), numbers[:, :2].copy()
     return rotations_from_quaternions(numbers[:, 3:7]), numbers[:, :3].copy()
@@ -96,186 +141,324 @@ def information_of(d: int, edges: Array) -> Array:
 
 
 class _Source:
-    """What the lines of a file say so far: parsed tag by tag, and when that fails, one by one to say which is wrong."""
+    """What the lines of a file hold, parsed tag by tag.
+
+    Where that fails, the lines are looked at one by one to name the wrong one.
+    """
 
     def __init__(self, path: Path, skip_unknown: bool) -> None:
-        self.path, self._skip_unknown = path, skip_unknown
-        self.parsed: dict[str, list[tuple[IntArray, IntArray, Array]]] = {tag: [] for tag in TAGS}
+        self.path = path
+        self._skip_unknown = skip_unknown
+        self.parsed: dict[str, list[_ParsedLines]] = {tag: [] for tag in TAGS}
         self.fixed: list[tuple[int, int]] = []  # a pose and its line
-        self.unknown: dict[str, tuple[int, int]] = {}  # how many lines, and the first
-        self._offset = 0  # line of a sensor that is not at its pose
+        self.unknown: dict[str, tuple[int, int]] = {}  # tag: how many lines, and the first
+        self._offset_line = 0  # line of a sensor that is not at its pose; 0 if there is none
 
-    def take(self, first: int, lines: list[str]) -> int:
-        """Parse lines, of which the first has that number, and return how many they are."""
-        done = 0
-        while done < len(lines):  # runs of lines of one tag, whose ends are found by bisection
-            tag = "".join(lines[done].split(None, 1)[:1])
-            end = bisect_left(lines, True, done, key=lambda line: not line.startswith(tag))
-            is_run = tag in TAGS and not TAGS[tag].has_offset and end - done >= _LONG_RUN
-            if not (is_run and self._parse(tag, np.arange(first + done, first + end), lines[done:end])):
+    def take(self, first_line: int, lines: list[str]) -> None:
+        """Parse lines, of which the first has the number `first_line` in the file."""
+        num_taken = self._take_runs(first_line, lines)
+        self._take_groups(first_line + num_taken, lines[num_taken:])
+
+    def _take_runs(self, first_line: int, lines: list[str]) -> int:
+        """Parse long runs of lines of one tag; return how many lines these are."""
+        start = 0
+        while start < len(lines):
+            tag = "".join(lines[start].split(None, 1)[:1])
+            # Bisection takes for granted that all lines of a tag follow each other. Where other
+            # lines stand between them, parsing fails, and the lines are sorted by their tags.
+            end = bisect_left(lines, True, start, key=lambda line: not line.startswith(tag))
+            is_run = tag in TAGS and not TAGS[tag].has_offset and end - start >= _LONG_RUN
+            numbers = np.arange(first_line + start, first_line + end)
+            if not is_run or not self._parse(tag, tag, numbers, lines[start:end]):
                 break
-            done = end
-        groups: dict[str, list[int]] = {}
-        for place, line in enumerate(lines[done:], done):
-            if words := line.split(None, 1):
-                groups.setdefault(words[0], []).append(place)
-        for tag, at in groups.items():
-            numbers, mine = np.array(at) + first, [lines[place] for place in at]
-            if (known := ALIASES.get(tag, tag)) in TAGS:
-                if TAGS[known].has_offset:
-                    mine = [" ".join([tag, *self._words(known, line)]) for line in mine]
-                if not self._parse(known, numbers, mine, tag):
-                    self._diagnose(known, numbers.tolist(), mine)
-            elif not tag.startswith("#"):
-                self._take_other(tag, numbers.tolist(), mine)
-        return len(lines)
+            start = end
+        return start
 
-    def joined(self, d: int, is_edge: bool) -> tuple[IntArray, Array, IntArray, BoolArray]:
-        """Ids (n, 2), rows, lines and whether they are of landmarks, of all VERTEX or all EDGE lines, line by line."""
-        wanted = [tag for tag, kind in TAGS.items() if (kind.d, kind.is_edge) == (d, is_edge)]
-        found = [(TAGS[tag], *part) for tag in wanted for part in self.parsed.pop(tag)]
-        kind, none = TAGS[wanted[0]], np.zeros(0, dtype=np.int64)
-        found = found or [(kind, none, none.reshape(0, kind.num_ids), np.zeros((0, kind.num_numbers)))]
-        lines = np.concatenate([at for _, at, _, _ in found])
-        ids = np.concatenate([np.insert(own, 0, WORLD_ID, axis=1)[:, -2:] for _, _, own, _ in found])
-        rows = np.concatenate([kind.rows(own) for kind, _, _, own in found])
-        points = np.repeat([kind.to_landmark for kind, *_ in found], [len(at) for _, at, _, _ in found])
-        order = np.argsort(lines) if (np.diff(lines) < 0).any() else slice(None)
-        return ids[order], rows[order], lines[order], points[order]
+    def _take_groups(self, first_line: int, lines: list[str]) -> None:
+        """Sort lines by their tags, and parse the lines of each tag."""
+        places: dict[str, list[int]] = {}
+        for place, line in enumerate(lines):
+            if words := line.split(None, 1):
+                places.setdefault(words[0], []).append(place)
+        for written_tag, places_of_tag in places.items():
+            numbers = np.array(places_of_tag) + first_line
+            lines_of_tag = [lines[place] for place in places_of_tag]
+            tag = ALIASES.get(written_tag, written_tag)
+            if tag in TAGS:
+                self._take_measurements(tag, written_tag, numbers, lines_of_tag)
+            elif not written_tag.startswith("#"):
+                self._take_others(written_tag, numbers.tolist(), lines_of_tag)
+
+    def _take_measurements(
+        self, tag: str, written_tag: str, numbers: IntArray, lines: list[str]
+    ) -> None:
+        """Take VERTEX or EDGE lines, whose tag may be written as an alias."""
+        if TAGS[tag].has_offset:
+            lines = [" ".join([written_tag, *_words(TAGS[tag], line)]) for line in lines]
+        if not self._parse(tag, written_tag, numbers, lines):
+            self._diagnose(tag, numbers.tolist(), lines)
+
+    def _take_others(self, tag: str, numbers: list[int], lines: list[str]) -> None:
+        """Take lines of a tag that is no measurement's."""
+        if tag == "FIX":
+            for number, line in zip(numbers, lines, strict=True):
+                self.fixed += [(self._id(number, word), number) for word in line.split()[1:]]
+        elif tag == "PARAMS_SE3OFFSET":
+            for number, line in zip(numbers, lines, strict=True):
+                offset = line.split()[2:8]
+                if any(finite_number(self.path, number, word) for word in offset):
+                    self._offset_line = number
+        elif tag.startswith("PARAMS_"):
+            return
+        elif self._skip_unknown:
+            shown_tag = tag[:_SHOWN]
+            count, first = self.unknown.get(shown_tag, (0, numbers[0]))
+            self.unknown[shown_tag] = (count + len(numbers), first)
+        else:
+            known = f"{', '.join(TAGS)} and FIX"
+            raise self._error(
+                numbers[0],
+                f"unknown tag {tag[:_SHOWN]!r}; supported are {known}: remove the line, "
+                "or have such lines skipped with --skip-unknown",
+            )
+
+    def text_of_unknown(self) -> str:
+        """Text of the warning for lines with unknown tags."""
+        named = islice(self.unknown.items(), _NAMED_TAGS)
+        counts = [
+            f"{count} of {printable(tag)} (first: line {first})" for tag, (count, first) in named
+        ]
+        text = f"{printable(str(self.path))}: lines with unknown tags were skipped: "
+        text += ", ".join(counts)
+        num_unnamed = len(self.unknown) - _NAMED_TAGS
+        if num_unnamed > 0:
+            text += f", .. and of {num_unnamed} other tags"
+        return text
+
+    def joined(self, d: int, is_edge: bool) -> _Rows:
+        """All VERTEX or all EDGE lines, line by line; what was parsed of them is given away."""
+        kinds = {tag: kind for tag, kind in TAGS.items() if (kind.d, kind.is_edge) == (d, is_edge)}
+        parts = []
+        for tag, kind in kinds.items():
+            parts += [_as_rows(kind, part) for part in self.parsed.pop(tag)]
+        if not parts:
+            kind = next(iter(kinds.values()))
+            no_ids = np.zeros((0, kind.num_ids), dtype=np.int64)
+            no_lines = np.zeros(0, dtype=np.int64)
+            none = _ParsedLines(no_lines, no_ids, np.zeros((0, kind.num_numbers)))
+            parts = [_as_rows(kind, none)]
+        ids, numbers, lines, is_point = map(np.concatenate, zip(*parts, strict=True))
+        if (np.diff(lines) < 0).any():
+            order = np.argsort(lines)
+            return _Rows(ids[order], numbers[order], lines[order], is_point[order])
+        return _Rows(ids, numbers, lines, is_point)
 
     def dimension(self) -> int:
-        """2 or 3; a FileFormatError where lines are of neither, or of both, or measured by a sensor off its pose."""
-        if self._offset and any(self.parsed[tag] for tag, kind in TAGS.items() if kind.has_offset):
-            problem = "a sensor that is not at its pose; give what it measured in the frame of the pose"
-            raise self._error(self._offset, f"{problem}, without this line")
-        at = [(part[0][0], TAGS[tag].d) for tag, parts in self.parsed.items() for part in parts]
-        first = {d: min((line for line, of in at if of == d), default=0) for d in (2, 3)}
-        if not first[2] and not first[3]:
+        """Dimension of the lines, 2 or 3.
+
+        A FileFormatError where lines are of neither or of both, or measured by a sensor that is not
+        at its pose.
+        """
+        uses_offset = any(self.parsed[tag] for tag, kind in TAGS.items() if kind.has_offset)
+        if self._offset_line and uses_offset:
+            raise self._error(
+                self._offset_line,
+                "a sensor that is not at its pose; give what it measured in the frame of the pose, "
+                "without this line",
+            )
+        first_line: dict[int, int] = {}
+        for tag, parts in self.parsed.items():
+            d = TAGS[tag].d
+            for part in parts:
+                line = int(part.lines[0])
+                first_line[d] = min(first_line.get(d, line), line)
+        if not first_line:
             problem = f"no measurement in it; a pose graph needs lines of {' or '.join(TAGS)}"
             raise FileFormatError(self.path, None, problem)
-        if first[2] and first[3]:
-            other = f"(the other kind is on line {min(first.values())})"
-            raise self._error(max(first.values()), f"2D and 3D lines in one file {other}; give one file for each")
-        return 2 if first[2] else 3
+        if len(first_line) == 2:
+            earlier, later = sorted(first_line.values())
+            raise self._error(
+                later,
+                f"2D and 3D lines in one file (the other kind is on line {earlier}); "
+                "give one file for each",
+            )
+        (d,) = first_line
+        return d
 
-    def _parse(self, tag: str, at: IntArray, lines: list[str], written: str = "") -> bool:
-        """Whether lines are all of one tag, which may be written as its alias, with ids and finite numbers; keep."""
+    def _parse(self, tag: str, written_tag: str, numbers: IntArray, lines: list[str]) -> bool:
+        """Parse lines of one tag by one call, keep what they hold, and return if they are sound.
+
+        They are sound unless a line has another tag, an id that is no integer, a number that is not
+        finite, or another number of words.
+        """
         kind = TAGS[tag]
         if max(map(len, lines)) > LONGEST:
             return False
-        shared = _shared_end(lines, kind.num_numbers - 1)
-        own = kind.num_numbers - len(shared.split())
-        row = np.dtype([("tag", "S20"), ("ids", "i8", (kind.num_ids,)), ("numbers", "f8", (own,))])
+        shared_end = _shared_end(lines, kind.num_numbers - 1)
+        num_own = kind.num_numbers - len(shared_end.split())
+        row_type = np.dtype(
+            [("tag", "S20"), ("ids", "i8", (kind.num_ids,)), ("numbers", "f8", (num_own,))]
+        )
+        own_ends = [line.removesuffix(shared_end) for line in lines]
+        shared = np.zeros((1, 0))
         try:
-            with warnings.catch_warnings(action="error", category=DeprecationWarning):  # of an id like 1.0
-                found = np.loadtxt([line.removesuffix(shared) for line in lines], comments=None, ndmin=1, dtype=row)
-            same = np.loadtxt([shared], comments=None, ndmin=2) if shared else np.zeros((1, 0))
+            # NumPy warns of an id like 1.0, which is none.
+            with warnings.catch_warnings(action="error", category=DeprecationWarning):
+                rows = np.loadtxt(own_ends, comments=None, ndmin=1, dtype=row_type)
+            if shared_end:
+                shared = np.loadtxt([shared_end], comments=None, ndmin=2)
         except (ValueError, DeprecationWarning):
             return False
-        ids, numbers = found["ids"], np.concatenate([found["numbers"], same.repeat(len(found), axis=0)], axis=1)
-        is_sound = len(ids) == len(at) and (found["tag"] == (written or tag).encode()).all()
-        if not is_sound or (ids == WORLD_ID).any() or not (np.abs(numbers) <= LARGEST).all():
+        ids = rows["ids"]
+        values = np.concatenate([rows["numbers"], shared.repeat(len(rows), axis=0)], axis=1)
+        has_tag = len(ids) == len(numbers) and (rows["tag"] == written_tag.encode()).all()
+        if not has_tag or (ids == WORLD_ID).any() or not (np.abs(values) <= LARGEST).all():
             return False
-        self.parsed[tag].append((at, ids.copy(), numbers))
+        self.parsed[tag].append(_ParsedLines(numbers, ids.copy(), values))
         return True
 
-    def _take_other(self, tag: str, at: list[int], lines: list[str]) -> None:
-        """Take lines of a tag that is no measurement's."""
-        for number, line in zip(at, lines, strict=True):
-            words = line.split()
-            if tag == "FIX":
-                self.fixed += [(self._integer(number, word), number) for word in words[1:]]
-            elif tag == "PARAMS_SE3OFFSET":
-                if any(finite_number(self.path, number, word) for word in words[2:8]):
-                    self._offset = number
-            elif not self._skip_unknown and not tag.startswith("PARAMS_"):
-                problem = f"unknown tag {tag[:40]!r}; supported are {', '.join(TAGS)} and FIX: remove the line"
-                raise self._error(number, f"{problem}, or have such lines skipped with --skip-unknown")
-        if self._skip_unknown and tag != "FIX" and not tag.startswith("PARAMS_"):
-            count, earliest = self.unknown.get(tag[:40], (0, at[0]))
-            self.unknown[tag[:40]] = count + len(at), earliest
+    def _diagnose(self, tag: str, numbers: list[int], lines: list[str]) -> NoReturn:
+        """Raise the error of the first line that is wrong."""
+        for number, line in zip(numbers, lines, strict=True):
+            check_length(self.path, number, line)
+            self._check_line(tag, number, line)
+        raise self._error(
+            numbers[0],
+            f"the {tag} lines cannot be read; write numbers like 1.5e-3, separated by blanks",
+        )
 
-    def _words(self, tag: str, line: str) -> list[str]:
-        """Ids and numbers on a line, without the id of an offset."""
-        kind, words = TAGS[tag], line.split()[1:]
-        if kind.has_offset and len(words) == kind.num_ids + 1 + kind.num_numbers:
-            words.pop(kind.num_ids)
-        return words
+    def _check_line(self, tag: str, number: int, line: str) -> None:
+        """Raise a FileFormatError when a word of a line is wrong, or there are not enough."""
+        kind = TAGS[tag]
+        words = _words(kind, line)
+        for word in words[: kind.num_ids]:
+            self._id(number, word)
+        for word in words[kind.num_ids :]:
+            finite_number(self.path, number, word)
+        expected = kind.num_ids + kind.num_numbers
+        if len(words) == expected:
+            return
+        ids = "1 id" if kind.num_ids == 1 else f"{kind.num_ids} ids"
+        cause = "the line is cut off" if len(words) < expected else "the line is too long"
+        raise self._error(
+            number,
+            f"{tag} needs {ids} and {kind.num_numbers} numbers, {expected} in all, "
+            f"found {len(words)}; {cause}: complete or remove it",
+        )
 
-    def _integer(self, line: int, word: str) -> int:
-        """Id of 64 bits."""
+    def _id(self, line: int, word: str) -> int:
+        """Id of a pose, which has 64 bits."""
         try:
             # int() also takes 1_000 and the digits of other scripts; number files do not.
             value = int(word if word.isascii() and "_" not in word else "")
         except ValueError:
-            raise self._error(line, f"id {word[:40]!r} is no integer; number the poses") from None
+            problem = f"id {word[:_SHOWN]!r} is no integer; number the poses"
+            raise self._error(line, problem) from None
         if not -(2**63) <= value < WORLD_ID:
             raise self._error(
-                line, f"id {word[:40]} does not fit 64 bits, less one that stands for the world; renumber the poses"
+                line,
+                f"id {word[:_SHOWN]} does not fit 64 bits, less one that stands for the world; "
+                "renumber the poses",
             )
         return value
-
-    def _diagnose(self, tag: str, at: list[int], lines: list[str]) -> NoReturn:
-        kind = TAGS[tag]
-        for number, line in zip(at, lines, strict=True):
-            check_length(self.path, number, line)
-            words = self._words(tag, line)
-            for word in words[: kind.num_ids]:
-                self._integer(number, word)
-            for word in words[kind.num_ids :]:
-                finite_number(self.path, number, word)
-            expected = kind.num_ids + kind.num_numbers
-            if len(words) != expected:
-                few = "the line is cut off" if len(words) < expected else "the line is too long"
-                needed = f"{kind.num_ids} id{'s' * (kind.num_ids > 1)} and {kind.num_numbers} numbers"
-                problem = f"{tag} needs {needed}, {expected} in all, found {len(words)}; {few}: complete or remove it"
-                raise self._error(number, problem)
-        raise self._error(at[0], f"the {tag} lines cannot be read; write numbers like 1.5e-3, separated by blanks")
 
     def _error(self, line: int, problem: str) -> FileFormatError:
         return FileFormatError(self.path, line, problem)
 
 
+def _words(kind: Tag, line: str) -> list[str]:
+    """Ids and numbers on a line, without the id of an offset."""
+    words = line.split()[1:]
+    if kind.has_offset and len(words) == kind.num_ids + 1 + kind.num_numbers:
+        words.pop(kind.num_ids)
+    return words
+
+
+def _as_rows(kind: Tag, part: _ParsedLines) -> _Rows:
+    """Lines of a tag in the common form: edges of one pose are priors, which begin at the world."""
+    two_ids = np.insert(part.ids, 0, WORLD_ID, axis=1)[:, -2:]
+    is_point = np.full(len(part.lines), kind.to_landmark)
+    return _Rows(two_ids, kind.rows(part.numbers), part.lines, is_point)
+
+
+def _landmarks(path: Path, vertices: _Rows, edges: _Rows) -> IntArray:
+    """Ids of landmarks; a FileFormatError where one stands for a pose in another line."""
+    vertex_ids = vertices.ids[:, 1]
+    landmarks = np.unique(
+        np.concatenate([vertex_ids[vertices.is_point], edges.ids[edges.is_point, 1]])
+    )
+    is_posed_vertex = np.isin(vertex_ids, landmarks) & ~vertices.is_point
+    # The first id of an edge is always that of a pose, the second one unless it ends at a point.
+    may_be_landmark = np.stack([np.zeros_like(edges.is_point), edges.is_point], axis=1)
+    is_posed_edge = (np.isin(edges.ids, landmarks) & ~may_be_landmark).any(axis=1)
+    posed = [*vertices.lines[is_posed_vertex], *edges.lines[is_posed_edge]]
+    if posed:
+        problem = (
+            "a pose, or an edge of poses, with the id of a landmark, which is a point; "
+            "renumber one of them"
+        )
+        raise FileFormatError(path, int(min(posed)), problem)
+    return landmarks
+
+
 def _shared_end(lines: list[str], most: int) -> str:
-    """Words that all lines end with, as information matrices are often the same; nothing where they are over `most`."""
-    first, last = (line.split(" ")[::-1] for line in (lines[0], lines[-1]))
-    count = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), 0)
-    shared = " " + " ".join(first[:count][::-1])
-    return shared if 0 < len(shared.split()) <= most and all(map(methodcaller("endswith", shared), lines)) else ""
+    """Words that all lines end with, as information matrices are often the same.
+
+    It is empty where these words are more than `most`.
+    """
+    first = lines[0].split(" ")[::-1]
+    last = lines[-1].split(" ")[::-1]
+    differs = (place for place, (a, b) in enumerate(zip(first, last, strict=False)) if a != b)
+    count = next(differs, 0)
+    shared_end = " " + " ".join(first[:count][::-1])
+    if not 0 < len(shared_end.split()) <= most:
+        return ""
+    return shared_end if all(line.endswith(shared_end) for line in lines) else ""
 
 
-def _faults(found: G2OLines) -> Iterator[tuple[int, str]]:
+def _faults(file: G2OLines) -> Iterator[tuple[int, str]]:
     """Line and description of what the numbers of a file cannot be."""
-    order = np.argsort(found.vertex_ids, kind="stable")
-    again = np.flatnonzero(np.diff(found.vertex_ids[order]) == 0)
-    if again.size:
-        earlier, later = order[again[0]], order[again[0] + 1]
-        first = f"(the first is line {found.vertex_lines[earlier]})"
-        problem = f"a second VERTEX line of pose {found.vertex_ids[later]} {first}; remove one"
-        yield int(found.vertex_lines[later]), problem
-    loops = found.edge_ids[:, 0] == found.edge_ids[:, 1]
+    order = np.argsort(file.vertex_ids, kind="stable")
+    repeated = np.flatnonzero(np.diff(file.vertex_ids[order]) == 0)
+    if repeated.size:
+        earlier = order[repeated[0]]
+        later = order[repeated[0] + 1]
+        first = f"(the first is line {file.vertex_lines[earlier]})"
+        problem = f"a second VERTEX line of pose {file.vertex_ids[later]} {first}; remove one"
+        yield int(file.vertex_lines[later]), problem
+    loops = file.edge_ids[:, 0] == file.edge_ids[:, 1]
     if loops.any():
-        at = int(np.argmax(loops))
-        yield int(found.edge_lines[at]), f"an edge from pose {found.edge_ids[at, 0]} to itself; remove it"
-    # The blocks alone are asked for: the precisions use nothing else, and the coupling blocks of the public cubicle
-    # graph make 5,021 of its whole matrices indefinite.
-    information = information_of(found.d, found.edges)
-    empty = ~information.any(axis=(1, 2))
-    if empty.any():
-        at = int(np.argmax(empty))
-        yield int(found.edge_lines[at]), "the information matrix is zero; the edge says nothing: remove it"
-    for name, block in (("translation", slice(None, found.d)), ("rotation", slice(found.d, None))):
-        bad = information[:, block, block].any(axis=(1, 2)) & ~_is_positive_definite(information[:, block, block])
-        if bad.any():
-            at = int(np.argmax(bad))
-            smallest = np.linalg.eigvalsh(information[at, block, block])[0]
-            indefinite = f"information matrix is not positive definite (smallest eigenvalue {smallest:.3g})"
-            way_out = "give the upper triangle row by row, or remove the line"
-            yield int(found.edge_lines[at]), f"{name} block of the {indefinite}; {way_out}"
+        e = int(np.argmax(loops))
+        problem = f"an edge from pose {file.edge_ids[e, 0]} to itself; remove it"
+        yield int(file.edge_lines[e]), problem
+    # Only the two blocks are checked: the precisions use nothing else, and the coupling blocks of
+    # the public cubicle graph make 5,021 of its whole matrices indefinite.
+    information = information_of(file.d, file.edges)
+    is_zero = ~information.any(axis=(1, 2))
+    if is_zero.any():
+        problem = "the information matrix is zero; the edge says nothing: remove it"
+        yield int(file.edge_lines[int(np.argmax(is_zero))]), problem
+    d = file.d
+    yield from _faults_of_blocks(file, "translation", information[:, :d, :d])
+    yield from _faults_of_blocks(file, "rotation", information[:, d:, d:])
+
+
+def _faults_of_blocks(file: G2OLines, name: str, blocks: Array) -> Iterator[tuple[int, str]]:
+    """Line and description of a block, (m, k, k), that is neither zero nor positive definite."""
+    is_wrong = blocks.any(axis=(1, 2)) & ~_is_positive_definite(blocks)
+    if is_wrong.any():
+        e = int(np.argmax(is_wrong))
+        smallest = np.linalg.eigvalsh(blocks[e])[0]
+        yield (
+            int(file.edge_lines[e]),
+            f"{name} block of the information matrix is not positive definite "
+            f"(smallest eigenvalue {smallest:.3g}); "
+            "give the upper triangle row by row, or remove the line",
+        )
 
 
 def _is_positive_definite(A: Array) -> BoolArray:
-    """Whether every (k, k) matrix of a stack is positive definite, (m,), beyond rounding and underflow."""
-    positive = (np.einsum("mkk->mk", A) > 1.0 / LARGEST).all(axis=1)
-    positive[positive] = are_definite(A[positive], _SINGULAR)
-    return np.asarray(positive)
+    """Whether matrices (m, k, k) are positive definite, (m,), beyond rounding and underflow."""
+    is_positive = (np.einsum("mkk->mk", A) > 1.0 / LARGEST).all(axis=1)
+    is_positive[is_positive] = are_definite(A[is_positive], _SINGULAR)
+    return np.asarray(is_positive)

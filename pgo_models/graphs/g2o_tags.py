@@ -1,9 +1,12 @@
-"""The tags of g2o files, as g2o, GTSAM and TORO write them, and their numbers in the order of EDGE_SE2, EDGE_SE3:QUAT.
+"""The tags of g2o files, as g2o, GTSAM and TORO write them, and what stands on their lines.
 
-Sources: `types_slam2d.cpp`, `types_slam3d.cpp` and every `read` and `computeError` there, in g2o (Kuemmerle et al.
-2011): errors are of (measurement)^-1 x, so that the information of a prior is in the frame measured, that of a position
-in the world's, that of a landmark in the pose's. TORO's page (Grisetti et al. 2007), but that its code and GTSAM take
-the first vertex of an edge for the one that observes.
+Numbers are brought into the order of EDGE_SE2 and EDGE_SE3:QUAT.
+
+Sources: `types_slam2d.cpp`, `types_slam3d.cpp` and every `read` and `computeError` there, in g2o
+(Kuemmerle et al. 2011). Errors are of (measurement)^-1 x, so that the information of a prior is in
+the frame that was measured, that of a position in the frame of the world, and that of a landmark in
+the frame of the pose. TORO's page (Grisetti et al. 2007), except that its code and GTSAM take the
+first vertex of an edge for the one that observes.
 """
 
 from dataclasses import dataclass
@@ -12,15 +15,17 @@ import numpy as np
 
 from pgo_models.geometry.rotations import Array, exp_map, quaternions_from_rotations
 
-_TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]  # of EDGE2: x y theta, then the triangle as ff fs ss rr fr sr
+# Places of the numbers of an EDGE2 line of TORO: x y theta, then the triangle as ff fs ss rr fr sr.
+_TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
 
 
 @dataclass(frozen=True)
 class Tag:
-    """What stands on a line behind its tag: `num_ids` ids, the measurement, and on EDGE lines a triangle.
+    """What stands on a line behind its tag: ids, a measurement and, on EDGE lines, a triangle.
 
-    A point is d numbers, and its information d x d. Between ids and numbers may stand the id of an offset, of a
-    PARAMS_SE3OFFSET line. TORO has roll, pitch and yaw in space.
+    The triangle is the upper one of an information matrix, row by row. A point has d numbers, and
+    its matrix is d x d. An id of a PARAMS_SE3OFFSET line may stand between ids and numbers. Poses
+    of TORO in space have roll, pitch and yaw in place of a quaternion.
     """
 
     d: int
@@ -35,22 +40,47 @@ class Tag:
     def num_numbers(self) -> int:
         """How many numbers stand behind the ids."""
         k = self.d if self.is_point else 3 * self.d - 3
-        return (7 if k == 6 and not self.is_toro else k) + self.is_edge * k * (k + 1) // 2
+        has_quaternion = k == 6 and not self.is_toro
+        num_measured = 7 if has_quaternion else k
+        num_in_triangle = k * (k + 1) // 2 if self.is_edge else 0
+        return num_measured + num_in_triangle
 
     def rows(self, numbers: Array) -> Array:
         """Numbers of lines, (n, num_numbers), as rows of `G2OLines`."""
-        d, k = self.d, 3 * self.d - 3
-        if self.is_toro and d == 3:
-            roll, pitch, yaw = (exp_map(numbers[:, 3 + a, None] * np.eye(3)[a]) for a in range(3))
-            q = quaternions_from_rotations(yaw @ pitch @ roll)
-            return np.concatenate([numbers[:, :3], q, numbers[:, 6:]], axis=1)
-        if not self.is_point:
-            return numbers[:, _TORO] if self.is_toro and self.is_edge else numbers
-        triangle = np.flatnonzero(np.triu_indices(k)[1] < d)
-        found = np.zeros((len(numbers), 4 * d - 5 + self.is_edge * k * (k + 1) // 2))
-        found[:, 4 * d - 6] = d - 2  # the angle 0, or the quaternion 0 0 0 1
-        found[:, np.append(np.arange(d), 4 * d - 5 + triangle[: numbers.shape[1] - d])] = numbers
-        return found
+        if self.is_point:
+            return self._rows_of_points(numbers)
+        if not self.is_toro:
+            return numbers
+        if self.d == 3:
+            return _with_quaternions(numbers)
+        return numbers[:, _TORO] if self.is_edge else numbers
+
+    def _rows_of_points(self, numbers: Array) -> Array:
+        """Points as poses that are not turned, with no information on their rotation."""
+        d = self.d
+        k = 3 * d - 3
+        num_measured = 4 * d - 5  # x y theta, or x y z and a quaternion
+        num_in_triangle = k * (k + 1) // 2 if self.is_edge else 0
+        rows = np.zeros((len(numbers), num_measured + num_in_triangle))
+        rows[:, :d] = numbers[:, :d]
+        rows[:, num_measured - 1] = d - 2  # the angle 0, or the w of the quaternion 0 0 0 1
+        # Entries of the pose's triangle that belong to the d x d block of the translation. Row by
+        # row they are in the order of the point's own triangle.
+        _, column = np.triu_indices(k)
+        in_block = np.flatnonzero(column < d)
+        if self.is_edge:
+            rows[:, num_measured + in_block] = numbers[:, d:]
+        return rows
+
+
+def _with_quaternions(numbers: Array) -> Array:
+    """Rows of TORO in space, with a quaternion in place of roll, pitch and yaw."""
+    axes = np.eye(3)
+    roll = exp_map(numbers[:, 3, None] * axes[0])
+    pitch = exp_map(numbers[:, 4, None] * axes[1])
+    yaw = exp_map(numbers[:, 5, None] * axes[2])
+    quaternions = quaternions_from_rotations(yaw @ pitch @ roll)
+    return np.concatenate([numbers[:, :3], quaternions, numbers[:, 6:]], axis=1)
 
 
 TAGS = {

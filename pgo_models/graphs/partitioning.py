@@ -1,4 +1,8 @@
-"""Poses to robots: as the graph names them, contiguous in time, balanced by METIS, or one pose a robot."""
+"""Partitions: which robot owns which pose.
+
+The graph names the owners, or poses are shared out contiguously in time, balanced by METIS, or one
+pose a robot.
+"""
 
 import enum
 from dataclasses import dataclass
@@ -8,8 +12,7 @@ import numpy as np
 from pgo_models.errors import MissingExtraError, SettingError, extra_module
 from pgo_models.geometry.arrays import ReadOnly, whole_array, whole_number
 from pgo_models.geometry.rotations import BoolArray
-from pgo_models.graphs.measurements import has_no_gap
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, has_no_gap
 
 
 class PartitionMethod(enum.Enum):
@@ -25,16 +28,29 @@ class PartitionMethod(enum.Enum):
 class Partition(ReadOnly):
     """Which robot owns which pose.
 
-    A SettingError when `robot`, (n,), does not number the robots 0 .. num_robots - 1, each of which owns a pose.
+    Parameters
+    ----------
+    robot : IntArray, (n,)
+        Owner of every pose, kept as a read-only copy. The robots are 0 .. num_robots - 1, and each
+        owns a pose.
+    method : PartitionMethod
+        How the partition was made.
+
+    Raises
+    ------
+    SettingError
+        When a robot is left out in the numbering.
     """
 
-    robot: IntArray  # a read-only copy
+    robot: IntArray
     method: PartitionMethod
 
     def __post_init__(self) -> None:
         robot = whole_array(self.robot, "robot", SettingError)
         if robot.ndim != 1 or not has_no_gap(robot):
-            raise SettingError(f"robot, of shape {robot.shape}, must number the robots 0, 1, .. without a gap")
+            raise SettingError(
+                f"robot, of shape {robot.shape}, must number the robots 0, 1, .. without a gap"
+            )
         object.__setattr__(self, "robot", robot)
 
     @property
@@ -48,28 +64,78 @@ class Partition(ReadOnly):
         return np.bincount(self.robot, minlength=self.num_robots)
 
     def cut_edges(self, graph: PoseGraph) -> BoolArray:
-        """Whether an edge joins two robots, (m,); a SettingError when the partition is of another number of poses."""
+        """Return which edges of a graph join two robots.
+
+        Parameters
+        ----------
+        graph : PoseGraph
+            Graph of the n poses.
+
+        Returns
+        -------
+        BoolArray
+            (m,), true for an edge between poses of different robots.
+
+        Raises
+        ------
+        SettingError
+            When the partition is one of another number of poses.
+        """
         if len(self.robot) != graph.num_poses:
-            raise SettingError(f"{self!r} of {len(self.robot)} poses beside {graph!r}; give one robot for every pose")
+            raise SettingError(
+                f"{self!r} of {len(self.robot)} poses beside {graph!r}; "
+                "give one robot for every pose"
+            )
         return np.asarray(self.robot[graph.i] != self.robot[graph.j])
 
     def separators(self, graph: PoseGraph) -> IntArray:
-        """Poses with an edge to another robot, (k,), ascending."""
+        """Return the poses that have an edge to a pose of another robot.
+
+        Parameters
+        ----------
+        graph : PoseGraph
+            Graph of the n poses.
+
+        Returns
+        -------
+        IntArray
+            (k,), ascending.
+        """
         cut = self.cut_edges(graph)
         return np.unique(np.concatenate([graph.i[cut], graph.j[cut]]))
 
     def __repr__(self) -> str:
-        sizes = self.sizes
-        return f"Partition({self.num_robots} robots, {sizes.min()} to {sizes.max()} poses each, {self.method.value})"
+        sizes = f"{self.sizes.min()} to {self.sizes.max()} poses each"
+        return f"Partition({self.num_robots} robots, {sizes}, {self.method.value})"
 
 
-def partition(graph: PoseGraph, num_robots: int | None = None, method: PartitionMethod | None = None) -> Partition:
+def partition(
+    graph: PoseGraph, num_robots: int | None = None, method: PartitionMethod | None = None
+) -> Partition:
     """Give the poses of a graph to robots.
 
-    The number of robots is needed unless the graph names its robots; where every pose is a robot it is not minded. The
-    method is GIVEN when the graph names as many robots as asked for, else CONTIGUOUS, unless another is given. A
-    SettingError when the number is no whole one of 1 to n, or the method is none or does not fit; a MissingExtraError
-    for METIS without the extra `fast`.
+    Parameters
+    ----------
+    graph : PoseGraph
+        Graph of the poses.
+    num_robots : int, optional
+        Number of robots, 1 to n. It is needed unless the graph names its robots, and ignored where
+        every pose is a robot.
+    method : PartitionMethod, optional
+        GIVEN when the graph names as many robots as asked for, else CONTIGUOUS, unless given.
+
+    Returns
+    -------
+    Partition
+        Owner of every pose.
+
+    Raises
+    ------
+    SettingError
+        When the number is no whole number of 1 to n, or the method is none, or GIVEN for a graph
+        that does not name as many robots.
+    MissingExtraError
+        For METIS without the extra `fast`.
 
     Examples
     --------
@@ -77,21 +143,30 @@ def partition(graph: PoseGraph, num_robots: int | None = None, method: Partition
     >>> partition(load("grid"), 3)
     Partition(3 robots, 9 to 9 poses each, contiguous in time)
     """
-    n = graph.num_poses
     if num_robots is not None:
         num_robots = whole_number(num_robots, "num_robots", SettingError)
     if not isinstance(method, PartitionMethod | None):
-        raise SettingError(f"method is {method!r:.60}; give one of {', '.join(map(str, PartitionMethod))}")
-    named = graph.robot is not None and num_robots in (None, graph.num_robots)
+        raise SettingError(
+            f"method is {method!r:.60}; give one of {', '.join(map(str, PartitionMethod))}"
+        )
+    names_robots = graph.robot is not None and num_robots in (None, graph.num_robots)
     if method is None:
-        method = PartitionMethod.GIVEN if named else PartitionMethod.CONTIGUOUS
+        method = PartitionMethod.GIVEN if names_robots else PartitionMethod.CONTIGUOUS
     if method is PartitionMethod.SINGLETONS:
-        return Partition(np.arange(n), method)
+        return Partition(np.arange(graph.num_poses), method)
     if method is PartitionMethod.GIVEN:
-        if not named:
+        if not names_robots:
             names = f"{graph!r} names {'no' if graph.robot is None else graph.num_robots} robots"
-            raise SettingError(f"{names}, asked for {num_robots}; use another method, or leave out the number")
+            raise SettingError(
+                f"{names}, asked for {num_robots}; use another method, or leave out the number"
+            )
         return Partition(graph.robots, method)
+    return _partition_into(graph, num_robots, method)
+
+
+def _partition_into(graph: PoseGraph, num_robots: int | None, method: PartitionMethod) -> Partition:
+    """Partition by METIS or contiguous in time."""
+    n = graph.num_poses
     if num_robots is None or not 1 <= num_robots <= n:
         raise SettingError(f"num_robots is {num_robots}; give 1 to {n}, the number of poses")
     if method is PartitionMethod.CONTIGUOUS or num_robots == 1:
@@ -100,7 +175,10 @@ def partition(graph: PoseGraph, num_robots: int | None = None, method: Partition
 
 
 def suited_partition(graph: PoseGraph, num_robots: int) -> Partition:
-    """GIVEN if the graph names as many robots, else METIS where it is there, else CONTIGUOUS; errors as `partition`."""
+    """Best partition that can be had: GIVEN if the graph names as many robots, else METIS.
+
+    It is CONTIGUOUS where METIS is not installed. Errors are those of `partition`.
+    """
     if graph.robot is not None and num_robots == graph.num_robots:
         return partition(graph, num_robots, PartitionMethod.GIVEN)
     try:
@@ -110,16 +188,28 @@ def suited_partition(graph: PoseGraph, num_robots: int) -> Partition:
 
 
 def _metis(graph: PoseGraph, num_robots: int) -> IntArray:
+    """Robot of every pose, (n,), by METIS; every robot has a pose."""
     pymetis = extra_module("pymetis", "fast")
-    neighbours = pymetis.CSRAdjacency(graph.adjacency.indptr.tolist(), graph.adjacency.indices.tolist())
-    counts, options = graph.adjacency.data.astype(np.int64).tolist(), pymetis.Options(contig=graph.is_connected, seed=0)
-    for in_halves in (None, True):  # METIS makes more than 8 at once, some of them empty where poses are few
-        _, found = pymetis.part_graph(
-            num_robots, adjacency=neighbours, eweights=counts, options=options, recursive=in_halves
+    adjacency = graph.adjacency
+    neighbours = pymetis.CSRAdjacency(adjacency.indptr.tolist(), adjacency.indices.tolist())
+    edge_weights = adjacency.data.astype(np.int64).tolist()
+    options = pymetis.Options(contig=graph.is_connected, seed=0)
+    # METIS cuts into more than 8 parts at once, and leaves some empty where poses are few. Then it
+    # is asked again to cut in halves.
+    for recursive in (None, True):
+        _, labels = pymetis.part_graph(
+            num_robots,
+            adjacency=neighbours,
+            eweights=edge_weights,
+            options=options,
+            recursive=recursive,
         )
-        part = np.unique(np.asarray(found), return_inverse=True)[1].astype(np.int64)
-        if part.max() == num_robots - 1:
-            break
-    for robot in range(int(part.max()) + 1, num_robots):  # the largest gives a pose
-        part[np.flatnonzero(part == np.bincount(part).argmax())[-1]] = robot
-    return part
+        _, robot = np.unique(np.asarray(labels), return_inverse=True)
+        robot = robot.astype(np.int64)
+        if robot.max() == num_robots - 1:
+            return robot
+    # Robots that are still without a pose get the last pose of the largest robot.
+    for empty_robot in range(int(robot.max()) + 1, num_robots):
+        largest_robot = np.bincount(robot).argmax()
+        robot[np.flatnonzero(robot == largest_robot)[-1]] = empty_robot
+    return robot

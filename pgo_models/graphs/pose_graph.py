@@ -1,64 +1,250 @@
-"""PoseGraph: measurements, their components, parts and edits, and which robot owns which pose."""
+"""PoseGraph: measured edges between poses, checked once, and the parts and edits of such a graph.
+
+The measurements and their precisions kappa and tau are those of the cost F (Ebrahimi & Deghat,
+`min overall`; Rosen et al. 2019, equation 11).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from pgo_models.errors import GraphError
-from pgo_models.geometry.arrays import read_only, whole_array
-from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.arrays import ReadOnly, read_only, real_array, whole_array, whole_number
+from pgo_models.geometry.poses import Poses, rotations_to_rounding
 from pgo_models.geometry.rotations import Array, BoolArray
-from pgo_models.graphs.measurements import IntArray as IntArray  # others have it from here
-from pgo_models.graphs.measurements import Measurements, isotropic_information
 from pgo_models.html_tables import facts_table
 
+# Numbers of poses and edges; those that come from sparse matrices have 32 bits.
+IntArray = NDArray[np.integer[Any]]
 Weights = Array | float
-WORLD_ID = 2**63 - 1  # of the world pose, which no file names
-_COLLINEAR = 1e-9  # spread of positions across a line, over that along it
-_ROUNDING = 1e-14  # of coordinates, relative: what the mean of equal ones may differ from them by
-_OF_EDGES = ("i", "j", "R_ij", "t_ij", "kappa", "tau", "information")
+
+WORLD_ID = 2**63 - 1  # id of the world pose, which no file names
+
+# Positions are collinear when their spread across a line is below this share of that along it.
+_COLLINEAR = 1e-9
+# Relative rounding of coordinates: the mean of equal numbers differs from them by at most this.
+_ROUNDING = 1e-14
+_NAMED_COMPONENTS = 5  # components that an error names
+
+_WHOLE_NUMBERS = ("num_poses", "world")
+_WHOLE_ARRAYS = ("i", "j", "ids", "robot", "fixed", "landmarks")
+_REAL_ARRAYS = ("R_ij", "t_ij", "kappa", "tau", "information", "times")
+_EDGE_FIELDS = ("i", "j", "R_ij", "t_ij", "kappa", "tau", "information", "uncoupled")
+
+
+def _no_poses() -> IntArray:
+    return np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
-class PoseGraph(Measurements):
-    """n poses and m measured edges; edge e says x_i^-1 x_j = (R_ij, t_ij) with precisions kappa and tau.
+class PoseGraph(ReadOnly):
+    """Graph of n poses and m edges, each a measurement of x_i^-1 x_j.
 
-    A prior is an edge from the world pose, a pose like any other but that it is the frame of the solution; of a
-    position (GPS) it has kappa = 0 and R_ij = I. A landmark is a pose whose rotation nobody asks for, so that an edge
-    to it has R_ij = I and kappa = 0; but for the first, whose kappa is positive: R_l stands in that term alone, which
-    is so zero at every optimum, R_l = R_i. F over the other unknowns is not changed by it, nor is its minimum.
+    Edge e measures x_i^-1 x_j = (R_ij, t_ij) with the precisions kappa and tau.
 
-    Of every edge: `i`, `j`, (m,), its 0-based poses, where repeated edges all count; `R_ij`, (m, d, d), the measured
-    rotation, treated as by `Poses`; `t_ij`, (m, d), the measured translation, metres, in the frame of pose i; `kappa`,
-    `tau`, (m,), precisions of the rotation (per radian^2) and of the translation (per metre^2), at least one of them
-    positive (of edges to landmarks kappa is settled here); optionally `information`, (m, k, k), matrices as read, k = 3
-    in the plane (x, y, theta) and 6 in space (x, y, z, then rotation).
+    A prior is an edge that begins at the world pose. The world pose is an unknown like any other
+    pose; after the solve all poses are given in its frame. A prior of a position (GPS) has
+    kappa = 0 and R_ij = I.
 
-    Of every pose, each optional: `ids`, (n,), its name in the file, a unique integer, 0 .. n-1 unless given; `robot`,
-    (n,), which robot, 0 .. num_robots - 1, owns it, all 0 unless given; `initial`, the estimate of the file, and
-    `truth`, that of a generated scene; `times`, (b,), seconds of the `bodies`, ascending, for trajectories written.
+    A landmark is a pose whose rotation has no meaning, so that an edge to it has R_ij = I and
+    kappa = 0. The first edge to a landmark is the exception: its kappa is positive. The rotation
+    R_l of the landmark stands in that term alone, which is therefore zero at every optimum, with
+    R_l = R_i. Minimised over R_l, F is the same function of the other unknowns.
 
-    Of some poses: `fixed`, (f,), those that the file says are fixed (F does not depend on the gauge: the solution is
-    moved so that the first of them is where the file has it, and all are kept for writing); `landmarks`, (l,), those
-    that are points, where edges can only end; `world`, optional, the world pose, where edges can only begin: no file
-    names it, and `initial` and `truth` may leave it out.
+    All arrays are kept as read-only copies. `dataclasses.replace` makes a graph with other arrays.
 
-    All arrays are read-only copies: `dataclasses.replace` makes a graph with others. A GraphError on wrong shapes,
-    entries that are no real or no whole numbers, an edge to itself or to no pose, nan or inf, no rotation, a negative
-    precision, two that are zero, or an edge that starts at a landmark or ends at the world.
+    Parameters
+    ----------
+    num_poses : int
+        Number of poses n, with landmarks and the world pose.
+    i, j : IntArray, (m,)
+        First and second pose of every edge, 0-based. Repeated edges all count. No edge ends at the
+        world pose, and no edge begins at a landmark.
+    R_ij : Array, (m, d, d)
+        Measured rotations, d = 2 or 3. As for `Poses`, a matrix within 64 eps of a rotation is
+        kept, and any other is projected; costs and bounds are those of the stored R_ij.
+    t_ij : Array, (m, d)
+        Measured translations in the frame of pose i, metres.
+    kappa : Array, (m,)
+        Precisions of the rotations, per radian^2, at least 0. Of the edges to a landmark the first
+        keeps its kappa, or has the median of the others if that is 0; kappa of the rest becomes 0.
+    tau : Array, (m,)
+        Precisions of the translations, per metre^2, at least 0. After that, kappa and tau of one
+        edge are not both 0.
+    information : Array, (m, k, k), optional
+        Information matrices as read: k = 3 in the plane (x, y, theta), k = 6 in space (x, y, z,
+        then rotation).
+    ids : IntArray, (n,), optional
+        Name of every pose in the file, unique; 0 .. n-1 unless given.
+    robot : IntArray, (n,), optional
+        Robot 0 .. num_robots - 1 that owns every pose; all 0 unless given.
+    initial : Poses, optional
+        Estimate of the file. It may leave out the world pose.
+    truth : Poses, optional
+        Ground truth, for example of a generated scene. It may leave out the world pose.
+    fixed : IntArray, (f,)
+        Poses that the file calls fixed. F does not depend on the gauge: the solution is moved so
+        that the first of them is where the file has it. All of them are kept for writing.
+    times : Array, (b,), optional
+        Time stamps of the `bodies`, seconds, ascending, for trajectories that are written.
+    name : str
+        Name of the graph, for texts.
+    world : int, optional
+        The world pose, if the graph has priors. No file names it.
+    landmarks : IntArray, (l,)
+        Poses that are points.
+    uncoupled : BoolArray, (m,), optional
+        Which information matrices have lost their coupling block because they were indefinite with
+        it, see `pgo_models.without_indefinite_coupling`.
+
+    Raises
+    ------
+    GraphError
+        For a wrong shape, an entry that is no real or no whole number, an edge to itself or to no
+        pose, nan or inf, a matrix that is no rotation, a negative precision, two precisions that
+        are zero, or an edge that begins at a landmark or ends at the world.
+
+    Examples
+    --------
+    Two poses one metre apart, and the second one metre from a third:
+
+    >>> R_ij = np.array([np.eye(2), np.eye(2)])
+    >>> t_ij = np.array([[1.0, 0.0], [1.0, 0.0]])
+    >>> ones = np.ones(2)
+    >>> PoseGraph(3, np.array([0, 1]), np.array([1, 2]), R_ij, t_ij, kappa=ones, tau=ones)
+    PoseGraph('graph', d=2, poses=3, edges=2, robots=1)
     """
+
+    num_poses: int
+    i: IntArray
+    j: IntArray
+    R_ij: Array
+    t_ij: Array
+    kappa: Array
+    tau: Array
+    information: Array | None = None
+    ids: IntArray | None = None
+    robot: IntArray | None = None
+    initial: Poses | None = None
+    truth: Poses | None = None
+    fixed: IntArray = field(default_factory=_no_poses)
+    times: Array | None = None
+    name: str = "graph"
+    world: int | None = None
+    landmarks: IntArray = field(default_factory=_no_poses)
+    uncoupled: BoolArray | None = None
+
+    def __post_init__(self) -> None:
+        self._convert(_WHOLE_NUMBERS, whole_number)
+        self._convert(_WHOLE_ARRAYS, whole_array)
+        self._convert(_REAL_ARRAYS, real_array)
+        if self.information is None:
+            self._set("uncoupled", None)
+        elif self.uncoupled is not None:
+            self._set("uncoupled", read_only(np.array(self.uncoupled, dtype=bool)))
+        self._check_shapes()
+        self._check_ends()
+        self._check_poses()
+        self._check_landmark_edges()
+        self._check_precisions()
+        self._check_names()
+        self._set("R_ij", rotations_to_rounding(self.R_ij, self._rotation_label))
+        self._check_not_empty()
+        self._settle_landmarks()
+        self._check_not_empty()
+        for name in ("initial", "truth"):
+            poses = getattr(self, name)
+            if poses is not None:
+                self._set(name, self.completed(poses))
+
+    def _set(self, name: str, value: object) -> None:
+        """Set a field while the frozen object is being made."""
+        object.__setattr__(self, name, value)
+
+    def _convert(self, names: tuple[str, ...], checked: Callable[..., object]) -> None:
+        """Replace the given fields by what `checked(value, name)` returns for them."""
+        for name in names:
+            value = getattr(self, name)
+            if value is not None:
+                self._set(name, checked(value, name))
+
+    def _rotation_label(self, e: int) -> str:
+        return f"R_ij of {self.edge_label(e)}"
+
+    # Sizes and names
+
+    @property
+    def d(self) -> int:
+        """Dimension of space: 2 or 3."""
+        return int(self.R_ij.shape[-1])
+
+    @property
+    def num_edges(self) -> int:
+        """Number of measurements, m."""
+        return len(self.i)
+
+    @property
+    def pose_ids(self) -> IntArray:
+        """Names of the poses, (n,)."""
+        return np.arange(self.num_poses) if self.ids is None else self.ids
+
+    @property
+    def robots(self) -> IntArray:
+        """Owner of every pose, (n,)."""
+        return np.zeros(self.num_poses, dtype=np.int64) if self.robot is None else self.robot
+
+    @property
+    def num_robots(self) -> int:
+        """Number of robots that own the poses."""
+        return 1 if self.robot is None else int(self.robot.max()) + 1
+
+    def pose_name(self, pose: int) -> str:
+        """Return the id of a pose, for messages.
+
+        Parameters
+        ----------
+        pose : int
+            Number of the pose, 0-based. It may be a number that the graph does not have.
+
+        Returns
+        -------
+        str
+            The id of the pose as text, or "the world".
+        """
+        if pose == self.world:
+            return "the world"
+        if self.ids is not None and 0 <= pose < len(self.ids):
+            return str(self.ids[pose])
+        return str(pose)
+
+    def edge_label(self, e: int) -> str:
+        """Return the number of an edge and the ids of its poses, for messages.
+
+        Parameters
+        ----------
+        e : int
+            Number of the edge, 0-based.
+
+        Returns
+        -------
+        str
+            Text such as "edge 3 (17 -> 18)".
+        """
+        return f"edge {e} ({self.pose_name(self.i[e])} -> {self.pose_name(self.j[e])})"
 
     @property
     def extras(self) -> str:
-        """How many landmarks and priors there are, if any, for texts."""
-        found = [(len(self.landmarks), "landmarks"), (int(self.is_prior.sum()), "priors")]
-        return "".join(f", {name}={count}" for count, name in found if count)
+        """Text with the number of landmarks and of priors, empty if there are none."""
+        counts = {"landmarks": len(self.landmarks), "priors": int(self.is_prior.sum())}
+        return "".join(f", {name}={count}" for name, count in counts.items() if count)
 
     def __repr__(self) -> str:
         size = f"poses={len(self.bodies)}, edges={self.num_edges}{self.extras}"
@@ -68,7 +254,13 @@ class PoseGraph(Measurements):
         return facts_table(self.facts())
 
     def facts(self) -> list[tuple[str, str]]:
-        """Labels and texts, as they are shown."""
+        """Return what the graph consists of, as labels and texts.
+
+        Returns
+        -------
+        list of (str, str)
+            A label and a text for every row of the table that a notebook or `pgo info` shows.
+        """
         return [
             ("graph", f"{self.name}, {self.d}D"),
             ("poses", str(len(self.bodies))),
@@ -81,15 +273,245 @@ class PoseGraph(Measurements):
             ("truth", "with the graph" if self.truth is not None else "none"),
         ]
 
+    # Landmarks and the world pose
+
+    @cached_property
+    def bodies(self) -> IntArray:
+        """Poses that are neither the world pose nor landmarks, (b,)."""
+        is_body = np.arange(self.num_poses) != self.world
+        is_body[self.landmarks] = False
+        return read_only(np.flatnonzero(is_body))
+
+    @property
+    def in_files(self) -> IntArray:
+        """All poses but the world pose, which files do not name."""
+        return np.flatnonzero(np.arange(self.num_poses) != self.world)
+
+    @property
+    def is_prior(self) -> BoolArray:
+        """Whether an edge begins at the world pose, (m,)."""
+        return np.asarray(self.i == self.world)
+
+    @property
+    def is_world_loose(self) -> bool:
+        """Whether every prior measures a position alone.
+
+        Then no single prior fixes the rotation of the world frame, only all of them together.
+        """
+        to_poses = self.is_prior & ~np.isin(self.j, self.landmarks)
+        return self.world is not None and not self.kappa[to_poses].any()
+
+    @cached_property
+    def first_sights(self) -> IntArray:
+        """The first edge to every landmark that has one, from a pose rather than from the world."""
+        to_landmarks = np.flatnonzero(np.isin(self.j, self.landmarks))
+        priors_last = np.argsort(self.is_prior[to_landmarks], kind="stable")
+        candidates = to_landmarks[priors_last]
+        _, first = np.unique(self.j[candidates], return_index=True)
+        return read_only(candidates[first])
+
+    def completed(self, poses: Poses) -> Poses:
+        """Return poses of this graph with the world pose, and with the rotations of landmarks set.
+
+        Parameters
+        ----------
+        poses : Poses
+            Poses of the graph, n of them or, without the world pose, n - 1.
+
+        Returns
+        -------
+        Poses
+            All n poses. The world pose is the identity where it was left out. A landmark has the
+            rotation of the pose that saw it first.
+        """
+        first = self.first_sights
+        if self.world is None and not len(first):
+            return poses
+        R = poses.R
+        t = poses.t
+        if self.world is not None and len(t) == self.num_poses - 1:
+            R = np.insert(R, self.world, np.eye(poses.d), axis=0)
+            t = np.insert(t, self.world, 0.0, axis=0)
+        if len(first) and len(t) == self.num_poses:
+            R = R.copy()
+            R[self.j[first]] = R[self.i[first]]
+        return Poses(R, t)
+
+    def _settle_landmarks(self) -> None:
+        """Set kappa and information of the edges to landmarks, see the docstring of the class."""
+        first = self.first_sights
+        if not len(first):
+            return
+        to_landmarks = np.isin(self.j, self.landmarks)
+        kappa = np.where(to_landmarks, 0.0, self.kappa)
+        usual = np.median(kappa[kappa > 0]) if kappa.any() else 1.0
+        kappa[first] = np.where(self.kappa[first] > 0, self.kappa[first], usual)
+        self._set("kappa", read_only(kappa))
+        if self.information is None:
+            return
+        d = self.d
+        information = self.information.copy()
+        information[to_landmarks, d:] = 0.0
+        information[to_landmarks, :, d:] = 0.0
+        information[first, d:, d:] = isotropic_information(kappa, kappa, d)[first, d:, d:]
+        self._set("information", read_only(information))
+
+    # Checks when a graph is made, in the order in which they are called
+
+    def _check_shapes(self) -> None:
+        if self.num_edges == 0:
+            raise GraphError(
+                f"{self.name} has no edges; a pose graph needs at least one measurement"
+            )
+        if not self._has_poses(self.landmarks):
+            raise GraphError(
+                f"landmarks are poses {self.landmarks}, "
+                f"not all of them of 0 .. {self.num_poses - 1}"
+            )
+        if self.R_ij.ndim != 3 or self.R_ij.shape[1:] not in ((2, 2), (3, 3)):
+            raise GraphError(f"R_ij has shape {self.R_ij.shape}; give (m, 2, 2) or (m, 3, 3)")
+        for name, shape in self._expected_shapes().items():
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise GraphError(
+                    f"{name} has shape {value.shape}; "
+                    f"with {self.num_edges} edges in {self.d}D give {shape}"
+                )
+        for name in ("initial", "truth"):
+            poses: Poses | None = getattr(self, name)
+            if poses is not None and not self._fits(poses):
+                raise GraphError(f"{name} is {poses}; give {self.num_poses} poses in {self.d}D")
+
+    def _has_poses(self, poses: IntArray) -> bool:
+        return bool(((poses >= 0) & (poses < self.num_poses)).all())
+
+    def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of every array."""
+        n = self.num_poses
+        m = self.num_edges
+        d = self.d
+        k = 3 * d - 3
+        return {
+            "i": (m,),
+            "j": (m,),
+            "R_ij": (m, d, d),
+            "t_ij": (m, d),
+            "kappa": (m,),
+            "tau": (m,),
+            "information": (m, k, k),
+            "uncoupled": (m,),
+            "ids": (n,),
+            "robot": (n,),
+            "fixed": (len(self.fixed),),
+            "times": (len(self.bodies),),
+        }
+
+    def _fits(self, poses: Poses) -> bool:
+        """Whether poses are as many as those of the graph, with or without the world pose."""
+        return poses.d == self.d and poses.num_poses in (self.num_poses, len(self.in_files))
+
+    def _refuse_edges(self, wrong: BoolArray, problem: str) -> None:
+        """Raise a GraphError for the first edge of a mask, (m,); `{edge}` stands for its label."""
+        if wrong.any():
+            label = self.edge_label(int(np.argmax(wrong)))
+            raise GraphError(problem.format(edge=label))
+
+    def _check_ends(self) -> None:
+        ends = np.stack([self.i, self.j])
+        is_outside = np.asarray(((ends < 0) | (ends >= self.num_poses)).any(axis=0))
+        self._refuse_edges(is_outside, f"{{edge}} names a pose outside 0 .. {self.num_poses - 1}")
+        is_loop = self.i == self.j
+        self._refuse_edges(is_loop, "{edge} leads from a pose to itself; remove it")
+
+    def _check_poses(self) -> None:
+        """Check the fields that number poses, and the times."""
+        if not self._has_poses(self.fixed):
+            raise GraphError(f"fixed names a pose outside 0 .. {self.num_poses - 1}")
+        if self.times is not None and not is_ascending(self.times):
+            raise GraphError(
+                "times do not ascend; give one for every pose, in the order of their ids"
+            )
+        num_worlds = 0 if self.world is None else 1
+        # Landmarks that are named twice, or a world pose among them, make this sum too large.
+        if len(self.bodies) + len(self.landmarks) + num_worlds != self.num_poses:
+            raise GraphError(
+                "world and landmarks are not different poses, "
+                f"0 to {self.num_poses - 1}; name each once"
+            )
+
+    def _check_landmark_edges(self) -> None:
+        """Check that no edge ends at the world, begins at a landmark or turns one."""
+        is_turned = (self.R_ij != np.eye(self.d)).any(axis=(1, 2))
+        turns_landmark = np.isin(self.j, self.landmarks) & is_turned
+        from_landmark = np.isin(self.i, self.landmarks)
+        self._refuse_edges(
+            turns_landmark | from_landmark | (self.j == self.world),
+            "{edge} begins at a landmark, has R_ij of one, or ends at the world; turn it, R_ij = I",
+        )
+
+    def _check_precisions(self) -> None:
+        """Check that the numbers of all edges are finite, and their precisions not negative."""
+        for name in ("R_ij", "t_ij", "kappa", "tau", "information"):
+            values = getattr(self, name)
+            if values is not None:
+                is_finite = np.isfinite(values.reshape(self.num_edges, -1)).all(axis=1)
+                self._refuse_edges(
+                    ~is_finite, f"{name} of {{edge}} has nan or inf; remove the edge"
+                )
+        for name in ("kappa", "tau"):
+            values = getattr(self, name)
+            is_negative = values < 0
+            worst = values[int(np.argmax(is_negative))]
+            self._refuse_edges(
+                is_negative,
+                f"{name} of {{edge}} is {worst:.6g}; a precision must not be negative",
+            )
+
+    def _check_not_empty(self) -> None:
+        """Check that every edge measures something, before and after landmarks are settled."""
+        is_empty = (self.kappa == 0) & (self.tau == 0)
+        self._refuse_edges(is_empty, "kappa and tau of {edge} are 0; remove it")
+
+    def _check_names(self) -> None:
+        if self.ids is not None and not np.diff(np.sort(self.ids)).all():
+            raise GraphError("ids are not unique; every pose needs a name of its own")
+        if self.robot is not None and not has_no_gap(self.robot):
+            raise GraphError(
+                "robot must number the robots 0, 1, .. without a gap; see numpy.unique"
+            )
+
+    # Connectivity
+
     @cached_property
     def adjacency(self) -> csr_array:
-        """Number of edges between every two poses, (n, n)."""
+        """Number of edges between every two poses, a sparse (n, n) matrix."""
         return read_only(edge_counts(self.i, self.j, self.num_poses))
 
     def components(self, edges: BoolArray | None = None) -> list[IntArray]:
-        """Poses of every connected component, largest first; of some of the edges, (m,), or of all."""
-        between = self.adjacency if edges is None else edge_counts(self.i[edges], self.j[edges], self.num_poses)
-        count, label = connected_components(between, connection="strong")  # which is quick where symmetric
+        """Return the poses of every connected component, the largest component first.
+
+        Parameters
+        ----------
+        edges : BoolArray, (m,), optional
+            Edges that connect poses; all edges unless given.
+
+        Returns
+        -------
+        list of IntArray
+            Poses of every component, ascending.
+
+        Examples
+        --------
+        >>> from pgo_models.graphs.datasets import load
+        >>> [len(part) for part in load("grid").components()]
+        [27]
+        """
+        if edges is None:
+            adjacency = self.adjacency
+        else:
+            adjacency = edge_counts(self.i[edges], self.j[edges], self.num_poses)
+        # The matrix is symmetric, so that strong components are the components; they are faster.
+        count, label = connected_components(adjacency, connection="strong")
         parts = [np.flatnonzero(label == c) for c in range(count)]
         return sorted(parts, key=lambda part: (-len(part), int(part[0])))
 
@@ -99,142 +521,407 @@ class PoseGraph(Measurements):
         return len(self.components()) == 1
 
     def check_connected(self) -> None:
-        """Raise a GraphError that names the components when there is more than one, or poses left undetermined."""
+        """Check that the measurements determine all poses up to one gauge.
+
+        Raises
+        ------
+        GraphError
+            When the graph has several components, which the message names; when no edge with a
+            positive precision ties the positions or rotations of some poses to those of the
+            others; or when priors of positions do not fix the rotation of the world.
+        """
         parts = self.components()
         if len(parts) > 1:
-            sizes = ", ".join(str(len(part)) for part in parts[:5])
-            more = f" and {len(parts) - 5} more" if len(parts) > 5 else ""
-            firsts = ", ".join(self.pose_name(part[0]) for part in parts[:5])
-            found = f"{len(parts)} components (sizes {sizes}{more}; with poses {firsts}{more})"
-            way_out = "add edges between them, or solve each on its own (PoseGraph.components, PoseGraph.subgraph)"
-            raise GraphError(f"pose graph has {found}; {way_out}")
-        self._check_determined()
+            named = parts[:_NAMED_COMPONENTS]
+            num_unnamed = len(parts) - len(named)
+            rest = f" and {num_unnamed} more" if num_unnamed else ""
+            sizes = ", ".join(str(len(part)) for part in named)
+            firsts = ", ".join(self.pose_name(part[0]) for part in named)
+            raise GraphError(
+                f"pose graph has {len(parts)} components "
+                f"(sizes {sizes}{rest}; with poses {firsts}{rest}); add edges between them, "
+                "or solve each on its own (PoseGraph.components, PoseGraph.subgraph)"
+            )
+        self._check_tied("tau", "position")
+        self._check_tied("kappa", "rotation")
+        if self.is_world_loose:
+            self._check_priors_fix_world()
 
-    @property
-    def is_world_loose(self) -> bool:
-        """Whether all priors are of positions, so that the rotation of the world hangs on all of them together."""
-        to_poses = self.is_prior & ~np.isin(self.j, self.landmarks)
-        return self.world is not None and not self.kappa[to_poses].any()
+    def _check_tied(self, precision: str, quantity: str) -> None:
+        """Raise a GraphError unless edges whose `precision` is positive connect all poses."""
+        measures = getattr(self, precision) > 0
+        if measures.all():
+            return
+        parts = self.components(measures)
+        if precision == "kappa" and self.is_world_loose:
+            # Priors of positions fix this rotation together, see _check_priors_fix_world.
+            parts = [part for part in parts if part[0] != self.world]
+        if len(parts) > 1:
+            poses = f"{len(parts[1])} poses (with {self.pose_name(parts[1][0])})"
+            raise GraphError(
+                f"the {quantity} of {poses} is not tied to that of the others: "
+                f"no edge between has {precision} > 0; add one, or leave these out"
+            )
 
-    def _check_determined(self) -> None:
-        """Raise a GraphError when no edge with a positive precision ties some poses, or the world, to the others."""
-        loose = self.is_world_loose
-        for name, what in (("tau", "position"), ("kappa", "rotation")):
-            said = getattr(self, name) > 0
-            parts = [] if said.all() else self.components(said)
-            parts = [part for part in parts if name == "tau" or not loose or part[0] != self.world]
-            if len(parts) > 1:
-                some = f"{len(parts[1])} poses (with {self.pose_name(parts[1][0])}) is not tied to that of the others"
-                raise GraphError(f"the {what} of {some}: no edge between has {name} > 0; add one, or leave these out")
-        if loose:
-            measured = self.t_ij[self.is_prior][np.unique(self.j[self.is_prior], return_index=True)[1]]
-            spread = np.linalg.svd(measured - measured.mean(axis=0), compute_uv=False)
-            least = max(_COLLINEAR * spread[0], _ROUNDING * np.abs(measured).max(initial=0.0), 1e-300)
-            if len(measured) < self.d or not spread[self.d - 2] > least:
-                few = f"positions of {len(measured)} poses, in a point or on a line, leave turns of the world open"
-                raise GraphError(f"the priors do not fix the gauge: {few}; give more, or a prior with a rotation")
+    def _check_priors_fix_world(self) -> None:
+        """Raise a GraphError when priors of positions lie in a point or, in space, on a line."""
+        _, first = np.unique(self.j[self.is_prior], return_index=True)
+        measured = self.t_ij[self.is_prior][first]
+        spread = np.linalg.svd(measured - measured.mean(axis=0), compute_uv=False)
+        rounding = _ROUNDING * np.abs(measured).max(initial=0.0)
+        threshold = max(_COLLINEAR * spread[0], rounding, 1e-300)
+        if len(measured) < self.d or not spread[self.d - 2] > threshold:
+            raise GraphError(
+                f"the priors do not fix the gauge: positions of {len(measured)} poses, in a point "
+                "or on a line, leave turns of the world open; "
+                "give more, or a prior with a rotation"
+            )
+
+    # Other graphs made of this one
 
     def subgraph(self, poses: IntArray) -> PoseGraph:
-        """Return the graph of some poses, (k,), in ascending order, and of the edges among them."""
+        """Return the graph of some poses and of the edges among them.
+
+        Parameters
+        ----------
+        poses : IntArray, (k,)
+            Poses to keep. They keep their ids, and are numbered anew in ascending order.
+
+        Returns
+        -------
+        PoseGraph
+            Graph of these poses.
+
+        Raises
+        ------
+        GraphError
+            When there is no pose, or one that the graph does not have, or no edge among them.
+        """
         chosen = np.unique(whole_array(poses, "poses"))
         if not len(chosen) or chosen[0] < 0 or chosen[-1] >= self.num_poses:
-            raise GraphError(f"poses of a subgraph are some of 0 .. {self.num_poses - 1}, got {chosen}")
-        number = np.full(self.num_poses, -1, dtype=np.int64)
-        number[chosen] = np.arange(len(chosen))
-        edges = (number[self.i] >= 0) & (number[self.j] >= 0)
-        robot = None if self.robot is None else np.unique(self.robot[chosen], return_inverse=True)[1]
+            raise GraphError(
+                f"poses of a subgraph are some of 0 .. {self.num_poses - 1}, got {chosen}"
+            )
+        new_number = np.full(self.num_poses, -1, dtype=np.int64)
+        new_number[chosen] = np.arange(len(chosen))
+        is_kept = new_number >= 0
+        edges = is_kept[self.i] & is_kept[self.j]
+        rows = self._edge_rows(edges)
+        rows["i"] = new_number[rows["i"]]
+        rows["j"] = new_number[rows["j"]]
+        robot = None
+        if self.robot is not None:
+            _, robot = np.unique(self.robot[chosen], return_inverse=True)
+        world = None
+        if self.world is not None and is_kept[self.world]:
+            world = int(new_number[self.world])
         return replace(
             self,
             num_poses=len(chosen),
-            **(self._rows(edges) | {"i": number[self.i[edges]], "j": number[self.j[edges]]}),
+            **rows,
             ids=self.pose_ids[chosen],
             robot=robot,
             initial=None if self.initial is None else self.initial[chosen],
             truth=None if self.truth is None else self.truth[chosen],
-            fixed=number[self.fixed][number[self.fixed] >= 0],
-            times=None if self.times is None else self.times[np.isin(self.bodies, chosen)],
-            world=None if self.world not in chosen else int(number[self.world]),
-            landmarks=number[self.landmarks][number[self.landmarks] >= 0],
+            fixed=new_number[self.fixed[is_kept[self.fixed]]],
+            times=None if self.times is None else self.times[is_kept[self.bodies]],
+            world=world,
+            landmarks=new_number[self.landmarks[is_kept[self.landmarks]]],
         )
 
     def unit_weights(self) -> PoseGraph:
-        """Return the graph with kappa = tau = 1, as in the paper (`min overall`), but where they are zero."""
+        """Return the graph with kappa = tau = 1, as in the paper, but where they are zero.
+
+        Returns
+        -------
+        PoseGraph
+            The same measurements; information matrices as read are left out.
+
+        References
+        ----------
+        Ebrahimi & Deghat, problem `min overall`.
+        """
         return self.with_weights((self.kappa > 0).astype(float), (self.tau > 0).astype(float))
 
     def with_weights(self, kappa: Array, tau: Array) -> PoseGraph:
-        """The same measurements with other kappa and tau, (m,); information matrices as read do not go along."""
+        """Return the graph with other precisions.
+
+        Parameters
+        ----------
+        kappa : Array, (m,)
+            Precisions of the rotations, per radian^2.
+        tau : Array, (m,)
+            Precisions of the translations, per metre^2.
+
+        Returns
+        -------
+        PoseGraph
+            The same measurements; information matrices as read are left out.
+        """
         return replace(self, kappa=kappa, tau=tau, information=None)
 
     def with_robots(self, robot: IntArray) -> PoseGraph:
-        """Return the same graph with `robot`, (n,), as owners of the poses."""
+        """Return the graph with other owners of the poses.
+
+        Parameters
+        ----------
+        robot : IntArray, (n,)
+            Robot 0 .. num_robots - 1 that owns every pose.
+
+        Returns
+        -------
+        PoseGraph
+            The same graph, shared by these robots.
+        """
         return replace(self, robot=robot)
 
     def without_edges(self, mask: BoolArray) -> PoseGraph:
-        """Return the graph without the edges of a mask, (m,); with the last prior goes the world pose."""
+        """Return the graph without some edges.
+
+        Parameters
+        ----------
+        mask : BoolArray, (m,)
+            Edges to leave out.
+
+        Returns
+        -------
+        PoseGraph
+            Graph of the other edges. It has no world pose if no prior is left.
+
+        Raises
+        ------
+        GraphError
+            When the mask has another shape, or no edge is left.
+        """
         mask = np.asarray(mask, dtype=bool)
         if mask.shape != (self.num_edges,):
             raise GraphError(
-                f"the mask has shape {mask.shape}; give one truth value for each of {self.num_edges} edges"
+                f"the mask has shape {mask.shape}; "
+                f"give one truth value for each of {self.num_edges} edges"
             )
-        kept = replace(self, **self._rows(~mask))
-        return kept if self.world is None or kept.is_prior.any() else kept.subgraph(self.in_files)
+        remaining = replace(self, **self._edge_rows(~mask))
+        if self.world is None or remaining.is_prior.any():
+            return remaining
+        return remaining.subgraph(self.in_files)
 
-    def with_edges(self, i: IntArray, j: IntArray, measured: Poses, kappa: Weights, tau: Weights) -> PoseGraph:
-        """Return the graph with more edges (i, j), (k,), of precisions (k,) or the same; information as they say."""
+    def with_edges(
+        self, i: IntArray, j: IntArray, measured: Poses, kappa: Weights, tau: Weights
+    ) -> PoseGraph:
+        """Return the graph with additional edges.
+
+        Where the graph has information matrices, the new edges have those of their precisions.
+
+        Parameters
+        ----------
+        i, j : IntArray, (k,)
+            First and second pose of every new edge.
+        measured : Poses
+            Measured x_i^-1 x_j of the k edges.
+        kappa : Array, (k,), or float
+            Precisions of the rotations, per radian^2, or one for all new edges.
+        tau : Array, (k,), or float
+            Precisions of the translations, per metre^2, or one for all new edges.
+
+        Returns
+        -------
+        PoseGraph
+            Graph with m + k edges, the new ones last.
+
+        Raises
+        ------
+        GraphError
+            When there is not one measurement for every edge, or as for `PoseGraph`.
+        """
         if measured.d != self.d or not len(i) == len(j) == measured.num_poses:
-            raise GraphError(f"{measured} for {len(i)} edges in {self.d}D; give one measured pose for every edge")
-        kappa, tau = (np.array(np.broadcast_to(one, np.shape(i)), dtype=float) for one in (kappa, tau))
-        more = i, j, measured.R, measured.t, kappa, tau, isotropic_information(kappa, tau, self.d)
-        rows = zip(self._rows(np.ones(self.num_edges, dtype=bool)).items(), more, strict=False)
-        extended: dict[str, Any] = {name: np.concatenate([own, new]) for (name, own), new in rows}
+            raise GraphError(
+                f"{measured} for {len(i)} edges in {self.d}D; give one measured pose for every edge"
+            )
+        kappa_rows = np.array(np.broadcast_to(kappa, np.shape(i)), dtype=float)
+        tau_rows = np.array(np.broadcast_to(tau, np.shape(i)), dtype=float)
+        new_rows = {
+            "i": i,
+            "j": j,
+            "R_ij": measured.R,
+            "t_ij": measured.t,
+            "kappa": kappa_rows,
+            "tau": tau_rows,
+            "information": isotropic_information(kappa_rows, tau_rows, self.d),
+            "uncoupled": np.zeros(len(kappa_rows), dtype=bool),
+        }
+        own_rows = self._edge_rows(np.ones(self.num_edges, dtype=bool))
+        extended: dict[str, Any] = {
+            name: np.concatenate([rows, new_rows[name]]) for name, rows in own_rows.items()
+        }
         return replace(self, **extended)
 
-    def with_prior(self, poses: IntArray, measured: Poses, kappa: Weights, tau: Weights) -> PoseGraph:
-        """Return the graph with poses (k,) measured in the frame of the world, in which the solution is then."""
-        poses = self._checked(poses)
-        graph = self if self.world is not None else self._with_node(poses[0], WORLD_ID, {"world": self.num_poses})
+    def with_prior(
+        self, poses: IntArray, measured: Poses, kappa: Weights, tau: Weights
+    ) -> PoseGraph:
+        """Return the graph with priors, after which the solution is in the frame of the world.
+
+        Parameters
+        ----------
+        poses : IntArray, (k,)
+            Poses that are measured.
+        measured : Poses
+            Measured poses in the frame of the world, k of them.
+        kappa : Array, (k,), or float
+            Precisions of the rotations, per radian^2.
+        tau : Array, (k,), or float
+            Precisions of the positions, per metre^2.
+
+        Returns
+        -------
+        PoseGraph
+            Graph with k more edges and, unless it had one, a world pose.
+
+        Raises
+        ------
+        GraphError
+            When there is no such pose, or as for `with_edges`.
+        """
+        poses = self._checked_poses(poses)
+        graph = self
+        if self.world is None:
+            graph = self._with_node(poses[0], WORLD_ID, {"world": self.num_poses})
         return graph.with_edges(np.full(len(poses), graph.world), poses, measured, kappa, tau)
 
     def with_position_prior(self, poses: IntArray, positions: Array, tau: Weights) -> PoseGraph:
-        """Return the graph with positions (k, d) of poses (k,) measured in the frame of the world, as by GPS."""
+        """Return the graph with priors of positions, as measured by GPS.
+
+        Parameters
+        ----------
+        poses : IntArray, (k,)
+            Poses that are measured.
+        positions : Array, (k, d)
+            Measured positions in the frame of the world, metres.
+        tau : Array, (k,), or float
+            Precisions of the positions, per metre^2.
+
+        Returns
+        -------
+        PoseGraph
+            Graph with k more edges and, unless it had one, a world pose.
+
+        Raises
+        ------
+        GraphError
+            When there is no such pose, or as for `with_edges`.
+
+        Examples
+        --------
+        >>> from pgo_models.graphs.datasets import load
+        >>> load("grid").with_position_prior(np.array([0, 5, 9]), np.eye(3), tau=1.0)
+        PoseGraph('grid', d=3, poses=27, edges=111, priors=3, robots=1)
+        """
         return self.with_prior(poses, Poses.of_points(positions), 0.0, tau)
 
-    def with_landmark(self, seen_from: IntArray, positions: Array, tau: Weights, name: int | None = None) -> PoseGraph:
-        """The graph, without truth, with a landmark `seen_from` poses, (k,), at `positions` in their frames, (k, d)."""
-        seen_from = self._checked(seen_from)
-        points, n, first, initial = Poses.of_points(positions), self.num_poses, seen_from[0], self.initial
-        if (points.num_poses, points.d) != (len(seen_from), self.d):
-            raise GraphError(f"{points.t.shape} positions seen from {len(seen_from)} poses in {self.d}D; give one each")
-        name = int(self.pose_ids[self.in_files].max()) + 1 if name is None else name
-        if initial is not None:
-            there = initial.t[first] + initial.R[first] @ points.t[0]
-            initial = Poses(initial.R[[*range(n), first]], np.append(initial.t, there[None], axis=0))
-        others = {"landmarks": np.append(self.landmarks, n), "initial": initial, "truth": None}
-        return self._with_node(first, name, others).with_edges(seen_from, np.full(len(seen_from), n), points, 0.0, tau)
+    def with_landmark(
+        self, seen_from: IntArray, positions: Array, tau: Weights, name: int | None = None
+    ) -> PoseGraph:
+        """Return the graph with one more landmark; the ground truth is left out.
 
-    def _checked(self, poses: IntArray) -> IntArray:
+        Parameters
+        ----------
+        seen_from : IntArray, (k,)
+            Poses that see the landmark.
+        positions : Array, (k, d)
+            Measured positions of the landmark in the frames of these poses, metres.
+        tau : Array, (k,), or float
+            Precisions of the positions, per metre^2.
+        name : int, optional
+            Id of the landmark; the first above all other ids unless given.
+
+        Returns
+        -------
+        PoseGraph
+            Graph with one more pose and k more edges. Its estimate, if there is one, has the
+            landmark where the first of these poses sees it.
+
+        Raises
+        ------
+        GraphError
+            When there is no such pose, not one position for each, or as for `with_edges`.
+        """
+        seen_from = self._checked_poses(seen_from)
+        points = Poses.of_points(positions)
+        if (points.num_poses, points.d) != (len(seen_from), self.d):
+            raise GraphError(
+                f"{points.t.shape} positions seen from {len(seen_from)} poses in {self.d}D; "
+                "give one each"
+            )
+        n = self.num_poses
+        first = seen_from[0]
+        if name is None:
+            name = int(self.pose_ids[self.in_files].max()) + 1
+        initial = self.initial
+        if initial is not None:
+            position = initial.t[first] + initial.R[first] @ points.t[0]
+            R = initial.R[[*range(n), first]]
+            initial = Poses(R, np.append(initial.t, position[None], axis=0))
+        landmarks = np.append(self.landmarks, n)
+        graph = self._with_node(
+            first, name, {"landmarks": landmarks, "initial": initial, "truth": None}
+        )
+        return graph.with_edges(seen_from, np.full(len(seen_from), n), points, 0.0, tau)
+
+    def _checked_poses(self, poses: IntArray) -> IntArray:
         """Poses (k,), k > 0, as whole numbers; a GraphError unless the graph has them."""
         poses = whole_array(poses, "poses")
-        if not (poses.size and 0 <= poses.min() <= poses.max() < self.num_poses):
-            raise GraphError(f"measured poses are {poses}; give one or more, 0 to {self.num_poses - 1}")
+        if not poses.size or not self._has_poses(poses):
+            raise GraphError(
+                f"measured poses are {poses}; give one or more, 0 to {self.num_poses - 1}"
+            )
         return poses
 
-    def _rows(self, edges: BoolArray) -> dict[str, Any]:
-        return {name: getattr(self, name)[edges] for name in _OF_EDGES if getattr(self, name) is not None}
+    def _edge_rows(self, edges: BoolArray) -> dict[str, Any]:
+        """Rows of the given edges, (m,), of every field that has a row for each edge."""
+        fields = {name: getattr(self, name) for name in _EDGE_FIELDS}
+        return {name: values[edges] for name, values in fields.items() if values is not None}
 
-    def _with_node(self, beside: int, name: int, others: dict[str, Any]) -> PoseGraph:
-        """Graph with one more pose, of the robot of another, and other fields."""
-        robot = None if self.robot is None else np.append(self.robot, self.robot[beside])
-        return replace(self, num_poses=self.num_poses + 1, ids=np.append(self.pose_ids, name), robot=robot, **others)
+    def _with_node(self, beside: int, name: int, others: Mapping[str, Any]) -> PoseGraph:
+        """Return the graph with one more pose, owned by the robot of `beside`, and other fields."""
+        robot = None
+        if self.robot is not None:
+            robot = np.append(self.robot, self.robot[beside])
+        ids = np.append(self.pose_ids, name)
+        return replace(self, num_poses=self.num_poses + 1, ids=ids, robot=robot, **others)
+
+
+def isotropic_information(kappa: Array, tau: Array, d: int) -> Array:
+    """Diagonal information matrices, (m, k, k), whose `edge_precisions` are kappa and tau.
+
+    k is 3 in the plane and 6 in space.
+    """
+    diagonal = [tau, tau, kappa] if d == 2 else [tau, tau, tau, 2 * kappa, 2 * kappa, 2 * kappa]
+    rows = np.stack(diagonal, axis=1)
+    return np.asarray(rows[:, :, None] * np.eye(len(diagonal)))
+
+
+def has_no_gap(robot: IntArray) -> bool:
+    """Whether the robots are numbered 0, 1, .. and every one owns a pose."""
+    if not len(robot) or robot.min() != 0 or robot.max() >= len(robot):
+        return False
+    return bool(np.bincount(robot).all())
+
+
+def is_ascending(times: Array) -> bool:
+    """Whether times are finite, and each is later than the one before."""
+    return bool(np.isfinite(times).all() and (np.diff(times) > 0).all())
 
 
 def middle_pose(graph: PoseGraph) -> int:
-    """A pose half-way along a long shortest path of a connected graph, found by two breadth-first searches."""
+    """Pose half-way along a long shortest path of a connected graph.
+
+    The path ends at the pose farthest from pose 0, and at the pose farthest from that one. Two
+    breadth-first searches find them.
+    """
     end = poses_by_distance(graph, 0)[-1]
-    order, parent = breadth_first_order(graph.adjacency, end)
-    path, before = [int(order[-1])], parent.tolist()
+    order, parents = breadth_first_order(graph.adjacency, end)
+    parent = parents.tolist()
+    path = [int(order[-1])]
     while path[-1] != end:
-        path.append(before[path[-1]])
+        path.append(parent[path[-1]])
     return path[len(path) // 2]
 
 
@@ -244,18 +931,32 @@ def poses_by_distance(graph: PoseGraph, pose: int) -> IntArray:
 
 
 def bridges(graph: PoseGraph, kept: BoolArray, ratio: Array) -> IntArray:
-    """Edges of the least ratios, (m,), that connect what the kept ones, (m,), leave apart (Kruskal)."""
-    n = graph.num_poses
-    count, part = connected_components(edge_counts(graph.i[kept], graph.j[kept], n), directed=False)
+    """Edges that connect the components of the kept edges, with the smallest ratios.
+
+    They are a minimum spanning tree (Kruskal) of the graph whose nodes are these components; kept
+    and ratio are (m,).
+    """
+    kept_edges = edge_counts(graph.i[kept], graph.j[kept], graph.num_poses)
+    count, part = connected_components(kept_edges, directed=False)
     order = np.argsort(ratio, kind="stable")
-    ends = np.sort(np.stack([part[graph.i[order]], part[graph.j[order]]]).astype(np.int64), axis=0)
-    order, ends = order[ends[0] != ends[1]], ends[:, ends[0] != ends[1]]
+    parts = np.stack([part[graph.i[order]], part[graph.j[order]]])
+    ends = np.sort(parts.astype(np.int64), axis=0)
+    is_between = ends[0] != ends[1]
+    order = order[is_between]
+    ends = ends[:, is_between]
+    # Of several edges between two components the first, with the smallest ratio, is enough.
     _, first = np.unique(ends[0] * count + ends[1], return_index=True)
-    tree = minimum_spanning_tree(csr_array((first + 1.0, ends[:, first]), shape=(count, count)))
+    links = ends[:, first].astype(np.int32)  # SciPy 1.14 finds no trees with indices of 64 bits
+    # The place in the order is the length of a link. It is positive, since 0 would be no link.
+    lengths = csr_array((first + 1.0, links), shape=(count, count))
+    tree = minimum_spanning_tree(lengths)
     return np.asarray(order[tree.data.astype(np.int64) - 1])
 
 
 def edge_counts(i: IntArray, j: IntArray, size: int) -> csr_array:
-    """Symmetric matrix with the number of edges (i, j) between every two."""
-    ends = np.concatenate([i, j]), np.concatenate([j, i])
-    return csr_array((np.ones(2 * len(i)), ends), shape=(size, size))
+    """Symmetric matrix with the number of edges (i, j) between every two.
+
+    Its indices have 32 bits: SciPy 1.14 finds no shortest paths with others.
+    """
+    ends = np.concatenate([[i, j], [j, i]], axis=1).astype(np.int32)
+    return csr_array((np.ones(2 * len(i)), tuple(ends)), shape=(size, size))

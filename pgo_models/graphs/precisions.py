@@ -1,125 +1,352 @@
-"""Information matrices as the precisions kappa and tau of the isotropic cost, and back (SE-Sync: Rosen et al. 2019)."""
+"""Information matrices as the precisions kappa and tau of the isotropic cost, and back.
+
+The formulas are those of SE-Sync (Rosen et al. 2019, section 2 and its code).
+"""
 
 import enum
+from dataclasses import replace
 
 import numpy as np
 
-from pgo_models.errors import SettingError
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.rotations import Array, BoolArray
-from pgo_models.graphs.measurements import isotropic_information
-from pgo_models.graphs.pose_graph import PoseGraph, bridges
+from pgo_models.graphs.pose_graph import PoseGraph, bridges, isotropic_information
 
-LEAST_SCALED = 1e-12  # smallest eigenvalue of a matrix scaled to ones on its diagonal that counts as positive
+# Bounds on eigenvalues of a matrix that is scaled to ones on its diagonal. An eigenvalue above the
+# first counts as positive. One below the second is negative beyond all rounding, also that of the
+# eigenvalue itself.
+LEAST_SCALED = 1e-12
+_SURELY_NEGATIVE = -1e-10
+# Share of the diagonal that the rounding of the entries can hide. This share is added to the
+# diagonal of a matrix that is semidefinite but for rounding.
+_ROUNDED_ENTRIES = 2.0**-45
+_WAYS_OUT = (
+    "so that chi2 can be negative: correct them, leave out their coupling blocks "
+    "(pgo_models.without_indefinite_coupling), or solve F"
+)
 
 
 class RotationWeight(enum.Enum):
-    """What kappa becomes of I_theta in the plane; in space both are kappa = 3 / (2 tr(I_rr^-1)).
+    """Which kappa stands for the information I_theta of a heading in the plane.
 
-    A rotation error theta costs kappa ||R - I||_F^2 = 4 kappa (1 - cos theta), about 2 kappa theta^2. A Gaussian says
-    I_theta theta^2 (F has no factor 1/2, nor has tau ||.||^2), so that kappa = I_theta / 2, as it is in space.
-    SE-Sync's kappa = I_theta counts rotations twice against translations; published optima of 2D graphs are with it.
+    In space both choices have kappa = 3 / (2 tr(I_rr^-1)).
+
+    A rotation error theta costs kappa ||R - I||_F^2 = 4 kappa (1 - cos theta), about 2 kappa
+    theta^2. For a Gaussian error it is I_theta theta^2 (neither F nor tau ||.||^2 has a factor
+    1/2), so that kappa = I_theta / 2, as it is in space. SE-Sync's kappa = I_theta gives rotations
+    twice the weight against translations; published optima of 2D graphs are with it.
     """
 
     SE_SYNC = "kappa = I_theta in the plane"
     GAUSSIAN = "kappa = I_theta / 2 in the plane"
 
 
-def edge_precisions(information: Array, weights: RotationWeight = RotationWeight.SE_SYNC) -> tuple[Array, Array]:
-    """(kappa, tau), each (m,), of information matrices (m, 3, 3) in the plane or (m, 6, 6) in space.
+def edge_precisions(
+    information: Array, weights: RotationWeight = RotationWeight.SE_SYNC
+) -> tuple[Array, Array]:
+    """Precisions (kappa, tau), each (m,), of information matrices (m, k, k).
 
-    d = 3: tau = 3 / tr(I_tt^-1), kappa = 3 / (2 tr(I_rr^-1)); d = 2: tau = 2 / tr(I_tt^-1), kappa as `weights` say.
-    The blocks themselves are inverted, not the marginal information; those of zeros give 0. Per radian^2 and metre^2.
-    A SettingError when weights is no RotationWeight.
+    In space, k = 6: tau = 3 / tr(I_tt^-1) and kappa = 3 / (2 tr(I_rr^-1)). In the plane, k = 3: tau
+    = 2 / tr(I_tt^-1), and kappa as `weights` says. The blocks themselves are inverted, not the
+    marginal information; blocks of zeros give 0. The units are those of the matrices, per radian^2
+    and per metre^2. A SettingError when `weights` is no RotationWeight.
     """
     if not isinstance(weights, RotationWeight):
-        raise SettingError(f"weights is {weights!r}; give RotationWeight.SE_SYNC or RotationWeight.GAUSSIAN")
+        raise SettingError(
+            f"weights is {weights!r}; give RotationWeight.SE_SYNC or RotationWeight.GAUSSIAN"
+        )
     if information.shape[-1] == 3:
-        share = 0.5 if weights is RotationWeight.GAUSSIAN else 1.0
-        return share * information[:, 2, 2], 2.0 / _trace_of_inverse(information[:, :2, :2])
+        factor = 0.5 if weights is RotationWeight.GAUSSIAN else 1.0
+        kappa = factor * information[:, 2, 2]
+        tau = 2.0 / _trace_of_inverse(information[:, :2, :2])
+        return kappa, tau
+    kappa = 1.5 / _trace_of_inverse(information[:, 3:, 3:])
     tau = 3.0 / _trace_of_inverse(information[:, :3, :3])
-    return 1.5 / _trace_of_inverse(information[:, 3:, 3:]), tau
+    return kappa, tau
 
 
 def proper_information(graph: PoseGraph) -> Array:
-    """Information matrices that chi2 is of, (m, k, k), symmetric: without coupling blocks that make one indefinite.
+    """Information matrices of chi2, (m, k, k): symmetric, and semidefinite where they couple.
 
-    Those of kappa and tau (`isotropic_information`) where the graph has none. The file's reader asks but for definite
-    blocks I_tt and I_rr: 5,021 whole matrices of the public cubicle graph are indefinite.
+    They are the whole matrices of the graph, or those of kappa and tau (`isotropic_information`)
+    where it has none. A matrix with coupling blocks whose eigenvalues are negative by the rounding
+    of its entries alone has 2^-45 of its diagonal added. A GraphError, which names the first edge,
+    when a matrix is indefinite (`indefinite_edges`). The blocks of matrices without coupling are
+    checked by `information_cost`.
     """
-    if graph.information is None:
-        return isotropic_information(graph.kappa, graph.tau, graph.d)
-    information = 0.5 * (graph.information + np.swapaxes(graph.information, 1, 2))
-    if not information[:, : graph.d, graph.d :].any():
-        return np.asarray(information)
-    bad = ~are_definite(information, LEAST_SCALED)
-    information[bad, : graph.d, graph.d :], information[bad, graph.d :, : graph.d] = 0.0, 0.0
-    return information
+    information = _symmetric_information(graph)
+    raised, is_indefinite = _semidefinite(information, graph.d)
+    if is_indefinite.any():
+        raise GraphError(f"{text_of_indefinite(graph, is_indefinite)}, {_WAYS_OUT}")
+    return raised
+
+
+def gaussian_information(graph: PoseGraph) -> Array:
+    """Inverse covariances of the errors of the measurements, (m, k, k), for tests of measurements.
+
+    No Gaussian has an indefinite matrix: of such a matrix the coupling block is left out. Nothing
+    is proved with these matrices; those of chi2 are `proper_information`.
+    """
+    information = _symmetric_information(graph)
+    raised, is_indefinite = _semidefinite(information, graph.d)
+    if not is_indefinite.any():
+        return raised
+    return _without_coupling(raised, is_indefinite, graph.d)
+
+
+def indefinite_edges(graph: PoseGraph) -> BoolArray:
+    """Return which edges have a coupling block that makes their information matrix indefinite.
+
+    Such a matrix has a negative eigenvalue beyond the rounding of its entries, so that its share of
+    chi2 can be negative. `Weighting.INFORMATION` refuses such a matrix, and
+    `without_indefinite_coupling` leaves its coupling block out. F uses no coupling block.
+
+    Cholesky factors and eigenvalues decide where they are clear, exact arithmetic elsewhere.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        Any graph, with or without information matrices.
+
+    Returns
+    -------
+    BoolArray
+        (m,), true where r^T I r can be negative for a residual r of the edge. Matrices without a
+        coupling block are not checked here.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from pgo_models.graphs.scenes import circle
+    >>> graph = circle(np.random.default_rng(0))
+    >>> information = isotropic_information(graph.kappa, graph.tau, graph.d)
+    >>> information[5, 0, 3] = information[5, 3, 0] = 1e9
+    >>> coupled = replace(graph, information=information)
+    >>> np.flatnonzero(indefinite_edges(coupled)).tolist()
+    [5]
+    """
+    return _semidefinite(_symmetric_information(graph), graph.d)[1]
+
+
+def without_indefinite_coupling(graph: PoseGraph) -> PoseGraph:
+    """Return the graph without the coupling blocks that make information matrices indefinite.
+
+    The blocks I_tr of these matrices are set to zero. The chi2 of the graph is then another than
+    that of its file, which can be negative. `PoseGraph.uncoupled` says which edges have lost their
+    block, and `Solution.note` how many.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        Any graph; a graph without such matrices is returned as it is.
+
+    Returns
+    -------
+    PoseGraph
+        The same measurements, kappa and tau.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from pgo_models.graphs.scenes import circle
+    >>> graph = circle(np.random.default_rng(0))
+    >>> information = isotropic_information(graph.kappa, graph.tau, graph.d)
+    >>> information[5, 0, 3] = information[5, 3, 0] = 1e9
+    >>> changed = without_indefinite_coupling(replace(graph, information=information))
+    >>> np.flatnonzero(changed.uncoupled).tolist(), float(changed.information[5, 0, 3])
+    ([5], 0.0)
+    """
+    is_indefinite = indefinite_edges(graph)
+    if graph.information is None or not is_indefinite.any():
+        return graph
+    uncoupled = is_indefinite
+    if graph.uncoupled is not None:
+        uncoupled = graph.uncoupled | is_indefinite
+    information = _without_coupling(graph.information, is_indefinite, graph.d)
+    return replace(graph, information=information, uncoupled=uncoupled)
+
+
+def text_of_indefinite(graph: PoseGraph, is_indefinite: BoolArray, place: str = "") -> str:
+    """Text with the number of indefinite matrices and the first; `place` is its `file:line`."""
+    first = int(np.argmax(is_indefinite))
+    first_matrix = _symmetric_information(graph)[first : first + 1]
+    scaled, _ = scaled_blocks(first_matrix)
+    smallest = np.linalg.eigvalsh(scaled)[0, 0]
+    count = (
+        f"information matrices of {is_indefinite.sum()} of {graph.num_edges} edges are indefinite"
+    )
+    which = f"{place}, {graph.edge_label(first)}" if place else graph.edge_label(first)
+    return f"{count} (first {which}: eigenvalue {smallest:.3g} beside ones on the diagonal)"
 
 
 def are_definite(blocks: Array, least: float) -> BoolArray:
-    """Whether symmetric blocks (m, k, k), scaled to ones where the diagonal is positive, are above least I, (m,)."""
-    scaled = scaled_blocks(blocks)[0] - least * np.eye(blocks.shape[1])
+    """Whether symmetric blocks (m, k, k) are above `least` times I, (m,).
+
+    They are scaled first, to ones where the diagonal is positive.
+    """
+    scaled, _ = scaled_blocks(blocks)
+    shifted = scaled - least * np.eye(blocks.shape[1])
     try:
-        np.linalg.cholesky(scaled)
-    except np.linalg.LinAlgError:  # which are not
-        return np.asarray(np.linalg.eigvalsh(scaled)[:, 0] > 0.0)
+        np.linalg.cholesky(shifted)
+    except np.linalg.LinAlgError:  # some are not; eigenvalues say which
+        return np.asarray(np.linalg.eigvalsh(shifted)[:, 0] > 0.0)
     return np.ones(len(blocks), dtype=bool)
 
 
 def scaled_blocks(blocks: Array) -> tuple[Array, Array]:
-    """Blocks (m, k, k) with ones on the diagonal where that is positive, and the scale, (m, k), on either side."""
+    """Blocks D A D, (m, k, k), with ones on the diagonal where that is positive, and D, (m, k)."""
     diagonal = np.einsum("mkk->mk", blocks)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     return blocks * scale[:, :, None] * scale[:, None, :], scale
 
 
 def uncoupled_share(information: Array, d: int) -> Array:
-    """Largest share, (m,), for which I >= share blockdiag(I_tt, I_rr): 1 - ||I_tt^-1/2 I_tr I_rr^-1/2||_2."""
-    I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
-    squared = np.linalg.solve(filled(I_rr), np.swapaxes(I_tr, 1, 2)) @ np.linalg.solve(filled(I_tt), I_tr)
-    return np.asarray(1.0 - np.sqrt(np.abs(np.linalg.eigvals(squared)).max(axis=1)))
+    """Largest share, (m,), for which I >= share blockdiag(I_tt, I_rr).
+
+    It is 1 - ||I_tt^-1/2 I_tr I_rr^-1/2||_2, whose square is the largest eigenvalue of I_rr^-1
+    I_tr^T I_tt^-1 I_tr.
+    """
+    I_tt = information[:, :d, :d]
+    I_tr = information[:, :d, d:]
+    I_rr = information[:, d:, d:]
+    left = np.linalg.solve(filled(I_rr), np.swapaxes(I_tr, 1, 2))
+    right = np.linalg.solve(filled(I_tt), I_tr)
+    squared_norm = np.abs(np.linalg.eigvals(left @ right)).max(axis=1)
+    return np.asarray(1.0 - np.sqrt(squared_norm))
 
 
 def condition(blocks: Array) -> Array:
-    """Largest over smallest eigenvalue, (m,), of positive definite blocks (m, k, k); 1 of those that are zero."""
+    """Largest over smallest eigenvalue, (m,), of definite blocks (m, k, k); 1 of zero blocks."""
     values = np.linalg.eigvalsh(filled(blocks))
     return np.asarray(values[:, -1] / values[:, 0])
 
 
 def filled(A: Array) -> Array:
     """Blocks (m, k, k) with the identity in place of those that are zero."""
-    return np.asarray(A + ~A.any(axis=(1, 2), keepdims=True) * np.eye(A.shape[1]))
+    is_zero = ~A.any(axis=(1, 2), keepdims=True)
+    return np.asarray(A + is_zero * np.eye(A.shape[1]))
 
 
 def _trace_of_inverse(A: Array) -> Array:
-    """tr(A^-1), (m,), by elimination of all blocks at once, a fraction of the time of their inverses; inf of zeros."""
-    U = np.ascontiguousarray(np.moveaxis(filled(A), 0, -1))  # of A = L U, (k, k, m), and the rows of L^-1
-    rows = np.eye(len(U))[:, :, None] + np.zeros(len(A))
+    """tr(A^-1), (m,), of symmetric blocks (m, k, k); inf of blocks of zeros.
+
+    All blocks are eliminated at once, A = L D L^T, in a fraction of the time of their inverses. The
+    trace is the sum of the squares of D^-1/2 L^-1.
+    """
+    # The edges come last, (k, k, m): then every operation runs through contiguous memory.
+    U = np.ascontiguousarray(np.moveaxis(filled(A), 0, -1))
+    L_inverse = np.eye(len(U))[:, :, None] + np.zeros(len(A))
     trace = np.where(A.any(axis=(1, 2)), 0.0, np.inf)
     for k, pivot in enumerate(np.einsum("kkm->km", U)):
-        trace += np.sum(rows[k] ** 2, axis=0) / pivot
-        share = U[k + 1 :, k, None] / pivot
-        U[k + 1 :] -= share * U[k]
-        rows[k + 1 :] -= share * rows[k]
+        trace += np.sum(L_inverse[k] ** 2, axis=0) / pivot
+        multiplier = U[k + 1 :, k, None] / pivot
+        U[k + 1 :] -= multiplier * U[k]
+        L_inverse[k + 1 :] -= multiplier * L_inverse[k]
     return trace
 
 
 def extreme_weight(graph: PoseGraph) -> tuple[float, int, str]:
-    """How far weights of a connected graph are apart where it counts, the edge to blame, and a sentence on its weight.
+    """Largest ratio of two weights of a connected graph, the edge to blame, and a sentence on it.
 
-    Rounding beside the heaviest edge hides what lighter ones hold alone. The lightest such edge is that of a maximum
-    spanning tree; of the two the one farther from the median is to blame.
+    Rounding beside the heaviest edge hides the lighter edges that alone hold a part of the graph.
+    The lightest such edge is the lightest one of a maximum spanning tree. Of the heaviest and this
+    edge, the one farther from the median is to blame.
     """
-    found = []
+    extremes = []
     for kind in ("kappa", "tau"):
         weight = getattr(graph, kind)
-        if not (weight > 0).all():  # of positions alone, or of rotations
-            continue
-        ratio, tree = weight / np.median(weight), bridges(graph, np.zeros(graph.num_edges, dtype=bool), -weight)
-        heaviest, lightest = int(np.argmax(weight)), int(tree[np.argmin(weight[tree])])
-        e = max(heaviest, lightest, key=lambda end: abs(np.log(ratio[end])))
-        i, j = graph.pose_ids[[graph.i[e], graph.j[e]]]
-        text = f"{kind} of edge {i} -> {j} is {weight[e]:.3g}, {ratio[e]:.3g} times the median"
-        found.append((float(weight[heaviest] / weight[lightest]), e, text))
-    # Rounded, so that it is kappa where both are equal but for rounding.
-    return max(found, default=(0.0, 0, ""), key=lambda one: round(float(np.log(one[0])), 9))
+        # Only where all edges have this weight: some graphs measure positions alone, or rotations.
+        if (weight > 0).all():
+            extremes.append(_extreme_weight_of(graph, kind, weight))
+
+    def rounded_size(extreme: tuple[float, int, str]) -> float:
+        # Rounded, so that kappa is named where both ratios are equal but for rounding.
+        return round(float(np.log(extreme[0])), 9)
+
+    return max(extremes, default=(0.0, 0, ""), key=rounded_size)
+
+
+def _extreme_weight_of(graph: PoseGraph, kind: str, weight: Array) -> tuple[float, int, str]:
+    """Like `extreme_weight`, for the positive kappa or tau of the graph alone."""
+    ratio = weight / np.median(weight)
+    tree = bridges(graph, np.zeros(graph.num_edges, dtype=bool), -weight)
+    heaviest = int(np.argmax(weight))
+    lightest = int(tree[np.argmin(weight[tree])])
+    e = max(heaviest, lightest, key=lambda end: abs(np.log(ratio[end])))
+    i, j = graph.pose_ids[[graph.i[e], graph.j[e]]]
+    text = f"{kind} of edge {i} -> {j} is {weight[e]:.3g}, {ratio[e]:.3g} times the median"
+    return float(weight[heaviest] / weight[lightest]), e, text
+
+
+def _symmetric_information(graph: PoseGraph) -> Array:
+    if graph.information is None:
+        return isotropic_information(graph.kappa, graph.tau, graph.d)
+    transposed = np.swapaxes(graph.information, 1, 2)
+    return np.asarray(0.5 * (graph.information + transposed))
+
+
+def _without_coupling(information: Array, chosen: BoolArray, d: int) -> Array:
+    """Matrices with zeros in the coupling blocks of the chosen ones."""
+    uncoupled = information.copy()
+    uncoupled[chosen, :d, d:] = 0.0
+    uncoupled[chosen, d:, :d] = 0.0
+    return uncoupled
+
+
+def _semidefinite(information: Array, d: int) -> tuple[Array, BoolArray]:
+    """Matrices, raised where rounding alone makes them indefinite; which are indefinite, (m,).
+
+    Matrices without coupling blocks are left alone.
+    """
+    is_indefinite = np.zeros(len(information), dtype=bool)
+    coupled = np.flatnonzero(information[:, :d, d:].any(axis=(1, 2)))
+    doubtful = coupled[~are_definite(information[coupled], LEAST_SCALED)]
+    if not len(doubtful):
+        return information, is_indefinite
+    information = information.copy()
+    # Edges often share a matrix: each is judged once.
+    matrices, which = np.unique(information[doubtful], axis=0, return_inverse=True)
+    scaled, _ = scaled_blocks(matrices)
+    lowest = np.linalg.eigvalsh(scaled)[:, 0]
+    for k, matrix in enumerate(matrices):
+        same = doubtful[which.ravel() == k]
+        if lowest[k] < _SURELY_NEGATIVE:
+            is_indefinite[same] = True
+        elif not is_semidefinite_exactly(matrix):
+            raised = matrix + _ROUNDED_ENTRIES * np.diag(np.diag(matrix))
+            is_indefinite[same] = not is_semidefinite_exactly(raised)
+            information[same] = raised
+    return information, is_indefinite
+
+
+def is_semidefinite_exactly(matrix: Array) -> bool:
+    """Whether a symmetric matrix of doubles, (k, k), has no negative eigenvalue, exactly.
+
+    The matrix is scaled to whole numbers and eliminated. Pivots must not be negative, and in the
+    row of a pivot of zero all entries must be zero.
+    """
+    rows = _as_whole_numbers(matrix)
+    while rows:
+        pivot, *pivot_row = rows[0]
+        if pivot < 0 or (pivot == 0 and any(pivot_row)):
+            return False
+        # A pivot of zero has zeros in its row and column: nothing is subtracted.
+        factor = pivot if pivot > 0 else 1
+        rows = [_eliminated(row, pivot_row, factor) for row in rows[1:]]
+    return True
+
+
+def _as_whole_numbers(matrix: Array) -> list[list[int]]:
+    """Entries of a matrix of doubles, all times one power of two that makes them whole."""
+    fractions = [[entry.as_integer_ratio() for entry in row] for row in matrix.tolist()]
+    # Denominators of doubles are powers of two, so that the largest is a common one.
+    common = max(denominator for row in fractions for _, denominator in row)
+    return [
+        [numerator * (common // denominator) for numerator, denominator in row] for row in fractions
+    ]
+
+
+def _eliminated(row: list[int], pivot_row: list[int], factor: int) -> list[int]:
+    """`factor` times a row, less its first entry times the row of the pivot, without column one."""
+    first, *others = row
+    return [factor * entry - first * above for entry, above in zip(others, pivot_row, strict=True)]

@@ -1,4 +1,7 @@
-"""What the paper reports for its graphs (tables 1 to 4), from data/reference.json: the mark beside our curves."""
+"""What the paper reports for its graphs (tables 1 to 4), from data/reference.json.
+
+The reports and figures of the project show these numbers beside their own.
+"""
 
 import json
 from dataclasses import dataclass
@@ -49,26 +52,49 @@ def published_rows() -> tuple[PublishedRow, ...]:
     """Return the rows of the paper's tables, in its order."""
     rows = []
     for name, row in _paper_tables().items():
+        # The tables also hold notes on their columns, which are texts.
         if isinstance(row, dict):
-            se_sync = PublishedFigures(row["F_star"], None, row.get("seconds_sesync"))
-            dgs = PublishedFigures(row.get("F_dgs"), row.get("iterations_dgs"), row.get("seconds_dgs"))
-            soc = PublishedFigures(row["F_soc"], row["iterations_soc"], row.get("seconds_soc"))
-            rows.append(PublishedRow(name, row["poses"], row["measurements"], se_sync, dgs, soc))
+            rows.append(_published_row(name, row))
     return tuple(rows)
 
 
-def published_run(graph: PoseGraph) -> PublishedRun | None:
-    """Return what the paper reports for a graph of this name and size; None where it reports nothing.
+def _published_row(name: str, row: dict[str, Any]) -> PublishedRow:
+    return PublishedRow(
+        name,
+        num_poses=row["poses"],
+        num_edges=row["measurements"],
+        se_sync=PublishedFigures(
+            objective=row["F_star"], iterations=None, seconds=row.get("seconds_sesync")
+        ),
+        dgs=PublishedFigures(
+            objective=row.get("F_dgs"),
+            iterations=row.get("iterations_dgs"),
+            seconds=row.get("seconds_dgs"),
+        ),
+        soc=PublishedFigures(
+            objective=row["F_soc"],
+            iterations=row["iterations_soc"],
+            seconds=row.get("seconds_soc"),
+        ),
+    )
 
-    Its scenes (circle, grid, sphere) were drawn anew here, with other noise of the same size: compare gaps, not costs.
+
+def published_run(graph: PoseGraph) -> PublishedRun | None:
+    """Return what the paper reports for a graph of this name and size, if anything.
+
+    Its scenes (circle, grid, sphere) were drawn anew here, with other noise of the same size:
+    compare gaps, not costs.
     """
     row = _paper_tables().get(graph.name)
-    if isinstance(row, dict) and (row["poses"], row["measurements"]) == (graph.num_poses, graph.num_edges):
-        return PublishedRun(graph.name, row["F_soc"], row["F_star"], row["iterations_soc"])
-    return None
+    if not isinstance(row, dict):
+        return None
+    if (row["poses"], row["measurements"]) != (graph.num_poses, graph.num_edges):
+        return None
+    return PublishedRun(graph.name, row["F_soc"], row["F_star"], row["iterations_soc"])
 
 
 def _paper_tables() -> dict[str, Any]:
+    """Rows of the paper's tables by graph; empty where the project's data are not installed."""
     for folder in project_folders():
         path = folder / "reference.json"
         if path.is_file():

@@ -1,7 +1,8 @@
-"""Generated pose graphs with known truth: the paper's circle, grid and sphere networks, and random geometric graphs.
+"""Generated pose graphs with known truth: the paper's networks, random graphs, and landmarks.
 
-The three networks follow the paper's section `SIMULATION RESULTS` and, for the geometry, Cristofalo et al. 2020 (GeoD);
-the figures stand in data/reference.json under "scenes". Every function takes its random generator.
+The networks circle, grid and sphere follow the paper's section `SIMULATION RESULTS` and, for the
+geometry, Cristofalo et al. 2020 (GeoD); the figures stand in data/reference.json under "scenes".
+Every function takes its random generator.
 """
 
 from dataclasses import dataclass, replace
@@ -15,18 +16,30 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, random_rotations, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 
-NETWORK_KAPPA = np.pi / 6  # the weights of the published experiments: the standard deviations, not their squares
+# Weights of the published experiments: the standard deviations, not the squares of their inverses.
+NETWORK_KAPPA = np.pi / 6
 NETWORK_TAU = 0.5
-_SLACK = 1e-9  # metres: distances that equal the communication radius count, whatever their last bit
+# Metres. Distances equal to the communication radius count, whatever their last bit.
+_SLACK = 1e-9
 _SPHERE_PAIR_LEFT_OUT = (0, 12)
+_POSES_PER_TREE = 4  # of the scene victoria_park
 
 
 @dataclass(frozen=True)
 class NoiseModel:
     """Zero-mean Gaussian noise of measurements and initial guesses; the defaults are the paper's.
 
-    Standard deviations of every component of a translation, metres, and of the tangent vector of a rotation, radians. A
-    SettingError when one is not positive and finite: a precision would be infinite.
+    Parameters
+    ----------
+    translation_std : float
+        Standard deviation of every component of a translation, metres.
+    rotation_std : float
+        Standard deviation of every component of the tangent vector of a rotation, radians.
+
+    Raises
+    ------
+    SettingError
+        When one is not positive and finite: a precision would be infinite.
     """
 
     translation_std: float = 0.5
@@ -41,21 +54,48 @@ class NoiseModel:
         return self.translation_std**-2
 
     def kappa(self, d: int) -> float:
-        """Rotation precision, per radian^2: 1 / rotation_std^2 in the plane, 1 / (2 rotation_std^2) in space.
+        """Return the rotation precision.
 
-        They are what the information matrix I / rotation_std^2 becomes on reading (`edge_precisions`), as in SE-Sync.
+        It is 1 / rotation_std^2 in the plane and 1 / (2 rotation_std^2) in space, as SE-Sync finds
+        it in the information matrix I / rotation_std^2 of this noise.
+
+        Parameters
+        ----------
+        d : int
+            Dimension of space: 2 or 3.
+
+        Returns
+        -------
+        float
+            kappa, per radian^2.
         """
         return self.rotation_std**-2 / (d - 1)
 
 
-MILD_NOISE = NoiseModel(translation_std=0.1, rotation_std=np.pi / 60)  # 0.1 m and 3 degrees, of a good odometry
+# 0.1 m and 3 degrees, as of a good odometry.
+MILD_NOISE = NoiseModel(translation_std=0.1, rotation_std=np.pi / 60)
 
 
 def circle(rng: np.random.Generator) -> PoseGraph:
-    """25 poses on a circle of radius 2.6 m in the x-y plane, 300 directed edges between those within 4.0 m.
+    """Generate the paper's circle: 25 poses at a radius of 2.6 m in the x-y plane.
 
-    Truth rotations are uniform on SO(3), measurements and initial guess have `NoiseModel()`, and the weights are
-    kappa = pi / 6, tau = 0.5 on every edge. The edges are the same for every `rng`.
+    The 300 directed edges join poses that are within 4.0 m. Truth rotations are uniform on SO(3),
+    measurements and initial guess have `NoiseModel()`, and the weights are kappa = pi / 6, tau =
+    0.5 on every edge. The edges are the same for every `rng`.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of the truth rotations and the noise.
+
+    Returns
+    -------
+    PoseGraph
+        Graph with estimate and truth.
+
+    References
+    ----------
+    Ebrahimi & Deghat, section `SIMULATION RESULTS`.
 
     Examples
     --------
@@ -63,46 +103,112 @@ def circle(rng: np.random.Generator) -> PoseGraph:
     PoseGraph('circle', d=3, poses=25, edges=300, robots=1)
     """
     angle = 2 * np.pi * np.arange(25) / 25
-    return _network("circle", 2.6 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]), 4.0, rng)
+    t = 2.6 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    return _network("circle", t, radius=4.0, rng=rng)
 
 
 def grid(rng: np.random.Generator) -> PoseGraph:
-    """27 poses on a 3 x 3 x 3 lattice, 1.66 m apart, 108 directed edges between neighbours; else as `circle`.
+    """Generate the paper's grid: 27 poses on a 3 x 3 x 3 lattice with a spacing of 1.66 m.
+
+    The 108 directed edges join neighbours on the lattice; all else is as in `circle`.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of the truth rotations and the noise.
+
+    Returns
+    -------
+    PoseGraph
+        Graph with estimate and truth.
+
+    References
+    ----------
+    Ebrahimi & Deghat, section `SIMULATION RESULTS`.
 
     Examples
     --------
     >>> grid(np.random.default_rng(0))
     PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
     """
-    lattice = np.stack(np.meshgrid(*[np.arange(3.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    return _network("grid", 1.66 * lattice, 1.66, rng)
+    steps = np.arange(3.0)
+    lattice = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    return _network("grid", 1.66 * lattice, radius=1.66, rng=rng)
 
 
 def sphere(rng: np.random.Generator) -> PoseGraph:
-    """50 poses on a sphere of radius 3 m by Deserno's equal-area rule, 544 directed edges within 3 m; else as `circle`.
+    """Generate the paper's sphere: 50 poses by Deserno's equal-area rule at a radius of 3 m.
 
-    Four pairs on the meridian of zero longitude, (0, 12), (3, 25), (12, 38) and (25, 47), are 60 degrees apart and so
-    at exactly the communication radius; the next distances differ by 3 mm. With all four there are 546 directed edges,
-    with none 538. The published 544 is what double precision makes of it: the pair (0, 12) comes out one bit too long.
-    That pair is left out by name here, and the others are in by a tolerance, so that no last bit decides.
+    The 544 directed edges join poses that are within 3 m; all else is as in `circle`.
+
+    Four pairs on the meridian of zero longitude, (0, 12), (3, 25), (12, 38) and (25, 47), are 60
+    degrees apart and so at exactly the communication radius; the next distances differ by 3 mm.
+    With all four there are 546 directed edges, with none 538. The published number of 544 is the
+    result of double precision: the pair (0, 12) comes out one bit too long. That pair is left out
+    by name here, and the others are in by a tolerance, so that no last bit decides.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of the truth rotations and the noise.
+
+    Returns
+    -------
+    PoseGraph
+        Graph with estimate and truth.
+
+    References
+    ----------
+    Ebrahimi & Deghat, section `SIMULATION RESULTS`; Deserno, How to generate equidistributed
+    points on the surface of a sphere, 2004.
 
     Examples
     --------
     >>> sphere(np.random.default_rng(0))
     PoseGraph('sphere', d=3, poses=50, edges=544, robots=1)
     """
-    return _network("sphere", 3.0 * _equal_area_points(50), 3.0, rng, _SPHERE_PAIR_LEFT_OUT)
+    t = 3.0 * _equal_area_points(50)
+    return _network("sphere", t, radius=3.0, rng=rng, left_out=_SPHERE_PAIR_LEFT_OUT)
 
 
 def random_geometric(
-    num_poses: int, rng: np.random.Generator, *, d: int = 3, mean_degree: float = 6.0, noise: NoiseModel = MILD_NOISE
+    num_poses: int,
+    rng: np.random.Generator,
+    *,
+    d: int = 3,
+    mean_degree: float = 6.0,
+    noise: NoiseModel = MILD_NOISE,
 ) -> PoseGraph:
-    """Poses uniform in a box at one per metre^d, with an edge i < j wherever two are closer than a radius.
+    """Generate a random geometric graph: poses uniform in a box, edges between those that are near.
 
-    The radius is that of the ball which holds `mean_degree` poses on average; near the walls there are fewer. Connected
-    by construction: a pose without an edge to an earlier one gets an edge to the nearest earlier one. Precisions are
-    `noise.tau` and `noise.kappa(d)`; truth rotations are uniform, the initial guess is the truth with the same noise. A
-    SettingError for fewer than 2 poses, d other than 2 and 3, or a mean degree that is not positive.
+    There is one pose per metre^d, and an edge i < j wherever two are closer than a radius. The
+    graph is connected by construction: a pose without an edge to an earlier one gets an edge to the
+    nearest earlier one. Truth rotations are uniform.
+
+    Parameters
+    ----------
+    num_poses : int
+        Number of poses, at least 2.
+    rng : numpy.random.Generator
+        Source of the truth and the noise.
+    d : int
+        Dimension of space: 2 or 3.
+    mean_degree : float
+        The radius is that of the ball which holds this many poses on average. Near the walls there
+        are fewer.
+    noise : NoiseModel
+        Noise of the measurements and of the initial guess. The precisions are `noise.tau` and
+        `noise.kappa(d)`.
+
+    Returns
+    -------
+    PoseGraph
+        Graph with estimate and truth.
+
+    Raises
+    ------
+    SettingError
+        For fewer than 2 poses, d other than 2 and 3, or a mean degree that is not positive.
 
     Examples
     --------
@@ -114,25 +220,64 @@ def random_geometric(
     check_dimension(d)
     if not 0 < mean_degree < np.inf:
         raise SettingError(f"mean_degree must be positive and finite, got {mean_degree}")
-    t = rng.uniform(0.0, num_poses ** (1 / d), (num_poses, d))
-    ball = np.pi if d == 2 else 4 * np.pi / 3
-    pairs = scipy.spatial.KDTree(t).query_pairs((mean_degree / ball) ** (1 / d), output_type="ndarray").astype(np.int64)
+    side = num_poses ** (1 / d)
+    t = rng.uniform(0.0, side, (num_poses, d))
+    unit_ball = np.pi if d == 2 else 4 * np.pi / 3
+    radius = (mean_degree / unit_ball) ** (1 / d)
+    pairs = scipy.spatial.KDTree(t).query_pairs(radius, output_type="ndarray").astype(np.int64)
     alone = np.setdiff1d(np.arange(1, num_poses), pairs[:, 1])
-    nearest = [int(np.argmin(np.sum((t[:pose] - t[pose]) ** 2, axis=1))) for pose in alone]
-    pairs = np.concatenate([pairs, np.column_stack([np.array(nearest, dtype=np.int64), alone])])
-    i, j = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T
+    nearest = [_nearest_earlier(t, pose) for pose in alone]
+    added = np.column_stack([np.array(nearest, dtype=np.int64), alone])
+    i, j = _sorted_pairs(np.concatenate([pairs, added])).T
     truth = Poses(random_rotations(num_poses, d, rng), t)
     return observe("random_geometric", truth, i, j, noise, noise.kappa(d), noise.tau, rng)
 
 
-def victoria_park(
-    rng: np.random.Generator, *, num_poses: int = 300, noise: NoiseModel = MILD_NOISE, reach: float = 12.0
-) -> PoseGraph:
-    """A drive in rounds among trees, like the Victoria Park data set: poses 1 m apart, landmarks seen within `reach`.
+def _nearest_earlier(t: Array, pose: int) -> int:
+    squared_distance = np.sum((t[:pose] - t[pose]) ** 2, axis=1)
+    return int(np.argmin(squared_distance))
 
-    The poses of the plane are joined by odometry alone, along two rounds of a wavy loop; the trees, one for every four
-    poses, stand along it, those seen but once felled. Truth, estimate and precisions as in `random_geometric`; a
-    SettingError for fewer than 20 poses.
+
+def _sorted_pairs(pairs: IntArray) -> IntArray:
+    """Pairs, (k, 2), by their first entry, then by their second."""
+    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+    return np.asarray(pairs[order])
+
+
+def victoria_park(
+    rng: np.random.Generator,
+    *,
+    num_poses: int = 300,
+    noise: NoiseModel = MILD_NOISE,
+    reach: float = 12.0,
+) -> PoseGraph:
+    """Generate a drive in rounds among trees, like the Victoria Park data set.
+
+    The poses of the plane are 1 m apart along two rounds of a wavy loop, and joined by odometry
+    alone. The trees are landmarks along the loop, one for every four poses; those seen only once
+    are left out.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of the truth and the noise.
+    num_poses : int
+        Number of poses of the drive, at least 20.
+    noise : NoiseModel
+        Noise of the measurements and of the initial guess. The precisions are `noise.tau` and
+        `noise.kappa(2)`.
+    reach : float
+        Distance within which a tree is seen, metres.
+
+    Returns
+    -------
+    PoseGraph
+        Graph with landmarks, estimate and truth.
+
+    Raises
+    ------
+    SettingError
+        For fewer than 20 poses.
 
     Examples
     --------
@@ -144,16 +289,23 @@ def victoria_park(
     angle = 4 * np.pi * np.arange(num_poses) / num_poses
     radius = num_poses / (4 * np.pi) * (1 + 0.2 * np.cos(3 * angle))
     t = radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-    heading = np.arctan2(*np.gradient(t, axis=0).T[::-1])
-    trees = t[rng.integers(0, num_poses, num_poses // 4)] + rng.uniform(-reach / 2, reach / 2, (num_poses // 4, 2))
-    sight = np.linalg.norm(t[:, None] - trees, axis=2) <= reach
-    trees, sight = trees[sight.sum(axis=0) > 1], sight[:, sight.sum(axis=0) > 1]
-    seen_from, tree = np.nonzero(sight)
-    i, j = np.append(np.arange(num_poses - 1), seen_from), np.append(np.arange(1, num_poses), num_poses + tree)
-    truth = Poses(exp_map(np.append(heading, np.zeros(len(trees)))[:, None]), np.concatenate([t, trees]))
-    made = observe("victoria_park", truth, i, j, noise, noise.kappa(2), noise.tau, rng)
-    R_ij = np.where((j < num_poses)[:, None, None], made.R_ij, np.eye(2))
-    return replace(made, R_ij=R_ij, landmarks=np.arange(num_poses, truth.num_poses))
+    dx, dy = np.gradient(t, axis=0).T
+    heading = np.arctan2(dy, dx)
+    num_trees = num_poses // _POSES_PER_TREE
+    beside = t[rng.integers(0, num_poses, num_trees)]
+    trees = beside + rng.uniform(-reach / 2, reach / 2, (num_trees, 2))
+    is_seen = np.linalg.norm(t[:, None] - trees, axis=2) <= reach
+    is_kept = is_seen.sum(axis=0) > 1
+    trees = trees[is_kept]
+    seen_from, tree = np.nonzero(is_seen[:, is_kept])
+    i = np.append(np.arange(num_poses - 1), seen_from)
+    j = np.append(np.arange(1, num_poses), num_poses + tree)
+    R = exp_map(np.append(heading, np.zeros(len(trees)))[:, None])
+    truth = Poses(R, np.concatenate([t, trees]))
+    graph = observe("victoria_park", truth, i, j, noise, noise.kappa(2), noise.tau, rng)
+    is_odometry = (j < num_poses)[:, None, None]
+    R_ij = np.where(is_odometry, graph.R_ij, np.eye(2))
+    return replace(graph, R_ij=R_ij, landmarks=np.arange(num_poses, truth.num_poses))
 
 
 def observe(
@@ -167,19 +319,31 @@ def observe(
     rng: np.random.Generator,
     robot: IntArray | None = None,
 ) -> PoseGraph:
-    """Pose graph with measurements of the edges (i, j), and an initial guess like GPS and IMU, of known poses.
+    """Pose graph with noisy measurements of the edges (i, j) of known poses, and an initial guess.
 
-    t_ij = R_i^T (t_j - t_i) + N(0, s_t^2 I),  R_ij = Exp(N(0, s_R^2 I)) R_i^T R_j;  the initial guess is
-    t_i + N(0, s_t^2 I),  R_i Exp(N(0, s_R^2 I)).  All draws are independent (Ebrahimi & Deghat, `SIMULATION RESULTS`).
+    t_ij = R_i^T (t_j - t_i) + N(0, s_t^2 I) and R_ij = Exp(N(0, s_R^2 I)) R_i^T R_j. The initial
+    guess, as by GPS and IMU, is t_i + N(0, s_t^2 I) and R_i Exp(N(0, s_R^2 I)). All draws are
+    independent (Ebrahimi & Deghat, `SIMULATION RESULTS`).
     """
-    R_inverse = np.swapaxes(truth.R[i], 1, 2)
-    t_ij = np.einsum("mab,mb->ma", R_inverse, truth.t[j] - truth.t[i])
+    R_i_inverse = np.swapaxes(truth.R[i], 1, 2)
+    t_ij = np.einsum("mab,mb->ma", R_i_inverse, truth.t[j] - truth.t[i])
     t_ij += noise.translation_std * rng.standard_normal(t_ij.shape)
-    R_ij = _random_turns(len(i), truth.d, noise, rng) @ R_inverse @ truth.R[j]
-    turned = truth.R @ _random_turns(truth.num_poses, truth.d, noise, rng)
-    initial = Poses(turned, truth.t + noise.translation_std * rng.standard_normal(truth.t.shape))
-    measured = R_ij, t_ij, np.full(len(i), kappa), np.full(len(i), tau)
-    return PoseGraph(truth.num_poses, i, j, *measured, robot=robot, initial=initial, truth=truth, name=name)
+    R_ij = _random_turns(len(i), truth.d, noise, rng) @ R_i_inverse @ truth.R[j]
+    guessed_R = truth.R @ _random_turns(truth.num_poses, truth.d, noise, rng)
+    guessed_t = truth.t + noise.translation_std * rng.standard_normal(truth.t.shape)
+    return PoseGraph(
+        truth.num_poses,
+        i,
+        j,
+        R_ij,
+        t_ij,
+        kappa=np.full(len(i), kappa),
+        tau=np.full(len(i), tau),
+        robot=robot,
+        initial=Poses(guessed_R, guessed_t),
+        truth=truth,
+        name=name,
+    )
 
 
 def check_dimension(d: int) -> None:
@@ -189,28 +353,47 @@ def check_dimension(d: int) -> None:
 
 
 def _random_turns(count: int, d: int, noise: NoiseModel, rng: np.random.Generator) -> Array:
-    return exp_map(noise.rotation_std * rng.standard_normal((count, tangent_dimension(d))))
+    """Rotations (count, d, d) near the identity."""
+    tangents = rng.standard_normal((count, tangent_dimension(d)))
+    return exp_map(noise.rotation_std * tangents)
 
 
-def _network(name: str, t: Array, radius: float, rng: np.random.Generator, left_out: tuple[int, ...] = ()) -> PoseGraph:
-    """Both directed edges between poses at most `radius` apart but a pair left out, each with noise of its own."""
-    near: NDArray[np.bool_] = np.linalg.norm(t[:, None] - t[None], axis=2) <= radius + _SLACK
-    np.fill_diagonal(near, False)
-    if left_out:
-        near[left_out] = near[left_out[::-1]] = False
-    i, j = np.nonzero(near)
+def _network(
+    name: str,
+    t: Array,
+    radius: float,
+    rng: np.random.Generator,
+    left_out: tuple[int, int] | None = None,
+) -> PoseGraph:
+    """Network of the paper: both directed edges between poses at most `radius` apart.
+
+    Each of the two has noise of its own. One pair may be left out.
+    """
+    distance = np.linalg.norm(t[:, None] - t[None], axis=2)
+    is_edge: NDArray[np.bool_] = distance <= radius + _SLACK
+    np.fill_diagonal(is_edge, False)
+    if left_out is not None:
+        a, b = left_out
+        is_edge[a, b] = False
+        is_edge[b, a] = False
+    i, j = np.nonzero(is_edge)
     truth = Poses(random_rotations(len(t), 3, rng), t)
     return observe(name, truth, i, j, NoiseModel(), NETWORK_KAPPA, NETWORK_TAU, rng)
 
 
 def _equal_area_points(count: int) -> Array:
-    """About `count` unit vectors, (n, 3), on circles of latitude, each with about the same area (Deserno 2004)."""
+    """About `count` unit vectors, (n, 3), on circles of latitude, each of about the same area.
+
+    Every vector has about the area 4 pi / count of the sphere (Deserno 2004).
+    """
     area = 4 * np.pi / count
     num_circles = round(np.pi / np.sqrt(area))
-    points = []
+    circles = []
     for theta in np.pi * (np.arange(num_circles) + 0.5) / num_circles:
-        on_circle = round(2 * np.pi * np.sin(theta) * np.pi / num_circles / area)
-        phi = 2 * np.pi * np.arange(on_circle) / on_circle
-        latitude = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi
-        points.append(np.column_stack(latitude))
-    return np.concatenate(points)
+        num_points = round(2 * np.pi * np.sin(theta) * np.pi / num_circles / area)
+        phi = 2 * np.pi * np.arange(num_points) / num_points
+        x = np.sin(theta) * np.cos(phi)
+        y = np.sin(theta) * np.sin(phi)
+        z = np.cos(theta) + 0 * phi
+        circles.append(np.column_stack([x, y, z]))
+    return np.concatenate(circles)

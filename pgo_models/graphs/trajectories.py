@@ -1,6 +1,6 @@
-"""Trajectories in the TUM and KITTI text formats, as evo reads and writes them; poses in the plane are lifted to z = 0.
+"""Trajectories in the text formats of TUM and KITTI, as evo reads and writes them.
 
-Both hold world from body, metres: see `write_tum` and `write_kitti`.
+Both hold world from body, metres. Poses in the plane are written as poses in space with z = 0.
 """
 
 from collections.abc import Sequence
@@ -9,41 +9,90 @@ from pathlib import Path
 import numpy as np
 
 from pgo_models.errors import FileFormatError, GraphError
-from pgo_models.files import check_metres, check_quaternions, read_table, read_text, replace_when_done
+from pgo_models.files import (
+    check_metres,
+    check_quaternions,
+    read_table,
+    read_text,
+    replace_when_done,
+)
 from pgo_models.geometry import rotations
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations
+from pgo_models.graphs.pose_graph import is_ascending
 
-_PLANE_TOLERANCE = 1e-6  # metres, and of the entries of R that vanish when a pose lies in the plane
-_MATRIX_TOLERANCE = 1e-3  # KITTI's own files have about seven digits; this tells digits from a wrong matrix
+# Metres; also a bound on those entries of R that vanish when a pose lies in the plane.
+_PLANE_TOLERANCE = 1e-6
+# KITTI's own files have about seven digits. This bound tells few digits from a wrong matrix.
+_MATRIX_TOLERANCE = 1e-3
 
 
 def write_tum(poses: Poses, path: Path | str, timestamps: Array | None = None) -> None:
-    """Write one line `timestamp tx ty tz qx qy qz qw` for each pose; the floats come back exactly.
+    """Write a TUM file: a line `timestamp tx ty tz qx qy qz qw` for each pose.
 
-    `timestamps`, (n,), are ascending seconds; 0, 1, .. unless given. A GraphError when there is not one finite one for
-    each pose, or they do not ascend; a PGOError when the file cannot be written; what stood there stays.
+    The numbers have all digits of the doubles. A file that exists is replaced when the new one is
+    complete.
+
+    Parameters
+    ----------
+    poses : Poses
+        World from body, metres.
+    path : Path or str
+        File to write.
+    timestamps : Array, (n,), optional
+        Ascending seconds; 0, 1, .. unless given.
+
+    Raises
+    ------
+    GraphError
+        When there is not one finite time stamp for each pose, or they do not ascend.
+    PGOError
+        When the file cannot be written.
 
     Examples
     --------
     >>> import tempfile
     >>> path = Path(tempfile.mkdtemp()) / "poses.tum"
     >>> write_tum(Poses.identity(2, 3), path)
-    >>> len(path.read_text().splitlines())
-    2
+    >>> read_tum(path)
+    Poses(n=2, d=3)
     """
-    seconds = np.arange(poses.num_poses, dtype=float) if timestamps is None else np.asarray(timestamps, dtype=float)
-    if seconds.shape != (poses.num_poses,) or not np.isfinite(seconds).all() or (np.diff(seconds) <= 0).any():
-        raise GraphError(f"timestamps of shape {seconds.shape} for {poses}; give {poses.num_poses} that ascend")
+    if timestamps is None:
+        seconds = np.arange(poses.num_poses, dtype=float)
+    else:
+        seconds = np.asarray(timestamps, dtype=float)
+    if seconds.shape != (poses.num_poses,) or not is_ascending(seconds):
+        raise GraphError(
+            f"timestamps of shape {seconds.shape} for {poses}; give {poses.num_poses} that ascend"
+        )
     R, t = _lifted(poses)
-    _write_rows(np.column_stack([seconds, t, rotations.quaternions_from_rotations(R)]), path)
+    quaternions = rotations.quaternions_from_rotations(R)
+    _write_rows(np.column_stack([seconds, t, quaternions]), path)
 
 
 def read_tum(path: Path | str, d: int = 3) -> Poses:
-    """Poses of a TUM file, in the order of its lines; `read_times` reads the timestamps.
+    """Return the poses of a TUM file, in the order of its lines.
 
-    A FileFormatError with file:line, for a row that is not 8 finite numbers, a zero quaternion, a position beyond
-    `FARTHEST`, or, with d = 2, a pose out of the plane.
+    A line is `timestamp tx ty tz qx qy qz qw`; `pgo_models.graphs.trajectories.read_times` reads
+    the time stamps. Blank lines and comments (#) are skipped.
+
+    Parameters
+    ----------
+    path : Path or str
+        File to read.
+    d : int
+        Dimension of the poses: 3, or 2 for poses that lie in the x-y plane.
+
+    Returns
+    -------
+    Poses
+        World from body, metres.
+
+    Raises
+    ------
+    FileFormatError
+        With file:line, for a row that is not 8 finite numbers, a zero quaternion, a position beyond
+        1e15 m, or, with d = 2, a pose out of the plane.
 
     Examples
     --------
@@ -52,51 +101,98 @@ def read_tum(path: Path | str, d: int = 3) -> Poses:
     Poses(n=27, d=3)
     """
     rows, lines = read_table(path, 8)
-    check_quaternions(path, lines, rows[:, 4:])
-    return _in_dimension(rotations.rotations_from_quaternions(rows[:, 4:]), rows[:, 1:4], d, path, lines)
+    t = rows[:, 1:4]
+    quaternions = rows[:, 4:]
+    check_quaternions(path, lines, quaternions)
+    R = rotations.rotations_from_quaternions(quaternions)
+    return _in_dimension(R, t, d, path, lines)
 
 
 def read_times(path: Path | str) -> Array:
     """Seconds, (n,), of a TUM file or of one with a number a line, ascending.
 
-    A FileFormatError with file:line, for a row that is not 8 finite numbers, or 1, like the first, or does not ascend.
+    A FileFormatError with file:line, for a row that is not 8 finite numbers, or 1, like the first,
+    or does not ascend.
     """
-    words = (line.split() for line in read_text(path).split("\n"))
-    first = next((row for row in words if row and not row[0].startswith("#")), [])
-    rows, lines = read_table(path, 8 if len(first) == 8 else 1)
-    late = np.flatnonzero(np.diff(rows[:, 0]) <= 0)
+    all_rows = (line.split() for line in read_text(path).split("\n"))
+    rows_of_numbers = (words for words in all_rows if words and not words[0].startswith("#"))
+    is_tum = len(next(rows_of_numbers, [])) == 8
+    rows, lines = read_table(path, 8 if is_tum else 1)
+    times = rows[:, 0]
+    late = np.flatnonzero(np.diff(times) <= 0)
     if len(late):
-        before, after = rows[late[0] : late[0] + 2, 0].tolist()
-        raise FileFormatError(path, lines[late[0] + 1], f"time {after!r} is not after {before!r}; sort the lines")
-    return rows[:, 0]
+        before = int(late[0])
+        times_of_two = f"time {times[before + 1].item()!r} is not after {times[before].item()!r}"
+        raise FileFormatError(path, lines[before + 1], f"{times_of_two}; sort the lines")
+    return times
 
 
 def write_kitti(poses: Poses, path: Path | str) -> None:
-    """Write one line of 12 numbers for each pose: the 3 x 4 matrix (R_i, t_i) row by row; the floats come back exactly.
+    """Write one line of 12 numbers for each pose: the 3 x 4 matrix (R_i, t_i) row by row.
 
-    A PGOError when the file cannot be written; what stood there stays.
+    The numbers have all digits of the doubles. A file that exists is replaced when the new one is
+    complete. A PGOError when the file cannot be written.
     """
     R, t = _lifted(poses)
-    _write_rows(np.concatenate([R, t[:, :, None]], axis=2).reshape(-1, 12), path)
+    matrices = np.concatenate([R, t[:, :, None]], axis=2)
+    _write_rows(matrices.reshape(-1, 12), path)
 
 
 def read_kitti(path: Path | str, d: int = 3) -> Poses:
-    """Poses of a KITTI file; the rotations are projected, since its files have few digits.
+    r"""Return the poses of a KITTI odometry file, in the order of its lines.
 
-    A FileFormatError with file:line, for a row that is not 12 finite numbers, a matrix that is no rotation even to
-    three digits, a position beyond `FARTHEST`, or, with d = 2, a pose out of the plane.
+    A line has 12 numbers: the 3 x 4 matrix (R_i, t_i) of a pose, row by row. There are no time
+    stamps. The rotations are projected, since files of this format have few digits. Blank lines and
+    comments (#) are skipped.
+
+    Parameters
+    ----------
+    path : Path or str
+        File to read.
+    d : int
+        Dimension of the poses: 3, or 2 for poses that lie in the x-y plane. KITTI's own files have
+        z ahead of the camera and y down, so that their poses are not in the x-y plane.
+
+    Returns
+    -------
+    Poses
+        World from body, metres. The body of KITTI's own files is the left camera, and their world
+        is its first pose.
+
+    Raises
+    ------
+    FileFormatError
+        With file:line, for a row that is not 12 finite numbers, a matrix that is no rotation even
+        to three digits, a position beyond 1e15 m, or, with d = 2, a pose out of the plane.
+
+    References
+    ----------
+    Geiger, Lenz & Urtasun, Are we ready for autonomous driving? The KITTI vision benchmark suite,
+    CVPR 2012.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "00.txt"
+    >>> _ = path.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 1 2.5\n")
+    >>> read_kitti(path).t.tolist()
+    [[0.0, 0.0, 0.0], [0.0, 0.0, 2.5]]
     """
     rows, lines = read_table(path, 12)
     matrices = rows.reshape(-1, 3, 4)
-    error = rotations.orthogonality_error(matrices[:, :, :3])
+    R = matrices[:, :, :3]
+    t = matrices[:, :, 3]
+    error = rotations.orthogonality_error(R)
     worst = int(np.argmax(error))
     if not error[worst] < _MATRIX_TOLERANCE:
-        what = f"||R^T R - I|| or 1 - det R is {error[worst]:.3g}"
-        raise FileFormatError(path, lines[worst], f"the 3 x 3 part is no rotation: {what}; give (R, t) by rows")
-    return _in_dimension(project_to_rotations(matrices[:, :, :3]), matrices[:, :, 3], d, path, lines)
+        difference = f"||R^T R - I|| or 1 - det R is {error[worst]:.3g}"
+        problem = f"the 3 x 3 part is no rotation: {difference}; give (R, t) by rows"
+        raise FileFormatError(path, lines[worst], problem)
+    return _in_dimension(project_to_rotations(R), t, d, path, lines)
 
 
 def _lifted(poses: Poses) -> tuple[Array, Array]:
+    """Rotations (n, 3, 3) and positions (n, 3) of poses, those in the plane at z = 0."""
     if poses.d == 3:
         return poses.R, poses.t
     R = np.tile(np.eye(3), (poses.num_poses, 1, 1))
@@ -105,16 +201,25 @@ def _lifted(poses: Poses) -> tuple[Array, Array]:
 
 
 def _in_dimension(R: Array, t: Array, d: int, path: Path | str, lines: Sequence[int]) -> Poses:
+    """Poses in d dimensions of those that a file has in space; every pose is one of `lines`."""
     check_metres(path, lines, t)
     if d == 3:
         return Poses(R, t)
-    out = np.maximum(np.abs(t[:, 2]), np.abs(R[:, 2, :] - [0.0, 0.0, 1.0]).max(axis=1))
-    worst = int(np.argmax(out))
-    if out[worst] > _PLANE_TOLERANCE:
-        raise FileFormatError(path, lines[worst], f"pose is out of the x-y plane by {out[worst]:.3g}; read with d = 3")
+    out_of_plane = np.abs(t[:, 2])
+    tilt = np.abs(R[:, 2, :] - [0.0, 0.0, 1.0]).max(axis=1)
+    distance = np.maximum(out_of_plane, tilt)
+    worst = int(np.argmax(distance))
+    if distance[worst] > _PLANE_TOLERANCE:
+        problem = f"pose is out of the x-y plane by {distance[worst]:.3g}; read with d = 3"
+        raise FileFormatError(path, lines[worst], problem)
     return Poses(project_to_rotations(R[:, :2, :2]), t[:, :2])
 
 
 def _write_rows(rows: Array, path: Path | str) -> None:
-    with replace_when_done(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
-        file.writelines(" ".join(map(repr, row)) + "\n" for row in rows.tolist())
+    """Write a line for every row; `repr` of a double gives the digits that bring it back."""
+    with (
+        replace_when_done(path) as temporary,
+        temporary.open("w", encoding="ascii", newline="\n") as file,
+    ):
+        for row in rows.tolist():
+            file.write(" ".join(map(repr, row)) + "\n")

@@ -1,4 +1,7 @@
-"""Pictures of pose graphs with matplotlib (extra `plot`): by robot, doubtful edges marked, truth against estimate."""
+"""Figures of pose graphs with matplotlib (extra `plot`).
+
+Robots have colours, doubtful edges are marked, and estimates are compared with the truth.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ import numpy as np
 
 from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses, absolute_trajectory_error
-from pgo_models.geometry.rotations import Array, log_map
+from pgo_models.geometry.rotations import Array, BoolArray, log_map
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.residuals import check_poses, uncertain_edges
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, column_figure, count_along_x
@@ -21,94 +24,145 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
+# Kinds of edges, in the order in which they are drawn: a landmark that is seen, one robot's own
+# edges, those between robots, and the two kinds of marked edges.
 SIGHTING, OWN, BETWEEN, UNCERTAIN, MISFIT = range(5)
-_WIDTHS = np.array([0.15, 0.6, 0.5, 0.5, 1.8])
+_NOT_DRAWN = -1
+_WIDTHS = np.array([0.15, 0.6, 0.5, 0.5, 1.8])  # points, of every kind
 KIND_LABELS = {
     SIGHTING: "a landmark seen",
     BETWEEN: "between robots",
     UNCERTAIN: "uncertain: precision under a tenth of the median",
     MISFIT: "misfit: costs more than its information allows",
 }
-MOST_LINES = 40_000  # of a picture
+MOST_LINES = 40_000  # of a figure
+_MOST_ELLIPSES = 100
+_ELLIPSE_POINTS = 49  # the first is the last
 _ZOOM = 0.82  # leaves room for the labels of axes in space, which the layout does not see
 _MOST_NAMED_ROBOTS = len(COLOURS)
 
 
-def edge_kinds(graph: PoseGraph, poses: Poses, mark: bool = True, residuals: EdgeResiduals | None = None) -> IntArray:
-    """How every edge is drawn, (m,): OWN, BETWEEN (two robots), SIGHTING (a landmark's), marked UNCERTAIN or MISFIT.
+def edge_kinds(
+    graph: PoseGraph, poses: Poses, mark: bool = True, residuals: EdgeResiduals | None = None
+) -> IntArray:
+    """Kind of every edge, (m,): SIGHTING, OWN, BETWEEN, UNCERTAIN or MISFIT.
 
-    The last that fits; priors are -1. Misfits are of F unless `residuals` are given. A GraphError if sizes differ.
+    With `mark`, UNCERTAIN and MISFIT take precedence over the others. Misfits are of F unless
+    `residuals` are given. Priors, which are not drawn, are -1. A GraphError if sizes differ.
     """
     check_poses(graph, poses)
-    kind = np.where(graph.robots[graph.i] == graph.robots[graph.j], OWN, BETWEEN)
+    same_robot = graph.robots[graph.i] == graph.robots[graph.j]
+    kind = np.where(same_robot, OWN, BETWEEN)
     kind[np.isin(graph.j, graph.landmarks)] = SIGHTING
     if mark:
+        if residuals is None:
+            residuals = edge_residuals(graph, poses)
         kind[uncertain_edges(graph)] = UNCERTAIN
-        kind[(residuals or edge_residuals(graph, poses)).is_misfit] = MISFIT
-    kind[graph.is_prior] = -1
+        kind[residuals.is_misfit] = MISFIT
+    kind[graph.is_prior] = _NOT_DRAWN
     return kind
 
 
-def lines_to_draw(graph: PoseGraph, kind: IntArray, most: int = MOST_LINES) -> tuple[IntArray, IntArray]:
-    """Poses (l, 2) to join by lines, and the kinds of these, (l,), for edges of some kinds (m,): what stands out last.
+def lines_to_draw(
+    graph: PoseGraph, kind: IntArray, most: int = MOST_LINES
+) -> tuple[IntArray, IntArray]:
+    """Pairs of poses to join by lines, (l, 2), and the kinds of the lines, (l,).
 
-    They are all edges but priors while `most` are as many. Else, k = `thinning_step`, they are misfits, paths through
-    every k-th pose that consecutive edges join, and every k-th of the other edges.
+    `kind`, (m,), is that of every edge. The lines are all edges but priors while these are at most
+    `most`. Otherwise, with k = `thinning_step`, they are the paths of consecutive edges through
+    every k-th pose, every k-th of the other edges, and the misfits. Lines that should stand out are
+    the last.
     """
-    ends, step = np.stack([graph.i, graph.j], axis=1), thinning_step(graph.num_edges, most)
+    ends = np.stack([graph.i, graph.j], axis=1)
+    step = thinning_step(graph.num_edges, most)
     if step > 1:
-        pose, on_path = np.arange(graph.num_poses), (kind == OWN) & (graph.j == graph.i + 1)
-        goes_on = np.zeros(graph.num_poses + 1, dtype=bool)
-        goes_on[graph.j[on_path]] = True
-        first = np.maximum.accumulate(np.where(goes_on[:-1], 0, pose))
-        path = np.flatnonzero(((pose - first) % step == 0) | ~goes_on[1:])
-        paths = np.stack([path[:-1], path[1:]], axis=1)[first[path[1:]] == first[path[:-1]]]
+        is_on_path = (kind == OWN) & (graph.j == graph.i + 1)
+        paths = _thinned_paths(graph, is_on_path, step)
         misfits = np.flatnonzero(kind == MISFIT)
-        others = np.flatnonzero((kind >= 0) & (kind != MISFIT) & ~on_path)[::step]
-        kept = np.append(others, misfits[:: thinning_step(len(misfits), most)])
-        ends, kind = np.concatenate([paths, ends[kept]]), np.append(np.full(len(paths), OWN), kind[kept])
-    order = np.argsort(kind, kind="stable")[int(np.sum(kind < 0)) :]
+        others = np.flatnonzero((kind != _NOT_DRAWN) & (kind != MISFIT) & ~is_on_path)
+        misfit_step = thinning_step(len(misfits), most)
+        drawn = np.append(others[::step], misfits[::misfit_step])
+        ends = np.concatenate([paths, ends[drawn]])
+        kind = np.append(np.full(len(paths), OWN), kind[drawn])
+    order = np.argsort(kind, kind="stable")
+    order = order[int(np.sum(kind == _NOT_DRAWN)) :]
     return ends[order], kind[order]
 
 
+def _thinned_paths(graph: PoseGraph, is_on_path: BoolArray, step: int) -> IntArray:
+    """Lines, (l, 2), along paths of edges (k, k + 1), through every `step`-th pose of a path.
+
+    The last pose of a path is kept, too.
+    """
+    pose = np.arange(graph.num_poses)
+    has_edge_before = np.zeros(graph.num_poses + 1, dtype=bool)
+    has_edge_before[graph.j[is_on_path]] = True
+    is_first = ~has_edge_before[:-1]
+    is_last = ~has_edge_before[1:]
+    first_of_path = np.maximum.accumulate(np.where(is_first, pose, 0))
+    kept = np.flatnonzero(((pose - first_of_path) % step == 0) | is_last)
+    lines = np.stack([kept[:-1], kept[1:]], axis=1)
+    same_path = first_of_path[kept[1:]] == first_of_path[kept[:-1]]
+    return np.asarray(lines[same_path])
+
+
 def thinning_step(count: int, most: int) -> int:
-    """Every how many of `count` things are drawn, of which there may be `most`."""
+    """Step k for which every k-th of `count` things are at most `most`."""
     return max(1, -(-count // most))
 
 
 def confidence_ellipses(poses: Poses, covariances: Array) -> Array:
-    """Outlines, (k, 49, d) points, that hold the true x and y with 95 %, in space at the height of the pose.
+    """Outlines, (k, 49, d) points, of ellipses that hold the true x and y with 95 %.
 
-    Of covariances (n, p, p) of moves along the axes of the world first (`Marginals`), at most 100 poses, evenly chosen.
+    In space they are at the height of the pose. The covariances, (n, p, p), are those of
+    `Marginals`, with moves along the axes of the world first. At most 100 poses have an ellipse,
+    evenly chosen.
     """
-    chosen = np.linspace(0, poses.num_poses - 1, min(poses.num_poses, 100)).astype(int)
-    angle = np.linspace(0.0, 2.0 * np.pi, 49)
+    num_ellipses = min(poses.num_poses, _MOST_ELLIPSES)
+    chosen = np.linspace(0, poses.num_poses - 1, num_ellipses).astype(int)
+    angle = np.linspace(0.0, 2.0 * np.pi, _ELLIPSE_POINTS)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     variances, axes = np.linalg.eigh(covariances[chosen, :2, :2])
+    # The squared radius is exponential, with mean 2 in units of the variance.
     radii = np.sqrt(-2.0 * np.log(0.05) * np.maximum(variances, 0.0))
-    outlines = np.repeat(poses.t[chosen, None], len(angle), axis=1)
-    outlines[:, :, :2] += np.stack([np.cos(angle), np.sin(angle)], axis=1) @ np.swapaxes(axes * radii[:, None], 1, 2)
+    scaled_axes = axes * radii[:, None]
+    outlines = np.repeat(poses.t[chosen, None], _ELLIPSE_POINTS, axis=1)
+    outlines[:, :, :2] += circle @ np.swapaxes(scaled_axes, 1, 2)
     return outlines
 
 
 def draw_graph(
-    graph: PoseGraph, poses: Poses, axes: Axes, mark_edges: bool = True, residuals: EdgeResiduals | None = None
+    graph: PoseGraph,
+    poses: Poses,
+    axes: Axes,
+    mark_edges: bool = True,
+    residuals: EdgeResiduals | None = None,
 ) -> None:
-    """Draw positions and edges: each robot's own edges in its colour, those between robots in grey.
+    """Draw edges between positions: each robot's own in its colour, those between robots in grey.
 
-    The axes are of projection "3d" for graphs in space. With `mark_edges`, edges with a low precision are dotted, and
-    those that cost more than they may (`residuals`, those of F unless given) thick and vermilion.
+    The axes have projection "3d" for graphs in space. With `mark_edges`, edges with a low precision
+    are dotted, and those that cost more than they may (`residuals`, those of F unless given) are
+    thick and vermilion.
     """
     from matplotlib.colors import to_rgb
 
-    kind = edge_kinds(graph, poses, mark_edges, residuals)
-    ends, kind = lines_to_draw(graph, kind)
-    i, j = ends.T
+    ends, kind = lines_to_draw(graph, edge_kinds(graph, poses, mark_edges, residuals))
     palette = np.array([to_rgb(name) for name in (*COLOURS, QUIET_COLOUR, ALARM_COLOUR)])
-    colour = np.where(graph.robots[i] == graph.robots[j], graph.robots[i] % len(COLOURS), len(COLOURS))
-    colour[kind == SIGHTING], colour[kind == MISFIT] = len(COLOURS), len(COLOURS) + 1
-    widths, dashes = _WIDTHS[kind], [(0, (1, 1.5)) if one == UNCERTAIN else "solid" for one in kind]
-    drawn, many = _line_collection(graph.d), graph.num_edges > MOST_LINES
-    lines = drawn(list(poses.t[ends]), colors=palette[colour], linewidths=widths, linestyles=dashes, rasterized=many)
+    quiet = len(COLOURS)
+    alarm = quiet + 1
+    robot_i, robot_j = graph.robots[ends].T
+    colour = np.where(robot_i == robot_j, robot_i % len(COLOURS), quiet)
+    colour[kind == SIGHTING] = quiet
+    colour[kind == MISFIT] = alarm
+    dashes = [(0, (1, 1.5)) if is_dotted else "solid" for is_dotted in kind == UNCERTAIN]
+    collection = _line_collection(graph.d)
+    lines = collection(
+        list(poses.t[ends]),
+        colors=palette[colour],
+        linewidths=_WIDTHS[kind],
+        linestyles=dashes,
+        rasterized=graph.num_edges > MOST_LINES,
+    )
     axes.add_collection(lines)
     _frame(axes, poses.t[graph.in_files])
 
@@ -120,7 +174,35 @@ def plot_graph(
     covariances: Array | None = None,
     residuals: EdgeResiduals | None = None,
 ) -> Figure:
-    """Figure of a graph by robot, with a legend (`draw_graph`); of covariances (n, p, p), `confidence_ellipses`.
+    """Plot a graph with matplotlib, its robots in colours, with a legend.
+
+    Edges with a low precision are dotted, and misfits, which cost more than they may, are thick and
+    vermilion.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        Graph to draw.
+    poses : Poses
+        Positions of its poses, metres.
+    title : str
+        Title of the figure; the name of the graph unless given.
+    covariances : Array, (n, p, p), optional
+        Covariances of the poses (`Marginals`), drawn as ellipses that hold x and y with 95 %.
+    residuals : EdgeResiduals, optional
+        Residuals that decide which edges are misfits; those of F unless given.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure, which a notebook shows by itself.
+
+    Raises
+    ------
+    GraphError
+        When there is not one pose for every pose of the graph.
+    MissingExtraError
+        Without the extra `plot`.
 
     Examples
     --------
@@ -130,22 +212,53 @@ def plot_graph(
     '27 poses'
     """
     with column_figure(height=1.15) as figure:
-        axes = figure.add_subplot(projection="3d" if graph.d == 3 else None)
+        axes = _add_axes(figure, graph)
         draw_graph(graph, poses, axes, residuals=residuals)
         axes.set_title(title or graph.name)
         handles: list[Artist] = list(_legend(graph, edge_kinds(graph, poses, residuals=residuals)))
         if covariances is not None:
-            named, style = graph.in_files, {"colors": QUIET_COLOUR, "linewidths": 0.3}
-            outlines = list(confidence_ellipses(poses[named], covariances[named]))
-            ellipses = _line_collection(graph.d)(outlines, **style, zorder=1, label="95 % of x, y")
+            shown = graph.in_files
+            outlines = confidence_ellipses(poses[shown], covariances[shown])
+            collection = _line_collection(graph.d)
+            ellipses = collection(
+                list(outlines),
+                colors=QUIET_COLOUR,
+                linewidths=0.3,
+                zorder=1,
+                label="95 % of x, y",
+            )
             handles.append(axes.add_collection(ellipses))
         if handles:
-            figure.legend(handles=handles, loc="outside lower center", ncols=3 if graph.num_robots > 1 else 1)
+            num_columns = 3 if graph.num_robots > 1 else 1
+            figure.legend(handles=handles, loc="outside lower center", ncols=num_columns)
     return figure
 
 
-def compare_poses(graph: PoseGraph, panels: list[tuple[str, Poses]], residuals: EdgeResiduals | None = None) -> Figure:
-    """Figure with one panel for every (title, poses), side by side; edges are marked by `residuals` of the last.
+def compare_poses(
+    graph: PoseGraph, panels: list[tuple[str, Poses]], residuals: EdgeResiduals | None = None
+) -> Figure:
+    """Plot several sets of poses of one graph side by side with matplotlib.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        Graph to draw.
+    panels : list of (str, Poses)
+        Title and poses of every panel.
+    residuals : EdgeResiduals, optional
+        Residuals at the poses of the last panel, in which edges are marked by them.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure, which a notebook shows by itself.
+
+    Raises
+    ------
+    GraphError
+        When there is not one pose for every pose of the graph.
+    MissingExtraError
+        Without the extra `plot`.
 
     Examples
     --------
@@ -158,67 +271,103 @@ def compare_poses(graph: PoseGraph, panels: list[tuple[str, Poses]], residuals: 
     return plot_panels([[(title, graph, poses) for title, poses in panels]], residuals)
 
 
-def plot_panels(panels: list[list[tuple[str, PoseGraph, Poses]]], residuals: EdgeResiduals | None = None) -> Figure:
-    """Figure with a row of pictures for every list of (title, graph, poses); `residuals` are of the last picture."""
-    columns, marked = max(len(row) for row in panels), None
-    with column_figure(height=1.0 * len(panels), width=columns) as figure:
+def plot_panels(
+    panels: list[list[tuple[str, PoseGraph, Poses]]], residuals: EdgeResiduals | None = None
+) -> Figure:
+    """Figure with a row of panels for every list of (title, graph, poses).
+
+    `residuals` are those of the last panel, whose edges are marked by them.
+    """
+    num_columns = max(len(row) for row in panels)
+    with column_figure(height=1.0 * len(panels), width=num_columns) as figure:
         for r, row in enumerate(panels):
-            for place, (title, graph, poses) in enumerate(row, r * columns + 1):
-                axes = figure.add_subplot(len(panels), columns, place, projection="3d" if graph.d == 3 else None)
-                marked = residuals if (r, place) == (len(panels) - 1, r * columns + len(row)) else None
-                draw_graph(graph, poses, axes, marked is not None, marked)
+            is_last_row = r == len(panels) - 1
+            for column, (title, graph, poses) in enumerate(row):
+                is_last = is_last_row and column == len(row) - 1
+                is_marked = is_last and residuals is not None
+                place = (len(panels), num_columns, r * num_columns + column + 1)
+                axes = _add_axes(figure, graph, *place)
+                draw_graph(graph, poses, axes, is_marked, residuals if is_marked else None)
                 axes.set_title(title)
-        if marked is not None and (handles := _legend(graph, edge_kinds(graph, poses, residuals=marked))):
-            figure.legend(handles=handles, loc="outside lower center", ncols=3)
+        if residuals is not None:
+            _, graph, poses = panels[-1][-1]
+            handles = _legend(graph, edge_kinds(graph, poses, residuals=residuals))
+            if handles:
+                figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
 
 
 def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = None) -> Figure:
-    """Figure of an estimate on top of the truth, and of its errors pose by pose, in metres and degrees.
+    """Figure of an estimate on top of the truth, and of its errors pose by pose.
 
-    The estimate is aligned to the truth, the graph's own unless given. A GraphError if there is none, or sizes differ.
+    The errors are in metres and degrees. The estimate is aligned to the truth, which is the graph's
+    own unless given. A GraphError if there is none, or sizes differ.
     """
-    truth = graph.truth if truth is None else truth
+    if truth is None:
+        truth = graph.truth
     if truth is None:
         raise GraphError(f"{graph!r} came without a ground truth; give one as truth=")
-    for given in (poses, truth):
-        check_poses(graph, given)
-    poses, truth = poses[graph.bodies], truth[graph.bodies]
+    check_poses(graph, poses)
+    check_poses(graph, truth)
+    poses = poses[graph.bodies]
+    truth = truth[graph.bodies]
     aligned = poses.aligned_to(truth)
     metres = np.linalg.norm(aligned.t - truth.t, axis=1)
-    degrees = np.rad2deg(np.linalg.norm(log_map(np.swapaxes(truth.R, 1, 2) @ aligned.R), axis=1))
+    R_error = np.swapaxes(truth.R, 1, 2) @ aligned.R
+    degrees = np.rad2deg(np.linalg.norm(log_map(R_error), axis=1))
+    ate = absolute_trajectory_error(poses, truth)
+    rotation_rms = np.sqrt(np.mean(degrees**2))
     with column_figure(height=1.6) as figure:
         from matplotlib.gridspec import GridSpec
 
-        grid = GridSpec(3, 1, figure=figure, height_ratios=[3.2, 1, 1])
-        axes = figure.add_subplot(grid[0], projection="3d" if graph.d == 3 else None)
-        axes.plot(*truth.t.T, color="black", linewidth=0.8, label="truth")
-        axes.plot(*aligned.t.T, color=COLOURS[0], linewidth=0.8, label="estimate, aligned")
-        errors = list(np.stack([aligned.t, truth.t], axis=1))
-        axes.add_collection(_line_collection(graph.d)(errors, colors=ALARM_COLOUR, linewidths=0.5, label="error"))
-        _frame(axes, np.concatenate([aligned.t, truth.t]))
-        ate = absolute_trajectory_error(poses, truth)
-        axes.set_title(f"{graph.name}: ATE {ate:.3g} m, rotation {np.sqrt(np.mean(degrees**2)):.3g} deg (rms)")
-        above = figure.add_subplot(grid[1])
-        below = figure.add_subplot(grid[2], sharex=above)
-        for panel, error, label in ((above, metres, "position (m)"), (below, degrees, "rotation (deg)")):
-            panel.plot(error, color=ALARM_COLOUR, linewidth=0.7)
-            panel.set_ylabel(label)
-            panel.set_ylim(bottom=0.0)
-            panel.label_outer()
-        below.set_xlabel("pose")
-        count_along_x(below)
+        layout = GridSpec(3, 1, figure=figure, height_ratios=[3.2, 1, 1])
+        axes = _add_axes(figure, graph, layout[0])
+        _draw_errors(axes, aligned, truth)
+        axes.set_title(f"{graph.name}: ATE {ate:.3g} m, rotation {rotation_rms:.3g} deg (rms)")
+        upper = figure.add_subplot(layout[1])
+        lower = figure.add_subplot(layout[2], sharex=upper)
+        _draw_error_curve(upper, metres, "position (m)")
+        _draw_error_curve(lower, degrees, "rotation (deg)")
+        lower.set_xlabel("pose")
+        count_along_x(lower)
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
 
+def _draw_errors(axes: Axes, estimate: Poses, truth: Poses) -> None:
+    """Draw two trajectories, and a line between the two positions of every pose."""
+    axes.plot(*truth.t.T, color="black", linewidth=0.8, label="truth")
+    axes.plot(*estimate.t.T, color=COLOURS[0], linewidth=0.8, label="estimate, aligned")
+    collection = _line_collection(truth.d)
+    errors = np.stack([estimate.t, truth.t], axis=1)
+    lines = collection(list(errors), colors=ALARM_COLOUR, linewidths=0.5, label="error")
+    axes.add_collection(lines)
+    _frame(axes, np.concatenate([estimate.t, truth.t]))
+
+
+def _draw_error_curve(axes: Axes, errors: Array, label: str) -> None:
+    """Draw an error, (n,), over the poses."""
+    axes.plot(errors, color=ALARM_COLOUR, linewidth=0.7)
+    axes.set_ylabel(label)
+    axes.set_ylim(bottom=0.0)
+    axes.label_outer()
+
+
+def _add_axes(figure: Figure, graph: PoseGraph, *place: object) -> Axes:
+    """Axes in the plane or in space, at a place of the figure."""
+    projection = "3d" if graph.d == 3 else None
+    return figure.add_subplot(*place, projection=projection)
+
+
 def _frame(axes: Axes, points: Array) -> None:
-    """Equal scales, limits around points, (k, d), and labels with the unit."""
+    """Set equal scales, limits around points, (k, d), and labels with the unit."""
     from mpl_toolkits.mplot3d import Axes3D
 
-    lower, upper = points.min(axis=0), points.max(axis=0)
+    lower = points.min(axis=0)
+    upper = points.max(axis=0)
     margin = 1.0 if points.shape[1] == 3 else 1.04  # in space the axes have a margin of their own
-    middle, half = (lower + upper) / 2, max(margin * float((upper - lower).max()) / 2, 1e-9)
+    middle = (lower + upper) / 2
+    half = max(margin * float((upper - lower).max()) / 2, 1e-9)
     for letter, centre in zip("xyz", middle, strict=False):
         getattr(axes, f"set_{letter}lim")(centre - half, centre + half)
         getattr(axes, f"set_{letter}label")(f"{letter} (m)")
@@ -236,15 +385,24 @@ def _line_collection(d: int) -> type[LineCollection]:
 
 
 def _legend(graph: PoseGraph, kind: IntArray) -> list[Line2D]:
+    """Entries of the legend: robots, if their colours are all different, and kinds of edges."""
     from matplotlib.lines import Line2D
 
     handles = []
     if 1 < graph.num_robots <= _MOST_NAMED_ROBOTS:
-        handles = [Line2D([], [], color=COLOURS[a], label=f"robot {a}") for a in range(graph.num_robots)]
-    style = {one: (QUIET_COLOUR, "solid") for one in (SIGHTING, BETWEEN)}
-    style |= {UNCERTAIN: (COLOURS[0], "dotted"), MISFIT: (ALARM_COLOUR, "solid")}
-    for one, label in KIND_LABELS.items():
-        if (kind == one).any():
-            colour, line = style[one]
-            handles.append(Line2D([], [], color=colour, linestyle=line, linewidth=2 * _WIDTHS[one], label=label))
+        for robot in range(graph.num_robots):
+            handles.append(Line2D([], [], color=COLOURS[robot], label=f"robot {robot}"))
+    styles = {
+        SIGHTING: (QUIET_COLOUR, "solid"),
+        BETWEEN: (QUIET_COLOUR, "solid"),
+        UNCERTAIN: (COLOURS[0], "dotted"),
+        MISFIT: (ALARM_COLOUR, "solid"),
+    }
+    for this_kind, label in KIND_LABELS.items():
+        if (kind == this_kind).any():
+            colour, dash = styles[this_kind]
+            width = 2 * _WIDTHS[this_kind]
+            handles.append(
+                Line2D([], [], color=colour, linestyle=dash, linewidth=width, label=label)
+            )
     return handles

@@ -1,11 +1,11 @@
-"""Pictures to explore with plotly (extra `plot`): a graph to turn and hover over, and a film of iterates."""
+"""Figures to explore with plotly (extra `plot`): a graph to turn, and a film of iterates."""
 
 from __future__ import annotations
 
 import html
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,13 +27,35 @@ if TYPE_CHECKING:
 Trace = dict[str, object]  # a plotly trace is plain data
 
 _MOST_NAMED_ROBOTS = 12
-MOST_DOTS, _MOST_BEHIND = 20_000, 10_000  # poses that say their names, and lines of where they were before
+MOST_DOTS = 20_000  # poses that show their names
+_MOST_LINES_BEFORE = 10_000  # lines between the poses before
 _FILM_BYTES = 8_000_000
 _BYTES_PER_NUMBER = 7.5  # a float32 in base64, of which plotly writes every / as six characters
 _FRAME_MILLISECONDS = 150
-# Nothing on a page leaves it: plotly's button to share a chart uploads it.
-PAGE_CONFIG: dict[str, object] = {"displaylogo": False, "showSendToCloud": False, "responsive": True}
-PAGE_CONFIG |= {"modeBarButtonsToRemove": ["sendChartToCloud"]}
+# A page sends nothing away: plotly's button to share a chart would upload it.
+PAGE_CONFIG: dict[str, object] = {
+    "displaylogo": False,
+    "showSendToCloud": False,
+    "responsive": True,
+    "modeBarButtonsToRemove": ["sendChartToCloud"],
+}
+
+
+class _Line(NamedTuple):
+    """How lines are drawn."""
+
+    colour: str
+    width: float
+    dash: str = "solid"
+
+
+# Edges that are not one robot's own, in the order in which they are drawn.
+_LINES_OF_KINDS = {
+    graph_plots.SIGHTING: _Line(QUIET_COLOUR, 0.3),
+    graph_plots.BETWEEN: _Line(QUIET_COLOUR, 1.0),
+    graph_plots.UNCERTAIN: _Line(QUIET_COLOUR, 1.5, "dot"),
+    graph_plots.MISFIT: _Line(ALARM_COLOUR, 5.0),
+}
 
 
 def explore_graph(
@@ -44,11 +66,39 @@ def explore_graph(
     residuals: EdgeResiduals | None = None,
     before: Poses | None = None,
 ) -> Figure:
-    """Plotly figure of a graph by robot; poses and misfitting edges say who they are under the pointer.
+    """Plot a graph with plotly, its robots in colours, to turn and to explore with the pointer.
 
-    Of a large graph, what `lines_to_draw` leaves, and some of the poses; one of a single robot is parted by time.
-    Positions are drawn to seven digits (float32); covariances, (n, p, p), as `confidence_ellipses`; poses `before` in
-    grey, moved to fit. `residuals` are those of F unless given: give those of the problem that was solved.
+    Poses and misfitting edges show their names under the pointer. Of a large graph, the lines that
+    `lines_to_draw` leaves and some of the poses are drawn; one of a single robot is parted by time.
+    Positions are drawn to seven digits (float32).
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        Graph to draw.
+    poses : Poses
+        Positions of its poses, metres.
+    title : str
+        Title of the figure.
+    covariances : Array, (n, p, p), optional
+        Covariances of the poses (`Marginals`), drawn as ellipses that hold x and y with 95 %.
+    residuals : EdgeResiduals, optional
+        Residuals that decide which edges are misfits; those of F unless given. Give those of the
+        problem that was solved.
+    before : Poses, optional
+        Other poses, such as the start of a solve, drawn in grey and aligned to `poses`.
+
+    Returns
+    -------
+    plotly.graph_objects.Figure
+        Figure, which a notebook shows by itself.
+
+    Raises
+    ------
+    GraphError
+        When there is not one pose for every pose of the graph.
+    MissingExtraError
+        Without the extra `plot`.
 
     Examples
     --------
@@ -58,180 +108,324 @@ def explore_graph(
     ['edges and poses', 'edges and poses', 'misfit']
     """
     go = plotly("graph_objects")
-    residuals = residuals or edge_residuals(graph, poses)
+    if residuals is None:
+        residuals = edge_residuals(graph, poses)
     kind = graph_plots.edge_kinds(graph, poses, residuals=residuals)
-    names, several, named = np.array(pose_names(graph)), graph.num_robots > 1, graph.in_files
-    ends, kinds = graph_plots.lines_to_draw(graph, kind)
-    traces = []
+    traces: list[Trace] = []
     if before is not None:
-        behind, _ = graph_plots.lines_to_draw(graph, np.where(kind < 0, kind, graph_plots.OWN), _MOST_BEHIND)
-        traces.append(_lines(before.aligned_to(poses).t, behind, "before", QUIET_COLOUR, 0.7, "solid", True))
-    part, labels = _parts(graph, names)
-    dots = named[:: graph_plots.thinning_step(len(named), MOST_DOTS)]
-    for a, name in enumerate(labels):
-        mine, colour = dots[part[dots] == a], COLOURS[a % len(COLOURS)]
-        own = (kinds == graph_plots.OWN) & (part[ends[:, 0]] == a)
-        own_lines = _lines(poses.t, ends[own], name, colour, 1.0, "solid", False)
-        text = [f"pose {names[k]}, robot {graph.robots[k]}" if several else f"pose {names[k]}" for k in mine]
-        # One entry of the legend shows and hides both; a robot may have no edge of its own, but has poses.
-        for trace, shown in ((own_lines, False), (_dots(poses.t[mine], text, name, colour, 4.0), True)):
-            traces.append({**trace, "legendgroup": name, "showlegend": shown})
-    for one, colour, width, dash in (
-        (graph_plots.SIGHTING, QUIET_COLOUR, 0.3, "solid"),
-        (graph_plots.BETWEEN, QUIET_COLOUR, 1.0, "solid"),
-        (graph_plots.UNCERTAIN, QUIET_COLOUR, 1.5, "dot"),
-        (graph_plots.MISFIT, ALARM_COLOUR, 5.0, "solid"),
-    ):
-        if (kinds == one).any():
-            traces.append(_lines(poses.t, ends[kinds == one], graph_plots.KIND_LABELS[one], colour, width, dash, True))
-    misfits = np.flatnonzero(kind == graph_plots.MISFIT)
-    misfits = misfits[:: graph_plots.thinning_step(len(misfits), MOST_DOTS)]
-    middles = 0.5 * (poses.t[graph.i[misfits]] + poses.t[graph.j[misfits]])
-    traces.append(_dots(middles, _misfit_text(graph, misfits, residuals), "misfit", ALARM_COLOUR, 6.0))
+        traces.append(_lines_before(graph, before.aligned_to(poses), kind))
+    ends, line_kind = graph_plots.lines_to_draw(graph, kind)
+    own_ends = ends[line_kind == graph_plots.OWN]
+    traces += _traces_of_parts(graph, poses, own_ends)
+    for this_kind, line in _LINES_OF_KINDS.items():
+        ends_of_kind = ends[line_kind == this_kind]
+        if len(ends_of_kind):
+            label = graph_plots.KIND_LABELS[this_kind]
+            traces.append(_lines(poses.t, ends_of_kind, label, line))
+    traces.append(_misfit_dots(graph, poses, kind, residuals))
+    shown = graph.in_files
     if covariances is not None:
-        ellipses = graph_plots.confidence_ellipses(poses[named], covariances[named])
-        outlines = np.pad(ellipses, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
-        gaps, line = outlines.reshape(-1, graph.d), {"color": QUIET_COLOUR, "width": 1.0}
-        traces.append({**_points(gaps), "mode": "lines", "line": line, "name": "95 % of x, y", "hoverinfo": "skip"})
+        traces.append(_ellipses(poses[shown], covariances[shown]))
     figure = go.Figure(traces)
-    _arrange(figure, poses.t[named], title)
+    _arrange(figure, poses.t[shown], title)
     return figure
 
 
-def animate_poses(graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[str] | None = None) -> Figure:
-    """Plotly film of iterates with a slider and a play button, to step through.
+def _lines_before(graph: PoseGraph, before: Poses, kind: IntArray) -> Trace:
+    """Grey lines between other poses of the graph."""
+    as_own = np.where(graph.is_prior, kind, graph_plots.OWN)
+    ends, _ = graph_plots.lines_to_draw(graph, as_own, _MOST_LINES_BEFORE)
+    return _lines(before.t, ends, "before", _Line(QUIET_COLOUR, 0.7))
 
-    Edges are drawn straight between the positions of every iterate; the colours are the robots'. A film of a large
-    graph is thinned evenly to about 8 MB, first and last iterate kept.
 
-    Iterates, for example `[soc.poses(problem, state) for state in itertools.islice(iterate(soc, problem), 30)]`, are
-    aligned with the last one, so that only what changes moves. The slider shows `labels`; `k = 0`, `k = 1`, .. unless
-    given. A GraphError when there are no iterates, their labels are not as many, or they are not poses of the graph.
+def _traces_of_parts(graph: PoseGraph, poses: Poses, ends: IntArray) -> list[Trace]:
+    """Lines between poses of one robot, (l, 2), and dots at poses, part by part (`_parts`)."""
+    names = np.array(pose_names(graph))
+    part, labels = _parts(graph, names)
+    poses_in_files = graph.in_files
+    dots = poses_in_files[:: graph_plots.thinning_step(len(poses_in_files), MOST_DOTS)]
+    traces = []
+    for a, label in enumerate(labels):
+        colour = COLOURS[a % len(COLOURS)]
+        own_dots = dots[part[dots] == a]
+        texts = [f"pose {names[pose]}" for pose in own_dots]
+        if graph.num_robots > 1:
+            texts = [f"pose {names[pose]}, robot {graph.robots[pose]}" for pose in own_dots]
+        own_ends = ends[part[ends[:, 0]] == a]
+        lines = _lines(poses.t, own_ends, label, _Line(colour, 1.0))
+        points = _dots(poses.t[own_dots], texts, label, colour, 4.0)
+        # One entry of the legend shows and hides both. It is that of the dots: a robot has poses,
+        # but perhaps no edge of its own.
+        traces.append({**lines, "legendgroup": label, "showlegend": False})
+        traces.append({**points, "legendgroup": label, "showlegend": True})
+    return traces
+
+
+def _misfit_dots(graph: PoseGraph, poses: Poses, kind: IntArray, residuals: EdgeResiduals) -> Trace:
+    """Dots in the middle of misfits, which show what is known of them."""
+    misfits = np.flatnonzero(kind == graph_plots.MISFIT)
+    misfits = misfits[:: graph_plots.thinning_step(len(misfits), MOST_DOTS)]
+    middles = 0.5 * (poses.t[graph.i[misfits]] + poses.t[graph.j[misfits]])
+    texts = _misfit_texts(graph, misfits, residuals)
+    return _dots(middles, texts, "misfit", ALARM_COLOUR, 6.0)
+
+
+def _ellipses(poses: Poses, covariances: Array) -> Trace:
+    """Outlines of ellipses as one trace, with gaps between them."""
+    ellipses = graph_plots.confidence_ellipses(poses, covariances)
+    with_gaps = np.pad(ellipses, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+    return {
+        **_points(with_gaps.reshape(-1, poses.d)),
+        "mode": "lines",
+        "line": {"color": QUIET_COLOUR, "width": 1.0},
+        "name": "95 % of x, y",
+        "hoverinfo": "skip",
+    }
+
+
+def animate_poses(
+    graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[str] | None = None
+) -> Figure:
+    """Film of iterates with a slider and a play button, by plotly.
+
+    Edges are drawn straight between the positions of every iterate; the colours are the robots'. A
+    film of a large graph is subsampled evenly to about 8 MB, with the first and the last iterate.
+
+    Iterates, for example `[soc.poses(problem, state) for state in itertools.islice(iterate(soc,
+    problem), 30)]`, are aligned with the last one, so that only what changes moves. The slider
+    shows `labels`; `k = 0`, `k = 1`, .. unless given. A GraphError when there are no iterates,
+    their labels are not as many, or they are not poses of the graph.
     """
     go = plotly("graph_objects")
     if not iterates:
         raise GraphError("there are no iterates; give at least one set of poses")
-    names = [f"k = {k}" for k in range(len(iterates))] if labels is None else list(labels)
-    if len(names) != len(iterates):
-        raise GraphError(f"{len(names)} labels for {len(iterates)} iterates; give one each")
+    if labels is None:
+        labels = [f"k = {k}" for k in range(len(iterates))]
+    if len(labels) != len(iterates):
+        raise GraphError(f"{len(labels)} labels for {len(iterates)} iterates; give one each")
     for poses in iterates:
         check_poses(graph, poses)
-    most = max(2, int(_FILM_BYTES / (3 * graph.d * graph.num_edges * _BYTES_PER_NUMBER)))
-    shown = np.unique(np.linspace(0, len(iterates) - 1, min(len(iterates), most)).round().astype(int)).tolist()
+    shown = _frames_to_keep(graph, len(iterates))
+    names = [labels[k] for k in shown]
     positions = [iterates[k].aligned_to(iterates[-1]).t for k in shown]
-    names = [names[k] for k in shown]
-    owner = np.where(graph.robots[graph.i] == graph.robots[graph.j], graph.robots[graph.i], -1)
-    owner[graph.is_prior] = -2  # not drawn
-
-    def traces(t: Array) -> list[Trace]:
-        drawn = []
-        for a in [*range(graph.num_robots), -1]:
-            if (owner == a).any():
-                ends = np.stack([graph.i, graph.j], axis=1)[owner == a]
-                name = "between robots" if a < 0 else f"robot {a}"
-                colour = QUIET_COLOUR if a < 0 else COLOURS[a % len(COLOURS)]
-                in_legend = graph.num_robots > 1 and a < _MOST_NAMED_ROBOTS
-                drawn.append(_lines(t, ends, name, colour, 1.0, "solid", in_legend))
-        return drawn
-
-    frames = [go.Frame(data=traces(t), name=name) for t, name in zip(positions, names, strict=True)]
-    figure = go.Figure(data=traces(positions[0]), frames=frames)
+    frames = [
+        go.Frame(data=_frame_traces(graph, t), name=name)
+        for t, name in zip(positions, names, strict=True)
+    ]
+    figure = go.Figure(data=_frame_traces(graph, positions[0]), frames=frames)
     _arrange(figure, np.concatenate(positions), f"{graph.name}: {len(iterates)} iterates")
     _add_controls(figure, names)
     return figure
 
 
+def _frames_to_keep(graph: PoseGraph, num_iterates: int) -> list[int]:
+    """Iterates of a film that is not too large, evenly chosen."""
+    numbers_per_frame = 3 * graph.d * graph.num_edges  # start, end and gap of every line
+    most = max(2, int(_FILM_BYTES / (numbers_per_frame * _BYTES_PER_NUMBER)))
+    evenly = np.linspace(0, num_iterates - 1, min(num_iterates, most))
+    return [int(k) for k in np.unique(evenly.round().astype(int))]
+
+
+def _frame_traces(graph: PoseGraph, t: Array) -> list[Trace]:
+    """Lines of one iterate, robot by robot, then those between robots; priors are not drawn."""
+    ends = np.stack([graph.i, graph.j], axis=1)
+    robot_i = graph.robots[graph.i]
+    is_own = (robot_i == graph.robots[graph.j]) & ~graph.is_prior
+    traces = []
+    for robot in range(graph.num_robots):
+        own_ends = ends[is_own & (robot_i == robot)]
+        if len(own_ends):
+            line = _Line(COLOURS[robot % len(COLOURS)], 1.0)
+            in_legend = graph.num_robots > 1 and robot < _MOST_NAMED_ROBOTS
+            traces.append(_lines(t, own_ends, f"robot {robot}", line, in_legend))
+    ends_between = ends[~is_own & ~graph.is_prior]
+    if len(ends_between):
+        in_legend = graph.num_robots > 1
+        line = _Line(QUIET_COLOUR, 1.0)
+        traces.append(_lines(t, ends_between, "between robots", line, in_legend))
+    return traces
+
+
 def lay_out(figure: Figure, title: str, legend_y: float) -> None:
-    """White ground, narrow margins, the legend in a row at a height in figure heights, 0 at the foot of the axes."""
-    head = {"text": html.escape(title), "font": {"size": 14}}
-    margin = {"l": 80, "r": 10, "t": 40 if title else 10, "b": 50}
-    legend = {"itemsizing": "constant", "orientation": "h", "y": legend_y}
-    figure.update_layout(template="none", title=head, margin=margin, legend=legend, hovermode="closest")
+    """Set a white ground and narrow margins, and put the legend in a row at a height.
+
+    The height is in heights of the axes, 0 at their foot.
+    """
+    figure.update_layout(
+        template="none",
+        title={"text": html.escape(title), "font": {"size": 14}},
+        margin={"l": 80, "r": 10, "t": 40 if title else 10, "b": 50},
+        legend={"itemsizing": "constant", "orientation": "h", "y": legend_y},
+        hovermode="closest",
+    )
 
 
 def save_page(figure: Figure, path: Path | str) -> None:
-    """Write a plotly figure as an HTML page that opens offline, about 5 MB more; errors as `replace_when_done`."""
-    page = figure.to_html(include_plotlyjs=True, config=PAGE_CONFIG, auto_play=False, default_height="96vh")
+    """Write a plotly figure as an HTML page that opens offline.
+
+    The script of plotly adds about 5 MB to the page. Errors are those of `replace_when_done`.
+    """
+    page = figure.to_html(
+        include_plotlyjs=True, config=PAGE_CONFIG, auto_play=False, default_height="96vh"
+    )
     with replace_when_done(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
 
 def _parts(graph: PoseGraph, names: NDArray[np.str_]) -> tuple[IntArray, list[str]]:
-    """Part of every pose, (n,), that an entry of the legend shows and hides, and the entries: robots, or times."""
-    if graph.num_robots == 1 and graph.num_edges <= graph_plots.MOST_LINES:
+    """Part of every pose, (n,), that an entry of the legend shows and hides, and the entries.
+
+    Parts are robots, or groups of successive robots where these are many. A large graph of one
+    robot is parted by time.
+    """
+    if graph.num_robots > 1:
+        num_robots = int(graph.robots.max()) + 1
+        robot_names = np.arange(num_robots).astype(str)
+        return _grouped(graph.robots, _MOST_NAMED_ROBOTS, "robot", robot_names)
+    if graph.num_edges <= graph_plots.MOST_LINES:
         return graph.robots, ["edges and poses"]
-    owner, what = (graph.robots, "robot") if graph.num_robots > 1 else (np.arange(graph.num_poses), "pose")
-    count = int(owner.max()) + 1
-    parts = min(count, _MOST_NAMED_ROBOTS if what == "robot" else len(COLOURS))
-    part = owner * parts // count
-    of_part = [owner[part == a] for a in range(parts)]
-    spans = [(int(own.min()), int(own.max())) for own in of_part]
-    called = names if what == "pose" else np.arange(count).astype(str)
-    said = [f"{what} {called[a]}" if a == b else f"{what}s {called[a]} to {called[b]}" for a, b in spans]
-    return part, said
+    return _grouped(np.arange(graph.num_poses), len(COLOURS), "pose", names)
+
+
+def _grouped(
+    member: IntArray, most: int, what: str, names: NDArray[np.str_]
+) -> tuple[IntArray, list[str]]:
+    """Group of every entry, (n,), of which there are at most `most`, and the labels of the groups.
+
+    `member` is the robot or pose that an entry belongs to.
+    """
+    count = int(member.max()) + 1
+    num_groups = min(count, most)
+    group = member * num_groups // count
+    labels = []
+    for a in range(num_groups):
+        members = member[group == a]
+        first = int(members.min())
+        last = int(members.max())
+        label = f"{what} {names[first]}"
+        if first != last:
+            label = f"{what}s {names[first]} to {names[last]}"
+        labels.append(label)
+    return group, labels
 
 
 def _points(points: Array) -> Trace:
     """Trace at points, (k, d), which plotly packs as float32 in base64."""
-    x, y, *z = np.ascontiguousarray(points.T, dtype=np.float32)
-    return {"type": "scatter3d", "x": x, "y": y, "z": z[0]} if z else {"type": "scattergl", "x": x, "y": y}
+    coordinates = np.ascontiguousarray(points.T, dtype=np.float32)
+    if len(coordinates) == 2:
+        x, y = coordinates
+        return {"type": "scattergl", "x": x, "y": y}
+    x, y, z = coordinates
+    return {"type": "scatter3d", "x": x, "y": y, "z": z}
 
 
-def _lines(t: Array, ends: IntArray, name: str, colour: str, width: float, dash: str, in_legend: bool) -> Trace:
+def _lines(t: Array, ends: IntArray, name: str, line: _Line, in_legend: bool = True) -> Trace:
     """One trace for many lines between poses, (l, 2): start, end, and a gap."""
     d = t.shape[1]
     points = np.full((len(ends), 3, d), np.nan)
     points[:, :2] = t[ends]
-    line = {"color": colour, "width": width if d == 2 else 2.0 * width, "dash": dash}
-    shown = {"name": name, "hoverinfo": "skip", "showlegend": in_legend}
-    return {**_points(points.reshape(-1, d)), "mode": "lines", "line": line, **shown}
+    width = line.width if d == 2 else 2.0 * line.width
+    return {
+        **_points(points.reshape(-1, d)),
+        "mode": "lines",
+        "line": {"color": line.colour, "width": width, "dash": line.dash},
+        "name": name,
+        "hoverinfo": "skip",
+        "showlegend": in_legend,
+    }
 
 
-def _dots(points: Array, text: list[str], name: str, colour: str, size: float) -> Trace:
-    marker = {"color": colour, "size": size if points.shape[1] == 2 else 0.6 * size}
-    said = {"text": text, "hovertemplate": "%{text}<extra></extra>", "name": name, "showlegend": False}
-    return {**_points(points), "mode": "markers", "marker": marker, **said}
+def _dots(points: Array, texts: list[str], name: str, colour: str, size: float) -> Trace:
+    """Dots at points, (k, d), which show their texts under the pointer."""
+    in_plane = points.shape[1] == 2
+    return {
+        **_points(points),
+        "mode": "markers",
+        "marker": {"color": colour, "size": size if in_plane else 0.6 * size},
+        "text": texts,
+        "hovertemplate": "%{text}<extra></extra>",
+        "name": name,
+        "showlegend": False,
+    }
 
 
-def _misfit_text(graph: PoseGraph, edges: IntArray, residuals: EdgeResiduals) -> list[str]:
-    names, share = pose_names(graph), residuals.share
-    times = residuals.cost / np.where(residuals.allowed > 0.0, residuals.allowed, 1.0)
-    return [
-        f"edge {e}: {names[graph.i[e]]} to {names[graph.j[e]]}<br>{times[e]:.3g} times what it may cost, "
-        f"{100 * share[e]:.3g} % of all<br>"
-        f"{residuals.translation[e]:.3g} m"
-        + (f", {np.rad2deg(residuals.rotation[e]):.3g} deg" if graph.kappa[e] > 0 else "")
-        for e in edges
-    ]
+def _misfit_texts(graph: PoseGraph, edges: IntArray, residuals: EdgeResiduals) -> list[str]:
+    """Poses, cost and errors of some edges, (k,)."""
+    names = pose_names(graph)
+    allowed = np.where(residuals.allowed > 0.0, residuals.allowed, 1.0)
+    times_allowed = residuals.cost / allowed
+    texts = []
+    for e in edges:
+        text = (
+            f"edge {e}: {names[graph.i[e]]} to {names[graph.j[e]]}<br>"
+            f"{times_allowed[e]:.3g} times what it may cost, "
+            f"{100 * residuals.share[e]:.3g} % of all<br>{residuals.translation[e]:.3g} m"
+        )
+        if graph.kappa[e] > 0:
+            text += f", {np.rad2deg(residuals.rotation[e]):.3g} deg"
+        texts.append(text)
+    return texts
 
 
 def _arrange(figure: Figure, points: Array, title: str) -> None:
-    lay_out(figure, title, legend_y=-0.12 if points.shape[1] == 2 else 0.0)
-    lower, upper = points.min(axis=0), points.max(axis=0)
-    if points.shape[1] == 2:
-        margin = 0.04 * float((upper - lower).max())
-        (left, low), (right, high) = lower - margin, upper + margin
-        plain = {"zeroline": False, "gridcolor": "#eeeeee"}
-        figure.update_xaxes(title_text="x (m)", range=[left, right], **plain)
-        figure.update_yaxes(title_text="y (m)", range=[low, high], scaleanchor="x", **plain)
+    """Set title, legend, and axes with equal scales around points, (k, d)."""
+    d = points.shape[1]
+    lay_out(figure, title, legend_y=-0.12 if d == 2 else 0.0)
+    lower = points.min(axis=0)
+    upper = points.max(axis=0)
+    extent = float((upper - lower).max())
+    if d == 2:
+        margin = 0.04 * extent
+        ranges = np.stack([lower - margin, upper + margin], axis=1)
+        style = {"zeroline": False, "gridcolor": "#eeeeee"}
+        figure.update_xaxes(title_text="x (m)", range=list(ranges[0]), **style)
+        figure.update_yaxes(title_text="y (m)", range=list(ranges[1]), scaleanchor="x", **style)
         return
-    middle, half = (lower + upper) / 2, max(0.52 * float((upper - lower).max()), 1e-9)
+    middle = (lower + upper) / 2
+    half = max(0.52 * extent, 1e-9)
     for letter, centre in zip("xyz", middle.tolist(), strict=True):
         axis = {"title": {"text": f"{letter} (m)"}, "range": [centre - half, centre + half]}
         figure.update_scenes({f"{letter}axis": axis})
     figure.update_scenes(aspectmode="cube")
 
 
-def _add_controls(figure: Figure, names: list[str]) -> None:
-    def shown(milliseconds: int) -> dict[str, object]:
-        return {"frame": {"duration": milliseconds, "redraw": True}, "mode": "immediate", "transition": {"duration": 0}}
+def _frame_options(milliseconds: int) -> dict[str, object]:
+    """Options of plotly's `animate`: how long a frame is shown."""
+    return {
+        "frame": {"duration": milliseconds, "redraw": True},
+        "mode": "immediate",
+        "transition": {"duration": 0},
+    }
 
-    steps = [{"args": [[name], shown(0)], "label": name, "method": "animate"} for name in names]
-    presses = {"play": [None, {**shown(_FRAME_MILLISECONDS), "fromcurrent": True}], "pause": [[None], shown(0)]}
-    buttons = [{"label": label, "method": "animate", "args": args} for label, args in presses.items()]
+
+def _button(label: str, args: list[object]) -> dict[str, object]:
+    """Button that calls plotly's `animate`."""
+    return {"label": label, "method": "animate", "args": args}
+
+
+def _add_controls(figure: Figure, names: list[str]) -> None:
+    """Add a slider over the frames, and buttons to play and to pause."""
+    steps = [_button(name, [[name], _frame_options(0)]) for name in names]
+    play: list[object] = [None, {**_frame_options(_FRAME_MILLISECONDS), "fromcurrent": True}]
+    pause: list[object] = [[None], _frame_options(0)]
+    slider = {
+        "steps": steps,
+        "x": 0.16,
+        "len": 0.84,
+        "pad": {"t": 45},
+        "currentvalue": {"prefix": ""},
+    }
+    menu = {
+        "type": "buttons",
+        "direction": "left",
+        "buttons": [_button("play", play), _button("pause", pause)],
+        "x": 0.13,
+        "y": 0,
+        "pad": {"t": 60},
+    }
     figure.update_layout(
         margin={"b": 20},
         legend={"orientation": "v", "x": 0.0, "y": 1.0, "yanchor": "top"},
-        sliders=[{"steps": steps, "x": 0.16, "len": 0.84, "pad": {"t": 45}, "currentvalue": {"prefix": ""}}],
-        updatemenus=[{"type": "buttons", "direction": "left", "buttons": buttons, "x": 0.13, "y": 0, "pad": {"t": 60}}],
+        sliders=[slider],
+        updatemenus=[menu],
     )

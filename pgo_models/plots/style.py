@@ -1,4 +1,4 @@
-"""What all matplotlib figures share: a column's width, letters of 7 points and more, colours for every eye, saving."""
+"""What all matplotlib figures share: widths of columns, sizes of letters, colours, and saving."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLUMN_INCHES = 3.4  # a column of a two-column paper
-LETTER_POINTS, SMALL_POINTS = 8.0, 7.0
+LETTER_POINTS = 8.0
+SMALL_POINTS = 7.0
 DOTS_PER_INCH = 200
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
-# Okabe & Ito 2008: told apart by readers with any of the common colour blindnesses.
+# Okabe & Ito 2008: readers with any of the common colour blindnesses can distinguish them.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#000000")
-# Of methods, which may be more: Tol's muted ones besides.
+# Methods may be more than these colours: Tol's muted ones are added.
 METHOD_COLOURS = (*COLOURS, "#882255", "#999933", "#661100", "#44AA99")
 ALARM_COLOUR = "#D55E00"  # vermilion, kept for what is wrong
 QUIET_COLOUR = "#999999"
@@ -34,16 +35,25 @@ MARKERS = ("o", "s", "D", "^", "v", "P")
 
 @contextmanager
 def column_figure(height: float, width: float = 1.0) -> Iterator[Figure]:
-    """Context manager yielding a figure in the project's style, `width` columns wide, `height` of them high."""
+    """Yield a figure in the project's style, whose width and height are in columns of a paper."""
     matplotlib = extra_module("matplotlib", "plot")
-    letters = dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize"), LETTER_POINTS)
-    small = dict.fromkeys(("legend.fontsize", "xtick.labelsize", "ytick.labelsize"), SMALL_POINTS)
-    lines = {"lines.linewidth": 1.2, "lines.markersize": 3.5, "axes.grid": False}
-    with matplotlib.rc_context({**letters, **small, **lines}):
-        figure = _shown_figure()(figsize=(COLUMN_INCHES * width, COLUMN_INCHES * height), layout="constrained")
+    settings = {
+        "font.size": LETTER_POINTS,
+        "axes.titlesize": LETTER_POINTS,
+        "axes.labelsize": LETTER_POINTS,
+        "legend.fontsize": SMALL_POINTS,
+        "xtick.labelsize": SMALL_POINTS,
+        "ytick.labelsize": SMALL_POINTS,
+        "lines.linewidth": 1.2,
+        "lines.markersize": 3.5,
+        "axes.grid": False,
+    }
+    size = (COLUMN_INCHES * width, COLUMN_INCHES * height)
+    with matplotlib.rc_context(settings):
+        figure = _shown_figure()(figsize=size, layout="constrained")
         yield figure
         for axes in figure.axes:
-            # matplotlib would else choose the size of the tick labels when the figure is shown
+            # Otherwise matplotlib chooses the size of the tick labels when the figure is shown.
             axes.tick_params(which="both", labelsize=SMALL_POINTS)
 
 
@@ -53,7 +63,7 @@ def plotly(name: str) -> ModuleType:
 
 
 def count_along_x(axes: Axes) -> None:
-    """Ticks at whole numbers alone, for axes of things that are counted."""
+    """Put ticks of the x axis at whole numbers alone, for things that are counted."""
     from matplotlib.ticker import MaxNLocator
 
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -65,7 +75,10 @@ def is_picture(path: Path) -> bool:
 
 
 def check_installed(path: Path) -> None:
-    """Raise a MissingExtraError where what draws a file of this suffix, a picture or else a page, is not installed."""
+    """Raise a MissingExtraError unless the library that draws a file of this suffix is installed.
+
+    Matplotlib draws pictures, and plotly all other files, which are pages.
+    """
     module = "matplotlib" if is_picture(path) else "plotly"
     if importlib.util.find_spec(module) is None:
         raise MissingExtraError(module, "plot")

@@ -1,8 +1,9 @@
-"""The one seam to sparse Cholesky: analyse a pattern, factor, solve many right-hand sides, factor again.
+"""The one seam to sparse Cholesky: analyse a pattern once, factor and solve many times.
 
-SuperLU (scipy) is always there; CHOLMOD comes through CVXOPT with the extra `fast` and is found at run time, on the
-BLAS kernels of `pgo_models.problem.kernels`. Every factor knows how far it can be from exact
-(`pgo_models.problem.floating_point`), so that one that went through proves something in exact arithmetic.
+SuperLU (scipy) is always there; CHOLMOD comes through CVXOPT with the extra `fast` and is found at
+run time, on the BLAS kernels of `pgo_models.problem.kernels`. Every factor knows how far it can be
+from exact (`pgo_models.problem.floating_point`), so that one that went through proves something in
+exact arithmetic.
 """
 
 import enum
@@ -10,18 +11,37 @@ import importlib.util
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
-from scipy.sparse import csc_array, diags_array
+from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.cholmod import amd_order, import_cvxopt, lower_triangle, set_option, supernodal
-from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, FactorCounts, error_of_counts, gamma
+from pgo_models.problem.cholmod import (
+    amd_order,
+    import_cvxopt,
+    lower_triangle,
+    set_option,
+    supernodal,
+)
+from pgo_models.problem.floating_point import (
+    OUTWARD,
+    UNIT_ROUNDOFF,
+    FactorCounts,
+    check_pivots,
+    error_of_counts,
+    gamma,
+)
 
-_WHOLE, _PERMUTE, _FORWARD = 0, 7, 4  # CVXOPT's codes of A x = b, x = P b and L x = b
+# CVXOPT's codes of A x = b, x = P b and L x = b
+_WHOLE = 0
+_PERMUTE = 7
+_FORWARD = 4
+_DAMPING_SHARES = tuple(10.0**power for power in range(-15, -5))
 _Capsule = object  # a factorisation, which CVXOPT keeps to itself
 
 
@@ -47,28 +67,40 @@ class CholeskyFactor(ABC):
 
     @abstractmethod
     def half_solve(self, right_hand_side: Array) -> Array:
-        """R^-T P b by forward substitution, (N, k), for b of shape (N, k): more columns of R, P the order it is in."""
+        """R^-T P b, (N, k), by forward substitution, for b of shape (N, k).
+
+        These are more columns of R; P is the order it is in.
+        """
 
     @abstractmethod
     def backward_error(self, beside: Array | int = 0) -> Array:
-        """Shares epsilon, (N,), of the diagonal with A + diag(epsilon) diag(A) >= R^T R in exact arithmetic.
+        """Shares epsilon, (N,), of the diagonal that bound the rounding of the factorisation.
 
-        R is the computed factor, so that A + diag(epsilon) diag(A) is positive definite. The argument
-        (`pgo_models.problem.floating_point`) holds for diagonals between 1e-150 and 1e150, where nothing that counts
-        underflows. `beside`, an int or (N,), are non-zeros of further columns of R in its rows, as of `half_solve`:
-        with them A is the leading block of a larger matrix, their own columns' share of E is apart (`column_error`).
+        In exact arithmetic A + diag(epsilon) diag(A) >= R^T R.
+
+        R is the computed factor, so that A + diag(epsilon) diag(A) is positive definite. The
+        argument (`pgo_models.problem.floating_point`) holds for diagonals between 1e-150 and 1e150,
+        where nothing that counts underflows. `beside`, an int or (N,), are non-zeros of further
+        columns of R in its rows, as of `half_solve`: with them A is the leading block of a larger
+        matrix, their own columns' share of E is apart (`column_error`).
         """
 
     @abstractmethod
     def take_apart(self) -> tuple[csc_array, np.ndarray]:
-        """L and the order with A[order][:, order] = L L^T, rows sorted, all of its pattern stored; uses it up."""
+        """L and the order with A[order][:, order] = L L^T, rows sorted, all of its pattern stored.
+
+        It may give up the numbers that solves are made with: the next solve factors A again.
+        """
 
     def known_error(self) -> Array | None:
         """`backward_error` where it costs nothing but a look at the factor."""
         return self.backward_error()
 
     def last_error(self) -> Array:
-        """`backward_error` of a factor that is not used any more, which may make it cheaper."""
+        """`backward_error` of a factor that is hardly used any more, which may make it cheaper.
+
+        As `take_apart`, it may make the next solve factor again.
+        """
         return self.backward_error()
 
     @abstractmethod
@@ -79,37 +111,63 @@ class CholeskyFactor(ABC):
 class SymbolicCholesky(ABC):
     """A sparsity pattern, ordered and analysed once.
 
-    Matrices passed to `factorize` are symmetric, canonical CSC, and have the analysed pattern, explicit zeros included.
+    Matrices passed to `factorize` are symmetric, canonical CSC, and have the analysed pattern,
+    explicit zeros included.
     """
 
     def __init__(self, pattern: csc_array) -> None:
-        self._indptr, self._indices, self._shape = pattern.indptr, pattern.indices, pattern.shape
+        self._indptr = pattern.indptr
+        self._indices = pattern.indices
+        self._shape = pattern.shape
 
     @abstractmethod
-    def factorize(self, matrix: csc_array, overwrite: CholeskyFactor | None = None) -> CholeskyFactor:
-        """Factor a matrix of the analysed pattern; the memory of a factor to `overwrite`, from here, may be taken over.
+    def factorize(
+        self, matrix: csc_array, overwrite: CholeskyFactor | None = None
+    ) -> CholeskyFactor:
+        """Factor a matrix of the analysed pattern.
 
-        A NotPositiveDefiniteError when it is not positive definite in floating-point arithmetic, or has nan or inf.
+        The memory of a factor to `overwrite`, which has to be from here, may be taken over.
+
+        A NotPositiveDefiniteError when it is not positive definite in floating-point arithmetic, or
+        has nan or inf.
         """
 
     def expected_error(self, beside: int = 0) -> Array | None:
-        """What `CholeskyFactor.backward_error` will be about, where it is known before a factor is."""
+        """What `CholeskyFactor.backward_error` will be about; None before a factor was counted."""
         return None
 
     def crude_error(self) -> Array:
-        """Bound on `CholeskyFactor.backward_error` for any number of non-zeros; inf if there is none."""
+        """Bound on `CholeskyFactor.backward_error` for any number of non-zeros.
+
+        It is inf if there is none.
+        """
         return np.full(self._shape[0], np.inf)
 
     def error_before(self) -> Array:
-        """Bound on it for the most non-zeros that there can be, as given to `analyze`; inf if they were not."""
+        """Bound on `CholeskyFactor.backward_error` for the most non-zeros that there can be.
+
+        These were given to `analyze`; it is inf if they were not.
+        """
         return np.full(self._shape[0], np.inf)
 
     def _check(self, matrix: csc_array) -> None:
-        same = np.array_equal(matrix.indptr, self._indptr) and np.array_equal(matrix.indices, self._indices)
+        same = np.array_equal(matrix.indptr, self._indptr) and np.array_equal(
+            matrix.indices, self._indices
+        )
         if not same or matrix.shape != self._shape:
-            raise ValueError("the matrix has another sparsity pattern than the one that was analysed")
+            raise ValueError(
+                "the matrix has another sparsity pattern than the one that was analysed"
+            )
         if not np.isfinite(matrix.data).all():
-            raise NotPositiveDefiniteError("the matrix has nan or inf; check the weights and measurements")
+            raise NotPositiveDefiniteError(
+                "the matrix has nan or inf; check the weights and measurements"
+            )
+
+    def _pattern(self) -> csc_array:
+        """Matrix of zeros, all stored, from which a copy of the analysis is made."""
+        return csc_array(
+            (np.zeros(len(self._indices)), self._indices, self._indptr), shape=self._shape
+        )
 
 
 def analyze(
@@ -120,36 +178,74 @@ def analyze(
 ) -> SymbolicCholesky:
     """Analyse the pattern of a symmetric matrix, whose diagonal must be stored in full.
 
-    Rows are eliminated in the `order` given, (N,), as of `pgo_models.problem.ordering`, or in one of minimum degree.
-    `most_counts` finds cheaply how many non-zeros the factors have at most.
-    With `default_backend()` unless one is given; a MissingExtraError when CHOLMOD is, without the extra `fast`.
+    Rows are eliminated in the `order` given, (N,), as of `pgo_models.problem.ordering`, or in one
+    of minimum degree. `most_counts` finds cheaply how many non-zeros the factors have at most. With
+    `default_backend()` unless one is given; a MissingExtraError when CHOLMOD is, without the extra
+    `fast`.
     """
     pattern.sort_indices()
     chosen = backend or default_backend()
-    return _Cholmod(pattern, order, most_counts) if chosen is CholeskyBackend.CHOLMOD else _SuperLU(pattern, order)
+    return (
+        _Cholmod(pattern, order, most_counts)
+        if chosen is CholeskyBackend.CHOLMOD
+        else _SuperLU(pattern, order)
+    )
 
 
-def factorize(A: csc_array, backend: CholeskyBackend | None = None, order: IntArray | None = None) -> CholeskyFactor:
-    """Factor one symmetric positive definite matrix; see `analyze` and `SymbolicCholesky.factorize`."""
+def factorize(
+    A: csc_array, backend: CholeskyBackend | None = None, order: IntArray | None = None
+) -> CholeskyFactor:
+    """Factor one symmetric positive definite matrix, as `analyze` and `factorize` do."""
     return analyze(A, backend, order).factorize(A)
 
 
+def factorize_damped(analysis: SymbolicCholesky, matrix: csc_array) -> CholeskyFactor:
+    """Factor of a matrix that is positive definite but for rounding, damped where need be.
+
+    The Laplacian of weights that are many orders of magnitude apart has none in doubles. With the
+    least share of the diagonal added that gives one, it solves for start values and translations
+    near the best ones; proofs ask nothing of these. A NotPositiveDefiniteError where 1e-6 is not
+    enough.
+    """
+    with suppress(NotPositiveDefiniteError):
+        return analysis.factorize(matrix)
+    damped = matrix.copy()
+    diagonal = matrix.diagonal()
+    for share in _DAMPING_SHARES:
+        damped.setdiag((1.0 + share) * diagonal)
+        with suppress(NotPositiveDefiniteError):
+            return analysis.factorize(damped)
+    raise NotPositiveDefiniteError(
+        "no small share of the diagonal makes the matrix positive definite"
+    )
+
+
 def minimum_degree(pattern: csc_array) -> IntArray:
-    """Order of elimination, (N,), of a lower triangle: AMD with the extra `fast`, else the one SuperLU has."""
+    """Order of elimination, (N,), of a lower triangle.
+
+    It is AMD with the extra `fast`, else the one that SuperLU has.
+    """
     if importlib.util.find_spec("cvxopt") is None:
         return _SuperLU(csc_array(pattern + pattern.T)).order
     return amd_order(pattern)
 
 
 class _SuperLUFactor(CholeskyFactor):
-    def __init__(self, lu: SuperLU, analysis: "_SuperLU", diagonal: Array) -> None:
-        self._lu, self._analysis = lu, analysis
+    def __init__(self, lu: SuperLU, analysis: "_SuperLU", matrix: csc_array) -> None:
+        self._lu = lu
+        self._analysis = analysis
         self._rows = analysis.order[np.argsort(lu.perm_c)]  # in the order of elimination
-        self._diagonal = diagonal[self._rows]
+        self._diagonal = matrix.diagonal()[self._rows]
+        # from which a copy, or what comes out of a pickle, is factored again
+        self._matrix = matrix.copy()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _SuperLU.factorize, (self._analysis, self._matrix)
 
     def take_apart(self) -> tuple[csc_array, np.ndarray]:
         L = self._lu.L @ diags_array(np.sqrt(self._lu.U.diagonal()))
-        return (L + self._analysis.tiny_factor()).tocsr().tocsc(), self._rows  # to and fro, which sorts rows
+        # to and fro, which sorts rows
+        return (L + self._analysis.tiny_factor()).tocsr().tocsc(), self._rows
 
     def half_solve(self, right_hand_side: Array) -> Array:
         L = self._lu.L.tocsr()
@@ -161,14 +257,21 @@ class _SuperLUFactor(CholeskyFactor):
         return float((np.diff(self._lu.L.tocsc().indptr) + beside).max(initial=0))
 
     def backward_error(self, beside: Array | int = 0) -> Array:
-        """Bound as for Cholesky, with R = diag(u)^(1/2) L^T, u the pivots; U is only about diag(u) L^T.
+        """Bound as for Cholesky, with R = diag(u)^(1/2) L^T, u the pivots.
 
-        A = L U - E with |E| <= gamma |L| |U|, so that |R^T R - A| <= |L| (|diag(u) L^T - U| + gamma |U|). Both factors
-        are at hand, and v^T |L| |W| v <= (s^-1 |v^T |L| diag(u)^(1/2)|^2 + s |diag(u)^(-1/2) |W| v|^2) / 2 for any s.
+        U is only about diag(u) L^T.
+
+        A = L U - E with |E| <= gamma |L| |U|, so that |R^T R - A| <= |L| (|diag(u) L^T - U| + gamma
+        |U|). Both factors are at hand, and v^T |L| |W| v <= (s^-1 |v^T |L| diag(u)^(1/2)|^2 + s
+        |diag(u)^(-1/2) |W| v|^2) / 2 for any s.
         """
-        L, U = self._lu.L.tocsr(), self._lu.U.tocsc()
-        pivots, a = U.diagonal(), self._diagonal
-        # Of U, whose terms these are: scipy leaves out zeros, where a term is exact, of L and U each on its own.
+        # matrices of SciPy 1.14, whose sums are two-dimensional
+        L = csr_array(self._lu.L)
+        U = csc_array(self._lu.U)
+        pivots = U.diagonal()
+        a = self._diagonal
+        # Of U, whose terms these are: scipy leaves out zeros, where a term is exact, of L and U
+        # each on its own.
         count = gamma(np.diff(U.indptr) + 3.0)
         if not (float(count.max(initial=0.0)) < 0.5 and (a > 0).all()):
             return np.full(len(a), np.inf)
@@ -177,8 +280,10 @@ class _SuperLUFactor(CholeskyFactor):
         W = abs(product - U) + UNIT_ROUNDOFF * abs(product) + abs(U) @ diags_array(count)
         W.data **= 2
         L.data **= 2
-        most = np.maximum((L != 0).sum(axis=0), (W != 0).sum(axis=1))  # in the sums of Cauchy-Schwarz
-        of_L, of_W = (L @ (pivots * most)) / a, ((most / pivots) @ W) / a
+        # in the sums of Cauchy-Schwarz
+        most = np.maximum(L.astype(bool).sum(axis=0), W.astype(bool).sum(axis=1))
+        of_L = (L @ (pivots * most)) / a
+        of_W = ((most / pivots) @ W) / a
         balance = np.sqrt(of_L.mean() / max(of_W.mean(), np.finfo(float).tiny))
         error = np.empty(len(a))
         error[self._rows] = OUTWARD * 0.5 * (of_L / balance + balance * of_W)
@@ -201,20 +306,36 @@ class _SuperLU(SymbolicCholesky):
         if order is not None:
             self.order = order
             return
-        # A dominant diagonal on the same pattern is factored once, only for its fill-reducing order.
-        dominant = csc_array((np.zeros(pattern.nnz), pattern.indices, pattern.indptr), shape=pattern.shape)
+        # A dominant diagonal on the same pattern is factored once, only for its fill-reducing
+        # order.
+        dominant = csc_array(
+            (np.zeros(pattern.nnz), pattern.indices, pattern.indptr), shape=pattern.shape
+        )
         dominant.setdiag(1.0)
-        lu = splu(dominant, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        lu = splu(
+            dominant,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
         self.order = np.argsort(lu.perm_c)
 
     def tiny_factor(self) -> csc_array:
-        """1e-300 wherever a factor may have an entry: scipy leaves out zeros, of which that of a Laplacian has none."""
-        laplacian = csc_array((np.full(len(self._indices), -1.0), self._indices, self._indptr), shape=self._shape)
-        laplacian.setdiag((1.0 + 1e-6) * np.diff(self._indptr))  # with more, entries far down a chain would vanish
+        """Matrix with 1e-300 wherever a factor may have an entry.
+
+        scipy leaves out zeros, of which the factor of a Laplacian has none.
+        """
+        laplacian = csc_array(
+            (np.full(len(self._indices), -1.0), self._indices, self._indptr), shape=self._shape
+        )
+        # with more, entries far down a chain would vanish
+        laplacian.setdiag((1.0 + 1e-6) * np.diff(self._indptr))
         L = self._lu(laplacian).L
         return csc_array((np.full(L.nnz, 1e-300), L.indices, L.indptr), shape=L.shape)
 
-    def factorize(self, matrix: csc_array, overwrite: CholeskyFactor | None = None) -> CholeskyFactor:
+    def factorize(
+        self, matrix: csc_array, overwrite: CholeskyFactor | None = None
+    ) -> CholeskyFactor:
         self._check(matrix)
         try:
             lu = self._lu(matrix)
@@ -222,25 +343,66 @@ class _SuperLU(SymbolicCholesky):
             if "singular" not in str(error):
                 raise MemoryError(str(error)) from error  # its only other one
             raise NotPositiveDefiniteError("the matrix is singular") from error
-        if not (np.array_equal(lu.perm_r, lu.perm_c) and (lu.U.diagonal() > 0).all()):
+        if not np.array_equal(lu.perm_r, lu.perm_c):
             raise NotPositiveDefiniteError("the matrix has a pivot that is not positive")
-        return _SuperLUFactor(lu, self, matrix.diagonal())
+        check_pivots(lu.U.diagonal())
+        return _SuperLUFactor(lu, self, matrix)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _SuperLU, (self._pattern(), self.order)
 
     def _lu(self, matrix: csc_array) -> SuperLU:
         permuted = matrix[self.order][:, self.order].tocsc()
-        return splu(permuted, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        return splu(
+            permuted, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
 
 
 class _CholmodFactor(CholeskyFactor):
-    """CVXOPT factors in place, symbolic part included: that of a factor out of use is taken over by the next one."""
+    """A factor of CVXOPT, which factors in place, symbolic part included.
 
-    def __init__(self, numeric: _Capsule, analysis: "_Cholmod") -> None:
-        self._numeric: _Capsule | None = numeric  # None: used up
+    The symbolic part of a factor out of use is taken over by the next one.
+
+    Reading the entries of a factor, or counting them, uses up what CVXOPT solves with. The triangle
+    of the matrix stays, so that a later solve factors it again.
+    """
+
+    def __init__(self, numeric: _Capsule | None, analysis: "_Cholmod", lower: Array | None) -> None:
+        self._numeric = numeric  # None: given up
         self._analysis = analysis
+        # Triangle of the matrix: what a copy, what comes out of a pickle, or a factor that was
+        # given up is factored from. None: the caller had the factor overwritten.
+        self._lower = lower
 
-    def overwrite(self) -> _Capsule | None:
-        numeric, self._numeric = self._numeric, None
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self._lower is None:
+            return _CholmodFactor, (None, self._analysis, None)
+        return _Cholmod.factorize_triangle, (self._analysis, self._lower)
+
+    @property
+    def is_given_up(self) -> bool:
+        """Whether another factor may take over the symbolic part."""
+        return self._numeric is None
+
+    def overwrite(self) -> None:
+        """Leave the memory to a later factor, for good."""
+        self._numeric = None
+        self._lower = None
+
+    def _give_up(self) -> _Capsule:
+        """The numeric factor, for a use that it does not outlast."""
+        numeric = self._current()
+        self._numeric = None
         return numeric
+
+    def _current(self) -> _Capsule:
+        """The numeric factor, factored again if it was given up."""
+        if self._lower is None:
+            raise ValueError("this factor was overwritten by a later one")
+        if self._numeric is None:
+            self._numeric = self._analysis.fill(self._lower)
+            self._analysis.take(self._numeric, self)
+        return self._numeric
 
     def solve(self, right_hand_side: Array) -> Array:
         return self._solved(right_hand_side, _WHOLE)
@@ -250,15 +412,14 @@ class _CholmodFactor(CholeskyFactor):
 
     def _solved(self, right_hand_side: Array, *systems: int) -> Array:
         cvxopt, cholmod = import_cvxopt()
-        if self._numeric is None:
-            raise ValueError("this factor was overwritten by a later one")
+        numeric = self._current()
         solution = cvxopt.matrix(np.asfortranarray(right_hand_side, dtype=float))
         for system in systems:
-            cholmod.solve(self._numeric, solution, sys=system)
+            cholmod.solve(numeric, solution, sys=system)
         return np.array(solution).reshape(right_hand_side.shape)
 
     def take_apart(self) -> tuple[csc_array, np.ndarray]:
-        parts, order = self._analysis.take_apart(self.overwrite())
+        parts, order = self._analysis.take_apart(self._give_up())
         pointers, rows, values = (np.array(part).ravel() for part in parts)
         return csc_array((values, rows, pointers), shape=(len(order), len(order))), order
 
@@ -267,7 +428,7 @@ class _CholmodFactor(CholeskyFactor):
 
     def last_error(self) -> Array:
         if self._numeric is not None and self.known_error() is None:
-            self._analysis.count(self.overwrite())
+            self._analysis.count(self._give_up())
         return self.backward_error()
 
     def most_in_row(self, beside: Array | int = 0) -> float:
@@ -280,13 +441,19 @@ class _CholmodFactor(CholeskyFactor):
 class _Cholmod(SymbolicCholesky):
     """Supernodal L L^T of the lower triangle; AMD order unless another is given."""
 
-    def __init__(self, pattern: csc_array, order: IntArray | None, most: Callable[[], FactorCounts] | None) -> None:
+    def __init__(
+        self, pattern: csc_array, order: IntArray | None, most: Callable[[], FactorCounts] | None
+    ) -> None:
         super().__init__(pattern)
-        self._order, self._most_counts = order, most
+        self._order = order
+        self._most_counts = most
         self._error_before: Array | None = None
         self._matrix, self._lower, self._is_diagonal = lower_triangle(pattern)
-        # Symbolic parts with the factor that uses each. No finaliser gives them back: Ctrl-C in one would be lost.
-        self._taken: list[tuple[weakref.ref[_CholmodFactor] | None, _Capsule]] = [(None, self._analyze())]
+        # Symbolic parts with the factor that uses each. No finaliser gives them back: Ctrl-C in one
+        # would be lost.
+        self._taken: list[tuple[weakref.ref[_CholmodFactor] | None, _Capsule]] = [
+            (None, self._analyze())
+        ]
         self._counts: FactorCounts | None = None
 
     def expected_error(self, beside: int = 0) -> Array | None:
@@ -297,8 +464,10 @@ class _Cholmod(SymbolicCholesky):
 
     def error_before(self) -> Array:
         if self._error_before is None:
-            found = self._most_counts
-            self._error_before = super().error_before() if found is None else found().error(0)
+            if self._most_counts is None:
+                self._error_before = super().error_before()
+            else:
+                self._error_before = self._most_counts().error(0)
         return self._error_before
 
     def counts(self) -> FactorCounts:
@@ -309,13 +478,20 @@ class _Cholmod(SymbolicCholesky):
         """Find the counts of a numeric factor, which is used up for it."""
         try:
             (pointers, rows, _), order = self.take_apart(capsule)
-        except (ValueError, ArithmeticError):  # it is symbolic, or of a matrix that was not positive definite
-            (pointers, rows, _), order = self.take_apart(self._numeric(np.where(self._is_diagonal, 1.0, 0.0), capsule))
+        except (
+            ValueError,
+            ArithmeticError,
+        ):  # it is symbolic, or of a matrix that was not positive definite
+            self._fill(np.where(self._is_diagonal, 1.0, 0.0), capsule)
+            (pointers, rows, _), order = self.take_apart(capsule)
         self._counts = FactorCounts.of(np.array(pointers).ravel(), np.array(rows).ravel(), order)
         return self._counts
 
     def take_apart(self, capsule: _Capsule) -> tuple[tuple[object, object, object], np.ndarray]:
-        """Pointers, rows and values of L, and its order; CVXOPT uses the factor up: the next would be L D L^T in it."""
+        """Pointers, rows and values of L, and its order.
+
+        CVXOPT uses the factor up for it: the next one in it would be L D L^T.
+        """
         self._taken = [(user, other) for user, other in self._taken if other is not capsule]
         cvxopt, cholmod = import_cvxopt()
         order = cvxopt.matrix(np.arange(self._shape[0], dtype=float))
@@ -329,36 +505,70 @@ class _Cholmod(SymbolicCholesky):
             with set_option(cholmod, "nmethods", 1):  # else it compares the order with its own
                 return cholmod.symbolic(self._matrix, p=import_cvxopt()[0].matrix(self._order))
 
-    def factorize(self, matrix: csc_array, overwrite: CholeskyFactor | None = None) -> CholeskyFactor:
+    def factorize(
+        self, matrix: csc_array, overwrite: CholeskyFactor | None = None
+    ) -> CholeskyFactor:
         self._check(matrix)
         if isinstance(overwrite, _CholmodFactor):
             overwrite.overwrite()
+        return self.factorize_triangle(matrix.data[self._lower])
+
+    def factorize_triangle(self, lower: Array) -> CholeskyFactor:
+        """Factor the matrix that has these values in its lower triangle.
+
+        Nobody may change them from now on.
+        """
+        capsule = self.fill(lower)
+        factor = _CholmodFactor(capsule, self, lower)
+        self.take(capsule, factor)
+        return factor
+
+    def take(self, capsule: _Capsule, factor: _CholmodFactor) -> None:
+        """Note which factor uses a capsule; when it is gone, or gives it up, the next one may."""
+        self._taken.append((weakref.ref(factor), capsule))
+
+    def fill(self, lower: Array) -> _Capsule:
+        """A capsule with the factor of these values of the lower triangle.
+
+        A NotPositiveDefiniteError is raised when there is none.
+        """
         capsule = self._spare()
         try:
-            factor = _CholmodFactor(self._numeric(matrix.data[self._lower], capsule), self)
+            check_pivots(self._fill(lower, capsule))
         except ArithmeticError as error:
-            self._taken.append((None, capsule))  # a failed factorisation leaves the symbolic part intact
+            # a failed factorisation leaves the symbolic part intact
+            self._taken.append((None, capsule))
             raise NotPositiveDefiniteError("the matrix has a pivot that is not positive") from error
-        self._taken.append((weakref.ref(factor), capsule))
-        return factor
+        except NotPositiveDefiniteError:
+            self._taken.append((None, capsule))  # so does one with pivots that are not finite
+            raise
+        return capsule
 
     def _spare(self) -> _Capsule:
         """Take out a symbolic part that no factor uses, and let go of others like it."""
-        used, idle = [], []
+        used = []
+        idle = []
         for user, numeric in self._taken:
             factor = None if user is None else user()
-            if factor is None or factor._numeric is None:
+            if factor is None or factor.is_given_up:
                 idle.append(numeric)
             else:
                 used.append((user, numeric))
         self._taken = used
         return idle[-1] if idle else self._analyze()
 
-    def _numeric(self, lower: Array, capsule: _Capsule) -> _Capsule:
-        """Fill the capsule with the factor of the matrix that has these values in its lower triangle."""
+    def _fill(self, lower: Array, capsule: _Capsule) -> Array:
+        """Fill the capsule with the factor of these values of the lower triangle.
+
+        Its pivots are returned, (N,).
+        """
         cvxopt, cholmod = import_cvxopt()
         self._matrix.V = cvxopt.matrix(lower)
         with supernodal():
             cholmod.numeric(self._matrix, capsule)
-        cholmod.diag(capsule)  # raises ValueError for L D L^T, which indefinite matrices have, too
-        return capsule
+        # A ValueError here would mean L D L^T, which indefinite matrices have, too.
+        return np.array(cholmod.diag(capsule)).ravel()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        known = {"_counts": self._counts, "_error_before": self._error_before}
+        return _Cholmod, (self._pattern(), self._order, self._most_counts), known

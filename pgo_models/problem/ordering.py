@@ -1,8 +1,11 @@
-"""Orders of elimination that keep Cholesky factors sparse: found once for the poses, used by all matrices of a graph.
+"""Orders of elimination that keep Cholesky factors sparse.
 
-M, the Hessian and the matrices of translations couple two poses wherever an edge does, so that one order of the poses
-serves all of them: minimum degree (Amestoy, Davis & Duff 2004), or on large graphs nested dissection by METIS (Karypis
-& Kumar 1998), whose factors of a grid world of 12,500 poses in space have half the entries.
+One is found for the poses, and used by all matrices of a graph.
+
+M, the Hessian and the matrices of translations couple two poses wherever an edge does, so that one
+order of the poses serves all of them: minimum degree (Amestoy, Davis & Duff 2004), or on large
+graphs nested dissection by METIS (Karypis & Kumar 1998), whose factors of a grid world of 12,500
+poses in space have half the entries.
 """
 
 import importlib.util
@@ -14,8 +17,8 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import CholeskyBackend, factorize, minimum_degree
 from pgo_models.problem.floating_point import FactorCounts
 
-# Poses, by the dimension of space, from which METIS pays: it takes six to ten times as long as minimum degree, 0.25 s
-# for 50,000 poses in the plane, and what it saves grows faster in space.
+# Poses, by the dimension of space, from which METIS pays: it takes six to ten times as long as
+# minimum degree, 0.25 s for 50,000 poses in the plane, and what it saves grows faster in space.
 DISSECTED_FROM = {2: 75_000, 3: 10_000}
 
 
@@ -31,27 +34,40 @@ def pose_order(graph: PoseGraph) -> IntArray:
 
 
 def row_order(poses: IntArray, *widths: int) -> IntArray:
-    """Rows in an order of the poses, when the unknowns stand field by field, `widths[f]` numbers a pose."""
+    """Rows in an order of the poses, when the unknowns stand field by field.
+
+    A field has `widths[f]` numbers a pose.
+    """
     rank = np.argsort(poses)
     return np.argsort(np.concatenate([np.repeat(rank, width) for width in widths]), kind="stable")
 
 
 def most_counts(graph: PoseGraph, poses: IntArray, *widths: int) -> FactorCounts:
-    """Most non-zeros that factors in the order `row_order(poses, *widths)` can have: all of the blocks that fill in.
+    """Most non-zeros that factors in the order `row_order(poses, *widths)` can have.
+
+    They are all of the blocks that fill in.
 
     Zeros that CHOLMOD stores beside them, to have wider blocks, come out exact and add no rounding.
     """
-    pattern, width = _pattern(graph), sum(widths)
+    pattern = _pattern(graph)
+    width = sum(widths)
     pattern.data[:] = 0.0
     pattern.setdiag(1.0)
     L, order = factorize(pattern, CholeskyBackend.CHOLMOD, poses).take_apart()
-    found = FactorCounts.of(L.indptr, L.indices, order)
-    in_column, in_row, widest = (np.repeat(width * one, width) for one in (found.in_column, found.in_row, found.widest))
-    return FactorCounts(in_column, in_row, widest, row_order(order, *widths))
+    of_poses = FactorCounts.of(L.indptr, L.indices, order)
+    # A block that fills in has `width` rows and columns, all of which count as non-zeros.
+    return FactorCounts(
+        in_column=np.repeat(width * of_poses.in_column, width),
+        in_row=np.repeat(width * of_poses.in_row, width),
+        widest=np.repeat(width * of_poses.widest, width),
+        order=row_order(order, *widths),
+    )
 
 
 def _pattern(graph: PoseGraph) -> csc_array:
     """Lower triangle, positive where two poses share an edge, and on the diagonal."""
-    i, j, every = graph.i, graph.j, np.arange(graph.num_poses)
+    i = graph.i
+    j = graph.j
+    every = np.arange(graph.num_poses)
     places = np.append(np.maximum(i, j), every), np.append(np.minimum(i, j), every)
     return csc_array((np.ones(len(places[0])), places), shape=(len(every), len(every)))

@@ -1,39 +1,65 @@
-"""PGOProblem: the cost of a pose graph, its gradients, its matrices and exact translations (paper: `min overall`)."""
+"""PGOProblem: the cost of a pose graph with its gradients, matrices and exact translations.
 
-from dataclasses import dataclass, replace
+The cost is equation `min overall` of the paper, weighted, or chi2 of information matrices.
+"""
+
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any, cast
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array
 
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.arrays import read_only
+from pgo_models.geometry.arrays import ReadOnly, read_only
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes, vee
+from pgo_models.geometry.rotations import Array, stack_transposes, vee
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.precisions import proper_information
 from pgo_models.problem import matrices
-from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, analyze, factorize
-from pgo_models.problem.incidence import Incidence, blocks_of_rows, rows_of_blocks
+from pgo_models.problem.cholesky import (
+    CholeskyBackend,
+    CholeskyFactor,
+    SymbolicCholesky,
+    analyze,
+    factorize_damped,
+)
+from pgo_models.problem.edge_cost import EdgeCost
+from pgo_models.problem.incidence import Incidence
 from pgo_models.problem.ordering import most_counts, pose_order, row_order
-from pgo_models.problem.weighting import EdgeWeights, Weighting, convex_weights, edge_weights
+from pgo_models.problem.weighting import Weighting, convex_cost, information_cost
+
+MOST_REFINEMENTS = 60  # of translations: each but the last halves F at least
 
 
 @dataclass(frozen=True, eq=False)
-class PGOProblem:
-    """Minimise F(R, t) = sum_e kappa ||R_j - R_i R_ij||_F^2 + tau ||t_j - t_i - R_i t_ij||^2 over SE(d)^n.
+class PGOProblem(ReadOnly):
+    """Minimise a cost of the edges, F or chi2, over the poses of a graph, SE(d)^n.
 
-    With X, (N, d), N = (d+1) n, the rows t_i and then the rows of every R_i^T, F = tr(X^T M X).
+    F(R, t) = sum_e kappa ||R_j - R_i R_ij||_F^2 + tau ||t_j - t_i - R_i t_ij||^2. With X, (N, d), N
+    = (d+1) n, the rows t_i and then the rows of every R_i^T, F = tr(X^T M X).
 
-    With `Weighting.INFORMATION` the cost is chi2 of the graph's information matrices. It is quadratic in X, too, where
-    all matrices of translations are multiples of the identity and nothing couples them with rotations; else M is the
-    quadratic part, and `tangent_at` gives quadratic problems that touch chi2 from below (`problem.weighting`).
+    With `Weighting.INFORMATION` the cost is chi2 of the graph's information matrices. It is
+    quadratic in X, too, where all matrices of translations are multiples of the identity and
+    nothing couples them with rotations; else M is the quadratic part, and `tangent_at` gives
+    quadratic problems that touch chi2 from below (`problem.excess`).
 
-    `graph` is connected, its weights kappa, tau are the problem's; `graph.unit_weights()` gives the paper's equation.
-    `backend` is the sparse Cholesky to use, `default_backend()` unless given; `weighting` is F or chi2, or the weights.
+    Parameters
+    ----------
+    graph : PoseGraph
+        A connected graph, whose precisions kappa and tau are those of F. The paper's equation is
+        that of `graph.unit_weights()`.
+    backend : CholeskyBackend, optional
+        The sparse Cholesky to use; `default_backend()` unless given.
+    weighting : Weighting or EdgeCost
+        F, chi2, or a cost of the edges.
 
-    A GraphError when the graph is not connected; a SettingError when weighting is none.
+    Raises
+    ------
+    GraphError
+        When the graph is not connected.
+    SettingError
+        When the backend or the weighting is none.
 
     Examples
     --------
@@ -41,17 +67,23 @@ class PGOProblem:
     >>> problem = PGOProblem(circle(np.random.default_rng(0)))
     >>> problem
     PGOProblem('circle', d=3, poses=25, edges=300)
+    >>> problem.M.shape
+    (100, 100)
     """
 
     graph: PoseGraph
     backend: CholeskyBackend | None = None
-    weighting: Weighting | EdgeWeights = Weighting.ISOTROPIC
+    weighting: Weighting | EdgeCost = Weighting.ISOTROPIC
 
     def __post_init__(self) -> None:
-        if not isinstance(self.weighting, Weighting | EdgeWeights):
-            raise SettingError(f"weighting is {self.weighting!r}; give one of {', '.join(map(str, Weighting))}")
+        if not isinstance(self.weighting, Weighting | EdgeCost):
+            raise SettingError(
+                f"weighting is {self.weighting!r}; give one of {', '.join(map(str, Weighting))}"
+            )
         if self.backend is not None and not isinstance(self.backend, CholeskyBackend):
-            raise SettingError(f"backend is {self.backend!r}; give one of {', '.join(map(str, CholeskyBackend))}")
+            raise SettingError(
+                f"backend is {self.backend!r}; give one of {', '.join(map(str, CholeskyBackend))}"
+            )
         self.graph.check_connected()
 
     def __repr__(self) -> str:
@@ -75,12 +107,13 @@ class PGOProblem:
         return (self.d + 1) * self.num_poses
 
     @cached_property
-    def weights(self) -> EdgeWeights:
-        """Weights of the edges."""
-        if isinstance(self.weighting, EdgeWeights):
+    def weights(self) -> EdgeCost:
+        """The cost of the edges."""
+        if isinstance(self.weighting, EdgeCost):
             return self.weighting
-        is_F = self.weighting is Weighting.ISOTROPIC
-        return matrices.isotropic_weights(self.graph) if is_F else edge_weights(self.graph, self._information)
+        if self.weighting is Weighting.ISOTROPIC:
+            return matrices.isotropic_weights(self.graph)
+        return information_cost(self.graph, self._information)
 
     @cached_property
     def _information(self) -> Array:
@@ -89,76 +122,120 @@ class PGOProblem:
     @property
     def is_quadratic(self) -> bool:
         """Whether the cost is tr(X^T M X) of X alone."""
-        return self.weights.excess is None
+        return self.weights.is_quadratic
 
     @cached_property
     def convex_part(self) -> "PGOProblem":
-        """The problem itself if its cost is quadratic and convex in (R, t), else one near it: what SOC is run on."""
+        """The problem that SOC is run on: this one, if its cost is convex and quadratic in (R, t).
+
+        Otherwise it is one with a convex quadratic cost near this one.
+        """
         if self.is_quadratic and self.weights.is_convex:
             return self
-        return replace(self, weighting=convex_weights(self._information, self.d))
+        return replace(self, weighting=convex_cost(self._information, self.d))
 
     def check_quadratic(self, method: str, convex: bool = False) -> None:
-        """Raise a SettingError where a method needs a cost that is quadratic in the poses, or convex, and it is not."""
+        """Raise an error where a method needs a cost that is quadratic, or convex, and it is not.
+
+        Parameters
+        ----------
+        method : str
+            Name of the method, for the message.
+        convex : bool
+            Whether the cost has to be convex in (R, t), too.
+
+        Raises
+        ------
+        SettingError
+            When the cost is not what the method needs.
+        """
         if not self.is_quadratic or (convex and not self.weights.is_convex):
             kind = "convex and quadratic in (R, t)" if convex else "quadratic in (R, t)"
-            raise SettingError(f"{method} needs a cost that is {kind}, as F is, and chi2 here is not; use convex_part")
+            raise SettingError(
+                f"{method} needs a cost that is {kind}, as F is, and chi2 here is not; "
+                "use convex_part"
+            )
 
     def tangent_at(self, poses: Poses) -> "PGOProblem":
-        """Quadratic problem with F(X) <= chi2(X) for all poses, and equal value and gradient at the given ones."""
-        excess = self.weights.excess
-        if excess is None:
+        """Return the quadratic problem that touches the cost from below at poses.
+
+        Its cost F(X) is at most chi2(X) for all poses, and has the value and the gradient of chi2
+        at the given ones. A quadratic problem is its own tangent.
+
+        Parameters
+        ----------
+        poses : Poses
+            Where they touch.
+
+        Returns
+        -------
+        PGOProblem
+            It is computed once for these poses.
+        """
+        if self.is_quadratic:
             return self
-        if "tangent" in self._kept and self._kept["tangent"][0] is poses:
-            return cast("PGOProblem", self._kept["tangent"][1])
-        X, residuals = self.evaluated(poses)
-        tangent = excess.tangent(self.edge_products(residuals, X))
-        found = replace(self, weighting=replace(self.weights, excess=None, tangent=tangent))
-        found.__dict__.update({name: value for name, value in self.__dict__.items() if name in _OF_THE_PATTERN})
-        self._kept["tangent"] = poses, found
-        return found
+        tangent = self._tangents.get(poses)
+        if tangent is None:
+            cost = self.weights.minorant(self, poses)
+            tangent = _TangentProblem(self.graph, self.backend, cost, original=self)
+            self._tangents[poses] = tangent
+        return tangent
 
     @cached_property
-    def _kept(self) -> dict[str, tuple[Any, ...]]:
-        """What was found last, behind the poses it was found at."""
-        return {}
+    def _tangents(self) -> "WeakKeyDictionary[Poses, PGOProblem]":
+        """`tangent_at` of the poses that are still in use: it goes when they do."""
+        return WeakKeyDictionary()
+
+    @cached_property
+    def _evaluations(self) -> "WeakKeyDictionary[Poses, tuple[Array, Array]]":
+        """`evaluated` of the poses that are still in use: it goes when they do."""
+        return WeakKeyDictionary()
 
     # Matrices, each built when first asked for, read-only: what follows from them is kept, too.
 
     @cached_property
     def M(self) -> csc_array:
-        """M, (N, N): F = tr(X^T M X)."""
+        """Matrix M, (N, N), of the quadratic part: F = tr(X^T M X)."""
         return read_only(matrices.joint_matrix(self.graph, self.weights))
 
     @cached_property
     def L(self) -> csc_array:
-        """L, (dn, dn): the rotation part of F is tr(Y^T L Y) for Y the rows R_i^T."""
+        """Connection Laplacian L, (dn, dn): the rotation part of F is tr(Y^T L Y).
+
+        Y are the rows R_i^T.
+        """
         return read_only(matrices.connection_laplacian(self.graph, self.weights))
 
     @cached_property
     def Q(self) -> Array:
-        """Q, (dn, dn), dense: min over t of F is tr(Y^T Q Y) for Y the rows R_i^T; for small graphs."""
+        """Matrix Q, (dn, dn), dense, for small graphs: min over t of F is tr(Y^T Q Y).
+
+        Y are the rows R_i^T.
+        """
         return read_only(matrices.marginalized_matrix(self.graph, self.weights))
 
     @cached_property
     def residual_matrix(self) -> tuple[csr_array, Array]:
-        """A, ((d+1) m, N), and w: F = sum_rows w ||A X||^2."""
+        """Residual matrix A, ((d+1) m, N), and weights w: F = sum_rows w ||A X||^2."""
         A, w = matrices.residual_matrix(self.graph, self.weights)
         return read_only(A), read_only(w)
 
     @cached_property
     def plain_residual_matrix(self) -> csr_array:
         """A with the rotation residuals as they are, not along the axes of W."""
-        is_plain = self.weights.axes is None
-        return self.residual_matrix[0] if is_plain else read_only(matrices.residual_matrix(self.graph)[0])
+        if self.weights.rotation.has_own_axes:
+            A, _ = matrices.residual_matrix(self.graph, self.weights.with_unit_weights())
+            return read_only(A)
+        return self.residual_matrix[0]
 
     @cached_property
     def analysis(self) -> SymbolicCholesky:
         """Symbolic factorisation of the pattern of M, shared by every matrix that has it."""
         if self.convex_part is not self:
             return self.convex_part.analysis
-        of_poses = self.pose_order, 1, self.d
-        return analyze(self.M, self.backend, row_order(*of_poses), partial(most_counts, self.graph, *of_poses))
+        order = row_order(self.pose_order, 1, self.d)
+        counts = partial(most_counts, self.graph, self.pose_order, 1, self.d)
+        return analyze(self.M, self.backend, order, counts)
 
     @cached_property
     def pose_order(self) -> IntArray:
@@ -174,140 +251,364 @@ class PGOProblem:
     @cached_property
     def block_positions(self) -> IntArray:
         """Positions in `M.data` of the diagonal d x d rotation blocks of M, (n, d, d)."""
-        n, d = self.num_poses, self.d
+        n = self.num_poses
+        d = self.d
         block = matrices.rotation_columns(np.arange(n), n, d)
         return read_only(matrices.entry_positions(self.M, *matrices.block_entries(block, block)))
 
     def with_pattern_of_M(self, data: Array) -> csc_array:
-        """Return the matrix, (N, N), that has the pattern of M and stored values `data`, (nnz,)."""
+        """Return the matrix that has the pattern of M and given values.
+
+        Parameters
+        ----------
+        data : (nnz,) array
+            Values of the entries, in the order of `M.data`.
+
+        Returns
+        -------
+        (N, N) csc_array
+            A sparse matrix that shares the pattern.
+        """
         matrix = csc_array((data, self.M.indices, self.M.indptr), shape=self.M.shape)
         matrix.has_canonical_format = True
         return matrix
 
     def leave_out(self, data: Array, rows: IntArray, diagonal: Array | float) -> None:
-        """Overwrite `data`, (nnz,), stored of a matrix as M: `rows` and columns, (k,), hold but a `diagonal`, (k,)."""
+        """Overwrite rows and columns of a matrix with the pattern of M by a diagonal.
+
+        Parameters
+        ----------
+        data : (nnz,) array
+            Stored values of the matrix, which are changed.
+        rows : (k,) array of int
+            The rows, and columns, to leave out.
+        diagonal : (k,) array or float
+            What their diagonal entries become.
+        """
         data[matrices.meets(self.M, rows)] = 0.0
         data[self.diagonal_positions[rows]] = diagonal
 
     # The cost and its derivatives.
 
     def residuals(self, X: Array) -> Array:
-        """A X, ((d+1) m, d): translation residuals of the edges, then the rows of their rotation residuals."""
+        """Return A X: the translation residuals of the edges, then their rotation residuals.
+
+        Parameters
+        ----------
+        X : (N, d) array
+            Poses, stacked, or any other point.
+
+        Returns
+        -------
+        ((d+1) m, d) array
+            The residuals, those of rotations along the axes of W.
+        """
         return np.asarray(self.residual_matrix[0] @ X)
 
     def objective_stacked(self, X: Array, residuals: Array | None = None) -> float:
-        """F = tr(X^T M X) as a weighted sum of squares of the `residuals`, ((d+1) m, d), of any X, (N, d)."""
-        residuals, (_, w) = self.residuals(X) if residuals is None else residuals, self.residual_matrix
-        F = float(np.sum(w[:, None] * residuals**2))  # in pairs: off by a few dozen roundings, not by one an edge
-        beyond = self.weights.excess or self.weights.tangent
-        return F if beyond is None else F + float(np.sum(beyond.values(self.edge_products(residuals, X))))
+        """Return the cost at any X, as a weighted sum of squares of residuals.
+
+        Parameters
+        ----------
+        X : (N, d) array
+            The point.
+        residuals : ((d+1) m, d) array, optional
+            A X, if it is known.
+
+        Returns
+        -------
+        float
+            F = tr(X^T M X), or chi2.
+        """
+        residuals = self.residuals(X) if residuals is None else residuals
+        return self.weights.value(self, X, residuals)
 
     def objective(self, poses: Poses) -> float:
-        """F at poses (paper: `min overall`, weighted)."""
+        """Return the cost of poses: F (paper: `min overall`, weighted), or chi2.
+
+        Parameters
+        ----------
+        poses : Poses
+            One pose for every pose of the graph.
+
+        Returns
+        -------
+        float
+            It has no unit.
+
+        Raises
+        ------
+        GraphError
+            When the poses do not fit the graph.
+
+        Examples
+        --------
+        >>> from pgo_models.graphs.scenes import circle
+        >>> graph = circle(np.random.default_rng(0))
+        >>> problem = PGOProblem(graph)
+        >>> bool(np.isclose(problem.objective(graph.truth), problem.edge_costs(graph.truth).sum()))
+        True
+        """
         return self.objective_stacked(*self.evaluated(poses))
 
     def edge_costs(self, poses: Poses) -> Array:
-        """Share of every edge in F, (m,)."""
-        m, (X, residuals), (_, w) = self.graph.num_edges, self.evaluated(poses), self.residual_matrix
-        squares = w * np.sum(residuals**2, axis=1)
-        costs = squares[:m] + squares[m:].reshape(m, self.d).sum(axis=1)
-        beyond = self.weights.excess or self.weights.tangent
-        return np.asarray(costs if beyond is None else costs + beyond.values(self.edge_products(residuals, X)))
+        """Return the share of every edge in the cost.
+
+        Parameters
+        ----------
+        poses : Poses
+            One pose for every pose of the graph.
+
+        Returns
+        -------
+        (m,) array
+            Their sum is the objective.
+        """
+        return self.weights.edge_values(self, *self.evaluated(poses))
 
     def apply_M_at(self, poses: Poses) -> Array:
-        """M X, (N, d), at poses, M that of the tangent there for chi2."""
+        """Return M X at poses, half the gradient in X; for chi2 M is that of the tangent there.
+
+        Parameters
+        ----------
+        poses : Poses
+            One pose for every pose of the graph.
+
+        Returns
+        -------
+        (N, d) array
+            In the rows of X.
+        """
         return self.tangent_at(poses).apply_M(*self.evaluated(poses))
 
     def apply_M(self, X: Array, residuals: Array | None = None) -> Array:
-        """M X = A^T (w A X), (N, d), by `residuals`, ((d+1) m, d): accurate where edges fit, however large t."""
-        residuals, (_, w) = self.residuals(X) if residuals is None else residuals, self.residual_matrix
-        tangent, n, m = self.weights.tangent, self.num_poses, self.graph.num_edges
-        if tangent is None:
-            return np.asarray(self._adjoint @ (w[:, None] * residuals))
-        C, axes = tangent.C, self.weights.axes
-        pull = rows_of_blocks(C @ X[n:].reshape(n, self.d, self.d)[self.graph.i], axes)
-        product = self._adjoint @ (w[:, None] * residuals + pull)
-        product[n:] += self.incidence.at_beginning(np.swapaxes(C, 1, 2) @ blocks_of_rows(residuals, m, axes))
-        return np.asarray(product)
+        """Return M X = A^T (w A X) by way of the residuals.
+
+        That is accurate where the edges fit, however large the translations are.
+
+        Parameters
+        ----------
+        X : (N, d) array
+            The point.
+        residuals : ((d+1) m, d) array, optional
+            A X, if it is known.
+
+        Returns
+        -------
+        (N, d) array
+            In the rows of X.
+        """
+        residuals = self.residuals(X) if residuals is None else residuals
+        return self.weights.half_gradient(self, X, residuals)
 
     def apply_Q(self, Y: Array) -> Array:
-        """Q Y, (dn, k), for Y of shape (dn, k), without forming Q: M applied to Y and its best translations."""
+        """Return Q Y without forming Q: M applied to Y and its best translations.
+
+        Parameters
+        ----------
+        Y : (dn, k) array
+            Rows of rotations, or any others.
+
+        Returns
+        -------
+        (dn, k) array
+            In the rows of Y.
+        """
         return np.asarray(self._M_rotation_rows @ np.concatenate([self.translations_for(Y), Y]))
 
     def riemannian_gradient(self, poses: Poses) -> tuple[Array, Array]:
-        """Gradient of F(R_i Exp(hat(w_i)), t_i + v_i) in (w, v) at zero: (n, 1 or 3) and (n, d).
+        """Return the gradient of F(R_i Exp(hat(w_i)), t_i + v_i) in (w, v) at zero.
 
         With G = 2 M X it is (-2 vee(G_i R_i), G_{t_i}).
+
+        Parameters
+        ----------
+        poses : Poses
+            One pose for every pose of the graph.
+
+        Returns
+        -------
+        (n, 1 or 3) array
+            Gradient in w, per radian.
+        (n, d) array
+            Gradient in v, per metre.
         """
-        n, d = self.num_poses, self.d
+        n = self.num_poses
+        d = self.d
         G = 2.0 * self.apply_M_at(poses)
         return -2.0 * vee(G[n:].reshape(n, d, d) @ poses.R), G[:n]
 
     # Exact translations for given rotations.
 
     def recover_translations(self, R: Array) -> Array:
-        """t, (n, d), that minimises F for given R, (n, d, d), with t_0 = 0: M_tt t = -M_tR Y, one sparse solve."""
+        """Return the translations that minimise F for given rotations, with t_0 = 0.
+
+        They solve M_tt t = -M_tR Y, Y the rows R_i^T: one sparse solve.
+
+        Parameters
+        ----------
+        R : (n, d, d) array
+            Rotations.
+
+        Returns
+        -------
+        (n, d) array
+            Translations, in metres.
+        """
         return self.translations_for(stack_transposes(R))
 
     def translations_for(self, Y: Array) -> Array:
-        """t, (n, k), with t_0 = 0, that minimises tr(X^T M X) over t for X the rows of t and of given Y, (dn, k)."""
+        """Return the rows t that minimise tr(X^T M X) for X = (t, Y), with t_0 = 0.
+
+        Parameters
+        ----------
+        Y : (dn, k) array
+            Rows R_i^T of rotations, or any others.
+
+        Returns
+        -------
+        (n, k) array
+            The rows t.
+        """
         return self.solve_translations(-(self._M_tR @ Y))
 
     def solve_translations(self, b: Array) -> Array:
-        """t, (n, k), with M_tt t = b but for the row of pose 0, and t_0 = 0; b of shape (n, k)."""
+        """Return t with M_tt t = b but for the row of pose 0, and t_0 = 0.
+
+        Parameters
+        ----------
+        b : (n, k) array
+            Right-hand sides.
+
+        Returns
+        -------
+        (n, k) array
+            Solutions.
+        """
         t = np.zeros(b.shape)
         t[1:] = self._translation_factor.solve(b[1:])
         return t
 
     def with_best_translations(self, R: Array) -> Poses:
-        """Poses (R, t), R of shape (n, d, d), with the translations of `recover_translations`."""
+        """Return poses with given rotations and the translations of `recover_translations`.
+
+        Parameters
+        ----------
+        R : (n, d, d) array
+            Rotations.
+
+        Returns
+        -------
+        Poses
+            (R, t).
+        """
         return Poses(R, self.recover_translations(R))
 
     def at_best_translations(self, poses: Poses) -> Poses:
-        """Poses with the translations that are best for their rotations, t_0 where it is if chi2 is not quadratic."""
-        excess, d = self.weights.excess, self.d
-        if excess is None:
-            return poses.with_translations(self.recover_translations(poses.R))
-        X, residuals = self.evaluated(poses)
-        R_i, tau = poses.R[self.graph.i], self.weights.tau
-        half = R_i @ (excess.J[:, :d, :d] + tau[:, None, None] * np.eye(d)) @ np.swapaxes(R_i, 1, 2)
-        u, _ = excess.arguments(self.edge_products(residuals, X))
-        pull = tau[:, None] * residuals[: len(tau)] + (R_i @ (excess.J[:, :d] @ u[:, :, None]))[:, :, 0]
-        factor = self._chi2_translations.factorize(matrices.block_laplacian(self.incidence, half))
-        step = factor.solve((self.incidence.ends @ pull - self.incidence.begins @ pull).ravel()).reshape(-1, d)
-        return poses.with_translations(poses.t - (step - step[0]))
+        """Return the poses with the translations of least cost for their rotations.
+
+        Parameters
+        ----------
+        poses : Poses
+            Their translations count only where chi2 is not quadratic: t_0 stays where it is.
+
+        Returns
+        -------
+        Poses
+            With the same rotations.
+        """
+        return self.weights.best_translations(self, poses)
 
     def with_refined_translations(self, poses: Poses) -> Poses:
-        """Poses after steps of iterative refinement of the translations, as many as lower F, with t_0 where it is.
+        """Return the poses after steps of iterative refinement of the translations.
 
-        A solve leaves errors in proportion to its condition; a step with residuals edge by edge takes most of it away.
+        A solve leaves errors in proportion to its condition; a step with residuals edge by edge
+        takes most of it away. At most `MOST_REFINEMENTS` steps are taken, as many as lower the
+        cost. Another one follows only where the last one halved F and left it positive: chi2 may
+        come out below zero by rounding, and then every number is less than half of itself.
+
+        Parameters
+        ----------
+        poses : Poses
+            One pose for every pose of the graph.
+
+        Returns
+        -------
+        Poses
+            With the same rotations, and t_0 where it is.
         """
         objective = self.objective(poses)
-        while True:
+        for _ in range(MOST_REFINEMENTS):
             step = self.solve_translations(self.apply_M_at(poses)[: self.num_poses])
             refined = poses.with_translations(poses.t - step)
-            if not self.objective(refined) < 0.5 * objective:
-                return refined if self.objective(refined) < objective else poses
-            poses, objective = refined, self.objective(refined)
+            refined_objective = self.objective(refined)
+            if not refined_objective < objective:
+                break
+            was_halved = 0.0 < refined_objective < 0.5 * objective
+            poses = refined
+            objective = refined_objective
+            if not was_halved:
+                break
+        return poses
 
     def stacked(self, poses: Poses) -> Array:
-        """X, (N, d), of poses; a GraphError when number or dimension are not the graph's, or they are no Poses."""
-        if not isinstance(poses, Poses):
-            raise GraphError(f"poses are a {type(poses).__name__}; give Poses(R, t), or use with_best_translations(R)")
-        if (poses.num_poses, poses.d) != (self.num_poses, self.d):
-            raise GraphError(f"{poses} beside {self}; give one pose for every pose of the graph, in its order")
+        """Return X of poses: the rows t_i, then the rows of every R_i^T.
+
+        Parameters
+        ----------
+        poses : Poses
+            One pose for every pose of the graph.
+
+        Returns
+        -------
+        (N, d) array
+            X.
+
+        Raises
+        ------
+        GraphError
+            When they are no poses, or their number or dimension is not the graph's.
+        """
+        self._check_poses(poses)
         return poses.stacked()
 
+    def _check_poses(self, poses: Poses) -> None:
+        if not isinstance(poses, Poses):
+            raise GraphError(
+                f"poses are a {type(poses).__name__}; "
+                "give Poses(R, t), or use with_best_translations(R)"
+            )
+        if (poses.num_poses, poses.d) != (self.num_poses, self.d):
+            raise GraphError(
+                f"{poses} beside {self}; give one pose for every pose of the graph, in its order"
+            )
+
     def evaluated(self, poses: Poses) -> tuple[Array, Array]:
-        """X, (N, d), and its residuals, ((d+1) m, d), read-only, kept for the poses that were last asked for."""
-        if "X" not in self._kept or self._kept["X"][0] is not poses:
+        """Return X of poses and its residuals, read-only, computed once for these poses.
+
+        Parameters
+        ----------
+        poses : Poses
+            One pose for every pose of the graph.
+
+        Returns
+        -------
+        (N, d) array
+            X.
+        ((d+1) m, d) array
+            A X.
+        """
+        self._check_poses(poses)
+        evaluation = self._evaluations.get(poses)
+        if evaluation is None:
             X = self.stacked(poses)
-            self._kept["X"] = poses, read_only(X), read_only(self.residuals(X))
-        _, X, residuals = self._kept["X"]
-        return X, residuals
+            evaluation = (read_only(X), read_only(self.residuals(X)))
+            self._evaluations[poses] = evaluation
+        return evaluation
 
     @cached_property
-    def _adjoint(self) -> csc_array:
+    def residual_adjoint(self) -> csc_array:
+        """A^T, (N, (d+1) m)."""
         return self.residual_matrix[0].T
 
     @cached_property
@@ -316,21 +617,38 @@ class PGOProblem:
         return Incidence.of(self.graph)
 
     def edge_products(self, residuals: Array, X: Array) -> Array:
-        """Z, (m, d + 1, d): the residual rows of every edge, of `residuals`, ((d+1) m, d), times R_i of X, (N, d)."""
-        rho = blocks_of_rows(residuals, self.graph.num_edges, self.weights.axes)
-        return np.asarray(rho @ unstack_transposes(X[self.num_poses :])[self.graph.i])
+        """Return Z, the residual rows of every edge times R_i: residuals in the frame of pose i.
+
+        Parameters
+        ----------
+        residuals : ((d+1) m, d) array
+            A X.
+        X : (N, d) array
+            The point.
+
+        Returns
+        -------
+        (m, d + 1, d) array
+            Z.
+        """
+        return self.weights.edge_products(self.graph, X, residuals)
 
     @cached_property
     def _translation_factor(self) -> CholeskyFactor:
         n = self.num_poses
         order = self.pose_order[self.pose_order > 0] - 1
-        return factorize(self.M[1:n, 1:n].tocsc(), self.backend, order)
+        M_tt = self.M[1:n, 1:n].tocsc()
+        return factorize_damped(analyze(M_tt, self.backend, order), M_tt)
 
     @cached_property
-    def _chi2_translations(self) -> SymbolicCholesky:
+    def translation_information_analysis(self) -> SymbolicCholesky:
         """Of the matrix of `at_best_translations`, whose pattern the graph alone gives."""
         ones = np.broadcast_to(np.eye(self.d), self.graph.R_ij.shape)
-        return analyze(matrices.block_laplacian(self.incidence, ones), self.backend, row_order(self.pose_order, self.d))
+        return analyze(
+            matrices.block_laplacian(self.incidence, ones),
+            self.backend,
+            row_order(self.pose_order, self.d),
+        )
 
     @cached_property
     def _M_tR(self) -> csr_array:
@@ -341,12 +659,56 @@ class PGOProblem:
         return self.M[self.num_poses :].tocsr()
 
 
-_OF_THE_PATTERN = {"residual_matrix", "plain_residual_matrix", "_adjoint", "analysis", "pose_order"}
-_OF_THE_PATTERN |= {"incidence", "diagonal_positions", "block_positions"}
+@dataclass(frozen=True, eq=False)
+class _TangentProblem(PGOProblem):
+    """A tangent of chi2, which has the graph of the `original` and what follows from that alone."""
+
+    original: PGOProblem = field(kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Accept what the original was accepted with."""
+
+    @cached_property
+    def residual_matrix(self) -> tuple[csr_array, Array]:
+        """A and w, those of the quadratic part that both have."""
+        return self.original.residual_matrix[0], read_only(self.weights.row_weights(self.d))
+
+    @cached_property
+    def convex_part(self) -> PGOProblem:
+        """The tangent itself if it is convex in (R, t), else the problem near chi2 that is."""
+        return self if self.weights.is_convex else self.original.convex_part
+
+    @cached_property
+    def plain_residual_matrix(self) -> csr_array:
+        """A with the rotation residuals as they are."""
+        return self.original.plain_residual_matrix
+
+    @cached_property
+    def residual_adjoint(self) -> csc_array:
+        """A^T."""
+        return self.original.residual_adjoint
+
+    @cached_property
+    def incidence(self) -> Incidence:
+        """Which edges begin and end at a pose."""
+        return self.original.incidence
+
+    @cached_property
+    def pose_order(self) -> IntArray:
+        """Order of elimination of the poses."""
+        return self.original.pose_order
+
+    @cached_property
+    def analysis(self) -> SymbolicCholesky:
+        """Symbolic factorisation of the pattern of M, which both have."""
+        return self.original.analysis
 
 
 def as_problem(given: object) -> PGOProblem:
-    """Return the problem that is given, or that of the graph that is given; a SettingError when it is neither."""
+    """Return the problem that is given, or that of the graph that is given.
+
+    A SettingError is raised when it is neither.
+    """
     if isinstance(given, PoseGraph):
         return PGOProblem(given)
     if isinstance(given, PGOProblem):

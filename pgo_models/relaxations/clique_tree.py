@@ -1,25 +1,35 @@
-"""Cliques of a chordal extension of a pose graph, in a tree: what a sparse semidefinite program decomposes over."""
+"""Cliques of a chordal extension of a pose graph, in a tree.
+
+A sparse semidefinite program decomposes over them.
+"""
 
 import heapq
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 
-_CLIQUE_OVERHEAD = 300.0
+_CLIQUE_OVERHEAD = 300.0  # of every clique, in the unit of the cube of a side
 
 
 @dataclass(frozen=True, eq=False)
 class CliqueTree:
-    """Cliques of poses that cover every edge, joined in a tree with the running intersection property.
+    """Cliques of poses that cover every edge, joined in a tree.
 
-    The poses that a clique shares with all cliques before it in the order are all in its parent.
+    The tree has the running intersection property: the poses that a clique shares with all cliques
+    before it in the order are all in its parent.
+
+    Parameters
+    ----------
+    cliques : tuple of (c_k,) arrays
+        Poses of every clique, ascending; parents come before children.
+    parent : (K,) array
+        Parent of every clique, -1 for the root.
     """
 
-    cliques: tuple[IntArray, ...]  # (c_k,) each: poses of every clique, ascending; parents before children
-    parent: IntArray  # (K,): parent of every clique, -1 for the root
+    cliques: tuple[IntArray, ...]
+    parent: IntArray
 
     @property
     def sizes(self) -> IntArray:
@@ -34,58 +44,78 @@ class CliqueTree:
 
 
 def build_clique_tree(graph: PoseGraph) -> CliqueTree:
-    """Eliminate poses in the order of least degree, and merge cliques of the elimination where that saves work.
+    """Cliques of the elimination of poses, merged where that saves work.
 
-    A child and its parent are merged when the cube of the union's side is at most the sum of their cubes and an
-    overhead; sides are those of `pgo_models.relaxations.clique_decomposition`. Vandenberghe & Andersen, Chordal graphs
-    and semidefinite optimization, 2015, chapters 4 and 6; the merging is that of Garstka, Cannon & Goulart, A clique
-    graph based merging strategy, 2020, on the edges of the tree.
+    The order of elimination is that of least degree. A child and its parent are merged when the
+    cube of the union's side is at most the sum of their cubes and an overhead; sides are those of
+    `pgo_models.relaxations.clique_decomposition`. Vandenberghe & Andersen, Chordal graphs and
+    semidefinite optimization, 2015, chapters 4 and 6; the merging is that of Garstka, Cannon &
+    Goulart, A clique graph based merging strategy, 2020, on the edges of the tree.
     """
-    return _merge(*_eliminate(graph), lambda size: clique_side(size, graph.d) ** 3 + _CLIQUE_OVERHEAD)
+    members, parent = _eliminate(graph)
+    return _merge(members, parent, graph.d)
 
 
 def clique_side(num_poses: int, d: int) -> int:
-    """Side of the Gram matrix of a clique: d rows for its first pose, d + 1 for each of the others."""
+    """Side of the Gram matrix of a clique: d rows for its first pose, d + 1 for each other one."""
     return d + (d + 1) * (num_poses - 1)
 
 
 def _eliminate(graph: PoseGraph) -> tuple[list[set[int]], list[int]]:
-    """Cliques of the elimination of every pose, in order, and the place of every clique's parent."""
-    neighbours = [set(row.tolist()) for row in np.split(graph.adjacency.indices, graph.adjacency.indptr[1:-1])]
+    """The clique of every pose, in the order of elimination, and the position of its parent."""
+    adjacency = graph.adjacency
+    rows = np.split(adjacency.indices, adjacency.indptr[1:-1])
+    neighbours = [set(row.tolist()) for row in rows]
     heap = [(len(adjacent), pose) for pose, adjacent in enumerate(neighbours)]
     heapq.heapify(heap)
-    place: dict[int, int] = {}
+    position: dict[int, int] = {}  # of every pose, in the order of elimination
     members: list[set[int]] = []
     while heap:
         degree, pose = heapq.heappop(heap)
-        if pose in place or degree != len(neighbours[pose]):
+        if pose in position or degree != len(neighbours[pose]):
             continue  # an entry from before the degree changed
-        place[pose] = len(members)
+        position[pose] = len(members)
         remaining = neighbours[pose]
         members.append({pose, *remaining})
         for other in remaining:
             neighbours[other] |= remaining
             neighbours[other] -= {other, pose}
             heapq.heappush(heap, (len(neighbours[other]), other))
-    parent = [min((place[pose] for pose in clique if place[pose] > k), default=-1) for k, clique in enumerate(members)]
+    parent = []
+    for k, clique in enumerate(members):
+        # The parent is the clique of the pose that is eliminated next.
+        later = [position[pose] for pose in clique if position[pose] > k]
+        parent.append(min(later, default=-1))
     return members, parent
 
 
-def _merge(members: list[set[int]], parent: list[int], work: Callable[[int], float]) -> CliqueTree:
+def _merge(members: list[set[int]], parent: list[int], d: int) -> CliqueTree:
+    """Merge cliques with their parents, which come after their children in `members`."""
+    members = list(members)
     merged_into = list(range(len(members)))
-
-    def survivor(k: int) -> int:
-        while merged_into[k] != k:
-            k = merged_into[k]
-        return k
-
-    for k, above in enumerate(parent):
-        if above < 0:
+    for k, parent_of_k in enumerate(parent):
+        if parent_of_k < 0:
             continue
-        union = members[k] | members[above]
-        if work(len(union)) <= work(len(members[k])) + work(len(members[above])):
-            members[above], merged_into[k] = union, above
-    kept = [k for k in reversed(range(len(members))) if merged_into[k] == k]  # parents come later in the elimination
+        union = members[k] | members[parent_of_k]
+        work_apart = _work(members[k], d) + _work(members[parent_of_k], d)
+        if _work(union, d) <= work_apart:
+            members[parent_of_k] = union
+            merged_into[k] = parent_of_k
+    # A clique that was merged is represented by the one that its parent was merged into at last.
+    # Parents come later in the elimination, and earlier in the tree.
+    representative = list(range(len(members)))
+    for k in reversed(range(len(members))):
+        if merged_into[k] != k:
+            representative[k] = representative[merged_into[k]]
+    kept = [k for k in reversed(range(len(members))) if merged_into[k] == k]
     number = {k: new for new, k in enumerate(kept)}
-    parents = [-1 if parent[k] < 0 else number[survivor(parent[k])] for k in kept]
-    return CliqueTree(tuple(np.array(sorted(members[k])) for k in kept), np.array(parents))
+    parents = []
+    for k in kept:
+        is_root = parent[k] < 0
+        parents.append(-1 if is_root else number[representative[parent[k]]])
+    cliques = tuple(np.array(sorted(members[k])) for k in kept)
+    return CliqueTree(cliques, np.array(parents))
+
+
+def _work(clique: set[int], d: int) -> float:
+    return clique_side(len(clique), d) ** 3 + _CLIQUE_OVERHEAD

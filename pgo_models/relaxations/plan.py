@@ -1,4 +1,4 @@
-"""Which form of the semidefinite relaxation to pose, and which solver to give it: by the sizes of the cliques."""
+"""Choose the form of the semidefinite relaxation and its solver, by the sizes of the cliques."""
 
 import enum
 from dataclasses import dataclass
@@ -12,18 +12,23 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.clique_tree import CliqueTree, build_clique_tree, clique_side
 
 DEFAULT_MEMORY_LIMIT = 4e9  # bytes
-CLARABEL = ConvexSolver()  # interior point, accurate; its work grows with the sixth power of a cone's side
-SCS = ConvexSolver("SCS")  # first order, rougher; with the third power
+# An interior-point method is accurate; its work grows with the sixth power of a cone's side. The
+# work of a first-order method, which is rougher, grows with the third power.
+CLARABEL = ConvexSolver()
+SCS = ConvexSolver("SCS")
 
-# Measured on one core (tests/benchmarks/test_relaxations_benchmark.py). Clarabel factors a dense matrix of the order of
-# every cone's triangle at every iteration, about 15 of them; SCS takes an eigendecomposition of each, about 1000 times.
-_CLARABEL_ITERATIONS, _CLARABEL_RATE = 15, 2e10
-_SCS_ITERATIONS, _SCS_RATE = 1000, 2e9
+# Measured on one core (tests/benchmarks/test_relaxations_benchmark.py). Clarabel factors a dense
+# matrix of the order of every cone's triangle at every iteration, about 15 of them; SCS takes an
+# eigendecomposition of each, about 1000 times.
+_CLARABEL_ITERATIONS = 15
+_CLARABEL_RATE = 2e10
+_SCS_ITERATIONS = 1000
+_SCS_RATE = 2e9
 _PATIENCE = 2.0  # seconds: up to here the interior point is preferred for its accuracy
 _CLARABEL_BYTES = 56.0  # for every entry of those dense matrices: matrix and factor
-_SCS_BYTES = 400.0  # for every entry of a cone's triangle: constraint matrices, work vectors, cvxpy's copies
+_SCS_BYTES = 400.0  # for every entry of a cone's triangle: matrices, vectors, cvxpy's copies
 _DENSE_BYTES = 64.0  # for every entry of a dense matrix of the model
-_CONE_BYTES = 1.2e5  # of cvxpy's for every cone
+_CONE_BYTES = 1.2e5  # for every cone, in cvxpy
 
 
 class RelaxationForm(enum.Enum):
@@ -36,17 +41,19 @@ class RelaxationForm(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class RelaxationPlan:
-    """A form and a solver, what they will take, and why they were chosen."""
+    """A form and a solver, an estimate of their cost, and why they were chosen."""
 
     form: RelaxationForm
     solver: ConvexSolver
     tree: CliqueTree
-    seconds: float  # rough estimate
-    memory: float  # estimate in bytes
+    seconds: float  # estimate, rough
+    memory: float  # estimate, in bytes
     reason: str
 
     def __str__(self) -> str:
-        return f"{self.form.name} with {self.solver.name}, about {_bytes(self.memory)}: {self.reason}"
+        return (
+            f"{self.form.name} with {self.solver.name}, about {_bytes(self.memory)}: {self.reason}"
+        )
 
 
 def plan_relaxation(
@@ -55,56 +62,104 @@ def plan_relaxation(
     solver: ConvexSolver | str | None = None,
     memory_limit: float = DEFAULT_MEMORY_LIMIT,
 ) -> RelaxationPlan:
-    """Choose what is not given: the cliques with Clarabel where they are small, else the dense primal with SCS.
+    """Choose form and solver, unless they are given.
 
-    Forms nothing larger than the clique tree. A SettingError when `memory_limit`, bytes, is exceeded or not positive.
+    They are the cliques with Clarabel where the cliques are small, and else the dense primal with
+    SCS. Nothing larger than the clique tree is formed. A SettingError when `memory_limit`, in
+    bytes, is exceeded or not positive.
     """
     if not memory_limit > 0:
         raise SettingError(f"memory_limit is {memory_limit}; give positive bytes")
     tree = build_clique_tree(problem.graph)
-    largest = int(clique_side(int(tree.sizes.max()), problem.d))
-    dense_side = problem.d * problem.num_poses
-    shape = f"the largest of {len(tree.cliques)} cliques has side {largest}, the dense cone {dense_side}"
     if form is None and solver is None:
-        small = _seconds(problem, tree, RelaxationForm.CLIQUES, CLARABEL)
-        dense = _seconds(problem, tree, RelaxationForm.PRIMAL, SCS)
-        is_small = small <= max(_PATIENCE, dense)
-        form, chosen = (RelaxationForm.CLIQUES, CLARABEL) if is_small else (RelaxationForm.PRIMAL, SCS)
-        reason = f"{shape}; estimated {small:.2g} s for the cliques with Clarabel, {dense:.2g} s dense with SCS"
+        form, chosen, reason = _faster_choice(problem, tree)
     else:
-        chosen = as_solver(solver or (SCS if form is RelaxationForm.PRIMAL else CLARABEL))
-        asked = [*([] if form is None else [form.name]), *([] if solver is None else [chosen.name])]
-        form = form or (RelaxationForm.PRIMAL if chosen.is_first_order else RelaxationForm.CLIQUES)
-        reason = f"{' and '.join(asked)} as asked for; {shape}"
+        form, chosen, reason = _completed_choice(problem, tree, form, solver)
     memory = _memory(problem, tree, form, chosen)
     if memory > memory_limit:
-        needs = f"needs about {_bytes(memory)}, above the limit of {_bytes(memory_limit)} ({reason})"
-        way_out = "use certify(problem, poses), which proves the same bound by one factorisation, or raise memory_limit"
-        raise SettingError(f"the relaxation of {problem!r} as {form.name} with {chosen.name} {needs}; {way_out}")
-    return RelaxationPlan(form, chosen, tree, _seconds(problem, tree, form, chosen), memory, reason)
+        raise SettingError(
+            f"the relaxation of {problem!r} as {form.name} with {chosen.name} needs about "
+            f"{_bytes(memory)}, above the limit of {_bytes(memory_limit)} ({reason}); use "
+            "certify(problem, poses), which proves the same bound by one factorisation, or raise "
+            "memory_limit"
+        )
+    seconds = _seconds(problem, tree, form, chosen)
+    return RelaxationPlan(form, chosen, tree, seconds, memory, reason)
+
+
+def _faster_choice(
+    problem: PGOProblem, tree: CliqueTree
+) -> tuple[RelaxationForm, ConvexSolver, str]:
+    """Form and solver by their estimated times, and the reason."""
+    seconds_cliques = _seconds(problem, tree, RelaxationForm.CLIQUES, CLARABEL)
+    seconds_dense = _seconds(problem, tree, RelaxationForm.PRIMAL, SCS)
+    reason = (
+        f"{_size_text(problem, tree)}; estimated {seconds_cliques:.2g} s for the cliques with "
+        f"Clarabel, {seconds_dense:.2g} s dense with SCS"
+    )
+    if seconds_cliques <= max(_PATIENCE, seconds_dense):
+        return RelaxationForm.CLIQUES, CLARABEL, reason
+    return RelaxationForm.PRIMAL, SCS, reason
+
+
+def _completed_choice(
+    problem: PGOProblem,
+    tree: CliqueTree,
+    form: RelaxationForm | None,
+    solver: ConvexSolver | str | None,
+) -> tuple[RelaxationForm, ConvexSolver, str]:
+    """Form and solver where at least one of them is given, and the reason."""
+    if solver is not None:
+        chosen = as_solver(solver)
+    else:
+        chosen = SCS if form is RelaxationForm.PRIMAL else CLARABEL
+    given = []
+    if form is not None:
+        given.append(form.name)
+    if solver is not None:
+        given.append(chosen.name)
+    if form is None:
+        form = RelaxationForm.PRIMAL if chosen.is_first_order else RelaxationForm.CLIQUES
+    return form, chosen, f"{' and '.join(given)} as asked for; {_size_text(problem, tree)}"
+
+
+def _size_text(problem: PGOProblem, tree: CliqueTree) -> str:
+    largest = clique_side(int(tree.sizes.max()), problem.d)
+    dense = problem.d * problem.num_poses
+    return f"the largest of {len(tree.cliques)} cliques has side {largest}, the dense cone {dense}"
 
 
 def _sides(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm) -> Array:
+    """Sides of all cones."""
     if form is RelaxationForm.PRIMAL:
         return np.array([float(problem.d * problem.num_poses)])
     if form is RelaxationForm.CLIQUES:
         return np.asarray(clique_side(1, problem.d) + (problem.d + 1.0) * (tree.sizes - 1))
-    return np.asarray((problem.d + 1.0) * tree.sizes)  # as Clarabel will decompose it, about
+    return np.asarray((problem.d + 1.0) * tree.sizes)  # about as Clarabel decomposes the dual
 
 
-def _seconds(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm, solver: ConvexSolver) -> float:
+def _seconds(
+    problem: PGOProblem, tree: CliqueTree, form: RelaxationForm, solver: ConvexSolver
+) -> float:
     sides = _sides(problem, tree, form)
     if not solver.is_first_order:
         return float(_CLARABEL_ITERATIONS * np.sum(_triangle(sides) ** 3) / _CLARABEL_RATE)
     return float(_SCS_ITERATIONS * np.sum(sides**3) / _SCS_RATE)
 
 
-def _memory(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm, solver: ConvexSolver) -> float:
+def _memory(
+    problem: PGOProblem, tree: CliqueTree, form: RelaxationForm, solver: ConvexSolver
+) -> float:
     triangles = _triangle(_sides(problem, tree, form))
-    cones = _CLARABEL_BYTES * np.sum(triangles**2) if not solver.is_first_order else 0.0
-    # Of the dual, cvxpy vectorises the inequality as a whole.
-    dense = {RelaxationForm.PRIMAL: problem.d * problem.num_poses, RelaxationForm.DUAL: problem.side}.get(form, 0)
-    return float(cones + _SCS_BYTES * np.sum(triangles) + _CONE_BYTES * len(triangles) + _DENSE_BYTES * dense**2)
+    cones = _SCS_BYTES * np.sum(triangles) + _CONE_BYTES * len(triangles)
+    if not solver.is_first_order:
+        cones += _CLARABEL_BYTES * np.sum(triangles**2)
+    dense_side = 0
+    if form is RelaxationForm.PRIMAL:
+        dense_side = problem.d * problem.num_poses
+    elif form is RelaxationForm.DUAL:
+        dense_side = problem.side  # cvxpy vectorises the inequality as a whole
+    return float(cones + _DENSE_BYTES * dense_side**2)
 
 
 def _triangle(side: Array) -> Array:

@@ -1,4 +1,7 @@
-"""From a solution of the semidefinite relaxation, Z or its factor Y, to rotations; how far it is from having rank d."""
+"""From a solution of the semidefinite relaxation, Z or its factor Y, to rotations.
+
+And how far the solution is from rank d, which it has exactly when the relaxation is tight.
+"""
 
 from dataclasses import dataclass
 
@@ -8,7 +11,8 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations, unstack_transposes
 from pgo_models.problem.problem import PGOProblem
 
-RANK_TOLERANCE = 1e-3  # of the largest singular value; interior points and first-order methods leave about 1e-5
+# of the largest singular value; interior points and first-order methods leave about 1e-5
+RANK_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,37 +26,41 @@ class RankReport:
 
     @property
     def is_tight(self) -> bool:
-        """Whether the rank is d to `RANK_TOLERANCE`: evidence that rounding loses nothing, not a proof."""
+        """Whether the rank is d to `RANK_TOLERANCE`: evidence, no proof, that rounding is exact."""
         return self.rank <= self.d
 
     def __str__(self) -> str:
         leading = ", ".join(f"{value:.3g}" for value in self.singular_values[: self.d + 2])
-        return f"rank {self.rank} (d = {self.d}); ratio {self.tightness:.2g}; singular values {leading}, .."
+        rank = f"rank {self.rank} (d = {self.d})"
+        return f"{rank}; ratio {self.tightness:.2g}; singular values {leading}, .."
 
 
 def rank_report(Z: Array, d: int) -> RankReport:
-    """Report of a symmetric matrix, (side, side)."""
-    values = np.sort(np.abs(np.linalg.eigvalsh(Z)))[::-1]
+    """Report the numerical rank of a symmetric matrix, (side, side)."""
+    magnitudes = np.abs(np.linalg.eigvalsh(Z))
+    values = np.sort(magnitudes)[::-1]
     following = float(values[d]) if len(values) > d else 0.0
     rank = int(np.count_nonzero(values > RANK_TOLERANCE * values[0]))
     return RankReport(values, d, rank, following / float(values[d - 1]))
 
 
 def round_gram(problem: PGOProblem, Z: Array) -> tuple[Poses, RankReport]:
-    """Nearest rank d factor of Z, (dn, dn), its blocks projected to SO(d), and the best translations for them.
+    """Round Z, (dn, dn): its nearest factor of rank d, the blocks projected to SO(d).
 
-    Z = Y Y^T with the rows R_i^T of every pose in Y, up to one orthogonal matrix on the right; if it has determinant
-    -1 on most blocks, a column changes its sign (Rosen et al. 2019, algorithm 2).
+    The translations are the best ones for these rotations. Z = Y Y^T with the rows R_i^T of every
+    pose in Y, up to one orthogonal matrix on the right; if it has determinant -1 on most blocks, a
+    column changes its sign (Rosen et al. 2019, algorithm 2).
     """
     d = problem.d
     symmetric = 0.5 * (Z + Z.T)
     values, vectors = np.linalg.eigh(symmetric)
-    Y = vectors[:, -d:] * np.sqrt(np.maximum(values[-d:], 0.0))
+    scale = np.sqrt(np.maximum(values[-d:], 0.0))
+    Y = vectors[:, -d:] * scale
     return _rounded(problem, Y), rank_report(symmetric, d)
 
 
 def round_factor(problem: PGOProblem, Y: Array) -> tuple[Poses, RankReport]:
-    """Poses of a low-rank factor, (n, d, r): what `round_gram` makes of Z = Y Y^T, without forming it.
+    """Round a low-rank factor, (n, d, r), as `round_gram` rounds Z = Y Y^T, without forming Z.
 
     Rotations, which r = d gives as long as no block reflects, are returned as they are.
     """
@@ -60,15 +68,19 @@ def round_factor(problem: PGOProblem, Y: Array) -> tuple[Poses, RankReport]:
     stacked = Y.reshape(n * d, r)
     gram = stacked.T @ stacked
     report = rank_report(gram, d)
-    if r == d and (np.linalg.det(Y) > 0).all():
+    are_rotations = r == d and (np.linalg.det(Y) > 0).all()
+    if are_rotations:
         return problem.with_best_translations(np.swapaxes(Y, 1, 2)), report
     _, vectors = np.linalg.eigh(gram)
     return _rounded(problem, stacked @ vectors[:, -d:]), report
 
 
 def _rounded(problem: PGOProblem, Y: Array) -> Poses:
-    """Poses of a factor of rank d, (dn, d), turned over if most of its blocks reflect."""
+    """Round a factor of rank d, (dn, d), turned over if most of its blocks reflect."""
     d = problem.d
-    if np.count_nonzero(np.linalg.det(Y.reshape(-1, d, d)) < 0) > problem.num_poses / 2:
+    determinants = np.linalg.det(Y.reshape(-1, d, d))
+    num_reflections = np.count_nonzero(determinants < 0)
+    if num_reflections > problem.num_poses / 2:
         Y = Y * np.where(np.arange(d) == 0, -1.0, 1.0)
-    return problem.with_best_translations(project_to_rotations(unstack_transposes(Y)))
+    R = project_to_rotations(unstack_transposes(Y))
+    return problem.with_best_translations(R)

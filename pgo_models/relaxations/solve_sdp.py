@@ -1,4 +1,4 @@
-"""solve_relaxation: pose the semidefinite relaxation, solve it, round it, and prove the bound that its duals give."""
+"""solve_relaxation: pose the semidefinite relaxation, solve it, round it, and prove its bound."""
 
 import enum
 import math
@@ -7,14 +7,25 @@ from dataclasses import dataclass
 
 import cvxpy as cp
 
-from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, certify_with, gap_text
+from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, certify_with
 from pgo_models.convex.convex_solver import ConvexSolver
 from pgo_models.errors import PGOError, SettingError
+from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.clique_decomposition import CliqueRelaxation, clique_relaxation
-from pgo_models.relaxations.plan import DEFAULT_MEMORY_LIMIT, RelaxationForm, RelaxationPlan, plan_relaxation
-from pgo_models.relaxations.primal_dual import DualRelaxation, PrimalRelaxation, dual_relaxation, primal_relaxation
+from pgo_models.relaxations.plan import (
+    DEFAULT_MEMORY_LIMIT,
+    RelaxationForm,
+    RelaxationPlan,
+    plan_relaxation,
+)
+from pgo_models.relaxations.primal_dual import (
+    DualRelaxation,
+    PrimalRelaxation,
+    dual_relaxation,
+    primal_relaxation,
+)
 from pgo_models.relaxations.rounding import RankReport
 
 DEFAULT_RELAXATION_GAP = 1e-5
@@ -27,29 +38,53 @@ class RelaxationStatus(enum.Enum):
     """How the solver ended."""
 
     OPTIMAL = "solved to the solver's tolerance"
-    INACCURATE = "stopped where rounding lets it go no further, short of tolerance; the bound is proven all the same"
-    LIMIT = "stopped by its limit of time or iterations; the bound is proven all the same, but may be wide"
+    INACCURATE = (
+        "stopped where rounding lets it go no further, short of tolerance; "
+        "the bound is proven all the same"
+    )
+    LIMIT = (
+        "stopped by its limit of time or iterations; "
+        "the bound is proven all the same, but may be wide"
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class RelaxationSolution:
-    """What the relaxation says of a pose graph.
+    """Rounded poses, a proven bound, and how the relaxation was solved.
 
-    The certificate is of the rounded poses, with multipliers from the duals: its bound holds whatever the solver did.
+    Parameters
+    ----------
+    relaxation : PrimalRelaxation, DualRelaxation or CliqueRelaxation
+        The model with its variables and duals as solved.
+    plan : RelaxationPlan
+        Form and solver.
+    status : RelaxationStatus
+        How the solver ended.
+    value : float
+        Optimal value as the solver reports it: evidence, not a bound.
+    certificate : Certificate
+        Of the rounded poses, with multipliers from the duals: its bound holds whatever the solver
+        did.
+    rank : RankReport
+        Rank of the solution.
+    iterations : int
+        Of the solver.
+    seconds : float
+        From posing to proof.
     """
 
-    relaxation: Relaxation  # the model with its variables and duals as solved
+    relaxation: Relaxation
     plan: RelaxationPlan
     status: RelaxationStatus
-    value: float  # optimal value as the solver reports it: evidence, not a bound
+    value: float
     certificate: Certificate
     rank: RankReport
     iterations: int
-    seconds: float  # from posing to proof
+    seconds: float
 
     @property
     def poses(self) -> Poses:
-        """Rounded."""
+        """The rounded poses."""
         return self.certificate.poses
 
     @property
@@ -59,7 +94,7 @@ class RelaxationSolution:
 
     @property
     def lower_bound(self) -> float:
-        """Proven: F of no poses is below it."""
+        """The proven bound: F of no poses is below it."""
         return self.certificate.lower_bound
 
     @property
@@ -73,13 +108,15 @@ class RelaxationSolution:
         return self.certificate.verdict
 
     def __str__(self) -> str:
+        certificate = self.certificate
+        eta = rounded_up(certificate.eta, 3)
         lines = [
             f"relaxation   {self.plan}",
             f"status       {self.status.name}: {self.status.value}",
             f"effort       {self.iterations} iterations, {self.seconds:.3g} s",
-            f"F rounded    {self.objective:.10g}",
-            f"lower bound  {self.lower_bound:.10g}   (solver: {self.value:.10g}; eta = {self.certificate.eta:.3g})",
-            f"gap          {gap_text(self.gap)}   (asked for: {self.certificate.wanted_gap:.3g})",
+            f"F rounded    {certificate.cost_text}",
+            f"lower bound  {certificate.bound_text}   (solver: {self.value:.10g}; eta = {eta})",
+            f"gap          {certificate.gap_text}   (asked for: {certificate.wanted_gap:.3g})",
             f"rank         {self.rank}",
             f"verdict      {self.verdict.name}: {self.verdict.value}",
         ]
@@ -98,12 +135,40 @@ def solve_relaxation(
 ) -> RelaxationSolution:
     """Solve the semidefinite relaxation of a pose graph.
 
-    Form and solver, any of cvxpy that takes semidefinite cones, are chosen by `plan_relaxation` unless given. The
-    relative `gap` is for the verdict; where the proof needs a shift eta, the smallest that is tried follows from it.
-    An estimate above `memory_limit`, in bytes, is refused before anything is formed; `time_limit`, in seconds, is for
-    the solver. With `verbose`, the plan with its reason, the solver's table, and the result are printed.
+    Parameters
+    ----------
+    problem : PGOProblem
+        The problem; its cost must be quadratic in the poses.
+    form : RelaxationForm or None
+        How the relaxation is posed; chosen by the sizes of its cones unless given.
+    solver : ConvexSolver, str or None
+        A solver of cvxpy that takes semidefinite cones; chosen with the form unless given.
+    gap : float
+        Relative gap for the verdict. Where the proof needs a shift eta, the smallest that is tried
+        follows from it.
+    memory_limit : float, in bytes
+        An estimate above it is refused before anything is formed.
+    time_limit : float, in seconds
+        For the solver.
+    verbose : bool
+        Whether the plan with its reason, the solver's table, and the result are printed.
 
-    A SettingError when a limit or the gap is not positive, or memory would not do; a PGOError when there is no iterate.
+    Returns
+    -------
+    RelaxationSolution
+        The rounded poses with their certificate.
+
+    Raises
+    ------
+    SettingError
+        If a limit or the gap is not positive, the cost is not quadratic, or the memory limit is
+        exceeded.
+    PGOError
+        If the solver gives no iterate.
+
+    References
+    ----------
+    Rosen, Carlone, Bandeira & Leonard, SE-Sync, 2019.
 
     Examples
     --------
@@ -112,39 +177,57 @@ def solve_relaxation(
     >>> solution.status.name, solution.verdict.name, solution.rank.rank
     ('OPTIMAL', 'CERTIFIED', 3)
     """
-    for name, given in (("gap", gap), ("time_limit", time_limit)):
-        if not given > 0 or (name == "gap" and math.isinf(given)):
-            raise SettingError(f"{name} is {given}; it must be positive, the gap finite")
+    if not 0 < gap < math.inf:
+        raise SettingError(f"gap is {gap}; it must be positive, the gap finite")
+    if not time_limit > 0:
+        raise SettingError(f"time_limit is {time_limit}; it must be positive, the gap finite")
     problem.check_quadratic("the relaxation")
     began = time.perf_counter()
     plan = plan_relaxation(problem, form, solver, memory_limit)
     if verbose:
         print(plan)
-    if plan.form is RelaxationForm.CLIQUES:
-        relaxation: Relaxation = clique_relaxation(problem, tree=plan.tree)
-    else:
-        relaxation = primal_relaxation(problem) if plan.form is RelaxationForm.PRIMAL else dual_relaxation(problem)
+    relaxation = _posed(problem, plan)
     status = _solve(relaxation.model, plan.solver, time_limit, verbose)
     poses, rank = relaxation.rounded()
-    certificate = certify_with(problem, poses, relaxation.Lambda(), gap, math.nan, BoundSource.RELAXATION, ground=poses)
-    value, iterations = float(relaxation.model.value) * relaxation.scale, relaxation.model.solver_stats.num_iters or 0
+    certificate = certify_with(
+        problem, poses, relaxation.Lambda(), gap, math.nan, BoundSource.RELAXATION, ground=poses
+    )
+    value = float(relaxation.model.value) * relaxation.scale
+    iterations = relaxation.model.solver_stats.num_iters or 0
     seconds = time.perf_counter() - began
-    solution = RelaxationSolution(relaxation, plan, status, value, certificate, rank, int(iterations), seconds)
+    solution = RelaxationSolution(
+        relaxation, plan, status, value, certificate, rank, int(iterations), seconds
+    )
     if verbose:
         print(solution)
     return solution
 
 
-def _solve(model: cp.Problem, solver: ConvexSolver, time_limit: float, verbose: bool) -> RelaxationStatus:
+def _posed(problem: PGOProblem, plan: RelaxationPlan) -> Relaxation:
+    if plan.form is RelaxationForm.CLIQUES:
+        return clique_relaxation(problem, tree=plan.tree)
+    if plan.form is RelaxationForm.PRIMAL:
+        return primal_relaxation(problem)
+    return dual_relaxation(problem)
+
+
+def _solve(
+    model: cp.Problem, solver: ConvexSolver, time_limit: float, verbose: bool
+) -> RelaxationStatus:
     try:
         solver.run(model, TOLERANCE, time_limit=time_limit, verbose=verbose)
     except cp.SolverError as error:
-        raise PGOError(f"{solver.name} failed on the relaxation: {error}; try another solver or form") from error
+        raise PGOError(
+            f"{solver.name} failed on the relaxation: {error}; try another solver or form"
+        ) from error
     if model.value is None or not math.isfinite(model.value):
-        ended = f"{solver.name} ended with status {model.status} on the relaxation and gave no iterate"
-        raise PGOError(f"{ended}; raise time_limit, or try another solver or form")
+        raise PGOError(
+            f"{solver.name} ended with status {model.status} on the relaxation and gave no "
+            "iterate; raise time_limit, or try another solver or form"
+        )
     if model.status == cp.OPTIMAL:
         return RelaxationStatus.OPTIMAL
     # SCS calls inaccurate what its limits stopped.
-    stalled = model.status == cp.OPTIMAL_INACCURATE and not solver.is_first_order
-    return RelaxationStatus.INACCURATE if stalled else RelaxationStatus.LIMIT
+    if model.status == cp.OPTIMAL_INACCURATE and not solver.is_first_order:
+        return RelaxationStatus.INACCURATE
+    return RelaxationStatus.LIMIT

@@ -4,17 +4,19 @@ With H = J^T diag(w) J and b = -J^T diag(w) r, the robots of one turn, rows a, s
 
     x_a <- x_a + alpha H_aa^-1 (b - H x)_a
 
-each by the Cholesky factor of its own diagonal block; of the others' x they need separators only (Choudhary et al.
-2017; Bertsekas & Tsitsiklis, Parallel and Distributed Computation, section 2.4). Turns of robots that are no neighbours
-converge for 0 < alpha < 2 and every positive definite H (SOR). All robots at once converge for 0 < alpha <= 1: with D
-the diagonal blocks, 2 D - H is the H of the problem in which one end of every edge between robots has its sign flipped.
-It is a sum of squares, positive definite if connected with a fixed pose, as each end of an edge determines its pose.
+each by the Cholesky factor of its own diagonal block; of the others' x they need separators only
+(Choudhary et al. 2017; Bertsekas & Tsitsiklis, Parallel and Distributed Computation, section 2.4).
+Turns of robots that are no neighbours converge for 0 < alpha < 2 and every positive definite H
+(SOR). All robots at once converge for 0 < alpha <= 1: with D the diagonal blocks, 2 D - H is the H
+of the problem in which one end of every edge between robots has its sign flipped. It is a sum of
+squares, positive definite if connected with a fixed pose, as each end of an edge determines its
+pose.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array, csc_array, csr_array
 
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
@@ -25,28 +27,61 @@ from solvers.network.ledger import Ledger, Traffic
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """Minimise sum_rows w ||J x + r||^2, every row of one edge and every unknown of one pose."""
+    """Minimise sum_rows w ||J x + r||^2, every row of one edge and every unknown of one pose.
 
-    J: csr_array  # sparse (rows, unknowns)
-    w: Array  # (rows,)
-    r: Array  # (rows, columns)
-    edge: IntArray  # (rows,)
-    pose: IntArray  # (unknowns,)
+    Parameters
+    ----------
+    J : (rows, unknowns) sparse array
+        Jacobian.
+    w : (rows,) array
+        Weights.
+    r : (rows, columns) array
+        Residuals at x = 0.
+    edge : (rows,) array
+        Edge of every row.
+    pose : (unknowns,) array
+        Pose of every unknown.
+    """
+
+    J: csr_array
+    w: Array
+    r: Array
+    edge: IntArray
+    pose: IntArray
 
 
 @dataclass(frozen=True, eq=False)
 class Turn:
-    """Robots that update at once."""
+    """Robots that update at once.
 
-    rows: IntArray  # (rows,): their unknowns
-    H: csr_array  # sparse (rows, unknowns)
-    b: Array  # (rows, columns)
-    factor: CholeskyFactor | None  # of the robots' diagonal blocks, all of the turn in one block-diagonal matrix
-    traffic: Traffic  # what they send to their neighbours afterwards
+    Parameters
+    ----------
+    rows : (rows,) array
+        Their unknowns.
+    H : (rows, unknowns) sparse array
+        Their rows of the normal matrix.
+    b : (rows, columns) array
+        Their rows of the right-hand side.
+    factor : CholeskyFactor or None
+        Of their diagonal blocks, all of the turn in one block-diagonal matrix; None without rows.
+    traffic : Traffic
+        What they send to their neighbours afterwards.
+    """
+
+    rows: IntArray
+    H: csr_array
+    b: Array
+    factor: CholeskyFactor | None
+    traffic: Traffic
 
 
-def take_turns(turns: tuple[Turn, ...], x: Array, alpha: float, ledger: Ledger) -> tuple[Array, Ledger]:
-    """One sweep from x, (unknowns, columns): every turn with over-relaxation alpha, then its exchange."""
+def take_turns(
+    turns: tuple[Turn, ...], x: Array, alpha: float, ledger: Ledger
+) -> tuple[Array, Ledger]:
+    """Make one sweep from x, (unknowns, columns).
+
+    In every turn its robots update with over-relaxation alpha, and then send what has changed.
+    """
     x = x.copy()
     for turn in turns:
         if turn.factor is not None:
@@ -56,43 +91,68 @@ def take_turns(turns: tuple[Turn, ...], x: Array, alpha: float, ledger: Ledger) 
     return x, ledger
 
 
-def sweep_turns(linear: LeastSquares, turns: Schedule, count: int, backend: CholeskyBackend | None) -> tuple[Turn, ...]:
-    """Prepare the turns of a sweep, `count` numbers a pose being what is sent."""
+def sweep_turns(
+    linear: LeastSquares, turns: Schedule, count: int, backend: CholeskyBackend | None
+) -> tuple[Turn, ...]:
+    """Prepare the turns of a sweep, in which `count` numbers are sent for every pose."""
     return _prepare(linear.J, linear, turns, turns.group, count, backend)
 
 
 def flagged_turns(
-    linear: LeastSquares, graph: PoseGraph, turns: Schedule, count: int, backend: CholeskyBackend | None
+    linear: LeastSquares,
+    graph: PoseGraph,
+    turns: Schedule,
+    count: int,
+    backend: CholeskyBackend | None,
 ) -> tuple[Turn, ...]:
     """Prepare the turns of a first sweep that needs no start.
 
-    An edge between two robots counts for the end that comes later, which uses the estimate of the end before it.
-    Between two of one turn it does not count yet.
+    An edge between two robots counts for the end that comes later, which uses the estimate of the
+    end before it. An edge between two robots of the same turn does not count yet.
     """
     entries = linear.J.tocoo()
-    edge, pose = linear.edge[entries.row], linear.pose[entries.col]
-    other = graph.i[edge] + graph.j[edge] - pose
-    counts = (turns.robot[pose] == turns.robot[other]) | (turns.first[pose] > turns.first[other])
-    counted = coo_array((entries.data * counts, (entries.row, entries.col)), shape=entries.shape).tocsr()
-    return _prepare(counted, linear, turns, turns.first, count, backend)
+    edge = linear.edge[entries.row]
+    pose = linear.pose[entries.col]
+    other_end = graph.i[edge] + graph.j[edge] - pose
+    is_inside = turns.robot[pose] == turns.robot[other_end]
+    is_later = turns.first[pose] > turns.first[other_end]
+    data = entries.data * (is_inside | is_later)
+    counted = coo_array((data, (entries.row, entries.col)), shape=entries.shape)
+    return _prepare(counted.tocsr(), linear, turns, turns.first, count, backend)
 
 
 def _prepare(
-    left: csr_array, linear: LeastSquares, turns: Schedule, group: IntArray, count: int, backend: CholeskyBackend | None
+    left: csr_array,
+    linear: LeastSquares,
+    turns: Schedule,
+    group: IntArray,
+    count: int,
+    backend: CholeskyBackend | None,
 ) -> tuple[Turn, ...]:
     """Turns of left^T diag(w) (J x + r) = 0; `group`, (n,), is the turn of every pose."""
     weighted = (left * linear.w[:, None]).T.tocsr()
-    H, b = (weighted @ linear.J).tocsr(), -(weighted @ linear.r)
-    turn_of_row, robot = group[linear.pose], turns.robot[linear.pose]
-    number = np.zeros(H.shape[0], dtype=np.int64)
+    H = (weighted @ linear.J).tocsr()
+    b = -(weighted @ linear.r)
+    turn_of_row = group[linear.pose]
+    robot_of_row = turns.robot[linear.pose]
     prepared = []
     for turn in range(int(group.max()) + 1):
         rows = np.flatnonzero(turn_of_row == turn)
         traffic = turns.traffic(np.flatnonzero(group == turn), count)
-        H_rows, number[rows] = H[rows], np.arange(len(rows))
-        entries = H_rows.tocoo()
-        own = (robot[rows[entries.row]] == robot[entries.col]) & (turn_of_row[entries.col] == turn)
-        block = coo_array((entries.data[own], (entries.row[own], number[entries.col[own]])), shape=(len(rows),) * 2)
-        factor = factorize(block.tocsc(), backend) if len(rows) else None
+        H_rows = H[rows]
+        factor = None
+        if len(rows):
+            factor = factorize(_diagonal_blocks(H_rows, rows, robot_of_row), backend)
         prepared.append(Turn(rows, H_rows, b[rows], factor, traffic))
     return tuple(prepared)
+
+
+def _diagonal_blocks(H_rows: csr_array, rows: IntArray, robot_of_row: IntArray) -> csc_array:
+    """The diagonal blocks of the robots that own some rows of H, in one block-diagonal matrix."""
+    position = np.full(H_rows.shape[1], -1)
+    position[rows] = np.arange(len(rows))
+    entries = H_rows.tocoo()
+    is_same_robot = robot_of_row[rows[entries.row]] == robot_of_row[entries.col]
+    own = is_same_robot & (position[entries.col] >= 0)
+    positions = entries.row[own], position[entries.col[own]]
+    return coo_array((entries.data[own], positions), shape=(len(rows), len(rows))).tocsc()

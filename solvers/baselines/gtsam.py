@@ -1,14 +1,18 @@
-"""GTSAM as a rival: the same graph as its factors, solved by its optimiser, the poses judged by our F.
+"""GTSAM as a method to compare with: the same graph in its factors, its poses measured by our F.
 
-With `Weighting.INFORMATION` its noise models are the information matrices: its cost is chi2, with the logarithm in
-SE(d) for the residual. For F it minimises sum_e 1/2 ||Log(z_e^-1 x_i^-1 x_j)||^2 in units of standard deviations. A
-rotation residual of angle theta adds kappa ||R_j - R_i R_ij||_F^2 = 4 kappa (1 - cos theta) = 2 kappa theta^2 +
-O(theta^4) to F, in the plane as in space, so that
+With `Weighting.INFORMATION` its noise models are the information matrices: its cost is chi2, with
+the logarithm in SE(d) for the residual. For F it minimises sum_e 1/2 ||Log(z_e^-1 x_i^-1 x_j)||^2
+in units of standard deviations. A rotation residual of angle theta adds kappa ||R_j - R_i
+R_ij||_F^2 = 4 kappa (1 - cos theta) = 2 kappa theta^2 + O(theta^4) to F, in the plane as in space,
+so that
 
     sigma_R = 1 / (2 sqrt(kappa)),        sigma_t = 1 / sqrt(2 tau)
 
-make its cost F to leading order. Its optimum is that of the angles, not of the chords, and lies above ours in F by what
-is of fourth order. GTSAM is BSD-licensed: https://gtsam.org; the extra `peers` brings it.
+make its cost F to leading order. Its optimum is that of the angles, not of the chords, and lies
+above ours in F by what is of fourth order. Nothing in these optimisers says how far from the
+minimum they end; of rotations alone GTSAM has a certificate, `RiemannianStaircaseOptimizer` since
+4.3: yes or no, with a tolerance. GTSAM is BSD-licensed: https://gtsam.org; the extra `peers` brings
+it.
 """
 
 import enum
@@ -25,15 +29,15 @@ import numpy as np
 from pgo_models.errors import NotPositiveDefiniteError, SettingError, check_settings, extra_module
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, log_map, project_to_rotations
-from pgo_models.graphs.measurements import isotropic_information
-from pgo_models.graphs.precisions import proper_information
+from pgo_models.graphs.pose_graph import isotropic_information
+from pgo_models.graphs.precisions import LEAST_SCALED, are_definite, proper_information
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.result import History, Measurement, Record, Run, Status
 
 
 class GtsamMethod(enum.Enum):
-    """Which of its optimisers."""
+    """Which of GTSAM's optimisers is used."""
 
     LEVENBERG_MARQUARDT = "Levenberg-Marquardt"
     GAUSS_NEWTON = "Gauss-Newton"
@@ -41,24 +45,43 @@ class GtsamMethod(enum.Enum):
 
 @dataclass(frozen=True)
 class Gtsam:
-    """Settings of a run of GTSAM; a SettingError when one is out of its range."""
+    """Settings of a run of GTSAM.
+
+    Parameters
+    ----------
+    method : GtsamMethod
+        Which optimiser is used.
+    tolerance : float
+        On the relative change of its cost in one iteration; the default is GTSAM's.
+    max_iterations : int
+        Iterations at most.
+
+    Raises
+    ------
+    SettingError
+        If a setting is out of its range.
+    """
 
     method: GtsamMethod = GtsamMethod.LEVENBERG_MARQUARDT
-    tolerance: float = 1e-5  # on the relative change of its cost in one iteration; the default is GTSAM's
+    tolerance: float = 1e-5
     max_iterations: int = 100
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
 
 
-def run_gtsam(problem: PGOProblem, settings: Gtsam | None = None, start: Poses | None = None) -> Run[Poses]:
+def run_gtsam(
+    problem: PGOProblem, settings: Gtsam | None = None, start: Poses | None = None
+) -> Run[Poses]:
     """Solve a pose graph by GTSAM; history and objective are our F at its iterates.
 
-    Without a start GTSAM has its own: chordal rotations and a Gauss-Newton step in space, LAGO in the plane. Seconds
-    hold the making of the factors and the start, and leave out importing GTSAM and judging its poses.
+    Without a start GTSAM has its own: chordal rotations and a Gauss-Newton step in space, LAGO in
+    the plane. The seconds include making the factors and the start, and leave out importing GTSAM
+    and measuring its poses.
 
-    A MissingExtraError without GTSAM, a GraphError when the start does not fit the graph, a NotPositiveDefiniteError
-    when GTSAM meets a singular linear system, as Gauss-Newton does far from a solution.
+    A MissingExtraError without GTSAM, a GraphError when the start does not fit the graph, a
+    NotPositiveDefiniteError when GTSAM meets a singular linear system, as Gauss-Newton does far
+    from a solution.
     """
     gtsam = extra_module("gtsam", "peers")
     settings = settings if settings is not None else Gtsam()
@@ -66,61 +89,92 @@ def run_gtsam(problem: PGOProblem, settings: Gtsam | None = None, start: Poses |
         problem.stacked(start)  # raises unless the poses fit
     began = time.perf_counter()
     graph = factor_graph(problem, start)
-    with _named_singular():
+    with _singular_named():
         values = _own_start(gtsam, problem, graph) if start is None else _values(gtsam, start)
         optimizer = _optimizer(gtsam, settings, graph, values)
     seconds = time.perf_counter() - began
     poses = _poses(gtsam, optimizer.values(), problem.d)
-    best = (problem.objective(poses), poses)
-    records = [Record(0, seconds, Measurement(best[0], 0.0, math.inf))]
-    status, k = Status.MAX_ITERATIONS, 0
-    while k < settings.max_iterations:
-        before, began = optimizer.error(), time.perf_counter()
-        with _named_singular():
+    objective = problem.objective(poses)
+    best = (objective, poses)
+    records = [Record(0, seconds, Measurement(objective, 0.0, math.inf))]
+    status = Status.MAX_ITERATIONS
+    for k in range(1, settings.max_iterations + 1):
+        cost_before = optimizer.error()
+        began = time.perf_counter()
+        with _singular_named():
             optimizer.iterate()
         seconds += time.perf_counter() - began
-        k += 1
         cost = optimizer.error()
         if not math.isfinite(cost):
             records.append(Record(k, seconds, Measurement(math.nan, math.nan, math.nan)))
             status = Status.NOT_FINITE
             break
-        change = abs(before - cost) / max(before, np.finfo(float).tiny)
+        change = abs(cost_before - cost) / max(cost_before, np.finfo(float).tiny)
         poses = _poses(gtsam, optimizer.values(), problem.d)
         objective = problem.objective(poses)
         records.append(Record(k, seconds, Measurement(objective, 0.0, change)))
         best = min(best, (objective, poses), key=lambda pair: pair[0])
         if change <= settings.tolerance or cost <= np.finfo(float).tiny:
-            status, best = Status.CONVERGED, (objective, poses)
+            status = Status.CONVERGED
+            best = (objective, poses)
             break
-    (objective, poses), name = best, f"GTSAM {settings.method.value}"
-    return Run(name, objective, poses, status, k, History(tuple(records)), seconds, poses)
+    objective, poses = best
+    name = f"GTSAM {settings.method.value}"
+    iterations = records[-1].k
+    return Run(name, objective, poses, status, iterations, History(tuple(records)), seconds, poses)
 
 
-def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noqa: ANN401  GTSAM has no types
+def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noqa: ANN401 - GTSAM has no types
     """The `gtsam.NonlinearFactorGraph` of a problem, keys 0 .. n-1, with a prior on pose 0.
 
-    The prior, at pose 0 of `start` or at the identity, fixes the gauge, open in F. A MissingExtraError without GTSAM.
+    The prior, at pose 0 of `start` or at the identity, fixes the gauge, which F leaves open. A
+    MissingExtraError without GTSAM.
     """
-    gtsam, graph, d = extra_module("gtsam", "peers"), problem.graph, problem.d
+    gtsam = extra_module("gtsam", "peers")
+    graph = problem.graph
+    d = problem.d
     if not ((graph.kappa > 0) & (graph.tau > 0)).all():
-        raise SettingError(f"{graph.name} has edges without a rotation or position, which GTSAM is not given; solve()")
-    if problem.weighting is Weighting.INFORMATION:
-        information = 2.0 * proper_information(graph)  # GTSAM halves
-    else:
-        kappa = graph.kappa if d == 3 else 2.0 * graph.kappa  # an angle's information is twice kappa, in space as here
-        information = 2.0 * isotropic_information(kappa, graph.tau, d)
-    if d == 3:  # a tangent vector of Pose3 begins with the rotation, one of Pose2 with the translation
-        information = np.roll(information, 3, axis=(1, 2))
+        raise SettingError(
+            f"{graph.name} has edges without a rotation or position, "
+            "which GTSAM is not given; solve()"
+        )
+    information = _information(problem)
     between = gtsam.BetweenFactorPose3 if d == 3 else gtsam.BetweenFactorPose2
-    factors, noise = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Gaussian.Information
-    measured = _gtsam_poses(gtsam, Poses(graph.R_ij, graph.t_ij))
-    for i, j, pose, weight in zip(graph.i.tolist(), graph.j.tolist(), measured, information, strict=True):
-        factors.add(between(i, j, pose, noise(weight)))
     prior = gtsam.PriorFactorPose3 if d == 3 else gtsam.PriorFactorPose2
-    at = _gtsam_poses(gtsam, Poses.identity(1, d) if start is None else start[:1])[0]
-    factors.add(prior(0, at, noise(np.diag(np.einsum("mkk->mk", information).max(axis=0)))))
+    full_noise = gtsam.noiseModel.Gaussian.Information
+    factors = gtsam.NonlinearFactorGraph()
+    measured = _gtsam_poses(gtsam, Poses(graph.R_ij, graph.t_ij))
+    edges = zip(graph.i.tolist(), graph.j.tolist(), measured, information, strict=True)
+    definite = are_definite(information, LEAST_SCALED).tolist()
+    for (i, j, pose, weight), is_definite in zip(edges, definite, strict=True):
+        noise = full_noise(weight) if is_definite else _semidefinite_noise(gtsam, weight)
+        factors.add(between(i, j, pose, noise))
+    pose_0 = Poses.identity(1, d) if start is None else start[:1]
+    largest_information = np.einsum("mkk->mk", information).max(axis=0)
+    noise = full_noise(np.diag(largest_information))
+    factors.add(prior(0, _gtsam_poses(gtsam, pose_0)[0], noise))
     return factors
+
+
+def _information(problem: PGOProblem) -> Array:
+    """Information matrices of all edges for GTSAM, whose cost has the factor one half."""
+    graph = problem.graph
+    if problem.weighting is Weighting.INFORMATION:
+        information = 2.0 * proper_information(graph)
+    else:
+        # The information of an angle is twice kappa. `isotropic_information` has this factor in
+        # space, and not in the plane.
+        kappa = graph.kappa if problem.d == 3 else 2.0 * graph.kappa
+        information = 2.0 * isotropic_information(kappa, graph.tau, problem.d)
+    # A tangent vector of Pose3 begins with the rotation, one of Pose2 with the translation.
+    return np.roll(information, 3, axis=(1, 2)) if problem.d == 3 else information
+
+
+def _semidefinite_noise(gtsam: ModuleType, information: Array) -> Any:  # noqa: ANN401
+    """Noise model of a singular matrix, which `Gaussian.Information` factors wrongly in silence."""
+    eigenvalues, axes = np.linalg.eigh(information)
+    root = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * axes.T
+    return gtsam.noiseModel.Gaussian.SqrtInformation(np.linalg.qr(root)[1])
 
 
 def _own_start(gtsam: ModuleType, problem: PGOProblem, graph: Any) -> Any:  # noqa: ANN401
@@ -136,8 +190,8 @@ def _optimizer(gtsam: ModuleType, settings: Gtsam, graph: Any, values: Any) -> A
 
 
 @contextmanager
-def _named_singular() -> Iterator[None]:
-    """Raise GTSAM's error as ours."""
+def _singular_named() -> Iterator[None]:
+    """Raise GTSAM's error of a singular linear system as ours."""
     try:
         yield
     except RuntimeError as error:
@@ -150,7 +204,8 @@ def _gtsam_poses(gtsam: ModuleType, poses: Poses) -> list[Any]:
     if poses.d == 3:
         return [gtsam.Pose3(gtsam.Rot3(R), t) for R, t in zip(poses.R, poses.t, strict=True)]
     angles: Array = log_map(poses.R)[:, 0]
-    return [gtsam.Pose2(t[0], t[1], angle) for t, angle in zip(poses.t.tolist(), angles.tolist(), strict=True)]
+    t_and_angles = zip(poses.t.tolist(), angles.tolist(), strict=True)
+    return [gtsam.Pose2(t[0], t[1], angle) for t, angle in t_and_angles]
 
 
 def _values(gtsam: ModuleType, poses: Poses) -> Any:  # noqa: ANN401

@@ -1,7 +1,8 @@
-"""Levenberg-Marquardt on SE(d)^n: the Gauss-Newton matrix with a damping that the actual decrease steers.
+"""Levenberg-Marquardt on SE(d)^n: Gauss-Newton with a damping that the actual decrease controls.
 
-The baseline of g2o and GTSAM, with the damping rule of Nielsen (Madsen, Nielsen & Tingleff 2004, Methods for Non-Linear
-Least Squares Problems, algorithm 3.16) and the scaling of Marquardt (1963): rotations and translations differ in units.
+The baseline of g2o and GTSAM, with the damping rule of Nielsen (Madsen, Nielsen & Tingleff 2004,
+Methods for Non-Linear Least Squares Problems, algorithm 3.16) and the scaling of Marquardt (1963):
+rotations and translations differ in units.
 """
 
 import math
@@ -10,7 +11,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, ground_pose, move_poses, scaled_decrement
+from pgo_models.certificates.newton_polish import ground_pose, move_poses
+from pgo_models.certificates.newton_step import STATIONARY_DECREMENT, scaled_decrement
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.errors import NotPositiveDefiniteError, check_settings
 from pgo_models.geometry.poses import Poses
@@ -22,41 +24,93 @@ from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
 from solvers.result import Measurement, Status
 
-_SMALLEST_FACTOR = 1.0 / 3.0  # of the damping, after a step that the model foresaw
-_GROWTH = 2.0  # of the damping after the first step that was refused in a row; squared after the second, and so on
-_DAMPING_LIMITS = 1e-15, 1e15
-_TRUSTED_DAMPING = 1e-4  # above, the decrement is that of the damping, not of F
-_ROUNDING = 1e-14  # relative change of F that is not told apart from none
+_SMALLEST_FACTOR = 1.0 / 3.0  # on the damping, after a step that the model predicted well
+_GROWTH = 2.0  # of the damping after a refused step; it doubles with each refusal in a row
+_MIN_DAMPING = 1e-15
+_MAX_DAMPING = 1e15
+_TRUSTED_DAMPING = 1e-4  # above it the decrement is that of the damping, not of F
+_ROUNDING = 1e-14  # relative change of F that counts as none
 
 
 @dataclass(frozen=True, eq=False)
 class LevenbergMarquardtState:
-    """State k."""
+    """Iterate k, and the next step.
+
+    Parameters
+    ----------
+    k : int
+        Number of the iterate.
+    poses : Poses
+        Current poses.
+    objective : float
+        F there.
+    level : float
+        Rounding level of F.
+    matrix : (side, side) sparse array
+        A, the Gauss-Newton matrix at the poses, pose 0 grounded.
+    gradient : (side,) array
+        g, the gradient of F.
+    analysis : SymbolicCholesky
+        Ordering and pattern of the factor.
+    damping : float
+        mu of the next step, which solves (A + mu diag(A)) h = -g.
+    growth : float
+        Factor on mu if that step is refused.
+    step : (side,) array
+        h, nan where the damped matrix has no Cholesky factor.
+    decrement : float
+        -<g, h> / 2, less the rounding level of F, over F.
+    """
 
     k: int
     poses: Poses
-    objective: float  # F
-    level: float  # its rounding level
-    matrix: csc_array  # A, the Gauss-Newton matrix at the poses, pose 0 grounded
+    objective: float
+    level: float
+    matrix: csc_array
     gradient: Array
     analysis: SymbolicCholesky
-    damping: float  # mu, of the next step: it solves (A + mu diag(A)) h = -g
-    growth: float  # factor on mu if that step is refused
-    # h, nan where the matrix with this damping has no Cholesky factor.
+    damping: float
+    growth: float
     step: Array = field(default_factory=lambda: np.empty(0))
-    decrement: float = math.inf  # -<g, h> / 2, less the rounding level of F, over F
+    decrement: float = math.inf
 
 
 @dataclass(frozen=True)
 class LevenbergMarquardt:
-    """Levenberg-Marquardt on the full poses, one factorisation a step, F never rises.
+    """Levenberg-Marquardt on the full poses: one factorisation a step, and F never rises.
 
-    `dual_residual` is the relative decrement of the damped step: half of -<g, h>, less the rounding level of F, over F.
+    `dual_residual` is the relative decrement of the damped step: half of -<g, h>, less the rounding
+    level of F, over F.
+
+    Parameters
+    ----------
+    tolerance : float
+        On the decrement, once the damping is small.
+    max_iterations : int
+        Steps at most; refused steps count.
+    damping : float
+        First mu, relative to the diagonal of the Gauss-Newton matrix.
+
+    Raises
+    ------
+    SettingError
+        If a setting is out of its range.
+
+    References
+    ----------
+    Madsen, Nielsen & Tingleff, Methods for non-linear least squares problems, 2004.
+
+    Examples
+    --------
+    >>> import pgo_models as pgo
+    >>> from solvers import run
+    >>> run(LevenbergMarquardt(), pgo.PGOProblem(pgo.load("grid"))).status.name
+    'CONVERGED'
     """
 
-    tolerance: float = STATIONARY_DECREMENT  # on the decrement, once the damping is small
-    max_iterations: int = 200  # refused steps count
-    damping: float = 1e-3  # first mu, relative to the diagonal of the Gauss-Newton matrix
+    tolerance: float = STATIONARY_DECREMENT
+    max_iterations: int = 200
+    damping: float = 1e-3
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["tolerance", "damping"], not_negative=["max_iterations"])
@@ -67,13 +121,14 @@ class LevenbergMarquardt:
         return _linearized(problem, 0, poses, problem.objective(poses), self.damping)
 
     def step(self, problem: PGOProblem, state: LevenbergMarquardtState) -> LevenbergMarquardtState:
-        """Take the step if F falls, and set the damping by how well the model foresaw it."""
+        """Take the step if F falls, and set the damping by how well the model predicted it."""
         ratio, candidate, objective = self._tried(problem, state)
         if not ratio > 0:
-            damping = min(state.growth * state.damping, _DAMPING_LIMITS[1])
-            return _with_step(replace(state, k=state.k + 1, damping=damping, growth=_GROWTH * state.growth))
+            damping = min(state.growth * state.damping, _MAX_DAMPING)
+            growth = _GROWTH * state.growth
+            return _with_step(replace(state, k=state.k + 1, damping=damping, growth=growth))
         factor = max(_SMALLEST_FACTOR, 1.0 - (2.0 * min(ratio, 1.0) - 1.0) ** 3)
-        damping = max(factor * state.damping, _DAMPING_LIMITS[0])
+        damping = max(factor * state.damping, _MIN_DAMPING)
         return _linearized(problem, state.k + 1, candidate, objective, damping, state.analysis)
 
     def measure(self, problem: PGOProblem, state: LevenbergMarquardtState) -> Measurement:
@@ -81,45 +136,80 @@ class LevenbergMarquardt:
         return Measurement(state.objective, 0.0, state.decrement)
 
     def poses(self, problem: PGOProblem, state: LevenbergMarquardtState) -> Poses:
-        """Poses of the state."""
+        """Return the poses of a state.
+
+        Parameters
+        ----------
+        problem : PGOProblem
+            The problem that is solved.
+        state : LevenbergMarquardtState
+            A state of this solver.
+
+        Returns
+        -------
+        Poses
+            Its poses.
+        """
         return state.poses
 
     def converged(self, state: LevenbergMarquardtState, measurement: Measurement) -> Status | None:
-        """CONVERGED within tolerance under a small damping; STALLED when no damping is large enough."""
+        """CONVERGED within tolerance under a small damping; STALLED at the largest damping."""
         if measurement.dual_residual <= self.tolerance and state.damping <= _TRUSTED_DAMPING:
             return Status.CONVERGED
-        return Status.STALLED if state.damping >= _DAMPING_LIMITS[1] else None
+        return Status.STALLED if state.damping >= _MAX_DAMPING else None
 
-    def _tried(self, problem: PGOProblem, state: LevenbergMarquardtState) -> tuple[float, Poses, float]:
-        """Ratio of actual to foreseen decrease, and the poses after the step with their F."""
+    def _tried(
+        self, problem: PGOProblem, state: LevenbergMarquardtState
+    ) -> tuple[float, Poses, float]:
+        """Ratio of actual to predicted decrease, and the poses after the step with their F."""
         if not np.isfinite(state.step).all():
             return -math.inf, state.poses, state.objective
-        poses = move_poses(state.poses, *TangentLayout(problem.num_poses, problem.d).split(state.step))
+        w, v = TangentLayout(problem.num_poses, problem.d).split(state.step)
+        poses = move_poses(state.poses, w, v)
         objective = problem.objective(poses)
+        actual = state.objective - objective
         damped = state.damping * inner(state.step, state.matrix.diagonal() * state.step)
-        foreseen = 0.5 * (damped - inner(state.gradient, state.step))
+        predicted = 0.5 * (damped - inner(state.gradient, state.step))
         # Below the rounding of F both decreases are noise, and their ratio is made to tend to one.
         rounding = _ROUNDING * state.objective + state.level
-        return (state.objective - objective + rounding) / (foreseen + rounding), poses, objective
+        return (actual + rounding) / (predicted + rounding), poses, objective
 
 
 def _linearized(
-    problem: PGOProblem, k: int, poses: Poses, objective: float, mu: float, analysis: SymbolicCholesky | None = None
+    problem: PGOProblem,
+    k: int,
+    poses: Poses,
+    objective: float,
+    mu: float,
+    analysis: SymbolicCholesky | None = None,
 ) -> LevenbergMarquardtState:
     matrix = riemannian_hessian(problem, poses, None)
     ground_pose(matrix, problem)
     gradient = TangentLayout(problem.num_poses, problem.d).join(*problem.riemannian_gradient(poses))
-    analysis = analysis if analysis is not None else analyze(matrix, problem.backend, tangent_order(problem))
-    level = rounding_level(problem, poses)
-    return _with_step(LevenbergMarquardtState(k, poses, objective, level, matrix, gradient, analysis, mu, _GROWTH))
+    if analysis is None:
+        analysis = analyze(matrix, problem.backend, tangent_order(problem))
+    state = LevenbergMarquardtState(
+        k=k,
+        poses=poses,
+        objective=objective,
+        level=rounding_level(problem, poses),
+        matrix=matrix,
+        gradient=gradient,
+        analysis=analysis,
+        damping=mu,
+        growth=_GROWTH,
+    )
+    return _with_step(state)
 
 
 def _with_step(state: LevenbergMarquardtState) -> LevenbergMarquardtState:
+    """The state with the step that its damping gives."""
     damped = state.matrix.copy()
     damped.setdiag((1.0 + state.damping) * state.matrix.diagonal())
     try:
         step = -state.analysis.factorize(damped).solve(state.gradient)
     except NotPositiveDefiniteError:
         return replace(state, step=np.full_like(state.gradient, np.nan), decrement=math.inf)
-    foreseen = -inner(state.gradient, step)
-    return replace(state, step=step, decrement=scaled_decrement(foreseen, state.objective, state.level))
+    squared_decrement = -inner(state.gradient, step)
+    decrement = scaled_decrement(squared_decrement, state.objective, state.level)
+    return replace(state, step=step, decrement=decrement)

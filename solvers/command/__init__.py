@@ -1,41 +1,75 @@
-"""The command `pgo` from its first moment: Ctrl-C or SIGTERM while the packages are imported ends in one line.
+"""The command `pgo` from its first moment, before the packages are imported.
 
-So does a file or folder of the same name as one of the packages that comes before it on the path, as with ROS.
+A signal that arrives during the import ends the command in one line. So does a file or folder that
+has the name of one of the packages and comes before it on the path, as with ROS.
 """
 
 import os
 import re
 import signal
 import sys
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 
+# Ctrl-C and SIGTERM; and the signal of a terminal that is closed, where there is one. nohup has
+# that one ignored, and it stays so.
+_SIGNALS = [signal.SIGINT, signal.SIGTERM]
+if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+    _SIGNALS.append(signal.SIGHUP)
+# BLAS reads these once, when it is imported.
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def main() -> None:
-    """Run `solvers.cli.main`, BLAS with the threads of an option --threads: it looks once, as it is imported."""
-    if asked := re.search(r"--threads[= ]([1-9]\d*)", " ".join(sys.argv[1:])):
-        os.environ.update(dict.fromkeys(_THREADS, asked[1]))
-    for number in (signal.SIGINT, signal.SIGTERM):
+    """Run `solvers.cli.app.main`, with as many threads of BLAS as an option --threads says."""
+    if threads := re.search(r"--threads[= ]([1-9]\d*)", " ".join(sys.argv[1:])):
+        os.environ.update(dict.fromkeys(_THREADS, threads[1]))
+    for number in _SIGNALS:
         signal.signal(number, _leave)
-    for package, file in (("pgo_models", "errors.py"), ("solvers", "cli.py")):
-        spec = find_spec(package)
-        folders = (spec and spec.submodule_search_locations) or []
-        if spec is not None and not any(Path(folder, file).is_file() for folder in folders):
-            found = spec.origin or next(iter(folders))
-            sys.exit(f"pgo: {found} hides pgo's own {package}; rename it, or take its folder from PYTHONPATH")
-    from solvers.cli import main as run
-
+    for package, file in (("pgo_models", "errors.py"), ("solvers", "cli/app.py")):
+        _check_not_hidden(package, file)
+    run = _imported()
     try:
         run()
     finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)  # all is written: nothing is left to break off
+        # All is written: nothing is left to break off.
+        for number in _SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
+
+
+def _check_not_hidden(package: str, file: str) -> None:
+    """Leave with one line where another module has the name of a package, which has this file."""
+    spec = find_spec(package)
+    if spec is None:
+        return
+    folders = spec.submodule_search_locations or []
+    if any(Path(folder, file).is_file() for folder in folders):
+        return
+    other = spec.origin or next(iter(folders))
+    sys.exit(
+        f"pgo: {other} hides pgo's own {package}; rename it, or take its folder from PYTHONPATH"
+    )
+
+
+def _imported() -> Callable[[], None]:
+    """The command line, imported; where there is no memory for that, leave with one line."""
+    try:
+        from solvers.cli.app import main as run
+    except (ImportError, MemoryError) as error:
+        # Loaders say in these words that memory ran out.
+        is_out_of_memory = re.search("map segment|memory", str(error))
+        if isinstance(error, ImportError) and not is_out_of_memory:
+            raise
+        sys.exit("pgo: there is not enough memory to start; raise the limit")
+    return run
 
 
 def _leave(number: int, frame: FrameType | None) -> None:
-    """Leave at once: an exception could end in an import's own handler, or in a finaliser that only prints it."""
+    """Leave at once.
+
+    An exception could end in an import's own handler, or in a finaliser that only prints it.
+    """
     os.write(2, b"pgo: interrupted while it was starting\n")
     os._exit(128 + number)

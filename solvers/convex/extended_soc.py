@@ -1,4 +1,4 @@
-"""SOC on a pose graph with convex terms and constraints of one's own: the same recursion, another step (a)."""
+"""SOC on a pose graph with added convex terms and constraints: SOC with another step (a)."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -10,8 +10,8 @@ from pgo_models.convex.convex_solver import ConvexSolver, solve_compiled
 from pgo_models.convex.graph_subproblem import Changer, GraphQP, graph_qp
 from pgo_models.errors import GraphError, PGOError, SettingError, check_settings
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import project_to_rotations, unstack_transposes
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.geometry.rotations import Array, project_to_rotations, unstack_transposes
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
@@ -21,38 +21,73 @@ from solvers.soc.r_step import RStep, RSubproblem
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC, Joint, SOCState
 
-_FAINT = 1e-3  # beside terms of metres and radians
-_SAME = 1e-9  # relative: values of one term
+_FAINT = 1e-3  # weight that is small beside terms of metres and radians
+_SAME = 1e-9  # relative difference up to which two values of a term count as equal
 
 
 @dataclass(frozen=True, eq=False)
 class ExtendedStep:
-    """Step (a) with the change, for `SOC(r_step=..)`, JOINT: it changes iterates, `ExtendedSOC` what is reported."""
+    """Step (a) with the added terms and constraints, for `SOC(r_step=..)`, JOINT.
+
+    It changes the iterates of SOC; `ExtendedSOC` also reports the changed objective.
+    """
 
     graph: PoseGraph
     changer: Changer
     solver: ConvexSolver | str = "CLARABEL"
 
     def prepare(self, subproblem: RSubproblem) -> GraphQP:
-        """Changed program with a subproblem's penalties; a SettingError unless that is the whole graph's, in (R, t)."""
-        n, d = self.graph.num_poses, self.graph.d
+        """Compile the changed program with the penalties of a subproblem.
+
+        A SettingError unless the subproblem is that of the whole graph, in (R, t).
+        """
+        n = self.graph.num_poses
+        d = self.graph.d
         if subproblem.num_translations != n or not subproblem.needs_ground:
-            raise SettingError("a changed subproblem is that of the whole graph; use Coupling.JOINT")
-        return graph_qp(self.graph, subproblem.penalty[n::d], changer=self.changer, solver=self.solver)
+            raise SettingError(
+                "a changed subproblem is that of the whole graph; use Coupling.JOINT"
+            )
+        rho = subproblem.penalty[n::d]
+        return graph_qp(self.graph, rho, changer=self.changer, solver=self.solver)
 
 
 @dataclass(frozen=True)
 class ExtendedSOC:
-    """SOC on F plus convex terms under convex constraints, rotations in SO(d) as ever.
+    """SOC on F plus convex terms under convex constraints, with rotations in SO(d).
 
-    `changer`, given `PoseVariables`, returns a `ModelChange`; `solver` is that of step (a). `soc` has the settings,
-    JOINT; the penalty's multipliers are those of the unchanged problem at its start, and are not taken anew.
+    History and `cost` have the changed objective, `Run.objective` is F unchanged. The poses of an
+    iterate are omega with the translations of step (a) at its shift: constraints on translations
+    hold at each iterate, those on rotations in the limit.
 
-    History and `cost` have the changed objective, `Run.objective` is F unchanged. Poses of an iterate are omega with
-    translations of step (a) at its shift: constraints on translations hold at each iterate, on rotations in the limit.
+    The default start is the chordal one of the unchanged problem, moved as a whole to where the
+    added terms are low. This matters to terms that fix the gauge, as priors do: a pose turned by
+    180 degrees from its prior is stationary too.
 
-    The default start is the chordal one of the unchanged problem, moved as a whole to where the terms want it, which
-    matters to terms that fix the gauge, as priors do: a pose turned by 180 degrees from its prior is stationary too.
+    Parameters
+    ----------
+    changer : callable
+        Given the `PoseVariables`, it returns a `ModelChange`.
+    soc : SOC
+        The settings, for JOINT. The multipliers from which the penalty is chosen are those of the
+        unchanged problem at its start, and are not taken anew.
+    solver : ConvexSolver or str
+        Solver of step (a).
+
+    Raises
+    ------
+    SettingError
+        If `soc` is not for JOINT or has another R-step.
+
+    Examples
+    --------
+    >>> import pgo_models as pgo
+    >>> from solvers import run
+    >>> def prior(x):
+    ...     return pgo.ModelChange(terms=[100.0 * cp.sum_squares(x.t(0) - np.ones(3))])
+    >>> problem = pgo.PGOProblem(pgo.load("grid"))
+    >>> result = run(ExtendedSOC(prior), problem)
+    >>> result.poses.t[0].round(3).tolist()
+    [1.0, 1.0, 1.0]
     """
 
     changer: Changer
@@ -61,14 +96,19 @@ class ExtendedSOC:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        if self.soc.effective_coupling is not Coupling.JOINT:
-            raise SettingError(f"a changed problem is solved by Coupling.JOINT, got {self.soc.effective_coupling.name}")
+        coupling = self.soc.effective_coupling
+        if coupling is not Coupling.JOINT:
+            raise SettingError(
+                f"a changed problem is solved by Coupling.JOINT, got {coupling.name}"
+            )
         if self.soc.r_step is not RStep.FACTORIZED:
-            raise SettingError(f"the change brings its own R-step, got {self.soc.r_step}; leave r_step as it is")
+            raise SettingError(
+                f"the change brings its own R-step, got {self.soc.r_step}; leave r_step as it is"
+            )
 
     @property
     def max_iterations(self) -> int:
-        """Most iterations of a run."""
+        """The iterations of a run at most, those of `soc`."""
         return self.soc.max_iterations
 
     def init(self, problem: PGOProblem, start: Poses | None) -> SOCState:
@@ -78,63 +118,118 @@ class ExtendedSOC:
         return self._recursion(problem).init(problem, start)
 
     def model(self, problem: PGOProblem) -> GraphQP:
-        """The changed program with penalties of 1; a SettingError unless the cost is F."""
+        """Compile the changed program with penalties of 1.
+
+        Parameters
+        ----------
+        problem : PGOProblem
+            The problem that is changed.
+
+        Returns
+        -------
+        GraphQP
+            The program, whose `cost` is the changed objective.
+
+        Raises
+        ------
+        SettingError
+            Unless the cost of the problem is F.
+        """
         if problem.weighting is not Weighting.ISOTROPIC:
-            raise SettingError("terms are added to F, with two precisions an edge; use Weighting.ISOTROPIC")
-        return graph_qp(problem.graph, np.ones(problem.num_poses), changer=self.changer, solver=self.solver)
+            raise SettingError(
+                "terms are added to F, with two precisions an edge; use Weighting.ISOTROPIC"
+            )
+        rho = np.ones(problem.num_poses)
+        return graph_qp(problem.graph, rho, changer=self.changer, solver=self.solver)
 
     def step(self, problem: PGOProblem, state: SOCState) -> SOCState:
-        """One iteration of SOC."""
+        """Make one iteration of SOC."""
         return self._recursion(problem).step(problem, state)
-
-    def _recursion(self, problem: PGOProblem) -> Joint:
-        return Joint(replace(self.soc, r_step=ExtendedStep(problem.graph, self.changer, self.solver)))
 
     def measure(self, problem: PGOProblem, state: SOCState) -> Measurement:
         """Objective of the changed problem at the poses, and the residuals of SOC."""
         if np.isnan(state.primal_residual):
             return Measurement(np.nan, np.nan, np.nan)
-        return Measurement(self.cost(state, self.poses(problem, state)), state.primal_residual, state.dual_residual)
+        objective = self.cost(state, self.poses(problem, state))
+        return Measurement(objective, state.primal_residual, state.dual_residual)
 
     def poses(self, problem: PGOProblem, state: SOCState) -> Poses:
-        """Omega with the translations of step (a)."""
-        V = np.concatenate([np.zeros((problem.num_poses, problem.d)), state.block.shift])
-        return Poses(state.omega, _model(state).solve(V)[: problem.num_poses])
+        """Return the poses that a state stands for.
+
+        Parameters
+        ----------
+        problem : PGOProblem
+            The problem that is solved.
+        state : SOCState
+            A state of this solver.
+
+        Returns
+        -------
+        Poses
+            Omega with the translations of step (a).
+        """
+        X = state.r_step.solve_stacked(state.omega - state.B)
+        return Poses(state.omega, X[: problem.num_poses])
 
     def cost(self, state: SOCState, poses: Poses) -> float:
-        """F of the edges that count plus the added terms, at anybody's poses."""
+        """Evaluate the changed objective.
+
+        Parameters
+        ----------
+        state : SOCState
+            A state of this solver, which has the model.
+        poses : Poses
+            Any poses of the graph.
+
+        Returns
+        -------
+        float
+            F of the edges that count plus the added terms.
+        """
         return _model(state).cost(poses.stacked())
 
     def converged(self, state: SOCState, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals are within tolerance."""
         return self.soc.converged(state, measurement)
 
+    def _recursion(self, problem: PGOProblem) -> Joint:
+        r_step = ExtendedStep(problem.graph, self.changer, self.solver)
+        return Joint(replace(self.soc, r_step=r_step))
+
 
 def _model(state: SOCState) -> GraphQP:
-    model = state.r_step
+    model = state.r_step.back_end
     assert isinstance(model, GraphQP)
     return model
 
 
 def moved_to_terms(model: GraphQP, poses: Poses) -> Poses:
-    """Poses moved as a whole, where that lowers the added terms, or to where the constraints allow it.
+    """Poses moved as a whole, where that lowers the added terms or meets the constraints.
 
-    At Q poses + s the terms are convex in (Q, s), without Q in SO(d): Q is projected, and s is found again. What says
-    nothing of a direction of Q is held near a small multiple of I, which its projection completes to a rotation.
+    At Q poses + s the terms are convex in (Q, s), without Q in SO(d): first Q and s are free and Q
+    is projected, then s is found for this Q. Directions of Q that no term or constraint determines
+    are held near a small multiple of I, which the projection completes to a rotation.
     """
-    change, X, X_0, n, d = model.change, model.variables.X, poses.stacked(), len(poses.t), poses.d
-    Q, s = cp.Variable((d, d)), cp.Variable((1, d))
-    fixed: list[cp.Constraint] = []
-    motion = X_0 @ Q.T + np.repeat([1.0, 0.0], [n, d * n])[:, None] @ s == X
-    faint = _FAINT * cp.sum_squares(Q - _FAINT * np.eye(d))
+    change = model.change
+    X = model.variables.X
+    X_0 = poses.stacked()
+    n = len(poses.t)
+    d = poses.d
+    Q = cp.Variable((d, d))
+    s = cp.Variable((1, d))
+    is_translation = np.repeat([1.0, 0.0], [n, d * n])[:, None]
+    is_moved = X_0 @ Q.T + is_translation @ s == X
+    near_identity = _FAINT * cp.sum_squares(Q - _FAINT * np.eye(d))
+    objective = cp.Minimize(sum(change.terms, near_identity))
+    constraints = [*change.constraints, is_moved]
     for _ in range(2):
-        problem = cp.Problem(cp.Minimize(sum(change.terms, faint)), [*change.constraints, motion, *fixed])
+        problem = cp.Problem(objective, constraints)
         try:
             solve_compiled(problem, "motion of the start", solver=model.qp.solver)
         except PGOError:  # no motion meets the constraints: the poses will have to change
             return poses
         turn = project_to_rotations(Q.value[None])[0]
-        fixed = [turn == Q]
+        constraints = [*change.constraints, is_moved, turn == Q]
     moved = poses.moved(turn, s.value[0])
     is_lower = model.cost(moved.stacked()) < (1.0 - _FAINT) * model.cost(X_0)
     return moved if is_lower or change.constraints else poses
@@ -143,30 +238,64 @@ def moved_to_terms(model: GraphQP, poses: Poses) -> Poses:
 def with_priors(model: GraphQP) -> tuple[PoseGraph, list[cp.Expression]]:
     """The graph with the terms that are priors, and the terms that are not.
 
-    A term is one if it is sum tau_i ||t_i - p_i||^2 + kappa_i ||R_i - P_i||_F^2 with P_i in SO(d): these are read off
-    its gradient, which is affine, and it is then compared at a random point, where no other quadratic has its value.
+    A term is a prior if it is sum tau_i ||t_i - p_i||^2 + kappa_i ||R_i - P_i||_F^2 with P_i in
+    SO(d). Graphs that have a world already keep all terms: its frame is not that of the terms.
     """
-    whole, X, left = model.variables.graph, model.variables.X, []
-    graph, n, d, point = whole, whole.num_poses, whole.d, np.random.default_rng(0).standard_normal(X.shape)
-    for term in model.change.terms:
-        left.append(term)
-        if whole.world is not None or not term.is_quadratic():  # its world has a frame of its own
-            continue
-        gradients = []
-        for entry in (0.0, 1.0):
-            X.value = np.full(X.shape, entry)
-            gradients.append(model.gradient_of(term))
-        w = 0.5 * (gradients[1] - gradients[0])[:, 0]
-        centre, turned = -0.5 * gradients[0] / np.where(w > 0, w, np.inf)[:, None], w[n::d] > 0
-        R = np.where(turned[:, None, None], project_to_rotations(unstack_transposes(centre[n:])), np.eye(d))
-        priors, X.value = Poses(R, centre[:n]), point
-        poses = np.flatnonzero((w[:n] > 0) | turned)
-        squares = w @ np.sum((point - priors.stacked()) ** 2, axis=1)
-        if poses.size and math.isclose(squares, term.value, rel_tol=_SAME):
-            left.pop()
-            graph = graph.with_prior(poses, priors[poses], w[n::d][poses], w[:n][poses])
+    original = model.variables.graph
+    terms = list(model.change.terms)
+    if original.world is not None:
+        return original, terms
+    graph = original
+    others = []
+    for term in terms:
+        prior = _as_prior(model, term)
+        if prior is None:
+            others.append(term)
+        else:
+            graph = graph.with_prior(prior.poses, prior.values, prior.kappa, prior.tau)
     try:
         graph.check_connected()
-    except GraphError:  # positions on a line leave turns open, of which a graph has none
-        return whole, list(model.change.terms)
-    return graph, left
+    except GraphError:  # positions on a line leave a rotation about it free
+        return original, terms
+    return graph, others
+
+
+@dataclass(frozen=True, eq=False)
+class _Prior:
+    """sum tau_i ||t_i - p_i||^2 + kappa_i ||R_i - P_i||_F^2."""
+
+    poses: IntArray  # (k,)
+    values: Poses  # (k): P_i, p_i
+    kappa: Array  # (k,)
+    tau: Array  # (k,)
+
+
+def _as_prior(model: GraphQP, term: cp.Expression) -> _Prior | None:
+    """The prior that a term is, or None.
+
+    Weights and centres are read off the gradient, which is affine for a quadratic term. The term is
+    then compared with this prior at a random point, where no other quadratic has its value.
+    """
+    if not term.is_quadratic():
+        return None
+    X = model.variables.X
+    n = model.variables.graph.num_poses
+    d = model.variables.graph.d
+    X.value = np.zeros(X.shape)
+    gradient_at_zeros = model.gradient_of(term)
+    X.value = np.ones(X.shape)
+    gradient_at_ones = model.gradient_of(term)
+    w = 0.5 * (gradient_at_ones - gradient_at_zeros)[:, 0]
+    centre = -0.5 * gradient_at_zeros / np.where(w > 0, w, np.inf)[:, None]
+    tau = w[:n]
+    kappa = w[n::d]
+    R = project_to_rotations(unstack_transposes(centre[n:]))
+    R = np.where((kappa > 0)[:, None, None], R, np.eye(d))
+    values = Poses(R, centre[:n])
+    poses = np.flatnonzero((tau > 0) | (kappa > 0))
+
+    X.value = np.random.default_rng(0).standard_normal(X.shape)
+    squares = w @ np.sum((X.value - values.stacked()) ** 2, axis=1)
+    if not poses.size or not math.isclose(squares, term.value, rel_tol=_SAME):
+        return None
+    return _Prior(poses, values[poses], kappa[poses], tau[poses])

@@ -1,8 +1,12 @@
-"""SOC for any convex cvxpy objective with orthogonality constraints: the paper's Algorithm 1 without the pose graph.
+"""SOC for any convex cvxpy objective with orthogonality constraints.
+
+This is the paper's Algorithm 1 without the pose graph:
 
     (a) X  = argmin J(X) + rho/2 ||X - P + B||^2     convex, cvxpy, compiled once
     (b) P  = projection of X + B                     closed form, SVD or normalisation
     (c) B  = B + X - P
+
+A variable may be in two sets; it then has a copy P and a multiplier B for each.
 
 Ebrahimi & Deghat, Algorithm 1 (`algo1: SOC`); Lai & Osher 2014, Algorithm 1.
 """
@@ -15,37 +19,70 @@ import numpy as np
 
 from pgo_models.convex import orthogonality
 from pgo_models.convex.convex_solver import COLD, ConvexSolver
-from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem, SplitProblem, norm_of_all
+from pgo_models.convex.orthogonality import (
+    OrthogonalPoint,
+    OrthogonalProblem,
+    SplitProblem,
+    norm_of_all,
+)
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
 from solvers.loop import run
 from solvers.result import Measurement, Outcome, Status
 from solvers.soc.anderson import over_relax
 
-_PROBES = 12
-_NEAR = 0.1  # a relative distance at which gradients are alike, and SOC is no longer going round
-_FAINT = 1e-6  # their difference is rounding
-_BALANCE_EVERY = 5  # iterations
-_BALANCE_UNTIL = 500  # then rho is only raised, so that the recursion can settle
+# The first penalty is found with at most so many solves of step (a). It is right when the relative
+# distance of X from the start is between the two numbers: there the gradients at X and at the start
+# are alike, and their difference is not rounding.
+_MAX_PROBES = 12
+_NEAR = 0.1
+_FAINT = 1e-6
+# Residuals are balanced every so many iterations. Later rho is only raised, so that the recursion
+# can settle.
+_BALANCE_EVERY = 5
+_BALANCE_UNTIL = 500
 _BALANCE_RATIO = 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class OrthogonalState:
-    """Iterate k."""
+    """Iterate k.
+
+    Parameters
+    ----------
+    k : int
+        Number of the iterate.
+    X : tuple of arrays
+        Minimiser of step (a): the constrained variables.
+    others : tuple of arrays
+        The other variables of the problem there.
+    copies : tuple of arrays
+        P, one for every term of the problem (a variable in two sets has two).
+    B : tuple of arrays
+        Scaled multipliers, one for every term.
+    rho : float
+        Penalty.
+    split : SplitProblem
+        The compiled step (a).
+    scale : float
+        Largest norm of a subgradient of J so far.
+    primal_residual : float
+        ||X - P|| / ||P||.
+    dual_residual : float
+        ||G + rho B|| / scale, with G the subgradient of J at X that step (a) gives. Since rho B is
+        normal to the set at P, this is the stationarity residual of the KKT conditions. For one set
+        a variable it is rho ||P - P_last|| / scale.
+    """
 
     k: int
-    # X, others: minimisers of step (a): the constrained variables, and the other variables of the problem.
     X: tuple[Array, ...]
     others: tuple[Array, ...]
-    copies: tuple[Array, ...]  # P, one for every term of the problem (a variable in two sets has two)
-    B: tuple[Array, ...]  # scaled multipliers, one for every term
-    rho: float  # penalty
-    split: SplitProblem  # the compiled step (a)
-    scale: float = 0.0  # largest norm of a subgradient of J so far
-    primal_residual: float = math.inf  # ||X - P|| / ||P||
-    # ||G + rho B|| / scale, G the subgradient of J at X that step (a) gives: since rho B is normal to the set at P,
-    # this is the stationarity residual of the KKT conditions. For one set a variable it is rho ||P - P_before||.
+    copies: tuple[Array, ...]
+    B: tuple[Array, ...]
+    rho: float
+    split: SplitProblem
+    scale: float = 0.0
+    primal_residual: float = math.inf
     dual_residual: float = math.inf
 
 
@@ -53,15 +90,47 @@ class OrthogonalState:
 class OrthogonalSOC:
     """Splitting of orthogonality constraints for any convex objective (Lai & Osher 2014).
 
-    The problem is not convex: a run ends at a stationary point that depends on the start, see `solve_orthogonal`.
+    The problem is not convex: a run ends at a stationary point that depends on the start, see
+    `solve_orthogonal`.
 
-    `penalty` is rho, fixed, as in Algorithm 1. Unless given, rho starts at `safeguard` times the norm of the gradient
-    at the start and is adapted: residuals are balanced (Boyd et al. 2011, 3.4.1, as in the paper), and rho is at least
-    `safeguard` times the least penalty at which the copies are fixed points of their projection, the largest eigenvalue
-    of the multiplier Lambda. Near 1 the recursion may cycle.
+    Parameters
+    ----------
+    penalty : float or None
+        rho, fixed, as in Algorithm 1. Unless given, rho starts at `safeguard` times the norm of the
+        gradient at the start and is adapted: residuals are balanced (Boyd et al. 2011, 3.4.1, as in
+        the paper), and rho is at least `safeguard` times the least penalty at which the copies are
+        fixed points of their projection, the largest eigenvalue of the multiplier Lambda.
+    alpha : float in (0, 2)
+        Over-relaxation.
+    safeguard : float above 1
+        See `penalty`. Near 1 the recursion may cycle.
+    tolerance : float
+        On the primal and on the dual residual, both relative.
+    max_iterations : int
+        Iterations at most.
+    solver : ConvexSolver or str
+        Solver of step (a); Clarabel without warm start unless given.
 
-    `alpha` is the over-relaxation, in (0, 2), `tolerance` is on the primal and the dual residual, both relative, and
-    `solver` is that of step (a): Clarabel, cold, unless given.
+    Raises
+    ------
+    SettingError
+        If a setting is out of its range.
+
+    References
+    ----------
+    Lai & Osher, A splitting method for orthogonality constrained problems, 2014.
+
+    Examples
+    --------
+    The point of the unit circle that is nearest to (3, 4):
+
+    >>> import cvxpy as cp
+    >>> from solvers import run
+    >>> x = cp.Variable(2)
+    >>> distance = cp.Problem(cp.Minimize(cp.sum_squares(x - np.array([3.0, 4.0]))))
+    >>> result = run(OrthogonalSOC(), OrthogonalProblem(distance, unit_columns=[x]))
+    >>> result.status.name, result.state.copies[0].round(3).tolist()
+    ('CONVERGED', [0.6, 0.8])
     """
 
     penalty: float | None = None
@@ -72,40 +141,42 @@ class OrthogonalSOC:
     solver: ConvexSolver | str = COLD
 
     def __post_init__(self) -> None:
-        check_settings(self, finite=["penalty", "safeguard", "tolerance"], not_negative=["max_iterations"])
+        check_settings(
+            self, finite=["penalty", "safeguard", "tolerance"], not_negative=["max_iterations"]
+        )
         check_settings(self, above_one=["safeguard"], relaxation=["alpha"])
 
     def init(self, problem: OrthogonalProblem, start: OrthogonalPoint | None) -> OrthogonalState:
-        """State 0: X = P = start, first columns of the identity unless given; a SettingError if it does not fit."""
-        if (point := start) is None:
-            columns = [np.eye(v.shape[0], v.size // v.shape[0]).reshape(v.shape) for v in problem.variables]
-            point = problem.point(columns)
-        problem.check_point(point)
+        """State 0: X = P = start, the first columns of the identity unless given.
+
+        A SettingError if the start does not fit.
+        """
+        if start is None:
+            start = problem.point([_identity(variable.shape) for variable in problem.variables])
+        problem.check_point(start)
         split = problem.split(self.solver)
-        rho, others = self._first_penalty(split, point)
-        B = tuple(normal / rho for normal in point.normals)
-        return OrthogonalState(0, problem.values(point.copies), others, point.copies, B, rho, split)
+        rho, others = self._first_penalty(split, start)
+        X = problem.values(start.copies)
+        B = tuple(normal / rho for normal in start.normals)
+        return OrthogonalState(0, X, others, start.copies, B, rho, split)
 
     def step(self, problem: OrthogonalProblem, state: OrthogonalState) -> OrthogonalState:
-        """One iteration: (a), (b), (c)."""
-        state = self._with_penalty_due(problem, state)
-        rho, copies = state.rho, state.copies
-        V = [P - B for P, B in zip(copies, state.B, strict=True)]
-        X, others = state.split.solve(V, rho)  # (a)
-        spread = [X[term.variable] for term in problem.terms]
-        S = [over_relax(x, P, self.alpha) + B for x, P, B in zip(spread, copies, state.B, strict=True)]
-        following = tuple(term.constraint.project(s) for term, s in zip(problem.terms, S, strict=True))  # (b)
-        B = tuple(s - P for s, P in zip(S, following, strict=True))  # (c)
-        G = _summed(problem, [rho * (v - x) for v, x in zip(V, spread, strict=True)])
-        N = _summed(problem, [rho * b for b in B])
-        scale = max(state.scale, norm_of_all(G), np.finfo(float).tiny)
-        primal = norm_of_all([x - P for x, P in zip(spread, following, strict=True)]) / norm_of_all(following)
-        dual = norm_of_all([g + n for g, n in zip(G, N, strict=True)]) / scale
-        state = replace(state, k=state.k + 1, X=X, others=others, copies=following, B=B)
-        return replace(state, scale=scale, primal_residual=primal, dual_residual=dual)
+        """Make one iteration: (a), (b), (c)."""
+        state = self._with_due_penalty(problem, state)
+        # One P, B, V and x for every term; x is the X of the term's variable.
+        V = [P - B for P, B in zip(state.copies, state.B, strict=True)]
+        X, others = state.split.solve(V, state.rho)  # (a)
+        S = []
+        for term, P, B in zip(problem.terms, state.copies, state.B, strict=True):
+            S.append(over_relax(X[term.variable], P, self.alpha) + B)
+        terms = zip(problem.terms, S, strict=True)
+        copies = tuple(term.constraint.project(s) for term, s in terms)  # (b)
+        multipliers = tuple(s - P for s, P in zip(S, copies, strict=True))  # (c)
+        following = replace(state, k=state.k + 1, X=X, others=others, copies=copies, B=multipliers)
+        return _with_residuals(problem, V, following)
 
     def measure(self, problem: OrthogonalProblem, state: OrthogonalState) -> Measurement:
-        """J at the copies (in a variable's first set) and the other variables, and the residuals."""
+        """J at the copies (those in a variable's first set), and the residuals."""
         infeasibility = problem.infeasibility(state.copies, state.others)
         objective = problem.objective(problem.values(state.copies), state.others)
         return Measurement(objective, state.primal_residual, state.dual_residual, infeasibility)
@@ -116,68 +187,133 @@ class OrthogonalSOC:
         return Status.CONVERGED if worst <= self.tolerance else None
 
     def point(self, problem: OrthogonalProblem, state: OrthogonalState) -> OrthogonalPoint:
-        """Copies and multipliers of a state, from which a run can go on."""
-        terms = zip(problem.terms, state.copies, state.B, strict=True)
-        normals = tuple(term.constraint.normal_part(P, state.rho * B) for term, P, B in terms)
-        return OrthogonalPoint(state.copies, normals)
+        """Return the point of a state, from which a run can go on.
 
-    def _first_penalty(self, split: SplitProblem, point: OrthogonalPoint) -> tuple[float, tuple[Array, ...]]:
-        """`penalty`, or `safeguard` times the norm of the gradient at the start; and the other variables there.
+        Parameters
+        ----------
+        problem : OrthogonalProblem
+            The problem that is solved.
+        state : OrthogonalState
+            A state of this solver.
 
-        The gradient is minus the multipliers of the start. If it has none, step (a) gives the gradient at X: rho is
-        moved by tens until X is near the start, where the gradients are alike, or comes no nearer.
+        Returns
+        -------
+        OrthogonalPoint
+            The copies and the multipliers rho B.
         """
-        multiplier = max(_spectral(N) for N in point.normals)
-        if self.penalty is not None or multiplier > 0.0:
-            rho = self.penalty if self.penalty is not None else self.safeguard * multiplier
-            return rho, split.solve([P - N / rho for P, N in zip(point.copies, point.normals, strict=True)], rho)[1]
-        rho, was_far, gradient, distance = 1.0, False, 0.0, math.inf
-        for _ in range(_PROBES):
+        normals = []
+        for term, P, B in zip(problem.terms, state.copies, state.B, strict=True):
+            normals.append(term.constraint.normal_part(P, state.rho * B))
+        return OrthogonalPoint(state.copies, tuple(normals))
+
+    # The penalty.
+
+    def _first_penalty(
+        self, split: SplitProblem, point: OrthogonalPoint
+    ) -> tuple[float, tuple[Array, ...]]:
+        """The first rho, and the other variables at the start.
+
+        rho is `penalty`, or `safeguard` times the norm of the gradient at the start. The gradient
+        is minus the multipliers of the start, if it has any.
+        """
+        multiplier = max(_spectral_norm(normal) for normal in point.normals)
+        if self.penalty is None and multiplier == 0.0:
+            return self._probed_penalty(split, point)
+        rho = self.penalty if self.penalty is not None else self.safeguard * multiplier
+        V = [P - N / rho for P, N in zip(point.copies, point.normals, strict=True)]
+        _, others = split.solve(V, rho)
+        return rho, others
+
+    def _probed_penalty(
+        self, split: SplitProblem, point: OrthogonalPoint
+    ) -> tuple[float, tuple[Array, ...]]:
+        """The first rho of a start without multipliers, and the other variables at the start.
+
+        Step (a) gives the gradient at its solution X. rho is moved by tens until X is near the
+        start, where the gradients are alike, or comes no nearer.
+        """
+        rho = 1.0
+        was_far = False
+        gradient = 0.0
+        distance = math.inf
+        for _ in range(_MAX_PROBES):
             X, others = split.solve(point.copies, rho)
-            moves = [P - X[term.variable] for P, term in zip(point.copies, split.terms, strict=True)]
-            before, distance = distance, norm_of_all(moves) / norm_of_all(point.copies)
-            if was_far and distance > 0.5 * before:
-                break  # held away, by convex constraints or by J itself: start low, and let the rule raise rho
-            gradient = rho * max(_spectral(move) for move in moves)
-            if distance <= _NEAR and (was_far or distance >= _FAINT):
+            moves = [
+                P - X[term.variable] for P, term in zip(point.copies, split.terms, strict=True)
+            ]
+            distance_before = distance
+            distance = norm_of_all(moves) / norm_of_all(point.copies)
+            if was_far and distance > 0.5 * distance_before:
+                # Convex constraints, or J itself, hold X away from the start: begin with a low
+                # penalty and let the rule raise it.
                 break
-            was_far = was_far or distance > _NEAR
-            rho *= 10.0 if distance > _NEAR else 1e-3
+            gradient = rho * max(_spectral_norm(move) for move in moves)
+            is_far = distance > _NEAR
+            if not is_far and (was_far or distance >= _FAINT):
+                break
+            was_far = was_far or is_far
+            rho *= 10.0 if is_far else 1e-3
         return (self.safeguard * gradient if gradient > 0.0 else 1.0), others
 
-    def _with_penalty_due(self, problem: OrthogonalProblem, state: OrthogonalState) -> OrthogonalState:
-        """State with the rho that the rule of `penalty` wants from now on; mostly the state itself."""
+    def _with_due_penalty(
+        self, problem: OrthogonalProblem, state: OrthogonalState
+    ) -> OrthogonalState:
+        """State with the penalty for the next step; usually unchanged."""
         if self.penalty is not None:
             return state
-        rho, terms = state.rho, zip(problem.terms, state.copies, state.B, strict=True)
-        least = self.safeguard * max(term.constraint.least_penalty(P, rho * B) for term, P, B in terms)
-        wanted = max(rho, least)
-        if state.k % _BALANCE_EVERY == 0 and 0 < state.k <= _BALANCE_UNTIL:
-            if state.primal_residual > min(_NEAR, _BALANCE_RATIO * state.dual_residual):
-                wanted = max(2.0 * rho, least)
-            elif state.dual_residual > _BALANCE_RATIO * state.primal_residual:
-                wanted = max(0.5 * rho, least)
-        if wanted == rho:
+        rho = self._adapted_penalty(problem, state)
+        if rho == state.rho:
             return state
-        return replace(state, rho=wanted, B=tuple(rho / wanted * scaled for scaled in state.B))
+        return replace(state, rho=rho, B=tuple(state.rho / rho * B for B in state.B))
+
+    def _adapted_penalty(self, problem: OrthogonalProblem, state: OrthogonalState) -> float:
+        least_penalties = []
+        for term, P, B in zip(problem.terms, state.copies, state.B, strict=True):
+            least_penalties.append(term.constraint.least_penalty(P, state.rho * B))
+        least = self.safeguard * max(least_penalties)
+        primal = state.primal_residual
+        dual = state.dual_residual
+        if state.k % _BALANCE_EVERY == 0 and 0 < state.k <= _BALANCE_UNTIL:
+            if primal > min(_NEAR, _BALANCE_RATIO * dual):
+                return max(2.0 * state.rho, least)
+            if dual > _BALANCE_RATIO * primal:
+                return max(0.5 * state.rho, least)
+        return max(state.rho, least)
 
 
 @dataclass(frozen=True, eq=False)
 class OrthogonalSolution:
-    """The best of several runs."""
+    """The best of several runs.
 
-    problem: OrthogonalProblem  # its cvxpy variables hold the solution
-    # values, others: for every variable in problem.variables and in problem.others, of its shape.
+    Parameters
+    ----------
+    problem : OrthogonalProblem
+        Its cvxpy variables hold the solution.
+    values : tuple of arrays, of the shapes of the variables
+        Value of every variable in problem.variables.
+    others : tuple of arrays, of the shapes of the variables
+        Value of every variable in problem.others.
+    objective : float
+        J there.
+    kkt : KKTResiduals
+        Computed afresh by one convex solve.
+    outcome : Outcome
+        The best run: status, history, state.
+    objectives : tuple of floats
+        J of every start, nan where a run did not converge.
+    """
+
+    problem: OrthogonalProblem
     values: tuple[Array, ...]
     others: tuple[Array, ...]
-    objective: float  # J there
-    kkt: orthogonality.KKTResiduals  # computed afresh by one convex solve
-    outcome: Outcome[OrthogonalState]  # the run it came from: status, history, state
-    objectives: tuple[float, ...]  # J of every start, nan where a run did not converge
+    objective: float
+    kkt: orthogonality.KKTResiduals
+    outcome: Outcome[OrthogonalState]
+    objectives: tuple[float, ...]
 
     @property
     def status(self) -> Status:
-        """How the run ended."""
+        """How the best run ended."""
         return self.outcome.status
 
     def __repr__(self) -> str:
@@ -194,16 +330,42 @@ def solve_orthogonal(
     *,
     verbose: bool = False,
 ) -> OrthogonalSolution:
-    """Run SOC from random starts and keep the best: converged first, then the lowest J.
+    """Run SOC from random starts and keep the best run.
 
-    Nothing proves that the best of the stationary points found is the global minimum. `verbose` prints every run's
-    table. A SettingError when starts is below 1, a PGOError when the convex subproblem has no solution.
+    Runs that converged come first, then the lowest J. Nothing proves that the best of the
+    stationary points is the global minimum.
+
+    Parameters
+    ----------
+    problem : OrthogonalProblem
+        What is minimised.
+    rng : np.random.Generator
+        Source of the starts.
+    soc : OrthogonalSOC or None
+        Settings of the runs; the default ones unless given.
+    starts : int, at least 1
+        Number of runs.
+    verbose : bool
+        Whether the table of every run is printed.
+
+    Returns
+    -------
+    OrthogonalSolution
+        The best run.
+
+    Raises
+    ------
+    SettingError
+        If `starts` is below 1.
+    PGOError
+        If the convex subproblem has no solution.
 
     Examples
     --------
     >>> import cvxpy as cp, numpy as np
     >>> x = cp.Variable(2)
-    >>> problem = OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(x - [3.0, 4.0]))), unit_columns=[x])
+    >>> distance = cp.Problem(cp.Minimize(cp.sum_squares(x - [3.0, 4.0])))
+    >>> problem = OrthogonalProblem(distance, unit_columns=[x])
     >>> solve_orthogonal(problem, np.random.default_rng(0)).values[0].round(4).tolist()
     [0.6, 0.8]
     """
@@ -216,19 +378,51 @@ def solve_orthogonal(
         if outcomes[-1].status is Status.INTERRUPTED:
             break
     best = min(outcomes, key=lambda outcome: (not outcome.status.is_success, outcome.objective))
-    values = problem.values(best.state.copies)
-    kkt = orthogonality.kkt_residuals(problem, method.point(problem, best.state), best.state.rho, method.solver)
-    problem.assign(values, best.state.others)
-    objectives = tuple(outcome.objective if outcome.status.is_success else math.nan for outcome in outcomes)
-    return OrthogonalSolution(problem, values, best.state.others, best.objective, kkt, best, objectives)
+    state = best.state
+    values = problem.values(state.copies)
+    kkt = orthogonality.kkt_residuals(
+        problem, method.point(problem, state), state.rho, method.solver
+    )
+    problem.assign(values, state.others)
+    objectives = tuple(
+        outcome.objective if outcome.status.is_success else math.nan for outcome in outcomes
+    )
+    return OrthogonalSolution(problem, values, state.others, best.objective, kkt, best, objectives)
 
 
-def _summed(problem: OrthogonalProblem, of_terms: Sequence[Array]) -> list[Array]:
+def _with_residuals(
+    problem: OrthogonalProblem, V: Sequence[Array], state: OrthogonalState
+) -> OrthogonalState:
+    """State after the step from shifts V, with its residuals."""
+    X_of_terms = [state.X[term.variable] for term in problem.terms]
+    subgradients = [state.rho * (v - x) for v, x in zip(V, X_of_terms, strict=True)]
+    G = _sums_by_variable(problem, subgradients)
+    N = _sums_by_variable(problem, [state.rho * B for B in state.B])
+    scale = max(state.scale, norm_of_all(G), np.finfo(float).tiny)
+    disagreement = [x - P for x, P in zip(X_of_terms, state.copies, strict=True)]
+    imbalance = [g + n for g, n in zip(G, N, strict=True)]
+    return replace(
+        state,
+        scale=scale,
+        primal_residual=norm_of_all(disagreement) / norm_of_all(state.copies),
+        dual_residual=norm_of_all(imbalance) / scale,
+    )
+
+
+def _sums_by_variable(problem: OrthogonalProblem, of_terms: Sequence[Array]) -> list[Array]:
     sums = [np.zeros(variable.shape) for variable in problem.variables]
     for term, array in zip(problem.terms, of_terms, strict=True):
         sums[term.variable] += array
     return sums
 
 
-def _spectral(array: Array) -> float:
+def _identity(shape: tuple[int, ...]) -> Array:
+    """First columns of the identity, in the shape of a variable, which may be a vector."""
+    rows = shape[0]
+    columns = math.prod(shape) // rows
+    return np.eye(rows, columns).reshape(shape)
+
+
+def _spectral_norm(array: Array) -> float:
+    """Largest singular value; of a vector its norm."""
     return float(np.linalg.norm(array.reshape(len(array), -1), 2))

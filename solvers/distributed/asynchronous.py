@@ -1,7 +1,7 @@
-"""CONSENSUS without waiting: every robot goes on with the newest rows that it has, whatever was lost or is late.
+"""CONSENSUS without waiting: every robot continues with the newest rows that it has received.
 
-The same fixed-point map as `solvers.distributed.consensus` and no all-reduce: over-relaxed, and damped where values are
-old (Peng et al. 2016, ARock).
+The fixed-point map is that of `solvers.distributed.consensus`, without an all-reduce: over-relaxed,
+and damped where values are old (Peng et al. 2016, ARock).
 """
 
 import math
@@ -16,7 +16,7 @@ from solvers.distributed.driver import Driver
 from solvers.network.counted_pool import Count
 from solvers.network.faults import Faults, LossyChannel
 from solvers.result import Measurement, Status
-from solvers.soc.consensus import Consensus, ask_all
+from solvers.soc.consensus import Consensus, ask_all, objective_and_gradient
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.copies import Rows, TurnSettings
 from solvers.soc.soc import SOC
@@ -24,30 +24,40 @@ from solvers.soc.soc import SOC
 
 @dataclass(frozen=True, eq=False)
 class AsynchronousState:
-    """Round k: what the robots reported, and the channel with messages under way, which a step replaces in place."""
+    """Round k: what the robots reported, and the messages under way.
+
+    A step changes the channel of the messages in place.
+    """
 
     k: int
     size: float  # ||omega||_rho
     channel: LossyChannel[Array]
-    rows: list[Rows]  # what has arrived for the next turn, by its sender
+    rows: list[Rows]  # what has arrived for the next turn of every robot, by sender
+    # F and its relative gradient. Every robot evaluates its part at its own poses, beside its
+    # copies of the others' poses; in a confirmed state, beside the others' poses themselves.
+    objective: float
+    gradient: float
+    rotation_square: float  # as in `ConsensusState`
     primal_residual: float = np.inf
     dual_residual: float = np.inf
-    quiet: int = 0  # rounds in a row with residuals within tolerance
-    waited: int = 0  # the longest that a robot has not heard of a neighbour, in rounds
+    quiet: int = 0  # number of rounds in a row with residuals within tolerance
+    waited: int = 0  # age in rounds of the oldest rows that a robot has of a neighbour
+    # Whether the gradient is within tolerance at the poses that the robots hold.
+    is_confirmed: bool = False
 
 
 @dataclass(frozen=True)
 class AsynchronousSOC:
     """SOC by robots that do not wait for each other; a round is one turn of every robot."""
 
-    # Its penalties, local passes, tolerance and limit are used; acceleration, which needs sums over robots, is not.
+    # Settings. Of these penalties, local passes, tolerance and limit are used; the acceleration is
+    # not, since it needs sums over all robots.
     soc: SOC = field(default_factory=SOC)
     faults: Faults = field(default_factory=Faults)
     alpha: float = 1.8  # over-relaxation, in (0, 2)
-    damping: float = 1.0  # share of a step that is taken, in (0, 1]
-    # has_driver, goes_on: as in `ConsensusSOC`.
-    has_driver: bool = True
-    goes_on: bool = False
+    damping: float = 1.0  # fraction of a step that is taken, in (0, 1]
+    has_driver: bool = True  # as in `ConsensusSOC`
+    goes_on: bool = False  # as in `ConsensusSOC`
 
     def __post_init__(self) -> None:
         check_settings(self, relaxation=["alpha"])
@@ -56,41 +66,91 @@ class AsynchronousSOC:
 
     @property
     def max_iterations(self) -> int:
-        """Most rounds of a run."""
+        """Maximal number of rounds of a run."""
         return self.soc.max_iterations
 
     def init(self, driver: Driver, start: None) -> AsynchronousState:
-        """State 0: set-up, and the first rows, arrive in full; a SettingError where the silent robot is none."""
-        robots, silent = RobotsOfDriver(driver, self.has_driver, self.goes_on), self.faults.silent_robot
+        """State 0: the penalties and the first rows arrive without faults.
+
+        Raises a SettingError if there is no robot with the number of the silent one.
+        """
+        robots = RobotsOfDriver(driver, self.has_driver, self.goes_on)
+        silent = self.faults.silent_robot
         if silent is not None and silent >= robots.num_robots:
             raise SettingError(f"silent_robot is {silent}; give 0 to {robots.num_robots - 1}")
         state = Consensus(self.soc).init(robots)
         settings = TurnSettings(self.alpha, self.damping)
-        rows = robots.hand_on(ask_all(robots, ConsensusRobot.announce, settings, Count.PIGGYBACKED))
-        return AsynchronousState(0, state.size, LossyChannel(self.faults), rows)
+        sent = ask_all(robots, ConsensusRobot.announce, settings, Count.PIGGYBACKED)
+        return AsynchronousState(
+            k=0,
+            size=state.size,
+            channel=LossyChannel(self.faults),
+            rows=robots.exchange(sent),
+            objective=state.objective,
+            gradient=state.gradient,
+            rotation_square=state.rotation_square,
+        )
 
     def step(self, driver: Driver, state: AsynchronousState) -> AsynchronousState:
-        """One turn of every robot, with what has arrived."""
+        """One turn of every robot, with the rows that have arrived.
+
+        If it may be the last one, a round follows that confirms it.
+        """
         robots = RobotsOfDriver(driver)
         turns = robots.ask(ConsensusRobot.turn, state.rows, Count.PIGGYBACKED)
         squares = np.sum([turn.sums for turn in turns], axis=0)
         if not np.isfinite(squares).all():
             return replace(state, k=state.k + 1, primal_residual=np.nan, dual_residual=np.nan)
-        primal, dual = math.sqrt(squares[0]) / state.size, math.sqrt(squares[1]) / state.size
-        return replace(
+        primal = math.sqrt(squares[0]) / state.size
+        dual = math.sqrt(squares[1]) / state.size
+        objective, gradient = objective_and_gradient(
+            [turn.stationarity for turn in turns], state.rotation_square
+        )
+        is_within = max(primal, dual, gradient) <= self.soc.tolerance
+        following = replace(
             state,
             k=state.k + 1,
-            rows=robots.hand_on([turn.rows for turn in turns], state.channel),
+            rows=robots.exchange([turn.rows for turn in turns], state.channel),
+            objective=objective,
+            gradient=gradient,
             primal_residual=primal,
             dual_residual=dual,
-            quiet=state.quiet + 1 if max(primal, dual) <= self.soc.tolerance else 0,
+            quiet=state.quiet + 1 if is_within else 0,
             waited=max(turn.waited for turn in turns),
         )
+        oldest_in_use = following.waited + self.faults.max_delay
+        if following.quiet > oldest_in_use:
+            return self._confirmed(robots, following)
+        return following
+
+    def _confirmed(self, robots: RobotsOfDriver, state: AsynchronousState) -> AsynchronousState:
+        """State with the gradient at the poses that the robots hold.
+
+        The robots send each other these poses until all have arrived.
+        """
+        sent = ask_all(robots, ConsensusRobot.held_rows, None, Count.PIGGYBACKED)
+        rows = robots.exchange(sent)
+        parts = robots.ask(ConsensusRobot.stationarity_beside, rows, Count.ALL_REDUCE)
+        objective, gradient = objective_and_gradient(parts, state.rotation_square)
+        state = replace(state, objective=objective, gradient=gradient)
+        if gradient <= self.soc.tolerance:
+            return replace(state, is_confirmed=True)
+        return replace(state, quiet=0)
 
     def measure(self, driver: Driver, state: AsynchronousState) -> Measurement:
-        """F of the owners' omega with translations that are at hand, and the residuals."""
-        return RobotsOfDriver(driver).measured(Measurement(math.nan, state.primal_residual, state.dual_residual))
+        """F of the poses that the robots hold, and two residuals.
+
+        The primal residual is that of the recursion, the dual one the relative gradient of F.
+        """
+        if math.isnan(state.primal_residual):
+            return driver.measured(Measurement(math.nan, math.nan, math.nan))
+        return driver.measured(Measurement(state.objective, state.primal_residual, state.gradient))
 
     def converged(self, state: AsynchronousState, measurement: Measurement) -> Status | None:
-        """CONVERGED when the residuals have been within tolerance since before the oldest rows in use were sent."""
-        return Status.CONVERGED if state.quiet > state.waited + self.faults.max_delay else None
+        """CONVERGED when a last round has confirmed that residuals and gradient are small enough.
+
+        They have to be within tolerance since before the oldest rows in use were sent. In the last
+        round all robots send each other the poses that they hold, and the relative gradient of F
+        there has to be within tolerance, too.
+        """
+        return Status.CONVERGED if state.is_confirmed else None

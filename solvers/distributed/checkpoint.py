@@ -1,7 +1,11 @@
-"""Checkpoints of a distributed solve: what driver and robots know between two steps, in one file without pickle.
+"""Checkpoints of a solve by robots: what driver and robots know between two steps, in one file.
 
-A run that is broken off at any moment, and started again with the same graph, partition and settings, goes on from the
-last one, in the same place or in another, and ends with the same numbers.
+The process of the driver writes the file, without pickle. For that it is sent all that the robots
+know, interior poses too.
+
+A run that is broken off at any moment goes on from the last checkpoint when it is started again
+with the same graph, partition and settings, in the same place or in another, and ends with the same
+numbers.
 """
 
 import hashlib
@@ -28,7 +32,7 @@ from solvers.distributed.driver import CoverPoses, Driver, DriverState
 from solvers.distributed.newton import SubstructuredNewtonState
 from solvers.distributed.run_lock import RunLock
 from solvers.distributed.substructured import SubstructuredState
-from solvers.loop import Method, Watch
+from solvers.loop import Method, RunMonitor
 from solvers.network.ledger import Ledger, Traffic
 from solvers.network.serialization import deserialize, serialize
 from solvers.result import History, Measurement, Outcome, Record, Stage, Status
@@ -44,7 +48,8 @@ from solvers.soc.soc import SOC
 
 S = TypeVar("S")
 JudgedPoses = tuple[Poses, Certificate]
-_FORMAT = b"pgo-splitting checkpoint 4\n"  # first line of a file; the second is the SHA-256 of all that follows
+# First line of a file; the second is the SHA-256 of all that follows.
+_FORMAT = b"pgo-splitting checkpoint 5\n"
 _DIGEST_SIZE = 65
 _LOG = logging.getLogger(__name__)
 _PARTS = ("graph", "partition", "settings")
@@ -52,15 +57,43 @@ _PARTS = ("graph", "partition", "settings")
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Where and how often a solve writes what it needs to go on.
+    """Where and how often a solve by robots writes what it needs to go on.
 
-    If the file is there when a solve begins, the solve goes on from it. It is removed when the solve has converged, and
-    stays when the solve was stopped, interrupted or out of time. While a solve runs it is locked for others. One that
-    cannot be written, say on a full disk, is told once, and the solve goes on with the last one that could.
+    If the file exists when a solve begins, the solve goes on from it. The file is removed when the
+    solve has converged, and stays when the solve was stopped, interrupted or out of time. While a
+    solve runs it is locked for others. Where a checkpoint cannot be written, say on a full disk,
+    there is one warning, and the last one that could be written stays.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file.
+    rounds : int
+        Rounds of communication after which one is written; at least 1. There is also one when SOC
+        and when Newton begins.
+
+    Raises
+    ------
+    SettingError
+        When `rounds` is below 1.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pgo_models import load
+    >>> from solvers import solve
+    >>> path = Path(tempfile.mkdtemp()) / "solve.checkpoint"
+    >>> checkpoint = Checkpoint(path)
+    >>> stopped = solve(load("grid"), robots=2, checkpoint=checkpoint, callback=lambda *_: True)
+    >>> stopped.status.name, path.exists()
+    ('STOPPED', True)
+    >>> solution = solve(load("grid"), robots=2, checkpoint=checkpoint)
+    >>> solution.status.name, path.exists()
+    ('CONVERGED', False)
     """
 
     path: Path | str
-    rounds: int = 10  # of communication, after which one is written; also when SOC and when Newton begins
+    rounds: int = 10
 
     def __post_init__(self) -> None:
         check_settings(self, at_least_one=["rounds"])
@@ -68,177 +101,304 @@ class Checkpoint:
 
 @dataclass(frozen=True, eq=False)
 class Saved:
-    """What a checkpoint holds beside the robots' snapshots."""
+    """What a checkpoint holds beside the robots' snapshots.
 
-    attempts: tuple[JudgedPoses, ...]  # outcome of the attempts before the one under way
-    stages: tuple[Stage, ...]  # finished stages of all attempts
-    method: str  # name of the method that runs
-    state: object  # its state
-    records: tuple[Record, ...]  # of the states before
+    `attempts` are the outcomes of the attempts before the one under way, and `stages` the finished
+    stages of all attempts. `method` is the name of the method that runs, `state` its state, and
+    `records` are those of the states before.
+    """
+
+    attempts: tuple[JudgedPoses, ...]
+    stages: tuple[Stage, ...]
+    method: str
+    state: object
+    records: tuple[Record, ...]
     driver: DriverState
 
 
+# Types that a checkpoint may hold.
 _CLASSES = (
-    *(Saved, DriverState, CoverPoses, Poses, Certificate, LowerBound, BoundSource, Verdict, Weighting, Ledger, Traffic),
-    *(Stage, Status, History, Record, Measurement, RecursionBlock, StepSettings, AndersonShare, AndersonSums),
-    *(SubstructuredState, ConsensusState, SubstructuredNewtonState, SeparatorPenalty, Rotations),
-    *(SOC, Newton, Anderson, Coupling, RStep, MultiplierPenalty, FixedPenalty, BalancedPenalty),
-    *(Partition, PartitionMethod),
+    Saved,
+    # Poses and their certificate.
+    Poses,
+    Certificate,
+    LowerBound,
+    BoundSource,
+    Verdict,
+    Weighting,
+    # The driver and the account of its network.
+    DriverState,
+    CoverPoses,
+    Ledger,
+    Traffic,
+    # What was done so far.
+    Stage,
+    Status,
+    History,
+    Record,
+    Measurement,
+    # States of methods.
+    SubstructuredState,
+    ConsensusState,
+    SubstructuredNewtonState,
+    RecursionBlock,
+    StepSettings,
+    AndersonShare,
+    AndersonSums,
+    SeparatorPenalty,
+    Rotations,
+    # Settings of methods.
+    SOC,
+    Newton,
+    Anderson,
+    Coupling,
+    RStep,
+    MultiplierPenalty,
+    FixedPenalty,
+    BalancedPenalty,
+    Partition,
+    PartitionMethod,
 )
 
 
 class Journal:
-    """Writes the checkpoints of one solve, and hands out the one that it goes on from; to be closed after the solve."""
+    """Writes the checkpoints of one solve, and returns the one that it goes on from.
 
-    def __init__(self, checkpoint: Checkpoint | None, mark: Mapping[str, str], stages: list[Stage]) -> None:
+    It is to be closed after the solve. Without a checkpoint it only runs methods. `stages` are the
+    finished ones of the solve; those of the checkpoint are put there to begin with.
+    """
+
+    def __init__(
+        self, checkpoint: Checkpoint | None, mark: Mapping[str, str], stages: list[Stage]
+    ) -> None:
         """Read the checkpoint, if there is one.
 
-        A FileFormatError when the file is no checkpoint, is damaged, or is where none can be written; a SettingError
-        when it is one of another graph, partition or settings, or another run uses it.
+        A FileFormatError when the file is no checkpoint, is damaged, or is where none can be
+        written; a SettingError when it is that of another graph, partition or settings, or another
+        run uses it.
         """
-        self.stages = stages  # finished ones of the solve, those of the checkpoint to begin with
-        self._checkpoint, self._mark = checkpoint, mark
-        self._finished: list[JudgedPoses] = []
-        self._saved: Saved | None = None
-        self._snapshots: list[dict[str, NDArray[Any]]] = []
+        self.stages = stages
+        self._checkpoint = checkpoint
+        self._mark = mark
+        self._finished: list[JudgedPoses] = []  # outcomes of attempts
+        self._saved: Saved | None = None  # the checkpoint, until a run goes on from it
+        self._snapshots: list[dict[str, NDArray[Any]]] = []  # the robots', of the same
         self._has_warned = False
-        self._lock = RunLock(Path(checkpoint.path)) if checkpoint is not None else None
+        self._lock: RunLock | None = None
+        if checkpoint is None:
+            return
+        path = Path(checkpoint.path)
+        self._lock = RunLock(path)
         try:
-            if checkpoint is not None and Path(checkpoint.path).exists():
-                self._saved, self._snapshots = _read(Path(checkpoint.path), mark)
+            if path.exists():
+                self._saved, self._snapshots = _read(path, mark)
                 stages[:] = self._saved.stages
         except PGOError:
             self.close()
             raise
 
     def close(self) -> None:
-        """Let other runs have the checkpoint."""
+        """Leave the checkpoint to other runs."""
         if self._lock is not None:
             self._lock.release()
             self._lock = None
 
-    def outcome_of_attempt(self) -> JudgedPoses | None:
-        """Outcome of the attempt that begins, if the checkpoint is of a later one."""
-        if self._saved is None or len(self._finished) >= len(self._saved.attempts):
+    def take_outcome(self) -> JudgedPoses | None:
+        """Outcome of the attempt that begins, if the checkpoint is of a later one.
+
+        The next call is about the next attempt.
+        """
+        number = len(self._finished)
+        if self._saved is None or number >= len(self._saved.attempts):
             return None
-        self._finished.append(self._saved.attempts[len(self._finished)])
-        return self._finished[-1]
+        outcome = self._saved.attempts[number]
+        self._finished.append(outcome)
+        return outcome
 
     def end_attempt(self, outcome: JudgedPoses) -> None:
         """Remember the outcome of an attempt."""
         self._finished.append(outcome)
 
     def goes_on_with(self, method: type | None = None) -> bool:
-        """Whether there is a checkpoint that has not been used yet; one taken in this method, if a method is given."""
-        return self._saved is not None and (method is None or self._saved.method == method.__name__)
+        """Whether there is a checkpoint from which no run has gone on yet.
 
-    def run(self, method: Method[Driver, S, S], driver: Driver, watch: Watch) -> Outcome[S]:
-        """Run a method by driver and robots, from the checkpoint if there is one, and write checkpoints."""
+        With a method: whether it was taken while that method ran.
+        """
+        if self._saved is None:
+            return False
+        return method is None or self._saved.method == method.__name__
+
+    def run(self, method: Method[Driver, S, S], driver: Driver, monitor: RunMonitor) -> Outcome[S]:
+        """Run a method by driver and robots, and write checkpoints meanwhile.
+
+        It goes on from the checkpoint if there is one.
+        """
         start: S | None = None
         earlier: tuple[Record, ...] = ()
         if self._saved is not None:
             driver.resume(self._saved.driver, self._snapshots)
-            start, earlier = self._saved.state, self._saved.records  # type: ignore[assignment] # by its method's name
-            self._saved, self._snapshots = None, []
+            # The caller has compared the name of the method, so this is its state.
+            start = self._saved.state  # type: ignore[assignment]
+            earlier = self._saved.records
+            self._saved = None
+            self._snapshots = []
         if self._checkpoint is None:
-            return watch.run(method, driver, start, earlier)
-        writing = self._writing(type(method).__name__, driver, watch, list(earlier), start is None)
-        return replace(watch, callback=writing).run(method, driver, start, earlier)
+            return monitor.run(method, driver, start, earlier)
+        name = type(method).__name__
+        callback = self._writing(self._checkpoint, name, driver, monitor, earlier, start is None)
+        return replace(monitor, callback=callback).run(method, driver, start, earlier)
 
     def end(self) -> None:
         """Remove the checkpoint: the solve is done."""
-        if self._checkpoint is not None:
-            try:
-                Path(self._checkpoint.path).unlink(missing_ok=True)
-            except OSError as error:
-                _LOG.warning("cannot remove %s: %s; the solve is done without it", error.filename, error.strerror)
+        if self._checkpoint is None:
+            return
+        try:
+            Path(self._checkpoint.path).unlink(missing_ok=True)
+        except OSError as error:
+            _LOG.warning(
+                "cannot remove %s: %s; the solve is done without it",
+                error.filename,
+                error.strerror,
+            )
 
     def _writing(
-        self, name: str, driver: Driver, watch: Watch, records: list[Record], is_due: bool
+        self,
+        checkpoint: Checkpoint,
+        name: str,
+        driver: Driver,
+        monitor: RunMonitor,
+        earlier: Sequence[Record],
+        is_due: bool,
     ) -> Callable[[Any, Record], bool | None]:
-        """Callback that writes a checkpoint when one is due, and then calls the one of `watch`."""
+        """Callback that writes a checkpoint when one is due, and then calls that of `monitor`."""
+        records = list(earlier)
         last = -math.inf if is_due else driver.network.ledger.rounds
 
-        def write(state: Any, record: Record) -> bool | None:  # noqa: ANN401 - of whatever method runs
+        def write(state: Any, record: Record) -> bool | None:  # noqa: ANN401 - of any method
             nonlocal last
-            assert self._checkpoint is not None
-            if driver.network.ledger.rounds - last >= self._checkpoint.rounds:
-                last = driver.network.ledger.rounds
-                done = tuple(self._finished), tuple(self.stages)
-                saved = Saved(*done, name, state, tuple(records), driver.state)
-                snapshots = driver.snapshots()
-                try:
-                    _write(Path(self._checkpoint.path), self._mark, saved, snapshots)
-                except PGOError as error:  # the disk's, which may have room again by the next time
-                    if not self._has_warned:
-                        _LOG.warning("the solve goes on without a new checkpoint: %s", error)
-                    self._has_warned = True
+            rounds = driver.network.ledger.rounds
+            if rounds - last >= checkpoint.rounds:
+                last = rounds
+                self._save(Path(checkpoint.path), name, state, records, driver)
             records.append(record)
-            return watch.callback(state, record) if watch.callback is not None else None
+            return monitor.callback(state, record) if monitor.callback is not None else None
 
         return write
 
+    def _save(
+        self, path: Path, name: str, state: object, records: Sequence[Record], driver: Driver
+    ) -> None:
+        """Write a checkpoint, or warn once that it cannot be written."""
+        # The ledger counts the snapshots, so they come before the state that holds it.
+        snapshots = driver.snapshots()
+        saved = Saved(
+            attempts=tuple(self._finished),
+            stages=tuple(self.stages),
+            method=name,
+            state=state,
+            records=tuple(records),
+            driver=driver.state,
+        )
+        try:
+            _write(path, self._mark, saved, snapshots)
+        except PGOError as error:  # the disk may have room again by the next time
+            if not self._has_warned:
+                _LOG.warning("the solve goes on without a new checkpoint: %s", error)
+            self._has_warned = True
 
-def run_fingerprint(problem: PGOProblem, robots: Partition, settings: object, start: Poses | None) -> dict[str, str]:
+
+def run_fingerprint(
+    problem: PGOProblem, robots: Partition, settings: object, start: Poses | None
+) -> dict[str, str]:
     """What a checkpoint must have in common with the run that goes on from it."""
     graph = problem.graph
-    weights = problem.weights
-    edges = [graph.i, graph.j, graph.R_ij, graph.t_ij, weights.W(graph.d), weights.tau]
-    if weights.excess is not None:
-        edges.append(weights.excess.J)
+    edges = [graph.i, graph.j, graph.R_ij, graph.t_ij, *problem.weights.arrays(graph.d)]
     poses = () if start is None else (start.R, start.t)
     text = np.frombuffer(repr(settings).encode(), dtype=np.uint8)
-    return dict(zip(_PARTS, (digest(*edges), digest(robots.robot), digest(text, *poses)), strict=True))
+    digests = (digest(*edges), digest(robots.robot), digest(text, *poses))
+    return dict(zip(_PARTS, digests, strict=True))
 
 
 def digest(*arrays: NDArray[Any]) -> str:
     """SHA-256 of arrays with their shapes and types."""
-    found = hashlib.sha256()
+    sha = hashlib.sha256()
     for array in arrays:
-        found.update(f"{array.shape}{array.dtype}".encode())
-        found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()
+        sha.update(f"{array.shape}{array.dtype}".encode())
+        sha.update(np.ascontiguousarray(array).tobytes())
+    return sha.hexdigest()
 
 
 def _digest_of_rest(stream: BufferedReader | BufferedRandom) -> bytes:
-    """SHA-256 of a stream from where it stands to its end, as a line."""
+    """SHA-256 of a stream from its current position to its end, as a line."""
     return hashlib.file_digest(stream, "sha256").hexdigest().encode() + b"\n"
 
 
-def _write(path: Path, mark: Mapping[str, str], saved: Saved, snapshots: Sequence[Mapping[str, NDArray[Any]]]) -> None:
-    parts = {"run": serialize(saved)} | {f"robot {robot}": dict(snapshot) for robot, snapshot in enumerate(snapshots)}
-    arrays = {f"{part}/{name}": array for part, found in parts.items() for name, array in found.items()}
-    header = np.array([mark[part] for part in _PARTS])
+def _write(
+    path: Path,
+    mark: Mapping[str, str],
+    saved: Saved,
+    snapshots: Sequence[Mapping[str, NDArray[Any]]],
+) -> None:
+    """Write a checkpoint, whole or not at all; `_read` has the format."""
+    arrays: dict[str, NDArray[Any]] = {"header": np.array([mark[part] for part in _PARTS])}
+    for name, array in serialize(saved).items():
+        arrays[f"run/{name}"] = array
+    for robot, snapshot in enumerate(snapshots):
+        for name, array in snapshot.items():
+            arrays[f"robot {robot}/{name}"] = array
     with replace_when_done(path) as temporary, temporary.open("w+b") as file:
         file.write(_FORMAT + b"0" * _DIGEST_SIZE)
-        np.savez(file, allow_pickle=False, **{"header": header, **arrays})
+        np.savez(file, allow_pickle=False, **arrays)
         file.seek(len(_FORMAT) + _DIGEST_SIZE)
-        digest = _digest_of_rest(file)
+        digest_of_arrays = _digest_of_rest(file)
         file.seek(len(_FORMAT))
-        file.write(digest)
+        file.write(digest_of_arrays)
 
 
 def _read(path: Path, mark: Mapping[str, str]) -> tuple[Saved, list[dict[str, NDArray[Any]]]]:
-    parts: dict[str, dict[str, NDArray[Any]]] = {}
+    """Read a checkpoint, and the snapshot of every robot.
+
+    Arrays are named PART/NAME, where the part is "run" or "robot K"; the header is that of the run
+    (`run_fingerprint`). A FileFormatError when the file is no checkpoint or is damaged, a
+    SettingError when it is that of another run.
+    """
     try:
-        with path.open("rb") as stream:
-            if stream.read(len(_FORMAT)) != _FORMAT:
-                raise FileFormatError(path, None, "no checkpoint of a solve; choose another name or remove it")
-            if stream.read(_DIGEST_SIZE) != _digest_of_rest(stream):
-                raise FileFormatError(path, None, "a damaged checkpoint, its checksum does not fit; remove it")
-            stream.seek(len(_FORMAT) + _DIGEST_SIZE)
-            file = np.load(stream, allow_pickle=False)
-            for key in file:
-                part, _, name = key.partition("/")
-                parts.setdefault(part, {})[name] = file[key]
+        parts = _read_parts(path)
         header = [str(text) for text in parts["header"][""]]
-        other = [part for part, found in zip(_PARTS, header, strict=True) if found != mark[part]]
-        if not other:
+        others = [part for part, text in zip(_PARTS, header, strict=True) if text != mark[part]]
+        if not others:
             saved: Saved = deserialize(parts["run"], _CLASSES)
-            return saved, [parts[f"robot {robot}"] for robot in range(saved.driver.ledger.num_robots)]
+            num_robots = saved.driver.ledger.num_robots
+            return saved, [parts[f"robot {robot}"] for robot in range(num_robots)]
     except OSError as error:
-        raise FileFormatError(path, None, f"cannot be read: {error.strerror or error}; choose another name") from error
+        raise FileFormatError(
+            path, None, f"cannot be read: {error.strerror or error}; choose another name"
+        ) from error
     except (ValueError, KeyError) as error:  # whole, but of another version
-        raise FileFormatError(path, None, "a checkpoint of another version of this package; remove it") from error
-    way_out = "go on with the same ones, or remove the file to start anew"
-    raise SettingError(f"{path} is the checkpoint of a run with another {' and another '.join(other)}; {way_out}")
+        raise FileFormatError(
+            path, None, "a checkpoint of another version of this package; remove it"
+        ) from error
+    raise SettingError(
+        f"{path} is the checkpoint of a run with another {' and another '.join(others)}; "
+        "go on with the same ones, or remove the file to start anew"
+    )
+
+
+def _read_parts(path: Path) -> dict[str, dict[str, NDArray[Any]]]:
+    """Arrays of a checkpoint by part and name; a FileFormatError where it is damaged or none."""
+    parts: dict[str, dict[str, NDArray[Any]]] = {}
+    with path.open("rb") as stream:
+        if stream.read(len(_FORMAT)) != _FORMAT:
+            raise FileFormatError(
+                path, None, "no checkpoint of a solve; choose another name or remove it"
+            )
+        if stream.read(_DIGEST_SIZE) != _digest_of_rest(stream):
+            raise FileFormatError(
+                path, None, "a damaged checkpoint, its checksum does not fit; remove it"
+            )
+        stream.seek(len(_FORMAT) + _DIGEST_SIZE)
+        file = np.load(stream, allow_pickle=False)
+        for key in file:
+            part, _, name = key.partition("/")
+            parts.setdefault(part, {})[name] = file[key]
+    return parts

@@ -1,4 +1,4 @@
-"""CONSENSUS by robots on a network: `solvers.soc.consensus` from the poses that they and a driver hold."""
+"""CONSENSUS by robots on a network: `solvers.soc.consensus`, from the poses that they hold."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -28,78 +28,101 @@ class RobotsOfDriver:
     """All robots, reached by the network."""
 
     driver: Driver
-    # Whether a driver sends the cover's poses at the start, and finds the best translations where penalties are taken
-    # anew. Else robots begin at poses that they know, and go on from the translations that they agreed on.
+    # Whether a driver sends the poses of the cover at the start, and computes the best translations
+    # whenever new penalties are chosen. Without one, robots begin at poses that they know, and
+    # continue from the translations that they agreed on.
     has_driver: bool = True
-    goes_on: bool = False  # whether robots without a driver begin where an earlier run has left them
+    # Whether robots without a driver begin where an earlier run has left them.
+    goes_on: bool = False
 
     @property
     def num_robots(self) -> int:
-        """How many there are."""
+        """Number of robots."""
         return self.driver.network.ledger.num_robots
 
     def begin(self, is_first: bool) -> list[Rows]:
-        """Give all robots the poses to start at, or to go on from; what they send each other then."""
-        if self.goes_on or not (is_first or self.has_driver):
+        """Set the poses of all robots, at the start of a run (`is_first`) or for new penalties.
+
+        The answers are the rows that the robots then send each other.
+        """
+        stays_at_own_poses = self.goes_on or not (is_first or self.has_driver)
+        if stays_at_own_poses:
             return ask_all(self, ConsensusRobot.begin_here, None, Count.PIGGYBACKED)
         if not is_first:
             self.finish()
-        count = Count.PIGGYBACKED if self.has_driver else Count.OFF  # without a driver all know where they start
+        # Without a driver no poses are sent: all robots know where they start.
+        count = Count.PIGGYBACKED if self.has_driver else Count.OFF
         return self.driver.network.ask(begin_copies, self.driver.poses_of_cover(), count)
 
     def ask(self, order: Order[Q, A], requests: Sequence[Q], count: Count) -> list[A]:
         """Answers of all robots to an order, each with its request."""
         return self.driver.network.ask(partial(order_copies, order), requests, count)
 
-    def hand_on(self, sent: Sequence[Mapping[int, A]], channel: LossyChannel[A] | None = None) -> list[Mapping[int, A]]:
-        """What every robot receives, by its sender, of what each sent, by its receiver: one round."""
-        return self.driver.network.hand_on(sent, channel)
-
-    def measured(self, measurement: Measurement) -> Measurement:
-        """Residuals, with F at omega and the translations at hand, and the account so far."""
-        if math.isnan(measurement.primal_residual):
-            return self.driver.measured(Measurement(np.nan, np.nan, np.nan))
-        objective = measurement.objective  # told with the step, or
-        if math.isnan(objective):
-            objective = math.fsum(ask_all(self, ConsensusRobot.cost, None, Count.OFF))
-        return self.driver.measured(Measurement(objective, measurement.primal_residual, measurement.dual_residual))
+    def exchange(
+        self, sent: Sequence[Mapping[int, A]], channel: LossyChannel[A] | None = None
+    ) -> list[Mapping[int, A]]:
+        """Carry out one round: messages by receiver in, messages by sender out."""
+        return self.driver.network.exchange(sent, channel)
 
     def finish(self) -> None:
-        """Leave omega and the best translations for it with driver and robots: two rounds."""
+        """Give driver and robots omega, and the best translations for it: two rounds."""
+        requests = [None] * self.num_robots
+        answers = self.driver.network.ask(finish_copies, requests, Count.PIGGYBACKED)
         R = np.empty_like(self.driver.at.R)
-        for answer in self.driver.network.ask(finish_copies, [None] * self.num_robots, Count.PIGGYBACKED):
+        for answer in answers:
             R[answer.in_cover] = answer.R
-        self.driver.adopt(R)  # copies of robots that do not wait differ: all take the owners'
+        # The copies of robots that do not wait differ, so that all robots take those of the owners.
+        self.driver.adopt(R)
 
 
 @dataclass(frozen=True)
 class ConsensusSOC:
-    """SOC by robots, from the poses that they and the driver hold; a step replaces what they have."""
+    """SOC by robots, from the poses that they and the driver hold.
 
-    soc: SOC = field(default_factory=SOC)  # settings; its coupling and robots are not looked at
-    # has_driver, goes_on: as in `RobotsOfDriver`; rotations: as in `Consensus`.
-    has_driver: bool = True
-    goes_on: bool = False
-    rotations: Rotations = Rotations.PROJECTED
+    The iterates are with the robots, and a step replaces them.
+    """
+
+    soc: SOC = field(default_factory=SOC)  # settings; its coupling and robots are ignored
+    has_driver: bool = True  # as in `RobotsOfDriver`
+    goes_on: bool = False  # as in `RobotsOfDriver`
+    rotations: Rotations = Rotations.PROJECTED  # as in `Consensus`
 
     @property
     def max_iterations(self) -> int:
-        """Most steps of a run."""
+        """Maximal number of steps of a run."""
         return self.soc.max_iterations
 
+    @property
+    def _method(self) -> Consensus:
+        return Consensus(self.soc, self.rotations)
+
     def init(self, driver: Driver, start: ConsensusState | None) -> ConsensusState:
-        """State 0: omega = the rotations at hand, B in balance; two rounds for poses, penalties and forces."""
-        robots = RobotsOfDriver(driver, self.has_driver, self.goes_on)
-        return start if start is not None else Consensus(self.soc, self.rotations).init(robots)
+        """State 0: omega = the current rotations, B in balance.
+
+        Poses, penalties and forces take two rounds.
+        """
+        if start is not None:
+            return start
+        return self._method.init(RobotsOfDriver(driver, self.has_driver, self.goes_on))
 
     def step(self, driver: Driver, state: ConsensusState) -> ConsensusState:
         """One round between neighbours, and with it an all-reduce."""
-        return Consensus(self.soc, self.rotations).step(RobotsOfDriver(driver, self.has_driver), state)
+        return self._method.step(RobotsOfDriver(driver, self.has_driver), state)
 
     def measure(self, driver: Driver, state: ConsensusState) -> Measurement:
-        """F at omega and the translations at hand, and the residuals."""
-        return RobotsOfDriver(driver).measured(state.measurement(state.objective))
+        """F of the poses that the robots hold, the residuals, and what crossed the network.
+
+        A single robot with a driver ends as JOINT does, by the residuals of the recursion: the
+        driver computes the translations.
+        """
+        is_joint = self.has_driver and driver.network.ledger.num_robots == 1
+        if is_joint and not math.isnan(state.primal_residual):
+            return driver.measured(state.measurement(state.objective))
+        return driver.measured(self._method.measurement(state))
 
     def converged(self, state: ConsensusState, measurement: Measurement) -> Status | None:
-        """CONVERGED when the residuals are within tolerance."""
+        """CONVERGED when primal residual and relative gradient of F are within tolerance.
+
+        The gradient is that at the poses which the robots hold.
+        """
         return self.soc.converged(state, measurement)

@@ -1,13 +1,21 @@
-"""CONSENSUS without a driver: robots alone find poses, from a start by rounds, and nothing is proved about them.
+"""CONSENSUS without a driver: robots alone compute poses, and nothing is proved about them.
 
-They begin at a spanning tree, relax rotations and translations jointly, then find translations for the rotations, by
-rounds, or begin at given poses; they end as near to the optimum as SOC's tolerance says: best translations of given
-rotations, Newton and certificate are a driver's. Sums, and so the tests, go along a tree.
+Unless poses are given, the robots begin at a spanning tree of the graph. They relax the rotations
+and solve for rotations and translations jointly, project the rotations, and solve for the
+translations that belong to these. Both are runs of CONSENSUS to a loose tolerance. Then SOC
+follows. Best translations of given rotations, Newton and the certificate need a driver.
+
+The sums that robots need, and so their tests of convergence, go along a tree of robots. CONVERGED
+means of SOC that the relative gradient of F over rotations and translations is within its tolerance
+at the poses that the robots hold and that are returned. How far F is from an optimum does not
+follow from it. Of the start, in which the rotations are first relaxed and then held, it means that
+the residuals of the recursion are within `_START_TOLERANCE`.
 """
 
 import math
 import time
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -24,7 +32,7 @@ from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.distributed.driver import Driver
-from solvers.loop import Watch
+from solvers.loop import RunMonitor
 from solvers.network.counted_pool import Count
 from solvers.network.faults import Faults
 from solvers.network.ledger import BYTES_PER_NUMBER, Traffic
@@ -34,8 +42,13 @@ from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.recursion_block import Rotations
 from solvers.soc.soc import SOC
 
-_TOLERANCE, _MOST_ROUNDS = 1e-2, 100  # of the relaxation: SOC goes on from the rotations nearest to it
-NO_CERTIFICATE = "no driver: Newton and the certificate were left out, and F >= 0 is all that is known of the optimum"
+# SOC improves the rotations of the start anyway, so that these limits are loose.
+_START_TOLERANCE = 1e-2
+_START_ROUNDS = 100
+NO_CERTIFICATE = (
+    "no driver: Newton and the certificate were left out, "
+    "and F >= 0 is all that is known of the optimum"
+)
 
 
 def attempt_leaderless(
@@ -45,87 +58,184 @@ def attempt_leaderless(
     gap: float,
     faults: Faults | None,
     journal: Journal,
-    watch: Watch,
+    monitor: RunMonitor,
     soc: SOC | None,
     start: Poses | None,
 ) -> tuple[Poses, Certificate]:
-    """Start and CONSENSUS; what was done goes to the stages of `journal`. The bound is F >= 0.
+    """Run the start and CONSENSUS; the certificate has the bound F >= 0 and no other.
 
-    Of the whole `problem` nothing is used but the trees, and F of the start and of the poses that are returned.
+    What was done goes to the stages of `journal`. Of the whole `problem` only the trees are used,
+    and F of the start and of the poses that are returned.
     """
     assert soc is not None
     driver.network.tree = robot_tree(problem, robots)
     began = time.perf_counter()
-    iterations, status, history, goes_on = 0, Status.CONVERGED, History(), False
-    before = start if start is not None else spanning_tree_start(problem.graph)
-    driver.hand_out(before)
-    if start is None:
-        for traffic in tree_traffic(problem, robots):
-            driver.network.ledger = driver.network.ledger.after_round(traffic)
-        few = replace(soc, local_passes=1, tolerance=_TOLERANCE, max_iterations=_MOST_ROUNDS)
-        unseen = replace(watch, callback=None, verbose=False, progress=False)
-        for rotations in (Rotations.RELAXED, Rotations.FIXED):
-            rounds = unseen.run(ConsensusSOC(few, False, rotations is Rotations.FIXED, rotations), driver)
-            iterations, status, history = iterations + rounds.iterations, rounds.status, rounds.history
-            if not status.is_success:
-                break
-        found = collect_copies(driver)
-        goes_on = status.is_success and problem.objective(found) < problem.objective(before)  # else from the tree
-        before = found if goes_on else before
+    if start is not None:
+        driver.hand_out(start)
+        first = _Start(start, "given start")
+    else:
+        first = _start_by_rounds(driver, problem, robots, soc, monitor)
     if not journal.goes_on_with():
-        name = "chordal start, by rounds" if goes_on else "given start" if start is not None else "spanning tree"
-        objective, seconds = problem.objective(before), time.perf_counter() - began
-        journal.stages.append(Stage(name, status, iterations, objective, seconds, history))
-    poses = before
-    watch.found.append(before)
-    if status not in OUT_OF_TIME:
-        began = time.perf_counter()
-        first: Outcome[AsynchronousState] | Outcome[ConsensusState]
-        if faults is not None:
-            first = watch.run(AsynchronousSOC(soc, faults, has_driver=False, goes_on=goes_on), driver)
-        else:
-            first = journal.run(ConsensusSOC(soc, has_driver=False, goes_on=goes_on), driver, watch)
-        poses = min(before, collect_copies(driver), key=problem.objective)
-        watch.found.append(poses)
-        objective, seconds = problem.objective(poses), time.perf_counter() - began
-        journal.stages.append(Stage("SOC", first.status, first.iterations, objective, seconds, first.history, soc))
-    nothing = np.zeros((problem.num_poses, problem.d, problem.d))
-    return poses, certify_with(problem, poses, nothing, gap, math.inf, BoundSource.GIVEN, NO_BOUND)
+        journal.stages.append(
+            Stage(
+                first.name,
+                first.status,
+                first.iterations,
+                problem.objective(first.poses),
+                time.perf_counter() - began,
+                first.history,
+            )
+        )
+    monitor.poses_found.append(first.poses)
+    poses = first.poses
+    if first.status not in OUT_OF_TIME:
+        poses = _run_soc(driver, problem, faults, journal, monitor, soc, first)
+        monitor.poses_found.append(poses)
+    no_multipliers = np.zeros((problem.num_poses, problem.d, problem.d))
+    certificate = certify_with(
+        problem, poses, no_multipliers, gap, math.inf, BoundSource.GIVEN, NO_BOUND
+    )
+    return poses, certificate
+
+
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """Poses at which SOC starts, and how they were obtained."""
+
+    poses: Poses
+    name: str
+    status: Status = Status.CONVERGED
+    iterations: int = 0
+    history: History = field(default_factory=History)
+    # Whether the robots hold these poses in their copies from the run before.
+    is_in_copies: bool = False
+
+
+def _start_by_rounds(
+    driver: Driver, problem: PGOProblem, robots: Partition, soc: SOC, monitor: RunMonitor
+) -> _Start:
+    """Start at a spanning tree, and run the chordal relaxation from there.
+
+    The relaxation is two runs of CONSENSUS: with relaxed rotations, then with these rotations,
+    projected and held. The poses of the tree are kept if they cost less.
+    """
+    tree_poses = spanning_tree_start(problem.graph)
+    driver.hand_out(tree_poses)
+    for traffic in tree_traffic(problem, robots):
+        driver.network.ledger = driver.network.ledger.after_round(traffic)
+    loose = replace(soc, local_passes=1, tolerance=_START_TOLERANCE, max_iterations=_START_ROUNDS)
+    silent = replace(monitor, callback=None, verbose=False, progress=False)
+    relaxed = ConsensusSOC(loose, has_driver=False, goes_on=False, rotations=Rotations.RELAXED)
+    outcome = silent.run(relaxed, driver)
+    iterations = outcome.iterations
+    if outcome.status.is_success:
+        held = replace(relaxed, goes_on=True, rotations=Rotations.FIXED)
+        outcome = silent.run(held, driver)
+        iterations += outcome.iterations
+    poses = collect_copies(driver)
+    cost_of_tree = problem.objective(tree_poses)
+    if outcome.status.is_success and problem.objective(poses) < cost_of_tree:
+        return _Start(
+            poses,
+            "chordal start, by rounds",
+            outcome.status,
+            iterations,
+            outcome.history,
+            is_in_copies=True,
+        )
+    return _Start(tree_poses, "spanning tree", outcome.status, iterations, outcome.history)
+
+
+def _run_soc(
+    driver: Driver,
+    problem: PGOProblem,
+    faults: Faults | None,
+    journal: Journal,
+    monitor: RunMonitor,
+    soc: SOC,
+    start: _Start,
+) -> Poses:
+    """Run SOC, asynchronously if there are faults; return the cheaper of start and end."""
+    began = time.perf_counter()
+    outcome: Outcome[AsynchronousState] | Outcome[ConsensusState]
+    if faults is not None:
+        asynchronous = AsynchronousSOC(soc, faults, has_driver=False, goes_on=start.is_in_copies)
+        outcome = monitor.run(asynchronous, driver)
+    else:
+        consensus = ConsensusSOC(soc, has_driver=False, goes_on=start.is_in_copies)
+        outcome = journal.run(consensus, driver, monitor)
+    poses, status = cheaper_end(
+        problem, start.poses, collect_copies(driver), outcome, soc.tolerance
+    )
+    objective = problem.objective(poses)
+    seconds = time.perf_counter() - began
+    journal.stages.append(
+        Stage("SOC", status, outcome.iterations, objective, seconds, outcome.history, soc)
+    )
+    return poses
+
+
+def cheaper_end(
+    problem: PGOProblem, start: Poses, end: Poses, outcome: Outcome[Any], tolerance: float
+) -> tuple[Poses, Status]:
+    """Start or end of a run, whichever costs less, and the status of these poses.
+
+    If the start costs less than the end of a run that has converged, the start itself has not
+    converged, unless its gradient is within tolerance. The robots have summed up that gradient
+    before the first step.
+    """
+    if not problem.objective(start) < problem.objective(end):
+        return end, outcome.status
+    gradient = outcome.history.records[0].measurement.dual_residual
+    is_stationary = gradient <= tolerance
+    if outcome.status.is_success and not is_stationary:
+        return start, Status.START_KEPT
+    return start, outcome.status
 
 
 def collect_copies(driver: Driver) -> Poses:
-    """Poses that the robots agreed on, for whoever asked for the solution; off the ledger."""
-    n, d = driver.num_poses, driver.d
-    R, t = np.empty((n, d, d)), np.empty((n, d))
+    """Poses that the robots agreed on, for the result; off the ledger."""
+    R = np.empty((driver.num_poses, driver.d, driver.d))
+    t = np.empty((driver.num_poses, driver.d))
     for own in ask_all(RobotsOfDriver(driver), ConsensusRobot.own_poses, None, Count.OFF):
-        R[own.poses], t[own.poses] = own.R, own.t
+        R[own.poses] = own.R
+        t[own.poses] = own.t
     return Poses(R, t)
 
 
 def robot_tree(problem: PGOProblem, robots: Partition) -> tuple[IntArray, IntArray]:
-    """Robots in order of their distance from robot 0, and the neighbour by which each is reached; the root is its own.
+    """Tree of the robots: all robots, parents first, and the parent of each.
 
-    Up it go sums, and figures that are not summed up; down what follows from them.
+    It is a breadth-first tree of the graph of neighbours. The root is robot 0, which counts as its
+    own parent. Sums, and figures that are not summed up, go up the tree; what follows from them
+    goes down.
     """
-    links = robots.robot[problem.graph.i], robots.robot[problem.graph.j]
-    adjacency = csr_array((np.ones(problem.graph.num_edges), links), shape=(robots.num_robots, robots.num_robots))
+    ends = robots.robot[problem.graph.i], robots.robot[problem.graph.j]
+    ones = np.ones(problem.graph.num_edges)
+    adjacency = csr_array((ones, ends), shape=(robots.num_robots, robots.num_robots))
     order, parents = breadth_first_order(adjacency, 0, directed=False)
     parents[0] = 0
     return order, parents
 
 
 def tree_traffic(problem: PGOProblem, robots: Partition) -> list[Traffic]:
-    """Messages of every round of a spanning tree: a pose goes along each of its edges that join two robots."""
+    """Messages of every round in which poses are passed along a spanning tree of the graph.
+
+    A pose is sent along every edge of the tree that joins two robots. The round in which a robot
+    learns a pose is the number of such edges between the pose and the root.
+    """
     order, parent, _ = spanning_tree(problem.graph, 0)
-    owner, child = robots.robot, order[1:]
-    depth = np.zeros(problem.num_poses, dtype=np.int64)
-    is_cut = owner[child] != owner[parent[child]]
-    for pose, crosses in zip(child.tolist(), is_cut.tolist(), strict=True):
-        depth[pose] = depth[parent[pose]] + crosses
-    size = BYTES_PER_NUMBER * problem.d * (problem.d + 1)
-    found = []
-    for number in range(1, int(depth.max()) + 1):
-        at = child[is_cut & (depth[child] == number)]
-        links, poses = np.unique(np.stack([owner[parent[at]], owner[at]]), axis=1, return_counts=True)
-        found.append(Traffic(links[0], links[1], size * poses))
-    return found
+    owner = robots.robot
+    child = order[1:]
+    crosses = owner[child] != owner[parent[child]]
+    round_of_pose = np.zeros(problem.num_poses, dtype=np.int64)
+    for pose, is_sent in zip(child.tolist(), crosses.tolist(), strict=True):
+        round_of_pose[pose] = round_of_pose[parent[pose]] + is_sent
+    bytes_of_pose = BYTES_PER_NUMBER * problem.d * (problem.d + 1)
+    rounds = []
+    for number in range(1, int(round_of_pose.max()) + 1):
+        sent = child[crosses & (round_of_pose[child] == number)]
+        ends = np.stack([owner[parent[sent]], owner[sent]])
+        links, num_poses = np.unique(ends, axis=1, return_counts=True)
+        rounds.append(Traffic(links[0], links[1], bytes_of_pose * num_poses))
+    return rounds

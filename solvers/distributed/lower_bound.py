@@ -1,11 +1,10 @@
-"""The lower bound of `pgo_models.certificates.lower_bound` by a driver and its robots, every interior where it belongs.
+"""The lower bound of `pgo_models.certificates.lower_bound` by a driver and its robots.
 
-The pose that is left out is a separator, so that the driver leaves out its rows. An elimination and a solve are two
-rounds; what crosses are Schur complements, right-hand sides, rows of S X on the separators with their errors, and a few
-sums.
+Every interior stays with its robot. The pose that is left out is a separator, so that the driver
+leaves out its rows. An elimination and a solve are two rounds; what crosses are Schur complements,
+right-hand sides, rows of S X on the separators with their errors, and a few sums.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -13,140 +12,217 @@ from functools import partial
 import numpy as np
 
 from pgo_models.certificates import lower_bound as central
-from pgo_models.certificates.definiteness import FIRST_SHIFT, LEAST_SHIFT, MARGIN, SHRINK
+from pgo_models.certificates.definiteness import (
+    FIRST_SHIFT,
+    LEAST_SHIFT,
+    MARGIN,
+    SHRINK,
+    is_in_range,
+)
 from pgo_models.certificates.lower_bound import LowerBound
 from pgo_models.certificates.rounding_errors import evaluate_multipliers
 from pgo_models.errors import NotPositiveDefiniteError
-from pgo_models.geometry.rotations import Array, stack_transposes
+from pgo_models.geometry.rotations import Array, BoolArray, stack_transposes
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, gamma
+from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, exact_sum, gamma
 from pgo_models.problem.matrices import columns_of
 from solvers.distributed.driver import Driver
 from solvers.distributed.interface import Interface
 from solvers.distributed.robots.proof import ProofSums
-from solvers.distributed.robots.proof_orders import move_proof, prove_interior
+from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep
 from solvers.network.counted_pool import Count
 
 
 @dataclass(frozen=True, eq=False)
 class InterfaceProof:
-    """S on the separators: its factor, what it is at least, the robots' answers, and parts of tr(Lambda)."""
+    """S on the separators, shown to be positive definite."""
 
     factor: Interface
-    slack: Array
-    answers: list[ProofAnswer]
-    Lambda: Array
-    traces: list[float]
+    slack: Array  # ((d+1) g,): diagonal that it is at least
+    answers: list[ProofAnswer]  # of the robots
+    Lambda: Array  # (g, d, d): multipliers of the separators
+    traces: list[float]  # parts of tr(Lambda)
 
 
 def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
-    """Grounded without eta where that goes through, else the better form with the smallest eta found; at the poses."""
-    if driver.at.objective <= driver.at.rounding_level:
-        return central.NO_BOUND
+    """Return the bound at the current poses, as `central.best_bound` does in one place.
+
+    It is grounded without eta where that goes through, else the better form with the smallest eta
+    found.
+    """
+    is_near_zero = driver.at.objective <= driver.at.rounding_level
+    if is_near_zero and all(driver.ask(fits_part, None, Count.ROUND)):
+        return central.NO_BOUND  # the poses are exact
     if driver.is_final:
         driver.describe(Count.PIGGYBACKED)
         if not (driver.diagonal > 0.0).all():
             return central.NO_BOUND
-    found = prove_grounded(driver, 0.0)
-    if found is not None and found.value > 0.0:
-        return found
+    grounded = prove_grounded(driver, 0.0)
+    if grounded is not None and grounded.value > 0.0:
+        return grounded
     count = driver.num_poses * driver.d
     smallest = central.smallest_shift(gap, driver.at.objective, count)
     # At stationary poses tr(Lambda) is F; it only says where the search ends.
-    forms = prove_with_eta, prove_grounded
-    bounds = [central.search_bound(partial(form, driver), smallest, driver.at.objective, count) for form in forms]
-    return max([central.NO_BOUND, *bounds], key=lambda bound: bound.value)
+    return central.search_forms(
+        partial(prove_with_eta, driver),
+        partial(prove_grounded, driver),
+        smallest,
+        driver.at.objective,
+        count,
+    )
 
 
 def prove_with_eta(driver: Driver, eta: float) -> LowerBound | None:
-    """Bound tr(Lambda) - eta n d if S + eta blockdiag(0, I) without a translation is positive definite: one round."""
+    """Bound F by tr(Lambda) - eta n d: one round.
+
+    None unless S + eta blockdiag(0, I) without a translation is positive definite.
+    """
     proof = eliminate_S(driver, driver.ground(1).ravel(), eta, central.UNGROUNDED_SHIFT)
     if proof is None:
         return None
-    lost = eta * driver.num_poses * driver.d
-    rounding = OUTWARD * 4.0 * UNIT_ROUNDOFF * (sum(map(abs, proof.traces)) + lost)
-    return central.bound_from([*proof.traces, -lost], rounding, eta, is_grounded=False)
+    return central.bound_with_eta(proof.traces, eta, driver.num_poses * driver.d)
 
 
 def prove_grounded(driver: Driver, eta: float) -> LowerBound | None:
-    """Bound grounded at the driver's pose, if S_r + eta blockdiag(0, I) is positive definite, else None."""
-    g, d, r = len(driver.cover), driver.d, driver.grounded
-    fixed = columns_of(np.array([r]), g, (1, d))
-    R, t = driver.at.R[r], driver.at.t[r]
-    X = np.concatenate([(driver.at.t - t) @ R, stack_transposes(R.T @ driver.at.R)])
-    X[fixed] = np.concatenate([np.zeros((1, d)), np.eye(d)])
-    share, proof = FIRST_SHIFT, None
+    """Bound F grounded at the driver's pose; None unless S_r + eta blockdiag(0, I) is definite."""
+    g = len(driver.cover)
+    fixed = columns_of(np.array([driver.grounded]), g, (1, driver.d))
+    X = _grounded_point(driver, fixed)
+    proof = None
+    share = FIRST_SHIFT
     while proof is None:
         if share < LEAST_SHIFT:
             return None
         proof = eliminate_S(driver, fixed, eta, share, X)
         share *= SHRINK
-    start = X
     free = np.ones(len(X), dtype=bool)
     free[fixed] = False
     steps = [answer.step for answer in proof.answers if answer.step is not None]
-    at = _sum_up(driver, proof, X, steps, free)
-    for _ in range(central.MOST_MOVES):
-        if at.left <= central.SETTLED * abs(at.value):
-            break
-        at.product[fixed] = 0.0  # as it is of the robots
-        step, parts, _ = proof.factor.solve([one.right.b for one in steps], at.product)
-        steps = driver.ask_each(move_proof, parts, is_along=True)
-        there = X.copy()
-        there[g:] -= step[g:]  # the translations matter in the residuals alone, which the robots have
-        moved = _sum_up(driver, proof, there, steps, free)
-        if not moved.left < at.left:
-            break
-        X, at = there, moved
-    lost = OUTWARD * eta * (at.squared_distances + central.squared_distances(X[g:], start[g:]))
-    return central.bound_from([at.value, -lost], at.value_error + at.quadratic, eta, is_grounded=True)
+    first = CoverProof(X, steps, _sum_up(driver, proof, X, steps, free))
+    moved = central.move_until_settled(first, partial(_moved, driver, proof, free))
+    sums = moved.sums
+    distances = sums.squared_distances + central.squared_distances(moved.X[g:], X[g:])
+    return central.grounded_bound(sums.value, sums.value_error, sums.quadratic, eta, distances)
 
 
-def _sum_up(driver: Driver, proof: InterfaceProof, X: Array, steps: Sequence[ProofStep], free: Array) -> ProofSums:
-    """Sums at X over robots and driver; of S X its own part, and the error of the whole."""
-    g, d = len(driver.cover), driver.d
+def _grounded_point(driver: Driver, fixed: IntArray) -> Array:
+    """Rows of X on the cover, ((d+1) g, d), with the grounded pose at (0, I) exactly."""
+    d = driver.d
+    R = driver.at.R[driver.grounded]
+    t = driver.at.t[driver.grounded]
+    translations = (driver.at.t - t) @ R
+    rotations = stack_transposes(R.T @ driver.at.R)
+    X = np.concatenate([translations, rotations])
+    X[fixed] = np.concatenate([np.zeros((1, d)), np.eye(d)])
+    return X
+
+
+@dataclass(frozen=True, eq=False)
+class CoverProof:
+    """`certificates.lower_bound.ProofPoint`: X on the cover, the robots' steps there, and sums."""
+
+    X: Array
+    steps: Sequence[ProofStep]
+    sums: ProofSums
+
+    @property
+    def value(self) -> float:
+        """Value of the certificate at X."""
+        return self.sums.value
+
+    @property
+    def left(self) -> float:
+        """About what is lost to G = S X."""
+        return self.sums.left
+
+    @property
+    def quadratic(self) -> float:
+        """The same with the error of G."""
+        return self.sums.quadratic
+
+
+def _moved(
+    driver: Driver, proof: InterfaceProof, free: Array, point: CoverProof
+) -> tuple[CoverProof, float]:
+    """Proof at X - S_r^-1 S X, and the gain: two rounds."""
+    g = len(driver.cover)
+    own = np.where(free[:, None], point.sums.product, 0.0)  # as robots leave out the fixed rows
+    rights = [step.right for step in point.steps]
+    move, parts, energy = proof.factor.solve([right.b for right in rights], own)
+    steps = driver.ask_each(move_proof, parts, is_along=True)
+    X = point.X.copy()
+    # the translations matter in the residuals alone, which the robots have
+    X[g:] -= move[g:]
+    gain = energy + exact_sum(right.energy for right in rights)
+    return CoverProof(X, steps, _sum_up(driver, proof, X, steps, free)), gain
+
+
+def _sum_up(
+    driver: Driver, proof: InterfaceProof, X: Array, steps: Sequence[ProofStep], free: Array
+) -> ProofSums:
+    """Sum the parts of the bound at X over robots and driver.
+
+    Of S X the sums have the driver's own part, and the error of the whole.
+    """
+    g = len(driver.cover)
+    d = driver.d
     space = driver.interface(1, d)
+    parts = [step.sums for step in steps]
     blocks = evaluate_multipliers(proof.Lambda, X[g:].reshape(g, d, d))
-    own, error = np.zeros_like(X), np.zeros_like(X)
-    own[g:], error[g:] = blocks.product, blocks.product_error
-    found = [step.sums for step in steps]
-    parts = [one.product for one in found]
-    sizes = space.gather([np.abs(part) for part in parts]) + np.abs(own)
-    error += space.gather([one.error for one in found]) + gamma(len(parts) + 2.0) * sizes
-    product = space.gather(parts) + own
+    own = np.zeros_like(X)
+    own[g:] = blocks.product
+    product = space.gather([part.product for part in parts]) + own
+    error = np.zeros_like(X)
+    error[g:] = blocks.product_error
+    sizes = space.gather([np.abs(part.product) for part in parts]) + np.abs(own)
+    of_robots = space.gather([part.error for part in parts])
+    error += of_robots + gamma(len(parts) + 2.0) * sizes
+    value = exact_sum([*(part.value for part in parts), blocks.value])
+    value_error = exact_sum(part.value_error for part in parts)
+    value_error += blocks.value_error + UNIT_ROUNDOFF * abs(value)
     slack = proof.slack[free]
-    values = [*(one.value for one in found), blocks.value]
-    value = math.fsum(values)
-    value_error = math.fsum(one.value_error for one in found) + blocks.value_error + UNIT_ROUNDOFF * abs(value)
-    left = math.fsum(one.left for one in found) + central.quadratic_loss(product[free], 0.0, slack)
-    quadratic = math.fsum(one.quadratic for one in found) + central.quadratic_loss(product[free], error[free], slack)
-    apart = math.fsum(one.squared_distances for one in found)
-    return ProofSums(value, OUTWARD * value_error, left, OUTWARD * quadratic, apart, own, error)
+    left = exact_sum(part.left for part in parts)
+    left += central.quadratic_loss(product[free], 0.0, slack)
+    quadratic = exact_sum(part.quadratic for part in parts)
+    quadratic += central.quadratic_loss(product[free], error[free], slack)
+    return ProofSums(
+        value=value,
+        value_error=OUTWARD * value_error,
+        left=left,
+        quadratic=OUTWARD * quadratic,
+        squared_distances=exact_sum(part.squared_distances for part in parts),
+        product=own,
+        error=error,
+    )
 
 
 def eliminate_S(
     driver: Driver, fixed: IntArray, eta: float, share: float, X: Array | None = None
 ) -> InterfaceProof | None:
-    """One elimination of S + eta blockdiag(0, I) less a share of its diagonal; None when it is not shown definite."""
-    g, d = len(driver.cover), driver.d
-    space, marked = driver.interface(1, d), np.zeros((d + 1) * g)
-    marked[fixed] = 1.0
+    """Eliminate S + eta blockdiag(0, I) less a share of its diagonal, once.
+
+    None when it is not shown to be positive definite. With X, rows on the cover, the robots begin a
+    proof there.
+    """
+    g = len(driver.cover)
+    d = driver.d
+    space = driver.interface(1, d)
     Lambda = driver.at.multipliers
     added = eta * np.eye(d) - Lambda
     columns = driver.rotation_rows.reshape(g, d)
     diagonal = driver.diagonal.copy()
     diagonal[columns] += np.maximum(np.einsum("naa->na", added), 0.0)
-    points: Sequence[Array | None] = space.scatter(X) if X is not None else [None] * len(driver.robots)
-    known = zip(space.scatter(marked), space.scatter(diagonal), points, strict=True)
-    answers = driver.ask_each(prove_interior, [ProofOrder(eta, share, *one) for one in known])
-    traces = [*np.einsum("naa->na", Lambda).ravel().tolist(), *(answer.trace for answer in answers)]
+    if not is_in_range(added, diagonal):
+        return None
+    is_fixed = np.zeros(len(diagonal), dtype=bool)
+    is_fixed[fixed] = True
+    orders = _proof_orders(driver, eta, share, is_fixed, diagonal, X)
+    answers = driver.ask_each(prove_interior, orders)
     contributions = [answer.schur for answer in answers if answer.schur is not None]
     sizes = [answer.sizes for answer in answers if answer.sizes is not None]
     if len(contributions) < len(answers):
         return None
-    is_fixed = np.zeros(len(diagonal), dtype=bool)
-    is_fixed[fixed] = True
     added[is_fixed[columns].any(axis=1)] = 0.0
     lost = space.rounding(sizes, [(columns, added)], diagonal) + 8.0 * UNIT_ROUNDOFF * diagonal
     shift = np.maximum(share * diagonal, MARGIN * lost)
@@ -156,4 +232,24 @@ def eliminate_S(
         factor = space.factorize(contributions, own)
     except NotPositiveDefiniteError:
         return None
+    traces = [*np.einsum("naa->na", Lambda).ravel().tolist(), *(answer.trace for answer in answers)]
     return InterfaceProof(factor, (shift - lost) / OUTWARD, answers, Lambda, traces)
+
+
+def _proof_orders(
+    driver: Driver,
+    eta: float,
+    share: float,
+    is_fixed: BoolArray,
+    diagonal: Array,
+    X: Array | None,
+) -> list[ProofOrder]:
+    """Orders to the robots, each with what it holds of the rows of the cover."""
+    space = driver.interface(1, driver.d)
+    fixed_rows = space.scatter(is_fixed.astype(float))
+    diagonals = space.scatter(diagonal)
+    points: Sequence[Array | None] = [None] * len(driver.robots)
+    if X is not None:
+        points = space.scatter(X)
+    rows = zip(fixed_rows, diagonals, points, strict=True)
+    return [ProofOrder(eta, share, *of_robot) for of_robot in rows]

@@ -1,12 +1,23 @@
-"""The second stage by driver and robots: `pgo_models.certificates.newton_polish` without secants, step for step."""
+"""Newton's method by a driver and its robots: `newton_step` on matrices eliminated to separators.
+
+The rules are those of `pgo_models.certificates.newton_step`; here are its algebra, which asks the
+robots for their parts and solves for the separators, and the method that the loop runs.
+"""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from pgo_models.certificates import newton_polish as central
+from pgo_models.certificates.newton_step import (
+    ModelOrder,
+    NewtonFigures,
+    StepRules,
+    first_shift,
+    newton_step,
+    stationary_tolerance,
+)
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
@@ -15,45 +26,133 @@ from pgo_models.relaxations.low_rank import LiftedPoses, move_poses, poses_from
 from solvers.distributed.driver import CoverPoses, Driver
 from solvers.distributed.interface import Interface
 from solvers.distributed.robots.interior import Interior
-from solvers.distributed.robots.records import ModelOrder, Move, Reduced, RightHandSide, TrialEvaluation
+from solvers.distributed.robots.records import Move, Reduced, RightHandSide, TrialEvaluation
 from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Status
-from solvers.riemannian.newton import Newton
-
-_FIRST_ETA, _SHRINK, _GROWTH = 1e-3, 0.25, 4.0  # of F / (n d), of the last one, and in turn
+from solvers.riemannian.newton import Newton, newton_status
 
 
-@dataclass(frozen=True)
-class SubstructuredNewtonState:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SubstructuredNewtonState(NewtonFigures):
     """Figures of iterate k; the poses are with driver and robots."""
 
     k: int
-    objective: float
-    decrement: float = math.inf
-    moved: bool = True
-    is_at_rounding: bool = False
-    tolerance: float = central.STATIONARY_DECREMENT
     eta: float = 0.0  # last one that was added to S
     is_convex: bool = True  # whether the last step needed none
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A factored model at the poses at hand, Newton's or another, and the solution y = H^-1 g on the cover."""
+    """A factored matrix H at poses, and the solution y = H^-1 g on the cover."""
 
     order: ModelOrder
     factor: Interface
+    at: CoverPoses
     y: Array
     parts: list[Array]  # of y, at every robot
     square: float  # g^T H^-1 g
+
+    @property
+    def objective(self) -> float:
+        """F at the poses."""
+        return self.at.objective
+
+    @property
+    def rounding_level(self) -> float:
+        """F where every residual is as large as rounding can make it."""
+        return self.at.rounding_level
+
+
+@dataclass(frozen=True, eq=False)
+class CoverTrial:
+    """Poses of the cover after a move, and the robots' reduced gradients there."""
+
+    at: CoverPoses
+    gradients: list[RightHandSide]
+
+    @property
+    def objective(self) -> float:
+        """F at the poses."""
+        return self.at.objective
+
+
+@dataclass(frozen=True)
+class EliminatedAlgebra:
+    """`newton_step.NewtonAlgebra` by driver and robots: two rounds a factorisation, two a move."""
+
+    driver: Driver
+
+    @property
+    def has_secants(self) -> bool:
+        """Whether moves are learned from: no, as each learned one would cost a reduction."""
+        return False
+
+    def factorize(self, order: ModelOrder) -> Model | None:
+        """Return the model at the current poses."""
+        return model_at(self.driver, order)
+
+    def evaluate(self, model: Model, length: float) -> CoverTrial:
+        """Return the poses after a move.
+
+        Their translations are the best ones for the rotations, but not of chi2: there the matrix of
+        the translations differs from rotations to rotations.
+        """
+        if self.driver.is_final:
+            return self._straight_trial(model, length)
+        return self._trial_with_best_translations(model, length)
+
+    def model_at(self, model: Model, trial: CoverTrial) -> Model:
+        """Return the model at the trial, from the gradients that the robots sent with it."""
+        return _solved(model.order, model.factor, trial.at, trial.gradients)
+
+    def accept(self, trial: CoverTrial) -> None:
+        """Go to the trial, here and on the robots."""
+        self.driver.accept(trial.at)
+
+    def _straight_trial(self, model: Model, length: float) -> CoverTrial:
+        """Return the trial whose translations move straight on."""
+        driver = self.driver
+        if length == 1.0:
+            moves = [Move(part, length) for part in model.parts]
+            answers = driver.ask_each(Interior.move_straight, moves)
+        else:
+            answers = driver.ask(Interior.go_straight, length, Count.PIGGYBACKED)
+        R, t = self._moved(model, length)
+        return self._trial(R, t, answers)
+
+    def _trial_with_best_translations(self, model: Model, length: float) -> CoverTrial:
+        """Return the trial whose translations are the best ones for its rotations."""
+        driver = self.driver
+        if length == 1.0:
+            moves = [Move(part, length) for part in model.parts]
+            turned = driver.ask_each(Interior.move, moves)
+        else:
+            turned = driver.ask(Interior.turn, length, Count.PIGGYBACKED)
+        t, parts = driver.best_translations(turned)
+        answers = driver.ask_each(Interior.evaluate_trial, parts, is_along=True)
+        return self._trial(self._moved(model, length)[0], t, answers)
+
+    def _moved(self, model: Model, length: float) -> tuple[Array, Array]:
+        """Return rotations and translations of the cover after a straight move."""
+        driver = self.driver
+        layout = TangentLayout(len(driver.cover), *driver.tangent)
+        w, v = layout.split(-model.y[:, 0])
+        moved = move_poses(poses_from(model.at.R, model.at.t), length * w, length * v)
+        return moved.R, moved.t
+
+    def _trial(self, R: Array, t: Array, answers: Sequence[TrialEvaluation]) -> CoverTrial:
+        at = CoverPoses(R, t, self.driver.at.force)
+        at = self.driver.with_sums(at, [answer.at for answer in answers])
+        return CoverTrial(at, [answer.gradient for answer in answers])
 
 
 @dataclass(frozen=True)
 class SubstructuredNewton:
     """Newton by a driver and its robots, from the poses that they hold; `newton` has the settings.
 
-    Where the Hessian is not positive definite it is that of S + eta blockdiag(0, I), with a small eta that makes it so,
-    if the model `is_shifted`, which follows negative curvature; else the damped Gauss-Newton matrix.
+    Where the Hessian is not positive definite it is that of S + eta blockdiag(0, I), with a small
+    eta that makes it so, if the model `is_shifted`, which follows negative curvature; else the
+    damped Gauss-Newton matrix.
     """
 
     newton: Newton = field(default_factory=Newton)
@@ -64,66 +163,49 @@ class SubstructuredNewton:
         """Most steps of a run."""
         return self.newton.max_iterations
 
-    def init(self, driver: Driver, start: SubstructuredNewtonState | None) -> SubstructuredNewtonState:
+    def init(
+        self, driver: Driver, start: SubstructuredNewtonState | None
+    ) -> SubstructuredNewtonState:
         """State 0, at the poses that driver and robots hold."""
-        return start if start is not None else SubstructuredNewtonState(0, driver.at.objective)
+        if start is not None:
+            return start
+        return SubstructuredNewtonState(k=0, objective=driver.at.objective)
 
     def step(self, driver: Driver, state: SubstructuredNewtonState) -> SubstructuredNewtonState:
         """One factorisation and the moves it serves, two rounds each."""
-        model = self._factorize(driver, state.eta)
-        at_rounding = False
-        decrement = central.scaled_decrement(model.square, driver.at.objective, driver.at.rounding_level)
-        moved, tolerance = False, central.STATIONARY_FOR_TANGENTS if driver.is_final else central.STATIONARY_DECREMENT
-        for _ in range(1 + central.CHORD_STEPS):
-            if decrement <= tolerance:
-                break
-            found = _backtrack(driver, model)
-            if found is None:
-                break
-            trial, answers = found
-            gradients = [answer.gradient for answer in answers]
-            following = _solved(model.order, model.factor, gradients)
-            after = central.scaled_decrement(following.square, trial.objective, trial.rounding_level)
-            at_rounding = central.reached_rounding(decrement, after, model.order.is_newton and not moved)
-            if trial.objective >= driver.at.objective and after > 0.5 * decrement:
-                break
-            driver.accept(trial)
-            enough = after <= central.PROGRESS * decrement
-            model, decrement, moved = following, after, True
-            if not enough:
-                break
-        figures = driver.at.objective, decrement, moved, at_rounding, tolerance, model.order.eta or state.eta
-        return SubstructuredNewtonState(state.k + 1, *figures, not model.order.eta)
+        tolerance = stationary_tolerance(not driver.is_final, self.newton.share)
+        shift = None
+        if self.is_shifted:
+            num_rows = driver.num_poses * driver.d
+            shift = first_shift(state.eta, driver.at.objective, num_rows)
+        rules = StepRules(tolerance, self.newton.second_order, shift)
+        result = newton_step(EliminatedAlgebra(driver), rules)
+        eta = result.model.order.eta
+        return SubstructuredNewtonState(
+            k=state.k + 1,
+            objective=driver.at.objective,
+            decrement=result.decrement,
+            moved=result.moved,
+            is_at_rounding=result.is_at_rounding,
+            tolerance=tolerance,
+            eta=eta or state.eta,
+            is_convex=not eta,
+        )
 
     def measure(self, driver: Driver, state: SubstructuredNewtonState) -> Measurement:
         """F and the relative decrement."""
         return driver.measured(Measurement(state.objective, 0.0, state.decrement))
 
     def converged(self, state: SubstructuredNewtonState, measurement: Measurement) -> Status | None:
-        """CONVERGED within tolerance or where the gradient is rounding; STALLED when the last step could not move."""
-        share = state.tolerance / central.STATIONARY_DECREMENT if state.moved else 1.0
-        if measurement.dual_residual <= share * self.newton.tolerance or state.is_at_rounding:
-            return Status.CONVERGED
-        return None if state.moved else Status.STALLED
-
-    def _factorize(self, driver: Driver, eta: float) -> Model:
-        """Factor the Hessian if it is positive definite, else with the least shift or damping; `eta` was the last."""
-        order = ModelOrder(self.newton.second_order, 0.0)
-        first = _SHRINK * eta or _FIRST_ETA * driver.at.objective / (driver.num_poses * driver.d)
-        while (model := model_at(driver, order)) is None:
-            if self.is_shifted:
-                order = replace(order, eta=max(first, _GROWTH * order.eta))
-            elif order.second_order:
-                order = replace(order, second_order=False)
-            else:
-                order = replace(order, damping=max(central.DAMPING_START, central.DAMPING_GROWTH * order.damping))
-            if order.damping > central.DAMPING_MAX or math.isinf(order.eta):
-                raise NotPositiveDefiniteError("no damping or shift makes Newton's matrix positive definite")
-        return model
+        """As `Newton`."""
+        return newton_status(state)
 
 
 def model_at(driver: Driver, order: ModelOrder) -> Model | None:
-    """Model at the poses at hand; None when a robot's interior, or the sum, is not positive definite."""
+    """Return the model at the current poses.
+
+    None when a robot's interior, or the sum of what they reduce to, is not positive definite.
+    """
     answers = driver.ask(Interior.model, order, Count.PIGGYBACKED)
     reduced = [answer for answer in answers if answer is not None]
     if len(reduced) < len(answers):
@@ -134,13 +216,17 @@ def model_at(driver: Driver, order: ModelOrder) -> Model | None:
         factor = interface.factorize([answer.schur for answer in reduced], own)
     except NotPositiveDefiniteError:
         return None
-    return _solved(order, factor, [answer.right for answer in reduced])
+    return _solved(order, factor, driver.at, [answer.right for answer in reduced])
 
 
-def _own(driver: Driver, reduced: Sequence[Reduced], order: ModelOrder) -> list[tuple[IntArray, Array]]:
+def _own(
+    driver: Driver, reduced: Sequence[Reduced], order: ModelOrder
+) -> list[tuple[IntArray, Array]]:
     """What the driver adds: the multipliers of the cover, the ground, the damping."""
-    g, at = len(driver.cover), LiftedPoses(driver.at.R, driver.at.t)
-    interface, layout = driver.interface(*driver.tangent), at.layout
+    g = len(driver.cover)
+    at = LiftedPoses(driver.at.R, driver.at.t)
+    interface = driver.interface(*driver.tangent)
+    layout = at.layout
     own: list[tuple[IntArray, Array]] = []
     diagonal = interface.gather([answer.diagonal[:, None] for answer in reduced])[:, 0]
     columns = layout.rotations(np.arange(g))
@@ -156,34 +242,10 @@ def _own(driver: Driver, reduced: Sequence[Reduced], order: ModelOrder) -> list[
     return own
 
 
-def _solved(order: ModelOrder, factor: Interface, right: Sequence[RightHandSide]) -> Model:
+def _solved(
+    order: ModelOrder, factor: Interface, at: CoverPoses, right: Sequence[RightHandSide]
+) -> Model:
     """Solution y = H^-1 g on the cover, and g^T H^-1 g."""
     y, parts, energy = factor.solve([part.b for part in right])
-    return Model(order, factor, y, parts, math.fsum(part.energy for part in right) + energy)
-
-
-def _backtrack(driver: Driver, model: Model) -> tuple[CoverPoses, list[TrialEvaluation]] | None:
-    """First of the moves -y, -y/2, .. that lowers F enough, and the robots' answers there; None when none does."""
-    now = poses_from(driver.at.R, driver.at.t)
-    layout = TangentLayout(len(driver.cover), *driver.tangent)
-    w, v = layout.split(-model.y[:, 0])
-    length = 1.0
-    moves = [Move(part, length) for part in model.parts]
-    for _ in range(central.HALVINGS):
-        there = move_poses(now, length * w, length * v)
-        R, t, is_first = there.R, there.t, length == 1.0
-        if driver.is_final:  # chi2, whose best translations have another matrix at all rotations
-            straight, further = Interior.move_straight, Interior.go_straight
-            answers = driver.ask_each(straight, moves) if is_first else driver.ask(further, length, Count.PIGGYBACKED)
-        else:
-            turn = Interior.turn
-            turned = driver.ask_each(Interior.move, moves) if is_first else driver.ask(turn, length, Count.PIGGYBACKED)
-            t, parts = driver.best_translations(turned)
-            answers = driver.ask_each(Interior.evaluate_trial, parts, is_along=True)
-        trial = driver.with_sums(CoverPoses(R, t, driver.at.force), [answer.at for answer in answers])
-        objective, before = trial.objective, driver.at.objective
-        is_within_rounding = is_first and objective <= before * (1.0 + central.ROUNDING)
-        if is_within_rounding or objective <= before - central.SUFFICIENT * length * model.square:
-            return trial, answers
-        length *= 0.5
-    return None
+    square = math.fsum(part.energy for part in right) + energy
+    return Model(order, factor, at, y, parts, square)

@@ -1,8 +1,14 @@
-"""Robots that load their own files, and a driver that learns nothing of the graph but the interface between them.
+"""Robots that load their own files, and a driver that learns only the interface between them.
 
-Ids reach the driver as runs of consecutive ones, so that it can number the poses; edges between robots by their ends,
-of which it takes the vertex cover. What robots measured of each other they send each other. A pose belongs to the first
-file with a VERTEX line of it, else to the first that names it; edges of several files are one as of `read_g2o`.
+The driver learns the ids of poses as runs of consecutive ids, so that it can number the poses, and
+of the edges between robots their ends, of which it computes a vertex cover. Measurements between
+two robots are exchanged by these robots alone. A pose belongs to the first file with a VERTEX line
+of it, or else to the first file that names it. An edge that stands in several files counts once, as
+in `read_g2o`.
+
+The orders to a robot stand below in the sequence in which they are given: `read_file`,
+`number_poses`, `join_neighbours`, `place_cover`; then, after the solve, `keep_answer`,
+`return_to_answer`, `move_answer` and `write_answer`.
 """
 
 from __future__ import annotations
@@ -14,14 +20,19 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from pgo_models.certificates.rounding_errors import objective_rounding
+from pgo_models.certificates.rounding_errors import ObjectiveRounding, objective_rounding
 from pgo_models.errors import FileFormatError, GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.g2o import join_edges, make_folder, write_g2o
 from pgo_models.graphs.g2o_parser import G2OLines, information_of, poses_of, read_lines
-from pgo_models.graphs.measurements import IntArray
-from pgo_models.graphs.pose_graph import WORLD_ID, PoseGraph, edge_counts, middle_pose
+from pgo_models.graphs.pose_graph import (
+    WORLD_ID,
+    IntArray,
+    PoseGraph,
+    edge_counts,
+    middle_pose,
+)
 from pgo_models.graphs.precisions import edge_precisions
 from pgo_models.problem.matrices import isotropic_weights
 from solvers.distributed.driver import Driver
@@ -29,18 +40,22 @@ from solvers.distributed.robots.agent import Agent, held_poses, order_interior
 from solvers.distributed.robots.interior import Interior, interior_of
 from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import Engine
-from solvers.soc.subgraph import Outline, Placement, Subgraph, place_poses
+from solvers.soc.subgraph import Placement, RobotSummary, Subgraph, place_poses
 
-READ_HERE = "have the graph read in one process: --split given, or solve(read_g2o(folder), robots=..)"
+READ_HERE = (
+    "have the graph read in one process: --split given, or solve(read_g2o(folder), robots=..)"
+)
 
 
 RobotFile = tuple[int, Path]  # a robot and its file, on the machine where the robot runs
-Claim = tuple[int, IntArray, IntArray]  # d, and ids of VERTEX lines, and of edges alone, as `_runs`
+# What a file names: d, the ids of its VERTEX lines, and the ids that only its edges name; see
+# `_runs`.
+Claim = tuple[int, IntArray, IntArray]
 
 
 @dataclass(frozen=True, eq=False)
 class OwnedRuns:
-    """Runs of consecutive ids, (k,): the first, its number in the whole graph, and who owns them."""
+    """Runs of consecutive ids, (k,): first id, number of that pose in the whole graph, owner."""
 
     first: IntArray
     number: IntArray
@@ -49,7 +64,7 @@ class OwnedRuns:
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """Edges as of `G2OLines`, and the numbers and owners of their ends, (m, 2)."""
+    """Edges as in `G2OLines`, and the numbers and owners of their ends, (m, 2)."""
 
     ids: IntArray
     rows: Array
@@ -57,129 +72,230 @@ class Edges:
     owners: IntArray
 
     def some(self, chosen: IntArray | BoolArray | slice) -> Edges:
-        """Some of them."""
-        return Edges(*(values[chosen] for values in vars(self).values()))
+        """Some of the edges."""
+        return Edges(self.ids[chosen], self.rows[chosen], self.numbers[chosen], self.owners[chosen])
+
+    @staticmethod
+    def joined(parts: Sequence[Edges]) -> Edges:
+        """Edges of several parts, one after the other."""
+        return Edges(
+            np.concatenate([part.ids for part in parts]),
+            np.concatenate([part.rows for part in parts]),
+            np.concatenate([part.numbers for part in parts]),
+            np.concatenate([part.owners for part in parts]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Border:
-    """What a robot says of its edges to others."""
+    """What a robot reports of its edges to other robots."""
 
-    counts: tuple[int, int]  # poses that it owns, and edges, a shared one at one end
+    counts: tuple[int, int]  # own poses, and edges, where a shared edge counts at one end
     pairs: IntArray  # (k, 2): poses that its edges to others join
-    owners: IntArray  # (k, 2): of these
-    poses: IntArray  # (h,): all of them
-    labels: IntArray  # (3, h): their components by all edges, by those with tau > 0, and with kappa > 0
-    alone: IntArray  # (3,): how many components have none of them
-    middle: int  # its middle pose, where it has no such edge
+    owners: IntArray  # (k, 2): owners of these poses
+    poses: IntArray  # (h,): all of these poses, ascending
+    # (3, h): their components in the graph of all edges, of those with tau > 0, and of those with
+    # kappa > 0.
+    labels: IntArray
+    alone: IntArray  # (3,): number of components without any of these poses
+    middle: int  # its middle pose if it has no edge to another robot, else -1
+
+
+NO_ROUNDING = ObjectiveRounding(0.0, 0.0, True)  # of no edges
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """How well a robot knows its part of F, and a pose to hold the frame: a fixed one, or the first of its own."""
+    """Rounding of a robot's part of F, and a pose that can hold the frame.
 
-    error: float
-    held: tuple[bool, int, int]  # whether that pose is fixed, its number and id
-    solved: Array  # (d + 1, d): its rows t and R^T
-    given: Array  # (d + 1, d): the same in the file, nan if not there
+    That pose is its first one with a FIX line, or else its first one.
+    """
+
+    rounding: ObjectiveRounding
+    held: tuple[bool, int, int]  # whether the pose has a FIX line, its number and id
+    solved: Array  # (d + 1, d): rows t and R^T of the pose
+    given: Array  # (d + 1, d): the same in the file, nan if it is not there
 
 
 class FileAgent(Agent):
-    """A robot that loads its own file; orders about that are given in the order in which they stand below."""
+    """A robot that loads its own file; its attributes are set by the orders below."""
 
     lines: G2OLines
     edges: Edges
     graph: PoseGraph  # of its own poses, and those at the far end of its edges
-    numbers: IntArray  # (n_a,): of these in the whole graph, ascending
+    numbers: IntArray  # (n_a,): numbers of these poses in the whole graph, ascending
     owners: IntArray  # (n_a,)
-    given: Array  # of `Answer`
+    given: Array  # as in `Answer`
     answer: Poses
 
     def __init__(self, source: RobotFile) -> None:
-        (self.robot, self.path), self.backend = source, None
-        self.interior, self.copies, self.front = None, None, None
+        self.robot, self.path = source
+        self.backend = None
+        self.interior = None
+        self.copies = None
+        self.front = None
 
 
 def read_file(agent: FileAgent, _: None) -> Claim:
-    """Read the file: the ids in it. Errors are those of `read_lines`; a GraphError for priors and landmarks."""
-    path = agent.path
-    agent.lines = lines = read_lines(path)
+    """Read the file, and return the ids in it.
+
+    Errors are those of `read_lines`, and a GraphError for priors and landmarks.
+    """
+    lines = read_lines(agent.path)
     if len(lines.landmarks) or (lines.edge_ids == WORLD_ID).any():
-        raise GraphError(f"{path} has priors or landmarks, which all robots share; {READ_HERE}")
-    return lines.d, _runs(np.unique(lines.vertex_ids)), _runs(np.setdiff1d(lines.edge_ids, lines.vertex_ids))
+        raise GraphError(
+            f"{agent.path} has priors or landmarks, which all robots share; {READ_HERE}"
+        )
+    agent.lines = lines
+    ids_of_edges_alone = np.setdiff1d(lines.edge_ids, lines.vertex_ids)
+    return lines.d, _runs(np.unique(lines.vertex_ids)), _runs(ids_of_edges_alone)
 
 
 def number_poses(agent: FileAgent, runs: OwnedRuns) -> Mapping[int, Edges]:
-    """Take numbers and owners for the ids; edges of the file with an end at another robot, by that robot."""
-    ids, robot = agent.lines.edge_ids, agent.robot
-    at = np.searchsorted(runs.first, ids, side="right") - 1
-    numbers, owners = runs.number[at] + ids - runs.first[at], runs.owner[at]
+    """Take numbers and owners for the ids; return the edges with an end at another robot.
+
+    They are messages, by the number of that robot.
+    """
+    ids = agent.lines.edge_ids
+    run = np.searchsorted(runs.first, ids, side="right") - 1
+    numbers = runs.number[run] + ids - runs.first[run]
+    owners = runs.owner[run]
     edges = Edges(ids, agent.lines.edges, numbers, owners)
-    agent.edges = edges.some((owners == robot).any(axis=1))
-    return {to: edges.some((owners == to).any(axis=1)) for to in np.unique(owners).tolist() if to != robot}
+    agent.edges = edges.some((owners == agent.robot).any(axis=1))
+    messages = {}
+    for robot in np.unique(owners).tolist():
+        if robot != agent.robot:
+            messages[robot] = edges.some((owners == robot).any(axis=1))
+    return messages
 
 
 def join_neighbours(agent: FileAgent, received: Mapping[int, Edges]) -> Border:
-    """Make the robot's graph of its edges and those that others have of its poses; FIX lines of its own poses count."""
-    lines, robot, path = agent.lines, agent.robot, agent.path
-    files = [one for _, one in sorted({**received, robot: agent.edges}.items())]
-    joined = join_edges([(file.ids, file.rows) for file in files])
-    parts = [vars(file.some(kept)).values() for file, kept in zip(files, joined, strict=True)]
-    edges = Edges(*map(np.concatenate, zip(*parts, strict=True)))
+    """Make the graph of the robot: its own edges, and those that others have of its poses.
+
+    FIX lines of its own poses count.
+    """
+    edges = _joined_edges({**received, agent.robot: agent.edges})
     if not len(edges.rows):
-        raise GraphError(f"{path}: no edge touches a pose of this robot; add one, or take the file away")
-    agent.numbers, at, ends = np.unique(edges.numbers, return_index=True, return_inverse=True)
-    agent.owners, ids, (i, j) = edges.owners.ravel()[at], edges.ids.ravel()[at], ends.reshape(-1, 2).T
-    is_own, information = agent.owners == robot, information_of(lines.d, edges.rows)
-    measured = *poses_of(lines.d, edges.rows), *edge_precisions(information), information
+        raise GraphError(
+            f"{agent.path}: no edge touches a pose of this robot; add one, or remove the file"
+        )
+    agent.numbers, first, ends = np.unique(edges.numbers, return_index=True, return_inverse=True)
+    agent.owners = edges.owners.ravel()[first]
+    ids = edges.ids.ravel()[first]
+    i, j = ends.reshape(-1, 2).T
+    is_own = agent.owners == agent.robot
+    lines = agent.lines
+    R_ij, t_ij = poses_of(lines.d, edges.rows)
+    information = information_of(lines.d, edges.rows)
+    kappa, tau = edge_precisions(information)
     fixed = np.flatnonzero(is_own & np.isin(ids, lines.fixed))
-    agent.graph = graph = PoseGraph(len(ids), i, j, *measured, ids, fixed=fixed, name=path.stem)
-    given = lines.vertices[lines.vertex_ids == ids[fixed[0] if len(fixed) else np.argmax(is_own)]]
-    agent.given = Poses(*poses_of(lines.d, given)).stacked() if len(given) else np.full((lines.d + 1, lines.d), np.nan)
+    agent.graph = PoseGraph(
+        len(ids),
+        i,
+        j,
+        R_ij,
+        t_ij,
+        kappa,
+        tau,
+        information=information,
+        ids=ids,
+        fixed=fixed,
+        name=agent.path.stem,
+    )
+    holding = fixed[0] if len(fixed) else np.argmax(is_own)
+    agent.given = _given_pose(lines, ids[holding])
     del agent.lines, agent.edges
-    both = np.stack([i, j], axis=1)
-    pairs = np.unique(both[agent.owners[i] != agent.owners[j]], axis=0)
-    poses, kinds = np.unique(pairs), (graph.tau >= 0, graph.tau > 0, graph.kappa > 0)
-    labels = [connected_components(edge_counts(i[kind], j[kind], len(ids)))[1] for kind in kinds]
-    alone = np.array([len(np.setdiff1d(label, label[poses])) for label in labels])
-    counts = int(is_own.sum()), int((agent.owners[both].min(axis=1) == robot).sum())
-    middle = -1 if len(poses) else int(agent.numbers[middle_pose(graph)])
-    tied = agent.numbers[poses], np.stack(labels)[:, poses]
-    return Border(counts, agent.numbers[pairs], agent.owners[pairs], *tied, alone, middle)
+    return _border(agent)
 
 
-def place_cover(agent: FileAgent, placement: Placement) -> Outline:
-    """Learn which poses the driver solves for, and who else holds which: from now on an agent like any other."""
-    known = agent.robot, agent.graph, agent.numbers, agent.owners
-    of_edges = np.arange(agent.graph.num_edges), isotropic_weights(agent.graph)
-    agent.subgraph = Subgraph(*known, *placement.of(*known), *of_edges)
+def _joined_edges(edges_of: Mapping[int, Edges]) -> Edges:
+    """Edges of several files as one, in which an edge of several files counts once."""
+    files = [edges for _, edges in sorted(edges_of.items())]
+    kept_of_files = join_edges([(file.ids, file.rows) for file in files])
+    parts = [file.some(kept) for file, kept in zip(files, kept_of_files, strict=True)]
+    return Edges.joined(parts)
+
+
+def _given_pose(lines: G2OLines, pose_id: int) -> Array:
+    """Rows t and R^T of a pose in the file, (d + 1, d); nan if it is not there."""
+    rows = lines.vertices[lines.vertex_ids == pose_id]
+    if len(rows) == 0:
+        return np.full((lines.d + 1, lines.d), np.nan)
+    return Poses(*poses_of(lines.d, rows)).stacked()
+
+
+def _border(agent: FileAgent) -> Border:
+    """Border of a robot whose graph is known."""
+    graph = agent.graph
+    owners = agent.owners
+    ends = np.stack([graph.i, graph.j], axis=1)
+    pairs = np.unique(ends[owners[graph.i] != owners[graph.j]], axis=0)
+    poses = np.unique(pairs)
+    labels = []
+    for kind in (graph.tau >= 0, graph.tau > 0, graph.kappa > 0):
+        adjacency = edge_counts(graph.i[kind], graph.j[kind], graph.num_poses)
+        labels.append(connected_components(adjacency)[1])
+    # A shared edge counts with the owner of the lower number.
+    num_poses = int((owners == agent.robot).sum())
+    num_edges = int((owners[ends].min(axis=1) == agent.robot).sum())
+    return Border(
+        counts=(num_poses, num_edges),
+        pairs=agent.numbers[pairs],
+        owners=owners[pairs],
+        poses=agent.numbers[poses],
+        labels=np.stack(labels)[:, poses],
+        alone=np.array([len(np.setdiff1d(label, label[poses])) for label in labels]),
+        middle=-1 if len(poses) else int(agent.numbers[middle_pose(graph)]),
+    )
+
+
+def place_cover(agent: FileAgent, placement: Placement) -> RobotSummary:
+    """Learn which poses the driver solves for, and which robots hold which of them.
+
+    From now on the robot is an agent like any other.
+    """
+    graph = agent.graph
+    known = agent.robot, graph, agent.numbers, agent.owners
+    edges = np.arange(graph.num_edges)
+    agent.subgraph = Subgraph(*known, *placement.of(*known), edges, isotropic_weights(graph))
     agent.interior = interior_of(agent.subgraph, agent.backend)
-    return replace(agent.subgraph.outline, part=None)
+    return replace(agent.subgraph.summary, part=None)
 
 
 def keep_answer(agent: FileAgent, cover: Poses) -> Answer:
-    """Keep the poses at hand for the answer; of the cover they are the driver's."""
-    agent.answer, interior, fixed = held_poses(agent, cover), agent.interior, agent.graph.fixed
-    first = int(fixed[0] if len(fixed) else np.argmax(agent.subgraph.is_own))
-    error = 0.0 if interior is None else objective_rounding(interior.problem, interior.state.poses).error
-    held = len(fixed) > 0, int(agent.numbers[first]), int(agent.graph.pose_ids[first])
-    return Answer(error, held, agent.answer[np.array([first])].stacked(), agent.given)
+    """Keep the current poses for the answer; the driver sends those of the cover."""
+    agent.answer = held_poses(agent, cover)
+    interior = agent.interior
+    fixed = agent.graph.fixed
+    holding = int(fixed[0] if len(fixed) else np.argmax(agent.subgraph.is_own))
+    rounding = NO_ROUNDING
+    if interior is not None:
+        rounding = objective_rounding(interior.problem, interior.state.poses)
+    number = int(agent.numbers[holding])
+    pose_id = int(agent.graph.pose_ids[holding])
+    solved = agent.answer[np.array([holding])].stacked()
+    return Answer(rounding, (len(fixed) > 0, number, pose_id), solved, agent.given)
 
 
 def return_to_answer(agent: FileAgent, _: None) -> None:
-    """Go back to the poses that were kept; the driver does likewise."""
+    """Return to the poses that were kept; the driver does likewise."""
     if agent.interior is not None:
-        order_interior(Interior.set_poses, agent, agent.answer[_places(agent, agent.interior)])
+        order_interior(Interior.set_poses, agent, _interior_answer(agent, agent.interior))
 
 
-def move_answer(agent: FileAgent, motion: tuple[Array, Array]) -> Array:
-    """Move the poses that were kept by (R, t); parts of F there, of its rounding level and of its error, (3,)."""
+def move_answer(agent: FileAgent, motion: tuple[Array, Array]) -> tuple[float, ObjectiveRounding]:
+    """Move the poses that were kept by (R, t); return the part of F there, and its rounding."""
     agent.answer = agent.answer.moved(*motion)
     if agent.interior is None:
-        return np.zeros(3)
-    problem, poses = agent.interior.problem, agent.answer[_places(agent, agent.interior)]
-    rounding = objective_rounding(problem, poses)
-    return np.array([problem.objective(poses), rounding.level, rounding.error])
+        return 0.0, NO_ROUNDING
+    problem = agent.interior.problem
+    poses = _interior_answer(agent, agent.interior)
+    return problem.objective(poses), objective_rounding(problem, poses)
+
+
+def _interior_answer(agent: FileAgent, interior: Interior) -> Poses:
+    """Poses that were kept, of those that the interior's problem has."""
+    return agent.answer[np.searchsorted(agent.subgraph.poses, interior.part.poses)]
 
 
 def write_answer(folder: Path, agent: FileAgent, _: None) -> None:
@@ -188,71 +304,107 @@ def write_answer(folder: Path, agent: FileAgent, _: None) -> None:
     write_g2o(agent.graph, folder / f"{agent.robot}.g2o", agent.answer, agent.subgraph.is_own)
 
 
-def open_files(files: Sequence[RobotFile], engine: Engine, memory: float) -> tuple[Driver, IntArray]:
-    """Driver of robots with these files, and how many poses, and edges, every robot has, (2, num_robots).
+def open_files(
+    files: Sequence[RobotFile], engine: Engine, memory: float
+) -> tuple[Driver, IntArray]:
+    """Driver of robots with these files, and how many poses and edges each has, (2, num_robots).
 
-    A FileFormatError for a file that cannot be read or has no pose of its own, a GraphError when the graph is not
-    connected. All but the start of the robots is counted.
+    Raises a FileFormatError for a file that cannot be read or has no pose of its own, and a
+    GraphError if the graph is not connected. All messages but the start of the robots are counted.
     """
     network = CountedPool(engine.open(FileAgent, files), len(files))
     try:
-        runs, num_poses = number_ids(network.ask(read_file, [None] * len(files), Count.ROUND), files)
+        claims = network.ask(read_file, [None] * len(files), Count.ROUND)
+        runs, num_poses = number_ids(claims, files)
         sent = network.ask(number_poses, runs, Count.PIGGYBACKED)
-        borders = network.ask(join_neighbours, network.hand_on(sent), Count.PIGGYBACKED)
+        borders = network.ask(join_neighbours, network.exchange(sent), Count.PIGGYBACKED)
         sizes = np.array([border.counts for border in borders]).T
-        _check_connected(borders, num_poses - int(sizes[0].sum()), files[0][1].parent)
-        pairs, owners = (np.concatenate([getattr(one, name) for one in borders]) for name in ("pairs", "owners"))
-        outlines = network.ask(place_cover, place_poses(pairs, owners, len(files), borders[0].middle), Count.ROUND)
-        most = max(int(outline.in_cover.max(initial=0)) for outline in outlines)
-        return Driver(outlines, num_poses, lambda: network, memory, grounded=(most + 1) // 2), sizes
-    except BaseException:  # also Ctrl-C: nothing stays behind
+        num_without_edge = num_poses - int(sizes[0].sum())
+        _check_connected(borders, num_without_edge, files[0][1].parent)
+        pairs = np.concatenate([border.pairs for border in borders])
+        owners = np.concatenate([border.owners for border in borders])
+        placements = place_poses(pairs, owners, len(files), borders[0].middle)
+        summaries = network.ask(place_cover, placements, Count.ROUND)
+        last = max(int(summary.in_cover.max(initial=0)) for summary in summaries)
+        grounded = (last + 1) // 2  # a pose in the middle of the cover
+        return Driver(summaries, num_poses, lambda: network, memory, grounded), sizes
+    except BaseException:  # also Ctrl-C: no robot stays behind
         network.workers.close()
         raise
 
 
 def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> tuple[list[OwnedRuns], int]:
-    """Numbers and owners of the ids that every file names, and how many ids there are."""
-    ends = np.concatenate([runs for _, *both in claims for runs in both])
-    marks = np.unique(np.concatenate([ends[:, 0], ends[:, 1] + 1]))
-    first, size = marks[:-1], np.diff(marks)  # between two marks all ids are of the same files, or of none
+    """Numbers and owners of the ids that every file names, and the number of different ids.
 
-    def covered(runs: IntArray) -> BoolArray:
-        at = np.searchsorted(marks, runs + np.array([0, 1]))
-        change = np.bincount(at[:, 0], minlength=len(marks)) - np.bincount(at[:, 1], minlength=len(marks))
-        return np.asarray(np.cumsum(change)[:-1] > 0)
+    The ends of all runs cut the ids into intervals. All ids of an interval are named by the same
+    files, or by none.
+    """
+    runs = np.concatenate([np.concatenate(claim[1:]) for claim in claims])
+    bounds = np.unique(np.concatenate([runs[:, 0], runs[:, 1] + 1]))
+    first = bounds[:-1]
+    size = np.diff(bounds)
+    # Whether a file has VERTEX lines of an interval, and names it at all: (files, intervals).
+    has_vertex = np.stack([_covers(vertices, bounds) for _, vertices, _ in claims])
+    has_edge_alone = np.stack([_covers(others, bounds) for _, _, others in claims])
+    is_named = has_vertex | has_edge_alone
+    claimants = np.where(has_vertex.any(axis=0), has_vertex, is_named)
+    owner = claimants.argmax(axis=0)  # the first of them
+    known = is_named.any(axis=0)
+    _check_claims(claims, files, owner[known])
+    known_size = np.where(known, size, 0)
+    number = np.cumsum(known_size) - known_size
+    owned = [OwnedRuns(first[named], number[named], owner[named]) for named in is_named]
+    return owned, int(known_size.sum())
 
-    has_vertex = np.stack([covered(vertices) for _, vertices, _ in claims])
-    names = has_vertex | np.stack([covered(others) for _, _, others in claims])
-    owner, known = np.where(has_vertex.any(axis=0), has_vertex, names).argmax(axis=0), np.flatnonzero(names.any(axis=0))
+
+def _covers(runs: IntArray, bounds: IntArray) -> BoolArray:
+    """Whether runs of ids cover the intervals between bounds, (intervals,)."""
+    start = np.searchsorted(bounds, runs[:, 0])
+    end = np.searchsorted(bounds, runs[:, 1] + 1)
+    num_started = np.bincount(start, minlength=len(bounds))
+    num_ended = np.bincount(end, minlength=len(bounds))
+    return np.asarray(np.cumsum(num_started - num_ended)[:-1] > 0)
+
+
+def _check_claims(claims: Sequence[Claim], files: Sequence[RobotFile], owners: IntArray) -> None:
+    """Refuse a file of another dimension than the first, and one without a pose of its own."""
+    d_of_first = claims[0][0]
     for (robot, path), (d, *_) in zip(files, claims, strict=True):
-        if d != claims[0][0] or robot not in owner[known]:
-            problem = "no pose in it is of this robot" if d == claims[0][0] else "2D beside 3D"
-            raise FileFormatError(path, None, f"{problem}; take it away, or {READ_HERE}")
-    number = np.cumsum(np.where(names.any(axis=0), size, 0)) - size
-    return [OwnedRuns(first[own], number[own], owner[own]) for own in names], int(size[known].sum())
+        problem = ""
+        if d != d_of_first:
+            problem = "2D beside 3D"
+        elif robot not in owners:
+            problem = "no pose in it is of this robot"
+        if problem:
+            raise FileFormatError(path, None, f"{problem}; remove it, or {READ_HERE}")
 
 
-def _places(agent: FileAgent, interior: Interior) -> IntArray:
-    """Places of the interior's poses among those that the robot holds."""
-    return np.searchsorted(agent.subgraph.poses, interior.part.poses)
+def _check_connected(borders: Sequence[Border], num_without_edge: int, folder: Path) -> None:
+    """Raise a GraphError unless the robots' graphs together are connected.
 
-
-def _check_connected(borders: Sequence[Border], without_edge: int, folder: Path) -> None:
-    """Raise a GraphError when the robots' graphs are not tied together to one."""
-    poses, pose = np.unique(np.concatenate([border.poses for border in borders]), return_inverse=True)
-    robot = np.repeat(np.arange(len(borders)), [len(border.poses) for border in borders])
+    Positions have to be connected by edges with tau > 0, rotations by edges with kappa > 0. A
+    component of one robot that has a shared pose is a vertex, as the shared poses are; the rest are
+    components of their own.
+    """
+    shared = np.concatenate([border.poses for border in borders])
+    poses, pose = np.unique(shared, return_inverse=True)
+    num_shared = [len(border.poses) for border in borders]
+    robot = np.repeat(np.arange(len(borders)), num_shared)
     for kind, what in enumerate(("graph", "positions", "rotations")):
-        label = np.stack([robot, np.concatenate([border.labels[kind] for border in borders])])
-        parts, part = np.unique(label, axis=1, return_inverse=True)
-        tied = edge_counts(pose, len(poses) + part.ravel(), len(poses) + parts.shape[1])
-        alone = without_edge + sum(int(border.alone[kind]) for border in borders)
-        count = alone + (connected_components(tied)[0] if len(poses) else 0)
+        label = np.concatenate([border.labels[kind] for border in borders])
+        parts, part = np.unique(np.stack([robot, label]), axis=1, return_inverse=True)
+        num_vertices = len(poses) + parts.shape[1]
+        tied = edge_counts(pose, len(poses) + part.ravel(), num_vertices)
+        count = num_without_edge + sum(int(border.alone[kind]) for border in borders)
+        if len(poses):
+            count += connected_components(tied)[0]
         if count > 1:
             problem = f"the {what} of all robots fall into {count} parts, no edge between"
             raise GraphError(f"{folder}: {problem}; {READ_HERE}")
 
 
 def _runs(ids: IntArray) -> IntArray:
-    """First and last of all runs of consecutive ids, (k, 2), of ids in ascending order."""
-    first, last = np.diff(ids, prepend=ids[:1] - 2) != 1, np.diff(ids, append=ids[-1:] + 2) != 1
-    return np.stack([ids[first], ids[last]], axis=1)
+    """First and last id of every run of consecutive ids, (k, 2), of ids in ascending order."""
+    is_first = np.diff(ids, prepend=ids[:1] - 2) != 1
+    is_last = np.diff(ids, append=ids[-1:] + 2) != 1
+    return np.stack([ids[is_first], ids[is_last]], axis=1)

@@ -1,10 +1,14 @@
-"""Graduated non-convexity by driver and robots: residuals and weights stay with the robots, the control is sent."""
+"""Graduated non-convexity by driver and robots.
+
+The algorithm is that of `solvers.robust.gnc`. `SharedEdges` answers what it asks of the edges by
+orders to the robots: residuals and weights stay with them, the control is sent, and sums return.
+"""
 
 from __future__ import annotations
 
 import math
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,32 +19,83 @@ from pgo_models.graphs.pose_graph import bridges
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.leaderless import tree_traffic
-from solvers.distributed.newton import SubstructuredNewton
-from solvers.distributed.robots.records import RatioSums, Reweigh
+from solvers.distributed.newton import SubstructuredNewton, SubstructuredNewtonState
+from solvers.distributed.robots.records import Reweigh
 from solvers.distributed.robots.reweighting import count_below, edges_within, sum_ratios
 from solvers.distributed.stages import open_driver
-from solvers.loop import Watch
+from solvers.loop import RunMonitor
 from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine
 from solvers.network.ledger import Ledger
 from solvers.result import Measurement, Stage, Status
-from solvers.robust.gnc import GNC, GNCSchedule, RobustLoss, first_poses, known_inliers, left_out
+from solvers.robust.gnc import (
+    GNC,
+    ScheduleState,
+    ending,
+    first_schedule,
+    measurement_of,
+    next_state,
+)
+from solvers.robust.losses import RobustLoss
+from solvers.robust.weighted_edges import (
+    RatioSums,
+    first_poses,
+    known_inliers,
+    negligible_weight,
+)
 
-_HALVINGS = 26  # of an interval of 24 factors of ten, for a median to 1e-6 of itself
+# The median of ratios between 10^-24 and 1 by bisection of the exponent, to 1e-6 of itself.
+_LEAST_EXPONENT = -24.0
+_NUM_HALVINGS = 26
 
 
 @dataclass(frozen=True)
-class SharedGNCState:
-    """State k; see `solvers.robust.gnc.GNCState`. The poses are with driver and robots."""
+class SharedEdges:
+    """The edges that robots hold at their poses.
 
-    k: int
-    schedule: GNCSchedule
-    sums: RatioSums
+    `newton` has the figures of the last weighted cost.
+    """
+
+    driver: Driver
+    least_weight: float
+    newton: SubstructuredNewtonState
 
     @property
-    def objective(self) -> float:
-        """The robust cost."""
-        return self.sums.cost
+    def d(self) -> int:
+        """Dimension of the space, 2 or 3."""
+        return self.driver.d
+
+    def sums(self, loss: RobustLoss, mu: float, scale: float) -> RatioSums:
+        """Sums over the edges of all robots."""
+        return RatioSums.total(self.driver.ask(sum_ratios, self._order(loss, mu, scale)))
+
+    def median_ratio(self, scale: float, num_kept: float) -> float:
+        """Median ratio of the edges within their thresholds, by counts of those below a bound."""
+        low = _LEAST_EXPONENT
+        high = 0.0
+        for _ in range(_NUM_HALVINGS):
+            middle = 0.5 * (low + high)
+            num_below = math.fsum(self.driver.ask(count_below, (scale, 10.0**middle)))
+            if num_below >= 0.5 * num_kept:
+                high = middle
+            else:
+                low = middle
+        return float(10.0**high)
+
+    def reweighted(self, loss: RobustLoss, mu: float, scale: float) -> SharedEdges:
+        """Edges with the weights that belong to their residuals."""
+        self.driver.reweigh(self._order(loss, mu, scale))
+        return replace(self, newton=SubstructuredNewton().init(self.driver, None))
+
+    def newton_step(self) -> SharedEdges:
+        """Edges after a Newton step on the weighted cost, which moves the robots' poses."""
+        return replace(self, newton=SubstructuredNewton().step(self.driver, self.newton))
+
+    def _order(self, loss: RobustLoss, mu: float, scale: float) -> Reweigh:
+        return Reweigh(loss is RobustLoss.TRUNCATED, mu, scale, self.least_weight)
+
+
+SharedGNCState = ScheduleState[SharedEdges]
 
 
 @dataclass(frozen=True)
@@ -48,7 +103,7 @@ class SharedGNC:
     """`GNC` by a driver and its robots, from the poses that they hold."""
 
     gnc: GNC
-    least: float
+    least_weight: float
 
     @property
     def max_iterations(self) -> int:
@@ -57,60 +112,30 @@ class SharedGNC:
 
     def init(self, driver: Driver, start: SharedGNCState | None) -> SharedGNCState:
         """State 0, at the poses that driver and robots hold."""
-        sums = self._sums(driver, 1.0, self.gnc.scale)
-        mu = self.gnc.first_control(sums.largest, self.least**2 * min(1.0, sums.least))
-        return SharedGNCState(0, GNCSchedule(mu, self.gnc.scale, self.gnc.scalings), sums)
+        newton = SubstructuredNewton().init(driver, None)
+        edges = SharedEdges(driver, self.least_weight, newton)
+        schedule, sums = first_schedule(self.gnc, edges)
+        return ScheduleState(0, schedule, sums, edges)
 
     def step(self, driver: Driver, state: SharedGNCState) -> SharedGNCState:
-        """Weights for the residuals at hand, Newton steps with them, and the next control."""
-        gnc, schedule = self.gnc, state.schedule
-        if schedule.rescaled and gnc.is_settled(schedule):
-            of_kept = (self._median(driver, state), state.sums.largest_kept) if state.sums.kept else None
-            schedule = gnc.rescaled(driver.d, schedule, of_kept)
-        driver.reweigh(self._order(schedule.mu, schedule.scale))
-        before, newton = driver.at.objective, SubstructuredNewton()
-        moving = newton.init(driver, None)
-        for _ in range(gnc.inner_steps):
-            moving = newton.step(driver, moving)
-            if gnc.follows(moving.decrement, moving.moved):
-                break
-        sums = self._sums(driver, schedule.mu, schedule.scale)
-        lost = before / driver.at.objective - 1.0 if driver.at.objective else 0.0
-        undecided = sums.undecided / max(1.0, sums.count)
-        following = gnc.following(schedule, undecided, moving.decrement + lost, moving.moved)
-        return SharedGNCState(state.k + 1, following, sums)
+        """Weights for the current residuals, Newton steps with them, and the next control."""
+        return next_state(self.gnc, state)
 
     def measure(self, driver: Driver, state: SharedGNCState) -> Measurement:
         """The robust cost, the share of undecided edges, and the decrement."""
-        return driver.measured(Measurement(state.objective, state.schedule.undecided, state.schedule.decrement))
+        return driver.measured(measurement_of(state))
 
     def converged(self, state: SharedGNCState, measurement: Measurement) -> Status | None:
-        """As the central run."""
-        return self.gnc.ending(state.schedule)
-
-    def _order(self, mu: float, scale: float) -> Reweigh:
-        return Reweigh(self.gnc.loss is RobustLoss.TRUNCATED, mu, scale, self.least)
-
-    def _sums(self, driver: Driver, mu: float, scale: float) -> RatioSums:
-        answers = driver.ask(sum_ratios, self._order(mu, scale))
-        names = ("count", "undecided", "kept", "cost")
-        sums = {name: math.fsum(getattr(one, name) for one in answers) for name in names}
-        most = {name: max(getattr(one, name) for one in answers) for name in ("largest", "largest_kept")}
-        return RatioSums(**sums, **most, least=min(one.least for one in answers))
-
-    def _median(self, driver: Driver, state: SharedGNCState) -> float:
-        """Median ratio of the edges kept, by counts."""
-        low, high = -24.0, 0.0
-        for _ in range(_HALVINGS):
-            middle = 0.5 * (low + high)
-            below = math.fsum(driver.ask(count_below, (state.schedule.scale, 10.0**middle)))
-            low, high = (low, middle) if below >= 0.5 * state.sums.kept else (middle, high)
-        return float(10.0**high)
+        """How a run in one place would end."""
+        return ending(self.gnc, state.schedule)
 
 
 @dataclass(frozen=True, eq=False)
 class SharedEstimate:
-    """What robots found: poses, the edges kept, (m,), the scale of the thresholds, and the account of it."""
+    """An estimate by robots: poses, the edges kept, (m,), and the scale of the thresholds.
+
+    `ledger` is the account of what was sent for it.
+    """
 
     poses: Poses
     kept: BoolArray
@@ -124,28 +149,32 @@ def estimate_by_robots(
     gnc: GNC,
     thresholds: Array,
     start: Poses | None,
-    watch: Watch,
+    watch: RunMonitor,
     robots: Partition,
     engine: Engine,
     memory: float,
 ) -> SharedEstimate:
     """Graduated non-convexity by robots, from `start` or along a tree of known inliers.
 
-    Edges that connect what those kept leave apart are kept, too; as all that is handed back they are off the ledger.
+    Edges that connect what those kept leave apart are kept, too. What is collected for the result
+    is not on the ledger.
     """
-    known = known_inliers(problem.graph, gnc.known)
+    graph = problem.graph
+    known = known_inliers(graph, gnc.known)
     allowed = np.where(known, np.inf, thresholds)
     with closing(open_driver(problem, robots, engine, memory, allowed)) as driver:
-        driver.hand_out(start if start is not None else first_poses(problem.graph, known))
+        driver.hand_out(start if start is not None else first_poses(graph, known))
         if start is None:
             for traffic in tree_traffic(problem, robots):
                 driver.network.ledger = driver.network.ledger.after_round(traffic)
         driver.choose_cost(final=True)
-        run = watch.run(SharedGNC(gnc, left_out(problem.graph, known)), driver)
+        run = watch.run(SharedGNC(gnc, negligible_weight(graph, known)), driver)
         scale = run.state.schedule.scale
-        kept = np.zeros(problem.graph.num_edges, dtype=bool)
+        kept = np.zeros(graph.num_edges, dtype=bool)
         kept[np.concatenate(driver.ask(edges_within, scale, Count.OFF))] = True
         poses = collect(driver)[0]
-        kept[bridges(problem.graph, kept, problem.edge_costs(poses) / thresholds)] = True
-        stage = Stage("GNC", run.status, run.iterations, run.objective, run.seconds, run.history, gnc)
+        kept[bridges(graph, kept, problem.edge_costs(poses) / thresholds)] = True
+        stage = Stage(
+            "GNC", run.status, run.iterations, run.objective, run.seconds, run.history, gnc
+        )
         return SharedEstimate(poses, kept, scale, stage, driver.network.ledger)

@@ -1,6 +1,8 @@
-"""One run at a time on a file: an advisory lock of the operating system, which goes with its process however that ends.
+"""Lock that admits one run at a time to a file.
 
-The lock is on a file beside it (NAME.lock), since the file itself is replaced. One that a killed run left is free.
+It is an advisory lock of the operating system, which is released when its process ends, in whatever
+way. The lock is on a file beside it (NAME.lock), since the file itself is replaced. A lock file
+that a killed run has left behind is free.
 """
 
 import os
@@ -17,9 +19,10 @@ class RunLock:
     def __init__(self, path: Path) -> None:
         """Take the lock.
 
-        A SettingError when another run has it, a FileFormatError when the lock's file cannot be written.
+        Raises a SettingError if another run has it, and a FileFormatError if the lock file cannot
+        be written.
         """
-        path = path.resolve()  # as the file is replaced: a link stays one
+        path = path.resolve()  # the lock is beside the file, not beside a link to it
         self._path = path.with_name(f"{path.name}.lock")
         try:
             while True:
@@ -29,16 +32,22 @@ class RunLock:
                     return
                 os.close(self._file)
                 if not is_taken:
-                    raise SettingError(f"{path} is in use by another run; wait until that has ended, or name another")
+                    raise SettingError(
+                        f"{path} is in use by another run; "
+                        "wait until that has ended, or name another"
+                    )
         except OSError as error:
             problem = f"cannot be written ({error.strerror}); choose a place that can be written"
             raise FileFormatError(path, None, problem) from error
 
     def release(self) -> None:
-        """Let other runs have it."""
+        """Release the lock for other runs."""
         if sys.platform == "win32":
-            os.close(self._file)  # an open file cannot be removed there, so nobody can have opened what is
-        with suppress(OSError):  # somebody else's by now, or in a folder that became read-only: it does no harm
+            # Windows cannot remove an open file, so that no other run can have opened a file that
+            # it removes.
+            os.close(self._file)
+        # The file may belong to another run by now, or its folder be read-only: neither does harm.
+        with suppress(OSError):
             self._path.unlink()
         if sys.platform != "win32":
             os.close(self._file)
@@ -61,7 +70,10 @@ def _lock(file: int) -> bool:
 
 
 def _is_same(file: int, path: Path) -> bool:
-    """Whether an open file is the one of that name: a run that ended may have removed it before we had the lock."""
+    """Whether an open file still has this name.
+
+    A run that ended may have removed it before this run took the lock.
+    """
     try:
         return os.path.samestat(os.fstat(file), path.stat())
     except FileNotFoundError:

@@ -1,35 +1,43 @@
-"""A whole solve by a driver and its robots: start, SOC, Newton and certificate, each as its central twin does it."""
+"""The stages of a solve that a driver and its robots run.
+
+Each does what its twin of `solvers.stages` does in one place. The robots hold the poses between two
+stages. What is done goes to the stages of the journal.
+"""
+
+from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 
 from pgo_models.certificates.certificate import BoundSource, Certificate, certify_with
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.distributed.driver import DEFAULT_MEMORY, Driver, collect
+from solvers.distributed.leaderless import attempt_leaderless
 from solvers.distributed.lower_bound import best_bound_distributed
 from solvers.distributed.newton import SubstructuredNewton
 from solvers.distributed.robots.agent import Agent
 from solvers.distributed.staircase import SubstructuredStaircase, round_lifted
 from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
-from solvers.loop import Watch
+from solvers.loop import RunMonitor
 from solvers.network.engine import Engine
 from solvers.network.faults import Faults
 from solvers.result import OUT_OF_TIME, History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
-from solvers.riemannian.staircase import DualBound, Staircase
+from solvers.riemannian.staircase import Staircase
 from solvers.soc.consensus import ConsensusState
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
 from solvers.soc.subgraph import middle_separator, split_graph
+from solvers.stages import Answer
 
 
 def open_driver(
@@ -39,122 +47,301 @@ def open_driver(
     memory: float = DEFAULT_MEMORY,
     thresholds: Array | None = None,
 ) -> Driver:
-    """Driver and robots for a problem, for a robust solve with the thresholds, (m,), of its edges."""
+    """Driver and robots for a problem.
+
+    A robust solve gives the `thresholds`, (m,), of its edges.
+    """
     subgraphs = split_graph(problem, robots, thresholds)
     grounded = middle_separator(problem.graph, subgraphs)
+    summaries = [subgraph.summary for subgraph in subgraphs]
     start = partial(engine.open, partial(Agent, backend=problem.backend), subgraphs)
-    return Driver([subgraph.outline for subgraph in subgraphs], problem.num_poses, start, memory, grounded)
+    return Driver(summaries, problem.num_poses, start, memory, grounded)
 
 
-def attempt_distributed(
-    driver: Driver,
-    problem: PGOProblem,
-    newton: Newton,
-    gap: float,
-    faults: Faults | None,
-    journal: Journal,
-    watch: Watch,
-    soc: SOC | None,
-    start: Poses | None,
-) -> tuple[Poses, Certificate]:
-    """Start, SOC, Newton and certificate; what was done goes to the stages of `journal`.
+@dataclass(frozen=True, eq=False)
+class RobotJob:
+    """What the stages of one solve by robots share."""
 
-    Of the whole `problem` nothing is used but F of the poses that are returned, and where the rotation of the world
-    hangs on positions alone, the start, which is found in one place then.
+    driver: Driver
+    journal: Journal
+    monitor: RunMonitor
+
+    @property
+    def stages(self) -> list[Stage]:
+        """Stages done so far."""
+        return self.journal.stages
+
+    def without_checkpoints(self) -> RobotJob:
+        """The same job with stages that write no checkpoint."""
+        return replace(self, journal=Journal(None, {}, self.stages))
+
+
+@dataclass(frozen=True, eq=False)
+class RecallAttempt:
+    """The outcome of an attempt that a checkpoint has, in place of the stages of that attempt."""
+
+    poses: Poses
+    certificate: Certificate
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return "outcome of the checkpoint"
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the outcome."""
+        return Answer(self.poses, certificate=self.certificate)
+
+
+@dataclass(frozen=True, eq=False)
+class StartByRobots:
+    """Start, unless a checkpoint is of a later stage.
+
+    The robots relax the rotations (chordal start), or are given the poses that `find` returns.
     """
-    outcome, stages = journal.outcome_of_attempt(), journal.stages
-    if outcome is not None:
-        return outcome
-    if not journal.goes_on_with():
+
+    job: RobotJob
+    name: str = "chordal start"
+    find: Callable[[], Poses] | None = None
+
+    def run(self, answer: Answer) -> Answer:
+        """Start the robots."""
+        if self.job.journal.goes_on_with():
+            return Answer()
+        driver = self.job.driver
         driver.choose_cost(final=False)
-        if start is None and problem.graph.is_world_loose:
-            stages.append(
-                replace(start_robots(driver, chordal_start(problem.convex_part)), name="chordal start, in one place")
-            )
+        poses = self.find() if self.find is not None else None
+        began = time.perf_counter()
+        if poses is None:
+            driver.start()
         else:
-            stages.append(start_robots(driver, start))
-    decrement = refine(driver, newton, journal, watch, soc, faults)
-    outcome = judge_collected(driver, problem, gap, decrement)
-    journal.end_attempt(outcome)
-    return outcome
+            driver.set_poses(poses)
+        objective = _final_objective(driver)
+        driver.choose_cost(final=False)
+        seconds = time.perf_counter() - began
+        self.job.stages.append(Stage(self.name, Status.CONVERGED, 0, objective, seconds, History()))
+        return Answer()
 
 
-def judge_collected(driver: Driver, problem: PGOProblem, gap: float, decrement: float) -> tuple[Poses, Certificate]:
+@dataclass(frozen=True, eq=False)
+class SOCByRobots:
+    """SOC from the current poses, unless a checkpoint is of a later stage.
+
+    `faults` go wrong between the robots of a CONSENSUS stage, which then does not wait.
+    """
+
+    job: RobotJob
+    soc: SOC
+    faults: Faults | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return "SOC"
+
+    def run(self, answer: Answer) -> Answer:
+        """Run SOC; the current poses stay where it finds none that are better."""
+        journal = self.job.journal
+        if journal.goes_on_with(SubstructuredNewton):
+            return answer
+        driver = self.job.driver
+        began = time.perf_counter()
+        if not journal.goes_on_with():
+            driver.save_poses()
+        finished = self._finished()
+        if not driver.at.objective <= driver.kept.objective:
+            driver.restore_poses()
+        objective = _final_objective(driver)
+        seconds = time.perf_counter() - began
+        name = "SOC, convex" if driver.is_final else "SOC"
+        self.job.stages.append(
+            Stage(
+                name,
+                finished.status,
+                finished.iterations,
+                objective,
+                seconds,
+                finished.history,
+                self.soc,
+            )
+        )
+        return answer
+
+    def _finished(
+        self,
+    ) -> Outcome[AsynchronousState] | Outcome[ConsensusState] | Outcome[SubstructuredState]:
+        """Run of the coupling that the settings name; its factors go with it."""
+        driver = self.job.driver
+        journal = self.job.journal
+        monitor = self.job.monitor
+        if self.soc.effective_coupling is not Coupling.CONSENSUS:
+            substructured = SubstructuredSOC(self.soc)
+            finished = journal.run(substructured, driver, monitor)
+            substructured.finish(driver)
+            return finished
+        if self.faults is None:
+            waiting = journal.run(ConsensusSOC(self.soc), driver, monitor)
+            RobotsOfDriver(driver).finish()
+            return waiting
+        # No checkpoint can hold the messages that are under way.
+        asynchronous = monitor.run(AsynchronousSOC(self.soc, self.faults), driver)
+        RobotsOfDriver(driver).finish()
+        return asynchronous
+
+
+@dataclass(frozen=True, eq=False)
+class NewtonByRobots:
+    """Newton on the cost that is asked for, unless time is up."""
+
+    job: RobotJob
+    newton: Newton
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return "Newton"
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the last relative decrement; the robots hold the poses."""
+        driver = self.job.driver
+        stages = self.job.stages
+        driver.choose_cost(final=True)  # again, where a checkpoint is from before
+        if stages[-1].status in OUT_OF_TIME:
+            return replace(answer, decrement=math.inf)
+        method = SubstructuredNewton(self.newton)
+        finished = self.job.journal.run(method, driver, self.job.monitor)
+        stages.append(
+            Stage(
+                "Newton",
+                finished.status,
+                finished.iterations,
+                driver.at.objective,
+                finished.seconds,
+                finished.history,
+                self.newton,
+            )
+        )
+        return replace(answer, decrement=finished.state.decrement)
+
+
+@dataclass(frozen=True, eq=False)
+class CertifyByRobots:
     """All poses, and their certificate with a bound that driver and robots find."""
-    bound = best_bound_distributed(driver, gap)
-    poses, Lambda = collect(driver)
-    return poses, certify_with(problem, poses, Lambda, gap, decrement, BoundSource.GIVEN, bound)
+
+    job: RobotJob
+    problem: PGOProblem
+    gap: float
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return "certificate"
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the poses, collected from the robots, and their certificate.
+
+        Of the whole problem nothing is used but F of these poses.
+        """
+        driver = self.job.driver
+        bound = best_bound_distributed(driver, self.gap)
+        poses, Lambda = collect(driver)
+        certificate = certify_with(
+            self.problem, poses, Lambda, self.gap, answer.decrement, BoundSource.GIVEN, bound
+        )
+        self.job.journal.end_attempt((poses, certificate))
+        return replace(answer, poses=poses, certificate=certificate)
 
 
-def refine(
-    driver: Driver, newton: Newton, journal: Journal, watch: Watch, soc: SOC | None = None, faults: Faults | None = None
-) -> float:
-    """SOC and Newton from the poses at hand; the last relative decrement."""
-    stages = journal.stages
-    if soc is not None and not journal.goes_on_with(SubstructuredNewton):
-        stages.append(_run_soc(driver, soc, faults, journal, watch))
-    decrement = math.inf
-    driver.choose_cost(final=True)  # again, where a checkpoint is from before
-    if stages[-1].status not in OUT_OF_TIME:
-        second = journal.run(SubstructuredNewton(newton), driver, watch)
-        decrement = second.state.decrement
-        figures = second.status, second.iterations, driver.at.objective, second.seconds, second.history, newton
-        stages.append(Stage("Newton", *figures))
-    return decrement
+@dataclass(frozen=True, eq=False)
+class SetPoses:
+    """The robots are given the poses of the answer, from which the next stage begins."""
+
+    job: RobotJob
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return "poses to robots"
+
+    def run(self, answer: Answer) -> Answer:
+        """Hand out the poses."""
+        self.job.driver.set_poses(answer.current_poses)
+        return answer
 
 
-def climb_distributed(
-    driver: Driver, staircase: Staircase, newton: Newton, watch: Watch, stages: list[Stage]
-) -> tuple[float, DualBound | None]:
-    """Staircase from the poses at hand, rounding, and Newton: the last decrement, and the bound of the relaxation."""
-    driver.save_poses()
-    climb = watch.run(SubstructuredStaircase(staircase), driver)
-    if climb.status is Status.INTERRUPTED:  # some robots may have one dimension more than others
-        driver.restore_poses()
-    else:
-        round_lifted(driver)
-    figures = climb.status, climb.iterations, driver.at.objective, climb.seconds, climb.history, staircase
-    stages.append(Stage("Staircase", *figures))
-    return refine(driver, newton, Journal(None, {}, stages), watch), climb.state.bound
+@dataclass(frozen=True, eq=False)
+class ClimbByRobots:
+    """The staircase from the current poses, and rounding."""
+
+    job: RobotJob
+    staircase: Staircase
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return "Staircase"
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the bound on the relaxation, if one was proven.
+
+        The robots hold the rounded poses.
+        """
+        driver = self.job.driver
+        driver.save_poses()
+        climb = self.job.monitor.run(SubstructuredStaircase(self.staircase), driver)
+        if climb.status is Status.INTERRUPTED:
+            # Some robots may have one dimension more than others.
+            driver.restore_poses()
+        else:
+            round_lifted(driver)
+        self.job.stages.append(
+            Stage(
+                "Staircase",
+                climb.status,
+                climb.iterations,
+                driver.at.objective,
+                climb.seconds,
+                climb.history,
+                self.staircase,
+            )
+        )
+        return Answer(dual_bound=climb.state.bound)
 
 
-def start_robots(driver: Driver, start: Poses | None) -> Stage:
-    """Chordal start, or given poses."""
-    began = time.perf_counter()
-    if start is None:
-        driver.start()
-    else:
-        driver.set_poses(start)
-    name = "chordal start" if start is None else "given start"
-    objective = _of_the_problem(driver)
-    driver.choose_cost(final=False)
-    return Stage(name, Status.CONVERGED, 0, objective, time.perf_counter() - began, History())
+@dataclass(frozen=True, eq=False)
+class ConsensusAlone:
+    """Start and CONSENSUS by robots without a driver, and the bound F >= 0 (`leaderless`)."""
+
+    job: RobotJob
+    problem: PGOProblem
+    gap: float
+    robots: Partition
+    soc: SOC
+    faults: Faults | None
+    start: Poses | None
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return "SOC"
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the poses that the robots agree on."""
+        poses, certificate = attempt_leaderless(
+            self.job.driver,
+            self.problem,
+            self.robots,
+            self.gap,
+            self.faults,
+            self.job.journal,
+            self.job.monitor,
+            self.soc,
+            self.start,
+        )
+        return Answer(poses, certificate=certificate)
 
 
-def _of_the_problem(driver: Driver) -> float:
-    """The cost that is solved, at the poses at hand."""
+def _final_objective(driver: Driver) -> float:
+    """The cost that is solved, at the current poses; the driver stays with that cost."""
     driver.choose_cost(final=True)
     return driver.at.objective
-
-
-def _run_soc(driver: Driver, soc: SOC, faults: Faults | None, journal: Journal, watch: Watch) -> Stage:
-    """SOC from the poses at hand, which stay where it finds none that are better. Its factors go with it."""
-    began = time.perf_counter()
-    if not journal.goes_on_with():
-        driver.save_poses()
-    first: Outcome[AsynchronousState] | Outcome[ConsensusState] | Outcome[SubstructuredState]
-    if soc.effective_coupling is Coupling.CONSENSUS and faults is not None:
-        first = watch.run(AsynchronousSOC(soc, faults), driver)  # messages under way are in no checkpoint
-        RobotsOfDriver(driver).finish()
-    elif soc.effective_coupling is Coupling.CONSENSUS:
-        first = journal.run(ConsensusSOC(soc), driver, watch)
-        RobotsOfDriver(driver).finish()
-    else:
-        substructured = SubstructuredSOC(soc)
-        first = journal.run(substructured, driver, watch)
-        substructured.finish(driver)
-    if not driver.at.objective <= driver.kept.objective:
-        driver.restore_poses()
-    objective, seconds = _of_the_problem(driver), time.perf_counter() - began
-    name = "SOC, convex" if driver.is_final else "SOC"
-    return Stage(name, first.status, first.iterations, objective, seconds, first.history, soc)

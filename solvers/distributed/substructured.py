@@ -1,6 +1,7 @@
-"""SUBSTRUCTURED: the recursion of JOINT, its quadratic program split by elimination of the robots' interiors.
+"""SUBSTRUCTURED: the recursion of JOINT, with step (a) split by eliminating the robots' interiors.
 
-The iterates are those of JOINT to rounding, whatever the number of robots: `solvers.soc.soc` is the recursion to read.
+The iterates are those of JOINT up to rounding, whatever the number of robots: `solvers.soc.soc` is
+the recursion to read.
 """
 
 import math
@@ -10,65 +11,66 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pgo_models.certificates.dual_variables import multiplier_norms
-from pgo_models.geometry.rotations import unstack_transposes
+from pgo_models.geometry.rotations import Array, unstack_transposes
 from solvers.distributed.driver import Driver
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import Agree, Reduced, RescaleInterior
 from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Status
-from solvers.soc.copies import Norms, thinned
-from solvers.soc.penalty import Due, SharedSteps, next_penalty
+from solvers.soc.copies import Norms, subsampled
 from solvers.soc.recursion_block import Agreement, RecursionBlock
+from solvers.soc.safeguard import Due, SharedSteps, next_penalty
 from solvers.soc.soc import SOC
 
-ENOUGH_NORMS = 2**12  # for the penalty's quantile, where robots have files of their own and poses are many
+# Poses that are enough to estimate the penalty's quantile, where robots have files of their own.
+ENOUGH_NORMS = 2**12
 
 
 @dataclass(frozen=True, eq=False)
 class SubstructuredState(SharedSteps):
     """Figures of iterate k; its rows are with driver and robots, and a step replaces them."""
 
-    objective: float = math.nan  # F at omega and the translations of step (a), where that is known with the step
+    # F at omega and the translations of step (a); nan where the step did not evaluate it.
+    objective: float = math.nan
 
 
 @dataclass(frozen=True)
 class SubstructuredSOC:
     """SOC by a driver and its robots, from the poses that they hold."""
 
-    soc: SOC = field(default_factory=SOC)  # settings; its coupling and robots are not looked at
+    soc: SOC = field(default_factory=SOC)  # settings; its coupling and robots are ignored
 
     @property
     def max_iterations(self) -> int:
-        """Most steps of a run."""
+        """Maximal number of steps of a run."""
         return self.soc.max_iterations
 
     def init(self, driver: Driver, start: SubstructuredState | None) -> SubstructuredState:
-        """State 0: omega = the rotations that driver and robots hold, B = 0; or the state that they were resumed at."""
+        """State 0: omega = the rotations that driver and robots hold, B = 0.
+
+        With `start` the run continues from that state, to which driver and robots were resumed.
+        """
         if start is not None:
+            # The driver needs the factor of step (a) again.
             _take(driver, _block(driver), driver.ask(Interior.eliminated, None, Count.PIGGYBACKED))
             return start
         return self._penalized(driver, is_stationary=False)
 
     def step(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
-        """One round: (a) by elimination; and one all-reduce: (b), (c)."""
+        """One round, step (a) by elimination, and one all-reduce, steps (b) and (c)."""
         state = self._with_penalty_due(driver, state)
-        rows, block = driver.rotation_rows, _block(driver)
-        interface = driver.interface(1, driver.d)
-        b = np.zeros((interface.side, driver.d))
-        b[rows] = (0.5 * block.penalty)[:, None] * block.shift
-        x, parts, _ = interface.solve([part.b for part in driver.right], b)
-        block, own = block.after_solve(x[rows])  # (a)
-        sums = own + np.sum(driver.ask_each(Interior.solve, parts, is_along=True), axis=0)
+        block, sums = _solve_a(driver)  # (a)
         merit = math.sqrt(sums[0])
         if not math.isfinite(merit):
             return state.broken()
         gamma, anderson = state.sums.coefficients(self.soc.acceleration, sums)
         agreement = Agreement(gamma, state.is_best(merit))
-        block, own = block.extrapolated(agreement).projected()  # (b), (c)
+        block, own_squares = block.extrapolated(agreement).projected()  # (b), (c)
         orders = [Agree(agreement, z) for z in driver.scattered_rotations(block.z)]
         answers = driver.ask_each(Interior.agree, orders, Count.ALL_REDUCE)
-        driver.block, driver.right = block, [answer.right for answer in answers]
-        squares = own + np.sum([answer.sums for answer in answers], axis=0)
+        driver.block = block
+        driver.right = [answer.right for answer in answers]
+        squares = own_squares + np.sum([answer.sums for answer in answers], axis=0)
         objective = math.fsum(answer.measured for answer in answers)
         return replace(state.after(merit, squares, state.size, anderson), objective=objective)
 
@@ -76,54 +78,70 @@ class SubstructuredSOC:
         """F at omega and the translations of step (a), and the residuals."""
         if math.isnan(state.primal_residual):
             return driver.measured(Measurement(np.nan, np.nan, np.nan))
-        if not math.isnan(state.objective):  # told with the step
-            return driver.measured(state.measurement(state.objective))
-        parts = driver.ask_each(Interior.cost, driver.scattered_rotations(_block(driver).z), Count.OFF)
-        return driver.measured(state.measurement(math.fsum(parts)))
+        objective = state.objective
+        if math.isnan(objective):
+            z = driver.scattered_rotations(_block(driver).z)
+            objective = math.fsum(driver.ask_each(Interior.cost, z, Count.OFF))
+        return driver.measured(state.measurement(objective))
 
     def converged(self, state: SubstructuredState, measurement: Measurement) -> Status | None:
-        """CONVERGED when the residuals are within tolerance."""
+        """CONVERGED when R agrees with omega and omega has stopped moving.
+
+        Both hold within the tolerance in the norm of rho.
+        """
         return self.soc.converged(state, measurement)
 
     def finish(self, driver: Driver) -> None:
-        """Leave omega and the best translations for it with driver and robots: two rounds."""
+        """Give driver and robots omega, and the best translations for it: two rounds."""
         z = _block(driver).z
         driver.right = []
         driver.at = replace(driver.at, R=unstack_transposes(z))
         driver.set_translations(driver.ask_each(Interior.finish, driver.scattered_rotations(z)))
 
     def _penalized(self, driver: Driver, is_stationary: bool) -> SubstructuredState:
-        """State 0 at the poses that driver and robots hold; one round, in which the quantile is found."""
-        step = None if driver.has_whole else driver.num_poses // ENOUGH_NORMS or None  # so many stand for all
+        """State 0 at the poses that driver and robots hold: one round, for the penalties.
+
+        If the poses are stationary, B is the multiplier that belongs to them.
+        """
+        # Where robots have files of their own, every k-th pose stands for all in the quantile.
+        step = None
+        if not driver.has_whole and driver.num_poses >= ENOUGH_NORMS:
+            step = driver.num_poses // ENOUGH_NORMS
         Lambda = driver.at.multipliers
         answers = [*driver.ask(Interior.multiplier_norms, step, Count.PIGGYBACKED)]
-        answers.append(thinned(Norms(multiplier_norms(Lambda), driver.scale), step))
-        all_norms = np.concatenate([answer.norms for answer in answers])
-        all_scales = np.concatenate([answer.scale for answer in answers])
-        order = self.soc.penalty_order(all_norms / all_scales, is_stationary)
-        ratio = order.rho(all_norms, all_scales) / all_scales
+        answers.append(subsampled(Norms(multiplier_norms(Lambda), driver.scale), step))
+        norms = np.concatenate([answer.norms for answer in answers])
+        scales = np.concatenate([answer.scale for answer in answers])
+        order = self.soc.penalty_order(norms / scales, is_stationary)
+        ratio = order.rho(norms, scales) / scales
         block = order.block(driver.at.R, Lambda, driver.diagonal[driver.rotation_rows])
         _take(driver, block, driver.ask(Interior.penalize, order))
-        return SubstructuredState(ratio=ratio, size=math.sqrt(driver.d * (step or 1) * float(ratio @ all_scales)))
+        # ||omega||_rho^2 = d sum_i rho_i, of which the sampled poses are a fraction 1 / step.
+        squared_size = driver.d * (step or 1) * float(ratio @ scales)
+        return SubstructuredState(ratio=ratio, size=math.sqrt(squared_size))
 
     def _with_penalty_due(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
-        """As in `solvers.soc.soc`: the penalty that the rule, or the safeguard, wants from now on."""
+        """State with the penalty that the rule or the safeguard requires, see `solvers.soc.soc`."""
         due, factor = next_penalty(self.soc.penalty, state.ratio, state)
         if due is Due.RAISE:
-            return replace(self._rescaled(driver, state, factor, from_best=True), raises=state.raises + 1)
+            rescaled = self._rescaled(driver, state, factor, from_best=True)
+            return replace(rescaled, raises=state.raises + 1)
         if due is Due.REFRESH:
             self.finish(driver)
             fresh = self._penalized(driver, is_stationary=True)
             return fresh.in_place_of(state)
         if due is Due.RESCALE:
-            return replace(self._rescaled(driver, state, factor, from_best=False), refreshes=state.refreshes + 1)
+            rescaled = self._rescaled(driver, state, factor, from_best=False)
+            return replace(rescaled, refreshes=state.refreshes + 1)
         return state
 
     def _rescaled(
         self, driver: Driver, state: SubstructuredState, factor: float, from_best: bool
     ) -> SubstructuredState:
-        """State with factor * rho and the same unscaled multiplier rho B."""
-        block = _block(driver).back_at_best() if from_best else _block(driver)
+        """State with the penalty factor * rho and the same unscaled multiplier rho B."""
+        block = _block(driver)
+        if from_best:
+            block = block.back_at_best()
         block = block.rescaled(factor * block.penalty)
         _take(driver, block, driver.ask(Interior.rescale, RescaleInterior(factor, from_best)))
         return state.rescaled(factor)
@@ -134,9 +152,29 @@ def _block(driver: Driver) -> RecursionBlock:
     return driver.block
 
 
+def _solve_a(driver: Driver) -> tuple[RecursionBlock, Array]:
+    """Step (a): the driver's rows after it, and the sums over all parties."""
+    rows = driver.rotation_rows
+    block = _block(driver)
+    interface = driver.interface(1, driver.d)
+    b = np.zeros((interface.side, driver.d))
+    b[rows] = (0.5 * block.penalty)[:, None] * block.shift
+    x, parts, _ = interface.solve([right.b for right in driver.right], b)
+    block, own_sums = block.after_solve(x[rows])
+    sums_of_robots = driver.ask_each(Interior.solve, parts, is_along=True)
+    return block, own_sums + np.sum(sums_of_robots, axis=0)
+
+
 def _take(driver: Driver, block: RecursionBlock, reduced: Sequence[Reduced]) -> None:
-    """Go on from a block, with the robots' eliminations for its penalty: factor the driver's matrix of step (a)."""
-    own = [(driver.rotation_rows[:, None], (0.5 * block.penalty)[:, None, None]), *driver.grounded_translation()]
+    """Continue from a block, of whose penalty the robots have sent their eliminations.
+
+    The driver factors its matrix of step (a): the sum of the robots' Schur complements, of rho / 2
+    on the rows of rotations, and of the grounding of pose 0.
+    """
+    rows = driver.rotation_rows[:, None]
+    half_penalty = (0.5 * block.penalty)[:, None, None]
+    own = [(rows, half_penalty), *driver.grounded_translation()]
     matrices = [answer.schur for answer in reduced]
     driver.interface(1, driver.d).factorize(matrices, own)
-    driver.block, driver.right = block, [answer.right for answer in reduced]
+    driver.block = block
+    driver.right = [answer.right for answer in reduced]

@@ -1,4 +1,4 @@
-"""Workers whose messages are counted: what the driver asks of them, and what they send each other."""
+"""Workers whose messages are counted: those to and from the driver, and those between workers."""
 
 import enum
 from collections.abc import Callable, Mapping, Sequence
@@ -10,14 +10,15 @@ from pgo_models.graphs.pose_graph import IntArray
 from solvers.network.engine import WorkerPool
 from solvers.network.faults import LossyChannel
 from solvers.network.ledger import BYTES_PER_NUMBER, DRIVER, Ledger, Traffic
-from solvers.network.messages import count_numbers
+from solvers.network.messages import count_numbers, snapshot_bytes, take_snapshot
+from solvers.network.recovery import RecoveringPool
 
 Q = TypeVar("Q")
 A = TypeVar("A")
 
 
 class Count(enum.Enum):
-    """What an order costs on the network."""
+    """How an order is counted on the ledger."""
 
     ROUND = "robots wait for values at the separators"
     ALL_REDUCE = "sums of a few numbers, and what follows from them"
@@ -30,10 +31,16 @@ class CountedPool:
     """A worker pool and its ledger."""
 
     def __init__(self, workers: WorkerPool, num_robots: int) -> None:
-        self.workers, self.ledger = workers, Ledger(num_robots)
+        self.workers = workers
+        self.ledger = Ledger(num_robots)
+        # Every exchange that was counted, by its content: equal ones share one object.
         self._traffic: dict[bytes, Traffic] = {}
-        self.elsewhere: tuple[str, ...] = ()  # fields that go along a tree of workers
-        # Of robots without a driver, whose sums go along a tree to its root: all, parents first, and their parents.
+        # Bytes, already on the ledger, of the snapshots that a recovering pool took unasked.
+        self._counted_snapshot_bytes = 0
+        # Names of the fields that go along a tree of workers.
+        self.elsewhere: tuple[str, ...] = ()
+        # Robots without a driver sum along a tree to its root: all of them, parents first, and the
+        # parent of each.
         self.tree: tuple[IntArray, IntArray] | None = None
 
     def ask(
@@ -44,54 +51,97 @@ class CountedPool:
         robots: IntArray | None = None,
         is_along: bool = False,
     ) -> list[A]:
-        """Answers of all workers to an order; of them `robots`, all unless given, exchange something with the driver.
+        """Answers of all workers to an order, each with its request.
 
-        What goes to other workers is counted when it is handed on; if along a tree, so are requests that `is_along`.
+        The ledger counts what `robots`, all unless given, exchange with the driver. Messages to
+        other workers are counted when they are exchanged. If there is a tree of workers, requests
+        with `is_along` go along it, and are counted there.
         """
         answers = self.workers.ask(order, requests)
+        self._count_snapshots(answers if order is take_snapshot else [])
         if count is Count.OFF:
             return answers
         robots = np.arange(len(requests)) if robots is None else robots
-        asked = requests if not (is_along and self.elsewhere) else [None] * len(requests)
-        sizes = [count_numbers(asked[robot], self.elsewhere) for robot in robots.tolist()]
-        sizes += [count_numbers(answers[robot], self.elsewhere) for robot in robots.tolist()]
-        driver = np.full(len(robots), DRIVER)
-        if self.tree is not None:
-            outwards, driver = self.tree
-            for robot in outwards[:0:-1].tolist() if count is Count.GATHER else ():
-                sizes[len(robots) + driver[robot]] += sizes[len(robots) + robot]
-        sender, receiver = np.concatenate([driver, robots]), np.concatenate([robots, driver])
-        self.count(sender, receiver, sizes, is_round=count is Count.ROUND)
+        asked = [] if is_along and self.elsewhere else requests
+        self._count_exchange_with_driver(robots, asked, answers, count)
         if count in (Count.ALL_REDUCE, Count.GATHER):
             self.ledger = self.ledger.after_all_reduce(0)
         return answers
 
-    def hand_on(self, sent: Sequence[Mapping[int, A]], channel: LossyChannel[A] | None = None) -> list[Mapping[int, A]]:
-        """What all receive, by sender, of what each sent, by receiver: a round; what `channel` loses is counted too."""
+    def _count_exchange_with_driver(
+        self, robots: IntArray, requests: Sequence[Any], answers: Sequence[Any], count: Count
+    ) -> None:
+        """Count requests, unless there are none, and answers."""
+        request_sizes = [0] * len(robots)
+        if requests:
+            request_sizes = [count_numbers(requests[a], self.elsewhere) for a in robots.tolist()]
+        answer_sizes = [count_numbers(answers[a], self.elsewhere) for a in robots.tolist()]
+        parent = np.full(len(robots), DRIVER)
+        if self.tree is not None:
+            outwards, parent = self.tree
+            if count is Count.GATHER:  # what is not summed up grows on its way to the root
+                for robot in outwards[:0:-1].tolist():
+                    answer_sizes[parent[robot]] += answer_sizes[robot]
+        sender = np.concatenate([parent, robots])
+        receiver = np.concatenate([robots, parent])
+        sizes = request_sizes + answer_sizes
+        self.count(sender, receiver, sizes, is_round=count is Count.ROUND)
+
+    def exchange(
+        self, sent: Sequence[Mapping[int, A]], channel: LossyChannel[A] | None = None
+    ) -> list[Mapping[int, A]]:
+        """Carry out one round between robots: messages by receiver in, messages by sender out.
+
+        Entry a of `sent` is what robot a sends, entry a of the answer what it receives. Messages
+        that `channel` loses are counted, too.
+        """
         messages = by_link(sent)
         links = np.array(list(messages), dtype=np.int64).reshape(-1, 2)
-        self.count(links[:, 0], links[:, 1], [count_numbers(value) for value in messages.values()], is_round=True)
-        return delivered(messages if channel is None else channel.carry(messages), len(sent))
+        sizes = [count_numbers(value) for value in messages.values()]
+        self.count(links[:, 0], links[:, 1], sizes, is_round=True)
+        arrived = messages if channel is None else channel.carry(messages)
+        return delivered(arrived, len(sent))
+
+    def _count_snapshots(self, asked_for: Sequence[Any]) -> None:
+        """Count snapshots asked for, and those that the pool took unasked since the last call."""
+        num_bytes = snapshot_bytes(asked_for)
+        if isinstance(self.workers, RecoveringPool):
+            num_bytes += self.workers.snapshot_bytes - self._counted_snapshot_bytes
+            self._counted_snapshot_bytes = self.workers.snapshot_bytes
+        if num_bytes:
+            self.ledger = self.ledger.after_snapshots(num_bytes)
 
     def count(
-        self, sender: IntArray, receiver: IntArray, numbers: Sequence[int] | IntArray, is_round: bool, level: int = 0
+        self,
+        sender: IntArray,
+        receiver: IntArray,
+        numbers: Sequence[int] | IntArray,
+        is_round: bool,
+        level: int = 0,
     ) -> None:
-        """Count an exchange, without what a worker has itself; equal ones are one object, which the ledger counts."""
+        """Count an exchange of messages with `numbers` numbers each, (q,).
+
+        Empty messages, and those of a worker to itself, are left out.
+        """
         num_bytes = BYTES_PER_NUMBER * np.array(numbers, dtype=np.int64)
-        used = (num_bytes > 0) & (sender != receiver)
-        exchange = sender[used], receiver[used], num_bytes[used]
+        is_sent = (num_bytes > 0) & (sender != receiver)
+        exchange = sender[is_sent], receiver[is_sent], num_bytes[is_sent]
         key = np.append(np.concatenate(exchange), level).tobytes()
         traffic = self._traffic.setdefault(key, Traffic(*exchange, level))
         self.ledger = self.ledger.after_exchange(traffic, is_round)
 
 
 def by_link(sent: Sequence[Mapping[int, A]]) -> dict[tuple[int, int], A]:
-    """Messages by (sender, receiver), of what every sender sent by its receiver."""
-    return {(robot, to): value for robot, addressed in enumerate(sent) for to, value in addressed.items()}
+    """Messages by (sender, receiver), of what every sender sends, by receiver."""
+    messages = {}
+    for sender, addressed in enumerate(sent):
+        for receiver, value in addressed.items():
+            messages[sender, receiver] = value
+    return messages
 
 
 def delivered(messages: Mapping[tuple[int, int], A], num_robots: int) -> list[Mapping[int, A]]:
-    """Messages of every link (sender, receiver) for each of the receivers, by their senders."""
+    """Messages by sender for every receiver, of messages by (sender, receiver)."""
     received: list[dict[int, A]] = [{} for _ in range(num_robots)]
     for (sender, receiver), value in messages.items():
         received[receiver][sender] = value

@@ -1,39 +1,86 @@
-"""What goes wrong between robots, for study: messages lost, late, or of a robot that is silent."""
+"""Faults between robots, for study: messages lost, messages late, and a robot that is silent."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from pgo_models.errors import SettingError, check_settings
 
 T = TypeVar("T")
+Link = tuple[int, int]  # sender and receiver
 
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong between robots, for study; the same seed gives the same faults.
+    """Faults between robots, for study; the same seed gives the same faults.
 
-    `Pipeline(faults=..)` runs its CONSENSUS stage with them: robots then do not wait for each other.
+    `Pipeline(faults=..)` runs its CONSENSUS stage with them: robots then do not wait for each
+    other.
+
+    Parameters
+    ----------
+    loss : float
+        Probability that a message is lost, in [0, 1).
+    max_delay : int
+        Messages arrive 0 to `max_delay` rounds late, equally likely. A message that a later one has
+        overtaken is dropped.
+    silent_robot : int, optional
+        A robot that neither sends nor receives for some rounds.
+    silent_from : int
+        First round in which `silent_robot` is silent.
+    silent_rounds : int
+        Number of rounds in which `silent_robot` is silent.
+    seed : int
+        Seed of the random losses and delays.
+
+    Raises
+    ------
+    SettingError
+        If `loss` is not in [0, 1), or another setting is negative.
     """
 
-    loss: float = 0.0  # probability that a message is lost
-    max_delay: int = 0  # messages arrive 0 to so many rounds late, equally likely; an overtaken one is dropped
-    silent_robot: int | None = None  # a robot that neither sends nor receives ..
-    silent_from: int = 0  # .. from this round on ..
-    silent_rounds: int = 0  # .. for so many rounds
+    loss: float = 0.0
+    max_delay: int = 0
+    silent_robot: int | None = None
+    silent_from: int = 0
+    silent_rounds: int = 0
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_settings(self, not_negative=["max_delay", "silent_robot", "silent_from", "silent_rounds"])
+        check_settings(
+            self, not_negative=["max_delay", "silent_robot", "silent_from", "silent_rounds"]
+        )
         if not 0 <= self.loss < 1:
             raise SettingError(f"loss must be in [0, 1), got {self.loss}")
 
     def is_silent(self, robot: int, number: int) -> bool:
-        """Whether a robot is cut off in a round."""
+        """Whether a robot is cut off in a round.
+
+        Parameters
+        ----------
+        robot : int
+            Number of the robot.
+        number : int
+            Number of the round; the first round is 0.
+
+        Returns
+        -------
+        bool
+            True if the robot neither sends nor receives in the round.
+        """
         since = number - self.silent_from
         return robot == self.silent_robot and 0 <= since < self.silent_rounds
+
+
+class _Letter(NamedTuple, Generic[T]):
+    """A message under way."""
+
+    arrival: int  # round in which it arrives
+    departure: int  # round in which it was sent
+    link: Link
+    content: T
 
 
 class LossyChannel(Generic[T]):
@@ -42,23 +89,34 @@ class LossyChannel(Generic[T]):
     def __init__(self, faults: Faults) -> None:
         self.faults = faults
         self._rng = np.random.default_rng(faults.seed)
-        self._number = 0
-        self._under_way: list[tuple[int, int, tuple[int, int], T]] = []
-        self._newest: dict[tuple[int, int], int] = {}
+        self._number = 0  # of the next round
+        self._under_way: list[_Letter[T]] = []
+        # Round in which the newest message that has arrived was sent, by link.
+        self._newest: dict[Link, int] = {}
 
-    def carry(self, messages: Mapping[tuple[int, int], T]) -> dict[tuple[int, int], T]:
-        """Take what every (sender, receiver) sends in this round; what arrives in it."""
-        faults, number = self.faults, self._number
-        for link in sorted(messages):
-            is_lost = self._rng.random() < faults.loss
-            delay = int(self._rng.integers(faults.max_delay + 1))
-            if not is_lost and not any(faults.is_silent(robot, number) for robot in link):
-                self._under_way.append((number + delay, number, link, messages[link]))
-        arriving = [message for message in self._under_way if message[0] <= number]
-        self._under_way = [message for message in self._under_way if message[0] > number]
-        arrived: dict[tuple[int, int], T] = {}
-        for _, sent, link, message in sorted(arriving, key=lambda entry: entry[1]):
-            if sent >= self._newest.get(link, 0) and not faults.is_silent(link[1], number):
-                arrived[link], self._newest[link] = message, sent
+    def carry(self, messages: Mapping[Link, T]) -> dict[Link, T]:
+        """Carry out one round: take what is sent in it, by link, and return what arrives in it."""
+        self._send(messages)
+        arriving = [letter for letter in self._under_way if letter.arrival <= self._number]
+        self._under_way = [letter for letter in self._under_way if letter.arrival > self._number]
+        arrived: dict[Link, T] = {}
+        for letter in sorted(arriving, key=lambda letter: letter.departure):
+            is_overtaken = letter.departure < self._newest.get(letter.link, 0)
+            receiver = letter.link[1]
+            if is_overtaken or self.faults.is_silent(receiver, self._number):
+                continue
+            arrived[letter.link] = letter.content
+            self._newest[letter.link] = letter.departure
         self._number += 1
         return arrived
+
+    def _send(self, messages: Mapping[Link, T]) -> None:
+        """Draw the fate of every message, in the order of the links, and send those not lost."""
+        for link in sorted(messages):
+            is_lost = self._rng.random() < self.faults.loss
+            delay = int(self._rng.integers(self.faults.max_delay + 1))
+            is_cut_off = any(self.faults.is_silent(robot, self._number) for robot in link)
+            if not is_lost and not is_cut_off:
+                self._under_way.append(
+                    _Letter(self._number + delay, self._number, link, messages[link])
+                )

@@ -1,4 +1,4 @@
-"""What crosses the network: rounds, messages and bytes by link."""
+"""Account of what crosses the network: rounds, messages, and bytes by link."""
 
 from __future__ import annotations
 
@@ -9,120 +9,260 @@ import numpy as np
 from pgo_models.errors import SettingError
 from pgo_models.graphs.pose_graph import IntArray
 
-DRIVER = -1  # the number that stands for the driver among senders and receivers
+DRIVER = -1  # stands for the driver among the numbers of senders and receivers
 BYTES_PER_NUMBER = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Traffic:
-    """Messages of one exchange; the same object may be counted many times."""
+    """Messages of one exchange; the same object may be counted many times.
 
-    # sender, receiver: (q,); robots, or `DRIVER`.
+    Parameters
+    ----------
+    sender : IntArray, (q,)
+        Robot that sends a message, or `DRIVER`.
+    receiver : IntArray, (q,)
+        Robot that receives it, or `DRIVER`.
+    num_bytes : IntArray, (q,)
+        Payload of every message, eight bytes a number.
+    level : int
+        Level in a tree of robots, 1 at its leaves; 0 between driver and robots, or neighbours.
+    """
+
     sender: IntArray
     receiver: IntArray
-    num_bytes: IntArray  # (q,): payload of every message: eight bytes a number
-    level: int = 0  # of a tree of robots, 1 at its leaves; 0 between driver and robots, or neighbours
+    num_bytes: IntArray
+    level: int = 0
 
     def __post_init__(self) -> None:
         if not self.sender.shape == self.receiver.shape == self.num_bytes.shape:
             shapes = f"{self.sender.shape}, {self.receiver.shape} and {self.num_bytes.shape}"
-            raise SettingError(f"senders, receivers and bytes have shapes {shapes}; give one of each for every message")
+            raise SettingError(
+                f"senders, receivers and bytes have shapes {shapes}; "
+                "give one of each for every message"
+            )
 
 
 @dataclass(frozen=True, eq=False)
 class Ledger:
-    """Account of a distributed run.
+    """Account of a distributed run; `Solution.ledger` has that of a solve by robots.
 
-    A round is one exchange that robots wait for: between neighbours, or to the driver and back, level by level where
-    there is a tree of robots. An all-reduce, by which all come to know a sum of a few numbers, is counted apart.
+    A round is one exchange that robots wait for: between neighbours, or to the driver and back,
+    level by level where there is a tree of robots. An all-reduce, after which all robots know the
+    sum of a few numbers, is counted apart.
+
+    Parameters
+    ----------
+    num_robots : int
+        Number of robots.
+    rounds : int
+        Number of rounds.
+    all_reduces : int
+        Number of all-reduces.
+    all_reduce_bytes : int
+        Payload in bytes of the all-reduces whose messages are not in `counted`, up and down for
+        every robot.
+    counted : tuple of (Traffic, int)
+        Exchanges, and how often each took place.
+    snapshot_bytes : int
+        Bytes of the snapshots for recovery and checkpoints, which robots give the process of the
+        driver. They are no messages of a method, and are in none of the other figures.
+
+    Examples
+    --------
+    >>> import pgo_models as pgo, solvers
+    >>> ledger = solvers.solve(pgo.load("circle"), robots=2).ledger
+    >>> ledger.num_robots, ledger.rounds > 0, ledger.num_bytes > 0
+    (2, True, True)
     """
 
     num_robots: int
     rounds: int = 0
     all_reduces: int = 0
-    all_reduce_bytes: int = 0  # of all-reduces that no messages are counted of, up and down for every robot
-    counted: tuple[tuple[Traffic, int], ...] = ()  # exchanges, and how often each took place
+    all_reduce_bytes: int = 0
+    counted: tuple[tuple[Traffic, int], ...] = ()
+    snapshot_bytes: int = 0
 
     def after_round(self, *exchanged: Traffic) -> Ledger:
-        """Return the ledger after one more round with these exchanges."""
-        counted = dict(self.counted)  # by the object: one of equal content is another
+        """Return the ledger after one more round with these exchanges.
+
+        Parameters
+        ----------
+        *exchanged : Traffic
+            Messages of the round.
+
+        Returns
+        -------
+        Ledger
+            The ledger with the round and its messages.
+        """
+        # Keys are objects: another object with equal content is counted on its own.
+        counted = dict(self.counted)
         for traffic in exchanged:
             counted[traffic] = counted.get(traffic, 0) + 1
         return replace(self, rounds=self.rounds + 1, counted=tuple(counted.items()))
 
     def after_exchange(self, traffic: Traffic, is_round: bool) -> Ledger:
-        """Return the ledger after an exchange; one that is no round is part of the next round or of an all-reduce."""
+        """Return the ledger after an exchange.
+
+        Parameters
+        ----------
+        traffic : Traffic
+            Messages of the exchange.
+        is_round : bool
+            Whether robots wait for it. Otherwise it is part of the next round, or of an all-reduce.
+
+        Returns
+        -------
+        Ledger
+            The ledger with the messages, and with the round if it is one.
+        """
         after = self.after_round(traffic)
         return after if is_round else replace(after, rounds=self.rounds)
 
     def after_all_reduce(self, count: int) -> Ledger:
-        """Return the ledger after one more all-reduce of `count` numbers."""
+        """Return the ledger after one more all-reduce.
+
+        Parameters
+        ----------
+        count : int
+            How many numbers are summed up; 0 if their messages are counted as an exchange.
+
+        Returns
+        -------
+        Ledger
+            The ledger with the all-reduce and its bytes.
+        """
         num_bytes = 2 * BYTES_PER_NUMBER * count * self.num_robots
-        return replace(self, all_reduces=self.all_reduces + 1, all_reduce_bytes=self.all_reduce_bytes + num_bytes)
+        return replace(
+            self,
+            all_reduces=self.all_reduces + 1,
+            all_reduce_bytes=self.all_reduce_bytes + num_bytes,
+        )
+
+    def after_snapshots(self, num_bytes: int) -> Ledger:
+        """Return the ledger after snapshots.
+
+        Parameters
+        ----------
+        num_bytes : int
+            Payload of the snapshots in bytes.
+
+        Returns
+        -------
+        Ledger
+            The ledger with these bytes.
+        """
+        return replace(self, snapshot_bytes=self.snapshot_bytes + num_bytes)
 
     def joined(self, other: Ledger) -> Ledger:
-        """Return the account of this run and another of as many robots."""
+        """Return the account of this run and another together.
+
+        Parameters
+        ----------
+        other : Ledger
+            Account of another run, of as many robots.
+
+        Returns
+        -------
+        Ledger
+            Sums of both accounts.
+        """
         counted = dict(self.counted)
         for traffic, times in other.counted:
             counted[traffic] = counted.get(traffic, 0) + times
-        sums = self.rounds + other.rounds, self.all_reduces + other.all_reduces
-        return Ledger(self.num_robots, *sums, self.all_reduce_bytes + other.all_reduce_bytes, tuple(counted.items()))
+        return Ledger(
+            self.num_robots,
+            rounds=self.rounds + other.rounds,
+            all_reduces=self.all_reduces + other.all_reduces,
+            all_reduce_bytes=self.all_reduce_bytes + other.all_reduce_bytes,
+            counted=tuple(counted.items()),
+            snapshot_bytes=self.snapshot_bytes + other.snapshot_bytes,
+        )
 
     @property
     def messages(self) -> int:
-        """Messages in all, with those by which a driver sums; of other all-reduces `all_reduce_bytes` are counted."""
+        """Number of messages in all.
+
+        Messages by which a driver sums are among them; of other all-reduces `all_reduce_bytes` has
+        the bytes.
+        """
         return sum(times * len(traffic.sender) for traffic, times in self.counted)
 
     @property
     def num_bytes(self) -> int:
-        """Payload of all messages."""
+        """Payload of all messages in bytes."""
         return int(self.bytes_by_level.sum())
 
     @property
     def bytes_by_level(self) -> IntArray:
-        """Payload on every level of a tree of robots, (levels + 1,); first what is on none."""
+        """Bytes on every level of a tree of robots, (levels + 1,); entry 0 is outside the tree."""
         level = [traffic.level for traffic, _ in self.counted]
         payload = [times * int(traffic.num_bytes.sum()) for traffic, times in self.counted]
         return np.bincount(level, weights=payload, minlength=1).astype(np.int64)
 
     @property
     def bytes_sent(self) -> IntArray:
-        """Payload that every robot sent, (num_robots,)."""
+        """Bytes that every robot sent, (num_robots,)."""
         sender, _, _, num_bytes = self.by_link()
         return self._per_robot(sender, num_bytes)
 
     @property
     def bytes_received(self) -> IntArray:
-        """Payload that every robot received, (num_robots,)."""
+        """Bytes that every robot received, (num_robots,)."""
         _, receiver, _, num_bytes = self.by_link()
         return self._per_robot(receiver, num_bytes)
 
     def by_link(self) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-        """Sender, receiver, messages and bytes of every link that was used, each (links,), in order of the links."""
+        """Sum up messages and bytes of every link that was used.
+
+        Returns
+        -------
+        sender, receiver : ndarray, (links,)
+            Ends of the links, in ascending order; -1 stands for the driver.
+        messages : ndarray, (links,)
+            Number of messages.
+        num_bytes : ndarray, (links,)
+            Payload in bytes.
+        """
         if not self.counted:
             none = np.zeros(0, dtype=np.int64)
             return none, none, none, none
-        times = np.concatenate([np.full(len(traffic.sender), count) for traffic, count in self.counted])
+        times = np.concatenate(
+            [np.full(len(traffic.sender), count) for traffic, count in self.counted]
+        )
         sender = np.concatenate([traffic.sender for traffic, _ in self.counted])
         receiver = np.concatenate([traffic.receiver for traffic, _ in self.counted])
         num_bytes = np.concatenate([traffic.num_bytes for traffic, _ in self.counted]) * times
-        side = self.num_robots + 1  # the driver is -1
-        link, position = np.unique((sender + 1) * side + receiver + 1, return_inverse=True)
+        # A link as one number, in which the driver counts as 0 and robot a as a + 1.
+        num_parties = self.num_robots + 1
+        link_numbers = (sender + 1) * num_parties + receiver + 1
+        link, position = np.unique(link_numbers, return_inverse=True)
         messages = np.bincount(position, weights=times, minlength=len(link)).astype(np.int64)
         payload = np.bincount(position, weights=num_bytes, minlength=len(link)).astype(np.int64)
-        return link // side - 1, link % side - 1, messages, payload
+        return link // num_parties - 1, link % num_parties - 1, messages, payload
 
     def facts(self) -> list[tuple[str, str]]:
-        """Labels and figures, as they are printed."""
+        """List labels and figures as they are printed.
+
+        Returns
+        -------
+        list of (str, str)
+            Label and text of every line.
+        """
         both_ways = self.bytes_sent + self.bytes_received
-        return [
-            ("network", f"{self.rounds} rounds, {self.all_reduces} all-reduces, {self.messages} messages"),
-            ("bytes", f"{self.num_bytes:,}; of one robot {both_ways.min():,} to {both_ways.max():,}"),
-        ]
+        of_one = f"of one robot {both_ways.min():,} to {both_ways.max():,}"
+        counts = f"{self.rounds} rounds, {self.all_reduces} all-reduces, {self.messages} messages"
+        facts = [("network", counts), ("bytes", f"{self.num_bytes:,}; {of_one}")]
+        if self.snapshot_bytes:
+            target = "to the driver's process, interior poses among them"
+            facts.append(("snapshots", f"{self.snapshot_bytes:,} bytes {target}"))
+        return facts
 
     def _per_robot(self, robot: IntArray, num_bytes: IntArray) -> IntArray:
-        of_robots = robot != DRIVER
-        total = np.bincount(robot[of_robots], weights=num_bytes[of_robots], minlength=self.num_robots)
+        """Sum of `num_bytes` for every robot, (num_robots,), without the driver."""
+        is_robot = robot != DRIVER
+        total = np.bincount(robot[is_robot], weights=num_bytes[is_robot], minlength=self.num_robots)
         return total.astype(np.int64)
 
     def __repr__(self) -> str:

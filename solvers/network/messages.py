@@ -1,4 +1,7 @@
-"""Orders to workers: functions of a worker and a request. Requests and answers are numbers, arrays and records."""
+"""Orders to workers: functions of a worker and a request.
+
+Requests and answers are numbers, arrays and records.
+"""
 
 import enum
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -16,60 +19,93 @@ class Worker(Protocol):
     """One robot as an engine runs it."""
 
     def snapshot(self) -> Snapshot:
-        """All that earlier orders left here."""
+        """Return the state that earlier orders left in the worker.
+
+        Returns
+        -------
+        mapping of str to array
+            Arrays of any shape, by name.
+        """
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Go on from a snapshot."""
+        """Continue from a snapshot.
 
-
-def take_snapshot(worker: Worker, _: None) -> Snapshot:
-    """Order: all that earlier orders left with the worker."""
-    return worker.snapshot()
-
-
-def restore(worker: Worker, snapshot: Snapshot) -> None:
-    """Order: go on from a snapshot."""
-    worker.restore(snapshot)
+        Parameters
+        ----------
+        snapshot : mapping of str to array
+            Arrays by name, of the shapes that `snapshot` returned.
+        """
 
 
 class Idle(enum.Enum):
-    """In place of a request: the worker gets no order, and its answer is None."""
+    """Stands for a request: the worker gets no order, and its answer is None."""
 
     IDLE = "no order"
 
 
-def obey(workers: Sequence[Worker], order: Callable[[Any, Any], Any], requests: Sequence[object]) -> list[Any]:
-    """Answers of workers to an order; a PGOError of one stands for its answer, so that the others' are not lost."""
-
-    def obeyed(worker: Worker, request: object) -> Any:  # noqa: ANN401 - as the order has it
-        try:
-            return None if request is Idle.IDLE else order(worker, request)
-        except PGOError as error:
-            return error
-
-    return list(map(obeyed, workers, requests))
+def take_snapshot(worker: Worker, _: None) -> Snapshot:
+    """Order: return the state that earlier orders left in the worker."""
+    return worker.snapshot()
 
 
-def raised(answers: list[Any]) -> list[Any]:
-    """The answers; the first PGOError among them is raised."""
+def restore(worker: Worker, snapshot: Snapshot) -> None:
+    """Order: continue from a snapshot."""
+    worker.restore(snapshot)
+
+
+def snapshot_bytes(snapshots: Sequence[Snapshot]) -> int:
+    """Payload of snapshots in bytes."""
+    return sum(array.nbytes for snapshot in snapshots for array in snapshot.values())
+
+
+def obey(
+    workers: Sequence[Worker], order: Callable[[Any, Any], Any], requests: Sequence[object]
+) -> list[Any]:
+    """Answers of workers to an order, each with its request.
+
+    A PGOError that a worker raises takes the place of its answer, so that the answers of the other
+    workers are not lost; see `raise_first_error`.
+    """
+    return [
+        _answer(worker, order, request) for worker, request in zip(workers, requests, strict=True)
+    ]
+
+
+def _answer(worker: Worker, order: Callable[[Any, Any], Any], request: object) -> Any:  # noqa: ANN401 - the order chooses
+    if request is Idle.IDLE:
+        return None
+    try:
+        return order(worker, request)
+    except PGOError as error:
+        return error
+
+
+def raise_first_error(answers: list[Any]) -> list[Any]:
+    """Raise the first PGOError among the answers; return the answers if there is none."""
     for answer in answers:
         if isinstance(answer, PGOError):
             raise answer
     return answers
 
 
-def count_numbers(record: object, elsewhere: Collection[str] = ()) -> int:
-    """Numbers in a request or an answer; a mapping is between workers, and counted where it is handed on.
+def count_numbers(record: object, ignored_fields: Collection[str] = ()) -> int:
+    """Count the numbers that a request or an answer carries between a worker and the driver.
 
-    So are fields with names in `elsewhere`; those whose names begin with `measured` are off the ledger.
+    A mapping holds messages for other workers, which are counted when they are exchanged. Fields in
+    `ignored_fields` are counted elsewhere, and fields whose names begin with `measured` are off the
+    ledger.
     """
     if isinstance(record, np.ndarray):
         return record.size
     if record is None or isinstance(record, Mapping):
         return 0
-    if (names := getattr(type(record), "__dataclass_fields__", None)) is not None:
-        counted = [name for name in names if name not in elsewhere and not name.startswith("measured")]
-        return sum(count_numbers(getattr(record, name), elsewhere) for name in counted)
     if isinstance(record, tuple):
-        return sum(count_numbers(item, elsewhere) for item in record)
-    return int(np.size(record))  # type: ignore[arg-type] # a number or an array
+        return sum(count_numbers(item, ignored_fields) for item in record)
+    fields = getattr(type(record), "__dataclass_fields__", None)
+    if fields is None:
+        return int(np.size(record))  # type: ignore[arg-type] # a number or an array
+    total = 0
+    for name in fields:
+        if name not in ignored_fields and not name.startswith("measured"):
+            total += count_numbers(getattr(record, name), ignored_fields)
+    return total

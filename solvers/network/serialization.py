@@ -1,6 +1,6 @@
-"""Objects of ours as arrays, and back: what a robot or a driver remembers, to be sent or written without pickle.
+"""Records as arrays, and back: the state of a robot or a driver, sent or written without pickle.
 
-A tree in JSON says what the object is made of, and names the arrays in it by number.
+A tree in JSON describes the record, and refers to its arrays by number.
 """
 
 import dataclasses
@@ -16,29 +16,33 @@ _TREE = "tree"
 
 
 def serialize(value: object) -> dict[str, NDArray[Any]]:
-    """Arrays that `deserialize` makes an equal object of.
+    """Arrays of which `deserialize` makes an equal record.
 
-    The object is None, a number, a string, an array, an enum's member, a dataclass, a sequence of such, or a mapping of
-    strings or integers to such; a sequence comes back as a tuple. A TypeError when there is something else in it.
+    The record is None, a number, a string, an array, a member of an enum, a dataclass, a sequence
+    of such, or a mapping of strings or integers to such; a sequence comes back as a tuple. Raises a
+    TypeError if it contains anything else.
     """
     arrays: list[NDArray[Any]] = []
-    tree = json.dumps(_tree(value, arrays))
-    return {_TREE: np.array(tree), **{str(number): array for number, array in enumerate(arrays)}}
+    tree = json.dumps(_describe(value, arrays))
+    numbered = {str(number): array for number, array in enumerate(arrays)}
+    return {_TREE: np.array(tree), **numbered}
 
 
 def deserialize(arrays: Mapping[str, NDArray[Any]], classes: Sequence[type]) -> Any:  # noqa: ANN401 - whatever was serialized
-    """Object that `serialize` made the arrays of, of these dataclasses and enums; nothing else is ever made.
+    """Record of which `serialize` made the arrays.
 
-    A ValueError when the arrays are not those of `serialize`, or hold a class that is not among `classes`.
+    Only dataclasses and enums in `classes` are ever constructed. Raises a ValueError if the arrays
+    are not those of `serialize`, or contain a class that is not among `classes`.
     """
-    known = {one.__name__: one for one in classes}
+    class_of_name = {known.__name__: known for known in classes}
     try:
-        return _value(json.loads(str(arrays[_TREE])), arrays, known)
+        return _rebuild(json.loads(str(arrays[_TREE])), arrays, class_of_name)
     except (KeyError, TypeError, IndexError) as error:
         raise ValueError(f"arrays that were not serialized here: {error!r}") from error
 
 
-def _tree(value: object, arrays: list[NDArray[Any]]) -> object:
+def _describe(value: object, arrays: list[NDArray[Any]]) -> object:
+    """Describe a value as JSON; its arrays are appended to `arrays`."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int | float | str):
@@ -49,27 +53,37 @@ def _tree(value: object, arrays: list[NDArray[Any]]) -> object:
     if isinstance(value, enum.Enum):
         return {"enum": type(value).__name__, "member": value.name}
     if dataclasses.is_dataclass(value):
-        fields = {one.name: _tree(getattr(value, one.name), arrays) for one in dataclasses.fields(value)}
+        names = [field.name for field in dataclasses.fields(value)]
+        fields = {name: _describe(getattr(value, name), arrays) for name in names}
         return {"class": type(value).__name__, "fields": fields}
     if isinstance(value, Mapping):
         if not all(isinstance(key, str | int) for key in value):
             raise TypeError(f"cannot serialize the keys {list(value)!r}")
-        return {"keys": list(value), "values": [_tree(item, arrays) for item in value.values()]}
+        items = [_describe(item, arrays) for item in value.values()]
+        return {"keys": list(value), "values": items}
     if isinstance(value, Sequence):
-        return {"items": [_tree(item, arrays) for item in value]}
+        return {"items": [_describe(item, arrays) for item in value]}
     raise TypeError(f"cannot serialize {value!r}")
 
 
-def _value(tree: Any, arrays: Mapping[str, NDArray[Any]], known: Mapping[str, type]) -> Any:  # noqa: ANN401
+def _rebuild(
+    tree: Any,  # noqa: ANN401 - JSON
+    arrays: Mapping[str, NDArray[Any]],
+    class_of_name: Mapping[str, type],
+) -> Any:  # noqa: ANN401 - whatever was serialized
+    """Rebuild the value that `_describe` has described."""
     if not isinstance(tree, dict):
         return tree
     if "array" in tree:
         return np.array(arrays[str(tree["array"])])  # a copy, which may be written to
     if "enum" in tree:
-        return known[tree["enum"]][tree["member"]]  # type: ignore[index] # an enum's class
+        return class_of_name[tree["enum"]][tree["member"]]  # type: ignore[index] # an enum's class
     if "class" in tree:
-        fields = {name: _value(item, arrays, known) for name, item in tree["fields"].items()}
-        return known[tree["class"]](**fields)
+        fields = {}
+        for name, item in tree["fields"].items():
+            fields[name] = _rebuild(item, arrays, class_of_name)
+        return class_of_name[tree["class"]](**fields)
     if "keys" in tree:
-        return dict(zip(tree["keys"], (_value(item, arrays, known) for item in tree["values"]), strict=True))
-    return tuple(_value(item, arrays, known) for item in tree["items"])
+        values = [_rebuild(item, arrays, class_of_name) for item in tree["values"]]
+        return dict(zip(tree["keys"], values, strict=True))
+    return tuple(_rebuild(item, arrays, class_of_name) for item in tree["items"])

@@ -1,4 +1,4 @@
-"""Pictures of runs: residuals and gap over the iterations with the paper's mark; what methods spent."""
+"""Figures of a run: residuals and gap over the iterations, beside the gap of the paper."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from pgo_models.certificates.certificate import relative_gap
 from pgo_models.errors import SettingError
+from pgo_models.figures import rounded_up
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.published_results import PublishedRun
 from pgo_models.plots.interactive_plots import lay_out
@@ -24,14 +25,17 @@ if TYPE_CHECKING:
     from plotly.graph_objects import Figure as PlotlyFigure
 
 Stages = Sequence[tuple[str, History]]
-_MOST_MARKERS = 12
-_STAR_WITHIN = 3.0  # times our own iterations; a mark farther out is a line with its figures, lest it squeeze the rest
+_MAX_MARKERS = 12  # of a curve
+# Ratio of the paper's iterations to those of the run, up to which the paper's gap is a star. A star
+# farther to the right would squeeze the curves, so that a line is drawn instead.
+_MAX_STAR_RATIO = 3.0
 LINES = ("-", "--", ":", "-.")
-LOGARITHMIC = {"type": "log", "exponentformat": "power", "gridcolor": "#eeeeee", "zeroline": False}  # plotly's axis
+# Settings of an axis of plotly.
+LOGARITHMIC = {"type": "log", "exponentformat": "power", "gridcolor": "#eeeeee", "zeroline": False}
 
 
 class Effort(enum.Enum):
-    """What the progress of methods is held against; the value is the label of the axis."""
+    """Effort over which methods are compared; the value is the label of the axis."""
 
     ITERATIONS = "iterations"
     ROUNDS = "communication rounds"
@@ -41,15 +45,15 @@ class Effort(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A run to be compared: its history, the bound it is held against, and what it cost."""
+    """A run to be compared: its history, the bound for its gap, and its effort."""
 
     name: str
     history: History
     lower_bound: float  # proven for the graph, or the best value known
-    # rounds, num_bytes: (len(history),); communication up to every record.
+    # Communication up to every record, (len(history),).
     rounds: Array | None = None
     num_bytes: Array | None = None
-    place: int | None = None  # of its colour; its place in the figure unless given
+    place: int | None = None  # number of its colour; its position in the figure unless given
 
     def __post_init__(self) -> None:
         for label in ("rounds", "num_bytes"):
@@ -61,38 +65,52 @@ class Curve:
     @property
     def gap(self) -> Array:
         """(objective - lower_bound) / objective of every record."""
-        return np.array([relative_gap(objective, self.lower_bound) for objective in self.history.objective])
+        gaps = [relative_gap(cost, self.lower_bound) for cost in self.history.objective]
+        return np.array(gaps)
 
     def counts(self, effort: Effort) -> bool:
-        """Whether it is known what was spent."""
+        """Whether this effort was counted."""
         return self._efforts[effort] is not None
 
     def effort(self, effort: Effort) -> Array:
-        """What was spent up to every record; a SettingError when the curve does not know its communication."""
+        """Effort up to every record, (len(history),).
+
+        Raises a SettingError if the communication was not counted.
+        """
         if not self.counts(effort):
-            raise SettingError(f"{self.name} has no count of {effort.value}; give it to the Curve, or leave it out")
+            raise SettingError(
+                f"{self.name} has no count of {effort.value}; give it to the Curve, or leave it out"
+            )
         return np.asarray(self._efforts[effort], dtype=float)
 
     @property
     def _efforts(self) -> dict[Effort, Array | None]:
-        sent = {Effort.ROUNDS: self.rounds, Effort.BYTES: self.num_bytes}
-        return {Effort.ITERATIONS: self.history.k, Effort.SECONDS: self.history.seconds, **sent}
+        return {
+            Effort.ITERATIONS: self.history.k,
+            Effort.ROUNDS: self.rounds,
+            Effort.BYTES: self.num_bytes,
+            Effort.SECONDS: self.history.seconds,
+        }
 
 
-def plot_convergence(stages: Stages, lower_bound: float, published: PublishedRun | None = None) -> Figure:
-    """Figure of primal and dual residual, and of the gap (F - lower_bound) / F, over the iterations of stages in a row.
+def plot_convergence(
+    stages: Stages, lower_bound: float, published: PublishedRun | None = None
+) -> Figure:
+    """Figure of primal and dual residual, and of the gap (F - lower_bound) / F, over iterations.
 
-    Stages are for example `[(stage.name, stage.history) for stage in solution.stages]`; the later ones go on where the
-    earlier ones end. The paper's gap and iterations, if given, are a star; a line with the figures where these are far
-    to the right. A SettingError when no stage has a record.
+    Stages are for example `[(stage.name, stage.history) for stage in solution.stages]`; each of
+    them begins where the one before ends. The paper's gap and iterations, if given, are a star, or
+    a line with these figures if the star were far to the right. Raises a SettingError if no stage
+    has a record.
     """
-    run, begin = _with_records(stages), 0.0
+    run = _with_records(stages)
+    begin = 0.0
     with column_figure(height=1.3) as figure:
         above, below = figure.subplots(2, 1, sharex=True)
         for (name, history), colour, line in zip(run, cycle(COLOURS), cycle(LINES), strict=False):
             curve = Curve(name, history, lower_bound)
-            k, every = begin + history.k, max(1, len(history) // _MOST_MARKERS)
-            style = {"color": colour, "markevery": every}
+            k = begin + history.k
+            style = {"color": colour, "markevery": max(1, len(history) // _MAX_MARKERS)}
             _semilogy(above, k, history.primal_residual, f"{name}, primal", "o-", style)
             _semilogy(above, k, history.dual_residual, f"{name}, dual", "s--", style)
             _semilogy(below, k, curve.gap, f"{name}, gap", f"^{line}", style)
@@ -107,32 +125,55 @@ def plot_convergence(stages: Stages, lower_bound: float, published: PublishedRun
     return figure
 
 
-def explore_convergence(stages: Stages, lower_bound: float, published: PublishedRun | None = None) -> PlotlyFigure:
-    """Plotly figure of what `plot_convergence` shows: gap above, residuals below, figures under the pointer."""
-    run, begin = _with_records(stages), 0.0
+def explore_convergence(
+    stages: Stages, lower_bound: float, published: PublishedRun | None = None
+) -> PlotlyFigure:
+    """Plotly figure of the curves of `plot_convergence`: gap above, residuals below.
+
+    Figures are shown under the pointer.
+    """
+    run = _with_records(stages)
+    begin = 0.0
     figure = plotly("graph_objects").Figure()
     for (name, history), colour in zip(run, cycle(COLOURS), strict=False):
         k = begin + history.k
+        gap = Curve(name, history, lower_bound).gap
         for values, what, axis, dash, symbol in (
-            (Curve(name, history, lower_bound).gap, "gap", "y", "solid", "circle"),
+            (gap, "gap", "y", "solid", "circle"),
             (history.primal_residual, "primal residual", "y2", "solid", "square"),
             (history.dual_residual, "dual residual", "y2", "dash", "diamond"),
         ):
-            shown = np.isfinite(values) & (values > 0)
-            if shown.any():
-                line, marker = {"color": colour, "dash": dash}, {"symbol": symbol, "size": 6}
-                points = {"x": k[shown].tolist(), "y": [float(f"{value:.5g}") for value in values[shown]]}
-                label, mode = f"{name}: {what}", "lines+markers"
-                figure.add_scatter(**points, name=label, yaxis=axis, line=line, marker=marker, mode=mode)
+            is_visible = np.isfinite(values) & (values > 0)
+            if is_visible.any():
+                figure.add_scatter(
+                    x=k[is_visible].tolist(),
+                    y=[float(rounded_up(value, 5)) for value in values[is_visible]],
+                    name=f"{name}: {what}",
+                    yaxis=axis,
+                    line={"color": colour, "dash": dash},
+                    marker={"symbol": symbol, "size": 6},
+                    mode="lines+markers",
+                )
         begin = float(k[-1])
     if published is not None and published.gap > 0:
-        text = f"paper's SOC: {published.gap:.1e} after {published.iterations} iterations"
-        ends, line = [0.0, max(begin, 1.0)], {"color": ALARM_COLOUR, "dash": "dot"}
-        figure.add_scatter(x=ends, y=[published.gap, published.gap], name=text, mode="lines", line=line)
+        figure.add_scatter(
+            x=[0.0, max(begin, 1.0)],
+            y=[published.gap, published.gap],
+            name=f"paper's SOC: {published.gap:.1e} after {published.iterations} iterations",
+            mode="lines",
+            line={"color": ALARM_COLOUR, "dash": "dot"},
+        )
     lay_out(figure, "", legend_y=-0.14)
-    counted = {"dtick": 1} if begin < 10 else {}  # else plotly puts ticks between iterations
+    # Without this plotly would put ticks between few iterations.
+    ticks = {"dtick": 1} if begin < 10 else {}
     figure.update_layout(
-        xaxis={"title": {"text": "iteration"}, "anchor": "y2", "gridcolor": "#eeeeee", "zeroline": False, **counted},
+        xaxis={
+            "title": {"text": "iteration"},
+            "anchor": "y2",
+            "gridcolor": "#eeeeee",
+            "zeroline": False,
+            **ticks,
+        },
         yaxis={**LOGARITHMIC, "title": {"text": "relative gap"}, "domain": [0.54, 1.0]},
         yaxis2={**LOGARITHMIC, "title": {"text": "relative residual"}, "domain": [0.0, 0.46]},
     )
@@ -140,24 +181,32 @@ def explore_convergence(stages: Stages, lower_bound: float, published: Published
 
 
 def _with_records(stages: Stages) -> list[tuple[str, History]]:
+    """Stages that have a record; a SettingError if there is none."""
     run = [(name, history) for name, history in stages if len(history)]
     if not run:
-        raise SettingError("no stage has a record; give histories of runs that took at least their start")
+        raise SettingError(
+            "no stage has a record; give histories of runs that took at least their start"
+        )
     return run
 
 
-def _semilogy(axes: Axes, k: Array, values: Array, label: str, form: str, style: dict[str, object]) -> None:
-    """Draw what a logarithmic axis can show: zeros, nan and inf are left out."""
-    shown = np.isfinite(values) & (values > 0)
-    if shown.any():
-        axes.semilogy(k[shown], values[shown], form, label=label, **style)
+def _semilogy(
+    axes: Axes, k: Array, values: Array, label: str, form: str, style: dict[str, object]
+) -> None:
+    """Draw the values that a logarithmic axis can show: zeros, nan and inf are left out."""
+    is_visible = np.isfinite(values) & (values > 0)
+    if is_visible.any():
+        axes.semilogy(k[is_visible], values[is_visible], form, label=label, **style)
 
 
-def _mark(axes: Axes, published: PublishedRun, last: float) -> None:
+def _mark(axes: Axes, published: PublishedRun, last_iteration: float) -> None:
+    """Draw the paper's gap as a star, or as a line if its iterations are far to the right."""
     if published.gap <= 0:
         return
     text = f"paper's SOC: {published.gap:.1e} after {published.iterations}"
-    if published.iterations <= _STAR_WITHIN * max(last, 1.0):
-        axes.plot(published.iterations, published.gap, "*", color=ALARM_COLOUR, markersize=8, label=text)
+    if published.iterations <= _MAX_STAR_RATIO * max(last_iteration, 1.0):
+        axes.plot(
+            published.iterations, published.gap, "*", color=ALARM_COLOUR, markersize=8, label=text
+        )
     else:
         axes.axhline(published.gap, color=ALARM_COLOUR, linestyle=":", label=text)

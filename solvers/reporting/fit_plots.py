@@ -1,4 +1,4 @@
-"""A picture of how well edges fit: the histogram of their errors beside the one that their information expects."""
+"""Histogram of the errors of the edges, beside the one that their information matrices expect."""
 
 from typing import TYPE_CHECKING
 
@@ -14,34 +14,56 @@ from solvers.reporting.convergence_plots import LOGARITHMIC
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
-_BARS = 8  # a decade
-_LEAST, _MOST = -3, 2  # powers of ten where the first and the last bar end, which hold all beyond
+_BARS_PER_DECADE = 8
+# Powers of ten at which the first and the last bar end; errors beyond are in these bars.
+_SMALLEST_POWER = -3
+_LARGEST_POWER = 2
+_LEAST_SHOWN = 0.1  # edges, on the logarithmic axis
 
 
 def explore_fit(residuals: EdgeResiduals, d: int) -> "Figure":
-    """Plotly histogram of sqrt(cost / allowed) of the edges, and the line of as many errors as their matrices say.
+    """Plotly histogram of the errors sqrt(cost / allowed) of the edges, and the expected one.
 
-    Of such an error in d dimensions, cost / allowed is chi^2_p over its quantile 1 - FALSE_ALARM / m, with p = 3 or 6:
-    for chi2 exactly, for F where its weights are equal. Edges that may cost nothing are left out.
+    The expected histogram is a line. For errors as the information matrices say, in d dimensions,
+    cost / allowed is chi^2_p divided by its quantile 1 - FALSE_ALARM / m, with p = 3 or 6: exactly
+    for chi2, and for F if its weights are equal. Edges without an allowed cost are left out.
     """
-    counted = residuals.allowed > 0.0
-    size = np.log10(np.sqrt(np.maximum(residuals.cost[counted] / residuals.allowed[counted], 10.0 ** (2 * _LEAST))))
-    first = int(np.floor(size.min(initial=0.0)))
-    edges = first + np.arange(_BARS * (int(np.ceil(np.clip(size.max(initial=0.0), 0.0, _MOST))) - first) + 1) / _BARS
-    count, p = np.histogram(np.minimum(size, edges[-1]), edges)[0], tangent_dimension(d) + d
-    expected = len(size) * np.diff(chdtr(p, chdtri(p, FALSE_ALARM / max(len(counted), 1)) * 100.0**edges))
-    middles = (edges[:-1] + 0.5 / _BARS).tolist()
+    is_counted = residuals.allowed > 0.0
+    ratio = residuals.cost[is_counted] / residuals.allowed[is_counted]
+    # Decimal logarithms of the errors, and of the ends of the bars.
+    error = np.log10(np.sqrt(np.maximum(ratio, 10.0 ** (2 * _SMALLEST_POWER))))
+    first = int(np.floor(error.min(initial=0.0)))
+    last = int(np.ceil(np.clip(error.max(initial=0.0), 0.0, _LARGEST_POWER)))
+    ends = first + np.arange(_BARS_PER_DECADE * (last - first) + 1) / _BARS_PER_DECADE
+    count = np.histogram(np.minimum(error, ends[-1]), ends)[0]
+    p = tangent_dimension(d) + d
+    quantile = chdtri(p, FALSE_ALARM / max(len(error), 1))
+    expected = len(error) * np.diff(chdtr(p, quantile * 100.0**ends))
+
     figure = plotly("graph_objects").Figure()
-    for name, colour, shown in (("edges", COLOURS[0], edges[:-1] < 0.0), ("misfits", ALARM_COLOUR, edges[:-1] >= 0.0)):
+    middles = (ends[:-1] + 0.5 / _BARS_PER_DECADE).tolist()
+    is_misfit = ends[:-1] >= 0.0
+    for name, colour, shown in (
+        ("edges", COLOURS[0], ~is_misfit),
+        ("misfits", ALARM_COLOUR, is_misfit),
+    ):
         if count[shown].any():
-            figure.add_bar(x=middles, y=np.where(shown, count, 0).tolist(), name=name, marker={"color": colour})
-    curve = [float(f"{value:.4g}") if value > 0.1 else None for value in expected]
-    figure.add_scatter(x=middles, y=curve, name="as the matrices say", mode="lines", line={"color": COLOURS[5]})
+            heights = np.where(shown, count, 0).tolist()
+            figure.add_bar(x=middles, y=heights, name=name, marker={"color": colour})
+    curve = [float(f"{value:.4g}") if value > _LEAST_SHOWN else None for value in expected]
+    figure.add_scatter(
+        x=middles, y=curve, name="as the matrices say", mode="lines", line={"color": COLOURS[5]}
+    )
     lay_out(figure, "", legend_y=-0.25)
     figure.update_layout(bargap=0.05, barmode="stack")
-    tens = list(range(first, int(edges[-1]) + 1))
-    ticks = {"tickvals": tens, "ticktext": [f"10<sup>{power}</sup>" if power else "1" for power in tens]}
-    figure.update_xaxes(**ticks, title_text="error, in parts of what is allowed", zeroline=False)
-    top = float(np.log10(2.0 * max(1.0, count.max(initial=0), expected.max(initial=0.0))))
+    powers = list(range(first, int(ends[-1]) + 1))
+    figure.update_xaxes(
+        tickvals=powers,
+        ticktext=[f"10<sup>{power}</sup>" if power else "1" for power in powers],
+        title_text="error, in parts of what is allowed",
+        zeroline=False,
+    )
+    highest = max(1.0, count.max(initial=0), expected.max(initial=0.0))
+    top = float(np.log10(2.0 * highest))
     figure.update_yaxes(**LOGARITHMIC, dtick=1, title_text="edges", range=[-0.3, top])
     return figure

@@ -1,56 +1,98 @@
-"""What a pose graph is made of, in words and numbers."""
+"""Facts of a pose graph, in words and numbers: its size, its weights, and what a solve takes."""
 
 import numpy as np
 
+from pgo_models.figures import rounded_up
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import condition
+from pgo_models.graphs.precisions import condition, indefinite_edges, text_of_indefinite
 from pgo_models.graphs.residuals import Chi2Convention, chi2
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.reporting.versions import installed_versions
 
-_MUCH = 5e8  # bytes that are worth a word
+_WORTH_MENTIONING = 5e8  # bytes of memory
+_SHOWN_COMPONENTS = 5  # of which the sizes are listed
 
 
-def describe_graph(graph: PoseGraph) -> list[tuple[str, str]]:
-    """What `pgo info` says of a graph: label and text of every row."""
+def describe_graph(graph: PoseGraph, indefinite: str = "") -> list[tuple[str, str]]:
+    """Rows that `pgo info` prints of a graph: label and text of each.
+
+    `indefinite` is `text_of_indefinite` with a place in the file, if that is known.
+    """
+    is_indefinite = indefinite_edges(graph)
+    if is_indefinite.any() and not indefinite:
+        indefinite = text_of_indefinite(graph, is_indefinite)
+    rows = graph.facts()
+    components = graph.components()
+    sizes = ", ".join(str(len(part)) for part in components[:_SHOWN_COMPONENTS])
     degree = np.bincount(np.concatenate([graph.i, graph.j]), minlength=graph.num_poses)
-    rows, sizes = graph.facts(), [str(len(part)) for part in graph.components()]
-    parts, degrees = f"(sizes {', '.join(sizes[:5])})", f"{degree.min()} to {degree.max()}, mean {degree.mean():.2f}"
-    rows[4:5] = [("components", f"{len(sizes)} {parts}"), ("degree", degrees)]
-    rows[8:8] = _information_facts(graph)
-    if len(sizes) == 1:
-        problem, estimate = PGOProblem(graph), graph.initial
-        if estimate is not None:
-            rows.append(("F, estimate", f"{problem.objective(estimate):.8g}"))
-            if graph.information is not None:
-                rows += [(f"chi2, {one.name.lower()}", f"{chi2(graph, estimate, one):.8g}") for one in Chi2Convention]
-        rows.append(("F, tree", f"{problem.objective(spanning_tree_start(graph)):.8g}"))
-        note = memory_note(graph)
-        rows.append(("memory", note) if note else ("F, chordal", f"{problem.objective(chordal_start(problem)):.8g}"))
+    degrees = f"{degree.min()} to {degree.max()}, mean {degree.mean():.2f}"
+    rows[4:5] = [("components", f"{len(components)} (sizes {sizes})"), ("degree", degrees)]
+    information = _information_facts(graph)
+    if indefinite:
+        information.append(("chi2", f"none: {indefinite}"))
+    rows[8:8] = information
+    if len(components) == 1:
+        has_chi2 = graph.information is not None and not indefinite
+        rows += _cost_facts(graph, has_chi2)
     rows.append(("Cholesky", installed_versions(None)["cholesky"]))
     return rows
 
 
-def memory_note(graph: PoseGraph) -> str:
-    """How much memory a solve will take, in words; nothing where it is little.
+def _cost_facts(graph: PoseGraph, has_chi2: bool) -> list[tuple[str, str]]:
+    """Costs of the estimate and of the starts, or the memory that a solve takes if it is a lot."""
+    problem = PGOProblem(graph)
+    rows = []
+    estimate = graph.initial
+    if estimate is not None:
+        rows.append(("F, estimate", rounded_up(problem.objective(estimate), 8)))
+        if has_chi2:
+            for convention in Chi2Convention:
+                cost = rounded_up(chi2(graph, estimate, convention), 8)
+                rows.append((f"chi2, {convention.name.lower()}", cost))
+    rows.append(("F, tree", rounded_up(problem.objective(spanning_tree_start(graph)), 8)))
+    note = memory_note(graph)
+    if note:
+        rows.append(("memory", note))
+    else:
+        rows.append(("F, chordal", rounded_up(problem.objective(chordal_start(problem)), 8)))
+    return rows
 
-    About 600 (n + m) bytes and the Cholesky factor: 390 k log2 k bytes in the plane, 1250 k^(4/3) in space, as nested
-    dissection fills lattices, with k = min(n, 2 (m - n + 1)), the poses that are left where chains are eliminated. To
-    20 % on grid worlds of 10,000 to a million poses in the plane, to 50,000 in space; narrow graphs take less.
+
+def memory_note(graph: PoseGraph) -> str:
+    """How much memory a solve takes, in words; empty if it is little."""
+    needed = memory_of_a_solve(graph)
+    if needed <= _WORTH_MENTIONING:
+        return ""
+    return f"a solve takes about {1e-9 * needed:.2g} GB of memory"
+
+
+def memory_of_a_solve(graph: PoseGraph) -> float:
+    """Memory that a solve in one process takes, in bytes, beside the program and the graph.
+
+    It is about 600 (n + m) bytes, and the Cholesky factor: 390 k log2 k bytes in the plane,
+    1250 k^(4/3) in space, as nested dissection fills lattices. Here k = min(n, 2 (m - n + 1)) is
+    the number of poses that are left after chains are eliminated. The estimate is right to 20 % on
+    grid worlds of 10,000 to a million poses in the plane, and to 50,000 in space; narrow graphs
+    take less.
     """
-    n, m = graph.num_poses, graph.num_edges
+    n = graph.num_poses
+    m = graph.num_edges
     k = max(2, min(n, 2 * (m - n + 1)))
-    needed = 600.0 * (n + m) + (390.0 * k * np.log2(k) if graph.d == 2 else 1250.0 * k ** (4 / 3))
-    return f"a solve takes about {1e-9 * needed:.2g} GB of memory" if needed > _MUCH else ""
+    factor = 390.0 * k * np.log2(k) if graph.d == 2 else 1250.0 * k ** (4 / 3)
+    return float(600.0 * (n + m) + factor)
 
 
 def _information_facts(graph: PoseGraph) -> list[tuple[str, str]]:
+    """Rows on the blocks of the information matrices: translations, rotations, coupling."""
     if graph.information is None:
         return []
-    d, rows = graph.d, []
+    d = graph.d
+    rows = []
     for name, block in (("I_tt", slice(0, d)), ("I_rr", slice(d, None))):
         ratio = condition(graph.information[:, block, block])
-        rows.append((name, f"condition {np.median(ratio):.3g} in the median, at most {ratio.max():.3g}"))
-    coupled = int(graph.information[:, :d, d:].any(axis=(1, 2)).sum())
-    return [*rows, ("I_tr", f"not zero in {coupled} of {graph.num_edges} edges")]
+        text = f"condition {np.median(ratio):.3g} in the median, at most {ratio.max():.3g}"
+        rows.append((name, text))
+    is_coupled = graph.information[:, :d, d:].any(axis=(1, 2))
+    rows.append(("I_tr", f"not zero in {int(is_coupled.sum())} of {graph.num_edges} edges"))
+    return rows

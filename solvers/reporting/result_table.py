@@ -11,12 +11,14 @@ from itertools import zip_longest
 from pathlib import Path
 
 from pgo_models.errors import SettingError
+from pgo_models.figures import in_percent, rounded_up
 from pgo_models.files import replace_when_done
 
 Value = str | int | float | None
 TABLE_SUFFIXES = (".md", ".csv", ".json")
 _LABELS = ("graph", "method")  # heads of the columns that name a row
-_NARROWEST = 20  # characters of a remark
+_GAP = "  "  # between columns
+_NARROWEST_REMARK = 20  # characters
 
 
 @dataclass(frozen=True)
@@ -24,45 +26,74 @@ class TablePart:
     """A table of formatted cells."""
 
     heads: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]  # a cell for every head
+    rows: tuple[tuple[str, ...], ...]  # one cell for every head
     caption: str = ""  # above the table
-    texts: tuple[str, ...] = ("graph", "method", "remark")  # heads of the columns that are text and not figures
+    # Heads of the columns that are text, aligned to the left; figures are aligned to the right.
+    texts: tuple[str, ...] = ("graph", "method", "remark")
 
     def __post_init__(self) -> None:
         for row in self.rows:
             if len(row) != len(self.heads):
-                raise SettingError(f"row {row} has {len(row)} cells for {len(self.heads)} heads; give one each")
+                raise SettingError(
+                    f"row {row} has {len(row)} cells for {len(self.heads)} heads; give one each"
+                )
 
     @property
     def markdown(self) -> list[str]:
         """Lines of Markdown."""
-        caption = [f"**{self.caption}**", ""] if self.caption else []
-        rule = "|" + "|".join("---" if head in self.texts else "---:" for head in self.heads) + "|"
-        return [*caption, _markdown_row(self.heads), rule, *(_markdown_row(row) for row in self.rows), ""]
+        lines = [f"**{self.caption}**", ""] if self.caption else []
+        lines.append(_markdown_row(self.heads))
+        alignments = ["---" if head in self.texts else "---:" for head in self.heads]
+        lines.append("|" + "|".join(alignments) + "|")
+        lines += [_markdown_row(row) for row in self.rows]
+        return [*lines, ""]
 
     def lines(self, width: int) -> list[str]:
-        """Lines for a terminal so wide, in characters: columns that do not fit stand below, beside the labels again."""
-        columns = list(zip(self.heads, *self.rows, strict=True))
-        keys = [k for k, head in enumerate(self.heads) if head in _LABELS]
-        # Heads wrap at blanks, figures do not; a remark, the last column, wraps where the line ends.
-        need = [max(map(len, (*head.split(), *cells))) for head, *cells in columns]
-        blocks = [list(keys)]
-        for k in (k for k, (_, *cells) in enumerate(columns) if k not in keys and any(cells)):
-            if len(blocks[-1]) > len(keys) and sum(need[c] + 2 for c in blocks[-1]) + need[k] > width:
-                blocks.append(list(keys))
-            blocks[-1].append(k)
-        return [line for block in blocks for line in self._block(sorted(block), need, width)]
+        """Lines for a terminal with `width` columns of characters.
 
-    def _block(self, shown: list[int], need: list[int], width: int) -> list[str]:
-        room = {k: need[k] for k in shown}
-        room[shown[-1]] = min(need[shown[-1]], max(width - sum(need[k] + 2 for k in shown[:-1]), _NARROWEST))
+        Columns of the table that do not fit are shown below the others, again beside the labels.
+        """
+        needed = self._needed_widths()
+        labels = [k for k, head in enumerate(self.heads) if head in _LABELS]
+        blocks = [list(labels)]
+        for k in range(len(self.heads)):
+            is_empty = not any(row[k] for row in self.rows)
+            if k in labels or is_empty:
+                continue
+            width_with_column = sum(needed[c] + len(_GAP) for c in blocks[-1]) + needed[k]
+            has_columns = len(blocks[-1]) > len(labels)
+            if has_columns and width_with_column > width:
+                blocks.append(list(labels))
+            blocks[-1].append(k)
         lines = []
-        for row in (self.heads, tuple("-" * room.get(k, 0) for k in range(len(need))), *self.rows):
-            cells = [textwrap.wrap(row[k], room[k], break_long_words=False) for k in shown]
-            for words in zip_longest(*cells, fillvalue=""):
-                placed = zip(shown, words, strict=True)
-                aligned = (f"{word:{'<' if self.heads[k] in self.texts else '>'}{room[k]}}" for k, word in placed)
-                lines.append("  ".join(aligned).rstrip())
+        for block in blocks:
+            lines += self._block(sorted(block), needed, width)
+        return lines
+
+    def _needed_widths(self) -> list[int]:
+        """Characters that every column needs: of a figure all, of a head its longest word."""
+        widths = []
+        for k, head in enumerate(self.heads):
+            texts = [*head.split(), *(row[k] for row in self.rows)]
+            widths.append(max(map(len, texts)))
+        return widths
+
+    def _block(self, columns: list[int], needed: list[int], width: int) -> list[str]:
+        """Lines of some columns, the last of which, a remark, is wrapped at the width."""
+        *others, last = columns
+        widths = {k: needed[k] for k in columns}
+        room = width - sum(needed[k] + len(_GAP) for k in others)
+        widths[last] = min(needed[last], max(room, _NARROWEST_REMARK))
+        rules = tuple("-" * widths.get(k, 0) for k in range(len(self.heads)))
+        lines = []
+        for row in (self.heads, rules, *self.rows):
+            wrapped = [textwrap.wrap(row[k], widths[k], break_long_words=False) for k in columns]
+            for words in zip_longest(*wrapped, fillvalue=""):
+                cells = []
+                for k, word in zip(columns, words, strict=True):
+                    is_text = self.heads[k] in self.texts
+                    cells.append(word.ljust(widths[k]) if is_text else word.rjust(widths[k]))
+                lines.append(_GAP.join(cells).rstrip())
         return [*lines, ""]
 
 
@@ -71,14 +102,21 @@ class ResultTable:
     """Results in one or more tables for readers, and the figures behind them for programs."""
 
     parts: tuple[TablePart, ...]
-    records: tuple[dict[str, Value], ...]  # the same figures in full, for CSV and JSON: all with the same names
+    # The same figures in full, for CSV and JSON: all records have the same names.
+    records: tuple[dict[str, Value], ...]
     notes: tuple[str, ...] = ()  # sentences below the tables
 
     def print(self, width: int | None = None) -> None:
-        """Print within so many columns, those of the terminal unless given, or 80 where there is none."""
-        width = shutil.get_terminal_size().columns if width is None else width
+        """Print tables and notes within `width` columns.
+
+        They are those of the terminal unless given, or 80 if there is none.
+        """
+        if width is None:
+            width = shutil.get_terminal_size().columns
         for part in self.parts:
-            print("\n".join([part.caption] * bool(part.caption) + part.lines(width)))
+            if part.caption:
+                print(part.caption)
+            print("\n".join(part.lines(width)))
         for note in self.notes:
             print(textwrap.fill(note, width))
 
@@ -89,11 +127,12 @@ class ResultTable:
         return "\n".join(lines).rstrip("\n") + "\n"
 
     def csv(self) -> str:
-        """Return the records as CSV, figures in full, unknown ones empty."""
+        """Return the records as CSV, with figures in full and unknown ones empty."""
+        names = list(self.records[0]) if self.records else []
         text = io.StringIO()
-        writer = csv.DictWriter(text, list(self.records[0]) if self.records else [], lineterminator="\n")
+        writer = csv.DictWriter(text, names, lineterminator="\n")
         writer.writeheader()
-        writer.writerows({name: finite_or_none(value) for name, value in record.items()} for record in self.records)
+        writer.writerows(self._finite_records())
         return text.getvalue()
 
     def json(self) -> str:
@@ -101,37 +140,49 @@ class ResultTable:
         return json.dumps(self.as_json(), indent=1, allow_nan=False) + "\n"
 
     def as_json(self) -> dict[str, object]:
-        """Return records and notes; what is unknown or not finite is None."""
-        rows = [{name: finite_or_none(value) for name, value in record.items()} for record in self.records]
-        return {"rows": rows, "notes": list(self.notes)}
+        """Return records and notes; a value that is unknown or not finite is None."""
+        return {"rows": self._finite_records(), "notes": list(self.notes)}
+
+    def _finite_records(self) -> list[dict[str, Value]]:
+        return [
+            {name: finite_or_none(value) for name, value in record.items()}
+            for record in self.records
+        ]
 
     def save(self, path: Path | str) -> None:
-        """Write the table in the format that the suffix of `path` names: .md, .csv or .json; whole or not at all.
+        """Write the table in the format of the suffix of `path`: .md, .csv or .json.
 
-        Errors as `check_table_format` and `replace_when_done`.
+        The file is written whole or not at all. Errors are those of `check_table_format` and
+        `replace_when_done`.
         """
         path = Path(path)
         check_table_format(path)
-        text = {".md": self.markdown, ".csv": self.csv, ".json": self.json}[path.suffix.lower()]()
+        write = {".md": self.markdown, ".csv": self.csv, ".json": self.json}
+        text = write[path.suffix.lower()]()
         with replace_when_done(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
 
 
 def check_table_format(path: Path) -> None:
-    """Raise a SettingError when `ResultTable.save` knows no format for the suffix of `path`."""
+    """Raise a SettingError if `ResultTable.save` has no format for the suffix of `path`."""
     if path.suffix.lower() not in TABLE_SUFFIXES:
-        raise SettingError(f"cannot write {path}: no table has suffix {path.suffix!r}; use .md, .csv or .json")
+        raise SettingError(
+            f"cannot write {path}: no table has suffix {path.suffix!r}; use .md, .csv or .json"
+        )
 
 
 def gap_percent(gap: float) -> str:
-    """Gap in percent, two digits."""
-    return f"{100.0 * gap:.2g}"
+    """Gap in percent, two digits, rounded up."""
+    return rounded_up(in_percent(gap), 2)
 
 
 def finite_or_none(value: Value) -> Value:
-    """Value for a file, where what is unknown or not finite is nothing: JSON knows neither nan nor inf."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    """Value for a file: None if it is not finite, since JSON has neither nan nor inf."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def _markdown_row(cells: tuple[str, ...]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
+    escaped = [cell.replace("|", "\\|").replace("\n", " ") for cell in cells]
+    return "| " + " | ".join(escaped) + " |"

@@ -1,4 +1,4 @@
-"""Versions of what computed a result, for records."""
+"""Versions of the software that computed a result, for records."""
 
 import os
 import platform
@@ -20,21 +20,42 @@ def installed_version(distribution: str = _DISTRIBUTION) -> str:
 
 
 def installation() -> list[tuple[str, str]]:
-    """What `pgo info` says of this installation, label and text: versions, back ends, threads, and every extra."""
-    limits = (f"{name}={value}" for name, value in sorted(os.environ.items()) if name.endswith("_NUM_THREADS"))
-    rows = [*installed_versions(None).items(), ("threads", ", ".join([f"{os.cpu_count()} CPUs", *limits]))]
-    extras: dict[str, list[str]] = {}
+    """Rows that `pgo info` prints of this installation: label and text of each.
+
+    They are versions, back ends, threads, and the packages of every extra.
+    """
+    limits = []
+    for name, value in sorted(os.environ.items()):
+        if name.endswith("_NUM_THREADS"):
+            limits.append(f"{name}={value}")
+    rows = list(installed_versions(None).items())
+    rows.append(("threads", ", ".join([f"{os.cpu_count()} CPUs", *limits])))
+    for extra, packages in _packages_of_extras().items():
+        versions = [f"{name} {installed_version(name)}" for name in packages]
+        rows.append((f"extra {extra}", ", ".join(versions)))
+    return rows
+
+
+def _packages_of_extras() -> dict[str, list[str]]:
+    """Names of the packages that every extra requires; empty if this package is not installed."""
+    packages: dict[str, list[str]] = {}
     with suppress(metadata.PackageNotFoundError):
-        for needed in metadata.requires(_DISTRIBUTION) or ():
-            for name, extra in re.findall(r"""^([\w.-]+)[^\[]*; extra == ["'](\w+)""", needed):
-                extras.setdefault(extra, []).append(f"{name} {installed_version(name)}")
-    return rows + [(f"extra {extra}", ", ".join(found)) for extra, found in extras.items()]
+        for requirement in metadata.requires(_DISTRIBUTION) or ():
+            # for example: matplotlib>=3.8; extra == "plot"
+            pattern = r"""^([\w.-]+)[^\[]*; extra == ["'](\w+)"""
+            for name, extra in re.findall(pattern, requirement):
+                packages.setdefault(extra, []).append(name)
+    return packages
 
 
 def installed_versions(backend: CholeskyBackend | None) -> dict[str, str]:
-    """Versions of what computed a result, for records."""
-    names = (_DISTRIBUTION, "numpy", "scipy", "cvxpy", "clarabel")
-    found = {"python": platform.python_version(), **{name: installed_version(name) for name in names}}
-    chosen, kernels = backend or default_backend(), chosen_kernels()
-    has_kernels = chosen is CholeskyBackend.CHOLMOD and kernels
-    return {**found, "cholesky": f"{chosen.value}, {kernels} kernels" if has_kernels else chosen.value}
+    """Versions of the software that computed a result, by name."""
+    versions = {"python": platform.python_version()}
+    for name in (_DISTRIBUTION, "numpy", "scipy", "cvxpy", "clarabel"):
+        versions[name] = installed_version(name)
+    chosen = backend or default_backend()
+    kernels = chosen_kernels()
+    versions["cholesky"] = chosen.value
+    if chosen is CholeskyBackend.CHOLMOD and kernels:
+        versions["cholesky"] += f", {kernels} kernels"
+    return versions

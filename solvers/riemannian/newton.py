@@ -1,15 +1,23 @@
-"""Second stage: damped Riemannian Newton, or Gauss-Newton, with sparse Cholesky; F never rises (paper: after SOC)."""
+"""Second stage, after SOC: damped Riemannian Newton, or Gauss-Newton, with sparse Cholesky.
+
+F never rises but by rounding.
+"""
 
 from dataclasses import dataclass
 
-from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, PolishState, polish_step, start_polish
+from pgo_models.certificates.newton_polish import (
+    PolishState,
+    polish_step,
+    start_polish,
+)
+from pgo_models.certificates.newton_step import STATIONARY_DECREMENT, NewtonFigures
 from pgo_models.errors import check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.result import Measurement, Status
 
-SMALL = 1000  # poses in space
+SMALL = 1000  # poses in space up to which Newton alone is faster
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,13 +30,41 @@ class NewtonState:
 
 @dataclass(frozen=True)
 class Newton:
-    """Riemannian Newton on SE(d)^n (`pgo_models.certificates.newton_polish`), one factorisation a step.
+    """Riemannian Newton on SE(d)^n, one factorisation a step.
 
-    `dual_residual` is the relative Newton decrement: half its square, less the rounding level of F, over F.
+    `dual_residual` is the relative Newton decrement: half its square, less the rounding level of F,
+    over F (`pgo_models.certificates.newton_step`).
 
-    `tolerance` is on it: about the relative decrease of F that is left. Without `second_order` it is Gauss-Newton, the
-    second layer of the paper's method. With `secants` moves with one factorisation learn from those before (L-BFGS);
-    robots do without, as each learned one would cost them a reduction.
+    Parameters
+    ----------
+    tolerance : float
+        On `dual_residual`: about the relative decrease of F that is left.
+    max_iterations : int
+        Most factorisations.
+    second_order : bool
+        Whether the matrix is the Hessian; else it is Gauss-Newton, the second layer of the paper's
+        method.
+    secants : bool
+        Whether moves with one factorisation learn from those before (L-BFGS). Robots do without, as
+        each learned one would cost them a reduction.
+
+    Raises
+    ------
+    SettingError
+        If the tolerance is not positive, or `max_iterations` is negative.
+
+    References
+    ----------
+    P.-A. Absil, R. Mahony and R. Sepulchre, Optimization Algorithms on Matrix Manifolds, 2008,
+    chapter 6.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models import grid
+    >>> from solvers import run
+    >>> run(Newton(), grid(np.random.default_rng(0))).status.name
+    'CONVERGED'
     """
 
     tolerance: float = STATIONARY_DECREMENT
@@ -39,32 +75,70 @@ class Newton:
     def __post_init__(self) -> None:
         check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
 
+    @property
+    def share(self) -> float:
+        """How many times looser than usual the tolerance is."""
+        return self.tolerance / STATIONARY_DECREMENT
+
     def init(self, problem: PGOProblem, start: Poses | None) -> NewtonState:
         """State 0: `start`, or the chordal relaxation."""
-        poses, share = start if start is not None else chordal_start(problem), self.tolerance / STATIONARY_DECREMENT
-        return NewtonState(0, start_polish(problem, poses, share))
+        poses = start if start is not None else chordal_start(problem)
+        return NewtonState(0, start_polish(problem, poses, self.share))
 
     def step(self, problem: PGOProblem, state: NewtonState) -> NewtonState:
         """One factorisation and the moves it serves."""
-        return NewtonState(state.k + 1, polish_step(problem, state.polish, self.second_order, self.secants))
+        return NewtonState(
+            state.k + 1, polish_step(problem, state.polish, self.second_order, self.secants)
+        )
 
     def measure(self, problem: PGOProblem, state: NewtonState) -> Measurement:
         """F and the relative decrement."""
         return Measurement(state.polish.objective, 0.0, state.polish.decrement)
 
     def poses(self, problem: PGOProblem, state: NewtonState) -> Poses:
-        """Poses of the state."""
+        """Return the poses of a state.
+
+        Parameters
+        ----------
+        problem : PGOProblem
+            The problem that is solved.
+        state : NewtonState
+            A state of this method.
+
+        Returns
+        -------
+        Poses
+            Those whose F `measure` reports.
+        """
         return state.polish.poses
 
     def converged(self, state: NewtonState, measurement: Measurement) -> Status | None:
-        """CONVERGED within tolerance or where the gradient is rounding; STALLED when the last step could not move."""
-        if state.polish.is_stationary:
-            return Status.CONVERGED
-        return None if state.polish.moved else Status.STALLED
+        """As `newton_status` says."""
+        return newton_status(state.polish)
+
+
+def newton_status(figures: NewtonFigures) -> Status | None:
+    """Ending of a run of Newton: CONVERGED within tolerance or where the gradient is rounding.
+
+    STALLED when the last step could not move; None while it goes on.
+    """
+    if figures.is_stationary:
+        return Status.CONVERGED
+    return None if figures.moved else Status.STALLED
 
 
 def gauss_newton(max_iterations: int = Newton.max_iterations) -> Newton:
-    """Newton with the Gauss-Newton matrix instead of the Hessian.
+    """Return Newton with the Gauss-Newton matrix instead of the Hessian.
+
+    Parameters
+    ----------
+    max_iterations : int, optional
+        Most factorisations.
+
+    Returns
+    -------
+    Newton
+        The method, without secants.
 
     Examples
     --------
@@ -75,5 +149,8 @@ def gauss_newton(max_iterations: int = Newton.max_iterations) -> Newton:
 
 
 def needs_no_soc(problem: PGOProblem) -> bool:
-    """Whether Newton alone is faster from the chordal start: in the plane, where its matrix is no larger than SOC's."""
+    """Whether Newton alone is faster from the chordal start.
+
+    It is in the plane, where its matrix is no larger than SOC's, and on small graphs.
+    """
     return problem.d == 2 or problem.num_poses <= SMALL

@@ -1,4 +1,7 @@
-"""Truncated conjugate gradients: the minimum of a quadratic model in a trust region, roughly (Steihaug 1983)."""
+"""Truncated conjugate gradients: about the minimum of a quadratic model in a trust region.
+
+The method is Steihaug's (1983).
+"""
 
 import math
 from collections.abc import Callable
@@ -16,7 +19,8 @@ class TruncatedStep:
 
     step: Array  # of the shape of the gradient
     decrease: float  # what the model promises: -<g, s> - <s, H s> / 2, positive
-    length: float  # norm of the step in the preconditioner's metric, the one that measures the trust region
+    # norm of the step in the preconditioner's metric, the one that measures the trust region
+    length: float
     iterations: int  # products with H
     is_at_boundary: bool  # whether the region, or negative curvature, ended it
 
@@ -32,20 +36,26 @@ def truncated_conjugate_gradients(
 ) -> TruncatedStep:
     """Minimise <g, s> + <s, H s> / 2 over ||s||_P <= radius by preconditioned conjugate gradients.
 
-    It ends inside when the residual has fallen by the factor `forcing`, in the norm of P^-1, or its square
-    <r, P^-1 r> to `floor`, and at the boundary along the first direction that leaves the region or has no positive
-    curvature. H, `hessian`, is symmetric on the tangent space, P^-1, `precondition`, positive definite, too; the radius
-    is in the norm ||s||_P^2 = <s, P s>, in which the iterates grow (Steihaug 1983; Toint 1981; Conn, Gould & Toint,
-    Trust-Region Methods, algorithm 7.5.1).
+    It ends inside when the residual has fallen by the factor `forcing`, in the norm of P^-1, or its
+    square <r, P^-1 r> to `floor`, and at the boundary along the first direction that leaves the
+    region or has no positive curvature. H, `hessian`, is symmetric on the tangent space, P^-1,
+    `precondition`, positive definite, too; the radius is in the norm ||s||_P^2 = <s, P s>, in which
+    the iterates grow (Steihaug 1983; Toint 1981; Conn, Gould & Toint, Trust-Region Methods,
+    algorithm 7.5.1).
     """
-    step, H_step, residual = np.zeros_like(gradient), np.zeros_like(gradient), gradient
+    step = np.zeros_like(gradient)
+    H_step = np.zeros_like(gradient)
+    residual = gradient
     z = precondition(residual)
     direction = -z
     squared = inner(residual, z)
     enough = max(forcing**2 * squared, floor)
     # <s, s>, <s, p> and <p, p> in the norm of P, by recurrence: P itself is never applied.
-    step_step, step_direction, direction_direction = 0.0, 0.0, squared
-    iterations, is_at_boundary = 0, False
+    step_step = 0.0
+    step_direction = 0.0
+    direction_direction = squared
+    iterations = 0
+    is_at_boundary = False
     while squared > enough and iterations < max_iterations:
         H_direction = hessian(direction)
         iterations += 1
@@ -64,7 +74,8 @@ def truncated_conjugate_gradients(
             break
         residual = residual + length * H_direction
         z = precondition(residual)
-        previous, squared = squared, inner(residual, z)
+        previous = squared
+        squared = inner(residual, z)
         ratio = squared / previous
         step_direction = ratio * (step_direction + length * direction_direction)
         direction_direction = squared + ratio**2 * direction_direction

@@ -1,4 +1,9 @@
-"""Maximum cliques: a greedy set, then branch and bound with greedy colouring on bitsets (San Segundo et al. 2011)."""
+"""Maximum cliques: a greedy one, then branch and bound with greedy colouring on bitsets.
+
+The search follows San Segundo, Rodriguez-Losada & Jimenez, "An exact bit-parallel algorithm for the
+maximum clique problem", Computers & Operations Research 2011. A set of vertices is a Python
+integer, whose bit v says whether vertex v is in it.
+"""
 
 from __future__ import annotations
 
@@ -6,84 +11,116 @@ import numpy as np
 
 from pgo_models.geometry.rotations import BoolArray
 
-_MOST_COLOURINGS = 1_000_000  # of a vertex: a few seconds, and no clock, so that the same graph gives the same set
+# Colourings of a vertex, which take a few seconds. A limit of time would give the same graph
+# different cliques.
+_MOST_COLOURINGS = 1_000_000
 
 
-def maximum_clique(adjacent: BoolArray, most_colourings: int = _MOST_COLOURINGS) -> tuple[BoolArray, bool]:
+def maximum_clique(
+    adjacent: BoolArray, most_colourings: int = _MOST_COLOURINGS
+) -> tuple[BoolArray, bool]:
     """A largest set, (n,), of vertices that are all adjacent, and whether it is proven to be one.
 
-    Greedy: take out the vertex with the fewest neighbours left until all are adjacent. Vertices of too few neighbours
-    for a larger clique go, those adjacent to all others are in it; on the rest a greedy colouring bounds what every
-    branch can hold. `adjacent`, (n, n), is symmetric without a diagonal. Own code: networkx, in pure Python and no
-    dependency, takes the same exponential time without bitsets.
+    A greedy clique comes first. Vertices with too few neighbours for a larger one are left out,
+    those adjacent to all others are in it. On the rest branch and bound looks for a larger one,
+    where a greedy colouring bounds what every branch can hold. `adjacent`, (n, n), is symmetric
+    without a diagonal. The code is our own: networkx, in pure Python and no dependency, takes the
+    same exponential time without bitsets.
     """
-    found = _greedy(adjacent)
-    alive = np.ones(len(adjacent), dtype=bool)
-    while not (enough := adjacent[:, alive].sum(axis=1) >= found.sum())[alive].all():
-        alive &= enough
-    in_all = alive & (adjacent[:, alive].sum(axis=1) == alive.sum() - 1)
-    rest = np.flatnonzero(alive & ~in_all)
-    rest = rest[np.argsort(-adjacent[rest][:, rest].sum(axis=1), kind="stable")]
+    clique = greedy_clique(adjacent)
+    candidates = _with_enough_neighbours(adjacent, int(clique.sum()))
+    num_others = candidates.sum() - 1
+    in_all = candidates & (adjacent[:, candidates].sum(axis=1) == num_others)
+    rest = np.flatnonzero(candidates & ~in_all)
+    degree = adjacent[rest][:, rest].sum(axis=1)
+    rest = rest[np.argsort(-degree, kind="stable")]
     rows = np.packbits(adjacent[rest][:, rest], axis=1, bitorder="little")
     neighbours = [int.from_bytes(row.tobytes(), "little") for row in rows]
-    larger, is_proven = _branch(neighbours, int(found.sum() - in_all.sum()), most_colourings)
+    size_to_beat = int(clique.sum() - in_all.sum())
+    larger, is_proven = _branch(neighbours, size_to_beat, most_colourings)
     if larger:
-        found = in_all.copy()
-        found[rest[larger]] = True
-    return found, is_proven
+        clique = in_all.copy()
+        clique[rest[larger]] = True
+    return clique, is_proven
 
 
-def _greedy(adjacent: BoolArray) -> BoolArray:
-    kept, degree = np.ones(len(adjacent), dtype=bool), adjacent.sum(axis=1)
+def greedy_clique(adjacent: BoolArray) -> BoolArray:
+    """Vertices, (n,), that are all adjacent.
+
+    Vertices with the fewest neighbours are taken out until all are adjacent; then those adjacent to
+    all that are left are added.
+    """
+    clique = np.ones(len(adjacent), dtype=bool)
+    degree = adjacent.sum(axis=1)
     for count in range(len(adjacent), 0, -1):
-        worst = int(np.argmin(np.where(kept, degree, len(adjacent))))
+        worst = int(np.argmin(np.where(clique, degree, len(adjacent))))
         if degree[worst] == count - 1:
             break
-        kept[worst] = False
+        clique[worst] = False
         degree = degree - adjacent[worst]
-    while (more := adjacent[:, kept].all(axis=1) & ~kept).any():
-        kept[np.argmax(more)] = True
-    return kept
+    while True:
+        addable = adjacent[:, clique].all(axis=1) & ~clique
+        if not addable.any():
+            return clique
+        clique[np.argmax(addable)] = True
 
 
-def _branch(neighbours: list[int], best: int, most_colourings: int) -> tuple[list[int], bool]:
-    """A clique of more than `best` vertices, the largest, else none; and whether the search came to its end."""
-    found: list[int] = []
+def _with_enough_neighbours(adjacent: BoolArray, count: int) -> BoolArray:
+    """Vertices, (n,), that have at least `count` neighbours among these vertices."""
+    candidates = np.ones(len(adjacent), dtype=bool)
+    while True:
+        has_enough = adjacent[:, candidates].sum(axis=1) >= count
+        if has_enough[candidates].all():
+            return candidates
+        candidates &= has_enough
+
+
+def _branch(neighbours: list[int], best_size: int, most_colourings: int) -> tuple[list[int], bool]:
+    """A largest clique of more than `best_size` vertices, else none, and whether this is proven.
+
+    `levels` holds, for every vertex of the clique `chosen` and the next one, the vertices that may
+    follow, coloured, and the set of them. A clique has at most one vertex of each colour: where the
+    vertices chosen and the colours left are not more than the best size, the branch ends.
+    """
+    best: list[int] = []
     chosen: list[int] = []
-    everyone = (1 << len(neighbours)) - 1
-    levels = [(_coloured(neighbours, everyone), everyone)]
-    work = len(neighbours)
+    all_vertices = (1 << len(neighbours)) - 1
+    levels = [(_coloured(neighbours, all_vertices), all_vertices)]
+    num_coloured = len(neighbours)
     while levels:
         branches, candidates = levels.pop()
-        if not branches or len(chosen) + branches[-1][1] <= best:
+        if not branches or len(chosen) + branches[-1][1] <= best_size:
             if chosen:
                 chosen.pop()
             continue
         vertex, _ = branches.pop()
         levels.append((branches, candidates & ~(1 << vertex)))
         chosen.append(vertex)
-        if inner := candidates & neighbours[vertex]:
-            work += inner.bit_count()
-            if work > most_colourings:
-                return found, False
+        inner = candidates & neighbours[vertex]
+        if inner:
+            num_coloured += inner.bit_count()
+            if num_coloured > most_colourings:
+                return best, False
             levels.append((_coloured(neighbours, inner), inner))
             continue
-        if len(chosen) > best:
-            best, found = len(chosen), list(chosen)
+        if len(chosen) > best_size:
+            best_size = len(chosen)
+            best = list(chosen)
         chosen.pop()
-    return found, True
+    return best, True
 
 
 def _coloured(neighbours: list[int], candidates: int) -> list[tuple[int, int]]:
-    """(vertex, colour), ascending from 1; adjacent vertices differ, so that a clique has one of each colour at most."""
-    order, colour = [], 0
+    """Candidates as (vertex, colour), colours ascending from 1; adjacent vertices differ."""
+    order = []
+    colour = 0
     while candidates:
         colour += 1
-        apart = candidates
-        while apart:
-            lowest = apart & -apart
+        same_colour = candidates
+        while same_colour:
+            lowest = same_colour & -same_colour
             vertex = lowest.bit_length() - 1
             order.append((vertex, colour))
             candidates ^= lowest
-            apart &= ~(neighbours[vertex] | lowest)
+            same_colour &= ~(neighbours[vertex] | lowest)
     return order

@@ -1,23 +1,47 @@
-"""Which edges a robust solve kept and which it rejected, what it tried, and what its certificate is conditional on."""
+"""What a robust solve decided of every edge, and what its certificate is conditional on."""
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass
 
 import numpy as np
 
+from pgo_models.certificates.certificate import Verdict
+from pgo_models.figures import rounded_up
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.problem.problem import PGOProblem
 
-NEAR = 4.0  # r^2 / c^2 and its inverse: residuals within twice and half their threshold
-_NAMED = 5
+# Largest r^2 / c^2 of a doubtful edge, and the inverse of the least: residuals are within twice and
+# half their threshold.
+NEAR = 4.0
+# Edges that are named in a row of the summary, at most.
+_MAX_NAMED = 5
+# An attempt is a rival where its truncated cost is so little above that of the answer, relative,
+# and it keeps so many edges that the answer rejects: more than one, and more than this share of the
+# closures kept. The same share of rejected edges may be near their thresholds.
+_RIVAL_COST = 0.02
+_TOLERATED_SHARE = 0.05
+
+
+class Support(enum.Enum):
+    """What supports the edges that a robust solve kept, beside their certificate."""
+
+    CHECKED = (
+        "the closures kept agree with each other and with known edges, "
+        "and nothing speaks against them"
+    )
+    DOUBTFUL = "there are signs that right closures were rejected or wrong ones kept"
+    UNCHECKED = "the edges kept form a tree: nothing checks them"
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """One robust estimate: how many edges it rejects, and the gap of those that it keeps.
+    """Record of an attempt: how many edges it rejects, and the gap of those that it keeps.
 
-    `cost` is truncated: known inliers in full, of others at most the quantile of `GNC.quantile`.
+    `cost` is truncated: known inliers count in full, each other edge at most the quantile of
+    `GNC.quantile` times `Rejection.threshold_scale`. `others` is the number of edges that the
+    attempt keeps and the answer rejects.
     """
 
     name: str
@@ -26,15 +50,39 @@ class Attempt:
     gap: float
     is_certified: bool
     seconds: float
+    others: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Rejection:
-    """What a robust solve decided of every edge of `problem`, the whole one.
+    """Decision of a robust solve on every edge of `problem`, the whole one.
 
-    (m,) are `known`, the inliers given, `kept`, and `ratio`, r_e^2 / c_e^2 at the poses of the solution, with c_e^2 the
-    `quantile`, scaled. `start` names the attempt that was kept, `is_certified` says whether the edges kept are;
-    `places` are `file:line` of every edge, where they are known.
+    Parameters
+    ----------
+    problem : PGOProblem
+        Problem with all edges.
+    known : BoolArray, (m,)
+        Edges that were given as inliers.
+    kept : BoolArray, (m,)
+        Edges that the solution is of.
+    ratio : Array, (m,)
+        r_e^2 / c_e^2 at the poses of the solution, with c_e^2 the quantile, scaled.
+    quantile : float
+        Quantile of chi2 that thresholds are.
+    start : str
+        Name of the attempt that was kept.
+    attempts : tuple of Attempt
+        All attempts.
+    cost : float
+        Truncated cost of the kept attempt after revision.
+    threshold_scale : float
+        Factor of the thresholds.
+    verdict : Verdict
+        Verdict of the certificate of the kept edges.
+    is_misfit : bool
+        Whether the kept edges cost more together than right ones may.
+    places : tuple of str
+        `file:line` of every edge, where they are known.
     """
 
     problem: PGOProblem
@@ -44,7 +92,10 @@ class Rejection:
     quantile: float
     start: str
     attempts: tuple[Attempt, ...]
-    is_certified: bool
+    cost: float
+    threshold_scale: float
+    verdict: Verdict
+    is_misfit: bool
     places: tuple[str, ...] = ()
 
     @property
@@ -54,17 +105,98 @@ class Rejection:
 
     @property
     def doubtful(self) -> BoolArray:
-        """Edges, known ones aside, whose residual is between half and twice the threshold, (m,)."""
-        return np.asarray(~self.known & (self.ratio > 1.0 / NEAR) & (self.ratio < NEAR))
+        """Edges, not known ones, whose residual is between half and twice its threshold, (m,)."""
+        is_near = (self.ratio > 1.0 / NEAR) & (self.ratio < NEAR)
+        return np.asarray(~self.known & is_near)
+
+    @property
+    def is_certified(self) -> bool:
+        """Whether the edges kept are certified, whatever supports them."""
+        return self.verdict in (Verdict.CERTIFIED, Verdict.EXACT)
+
+    @property
+    def num_closures(self) -> int:
+        """Number of edges that are not known to be right."""
+        return int((~self.known).sum())
+
+    @property
+    def num_closures_kept(self) -> int:
+        """Number of edges kept that are not known to be right."""
+        return int((self.kept & ~self.known).sum())
+
+    @property
+    def num_cycles(self) -> int:
+        """Number of independent cycles among the edges kept; 0 where these form a tree."""
+        return int(self.kept.sum()) - (self.problem.num_poses - 1)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What speaks against the edges kept, in a few words each."""
+        doubts = []
+        num_rejected = self.num_closures - self.num_closures_kept
+        if 2 * num_rejected > self.num_closures:
+            share = f"{num_rejected} of {self.num_closures}"
+            doubts.append(f"more than half of the closures were rejected, {share}")
+        if self.is_misfit:
+            doubts.append("the edges kept do not fit together")
+        num_near = int((self.rejected & self.doubtful).sum())
+        if num_near > self._num_tolerated:
+            doubts.append(f"{num_near} rejected edges are near their thresholds")
+        rival = self._rival
+        if rival is not None:
+            kept_by = f"kept by an attempt of nearly the same cost, {rival.name}"
+            doubts.append(f"{rival.others} rejected edges are {kept_by}")
+        return tuple(doubts)
+
+    @property
+    def support(self) -> Support:
+        """What supports the edges kept."""
+        if self.num_cycles <= 0:
+            return Support.UNCHECKED
+        return Support.DOUBTFUL if self.doubts else Support.CHECKED
+
+    @property
+    def standing(self) -> Verdict | Support:
+        """Verdict on the answer: that of the certificate, unless the edges lack support."""
+        if self.support is Support.UNCHECKED:
+            return self.support
+        if self.support is Support.DOUBTFUL and self.is_certified:
+            return self.support
+        return self.verdict
+
+    @property
+    def held(self) -> str:
+        """How many closures constrain the map, in words."""
+        closures = f"{self.num_closures_kept} of {self.num_closures} closures"
+        return f"{closures} hold the map ({self.num_cycles} cycles)"
+
+    @property
+    def headline(self) -> str:
+        """What is proven of the edges kept, and what supports them; doubts come first."""
+        if self.support is Support.UNCHECKED:
+            return f"{self.support.name}, {self.support.value}; {self.held}"
+        edges = f"for all {len(self.kept)} edges"
+        if self.rejected.any():
+            edges = f"for the {int(self.kept.sum())} edges kept"
+        proven = f"{self.verdict.name} {edges}; {self.held}"
+        if not self.doubts:
+            return proven
+        doubts = "; ".join(self.doubts)
+        if not self.is_certified:
+            return f"{proven}; {doubts}"
+        return f"{self.support.name}, {doubts}: {proven}"
 
     @property
     def conditional(self) -> str:
         """What the certificate is conditional on, in a sentence."""
-        m, gone = len(self.kept), int(self.rejected.sum())
-        if not gone:
-            return f"All {m} edges are kept; that none of them is wrong is not proven."
-        bound = f"The bound is on the cost of the {m - gone} edges kept; {gone} of {m} were rejected"
-        return f"{bound}, and that the rejected edges are wrong is not proven, nor that all others are right."
+        num_edges = len(self.kept)
+        num_rejected = int(self.rejected.sum())
+        if not num_rejected:
+            return f"All {num_edges} edges are kept; that none of them is wrong is not proven."
+        bound = f"The bound is on the cost of the {num_edges - num_rejected} edges kept"
+        rejected = f"{num_rejected} of {num_edges} were rejected"
+        condition = "that the rejected edges are wrong is not proven"
+        return f"{bound}; {rejected}, and {condition}, nor that all others are right."
 
     @property
     def warning(self) -> str:
@@ -74,31 +206,104 @@ class Rejection:
         return "not certified after all attempts: the edges kept or the poses are probably wrong"
 
     def facts(self) -> list[tuple[str, str]]:
-        """Label and text of every row of a summary."""
-        each = [f"{one.name}: {one.rejected} rejected, cost {one.cost:.6g}, gap {one.gap:.1e}" for one in self.attempts]
-        gone = f"{self.named(self.rejected)}{'; written files are without them' if self.rejected.any() else ''}"
-        rows = [("given", self.conditional), ("rejected", gone)]
-        rows += [("doubtful", self.named(self.doubtful)), ("found by", self.start)]
-        rows += [("attempts", "; ".join(each))] if len(each) > 1 else []
-        return rows + ([("warning", self.warning)] if self.warning else [])
+        """Return the rows of a summary.
+
+        Returns
+        -------
+        list of (str, str)
+            Label and text of every row.
+        """
+        rejected = self.named(self.rejected)
+        if self.rejected.any():
+            rejected += "; written files are without them"
+        rows = [
+            ("given", self.conditional),
+            ("rejected", rejected),
+            ("doubtful", self.named(self.doubtful)),
+            ("found by", self.start),
+        ]
+        if len(self.attempts) > 1:
+            attempts = "; ".join(map(_summary, self.attempts))
+            rows.append(("attempts", attempts))
+        if self.warning:
+            rows.append(("warning", self.warning))
+        return rows
 
     def named(self, chosen: BoolArray) -> str:
-        """Number of chosen edges, (m,), and the first of them by name, with file and line where they are known."""
-        at, graph = np.flatnonzero(chosen), self.problem.graph
-        names = [f"{graph.edge_label(e)}{f' {self.places[e]}' if self.places else ''}" for e in at[:_NAMED].tolist()]
-        return f"{len(at)}{': ' if names else ''}{', '.join(names)}{', ..' if len(at) > _NAMED else ''}"
+        """Return how many edges are chosen, with the names of the first and their places in files.
+
+        Parameters
+        ----------
+        chosen : BoolArray, (m,)
+            The edges.
+
+        Returns
+        -------
+        str
+            Number and names.
+        """
+        edges = np.flatnonzero(chosen).tolist()
+        names = ", ".join(map(self._label, edges[:_MAX_NAMED]))
+        if not edges:
+            return "0"
+        ellipsis = ", .." if len(edges) > _MAX_NAMED else ""
+        return f"{len(edges)}: {names}{ellipsis}"
 
     def as_json(self) -> dict[str, object]:
-        """What `.json` files hold: edges by their place in the file, from 0."""
-        lines = {"rejected_lines": [self.places[e] for e in np.flatnonzero(self.rejected)]} if self.places else {}
+        """Return what `.json` files hold of it.
+
+        Returns
+        -------
+        dict
+            Edges by their place in the file, from 0, and the figures.
+        """
+        rejected = np.flatnonzero(self.rejected).tolist()
+        lines: dict[str, object] = {}
+        if self.places:
+            lines["rejected_lines"] = [self.places[e] for e in rejected]
         robust = {
             "doubtful": np.flatnonzero(self.doubtful).tolist(),
             "known": np.flatnonzero(self.known).tolist(),
             **lines,
             "quantile": self.quantile,
             "start": self.start,
-            "attempts": [dict(vars(one)) for one in self.attempts],
+            "attempts": [dict(vars(attempt)) for attempt in self.attempts],
             "conditional": self.conditional,
             "warning": self.warning,
+            "support": self.support.name,
+            "doubts": list(self.doubts),
+            "verdict_of_kept": self.verdict.name,
+            "closures": self.num_closures,
+            "closures_kept": self.num_closures_kept,
+            "cycles": self.num_cycles,
+            "truncated_cost": self.cost,
+            "threshold_scale": self.threshold_scale,
         }
-        return {"rejected": np.flatnonzero(self.rejected).tolist(), "robust": robust}
+        return {"rejected": rejected, "robust": robust}
+
+    @property
+    def _num_tolerated(self) -> float:
+        """Number of edges on which the answer may be in doubt without saying so."""
+        return max(1.0, _TOLERATED_SHARE * self.num_closures_kept)
+
+    @property
+    def _rival(self) -> Attempt | None:
+        """The cheapest attempt of nearly the same cost that keeps many rejected edges, if any."""
+        max_cost = (1.0 + _RIVAL_COST) * self.cost
+        rivals = [
+            attempt
+            for attempt in self.attempts
+            if attempt.cost <= max_cost and attempt.others > self._num_tolerated
+        ]
+        return min(rivals, key=lambda attempt: attempt.cost, default=None)
+
+    def _label(self, e: int) -> str:
+        """Name of an edge, with file and line where they are known."""
+        label = self.problem.graph.edge_label(e)
+        return f"{label} {self.places[e]}" if self.places else label
+
+
+def _summary(attempt: Attempt) -> str:
+    cost = rounded_up(attempt.cost, 6)
+    gap = rounded_up(attempt.gap, 2)
+    return f"{attempt.name}: {attempt.rejected} rejected, cost {cost}, gap {gap}"

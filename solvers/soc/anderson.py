@@ -1,13 +1,16 @@
-"""Over-relaxation and safeguarded Anderson acceleration of a fixed-point map (Walker & Ni 2011; Zhang et al. 2020).
+"""Over-relaxation and safeguarded Anderson acceleration of a fixed-point map s -> g(s).
 
     s' = g(s) - sum_k gamma_k dg_k,   gamma = argmin || f - sum_k gamma_k df_k ||,   f = g(s) - s
 
-over the last differences df_k of residuals and dg_k of images. The vectors may be spread over parties: each has its
-rows (`AndersonShare`), and sums over the parties give everybody the coefficients (`AndersonSums`).
+over the last differences df_k of residuals and dg_k of images (Walker & Ni 2011; Zhang et al.
+2020). The vectors may be spread over parties: each has its rows (`AndersonShare`), and sums over
+the parties give all of them the same coefficients (`AndersonSums`). `extrapolate` is the whole
+procedure where one party has all rows.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,22 +19,49 @@ from pgo_models.errors import check_settings
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.matrices import inner
 
-_SMALL = 3000  # numbers of a share up to which its differences are taken at once, from a copy
+# Shares of at most so many numbers take the products with all differences in one call of numpy,
+# from a copy; above it the copy costs more than the calls.
+_MAX_SIZE_OF_COPY = 3000
 
 
 def over_relax(new: Array, old: Array, alpha: float) -> Array:
-    """Alpha new + (1 - alpha) old (Boyd et al. 2011, section 3.4.3)."""
+    """Return alpha new + (1 - alpha) old (Boyd et al. 2011, section 3.4.3)."""
     return new if alpha == 1.0 else alpha * new + (1.0 - alpha) * old
 
 
 @dataclass(frozen=True)
 class Anderson:
-    """Settings of the acceleration.
+    """Settings of the Anderson acceleration.
 
-    `memory` past differences are combined, with a relative Tikhonov term, `regularization`; they are forgotten when the
-    residual exceeds `restart_ratio` times the smallest since they last were. With `per_robot` every robot extrapolates
-    its own rows with its own inner products, and nothing is summed over the robots; otherwise each round has one
-    all-reduce, of the products of the newest difference with all others.
+    Parameters
+    ----------
+    memory : int, at least 1
+        How many past differences are combined.
+    regularization : float
+        Relative Tikhonov term of the least-squares problem.
+    restart_ratio : float above 1
+        The differences are forgotten when the residual exceeds this many times the smallest one
+        since they last were.
+    per_robot : bool
+        Whether every robot extrapolates its own rows with its own inner products, so that nothing
+        is summed over the robots. Otherwise each round has one all-reduce, of the products of the
+        newest difference with all others.
+
+    Raises
+    ------
+    SettingError
+        If a setting is out of its range.
+
+    References
+    ----------
+    Walker & Ni, Anderson acceleration for fixed-point iterations, 2011.
+    Zhang, O'Donoghue & Boyd, Globally convergent type-I Anderson acceleration, 2020.
+
+    Examples
+    --------
+    >>> from solvers import SOC
+    >>> SOC(acceleration=Anderson(memory=10)).acceleration.memory
+    10
     """
 
     memory: int = 60
@@ -40,12 +70,17 @@ class Anderson:
     per_robot: bool = False
 
     def __post_init__(self) -> None:
-        check_settings(self, not_negative=["regularization"], at_least_one=["memory"], above_one=["restart_ratio"])
+        check_settings(
+            self,
+            not_negative=["regularization"],
+            at_least_one=["memory"],
+            above_one=["restart_ratio"],
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class AndersonShare:
-    """One party's rows of what the acceleration remembers: past differences of residuals and of images."""
+    """One party's rows of the past differences of residuals and of images."""
 
     residual_differences: tuple[Array, ...] = ()
     image_differences: tuple[Array, ...] = ()
@@ -55,60 +90,119 @@ class AndersonShare:
     def observe(self, residual: Array, image: Array, keep: int) -> tuple[Array, AndersonShare]:
         """Part of the sums, and the share with the newest of at most `keep` differences.
 
-        `residual`, (rows, d), may carry weights; `image`, (rows, d), not. The sums, (1 + 2 q,), are ||residual||^2;
-        newest . difference for the q differences, the newest last; difference . residual for them.
+        `residual`, (rows, d), may carry weights; `image`, (rows, d), does not. The sums, (1 + 2
+        q,), are ||residual||^2; newest . difference for the q differences, the newest last;
+        difference . residual for them.
         """
         share = self.after(residual, image, keep)
-        known = share.residual_differences
-        if known and residual.size <= _SMALL:
-            ends = np.array([known[-1], residual]).reshape(2, -1)
-            sums = np.einsum("kr,er->ek", np.array(known).reshape(len(known), -1), ends).ravel()
+        differences = share.residual_differences
+        if differences and residual.size <= _MAX_SIZE_OF_COPY:
+            newest_and_residual = np.array([differences[-1], residual]).reshape(2, -1)
+            flat_differences = np.array(differences).reshape(len(differences), -1)
+            products = np.einsum("kr,er->ek", flat_differences, newest_and_residual).ravel()
         else:
-            sums = np.array([inner(other, end) for end in (*known[-1:], residual) for other in known])
-        return np.append(inner(residual, residual), sums), share
+            others = (*differences[-1:], residual)
+            products = np.array(
+                [inner(difference, other) for other in others for difference in differences]
+            )
+        return np.append(inner(residual, residual), products), share
 
     def after(self, residual: Array, image: Array, keep: int) -> AndersonShare:
         """Return the share with the newest of at most `keep` differences."""
         if self.residual is None or self.image is None or not keep:
             return AndersonShare(residual=residual, image=image)
-        residuals = (*(self.residual_differences[-(keep - 1) :] if keep > 1 else ()), residual - self.residual)
-        images = (*(self.image_differences[-(keep - 1) :] if keep > 1 else ()), image - self.image)
-        return AndersonShare(residuals, images, residual, image)
+        num_old = min(keep - 1, len(self.residual_differences))
+        first = len(self.residual_differences) - num_old
+        return AndersonShare(
+            (*self.residual_differences[first:], residual - self.residual),
+            (*self.image_differences[first:], image - self.image),
+            residual,
+            image,
+        )
 
     def extrapolated(self, gamma: Array | None) -> tuple[Array, AndersonShare]:
-        """Rows of image - sum_k gamma_k dg_k, and the share; None is a plain step after which it starts anew."""
+        """Rows of image - sum_k gamma_k dg_k, and the share.
+
+        Without coefficients the step is plain, and where `gamma` is None the share forgets its
+        differences.
+        """
         assert self.image is not None
-        if gamma is None or not len(gamma):
-            return self.image, self if gamma is not None else AndersonShare(residual=self.residual, image=self.image)
-        known = self.image_differences[-len(gamma) :]
-        if self.image.size <= _SMALL:
-            return self.image - np.einsum("k,krd->rd", gamma, np.array(known)), self
+        if gamma is None:
+            return self.image, AndersonShare(residual=self.residual, image=self.image)
+        if not len(gamma):
+            return self.image, self
+        differences = self.image_differences[-len(gamma) :]
+        if self.image.size <= _MAX_SIZE_OF_COPY:
+            return self.image - np.einsum("k,k...->...", gamma, np.array(differences)), self
         following = self.image.copy()
-        for coefficient, difference in zip(gamma, known, strict=True):
+        for coefficient, difference in zip(gamma, differences, strict=True):
             following -= coefficient * difference
         return following, self
 
 
 @dataclass(frozen=True, eq=False)
 class AndersonSums:
-    """What all parties know: the Gram matrix of the differences, and the smallest residual since the last restart."""
+    """What all parties know: the Gram matrix of the differences, and the smallest residual."""
 
     gram: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    smallest: float = np.inf
+    smallest: float = np.inf  # since the last restart
 
-    def coefficients(self, settings: Anderson | None, sums: Array) -> tuple[Array | None, AndersonSums]:
-        """Coefficients gamma of the differences, none without settings; None is a restart: parties forget theirs."""
+    def coefficients(
+        self, settings: Anderson | None, sums: Array
+    ) -> tuple[Array | None, AndersonSums]:
+        """Coefficients gamma of the differences, from the sums of `AndersonShare.observe`.
+
+        There are none without settings; None is a restart, and the parties forget their
+        differences.
+        """
         if settings is None:
             return np.zeros(0), self
-        size = float(np.sqrt(sums[0]))
-        if size > settings.restart_ratio * self.smallest:
-            return None, AndersonSums(smallest=size)
-        count, smallest = len(sums) // 2, min(self.smallest, size)
-        if not count:
+        length = float(np.sqrt(sums[0]))
+        if length > settings.restart_ratio * self.smallest:
+            return None, AndersonSums(smallest=length)
+        smallest = min(self.smallest, length)
+        num_differences = len(sums) // 2
+        if not num_differences:
             return np.zeros(0), AndersonSums(smallest=smallest)
-        gram = np.empty((count, count))
-        gram[:-1, :-1] = self.gram[len(self.gram) - count + 1 :, len(self.gram) - count + 1 :]
-        gram[-1, :] = gram[:, -1] = sums[1 : 1 + count]
-        damped = gram + settings.regularization * np.trace(gram) * np.eye(count)
-        gamma = np.linalg.lstsq(damped, sums[1 + count :], rcond=None)[0]
+        products_of_newest = sums[1 : 1 + num_differences]
+        products_with_residual = sums[1 + num_differences :]
+        # The last rows and columns of the old matrix, without the difference that is dropped.
+        first_kept = len(self.gram) - num_differences + 1
+        gram = np.empty((num_differences, num_differences))
+        gram[:-1, :-1] = self.gram[first_kept:, first_kept:]
+        gram[-1, :] = products_of_newest
+        gram[:, -1] = products_of_newest
+        damped = gram + settings.regularization * np.trace(gram) * np.eye(num_differences)
+        gamma = np.linalg.lstsq(damped, products_with_residual, rcond=None)[0]
         return gamma, AndersonSums(gram, smallest)
+
+
+@dataclass(frozen=True, eq=False)
+class Extrapolation:
+    """The next s, the length of the residual, and what is remembered for the next step."""
+
+    image: Array
+    merit: float
+    share: AndersonShare
+    sums: AndersonSums
+
+
+def extrapolate(
+    settings: Anderson | None,
+    share: AndersonShare,
+    sums: AndersonSums,
+    residual: Array,
+    image: Array,
+) -> Extrapolation:
+    """Accelerate one step s -> g(s) of a party that has all rows.
+
+    `residual` is g(s) - s, with weights; `image` is g(s). The result is the image itself without
+    settings, and nan where the residual is not finite.
+    """
+    new_sums, share = share.observe(residual, image, 0 if settings is None else settings.memory)
+    merit = math.sqrt(new_sums[0])
+    if not math.isfinite(merit):
+        return Extrapolation(np.full_like(image, np.nan), merit, share, sums)
+    gamma, sums = sums.coefficients(settings, new_sums)
+    next_image, share = share.extrapolated(gamma)
+    return Extrapolation(next_image, merit, share, sums)

@@ -1,7 +1,8 @@
 """CONSENSUS: SOC by robots that hold copies, and send each other rows of the poses they share.
 
-Robots may be anywhere: in one place they are `LocalRobots`, on a network those of `solvers.distributed.consensus`. What
-one robot does is `solvers.soc.consensus_robot`; here is in which order, and what follows from sums over robots.
+`solvers.soc.consensus_robot` is what one robot does. `Consensus` calls the robots in turn and
+decides what follows from sums over them. The robots may be in one process (`LocalRobots`) or on a
+network (`solvers.distributed.consensus`).
 """
 
 import math
@@ -14,50 +15,79 @@ import numpy as np
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.stationarity import relative_length
 from solvers.network.counted_pool import Count, by_link, delivered
+from solvers.result import Measurement
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.copies import CopiesState, CopyLayout, RescaleCopies, Rows, SeparatorPenalty, Solved
-from solvers.soc.penalty import Due, MultiplierPenalty, PenaltyOrder, SharedSteps, next_penalty
+from solvers.soc.copies import (
+    CopiesState,
+    CopyLayout,
+    InitReply,
+    RescaleCopies,
+    Rows,
+    SeparatorPenalty,
+    SolveReply,
+    Stationarity,
+)
+from solvers.soc.penalty import MultiplierPenalty, PenaltyOrder
 from solvers.soc.recursion_block import Agreement, Rotations
+from solvers.soc.safeguard import Due, SharedSteps, next_penalty
 from solvers.soc.separator_stiffness import TRANSLATION_PENALTY, adapted_penalty, fell_most
 from solvers.soc.settings import SOCSettings
 from solvers.soc.subgraph import split_graph
 
 Q = TypeVar("Q")
 A = TypeVar("A")
-_RELAXED = 1e-6  # of m_i: penalty of rotations that nothing is asked of
+_PENALTY_OF_RELAXED = 1e-6  # rho_i / m_i of rotations that need not be rotations
 Order = Callable[[ConsensusRobot, Q], tuple[ConsensusRobot, A]]
 
 
 class Robots(Protocol):
-    """All robots, wherever they are."""
+    """All robots, in one process or on a network."""
 
     @property
     def num_robots(self) -> int:
         """How many there are."""
 
     def begin(self, is_first: bool) -> list[Rows]:
-        """Give all robots the poses to start at, or to go on from; what they send each other then."""
+        """Let all robots start at given poses, or at their own; return what each of them sends."""
 
     def ask(self, order: Order[Q, A], requests: Sequence[Q], count: Count) -> list[A]:
-        """Answers of all robots to an order, each with its request."""
+        """Return the answers of all robots to an order, each with its request."""
 
-    def hand_on(self, sent: Sequence[Mapping[int, A]]) -> list[Mapping[int, A]]:
-        """What every robot receives, by its sender, of what each sent, by its receiver."""
+    def exchange(self, sent: Sequence[Mapping[int, A]]) -> list[Mapping[int, A]]:
+        """Deliver what every robot sent, by receiver; return what every robot gets, by sender."""
 
 
 def ask_all(robots: Robots, order: Order[Q, A], request: Q, count: Count) -> list[A]:
-    """Answers of all robots to an order with one request."""
+    """Return the answers of all robots to an order with the same request."""
     return robots.ask(order, [request] * robots.num_robots, count)
 
 
 @dataclass(frozen=True, eq=False)
 class ConsensusState(SharedSteps):
-    """Iterate k: the sums that all robots know; the iterates are theirs."""
+    """Iterate k: the sums that all robots know; x, z and B are with the robots.
+
+    Parameters
+    ----------
+    separators : SeparatorPenalty
+        Penalties of the separators.
+    objective : float
+        F at the poses that the robots hold, omega and the translations agreed on.
+    gradient : float
+        Relative gradient of F there.
+    rotation_square : float
+        Sum of `rotation_squares`, to which the gradient is relative.
+    ahead : array or None
+        Sums of the next step (a), unless the penalties change before.
+    rows : sequence of Rows
+        Rows of the next step (a), as their receivers have them.
+    """
 
     separators: SeparatorPenalty
-    objective: float = math.nan  # F at omega and the translations at hand, where that is known with the step
-    # Of the next step (a), unless the penalties change before: sums, and rows as their receivers have them.
+    objective: float
+    gradient: float
+    rotation_square: float
     ahead: Array | None = None
     rows: Sequence[Rows] = ()
 
@@ -66,104 +96,176 @@ class ConsensusState(SharedSteps):
 class Consensus:
     """The recursion by robots, from the poses that they begin at.
 
-    An iteration is one exchange: a round between neighbours, and with it one all-reduce, of the residuals and, for the
-    next iterate, the sums of the acceleration, of which only the merit is left where every robot accelerates alone.
+    An iteration is one exchange: a round between neighbours, and with it one all-reduce, of the
+    residuals and, for the next iterate, the sums of the acceleration, of which only the merit is
+    left where every robot accelerates alone.
     """
 
-    soc: SOCSettings  # settings; its coupling and robots are not looked at
+    soc: SOCSettings  # its coupling and robots are not used
     rotations: Rotations = Rotations.PROJECTED
 
     def init(self, robots: Robots, before: ConsensusState | None = None) -> ConsensusState:
-        """State 0: omega at hand, B in balance, separators as `before`; two rounds for poses, penalties and forces."""
-        rows = robots.hand_on(robots.begin(before is None))
-        answers = robots.ask(ConsensusRobot.multiplier_norms, rows, Count.GATHER)
-        norms = np.concatenate([answer.norms / answer.scale for answer in answers])
+        """State 0: omega at the robots' poses, B in balance, separator penalties as in `before`.
+
+        It takes two rounds, for poses and for penalties and forces.
+        """
+        sent_poses = robots.begin(is_first=before is None)
+        received_poses = robots.exchange(sent_poses)
+        norms = robots.ask(ConsensusRobot.multiplier_norms, received_poses, Count.GATHER)
+        ratio = np.concatenate([answer.norms / answer.scale for answer in norms])
         has_multipliers = isinstance(self.soc.penalty, MultiplierPenalty)
         is_stationary = (has_multipliers and robots.num_robots > 1) or before is not None
-        order = self.soc.penalty_order(norms, is_stationary)
-        if self.rotations is not Rotations.PROJECTED:
-            least = _RELAXED if self.rotations is Rotations.RELAXED else 1.0
-            order = PenaltyOrder(0.0, least, 0.0, settings=replace(order.settings, rotations=self.rotations))
-        known = robots.hand_on(ask_all(robots, ConsensusRobot.penalize, order, Count.PIGGYBACKED))
-        stiffness = float(np.median(robots.ask(ConsensusRobot.stiffness, known, Count.GATHER)))
-        given = self.soc.translation_penalty
-        translation = given if given is not None else TRANSLATION_PENALTY * stiffness
-        separators = before.separators if before is not None else self._separators(translation)
-        started = ask_all(robots, ConsensusRobot.start, separators, Count.GATHER)
-        size = math.sqrt(math.fsum(answer.size for answer in started))
-        ratio = np.concatenate([answer.ratio for answer in started])
-        return ConsensusState(ratio=ratio, size=size, separators=separators)
+        order = self._penalty_order(ratio, is_stationary)
+        sent_penalties = ask_all(robots, ConsensusRobot.penalize, order, Count.PIGGYBACKED)
+        received_penalties = robots.exchange(sent_penalties)
+        stiffness = robots.ask(ConsensusRobot.stiffness, received_penalties, Count.GATHER)
+        if before is not None:
+            separators = before.separators
+        else:
+            separators = self._separators_of_stiffness(float(np.median(stiffness)))
+        replies = ask_all(robots, ConsensusRobot.start, separators, Count.GATHER)
+        return _first_state(separators, replies)
 
     def step(self, robots: Robots, state: ConsensusState) -> ConsensusState:
-        """One exchange: (b) and (c) on every robot, and (a) of the next step."""
-        due = state if self.rotations is not Rotations.PROJECTED else self._with_penalty_due(robots, state)
-        if due is not state or state.ahead is None:
-            state = _solved(robots, due, ask_all(robots, ConsensusRobot.solve, None, Count.ALL_REDUCE))  # (a)
+        """Make one exchange: (b) and (c) on every robot, and (a) of the next step."""
+        with_penalty = state
+        if self.rotations is Rotations.PROJECTED:
+            with_penalty = self._with_due_penalty(robots, state)
+        if with_penalty is not state or state.ahead is None:
+            solved = ask_all(robots, ConsensusRobot.solve, None, Count.ALL_REDUCE)  # (a)
+            state = _with_solution(robots, with_penalty, solved)
         assert state.ahead is not None
         merit = math.sqrt(state.ahead[0])
         if not math.isfinite(merit):
             return state.broken()
-        together = self.soc.acceleration if self.soc.step_settings.alone is None else None
-        gamma, anderson = state.sums.coefficients(together, state.ahead)
+        is_per_robot = self.soc.step_settings.alone is not None
+        acceleration = None if is_per_robot else self.soc.acceleration
+        gamma, anderson = state.sums.coefficients(acceleration, state.ahead)
         agreement = Agreement(gamma, state.is_best(merit))
         orders = [(agreement, rows) for rows in state.rows]
         answers = robots.ask(ConsensusRobot.step, orders, Count.ALL_REDUCE)  # (b), (c)
         squares = np.sum([answer.squares for answer in answers], axis=0)
-        objective = math.fsum(answer.measured for answer in answers)
-        following = replace(state.after(merit, squares, state.size, anderson), objective=objective)
-        return _solved(robots, following, [answer.solved for answer in answers])
+        stationarities = [answer.stationarity for answer in answers]
+        objective, gradient = objective_and_gradient(stationarities, state.rotation_square)
+        following = state.after(merit, squares, state.size, anderson)
+        following = replace(following, objective=objective, gradient=gradient)
+        return _with_solution(robots, following, [answer.solved for answer in answers])
 
-    def _with_penalty_due(self, robots: Robots, state: ConsensusState) -> ConsensusState:
-        """State with the penalty that the rule, or the safeguard, wants from now on; mostly the state itself."""
+    def measurement(self, state: ConsensusState) -> Measurement:
+        """F at the poses that the robots hold, and the residuals.
+
+        The dual residual is the relative gradient of F. Where rotations are relaxed or fixed F is
+        not what is minimised, and the dual residual is that of the recursion.
+        """
+        if math.isnan(state.primal_residual):
+            return Measurement(math.nan, math.nan, math.nan)
+        is_projected = self.rotations is Rotations.PROJECTED
+        dual_residual = state.gradient if is_projected else state.dual_residual
+        return Measurement(state.objective, state.primal_residual, dual_residual)
+
+    def _with_due_penalty(self, robots: Robots, state: ConsensusState) -> ConsensusState:
+        """State with the penalty that the rule or the safeguard asks for; usually unchanged."""
         due, factor = next_penalty(self.soc.penalty, state.ratio, state)
         if due is Due.RAISE:
-            return replace(self._rescaled(robots, state, factor, from_best=True), raises=state.raises + 1)
-        if due in (Due.REFRESH, Due.SECOND_LOOK):
-            adapted = self._adapted(robots, state)
-            if due is Due.REFRESH or fell_most(state.separators.translation, adapted.separators.translation):
-                return self.init(robots, adapted).in_place_of(state)
+            rescaled = self._rescaled(robots, state, factor, from_best=True)
+            return replace(rescaled, raises=state.raises + 1)
         if due is Due.RESCALE:
-            return replace(self._rescaled(robots, state, factor, from_best=False), refreshes=state.refreshes + 1)
+            rescaled = self._rescaled(robots, state, factor, from_best=False)
+            return replace(rescaled, refreshes=state.refreshes + 1)
+        if due in (Due.REFRESH, Due.RECHECK):
+            adapted = self._adapted(robots, state)
+            penalty_before = state.separators.translation
+            penalty_after = adapted.separators.translation
+            if due is Due.REFRESH or fell_most(penalty_before, penalty_after):
+                return self.init(robots, adapted).in_place_of(state)
         return state
 
+    def _penalty_order(self, ratio: Array, is_stationary: bool) -> PenaltyOrder:
+        """Rule of rho, from ||Lambda_i||_2 / m_i; a fixed one unless rotations are projected."""
+        order = self.soc.penalty_order(ratio, is_stationary)
+        if self.rotations is Rotations.PROJECTED:
+            return order
+        per_scale = _PENALTY_OF_RELAXED if self.rotations is Rotations.RELAXED else 1.0
+        settings = replace(order.settings, rotations=self.rotations)
+        return PenaltyOrder(0.0, per_scale, 0.0, settings=settings)
+
+    def _separators_of_stiffness(self, stiffness: float) -> SeparatorPenalty:
+        if self.soc.translation_penalty is not None:
+            return self._separators(self.soc.translation_penalty)
+        return self._separators(TRANSLATION_PENALTY * stiffness)
+
     def _separators(self, translation: float) -> SeparatorPenalty:
-        is_held = self.rotations is Rotations.RELAXED or isinstance(self.soc.penalty, MultiplierPenalty)
-        return SeparatorPenalty(translation, self.soc.separator_penalty_for(translation) if is_held else 0.0)
+        has_multipliers = isinstance(self.soc.penalty, MultiplierPenalty)
+        if self.rotations is Rotations.RELAXED or has_multipliers:
+            return SeparatorPenalty(translation, self.soc.separator_penalty_for(translation))
+        return SeparatorPenalty(translation, 0.0)
 
     def _adapted(self, robots: Robots, state: ConsensusState) -> ConsensusState:
-        """State with the penalties of separators that the way so far suggests."""
+        """State with separator penalties adapted to how far their translations have gone."""
         if self.soc.translation_penalty is not None or robots.num_robots == 1:
             return state
         sums = np.sum(ask_all(robots, ConsensusRobot.travel, None, Count.ALL_REDUCE), axis=0)
-        return replace(state, separators=self._separators(adapted_penalty(state.separators.translation, sums)))
+        translation = adapted_penalty(state.separators.translation, sums)
+        return replace(state, separators=self._separators(translation))
 
-    def _rescaled(self, robots: Robots, state: ConsensusState, factor: float, from_best: bool) -> ConsensusState:
+    def _rescaled(
+        self, robots: Robots, state: ConsensusState, factor: float, from_best: bool
+    ) -> ConsensusState:
         """State with factor * rho and the same unscaled multiplier rho B."""
         order = RescaleCopies(factor, state.separators.translation, None)
         orders = [order] * robots.num_robots
         if from_best:
             sent = ask_all(robots, ConsensusRobot.back_at_best, None, Count.PIGGYBACKED)
-            orders = [replace(order, rows=rows) for rows in robots.hand_on(sent)]
+            orders = [replace(order, rows=rows) for rows in robots.exchange(sent)]
         robots.ask(ConsensusRobot.rescale, orders, Count.PIGGYBACKED)
         return state.rescaled(factor)
 
 
-def _solved(robots: Robots, state: ConsensusState, answers: Sequence[Solved]) -> ConsensusState:
-    """State with what step (a) gave, handed on."""
-    rows = robots.hand_on([answer.rows for answer in answers])
-    return replace(state, ahead=np.sum([answer.sums for answer in answers], axis=0), rows=rows)
+def objective_and_gradient(
+    parts: Sequence[Stationarity], rotation_square: float
+) -> tuple[float, float]:
+    """F and its relative gradient at the poses that all robots hold, from their sums."""
+    objective = math.fsum(part.cost for part in parts)
+    gradient_square = math.fsum(part.gradient for part in parts)
+    return objective, relative_length(gradient_square, objective, rotation_square)
 
 
-# In one place.
+def _first_state(separators: SeparatorPenalty, replies: Sequence[InitReply]) -> ConsensusState:
+    parts = [reply.stationarity for reply in replies]
+    rotation_square = math.fsum(part.rotations for part in parts if part.rotations is not None)
+    objective, gradient = objective_and_gradient(parts, rotation_square)
+    return ConsensusState(
+        ratio=np.concatenate([reply.ratio for reply in replies]),
+        size=math.sqrt(math.fsum(reply.size for reply in replies)),
+        separators=separators,
+        objective=objective,
+        gradient=gradient,
+        rotation_square=rotation_square,
+    )
+
+
+def _with_solution(
+    robots: Robots, state: ConsensusState, answers: Sequence[SolveReply]
+) -> ConsensusState:
+    """State with the result of step (a), whose rows are delivered to the neighbours."""
+    rows = robots.exchange([answer.rows for answer in answers])
+    sums = np.sum([answer.sums for answer in answers], axis=0)
+    return replace(state, ahead=sums, rows=rows)
+
+
+# In one process.
 
 
 @dataclass(eq=False)
 class LocalRobots:
-    """Robots in one place, for one step: an order replaces them, and leaves those of the step before alone."""
+    """Robots in one process, for one step.
+
+    An order replaces them, and leaves the robots of the step before alone.
+    """
 
     problem: PGOProblem
     robots: tuple[ConsensusRobot, ...]
-    start: Poses | None = None  # where they begin; they go on from omega with the best translations for it
+    start: Poses | None = None  # where they begin, in the first step
 
     @property
     def num_robots(self) -> int:
@@ -171,26 +273,28 @@ class LocalRobots:
         return len(self.robots)
 
     def begin(self, is_first: bool) -> list[Rows]:
-        """Give all robots the poses to start at, or to go on from; what they send each other then."""
+        """Let all robots start at `start`, or later at omega with the best translations for it."""
         poses = self.start
         if poses is None or not is_first:
             poses = self.problem.with_best_translations(owned_rotations(self.robots))
-        return self.ask(ConsensusRobot.begin, [poses[robot.layout.subgraph.poses] for robot in self.robots], Count.OFF)
+        own_poses = [poses[robot.layout.subgraph.poses] for robot in self.robots]
+        return self.ask(ConsensusRobot.begin, own_poses, Count.OFF)
 
     def ask(self, order: Order[Q, A], requests: Sequence[Q], count: Count) -> list[A]:
-        """Answers of all robots to an order, each with its request."""
-        pairs = [order(robot, request) for robot, request in zip(self.robots, requests, strict=True)]
+        """Return the answers of all robots to an order, each with its request."""
+        robots_and_requests = zip(self.robots, requests, strict=True)
+        pairs = [order(robot, request) for robot, request in robots_and_requests]
         self.robots = tuple(robot for robot, _ in pairs)
         return [answer for _, answer in pairs]
 
-    def hand_on(self, sent: Sequence[Mapping[int, A]]) -> list[Mapping[int, A]]:
-        """What every robot receives, by its sender, of what each sent, by its receiver."""
+    def exchange(self, sent: Sequence[Mapping[int, A]]) -> list[Mapping[int, A]]:
+        """Deliver what every robot sent, by receiver; return what every robot gets, by sender."""
         return delivered(by_link(sent), self.num_robots)
 
 
 @dataclass(frozen=True, eq=False)
 class ConsensusIterate:
-    """Iterate k of CONSENSUS in one place."""
+    """Iterate k of CONSENSUS in one process."""
 
     shared: ConsensusState  # what all robots know
     robots: tuple[ConsensusRobot, ...]  # their copies: `robots[a].block` has x, z, s and B
@@ -199,11 +303,6 @@ class ConsensusIterate:
     def k(self) -> int:
         """Number of the iterate."""
         return self.shared.k
-
-    @property
-    def steps(self) -> ConsensusState:
-        """Residuals, and what they say of the penalty."""
-        return self.shared
 
     @property
     def omega(self) -> Array:
@@ -218,7 +317,7 @@ class ConsensusIterate:
 
 @dataclass(frozen=True)
 class LocalConsensus:
-    """CONSENSUS in one place, robot by robot; `soc` has the settings."""
+    """CONSENSUS in one process, robot by robot; `soc` has the settings."""
 
     soc: SOCSettings
 
@@ -226,16 +325,27 @@ class LocalConsensus:
         """State 0: omega = the rotations of `start`."""
         assert self.soc.robots is not None
         problem.stacked(start)  # raises unless the poses fit
-        layouts = [CopyLayout(s, problem.backend, self.soc.r_step) for s in split_graph(problem, self.soc.robots)]
-        here = LocalRobots(problem, tuple(ConsensusRobot(layout, CopiesState()) for layout in layouts), start)
-        shared = Consensus(self.soc).init(here)
-        return ConsensusIterate(shared, here.robots)
+        robots = []
+        for subgraph in split_graph(problem, self.soc.robots):
+            layout = CopyLayout(subgraph, problem.backend, self.soc.r_step)
+            robots.append(ConsensusRobot(layout, CopiesState()))
+        local = LocalRobots(problem, tuple(robots), start)
+        shared = Consensus(self.soc).init(local)
+        return ConsensusIterate(shared, local.robots)
 
     def step(self, problem: PGOProblem, state: ConsensusIterate) -> ConsensusIterate:
         """One iteration: (a), (b), (c)."""
-        here = LocalRobots(problem, state.robots)
-        shared = Consensus(self.soc).step(here, state.shared)
-        return ConsensusIterate(shared, here.robots)
+        local = LocalRobots(problem, state.robots)
+        shared = Consensus(self.soc).step(local, state.shared)
+        return ConsensusIterate(shared, local.robots)
+
+    def measure(self, problem: PGOProblem, state: ConsensusIterate) -> Measurement:
+        """As of `Consensus.measurement`."""
+        return Consensus(self.soc).measurement(state.shared)
+
+    def poses(self, problem: PGOProblem, state: ConsensusIterate) -> Poses:
+        """Omega, and the translations that the robots hold."""
+        return Poses(state.omega, _owned([robot.poses.t for robot in state.robots], state.robots))
 
 
 def owned_rotations(robots: Sequence[ConsensusRobot]) -> Array:
@@ -244,7 +354,12 @@ def owned_rotations(robots: Sequence[ConsensusRobot]) -> Array:
 
 
 def _owned(values: Sequence[Array], robots: Sequence[ConsensusRobot]) -> Array:
-    """Values of all poses, (n, ..), from those of every robot's, (n_a, ..)."""
-    own = [robot.layout.own for robot in robots]
-    order = np.argsort(np.concatenate([r.layout.subgraph.poses[mine] for r, mine in zip(robots, own, strict=True)]))
-    return np.concatenate([part[mine] for part, mine in zip(values, own, strict=True)])[order]
+    """Values of all poses, (n, ..), from each robot's values of its poses, (n_a, ..)."""
+    poses = []
+    values_of_owners = []
+    for robot, values_of_robot in zip(robots, values, strict=True):
+        own = robot.layout.own
+        poses.append(robot.layout.subgraph.poses[own])
+        values_of_owners.append(values_of_robot[own])
+    order = np.argsort(np.concatenate(poses))
+    return np.concatenate(values_of_owners)[order]

@@ -1,8 +1,9 @@
-"""One robot of the CONSENSUS coupling: its own poses, copies of its neighbours' separators, and its part of SOC.
+"""One robot of the CONSENSUS coupling: its own poses, copies of separators, and its part of SOC.
 
-An edge between two robots counts half with each. What robots send each other, by the number of the receiver, are rows
-of poses that both hold, and what the owner of a pose knows of it. Every method is an order: of a robot, which it leaves
-alone, and a request it makes the robot after it and the answer. `solvers.soc.consensus` tells in which order.
+An edge between two robots counts half with each. Robots send their neighbours rows of the poses
+that both hold, and what the owner of a pose knows of it; such messages are mappings from the number
+of the receiver. Most methods are orders: an order takes a request and returns the robot after it
+and the answer; the robot before it is left alone. `solvers.soc.consensus` calls the orders in turn.
 """
 
 from __future__ import annotations
@@ -16,183 +17,259 @@ from scipy.sparse.csgraph import connected_components
 
 from pgo_models.certificates.dual_variables import multiplier_norms, multipliers
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, project_to_rotations, unstack_transposes
+from pgo_models.geometry.rotations import (
+    Array,
+    project_to_rotations,
+    stack_transposes,
+    unstack_transposes,
+)
 from pgo_models.problem.matrices import inner
+from pgo_models.problem.stationarity import gradient_squares, rotation_squares
 from solvers.soc import copies
 from solvers.soc.anderson import AndersonShare, AndersonSums, over_relax
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.r_step import RotationStep, prepare
-from solvers.soc.recursion_block import Agreement, RecursionBlock, Rotations, block_at, nearest_rotations, stationary_B
+from solvers.soc.recursion_block import (
+    Agreement,
+    RecursionBlock,
+    Rotations,
+    block_at,
+    nearest_rotations,
+    stationary_B,
+)
 from solvers.soc.separator_stiffness import GROUND, stiffness_of_separators, travel
 
 
 @dataclass(frozen=True, eq=False)
 class ConsensusRobot:
-    """A robot: its layout, what earlier orders left, and the back end of step (a), which follows from both."""
+    """A robot: its layout, the state that earlier orders left, and the back end of step (a)."""
 
     layout: copies.CopyLayout
     state: copies.CopiesState
-    step_a: RotationStep | None = None
+    step_a: RotationStep | None = None  # follows from layout and state
 
     # Set-up: poses and penalties.
 
     def begin(self, poses: Poses) -> tuple[ConsensusRobot, copies.Rows]:
-        """Start at own poses, (n_a): rows of the others' copies come from their owners."""
+        """Start at own poses, (n_a), and send them to the neighbours that hold copies."""
         X = poses.stacked()
-        return self._with(X=X), {robot: X[self.layout.rows(mine)] for robot, mine in self.layout.told.items()}
+        return self._with(X=X), self._rows_of_own_poses(X)
 
     def begin_here(self, _: None) -> tuple[ConsensusRobot, copies.Rows]:
-        """Start at omega, with the translations agreed on, and of step (a) in the interior."""
+        """Start at omega with the robot's translations."""
         return self.begin(self.poses)
 
     def multiplier_norms(self, rows: copies.Rows) -> tuple[ConsensusRobot, copies.Norms]:
-        """Take the owners' poses: ||Lambda_i||_2 and m_i of the robot's own."""
-        layout, X = self.layout, self.state.X.copy()
-        for robot, theirs in layout.heard.items():
-            X[layout.rows(theirs)] = rows[robot]
-        n, d, whole = layout.problem.num_poses, layout.problem.d, layout.whole
+        """Take the owners' poses; return ||Lambda_i||_2 and m_i of the robot's own."""
+        layout = self.layout
+        X = self._with_rows_of_others(self.state.X.copy(), rows)
+        n = layout.problem.num_poses
+        d = layout.problem.d
+        whole = layout.whole
         Lambda = multipliers(whole, Poses(unstack_transposes(X[n:]), X[:n]))
-        every = whole.M.data[whole.diagonal_positions]
-        diagonal = np.concatenate([every[:n, None], every[n:].reshape(n, d)], axis=1)
+        diagonal_of_M = whole.M.data[whole.diagonal_positions]
+        of_translations = diagonal_of_M[:n, None]
+        of_rotations = diagonal_of_M[n:].reshape(n, d)
+        diagonal = np.concatenate([of_translations, of_rotations], axis=1)
         following = self._with(X=X, Lambda=Lambda, diagonal=diagonal)
-        return following, copies.Norms(multiplier_norms(Lambda[layout.own]), following._scale[layout.own])
+        norms = multiplier_norms(Lambda[layout.own])
+        return following, copies.Norms(norms, following._scale[layout.own])
 
-    def penalize(self, order: PenaltyOrder) -> tuple[ConsensusRobot, Mapping[int, copies.Known]]:
-        """Set rho of own poses; what their holders must know of them, and the forces on the common ones."""
-        layout, state = self.layout, self.state
-        n, d = layout.problem.num_poses, layout.problem.d
+    def penalize(
+        self, order: PenaltyOrder
+    ) -> tuple[ConsensusRobot, Mapping[int, copies.NeighbourMessage]]:
+        """Set rho of own poses; tell their holders about them, and the forces on common poses."""
+        layout = self.layout
+        state = self.state
+        n = layout.problem.num_poses
+        d = layout.problem.d
         rho = order.rho(multiplier_norms(state.Lambda), self._scale)
         pull = np.zeros((n, d * d))
         if order.is_stationary:
-            pull = stationary_B(unstack_transposes(state.X[n:]), state.Lambda, np.ones(n)).reshape(n, d * d)
+            B = stationary_B(unstack_transposes(state.X[n:]), state.Lambda, np.ones(n))
+            pull = stack_transposes(B).reshape(n, d * d)
         force = -2.0 * layout.problem.apply_M(state.X)
-        known = np.concatenate([rho[:, None], state.diagonal, pull], axis=1)
-        none = np.zeros(0, dtype=np.int64)
-        own = {robot: known[layout.told.get(robot, none)] for robot in layout.common}
-        told = {robot: copies.Known(own[robot], force[rows]) for robot, rows in layout.common.items()}
-        return self._with(rho=rho, pull=pull, force=force, settings=order.settings), told
-
-    def stiffness(self, known: Mapping[int, copies.Known]) -> tuple[ConsensusRobot, float]:
-        """Take what the owners know, and the forces of others; the stiffness of the robot's separators."""
-        layout, state = self.layout, self.state
-        n, d, times = layout.problem.num_poses, layout.problem.d, layout.subgraph.copies
-        rho, diagonal, pull, total = (v.copy() for v in (state.rho, state.diagonal, state.pull, state.force))
-        for robot, theirs in layout.heard.items():
-            of_own = known[robot].of_own
-            rho[theirs], diagonal[theirs], pull[theirs] = of_own[:, 0], of_own[:, 1 : d + 2], of_own[:, d + 2 :]
+        of_poses = np.concatenate([rho[:, None], state.diagonal, pull], axis=1)
+        no_poses = np.zeros(0, dtype=np.int64)
+        messages = {}
         for robot, rows in layout.common.items():
-            total[rows] += known[robot].force
+            own = layout.sent.get(robot, no_poses)
+            messages[robot] = copies.NeighbourMessage(of_poses[own], force[rows])
+        return self._with(rho=rho, pull=pull, force=force, settings=order.settings), messages
+
+    def stiffness(
+        self, messages: Mapping[int, copies.NeighbourMessage]
+    ) -> tuple[ConsensusRobot, float]:
+        """Take the neighbours' messages; return the stiffness of the robot's separators."""
+        layout = self.layout
+        n = layout.problem.num_poses
+        d = layout.problem.d
+        num_copies = layout.subgraph.copies
+        rho = self.state.rho.copy()
+        diagonal = self.state.diagonal.copy()
+        pull = self.state.pull.copy()
+        total_force = self.state.force.copy()
+        for robot, theirs in layout.received.items():
+            of_poses = messages[robot].of_own
+            rho[theirs] = of_poses[:, 0]
+            diagonal[theirs] = of_poses[:, 1 : d + 2]
+            pull[theirs] = of_poses[:, d + 2 :]
+        for robot, rows in layout.common.items():
+            total_force[rows] += messages[robot].force
         separators = layout.separators
-        half_scale = 0.5 * diagonal[separators, 0] / times[separators]
-        penalty = np.concatenate([np.zeros(n), np.repeat(rho / times, d)])
+        half_scale = 0.5 * diagonal[separators, 0] / num_copies[separators]
+        penalty = np.concatenate([np.zeros(n), np.repeat(rho / num_copies, d)])
         penalty[separators] = 2.0 * GROUND * half_scale
         components = connected_components(layout.subgraph.graph.adjacency, directed=False)[1]
         factor = layout.problem.analysis.factorize(layout.subproblem(penalty).K)
-        stiffness = stiffness_of_separators(factor, (d + 1) * n, separators, half_scale, components[separators])
-        return self._with(rho=rho, diagonal=diagonal, pull=pull, total_force=total), stiffness
+        stiffness = stiffness_of_separators(
+            factor, (d + 1) * n, separators, half_scale, components[separators]
+        )
+        following = self._with(rho=rho, diagonal=diagonal, pull=pull, total_force=total_force)
+        return following, stiffness
 
-    def start(self, separators: copies.SeparatorPenalty) -> tuple[ConsensusRobot, copies.Started]:
-        """Factor, with omega at the poses and B in balance; ||omega||_rho^2 and rho_i / m_i of the own poses."""
-        layout, state = self.layout, self.state
-        n, d, held, own = layout.problem.num_poses, layout.problem.d, layout.held, layout.own
+    def start(self, separators: copies.SeparatorPenalty) -> tuple[ConsensusRobot, copies.InitReply]:
+        """Set omega to the poses and B in balance, and prepare step (a)."""
+        layout = self.layout
+        state = self.state
+        n = layout.problem.num_poses
+        d = layout.problem.d
+        held = layout.held
+        own = layout.own
         floor = separators.rotation * self._scale
         rho = np.where(layout.subgraph.copies > 1, np.maximum(state.rho, floor), state.rho)
         if state.settings.rotations is Rotations.RELAXED:
             rho = np.where(layout.subgraph.poses == 0, np.maximum(rho, self._scale), rho)
         penalty = self._penalty(rho, separators.translation)
-        # B makes every subproblem stationary; its mean over the copies is the multiplier of the constraint.
-        mean = np.concatenate([np.zeros((n, d)), (state.pull / rho[:, None]).reshape(d * n, d)])
-        balanced = (state.force - state.total_force / layout.copies) / np.where(held[:, 0], penalty, 1.0)[:, None]
-        z, B = np.where(held, state.X, 0.0), np.where(held, balanced + mean, 0.0)
-        diagonal = np.concatenate([state.diagonal[:, 0], state.diagonal[:, 1:].ravel()]) / layout.copies[:, 0]
-        block = block_at(z, penalty, diagonal, state.settings, B)
-        started = copies.Started(d * float(rho[own].sum()), (rho / self._scale)[own])
-        following = self._with(rho=rho, block=block, origin=(z, block.s), sums=AndersonSums(), heard={}, ahead=None)
-        return following._prepared(), started
+        # B makes every subproblem stationary: it balances the difference between the robot's force
+        # and the mean force. Its mean over the copies is the multiplier of the constraint.
+        mean_B_of_rotations = (state.pull / rho[:, None]).reshape(d * n, d)
+        mean_B = np.concatenate([np.zeros((n, d)), mean_B_of_rotations])
+        excess_force = state.force - state.total_force / layout.copies
+        balanced_B = excess_force / np.where(held[:, 0], penalty, 1.0)[:, None]
+        z = np.where(held, state.X, 0.0)
+        B = np.where(held, balanced_B + mean_B, 0.0)
+        diagonal_of_M = np.concatenate([state.diagonal[:, 0], state.diagonal[:, 1:].ravel()])
+        share_of_diagonal = diagonal_of_M / layout.copies[:, 0]
+        block = block_at(z, penalty, share_of_diagonal, state.settings, B)
+        following = self._with(
+            rho=rho, block=block, origin=(z, block.s), sums=AndersonSums(), received={}, ahead=None
+        )
+        rotations = float(rotation_squares(layout.whole)[own].sum())
+        stationarity = replace(following.stationarity(None)[1], rotations=rotations)
+        size = d * float(rho[own].sum())
+        reply = copies.InitReply(size, (rho / self._scale)[own], stationarity)
+        return following._prepared(), reply
 
     # The recursion.
 
-    def solve(self, _: None) -> tuple[ConsensusRobot, copies.Solved]:
-        """Step (a): rows of s after it, and sums; of those the merit alone where robots accelerate alone."""
+    def solve(self, _: None) -> tuple[ConsensusRobot, copies.SolveReply]:
+        """Step (a); return rows of s after it, and sums for the acceleration.
+
+        Where robots accelerate alone the rows are extrapolated already, and of the sums only the
+        merit is returned.
+        """
         X, z, _B, drift = self._solved_after_local_passes()
         block, sums = self.block.after_solve(np.where(self.layout.held, X, 0.0), z, drift)
-        alone, known, s = block.settings.alone, self.state.sums, block.anderson.image
+        alone = block.settings.alone
+        own_sums = self.state.sums
+        s = block.anderson.image
         if alone is not None:
             gamma: Array | None = None
             if np.isfinite(sums).all():
-                gamma, known = known.coefficients(alone, sums)
-            block, sums = block.extrapolated(Agreement(gamma, is_best=False)), sums[:1]
+                gamma, own_sums = own_sums.coefficients(alone, sums)
+            block = block.extrapolated(Agreement(gamma, is_best=False))
+            sums = sums[:1]
             s = block.s
         assert s is not None
         rows = {robot: s[rows] for robot, rows in self.layout.common.items()}
-        return self._with(ahead=(X, block, known)), copies.Solved(sums, rows)
+        return self._with(ahead=(X, block, own_sums)), copies.SolveReply(sums, rows)
 
-    def step(self, order: tuple[Agreement, copies.Rows]) -> tuple[ConsensusRobot, copies.Stepped]:
-        """Extrapolate what was solved, own rows and the neighbours'; (b) and (c) with them; and (a) of the next step.
+    def step(self, order: tuple[Agreement, copies.Rows]) -> tuple[ConsensusRobot, copies.StepReply]:
+        """Steps (b) and (c) with the neighbours' rows, and step (a) of the next iteration.
 
-        A neighbour extrapolates its rows with the same coefficients: nobody waits for them a second time.
+        Own rows and the neighbours' are extrapolated first. A neighbour extrapolates its rows with
+        the same coefficients, so that nobody waits for them a second time.
         """
-        (agreement, received), before = order, self.block
+        agreement, images = order
+        before = self.block
         assert self.state.ahead is not None
-        X, block, sums = self.state.ahead
-        memory, heard, rows = before.settings.memory, {}, {}
+        X, block, own_sums = self.state.ahead
         if before.settings.alone is not None:
-            block, memory = replace(block, best=before.s if agreement.is_best else before.best), 0
+            block = replace(block, best=before.s if agreement.is_best else before.best)
+            memory = 0
         else:
             block = block.extrapolated(agreement)
-        for robot, image in received.items():
-            known = self.state.heard.get(robot, AndersonShare()).after(np.zeros((0, 0)), image, memory)
-            rows[robot], heard[robot] = known.extrapolated(agreement.gamma)
-        moved = self._with(X=X, block=block, sums=sums, heard=heard)
-        block, squares = block.agreed(moved._mean(rows))
+            memory = before.settings.memory
+        received = {}
+        rows = {}
+        for robot, image in images.items():
+            share = self.state.received.get(robot, AndersonShare())
+            share = share.after(np.zeros((0, 0)), image, memory)
+            rows[robot], received[robot] = share.extrapolated(agreement.gamma)
+        moved = self._with(X=X, block=block, sums=own_sums, received=received)
+        block, squares = block.agreed(moved._mean(rows))  # (b), (c)
         moved = moved._with(block=block)
-        following, solved = moved.solve(None)
-        return following, copies.Stepped(squares, moved.cost(None)[1], solved)
+        following, reply_of_solve = moved.solve(None)  # (a)
+        return following, copies.StepReply(squares, moved.stationarity(None)[1], reply_of_solve)
 
     def announce(self, settings: copies.TurnSettings) -> tuple[ConsensusRobot, copies.Rows]:
-        """Return the robot's rows for every neighbour, before the first turn."""
+        """Send the robot's rows to every neighbour, before the first turn."""
         waiting = copies.Waiting(settings, {}, dict.fromkeys(self.layout.common, 0))
         return self._with(waiting=waiting)._sending(self.block)
 
     def turn(self, rows: copies.Rows) -> tuple[ConsensusRobot, copies.TurnAnswer]:
-        """One turn with the newest rows that have arrived: (b), (c) and (a), damped; rows for every neighbour.
+        """Make one turn, (b), (c) and (a), with the newest rows that have arrived, damped.
 
-        s <- s + damping (T(s) - s) with T the map of the synchronous recursion, the neighbours' rows being old ones: an
-        asynchronous fixed-point iteration (Peng et al. 2016). B = s - z is never summed up, so nothing drifts.
+        s <- s + damping (T(s) - s) with T the map of the synchronous recursion, and the neighbours'
+        rows as old as they are: an asynchronous fixed-point iteration (Peng et al. 2016). B = s - z
+        is never summed up, so nothing drifts. The answer has rows for every neighbour.
         """
-        before, waiting = self.block, self.state.waiting
+        before = self.block
+        waiting = self.state.waiting
         assert waiting is not None
-        waited = {robot: 0 if robot in rows else turns + 1 for robot, turns in waiting.waited.items()}
-        waiting = replace(waiting, newest={**waiting.newest, **rows}, waited=waited)
+        waiting = waiting.with_rows(rows)
         has_all = len(waiting.newest) == len(self.layout.common)
         block = replace(before, z=self._mean(waiting.newest)) if has_all else before
         X, z, B, _ = self._with(block=block)._solved_after_local_passes()
         alpha = 1.0 + waiting.excess * (waiting.settings.alpha - 1.0)
-        moved = over_relax(np.where(self.layout.held, X, 0.0), z, alpha) + B - block.s
+        change = over_relax(np.where(self.layout.held, X, 0.0), z, alpha) + B - block.s
         weight = np.sqrt(block.penalty)[:, None]
-        primal, dual = weight * moved, weight * (block.z - before.z)
+        primal = weight * change
+        dual = weight * (block.z - before.z)
         sums = np.array([inner(primal, primal), inner(dual, dual)])
-        block = replace(block, s=block.s + waiting.settings.damping * moved)
-        robot, sent = self._with(X=X, waiting=waiting.after(math.sqrt(sums[0])))._sending(block)
-        return robot, copies.TurnAnswer(sent, sums, max(waited.values(), default=0))
+        block = replace(block, s=block.s + waiting.settings.damping * change)
+        waiting = waiting.after(math.sqrt(sums[0]))
+        robot, sent = self._with(X=X, waiting=waiting)._sending(block)
+        stationarity = robot.stationarity(None)[1]
+        age = max(waiting.waited.values(), default=0)
+        return robot, copies.TurnAnswer(sent, sums, stationarity, age)
 
     def travel(self, _: None) -> tuple[ConsensusRobot, Array]:
-        """How far separator translations, and their multipliers, went: see `solvers.soc.separator_stiffness`."""
+        """How far separator translations and their multipliers have gone.
+
+        `solvers.soc.separator_stiffness` has the sums.
+        """
         assert self.state.origin is not None
-        at, block, (z, s) = self.layout.separators, self.block, self.state.origin
-        pulled = block.penalty[at, None] * (block.B - s + z)[at]
-        return self, travel((block.z - z)[at], pulled, block.diagonal[at])
+        separators = self.layout.separators
+        block = self.block
+        z_first, s_first = self.state.origin
+        moved = (block.z - z_first)[separators]
+        change_of_B = (block.B - s_first + z_first)[separators]
+        pulled = block.penalty[separators, None] * change_of_B
+        return self, travel(moved, pulled, block.diagonal[separators])
 
     def back_at_best(self, _: None) -> tuple[ConsensusRobot, copies.Rows]:
-        """Return to the s of the smallest merit; its rows for every neighbour."""
+        """Return to the s of the smallest merit, and send its rows to every neighbour."""
         return self._sending(replace(self.block, s=self.block.best))
 
     def rescale(self, order: copies.RescaleCopies) -> tuple[ConsensusRobot, None]:
-        """Agree on what was sent, if all went back to their best, multiply rho and keep rho B."""
+        """Multiply rho and keep rho B; agree first on what was sent, if all are at their best."""
         block = self.block if order.rows is None else replace(self.block, z=self._mean(order.rows))
         rho = order.factor * self.state.rho
         block = block.rescaled(self._penalty(rho, order.translation))
-        return self._with(rho=rho, block=block, sums=AndersonSums(), heard={}, ahead=None)._prepared(), None
+        following = self._with(rho=rho, block=block, sums=AndersonSums(), received={}, ahead=None)
+        return following._prepared(), None
 
     # Answers.
 
@@ -204,55 +281,94 @@ class ConsensusRobot:
 
     @property
     def omega(self) -> Array:
-        """Rotations of the robot's poses, (n_a, d, d); those nearest to a relaxation."""
+        """Rotations of the robot's poses, (n_a, d, d); a relaxation is projected to them."""
         R = unstack_transposes(self.block.z[self.layout.problem.num_poses :])
         return project_to_rotations(R) if self.block.settings.rotations is Rotations.RELAXED else R
 
     @property
     def poses(self) -> Poses:
-        """Omega and the translations at hand, (n_a)."""
+        """The robot's poses, (n_a): omega and the current translations."""
         X = np.where(self.layout.held, self.block.z, self.state.X)
         return Poses(self.omega, X[: self.layout.problem.num_poses])
 
     def own_poses(self, _: None) -> tuple[ConsensusRobot, copies.OwnPoses]:
-        """Omega and the translations at hand of the own poses, for whoever may see them."""
-        mine = self.poses[self.layout.own]
-        return self, copies.OwnPoses(self.layout.subgraph.poses[self.layout.own], mine.R, mine.t)
+        """The poses that the robot owns, for the result."""
+        own = self.layout.own
+        poses = self.poses[own]
+        return self, copies.OwnPoses(self.layout.subgraph.poses[own], poses.R, poses.t)
 
-    def cost(self, _: None) -> tuple[ConsensusRobot, float]:
-        """Part of F at omega, the translations agreed on, and inside those of step (a)."""
-        return self, float(self.layout.whole.edge_costs(self.poses)[self.layout.subgraph.is_counted].sum())
+    def held_rows(self, _: None) -> tuple[ConsensusRobot, copies.Rows]:
+        """Rows of the own poses, for every neighbour that holds copies of them."""
+        return self, self._rows_of_own_poses(self.poses.stacked())
+
+    def stationarity_beside(self, rows: copies.Rows) -> tuple[ConsensusRobot, copies.Stationarity]:
+        """As `stationarity`, with the owners' rows in place of the robot's copies."""
+        X = self._with_rows_of_others(self.poses.stacked(), rows)
+        n = self.layout.problem.num_poses
+        return self, self._stationarity_at(Poses(unstack_transposes(X[n:]), X[:n]))
+
+    def stationarity(self, _: None) -> tuple[ConsensusRobot, copies.Stationarity]:
+        """How stationary the own poses are beside the robot's copies, and its part of F."""
+        return self, self._stationarity_at(self.poses)
 
     # What the orders share.
 
     def restored(self, state: copies.CopiesState) -> ConsensusRobot:
-        """Return the robot with all that orders left with it elsewhere."""
+        """The robot with a state that orders left elsewhere."""
         robot = replace(self, state=state)
         return robot if state.block is None else robot._prepared()
 
     def _with(self, **changes: object) -> ConsensusRobot:
-        return replace(self, state=replace(self.state, **changes))  # type: ignore[arg-type] # checked by the class
+        """The robot with changed fields of its state, whose types mypy cannot check."""
+        return replace(self, state=replace(self.state, **changes))  # type: ignore[arg-type]
+
+    def _stationarity_at(self, poses: Poses) -> copies.Stationarity:
+        problem = self.layout.whole
+        cost = float(problem.edge_costs(poses)[self.layout.subgraph.is_counted].sum())
+        gradient = float(gradient_squares(problem, poses)[self.layout.own].sum())
+        return copies.Stationarity(gradient, cost)
+
+    def _rows_of_own_poses(self, X: Array) -> copies.Rows:
+        layout = self.layout
+        return {robot: X[layout.rows(mine)] for robot, mine in layout.sent.items()}
+
+    def _with_rows_of_others(self, X: Array, rows: copies.Rows) -> Array:
+        """X, (rows, d), which is changed, with the rows that the owners of other poses sent."""
+        for robot, theirs in self.layout.received.items():
+            X[self.layout.rows(theirs)] = rows[robot]
+        return X
 
     def _sending(self, block: RecursionBlock) -> tuple[ConsensusRobot, copies.Rows]:
-        return self._with(block=block), {robot: block.s[rows] for robot, rows in self.layout.common.items()}
+        sent = {robot: block.s[rows] for robot, rows in self.layout.common.items()}
+        return self._with(block=block), sent
 
     @property
     def _scale(self) -> Array:
+        """m_i, the mean diagonal of M over the rotation rows of pose i, (n_a,)."""
         return np.asarray(self.state.diagonal[:, 1:].mean(axis=1))
 
     def _penalty(self, rho: Array, translation: float) -> Array:
         """The robot's shares of the penalties of its rows, (rows,)."""
-        whole = np.concatenate([translation * self.state.diagonal[:, 0], np.repeat(rho, self.layout.problem.d)])
+        of_translations = translation * self.state.diagonal[:, 0]
+        of_rotations = np.repeat(rho, self.layout.problem.d)
+        whole = np.concatenate([of_translations, of_rotations])
         return np.where(self.layout.held[:, 0], whole / self.layout.copies[:, 0], 0.0)
 
     def _prepared(self) -> ConsensusRobot:
-        return replace(self, step_a=prepare(self.layout.subproblem(self.block.penalty), self.layout.r_step))
+        subproblem = self.layout.subproblem(self.block.penalty)
+        return replace(self, step_a=prepare(subproblem, self.layout.r_step))
 
     def _solved_after_local_passes(self) -> tuple[Array, Array, Array, Array | float]:
-        """X of step (a), and z, B and what they moved by, after (a) to (c) on the poses that no other robot holds."""
+        """X of step (a), with z, B and the change of z + B in the local passes before it.
+
+        A local pass does (a) to (c) on the poses that no other robot holds.
+        """
         assert self.step_a is not None
-        block, private = self.block, self.layout.private
-        z, B, drift = block.z.copy(), block.B, np.zeros((1, 1))
+        block = self.block
+        private = self.layout.private
+        z = block.z.copy()
+        B = block.B
+        drift = np.zeros((1, 1))
         passes = block.settings.local_passes - 1
         if passes and private.any() and block.is_finite:
             for _ in range(passes):
@@ -263,8 +379,12 @@ class ConsensusRobot:
         return self.step_a.solve(z - B), z, B, drift
 
     def _mean(self, received: copies.Rows) -> Array:
-        """Rotations omega and the mean translations, from s and the neighbours' rows in the order of robots."""
-        block, n = self.block, self.layout.problem.num_poses
+        """Step (b): omega and the mean translations, from s and the neighbours' rows.
+
+        The rows are summed in the order of the robots, so that all get the same bits.
+        """
+        block = self.block
+        n = self.layout.problem.num_poses
         parts = {**received, self.layout.subgraph.robot: block.s}
         total = np.zeros_like(block.s)
         for robot in sorted(parts):
@@ -275,7 +395,7 @@ class ConsensusRobot:
             z[n:] = nearest_rotations(mean[n:])
         else:
             is_relaxed = block.settings.rotations is Rotations.RELAXED
-            held = np.flatnonzero(self.layout.subgraph.poses == 0) if is_relaxed else np.arange(n)
-            rows = self.layout.rows(held)[len(held) :]
-            z[rows] = block.z[rows]
+            fixed = np.flatnonzero(self.layout.subgraph.poses == 0) if is_relaxed else np.arange(n)
+            rotation_rows = self.layout.rows(fixed)[len(fixed) :]
+            z[rotation_rows] = block.z[rotation_rows]
         return z

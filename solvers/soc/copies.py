@@ -1,4 +1,4 @@
-"""What a robot that holds copies knows, and what such robots tell each other and whoever sums up."""
+"""Records of CONSENSUS: what a robot that holds copies knows, and the messages of such robots."""
 
 import math
 from collections.abc import Mapping
@@ -17,7 +17,10 @@ from solvers.soc.recursion_block import RecursionBlock, StepSettings
 from solvers.soc.subgraph import PartProblem, Subgraph
 
 Rows = Mapping[int, Array]  # to or from every neighbour
-_PROGRESS, _PATIENCE = 0.9, 20  # a merit that is smaller, and how many turns of an asynchronous run it may take
+# An asynchronous run makes progress when a merit falls to this share of the smallest so far; it
+# stagnates when that has not happened for so many turns.
+_PROGRESS = 0.9
+_PATIENCE = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,61 +31,75 @@ class Norms:
     scale: Array
 
 
-def thinned(norms: Norms, step: int | None) -> Norms:
-    """Every so manieth of the poses in the order of their ratios, if a step is given."""
-    some = slice(None) if step is None else np.argsort(norms.norms / norms.scale)[step // 2 :: step]
-    return Norms(norms.norms[some], norms.scale[some])
+def subsampled(norms: Norms, step: int | None) -> Norms:
+    """Every k-th of the poses in the order of their ratios, with k = `step`; all without a step."""
+    if step is None:
+        return norms
+    in_order = np.argsort(norms.norms / norms.scale)
+    chosen = in_order[step // 2 :: step]
+    return Norms(norms.norms[chosen], norms.scale[chosen])
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """What one robot tells another of the poses that both hold."""
+class NeighbourMessage:
+    """What one robot sends another about the poses that both hold."""
 
-    # (q, 1 + (d + 1) + d^2): rho_i, the diagonal of M and the unscaled multiplier of the poses that the sender owns.
+    # (q, 1 + (d + 1) + d^2): rho_i, the diagonal of M and the unscaled multiplier of the poses that
+    # the sender owns.
     of_own: Array
     force: Array  # ((d + 1) q, d): -2 M_a X on the rows of all
 
 
 @dataclass(frozen=True)
 class SeparatorPenalty:
-    """Penalties of separators: of translations, times the diagonal of M; least rho_i / m_i of rotations."""
+    """Penalties of separators."""
 
-    translation: float
-    rotation: float
+    translation: float  # of their translations, over the diagonal of M
+    rotation: float  # least rho_i / m_i of their rotations
 
 
 @dataclass(frozen=True, eq=False)
-class Started:
-    """||omega||_rho^2 and rho_i / m_i of a robot's own poses."""
+class Stationarity:
+    """One robot's part of F and of its relative gradient: sums over its own edges and poses."""
 
-    size: float
-    ratio: Array
+    gradient: float  # of `gradient_squares`
+    cost: float  # of F, at the poses that the robot holds
+    rotations: float | None = None  # of `rotation_squares`: they never change and are sent once
+
+
+@dataclass(frozen=True, eq=False)
+class InitReply:
+    """What a robot reports of its own poses when it is ready for the first step."""
+
+    size: float  # ||omega||_rho^2
+    ratio: Array  # rho_i / m_i
+    stationarity: Stationarity
 
 
 @dataclass(frozen=True)
 class RescaleCopies:
-    """Factor on rho, the penalty of separator translations, and rows to agree on, if all went back to their best."""
+    """Order to multiply rho."""
 
     factor: float
-    translation: float
-    rows: Rows | None
+    translation: float  # the penalty of separator translations, over the diagonal of M
+    rows: Rows | None  # rows to agree on, where all robots have gone back to their best iterate
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
-    """Sums of step (a), and for every neighbour its rows of s after it, before what is extrapolated together."""
+class SolveReply:
+    """What step (a) gives."""
 
-    sums: Array
-    rows: Rows
+    sums: Array  # of this robot, for the acceleration
+    rows: Rows  # of s for every neighbour, before the extrapolation that all do together
 
 
 @dataclass(frozen=True, eq=False)
-class Stepped:
-    """Squared residuals, (2,), part of F at omega, and what the next step (a) gave."""
+class StepReply:
+    """What an iteration gives, which ends with step (a) of the next one."""
 
-    squares: Array
-    measured: float
-    solved: Solved
+    squares: Array  # (2,): squared residuals
+    stationarity: Stationarity
+    solved: SolveReply
 
 
 @dataclass(frozen=True)
@@ -95,11 +112,12 @@ class TurnSettings:
 
 @dataclass(frozen=True, eq=False)
 class TurnAnswer:
-    """Rows for every neighbour, squared residuals, and how many turns the oldest rows in use are old."""
+    """What one turn of an asynchronous run gives."""
 
-    rows: Rows
-    sums: Array
-    waited: int
+    rows: Rows  # for every neighbour
+    sums: Array  # (2,): squared residuals
+    stationarity: Stationarity
+    waited: int  # age in turns of the oldest rows in use
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +131,11 @@ class OwnPoses:
 
 @dataclass(frozen=True, eq=False)
 class CopyLayout:
-    """What follows from a robot's subgraph.
+    """The rows of a robot, and which of them it shares: all that follows from its subgraph.
 
-    Rows are those of X for the robot's poses, (d + 1) n_a of them: translations, then rotations. Translations of poses
-    that no other robot holds are not held: they have no penalty, no part in the iterates, and are zero there.
+    Rows are those of X for the robot's poses, (d + 1) n_a of them: translations, then rotations.
+    Translations of poses that no other robot holds are not held: they have no penalty, no part in
+    the iterates, and are zero there.
     """
 
     subgraph: Subgraph
@@ -126,13 +145,14 @@ class CopyLayout:
     @cached_property
     def problem(self) -> PartProblem:
         """The cost of the robot's edges, those to other robots half."""
-        graph, is_own = self.subgraph.graph, self.subgraph.is_own
+        graph = self.subgraph.graph
+        is_own = self.subgraph.is_own
         halved = np.where(is_own[graph.i] & is_own[graph.j], 1.0, 0.5)
         return PartProblem(graph, self.backend, self.subgraph.weights.scaled(halved))
 
     @cached_property
     def whole(self) -> PartProblem:
-        """The cost of the robot's edges: all edges of its own poses are here."""
+        """The cost of the robot's edges in full; they include all edges of its own poses."""
         return PartProblem(self.subgraph.graph, self.backend, self.subgraph.weights)
 
     @cached_property
@@ -148,18 +168,25 @@ class CopyLayout:
     @cached_property
     def held(self) -> BoolArray:
         """Rows with a penalty, (rows, 1)."""
-        n, d = self.problem.num_poses, self.problem.d
-        return np.concatenate([self.subgraph.copies > 1, np.ones(d * n, dtype=bool)])[:, None]
+        is_separator = self.subgraph.copies > 1
+        all_rotations = np.ones(self.problem.d * self.problem.num_poses, dtype=bool)
+        return np.concatenate([is_separator, all_rotations])[:, None]
 
     @cached_property
     def copies(self) -> IntArray:
         """How many robots hold a row, (rows, 1)."""
-        return np.concatenate([self.subgraph.copies, np.repeat(self.subgraph.copies, self.problem.d)])[:, None]
+        of_poses = self.subgraph.copies
+        of_rotations = np.repeat(of_poses, self.problem.d)
+        return np.concatenate([of_poses, of_rotations])[:, None]
 
     @cached_property
     def private(self) -> BoolArray:
-        """Rows of rotations that no other robot holds, (rows,); none for a robot alone, which has no round to save."""
-        return np.asarray((self.held & (self.copies == 1))[:, 0] & bool(self.subgraph.common))
+        """Rows of rotations that no other robot holds, (rows,).
+
+        A robot without neighbours has none: its local passes would save no round.
+        """
+        is_private = (self.held & (self.copies == 1))[:, 0]
+        return np.asarray(is_private & bool(self.subgraph.common))
 
     @cached_property
     def common(self) -> Mapping[int, IntArray]:
@@ -167,16 +194,24 @@ class CopyLayout:
         return {robot: self.rows(poses) for robot, poses in self.subgraph.common}
 
     @cached_property
-    def told(self) -> Mapping[int, IntArray]:
-        """Own poses that a neighbour holds, where there are some."""
-        owner, robot = self.subgraph.owner, self.subgraph.robot
-        return {to: mine for to, poses in self.subgraph.common if len(mine := poses[owner[poses] == robot])}
+    def sent(self) -> Mapping[int, IntArray]:
+        """Own poses that a neighbour holds, for every neighbour that holds some."""
+        robot = self.subgraph.robot
+        return self._common_poses_owned_by({other: robot for other, _ in self.subgraph.common})
 
     @cached_property
-    def heard(self) -> Mapping[int, IntArray]:
-        """Poses of a neighbour that the robot holds, where there are some."""
-        owner = self.subgraph.owner
-        return {other: theirs for other, poses in self.subgraph.common if len(theirs := poses[owner[poses] == other])}
+    def received(self) -> Mapping[int, IntArray]:
+        """Poses of a neighbour that the robot holds, for every neighbour that owns some."""
+        return self._common_poses_owned_by({other: other for other, _ in self.subgraph.common})
+
+    def _common_poses_owned_by(self, owners: Mapping[int, int]) -> Mapping[int, IntArray]:
+        """Of the poses in common with every neighbour those that its entry of `owners` owns."""
+        chosen = {}
+        for neighbour, poses in self.subgraph.common:
+            owned = poses[self.subgraph.owner[poses] == owners[neighbour]]
+            if len(owned):
+                chosen[neighbour] = owned
+        return chosen
 
     def rows(self, poses: IntArray) -> IntArray:
         """Rows of X of some poses."""
@@ -186,23 +221,32 @@ class CopyLayout:
         """Step (a) of the robot."""
         problem = self.problem
         A, w = problem.residual_matrix
-        return RSubproblem(A, w, problem.M, problem.d, problem.num_poses, penalty, problem.analysis, self.backend)
+        return RSubproblem(
+            A, w, problem.M, problem.d, problem.num_poses, penalty, problem.analysis, self.backend
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Waiting:
-    """What a robot of an asynchronous run has heard, and how far it relaxes."""
+    """What a robot of an asynchronous run has received, and how far it relaxes."""
 
     settings: TurnSettings
-    newest: Rows  # the newest that has arrived from every neighbour
-    waited: Mapping[int, int]  # how many turns ago
+    newest: Rows  # the newest rows from every neighbour
+    waited: Mapping[int, int]  # how many turns ago they arrived
     excess: float = 1.0  # share of the over-relaxation that is left
-    # least, turns_since: the smallest merit since that changed, and how long ago it was.
-    least: float = math.inf
-    turns_since: int = 0
+    least: float = math.inf  # the smallest merit since that share changed
+    turns_since: int = 0  # how many turns ago that merit was
+
+    def with_rows(self, rows: Rows) -> "Waiting":
+        """The record a turn later, with the rows that have arrived."""
+        waited = {robot: 0 if robot in rows else turns + 1 for robot, turns in self.waited.items()}
+        return replace(self, newest={**self.newest, **rows}, waited=waited)
 
     def after(self, merit: float) -> "Waiting":
-        """Relax less on stagnation (no new best residual): over-relaxed steps may cycle."""
+        """The record after a turn with this merit; on stagnation the robot relaxes less.
+
+        Over-relaxed steps may cycle.
+        """
         if merit <= _PROGRESS * self.least:
             return replace(self, least=merit, turns_since=0)
         if self.turns_since < _PATIENCE:
@@ -212,22 +256,51 @@ class Waiting:
 
 @dataclass(frozen=True, eq=False)
 class CopiesState:
-    """What orders leave with a robot; rows as in `CopyLayout`."""
+    """What orders leave with a robot; rows are those of `CopyLayout`.
 
-    # (rows, d): poses at the start, then x of the last step (a) with all translations.
+    Parameters
+    ----------
+    X : (rows, d) array
+        The poses at the start, then x of the last step (a) with all translations.
+    rho : (n_a,) array
+        Penalties of the poses.
+    diagonal : (n_a, d + 1) array
+        Diagonal of M of every pose, its translation first.
+    Lambda : (n_a, d, d) array
+        Multipliers, right for own poses.
+    pull : (n_a, d^2) array
+        rho_i B_i of a stationary point.
+    force : (rows, d) array
+        -2 M_a X.
+    total_force : (rows, d) array
+        The same, summed over robots.
+    settings : StepSettings
+        Settings of the steps.
+    block : RecursionBlock or None
+        The robot's rows of the recursion.
+    origin : pair of (rows, d) arrays or None
+        z and s when the penalties were set.
+    sums : AndersonSums
+        Of a robot that accelerates alone.
+    received : mapping from robots to AndersonShare
+        Rows of the neighbours, which are extrapolated here as there.
+    ahead : tuple or None
+        X, block and sums after the next step (a).
+    waiting : Waiting or None
+        Of an asynchronous run.
+    """
+
     X: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    rho: Array = field(default_factory=lambda: np.zeros(0))  # (n_a,)
-    diagonal: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (n_a, d + 1): diagonal of M of every pose
-    # Lambda, pull: (n_a, d, d), (n_a, d^2); multipliers, right for own poses, and rho_i B_i of a stationary point.
+    rho: Array = field(default_factory=lambda: np.zeros(0))
+    diagonal: Array = field(default_factory=lambda: np.zeros((0, 0)))
     Lambda: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     pull: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    # force, total_force: (rows, d); -2 M_a X, and the same summed over robots.
     force: Array = field(default_factory=lambda: np.zeros((0, 0)))
     total_force: Array = field(default_factory=lambda: np.zeros((0, 0)))
     settings: StepSettings = field(default_factory=StepSettings)
     block: RecursionBlock | None = None
-    origin: tuple[Array, Array] | None = None  # (rows, d) each: z and s when the penalties were set
-    sums: AndersonSums = field(default_factory=AndersonSums)  # of a robot that accelerates alone
-    heard: Mapping[int, AndersonShare] = field(default_factory=dict)  # neighbours' rows, to be extrapolated as theirs
-    ahead: tuple[Array, RecursionBlock, AndersonSums] | None = None  # X, block and sums after the next step (a)
+    origin: tuple[Array, Array] | None = None
+    sums: AndersonSums = field(default_factory=AndersonSums)
+    received: Mapping[int, AndersonShare] = field(default_factory=dict)
+    ahead: tuple[Array, RecursionBlock, AndersonSums] | None = None
     waiting: Waiting | None = None

@@ -1,25 +1,36 @@
-"""SOC as the paper has it: rotations only, every robot with its neighbours frozen (Algorithm 1, `algo1: SOC`).
+"""SOC as the paper has it: rotations only, every robot with its neighbours frozen.
 
-All robots' subproblems (a) are solved together: they are the diagonal blocks of L, one a robot, so that with the
-neighbours of the last iterate on the right-hand side
+This is Algorithm 1 (`algo1: SOC`) to the letter; `solvers.soc.soc` is the faster variant. All
+robots' subproblems (a) are solved together: they are the diagonal blocks of L, one a robot, so that
+with the neighbours of the last iterate on the right-hand side
 
     (L_blocks + rho/2) Y = rho/2 (omega - B) - L_between Y_last,     L = L_blocks + L_between.
 
-With the B that (c) makes of it, the gradient of the Lagrangian of min <Y, L Y> subject to Y = omega is at Y
+With the B that (c) makes of it, the gradient of the Lagrangian of min <Y, L Y> subject to Y = omega
+is at Y
 
     2 L Y + rho B = 2 L_between (Y - Y_last) - rho (omega - omega_last),
 
-the dual residual: beside the change of omega, as in Boyd et al. 2011 (3.6), that of the frozen neighbours counts.
+the dual residual: beside the change of omega, as in Boyd et al. 2011 (3.6), that of the frozen
+neighbours counts. `PaperSOC` lists where this differs from the paper's text.
 """
 
+import enum
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array, vstack
+from scipy.sparse import coo_array, csc_array, csr_array, vstack
 
 from pgo_models.errors import check_settings
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, project_to_rotations, stack_transposes, unstack_transposes
+from pgo_models.geometry.rotations import (
+    Array,
+    BoolArray,
+    project_to_rotations,
+    stack_transposes,
+    unstack_transposes,
+)
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.problem.cholesky import SymbolicCholesky, analyze
 from pgo_models.problem.initialization import spanning_tree_start
@@ -35,46 +46,142 @@ _PATIENCE = 20  # steps without a new smallest merit, after which rho goes up
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """L split by robots: what a robot knows of its own rotations, and what ties them to frozen neighbours."""
+    """L split by robots: L = own + between.
 
-    # A, w, own: sparse (rows, dn), (rows,), sparse (dn, dn); own = A^T diag(w) A: edges within a robot, and kappa I for
-    # both ends of an edge between robots.
+    Parameters
+    ----------
+    A : (rows, dn) sparse array
+        Residuals of `own`: the edges within a robot, and one end at a time of the edges between
+        robots.
+    w : (rows,) array
+        Weights of these residuals.
+    own : (dn, dn) sparse array
+        A^T diag(w) A, a block for every robot: its edges, and kappa I for its ends of the edges
+        between robots.
+    between : (dn, dn) sparse array
+        L - own, which ties rotations to the frozen neighbours.
+    analysis : SymbolicCholesky
+        Ordering and pattern of the factor of `own`.
+    """
+
     A: csr_array
     w: Array
     own: csc_array
-    between: csr_array  # sparse (dn, dn): L - own
+    between: csr_array
     analysis: SymbolicCholesky
 
 
 @dataclass(frozen=True, eq=False)
 class PaperState:
-    """Iterate k of the paper's recursion; names as in Algorithm 1."""
+    """Iterate k of the paper's recursion; names as in Algorithm 1.
+
+    Parameters
+    ----------
+    k : int
+        Number of the iterate.
+    R, omega, B : (n, d, d) arrays
+        R_i, omega_i and B_i of all poses.
+    rho : float
+        One penalty for all poses, as in the paper.
+    blocks : Blocks
+        The split matrix.
+    r_step : RotationStep
+        The back end, prepared for this rho.
+    scale : float
+        Mean diagonal of L, the unit of the dual residual.
+    dual_residual : float
+        Stationarity, ||2 L R + rho B||_F / scale over the root of n d, with the rows of R and B
+        stacked as those of L.
+    smallest_merit : float
+        For the safeguard of the adaptive rho: the smallest norm of (R - omega, omega - omega_last)
+        since rho changed.
+    steps_since_smallest : int
+        How many steps ago that was.
+    may_fall : bool
+        Whether rho may still be lowered.
+    """
 
     k: int
-    # R, omega, B: (n, d, d)
     R: Array
     omega: Array
     B: Array
-    rho: float  # one penalty for all poses, as in the paper
-    blocks: Blocks  # the split matrix
-    r_step: RotationStep  # the prepared back end for the present rho
-    scale: float  # mean diagonal of L, the unit in which the stationarity residual is measured
-    # Stationarity, ||2 L R + rho B||_F / scale over the root of n d, rows of R and B stacked as L has them.
+    rho: float
+    blocks: Blocks
+    r_step: RotationStep
+    scale: float
     dual_residual: float = np.inf
-    # smallest_merit, steps_since_smallest, may_fall: safeguard of the adaptive rho: the smallest ||R - omega|| and
-    # ||omega - omega_last|| together since rho changed, how long ago, and whether rho may still be lowered.
     smallest_merit: float = np.inf
     steps_since_smallest: int = 0
     may_fall: bool = True
 
 
+class PaperStop(enum.Enum):
+    """When the recursion has converged."""
+
+    BOTH_RESIDUALS = "p_res and the gradient of the Lagrangian are within tolerance"
+    PRIMAL_RESIDUAL = (
+        "p_res alone is within tolerance, as the paper's text says, its inequality turned round"
+    )
+
+
 @dataclass(frozen=True)
 class PaperSOC:
-    """Algorithm 1 to the letter (`algo1: SOC`): rotations only, every robot with its neighbours frozen.
+    """Algorithm 1 (`algo1: SOC`): rotations only, each robot with its neighbours frozen.
 
-    `robots` own the poses, one each unless given, as in the paper. `penalty` is one rho for all; BoydPenalty is the one
-    it names. `r_step` is the back end of (a). `tolerance` is on the paper's KKT residual, the root mean square over the
-    poses of ||omega_i^T omega_i - I||^2 + ||omega_i - R_i||^2, and on the Lagrangian's gradient, over the scale of L.
+    Parameters
+    ----------
+    robots : Partition or None
+        Who owns which poses; one pose a robot unless given, as in the paper.
+    penalty : BalancedPenalty, BoydPenalty or FixedPenalty
+        Rule of rho, one for all poses. The paper's own is `BoydPenalty`.
+    r_step : RStep or CustomRStep
+        Back end of step (a). The paper's own is `RStep.FISTA`.
+    tolerance : float
+        On the residuals that `stop` names: p_res, the root mean square over the poses of
+        ||omega_i^T omega_i - I||^2 + ||omega_i - R_i||^2, and the Lagrangian's gradient over the
+        scale of L.
+    max_iterations : int
+        Iterations at most.
+    stop : PaperStop
+        Which residuals have to be small. The paper's own is `PaperStop.PRIMAL_RESIDUAL`.
+
+    Raises
+    ------
+    SettingError
+        If a setting is out of its range.
+
+    Notes
+    -----
+    Steps (a), (b), (c), the frozen neighbours, omega^0 = R^0 and B^0 = 0 are the algorithm's. The
+    rest differs from the text, or had to be chosen where the text leaves it open:
+
+    - *Weights* (line 3). The paper's sum has none; here the edges have the kappa of F, which
+      `graph.unit_weights()` makes 1. The sum over (i, j) is taken over all edges of pose i, in
+      either direction: without the incoming ones (a) would not descend on the whole sum.
+    - *R-step* (the text after line (c)). The paper says that FISTA can solve it; the default
+      factors the matrix once per rho. The minimiser is the same to 1e-8.
+    - *Determinant* (line 5). Algorithm and `relaxation rotation` drop det = 1, a sentence below
+      says that the SVD projects to SO(3). Omega is a rotation here.
+    - *Penalty* (before the first remark). "Boyd's adaptive scheme", which doubles or halves rho, is
+      said to be that of Choudhary et al. 2015, with no constant and no first rho. `BoydPenalty` is
+      that rule with Boyd's constants, 10 and 2, from the mean of m_i on, and B rescaled with rho as
+      Boyd asks, which the paper does not mention. The default, `BalancedPenalty`, compares relative
+      residuals instead, moves rho seldom, and raises it for good when the residuals stay up: on the
+      paper's scenes Boyd's rule lowers rho until the recursion no longer settles.
+    - *Stopping* (the equation of p_res). The paper stops when p_res is at most the residual, which
+      is the wrong way round, names no tolerance, and leaves out the stationarity that the text asks
+      for. Here both residuals count, unless `stop` says otherwise.
+    - *Start and output*. The paper starts at GPS and IMU estimates or at a spanning tree, which is
+      the default here; it returns R and omega, here omega is the answer, with the best
+      translations for it, where the paper goes on to Gauss-Newton.
+
+    Examples
+    --------
+    >>> import pgo_models as pgo
+    >>> from solvers.loop import run
+    >>> graph = pgo.load("grid")
+    >>> run(PaperSOC(), pgo.PGOProblem(graph), graph.initial).status.name
+    'CONVERGED'
     """
 
     robots: Partition | None = None
@@ -82,6 +189,26 @@ class PaperSOC:
     r_step: BackEnd = RStep.FACTORIZED
     tolerance: float = 1e-5
     max_iterations: int = 500
+    stop: PaperStop = PaperStop.BOTH_RESIDUALS
+
+    @classmethod
+    def as_published(cls) -> Self:
+        """Return the settings nearest to the paper: its rule of rho, FISTA, its test of p_res.
+
+        The test stops where omega and R agree, at a stationary point or not.
+
+        Returns
+        -------
+        PaperSOC
+            One pose a robot, with the tolerance and the iterations of the default, which the paper
+            does not give.
+
+        Examples
+        --------
+        >>> PaperSOC.as_published().penalty
+        BoydPenalty(scale=1.0, imbalance=10.0, growth=2.0)
+        """
+        return cls(penalty=BoydPenalty(), r_step=RStep.FISTA, stop=PaperStop.PRIMAL_RESIDUAL)
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
@@ -91,94 +218,169 @@ class PaperSOC:
         problem.check_quadratic("SOC", convex=True)
         start = start if start is not None else spanning_tree_start(problem.graph)
         problem.stacked(start)  # raises unless the poses fit
-        blocks = _split(problem, self.robots or partition(problem.graph, method=PartitionMethod.SINGLETONS))
-        rho, scale = float(self.penalty.initial(problem, start).mean()), float(problem.L.diagonal().mean())
+        robots = self.robots or partition(problem.graph, method=PartitionMethod.SINGLETONS)
+        blocks = _split(problem, robots)
+        rho = float(self.penalty.initial(problem, start).mean())
+        scale = float(problem.L.diagonal().mean())
         r_step = _prepare(problem, blocks, rho, self.r_step)
-        return PaperState(0, start.R, start.R, np.zeros_like(start.R), rho, blocks, r_step, scale)
+        return PaperState(
+            k=0,
+            R=start.R,
+            omega=start.R,
+            B=np.zeros_like(start.R),
+            rho=rho,
+            blocks=blocks,
+            r_step=r_step,
+            scale=scale,
+        )
 
     def step(self, problem: PGOProblem, state: PaperState) -> PaperState:
-        """Steps (a), (b), (c), then the adaptive rho with B rescaled."""
-        neighbours = state.blocks.between @ stack_transposes(state.R)
-        shift = stack_transposes(state.omega - state.B) - (2.0 / state.rho) * neighbours
-        R = unstack_transposes(state.r_step.solve(shift))  # (a)
+        """Make one iteration, (a), (b), (c); then adapt rho, and B with it."""
+        frozen = state.blocks.between @ stack_transposes(state.R)
+        shift = stack_transposes(state.omega - state.B) - (2.0 / state.rho) * frozen
+        R = unstack_transposes(state.r_step.solve(shift))  # (a) R-step
         if not np.isfinite(R).all():
             return replace(state, k=state.k + 1, R=R, dual_residual=np.nan)
-        omega = project_to_rotations(R + state.B)  # (b)
-        B = state.B + R - omega  # (c)
-        root = np.sqrt(R.shape[0] * R.shape[1])
-        primal, change = norm(omega - R) / root, norm(omega - state.omega) / root
-        gradient = 2.0 * (problem.L @ stack_transposes(R)) + state.rho * stack_transposes(B)
-        dual, merit = norm(gradient) / (root * state.scale), float(np.hypot(primal, change))
-        smallest, since = state.smallest_merit, state.steps_since_smallest
-        smallest, since = (merit, 0) if merit < smallest else (smallest, since + 1)
-        following = replace(state, k=state.k + 1, R=R, omega=omega, B=B, dual_residual=dual)
-        following = replace(following, smallest_merit=smallest, steps_since_smallest=since)
-        return _with_adapted_rho(problem, following, self.penalty, primal, change, self.r_step)
+        omega = project_to_rotations(R + state.B)  # (b) projection
+        B = state.B + R - omega  # (c) Bregman update
+        following = replace(state, k=state.k + 1, R=R, omega=omega, B=B)
+        return self._with_residuals(problem, state, following)
+
+    def _with_residuals(
+        self, problem: PGOProblem, before: PaperState, state: PaperState
+    ) -> PaperState:
+        """The state with its dual residual and merit, and with the rho for the next step."""
+        gradient = 2.0 * (problem.L @ stack_transposes(state.R))
+        gradient += state.rho * stack_transposes(state.B)
+        root = np.sqrt(state.R.shape[0] * state.R.shape[1])
+        dual_residual = norm(gradient) / (root * state.scale)
+        primal = norm(state.omega - state.R) / root
+        change = norm(state.omega - before.omega) / root
+        merit = float(np.hypot(primal, change))
+        state = replace(state, dual_residual=dual_residual)
+        if merit < state.smallest_merit:
+            state = replace(state, smallest_merit=merit, steps_since_smallest=0)
+        else:
+            state = replace(state, steps_since_smallest=state.steps_since_smallest + 1)
+        return _with_adapted_rho(problem, state, self.penalty, primal, change, self.r_step)
 
     def measure(self, problem: PGOProblem, state: PaperState) -> Measurement:
         """F at omega with the best translations, and the paper's KKT residual p_res per pose.
 
-        p_res = sqrt(||omega^T omega - I||^2 + ||omega - R||^2) over the root of n. The paper stops when its tolerance
-        is at most this value; the inequality belongs the other way round.
+        p_res = sqrt(||omega^T omega - I||^2 + ||omega - R||^2) over the root of n. The paper stops
+        when its tolerance is at most this value; the inequality belongs the other way round.
         """
         if np.isnan(state.dual_residual):
             return Measurement(np.nan, np.nan, np.nan)
-        omega, d = state.omega, state.omega.shape[1]
+        omega = state.omega
+        d = state.omega.shape[1]
         orthogonality = norm(np.swapaxes(omega, 1, 2) @ omega - np.eye(d))
-        p_res = float(np.hypot(orthogonality, norm(omega - state.R))) / np.sqrt(len(omega))
+        disagreement = norm(omega - state.R)
+        p_res = float(np.hypot(orthogonality, disagreement)) / np.sqrt(len(omega))
         X = np.concatenate([problem.recover_translations(omega), stack_transposes(omega)])
         return Measurement(problem.objective_stacked(X), p_res, state.dual_residual)
 
     def poses(self, problem: PGOProblem, state: PaperState) -> Poses:
-        """Omega with the best translations."""
+        """Return the poses that a state stands for.
+
+        Parameters
+        ----------
+        problem : PGOProblem
+            The problem that is solved.
+        state : PaperState
+            A state of this solver.
+
+        Returns
+        -------
+        Poses
+            Omega with the best translations for it.
+        """
         return problem.with_best_translations(state.omega)
 
     def converged(self, state: PaperState, measurement: Measurement) -> Status | None:
-        """CONVERGED when both residuals are within tolerance."""
-        worst = max(measurement.primal_residual, measurement.dual_residual)
+        """CONVERGED when the residuals that `stop` names are within tolerance."""
+        if state.k == 0:  # omega^0 is R^0, which says nothing
+            return None
+        worst = measurement.primal_residual
+        if self.stop is PaperStop.BOTH_RESIDUALS:
+            worst = max(worst, measurement.dual_residual)
         return Status.CONVERGED if worst <= self.tolerance else None
 
 
 def _with_adapted_rho(
-    problem: PGOProblem, state: PaperState, rule: PaperPenalty, primal: float, change: float, back_end: BackEnd
+    problem: PGOProblem,
+    state: PaperState,
+    rule: PaperPenalty,
+    primal: float,
+    change: float,
+    back_end: BackEnd,
 ) -> PaperState:
-    """State with the rho for the next step, B rescaled: balanced, and up again for good when the merit stays up."""
+    """State with the rho for the next step, and B rescaled with it.
+
+    Under a BalancedPenalty rho goes up, and may not fall any more, when the merit has stayed up for
+    long.
+    """
+    if isinstance(rule, FixedPenalty):
+        return state
     may_fall = state.may_fall
     if isinstance(rule, BoydPenalty):
         factor = rule.factor(primal, state.rho * change)
-    elif not isinstance(rule, BalancedPenalty):
-        return state
     elif state.steps_since_smallest >= _PATIENCE:
-        factor, may_fall = rule.refactor_ratio, False
+        factor = rule.refactor_ratio
+        may_fall = False
     else:
         factor = rule.factor(primal, change)
     if factor == 1.0 or (factor < 1.0 and not may_fall):
         return state
     rho = factor * state.rho
-    state = replace(state, smallest_merit=np.inf, steps_since_smallest=0, may_fall=may_fall)
-    return replace(state, rho=rho, B=state.B / factor, r_step=_prepare(problem, state.blocks, rho, back_end))
+    return replace(
+        state,
+        rho=rho,
+        B=state.B / factor,
+        r_step=_prepare(problem, state.blocks, rho, back_end),
+        smallest_merit=np.inf,
+        steps_since_smallest=0,
+        may_fall=may_fall,
+    )
 
 
 def _prepare(problem: PGOProblem, blocks: Blocks, rho: float, back_end: BackEnd) -> RotationStep:
-    penalty, d = np.full(blocks.own.shape[0], rho), problem.d
-    subproblem = RSubproblem(blocks.A, blocks.w, blocks.own, d, 0, penalty, blocks.analysis, problem.backend)
+    penalty = np.full(blocks.own.shape[0], rho)
+    d = problem.d
+    subproblem = RSubproblem(
+        blocks.A, blocks.w, blocks.own, d, 0, penalty, blocks.analysis, problem.backend
+    )
     return prepare(subproblem, back_end)
 
 
 def _split(problem: PGOProblem, robots: Partition) -> Blocks:
-    graph, n, d = problem.graph, problem.num_poses, problem.d
-    cut = robots.cut_edges(graph)
+    """Split L: a residual between two robots becomes two, each with only one of its ends."""
+    graph = problem.graph
+    n = problem.num_poses
+    d = problem.d
+    is_cut = robots.cut_edges(graph)
     A, w = problem.residual_matrix
+    # Rows of the rotation residuals come after one translation residual for every edge.
     rows = graph.num_edges + d * np.arange(graph.num_edges)[:, None] + np.arange(d)
-    inner, between = rows[~cut].ravel(), rows[cut].ravel()
-    rotations = A[:, n:].tocsr()
-    across = rotations[between].tocoo()
-    of_i = across.col // d == np.repeat(graph.i[cut], d)[across.row]
-    alone = [csr_array((across.data[at], (across.row[at], across.col[at])), shape=across.shape) for at in (of_i, ~of_i)]
-    A_own = vstack([rotations[inner], *alone], format="csr")
-    w_own = np.concatenate([w[inner], w[between], w[between]])
-    full_blocks = rotation_columns(np.arange(n), 0, d)
-    zero = *block_entries(full_blocks, full_blocks), np.zeros((n, d, d))
+    rows_inside = rows[~is_cut].ravel()
+    rows_between = rows[is_cut].ravel()
+    A_R = A[:, n:].tocsr()
+    A_between = A_R[rows_between].tocoo()
+    is_of_i = A_between.col // d == np.repeat(graph.i[is_cut], d)[A_between.row]
+    A_own = vstack(
+        [A_R[rows_inside], _entries(A_between, is_of_i), _entries(A_between, ~is_of_i)],
+        format="csr",
+    )
+    w_own = np.concatenate([w[rows_inside], w[rows_between], w[rows_between]])
     product = (A_own.T @ (A_own * w_own[:, None])).tocoo()
-    own = assemble([(product.row, product.col, product.data), zero], n * d)
+    # Zeros keep the full block of every pose in the pattern.
+    full_blocks = rotation_columns(np.arange(n), 0, d)
+    zeros = *block_entries(full_blocks, full_blocks), np.zeros((n, d, d))
+    own = assemble([(product.row, product.col, product.data), zeros], n * d)
     return Blocks(A_own, w_own, own, (problem.L - own).tocsr(), analyze(own, problem.backend))
+
+
+def _entries(matrix: coo_array, chosen: BoolArray) -> csr_array:
+    """The matrix with some of its entries only."""
+    positions = matrix.row[chosen], matrix.col[chosen]
+    return csr_array((matrix.data[chosen], positions), shape=matrix.shape)

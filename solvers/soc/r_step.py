@@ -1,6 +1,8 @@
-"""Back ends of step (a), the R-subproblem, behind one function: V -> X (Algorithm 1, step 3).
+"""Back ends of step (a), the R-subproblem, behind one function V -> X (Algorithm 1, step 3).
 
-X(V) = argmin  sum_rows w ||A X||^2 + 1/2 ||sqrt(D) (X - V)||_F^2,     (M + D/2) X = D/2 V
+    X(V) = argmin  sum_rows w ||A X||^2 + 1/2 ||sqrt(D) (X - V)||_F^2
+
+With M = A^T diag(w) A this is the solution of (M + D/2) X = D/2 V.
 """
 
 import enum
@@ -11,16 +13,19 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from scipy.sparse import csc_array, csr_array, diags_array
 
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, factorize
 from pgo_models.problem.matrices import entry_positions
+from pgo_models.problem.problem import PGOProblem
 from solvers.soc.fista import minimize_with_fista
 
 if TYPE_CHECKING:
     from pgo_models.convex.convex_solver import ConvexSolver
     from pgo_models.convex.rotation_subproblem import RotationQP
 
-_BOUND_SWEEPS = 10  # then at most 1.27 times the largest eigenvalue of H on the benchmark graphs
+# Multiplications that tighten the bound on the largest eigenvalue of H. On the benchmark graphs
+# the bound is then at most 1.27 times that eigenvalue.
+_BOUND_SWEEPS = 10
 
 
 class RStep(enum.Enum):
@@ -33,15 +38,35 @@ class RStep(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class RSubproblem:
-    """The R-subproblem of one robot, or of the whole graph."""
+    """The R-subproblem of one robot, or of the whole graph.
 
-    # A, w: sparse (rows, N), (rows,); residuals and weights of the edges concerned.
+    Parameters
+    ----------
+    A : (rows, N) sparse array
+        Residuals of the edges concerned, linear in X.
+    w : (rows,) array
+        Weights of the residuals.
+    M : (N, N) sparse array
+        A^T diag(w) A, in the pattern of `analysis`.
+    d : int
+        Dimension, 2 or 3.
+    num_translations : int
+        Number of the first rows of X, which are translations; 0 for rotations only. The others are
+        rows of R_i^T.
+    penalty : (N,) array
+        Diagonal of D. When no translation has a penalty, row 0 is grounded: the minimiser with
+        t_0 = 0 is taken.
+    analysis : SymbolicCholesky
+        Ordering and pattern of the factor.
+    backend : CholeskyBackend or None
+        Which library factors the matrix.
+    """
+
     A: csr_array
     w: Array
-    M: csc_array  # (N, N): A^T diag(w) A, in the pattern of `analysis`
+    M: csc_array
     d: int
-    num_translations: int  # the first rows of X, 0 for rotations only; the others are rows of R_i^T
-    # (N,): diagonal of D. When no translation has one, row 0 is grounded: the minimiser with t_0 = 0 is taken.
+    num_translations: int
     penalty: Array
     analysis: SymbolicCholesky
     backend: CholeskyBackend | None
@@ -66,17 +91,39 @@ class RSubproblem:
 
 
 class RotationStep(Protocol):
-    """A prepared back end."""
+    """A back end that is ready for many shifts."""
 
     def solve(self, V: Array) -> Array:
-        """X, (N, d), for the shift V, (N, d)."""
+        """Solve the subproblem for a shift.
+
+        Parameters
+        ----------
+        V : Array, (N, d)
+            The shift.
+
+        Returns
+        -------
+        Array, (N, d)
+            The minimiser X.
+        """
 
 
 class CustomRStep(Protocol):
-    """A back end of one's own, in place of an RStep."""
+    """A back end that a user writes, in place of an RStep."""
 
     def prepare(self, subproblem: RSubproblem) -> RotationStep:
-        """Make the subproblem, or a changed one with the same rows, ready for many shifts."""
+        """Make the subproblem, or a changed one with the same rows, ready for many shifts.
+
+        Parameters
+        ----------
+        subproblem : RSubproblem
+            The subproblem.
+
+        Returns
+        -------
+        RotationStep
+            What solves it for one shift after the other.
+        """
 
 
 BackEnd = RStep | CustomRStep
@@ -87,23 +134,93 @@ def prepare(subproblem: RSubproblem, back_end: BackEnd) -> RotationStep:
     if not isinstance(back_end, RStep):
         return back_end.prepare(subproblem)
     if back_end is RStep.FACTORIZED:
-        return _Factorized(subproblem.analysis.factorize(subproblem.K), 0.5 * subproblem.penalty[:, None])
-    return _Fista(subproblem) if back_end is RStep.FISTA else CvxpyStep().prepare(subproblem)
+        factor = subproblem.analysis.factorize(subproblem.K)
+        return _Factorized(factor, 0.5 * subproblem.penalty[:, None])
+    if back_end is RStep.FISTA:
+        return _Fista(subproblem)
+    return CvxpyStep().prepare(subproblem)
+
+
+@dataclass(frozen=True, eq=False)
+class JointStep:
+    """Step (a) of JOINT: the rotations of the minimiser over rotations and translations.
+
+    Parameters
+    ----------
+    back_end : RotationStep
+        What solves for rotations and translations.
+    num_poses : int
+        Number n of poses.
+    stiffness : (n, 1, d) array
+        max(1, rho_i / diagonal of M) for every row of R_i^T, for the dual residual.
+    """
+
+    back_end: RotationStep
+    num_poses: int
+    stiffness: Array
+
+    def solve(self, V: Array) -> Array:
+        """R, (n, d, d), for the shift V, (n, d, d)."""
+        return unstack_transposes(self.solve_stacked(V)[self.num_poses :])
+
+    def solve_stacked(self, V: Array) -> Array:
+        """X, (N, d), translations first, for the shift V, (n, d, d), of the rotations."""
+        no_translations = np.zeros((self.num_poses, V.shape[-1]))
+        return self.back_end.solve(np.concatenate([no_translations, stack_transposes(V)]))
+
+
+def prepare_joint(problem: PGOProblem, rho: Array, back_end: BackEnd) -> JointStep:
+    """Step (a) for the whole graph with the penalties rho, (n,)."""
+    n = problem.num_poses
+    d = problem.d
+    A, w = problem.residual_matrix
+    rho_of_rows = np.repeat(rho, d)
+    penalty = np.concatenate([np.zeros(n), rho_of_rows])
+    subproblem = RSubproblem(A, w, problem.M, d, n, penalty, problem.analysis, problem.backend)
+    diagonal = problem.M.data[problem.diagonal_positions[n:]]
+    stiffness = np.maximum(1.0, rho_of_rows / diagonal)
+    return JointStep(prepare(subproblem, back_end), n, stiffness.reshape(n, 1, d))
 
 
 @dataclass(frozen=True)
 class CvxpyStep:
-    """`RStep.CLARABEL` by another solver of cvxpy that takes quadratic programs: a name, or a `ConvexSolver`."""
+    """Back end of step (a) that solves the quadratic program by cvxpy.
+
+    `RStep.CLARABEL` is this with the default.
+
+    Parameters
+    ----------
+    solver : ConvexSolver or str
+        A solver of cvxpy that takes quadratic programs, by its name or with settings.
+
+    Examples
+    --------
+    >>> from solvers import SOC
+    >>> SOC(r_step=CvxpyStep("OSQP")).r_step.solver
+    'OSQP'
+    """
 
     solver: "ConvexSolver | str" = "CLARABEL"
 
     def prepare(self, subproblem: RSubproblem) -> RotationStep:
-        """Compile the cvxpy quadratic program."""
+        """Compile the cvxpy quadratic program.
+
+        Parameters
+        ----------
+        subproblem : RSubproblem
+            The R-subproblem with its penalties.
+
+        Returns
+        -------
+        RotationStep
+            The compiled program, which is solved for every shift.
+        """
         from pgo_models.convex.rotation_subproblem import rotation_qp
 
-        s = subproblem
-        qp = rotation_qp(s.A, s.w, s.penalty, s.d, solver=self.solver)
-        return _Cvxpy(qp, s.num_translations if s.needs_ground else 0)
+        qp = rotation_qp(
+            subproblem.A, subproblem.w, subproblem.penalty, subproblem.d, solver=self.solver
+        )
+        return _Cvxpy(qp, subproblem.num_translations if subproblem.needs_ground else 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,21 +233,27 @@ class _Factorized:
 
 
 class _Fista:
-    """FISTA on the rotations alone; the best translations of an iterate come from one factorised Laplacian.
+    """FISTA on the rotations alone.
 
-    In the variable D^(1/2) R, with H = D^(-1/2) (K_RR - K_Rt K_tt^-1 K_tR) D^(-1/2), the strong convexity is at least
-    1/2 because Q is positive semidefinite. The Lipschitz constant is a bound on the largest eigenvalue.
+    The best translations of an iterate come from one factorised Laplacian. In the variable
+    D^(1/2) R, with H = D^(-1/2) (K_RR - K_Rt K_tt^-1 K_tR) D^(-1/2), the strong convexity is at
+    least 1/2 because Q is positive semidefinite. The Lipschitz constant is a bound on the largest
+    eigenvalue.
     """
 
     def __init__(self, subproblem: RSubproblem) -> None:
-        K, count = subproblem.K, subproblem.num_translations
+        K = subproblem.K
+        count = subproblem.num_translations
         self._subproblem = subproblem
-        self._factor_tt = factorize(K[:count, :count].tocsc(), subproblem.backend) if count else None
+        self._factor_tt = (
+            factorize(K[:count, :count].tocsc(), subproblem.backend) if count else None
+        )
         self._K_tR = K[:count, count:].tocsr()
         scale = 1.0 / np.sqrt(subproblem.penalty[count:])
         self._scale = scale[:, None]
         self._H_RR = (diags_array(scale) @ K[count:, count:] @ diags_array(scale)).tocsr()
-        self._lipschitz = _largest_eigenvalue_bound(self._H_RR)  # without the correction, which only lowers it
+        # The correction K_Rt K_tt^-1 K_tR only lowers the eigenvalues of H.
+        self._lipschitz = _largest_eigenvalue_bound(self._H_RR)
 
     def solve(self, V: Array) -> Array:
         count = self._subproblem.num_translations
@@ -138,7 +261,9 @@ class _Fista:
         b_t = b[:count]
         reduced = self._scale * (b[count:] - self._K_tR.T @ self._solve_tt(b_t))
         start = V[count:] / self._scale
-        R = self._scale * minimize_with_fista(self._apply, reduced, start, self._lipschitz, strong_convexity=0.5)
+        R = self._scale * minimize_with_fista(
+            self._apply, reduced, start, self._lipschitz, strong_convexity=0.5
+        )
         return np.concatenate([self._solve_tt(b_t - self._K_tR @ R), R])
 
     def _apply(self, Y: Array) -> Array:
@@ -161,13 +286,14 @@ class _Cvxpy:
 
 
 def _largest_eigenvalue_bound(H: csr_array) -> float:
-    """max_i (|H| v)_i / v_i, at least the largest eigenvalue of a symmetric H for any v > 0 (Collatz 1942).
+    """Upper bound on the largest eigenvalue of a symmetric H (Collatz 1942).
 
-    With v = 1 it is Gershgorin's; every multiplication of v by |H| lowers it.
+    It is max_i (|H| v)_i / v_i for any v > 0. With v = 1 it is Gershgorin's bound; every
+    multiplication of v by |H| lowers it.
     """
-    size = abs(H)
-    v = np.ones(H.shape[0])
+    absolute = abs(H)
+    v: Array = np.ones(H.shape[0])
     for _ in range(_BOUND_SWEEPS):
-        v = size @ v
+        v = absolute @ v
         v /= v.max()
-    return float((size @ v / v).max())
+    return float((absolute @ v / v).max())

@@ -1,4 +1,8 @@
-"""Settings of SOC, for all couplings."""
+"""Settings of SOC and its coupling, which the recursions of all couplings read.
+
+They are a base class of `solvers.soc.soc.SOC`, because SOC calls the recursions and the recursions
+read the settings.
+"""
 
 import enum
 import math
@@ -13,7 +17,10 @@ from solvers.soc.penalty import BoydPenalty, MultiplierPenalty, PenaltyOrder, Pe
 from solvers.soc.r_step import BackEnd, RStep
 from solvers.soc.recursion_block import StepSettings
 
-_SEPARATOR_PENALTY, _MOST_SEPARATOR_PENALTY = 0.7, 0.3  # times the root of the translation penalty, and no more
+# The default `separator_penalty`: this times the square root of the translation penalty, but no
+# more than the maximum.
+_SEPARATOR_PENALTY = 0.7
+_MAX_SEPARATOR_PENALTY = 0.3
 
 
 class Coupling(enum.Enum):
@@ -21,12 +28,14 @@ class Coupling(enum.Enum):
 
     JOINT = "one robot, all rotations and translations in one QP"
     CONSENSUS = "many robots, omega agreed between the copies of separator poses"
-    SUBSTRUCTURED = "many robots and a driver: the program of JOINT, split by elimination to the separators"
+    SUBSTRUCTURED = (
+        "many robots and a driver: the program of JOINT, split by elimination to the separators"
+    )
 
 
 @dataclass(frozen=True)
 class SOCSettings:
-    """Settings of `solvers.soc.soc.SOC`, which documents them, as its recursions need them."""
+    """Settings of `solvers.soc.soc.SOC`, whose docstring explains each of them."""
 
     coupling: Coupling | None = None
     robots: Partition | None = None
@@ -42,44 +51,59 @@ class SOCSettings:
 
     def __post_init__(self) -> None:
         if isinstance(self.penalty, BoydPenalty):
-            raise SettingError(f"{self.penalty} has one rho for all poses; use it with PaperSOC, or a BalancedPenalty")
+            raise SettingError(
+                f"{self.penalty} has one rho for all poses; use it with PaperSOC, "
+                "or a BalancedPenalty"
+            )
         check_settings(self, relaxation=["alpha"], positive=["translation_penalty", "tolerance"])
-        check_settings(self, not_negative=["separator_penalty", "max_iterations"], at_least_one=["local_passes"])
-        if self.coupling is Coupling.JOINT and self.robots is not None and self.robots.num_robots > 1:
+        check_settings(
+            self,
+            not_negative=["separator_penalty", "max_iterations"],
+            at_least_one=["local_passes"],
+        )
+        if self.coupling is Coupling.JOINT and self._has_many_robots:
             raise SettingError(f"JOINT has one robot, got {self.robots}; use Coupling.CONSENSUS")
         if self.coupling is Coupling.CONSENSUS and self.robots is None:
             raise SettingError("CONSENSUS needs robots; see pgo_models.partition()")
 
     @property
     def effective_coupling(self) -> Coupling:
-        """The coupling that is used."""
+        """The coupling that is used: `coupling`, or what follows from `robots`."""
         if self.coupling is not None:
             return self.coupling
         return Coupling.JOINT if self.robots is None else Coupling.CONSENSUS
 
-    def converged(self, state: object, measurement: Measurement) -> Status | None:
-        """CONVERGED when the residuals are within tolerance."""
-        worst = max(measurement.primal_residual, measurement.dual_residual)
-        return Status.CONVERGED if worst <= self.tolerance else None
-
     @property
     def is_split(self) -> bool:
         """Whether more than one robot holds copies."""
-        return self.effective_coupling is Coupling.CONSENSUS and self.robots is not None and self.robots.num_robots > 1
+        return self.effective_coupling is Coupling.CONSENSUS and self._has_many_robots
+
+    def converged(self, state: object, measurement: Measurement) -> Status | None:
+        """CONVERGED when both residuals are within tolerance."""
+        worst = max(measurement.primal_residual, measurement.dual_residual)
+        return Status.CONVERGED if worst <= self.tolerance else None
+
+    # What the recursions are given.
 
     @property
     def step_settings(self) -> StepSettings:
-        """What a robot must know of them."""
-        found = self.acceleration
-        alone = found if found is not None and found.per_robot else None
-        return StepSettings(self.alpha, found.memory if found is not None else 0, self.local_passes, alone)
+        """The settings that every robot needs for its steps."""
+        acceleration = self.acceleration
+        if acceleration is None:
+            return StepSettings(self.alpha, memory=0, local_passes=self.local_passes)
+        alone = acceleration if acceleration.per_robot else None
+        return StepSettings(self.alpha, acceleration.memory, self.local_passes, alone)
 
     def penalty_order(self, ratio: Array, is_stationary: bool) -> PenaltyOrder:
         """Rule of rho, from ||Lambda_i||_2 / m_i of all poses, (n,)."""
         return PenaltyOrder(*self.penalty.bounds(ratio), is_stationary, self.step_settings)
 
     def separator_penalty_for(self, translation_penalty: float) -> float:
-        """Least penalty of separator rotations, times m_i, beside a penalty of their translations."""
+        """Least penalty of separator rotations over m_i, given that of their translations."""
         if self.separator_penalty is not None:
             return self.separator_penalty
-        return min(_SEPARATOR_PENALTY * math.sqrt(translation_penalty), _MOST_SEPARATOR_PENALTY)
+        return min(_SEPARATOR_PENALTY * math.sqrt(translation_penalty), _MAX_SEPARATOR_PENALTY)
+
+    @property
+    def _has_many_robots(self) -> bool:
+        return self.robots is not None and self.robots.num_robots > 1

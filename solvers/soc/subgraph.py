@@ -1,4 +1,4 @@
-"""What one robot is given: its own poses, the edges that touch them, and where its neighbours' separators fit in."""
+"""What one robot is given: its own poses, the edges that touch them, and the poses it shares."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array
 
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, middle_pose, poses_by_distance
 from pgo_models.graphs.separators import cover_of_edges
+from pgo_models.problem.edge_cost import EdgeCost
 from pgo_models.problem.problem import PGOProblem, as_problem
-from pgo_models.problem.weighting import EdgeWeights
 
 
 class PartProblem(PGOProblem):
-    """The cost of some of the edges; what they leave apart, other robots hold together."""
+    """The cost of some of the edges; their graph need not be connected."""
 
     def __post_init__(self) -> None:
         """Accept graphs that are not connected."""
@@ -26,24 +26,53 @@ class PartProblem(PGOProblem):
 
 @dataclass(frozen=True, eq=False)
 class Subgraph:
-    """A robot's part of a graph: all that it ever learns of it before the first round."""
+    """A robot's part of a graph: all that it learns of the graph before the first round.
+
+    Parameters
+    ----------
+    robot : int
+        Number of the robot.
+    graph : PoseGraph
+        Its poses and edges, renumbered: its own poses, and the poses of others at the far end of
+        its edges.
+    poses : (n_a,) array
+        Numbers of its poses in the whole graph, ascending.
+    owner : (n_a,) array
+        Which robot owns each pose.
+    in_cover : (n_a,) array
+        Position of each pose among those that the driver solves for, or -1.
+    is_counted : (m_a,) array
+        Whether an edge is this robot's in sums over robots; every edge of the whole graph is
+        counted once. An edge to a pose that the driver does not solve for is counted by the owner
+        of that pose.
+    copies : (n_a,) array
+        How many robots hold each pose.
+    common : tuple of pairs
+        Every other robot that holds some of the same poses, and which of `poses` they are, (q,),
+        ascending.
+    edges : (m_a,) array
+        Numbers of its edges in the whole graph.
+    weights : EdgeCost
+        Weights of its edges in the cost that SOC is run on.
+    final : EdgeCost or None
+        Their weights in the cost that is solved, where that is another one
+        (`PGOProblem.convex_part`).
+    thresholds : (m_a,) array or None
+        What its edges may cost in a robust solve, inf for known inliers.
+    """
 
     robot: int
-    # Its poses and edges, renumbered: its own poses, and the poses of others at the far end of its edges.
     graph: PoseGraph
-    poses: IntArray  # (n_a,): their numbers in the whole graph, ascending
-    owner: IntArray  # (n_a,): which robot owns each
-    in_cover: IntArray  # (n_a,): position of each among the poses that the driver solves for, or -1
-    # (m_a,): whether an edge is this robot's in sums over robots; every edge of the whole graph is counted once. An
-    # edge to a pose that the driver does not solve for is counted by the owner of that pose.
+    poses: IntArray
+    owner: IntArray
+    in_cover: IntArray
     is_counted: BoolArray
-    copies: IntArray  # (n_a,): how many robots hold each pose
-    # For every other robot that holds some of the same poses: which of `poses` they are, (q,), ascending.
+    copies: IntArray
     common: tuple[tuple[int, IntArray], ...]
-    edges: IntArray  # (m_a,): numbers of its edges in the whole graph
-    weights: EdgeWeights  # of its edges, in the cost that SOC is run on
-    final: EdgeWeights | None = None  # in the cost that is solved, where that is another (`PGOProblem.convex_part`)
-    thresholds: Array | None = None  # (m_a,): what they may cost in a robust solve, inf for known inliers
+    edges: IntArray
+    weights: EdgeCost
+    final: EdgeCost | None = None
+    thresholds: Array | None = None
 
     @cached_property
     def is_own(self) -> BoolArray:
@@ -52,52 +81,97 @@ class Subgraph:
 
     @cached_property
     def counted(self) -> tuple[IntArray, IntArray]:
-        """Which of `poses` the edges that this robot counts join, and where their ends are in these."""
+        """Which of `poses` the counted edges join, and the positions of their ends among these."""
         kept = self.is_counted
-        return np.unique(np.concatenate([self.graph.i[kept], self.graph.j[kept]]), return_inverse=True)
+        ends = np.concatenate([self.graph.i[kept], self.graph.j[kept]])
+        return np.unique(ends, return_inverse=True)
 
     @cached_property
     def part(self) -> Part | None:
         """The edges that this robot counts; None when there are none."""
         if not self.is_counted.any():
             return None
-        graph, kept, (poses, ends) = self.graph, self.is_counted, self.counted
+        graph = self.graph
+        kept = self.is_counted
+        poses, ends = self.counted
         i, j = np.split(ends, 2)
-        measured = graph.R_ij[kept], graph.t_ij[kept], graph.kappa[kept], graph.tau[kept]
-        counted = PoseGraph(len(poses), i, j, *measured, name=graph.name)
-        problem = PartProblem(counted, None, self.weights.of_edges(kept))
-        final = None if self.final is None else PartProblem(counted, None, self.final.of_edges(kept))
-        allowed = None if self.thresholds is None else self.thresholds[kept]
-        return Part(problem, self.poses[poses], self.in_cover[poses], final, self.edges[kept], allowed)
+        counted = PoseGraph(
+            len(poses),
+            i,
+            j,
+            graph.R_ij[kept],
+            graph.t_ij[kept],
+            graph.kappa[kept],
+            graph.tau[kept],
+            name=graph.name,
+        )
+        final = None
+        if self.final is not None:
+            final = PartProblem(counted, None, self.final.of_edges(kept))
+        return Part(
+            problem=PartProblem(counted, None, self.weights.of_edges(kept)),
+            poses=self.poses[poses],
+            in_cover=self.in_cover[poses],
+            final=final,
+            edges=self.edges[kept],
+            thresholds=None if self.thresholds is None else self.thresholds[kept],
+        )
 
     @cached_property
-    def outline(self) -> Outline:
-        """What the driver is told of it."""
-        part, held = self.counted[0], np.flatnonzero(self.in_cover >= 0)
-        touched = self.in_cover[part][self.in_cover[part] >= 0]
-        counts = np.sort(touched) if self.is_counted.any() else None
-        known = self.graph.d, self.poses[held], self.in_cover[held], counts, self.final is not None
-        return Outline(self.robot, *known, self.poses[part])
+    def summary(self) -> RobotSummary:
+        """What the driver is sent of it."""
+        poses_of_part = self.counted[0]
+        in_cover_of_part = self.in_cover[poses_of_part]
+        touched = np.sort(in_cover_of_part[in_cover_of_part >= 0])
+        shared = np.flatnonzero(self.in_cover >= 0)
+        return RobotSummary(
+            robot=self.robot,
+            d=self.graph.d,
+            cover=self.poses[shared],
+            in_cover=self.in_cover[shared],
+            touched=touched if self.is_counted.any() else None,
+            has_two_costs=self.final is not None,
+            part=self.poses[poses_of_part],
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Outline:
-    """What a driver knows of a robot: of the poses that it solves for, those that the robot holds."""
+class RobotSummary:
+    """What a driver knows of a robot, whose poses in the cover are those the driver solves for.
+
+    Parameters
+    ----------
+    robot : int
+        Number of the robot.
+    d : int
+        Dimension.
+    cover : (h,) array
+        Numbers in the whole graph of the poses in the cover that the robot holds.
+    in_cover : (h,) array
+        Their positions in the cover.
+    touched : array or None
+        Positions in the cover of the poses that the robot's counted edges join; None if it counts
+        none.
+    has_two_costs : bool
+        Whether SOC is run on another cost than the one that is solved.
+    part : (p,) array or None
+        Numbers of all poses that these edges join; None where only the robot may know them.
+    """
 
     robot: int
     d: int
-    cover: IntArray  # (h,): their numbers in the whole graph
-    in_cover: IntArray  # (h,): their positions among all that the driver solves for
-    touched: IntArray | None  # positions of those that an edge which the robot counts joins; None if it counts none
+    cover: IntArray
+    in_cover: IntArray
+    touched: IntArray | None
     has_two_costs: bool
-    part: IntArray | None  # (p,): numbers of all poses that these edges join; None where they are the robot's to know
+    part: IntArray | None
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Of the poses that a robot shares with others, their numbers, (h,), and what `Subgraph` says of them."""
+    """The poses that a robot shares with others, with the fields that `Subgraph` has of them."""
 
-    poses: IntArray
+    poses: IntArray  # (h,): their numbers in the whole graph
     in_cover: IntArray
     copies: IntArray
     common: tuple[tuple[int, IntArray], ...]  # positions in `poses`
@@ -106,33 +180,50 @@ class Placement:
         self, robot: int, graph: PoseGraph, poses: IntArray, owner: IntArray
     ) -> tuple[IntArray, BoolArray, IntArray, tuple[tuple[int, IntArray], ...]]:
         """`in_cover`, `is_counted`, `copies` and `common` of the robot's subgraph."""
-        at = np.searchsorted(poses, self.poses)
-        in_cover, copies = np.full(len(poses), -1), np.ones(len(poses), dtype=np.int64)
-        in_cover[at], copies[at] = self.in_cover, self.copies
-        # An end outside the cover decides: such ends of one edge have one owner. Else that of the first end counts it.
-        counted = np.where(in_cover[graph.j] < 0, owner[graph.j], owner[graph.i]) == robot
-        return in_cover, counted, copies, tuple((other, at[both]) for other, both in self.common)
+        positions = np.searchsorted(poses, self.poses)
+        in_cover = np.full(len(poses), -1)
+        in_cover[positions] = self.in_cover
+        copies = np.ones(len(poses), dtype=np.int64)
+        copies[positions] = self.copies
+        # The owner of an end outside the cover counts the edge; if both ends are outside they have
+        # the same owner. Else the owner of the first end counts it.
+        counted_by = np.where(in_cover[graph.j] < 0, owner[graph.j], owner[graph.i])
+        common = tuple((other, positions[shared]) for other, shared in self.common)
+        return in_cover, counted_by == robot, copies, common
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """The cost of the edges that one robot counts."""
+    """The cost of the edges that one robot counts.
+
+    Parameters
+    ----------
+    problem : PartProblem
+        The cost that SOC is run on.
+    poses : (p,) array
+        Numbers of its poses in the whole graph.
+    in_cover : (p,) array
+        Position of each pose among those that the driver solves for, or -1 for the robot's
+        interior.
+    final : PartProblem or None
+        The cost that is solved, where SOC is run on another one.
+    edges : (k,) array or None
+        Numbers of its edges in the whole graph.
+    thresholds : (k,) array or None
+        What its edges may cost in a robust solve.
+    """
 
     problem: PartProblem
-    poses: IntArray  # (p,): numbers of its poses in the whole graph
-    # (p,): position of each among the poses that the driver solves for, or -1 for the robot's interior.
+    poses: IntArray
     in_cover: IntArray
-    final: PartProblem | None = None  # the cost that is solved, where SOC is run on another
-    edges: IntArray | None = None  # (k,): as of `Subgraph`
+    final: PartProblem | None = None
+    edges: IntArray | None = None
     thresholds: Array | None = None
 
     def weighted(self, weights: Array) -> Part:
         """The part with the costs of its edges times weights, (k,)."""
-
-        def scaled(one: PartProblem) -> PartProblem:
-            return PartProblem(one.graph, one.backend, one.weights.scaled(weights))
-
-        return replace(self, problem=scaled(self.problem), final=None if self.final is None else scaled(self.final))
+        final = None if self.final is None else _scaled(self.final, weights)
+        return replace(self, problem=_scaled(self.problem, weights), final=final)
 
     def ratios(self, poses: Poses, scale: float) -> Array:
         """Costs of its edges over their scaled thresholds, (k,); 0 of known inliers."""
@@ -141,7 +232,8 @@ class Part:
 
     def costs(self, poses: Poses) -> Array:
         """Shares of its edges, (k,), in the cost that is solved."""
-        return (self.problem if self.final is None else self.final).edge_costs(poses)
+        problem = self.problem if self.final is None else self.final
+        return problem.edge_costs(poses)
 
     @cached_property
     def interior(self) -> IntArray:
@@ -151,64 +243,132 @@ class Part:
     @cached_property
     def boundary(self) -> IntArray:
         """Poses of the part that the driver solves for, in the driver's order."""
-        found = np.flatnonzero(self.in_cover >= 0)
-        return found[np.argsort(self.in_cover[found])]
+        in_cover = np.flatnonzero(self.in_cover >= 0)
+        return in_cover[np.argsort(self.in_cover[in_cover])]
 
 
-def split_graph(given: PGOProblem | PoseGraph, parts: Partition, limits: Array | None = None) -> tuple[Subgraph, ...]:
-    """Subgraphs of all robots; `limits`, (m,): thresholds of a robust solve. A SettingError if `parts` does not fit."""
+def _scaled(problem: PartProblem, weights: Array) -> PartProblem:
+    return PartProblem(problem.graph, problem.backend, problem.weights.scaled(weights))
+
+
+def split_graph(
+    given: PGOProblem | PoseGraph, parts: Partition, limits: Array | None = None
+) -> tuple[Subgraph, ...]:
+    """Subgraphs of all robots; `limits`, (m,): thresholds of a robust solve.
+
+    A SettingError if `parts` does not fit.
+    """
     problem = as_problem(given)
-    graph, first = problem.graph, problem.convex_part
-    costs = first.weights, None if first is problem else problem.weights
-    owner, cut = parts.robot, parts.cut_edges(graph)
-    pairs = np.stack([graph.i[cut], graph.j[cut]], axis=1)
-    placements = place_poses(pairs, owner[pairs], parts.num_robots, -1 if cut.any() else middle_pose(graph))
-    m, robots = graph.num_edges, range(parts.num_robots)
-    robot, edge = np.divmod(np.unique(np.concatenate([owner[end] * m + np.arange(m) for end in (graph.i, graph.j)])), m)
-    every_edge = np.split(edge, np.searchsorted(robot, robots[1:]))
-    own = np.split(np.argsort(owner, kind="stable"), np.cumsum(parts.sizes)[:-1])
+    graph = problem.graph
+    owner = parts.robot
+    is_cut = parts.cut_edges(graph)
+    pairs = np.stack([graph.i[is_cut], graph.j[is_cut]], axis=1)
+    middle = -1 if is_cut.any() else middle_pose(graph)
+    placements = place_poses(pairs, owner[pairs], parts.num_robots, middle)
+    in_order_of_owners = np.argsort(owner, kind="stable")
+    poses_by_owner = np.split(in_order_of_owners, np.cumsum(parts.sizes)[:-1])
+    subgraphs = []
+    for robot, edges in enumerate(_edges_by_robot(graph, parts)):
+        placement = placements[robot]
+        poses = np.union1d(poses_by_owner[robot], placement.poses)
+        subgraphs.append(_subgraph(problem, robot, poses, owner[poses], edges, placement, limits))
+    return tuple(subgraphs)
 
-    def subgraph_of(robot: int, edges: IntArray, placement: Placement) -> Subgraph:
-        poses = np.union1d(own[robot], placement.poses)
-        i, j = np.searchsorted(poses, graph.i[edges]), np.searchsorted(poses, graph.j[edges])
-        measured = graph.R_ij[edges], graph.t_ij[edges], graph.kappa[edges], graph.tau[edges]
-        name = f"{graph.name}, robot {robot}"
-        local = PoseGraph(len(poses), i, j, *measured, ids=graph.pose_ids[poses], name=name)
-        final = None if costs[1] is None else costs[1].of_edges(edges)
-        of_edges = edges, costs[0].of_edges(edges), final, None if limits is None else limits[edges]
-        return Subgraph(robot, local, poses, owner[poses], *placement.of(robot, local, poses, owner[poses]), *of_edges)
 
-    return tuple(map(subgraph_of, robots, every_edge, placements))
+def _edges_by_robot(graph: PoseGraph, parts: Partition) -> list[IntArray]:
+    """Numbers of the edges that touch a pose of each robot, ascending."""
+    m = graph.num_edges
+    owner = parts.robot
+    # A number for every pair of a robot and an edge, so that sorting the numbers sorts the pairs.
+    pairs = [owner[end] * m + np.arange(m) for end in (graph.i, graph.j)]
+    robot, edge = np.divmod(np.unique(np.concatenate(pairs)), m)
+    return np.split(edge, np.searchsorted(robot, np.arange(1, parts.num_robots)))
+
+
+def _subgraph(
+    problem: PGOProblem,
+    robot: int,
+    poses: IntArray,
+    owner: IntArray,
+    edges: IntArray,
+    placement: Placement,
+    limits: Array | None,
+) -> Subgraph:
+    """Subgraph of a robot with these poses, their owners and edges."""
+    graph = problem.graph
+    local = PoseGraph(
+        len(poses),
+        np.searchsorted(poses, graph.i[edges]),
+        np.searchsorted(poses, graph.j[edges]),
+        graph.R_ij[edges],
+        graph.t_ij[edges],
+        graph.kappa[edges],
+        graph.tau[edges],
+        ids=graph.pose_ids[poses],
+        name=f"{graph.name}, robot {robot}",
+    )
+    convex_part = problem.convex_part
+    in_cover, is_counted, copies, common = placement.of(robot, local, poses, owner)
+    return Subgraph(
+        robot,
+        local,
+        poses,
+        owner,
+        in_cover,
+        is_counted,
+        copies,
+        common,
+        edges,
+        weights=convex_part.weights.of_edges(edges),
+        final=None if convex_part is problem else problem.weights.of_edges(edges),
+        thresholds=None if limits is None else limits[edges],
+    )
 
 
 def place_poses(pairs: IntArray, owners: IntArray, num_robots: int, middle: int) -> list[Placement]:
-    """What every robot must know of the poses that it shares, from pairs, (k, 2), that edges between robots join.
+    """What every robot must know of the poses that it shares.
 
-    `owners`, (k, 2), are theirs; where there are none the driver solves for the pose `middle`.
+    `pairs`, (k, 2), are the poses that edges between robots join, `owners`, (k, 2), the robots that
+    own them. Where there are none the driver solves for the pose `middle`.
     """
-    poses, at, ends = np.unique(pairs, return_index=True, return_inverse=True)
-    (i, j), owner = ends.reshape(-1, 2).T, owners.ravel()[at]
+    poses, first_positions, ends = np.unique(pairs, return_index=True, return_inverse=True)
+    i, j = ends.reshape(-1, 2).T
+    owner = owners.ravel()[first_positions]
     cover = cover_of_edges(i, j)
     if not len(poses):  # the bound is grounded at a pose that the driver has
         poses, owner, cover = np.array([[middle], [0], [0]])
     in_cover = np.full(len(poses), -1)
     in_cover[cover] = np.arange(len(cover))
-    # Whether a robot holds a pose: its own, and the far ends of its edges.
-    pose, robot = np.concatenate([np.arange(len(poses)), i, j]), np.concatenate([owner, owner[j], owner[i]])
+    # A robot holds its own poses, and the far ends of its edges.
+    pose = np.concatenate([np.arange(len(poses)), i, j])
+    robot = np.concatenate([owner, owner[j], owner[i]])
     pose, robot = np.divmod(np.unique(pose * num_robots + robot), num_robots)
     holds = csr_array((np.ones(len(pose)), (pose, robot)), shape=(len(poses), num_robots))
-    by_robot, copies, found = holds.tocsc(), np.diff(holds.indptr), []
-    for own, mine in enumerate(np.split(by_robot.indices, by_robot.indptr[1:-1])):
-        mine.sort()
-        held = holds[mine].tocsc()
-        others = [other for other in np.flatnonzero(np.diff(held.indptr)).tolist() if other != own]
-        common = tuple((other, np.sort(held.indices[held.indptr[other] : held.indptr[other + 1]])) for other in others)
-        found.append(Placement(poses[mine], in_cover[mine], copies[mine], common))
-    return found
+    by_robot = holds.tocsc()
+    copies = np.diff(holds.indptr)
+    placements = []
+    for number, own in enumerate(np.split(by_robot.indices, by_robot.indptr[1:-1])):
+        own.sort()
+        common = _poses_in_common(holds[own].tocsc(), number)
+        placements.append(Placement(poses[own], in_cover[own], copies[own], common))
+    return placements
+
+
+def _poses_in_common(holds: csc_array, robot: int) -> tuple[tuple[int, IntArray], ...]:
+    """Other robots that hold some of a robot's poses, and which of its poses these are.
+
+    Column b of `holds` has entries for those of the poses that robot b holds.
+    """
+    others = np.flatnonzero(np.diff(holds.indptr))
+    common = []
+    for other in others[others != robot].tolist():
+        column = holds.indices[holds.indptr[other] : holds.indptr[other + 1]]
+        common.append((other, np.sort(column)))
+    return tuple(common)
 
 
 def middle_separator(graph: PoseGraph, subgraphs: tuple[Subgraph, ...]) -> int:
-    """Which of the poses that the driver solves for is nearest to the middle of the graph."""
+    """Position in the cover of the pose that is nearest to the middle of the graph."""
     in_cover = np.full(graph.num_poses, -1)
     for subgraph in subgraphs:
         in_cover[subgraph.poses] = np.maximum(in_cover[subgraph.poses], subgraph.in_cover)

@@ -1,4 +1,4 @@
-"""What a method did on a graph, start to end: its stages, and their cost in iterations, rounds, bytes and seconds."""
+"""Runs of methods on a graph: their stages, with iterations, rounds, bytes and seconds."""
 
 import enum
 import math
@@ -7,16 +7,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pgo_models.errors import SettingError, check_settings
+from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition, suited_partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from solvers.reporting.convergence_plots import Curve
-from solvers.result import History, Status
+from solvers.result import History, Record, Status
 
 
 class BenchmarkMethod(enum.Enum):
-    """Methods that can be held against each other, by the name that `pgo compare` knows."""
+    """Methods that can be compared; the value is the name that `pgo compare` takes."""
 
     JOINT = "joint", "SOC joint + Newton"
     CONSENSUS = "consensus", "SOC consensus + Newton"
@@ -31,39 +32,64 @@ class BenchmarkMethod(enum.Enum):
     label: str
 
     def __new__(cls, name: str, label: str) -> "BenchmarkMethod":
-        """Member whose value is its name alone; `label` is what tables and pictures call it."""
-        one = object.__new__(cls)
-        one._value_, one.label = name, label
-        return one
+        """Make a member whose value is its name; `label` is its name in tables and figures."""
+        member = object.__new__(cls)
+        member._value_ = name
+        member.label = label
+        return member
 
 
 @dataclass(frozen=True)
 class BenchmarkSettings:
-    """What all contenders share; the first stage of PAPER has one pose a robot, as the paper has."""
+    """Settings of all contenders.
 
-    num_robots: int = 5  # of CONSENSUS, SUBSTRUCTURED, GAUSS_SEIDEL and the second stages; at most one a pose
-    max_rounds: int | None = None  # of PAPER, both stages together
-    time_limit: float = math.inf  # seconds for each contender
+    Parameters
+    ----------
+    num_robots : int
+        Robots of CONSENSUS, SUBSTRUCTURED, GAUSS_SEIDEL and of the second stages; at most as many
+        as poses. The first stage of PAPER has one robot for every pose, as in the paper.
+    max_rounds : int, optional
+        Maximal number of rounds of PAPER, both stages together; at least 2.
+    time_limit : float
+        Seconds for each contender.
+    """
+
+    num_robots: int = 5
+    max_rounds: int | None = None
+    time_limit: float = math.inf
 
     def __post_init__(self) -> None:
-        if self.max_rounds is not None and self.max_rounds < 2:
-            raise SettingError(f"max_rounds is {self.max_rounds}; give at least 2, one for each stage")
         check_settings(self, positive=["time_limit"], at_least_one=["num_robots"])
+        if self.max_rounds is not None and self.max_rounds < 2:
+            raise SettingError(
+                f"max_rounds is {self.max_rounds}; give at least 2, one for each stage"
+            )
 
     def robots(self, graph: PoseGraph) -> Partition:
-        """Who owns which pose, as `suited_partition` says."""
+        """Share a graph among the robots, by `suited_partition`.
+
+        Parameters
+        ----------
+        graph : PoseGraph
+            The graph.
+
+        Returns
+        -------
+        Partition
+            Owner of every pose.
+        """
         return suited_partition(graph, min(self.num_robots, graph.num_poses))
 
 
 @dataclass(frozen=True, eq=False)
 class StageRecord:
-    """One stage of a trial."""
+    """One stage of a run."""
 
     name: str
     status: Status
-    history: History  # seconds and communication count from the beginning of the leg
-    num_robots: int = 1  # among which its seconds are divided; 1 when all is done in one place
-    # rounds, num_bytes: (len(history),); communication up to every record, where it is counted.
+    history: History  # seconds and communication count from the beginning of the stage
+    num_robots: int = 1  # among which its seconds are divided; 1 if all is done in one process
+    # Communication up to every record, (len(history),), if it is counted.
     rounds: Array | None = None
     num_bytes: Array | None = None
 
@@ -75,74 +101,96 @@ class StageRecord:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BenchmarkRun:
-    """What a contender did on a graph."""
+    """Run of a contender on a graph."""
 
     contender: BenchmarkMethod
-    legs: tuple[StageRecord, ...]
-    poses: Poses  # where it ended
-    objective: float  # F of them
-    status: Status  # how the last leg ended, or an earlier one that ran out of time
-    remark: str = ""  # what has to be said beside the figures; empty when all went as it should
-    # Whether the figures are the contender's: not those of a method that was cut short in a stage without an answer.
+    stages: tuple[StageRecord, ...]
+    poses: Poses  # at the end
+    objective: float  # F of these poses
+    status: Status  # of the last stage, or of an earlier one that ran out of time
+    remark: str = ""  # sentence beside the figures; empty if nothing went wrong
+    # Whether the poses are a result of the contender. Those of a method that was stopped in a stage
+    # without poses are not.
     is_answer: bool = True
 
     @property
     def iterations(self) -> tuple[int, ...]:
-        """Of every stage."""
-        return tuple(int(leg.history.k[-1]) for leg in self.legs)
+        """Number of iterations of every stage."""
+        return tuple(int(stage.history.k[-1]) for stage in self.stages)
 
     @property
     def first_objective(self) -> float | None:
-        """F of the poses that the first of two stages handed on; None where there is only one."""
-        return float(self.legs[1].history.objective[0]) if len(self.legs) > 1 else None
+        """F of the poses at which the second stage began; None if there is only one stage."""
+        if len(self.stages) == 1:
+            return None
+        return float(self.stages[1].history.objective[0])
 
     @property
     def rounds(self) -> int | None:
-        """Rounds in all; None where they are not counted."""
-        joined = _joined([leg.rounds for leg in self.legs])
-        return None if joined is None else int(joined[-1])
+        """Number of rounds of all stages; None if they are not counted."""
+        total = _added_up([stage.rounds for stage in self.stages])
+        return None if total is None else int(total[-1])
 
     @property
     def all_reduces(self) -> int | None:
-        """All-reduces in all; None where they are not counted."""
-        counts = [leg.history.records[-1].measurement.all_reduces for leg in self.legs]
-        return None if None in counts else counts[-1]  # of one ledger
+        """Number of all-reduces of all stages; None if they are not counted."""
+        last_measurements = [stage.history.records[-1].measurement for stage in self.stages]
+        counts = [measurement.all_reduces for measurement in last_measurements]
+        # All stages have one ledger, so that the last count includes the others.
+        return None if None in counts else counts[-1]
 
     @property
     def num_bytes(self) -> int | None:
-        """Bytes sent in all; None where they are not counted."""
-        joined = _joined([leg.num_bytes for leg in self.legs])
-        return None if joined is None else int(joined[-1])
+        """Bytes sent in all stages; None if they are not counted."""
+        total = _added_up([stage.num_bytes for stage in self.stages])
+        return None if total is None else int(total[-1])
 
     @property
     def seconds(self) -> float:
         """Seconds in steps, all robots together."""
-        return math.fsum(leg.seconds for leg in self.legs)
+        return math.fsum(stage.seconds for stage in self.stages)
 
     @property
     def seconds_per_robot(self) -> float:
-        """Seconds of every leg divided by its number of robots: what it would take side by side on a free network."""
-        return math.fsum(leg.seconds / leg.num_robots for leg in self.legs)
+        """Seconds of every stage divided by its number of robots.
+
+        It is the time that robots would take at the same time on a network without delays.
+        """
+        return math.fsum(stage.seconds / stage.num_robots for stage in self.stages)
 
     def curve(self, lower_bound: float) -> Curve:
-        """All legs in a row, to be plotted."""
-        records, k, seconds = [], 0, 0.0
-        for leg in self.legs:
-            records += [replace(one, k=k + one.k, seconds=seconds + one.seconds) for one in leg.history.records]
-            k, seconds = records[-1].k, records[-1].seconds
-        rounds, num_bytes = _joined([leg.rounds for leg in self.legs]), _joined([leg.num_bytes for leg in self.legs])
-        place = list(BenchmarkMethod).index(self.contender)
-        return Curve(self.contender.label, History(tuple(records)), lower_bound, rounds, num_bytes, place)
+        """All stages, one after the other, to be plotted."""
+        records: list[Record] = []
+        k = 0
+        seconds = 0.0
+        for stage in self.stages:
+            for record in stage.history.records:
+                shifted = replace(record, k=k + record.k, seconds=seconds + record.seconds)
+                records.append(shifted)
+            k = records[-1].k
+            seconds = records[-1].seconds
+        return Curve(
+            self.contender.label,
+            History(tuple(records)),
+            lower_bound,
+            rounds=_added_up([stage.rounds for stage in self.stages]),
+            num_bytes=_added_up([stage.num_bytes for stage in self.stages]),
+            place=list(BenchmarkMethod).index(self.contender),
+        )
 
     def __repr__(self) -> str:
-        rounds = "" if self.rounds is None else f", {self.rounds} rounds"
-        done = f"{self.status.name} after {' + '.join(map(str, self.iterations))} iterations{rounds}"
-        return f"BenchmarkRun({self.contender.label}: {done}, F = {self.objective:.10g}, {self.seconds:.3g} s)"
+        iterations = " + ".join(map(str, self.iterations))
+        ending = f"{self.status.name} after {iterations} iterations"
+        if self.rounds is not None:
+            ending += f", {self.rounds} rounds"
+        cost = f"F = {rounded_up(self.objective)}"
+        return f"BenchmarkRun({self.contender.label}: {ending}, {cost}, {self.seconds:.3g} s)"
 
 
-def _joined(parts: list[Array | None]) -> Array | None:
-    """Counts of all legs in a row; None when a leg has none."""
-    joined, before = [], 0.0
+def _added_up(parts: list[Array | None]) -> Array | None:
+    """Counts up to every record of all stages; None if a stage has no counts."""
+    joined = []
+    before = 0.0
     for part in parts:
         if part is None:
             return None

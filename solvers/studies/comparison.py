@@ -1,15 +1,18 @@
-"""Chosen methods on one graph, side by side: a table, and the gap against rounds, bytes and seconds."""
+"""Methods compared on one graph: a table, and the gap over rounds, bytes and seconds."""
 
 import importlib.util
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pgo_models.certificates.certificate import relative_gap
+from pgo_models.certificates.rounding_errors import fits_to_rounding, objective_rounding
 from pgo_models.errors import SettingError
+from pgo_models.figures import gap_above, rounded_down, rounded_up, sum_above
+from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.plots.interactive_plots import save_page
 from pgo_models.plots.style import check_installed, is_picture, save_figure
@@ -21,8 +24,9 @@ from solvers.reporting.result_table import ResultTable, TablePart, Value, gap_pe
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings
 from solvers.studies.benchmark_runs import FAILURES, reason_of, run_benchmark, solve_whole
 
-_COLUMNS: tuple[tuple[str, str, Callable[[Any], str]], ...] = (  # head, name in the record, how it is written
-    ("F", "objective", "{:.9g}".format),
+# Columns of figures: head, name in the record, and the function that formats a value.
+_COLUMNS: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
+    ("F", "objective", lambda F: rounded_up(F, 9)),
     ("gap (%)", "gap", gap_percent),
     ("iterations", "iterations", str),
     ("rounds", "rounds", str),
@@ -35,60 +39,114 @@ _COLUMNS: tuple[tuple[str, str, Callable[[Any], str]], ...] = (  # head, name in
 
 @dataclass(frozen=True)
 class ComparisonSettings:
-    """Which methods, and what they share."""
+    """Methods to compare, and their common settings.
 
-    contenders: tuple[BenchmarkMethod, ...] = ()  # all that can be run here unless given: GTSAM where it is installed
+    Parameters
+    ----------
+    contenders : tuple of BenchmarkMethod
+        Methods; all that can be run here unless given. GTSAM has to be installed.
+    trial : BenchmarkSettings
+        Common settings.
+    """
+
+    contenders: tuple[BenchmarkMethod, ...] = ()
     trial: BenchmarkSettings = field(default_factory=BenchmarkSettings)
 
     @property
     def chosen(self) -> tuple[BenchmarkMethod, ...]:
-        """The methods to be run, in order."""
+        """Methods to be run, in order."""
         if self.contenders:
             return self.contenders
-        has_gtsam = importlib.util.find_spec("gtsam") is not None
-        return tuple(one for one in BenchmarkMethod if one is not BenchmarkMethod.GTSAM or has_gtsam)
+        methods = list(BenchmarkMethod)
+        if importlib.util.find_spec("gtsam") is None:
+            methods.remove(BenchmarkMethod.GTSAM)
+        return tuple(methods)
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Methods side by side on one graph."""
+    """Methods compared on one graph.
+
+    Parameters
+    ----------
+    problem : PGOProblem
+        The problem that they solved.
+    optimum : float
+        Upper bound on the cost of the best known poses, from `solve` or one of the methods.
+    lower_bound : float
+        Proven lower bound on the cost.
+    trials : tuple of BenchmarkRun
+        Runs of the methods.
+    reasons : tuple of (BenchmarkMethod, str)
+        Methods without figures, and why.
+    is_complete : bool
+        Whether all methods were run; after Ctrl-C they were not.
+    """
 
     problem: PGOProblem
-    optimum: float  # the best F known, from `solve` or one of the methods
-    lower_bound: float  # that is proven
+    optimum: float
+    lower_bound: float
     trials: tuple[BenchmarkRun, ...]
-    reasons: tuple[tuple[BenchmarkMethod, str], ...]  # methods without figures, and why
-    is_complete: bool = True  # whether all were run; after Ctrl-C they were not
-    rounding_level: float = 0.0  # F below it is as good as zero
+    reasons: tuple[tuple[BenchmarkMethod, str], ...]
+    is_complete: bool = True
 
     @property
     def curves(self) -> list[Curve]:
-        """Curves of all that have an answer, their gaps held against the proven bound."""
+        """Curves of all methods with a result; their gaps are those to the proven bound."""
         return [trial.curve(self.lower_bound) for trial in self.trials if trial.is_answer]
 
     def table(self) -> ResultTable:
-        """Return a row for every method, those without figures last, with their reasons."""
-        rows, records = [], []
-        found = [(trial.contender, trial, trial.remark) for trial in self.trials]
-        for contender, trial, remark in [*found, *((one, None, reason) for one, reason in self.reasons)]:
-            records.append(_record(contender, trial, self, remark))
-            iterations = None if trial is None else " + ".join(map(str, trial.iterations))
-            shown = {**records[-1], "iterations": iterations}
-            figures = ("-" if shown[name] is None else write(shown[name]) for _, name, write in _COLUMNS)
-            rows.append((contender.label, *figures, remark))
+        """Return a row for every method, with those without figures last.
+
+        Returns
+        -------
+        ResultTable
+            The table, which prints itself.
+        """
+        rows = []
+        records = []
+        for trial in self.trials:
+            record = _record(trial, self)
+            figures = {
+                **record,
+                **_printed_costs(trial, self),
+                "iterations": " + ".join(map(str, trial.iterations)),
+            }
+            records.append(record)
+            rows.append((trial.contender.label, *_cells(figures), trial.remark))
+        for contender, reason in self.reasons:
+            records.append(_empty_record(contender, reason))
+            rows.append((contender.label, *_cells({}), reason))
+        heads = ("method", *(head for head, _, _ in _COLUMNS), "remark")
+        return ResultTable((TablePart(heads, tuple(rows)),), tuple(records), self._notes())
+
+    def _notes(self) -> tuple[str, ...]:
         graph = self.problem.graph
-        best = f"best F {self.optimum:.10g}, proven lower bound {self.lower_bound:.10g}; gaps are to the bound, over F"
-        notes = [f"{graph.name}: {len(graph.bodies)} poses, {graph.num_edges} edges{graph.extras}; {best}"]
-        notes.append("rounds, all-reduces and MB: where they are counted; seconds a robot: side by side")
+        notes = [
+            f"{graph.name}: {len(graph.bodies)} poses, {graph.num_edges} edges{graph.extras}; "
+            f"best F {rounded_up(self.optimum)}, "
+            f"proven lower bound {rounded_down(self.lower_bound)}; "
+            "gaps are to the bound, over F",
+            "rounds, all-reduces and MB: where they are counted; seconds a robot: side by side",
+        ]
         if not self.is_complete:
             notes.append("interrupted: the methods left out were not run")
-        heads = ("method", *(head for head, _, _ in _COLUMNS), "remark")
-        return ResultTable((TablePart(heads, tuple(rows)),), tuple(records), tuple(notes))
+        return tuple(notes)
 
     def save_plot(self, path: Path | str) -> None:
-        """Write the gap against rounds, bytes and seconds as a picture or, for .html, as a page to explore.
+        """Write the gap over rounds, bytes and seconds as a picture, or for .html as a page.
 
-        A SettingError on another suffix, or when there is nothing to draw; a PGOError when the file cannot be written.
+        Parameters
+        ----------
+        path : Path or str
+            File to write: .png, .svg, .pdf or .html.
+
+        Raises
+        ------
+        SettingError
+            If the file has another suffix, or there is nothing to draw.
+        PGOError
+            If the file cannot be written.
         """
         path = Path(path)
         check_plot_format(path)
@@ -99,18 +157,41 @@ class Comparison:
 
 
 def compare_methods(
-    problem: PGOProblem | PoseGraph, settings: ComparisonSettings | None = None, *, progress: bool | None = None
+    problem: PGOProblem | PoseGraph,
+    settings: ComparisonSettings | None = None,
+    *,
+    progress: bool | None = None,
 ) -> Comparison:
-    """Run methods on a graph, one after the other, and hold them against a proven lower bound.
+    """Run methods on a graph, one after the other, and compare them with a proven lower bound.
 
-    A method that fails leaves its reason, Ctrl-C what was done; before the bound is there it raises KeyboardInterrupt.
-    `progress` shows a bar on stderr, where that is a terminal unless given. A PGOError when the graph is not connected.
+    For a method that fails the result has the reason. After Ctrl-C the result has the methods that
+    have ended; before the bound is known, Ctrl-C raises a KeyboardInterrupt.
+
+    Parameters
+    ----------
+    problem : PGOProblem or PoseGraph
+        The problem.
+    settings : ComparisonSettings, optional
+        Which methods, and their common settings.
+    progress : bool, optional
+        Whether to show a bar on stderr; if not given, it is shown on a terminal.
+
+    Returns
+    -------
+    Comparison
+        The runs, and the bound.
+
+    Raises
+    ------
+    PGOError
+        If the graph is not connected.
 
     Examples
     --------
     >>> import numpy as np
     >>> from pgo_models.graphs.scenes import grid
-    >>> comparison = compare_methods(grid(np.random.default_rng(0)), ComparisonSettings((BenchmarkMethod.STAIRCASE,)))
+    >>> settings = ComparisonSettings((BenchmarkMethod.STAIRCASE,))
+    >>> comparison = compare_methods(grid(np.random.default_rng(0)), settings)
     >>> bool(comparison.optimum - comparison.lower_bound < 1e-3), len(comparison.trials)
     (True, 1)
     """
@@ -129,36 +210,90 @@ def compare_methods(
                 reasons.append((contender, reason_of(error)))
             bar.end_part()
         is_complete = True
-    known = [solution.objective, solution.certificate.poses_objective]
-    known += [trial.objective for trial in trials if math.isfinite(trial.objective)]
-    level = solution.certificate.rounding_level
-    return Comparison(problem, min(known), solution.lower_bound, tuple(trials), tuple(reasons), is_complete, level)
+    certificate = solution.certificate
+    costs = [certificate.objective_at_most]
+    costs.append(_cost_at_most(problem, certificate.poses, certificate.poses_objective))
+    costs += [_cost_at_most(problem, trial.poses, trial.objective) for trial in trials]
+    return Comparison(
+        problem, min(costs), solution.lower_bound, tuple(trials), tuple(reasons), is_complete
+    )
 
 
 def check_plot_format(path: Path) -> None:
-    """Raise what `Comparison.save_plot` would for the suffix of `path`: a SettingError, or if its extra is missing."""
+    """Raise the errors of `Comparison.save_plot` for the suffix of `path`.
+
+    They are a SettingError, and a MissingExtraError if its plotting library is missing.
+    """
     if path.suffix.lower() != ".html" and not is_picture(path):
-        raise SettingError(f"cannot write {path}: no plot has suffix {path.suffix!r}; use .html, .png, .svg or .pdf")
+        problem = f"cannot write {path}: no plot has suffix {path.suffix!r}"
+        raise SettingError(f"{problem}; use .html, .png, .svg or .pdf")
     check_installed(path)
 
 
-def _record(
-    contender: BenchmarkMethod, trial: BenchmarkRun | None, beside: Comparison, remark: str
-) -> dict[str, Value]:
-    answer = trial if trial is not None and trial.is_answer else None
-    iterations = trial.iterations if trial is not None else ()
-    level = beside.lower_bound, beside.rounding_level
-    return {
-        "method": contender.value,
-        "objective": answer.objective if answer is not None else None,
-        "gap": relative_gap(answer.objective, *level) if answer is not None else None,
+def _cost_at_most(problem: PGOProblem, poses: Poses, objective: float) -> float:
+    """Upper bound on the cost of poses: the computed objective, and its rounding error."""
+    if not math.isfinite(objective):
+        return math.inf
+    return sum_above(objective, objective_rounding(problem, poses).error)
+
+
+def _cells(figures: Mapping[str, Value]) -> list[str]:
+    """Cells of all columns; a dash for figures that are not known."""
+    cells = []
+    for _, name, formatted in _COLUMNS:
+        value = figures.get(name)
+        cells.append("-" if value is None else formatted(value))
+    return cells
+
+
+def _printed_costs(trial: BenchmarkRun, comparison: Comparison) -> dict[str, Value]:
+    """F and gap as they are printed: upper bounds for the exact cost of the poses.
+
+    The record has them as computed. A run without a result has none.
+    """
+    if not trial.is_answer:
+        return {}
+    cost = _cost_at_most(comparison.problem, trial.poses, trial.objective)
+    gap = 0.0
+    if not fits_to_rounding(comparison.problem, trial.poses):
+        gap = gap_above(cost, comparison.lower_bound)
+    return {"objective": cost, "gap": gap}
+
+
+def _record(trial: BenchmarkRun, comparison: Comparison) -> dict[str, Value]:
+    """Figures of a run in full."""
+    iterations = trial.iterations
+    record = _empty_record(trial.contender, trial.remark)
+    record |= {
         "iterations_first_stage": iterations[0] if iterations else None,
         "iterations_second_stage": iterations[1] if len(iterations) > 1 else None,
-        "rounds": trial.rounds if trial is not None else None,
-        "all_reduces": trial.all_reduces if trial is not None else None,
-        "bytes": trial.num_bytes if trial is not None else None,
-        "seconds": trial.seconds if trial is not None else None,
-        "seconds_per_robot": trial.seconds_per_robot if trial is not None else None,
-        "status": trial.status.name if trial is not None else None,
+        "rounds": trial.rounds,
+        "all_reduces": trial.all_reduces,
+        "bytes": trial.num_bytes,
+        "seconds": trial.seconds,
+        "seconds_per_robot": trial.seconds_per_robot,
+        "status": trial.status.name,
+    }
+    if trial.is_answer:
+        is_exact = fits_to_rounding(comparison.problem, trial.poses)
+        record["objective"] = trial.objective
+        record["gap"] = relative_gap(trial.objective, comparison.lower_bound, is_exact)
+    return record
+
+
+def _empty_record(contender: BenchmarkMethod, remark: str) -> dict[str, Value]:
+    """Record of a method without figures; its keys are those of all records, in order."""
+    return {
+        "method": contender.value,
+        "objective": None,
+        "gap": None,
+        "iterations_first_stage": None,
+        "iterations_second_stage": None,
+        "rounds": None,
+        "all_reduces": None,
+        "bytes": None,
+        "seconds": None,
+        "seconds_per_robot": None,
+        "status": None,
         "remark": remark,
     }

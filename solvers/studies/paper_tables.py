@@ -1,9 +1,10 @@
-"""The paper's tables 1 to 4, row for row: its figures beside ours, each held against a proven lower bound."""
+"""The paper's tables 1 to 4, row by row: its figures beside ours, with proven lower bounds."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -20,33 +21,72 @@ from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
 from solvers.studies.benchmark_runs import FAILURES, reason_of, run_benchmark, solve_whole
 from solvers.studies.results_cache import Entry, KeptResults, graph_fingerprint
 
-SCENES: dict[str, Callable[[np.random.Generator], PoseGraph]] = {"circle": circle, "grid": grid, "sphere": sphere}
-TABLE_CONTENDERS = tuple(BenchmarkMethod[name] for name in ("STAIRCASE", "GAUSS_SEIDEL", "PAPER", "CONSENSUS"))
+SCENES: dict[str, Callable[[np.random.Generator], PoseGraph]] = {
+    "circle": circle,
+    "grid": grid,
+    "sphere": sphere,
+}
+TABLE_CONTENDERS = (
+    BenchmarkMethod.STAIRCASE,
+    BenchmarkMethod.GAUSS_SEIDEL,
+    BenchmarkMethod.PAPER,
+    BenchmarkMethod.CONSENSUS,
+)
 
 
 @dataclass(frozen=True)
 class ReproductionSettings:
-    """Which rows, and how they are made; a SettingError when a row is unknown or a number is out of its range."""
+    """Which rows are reproduced, and how.
 
-    only: tuple[str, ...] = ()  # graphs of the paper's tables; all unless given
-    num_seeds: int = 20  # draws of the random scenes: those of `numpy.random.default_rng(0)`, `(1)`, and so on
+    Parameters
+    ----------
+    only : tuple of str
+        Names of the rows; all unless given.
+    num_seeds : int
+        Number of draws of the random scenes: those of `numpy.random.default_rng(0)`, `(1)`, ...
+    num_robots : int
+        Number of robots, as in `BenchmarkSettings`.
+    download : bool
+        Whether to download graphs that are not here. Otherwise their row says how to get them.
+
+    Raises
+    ------
+    SettingError
+        If a row is unknown, or a number is out of its range.
+    """
+
+    only: tuple[str, ...] = ()
+    num_seeds: int = 20
     num_robots: int = BenchmarkSettings.num_robots
-    download: bool = False  # whether graphs that are not here are downloaded; otherwise their row says how to get them
+    download: bool = False
 
     def __post_init__(self) -> None:
+        check_settings(self, at_least_one=["num_seeds", "num_robots"])
         known = [row.name for row in published_rows()]
         for name in self.only:
             if name not in known:
-                raise SettingError(f"the paper's tables have no row {name!r}; they have {', '.join(known)}")
-        check_settings(self, at_least_one=["num_seeds", "num_robots"])
+                raise SettingError(
+                    f"the paper's tables have no row {name!r}; they have {', '.join(known)}"
+                )
 
     @property
     def rows(self) -> tuple[PublishedRow, ...]:
-        """The rows wanted, in the paper's order."""
+        """Rows to be reproduced, in the paper's order."""
         return tuple(row for row in published_rows() if not self.only or row.name in self.only)
 
     def seeds(self, name: str) -> range:
-        """Draws of a row: one where the graph is given."""
+        """Return the seeds of the draws of a row.
+
+        Parameters
+        ----------
+        name : str
+            Name of the graph.
+
+        Returns
+        -------
+        range
+            Seeds; one if the graph is a file.
+        """
         return range(self.num_seeds if name in SCENES else 1)
 
 
@@ -59,13 +99,13 @@ class Optimum:
 
     @property
     def gap(self) -> float:
-        """(objective - lower_bound) / objective, proven."""
+        """Proven gap (objective - lower_bound) / objective."""
         return relative_gap(self.objective, self.lower_bound)
 
 
 @dataclass(frozen=True)
 class TableEntry:
-    """What one method did on one graph (`solvers.studies.benchmark`); `first_gap` is that after SOC."""
+    """Figures of a method on one draw, see `BenchmarkRun`; `first_gap` is the gap after SOC."""
 
     objective: float
     gap: float
@@ -84,37 +124,56 @@ class ReproducedRow:
 
     published: PublishedRow
     contender: BenchmarkMethod
-    num_draws: int  # how many were wanted
+    num_draws: int  # number of draws, with or without figures
     optima: tuple[Optimum, ...]
     cells: tuple[TableEntry, ...]  # of the draws that have figures
-    reasons: tuple[str, ...]  # why others have none
+    reasons: tuple[str, ...]  # why other draws have none
 
     @property
     def is_scene(self) -> bool:
-        """Whether the graph is drawn at random, so that gaps compare with the paper's, and costs do not."""
+        """Whether the graph is drawn at random.
+
+        Gaps can then be compared with those of the paper, costs cannot.
+        """
         return self.published.name in SCENES
 
     @property
     def figures(self) -> PublishedFigures:
-        """The paper's figures of this method, all None where it has no such method."""
-        row = self.published
-        of = {"staircase": row.se_sync, "gauss-seidel": row.dgs, "paper": row.soc}
-        return of.get(self.contender.value, PublishedFigures(None, None, None))
+        """Figures of this method in the paper, all None if it has no such method."""
+        published = {
+            BenchmarkMethod.STAIRCASE: self.published.se_sync,
+            BenchmarkMethod.GAUSS_SEIDEL: self.published.dgs,
+            BenchmarkMethod.PAPER: self.published.soc,
+        }
+        return published.get(self.contender, PublishedFigures(None, None, None))
 
     @property
     def published_gap(self) -> float | None:
-        """Gap of the paper's figure to its F*."""
-        objective, optimum = self.figures.objective, self.published.se_sync.objective
-        return None if objective is None or optimum is None else relative_gap(objective, optimum)
+        """Gap of the paper's figure to its F*; None if it has no such figures."""
+        objective = self.figures.objective
+        optimum = self.published.se_sync.objective
+        if objective is None or optimum is None:
+            return None
+        return relative_gap(objective, optimum)
 
 
 @dataclass(frozen=True)
 class Reproduction:
-    """The reproduced tables."""
+    """The reproduced tables.
+
+    Parameters
+    ----------
+    settings : ReproductionSettings
+        Settings of the runs.
+    rows : tuple of ReproducedRow
+        Rows, graph by graph: SE-Sync, DGS, SOC as in the paper, SOC consensus.
+    is_complete : bool
+        Whether all runs were done; after Ctrl-C they were not.
+    """
 
     settings: ReproductionSettings
-    rows: tuple[ReproducedRow, ...]  # graph by graph, and for each SE-Sync, DGS, SOC as in the paper, SOC consensus
-    is_complete: bool  # whether all was done; after Ctrl-C it was not
+    rows: tuple[ReproducedRow, ...]
+    is_complete: bool
 
 
 def reproduce_tables(
@@ -126,12 +185,32 @@ def reproduce_tables(
 ) -> Reproduction:
     """Run the methods of the paper's tables on its graphs.
 
-    On the scenes SOC as in the paper starts at the estimate by GPS and IMU, on the others at a spanning tree; it has as
-    many rounds as the paper's SOC took iterations, for both its stages. All other methods start on their own. One that
-    fails on a graph leaves its reason there; Ctrl-C ends all with what was done until then.
+    On the scenes SOC as in the paper starts at the estimate by GPS and IMU, on other graphs at a
+    spanning tree. Both its stages together have as many rounds as the paper's SOC took iterations.
+    All other methods compute their own start. For a method that fails on a graph the row has the
+    reason. After Ctrl-C the tables have the runs that have ended.
 
-    `keep` is a JSON file of every figure from the moment it is there, not run again unless `is_fresh`; a PGOError when
-    it cannot be read or written. `progress` shows a bar on stderr; where that is a terminal, unless given.
+    Parameters
+    ----------
+    settings : ReproductionSettings, optional
+        Which rows, and how.
+    keep : Path, optional
+        JSON file that keeps every figure as soon as it is known; figures in it are not computed
+        again.
+    is_fresh : bool
+        Whether to ignore the figures in the file.
+    progress : bool, optional
+        Whether to show a bar on stderr; if not given, it is shown on a terminal.
+
+    Returns
+    -------
+    Reproduction
+        The tables.
+
+    Raises
+    ------
+    PGOError
+        If the file cannot be read or written.
 
     Examples
     --------
@@ -141,93 +220,137 @@ def reproduce_tables(
     """
     settings = settings if settings is not None else ReproductionSettings()
     kept = KeptResults(keep, is_fresh)
-    results, is_complete = [_RowResults(row, settings) for row in settings.rows], False
+    results = [_RowResults(row, settings) for row in settings.rows]
+    is_complete = False
     num_parts = sum(len(row.seeds) for row in results) * len(TABLE_CONTENDERS)
     with JobBar(num_parts, progress) as bar, suppress(KeyboardInterrupt):
         for row in results:
             for seed in row.seeds:
                 row.draw(seed, kept, bar)
         is_complete = True
-    return Reproduction(settings, tuple(one for row in results for one in row.rows()), is_complete)
+    rows = chain.from_iterable(row.rows() for row in results)
+    return Reproduction(settings, tuple(rows), is_complete)
 
 
 def graph_of_row(row: PublishedRow, seed: int, download: bool) -> PoseGraph:
-    """Graph of a row of the paper's tables: a draw of its scene, or the file; never another graph in its place.
+    """Graph of a row of the paper's tables: a draw of its scene, or the file.
 
-    A PGOError when it is not here, or what is here under its name is another graph.
+    Raises a PGOError if it is not here, or if another graph is here under its name.
     """
     if row.name in SCENES:
         return SCENES[row.name](np.random.default_rng(seed))
     graph = load(row.name, download=download)
-    n, m, wanted = graph.num_poses, graph.num_edges, f"the paper's has {row.num_poses} and {row.num_edges}"
+    n = graph.num_poses
+    m = graph.num_edges
     if (n, m) != (row.num_poses, row.num_edges):
-        raise PGOError(f"the {row.name} that is here has {n} poses and {m} edges, {wanted}: it is another graph")
+        raise PGOError(
+            f"the {row.name} that is here has {n} poses and {m} edges, the paper's has "
+            f"{row.num_poses} and {row.num_edges}: it is another graph"
+        )
     return graph
 
 
 class _RowResults:
-    """What has been found for one row of the paper's tables, over its draws."""
+    """Results of one row of the paper's tables, over its draws."""
 
     def __init__(self, row: PublishedRow, settings: ReproductionSettings) -> None:
-        self.row, self.settings, self.seeds = row, settings, settings.seeds(row.name)
+        self.row = row
+        self.settings = settings
+        self.seeds = settings.seeds(row.name)
         self.optima: list[Optimum] = []
-        self.cells: dict[BenchmarkMethod, list[TableEntry]] = {contender: [] for contender in TABLE_CONTENDERS}
-        self.reasons: dict[BenchmarkMethod, list[str]] = {contender: [] for contender in TABLE_CONTENDERS}
+        self.cells: dict[BenchmarkMethod, list[TableEntry]] = {}
+        self.reasons: dict[BenchmarkMethod, list[str]] = {}
+        for contender in TABLE_CONTENDERS:
+            self.cells[contender] = []
+            self.reasons[contender] = []
 
-    def fail(self, reason: str, bar: JobBar) -> None:
+    def rows(self) -> Iterator[ReproducedRow]:
+        """Row of every contender."""
+        for contender in TABLE_CONTENDERS:
+            yield ReproducedRow(
+                self.row,
+                contender,
+                num_draws=len(self.seeds),
+                optima=tuple(self.optima),
+                cells=tuple(self.cells[contender]),
+                reasons=tuple(self.reasons[contender]),
+            )
+
+    def draw(self, seed: int, kept: KeptResults, bar: JobBar) -> None:
+        """Compute the optimum and all cells of one draw, unless they are kept.
+
+        For a method that fails the reason is noted.
+        """
+        bar.name_part(f"{self.row.name}: certified optimum")
+        try:
+            graph = graph_of_row(self.row, seed, self.settings.download)
+        except FAILURES as error:
+            self._fail(reason_of(error), bar)
+            return
+        problem = PGOProblem(graph)
+        name = f"{self.row.name} {seed} {graph_fingerprint(graph)}"
+        entry = _kept_or_computed(kept, f"{name} optimum", partial(_optimum, problem))
+        if isinstance(entry, str):
+            self._fail(entry, bar)
+            return
+        optimum = Optimum(**entry)
+        self.optima.append(optimum)
+        robots = BenchmarkSettings(self.settings.num_robots).robots(graph)
+        for contender in TABLE_CONTENDERS:
+            bar.name_part(f"{self.row.name}: {contender.label}")
+            key = f"{name} {contender.value}, {robots.num_robots} robots {robots.method.name}"
+            compute = partial(self._compute_cell, contender, problem, optimum.lower_bound)
+            entry = _kept_or_computed(kept, key, compute)
+            if isinstance(entry, str):
+                self.reasons[contender].append(entry)
+            else:
+                entry = {**entry, "iterations": tuple(entry["iterations"])}
+                self.cells[contender].append(TableEntry(**entry))
+            bar.end_part()
+
+    def _fail(self, reason: str, bar: JobBar) -> None:
         """Note why a draw has no figures at all."""
         for contender in TABLE_CONTENDERS:
             self.reasons[contender].append(reason)
             bar.end_part()
 
-    def rows(self) -> Iterator[ReproducedRow]:
-        for contender in TABLE_CONTENDERS:
-            cells, reasons = tuple(self.cells[contender]), tuple(self.reasons[contender])
-            yield ReproducedRow(self.row, contender, len(self.seeds), tuple(self.optima), cells, reasons)
-
-    def draw(self, seed: int, kept: KeptResults, bar: JobBar) -> None:
-        """Optimum and all cells of one draw; what was kept is taken, what fails leaves its reason."""
-        bar.name_part(f"{self.row.name}: certified optimum")
-        try:
-            graph = graph_of_row(self.row, seed, self.settings.download)
-        except FAILURES as error:
-            self.fail(reason_of(error), bar)
-            return
-        problem, name = PGOProblem(graph), f"{self.row.name} {seed} {graph_fingerprint(graph)}"
-        found = _found(kept, f"{name} optimum", partial(_optimum, problem))
-        if isinstance(found, str):
-            self.fail(found, bar)
-            return
-        self.optima.append(Optimum(**found))
-        robots = BenchmarkSettings(self.settings.num_robots).robots(graph)
-        for contender in TABLE_CONTENDERS:
-            bar.name_part(f"{self.row.name}: {contender.label}")
-            key = f"{name} {contender.value}, {robots.num_robots} robots {robots.method.name}"
-            cell = _found(kept, key, partial(self._cell, contender, problem, self.optima[-1].lower_bound))
-            if isinstance(cell, str):
-                self.reasons[contender].append(cell)
-            else:
-                self.cells[contender].append(TableEntry(**{**cell, "iterations": tuple(cell["iterations"])}))
-            bar.end_part()
-
-    def _cell(self, contender: BenchmarkMethod, problem: PGOProblem, bound: float) -> Entry:
-        allowed = BenchmarkSettings(self.settings.num_robots, self.row.soc.iterations)
-        is_placed = contender is BenchmarkMethod.PAPER and self.row.name in SCENES
-        trial = run_benchmark(contender, problem, allowed, problem.graph.initial if is_placed else None)
+    def _compute_cell(
+        self, contender: BenchmarkMethod, problem: PGOProblem, lower_bound: float
+    ) -> Entry:
+        """Figures of a contender, as a record for the file; a PGOError if it has no result."""
+        start = None
+        if contender is BenchmarkMethod.PAPER and self.row.name in SCENES:
+            start = problem.graph.initial
+        settings = BenchmarkSettings(self.settings.num_robots, self.row.soc.iterations)
+        trial = run_benchmark(contender, problem, settings, start)
         if not trial.is_answer or not np.isfinite(trial.objective):
             raise PGOError(trial.remark)
-        first, gap = trial.first_objective, float(relative_gap(trial.objective, bound))
-        first_gap = None if first is None else float(relative_gap(first, bound))
-        effort = trial.iterations, trial.rounds, trial.num_bytes, trial.seconds, trial.seconds_per_robot
-        return asdict(TableEntry(float(trial.objective), gap, first_gap, *effort, trial.remark))
+        first_gap = None
+        if trial.first_objective is not None:
+            first_gap = float(relative_gap(trial.first_objective, lower_bound))
+        entry = TableEntry(
+            objective=float(trial.objective),
+            gap=float(relative_gap(trial.objective, lower_bound)),
+            first_gap=first_gap,
+            iterations=trial.iterations,
+            rounds=trial.rounds,
+            num_bytes=trial.num_bytes,
+            seconds=trial.seconds,
+            seconds_per_robot=trial.seconds_per_robot,
+            remark=trial.remark,
+        )
+        return asdict(entry)
 
 
-def _found(kept: KeptResults, key: str, find: Callable[[], Entry]) -> Entry | str:
-    """What is kept of a key, or else is found now; a reason where it cannot be found, which is not kept."""
+def _kept_or_computed(kept: KeptResults, key: str, compute: Callable[[], Entry]) -> Entry | str:
+    """Result that is kept under a key, or else is computed and then kept.
+
+    If it cannot be computed the answer is the reason, which is not kept.
+    """
     entry = kept.get(key)
     if entry is None:
         try:
-            entry = find()
+            entry = compute()
         except FAILURES as error:
             return reason_of(error)
         kept.add(key, entry)
@@ -235,6 +358,7 @@ def _found(kept: KeptResults, key: str, find: Callable[[], Entry]) -> Entry | st
 
 
 def _optimum(problem: PGOProblem) -> Entry:
+    """Certified optimum of a graph, as a record for the file."""
     solution = solve_whole(problem)
     best = min(solution.objective, solution.certificate.poses_objective)
     return asdict(Optimum(float(best), float(solution.lower_bound)))

@@ -1,6 +1,6 @@
-"""Finished results of a long job in a JSON file, so that the job can go on where it was interrupted.
+"""Finished results of a long job in a JSON file, so that an interrupted job can be continued.
 
-Readers and other programs can open it, which they cannot with what joblib.Memory or diskcache keep.
+People and other programs can read that file, unlike the files of joblib.Memory or diskcache.
 """
 
 import json
@@ -17,21 +17,23 @@ Entry = dict[str, Any]
 
 
 class KeptResults(dict[str, Entry]):
-    """Results by key; the file, if there is one, is written anew, whole, whenever a result is added.
+    """Results by key; the whole file, if one is given, is written again when a result is added.
 
-    Results that other versions of the software made are not taken up again, with `is_fresh` none of what it holds. A
-    FileFormatError when the file is there and holds no results.
+    Results of other versions of the software are ignored, with `is_fresh` all results in the file.
+    Raises a FileFormatError if the file exists and is not one of results.
     """
 
     def __init__(self, path: Path | None, is_fresh: bool = False) -> None:
         self._path = path
         self._header = {"kind": "results of pgo, by key", "versions": installed_versions(None)}
         if path is not None and path.exists():
-            found = self._read(path)  # in any case: a file of something else is not to be written over
-            self.update({} if is_fresh else found)
+            # The file is read in any case, so that a file of another kind is not overwritten.
+            results = self._read(path)
+            if not is_fresh:
+                self.update(results)
 
     def add(self, key: str, entry: Entry) -> None:
-        """Keep a result; a PGOError when the file cannot be written."""
+        """Keep a result; raises a PGOError if the file cannot be written."""
         self[key] = entry
         if self._path is not None:
             text = json.dumps({**self._header, "results": self}, indent=1, allow_nan=False)
@@ -39,6 +41,7 @@ class KeptResults(dict[str, Entry]):
                 temporary.write_text(text + "\n", encoding="utf-8")
 
     def _read(self, path: Path) -> dict[str, Entry]:
+        """Results in the file; none if other versions of the software made them."""
         way_out = "remove it or name another file"
         try:
             content = json.loads(read_text(path))
@@ -49,12 +52,15 @@ class KeptResults(dict[str, Entry]):
         if content.get("versions") != self._header["versions"]:
             return {}
         results = content.get("results", {})
-        if not isinstance(results, dict) or not all(isinstance(entry, dict) for entry in results.values()):
+        is_valid = isinstance(results, dict) and all(
+            isinstance(entry, dict) for entry in results.values()
+        )
+        if not is_valid:
             raise FileFormatError(path, None, f"no results of pgo; {way_out}")
-        return results
+        return dict(results)
 
 
 def graph_fingerprint(graph: PoseGraph) -> str:
-    """Short text that differs between graphs with different measurements or estimates."""
+    """Short text that tells graphs with different measurements or estimates apart."""
     poses = [] if graph.initial is None else [graph.initial.R, graph.initial.t]
     return digest(graph.i, graph.j, graph.R_ij, graph.t_ij, graph.kappa, graph.tau, *poses)[:12]

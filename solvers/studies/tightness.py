@@ -1,4 +1,7 @@
-"""Where the semidefinite relaxation stops being tight: rotation noise swept on the paper's circle and grid."""
+"""Noise at which the semidefinite relaxation is no longer tight, on the paper's circle and grid.
+
+The rotation noise is swept from small to large.
+"""
 
 import enum
 from dataclasses import dataclass
@@ -6,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pgo_models.errors import SettingError
+from pgo_models.figures import rounded_up
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NETWORK_KAPPA, NETWORK_TAU, NoiseModel, circle, grid, observe
@@ -13,7 +17,7 @@ from solvers.studies.benchmark_runs import solve_whole
 
 
 class SweptScene(enum.Enum):
-    """Which network."""
+    """Network of the paper whose noise is swept."""
 
     CIRCLE = "circle"
     GRID = "grid"
@@ -21,45 +25,85 @@ class SweptScene(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class NoiseSweep:
-    """Which graphs were certified at which noise."""
+    """Result of a sweep: which graphs were certified at which noise.
+
+    Parameters
+    ----------
+    scene : SweptScene
+        The network.
+    rotation_std : ndarray, (levels,)
+        Standard deviation of the rotation noise, radians.
+    certified : ndarray of bool, (levels, graphs)
+        Whether `solvers.solve` certified its solution. If it did, the relaxation is tight; if not,
+        the relaxation is not tight or the solution not optimal.
+    gap : ndarray, (levels, graphs)
+        Certified gap of the solution; that of the relaxation is at most as large.
+    """
 
     scene: SweptScene
-    rotation_std: Array  # (levels,): radians
-    # (levels, graphs): whether `solvers.solve` certified its answer. Where it did, the relaxation is tight; where it
-    # did not, the relaxation is not tight, or the answer not optimal.
+    rotation_std: Array
     certified: BoolArray
-    gap: Array  # (levels, graphs): certified gap of the answer; the relaxation's own is at most that
+    gap: Array
 
     @property
     def fraction(self) -> Array:
-        """Share of certified graphs at every level, (levels,)."""
+        """Fraction of certified graphs at every level, (levels,)."""
         return np.asarray(self.certified.mean(axis=1))
 
     @property
     def last_tight(self) -> float:
-        """Largest noise, radians, up to which every graph was certified; nan when there is none."""
-        all_certified = np.logical_and.accumulate(self.certified.all(axis=1))
-        return float(self.rotation_std[all_certified][-1]) if all_certified.any() else float("nan")
+        """Largest noise, radians, up to which every graph was certified; nan if there is none."""
+        is_tight = np.logical_and.accumulate(self.certified.all(axis=1))
+        if not is_tight.any():
+            return float("nan")
+        return float(self.rotation_std[is_tight][-1])
 
     def __str__(self) -> str:
         rows = [f"{'degrees':>8} {'certified':>10} {'worst gap':>10}"]
-        for level, share, gaps in zip(self.rotation_std, self.fraction, self.gap, strict=True):
-            rows.append(f"{np.rad2deg(level):>8.1f} {share:>10.0%} {gaps.max():>10.2g}")
+        for std, fraction, gaps in zip(self.rotation_std, self.fraction, self.gap, strict=True):
+            worst = rounded_up(gaps.max(), 2)
+            rows.append(f"{np.rad2deg(std):>8.1f} {fraction:>10.0%} {worst:>10}")
         return "\n".join(rows)
 
 
 def noisy_scene(scene: SweptScene, rotation_std: float, rng: np.random.Generator) -> PoseGraph:
-    """The paper's network with its geometry, weights and translation noise, and another rotation noise, in radians."""
+    """The paper's network with another rotation noise, in radians.
+
+    Geometry, weights and translation noise are those of the paper.
+    """
     network = circle(rng) if scene is SweptScene.CIRCLE else grid(rng)
     assert network.truth is not None
     noise = NoiseModel(rotation_std=rotation_std)
-    return observe(scene.value, network.truth, network.i, network.j, noise, NETWORK_KAPPA, NETWORK_TAU, rng)
+    return observe(
+        scene.value, network.truth, network.i, network.j, noise, NETWORK_KAPPA, NETWORK_TAU, rng
+    )
 
 
-def noise_sweep(scene: SweptScene, rotation_std: Array, graphs: int, rng: np.random.Generator) -> NoiseSweep:
-    """Solve and certify `graphs` random graphs at every noise level.
+def noise_sweep(
+    scene: SweptScene, rotation_std: Array, graphs: int, rng: np.random.Generator
+) -> NoiseSweep:
+    """Solve and certify random graphs at every level of the rotation noise.
 
-    `rotation_std`, (levels,), in radians; a SettingError unless positive and ascending, or when graphs is not positive.
+    Parameters
+    ----------
+    scene : SweptScene
+        The network.
+    rotation_std : ndarray, (levels,)
+        Standard deviations of the rotation noise, radians, positive and ascending.
+    graphs : int
+        Number of graphs at every level.
+    rng : numpy.random.Generator
+        Source of the noise.
+
+    Returns
+    -------
+    NoiseSweep
+        Which graphs were certified, and their gaps.
+
+    Raises
+    ------
+    SettingError
+        If the levels are not positive and ascending, or `graphs` is not positive.
 
     Examples
     --------
@@ -68,7 +112,8 @@ def noise_sweep(scene: SweptScene, rotation_std: Array, graphs: int, rng: np.ran
     array([1.])
     """
     levels = np.asarray(rotation_std, dtype=float)
-    if levels.ndim != 1 or not len(levels) or not (levels > 0).all() or (np.diff(levels) <= 0).any():
+    is_list = levels.ndim == 1 and len(levels) > 0
+    if not is_list or not (levels > 0).all() or (np.diff(levels) <= 0).any():
         raise SettingError(f"rotation_std must be positive and ascending, got {rotation_std}")
     if graphs < 1:
         raise SettingError(f"graphs must be at least 1, got {graphs}")
@@ -77,5 +122,6 @@ def noise_sweep(scene: SweptScene, rotation_std: Array, graphs: int, rng: np.ran
     for level, std in enumerate(levels):
         for number in range(graphs):
             solution = solve_whole(noisy_scene(scene, float(std), rng))
-            certified[level, number], gap[level, number] = solution.is_certified, solution.gap
+            certified[level, number] = solution.is_certified
+            gap[level, number] = solution.certificate.proven_gap
     return NoiseSweep(scene, levels, certified, gap)

@@ -1,4 +1,4 @@
-"""DGS: both linear problems, their convergence to the centralised solution, flags, rounds and outer iterations."""
+"""DGS: both linear problems, convergence to the centralised solution, flags, rounds, steps."""
 
 import dataclasses
 import math
@@ -9,9 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 from budget import examples
-from graphs import DIMENSIONS, OPTIMUM, REFERENCE, SEEDS, exact_graph, random_poses, varied_graph, varied_problem
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from graphs import (
+    DIMENSIONS,
+    OPTIMUM,
+    REFERENCE,
+    SEEDS,
+    exact_graph,
+    random_poses,
+    varied_graph,
+    varied_problem,
+)
+from hypothesis import given, settings, strategies as st
 from scipy.sparse.linalg import spsolve
 from test_sweep_order import scattered
 
@@ -43,7 +51,9 @@ METHODS = {
 EVERY_METHOD = pytest.mark.parametrize(("sweep", "alpha"), METHODS.values(), ids=METHODS)
 
 
-def fixed_by_hand(matrix: Any, right: np.ndarray, fixed: np.ndarray, values: np.ndarray) -> np.ndarray:
+def fixed_by_hand(
+    matrix: Any, right: np.ndarray, fixed: np.ndarray, values: np.ndarray
+) -> np.ndarray:
     """Solution of matrix x = right with the rows `fixed` of x given, by SuperLU's general LU."""
     free = np.setdiff1d(np.arange(matrix.shape[0]), fixed)
     x = np.zeros((matrix.shape[0], right.shape[1]))
@@ -60,7 +70,10 @@ def relaxed_rotations(problem: PGOProblem, R_0: np.ndarray) -> np.ndarray:
 
 
 def gauss_newton_move(problem: PGOProblem, R: np.ndarray) -> np.ndarray:
-    """One Gauss-Newton step (v, w) of poses 1, 2, .. from (R, 0), solved whole with the matrix of the Hessian room."""
+    """One Gauss-Newton step (v, w) of poses 1, 2, ..
+
+    from (R, 0), solved whole with the matrix of the Hessian room.
+    """
     n, d = R.shape[:2]
     origin = Poses(R, np.zeros((n, d)))
     layout = TangentLayout(n, d)
@@ -74,11 +87,16 @@ def gauss_newton_move(problem: PGOProblem, R: np.ndarray) -> np.ndarray:
 
 def centralized(problem: PGOProblem) -> Poses:
     """Both stages, each system solved whole."""
-    n, d = problem.num_poses, problem.d
+    n = problem.num_poses
+    d = problem.d
     projected = project_to_rotations(unstack_transposes(relaxed_rotations(problem, np.eye(d))))
-    w, v = TangentLayout(n - 1, d).split(gauss_newton_move(problem, np.concatenate([np.eye(d)[None], projected]))[:, 0])
+    w, v = TangentLayout(n - 1, d).split(
+        gauss_newton_move(problem, np.concatenate([np.eye(d)[None], projected]))[:, 0]
+    )
     moved = move_poses(Poses(projected, np.zeros((n - 1, d))), w, v)
-    return Poses(np.concatenate([np.eye(d)[None], moved.R]), np.concatenate([np.zeros((1, d)), moved.t]))
+    return Poses(
+        np.concatenate([np.eye(d)[None], moved.R]), np.concatenate([np.zeros((1, d)), moved.t])
+    )
 
 
 def squares(linear: LeastSquares, x: np.ndarray) -> float:
@@ -86,13 +104,21 @@ def squares(linear: LeastSquares, x: np.ndarray) -> float:
 
 
 def assert_converges(
-    linear: LeastSquares, exact: np.ndarray, problem: PGOProblem, robots: Partition, sweep: Sweep, alpha: float
+    linear: LeastSquares,
+    exact: np.ndarray,
+    problem: PGOProblem,
+    robots: Partition,
+    sweep: Sweep,
+    alpha: float,
 ) -> None:
-    """Sweeps from the flagged one on come as near as wanted to the exact solution; none makes the squares larger."""
+    """Sweeps after the flagged one converge to the exact solution, and none raises the squares."""
     turns = schedule(problem.graph, robots, sweep)
     prepared = sweep_turns(linear, turns, 1, problem.backend)
-    x, ledger = np.zeros_like(exact), Ledger(robots.num_robots)
-    x, ledger = take_turns(flagged_turns(linear, problem.graph, turns, 1, problem.backend), x, 1.0, ledger)
+    x = np.zeros_like(exact)
+    ledger = Ledger(robots.num_robots)
+    x, ledger = take_turns(
+        flagged_turns(linear, problem.graph, turns, 1, problem.backend), x, 1.0, ledger
+    )
     value = squares(linear, x)
     for _ in range(100_000):
         if np.abs(x - exact).max() <= WANTED * max(1.0, np.abs(exact).max()):
@@ -109,8 +135,11 @@ def assert_converges(
 
 @settings(max_examples=examples(30))
 @given(seed=SEEDS, n=st.integers(2, 12), d=DIMENSIONS)
-def test_least_squares_are_F_without_orthogonality_and_F_linearized(seed: int, n: int, d: int) -> None:
-    problem, rng = varied_problem(seed, n, d), np.random.default_rng(seed)
+def test_least_squares_are_F_without_orthogonality_and_F_linearized(
+    seed: int, n: int, d: int
+) -> None:
+    problem = varied_problem(seed, n, d)
+    rng = np.random.default_rng(seed)
     R = random_rotations(n, d, rng)
     rotations = rotation_problem(problem, R[0])
     Y = rng.standard_normal(((n - 1) * d, d))
@@ -118,16 +147,28 @@ def test_least_squares_are_F_without_orthogonality_and_F_linearized(seed: int, n
     value = np.sum(rotations.w[:, None] * (rotations.J @ Y + rotations.r) ** 2)
     assert value == pytest.approx(np.sum(X * (problem.L @ X)), rel=1e-10)
     linear = pose_problem(problem, R)
-    assert np.sum(linear.w[:, None] * linear.r**2) == pytest.approx(problem.objective(Poses(R, np.zeros((n, d)))))
+    assert np.sum(linear.w[:, None] * linear.r**2) == pytest.approx(
+        problem.objective(Poses(R, np.zeros((n, d))))
+    )
     layout = TangentLayout(n, d)
-    free = np.concatenate([np.arange(d, n * d), np.arange(n * d + (layout.side - n * d) // n, layout.side)])
-    hessian = riemannian_hessian(problem, Poses(R, np.zeros((n, d))), None).toarray()[np.ix_(free, free)]
+    free = np.concatenate(
+        [np.arange(d, n * d), np.arange(n * d + (layout.side - n * d) // n, layout.side)]
+    )
+    hessian = riemannian_hessian(problem, Poses(R, np.zeros((n, d))), None).toarray()[
+        np.ix_(free, free)
+    ]
     np.testing.assert_allclose(
-        2 * (linear.J.T @ (linear.J * linear.w[:, None])).toarray(), hessian, rtol=0, atol=1e-12 * np.abs(hessian).max()
+        2 * (linear.J.T @ (linear.J * linear.w[:, None])).toarray(),
+        hessian,
+        rtol=0,
+        atol=1e-12 * np.abs(hessian).max(),
     )
     gradient = layout.join(*problem.riemannian_gradient(Poses(R, np.zeros((n, d)))))[free]
     np.testing.assert_allclose(
-        2 * (linear.J.T @ (linear.w[:, None] * linear.r))[:, 0], gradient, rtol=0, atol=1e-11 * np.abs(gradient).max()
+        2 * (linear.J.T @ (linear.w[:, None] * linear.r))[:, 0],
+        gradient,
+        rtol=0,
+        atol=1e-11 * np.abs(gradient).max(),
     )
 
 
@@ -137,14 +178,18 @@ def test_least_squares_are_F_without_orthogonality_and_F_linearized(seed: int, n
 @EVERY_METHOD
 @settings(max_examples=examples(6))
 @given(seed=SEEDS, n=st.integers(2, 10), d=DIMENSIONS)
-def test_sweeps_settle_at_the_exact_solutions(sweep: Sweep, alpha: float, seed: int, n: int, d: int) -> None:
+def test_sweeps_settle_at_the_exact_solutions(
+    sweep: Sweep, alpha: float, seed: int, n: int, d: int
+) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, weights=0.3))
     robots = scattered(problem.graph, 1 + seed % n, seed)
     R = random_rotations(n, d, np.random.default_rng(seed))
     exact = relaxed_rotations(problem, R[0])
     assert_converges(rotation_problem(problem, R[0]), exact, problem, robots, sweep, alpha)
     R[1:] = project_to_rotations(unstack_transposes(exact))
-    assert_converges(pose_problem(problem, R), gauss_newton_move(problem, R), problem, robots, sweep, alpha)
+    assert_converges(
+        pose_problem(problem, R), gauss_newton_move(problem, R), problem, robots, sweep, alpha
+    )
 
 
 @EVERY_METHOD
@@ -155,7 +200,9 @@ def test_the_solver_reaches_its_centralised_counterpart(
 ) -> None:
     problem = PGOProblem(make(np.random.default_rng(3)))
     robots = partition(problem.graph, 4, method)
-    solver = GaussSeidel(robots=robots, sweep=sweep, alpha=alpha, tolerance=1e-12, max_iterations=20_000)
+    solver = GaussSeidel(
+        robots=robots, sweep=sweep, alpha=alpha, tolerance=1e-12, max_iterations=20_000
+    )
     result = run_without_measuring(solver, problem)
     poses = centralized(problem)
     np.testing.assert_allclose(result.R, poses.R, rtol=0, atol=WANTED)
@@ -213,14 +260,16 @@ def test_a_flagged_sweep_ignores_where_it_begins(sweep: Sweep, seed: int, n: int
     for linear in (rotation_problem(problem, R[0]), pose_problem(problem, R)):
         prepared = flagged_turns(linear, problem.graph, turns, 1, problem.backend)
         begin = np.random.default_rng(seed).standard_normal((linear.J.shape[1], linear.r.shape[1]))
-        one, ledger = take_turns(prepared, begin, 1.0, Ledger(robots.num_robots))
-        other, _ = take_turns(prepared, np.zeros_like(begin), 1.0, Ledger(robots.num_robots))
-        np.testing.assert_allclose(one, other, rtol=0, atol=1e-9 * max(1.0, np.abs(one).max()))
+        from_random, ledger = take_turns(prepared, begin, 1.0, Ledger(robots.num_robots))
+        from_zero, _ = take_turns(prepared, np.zeros_like(begin), 1.0, Ledger(robots.num_robots))
+        atol = 1e-9 * max(1.0, np.abs(from_random).max())
+        np.testing.assert_allclose(from_random, from_zero, rtol=0, atol=atol)
         assert ledger.rounds <= turns.first.max() + 1
 
 
 def test_a_flagged_sweep_over_a_tree_is_exact() -> None:
-    # On a tree every measurement can be met: composing them, which the flagged sweep does, is the solution.
+    # On a tree every measurement can be met: composing them, which the flagged sweep does, is the
+    # solution.
     rng = np.random.default_rng(0)
     n = 12
     graph = dataclasses.replace(
@@ -240,10 +289,14 @@ def test_a_flagged_sweep_over_a_tree_is_exact() -> None:
 
 def test_without_flags_the_first_sweep_listens_to_everybody() -> None:
     problem = PGOProblem(circle(np.random.default_rng(0)))
-    flagged, plain = (next(islice(iterate(GaussSeidel(is_flagged=f), problem), 1, None)) for f in (True, False))
+    flagged, plain = (
+        next(islice(iterate(GaussSeidel(is_flagged=f), problem), 1, None)) for f in (True, False)
+    )
     assert not np.allclose(flagged.x, plain.x)
-    one, other = (run(GaussSeidel(is_flagged=f, tolerance=1e-10), problem) for f in (True, False))
-    assert one.objective == pytest.approx(other.objective, rel=1e-7)
+    with_flags, without_flags = (
+        run(GaussSeidel(is_flagged=f, tolerance=1e-10), problem) for f in (True, False)
+    )
+    assert with_flags.objective == pytest.approx(without_flags.objective, rel=1e-7)
 
 
 @settings(max_examples=examples(10))
@@ -251,7 +304,9 @@ def test_without_flags_the_first_sweep_listens_to_everybody() -> None:
 def test_pose_0_of_the_start_stays_and_the_gauge_does_not_matter(seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)
     start = random_poses(n, d, seed)
-    solver = GaussSeidel(robots=partition(problem.graph, min(2, n)), tolerance=1e-11, max_iterations=50_000)
+    solver = GaussSeidel(
+        robots=partition(problem.graph, min(2, n)), tolerance=1e-11, max_iterations=50_000
+    )
     result = run(solver, problem, start)
     np.testing.assert_allclose(result.poses.R[0], start.R[0], rtol=0, atol=1e-12)
     np.testing.assert_allclose(result.poses.t[0], start.t[0], rtol=0, atol=1e-12)
@@ -269,7 +324,8 @@ def test_rounds_are_turns_and_bytes_are_separators(sweep: Sweep) -> None:
     turns = schedule(problem.graph, robots, sweep)
     solver = GaussSeidel(robots=robots, sweep=sweep)
     states = list(islice(iterate(solver, problem), 60))
-    per_sweep, first = int(turns.group.max()) + 1, int(turns.first.max()) + 1
+    per_sweep = int(turns.group.max()) + 1
+    first = int(turns.first.max()) + 1
     pairs = len(turns.sent)
     for state, following in pairwise(states):
         begins = following.stage is not state.stage or state.k == 0
@@ -286,8 +342,12 @@ def test_rounds_are_turns_and_bytes_are_separators(sweep: Sweep) -> None:
 @pytest.mark.parametrize("d", [2, 3])
 def test_more_gauss_newton_steps_go_on_to_a_stationary_point(d: int) -> None:
     problem = PGOProblem(random_geometric(20, np.random.default_rng(0), d=d, mean_degree=5.0))
-    solver = GaussSeidel(robots=partition(problem.graph, 3), alpha=1.5, tolerance=1e-10, max_iterations=100_000)
-    results = [run(dataclasses.replace(solver, gauss_newton_steps=steps), problem) for steps in (1, 2, 8)]
+    solver = GaussSeidel(
+        robots=partition(problem.graph, 3), alpha=1.5, tolerance=1e-10, max_iterations=100_000
+    )
+    results = [
+        run(dataclasses.replace(solver, gauss_newton_steps=steps), problem) for steps in (1, 2, 8)
+    ]
     assert [result.state.gauss_newton_step for result in results] == [1, 2, 8]
     optimum = problem.objective(polish(problem, results[0].poses))
     assert results[0].objective > results[1].objective
@@ -298,13 +358,14 @@ def test_more_gauss_newton_steps_go_on_to_a_stationary_point(d: int) -> None:
 def test_it_answers_where_the_paper_has_no_figure_for_it(
     name: str, benchmark_problem: Callable[[str], PGOProblem]
 ) -> None:
-    problem, figures = benchmark_problem(name), REFERENCE["paper_tables"][name]
+    problem = benchmark_problem(name)
+    figures = REFERENCE["paper_tables"][name]
     assert figures["F_dgs"] is None
     robots = partition(problem.graph, 5, PartitionMethod.CONTIGUOUS)
     poses = run_without_measuring(GaussSeidel(robots=robots, alpha=1.8, tolerance=1e-4), problem)
     exact = run_without_measuring(GaussSeidel(robots=partition(problem.graph, 1)), problem)
-    for found in (poses, exact):
-        assert OPTIMUM[name] < problem.objective(found) < figures["F_soc"]
+    for end in (poses, exact):
+        assert OPTIMUM[name] < problem.objective(end) < figures["F_soc"]
     assert problem.objective(poses) == pytest.approx(problem.objective(exact), rel=1e-2)
 
 

@@ -5,9 +5,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from budget import examples
-from graphs import DIMENSIONS, LOUD_NOISE, OPTIMUM, SEEDS, optimum_tolerance, random_poses, varied_graph, varied_problem
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from graphs import (
+    DIMENSIONS,
+    LOUD_NOISE,
+    OPTIMUM,
+    SEEDS,
+    optimum_tolerance,
+    random_poses,
+    varied_graph,
+    varied_problem,
+)
+from hypothesis import given, settings, strategies as st
 
 from pgo_models.certificates.newton_polish import polish, relative_decrement
 from pgo_models.errors import SettingError
@@ -65,7 +73,8 @@ def test_damping_falls_after_foreseen_steps_and_rises_ever_faster_after_refused_
     problem = PGOProblem(varied_graph(0, 30, 3, LOUD_NOISE, weights=3.0))
     solver = LevenbergMarquardt(damping=1e-6)
     state = solver.init(problem, random_poses(30, 3, 0))
-    refused_in_a_row, most = 0, 0
+    refused_in_a_row = 0
+    most = 0
     for _ in range(60):
         following = solver.step(problem, state)
         if following.poses is state.poses:
@@ -73,7 +82,8 @@ def test_damping_falls_after_foreseen_steps_and_rises_ever_faster_after_refused_
             assert following.damping == pytest.approx(2.0**refused_in_a_row * state.damping)
         else:
             refused_in_a_row = 0
-            # 1 - (2 ratio - 1)^3 is below 2: a poor step that is taken raises the damping, by less than a refused one.
+            # 1 - (2 ratio - 1)^3 is below 2: a poor step that is taken raises the damping, by less
+            # than a refused one.
             assert state.damping / 3 * (1 - 1e-12) <= following.damping <= 2 * state.damping
             assert following.growth == 2.0
         most = max(most, refused_in_a_row)
@@ -82,8 +92,11 @@ def test_damping_falls_after_foreseen_steps_and_rises_ever_faster_after_refused_
 
 
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, damping=st.sampled_from([1e-6, 1e-2, 10.0]))
-def test_a_step_solves_the_damped_equations_of_the_poses(seed: int, n: int, d: int, damping: float) -> None:
-    problem, poses = varied_problem(seed, n, d), random_poses(n, d, seed)
+def test_a_step_solves_the_damped_equations_of_the_poses(
+    seed: int, n: int, d: int, damping: float
+) -> None:
+    problem = varied_problem(seed, n, d)
+    poses = random_poses(n, d, seed)
     state = LevenbergMarquardt(damping=damping).init(problem, poses)
     layout = TangentLayout(n, d)
     gradient = layout.join(*problem.riemannian_gradient(poses))

@@ -1,10 +1,11 @@
-"""Prints the tables of many robots (README.md beside this file): rounds, bytes, seconds, faults, a world of 100 robots.
+"""Prints the tables of many robots (README.md beside this file): rounds, bytes, seconds, faults, a
+world of 100 robots.
 
-    PGO_DATA=folder python tests/benchmarks/robots.py [TABLE ..]
+    PGO_DATA=folder python tests/benchmarks/robots.py
+    [substructured|consensus|held|seconds|faults|driver|world|ray ..]
 
-TABLE is substructured, consensus, seconds, faults, driver, world or ray.
-
-Every line runs in a process of its own, one thread, robots in this process; those of `ray` in actors on two CPUs, too.
+Every line runs in a process of its own, one thread, robots in this process; those of `ray` in
+actors on two CPUs, too.
 """
 
 import json
@@ -22,6 +23,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[variable] = "1"
 
 import numpy as np
+from held_poses import rounds_held
 from rich.box import MARKDOWN
 from rich.console import Console
 from rich.table import Table
@@ -29,6 +31,7 @@ from unit import seconds_of_unit
 
 import pgo_models as pgo
 import solvers
+from pgo_models.figures import rounded_up
 from pgo_models.graphs.separators import vertex_cover
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.consensus import RobotsOfDriver
@@ -53,7 +56,8 @@ FAULTS = {
     "up to 5 late": Faults(max_delay=5, seed=1),
     "one silent for 50": Faults(silent_robot=2, silent_from=5, silent_rounds=50),
 }
-METIS, CONTIGUOUS = pgo.PartitionMethod.METIS, pgo.PartitionMethod.CONTIGUOUS
+METIS = pgo.PartitionMethod.METIS
+CONTIGUOUS = pgo.PartitionMethod.CONTIGUOUS
 
 
 def substructured_job(name: str, robots: str, method: str) -> dict[str, object]:
@@ -69,7 +73,7 @@ def substructured_job(name: str, robots: str, method: str) -> dict[str, object]:
         "all_reduces": solution.ledger.all_reduces,
         "sent": solution.ledger.bytes_sent.max() / 1e3,
         "received": solution.ledger.bytes_received.max() / 1e3,
-        "gap": solution.gap,
+        "gap": solution.certificate.proven_gap,
         "verdict": solution.certificate.verdict.name,
         "seconds": solution.seconds,
         "memory": memory(),
@@ -80,7 +84,11 @@ def consensus_job(name: str, robots: str, method: str) -> dict[str, object]:
     """Rounds of CONSENSUS from the chordal start to three relative gaps; default settings."""
     problem = pgo.PGOProblem(pgo.load(name))
     shared = pgo.partition(problem.graph, int(robots), pgo.PartitionMethod[method])
-    done = to_gap(problem, solvers.SOC(robots=shared, tolerance=1e-12, max_iterations=MAX_ROUNDS), OPTIMUM[name])
+    done = to_gap(
+        problem,
+        solvers.SOC(robots=shared, tolerance=1e-12, max_iterations=MAX_ROUNDS),
+        OPTIMUM[name],
+    )
     return {
         "rounds": rounds_to(done.history, OPTIMUM[name]),
         "seconds": float(done.history.seconds[-1]),
@@ -88,8 +96,17 @@ def consensus_job(name: str, robots: str, method: str) -> dict[str, object]:
     }
 
 
+def held_job(name: str, robots: str) -> dict[str, object]:
+    """Rounds of CONSENSUS until the poses that the robots hold cost so much; METIS partition."""
+    return rounds_held(
+        name, int(robots), [OPTIMUM[name] + level * max(1.0, OPTIMUM[name]) for level in LEVELS]
+    )
+
+
 def faults_job(name: str, fault: str) -> dict[str, object]:
-    """Rounds of the asynchronous CONSENSUS, 5 robots, METIS partition, to 1e-6; the whole graph measures omega."""
+    """Rounds of the asynchronous CONSENSUS, 5 robots, METIS partition, to 1e-6; the whole graph
+    measures omega.
+    """
     graph = pgo.load(name)
     problem = pgo.PGOProblem(graph)
     shared = pgo.partition(graph, 5, METIS)
@@ -104,7 +121,9 @@ def faults_job(name: str, fault: str) -> dict[str, object]:
             R[own.poses] = own.R
         gaps.append(gap_of(problem.objective(problem.with_best_translations(R)), OPTIMUM[name]))
         return (
-            gaps[-1] <= LEVELS[-1] and not FAULTS[fault].is_silent(2, state.k) and state.k > FAULTS[fault].silent_from
+            gaps[-1] <= LEVELS[-1]
+            and not FAULTS[fault].is_silent(2, state.k)
+            and state.k > FAULTS[fault].silent_from
         )
 
     outcome = run(AsynchronousSOC(soc, FAULTS[fault]), driver, callback=is_done)
@@ -112,22 +131,37 @@ def faults_job(name: str, fault: str) -> dict[str, object]:
 
 
 def ray_job(name: str, robots: str, coupling: str) -> dict[str, object]:
-    """Iterations of SOC, no tolerance, in this process and in two actors that are kept: least of five solves each."""
+    """Iterations of SOC, no tolerance, in this process and in two actors that are kept: least of
+    five solves each.
+    """
     graph = pgo.load(name)
     shared = pgo.partition(graph, int(robots), METIS)
-    soc = solvers.SOC(robots=shared, coupling=solvers.Coupling[coupling], tolerance=1e-14, max_iterations=40)
+    soc = solvers.SOC(
+        robots=shared, coupling=solvers.Coupling[coupling], tolerance=1e-14, max_iterations=40
+    )
     pipeline = solvers.Pipeline(soc=soc, second_try=False, staircase=None)
 
     def least(engine: Engine) -> dict[str, float]:
         found = []
         for _ in range(5):
-            began, cpu = time.perf_counter(), time.process_time()
+            began = time.perf_counter()
+            cpu = time.process_time()
             solution = solvers.solve(graph, pipeline, robots=shared, engine=engine)
-            whole, driver = time.perf_counter() - began, time.process_time() - cpu
+            whole = time.perf_counter() - began
+            driver = time.process_time() - cpu
             (stage,) = (stage for stage in solution.stages if stage.name == "SOC")
             steps = np.diff(stage.history.seconds)
-            found.append((stage.seconds / stage.iterations, np.median(steps), driver / stage.iterations, whole))
-        return dict(zip(("mean", "median", "cpu", "whole"), np.min(found, axis=0).tolist(), strict=True))
+            found.append(
+                (
+                    stage.seconds / stage.iterations,
+                    np.median(steps),
+                    driver / stage.iterations,
+                    whole,
+                )
+            )
+        return dict(
+            zip(("mean", "median", "cpu", "whole"), np.min(found, axis=0).tolist(), strict=True)
+        )
 
     here = least(InProcess())
     with RayEngine(num_cpus=2).kept() as engine:
@@ -136,10 +170,14 @@ def ray_job(name: str, robots: str, coupling: str) -> dict[str, object]:
 
 
 def world_job() -> dict[str, object]:
-    """A world of 100 robots and 50,000 poses in space, read from the folder that `pgo generate` wrote."""
+    """A world of 100 robots and 50,000 poses in space, read from the folder that `pgo generate`
+    wrote.
+    """
     with tempfile.TemporaryDirectory() as folder:
         world = Path(folder) / "world"
-        run_cli(["generate", "grid-world", "--robots", "100", "--poses", "500", "--out", str(world)])
+        run_cli(
+            ["generate", "grid-world", "--robots", "100", "--poses", "500", "--out", str(world)]
+        )
         began = time.perf_counter()
         graph = pgo.load(str(world))
         solution = solvers.solve(graph, robots=pgo.partition(graph, 100, METIS))
@@ -151,7 +189,7 @@ def world_job() -> dict[str, object]:
         "rounds": solution.ledger.rounds,
         "sent": solution.ledger.bytes_sent.max() / 1e6,
         "received": solution.ledger.bytes_received.max() / 1e6,
-        "gap": solution.gap,
+        "gap": solution.certificate.proven_gap,
         "verdict": solution.certificate.verdict.name,
         "seconds": seconds,
         "memory": memory(),
@@ -168,12 +206,16 @@ class TimedRobots:
         """Robots of these shares."""
         self.seconds = np.zeros(len(shares))
         robots = range(len(shares))
-        self._pool = InProcess().open(lambda robot: (robot, self._timed(robot, make, shares[robot])), robots)
+        self._pool = InProcess().open(
+            lambda robot: (robot, self._timed(robot, make, shares[robot])), robots
+        )
         return self
 
     def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
         """Answers of all to an order."""
-        return self._pool.ask(lambda held, request: self._timed(held[0], order, held[1], request), requests)
+        return self._pool.ask(
+            lambda held, request: self._timed(held[0], order, held[1], request), requests
+        )
 
     def close(self) -> None:
         """Let them go."""
@@ -193,7 +235,8 @@ def driver_job(robots: str, poses: str) -> dict[str, object]:
         shape = ["--robots", robots, "--poses", poses, "-d", "2"]
         run_cli(["generate", "grid-world", *shape, "--out", str(world)])
         graph = pgo.load(str(world))
-    shared, timed = pgo.partition(graph, int(robots), METIS), TimedRobots()
+    shared = pgo.partition(graph, int(robots), METIS)
+    timed = TimedRobots()
     began = time.process_time()
     solution = solvers.solve(graph, robots=shared, engine=timed)
     total = time.process_time() - began
@@ -205,7 +248,7 @@ def driver_job(robots: str, poses: str) -> dict[str, object]:
         "driver": total - timed.seconds.sum(),
         "busiest": timed.seconds.max(),
         "levels": [round(1e-6 * one, 1) for one in solution.ledger.bytes_by_level],
-        "gap": solution.gap,
+        "gap": solution.certificate.proven_gap,
         "verdict": solution.certificate.verdict.name,
         "memory": memory(),
     }
@@ -213,14 +256,18 @@ def driver_job(robots: str, poses: str) -> dict[str, object]:
 
 def run_cli(arguments: list[str]) -> None:
     """`pgo` with these arguments."""
-    code = "from solvers.cli import main; main()"
-    subprocess.run([sys.executable, "-c", code, *arguments], check=True, capture_output=True, env=os.environ)
+    code = "from solvers.cli.app import main; main()"
+    subprocess.run(
+        [sys.executable, "-c", code, *arguments], check=True, capture_output=True, env=os.environ
+    )
 
 
 def to_gap(problem: pgo.PGOProblem, soc: solvers.SOC, optimum: float) -> solvers.Run:
     """Run until the smallest of the levels is reached."""
     return solvers.run(
-        soc, problem, callback=lambda state, record: gap_of(record.measurement.objective, optimum) <= LEVELS[-1]
+        soc,
+        problem,
+        callback=lambda state, record: gap_of(record.measurement.objective, optimum) <= LEVELS[-1],
     )
 
 
@@ -241,11 +288,25 @@ def memory() -> float:
 
 
 def substructured_table() -> Table:
-    """SUBSTRUCTURED: start, SOC, Newton and certificate, METIS partition (then contiguous parts)."""
-    heads = ("graph", "robots", "cover", "SOC", "rounds", "all-reduces", "sent, kB", "received, kB", "gap", "s", "MB")
+    """SUBSTRUCTURED: start, SOC, Newton, certificate; METIS partition (then contiguous parts)."""
+    heads = (
+        "graph",
+        "robots",
+        "cover",
+        "SOC",
+        "rounds",
+        "all-reduces",
+        "sent, kB",
+        "received, kB",
+        "gap",
+        "s",
+        "MB",
+    )
     table = Table(*heads, box=MARKDOWN)
     cases = [(name, k, METIS) for name in NAMES for k in (5, 25)]
-    cases += [(name, k, CONTIGUOUS) for name in ("sphere2500", "torus3D", "kitti_00") for k in (5, 25)]
+    cases += [
+        (name, k, CONTIGUOUS) for name in ("sphere2500", "torus3D", "kitti_00") for k in (5, 25)
+    ]
     for name, robots, method in cases:
         row = child("substructured", name, str(robots), method.name)
         table.add_row(
@@ -253,7 +314,8 @@ def substructured_table() -> Table:
             str(robots),
             *(str(row[key]) for key in ("cover", "soc", "rounds", "all_reduces")),
             *(f"{row[key]:.0f}" for key in ("sent", "received")),
-            f"{row['gap']:.1e} {'' if row['verdict'] == 'CERTIFIED' else row['verdict']}",
+            f"{rounded_up(row['gap'], 2)}"
+            f" {'' if row['verdict'] == 'CERTIFIED' else row['verdict']}",
             f"{row['seconds']:.2f}",
             f"{row['memory']:.0f}",
         )
@@ -261,24 +323,48 @@ def substructured_table() -> Table:
 
 
 def consensus_table() -> Table:
-    """CONSENSUS from the chordal start, default settings: rounds to relative gaps of 1e-3 / 1e-4 / 1e-6."""
-    table = Table("graph", "5, METIS", "5, contiguous", "25, METIS", "25, contiguous", "AMM-PGO, 5", box=MARKDOWN)
+    """CONSENSUS, default settings: iterations to gaps of 1e-3 / 1e-4 / 1e-6, with the best
+    translations for omega.
+    """
+    table = Table("graph", "5, METIS", "5, contiguous", "25, METIS", "25, contiguous", box=MARKDOWN)
     for name in NAMES:
         cells = [
             as_text(child("consensus", name, str(robots), method.name)["rounds"])
             for robots, method in ((5, METIS), (5, CONTIGUOUS), (25, METIS), (25, CONTIGUOUS))
         ]
-        published = AMM["rounds"][name]
-        table.add_row(name, *cells, as_text([published[0], published[1], published[3]]))
+        table.add_row(name, *cells)
+    return table
+
+
+def held_table() -> Table:
+    """CONSENSUS, default settings, F at the poses held: all rounds to 1e-3 / 1e-4 / 1e-6, those of
+    the start apart.
+    """
+    table = Table("graph", "5, METIS", "of these, start", "25, METIS", "AMM-PGO, 5", box=MARKDOWN)
+    for name in NAMES:
+        five, many = (child("held", name, robots) for robots in ("5", "25"))
+        rounds = five["rounds"], many["rounds"], [AMM["rounds"][name][k] for k in (0, 1, 3)]
+        of_five, of_many, theirs = map(as_text, rounds)
+        table.add_row(name, of_five, str(five["start"]), of_many, theirs)
     return table
 
 
 def seconds_table() -> Table:
-    """Seconds to 1e-6, 5 robots, METIS partition, summed over robots: chordal start not included."""
-    table = Table("graph", "CONSENSUS, s", "u", "whole SUBSTRUCTURED solve, s", "u", "AMM-PGO, u", "MB", box=MARKDOWN)
+    """Seconds to 1e-6 of 5 robots by METIS, summed over robots: chordal start not included."""
+    table = Table(
+        "graph",
+        "CONSENSUS, s",
+        "u",
+        "whole SUBSTRUCTURED solve, s",
+        "u",
+        "AMM-PGO, u",
+        "MB",
+        box=MARKDOWN,
+    )
     for name in ("sphere2500", "torus3D", "cubicle"):
         unit = seconds_of_unit()
-        one, other = child("consensus", name, "5", "METIS"), child("substructured", name, "5", "METIS")
+        one = child("consensus", name, "5", "METIS")
+        other = child("substructured", name, "5", "METIS")
         table.add_row(
             name,
             f"{one['seconds']:.2f}",
@@ -301,8 +387,20 @@ def faults_table() -> Table:
 
 
 def driver_table() -> Table:
-    """Driver and busiest robot of SUBSTRUCTURED solves in the plane: CPU seconds, MB sent on each level of the tree."""
-    heads = ("poses", "robots", "cover", "rounds", "driver, s", "busiest robot, s", "MB by level", "gap", "MB")
+    """Driver and busiest robot of SUBSTRUCTURED solves in the plane: CPU seconds, MB sent on each
+    level of the tree.
+    """
+    heads = (
+        "poses",
+        "robots",
+        "cover",
+        "rounds",
+        "driver, s",
+        "busiest robot, s",
+        "MB by level",
+        "gap",
+        "MB",
+    )
     table = Table(*heads, box=MARKDOWN)
     for robots, poses in ((100, 228), (144, 903)):
         row = child("driver", str(robots), str(poses))
@@ -312,7 +410,7 @@ def driver_table() -> Table:
             *(str(row[key]) for key in ("cover", "rounds")),
             *(f"{row[key]:.2f}" for key in ("driver", "busiest")),
             " / ".join(map(str, row["levels"])),
-            f"{row['gap']:.1e} {row['verdict']}",
+            f"{rounded_up(row['gap'], 2)} {row['verdict']}",
             f"{row['memory']:.0f}",
         )
     return table
@@ -321,26 +419,54 @@ def driver_table() -> Table:
 def world_table() -> Table:
     """100 robots, 50,000 poses: read, solved and certified in this process."""
     row = child("world")
-    table = Table("poses", "edges", "rounds", "sent, MB a robot", "received", "gap", "seconds", "MB", box=MARKDOWN)
+    table = Table(
+        "poses",
+        "edges",
+        "rounds",
+        "sent, MB a robot",
+        "received",
+        "gap",
+        "seconds",
+        "MB",
+        box=MARKDOWN,
+    )
     table.add_row(
         *(str(row[key]) for key in ("poses", "edges", "rounds")),
         *(f"{row[key]:.1f}" for key in ("sent", "received")),
-        f"{row['gap']:.1e} {row['verdict']}",
+        f"{rounded_up(row['gap'], 2)} {row['verdict']}",
         *(f"{row[key]:.0f}" for key in ("seconds", "memory")),
     )
     return table
 
 
 def ray_table() -> Table:
-    """Robots in two Ray actors: ms an iteration of SOC, set-up and snapshots included; whole solves."""
-    heads = ("graph", "robots", "coupling", "process, ms", "Ray, ms", "(median)", "driver's CPU, ms", "solve, s")
+    """Robots in two Ray actors: ms an iteration of SOC, set-up and snapshots included; whole
+    solves.
+    """
+    heads = (
+        "graph",
+        "robots",
+        "coupling",
+        "process, ms",
+        "Ray, ms",
+        "(median)",
+        "driver's CPU, ms",
+        "solve, s",
+    )
     table = Table(*heads, box=MARKDOWN)
     for name, robots in (("smallGrid3D", 5), ("smallGrid3D", 25), ("sphere2500", 5)):
         for coupling in ("SUBSTRUCTURED", "CONSENSUS"):
             row = child("ray", name, str(robots), coupling)
-            here, there = row["here"], row["there"]
+            here = row["here"]
+            there = row["there"]
             figures = here["mean"], there["mean"], there["median"], there["cpu"]
-            table.add_row(name, str(robots), coupling, *(f"{1e3 * x:.1f}" for x in figures), f"{there['whole']:.2f}")
+            table.add_row(
+                name,
+                str(robots),
+                coupling,
+                *(f"{1e3 * x:.1f}" for x in figures),
+                f"{there['whole']:.2f}",
+            )
     return table
 
 
@@ -352,7 +478,11 @@ def as_text(rounds: list[int | None]) -> str:
 def child(*arguments: str) -> dict:
     """Figures of a job in a process of its own."""
     finished = subprocess.run(
-        [sys.executable, __file__, "--job", *arguments], capture_output=True, text=True, check=True, env=os.environ
+        [sys.executable, __file__, "--job", *arguments],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ,
     )
     return json.loads(finished.stdout)
 
@@ -360,6 +490,7 @@ def child(*arguments: str) -> dict:
 JOBS: dict[str, Callable[..., dict[str, object]]] = {
     "substructured": substructured_job,
     "consensus": consensus_job,
+    "held": held_job,
     "faults": faults_job,
     "driver": driver_job,
     "world": world_job,
@@ -368,6 +499,7 @@ JOBS: dict[str, Callable[..., dict[str, object]]] = {
 TABLES = {
     "substructured": substructured_table,
     "consensus": consensus_table,
+    "held": held_table,
     "seconds": seconds_table,
     "faults": faults_table,
     "driver": driver_table,

@@ -1,17 +1,25 @@
-"""Graphs with wrong loop closures: ours and GTSAM's GncLMOptimizer on the same files (extra `peers`), CPU seconds.
+"""Graphs with wrong loop closures: ours and GTSAM's GncLMOptimizer on the same files (extra
+`peers`), CPU seconds.
 
-    python tests/benchmarks/robust.py [--graphs intel MIT ..] [--shares 0.3 ..] [--kinds random aliased] [--seeds 0 ..]
-    python tests/benchmarks/robust.py --summary rows.jsonl
+    python tests/benchmarks/robust.py [--graphs intel MIT ..] [--shares 0.3 ..] [--kinds random
+    aliased] [--seeds 0 ..] python tests/benchmarks/robust.py --summary rows.jsonl python
+    tests/benchmarks/robust.py --verdicts
 
-Both start from odometry, which both are told is right. Each run is a process of its own with a time limit; a row a run
-is printed and appended to --rows, which --summary reads. precision: of the loop closures kept, the share that is right;
-recall: of the right ones, the share kept; ATE: metres to the optimum of the same cost without wrong edges.
+Both start from odometry, which both are told is right. Each run is a process of its own with a time
+limit; a row a run is printed and appended to --rows, which --summary reads. precision: of the loop
+closures kept, the share that is right; recall: of the right ones, the share kept; ATE: metres to
+the optimum of the same cost without wrong edges.
+
+`--verdicts` runs ours alone on the cases of `VERDICTS`, and prints for each precision, recall, the
+exit code of `pgo solve` and the line of the verdict. A run is silent where precision or recall is
+below 0.95 and the exit code is 0.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib.util
+import itertools
 import json
 import os
 import subprocess
@@ -26,20 +34,65 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
+from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import absolute_trajectory_error
-from solvers.robust.gnc import first_poses, odometry
+from pgo_models.graphs.scenes import NoiseModel
+from solvers.robust.consistency import odometry
+from solvers.robust.weighted_edges import first_poses
+
+sys.path.insert(0, str(Path(__file__).parent.parent))  # of the tests, whose graphs are used
+from wrong_edges import noisy_sphere
 
 NAMES = "smallGrid3D sphere2500 torus3D parking-garage cubicle CSAIL intel manhattan MIT kitti_00"
 TAGS = {"EDGE_SE2": (2, 3), "EDGE_SE3:QUAT": (3, 7)}
-HEADS = ("graph", "share", "kind", "seed", "ours P / R", "ATE m", "s", "verdict (gap)", "GTSAM P / R", "ATE m", "s")
+HEADS = (
+    "graph",
+    "share",
+    "kind",
+    "seed",
+    "ours P / R",
+    "ATE m",
+    "s",
+    "verdict (gap)",
+    "GTSAM P / R",
+    "ATE m",
+    "s",
+)
 LOST = 0.99  # precision or recall below it is a failure
+SILENT = 0.95  # precision or recall below it has to be said
+# Graphs, shares of wrong closures, kinds and seeds. Graphs of `SCENES` are generated.
+VERDICTS = [
+    ("noisy_sphere", (0.0,), ("random",), (0,)),
+    ("world", (0.5,), ("aliased",), (0,)),
+    *((name, (0.9,), ("random", "aliased"), (0, 1)) for name in ("kitti_07", "kitti_00", "MIT")),
+    *(
+        (name, (0.3, 0.5), ("random", "aliased"), (0, 1))
+        for name in ("MIT", "intel", "CSAIL", "smallGrid3D")
+    ),
+]
+VERDICT_HEADS = ("graph", "share", "kind", "seed", "P / R", "s", "exit", "verdict")
+
+
+def _noisy_sphere() -> pgo.PoseGraph:
+    return noisy_sphere(2200, 50, NoiseModel(0.1, 0.1), 0)
+
+
+def _world() -> pgo.PoseGraph:
+    noise = NoiseModel(0.05, np.deg2rad(1.0))
+    rng = np.random.default_rng(0)
+    return pgo.grid_world(1, 15_000, rng, d=2, loop_closure_probability=0.015, noise=noise)
+
+
+SCENES = {"noisy_sphere": _noisy_sphere, "world": _world}
 
 
 def spoil(source: Path, out: Path, share: float, kind: str, seed: int) -> list[int]:
-    """Write `source` with wrong loop closures added, `share` of all, and return which edges they are, in file order.
+    """Write `source` with wrong loop closures added, `share` of all, and return which edges they
+    are, in file order.
 
-    random: any two poses, a uniform rotation, a translation within three times the measured ones. aliased: runs of 10
-    that agree with each other: poses a .. a + 9 seen from b .. b + 9 under one wrong relative pose.
+    random: any two poses, a uniform rotation, a translation within three times the measured ones.
+    aliased: runs of 10 that agree with each other: poses a .. a + 9 seen from b .. b + 9 under one
+    wrong relative pose.
     """
     rng = np.random.default_rng(seed)
     lines = [line for line in source.read_text().splitlines() if line.strip()]
@@ -72,7 +125,8 @@ def spoil(source: Path, out: Path, share: float, kind: str, seed: int) -> list[i
 def posed(path: Path, information: bool) -> pgo.PGOProblem:
     """Problem of a file in the cost that is compared."""
     return pgo.PGOProblem(
-        pgo.read_g2o(path), weighting=pgo.Weighting.INFORMATION if information else pgo.Weighting.ISOTROPIC
+        pgo.read_g2o(path),
+        weighting=pgo.Weighting.INFORMATION if information else pgo.Weighting.ISOTROPIC,
     )
 
 
@@ -82,14 +136,20 @@ def ours(path: Path, information: bool) -> dict[str, Any]:
     began = time.process_time()
     solution = solvers.solve(problem, robust=solvers.GNC(), progress=False)
     seconds = time.process_time() - began
-    verdict, found = solution.certificate.verdict.name, solution.robust
+    verdict = solution.verdict.name
+    found = solution.robust
+    exit_code = 2
+    if solution.status.is_success:
+        exit_code = 0 if solution.is_certified else 3
     return {
         "kept": np.flatnonzero(found.kept).tolist(),
         "t": solution.poses.t.tolist(),
         "seconds": seconds,
         "verdict": verdict,
-        "gap": solution.gap,
+        "gap": solution.certificate.proven_gap,
         "start": found.start,
+        "headline": found.headline,
+        "exit": exit_code,
         "certified": solution.is_certified,
     }
 
@@ -98,14 +158,24 @@ def theirs(path: Path, _: bool) -> dict[str, Any]:
     """The same of GTSAM."""
     gtsam: ModuleType = importlib.import_module("gtsam")
     graph = pgo.read_g2o(path)
-    is_3d, ids = graph.d == 3, graph.pose_ids.tolist()
+    is_3d = graph.d == 3
+    ids = graph.pose_ids.tolist()
     factors, _ = gtsam.readG2o(str(path), is_3d)
     poses = first_poses(graph, odometry(graph))
     start = gtsam.Values()
     for k, R, t in zip(ids, poses.R, poses.t, strict=True):
-        start.insert(k, gtsam.Pose3(gtsam.Rot3(R), t) if is_3d else gtsam.Pose2(*t, np.arctan2(R[1, 0], R[0, 0])))
+        start.insert(
+            k,
+            (
+                gtsam.Pose3(gtsam.Rot3(R), t)
+                if is_3d
+                else gtsam.Pose2(*t, np.arctan2(R[1, 0], R[0, 0]))
+            ),
+        )
     ends = [tuple(factors.at(e).keys()) for e in range(factors.size())]
-    assert ends == [(ids[i], ids[j]) for i, j in zip(graph.i.tolist(), graph.j.tolist(), strict=True)]
+    assert ends == [
+        (ids[i], ids[j]) for i, j in zip(graph.i.tolist(), graph.j.tolist(), strict=True)
+    ]
     tight = gtsam.noiseModel.Isotropic.Sigma(6 if is_3d else 3, 1e-4)
     prior = gtsam.PriorFactorPose3 if is_3d else gtsam.PriorFactorPose2
     factors.add(prior(ids[0], (start.atPose3 if is_3d else start.atPose2)(ids[0]), tight))
@@ -122,7 +192,9 @@ def theirs(path: Path, _: bool) -> dict[str, Any]:
     return {"kept": np.flatnonzero(weights > 0.5).tolist(), "t": t, "seconds": seconds}
 
 
-def judged(result: dict[str, Any] | None, problem: pgo.PGOProblem, wrong: list[int], clean: pgo.Poses) -> dict:
+def judged(
+    result: dict[str, Any] | None, problem: pgo.PGOProblem, wrong: list[int], clean: pgo.Poses
+) -> dict:
     """Precision, recall and ATE of a run; nothing of one that did not finish."""
     if result is None:
         return {"precision": None, "recall": None, "ate": None, "seconds": None}
@@ -141,7 +213,15 @@ def judged(result: dict[str, Any] | None, problem: pgo.PGOProblem, wrong: list[i
 
 def child(which: str, path: Path, information: bool, limit: float) -> dict[str, Any] | None:
     """Result of a run in a process of its own; None where it fails or takes too long."""
-    command = [sys.executable, __file__, "--child", which, "--graphs", str(path), *["--information"] * information]
+    command = [
+        sys.executable,
+        __file__,
+        "--child",
+        which,
+        "--graphs",
+        str(path),
+        *["--information"] * information,
+    ]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=limit)
     except (subprocess.TimeoutExpired, subprocess.CalledProcessError) as error:
@@ -156,12 +236,22 @@ def row(one: dict[str, Any]) -> str:
     def cells(run: dict[str, Any]) -> list[str]:
         if run["seconds"] is None:
             return ["-", "-", "not finished"]
-        return [f"{run['precision']:.3f} / {run['recall']:.3f}", f"{run['ate']:.3g}", f"{run['seconds']:.2f}"]
+        return [
+            f"{run['precision']:.3f} / {run['recall']:.3f}",
+            f"{run['ate']:.3g}",
+            f"{run['seconds']:.2f}",
+        ]
 
     a = one["ours"]
-    verdict = "-" if a["seconds"] is None else f"{a['verdict']} ({a['gap']:.1e})"
+    verdict = "-" if a["seconds"] is None else f"{a['verdict']} ({rounded_up(a['gap'], 2)})"
     first = [one["graph"], str(one["share"]), one["kind"], str(one["seed"])]
-    return "| " + " | ".join([*first, *cells(a), verdict, *(cells(one["gtsam"]) if one["gtsam"] else "---")]) + " |"
+    return (
+        "| "
+        + " | ".join(
+            [*first, *cells(a), verdict, *(cells(one["gtsam"]) if one["gtsam"] else "---")]
+        )
+        + " |"
+    )
 
 
 def summary(rows: list[dict[str, Any]]) -> None:
@@ -170,40 +260,125 @@ def summary(rows: list[dict[str, Any]]) -> None:
     failed = [min(run["precision"], run["recall"]) < LOST for run in ours]
     spoiled = [run["precision"] < 1.0 for run in ours]
     alarm = [not run["certified"] for run in ours]
-    print(f"{len(rows)} runs, {len(ours)} finished; precision and recall of {LOST} or more in {failed.count(False)}")
-    for what, bad in ((f"precision or recall under {LOST}", failed), ("a wrong edge kept", spoiled)):
+    print(
+        f"{len(rows)} runs, {len(ours)} finished; precision and recall of {LOST} or more in"
+        f" {failed.count(False)}"
+    )
+    for what, bad in (
+        (f"precision or recall under {LOST}", failed),
+        ("a wrong edge kept", spoiled),
+    ):
         caught = sum(b and a for b, a in zip(bad, alarm, strict=True))
         print(f"{what}: {sum(bad)}, not certified of them: {caught}")
-    print(f"not certified and all is well: {sum(a and not b for a, b in zip(alarm, failed, strict=True))}")
-    both = [(one["ours"], one["gtsam"]) for one in rows if one["gtsam"] and one["ours"]["seconds"] is not None]
+    print(
+        "not certified and all is well:"
+        f" {sum(a and not b for a, b in zip(alarm, failed, strict=True))}"
+    )
+    both = [
+        (one["ours"], one["gtsam"])
+        for one in rows
+        if one["gtsam"] and one["ours"]["seconds"] is not None
+    ]
     done = [(a, b) for a, b in both if b["seconds"] is not None]
     if not done:
         print(f"GTSAM finished none of {len(both)}")
         return
     ratio = [b["seconds"] / a["seconds"] for a, b in done]
-    print(f"GTSAM finished {len(done)} of {len(both)}; its seconds over ours, geometric mean of these:", end=" ")
+    print(
+        f"GTSAM finished {len(done)} of {len(both)}; its seconds over ours, geometric mean of"
+        " these:",
+        end=" ",
+    )
     print(f"{np.exp(np.mean(np.log(ratio))):.3g}, from {min(ratio):.3g} to {max(ratio):.3g}")
     for name in ("precision", "recall"):
-        less = [(a[name] - b[name], one["graph"]) for one in rows for a, b in [(one["ours"], one["gtsam"])] if a and b
-                and a["seconds"] is not None and b["seconds"] is not None]  # fmt: skip
+        less = [
+            (one["ours"][name] - one["gtsam"][name], one["graph"])
+            for one in rows
+            if (one["ours"], one["gtsam"]) in done
+        ]
         lost = sum(b[name] >= LOST > a[name] for a, b in done)
-        print(f"{name}: ours less GTSAM's at worst {min(less)[0]:+.3f} ({min(less)[1]}), at least as good in", end=" ")
-        print(f"{sum(x >= 0 for x, _ in less)} of {len(less)}; under {LOST} where GTSAM is not: {lost}")
+        print(
+            f"{name}: ours less GTSAM's at worst {min(less)[0]:+.3f} ({min(less)[1]}), at least as"
+            " good in",
+            end=" ",
+        )
+        print(
+            f"{sum(x >= 0 for x, _ in less)} of {len(less)}; under {LOST} where GTSAM is not:"
+            f" {lost}"
+        )
 
 
-def main() -> None:
+def source_of(name: str, folder: Path) -> Path:
+    """File of a public graph, or of a scene, which is written into `folder`."""
+    if name not in SCENES:
+        return Path(os.environ["PGO_DATA"]) / f"{name}.g2o"
+    path = folder / f"{name}.clean.g2o"
+    pgo.write_g2o(SCENES[name](), path)
+    return path
+
+
+def verdicts(limit: float) -> None:
+    """Print the table of `--verdicts`, and how many runs were silent."""
+    print(f"| {' | '.join(VERDICT_HEADS)} |\n|{'---|' * len(VERDICT_HEADS)}")
+    silent = 0
+    cases = [(name, *case) for name, *lists in VERDICTS for case in itertools.product(*lists)]
+    for name, share, kind, seed in cases:
+        with tempfile.TemporaryDirectory() as folder:
+            source = source_of(name, Path(folder))
+            path = Path(folder) / f"{name}.g2o"
+            wrong = spoil(source, path, share, kind, seed)
+            found = child("ours", path, False, limit)
+            problem = posed(path, False)
+        if found is None:
+            print(f"| {name} | {share} | {kind} | {seed} | not finished |", flush=True)
+            continue
+        run = judged(found, problem, wrong, pgo.odometry_start(problem.graph))
+        quality = f"{run['precision']:.3f} / {run['recall']:.3f}"
+        silent += min(run["precision"], run["recall"]) < SILENT and run["exit"] == 0
+        cells = [
+            name,
+            share,
+            kind,
+            seed,
+            quality,
+            f"{run['seconds']:.1f}",
+            run["exit"],
+            run["headline"],
+        ]
+        print(f"| {' | '.join(map(str, cells))} |", flush=True)
+    print(f"silent: {silent} of {len(cases)}")
+
+
+def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--graphs", nargs="+", default=NAMES.split())
     parser.add_argument("--shares", nargs="+", type=float, default=[0.1, 0.3, 0.5, 0.7])
     parser.add_argument("--kinds", nargs="+", default=["random", "aliased"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--information", action="store_true", help="ours in chi2, not in F")
-    parser.add_argument("--limit", type=float, default=120.0, help="seconds of a run of GTSAM; ours: five times that")
+    parser.add_argument(
+        "--limit",
+        type=float,
+        default=120.0,
+        help="seconds of a run of GTSAM; ours: five times that",
+    )
     parser.add_argument("--no-gtsam", action="store_true")
     parser.add_argument("--rows", type=Path, help="JSON lines to append to")
-    parser.add_argument("--summary", type=Path, help="print what the rows of this file say, and run nothing")
+    parser.add_argument(
+        "--summary", type=Path, help="print what the rows of this file say, and run nothing"
+    )
     parser.add_argument("--child", choices=("ours", "gtsam"), help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    parser.add_argument(
+        "--verdicts", action="store_true", help="ours alone, and what it says of its answers"
+    )
+    return parser.parse_args()
+
+
+def main() -> None:
+    options = arguments()
+    if options.verdicts:
+        verdicts(5 * options.limit)
+        return
     if options.child:
         run = ours if options.child == "ours" else theirs
         print(json.dumps(run(Path(options.graphs[0]), options.information)))
@@ -217,16 +392,26 @@ def main() -> None:
     print(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}")
     for name in options.graphs:
         source = Path(os.environ["PGO_DATA"]) / f"{name}.g2o"
-        clean = {w: solvers.solve(posed(source, w), progress=False).poses for w in {options.information, True}}
-        for share, kind, seed in ((a, b, c) for a in options.shares for b in options.kinds for c in options.seeds):
+        clean = {
+            w: solvers.solve(posed(source, w), progress=False).poses
+            for w in {options.information, True}
+        }
+        for share, kind, seed in (
+            (a, b, c) for a in options.shares for b in options.kinds for c in options.seeds
+        ):
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / f"{name}.g2o"
                 wrong = spoil(source, path, share, kind, seed)
-                problem, w = posed(path, options.information), options.information
+                problem = posed(path, options.information)
+                w = options.information
                 one = {"graph": name, "share": share, "kind": kind, "seed": seed, "gtsam": None}
-                one["ours"] = judged(child("ours", path, w, 5 * options.limit), problem, wrong, clean[w])
+                one["ours"] = judged(
+                    child("ours", path, w, 5 * options.limit), problem, wrong, clean[w]
+                )
                 if has_gtsam:
-                    one["gtsam"] = judged(child("gtsam", path, w, options.limit), problem, wrong, clean[True])
+                    one["gtsam"] = judged(
+                        child("gtsam", path, w, options.limit), problem, wrong, clean[True]
+                    )
             rows.append(one)
             print(row(one), flush=True)
             if options.rows:

@@ -1,4 +1,6 @@
-"""All marginal covariances of a graph, against one factorisation of the same matrix (order and pattern included)."""
+"""All marginal covariances of a graph, against one factorisation of the same matrix (order and
+pattern included).
+"""
 
 import statistics
 import time
@@ -32,9 +34,12 @@ def test_all_marginals(benchmark: BenchmarkFixture, benchmark_data, name: str) -
     poses = polish(problem, chordal_start(problem))
     hessian = riemannian_hessian(problem, poses, multipliers(problem, poses))
     layout = TangentLayout(problem.num_poses, problem.d)
-    grounded = Marginals(hessian, layout)._information  # timed apart: to permute is no part of either
+    # timed apart: to permute is no part of either
+    grounded = Marginals(hessian, layout)._information
     analysis = analyze(grounded)
-    factors, numerics, wholes = [], [], []
+    factors = []
+    numerics = []
+    wholes = []
 
     def factored() -> tuple[tuple[Marginals], dict[str, object]]:
         # In turn with what they are held against: others use the machine, too.
@@ -49,8 +54,9 @@ def test_all_marginals(benchmark: BenchmarkFixture, benchmark_data, name: str) -
     inversion = benchmark.stats.stats.median
     factor, numeric, whole = map(statistics.median, (factors, numerics, wholes))
     print(
-        f"\n{name}: factorisation {1e3 * factor:.0f} ms (of it numeric {1e3 * numeric:.0f}), then all blocks "
-        f"{1e3 * inversion:.0f} ms: {inversion / factor:.2f} factorisations; from the Hessian {whole / factor:.2f}"
+        f"\n{name}: factorisation {1e3 * factor:.0f} ms (of it numeric {1e3 * numeric:.0f}), then"
+        f" all blocks {1e3 * inversion:.0f} ms: {inversion / factor:.2f} factorisations; from the"
+        f" Hessian {whole / factor:.2f}"
     )
     assert blocks.shape[0] == problem.num_poses
     assert np.isfinite(blocks).all()

@@ -1,4 +1,6 @@
-"""The semidefinite relaxation from posing to proof, on one thread, with a certified gap to the solution of SOC."""
+"""The semidefinite relaxation from posing to proof, on one thread, with a certified gap to the
+solution of SOC.
+"""
 
 import numpy as np
 import pytest
@@ -8,15 +10,23 @@ from pgo_models.certificates.certificate import relative_gap
 from pgo_models.graphs.g2o import read_g2o
 from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.relaxations.solve_sdp import DEFAULT_RELAXATION_GAP, RelaxationSolution, solve_relaxation
+from pgo_models.relaxations.solve_sdp import (
+    DEFAULT_RELAXATION_GAP,
+    RelaxationSolution,
+    solve_relaxation,
+)
 from solvers.pipeline import solve
 
 SCENES = {"grid": (grid, 3.0), "circle": (circle, 3.0), "sphere": (sphere, 10.0)}  # seconds
 
 
-def check(benchmark: BenchmarkFixture, problem: PGOProblem, seconds: float, rounds: int) -> RelaxationSolution:
+def check(
+    benchmark: BenchmarkFixture, problem: PGOProblem, seconds: float, rounds: int
+) -> RelaxationSolution:
     solved = solve(problem)
-    solution = benchmark.pedantic(solve_relaxation, (problem,), rounds=rounds, warmup_rounds=rounds > 1)
+    solution = benchmark.pedantic(
+        solve_relaxation, (problem,), rounds=rounds, warmup_rounds=rounds > 1
+    )
     assert relative_gap(solved.objective, solution.lower_bound) <= DEFAULT_RELAXATION_GAP
     assert benchmark.stats.stats.median < seconds
     return solution
@@ -33,6 +43,8 @@ def test_tinyGrid3D(benchmark: BenchmarkFixture, benchmark_data) -> None:
 
 
 @pytest.mark.parametrize(("first", "last"), [(2300, 3450), (0, 2000)])
-def test_a_long_trajectory_with_few_loops(benchmark: BenchmarkFixture, benchmark_data, first: int, last: int) -> None:
+def test_a_long_trajectory_with_few_loops(
+    benchmark: BenchmarkFixture, benchmark_data, first: int, last: int
+) -> None:
     graph = read_g2o(benchmark_data / "kitti_00.g2o").subgraph(np.arange(first, last))
     check(benchmark, PGOProblem(graph), 60.0, rounds=1)

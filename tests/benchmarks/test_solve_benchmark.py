@@ -1,4 +1,4 @@
-"""Timings of the whole job and of its parts: pytest tests/benchmarks --benchmark-only, one thread."""
+"""Timings of the job and its parts, one thread: pytest tests/benchmarks --benchmark-only."""
 
 import os
 from pathlib import Path
@@ -24,7 +24,9 @@ def test_read(benchmark, path):
 
 
 def test_file_to_certificate(benchmark, path):
-    solution = benchmark.pedantic(lambda: solvers.solve(pgo.read_g2o(path)), rounds=5, warmup_rounds=1)
+    solution = benchmark.pedantic(
+        lambda: solvers.solve(pgo.read_g2o(path)), rounds=5, warmup_rounds=1
+    )
     benchmark.extra_info["gap"] = solution.gap
     assert solution.is_certified
 

@@ -19,8 +19,7 @@ from graphs import (
     varied_graph,
     varied_problem,
 )
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 
 from pgo_models.certificates.certificate import (
     DEFAULT_GAP,
@@ -29,12 +28,12 @@ from pgo_models.certificates.certificate import (
     Verdict,
     certify,
     certify_at,
-    gap_text,
     judge,
-    proven_digits,
 )
 from pgo_models.certificates.lower_bound import prove_bound
-from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, polish, relative_decrement
+from pgo_models.certificates.newton_polish import polish, relative_decrement
+from pgo_models.certificates.newton_step import STATIONARY_DECREMENT
+from pgo_models.certificates.rounding_errors import fits_to_rounding, objective_rounding
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, random_rotations
@@ -60,19 +59,24 @@ def ring(seed: int, n: int, d: int, noise: NoiseModel) -> PoseGraph:
 
 
 def wound(truth: Poses) -> Poses:
-    """The truth of a ring in the plane, with one more turn around the loop: beside it lies a local minimum."""
+    """The truth of a ring in the plane, with one more turn around the loop.
+
+    Beside it lies a local minimum.
+    """
     n = truth.num_poses
     extra = exp_map(2 * np.pi * np.arange(n)[:, None] / n)
     return Poses(truth.R @ extra, truth.t)
 
 
-def assert_holds_together(problem: PGOProblem, poses: Poses, certificate: Certificate, known: float) -> None:
+def assert_holds_together(
+    problem: PGOProblem, poses: Poses, certificate: Certificate, known: float
+) -> None:
     """A certificate says only what is so, whatever its verdict is."""
     objective = problem.objective(poses)
     assert certificate.objective == objective
     assert certificate.lower_bound <= min(known, objective)
     if certificate.verdict is Verdict.EXACT:
-        assert (objective <= certificate.rounding_level, certificate.gap) == (True, 0.0)
+        assert (fits_to_rounding(problem, poses), certificate.gap) == (True, 0.0)
     else:
         assert certificate.gap == (objective - certificate.lower_bound) / objective
         assert certificate.is_certified == (certificate.gap <= certificate.wanted_gap)
@@ -94,13 +98,20 @@ def assert_holds_together(problem: PGOProblem, poses: Poses, certificate: Certif
 
 @settings(max_examples=examples(60))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, noise=NOISES, spread=st.sampled_from([1.0, 1e3, 1e6]))
-def test_certificates_of_any_poses_hold(seed: int, n: int, d: int, noise: NoiseModel, spread: float) -> None:
+def test_certificates_of_any_poses_hold(
+    seed: int, n: int, d: int, noise: NoiseModel, spread: float
+) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, noise))
     known = best_known(problem, seed)
     assert problem.graph.truth is not None
     assert problem.graph.initial is not None
     far = Poses(problem.graph.truth.R, problem.graph.truth.t + spread)
-    for poses in (problem.graph.truth, problem.graph.initial, random_poses(n, d, seed, spread), far):
+    for poses in (
+        problem.graph.truth,
+        problem.graph.initial,
+        random_poses(n, d, seed, spread),
+        far,
+    ):
         assert_holds_together(problem, poses, certify(problem, poses), known)
 
 
@@ -135,13 +146,17 @@ def test_the_optimum_of_every_benchmark_is_certified(
     benchmark_problem: Callable[[str], PGOProblem],
     benchmark_optimum: Callable[[str], Poses],
 ) -> None:
-    problem, poses = benchmark_problem(name), benchmark_optimum(name)
+    problem = benchmark_problem(name)
+    poses = benchmark_optimum(name)
     certificate = certify(problem, poses)
     assert certificate.verdict is Verdict.CERTIFIED
     assert certificate.source is BoundSource.GIVEN
     assert certificate.stationarity <= STATIONARY_DECREMENT
     assert_holds_together(problem, poses, certificate, OPTIMUM[name] + optimum_tolerance(name))
-    assert certificate.lower_bound >= OPTIMUM[name] - optimum_tolerance(name) - DEFAULT_GAP * OPTIMUM[name]
+    assert (
+        certificate.lower_bound
+        >= OPTIMUM[name] - optimum_tolerance(name) - DEFAULT_GAP * OPTIMUM[name]
+    )
 
 
 @BACKENDS
@@ -190,7 +205,9 @@ def test_poses_that_are_not_stationary_are_polished_and_said_so(seed: int, n: in
     assert polished.source is BoundSource.POLISHED
     assert polished.stationarity > STATIONARY_DECREMENT
     assert polished.objective == problem.objective(nudged) > polished.poses_objective
-    assert polished.lower_bound == pytest.approx(given_ones.lower_bound, rel=DEFAULT_GAP, abs=DEFAULT_GAP)
+    assert polished.lower_bound == pytest.approx(
+        given_ones.lower_bound, rel=DEFAULT_GAP, abs=DEFAULT_GAP
+    )
 
 
 def test_beside_a_bad_local_minimum_the_chordal_start_gives_the_bound() -> None:
@@ -215,8 +232,11 @@ def test_beside_a_bad_local_minimum_the_chordal_start_gives_the_bound() -> None:
 
 
 def test_beside_a_saddle_the_chordal_start_gives_better_poses() -> None:
-    # Newton stays at an exact saddle; no bound but zero is to be had, at either point, as the optimum is zero.
-    i, j, turn = np.zeros(1, dtype=int), np.ones(1, dtype=int), np.eye(2)[None]
+    # Newton stays at an exact saddle; no bound but zero is to be had, at either point, as the
+    # optimum is zero.
+    i = np.zeros(1, dtype=int)
+    j = np.ones(1, dtype=int)
+    turn = np.eye(2)[None]
     problem = PGOProblem(PoseGraph(2, i, j, turn, np.zeros((1, 2)), np.ones(1), np.ones(1)))
     saddle = Poses(exp_map(np.array([[0.0], [np.pi]])), np.zeros((2, 2)))
     certificate = certify(problem, saddle)
@@ -232,7 +252,9 @@ def test_beside_a_saddle_the_chordal_start_gives_better_poses() -> None:
 
 @settings(max_examples=examples(40))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
-def test_a_measurement_turned_by_half_a_turn_does_not_break_the_bound(seed: int, n: int, d: int) -> None:
+def test_a_measurement_turned_by_half_a_turn_does_not_break_the_bound(
+    seed: int, n: int, d: int
+) -> None:
     graph = varied_graph(seed, n, d)
     rng = np.random.default_rng(seed)
     R_ij = graph.R_ij.copy()
@@ -260,7 +282,8 @@ def test_a_measurement_turned_by_half_a_turn_changes_the_verdict(d: int) -> None
 
 
 @pytest.mark.parametrize(
-    ("seed", "n", "d", "rotation_std"), [(15, 6, 2, 0.5), (29, 6, 2, 0.5), (22, 6, 3, 0.5), (17, 10, 3, 0.5)]
+    ("seed", "n", "d", "rotation_std"),
+    [(15, 6, 2, 0.5), (29, 6, 2, 0.5), (22, 6, 3, 0.5), (17, 10, 3, 0.5)],
 )
 def test_where_the_relaxation_is_not_tight_the_bound_holds_and_the_verdict_says_no(
     seed: int, n: int, d: int, rotation_std: float
@@ -359,6 +382,32 @@ def test_multipliers_of_a_certificate_cannot_be_changed() -> None:
 
 
 def test_a_gap_is_written_with_the_digits_that_it_proves() -> None:
-    assert [proven_digits(gap) for gap in (3e-13, 0.2, 0.0)] == [12, 0, 0]
-    assert gap_text(3.2e-13) == "3.2e-13, proven to 12 digits"
-    assert (gap_text(0.2), gap_text(0.0)) == ("0.2", "0: F is at its rounding level")
+    found = certify(
+        grid(np.random.default_rng(0)), chordal_start(PGOProblem(grid(np.random.default_rng(0))))
+    )
+    whole = replace(found, objective=2.0**60, objective_error=0.0)
+    near = replace(whole, bound=replace(found.bound, value=2.0**60 - 2.0**20))
+    assert near.gap_text == "9.1e-13, proven to 12 digits"
+    far = replace(whole, bound=replace(found.bound, value=0.75 * 2.0**60))
+    assert (far.gap_text, far.digits) == ("0.25", 0)
+    exact = replace(found, verdict=Verdict.EXACT)
+    assert (exact.gap_text, exact.digits, exact.proven_gap) == (
+        "0: every edge fits to its rounding",
+        0,
+        0.0,
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_error_of_the_cost_is_that_of_the_poses_judged(seed: int) -> None:
+    problem = varied_problem(seed, 8, 3)
+    poses = random_poses(8, 3, seed)
+    certificate = certify(problem, poses)  # bound elsewhere, at polished poses
+    rounding = objective_rounding(problem, poses)
+    assert certificate.objective_error == rounding.error
+    assert (
+        certificate.objective
+        < certificate.objective_at_most
+        <= certificate.objective + 2.0 * rounding.error
+    )
+    assert certificate.proven_gap >= certificate.gap

@@ -1,7 +1,8 @@
-"""Every term of an error is there: each bound is at least its formula, written out here entry by entry.
+"""Every term of an error is there: each bound is at least its formula, written out here.
 
-That the formulas are bounds is held against exact arithmetic elsewhere (test_rounding_errors, test_factor_errors);
-there one term often covers another, and to leave one out would be seen by nobody.
+That the formulas are bounds is held against exact arithmetic elsewhere (test_rounding_errors,
+test_factor_errors); there one term often covers another, and to leave one out would be seen by
+nobody.
 """
 
 from dataclasses import replace
@@ -27,43 +28,64 @@ from pgo_models.certificates.rounding_errors import (
 )
 from pgo_models.geometry.rotations import Array, orthogonality_error, random_rotations
 from pgo_models.problem.cholesky import CholeskyBackend, analyze
-from pgo_models.problem.floating_point import UNIT_ROUNDOFF as u
-from pgo_models.problem.floating_point import column_error, error_of_counts, gamma
+from pgo_models.problem.floating_point import (
+    UNIT_ROUNDOFF as u,
+    column_error,
+    error_of_counts,
+    gamma,
+)
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed.robots import elimination as substructure
-from solvers.distributed.robots import proof as robot_proof
+from solvers.distributed.robots import elimination as substructure, proof as robot_proof
 from solvers.distributed.robots.elimination import Cut, eliminate, row_sums
 
 ENOUGH = 1.0 - 1e-12  # the formulas here are rounded, too; the bounds are rounded up by 2^-30
 SIZES = [(t, low, P) for t in (1e-6, 1.0, 1e6) for low in (0.0, 1.0, 1e9) for P in (1e-6, 1.0, 1e4)]
 
 
-def written_out(problem: PGOProblem, t: Array, low: Array, P: Array) -> tuple[float, float, Array, Array]:
+def written_out(
+    problem: PGOProblem, t: Array, low: Array, P: Array
+) -> tuple[float, float, Array, Array]:
     """Value, its error, M X and its error of `evaluate_edges`, one edge after the other."""
-    graph, n, d = problem.graph, problem.num_poses, problem.d
-    product, error = np.zeros((n * (d + 1), d)), np.zeros((n * (d + 1), d))
+    graph = problem.graph
+    n = problem.num_poses
+    d = problem.d
+    product = np.zeros((n * (d + 1), d))
+    error = np.zeros((n * (d + 1), d))
     value = value_error = 0.0
     degree = np.bincount(np.concatenate([graph.i, np.repeat(graph.i, d), graph.j]), minlength=n)
-    # Non-zeros in the longest column of A: one for a translation's edge, and of a rotation row one a t_ij and d or one.
+    # Non-zeros in the longest column of A: one for a translation's edge, and of a rotation row one
+    # a t_ij and d or one.
     A, _ = problem.residual_matrix
     most = int(np.diff(A.tocsc().indptr).max())
     assert degree.max() > 0
     for e in range(graph.num_edges):
-        i, j, tau, kappa, R, s = (x[e] for x in (graph.i, graph.j, graph.tau, graph.kappa, graph.R_ij, graph.t_ij))
-        high, lower = t[j] - t[i], low[j] - low[i]
-        r_t, r_R = high + lower - s @ P[i], P[j] - R.T @ P[i]
-        e_t = u * (abs(high) + abs(lower) + abs(high + lower) + abs(r_t)) + gamma(d) * (abs(s) @ abs(P[i]))
+        i, j, tau, kappa, R, s = (
+            x[e] for x in (graph.i, graph.j, graph.tau, graph.kappa, graph.R_ij, graph.t_ij)
+        )
+        high = t[j] - t[i]
+        lower = low[j] - low[i]
+        r_t = high + lower - s @ P[i]
+        r_R = P[j] - R.T @ P[i]
+        e_t = u * (abs(high) + abs(lower) + abs(high + lower) + abs(r_t)) + gamma(d) * (
+            abs(s) @ abs(P[i])
+        )
         e_R = u * abs(r_R) + gamma(d) * (abs(R.T) @ abs(P[i]))
         for weight, residual, its_error, rows in (
             (tau, r_t[None], e_t[None], [(j, 1.0, None), (i, -1.0, None), (i, None, -s[None])]),
             (kappa, r_R, e_R, [(j, None, np.eye(d)), (i, None, -R.T)]),
         ):
             value += weight * np.sum(residual**2)
-            value_error += weight * np.sum(2 * abs(residual) * its_error + gamma(d * d + 4) * residual**2)
+            value_error += weight * np.sum(
+                2 * abs(residual) * its_error + gamma(d * d + 4) * residual**2
+            )
             size = weight * (its_error + gamma(most + 2) * abs(residual))
             for pose, translation, block in rows:
-                at = slice(pose, pose + 1) if block is None else slice(n + d * pose, n + d * pose + d)
+                at = (
+                    slice(pose, pose + 1)
+                    if block is None
+                    else slice(n + d * pose, n + d * pose + d)
+                )
                 matrix = np.array([[translation]]) if block is None else block
                 product[at] += weight * matrix.T @ residual
                 error[at] += abs(matrix).T @ size
@@ -75,7 +97,8 @@ def written_out(problem: PGOProblem, t: Array, low: Array, P: Array) -> tuple[fl
 def test_errors_of_edges(d: int, of_t: float, of_low: float, of_P: float) -> None:
     problem = PGOProblem(varied_graph(1, 6, d))
     rng = np.random.default_rng(0)
-    t, low = of_t * rng.standard_normal((6, d)), of_low * rng.standard_normal((6, d))
+    t = of_t * rng.standard_normal((6, d))
+    low = of_low * rng.standard_normal((6, d))
     P = of_P * rng.standard_normal((6, d, d))
     found = evaluate_edges(problem, np.concatenate([t, P.reshape(-1, d)]), low)
     value, value_error, product, error = written_out(problem, t, low, P)
@@ -95,7 +118,8 @@ def test_errors_of_multipliers_and_of_the_certificate(d: int, defect: float) -> 
     Lambda = rng.standard_normal((5, d, d))
     Lambda += np.swapaxes(Lambda, 1, 2)
     found = evaluate_multipliers(Lambda, P)
-    value_error, error = 0.0, np.zeros((5, d, d))
+    value_error = 0.0
+    error = np.zeros((5, d, d))
     for k in range(5):
         off = np.eye(d) - P[k] @ P[k].T
         of_off = gamma(d) * (abs(P[k]) @ abs(P[k].T)) + u * abs(off)
@@ -103,9 +127,13 @@ def test_errors_of_multipliers_and_of_the_certificate(d: int, defect: float) -> 
         error[k] = gamma(d) * (abs(Lambda[k]) @ abs(P[k]))
     assert found.value_error >= ENOUGH * value_error
     assert (found.product_error >= ENOUGH * error.reshape(-1, d)).all()
-    X, low = np.concatenate([problem.graph.truth.t, P.reshape(-1, d)]), np.zeros((5, d))
-    whole, edges = evaluate_certificate(problem, Lambda, X, low), evaluate_edges(problem, X, low)
-    assert whole.value_error >= ENOUGH * (edges.value_error + found.value_error + u * abs(whole.value))
+    X = np.concatenate([problem.graph.truth.t, P.reshape(-1, d)])
+    low = np.zeros((5, d))
+    whole = evaluate_certificate(problem, Lambda, X, low)
+    edges = evaluate_edges(problem, X, low)
+    assert whole.value_error >= ENOUGH * (
+        edges.value_error + found.value_error + u * abs(whole.value)
+    )
     of_rotations = edges.product_error[5:] + found.product_error + u * abs(whole.product[5:])
     assert (whole.product_error[5:] >= ENOUGH * of_rotations).all()
     assert (whole.product_error[:5] >= ENOUGH * edges.product_error[:5]).all()
@@ -114,24 +142,35 @@ def test_errors_of_multipliers_and_of_the_certificate(d: int, defect: float) -> 
 @pytest.mark.parametrize("d", [2, 3])
 def test_errors_of_the_matrix_and_of_F(d: int) -> None:
     problem = PGOProblem(varied_graph(3, 9, d))
-    graph, m = problem.graph, problem.graph.num_edges
+    graph = problem.graph
+    m = problem.graph.num_edges
     most = np.bincount(np.concatenate([graph.i, graph.j])).max()
     slant = orthogonality_error(graph.R_ij).max() + d * gamma(d + 2)
     formula = (d + 2) * gamma(most + 4.0) * (1 + slant) + slant + 4 * d * u
     assert matrix_error(graph) >= ENOUGH * formula
     poses = graph.truth
     assert poses is not None
-    omega, share = orthogonality_error(poses.R).max() + d * gamma(d + 2), (2 * d + 3) * u
+    omega = orthogonality_error(poses.R).max() + d * gamma(d + 2)
+    share = (2 * d + 3) * u
     residuals = problem.residuals(poses.stacked())
     level = error = F = 0.0
     for e in range(m):
-        i, j, length = graph.i[e], graph.j[e], np.linalg.norm(graph.t_ij[e])
+        i = graph.i[e]
+        j = graph.j[e]
+        length = np.linalg.norm(graph.t_ij[e])
         e_R = 2 * np.sqrt(d) * share + 2 * omega
         sizes = [np.linalg.norm(poses.t[k] - poses.t[0]) for k in (i, j)]
-        near, far = np.linalg.norm(poses.t[j] - poses.t[i]), sum(sizes)
-        r_t, r_R = np.linalg.norm(residuals[e]), np.linalg.norm(residuals[m + d * e : m + d * e + d])
+        near = np.linalg.norm(poses.t[j] - poses.t[i])
+        far = sum(sizes)
+        r_t = np.linalg.norm(residuals[e])
+        r_R = np.linalg.norm(residuals[m + d * e : m + d * e + d])
         for weight, r, its_error, at_level in (
-            (graph.tau[e], r_t, share * (near + length) + omega * length, share * (far + length) + omega * length),
+            (
+                graph.tau[e],
+                r_t,
+                share * (near + length) + omega * length,
+                share * (far + length) + omega * length,
+            ),
             (graph.kappa[e], r_R, e_R, e_R),
         ):
             level += weight * at_level**2
@@ -142,8 +181,12 @@ def test_errors_of_the_matrix_and_of_F(d: int) -> None:
 
 
 def test_errors_of_counts() -> None:
-    count, most = np.array([1.0, 7.0, 400.0]), 12.0
-    assert (error_of_counts(count, most) >= ENOUGH * most * gamma(count + 3.0) / (1.0 - gamma(count + 3.0))).all()
+    count = np.array([1.0, 7.0, 400.0])
+    most = 12.0
+    assert (
+        error_of_counts(count, most)
+        >= ENOUGH * most * gamma(count + 3.0) / (1.0 - gamma(count + 3.0))
+    ).all()
     assert (column_error(count, most) >= ENOUGH * most * gamma(count + 6.0)).all()
     assert np.isinf(error_of_counts(np.array([2.0**53]), 1.0)).all()
 
@@ -163,12 +206,16 @@ def arrow(seed: int, side: int) -> csc_array:
 def test_errors_of_superlu(beside: int) -> None:
     A = arrow(0, 9)
     factor = analyze(A, CholeskyBackend.SUPERLU).factorize(A)
-    L, U, order = factor._lu.L.toarray(), factor._lu.U.toarray(), factor._rows
-    pivots, a = U.diagonal(), A.diagonal()[order]
+    L = factor._lu.L.toarray()
+    U = factor._lu.U.toarray()
+    order = factor._rows
+    pivots = U.diagonal()
+    a = A.diagonal()[order]
     DL = pivots[:, None] * L.T
     W = abs(DL - U) + u * abs(DL) + abs(U) * gamma((U != 0).sum(axis=0) + 3.0)
     most = np.maximum((L != 0).sum(axis=0), (W != 0).sum(axis=1))
-    of_L, of_W = (L**2 @ (pivots * most)) / a, ((most / pivots) @ W**2) / a
+    of_L = (L**2 @ (pivots * most)) / a
+    of_W = ((most / pivots) @ W**2) / a
     balance = np.sqrt(of_L.mean() / of_W.mean())
     formula = 0.5 * (of_L / balance + balance * of_W)
     if beside:
@@ -179,20 +226,32 @@ def test_errors_of_superlu(beside: int) -> None:
 
 
 @pytest.mark.parametrize("backend", CholeskyBackend)
-def test_errors_of_an_elimination_and_of_the_driver(backend: CholeskyBackend, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_of_an_elimination_and_of_the_driver(
+    backend: CholeskyBackend, monkeypatch: pytest.MonkeyPatch
+) -> None:
     K = arrow(1, 12)
     cut = Cut(np.arange(2, 11), np.array([0, 1, 11]), None)
     plain, verified = (eliminate(K, cut, backend, is_verified) for is_verified in (False, True))
     assert plain.factor is not None
     Z = plain.factor.half_solve(plain.K_IG.toarray())
-    squares, beside = (Z**2).sum(axis=0), (Z != 0).sum(axis=1)
-    sums = row_sums(K.toarray()[np.ix_(cut.boundary, cut.boundary)] - Z.T @ Z, np.maximum(plain.diagonal, squares))
-    for share in (1e-3, 0.0):  # of the squares, in place of one that is as small as the entries' own last bits
-        monkeypatch.setattr(substructure, "column_error", lambda count, most, share=share: share + 0.0 * count)
+    squares = (Z**2).sum(axis=0)
+    beside = (Z != 0).sum(axis=1)
+    sums = row_sums(
+        K.toarray()[np.ix_(cut.boundary, cut.boundary)] - Z.T @ Z,
+        np.maximum(plain.diagonal, squares),
+    )
+    # of the squares, in place of one that is as small as the entries' own last bits
+    for share in (1e-3, 0.0):
+        monkeypatch.setattr(
+            substructure, "column_error", lambda count, most, share=share: share + 0.0 * count
+        )
         lost = plain.schur - eliminate(K, cut, backend, is_verified=True).schur
         last_bits = 2 * u * np.abs(plain.schur).max()
         np.testing.assert_allclose(
-            lost[[0, 2, 5]], share * squares + 2 * u * sums, rtol=1e-6, atol=last_bits if share else 0.9 * last_bits
+            lost[[0, 2, 5]],
+            share * squares + 2 * u * sums,
+            rtol=1e-6,
+            atol=last_bits if share else 0.9 * last_bits,
         )
     monkeypatch.undo()
     assert (verified.interior_error >= ENOUGH * plain.factor.backward_error(beside)).all()
@@ -206,7 +265,9 @@ def test_errors_of_an_elimination_and_of_the_driver(backend: CholeskyBackend, mo
     for poses, size in zip(touched, sizes, strict=True):
         sums[poses] += size
     # Of every pose at least its own column, two contributions and eight more roundings.
-    assert (found >= ENOUGH * (gamma(11.0) * sums + column_error(np.full(3, 3.0), 2.0) * diagonal)).all()
+    assert (
+        found >= ENOUGH * (gamma(11.0) * sums + column_error(np.full(3, 3.0), 2.0) * diagonal)
+    ).all()
 
 
 def test_what_an_eta_costs_and_the_last_rounding() -> None:
@@ -216,7 +277,8 @@ def test_what_an_eta_costs_and_the_last_rounding() -> None:
     move = np.linalg.norm((moved - rotations).reshape(5, 9), axis=1)
     assert squared_distances(moved, rotations) >= ENOUGH * np.sum((np.sqrt(8.0) + move) ** 2)
     half_turn = np.diag([1.0, -1.0, -1.0])
-    for shrink in (1e-9, 1e-6, 1e-3):  # as far from a rotation as the distance to the one opposite grows
+    # as far from a rotation as the distance to the one opposite grows
+    for shrink in (1e-9, 1e-6, 1e-3):
         stretched = (1.0 + shrink) * rotations
         opposite = (half_turn @ rotations.reshape(5, 3, 3)).reshape(-1, 3)
         assert squared_distances(stretched, stretched) >= np.sum((stretched - opposite) ** 2)
@@ -230,7 +292,11 @@ def test_how_far_stored_rotations_are_from_exact_ones_is_counted_beside_a_half_t
     for off in (1e-7, 1e-5):
         stored = random_rotations(5, d, rng) + off * rng.standard_normal((5, d, d))
         moved = stored + off * rng.standard_normal((5, d, d))
-        apart = np.sqrt(8.0) + orthogonality_error(stored) + np.linalg.norm((moved - stored).reshape(5, -1), axis=1)
+        apart = (
+            np.sqrt(8.0)
+            + orthogonality_error(stored)
+            + np.linalg.norm((moved - stored).reshape(5, -1), axis=1)
+        )
         found = squared_distances(moved.reshape(-1, d), stored.reshape(-1, d))
         assert ENOUGH * np.sum(apart**2) <= found <= (1.0 + 1e-8) * np.sum(apart**2)
 
@@ -238,8 +304,10 @@ def test_how_far_stored_rotations_are_from_exact_ones_is_counted_beside_a_half_t
 @pytest.mark.parametrize("d", [2, 3])
 def test_the_error_of_S_X_is_taken_off(d: int, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = PGOProblem(varied_graph(4, 8, d))
-    poses, size = polish(problem, chordal_start(problem)), 1e-3
-    Lambda, evaluate = multipliers(problem, poses), lower_bound.evaluate_certificate
+    poses = polish(problem, chordal_start(problem))
+    size = 1e-3
+    Lambda = multipliers(problem, poses)
+    evaluate = lower_bound.evaluate_certificate
 
     def less_known(*args: object) -> lower_bound.Evaluation:
         found = evaluate(*args)  # type: ignore[arg-type]
@@ -251,7 +319,8 @@ def test_the_error_of_S_X_is_taken_off(d: int, monkeypatch: pytest.MonkeyPatch) 
     found = lower_bound._prove(problem, Lambda, 0.0, point)
     assert known is not None
     assert found is not None
-    diagonal = np.delete(problem.M.diagonal(), point.rows) + np.abs(Lambda).max()  # the slack is a share of less
+    # the slack is a share of less
+    diagonal = np.delete(problem.M.diagonal(), point.rows) + np.abs(Lambda).max()
     least = d * np.sum(size**2 / diagonal)
     assert known.rounding < 1e-3 * least < least <= found.rounding
 
@@ -266,19 +335,26 @@ def test_rounding_of_the_bound_with_eta_alone() -> None:
 
 def test_errors_of_a_robot_s_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = PGOProblem(varied_graph(5, 7, 3))
-    rng, n = np.random.default_rng(2), 7
-    start = np.concatenate([rng.standard_normal((n, 3)), random_rotations(n, 3, rng).reshape(-1, 3)])
-    X, Lambda = start + 1e-2 * rng.standard_normal(start.shape), rng.standard_normal((n, 3, 3))
-    Lambda, low = 0.5 * (Lambda + np.swapaxes(Lambda, 1, 2)), np.zeros((n, 3))
+    rng = np.random.default_rng(2)
+    n = 7
+    start = np.concatenate(
+        [rng.standard_normal((n, 3)), random_rotations(n, 3, rng).reshape(-1, 3)]
+    )
+    X = start + 1e-2 * rng.standard_normal(start.shape)
+    Lambda = rng.standard_normal((n, 3, 3))
+    Lambda = 0.5 * (Lambda + np.swapaxes(Lambda, 1, 2))
+    low = np.zeros((n, 3))
     is_inside = np.concatenate([np.arange(n) >= 2, np.repeat(np.arange(n) >= 2, 3)])
-    inside, boundary = np.flatnonzero(is_inside), np.flatnonzero(~is_inside)
+    inside = np.flatnonzero(is_inside)
+    boundary = np.flatnonzero(~is_inside)
     slack = rng.uniform(1.0, 2.0, len(inside))
     whole = evaluate_certificate(problem, Lambda, X, low)
-    whole = replace(whole, product_error=whole.product_error + np.abs(whole.product))  # large enough to be seen
+    # large enough to be seen
+    whole = replace(whole, product_error=whole.product_error + np.abs(whole.product))
     monkeypatch.setattr(robot_proof, "evaluate_certificate", lambda *_: whole)
-    found, product = robot_proof.RobotProof(Lambda, start, X, low, slack, inside, np.zeros(0)).evaluated(
-        problem, boundary
-    )
+    found, product = robot_proof.RobotProof(
+        Lambda, start, X, low, slack, inside, np.zeros(0)
+    ).evaluated(problem, boundary)
     np.testing.assert_array_equal(product, whole.product)
     np.testing.assert_array_equal(found.error, whole.product_error[boundary])
     assert (found.value, found.value_error) == (whole.value, whole.value_error)
@@ -289,22 +365,33 @@ def test_errors_of_a_robot_s_proof(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_a_robot_counts_the_rounding_of_its_separators_entries(d: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    problem, share = PGOProblem(varied_graph(7, 8, d)), 1e-6
+def test_a_robot_counts_the_rounding_of_its_separators_entries(
+    d: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = PGOProblem(varied_graph(7, 8, d))
+    share = 1e-6
     is_inside = np.concatenate([np.arange(8) >= 2, np.repeat(np.arange(8) >= 2, d)])
     cut = Cut(np.flatnonzero(is_inside), np.flatnonzero(~is_inside), None)
     Lambda = np.zeros((8, d, d))
     S, diagonal = shifted_certificate(problem, Lambda, np.zeros(problem.side))
     S_before = S.diagonal()
-    monkeypatch.setattr(robot_proof, "matrix_errors", lambda problem, diagonal: np.full(problem.side, share))
-    found = robot_proof.verify_interior(problem, Lambda, 0.0, cut, np.zeros(0, dtype=np.int64), 1e-12, None)
+    monkeypatch.setattr(
+        robot_proof, "matrix_errors", lambda problem, diagonal: np.full(problem.side, share)
+    )
+    found = robot_proof.verify_interior(
+        problem, Lambda, 0.0, cut, np.zeros(0, dtype=np.int64), 1e-12, None
+    )
     assert found is not None
     lost = S_before - found[0].diagonal()
     assert (lost[cut.boundary] >= (1.0 - 1e-9) * share * diagonal[cut.boundary]).all()
     assert (lost[cut.interior] >= (2.0 - 1e-9) * share * diagonal[cut.interior]).all()
     assert (found[2] <= lost[cut.interior] - (1.0 - 1e-9) * share * diagonal[cut.interior]).all()
-    monkeypatch.setattr(robot_proof, "matrix_errors", lambda problem, diagonal: np.zeros(problem.side))
-    found = robot_proof.verify_interior(problem, Lambda, 0.0, cut, np.zeros(0, dtype=np.int64), 1e-12, None)
+    monkeypatch.setattr(
+        robot_proof, "matrix_errors", lambda problem, diagonal: np.zeros(problem.side)
+    )
+    found = robot_proof.verify_interior(
+        problem, Lambda, 0.0, cut, np.zeros(0, dtype=np.int64), 1e-12, None
+    )
     assert found is not None
     assert (found[1].interior_error > 0.0).all()
     assert (found[2] <= (1e-12 - ENOUGH * found[1].interior_error) * diagonal[cut.interior]).all()

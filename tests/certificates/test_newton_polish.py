@@ -16,11 +16,9 @@ from graphs import (
     varied_graph,
     varied_problem,
 )
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pgo_models.certificates.newton_polish import (
-    STATIONARY_DECREMENT,
     _apply_inverse,
     move_poses,
     polish,
@@ -28,6 +26,7 @@ from pgo_models.certificates.newton_polish import (
     relative_decrement,
     start_polish,
 )
+from pgo_models.certificates.newton_step import STATIONARY_DECREMENT
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, orthogonality_error, tangent_dimension
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -44,7 +43,9 @@ ROUNDING = 1e-14  # the relative change of F that polish does not tell apart fro
 def pair(error_angle: float) -> PoseGraph:
     """Two poses in the plane, measured twice; the two measured angles differ by `error_angle`."""
     turns = exp_map(np.array([[0.0], [error_angle]]))
-    return PoseGraph(2, np.array([0, 0]), np.array([1, 1]), turns, np.zeros((2, 2)), np.ones(2), np.ones(2))
+    return PoseGraph(
+        2, np.array([0, 0]), np.array([1, 1]), turns, np.zeros((2, 2)), np.ones(2), np.ones(2)
+    )
 
 
 @pytest.mark.parametrize("name", OPTIMUM)
@@ -53,14 +54,25 @@ def test_the_certified_optimum_is_reached_on_every_benchmark(
     benchmark_problem: Callable[[str], PGOProblem],
     benchmark_optimum: Callable[[str], Poses],
 ) -> None:
-    problem, poses = benchmark_problem(name), benchmark_optimum(name)
-    assert problem.objective(poses) == pytest.approx(OPTIMUM[name], rel=0, abs=optimum_tolerance(name))
+    problem = benchmark_problem(name)
+    poses = benchmark_optimum(name)
+    assert problem.objective(poses) == pytest.approx(
+        OPTIMUM[name], rel=0, abs=optimum_tolerance(name)
+    )
     assert relative_decrement(problem, poses) <= STATIONARY_DECREMENT
     assert orthogonality_error(poses.R).max() <= 64 * EPS
 
 
-@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, spread=st.sampled_from([1.0, 1e6]), second_order=st.booleans())
-def test_F_never_rises_from_hostile_starts(seed: int, n: int, d: int, spread: float, second_order: bool) -> None:
+@given(
+    seed=SEEDS,
+    n=SIZES,
+    d=DIMENSIONS,
+    spread=st.sampled_from([1.0, 1e6]),
+    second_order=st.booleans(),
+)
+def test_F_never_rises_from_hostile_starts(
+    seed: int, n: int, d: int, spread: float, second_order: bool
+) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE))
     state = start_polish(problem, random_poses(n, d, seed, spread))
     assert state.objective == problem.objective(state.poses)
@@ -95,7 +107,11 @@ def test_the_decrement_predicts_what_is_left(seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)
     best = polish(problem, chordal_start(problem))
     rng = np.random.default_rng(seed)
-    near = move_poses(best, 1e-4 * rng.standard_normal((n, tangent_dimension(d))), 1e-4 * rng.standard_normal((n, d)))
+    near = move_poses(
+        best,
+        1e-4 * rng.standard_normal((n, tangent_dimension(d))),
+        1e-4 * rng.standard_normal((n, d)),
+    )
     left = (problem.objective(near) - problem.objective(best)) / problem.objective(near)
     # To first order in the distance, 1e-4, times the condition of the random weights.
     assert relative_decrement(problem, near) == pytest.approx(left, rel=0.05, abs=1e-12)
@@ -107,17 +123,22 @@ def test_the_gauge_does_not_matter(seed: int, n: int, d: int) -> None:
     start = chordal_start(problem)
     world = random_poses(1, d, seed)
     moved = start.moved(world.R[0], world.t[0])
-    one, other = polish(problem, start), polish(problem, moved)
+    one = polish(problem, start)
+    other = polish(problem, moved)
     assert problem.objective(other) == pytest.approx(problem.objective(one), rel=1e-10, abs=1e-12)
 
 
 @pytest.mark.parametrize("backend", CholeskyBackend)
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
-def test_both_backends_polish_to_the_same_value(backend: CholeskyBackend, seed: int, n: int, d: int) -> None:
+def test_both_backends_polish_to_the_same_value(
+    backend: CholeskyBackend, seed: int, n: int, d: int
+) -> None:
     problem = varied_problem(seed, n, d)
     other = PGOProblem(problem.graph, backend)
     expected = problem.objective(polish(problem, chordal_start(problem)))
-    assert other.objective(polish(other, chordal_start(other))) == pytest.approx(expected, rel=1e-10, abs=1e-12)
+    assert other.objective(polish(other, chordal_start(other))) == pytest.approx(
+        expected, rel=1e-10, abs=1e-12
+    )
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
@@ -125,7 +146,11 @@ def test_without_noise_nothing_is_left(seed: int, n: int, d: int) -> None:
     problem = PGOProblem(exact_graph(seed, n, d))
     near = chordal_start(problem)
     rng = np.random.default_rng(seed)
-    shaken = move_poses(near, 0.05 * rng.standard_normal((n, tangent_dimension(d))), 0.05 * rng.standard_normal((n, d)))
+    shaken = move_poses(
+        near,
+        0.05 * rng.standard_normal((n, tangent_dimension(d))),
+        0.05 * rng.standard_normal((n, d)),
+    )
     # The decrement tells to first order what is left.
     assert problem.objective(polish(problem, shaken)) <= 2 * STATIONARY_DECREMENT
 
@@ -134,12 +159,16 @@ def test_without_noise_nothing_is_left(seed: int, n: int, d: int) -> None:
 def test_two_measurements_are_averaged(angle: float) -> None:
     problem = PGOProblem(pair(angle))
     poses = polish(problem, Poses.identity(2, 2))
-    # 2 - 2 cos(angle / 2) for each of two residuals of Frobenius norm 2 sqrt(2) sin(angle / 4), weight 1.
-    assert problem.objective(poses) == pytest.approx(16 * np.sin(angle / 4) ** 2, rel=1e-12, abs=1e-12)
+    # 2 - 2 cos(angle / 2) for each of two residuals of Frobenius norm 2 sqrt(2) sin(angle / 4),
+    # weight 1.
+    assert problem.objective(poses) == pytest.approx(
+        16 * np.sin(angle / 4) ** 2, rel=1e-12, abs=1e-12
+    )
 
 
 def test_a_saddle_is_not_called_stationary() -> None:
-    # Both edges off by half a turn, in opposite directions from the mean: the gradient is zero, the curvature negative.
+    # Both edges off by half a turn, in opposite directions from the mean: the gradient is zero, the
+    # curvature negative.
     problem = PGOProblem(pair(0.0))
     saddle = Poses(exp_map(np.array([[0.0], [np.pi]])), np.zeros((2, 2)))
     assert np.abs(problem.riemannian_gradient(saddle)[0]).max() <= 1e-15
@@ -165,7 +194,9 @@ def test_a_state_can_be_stepped_from_twice(seed: int, n: int, d: int) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE))
     state = start_polish(problem, random_poses(n, d, seed))
     for _ in range(3):
-        once, gauss_newton, again = (polish_step(problem, state, second) for second in (True, False, True))
+        once, gauss_newton, again = (
+            polish_step(problem, state, second) for second in (True, False, True)
+        )
         np.testing.assert_array_equal(once.poses.R, again.poses.R)
         np.testing.assert_array_equal(once.poses.t, again.poses.t)
         assert (once.objective, once.decrement) == (again.objective, again.decrement)
@@ -175,11 +206,13 @@ def test_a_state_can_be_stepped_from_twice(seed: int, n: int, d: int) -> None:
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_a_move_is_learned_from(seed: int, n: int, d: int) -> None:
-    """The secant equation: a change of the gradient that was seen is answered by the move that made it."""
-    problem, layout = PGOProblem(varied_graph(seed, n, d)), TangentLayout(n, d)
+    """The secant equation: a change of the gradient gives back the move that made it."""
+    problem = PGOProblem(varied_graph(seed, n, d))
+    layout = TangentLayout(n, d)
     matrix = riemannian_hessian(problem, random_poses(n, d, seed), None)
     matrix.setdiag(2.0 * matrix.diagonal())
-    factor, rng = factorize(matrix), np.random.default_rng(seed)
+    factor = factorize(matrix)
+    rng = np.random.default_rng(seed)
     moves = rng.standard_normal((3, layout.side))
     curved = [(move, matrix @ move + 0.1 * rng.uniform() * move) for move in moves]
     level = (moves[0], -moves[0])  # of negative curvature: left out
@@ -204,7 +237,8 @@ def test_secants_save_a_factorisation(
 def test_retract_moves_along_the_exponential(seed: int, n: int, d: int) -> None:
     poses = random_poses(n, d, seed)
     rng = np.random.default_rng(seed)
-    w, v = rng.standard_normal((n, tangent_dimension(d))), rng.standard_normal((n, d))
+    w = rng.standard_normal((n, tangent_dimension(d)))
+    v = rng.standard_normal((n, d))
     there = move_poses(poses, w, v)
     np.testing.assert_allclose(there.R, poses.R @ exp_map(w), rtol=0, atol=16 * EPS)
     np.testing.assert_array_equal(there.t, poses.t + v)

@@ -1,4 +1,7 @@
-"""Every value with a bound on its rounding, held against 300 bits: the bound is kept, and it is needed."""
+"""Every value with a bound on its rounding, held against 300 bits.
+
+The bound is kept, and it is needed.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,7 @@ from exact_arithmetic import (
     transposed,
 )
 from graphs import DIMENSIONS, SEEDS, exact_graph, turned_away, varied_graph, wound_ring
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from roads import road
 
 from pgo_models.certificates import lower_bound
@@ -48,10 +50,12 @@ BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
 
 def exact_edges(graph: ExactGraph, X: Array, low: Array) -> tuple[Exact, Exact]:
     """tr(X^T M X) and M X."""
-    n, d = graph.num_poses, graph.d
+    n = graph.num_poses
+    d = graph.d
     at = exact(X)
     at[:n] += exact(low)
-    value, product = MP.mpf(0), np.full((len(X), d), MP.mpf(0), dtype=object)
+    value = MP.mpf(0)
+    product = np.full((len(X), d), MP.mpf(0), dtype=object)
     for weight, row in graph.residual_rows():
         residual = sum(entry * at[column] for column, entry in row.items())
         value += weight * (residual**2).sum()
@@ -62,18 +66,24 @@ def exact_edges(graph: ExactGraph, X: Array, low: Array) -> tuple[Exact, Exact]:
 
 def points(problem: PGOProblem, kind: str, rng: np.random.Generator) -> tuple[Array, Array]:
     """X and low where one source of error is large beside the others."""
-    graph, n, d = problem.graph, problem.num_poses, problem.d
-    X, low = rng.standard_normal((problem.side, d)), np.zeros((n, d))
+    graph = problem.graph
+    n = problem.num_poses
+    d = problem.d
+    X = rng.standard_normal((problem.side, d))
+    low = np.zeros((n, d))
     if kind == "rotations that fit":  # residuals cancel, products do not
         R = random_rotations(1, d, rng)[0]
         X[:n], X[n:] = 0.0, np.tile(R, (n, 1))
         assert graph.num_edges
-    elif kind == "high parts cancel":  # t in kilometres, taken back by low parts that are whole numbers
+    # t in kilometres, taken back by low parts that are whole numbers
+    elif kind == "high parts cancel":
         X[:n] = 1e6 * rng.standard_normal((n, d))
-        low, X[n:] = -np.round(X[:n]), 0.0
+        low = -np.round(X[:n])
+        X[n:] = 0.0
     elif kind == "low parts cancel":
         low = 1e6 * rng.standard_normal((n, d))
-        X[:n], X[n:] = -np.round(low), 0.0
+        X[:n] = -np.round(low)
+        X[n:] = 0.0
     elif kind == "poses":
         poses = polish(problem, chordal_start(problem))
         X = problem.stacked(poses)
@@ -87,7 +97,8 @@ KINDS = ["random", "rotations that fit", "high parts cancel", "low parts cancel"
 @settings(max_examples=examples(30))
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS)
 def test_edges_are_evaluated_within_their_errors(kind: str, seed: int, n: int, d: int) -> None:
-    graph, rng = varied_graph(seed, n, d), np.random.default_rng(seed)
+    graph = varied_graph(seed, n, d)
+    rng = np.random.default_rng(seed)
     if kind == "rotations that fit":
         graph = replace(graph, R_ij=np.broadcast_to(np.eye(d), graph.R_ij.shape) * (1.0 + 2.0**-30))
     problem = PGOProblem(graph)
@@ -101,24 +112,37 @@ def test_edges_are_evaluated_within_their_errors(kind: str, seed: int, n: int, d
 
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, size=st.floats(-8.0, 8.0))
 @settings(max_examples=examples(50))
-def test_multipliers_are_evaluated_within_their_errors(seed: int, n: int, d: int, size: float) -> None:
+def test_multipliers_are_evaluated_within_their_errors(
+    seed: int, n: int, d: int, size: float
+) -> None:
     rng = np.random.default_rng(seed)
     Lambda = rng.standard_normal((n, d, d))
     Lambda += np.swapaxes(Lambda, 1, 2)
     for P in (random_rotations(n, d, rng), 10.0**size * rng.standard_normal((n, d, d))):
-        found, at = evaluate_multipliers(Lambda, P), exact(P)
+        found = evaluate_multipliers(Lambda, P)
+        at = exact(P)
         defect = np.eye(d, dtype=int) - at @ transposed(at)
-        value, product = total(exact(Lambda) * defect), -(exact(Lambda) @ at).reshape(-1, d)
+        value = total(exact(Lambda) * defect)
+        product = -(exact(Lambda) @ at).reshape(-1, d)
         assert abs(exact(found.value) - value) <= exact(found.value_error)
         assert (abs(exact(found.product) - product) <= exact(found.product_error)).all()
         assert (exact(found.product) != product).any()
         assert exact(found.value) != value
 
 
-@given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, kind=st.sampled_from(KINDS), size=st.sampled_from([1.0, 1e8]))
+@given(
+    seed=SEEDS,
+    n=st.integers(2, 8),
+    d=DIMENSIONS,
+    kind=st.sampled_from(KINDS),
+    size=st.sampled_from([1.0, 1e8]),
+)
 @settings(max_examples=examples(40))
-def test_the_certificate_is_evaluated_within_its_errors(seed: int, n: int, d: int, kind: str, size: float) -> None:
-    graph, rng = varied_graph(seed, n, d), np.random.default_rng(seed)
+def test_the_certificate_is_evaluated_within_its_errors(
+    seed: int, n: int, d: int, kind: str, size: float
+) -> None:
+    graph = varied_graph(seed, n, d)
+    rng = np.random.default_rng(seed)
     problem = PGOProblem(graph)
     X, low = points(problem, kind, rng)
     Lambda = multipliers(problem, polish(problem, chordal_start(problem)))
@@ -152,9 +176,13 @@ def test_a_sum_over_many_edges_is_within_its_error() -> None:
 
 
 def hub(m: int, rng: np.random.Generator) -> PoseGraph:
-    """One pose with m edges, whose first weights are so much larger that every later one is rounded up."""
+    """One pose with m edges.
+
+    The first weights are so much larger that every later one is rounded up.
+    """
     weights = np.concatenate([[2.0**30], np.full(m - 1, 0.5 * 2.0**-22 + 2.0**-40)])
-    i, j = np.zeros(m, dtype=np.int64), 1 + np.arange(m)
+    i = np.zeros(m, dtype=np.int64)
+    j = 1 + np.arange(m)
     R_ij = np.broadcast_to(np.eye(2), (m, 2, 2))
     return PoseGraph(m + 1, i, j, R_ij, np.zeros((m, 2)), weights, weights, name="hub")
 
@@ -167,14 +195,24 @@ def slanted(graph: PoseGraph) -> PoseGraph:
 @pytest.mark.parametrize("kind", ["plain", "slanted", "hub"])
 @settings(max_examples=examples(15))
 @given(seed=SEEDS, n=st.integers(2, 6), d=DIMENSIONS)
-def test_entries_of_S_are_within_their_share_of_the_diagonal(kind: str, seed: int, n: int, d: int) -> None:
+def test_entries_of_S_are_within_their_share_of_the_diagonal(
+    kind: str, seed: int, n: int, d: int
+) -> None:
     graph = varied_graph(seed, n, d)
-    graph = slanted(graph) if kind == "slanted" else hub(40, np.random.default_rng(0)) if kind == "hub" else graph
+    graph = (
+        slanted(graph)
+        if kind == "slanted"
+        else hub(40, np.random.default_rng(0))
+        if kind == "hub"
+        else graph
+    )
     problem = PGOProblem(graph)
     Lambda = multipliers(problem, polish(problem, chordal_start(problem)))
     stored = certificate_matrix(problem, Lambda).toarray()
     S = ExactGraph.of_doubles(graph).certificate_matrix(Lambda)
-    difference = np.array([[row.get(column, 0) for column in range(len(S))] for row in S], dtype=object) - exact(stored)
+    difference = np.array(
+        [[row.get(column, 0) for column in range(len(S))] for row in S], dtype=object
+    ) - exact(stored)
     diagonal = np.maximum(problem.M.diagonal(), stored.diagonal())
     share = max(largest_share(difference, diagonal), largest_share(-difference, diagonal))
     assert 0.0 < share <= matrix_error(graph)
@@ -187,7 +225,8 @@ def test_entries_of_S_are_within_their_share_of_the_diagonal(kind: str, seed: in
 @given(seed=SEEDS, n=st.integers(3, 8), d=DIMENSIONS)
 def test_the_bound_with_eta_alone_is_below_its_two_terms(seed: int, n: int, d: int) -> None:
     """tr(Lambda) and eta n d nearly cancel, so that their rounding is in plain sight."""
-    problem, rng = PGOProblem(varied_graph(seed, n, d, NoiseModel(0.3, 0.3))), np.random.default_rng(seed)
+    problem = PGOProblem(varied_graph(seed, n, d, NoiseModel(0.3, 0.3)))
+    rng = np.random.default_rng(seed)
     eta = 1e3 * float(rng.random())
     Lambda = (eta + 1e-7 * rng.uniform(-1.0, 2.0, n))[:, None, None] * np.eye(d)
     bound = prove_bound(problem, Lambda, eta)
@@ -197,7 +236,10 @@ def test_the_bound_with_eta_alone_is_below_its_two_terms(seed: int, n: int, d: i
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_the_bound_holds_wherever_it_is_grounded(d: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a move G is not rounding, and its quadratic term is all that keeps the bound below F."""
+    """Without a move G is not rounding.
+
+    Its quadratic term is all that keeps the bound below F.
+    """
     monkeypatch.setattr(lower_bound, "MOST_MOVES", 0)
     problem = PGOProblem(varied_graph(0, 10, d))
     best = polish(problem, chordal_start(problem))
@@ -211,10 +253,14 @@ def test_the_bound_holds_wherever_it_is_grounded(d: int, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_what_eta_adds_is_taken_off(d: int) -> None:
-    """At a local minimum G is zero: F there less what eta can have added has to be below the optimum."""
+    """At a local minimum G is zero.
+
+    F there less what eta can have added has to be below the optimum.
+    """
     problem, start = wound_ring(12, d)
     graph = ExactGraph.of_doubles(problem.graph)
-    local, best = polish(problem, start), polish(problem, chordal_start(problem))
+    local = polish(problem, start)
+    best = polish(problem, chordal_start(problem))
     F = graph.objective_of(best)
     assert graph.objective_of(local) > F
     Lambda = multipliers(problem, local)
@@ -231,12 +277,17 @@ def test_what_eta_adds_is_taken_off(d: int) -> None:
 @given(seed=SEEDS, n=st.integers(3, 8), d=DIMENSIONS)
 def test_F_of_poses_is_known_to_its_error(kind: str, seed: int, n: int, d: int) -> None:
     graph = exact_graph(seed, n, d) if kind == "none" else varied_graph(seed, n, d)
-    problem, rng = PGOProblem(graph), np.random.default_rng(seed)
+    problem = PGOProblem(graph)
+    rng = np.random.default_rng(seed)
     poses = graph.truth if kind == "none" else polish(problem, chordal_start(problem))
     assert poses is not None
-    poses = poses.moved(random_rotations(1, d, rng)[0], (1e9 if kind == "far" else 1.0) * rng.standard_normal(d))
+    poses = poses.moved(
+        random_rotations(1, d, rng)[0], (1e9 if kind == "far" else 1.0) * rng.standard_normal(d)
+    )
     rounding = objective_rounding(problem, poses)
-    deviation = abs(exact(problem.objective(poses)) - ExactGraph.of_doubles(graph).objective_of(poses))
+    deviation = abs(
+        exact(problem.objective(poses)) - ExactGraph.of_doubles(graph).objective_of(poses)
+    )
     assert 0 < deviation <= exact(rounding.error)
     if kind == "none":
         assert problem.objective(poses) <= rounding.level
@@ -247,7 +298,9 @@ def test_poses_off_rotations_are_known_to_their_error() -> None:
     best = polish(problem, chordal_start(problem))
     off = Poses(best.R * (1.0 - 3e-15), best.t)  # as far as is not projected
     np.testing.assert_array_equal(off.R, best.R * (1.0 - 3e-15))
-    deviation = abs(exact(problem.objective(off)) - ExactGraph.of_doubles(problem.graph).objective_of(off))
+    deviation = abs(
+        exact(problem.objective(off)) - ExactGraph.of_doubles(problem.graph).objective_of(off)
+    )
     assert 0 < deviation <= exact(objective_rounding(problem, off).error)
 
 
@@ -258,16 +311,22 @@ def test_F_that_is_computed_as_zero_is_known_to_its_level(seed: int, d: int) -> 
     t = np.stack([np.zeros(d), R[0, :, 0]])
     one = np.ones(1)
     graph = PoseGraph(2, np.array([0]), np.array([1]), np.eye(d)[None], np.eye(d)[:1], one, one)
-    problem, poses = PGOProblem(graph), Poses(R, t)
+    problem = PGOProblem(graph)
+    poses = Poses(R, t)
     assert problem.objective(poses) == 0.0
-    assert 0.0 < ExactGraph.of_doubles(graph).objective_of(poses) <= exact(objective_rounding(problem, poses).error)
+    assert (
+        0.0
+        < ExactGraph.of_doubles(graph).objective_of(poses)
+        <= exact(objective_rounding(problem, poses).error)
+    )
 
 
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("offset", [0.0, 1e6])
 def test_F_of_a_road_without_noise_is_at_its_level(d: int, offset: float) -> None:
     """All that is left there is the last bit of coordinates, which are kilometres."""
-    pattern, rng = road(0, 500, 10.0, d), np.random.default_rng(0)
+    pattern = road(0, 500, 10.0, d)
+    rng = np.random.default_rng(0)
     assert pattern.truth is not None
     truth = pattern.truth.moved(random_rotations(1, d, rng)[0], np.zeros(d))
     R_i = np.swapaxes(truth.R[pattern.i], 1, 2)

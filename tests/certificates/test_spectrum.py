@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from graphs import DIMENSIONS, SEEDS, random_poses, varied_problem
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 from scipy.linalg import block_diag
 
 from pgo_models.certificates.dual_variables import multipliers
@@ -23,11 +22,15 @@ def test_it_is_the_smallest_eigenpair_of_the_marginalised_matrix(seed: int, n: i
     assume(smallest < -10 * eta)
     found = negative_curvature(problem, Lambda, eta, np.random.default_rng(0))
     assert found.value == pytest.approx(smallest, rel=1e-2)
-    assert found.value == pytest.approx(found.v.ravel() @ S @ found.v.ravel(), abs=1e-10 * np.abs(S).max() * n)
+    assert found.value == pytest.approx(
+        found.v.ravel() @ S @ found.v.ravel(), abs=1e-10 * np.abs(S).max() * n
+    )
     assert np.linalg.norm(found.v) == pytest.approx(1)
     assert -smallest <= found.shift * (1 + 1e-9)
     assert found.shift <= 1.34 * -smallest
     assert prove_bound(problem, Lambda, found.shift) is not None
     b = np.concatenate([np.zeros(n), np.random.default_rng(1).standard_normal(n * d)])
     y = found.factor.solve(b)[n:]
-    np.testing.assert_allclose((S + found.shift * np.eye(n * d)) @ y, b[n:], rtol=0, atol=1e-6 * np.abs(b).max())
+    np.testing.assert_allclose(
+        (S + found.shift * np.eye(n * d)) @ y, b[n:], rtol=0, atol=1e-6 * np.abs(b).max()
+    )

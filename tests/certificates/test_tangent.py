@@ -1,16 +1,16 @@
-"""Bounds on chi2 hold in exact arithmetic, and every rounding error of a tangent is within what is said of it."""
+"""Bounds on chi2 hold in exact arithmetic, and so do those on the errors of a tangent."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from budget import examples
 from exact_arithmetic import Exact, exact, nearest_rotations, total, transposed
 from graphs import DIMENSIONS, SEEDS, informed, random_poses
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from roads import Shape, road
 
 import solvers
@@ -19,14 +19,21 @@ from pgo_models.certificates.definiteness import shifted_certificate
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import best_bound, prove_bound
 from pgo_models.certificates.newton_polish import polish
-from pgo_models.certificates.rounding_errors import evaluate_edges, matrix_errors, objective_rounding
-from pgo_models.certificates.tangent import soften, softened_bound
+from pgo_models.certificates.rounding_errors import (
+    evaluate_edges,
+    matrix_errors,
+    objective_rounding,
+)
+from pgo_models.certificates.tangent import bound_by_shrinking, shrink_information
+from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.g2o import read_g2o
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import are_definite, proper_information, uncoupled_share
 from pgo_models.graphs.residuals import Chi2Convention, chi2
 from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.problem.information_costs import ExcessCost, TangentCost
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import rotation_columns
 from pgo_models.problem.problem import PGOProblem
@@ -41,15 +48,27 @@ def of_file(graph: PoseGraph) -> PGOProblem:
 
 def exact_chi2(graph: PoseGraph, poses: Poses) -> Exact:
     """chi2 in 300 bits at the rotations nearest to those stored, by its definition."""
-    d, R, t = graph.d, nearest_rotations(poses.R), exact(poses.t)
-    R_ij, information = nearest_rotations(graph.R_ij), exact(proper_information(graph))
-    R_i, R_j = R[graph.i], R[graph.j]
+    d = graph.d
+    R = nearest_rotations(poses.R)
+    t = exact(poses.t)
+    R_ij = nearest_rotations(graph.R_ij)
+    information = exact(proper_information(graph))
+    R_i = R[graph.i]
+    R_j = R[graph.j]
     back = transposed(R_ij)
-    r = back @ (transposed(R_i) @ (t[graph.j] - t[graph.i])[:, :, None] - exact(graph.t_ij)[:, :, None])
+    r = back @ (
+        transposed(R_i) @ (t[graph.j] - t[graph.i])[:, :, None] - exact(graph.t_ij)[:, :, None]
+    )
     E = back @ transposed(R_i) @ R_j
     skew = (E - transposed(E)) / 2
-    s = skew[:, 1, 0][:, None] if d == 2 else np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
-    I_tt, I_tr, I_rr = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
+    s = (
+        skew[:, 1, 0][:, None]
+        if d == 2
+        else np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
+    )
+    I_tt = information[:, :d, :d]
+    I_tr = information[:, :d, d:]
+    I_rr = information[:, d:, d:]
     cost = total(r * (I_tt @ r)) + 2 * total(r * (I_tr @ s[:, :, None]))
     off = np.eye(d, dtype=int) - E
     trace = sum(I_rr[:, k, k] for k in range(I_rr.shape[1]))
@@ -59,14 +78,22 @@ def exact_chi2(graph: PoseGraph, poses: Poses) -> Exact:
 
 
 def exact_tangent_matrix(problem: PGOProblem) -> Exact:
-    """M of a tangent in 300 bits, (N, N): from the stored tau, C, R_ij, t_ij, and the information matrices' W."""
-    graph, n, d = problem.graph, problem.num_poses, problem.d
+    """M of a tangent in 300 bits, (N, N).
+
+    It is made of the stored tau, C, R_ij, t_ij, and the information matrices' W.
+    """
+    graph = problem.graph
+    n = problem.num_poses
+    d = problem.d
     M = exact(np.zeros((problem.side, problem.side)))
     W = exact(problem.weights.W(d))
-    C, tau = exact(problem.weights.tangent.C), exact(problem.weights.tau)
-    R_ij, t_ij = exact(graph.R_ij), exact(graph.t_ij)
+    C = exact(problem.weights.tangent.C)
+    tau = exact(problem.weights.tau)
+    R_ij = exact(graph.R_ij)
+    t_ij = exact(graph.t_ij)
     for e in range(graph.num_edges):
-        i, j = int(graph.i[e]), int(graph.j[e])
+        i = int(graph.i[e])
+        j = int(graph.j[e])
         columns_i, columns_j = (rotation_columns(np.array([k]), n, d)[0] for k in (i, j))
         columns = np.concatenate([[i, j], columns_i, columns_j])
         rho = exact(np.zeros((d + 1, 2 + 2 * d)))
@@ -75,7 +102,8 @@ def exact_tangent_matrix(problem: PGOProblem) -> Exact:
         rho[1:, 2 : 2 + d] = -R_ij[e].T
         rho[1:, 2 + d :] = exact(np.eye(d))
         weight = exact(np.zeros((d + 1, d + 1)))
-        weight[0, 0], weight[1:, 1:] = tau[e], W[e]
+        weight[0, 0] = tau[e]
+        weight[1:, 1:] = W[e]
         half = rho.T @ weight @ rho
         cross = exact(np.zeros((2 + 2 * d, 2 + 2 * d)))
         cross[:, 2 : 2 + d] = rho.T @ C[e]
@@ -84,13 +112,20 @@ def exact_tangent_matrix(problem: PGOProblem) -> Exact:
 
 
 @settings(max_examples=examples(20))
-@given(seed=SEEDS, n=st.integers(3, 12), d=DIMENSIONS, coupled=COUPLED, spread=st.sampled_from([0.2, 1.0, 3.0]))
+@given(
+    seed=SEEDS,
+    n=st.integers(3, 12),
+    d=DIMENSIONS,
+    coupled=COUPLED,
+    spread=st.sampled_from([0.2, 1.0, 3.0]),
+)
 def test_no_bound_is_above_chi2(seed: int, n: int, d: int, coupled: bool, spread: float) -> None:
     graph = informed(seed, n, d, coupled, spread)
     problem = of_file(graph)
     poses = polish(problem, chordal_start(problem.convex_part), max_steps=30)
     least = exact_chi2(graph, poses)
-    rounding = 1e-12 * problem.objective(poses) if coupled else 0.0  # which R_ij is meant matters there
+    # which R_ij is meant matters there
+    rounding = 1e-12 * problem.objective(poses) if coupled else 0.0
     certificate = certify_at(problem, poses)
     assert certificate.lower_bound <= least + rounding
     Lambda = multipliers(problem, poses)
@@ -103,14 +138,22 @@ def test_no_bound_is_above_chi2(seed: int, n: int, d: int, coupled: bool, spread
 
 
 @settings(max_examples=examples(10))
-@given(seed=SEEDS, shape=st.sampled_from(Shape), d=DIMENSIONS, condition=st.sampled_from([1.0, 1e3, 1e6]))
+@given(
+    seed=SEEDS,
+    shape=st.sampled_from(Shape),
+    d=DIMENSIONS,
+    condition=st.sampled_from([1.0, 1e3, 1e6]),
+)
 def test_roads_with_information(seed: int, shape: Shape, d: int, condition: float) -> None:
-    graph, rng = road(seed, 60, 10.0, d, shape, 1e-2, 1e-3, loops=5), np.random.default_rng(seed)
+    graph = road(seed, 60, 10.0, d, shape, 1e-2, 1e-3, loops=5)
+    rng = np.random.default_rng(seed)
     information = proper_information(graph).copy()
     axes = np.linalg.qr(rng.standard_normal((graph.num_edges, d, d)))[0]
     values = information[:, :1, :1] * condition ** -rng.uniform(0.0, 1.0, (graph.num_edges, 1, d))
     information[:, :d, :d] = (axes * values) @ np.swapaxes(axes, 1, 2)
-    information[:, :d, :d] = 0.5 * (information[:, :d, :d] + np.swapaxes(information[:, :d, :d], 1, 2))
+    information[:, :d, :d] = 0.5 * (
+        information[:, :d, :d] + np.swapaxes(information[:, :d, :d], 1, 2)
+    )
     graph = replace(graph, information=information)
     solution = solvers.solve(of_file(graph), progress=False)
     assert solution.certificate.lower_bound <= exact_chi2(graph, solution.poses)
@@ -121,7 +164,7 @@ def test_rounding_of_the_matrix(seed: int, n: int, d: int, coupled: bool) -> Non
     problem = of_file(informed(seed, n, d, coupled, 2.0))
     poses = random_poses(n, d, seed)
     tangent = problem.tangent_at(poses)
-    assert tangent.weights.tangent is not None
+    assert isinstance(tangent.weights, TangentCost)
     Lambda = multipliers(problem, poses)
     stored, diagonal = shifted_certificate(tangent, Lambda, np.zeros(problem.side))
     S = exact_tangent_matrix(tangent)
@@ -136,31 +179,53 @@ def test_rounding_of_the_matrix(seed: int, n: int, d: int, coupled: bool) -> Non
         assert np.linalg.eigvalsh(room + sign * off)[0] >= -1e-12 * room.max()
 
 
-@given(seed=SEEDS, n=st.integers(2, 6), d=DIMENSIONS, coupled=COUPLED, defect=st.sampled_from([0.0, 1e-6, 0.1]))
-def test_rounding_of_value_and_product(seed: int, n: int, d: int, coupled: bool, defect: float) -> None:
+@given(
+    seed=SEEDS,
+    n=st.integers(2, 6),
+    d=DIMENSIONS,
+    coupled=COUPLED,
+    defect=st.sampled_from([0.0, 1e-6, 0.1]),
+)
+def test_rounding_of_value_and_product(
+    seed: int, n: int, d: int, coupled: bool, defect: float
+) -> None:
     graph = informed(seed, n, d, coupled, 2.0)
-    problem, poses = of_file(graph), random_poses(n, d, seed)
+    problem = of_file(graph)
+    poses = random_poses(n, d, seed)
     tangent = problem.tangent_at(poses)
-    assert tangent.weights.tangent is not None
+    assert isinstance(tangent.weights, TangentCost)
     X = poses.stacked() + defect * np.random.default_rng(seed).standard_normal((problem.side, d))
     found = evaluate_edges(tangent, X, np.zeros((n, d)))
-    M, point = exact_tangent_matrix(tangent), exact(X)
+    M = exact_tangent_matrix(tangent)
+    point = exact(X)
     product = M @ point
-    assert (np.abs(np.array(exact(found.product) - product, dtype=float)) <= found.product_error).all()
+    assert (
+        np.abs(np.array(exact(found.product) - product, dtype=float)) <= found.product_error
+    ).all()
     touched = tangent.weights.tangent
-    constant = total(exact(touched.value)) - total(exact(touched.loss)) - 2 * total(exact(touched.C) * exact(touched.Z))
+    constant = (
+        total(exact(touched.value))
+        - total(exact(touched.loss))
+        - 2 * total(exact(touched.C) * exact(touched.Z))
+    )
     assert abs(total(point * product) + constant - exact(found.value)) <= exact(found.value_error)
     assert abs(constant - exact(tangent.weights.constant[0])) <= exact(tangent.weights.constant[1])
 
 
 @given(seed=SEEDS, n=st.integers(2, 6), d=DIMENSIONS, size=st.sampled_from([1e-6, 1.0, 1e3]))
 def test_rounding_of_tangents(seed: int, n: int, d: int, size: float) -> None:
-    """The stored value is within its error, and the minorant of the stored C below the exact function everywhere."""
-    graph, rng = informed(seed, n, d, coupled=False, spread=3.0), np.random.default_rng(seed)
-    excess = of_file(graph).weights.excess
-    assert excess is not None
+    """The stored value is within its error.
+
+    The minorant of the stored C is below the exact function everywhere.
+    """
+    graph = informed(seed, n, d, coupled=False, spread=3.0)
+    rng = np.random.default_rng(seed)
+    cost = of_file(graph).weights
+    assert isinstance(cost, ExcessCost)
+    excess = cost.excess
     Z = size * rng.standard_normal((graph.num_edges, d + 1, d))
-    tangent, R_ij = excess.tangent(Z), exact(graph.R_ij)
+    tangent = excess.tangent(Z)
+    R_ij = exact(graph.R_ij)
     rest = exact(proper_information(graph)[:, :d, :d])
     tau = exact(of_file(graph).weights.tau)[:, None, None] * np.eye(d, dtype=int)
     J = R_ij @ rest @ transposed(R_ij) - tau
@@ -170,7 +235,13 @@ def test_rounding_of_tangents(seed: int, n: int, d: int, size: float) -> None:
         return (r * (J @ r))[:, :, 0].sum(axis=1)
 
     assert (abs(value(Z) - exact(tangent.value)) <= exact(tangent.value_error)).all()
-    for other in (Z, 0.0 * Z, Z * (1 + 1e-9), rng.standard_normal(Z.shape), 10.0 * size * rng.standard_normal(Z.shape)):
+    for other in (
+        Z,
+        0.0 * Z,
+        Z * (1 + 1e-9),
+        rng.standard_normal(Z.shape),
+        10.0 * size * rng.standard_normal(Z.shape),
+    ):
         linear = 2 * (exact(tangent.C) * (exact(other) - exact(Z))).sum(axis=(1, 2))
         assert (value(Z) + linear - exact(tangent.loss) <= value(other)).all()
 
@@ -188,7 +259,7 @@ def test_smaller_matrices_cost_less() -> None:
     graph = informed(0, 8, 3, coupled=True, spread=2.0)
     information = proper_information(graph)
     for cap in (1.0, 3.0, 1e9):
-        softer = soften(graph, cap).information
+        softer = shrink_information(graph, cap).information
         assert softer is not None
         assert np.linalg.eigvalsh(information - softer).min() >= -1e-13 * information.max()
         assert np.linalg.cond(softer[:, :3, :3]).max() <= cap * (1 + 1e-6)
@@ -203,31 +274,162 @@ def test_smaller_matrices_are_below_in_exact_arithmetic(d: int) -> None:
         information = proper_information(graph).copy()
         trace = np.trace(information[:, d:, d:], axis1=1, axis2=2)
         information[:, d:, d:] = trace[:, None, None] * np.eye(information.shape[1] - d)
-        softer = soften(replace(graph, information=information), 1e9).information
+        softer = shrink_information(replace(graph, information=information), 1e9).information
         assert softer is not None
         rest = np.array(exact(information) - exact(softer), dtype=float)
         assert are_definite(rest, 0.0).all()
-        assert coupled or np.abs(rest).max() <= 1e-9 * information.max()  # nothing was cut, so that rounding is seen
+        # nothing was cut, so that rounding is seen
+        assert coupled or np.abs(rest).max() <= 1e-9 * information.max()
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_smaller_matrices_are_below_whatever_share_was_computed(d: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_smaller_matrices_are_below_whatever_share_was_computed(
+    d: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     graph = informed(3, 8, d, coupled=True, spread=2.0)
     information = proper_information(graph)
     monkeypatch.setattr(
         "pgo_models.certificates.tangent.uncoupled_share",
         lambda blocks, d: np.minimum(1.0, uncoupled_share(blocks, d) + 0.3),
     )
-    softer = soften(graph, 1e9).information
+    softer = shrink_information(graph, 1e9).information
     assert softer is not None
     assert are_definite(information - softer, 0.0).all()
+
+
+def semidefinite(seed: int, n: int, d: int, rank: int, share: float = 1.0) -> PoseGraph:
+    """A graph of which a share of the matrices are B B^T, exact in doubles, for B of a rank."""
+    graph = informed(seed, n, d, coupled=True, noise=NoiseModel(0.05, 0.05))
+    rng = np.random.default_rng(seed)
+    assert graph.information is not None
+    B = rng.integers(-3, 4, (graph.num_edges, 3 * d - 3, rank)).astype(float)
+    while rank >= d:  # blocks I_tt and I_rr that are singular are drawn again
+        ranks = np.stack([np.linalg.matrix_rank(B[:, :d]), np.linalg.matrix_rank(B[:, d:])])
+        again = (ranks < [[d], [2 * d - 3]]).any(axis=0)
+        if not again.any():
+            break
+        B[again] = rng.integers(-3, 4, B[again].shape)
+    chosen = rng.random(graph.num_edges) < share
+    return replace(
+        graph,
+        information=np.where(chosen[:, None, None], B @ np.swapaxes(B, 1, 2), graph.information),
+    )
+
+
+def defined_chi2(graph: PoseGraph, poses: Poses) -> float:
+    """Edge by edge r^T I r, r = (r_t, a sin theta), and (1 - cos theta)^2 a^T I_rr a."""
+    assert graph.information is not None
+    cost = 0.0
+    d = graph.d
+    for e, weight in enumerate(graph.information):
+        R_i = poses.R[graph.i[e]]
+        R_j = poses.R[graph.j[e]]
+        R_ij = graph.R_ij[e]
+        E = R_ij.T @ R_i.T @ R_j
+        r_t = R_ij.T @ (R_i.T @ (poses.t[graph.j[e]] - poses.t[graph.i[e]]) - graph.t_ij[e])
+        turn = E - E.T
+        s = 0.5 * (turn[1:, 0] if d == 2 else np.array([turn[2, 1], turn[0, 2], turn[1, 0]]))
+        cosine = np.trace(E) / 2 if d == 2 else (np.trace(E) - 1) / 2
+        axis = s / max(np.linalg.norm(s), 1e-300)
+        r = np.concatenate([r_t, s])
+        cost += float(r @ weight @ r + (1 - cosine) ** 2 * axis @ weight[d:, d:] @ axis)
+    return cost
+
+
+@settings(max_examples=examples(20))
+@given(
+    seed=SEEDS,
+    n=st.integers(2, 8),
+    d=DIMENSIONS,
+    lost=st.integers(0, 3),
+    share=st.sampled_from([0.2, 1.0]),
+)
+def test_bounds_on_chi2_of_semidefinite_matrices(
+    seed: int, n: int, d: int, lost: int, share: float
+) -> None:
+    """Of every rank they are whole in value and bound.
+
+    A matrix with a singular block is refused by name.
+    """
+    k = 3 * d - 3
+    graph = semidefinite(seed, n, d, max(k - lost, 1), share)
+    assert graph.information is not None
+    problem = of_file(graph)
+    poses = random_poses(n, d, seed)
+    blocks = graph.information[:, :d, :d], graph.information[:, d:, d:]
+    if min(np.linalg.eigvalsh(block)[:, 0].min() for block in blocks) < 1e-9:
+        with pytest.raises(GraphError, match=r"edge .* is singular or indefinite"):
+            problem.objective(poses)
+        return
+    np.testing.assert_array_equal(proper_information(graph), graph.information)
+    assert chi2(graph, poses) == pytest.approx(defined_chi2(graph, poses), rel=1e-9)
+    assert problem.objective(poses) == pytest.approx(defined_chi2(graph, poses), rel=1e-9)
+    starts = [
+        chordal_start(problem.convex_part),
+        *(random_poses(n, d, seed + other) for other in (1, 2)),
+    ]
+    minima = [polish(problem, start, max_steps=20) for start in starts]
+    minima.append(solvers.solve(problem, progress=False).poses)
+    costs = [exact_chi2(graph, at) for at in (poses, *starts, *minima)]
+    # Which rotation a stored R_ij stands for matters beside coupling blocks.
+    least = min(costs) + 1e-12 * problem.objective(poses)
+    bounds = [certify(problem, at).lower_bound for at in (poses, minima[-1])]
+    bounds += [certify_at(problem, at).lower_bound for at in minima]
+    assert 0.0 <= max(bounds) <= least
+
+
+def test_a_semidefinite_file_of_two_edges(tmp_path: Path) -> None:
+    """Its coupling was left out in silence.
+
+    chi2 and bound were 98.967, where 10.727 is the minimum.
+    """
+    path = tmp_path / "two.g2o"
+    path.write_text(
+        "EDGE_SE2 0 1 1 0 0 100 0 100 100 0 100\nEDGE_SE2 0 1 2 0 -1 100 0 100 100 0 100\n"
+    )
+    graph = read_g2o(path)
+    solution = solvers.solve(of_file(graph), progress=False)
+    turn = np.array([[np.cos(0.69), np.sin(0.69)], [-np.sin(0.69), np.cos(0.69)]])
+    near = Poses(np.stack([np.eye(2), turn]), np.array([[0.0, 0.0], [1.73, 0.13]]))
+    least = exact_chi2(graph, near)
+    assert float(least) == pytest.approx(10.735, abs=5e-4)
+    assert chi2(graph, near) == pytest.approx(float(least), rel=1e-12)
+    assert solution.is_certified
+    assert solution.lower_bound <= exact_chi2(graph, solution.poses) <= least
+    certificate = certify(of_file(graph), near)
+    assert 10.7 < certificate.lower_bound <= least
+    assert solution.lower_bound == pytest.approx(certificate.lower_bound, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", [0, 4, 8])
+def test_some_semidefinite_matrices_leave_the_bound_sharp(seed: int) -> None:
+    graph = semidefinite(seed, 20, 2, 2, share=0.1)
+    assert 0 < (~are_definite(proper_information(graph), 1e-12)).sum() < graph.num_edges
+    solution = solvers.solve(of_file(graph), progress=False)
+    assert solution.is_certified
+    shared = solvers.solve(of_file(graph), robots=3, progress=False)
+    assert shared.objective == pytest.approx(solution.objective, rel=1e-9)
+    assert shared.is_certified
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_smaller_matrices_leave_semidefinite_ones_out(d: int) -> None:
+    graph = informed(2, 8, d, coupled=True)
+    information = proper_information(graph).copy()
+    values, axes = np.linalg.eigh(information[0])
+    information[0] = (axes[:, 1:] * values[1:]) @ axes[:, 1:].T
+    information[0] = 0.5 * (information[0] + information[0].T)
+    softer = shrink_information(replace(graph, information=information), 3.0)
+    assert softer.num_edges == graph.num_edges - 1
+    np.testing.assert_array_equal(softer.i, graph.i[1:])
 
 
 def test_coupling_that_leaves_nothing_gives_no_softened_bound() -> None:
     graph = informed(3, 8, 3, coupled=False, spread=0.5)
     information = proper_information(graph).copy()
     for e, block in enumerate(information):
-        L_t, L_r = np.linalg.cholesky(block[:3, :3]), np.linalg.cholesky(block[3:, 3:])
+        L_t = np.linalg.cholesky(block[:3, :3])
+        L_r = np.linalg.cholesky(block[3:, 3:])
         information[e, :3, 3:] = (1.0 - 1e-8) * L_t @ L_r.T
         information[e, 3:, :3] = information[e, :3, 3:].T
     graph = replace(graph, information=information)
@@ -240,13 +442,18 @@ def test_softened_bounds_hold_where_the_tangent_gives_none() -> None:
     graph = informed(1, 25, 3, coupled=False, spread=2.0, noise=NoiseModel(0.1, 0.1))
     problem = of_file(graph)
     poses = polish(problem, chordal_start(problem.convex_part))
-    bound, there, Lambda = softened_bound(problem, poses)
+    shrunk = bound_by_shrinking(problem, poses)
+    bound = shrunk.bound
     assert 0.0 < bound.value <= exact_chi2(graph, poses)
-    again = prove_bound(of_file(soften(graph, bound.cap)), Lambda, poses=there)
+    again = prove_bound(
+        of_file(shrink_information(graph, bound.cap)), shrunk.Lambda, poses=shrunk.poses
+    )
     assert again == pytest.approx(bound.value, rel=1e-9)
     certificate = certify(problem, poses)
     assert certificate.lower_bound >= (1 - 1e-9) * bound.value
-    assert certificate.source is not BoundSource.SOFTENED or "conditions cut to" in certificate.proof
+    assert (
+        certificate.source is not BoundSource.SOFTENED or "conditions cut to" in certificate.proof
+    )
 
 
 @pytest.mark.parametrize("d", [2, 3])

@@ -6,8 +6,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from budget import examples
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from shared_rotations import shared_rotation_step
 from signals import sparse_signal
 
@@ -24,12 +23,19 @@ from pgo_models.geometry.rotations import Array, random_rotations, stack_transpo
 from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.scenes import grid
 from pgo_models.problem.matrices import connection_laplacian
-from solvers.convex.bregman import AlternatingBregman, Bregman, MethodOfMultipliers, TwoLineBregman, feasibility_bound
+from solvers.convex.bregman import (
+    AlternatingBregman,
+    Bregman,
+    MethodOfMultipliers,
+    TwoLineBregman,
+    feasibility_bound,
+)
 from solvers.loop import iterate, run
 from solvers.result import Status
 
 EQUIVALENCE = 1e-7  # state by state, as the forms are stated in the paper
-INTERIOR = 1e-5  # an interior-point iterate is accurate to the square root of its gap where J is flat
+# an interior-point iterate is accurate to the square root of its gap where J is flat
+INTERIOR = 1e-5
 SEEDS = st.integers(0, 2**32 - 1)
 ALPHAS = st.sampled_from([0.3, 1.0, 5.0])
 FORMS = [Bregman, TwoLineBregman, MethodOfMultipliers, AlternatingBregman]
@@ -42,18 +48,24 @@ def states(method, problem, count: int, start=None):
 def lasso(seed: int, m: int = 6, s: int = 3) -> BregmanProblem:
     """1/2 ||A x - c||^2 + ||x||_1 s.t. K x = f: strongly convex, not smooth."""
     rng = np.random.default_rng(seed)
-    A, c = rng.standard_normal((m + 2, m)) + 2.0 * np.eye(m + 2, m), rng.standard_normal(m + 2)
+    A = rng.standard_normal((m + 2, m)) + 2.0 * np.eye(m + 2, m)
+    c = rng.standard_normal(m + 2)
     x = cp.Variable(m, name="x")
     return BregmanProblem(
-        0.5 * cp.sum_squares(A @ x - c) + cp.norm1(x), x, rng.standard_normal((s, m)), rng.standard_normal(s)
+        0.5 * cp.sum_squares(A @ x - c) + cp.norm1(x),
+        x,
+        rng.standard_normal((s, m)),
+        rng.standard_normal(s),
     )
 
 
 def split_lasso(seed: int) -> tuple[BregmanProblem, Array, Array]:
     """1/2 ||A u - c||^2 + 0.5 ||v||_1 s.t. u - v = 0."""
     rng = np.random.default_rng(seed)
-    A, c = rng.standard_normal((8, 5)) + 2.0 * np.eye(8, 5), rng.standard_normal(8)
-    u, v = cp.Variable(5, name="u"), cp.Variable(5, name="v")
+    A = rng.standard_normal((8, 5)) + 2.0 * np.eye(8, 5)
+    c = rng.standard_normal(8)
+    u = cp.Variable(5, name="u")
+    v = cp.Variable(5, name="v")
     J = 0.5 * cp.sum_squares(A @ u - c) + 0.5 * cp.norm1(v)
     return BregmanProblem(J, (u, v), np.hstack([np.eye(5), -np.eye(5)]), np.zeros(5)), A, c
 
@@ -62,11 +74,15 @@ def split_lasso(seed: int) -> tuple[BregmanProblem, Array, Array]:
 @given(seed=SEEDS, alpha=ALPHAS)
 def test_three_forms_have_the_same_states(seed: int, alpha: float) -> None:
     problem = lasso(seed)
-    one, two, three = (states(form(alpha=alpha), problem, 10) for form in FORMS[:3])
-    for bregman, two_line, multipliers in zip(one, two, three, strict=True):
+    of_bregman, of_two_line, of_multipliers = (
+        states(form(alpha=alpha), problem, 10) for form in FORMS[:3]
+    )
+    for bregman, two_line, multipliers in zip(of_bregman, of_two_line, of_multipliers, strict=True):
         np.testing.assert_allclose(bregman.x, two_line.x, rtol=0, atol=EQUIVALENCE)
         np.testing.assert_allclose(bregman.x, multipliers.x, rtol=0, atol=EQUIVALENCE)
-        np.testing.assert_allclose(bregman.p, problem.K.T @ multipliers.lam, rtol=0, atol=EQUIVALENCE)
+        np.testing.assert_allclose(
+            bregman.p, problem.K.T @ multipliers.lam, rtol=0, atol=EQUIVALENCE
+        )
         np.testing.assert_allclose(multipliers.lam, -alpha * two_line.b, rtol=0, atol=EQUIVALENCE)
 
 
@@ -86,7 +102,9 @@ def test_p_is_a_subgradient_of_J(seed: int, alpha: float) -> None:
 @given(seed=SEEDS, alpha=ALPHAS)
 def test_one_pass_is_admm(seed: int, alpha: float) -> None:
     problem, A, c = split_lasso(seed)
-    u, v, scaled = np.zeros(5), np.zeros(5), np.zeros(5)
+    u = np.zeros(5)
+    v = np.zeros(5)
+    scaled = np.zeros(5)
     for state in states(AlternatingBregman(alpha=alpha), problem, 10)[1:]:
         u = np.linalg.solve(A.T @ A + alpha * np.eye(5), A.T @ c + alpha * (v - scaled))
         v = soft_threshold(u + scaled, 0.5 / alpha)
@@ -107,8 +125,8 @@ def test_many_passes_are_the_method_of_multipliers() -> None:
 @given(seed=SEEDS, alpha=ALPHAS)
 def test_residual_falls_and_keeps_its_bound(seed: int, alpha: float) -> None:
     problem, solution = sparse_signal(seed, m=20, s=8, nonzeros=3)
-    found = states(TwoLineBregman(alpha=alpha), problem, 12)
-    residuals = [float(np.linalg.norm(problem.residual(state.x))) for state in found]
+    iterates = states(TwoLineBregman(alpha=alpha), problem, 12)
+    residuals = [float(np.linalg.norm(problem.residual(state.x))) for state in iterates]
     for k, (before, after) in enumerate(itertools.pairwise(residuals), start=1):
         assert after <= before + INTERIOR
         assert after <= feasibility_bound(problem.objective(solution), alpha, k) + INTERIOR
@@ -154,7 +172,9 @@ def test_errors_of_loose_subproblems_do_not_add_up(seed: int) -> None:
 
 def rof(noisy: Array, weight: float) -> tuple[Array, float]:
     u = cp.Variable(noisy.shape)
-    J = 0.5 * cp.sum_squares(u - noisy) + weight * cp.norm1(differences(noisy.shape) @ cp.vec(u, order="C"))
+    J = 0.5 * cp.sum_squares(u - noisy) + weight * cp.norm1(
+        differences(noisy.shape) @ cp.vec(u, order="C")
+    )
     value = cp.Problem(cp.Minimize(J)).solve(solver=cp.CLARABEL)
     return np.asarray(u.value), float(value)
 
@@ -210,21 +230,23 @@ def test_an_indicator_adds_constraints() -> None:
     J = cp.sum_squares(x - np.array([-1.0, 2.0, 3.0])) + cp.transforms.indicator([x >= 0])
     solved = run(MethodOfMultipliers(alpha=10.0), BregmanProblem(J, x, np.ones((1, 3)), [4.0]))
     assert solved.status is Status.CONVERGED
-    np.testing.assert_allclose(solved.state.x, [0.0, 1.5, 2.5], rtol=0, atol=1e-5)  # without it: -1, 2, 3
+    # without it: -1, 2, 3
+    np.testing.assert_allclose(solved.state.x, [0.0, 1.5, 2.5], rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("form", [AlternatingBregman, MethodOfMultipliers])
 def test_two_robots_agree_on_the_r_step(form) -> None:
     rng = np.random.default_rng(0)
     graph = grid(rng)
-    V, rho = random_rotations(graph.num_poses, 3, rng), 20.0
+    V = random_rotations(graph.num_poses, 3, rng)
+    rho = 20.0
     shared = shared_rotation_step(graph, partition(graph, 2), V, rho)
     outcome = run(form(alpha=10.0), shared.problem)
     assert outcome.status is Status.CONVERGED
     L = connection_laplacian(graph).toarray()
     expected = np.linalg.solve(L + 0.5 * rho * np.eye(len(L)), 0.5 * rho * stack_transposes(V))
-    found = stack_transposes(shared.rotations(outcome.state.x))
-    np.testing.assert_allclose(found, expected, rtol=0, atol=10 * form.tolerance)
+    rotations = stack_transposes(shared.rotations(outcome.state.x))
+    np.testing.assert_allclose(rotations, expected, rtol=0, atol=10 * form.tolerance)
 
 
 # The contract of every solver.
@@ -235,8 +257,11 @@ def test_step_leaves_its_input_alone(form) -> None:
     problem = lasso(1) if form is not AlternatingBregman else split_lasso(1)[0]
     method = form(alpha=1.0)
     state = states(method, problem, 3)[-1]
-    arrays = {name: value.copy() for name, value in vars(state).items() if isinstance(value, np.ndarray)}
-    first, second = method.step(problem, state), method.step(problem, state)
+    arrays = {
+        name: value.copy() for name, value in vars(state).items() if isinstance(value, np.ndarray)
+    }
+    first = method.step(problem, state)
+    second = method.step(problem, state)
     for name, value in arrays.items():
         np.testing.assert_array_equal(getattr(state, name), value)
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
@@ -269,8 +294,10 @@ def test_limits_are_reported(form) -> None:
 
 @pytest.mark.parametrize("form", FORMS)
 def test_same_problem_gives_the_same_bits(form) -> None:
-    one, other = (lasso(4) if form is not AlternatingBregman else split_lasso(4)[0] for _ in range(2))
-    np.testing.assert_array_equal(states(form(), one, 5)[-1].x, states(form(), other, 5)[-1].x)
+    first, again = (
+        lasso(4) if form is not AlternatingBregman else split_lasso(4)[0] for _ in range(2)
+    )
+    np.testing.assert_array_equal(states(form(), first, 5)[-1].x, states(form(), again, 5)[-1].x)
 
 
 def test_history_has_a_row_per_state() -> None:

@@ -2,8 +2,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from budget import examples
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.sparse import csr_array
 from shared_rotations import shared_rotation_step
 
@@ -35,7 +34,8 @@ def small_problem() -> BregmanProblem:
 
 
 def test_values_are_stacked_row_by_row_in_the_order_named() -> None:
-    u, v = cp.Variable((2, 2)), cp.Variable(3)
+    u = cp.Variable((2, 2))
+    v = cp.Variable(3)
     problem = BregmanProblem(cp.sum_squares(u) + cp.norm1(v), (u, v), np.zeros((1, 7)), [0.0])
     x = problem.stacked([np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([5.0, 6.0, 7.0])])
     np.testing.assert_array_equal(x, np.arange(1.0, 8.0))
@@ -53,9 +53,11 @@ def test_dense_and_sparse_constraints_are_the_same() -> None:
 
 def test_problem_does_not_share_arrays_with_its_caller() -> None:
     x = cp.Variable(2)
-    K, f = np.eye(2), np.ones(2)
+    K = np.eye(2)
+    f = np.ones(2)
     problem = BregmanProblem(cp.norm1(x), x, K, f)
-    K[:], f[:] = np.nan, np.nan
+    K[:] = np.nan
+    f[:] = np.nan
     np.testing.assert_array_equal(problem.residual(np.zeros(2)), [-1.0, -1.0])
 
 
@@ -81,10 +83,18 @@ def test_bad_objectives_are_refused(J, message: str) -> None:
         (np.ones((1, 2)), [1.0], r"K has shape \(1, 2\)"),
         (np.ones((2, 3)), [1.0], r"f \(1,\)"),
         (np.full((1, 3), np.nan), [1.0], "K has 3 entries that are not finite"),
-        (np.ones((1, 3)), [np.inf], r"f has 1 entries that are not finite, the first at \(0,\): inf"),
+        (
+            np.ones((1, 3)),
+            [np.inf],
+            r"f has 1 entries that are not finite, the first at \(0,\): inf",
+        ),
         (np.ones((1, 3)), ["one"], "f must be real numbers, got type <U3"),
         (np.ones((1, 3)) * 1j, [1.0], "K must be real numbers, got type complex128"),
-        (csr_array(np.ones((1, 3)) * 1j), [1.0], r"the entries of K must be .* numbers, got type complex128"),
+        (
+            csr_array(np.ones((1, 3)) * 1j),
+            [1.0],
+            r"the entries of K must be .* numbers, got type complex128",
+        ),
         (np.ones((1, 3)), [1.0 + 1j], "f must be real numbers, got type complex128"),
     ],
 )
@@ -116,7 +126,9 @@ def test_subproblems_are_compiled_once() -> None:
         *block_subproblems(problem, 1.0),
     ):
         assert compiled.problem.is_dcp(dpp=True)
-        assert [parameter.id for parameter in compiled.problem.parameters()] == [compiled.parameter.id]
+        assert [parameter.id for parameter in compiled.problem.parameters()] == [
+            compiled.parameter.id
+        ]
         compiled.solve(np.full(compiled.parameter.shape, 0.1))
         program = compiled.problem._cache.param_prog
         assert program is not None
@@ -125,8 +137,11 @@ def test_subproblems_are_compiled_once() -> None:
 
 
 def test_a_term_that_couples_the_blocks_is_refused() -> None:
-    u, v = cp.Variable(2, name="u"), cp.Variable(2, name="v")
-    problem = BregmanProblem(cp.sum_squares(u) + cp.sum_squares(u - v), (u, v), np.zeros((1, 4)), [0.0])
+    u = cp.Variable(2, name="u")
+    v = cp.Variable(2, name="v")
+    problem = BregmanProblem(
+        cp.sum_squares(u) + cp.sum_squares(u - v), (u, v), np.zeros((1, 4)), [0.0]
+    )
     with pytest.raises(SettingError, match="couples the variables u, v"):
         block_subproblems(problem, 1.0)
 
@@ -134,7 +149,9 @@ def test_a_term_that_couples_the_blocks_is_refused() -> None:
 def test_unbounded_and_infeasible_subproblems_say_so() -> None:
     x = cp.Variable(2)
     unbounded = bregman_subproblem(BregmanProblem(cp.sum(x), x, [[1.0, 1.0]], [1.0]), 1.0)
-    with pytest.raises(PGOError, match="unbounded on the Bregman subproblem: its objective has no minimum"):
+    with pytest.raises(
+        PGOError, match="unbounded on the Bregman subproblem: its objective has no minimum"
+    ):
         unbounded.solve(np.array([0.0, 2.0]))
     infeasible = cp.Problem(cp.Minimize(cp.sum(x)), [x >= 1, x <= 0])
     with pytest.raises(PGOError, match="infeasible on the toy: its constraints contradict"):
@@ -164,7 +181,9 @@ def test_total_variation_models_have_the_right_objectives(seed: int) -> None:
     split = total_variation_denoising(noisy, 0.7)
     x = split.stacked([u, differences(u.shape) @ u.ravel()])
     assert np.linalg.norm(split.residual(x)) < 1e-14
-    assert split.objective(x) == pytest.approx(0.5 * np.sum((u - noisy) ** 2) + 0.7 * total_variation, rel=1e-12)
+    assert split.objective(x) == pytest.approx(
+        0.5 * np.sum((u - noisy) ** 2) + 0.7 * total_variation, rel=1e-12
+    )
     space = total_variation_scale_space(noisy)
     assert space.objective(u.ravel()) == pytest.approx(total_variation, rel=1e-12)
     np.testing.assert_array_equal(space.residual(noisy.ravel()), np.zeros(noisy.size))
@@ -174,7 +193,8 @@ def test_examples_check_their_settings() -> None:
     with pytest.raises(SettingError, match="weight must not be negative"):
         total_variation_denoising(np.zeros(3), -1.0)
     graph = grid(np.random.default_rng(0))
-    robots, V = partition(graph, 2), np.zeros((graph.num_poses, 3, 3))
+    robots = partition(graph, 2)
+    V = np.zeros((graph.num_poses, 3, 3))
     with pytest.raises(SettingError, match="rho must be positive"):
         shared_rotation_step(graph, robots, V, 0.0)
     with pytest.raises(SettingError, match="V has shape"):
@@ -187,9 +207,11 @@ def test_shared_rotation_step_adds_up_to_the_whole_graph(seed: int, num_robots: 
     rng = np.random.default_rng(seed)
     graph = grid(rng)
     robots = Partition(
-        np.r_[np.arange(num_robots), rng.integers(0, num_robots, 27 - num_robots)], PartitionMethod.GIVEN
+        np.r_[np.arange(num_robots), rng.integers(0, num_robots, 27 - num_robots)],
+        PartitionMethod.GIVEN,
     )
-    V, R = random_rotations(27, 3, rng), random_rotations(27, 3, rng)
+    V = random_rotations(27, 3, rng)
+    R = random_rotations(27, 3, rng)
     model = shared_rotation_step(graph, robots, V, 3.0)
     x = model.problem.stacked([np.swapaxes(R[poses], 1, 2) for poses in model.held])
     assert np.linalg.norm(model.problem.residual(x)) == 0.0

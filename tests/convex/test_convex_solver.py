@@ -1,4 +1,4 @@
-"""Any solver of cvxpy by name or with options, for every model; and what is said of models that are not convex."""
+"""Any solver of cvxpy by name or with options; and the messages for models that are not convex."""
 
 import math
 import sys
@@ -11,7 +11,13 @@ from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC, SOLVER_MAP_QP
 from graphs import varied_problem
 
 from pgo_models.convex.bregman import BregmanProblem
-from pgo_models.convex.convex_solver import COLD, ConvexSolver, as_solver, check_convex, solve_compiled
+from pgo_models.convex.convex_solver import (
+    COLD,
+    ConvexSolver,
+    as_solver,
+    check_convex,
+    solve_compiled,
+)
 from pgo_models.convex.graph_subproblem import ModelChange, PoseVariables, graph_qp
 from pgo_models.convex.orthogonality import OrthogonalProblem
 from pgo_models.convex.orthogonality_examples import procrustes
@@ -31,16 +37,17 @@ from solvers.soc.soc import SOC
 
 FINE_SCS = ConvexSolver("SCS", {"eps_abs": 1e-10, "eps_rel": 1e-10, "max_iters": 100_000})
 SOLVERS = ["CLARABEL", "SCS", "OSQP", FINE_SCS]
-ROBUST_CVXOPT = ConvexSolver("CVXOPT", {"kktsolver": "robust"})  # the equations of the primal are not independent
+# the equations of the primal are not independent
+ROBUST_CVXOPT = ConvexSolver("CVXOPT", {"kktsolver": "robust"})
 ROUGH = 1e-5  # what a tolerance of 1e-7 of a first-order method leaves
 
 
 @pytest.mark.parametrize("solver", SOLVERS, ids=str)
 def test_the_r_step_of_soc_by_any_of_them(solver: ConvexSolver | str) -> None:
     problem = varied_problem(4, 6, 2)
-    found = run(SOC(r_step=CvxpyStep(solver), tolerance=1e-4), problem)
-    assert found.status is Status.CONVERGED
-    assert found.objective == pytest.approx(run(SOC(tolerance=1e-4), problem).objective, rel=1e-3)
+    result = run(SOC(r_step=CvxpyStep(solver), tolerance=1e-4), problem)
+    assert result.status is Status.CONVERGED
+    assert result.objective == pytest.approx(run(SOC(tolerance=1e-4), problem).objective, rel=1e-3)
 
 
 @pytest.mark.parametrize("solver", SOLVERS, ids=str)
@@ -48,12 +55,14 @@ def test_a_program_with_terms_by_any_of_them(solver: ConvexSolver | str) -> None
     problem = varied_problem(4, 6, 2)
 
     def change(unknown: PoseVariables) -> ModelChange:
-        return ModelChange(terms=[cp.sum_squares(unknown.t[:3] - 1.0)], constraints=[unknown.t[0] >= 0.5])
+        return ModelChange(
+            terms=[cp.sum_squares(unknown.t[:3] - 1.0)], constraints=[unknown.t[0] >= 0.5]
+        )
 
     V = np.random.default_rng(0).standard_normal((problem.side, 2))
     exact = graph_qp(problem.graph, np.ones(6), changer=change).solve(V)
-    found = graph_qp(problem.graph, np.ones(6), changer=change, solver=solver).solve(V)
-    np.testing.assert_allclose(found, exact, rtol=0, atol=100 * ROUGH)
+    X = graph_qp(problem.graph, np.ones(6), changer=change, solver=solver).solve(V)
+    np.testing.assert_allclose(X, exact, rtol=0, atol=100 * ROUGH)
 
 
 @pytest.mark.parametrize("solver", ["CLARABEL", "SCS", ROBUST_CVXOPT], ids=str)
@@ -72,16 +81,19 @@ def test_bregman_iterations_and_orthogonality_constraints_by_another() -> None:
     K = np.random.default_rng(1).standard_normal((2, 4))
     problem = BregmanProblem(cp.norm1(x), x, K, np.ones(2))
     by_clarabel, by_scs = (
-        run(TwoLineBregman(alpha=5.0, solver=solver, tolerance=1e-5), problem) for solver in (COLD, FINE_SCS)
+        run(TwoLineBregman(alpha=5.0, solver=solver, tolerance=1e-5), problem)
+        for solver in (COLD, FINE_SCS)
     )
     assert by_scs.status is by_clarabel.status is Status.CONVERGED
     assert by_scs.objective == pytest.approx(by_clarabel.objective, rel=1e-4)
     rng = np.random.default_rng(0)
     model = procrustes(rng.standard_normal((5, 3)), rng.standard_normal((5, 3)))
     soc = OrthogonalSOC(solver="OSQP", tolerance=1e-4)
-    found, exact = (solve_orthogonal(model, np.random.default_rng(0), s, 3) for s in (soc, OrthogonalSOC()))
-    assert found.status is Status.CONVERGED
-    assert found.objective == pytest.approx(exact.objective, rel=1e-3)
+    by_osqp, exact = (
+        solve_orthogonal(model, np.random.default_rng(0), s, 3) for s in (soc, OrthogonalSOC())
+    )
+    assert by_osqp.status is Status.CONVERGED
+    assert by_osqp.objective == pytest.approx(exact.objective, rel=1e-3)
 
 
 def test_an_extended_model_by_another() -> None:
@@ -91,16 +103,21 @@ def test_an_extended_model_by_another() -> None:
         return ModelChange(terms=[cp.sum_squares(unknown.t[[0, 3]])])
 
     soc = SOC(tolerance=1e-4)
-    found, exact = (run(ExtendedSOC(change, soc, solver=solver), problem) for solver in ("SCS", "CLARABEL"))
-    assert found.status is exact.status is Status.CONVERGED
-    assert found.history.objective[-1] == pytest.approx(exact.history.objective[-1], rel=1e-2)
+    by_scs, exact = (
+        run(ExtendedSOC(change, soc, solver=solver), problem) for solver in ("SCS", "CLARABEL")
+    )
+    assert by_scs.status is exact.status is Status.CONVERGED
+    assert by_scs.history.objective[-1] == pytest.approx(exact.history.objective[-1], rel=1e-2)
 
 
 def test_a_warm_start_saves_iterations_and_a_cold_one_gives_equal_bits() -> None:
-    x, c = cp.Variable(30), cp.Parameter(30)
+    x = cp.Variable(30)
+    c = cp.Parameter(30)
     rng = np.random.default_rng(0)
     A = rng.standard_normal((40, 30))
-    problem = cp.Problem(cp.Minimize(cp.sum_squares(A @ x - 1.0) + cp.sum_squares(x - c) + cp.norm1(x)))
+    problem = cp.Problem(
+        cp.Minimize(cp.sum_squares(A @ x - 1.0) + cp.sum_squares(x - c) + cp.norm1(x))
+    )
 
     def iterations(warm_start: bool) -> tuple[int, bytes]:
         c.value = np.ones(30)
@@ -119,15 +136,23 @@ def test_options_win_and_what_is_not_there_is_named() -> None:
         solve_compiled(quadratic, "toy", solver=ConvexSolver("SCS", {"max_iters": 1}))
     with pytest.raises(PGOError, match=r"OSQP ended with status solver_error on the toy: .*OSQP"):
         solve_compiled(cp.Problem(cp.Minimize(cp.norm(x - 1.0))), "toy", solver="OSQP")
-    with pytest.raises(SettingError, match="solver 'SNOPT' is not installed; cvxpy finds CLARABEL, "):
+    with pytest.raises(
+        SettingError, match="solver 'SNOPT' is not installed; cvxpy finds CLARABEL, "
+    ):
         as_solver("SNOPT")
     with pytest.raises(SettingError, match="what CVXOPT calls it is not known"):
-        solve_relaxation(PGOProblem(circle(np.random.default_rng(0))), solver="CVXOPT", time_limit=10.0)
-    assert math.isfinite(solve_relaxation(varied_problem(1, 8, 2), solver="SCS", time_limit=10.0).value)
+        solve_relaxation(
+            PGOProblem(circle(np.random.default_rng(0))), solver="CVXOPT", time_limit=10.0
+        )
+    assert math.isfinite(
+        solve_relaxation(varied_problem(1, 8, 2), solver="SCS", time_limit=10.0).value
+    )
 
 
 @pytest.mark.parametrize("name", cp.installed_solvers())
-def test_every_installed_solver_solves_what_it_can_and_says_in_one_line_what_it_cannot(name: str) -> None:
+def test_every_installed_solver_solves_what_it_can_and_says_in_one_line_what_it_cannot(
+    name: str,
+) -> None:
     problem = varied_problem(4, 5, 2)
     cone = lambda u: ModelChange(terms=[cp.norm(u.t(0) - 1.0)])  # noqa: E731
     V = np.random.default_rng(0).standard_normal((problem.side, 2))
@@ -137,59 +162,83 @@ def test_every_installed_solver_solves_what_it_can_and_says_in_one_line_what_it_
         "cone": lambda: graph_qp(problem.graph, np.ones(5), changer=cone, solver=name).solve(V),
         "semidefinite": lambda: solve_relaxation(problem, solver=name).lower_bound,
     }
-    cones = {one.__name__ for one in getattr(SOLVER_MAP_CONIC.get(name), "SUPPORTED_CONSTRAINTS", ())}
+    cones = {
+        kind.__name__ for kind in getattr(SOLVER_MAP_CONIC.get(name), "SUPPORTED_CONSTRAINTS", ())
+    }
     can = {"cone": "SOC" in cones, "semidefinite": bool({"PSD", "SvecPSD"} & cones)}
-    can["quadratic"] = (can["cone"] and name != "CVXOPT") or name in SOLVER_MAP_QP  # CVXOPT: see ROBUST_CVXOPT
+    # CVXOPT: see ROBUST_CVXOPT
+    can["quadratic"] = (can["cone"] and name != "CVXOPT") or name in SOLVER_MAP_QP
     for kind, solve_it in rounds.items():
         if can[kind]:
-            found = solve_it()
+            result = solve_it()
             if kind == "cone":
-                np.testing.assert_allclose(found, exact, rtol=0, atol=100 * ROUGH)
+                np.testing.assert_allclose(result, exact, rtol=0, atol=100 * ROUGH)
             if kind == "semidefinite":
-                assert found <= solve(problem).objective
+                assert result <= solve(problem).objective
             continue
         with pytest.raises(PGOError, match=f"^{name} ") as caught:
             solve_it()
         assert "\n" not in str(caught.value)
 
 
-def test_options_reach_mosek_by_their_name_and_a_missing_licence_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_reach_mosek_by_their_name_and_a_missing_licence_is_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """MOSEK is not on every machine: a stand-in of its name hears what it would be given."""
 
     class Error(Exception):
         pass
 
-    heard: list[dict[str, object]] = []
+    calls: list[dict[str, object]] = []
 
     def unlicensed(self: cp.Problem, **options: object) -> None:
-        heard.append(options)
-        raise Error("rescode.err_missing_license_file(1008): License cannot be located.\nThe default is mosek.lic")
+        calls.append(options)
+        raise Error(
+            "rescode.err_missing_license_file(1008): License cannot be located.\n"
+            "The default is mosek.lic"
+        )
 
     monkeypatch.setitem(sys.modules, "mosek", SimpleNamespace(Error=Error))
     monkeypatch.setattr(cp, "installed_solvers", lambda: ["CLARABEL", "MOSEK"])
     monkeypatch.setattr(cp.Problem, "solve", unlicensed)
-    mosek = ConvexSolver("MOSEK", {"mosek_params": {"MSK_DPAR_INTPNT_CO_TOL_REL_GAP": 1e-10}}, warm_start=False)
+    mosek = ConvexSolver(
+        "MOSEK", {"mosek_params": {"MSK_DPAR_INTPNT_CO_TOL_REL_GAP": 1e-10}}, warm_start=False
+    )
     problem = varied_problem(4, 5, 2)
     for solve_it in (
-        lambda: graph_qp(problem.graph, np.ones(5), solver=mosek).solve(np.zeros((problem.side, 2))),
+        lambda: graph_qp(problem.graph, np.ones(5), solver=mosek).solve(
+            np.zeros((problem.side, 2))
+        ),
         lambda: solve_relaxation(problem, solver=mosek),
         lambda: run(SOC(r_step=CvxpyStep(mosek)), problem),
         lambda: solve_orthogonal(
             procrustes(np.eye(3), np.eye(3)), np.random.default_rng(0), OrthogonalSOC(solver=mosek)
         ),
     ):
-        heard.clear()
-        with pytest.raises(PGOError, match=r"^MOSEK .*License cannot be located\. The default is mosek\.lic") as caught:
+        calls.clear()
+        with pytest.raises(
+            PGOError, match=r"^MOSEK .*License cannot be located\. The default is mosek\.lic"
+        ) as caught:
             solve_it()
         assert "\n" not in str(caught.value)
-        assert {options["solver"] for options in heard} == {"MOSEK"}
-        assert all(options["mosek_params"] == {"MSK_DPAR_INTPNT_CO_TOL_REL_GAP": 1e-10} for options in heard)
-        assert all(set(options) == {"solver", "warm_start", "verbose", "mosek_params"} for options in heard)
+        assert {options["solver"] for options in calls} == {"MOSEK"}
+        assert all(
+            options["mosek_params"] == {"MSK_DPAR_INTPNT_CO_TOL_REL_GAP": 1e-10}
+            for options in calls
+        )
+        assert all(
+            set(options) == {"solver", "warm_start", "verbose", "mosek_params"} for options in calls
+        )
 
 
 def test_a_solver_that_is_not_installed_is_one_line_that_names_those_that_are() -> None:
-    missing = next(name for name in ("MOSEK", "GUROBI", "KNITRO", "COPT") if name not in cp.installed_solvers())
-    for use in (lambda: ConvexSolver(missing), lambda: solve_relaxation(varied_problem(4, 5, 2), solver=missing)):
+    missing = next(
+        name for name in ("MOSEK", "GUROBI", "KNITRO", "COPT") if name not in cp.installed_solvers()
+    )
+    for use in (
+        lambda: ConvexSolver(missing),
+        lambda: solve_relaxation(varied_problem(4, 5, 2), solver=missing),
+    ):
         with pytest.raises(
             SettingError, match=rf"^solver '{missing}' is not installed; cvxpy finds CLARABEL, "
         ) as caught:
@@ -199,9 +248,15 @@ def test_a_solver_that_is_not_installed_is_one_line_that_names_those_that_are() 
 
 def test_what_is_not_convex_is_told_how_to_be_written() -> None:
     rng = np.random.default_rng(0)
-    Y, D, C = rng.standard_normal((6, 10)), cp.Variable((6, 2), name="D"), cp.Variable((2, 10), name="C")
-    with pytest.raises(SettingError, match=r"multiplies unknowns, D @ C; .*C = D\^T Y .*sparse_low_rank") as caught:
-        OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(Y - D @ C))), orthogonal=[D], sparse=[(C, 5)])
+    Y = rng.standard_normal((6, 10))
+    D = cp.Variable((6, 2), name="D")
+    C = cp.Variable((2, 10), name="C")
+    with pytest.raises(
+        SettingError, match=r"multiplies unknowns, D @ C; .*C = D\^T Y .*sparse_low_rank"
+    ) as caught:
+        OrthogonalProblem(
+            cp.Problem(cp.Minimize(cp.sum_squares(Y - D @ C))), orthogonal=[D], sparse=[(C, 5)]
+        )
     assert "\n" not in str(caught.value)
     with pytest.raises(SettingError, match=r"multiplies unknowns, D @ D\.T"):
         check_convex(cp.sum_squares(Y - D @ D.T @ Y), "J")

@@ -1,4 +1,4 @@
-"""The second stage of an extended model ends where dense optimisation by scipy, without cvxpy, ends."""
+"""The second stage of an extended model ends where dense optimisation by scipy ends."""
 
 import functools
 import math
@@ -29,7 +29,8 @@ from solvers.soc.soc import SOC
 
 N = 8
 ROUGH = SOC(penalty=MultiplierPenalty(max_refreshes=0), tolerance=1e-3)
-EXPONENT, KNEE = 3.0, 0.05
+EXPONENT = 3.0
+KNEE = 0.05
 IDS = np.array([1, 4, 6])
 
 
@@ -44,7 +45,10 @@ def positions(d: int) -> Array:
 
 def edge_norms(graph: object, poses: Poses) -> tuple[Array, Array]:
     """Norms of translation and rotation residuals of all edges, (m,) each."""
-    R, t, i, j = poses.R, poses.t, graph.i, graph.j
+    R = poses.R
+    t = poses.t
+    i = graph.i
+    j = graph.j
     apart = t[j] - t[i] - np.einsum("mab,mb->ma", R[i], graph.t_ij)
     return np.linalg.norm(apart, axis=1), np.linalg.norm(R[j] - R[i] @ graph.R_ij, axis=(1, 2))
 
@@ -54,7 +58,10 @@ def huber(x: Array, knee: float) -> Array:
 
 
 def differences(u: PoseVariables) -> list[cp.Expression]:
-    return [3.0 * cp.sum_squares(u.t[:3] - u.t[3:6] - 1.0), cp.sum_squares(u.R[2] @ np.ones(u.graph.d) - u.t(7))]
+    return [
+        3.0 * cp.sum_squares(u.t[:3] - u.t[3:6] - 1.0),
+        cp.sum_squares(u.R[2] @ np.ones(u.graph.d) - u.t(7)),
+    ]
 
 
 def of_differences(poses: Poses) -> float:
@@ -91,7 +98,8 @@ CASES = {
 
 def scipy_optimum(objective: Callable[[Poses], float], near: Poses) -> float:
     """Least value from poses, by BFGS on (w, t): R Exp(hat(w)), moved on whenever it ends."""
-    n, p = len(near.t), tangent_dimension(near.d)
+    n = len(near.t)
+    p = tangent_dimension(near.d)
 
     def moved(x: Array) -> Poses:
         return Poses(near.R @ exp_map(x[: n * p].reshape(n, p)), x[n * p :].reshape(n, near.d))
@@ -99,8 +107,11 @@ def scipy_optimum(objective: Callable[[Poses], float], near: Poses) -> float:
     least = math.inf
     for _ in range(4):
         x = np.concatenate([np.zeros(n * p), near.t.ravel()])
-        found = minimize(lambda x: objective(moved(x)), x, method="BFGS", options={"gtol": 1e-9, "maxiter": 5000})
-        least, near = min(least, float(found.fun)), moved(found.x)
+        result = minimize(
+            lambda x: objective(moved(x)), x, method="BFGS", options={"gtol": 1e-9, "maxiter": 5000}
+        )
+        least = min(least, float(result.fun))
+        near = moved(result.x)
     return least
 
 
@@ -111,16 +122,17 @@ def test_it_ends_at_the_optimum_of_dense_optimisation(
 ) -> None:
     changer = lambda u: ModelChange(terms=terms(u))  # noqa: E731
     rough = run(ExtendedSOC(changer, ROUGH), problem(d))
-    found = run(ExtendedNewton(changer), problem(d), rough.poses)
+    result = run(ExtendedNewton(changer), problem(d), rough.poses)
     objective = lambda poses: problem(d).objective(poses) + value(poses)  # noqa: E731
-    assert found.status is Status.CONVERGED
-    assert found.history.dual_residual[-1] <= ExtendedNewton.tolerance
-    assert np.all(np.diff(found.history.objective) <= 1e-14 * found.history.objective[0])
-    assert found.history.objective[-1] == pytest.approx(objective(found.poses), rel=1e-12)
-    assert found.history.objective[-1] <= rough.history.objective[-1]
+    assert result.status is Status.CONVERGED
+    assert result.history.dual_residual[-1] <= ExtendedNewton.tolerance
+    assert np.all(np.diff(result.history.objective) <= 1e-14 * result.history.objective[0])
+    assert result.history.objective[-1] == pytest.approx(objective(result.poses), rel=1e-12)
+    assert result.history.objective[-1] <= rough.history.objective[-1]
     least = scipy_optimum(objective, rough.poses)
-    assert found.history.objective[-1] <= least * (1 + 1e-12)
-    assert found.history.objective[-1] == pytest.approx(least, rel=1e-7)  # scipy's gradients are differences
+    assert result.history.objective[-1] <= least * (1 + 1e-12)
+    # scipy's gradients are differences
+    assert result.history.objective[-1] == pytest.approx(least, rel=1e-7)
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -134,18 +146,20 @@ def test_squares_end_where_least_squares_of_scipy_do_to_ten_digits(d: int) -> No
         poses = Poses(start.R @ exp_map(x[: N * p].reshape(N, p)), x[N * p :].reshape(N, d))
         apart = math.sqrt(3.0) * (poses.t[:3] - poses.t[3:6] - 1.0)
         of_edges = np.sqrt(w)[:, None] * (A @ poses.stacked())
-        return np.concatenate([of_edges.ravel(), apart.ravel(), poses.R[2].sum(axis=1) - poses.t[7]])
+        return np.concatenate(
+            [of_edges.ravel(), apart.ravel(), poses.R[2].sum(axis=1) - poses.t[7]]
+        )
 
     x = np.concatenate([np.zeros(N * p), start.t.ravel()])
     best = least_squares(residuals, x, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    found = run(ExtendedNewton(changer), problem(d), start)
-    assert found.history.objective[-1] == pytest.approx(2.0 * best.cost, rel=1e-10)
+    result = run(ExtendedNewton(changer), problem(d), start)
+    assert result.history.objective[-1] == pytest.approx(2.0 * best.cost, rel=1e-10)
 
 
 def test_without_terms_it_ends_at_the_optimum_of_F() -> None:
-    found = run(ExtendedNewton(lambda u: ModelChange()), problem(3), chordal_start(problem(3)))
-    assert found.status is Status.CONVERGED
-    assert found.objective == pytest.approx(solve(problem(3)).objective, rel=1e-12)
+    result = run(ExtendedNewton(lambda u: ModelChange()), problem(3), chordal_start(problem(3)))
+    assert result.status is Status.CONVERGED
+    assert result.objective == pytest.approx(solve(problem(3)).objective, rel=1e-12)
 
 
 def test_of_robust_edges_solve_ends_with_it_and_the_objective_is_hubers() -> None:
@@ -159,7 +173,9 @@ def test_of_robust_edges_solve_ends_with_it_and_the_objective_is_hubers() -> Non
 
     def objective(poses: Poses) -> float:
         of_t, of_R = edge_norms(graph, poses)
-        return float(huber(np.sqrt(graph.tau * of_t**2 + graph.kappa * of_R**2), math.sqrt(0.5)).sum())
+        return float(
+            huber(np.sqrt(graph.tau * of_t**2 + graph.kappa * of_R**2), math.sqrt(0.5)).sum()
+        )
 
     assert solution.objective == pytest.approx(objective(solution.poses), rel=1e-12)
     assert solution.objective <= scipy_optimum(objective, solution.poses) * (1 + 1e-12)
@@ -170,7 +186,10 @@ def test_of_robust_edges_solve_ends_with_it_and_the_objective_is_hubers() -> Non
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda u: ModelChange(terms=[cp.sum_squares(u.t(0))], constraints=[u.t(3) >= 1]), "constraints"),
+        (
+            lambda u: ModelChange(terms=[cp.sum_squares(u.t(0))], constraints=[u.t(3) >= 1]),
+            "constraints",
+        ),
         (lambda u: ModelChange(terms=[cp.norm(u.t(2) - 1.0)]), "norm"),
         (
             lambda u: ModelChange(terms=[cp.sum(cp.abs(u.t(2)))], constraints=[u.t(1) == 0]),
@@ -178,7 +197,9 @@ def test_of_robust_edges_solve_ends_with_it_and_the_objective_is_hubers() -> Non
         ),
     ],
 )
-def test_where_it_cannot_go_SOC_is_the_last_stage_and_the_note_says_why(change: Changer, reason: str) -> None:
+def test_where_it_cannot_go_SOC_is_the_last_stage_and_the_note_says_why(
+    change: Changer, reason: str
+) -> None:
     solution = solve(problem(2), Pipeline(soc=ExtendedSOC(change)))
     assert solution.stages[-1].name == "ExtendedSOC"
     assert solution.note.endswith(f"Newton needs smooth terms alone, and there are {reason}")
@@ -198,7 +219,11 @@ def test_what_has_a_kink() -> None:
     assert [kinks(term) for term in smooth] == [set()] * len(smooth)
     root = cp.power(x, 1.5)
     kinked = {
-        "norm": [cp.norm(x - x.value, "fro"), cp.huber(cp.norm(x[0] - x[0].value) + 1.0), cp.norm(cp.exp(x[0]))],
+        "norm": [
+            cp.norm(x - x.value, "fro"),
+            cp.huber(cp.norm(x[0] - x[0].value) + 1.0),
+            cp.norm(cp.exp(x[0])),
+        ],
         "abs": [cp.sum(cp.abs(x)), cp.sum_squares(cp.abs(x) + 1.0)],
         "norm1": [cp.norm1(x)],
         "max": [cp.square(cp.max(x))],
@@ -213,7 +238,9 @@ def test_what_has_a_kink() -> None:
 
 
 def test_odd_powers_are_left_to_SOC() -> None:
-    solution = solve(problem(2), Pipeline(soc=ExtendedSOC(lambda u: ModelChange(terms=[cp.power(u.t(3)[0], 3)]))))
+    solution = solve(
+        problem(2), Pipeline(soc=ExtendedSOC(lambda u: ModelChange(terms=[cp.power(u.t(3)[0], 3)])))
+    )
     assert solution.stages[-1].name == "ExtendedSOC"
     assert np.isfinite(solution.objective)
 
@@ -232,7 +259,10 @@ def test_what_it_does_not_minimise_is_refused() -> None:
 
 def test_where_the_objective_is_negative_it_goes_on_to_the_minimum() -> None:
     plain = run(ExtendedNewton(lambda u: ModelChange(terms=robust_positions(u))), problem(2))
-    lower = run(ExtendedNewton(lambda u: ModelChange(terms=[*robust_positions(u), -1e4 + 0 * u.t(0)[0]])), problem(2))
+    lower = run(
+        ExtendedNewton(lambda u: ModelChange(terms=[*robust_positions(u), -1e4 + 0 * u.t(0)[0]])),
+        problem(2),
+    )
     assert lower.state.objective + 1e4 == pytest.approx(plain.state.objective, abs=1e-6)
 
 
@@ -241,7 +271,9 @@ def test_ctrl_c_before_the_terms_are_added_is_the_end(monkeypatch: pytest.Monkey
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Newton, "step", broken_off)
-    solution = solve(problem(2), Pipeline(soc=ExtendedSOC(lambda u: ModelChange(terms=robust_positions(u)))))
+    solution = solve(
+        problem(2), Pipeline(soc=ExtendedSOC(lambda u: ModelChange(terms=robust_positions(u))))
+    )
     assert solution.status is Status.INTERRUPTED
     assert "ExtendedSOC" not in [stage.name for stage in solution.stages]
     objective = problem(2).objective(solution.poses) + of_robust_positions(solution.poses)

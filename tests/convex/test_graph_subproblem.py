@@ -3,10 +3,16 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, SEEDS, random_poses, translation_scale, varied_problem
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from pgo_models.convex.graph_subproblem import ModelChange, Neighbours, PoseVariables, Unknowns, graph_qp, robot_qp
+from pgo_models.convex.graph_subproblem import (
+    ModelChange,
+    Neighbours,
+    PoseVariables,
+    Unknowns,
+    graph_qp,
+    robot_qp,
+)
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, stack_transposes
 from pgo_models.graphs.partitioning import partition
@@ -37,11 +43,14 @@ def test_the_joint_program_is_the_factorised_step(seed: int, n: int, d: int) -> 
     problem, rho, V = drawn(seed, n, d)
     A, w = problem.residual_matrix
     D = np.concatenate([np.zeros(n), np.repeat(rho, d)])
-    step = prepare(RSubproblem(A, w, problem.M, d, n, D, problem.analysis, problem.backend), RStep.FACTORIZED)
+    subproblem = RSubproblem(A, w, problem.M, d, n, D, problem.analysis, problem.backend)
+    step = prepare(subproblem, RStep.FACTORIZED)
     X = graph_qp(problem.graph, rho).solve(V)
     np.testing.assert_allclose(X[n:], step.solve(V)[n:], rtol=0, atol=ACCURACY)
-    t = problem.M[:n, :n] @ X[:n] + problem.M[:n, n:] @ X[n:]  # the translations are the best ones for these rotations
-    np.testing.assert_allclose(t, 0.0, rtol=0, atol=ACCURACY * float(problem.M.diagonal().max()))
+    # The translations are the best ones for these rotations: the gradient in them is zero.
+    gradient_in_t = problem.M[:n] @ X
+    scale = float(problem.M.diagonal().max())
+    np.testing.assert_allclose(gradient_in_t, 0.0, rtol=0, atol=ACCURACY * scale)
 
 
 @settings(max_examples=examples(10))
@@ -87,12 +96,13 @@ def test_with_copies_it_is_the_consensus_step(seed: int, n: int, d: int) -> None
     share_t = np.where(separator, 0.5 * translation_scale(problem) / count, 0.0)
     for a, robot in enumerate(LocalConsensus(soc).init(problem, random_poses(n, d, seed)).robots):
         assert robot.step_a is not None
-        poses, held = robot.layout.subgraph.poses, robot.layout.held[:, 0]
+        poses = robot.layout.subgraph.poses
+        held = robot.layout.held[:, 0]
         qp = robot_qp(graph, a, rule.rho / count, Neighbours.COPIES, Unknowns.POSES, rho_t=share_t)
         np.testing.assert_array_equal(qp.variables.poses, poses)
-        at = V[np.concatenate([poses, (n + d * poses[:, None] + np.arange(d)).ravel()])]
-        found = robot.step_a.solve(np.where(held[:, None], at, 0.0))
-        np.testing.assert_allclose(qp.solve(at)[held], found[held], rtol=0, atol=ACCURACY)
+        shift = V[np.concatenate([poses, (n + d * poses[:, None] + np.arange(d)).ravel()])]
+        expected = robot.step_a.solve(np.where(held[:, None], shift, 0.0))
+        np.testing.assert_allclose(qp.solve(shift)[held], expected[held], rtol=0, atol=ACCURACY)
 
 
 def test_a_frozen_translation_needs_a_penalty() -> None:
@@ -101,16 +111,16 @@ def test_a_frozen_translation_needs_a_penalty() -> None:
     with pytest.raises(SettingError, match="give rho_t"):
         robot_qp(graph, 0, rho, Neighbours.FROZEN, Unknowns.POSES)
     qp = robot_qp(graph, 0, rho, Neighbours.FROZEN, Unknowns.POSES, rho_t=rho)
-    mine = np.concatenate([np.arange(3), 6 + np.arange(6)])
-    half = 0.5 * np.concatenate([rho, np.repeat(rho, 2)])[mine]
-    others = np.setdiff1d(np.arange(18), mine)
+    own = np.concatenate([np.arange(3), 6 + np.arange(6)])
+    others = np.setdiff1d(np.arange(18), own)
+    half = 0.5 * np.concatenate([rho, np.repeat(rho, 2)])[own]
     M = problem.M.toarray()
-    expected = np.linalg.solve(
-        M[np.ix_(mine, mine)] + np.diag(half), half[:, None] * V[mine] - M[np.ix_(mine, others)] @ V[others]
-    )
-    np.testing.assert_allclose(qp.solve(V[mine], V), expected, rtol=0, atol=ACCURACY)
+    K = M[np.ix_(own, own)] + np.diag(half)
+    pull_of_others = M[np.ix_(own, others)] @ V[others]
+    expected = np.linalg.solve(K, half[:, None] * V[own] - pull_of_others)
+    np.testing.assert_allclose(qp.solve(V[own], V), expected, rtol=0, atol=ACCURACY)
     with pytest.raises(SettingError, match="neighbours are frozen"):
-        qp.solve(V[mine])
+        qp.solve(V[own])
 
 
 def test_the_shift_is_the_only_parameter_and_it_is_compiled_once() -> None:
@@ -127,7 +137,8 @@ def test_the_shift_is_the_only_parameter_and_it_is_compiled_once() -> None:
 @given(seed=SEEDS, n=st.integers(3, 8), d=DIMENSIONS)
 def test_the_named_views_are_the_poses_and_residuals(seed: int, n: int, d: int) -> None:
     problem, rho, _ = drawn(seed, n, d)
-    graph, poses = problem.graph, random_poses(n, d, seed)
+    graph = problem.graph
+    poses = random_poses(n, d, seed)
     seen: list[PoseVariables] = []
 
     def look(unknown: PoseVariables) -> ModelChange:
@@ -170,20 +181,24 @@ def test_many_at_once_are_one_after_the_other(seed: int, n: int, d: int) -> None
 
 def test_a_term_on_many_edges_is_that_on_each() -> None:
     problem, rho, V = drawn(5, 8, 3)
-    some = np.arange(problem.graph.num_edges) % 2 == 0
+    chosen = np.arange(problem.graph.num_edges) % 2 == 0
+    edges = np.flatnonzero(chosen).tolist()
 
     def many(unknown: PoseVariables) -> ModelChange:
-        rotations = cp.reshape(unknown.rotation_residual[some], (int(some.sum()), 9), order="C")
-        norms = cp.norm(rotations, 2, axis=1), cp.norm(unknown.translation_residual[some], 2, axis=1)
-        return ModelChange(terms=[cp.sum(norm) for norm in norms])
+        rotations = cp.reshape(unknown.rotation_residual[chosen], (len(edges), 9), order="C")
+        translations = unknown.translation_residual[chosen]
+        norms_R = cp.norm(rotations, 2, axis=1)
+        norms_t = cp.norm(translations, 2, axis=1)
+        return ModelChange(terms=[cp.sum(norms_R), cp.sum(norms_t)])
 
     def each(unknown: PoseVariables) -> ModelChange:
-        edges = np.flatnonzero(some).tolist()
         terms = [cp.norm(unknown.rotation_residual(e), "fro") for e in edges]
-        return ModelChange(terms=terms + [cp.norm(unknown.translation_residual(e)) for e in edges])
+        terms += [cp.norm(unknown.translation_residual(e)) for e in edges]
+        return ModelChange(terms=terms)
 
-    one, other = (graph_qp(problem.graph, rho, changer=changer).solve(V) for changer in (many, each))
-    np.testing.assert_allclose(one, other, rtol=0, atol=1e-6)
+    X_many = graph_qp(problem.graph, rho, changer=many).solve(V)
+    X_each = graph_qp(problem.graph, rho, changer=each).solve(V)
+    np.testing.assert_allclose(X_many, X_each, rtol=0, atol=1e-6)
 
 
 def test_replaced_edges_leave_the_cost() -> None:
@@ -191,7 +206,8 @@ def test_replaced_edges_leave_the_cost() -> None:
     poses = random_poses(6, 3, 2)
     qp = graph_qp(problem.graph, rho, changer=lambda unknown: ModelChange(replaced_edges=[0, 3]))
     costs = problem.edge_costs(poses)
-    assert qp.cost(poses.stacked()) == pytest.approx(float(costs.sum() - costs[0] - costs[3]), rel=1e-12)
+    expected = float(costs.sum() - costs[0] - costs[3])
+    assert qp.cost(poses.stacked()) == pytest.approx(expected, rel=1e-12)
 
 
 def test_what_is_not_there_is_named() -> None:
@@ -199,12 +215,23 @@ def test_what_is_not_there_is_named() -> None:
     graph = problem.graph.with_robots(np.arange(6) // 3)
     with pytest.raises(SettingError, match="robot 5 owns no pose"):
         robot_qp(graph, 5, rho)
-    with pytest.raises(SettingError, match=r"\[5\] needs rows .* in this program, which has 6 of 18"):
-        robot_qp(graph, 0, rho, changer=lambda unknown: ModelChange(terms=[cp.sum_squares(unknown.R(5))]))
+
+    def rotation_of_another_robot(unknown: PoseVariables) -> ModelChange:
+        return ModelChange(terms=[cp.sum_squares(unknown.R(5))])
+
+    def translation(unknown: PoseVariables) -> ModelChange:
+        return ModelChange(terms=[cp.sum_squares(unknown.t(0))])
+
+    def concave(unknown: PoseVariables) -> ModelChange:
+        return ModelChange(terms=[-cp.sum_squares(unknown.t(0))])
+
+    needs_rows = r"\[5\] needs rows .* in this program, which has 6 of 18"
+    with pytest.raises(SettingError, match=needs_rows):
+        robot_qp(graph, 0, rho, changer=rotation_of_another_robot)
     with pytest.raises(SettingError, match=r"or Unknowns\.POSES"):
-        graph_qp(graph, rho, Unknowns.ROTATIONS, lambda unknown: ModelChange(terms=[cp.sum_squares(unknown.t(0))]))
+        graph_qp(graph, rho, Unknowns.ROTATIONS, translation)
     with pytest.raises(SettingError, match="not convex"):
-        graph_qp(graph, rho, changer=lambda unknown: ModelChange(terms=[-cp.sum_squares(unknown.t(0))]))
+        graph_qp(graph, rho, changer=concave)
 
 
 def test_edges_are_replaced_by_number_by_array_or_by_mask() -> None:

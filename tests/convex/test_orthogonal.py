@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import polar_factor
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from orthogonal_models import one_norm_components, rotation_averaging, smallest_eigenvectors
 
 from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem, kkt_residuals
@@ -51,7 +50,8 @@ def test_nearest_orthonormal_matrix(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_balanced_procrustes_is_the_svd(seed: int, rotation: bool) -> None:
     rng = rng_of(seed)
-    A, B = rng.standard_normal((8, 3)), rng.standard_normal((8, 3))
+    A = rng.standard_normal((8, 3))
+    B = rng.standard_normal((8, 3))
     solution = solve_orthogonal(procrustes(A, B, rotation=rotation), rng, starts=6)
     assert_solved(solution)
     X = polar_factor(A.T @ B, rotation=rotation)
@@ -63,7 +63,8 @@ def test_balanced_procrustes_is_the_svd(seed: int, rotation: bool) -> None:
 
 def test_unbalanced_procrustes_finds_the_planted_answer() -> None:
     rng = rng_of(0)
-    A, X = rng.standard_normal((10, 5)), np.linalg.qr(rng.standard_normal((5, 2)))[0]
+    A = rng.standard_normal((10, 5))
+    X = np.linalg.qr(rng.standard_normal((5, 2)))[0]
     solution = solve_orthogonal(procrustes(A, A @ X), rng, starts=4)
     assert_solved(solution)
     np.testing.assert_allclose(solution.values[0], X, rtol=0, atol=BETTER)
@@ -75,13 +76,19 @@ def test_smallest_eigenvectors_from_any_start(seed: int, n: int, count: int) -> 
     rng = rng_of(seed)
     basis = np.linalg.qr(rng.standard_normal((n, n)))[0]
     values = np.arange(1.0, n + 1)
-    solution = solve_orthogonal(smallest_eigenvectors((basis * values) @ basis.T, count), rng, starts=2)
+    solution = solve_orthogonal(
+        smallest_eigenvectors((basis * values) @ basis.T, count), rng, starts=2
+    )
     assert_solved(solution)
     assert solution.objective == pytest.approx(values[:count].sum(), rel=TOLERANCE)
     X = solution.values[0]
-    np.testing.assert_allclose(X @ X.T, basis[:, :count] @ basis[:, :count].T, rtol=0, atol=2 * BETTER)
+    np.testing.assert_allclose(
+        X @ X.T, basis[:, :count] @ basis[:, :count].T, rtol=0, atol=2 * BETTER
+    )
     # The multiplier of tr(X^T A X) is 2 X^T A X.
-    np.testing.assert_allclose(np.linalg.eigvalsh(solution.kkt.multipliers[0]), 2 * values[:count], rtol=0, atol=1e-2)
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(solution.kkt.multipliers[0]), 2 * values[:count], rtol=0, atol=1e-2
+    )
 
 
 def inliers_and_outliers(rng: np.random.Generator) -> tuple[Array, Array]:
@@ -130,9 +137,13 @@ def test_sparse_low_rank_finds_the_planted_support(seed: int) -> None:
     rng = rng_of(seed)
     B = np.zeros((20, 3))
     for column in range(3):
-        B[5 * column : 5 * column + 4, column] = rng.choice([-1.0, 1.0], 4) * rng.uniform(0.5, 1.0, 4)
+        B[5 * column : 5 * column + 4, column] = rng.choice([-1.0, 1.0], 4) * rng.uniform(
+            0.5, 1.0, 4
+        )
     B /= np.linalg.norm(B, axis=0)
-    Y = B @ (np.diag([5.0, 4.0, 3.0]) @ rng.standard_normal((3, 50))) + 0.05 * rng.standard_normal((20, 50))
+    Y = B @ (np.diag([5.0, 4.0, 3.0]) @ rng.standard_normal((3, 50))) + 0.05 * rng.standard_normal(
+        (20, 50)
+    )
     problem = sparse_low_rank(Y, 3, 12)
     singular = np.linalg.svd(Y)[0][:, :3]
     c = np.linalg.norm(Y, 2) ** 2
@@ -141,7 +152,8 @@ def test_sparse_low_rank_finds_the_planted_support(seed: int) -> None:
     orthonormal, sparse = outcome.state.copies
     np.testing.assert_allclose(orthonormal, sparse, rtol=0, atol=BETTER)
     np.testing.assert_array_equal(sparse != 0, B != 0)
-    # Better than the planted factor, which does not fit the noise, and no better than dense factors can be.
+    # Better than the planted factor, which does not fit the noise, and no better than dense factors
+    # can be.
     error = np.sum((Y - orthonormal @ orthonormal.T @ Y) ** 2)
     assert outcome.objective == pytest.approx(error, rel=BETTER)
     assert np.sum((Y - singular @ singular.T @ Y) ** 2) <= error <= np.sum((Y - B @ B.T @ Y) ** 2)
@@ -149,9 +161,12 @@ def test_sparse_low_rank_finds_the_planted_support(seed: int) -> None:
 
 def test_other_variables_and_convex_constraints_take_part() -> None:
     # Nearest unit vector with a nonnegative second entry, through an epigraph variable.
-    x, t = cp.Variable(2, name="x"), cp.Variable(name="t")
+    x = cp.Variable(2, name="x")
+    t = cp.Variable(name="t")
     distance = cp.norm(x - np.array([3.0, -4.0]))
-    model = OrthogonalProblem(cp.Problem(cp.Minimize(t), [distance <= t, x[1] >= 0]), unit_columns=[x])
+    model = OrthogonalProblem(
+        cp.Problem(cp.Minimize(t), [distance <= t, x[1] >= 0]), unit_columns=[x]
+    )
     solution = solve_orthogonal(model, rng_of(0), starts=3)
     assert solution.status is Status.CONVERGED
     assert solution.kkt.feasibility <= BETTER
@@ -161,21 +176,27 @@ def test_other_variables_and_convex_constraints_take_part() -> None:
 
 
 def test_unit_rows_solve_a_small_max_cut() -> None:
-    # Every edge of the 4-cycle can be cut: with unit rows tr(X^T L X) is at most 16, where neighbours are opposite.
+    # Every edge of the 4-cycle can be cut: with unit rows tr(X^T L X) is at most 16, where
+    # neighbours are opposite.
     L = 2.0 * np.eye(4) - np.roll(np.eye(4), 1, 0) - np.roll(np.eye(4), -1, 0)
     X = cp.Variable((4, 3), name="X")
     root = np.linalg.cholesky(4.1 * np.eye(4) - L).T
     solution = solve_orthogonal(
-        OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(root @ X))), unit_rows=[X]), rng_of(0), starts=2
+        OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(root @ X))), unit_rows=[X]),
+        rng_of(0),
+        starts=2,
     )
     assert_solved(solution)
     rows = solution.values[0]
-    np.testing.assert_allclose(rows @ rows.T, np.outer([1, -1, 1, -1], [1, -1, 1, -1]), rtol=0, atol=BETTER)
+    np.testing.assert_allclose(
+        rows @ rows.T, np.outer([1, -1, 1, -1], [1, -1, 1, -1]), rtol=0, atol=BETTER
+    )
 
 
 def test_over_relaxation_and_a_fixed_penalty_have_the_same_answer() -> None:
     rng = rng_of(0)
-    A, B = rng.standard_normal((8, 3)), rng.standard_normal((8, 3))
+    A = rng.standard_normal((8, 3))
+    B = rng.standard_normal((8, 3))
     problem = procrustes(A, B, rotation=True)
     start = problem.point([polar_factor(A.T @ B, rotation=True)])
     answers = [
@@ -188,12 +209,14 @@ def test_over_relaxation_and_a_fixed_penalty_have_the_same_answer() -> None:
 
 def test_fixed_penalty_is_the_papers_recursion() -> None:
     rng = rng_of(1)
-    A, B = rng.standard_normal((6, 3)), rng.standard_normal((6, 3))
+    A = rng.standard_normal((6, 3))
+    B = rng.standard_normal((6, 3))
     rho = 50.0
-    omega, scaled = np.eye(3), np.zeros((3, 3))
-    found = iterate(OrthogonalSOC(penalty=rho), procrustes(A, B, rotation=True))
-    next(found)
-    for state in itertools.islice(found, 10):
+    omega = np.eye(3)
+    scaled = np.zeros((3, 3))
+    iterates = iterate(OrthogonalSOC(penalty=rho), procrustes(A, B, rotation=True))
+    next(iterates)
+    for state in itertools.islice(iterates, 10):
         R = np.linalg.solve(2.0 * A.T @ A + rho * np.eye(3), 2.0 * A.T @ B + rho * (omega - scaled))
         omega = polar_factor(R + scaled, rotation=True)
         scaled = scaled + R - omega
@@ -203,11 +226,12 @@ def test_fixed_penalty_is_the_papers_recursion() -> None:
 
 def test_scaling_the_objective_scales_the_penalty() -> None:
     rng = rng_of(2)
-    A, B = rng.standard_normal((8, 3)), rng.standard_normal((8, 3))
-    one = run(OrthogonalSOC(), procrustes(A, B))
-    other = run(OrthogonalSOC(), procrustes(100.0 * A, 100.0 * B))
-    assert one.status is other.status is Status.CONVERGED
-    assert other.objective == pytest.approx(1e4 * one.objective, rel=BETTER)
+    A = rng.standard_normal((8, 3))
+    B = rng.standard_normal((8, 3))
+    plain = run(OrthogonalSOC(), procrustes(A, B))
+    scaled = run(OrthogonalSOC(), procrustes(100.0 * A, 100.0 * B))
+    assert plain.status is scaled.status is Status.CONVERGED
+    assert scaled.objective == pytest.approx(1e4 * plain.objective, rel=BETTER)
 
 
 # The contract of every solver.
@@ -219,11 +243,21 @@ def example() -> OrthogonalProblem:
 
 
 def test_step_leaves_its_input_alone() -> None:
-    problem, method = example(), OrthogonalSOC()
+    problem = example()
+    method = OrthogonalSOC()
     state = list(itertools.islice(iterate(method, problem), 4))[-1]
-    X, copies, B, rho = state.X[0].copy(), state.copies[0].copy(), state.B[0].copy(), state.rho
-    first, second = method.step(problem, state), method.step(problem, state)
-    for before, after in ((X, state.X[0]), (copies, state.copies[0]), (B, state.B[0]), (first.B[0], second.B[0])):
+    X = state.X[0].copy()
+    copies = state.copies[0].copy()
+    B = state.B[0].copy()
+    rho = state.rho
+    first = method.step(problem, state)
+    second = method.step(problem, state)
+    for before, after in (
+        (X, state.X[0]),
+        (copies, state.copies[0]),
+        (B, state.B[0]),
+        (first.B[0], second.B[0]),
+    ):
         np.testing.assert_array_equal(before, after)
     assert (state.rho, state.k, first.k) == (rho, 3, 4)
 
@@ -255,18 +289,21 @@ def test_unfinished_starts_are_told_apart() -> None:
 
 
 def test_same_seed_gives_the_same_bits() -> None:
-    one, other = (solve_orthogonal(example(), rng_of(3), starts=2) for _ in range(2))
-    np.testing.assert_array_equal(one.values[0], other.values[0])
-    assert one.objectives == other.objectives
+    first, again = (solve_orthogonal(example(), rng_of(3), starts=2) for _ in range(2))
+    np.testing.assert_array_equal(first.values[0], again.values[0])
+    assert first.objectives == again.objectives
 
 
 def test_residuals_of_the_run_are_those_of_the_answer() -> None:
-    problem, method = example(), OrthogonalSOC()
+    problem = example()
+    method = OrthogonalSOC()
     for state in itertools.islice(iterate(method, problem), 3, 12, 4):
         kkt = kkt_residuals(problem, method.point(problem, state), state.rho)
-        # Both bound the distance from stationarity, in the units of the gradient, of neighbouring iterates.
+        # Both bound the distance from stationarity, in the units of the gradient, of neighbouring
+        # iterates.
         bound = state.scale * (
-            state.dual_residual + 2.0 * state.rho / state.scale * math.sqrt(3) * state.primal_residual
+            state.dual_residual
+            + 2.0 * state.rho / state.scale * math.sqrt(3) * state.primal_residual
         )
         assert kkt.stationarity <= bound + BETTER
 
@@ -303,7 +340,8 @@ def test_rotation_start_of_a_graph_may_be_given() -> None:
 
 
 def test_ctrl_c_ends_all_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    step, calls = OrthogonalSOC.step, list[int]()
+    step = OrthogonalSOC.step
+    calls = list[int]()
 
     def interrupted(self: OrthogonalSOC, *args: object) -> object:
         calls.append(len(calls))
@@ -313,7 +351,9 @@ def test_ctrl_c_ends_all_starts(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(OrthogonalSOC, "step", interrupted)
     x = cp.Variable(2)
-    problem = OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(x - [3.0, 4.0]))), unit_columns=[x])
+    problem = OrthogonalProblem(
+        cp.Problem(cp.Minimize(cp.sum_squares(x - [3.0, 4.0]))), unit_columns=[x]
+    )
     solution = solve_orthogonal(problem, np.random.default_rng(0), starts=5)
     assert len(solution.objectives) == 1
     assert solution.outcome.status is Status.INTERRUPTED

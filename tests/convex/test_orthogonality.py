@@ -3,8 +3,7 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import polar_factor
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from orthogonal_models import one_norm_components, rotation_averaging, smallest_eigenvectors
 
 from pgo_models.convex.constraint_sets import Orthonormal, Rotations, Sparse, UnitColumns, UnitRows
@@ -46,7 +45,9 @@ def test_projection_is_in_the_set_and_nearest(seed: int, chosen, scale: float) -
     for _ in range(20):
         other = constraint.random(shape, rng)
         assert np.sum((V - P) ** 2) <= np.sum((V - other) ** 2) + ROUNDING * max(1.0, scale) ** 2
-    np.testing.assert_allclose(constraint.project(P), P, rtol=0, atol=ROUNDING * max(1.0, np.abs(P).max()))
+    np.testing.assert_allclose(
+        constraint.project(P), P, rtol=0, atol=ROUNDING * max(1.0, np.abs(P).max())
+    )
 
 
 @given(seed=SEEDS, chosen=SETS_AND_SHAPES)
@@ -64,7 +65,8 @@ def test_what_a_projection_leaves_is_normal(seed: int, chosen) -> None:
 def test_normal_part_is_an_orthogonal_projection(seed: int, chosen) -> None:
     constraint, shape = chosen
     rng = np.random.default_rng(seed)
-    P, G = constraint.random(shape, rng), rng.standard_normal(shape)
+    P = constraint.random(shape, rng)
+    G = rng.standard_normal(shape)
     N = constraint.normal_part(P, G)
     np.testing.assert_allclose(constraint.normal_part(P, N), N, rtol=0, atol=ROUNDING)
     assert abs(np.vdot(N, G - N)) <= ROUNDING
@@ -85,7 +87,9 @@ def test_least_penalty_is_the_least(seed: int, chosen) -> None:
 
 
 def test_normal_part_of_a_sparse_point_with_room_is_zero() -> None:
-    np.testing.assert_array_equal(Sparse(2).normal_part(np.array([1.0, 0.0, 0.0]), np.ones(3)), np.zeros(3))
+    np.testing.assert_array_equal(
+        Sparse(2).normal_part(np.array([1.0, 0.0, 0.0]), np.ones(3)), np.zeros(3)
+    )
 
 
 def test_projection_of_zero_is_in_the_set() -> None:
@@ -101,7 +105,11 @@ def small(kind: str = "orthogonal", shape: tuple[int, ...] = (3, 2)) -> Orthogon
 @pytest.mark.parametrize(
     ("kind", "shape", "message"),
     [
-        ("orthogonal", (2, 3), r"shape \(2, 3\); X\^T X = I needs at least as many rows as columns"),
+        (
+            "orthogonal",
+            (2, 3),
+            r"shape \(2, 3\); X\^T X = I needs at least as many rows as columns",
+        ),
         ("orthogonal", (3,), "needs at least as many rows"),
         ("rotations", (3, 2), r"shape \(3, 2\); a rotation must be square"),
         ("unit_columns", (), "give a vector or a matrix"),
@@ -126,11 +134,15 @@ def test_wrong_problems_are_refused() -> None:
 
 
 def test_wrong_variables_are_refused() -> None:
-    X, Z = cp.Variable((3, 2), name="X"), cp.Variable((3, 2), complex=True, name="Z")
+    X = cp.Variable((3, 2), name="X")
+    Z = cp.Variable((3, 2), complex=True, name="Z")
     B = cp.Variable((3, 2), boolean=True, name="B")
     problem = cp.Problem(cp.Minimize(cp.sum_squares(X)))
     for named, message in [
-        ([cp.Variable((3, 2), name="stranger")], r"orthogonal\[0\] \(stranger\) is not a variable of the problem"),
+        (
+            [cp.Variable((3, 2), name="stranger")],
+            r"orthogonal\[0\] \(stranger\) is not a variable of the problem",
+        ),
         ([X + 1.0], "give a cvxpy Variable"),
         ([], "no variable is named"),
         (X, "give a list of variables"),
@@ -140,7 +152,9 @@ def test_wrong_variables_are_refused() -> None:
     with pytest.raises(SettingError, match="complex"):
         OrthogonalProblem(cp.Problem(cp.Minimize(cp.norm(Z, "fro"))), orthogonal=[Z])
     with pytest.raises(SettingError, match="boolean"):
-        OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(X) + cp.sum_squares(B))), orthogonal=[X])
+        OrthogonalProblem(
+            cp.Problem(cp.Minimize(cp.sum_squares(X) + cp.sum_squares(B))), orthogonal=[X]
+        )
     with pytest.raises(SettingError, match="nonzeros must be at least 1"):
         OrthogonalProblem(problem, sparse=[(X, 0)])
 
@@ -177,7 +191,9 @@ def test_split_problem_is_compiled_once() -> None:
 @given(seed=SEEDS, rho=st.sampled_from([0.1, 1.0, 30.0]))
 def test_split_problem_gives_the_gradient(seed: int, rho: float) -> None:
     rng = np.random.default_rng(seed)
-    A, B, V = rng.standard_normal((6, 3)), rng.standard_normal((6, 2)), rng.standard_normal((3, 2))
+    A = rng.standard_normal((6, 3))
+    B = rng.standard_normal((6, 2))
+    V = rng.standard_normal((3, 2))
     (X,), _ = procrustes(A, B).split().solve([V], rho)
     gradient = 2.0 * A.T @ (A @ X - B)
     np.testing.assert_allclose(rho * (V - X), gradient, rtol=0, atol=SUBPROBLEM * max(1.0, rho))
@@ -189,13 +205,18 @@ def test_two_sets_of_a_variable_share_its_subproblem() -> None:
     V, W = rng.standard_normal((2, 6, 2))
     split = problem.split()
     np.testing.assert_allclose(
-        split.solve([V, W], 2.0)[0][0], split.solve([(V + W) / 2, (V + W) / 2], 2.0)[0][0], rtol=0, atol=SUBPROBLEM
+        split.solve([V, W], 2.0)[0][0],
+        split.solve([(V + W) / 2, (V + W) / 2], 2.0)[0][0],
+        rtol=0,
+        atol=SUBPROBLEM,
     )
 
 
 def test_infeasible_constraints_say_so() -> None:
     X = cp.Variable((2, 2))
-    problem = OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(X)), [X >= 1, X <= 0]), orthogonal=[X])
+    problem = OrthogonalProblem(
+        cp.Problem(cp.Minimize(cp.sum_squares(X)), [X >= 1, X <= 0]), orthogonal=[X]
+    )
     with pytest.raises(PGOError, match="infeasible on the split subproblem"):
         problem.split().solve([np.eye(2)], 1.0)
 
@@ -212,15 +233,17 @@ def test_kkt_residuals_know_the_stationary_points(seed: int) -> None:
     kkt = kkt_residuals(problem, OrthogonalPoint((X,), (normal,)), 1.0)
     assert kkt.feasibility <= ROUNDING
     assert kkt.stationarity <= SUBPROBLEM * max(1.0, kkt.gradient_norm)
-    np.testing.assert_allclose(kkt.multipliers[0], np.diag(2.0 * values[[1, 3]]), rtol=0, atol=1e-10 * values[-1])
+    np.testing.assert_allclose(
+        kkt.multipliers[0], np.diag(2.0 * values[[1, 3]]), rtol=0, atol=1e-10 * values[-1]
+    )
     elsewhere = problem.random_point(rng)
     X = elsewhere.copies[0]
     G = 2.0 * C @ C.T @ X
     tangential = np.linalg.norm(G - Orthonormal().normal_part(X, G))
     rho = 1e4 * values[-1]
-    found = kkt_residuals(problem, OrthogonalPoint((X,), (-G,)), rho)
+    residuals = kkt_residuals(problem, OrthogonalPoint((X,), (-G,)), rho)
     # With a large rho the subgradient is taken at X: the residual is the tangential gradient.
-    assert found.stationarity == pytest.approx(tangential, rel=1e-2, abs=SUBPROBLEM * rho)
+    assert residuals.stationarity == pytest.approx(tangential, rel=1e-2, abs=SUBPROBLEM * rho)
 
 
 def test_kkt_residuals_count_constraints_and_copies() -> None:
@@ -228,7 +251,9 @@ def test_kkt_residuals_count_constraints_and_copies() -> None:
     problem = OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum(x)), [x[0] >= 0.5]), unit_columns=[x])
     assert problem.infeasibility([np.array([0.0, 1.0])]) == pytest.approx(0.5, rel=1e-14)
     both = OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum(x))), unit_columns=[x], sparse=[(x, 1)])
-    assert both.infeasibility([np.array([0.6, 0.8]), np.array([0.6, 0.0])]) == pytest.approx(0.8, rel=1e-14)
+    assert both.infeasibility([np.array([0.6, 0.8]), np.array([0.6, 0.0])]) == pytest.approx(
+        0.8, rel=1e-14
+    )
 
 
 def test_examples_check_their_matrices() -> None:
@@ -246,7 +271,8 @@ def test_examples_check_their_matrices() -> None:
 @given(seed=SEEDS)
 def test_examples_have_the_objectives_they_claim(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    A, X = rng.standard_normal((6, 4)), Orthonormal().random((4, 2), rng)
+    A = rng.standard_normal((6, 4))
+    X = Orthonormal().random((4, 2), rng)
     Y = rng.standard_normal((4, 9))
     C = A.T @ A
     for problem, value in [
@@ -267,4 +293,19 @@ def test_examples_have_the_objectives_they_claim(seed: int) -> None:
 def test_polar_factor_is_the_projection(seed: int, d: int) -> None:
     A = np.random.default_rng(seed).standard_normal((d, d))
     np.testing.assert_allclose(polar_factor(A), Orthonormal().project(A), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(polar_factor(A, rotation=True), Rotations().project(A), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        polar_factor(A, rotation=True), Rotations().project(A), rtol=0, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("kind", ["unit_columns", "unit_rows"])
+def test_a_multiplier_is_the_gradient_that_it_balances(kind: str) -> None:
+    """At the point X of a set nearest to A the gradient X - A of ||X - A||^2 / 2 is normal."""
+    A = np.random.default_rng(0).standard_normal((3, 3)) + 2.0 * np.eye(3)
+    X = cp.Variable((3, 3), name="X")
+    objective = cp.Minimize(0.5 * cp.sum_squares(X - A))
+    problem = OrthogonalProblem(cp.Problem(objective), **{kind: [X]})
+    nearest = problem.terms[0].constraint.project(A)
+    residuals = kkt_residuals(problem, OrthogonalPoint((nearest,), (A - nearest,)), 1.0)
+    assert residuals.stationarity <= SUBPROBLEM
+    np.testing.assert_allclose(residuals.multipliers[0], nearest - A, rtol=0, atol=1e-9)

@@ -3,8 +3,7 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, SEEDS, SIZES, varied_problem
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pgo_models.convex.rotation_subproblem import RotationQP, rotation_qp
 from pgo_models.errors import PGOError, SettingError
@@ -12,7 +11,9 @@ from pgo_models.errors import PGOError, SettingError
 PENALISE_TRANSLATIONS = st.booleans()
 
 
-def posed(seed: int, n: int, d: int, with_translations: bool) -> tuple[RotationQP, np.ndarray, np.random.Generator]:
+def posed(
+    seed: int, n: int, d: int, with_translations: bool
+) -> tuple[RotationQP, np.ndarray, np.random.Generator]:
     """The QP of a whole graph, its dense M + D/2, and the generator for shifts."""
     problem = varied_problem(seed, n, d)
     rng = np.random.default_rng(seed)
@@ -25,7 +26,9 @@ def posed(seed: int, n: int, d: int, with_translations: bool) -> tuple[RotationQ
 
 @settings(max_examples=examples(25))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, with_translations=PENALISE_TRANSLATIONS)
-def test_the_solution_satisfies_the_normal_equations(seed: int, n: int, d: int, with_translations: bool) -> None:
+def test_the_solution_satisfies_the_normal_equations(
+    seed: int, n: int, d: int, with_translations: bool
+) -> None:
     qp, K, rng = posed(seed, n, d, with_translations)
     for _ in range(2):  # the second shift reuses what the first compiled
         V = rng.standard_normal((len(K), d))
@@ -48,7 +51,9 @@ def test_rows_without_a_penalty_do_not_matter(seed: int, n: int, d: int) -> None
 
 @settings(max_examples=examples(10))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, with_translations=PENALISE_TRANSLATIONS)
-def test_it_is_a_parametrised_quadratic_program(seed: int, n: int, d: int, with_translations: bool) -> None:
+def test_it_is_a_parametrised_quadratic_program(
+    seed: int, n: int, d: int, with_translations: bool
+) -> None:
     qp, K, _ = posed(seed, n, d, with_translations)
     assert qp.problem.is_dcp(dpp=True)
     assert qp.problem.is_qp()
@@ -85,7 +90,8 @@ def test_a_failure_of_the_backend_is_an_error_of_ours(monkeypatch: pytest.Monkey
     problem = varied_problem(0, 4, 2)
     qp = rotation_qp(*problem.residual_matrix, np.ones(problem.side), 2)
     V = np.ones((problem.side, 2))
-    monkeypatch.setattr(qp.problem, "solve", lambda **settings: None)  # leaves the status as it was: none
+    # leaves the status as it was: none
+    monkeypatch.setattr(qp.problem, "solve", lambda **settings: None)
     with pytest.raises(PGOError, match="CLARABEL ended with status None"):
         qp.solve(V)
 
@@ -93,5 +99,7 @@ def test_a_failure_of_the_backend_is_an_error_of_ours(monkeypatch: pytest.Monkey
         raise cp.SolverError("out of luck")
 
     monkeypatch.setattr(qp.problem, "solve", fail)
-    with pytest.raises(PGOError, match="CLARABEL ended with status solver_error on the R-subproblem: out of luck"):
+    with pytest.raises(
+        PGOError, match="CLARABEL ended with status solver_error on the R-subproblem: out of luck"
+    ):
         qp.solve(V)

@@ -11,22 +11,22 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import varied_graph
-from hypothesis import HealthCheck, given
-from hypothesis import settings as hypothesis_settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings as hypothesis_settings, strategies as st
 
 import pgo_models as pgo
 import solvers
 from pgo_models.errors import FileFormatError, PGOError, SettingError
 from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.scenes import NoiseModel
-from solvers.cli_options import BackEndName, FirstStage, chosen_partition, chosen_pipeline
+from solvers.cli.options import BackEndName, FirstStage, chosen_partition, chosen_pipeline
 from solvers.distributed import checkpoint
 from solvers.distributed.checkpoint import Checkpoint, Journal
 from solvers.network.engine import InProcess
 
+pytestmark = pytest.mark.slow  # solves by robots from end to end
+
 MEASURED = ("R_ij", "t_ij", "kappa", "tau")
-PGO = [sys.executable, "-c", "from solvers.cli import main; main()"]
+PGO = [sys.executable, "-c", "from solvers.cli.app import main; main()"]
 
 
 class Killed(BaseException):
@@ -47,7 +47,9 @@ def killed_after(steps):
 
 def pipeline(coupling, robots, gap=1e-6):
     chosen = solvers.Pipeline(gap=gap, staircase=None)
-    return replace(chosen, soc=replace(chosen.soc, coupling=coupling, robots=robots, tolerance=1e-6))
+    return replace(
+        chosen, soc=replace(chosen.soc, coupling=coupling, robots=robots, tolerance=1e-6)
+    )
 
 
 def assert_same(found, expected):
@@ -58,7 +60,11 @@ def assert_same(found, expected):
     assert found.ledger.all_reduces == expected.ledger.all_reduces
     assert [stage.name for stage in found.stages] == [stage.name for stage in expected.stages]
     for one, other in zip(found.stages, expected.stages, strict=True):
-        assert (one.iterations, one.status, one.objective) == (other.iterations, other.status, other.objective)
+        assert (one.iterations, one.status, one.objective) == (
+            other.iterations,
+            other.status,
+            other.objective,
+        )
         assert repr(one.method) == repr(other.method)
         np.testing.assert_array_equal(one.history.objective, other.history.objective)
         assert (np.diff(one.history.seconds) >= 0).all()
@@ -75,7 +81,9 @@ def test_a_run_that_was_broken_off_goes_on_to_the_same_numbers(coupling, part, t
     checkpoint = Checkpoint(tmp_path / "run.ckpt", rounds=3)
     after = round(part * (steps - 1))
     with pytest.raises(Killed):
-        solvers.solve(graph, settings, robots=robots, checkpoint=checkpoint, callback=killed_after(after))
+        solvers.solve(
+            graph, settings, robots=robots, checkpoint=checkpoint, callback=killed_after(after)
+        )
     seen = []
     found = solvers.solve(
         graph,
@@ -99,12 +107,19 @@ def test_a_second_attempt_goes_on_too(part, tmp_path):
     assert [stage.name for stage in expected.stages] == 2 * ["chordal start", "SOC", "Newton"]
     first = sum(len(stage.history) for stage in expected.stages[:3])
     second = sum(len(stage.history) for stage in expected.stages[3:])
-    checkpoint, after = Checkpoint(tmp_path / "run.ckpt", rounds=1), first + round(part * (second - 1))
+    checkpoint = Checkpoint(tmp_path / "run.ckpt", rounds=1)
+    after = first + round(part * (second - 1))
     with pytest.raises(Killed):
-        solvers.solve(graph, settings, robots=3, checkpoint=checkpoint, callback=killed_after(after))
+        solvers.solve(
+            graph, settings, robots=3, checkpoint=checkpoint, callback=killed_after(after)
+        )
     seen = []
     found = solvers.solve(
-        graph, settings, robots=3, checkpoint=checkpoint, callback=lambda state, record: seen.append(record.k)
+        graph,
+        settings,
+        robots=3,
+        checkpoint=checkpoint,
+        callback=lambda state, record: seen.append(record.k),
     )
     assert_same(found, expected)
     assert len(seen) <= first + second - after + 1
@@ -121,7 +136,8 @@ def test_without_soc_newton_goes_on(tmp_path):
 
 
 def test_the_file_stays_when_the_run_was_stopped_and_goes_when_it_converged(tmp_path):
-    graph, path = varied_graph(8, 40, 2), tmp_path / "run.ckpt"
+    graph = varied_graph(8, 40, 2)
+    path = tmp_path / "run.ckpt"
     stopped = solvers.solve(graph, robots=2, checkpoint=Checkpoint(path), time_limit=1e-9)
     assert stopped.status is solvers.Status.TIME_LIMIT
     assert path.exists()
@@ -131,7 +147,9 @@ def test_the_file_stays_when_the_run_was_stopped_and_goes_when_it_converged(tmp_
 
 
 def test_a_checkpoint_is_due_after_so_many_rounds(tmp_path, monkeypatch):
-    graph, write, written = varied_graph(8, 40, 2), checkpoint._write, []
+    graph = varied_graph(8, 40, 2)
+    write = checkpoint._write
+    written = []
 
     def recording(path, run_fingerprint, saved, snapshots):
         written.append((saved.method, saved.driver.ledger.rounds))
@@ -154,7 +172,8 @@ def test_a_checkpoint_is_due_after_so_many_rounds(tmp_path, monkeypatch):
 @pytest.fixture
 def broken_off(tmp_path):
     """Graph, and path of the checkpoint of a solve of it by three robots."""
-    graph, path = varied_graph(9, 30, 2), tmp_path / "run.ckpt"
+    graph = varied_graph(9, 30, 2)
+    path = tmp_path / "run.ckpt"
     with pytest.raises(Killed):
         solvers.solve(graph, robots=3, checkpoint=Checkpoint(path), callback=killed_after(2))
     return graph, path
@@ -173,13 +192,19 @@ def renamed(robots):
 @pytest.mark.parametrize(
     ("name", "change"),
     [
-        *(("graph", lambda graph, part=part: {"problem": changed_graph(graph, part)}) for part in MEASURED),
+        *(
+            ("graph", lambda graph, part=part: {"problem": changed_graph(graph, part)})
+            for part in MEASURED
+        ),
         ("graph", lambda graph: {"problem": replace(graph, i=graph.j, j=graph.i)}),
         ("partition", lambda graph: {"robots": 2}),
         ("partition", lambda graph: {"robots": renamed(partition(graph, 3))}),
         ("settings", lambda graph: {"pipeline": solvers.Pipeline(gap=1e-5)}),
         ("settings", lambda graph: {"pipeline": solvers.Pipeline(second_try=False)}),
-        ("settings", lambda graph: {"pipeline": solvers.Pipeline(newton=solvers.Newton(max_iterations=7))}),
+        (
+            "settings",
+            lambda graph: {"pipeline": solvers.Pipeline(newton=solvers.Newton(max_iterations=7))},
+        ),
         ("settings", lambda graph: {"pipeline": solvers.Pipeline(soc=None)}),
         ("settings", lambda graph: {"start": pgo.spanning_tree_start(graph)}),
     ],
@@ -195,7 +220,12 @@ def test_another_graph_partition_or_setting_is_refused(name, change, broken_off)
 def test_all_that_is_another_is_named(broken_off):
     graph, path = broken_off
     with pytest.raises(SettingError, match="run with another graph and another settings; go on"):
-        solvers.solve(changed_graph(graph, "t_ij"), solvers.Pipeline(gap=1e-5), robots=3, checkpoint=Checkpoint(path))
+        solvers.solve(
+            changed_graph(graph, "t_ij"),
+            solvers.Pipeline(gap=1e-5),
+            robots=3,
+            checkpoint=Checkpoint(path),
+        )
 
 
 @pytest.mark.parametrize("damage", ["text", "half", "empty", "array", "npz", "directory"])
@@ -212,17 +242,27 @@ def test_a_file_that_is_no_checkpoint_is_refused_and_left_alone(damage, broken_o
         path.unlink()
         path.mkdir()
     else:
-        path.write_bytes({"text": b"VERTEX_SE2 0 0 0 0\n", "half": whole[: len(whole) // 2], "empty": b""}[damage])
-    wrong = {"half": "a damaged checkpoint, its checksum", "directory": "cannot be read"}.get(damage, "no checkpoint")
+        path.write_bytes(
+            {"text": b"VERTEX_SE2 0 0 0 0\n", "half": whole[: len(whole) // 2], "empty": b""}[
+                damage
+            ]
+        )
+    wrong = {"half": "a damaged checkpoint, its checksum", "directory": "cannot be read"}.get(
+        damage, "no checkpoint"
+    )
     with pytest.raises(FileFormatError, match=rf"run\.ckpt: {wrong}"):
         solvers.solve(graph, robots=3, checkpoint=Checkpoint(path))
     assert [one.name for one in path.parent.iterdir()] == ["run.ckpt"]  # and no lock
 
 
 @given(
-    place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7), length=st.none() | st.floats(0, 1, exclude_max=True)
+    place=st.floats(0, 1, exclude_max=True),
+    bit=st.integers(0, 7),
+    length=st.none() | st.floats(0, 1, exclude_max=True),
 )
-@hypothesis_settings(max_examples=examples(500), suppress_health_check=[HealthCheck.function_scoped_fixture])
+@hypothesis_settings(
+    max_examples=examples(500), suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 def test_a_flipped_bit_or_a_lost_end_is_one_error(broken_off, place, bit, length):
     path = broken_off[1]
     whole = path.read_bytes()
@@ -230,17 +270,24 @@ def test_a_flipped_bit_or_a_lost_end_is_one_error(broken_off, place, bit, length
     damaged[int(place * len(whole))] ^= 1 << bit
     other = path.with_name("damaged.ckpt")
     other.write_bytes(damaged if length is None else whole[: int(length * len(whole))])
-    with pytest.raises(FileFormatError, match=r"damaged\.ckpt: (no checkpoint of a solve|a damaged checkpoint)"):
+    with pytest.raises(
+        FileFormatError, match=r"damaged\.ckpt: (no checkpoint of a solve|a damaged checkpoint)"
+    ):
         Journal(Checkpoint(other), {}, [])
 
 
-@pytest.mark.parametrize("arrays", [{}, {"run/tree": np.array("{}")}, {"run/tree": np.array("no JSON")}])
+@pytest.mark.parametrize(
+    "arrays", [{}, {"run/tree": np.array("{}")}, {"run/tree": np.array("no JSON")}]
+)
 def test_a_whole_file_of_another_version_is_refused(arrays, broken_off, monkeypatch):
-    path, save = broken_off[1], np.savez
+    path = broken_off[1]
+    save = np.savez
     kept = {"header": np.array(["graph", "partition", "settings"])}
     monkeypatch.setattr(np, "savez", lambda file, **options: save(file, **kept, **arrays))
     checkpoint._write(path, dict.fromkeys(checkpoint._PARTS, ""), None, [])
-    with pytest.raises(FileFormatError, match="a checkpoint of another version of this package; remove it"):
+    with pytest.raises(
+        FileFormatError, match="a checkpoint of another version of this package; remove it"
+    ):
         Journal(Checkpoint(path), {part: part for part in checkpoint._PARTS}, [])
 
 
@@ -255,13 +302,17 @@ def test_a_checkpoint_holds_no_pickle(broken_off):
 
 
 def test_room_on_the_disk_again_means_checkpoints_again(tmp_path, monkeypatch, caplog):
-    graph, path, written = varied_graph(6, 30, 2), tmp_path / "run.ckpt", []
+    graph = varied_graph(6, 30, 2)
+    path = tmp_path / "run.ckpt"
+    written = []
     write = checkpoint._write
 
     def failing(*arguments):
         written.append(path.exists())
         if len(written) in (2, 3, 5):
-            raise PGOError(f"cannot write {path}: No space left on device; choose a place that can be written")
+            raise PGOError(
+                f"cannot write {path}: No space left on device; choose a place that can be written"
+            )
         write(*arguments)
 
     monkeypatch.setattr(checkpoint, "_write", failing)
@@ -273,7 +324,8 @@ def test_room_on_the_disk_again_means_checkpoints_again(tmp_path, monkeypatch, c
 
 
 def test_a_checkpoint_that_cannot_be_written_or_removed_loses_no_result(tmp_path, caplog):
-    graph, path = varied_graph(6, 30, 2), tmp_path / "run.ckpt"
+    graph = varied_graph(6, 30, 2)
+    path = tmp_path / "run.ckpt"
 
     def block(state, record):
         if path.is_file():
@@ -291,7 +343,8 @@ def test_a_checkpoint_that_cannot_be_written_or_removed_loses_no_result(tmp_path
 
 @pytest.mark.parametrize("is_there", [False, True])
 def test_a_second_run_on_a_checkpoint_is_refused(is_there, tmp_path):
-    graph, path = varied_graph(9, 30, 2), tmp_path / "run.ckpt"
+    graph = varied_graph(9, 30, 2)
+    path = tmp_path / "run.ckpt"
     if is_there:
         with pytest.raises(Killed):
             solvers.solve(graph, robots=3, checkpoint=Checkpoint(path), callback=killed_after(2))
@@ -301,7 +354,9 @@ def test_a_second_run_on_a_checkpoint_is_refused(is_there, tmp_path):
 
     def second(state, record):
         for name in (path, link):
-            with pytest.raises(SettingError, match=r"run\.ckpt is in use by another run; wait until") as refused:
+            with pytest.raises(
+                SettingError, match=r"run\.ckpt is in use by another run; wait until"
+            ) as refused:
                 solvers.solve(graph, robots=3, checkpoint=Checkpoint(name))
             refusals.append(str(refused.value))
 
@@ -317,11 +372,24 @@ def test_rounds_are_positive():
 
 
 def test_a_killed_process_goes_on_where_it_was(tmp_path):
-    iterations, path = 250, tmp_path / "run.ckpt"
-    options = ["--robots", "3", "--tolerance", "1e-300", "--max-iterations", str(iterations), "--resume", str(path)]
+    iterations = 250
+    path = tmp_path / "run.ckpt"
+    options = [
+        "--robots",
+        "3",
+        "--tolerance",
+        "1e-300",
+        "--max-iterations",
+        str(iterations),
+        "--resume",
+        str(path),
+    ]
     environment = {**os.environ, "PYTHONPATH": str(Path(solvers.__file__).parent.parent)}
-    process = subprocess.Popen([*PGO, "solve", "circle", *options], env=environment, stdout=subprocess.DEVNULL)
-    written, deadline = set(), time.monotonic() + 60
+    process = subprocess.Popen(
+        [*PGO, "solve", "circle", *options], env=environment, stdout=subprocess.DEVNULL
+    )
+    written = set()
+    deadline = time.monotonic() + 60
     while len(written) < 3:  # checkpoints, each a new file: the run is in the middle of SOC
         assert process.poll() is None, "the run ended before it was killed"
         assert time.monotonic() < deadline, "no checkpoints are written"
@@ -329,17 +397,25 @@ def test_a_killed_process_goes_on_where_it_was(tmp_path):
         if path.exists():
             written.add(path.stat().st_mtime_ns)
     second = subprocess.run(
-        [*PGO, "solve", "circle", *options], env=environment, capture_output=True, text=True, check=False
+        [*PGO, "solve", "circle", *options],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert (second.returncode, second.stdout) == (1, "")
-    assert second.stderr == (f"pgo: {path} is in use by another run; wait until that has ended, or name another\n")
+    assert second.stderr == (
+        f"pgo: {path} is in use by another run; wait until that has ended, or name another\n"
+    )
     assert process.poll() is None
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     assert path.with_name("run.ckpt.lock").exists()  # a dead process's: it holds nobody up
     graph = pgo.load("circle")
     robots = chosen_partition(graph, 3, None)
-    settings = chosen_pipeline(FirstStage.SUBSTRUCTURED, robots, BackEndName.FACTORIZED, 1e-6, iterations, 1e-300)
+    settings = chosen_pipeline(
+        FirstStage.SUBSTRUCTURED, robots, BackEndName.FACTORIZED, 1e-6, iterations, 1e-300
+    )
     expected = solvers.solve(graph, settings, robots=robots)
     seen = []
     found = solvers.solve(

@@ -11,10 +11,13 @@ import solvers
 from pgo_models.errors import EngineError, FileFormatError
 from solvers.distributed.checkpoint import Checkpoint
 
+pytestmark = pytest.mark.slow  # solves by robots from end to end
+
 LIMITED = """
 import resource, signal, sys
 import pgo_models as pgo, solvers
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # a write beyond the limit is an error, as on a full disk
+# A write beyond the limit is an error, as on a full disk.
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 graph, seen = pgo.load("circle"), []
 def fill(state, record):
     seen.append(record.k)
@@ -22,8 +25,9 @@ def fill(state, record):
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), resource.RLIM_INFINITY))
     if len(seen) == 40:
         raise SystemExit(7)
-pipeline = solvers.Pipeline(soc=solvers.SOC(coupling=solvers.Coupling.SUBSTRUCTURED, tolerance=1e-300))
-solvers.solve(graph, pipeline, robots=3, checkpoint=solvers.Checkpoint(sys.argv[1], rounds=3), callback=fill)
+soc = solvers.SOC(coupling=solvers.Coupling.SUBSTRUCTURED, tolerance=1e-300)
+checkpoint = solvers.Checkpoint(sys.argv[1], rounds=3)
+solvers.solve(graph, solvers.Pipeline(soc=soc), robots=3, checkpoint=checkpoint, callback=fill)
 """
 
 
@@ -36,25 +40,36 @@ def test_a_full_disk_is_told_once_and_the_last_checkpoint_stays(size, full_after
     environment = {**os.environ, "PYTHONPATH": str(Path(solvers.__file__).parent.parent)}
     ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert ended.returncode == 7, ended.stderr
-    assert ended.stderr == (
-        f"the solve goes on without a new checkpoint: cannot write {path}: File too large; choose a place that can be "
-        "written\n"
+    assert (
+        ended.stderr
+        == f"the solve goes on without a new checkpoint: cannot write {path}: File too large;"
+        " choose a place that can be written\n"
     )
     assert [one.name for one in tmp_path.iterdir()] == ["run.ckpt"]
-    graph, seen = pgo.load("circle"), []
+    graph = pgo.load("circle")
+    seen = []
     soc = solvers.SOC(coupling=solvers.Coupling.SUBSTRUCTURED, tolerance=1e-300)
 
     def look(state, record):
         seen.append(record.k)
         return True
 
-    solvers.solve(graph, solvers.Pipeline(soc=soc), robots=3, checkpoint=Checkpoint(path), callback=look)
-    assert full_after - 4 <= seen[0] < full_after  # it goes on from the last one before the disk was full
+    solvers.solve(
+        graph, solvers.Pipeline(soc=soc), robots=3, checkpoint=Checkpoint(path), callback=look
+    )
+    # it goes on from the last one before the disk was full
+    assert full_after - 4 <= seen[0] < full_after
 
 
 def test_where_nothing_can_be_written_is_told_before_the_solve(tmp_path):
-    with pytest.raises(FileFormatError, match=r"missing/run\.ckpt: cannot be written \(No such file or directory\)"):
-        solvers.solve(varied_graph(9, 30, 2), robots=3, checkpoint=Checkpoint(tmp_path / "missing" / "run.ckpt"))
+    with pytest.raises(
+        FileFormatError, match=r"missing/run\.ckpt: cannot be written \(No such file or directory\)"
+    ):
+        solvers.solve(
+            varied_graph(9, 30, 2),
+            robots=3,
+            checkpoint=Checkpoint(tmp_path / "missing" / "run.ckpt"),
+        )
 
 
 def test_the_lock_is_let_go_when_the_robots_cannot_start(tmp_path):
@@ -63,5 +78,10 @@ def test_the_lock_is_let_go_when_the_robots_cannot_start(tmp_path):
             raise EngineError("nowhere")
 
     with pytest.raises(EngineError, match="nowhere"):
-        solvers.solve(varied_graph(9, 30, 2), robots=3, engine=Nowhere(), checkpoint=Checkpoint(tmp_path / "run.ckpt"))
+        solvers.solve(
+            varied_graph(9, 30, 2),
+            robots=3,
+            engine=Nowhere(),
+            checkpoint=Checkpoint(tmp_path / "run.ckpt"),
+        )
     assert list(tmp_path.iterdir()) == []

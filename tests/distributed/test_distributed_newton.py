@@ -6,13 +6,22 @@ from itertools import islice
 import numpy as np
 import pytest
 from budget import examples
-from graphs import DIMENSIONS, EPS, LOUD_NOISE, MILD_NOISE, SEEDS, random_poses, varied_graph, varied_problem
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from graphs import (
+    DIMENSIONS,
+    EPS,
+    LOUD_NOISE,
+    MILD_NOISE,
+    SEEDS,
+    random_poses,
+    varied_graph,
+    varied_problem,
+)
+from hypothesis import given, settings, strategies as st
 from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, driver_at, metis
 
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.newton_polish import STATIONARY_DECREMENT, ground_pose, move_poses
+from pgo_models.certificates.newton_polish import ground_pose, move_poses
+from pgo_models.certificates.newton_step import STATIONARY_DECREMENT, ModelOrder
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import tangent_dimension
@@ -26,7 +35,6 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.low_rank import LiftedPoses, append_dimension
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.newton import SubstructuredNewton, model_at
-from solvers.distributed.robots.records import ModelOrder
 from solvers.loop import iterate, run
 from solvers.result import Status
 from solvers.riemannian.newton import Newton
@@ -38,7 +46,10 @@ NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
 def near(problem: PGOProblem, seed: int, spread: float) -> Poses:
     """The chordal start, moved at random."""
     rng = np.random.default_rng(seed)
-    moves = [spread * rng.standard_normal((problem.num_poses, k)) for k in (tangent_dimension(problem.d), problem.d)]
+    moves = [
+        spread * rng.standard_normal((problem.num_poses, k))
+        for k in (tangent_dimension(problem.d), problem.d)
+    ]
     return move_poses(chordal_start(problem), *moves)
 
 
@@ -50,7 +61,8 @@ def check(problem: PGOProblem, parts: Partition, start: Poses, newton: Newton, s
         objective = one.polish.objective
         assert other.k == one.k
         assert other.objective == pytest.approx(objective, rel=1e-7, abs=1e-12)
-        if objective <= 1e6 * rounding_level(problem, one.polish.poses):  # an optimum of zero: F is rounding, too
+        # an optimum of zero: F is rounding, too
+        if objective <= 1e6 * rounding_level(problem, one.polish.poses):
             break
         assert other.decrement == pytest.approx(one.polish.decrement, rel=1e-5, abs=1e-13)
         if one.polish.decrement <= 1e-10:  # what is left is rounding
@@ -155,19 +167,29 @@ def test_a_model_is_the_central_matrix_with_its_ground_and_damping(
 
 
 @settings(max_examples=examples(25))
-@given(seed=SEEDS, n=st.integers(2, 12), d=DIMENSIONS, extra=st.integers(0, 2), partitioner=PARTITIONERS)
+@given(
+    seed=SEEDS,
+    n=st.integers(2, 12),
+    d=DIMENSIONS,
+    extra=st.integers(0, 2),
+    partitioner=PARTITIONERS,
+)
 def test_a_shifted_model_at_lifted_poses_is_the_central_matrix(
     seed: int, n: int, d: int, extra: int, partitioner: Partitioner
 ) -> None:
-    problem, rng = varied_problem(seed, n, d), np.random.default_rng(seed)
+    problem = varied_problem(seed, n, d)
+    rng = np.random.default_rng(seed)
     poses: Poses = near(problem, seed, 0.3)
     for _ in range(extra):
         flat = append_dimension(poses)
         poses = flat.moved_along(*flat.layout.split(0.1 * rng.standard_normal(flat.layout.side)))
     driver = driver_at(problem, partitioner(problem.graph, seed), poses)
-    at, Lambda = LiftedPoses(poses.R, poses.t), multipliers(problem, poses)
+    at = LiftedPoses(poses.R, poses.t)
+    Lambda = multipliers(problem, poses)
     eta = float(np.abs(Lambda).max()) * 2.0 * n
-    H, layout, zero = at.hessian(problem, Lambda - eta * np.eye(d)).toarray(), at.layout, np.zeros(1, dtype=np.int64)
+    H = at.hessian(problem, Lambda - eta * np.eye(d)).toarray()
+    layout = at.layout
+    zero = np.zeros(1, dtype=np.int64)
     ground = np.concatenate([layout.translations(zero)[0], layout.rotations(zero)[0]])
     H[ground, ground] *= 2.0
     model = model_at(driver, ModelOrder(True, 0.0, eta))
@@ -189,7 +211,9 @@ def test_where_the_hessian_is_not_positive_definite_gauss_newton_takes_over(d: i
     check(problem, parts, start, Newton(), 4)
 
 
-def test_damping_grows_until_the_matrix_is_positive_definite(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damping_grows_until_the_matrix_is_positive_definite(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     # As if rounding spoiled every factorisation with less damping than 1e-3.
     problem = varied_problem(0, 12, 3)
     driver = driver_at(problem, metis(problem.graph, 2), near(problem, 0, 0.2))
@@ -204,6 +228,29 @@ def test_damping_grows_until_the_matrix_is_positive_definite(monkeypatch: pytest
     state = next(islice(iterate(SubstructuredNewton(), driver), 1, None))
     assert [second_order for second_order, _ in tried] == [True] + [False] * (len(tried) - 1)
     dampings = [damping for _, damping in tried[1:]]
-    np.testing.assert_allclose(dampings, [0.0, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3], rtol=1e-12, atol=0)
+    np.testing.assert_allclose(
+        dampings, [0.0, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3], rtol=1e-12, atol=0
+    )
     assert state.moved
     assert driver.at.objective < before
+
+
+def test_a_shift_grows_until_the_matrix_is_positive_definite(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # As if every factorisation failed with a shift below a thousand times the first one.
+    problem = varied_problem(0, 12, 3)
+    driver = driver_at(problem, metis(problem.graph, 2), near(problem, 0, 0.2))
+    first = 1e-3 * driver.at.objective / (driver.num_poses * driver.d)
+    tried: list[float] = []
+
+    def spoiled(driver: Driver, order: ModelOrder) -> object:
+        tried.append(order.eta)
+        return model_at(driver, order) if order.eta >= 1e3 * first else None
+
+    monkeypatch.setattr("solvers.distributed.newton.model_at", spoiled)
+    state = next(islice(iterate(SubstructuredNewton(is_shifted=True), driver), 1, None))
+    expected = [0.0, *(first * 4.0**k for k in range(6))]
+    np.testing.assert_allclose(tried, expected, rtol=1e-12, atol=0)
+    assert state.eta == tried[-1]
+    assert not state.is_convex

@@ -1,4 +1,6 @@
-"""The staircase by driver and robots: the optimum of the relaxation that one place finds, by robots of every kind."""
+"""The staircase by driver and robots: the optimum of the relaxation that one place finds, by robots
+of every kind.
+"""
 
 from dataclasses import replace
 
@@ -6,8 +8,7 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, MILD_NOISE, SEEDS, random_poses, varied_problem, wound_ring
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from robots import PARTITIONERS, Partitioner, contiguous, metis, singletons
 
 import solvers
@@ -24,10 +25,15 @@ from solvers.network.engine import InProcess
 from solvers.result import Status
 from solvers.riemannian.staircase import Staircase
 
-LOOSE = NoiseModel(translation_std=1.0, rotation_std=1.5)  # the relaxation of most such graphs is not tight
+pytestmark = pytest.mark.slow  # solves by robots from end to end
+
+# the relaxation of most such graphs is not tight
+LOOSE = NoiseModel(translation_std=1.0, rotation_std=1.5)
 
 
-def driver_at(problem: PGOProblem, partitioner: Partitioner, seed: int, start: object, memory: float = 4e9) -> Driver:
+def driver_at(
+    problem: PGOProblem, partitioner: Partitioner, seed: int, start: object, memory: float = 4e9
+) -> Driver:
     driver = open_driver(problem, partitioner(problem.graph, seed), InProcess(), memory)
     driver.set_poses(start)
     return driver
@@ -45,10 +51,13 @@ def test_it_solves_the_relaxation_as_one_place_does(
     found = run(SubstructuredStaircase(), driver)
     assert found.status is Status.CONVERGED
     # Where no noise is, F is zero: both are near it, above the level of rounding or below.
-    value, rounding = central.state.point.value, 10.0 * (central.state.rounding_level + driver.at.rounding_level)
+    value = central.state.point.value
+    rounding = 10.0 * (central.state.rounding_level + driver.at.rounding_level)
     assert driver.at.objective == pytest.approx(value, rel=1e-7, abs=rounding)
     lifted, Lambda = collect(driver)
-    assert problem.objective(lifted) == pytest.approx(driver.at.objective, rel=1e-9, abs=driver.at.rounding_level)
+    assert problem.objective(lifted) == pytest.approx(
+        driver.at.objective, rel=1e-9, abs=driver.at.rounding_level
+    )
     dual = found.state.bound
     if dual is not None and dual.lower_bound > 0.0:
         assert dual.lower_bound <= value * (1 + 1e-9)
@@ -59,7 +68,9 @@ def test_it_solves_the_relaxation_as_one_place_does(
     round_lifted(driver)
     poses, _ = collect(driver)
     assert poses.R.shape == (n, d, d)
-    assert driver.at.objective == pytest.approx(problem.objective(poses), rel=1e-9, abs=driver.at.rounding_level)
+    assert driver.at.objective == pytest.approx(
+        problem.objective(poses), rel=1e-9, abs=driver.at.rounding_level
+    )
     assert driver.at.objective >= value * (1 - 1e-9) - rounding
 
 
@@ -80,7 +91,8 @@ def test_robots_climb_out_of_a_wound_ring(d: int, partitioner: Partitioner) -> N
 
 def test_where_the_relaxation_is_loose_its_bound_is_reported() -> None:
     problem = varied_problem(1, 30, 2, LOOSE)
-    by_robots, central = solvers.solve(problem, robots=4), solvers.solve(problem)
+    by_robots = solvers.solve(problem, robots=4)
+    central = solvers.solve(problem)
     assert by_robots.certificate.source is central.certificate.source is BoundSource.RELAXATION
     assert by_robots.lower_bound == pytest.approx(central.lower_bound, rel=2e-6)
     assert by_robots.objective == pytest.approx(central.objective, rel=1e-6)
@@ -104,7 +116,9 @@ def test_a_climb_goes_on_from_a_snapshot() -> None:
 
 def test_a_rank_that_the_drivers_memory_does_not_hold_is_not_climbed_to() -> None:
     problem, wound = wound_ring(20, 3)
-    enough = open_driver(problem, partition(problem.graph, 4), InProcess()).interface(3, 3).num_bytes
+    enough = (
+        open_driver(problem, partition(problem.graph, 4), InProcess()).interface(3, 3).num_bytes
+    )
     driver = driver_at(problem, contiguous, 3, wound, enough)
     assert driver.fits(3)
     assert not driver.fits(4)

@@ -1,12 +1,28 @@
-"""The driver and its robots: what they find together, what crosses between them, and what is counted of it."""
+"""The driver and its robots: their results, their messages, and how these are counted."""
 
 import numpy as np
 import pytest
 from budget import examples
-from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, random_poses, varied_graph, varied_problem
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from robots import BACKENDS, PARTITIONERS, Partitioner, Recording, arrays_in, corner_cases, driver_at, metis
+from graphs import (
+    DIMENSIONS,
+    LOUD_NOISE,
+    MILD_NOISE,
+    SEEDS,
+    random_poses,
+    varied_graph,
+    varied_problem,
+)
+from hypothesis import given, settings, strategies as st
+from robots import (
+    BACKENDS,
+    PARTITIONERS,
+    Partitioner,
+    Recording,
+    arrays_in,
+    corner_cases,
+    driver_at,
+    metis,
+)
 
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.errors import GraphError, NotPositiveDefiniteError, SettingError
@@ -21,7 +37,7 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import collect
 from solvers.distributed.interface import Interface
 from solvers.distributed.robots.interior import Interior
-from solvers.distributed.robots.proof_orders import move_proof, prove_interior
+from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.distributed.stages import open_driver
 from solvers.network.engine import InProcess
 from solvers.pipeline import Pipeline, solve
@@ -30,9 +46,10 @@ from solvers.solution import Solution
 
 SIZES = st.integers(2, 24)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
-OFF = ("Interior.describe", "Interior.set_poses", "Interior.cost", "Interior.result")  # orders that are not counted
+# orders that are not counted
+OFF = ("Interior.describe", "Interior.set_poses", "Interior.cost", "Interior.result")
 
-PROOF = (prove_interior, move_proof)
+PROOF = (fits_part, prove_interior, move_proof)
 
 
 def check_start(problem: PGOProblem, parts: Partition) -> None:
@@ -43,8 +60,12 @@ def check_start(problem: PGOProblem, parts: Partition) -> None:
     np.testing.assert_allclose(poses.R, expected.R, rtol=0, atol=1e-9)
     np.testing.assert_allclose(poses.t - poses.t[0], expected.t, rtol=0, atol=1e-9 * size)
     scale = float(problem.M.diagonal().max())
-    np.testing.assert_allclose(Lambda, multipliers(problem, poses), rtol=0, atol=1e-12 * scale * size)
-    assert driver.at.objective == pytest.approx(problem.objective(poses), rel=1e-12, abs=1e-24 * scale)
+    np.testing.assert_allclose(
+        Lambda, multipliers(problem, poses), rtol=0, atol=1e-12 * scale * size
+    )
+    assert driver.at.objective == pytest.approx(
+        problem.objective(poses), rel=1e-12, abs=1e-24 * scale
+    )
     assert driver.network.ledger.rounds == 2
 
 
@@ -84,9 +105,12 @@ def test_the_chordal_start_of_corner_cases(graph: PoseGraph, parts: Partition) -
 
 @settings(max_examples=examples(30))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
-def test_poses_from_elsewhere_are_taken_as_they_are(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
+def test_poses_from_elsewhere_are_taken_as_they_are(
+    seed: int, n: int, d: int, partitioner: Partitioner
+) -> None:
     problem = varied_problem(seed, n, d)
-    given_poses, other = random_poses(n, d, seed), random_poses(n, d, seed + 1)
+    given_poses = random_poses(n, d, seed)
+    other = random_poses(n, d, seed + 1)
     driver = driver_at(problem, partitioner(problem.graph, seed), given_poses)
     assert driver.at.objective == pytest.approx(problem.objective(given_poses), rel=1e-12)
     driver.save_poses()
@@ -114,9 +138,14 @@ def test_separators_that_would_not_fit_are_refused_before_a_robot_starts() -> No
 # What crosses.
 
 
-def solved(seed: int, n: int, d: int, partitioner: Partitioner, noise: NoiseModel) -> tuple[Solution, Recording]:
-    graph, engine = varied_graph(seed, n, d, noise), Recording()
-    solution = solve(graph, Pipeline(staircase=None), robots=partitioner(graph, seed), engine=engine)
+def solved(
+    seed: int, n: int, d: int, partitioner: Partitioner, noise: NoiseModel
+) -> tuple[Solution, Recording]:
+    graph = varied_graph(seed, n, d, noise)
+    engine = Recording()
+    solution = solve(
+        graph, Pipeline(staircase=None), robots=partitioner(graph, seed), engine=engine
+    )
     assert engine.is_closed
     return solution, engine
 
@@ -127,15 +156,22 @@ def test_the_ledger_counts_what_was_sent(
     seed: int, n: int, d: int, noise: NoiseModel, partitioner: Partitioner
 ) -> None:
     solution, engine = solved(seed, n, d, partitioner, noise)
-    ledger, number = solution.ledger, len(engine.shares)
+    ledger = solution.ledger
+    number = len(engine.shares)
     assert ledger is not None
-    sent, received, messages = np.zeros((2, number)), np.zeros((2, number)), 0
+    sent = np.zeros((2, number))
+    received = np.zeros((2, number))
+    messages = 0
     for order, down, up in engine.log:
         if order in OFF:
             continue
         for robot in range(number):
             for total, message in ((received, down[robot]), (sent, up[robot])):
-                size = 8 * sum(np.size(value) for name, value in arrays_in(message) if not name.startswith("measured"))
+                size = 8 * sum(
+                    np.size(value)
+                    for name, value in arrays_in(message)
+                    if not name.startswith("measured")
+                )
                 total[0, robot] += size
                 messages += size > 0
     np.testing.assert_array_equal(ledger.bytes_sent, sent[0])
@@ -145,9 +181,16 @@ def test_the_ledger_counts_what_was_sent(
         messages,
         sent[0].sum() + received[0].sum(),
     )
-    # A solve of M x = b, a step (a), a Newton direction, the best translations and a proof take one round each.
+    # A solve of M x = b, a step (a), a Newton direction, the best translations and a proof take one
+    # round each.
     counted = (
-        *(Interior.project, Interior.set_translations, Interior.penalize, Interior.rescale, Interior.solve),
+        *(
+            Interior.project,
+            Interior.set_translations,
+            Interior.penalize,
+            Interior.rescale,
+            Interior.solve,
+        ),
         *(Interior.finish, Interior.move, Interior.evaluate_trial, *PROOF),
     )
     assert ledger.rounds == engine.times(*counted)
@@ -157,7 +200,8 @@ def test_the_ledger_counts_what_was_sent(
 
 
 def test_rounds_of_a_whole_solve_are_as_documented() -> None:
-    graph, engine = grid(np.random.default_rng(0)), Recording()
+    graph = grid(np.random.default_rng(0))
+    engine = Recording()
     solution = solve(graph, robots=partition(graph, 3), engine=engine)
     assert solution.ledger is not None
     start, soc, newton = solution.stages
@@ -166,7 +210,8 @@ def test_rounds_of_a_whole_solve_are_as_documented() -> None:
     assert engine.times(Interior.rescale, Interior.turn) == 0
     assert engine.times(prove_interior) == 1
     assert engine.times(Interior.penalize) == 1  # no refresh
-    # 2 to start, 1 for the penalty and 1 a step and 2 for the result of SOC, 2 a move of Newton, 2 for the proof.
+    # 2 to start, 1 for the penalty and 1 a step and 2 for the result of SOC, 2 a move of Newton, 2
+    # for the proof.
     assert engine.times(move_proof) == 1
     assert solution.ledger.rounds == 2 + (1 + soc.iterations + 2) + 2 * moves + 2
     assert solution.ledger.all_reduces == soc.iterations
@@ -184,7 +229,9 @@ def lower(g: int, width: int) -> tuple[int]:
 @pytest.mark.parametrize("d", [2, 3])
 def test_what_crosses_has_the_size_of_the_separators(d: int, noise: NoiseModel) -> None:
     solution, engine = solved(7, 40, d, metis, noise)
-    graph, parts, tangent = solution.problem.graph, solution.robots, d + tangent_dimension(d)
+    graph = solution.problem.graph
+    parts = solution.robots
+    tangent = d + tangent_dimension(d)
     assert parts is not None
     memory = 40
     seen = set()
@@ -192,7 +239,8 @@ def test_what_crosses_has_the_size_of_the_separators(d: int, noise: NoiseModel) 
         part = share.part
         if part is None:
             continue
-        g, inside = len(part.boundary), len(part.interior)
+        g = len(part.boundary)
+        inside = len(part.interior)
         assert inside not in (0, g)
         any_side = {(width * g, k) for width, k in ((1, d), (d, d), (d + 1, d), (tangent, 1))}
         allowed = {
@@ -238,7 +286,9 @@ def test_no_interior_pose_and_no_private_measurement_crosses(
     seed: int, n: int, d: int, noise: NoiseModel, partitioner: Partitioner
 ) -> None:
     solution, engine = solved(seed, n, d, partitioner, noise)
-    graph, poses = solution.problem.graph, solution.certificate.poses  # as the robots hold them
+    # as the robots hold them
+    graph = solution.problem.graph
+    poses = solution.certificate.poses
     cover = np.unique(np.concatenate([share.poses[share.in_cover >= 0] for share in engine.shares]))
     interior = np.setdiff1d(np.arange(n), cover)
     private = ~np.isin(graph.i, cover) & ~np.isin(graph.j, cover)
@@ -253,16 +303,20 @@ def test_no_interior_pose_and_no_private_measurement_crosses(
         ]
     )
     secrets = secrets[~np.isin(np.abs(secrets), [0.0, 1.0])]  # which anything may be
-    # ||Lambda_i|| and m_i, for the quantile of the penalty, and the largest diagonal entry of M are told: of a pose
-    # with one edge they are its precision.
-    told = [value for name, value in engine.crossed(Interior.result) if name not in ("norms", "scale")]
-    assert not np.isin(secrets, np.concatenate(told)).any()
+    # ||Lambda_i|| and m_i, for the quantile of the penalty, and the largest diagonal entry of M are
+    # sent: of a pose with one edge they are its precision.
+    sent = [
+        value for name, value in engine.crossed(Interior.result) if name not in ("norms", "scale")
+    ]
+    assert not np.isin(secrets, np.concatenate(sent)).any()
 
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_threads_change_no_bit(d: int) -> None:
     graph = varied_graph(3, 30, d)
-    first, second = (solve(graph, robots=partition(graph, 4), engine=InProcess(threads)) for threads in (1, 3))
+    first, second = (
+        solve(graph, robots=partition(graph, 4), engine=InProcess(threads)) for threads in (1, 3)
+    )
     np.testing.assert_array_equal(first.poses.R, second.poses.R)
     np.testing.assert_array_equal(first.poses.t, second.poses.t)
     assert first.lower_bound == second.lower_bound

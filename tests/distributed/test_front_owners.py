@@ -1,4 +1,6 @@
-"""Fronts of the separator tree that robots hold: the numbers of the driver's, every message on the ledger, by level."""
+"""Fronts of the separator tree that robots hold: the numbers of the driver's, every message on the
+ledger, by level.
+"""
 
 from collections.abc import Iterator
 from typing import Any
@@ -35,8 +37,8 @@ def shared() -> Iterator[None]:
 
 
 def share(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(multifrontal, "LEAST", 0)
-    patch.setattr(multifrontal, "FEW", 0)
+    patch.setattr(multifrontal, "LEAST_SEPARATORS", 0)
+    patch.setattr(multifrontal, "LEAST_FRONTS", 0)
 
 
 def world(seed: int, d: int, robots: int) -> tuple[PoseGraph, Partition]:
@@ -44,7 +46,9 @@ def world(seed: int, d: int, robots: int) -> tuple[PoseGraph, Partition]:
     return graph, partition(graph, robots, PartitionMethod.CONTIGUOUS)
 
 
-def solved(graph: PoseGraph, robots: Partition, engine: Engine | None = None, **settings: Any) -> Solution:
+def solved(
+    graph: PoseGraph, robots: Partition, engine: Engine | None = None, **settings: Any
+) -> Solution:
     return solve(graph, Pipeline(staircase=None), robots=robots, engine=engine, **settings)
 
 
@@ -61,15 +65,22 @@ def test_the_numbers_are_those_of_a_driver_that_holds_all(seed: int, d: int, rob
     assert found.objective == pytest.approx(expected.objective, rel=1e-9)
     assert found.lower_bound == pytest.approx(expected.lower_bound, rel=1e-6, abs=1e-9)
     for one, other in zip(found.stages[:2], expected.stages[:2], strict=True):
-        assert (one.name, one.status, one.iterations) == (other.name, other.status, other.iterations)
+        assert (one.name, one.status, one.iterations) == (
+            other.name,
+            other.status,
+            other.iterations,
+        )
         np.testing.assert_allclose(one.history.objective, other.history.objective, rtol=1e-7)
     assert found.ledger.all_reduces == expected.ledger.all_reduces
 
 
 @pytest.mark.parametrize(("seed", "d", "robots"), [(0, 2, 3), (1, 3, 4), (2, 2, 9), (3, 3, 6)])
-def test_the_ledger_counts_what_every_robot_sent_and_received(seed: int, d: int, robots: int) -> None:
+def test_the_ledger_counts_what_every_robot_sent_and_received(
+    seed: int, d: int, robots: int
+) -> None:
     graph, parts = world(seed, d, robots)
-    engine, asked = Recording(), FrontOwners.ask
+    engine = Recording()
+    asked = FrontOwners.ask
     roots: list[Any] = []
     down: list[tuple[int, Any]] = []
 
@@ -89,7 +100,12 @@ def test_the_ledger_counts_what_every_robot_sent_and_received(seed: int, d: int,
     sent, received = np.zeros((2, robots), dtype=int)
     counted = [one for one in engine.log if one[0] not in OFF]
     for robot, agent in enumerate(engine.agents):
-        others = [request for _, requests, _ in counted for to, request in enumerate(requests) if to != robot]
+        others = [
+            request
+            for _, requests, _ in counted
+            for to, request in enumerate(requests)
+            if to != robot
+        ]
         told = {id(value) for request in (*others, *roots) for _, value in arrays_in(request)}
         own = {id(value) for _, _, answers in counted for _, value in arrays_in(answers[robot])}
         own |= {id(part) for _, part in down}
@@ -98,16 +114,23 @@ def test_the_ledger_counts_what_every_robot_sent_and_received(seed: int, d: int,
             answer = answers[robot]
             if order == "HeldFront.substitute" and answer is not None:
                 assert agent.front is not None
-                answer = answer[0], answer[1][min(agent.front.num_robots, 1) :]  # without what is the holder's own
+                # without what is the holder's own
+                answer = answer[0], answer[1][min(agent.front.num_robots, 1) :]
             for name, value in arrays_in(answer):
                 if name == "measured":
                     continue
                 # What goes up the tree is sent where somebody else takes it.
-                goes_up = name in ALONG_TREE or (order in ("HeldFront.eliminate", "HeldFront.reduce") and value.ndim)
+                goes_up = name in ALONG_TREE or (
+                    order in ("HeldFront.eliminate", "HeldFront.reduce") and value.ndim
+                )
                 sent[robot] += 0 if goes_up and id(value) not in told else value.size
-            named = [(name, value) for name, value in arrays_in(requests[robot]) if name != "measured_at"]
+            named = [
+                (name, value) for name, value in arrays_in(requests[robot]) if name != "measured_at"
+            ]
             numbers = [value for _, value in named if value.ndim or "HeldFront" not in order]
-            received[robot] += sum(value.size for value in numbers if not value.ndim or id(value) not in own)
+            received[robot] += sum(
+                value.size for value in numbers if not value.ndim or id(value) not in own
+            )
     np.testing.assert_array_equal(ledger.bytes_sent, 8 * sent)
     np.testing.assert_array_equal(ledger.bytes_received, 8 * received)
     assert ledger.bytes_by_level.sum() == ledger.num_bytes
@@ -129,12 +152,14 @@ def test_every_front_but_the_root_has_a_robot_of_its_group(shared: None) -> None
         assert len(set(fronts.owner)) == len(fronts.tree)
 
 
-def test_large_fronts_are_robots_and_few_or_small_ones_the_driver_s(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_fronts_are_robots_and_few_or_small_ones_the_driver_s(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     graph = grid_world(16, 60, np.random.default_rng(0), d=2)
     parts = partition(graph, 16, PartitionMethod.METIS)
     for least, few, expected in ((30, 3, True), (30, 100, False), (10**6, 3, False)):
-        monkeypatch.setattr(multifrontal, "LEAST", least)
-        monkeypatch.setattr(multifrontal, "FEW", few)
+        monkeypatch.setattr(multifrontal, "LEAST_SEPARATORS", least)
+        monkeypatch.setattr(multifrontal, "LEAST_FRONTS", few)
         driver = open_driver(PGOProblem(graph), parts, InProcess())
         fronts = driver.interface(1).fronts
         assert (set(fronts.owner) != {DRIVER}) == expected
@@ -144,7 +169,9 @@ class Killed(BaseException):
     """The process of the driver is gone."""
 
 
-def test_a_run_that_was_broken_off_goes_on_with_fronts_on_robots(shared: None, tmp_path: Any) -> None:
+def test_a_run_that_was_broken_off_goes_on_with_fronts_on_robots(
+    shared: None, tmp_path: Any
+) -> None:
     graph, parts = world(3, 3, 6)
     expected = solved(graph, parts)
     steps = sum(len(stage.history) for stage in expected.stages)

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, SEEDS, informed, varied_graph
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from robots import driver_at
 
 import solvers
@@ -23,9 +22,10 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.precisions import proper_information
 from pgo_models.graphs.scenes import NoiseModel, circle
+from pgo_models.problem.excess import Tangent
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Tangent, Weighting
+from pgo_models.problem.weighting import Weighting
 from solvers.distributed.checkpoint import Checkpoint
 from solvers.distributed.interface import Interface
 from solvers.distributed.lower_bound import prove_with_eta
@@ -47,8 +47,12 @@ def of_file(seed: int, n: int, d: int, coupled: bool, spread: float = 0.4) -> PG
 
 
 @settings(max_examples=examples(12))
-@given(seed=SEEDS, n=st.integers(6, 20), d=DIMENSIONS, coupled=st.booleans(), robots=st.integers(1, 4))
-def test_robots_find_what_one_place_finds(seed: int, n: int, d: int, coupled: bool, robots: int) -> None:
+@given(
+    seed=SEEDS, n=st.integers(6, 20), d=DIMENSIONS, coupled=st.booleans(), robots=st.integers(1, 4)
+)
+def test_robots_find_what_one_place_finds(
+    seed: int, n: int, d: int, coupled: bool, robots: int
+) -> None:
     problem = of_file(seed, n, d, coupled)
     central = solvers.solve(problem, progress=False)
     shared = solvers.solve(problem, robots=robots, progress=False)
@@ -74,7 +78,9 @@ def test_every_coupling_ends_at_the_minimum_of_chi2(d: int, coupling: Coupling) 
         solution = solvers.solve(problem, pipeline, robots=on_robots, progress=False)
         assert solution.objective == pytest.approx(central.objective, rel=1e-9)
         assert solution.certificate.verdict is central.certificate.verdict
-        assert solution.stages[-1].objective == pytest.approx(problem.objective(solution.poses), rel=1e-12)
+        assert solution.stages[-1].objective == pytest.approx(
+            problem.objective(solution.poses), rel=1e-12
+        )
 
 
 @pytest.mark.parametrize("coupling", [Coupling.SUBSTRUCTURED, Coupling.CONSENSUS])
@@ -84,7 +90,9 @@ def test_rotation_information_alone_is_solved_by_soc_itself(coupling: Coupling) 
     information[:, 3:, 3:] = np.diag([1.0, 1.5, 2.0]) * information[0, 3, 3]
     problem = PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION)
     assert problem.convex_part is problem
-    soc = solvers.SOC(coupling=coupling, robots=partition(graph, 3), tolerance=1e-9, max_iterations=2000)
+    soc = solvers.SOC(
+        coupling=coupling, robots=partition(graph, 3), tolerance=1e-9, max_iterations=2000
+    )
     alone = solvers.run(soc, problem)
     solution = solvers.solve(problem, progress=False)
     assert solution.is_certified
@@ -110,21 +118,30 @@ def test_a_run_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", [5, 12, 15, 20])
 def test_robots_go_on_until_the_tangent_is_as_sharp_as_in_one_place(seed: int) -> None:
     """What is left of chi2 weighs up to the condition of I_tt more in the bound."""
-    d, rng = 2 + seed % 2, np.random.default_rng(seed)
+    d = 2 + seed % 2
+    rng = np.random.default_rng(seed)
     graph = informed(seed, 25, d, False, 0.3, QUIET)
-    information, axes = proper_information(graph).copy(), np.linalg.qr(rng.standard_normal((graph.num_edges, d, d)))[0]
-    information[:, :d, :d] = (axes * 10.0 ** rng.uniform(-6, 0, (graph.num_edges, 1, d))) @ np.swapaxes(axes, 1, 2)
+    information = proper_information(graph).copy()
+    axes = np.linalg.qr(rng.standard_normal((graph.num_edges, d, d)))[0]
+    information[:, :d, :d] = (
+        axes * 10.0 ** rng.uniform(-6, 0, (graph.num_edges, 1, d))
+    ) @ np.swapaxes(axes, 1, 2)
     if d == 3:
         information[:, 3:, 3:] = np.eye(3) * information[:, 3, 3][:, None, None]
     problem = PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION)
-    central, shared = (solvers.solve(problem, robots=robots, progress=False) for robots in (None, 3))
+    central, shared = (
+        solvers.solve(problem, robots=robots, progress=False) for robots in (None, 3)
+    )
     assert shared.gap <= 4.0 * central.gap
     assert shared.stages[-1].status is solvers.Status.CONVERGED
 
 
-def test_robots_count_the_constants_of_their_tangents_and_their_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_robots_count_the_constants_of_their_tangents_and_their_errors(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     problem = of_file(3, 12, 3, coupled=False)
-    eta, values = 1e3 * float(abs(problem.tangent_at(chordal_start(problem.convex_part)).M).max()), []
+    eta = 1e3 * float(abs(problem.tangent_at(chordal_start(problem.convex_part)).M).max())
+    values = []
     with closing(driver_at(problem, partition(problem.graph, 3), None)) as driver:
         driver.choose_cost(final=True)
         driver.describe(Count.OFF)
@@ -139,8 +156,12 @@ def test_robots_count_the_constants_of_their_tangents_and_their_errors(monkeypat
 
 
 @pytest.mark.parametrize("eta", [0.0, 1e6])
-def test_the_driver_s_rounding_is_a_share_of_at_least_its_diagonal(eta: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    problem, seen, rounding = of_file(3, 12, 3, coupled=True), [], Interface.rounding
+def test_the_driver_s_rounding_is_a_share_of_at_least_its_diagonal(
+    eta: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = of_file(3, 12, 3, coupled=True)
+    seen = []
+    rounding = Interface.rounding
 
     def noted(self: Interface, sizes: Any, own: Any, diagonal: Array) -> Array:
         seen.append(diagonal.copy())
@@ -148,7 +169,11 @@ def test_the_driver_s_rounding_is_a_share_of_at_least_its_diagonal(eta: float, m
 
     monkeypatch.setattr(Interface, "rounding", noted)
     with closing(
-        driver_at(problem, partition(problem.graph, 3), polish(problem, chordal_start(problem.convex_part)))
+        driver_at(
+            problem,
+            partition(problem.graph, 3),
+            polish(problem, chordal_start(problem.convex_part)),
+        )
     ) as driver:
         driver.choose_cost(final=True)
         driver.describe(Count.OFF)
@@ -156,7 +181,9 @@ def test_the_driver_s_rounding_is_a_share_of_at_least_its_diagonal(eta: float, m
             driver.at = replace(driver.at, force=scale * driver.at.force)
             prove_with_eta(driver, eta)
             least = driver.diagonal.copy()
-            least[driver.rotation_rows] += (eta * np.eye(3) - driver.at.multipliers).diagonal(axis1=1, axis2=2).ravel()
+            least[driver.rotation_rows] += (
+                (eta * np.eye(3) - driver.at.multipliers).diagonal(axis1=1, axis2=2).ravel()
+            )
             assert (seen[-1] >= least).all()
 
 
@@ -164,15 +191,20 @@ def test_without_a_driver_chi2_is_refused() -> None:
     problem = of_file(0, 10, 2, coupled=False)
     soc = solvers.SOC(coupling=Coupling.CONSENSUS, robots=partition(problem.graph, 2))
     with pytest.raises(SettingError, match="without a driver"):
-        solvers.solve(problem, solvers.Pipeline(soc=soc, driver_memory=0), robots=soc.robots, progress=False)
+        solvers.solve(
+            problem, solvers.Pipeline(soc=soc, driver_memory=0), robots=soc.robots, progress=False
+        )
 
 
 @pytest.mark.parametrize("robots", [None, 3])
 @pytest.mark.parametrize("has_positions", [False, True])
-def test_quadratic_chi2_that_is_not_convex_has_an_answer_and_a_bound(has_positions: bool, robots: int | None) -> None:
+def test_quadratic_chi2_that_is_not_convex_has_an_answer_and_a_bound(
+    has_positions: bool, robots: int | None
+) -> None:
     graph = varied_graph(0, 20, 3)
     information = np.tile(
-        np.diag([4.0, 4.0, 5.0 if has_positions else 4.0, 40.0, 40.0, 100.0]), (graph.num_edges, 1, 1)
+        np.diag([4.0, 4.0, 5.0 if has_positions else 4.0, 40.0, 40.0, 100.0]),
+        (graph.num_edges, 1, 1),
     )
     graph = replace(graph, information=information)
     if has_positions:

@@ -1,4 +1,4 @@
-"""CONSENSUS without a driver: the optimum to SOC's tolerance, nothing sent to a driver, and nothing claimed."""
+"""CONSENSUS without a driver: the optimum to SOC's tolerance, and no certificate."""
 
 import math
 from pathlib import Path
@@ -8,9 +8,17 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, SEEDS, varied_graph, varied_problem
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
-from robots import PARTITIONERS, Partitioner, Recording, arrays_in, contiguous, metis, scattered, singletons
+from hypothesis import example, given, settings, strategies as st
+from robots import (
+    PARTITIONERS,
+    Partitioner,
+    Recording,
+    arrays_in,
+    contiguous,
+    metis,
+    scattered,
+    singletons,
+)
 
 from pgo_models.certificates.certificate import Verdict
 from pgo_models.certificates.newton_polish import polish
@@ -39,30 +47,38 @@ from solvers.soc.soc import SOC
 
 TOLERANCE = 1e-6
 OFF = ("Interior.describe", "Interior.set_poses")
-ALONE = ("in_cover", "force", "schur", "b")  # what only a driver is told
+ALONE = ("in_cover", "force", "schur", "b")  # fields that are sent to a driver only
 
 
 def alone(soc: SOC, faults: Faults | None = None) -> Pipeline:
     return Pipeline(soc=soc, faults=faults, driver_memory=0)
 
 
-@pytest.mark.parametrize(("at", "status"), [(3, Status.INTERRUPTED), (None, Status.TIME_LIMIT)])
-def test_a_start_that_is_cut_short_is_the_end(at: int | None, status: Status, monkeypatch: pytest.MonkeyPatch) -> None:
-    graph, steps, step = varied_graph(3, 30, 3), list[int](), ConsensusSOC.step
+@pytest.mark.parametrize(
+    ("interrupted_step", "status"), [(3, Status.INTERRUPTED), (None, Status.TIME_LIMIT)]
+)
+def test_a_start_that_is_cut_short_is_the_end(
+    interrupted_step: int | None, status: Status, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph = varied_graph(3, 30, 3)
+    steps = list[int]()
+    step = ConsensusSOC.step
     parts = metis(graph, 4)
 
     def counted(self: ConsensusSOC, *args: Any) -> Any:
         steps.append(len(steps))
-        if len(steps) == at:
+        if len(steps) == interrupted_step:
             raise KeyboardInterrupt
         return step(self, *args)
 
     monkeypatch.setattr(ConsensusSOC, "step", counted)
-    limit = math.inf if at is not None else 1e-6
-    solution = solve(graph, alone(SOC(coupling=Coupling.CONSENSUS, robots=parts)), robots=parts, time_limit=limit)
+    limit = math.inf if interrupted_step is not None else 1e-6
+    solution = solve(
+        graph, alone(SOC(coupling=Coupling.CONSENSUS, robots=parts)), robots=parts, time_limit=limit
+    )
     assert [stage.name for stage in solution.stages] == ["spanning tree"]
     assert solution.status is status
-    assert len(steps) == (at or 0)
+    assert len(steps) == (interrupted_step or 0)
     assert solution.objective == pytest.approx(solution.stages[0].objective, rel=1e-9)
 
 
@@ -74,16 +90,23 @@ def test_robots_alone_find_an_optimum_or_stay_at_their_start_and_claim_nothing(
     seed: int, n: int, d: int, partitioner: Partitioner
 ) -> None:
     graph = varied_graph(seed, n, d)
-    parts, engine = partitioner(graph, seed), Recording()
+    parts = partitioner(graph, seed)
+    engine = Recording()
     soc = SOC(coupling=Coupling.CONSENSUS, robots=parts, tolerance=TOLERANCE, max_iterations=5000)
     solution = solve(graph, alone(soc), robots=parts, engine=engine)
     problem = solution.problem
-    best, begun = problem.objective(polish(problem, solution.poses)), solution.stages[0].objective
-    assert [stage.name for stage in solution.stages] in (["chordal start, by rounds", "SOC"], ["spanning tree", "SOC"])
+    best = problem.objective(polish(problem, solution.poses))
+    begun = solution.stages[0].objective
+    assert [stage.name for stage in solution.stages] in (
+        ["chordal start, by rounds", "SOC"],
+        ["spanning tree", "SOC"],
+    )
     assert solution.status is Status.CONVERGED
     assert solution.objective == pytest.approx(problem.objective(solution.poses), rel=1e-12)
     assert solution.stages[1].objective == pytest.approx(solution.objective, rel=1e-9)
-    assert solution.objective - best <= 100 * TOLERANCE * max(1.0, best) or solution.objective == pytest.approx(begun)
+    assert solution.objective - best <= 100 * TOLERANCE * max(
+        1.0, best
+    ) or solution.objective == pytest.approx(begun)
     assert solution.lower_bound == 0.0
     if solution.objective > 1e-3:  # not of a tree, whose edges all fit
         assert solution.certificate.verdict is Verdict.TRIVIAL
@@ -97,13 +120,16 @@ def test_robots_alone_find_an_optimum_or_stay_at_their_start_and_claim_nothing(
 
 @pytest.mark.parametrize("partitioner", [contiguous, metis])
 @pytest.mark.parametrize(("seed", "d"), [(0, 2), (1, 3), (8, 3)])
-def test_rounds_of_the_relaxation_end_at_the_joint_minimiser(seed: int, d: int, partitioner: Partitioner) -> None:
+def test_rounds_of_the_relaxation_end_at_the_joint_minimiser(
+    seed: int, d: int, partitioner: Partitioner
+) -> None:
     problem = varied_problem(seed, 15, d)
     driver = open_driver(problem, partitioner(problem.graph, seed), InProcess(), 0)
     soc = SOC(local_passes=1, tolerance=TOLERANCE, max_iterations=500)
-    found = run(ConsensusSOC(soc, has_driver=False, rotations=Rotations.RELAXED), driver)
-    assert found.status is Status.CONVERGED
-    M, n = problem.M.toarray(), problem.num_poses
+    relaxed = run(ConsensusSOC(soc, has_driver=False, rotations=Rotations.RELAXED), driver)
+    assert relaxed.status is Status.CONVERGED
+    M = problem.M.toarray()
+    n = problem.num_poses
     fixed = np.concatenate([[0], n + np.arange(d)])
     free = np.setdiff1d(np.arange(problem.side), fixed)
     X = np.zeros((problem.side, d))
@@ -117,11 +143,15 @@ def test_sums_go_along_a_tree_of_robots_and_nothing_to_a_driver() -> None:
     problem = varied_problem(4, 24, 3)
     parts = scattered(problem.graph, 4)
     solution = solve(problem, alone(SOC(robots=parts, max_iterations=0)), robots=parts)
-    ledger, (order, parents) = solution.ledger, robot_tree(problem, parts)
+    ledger = solution.ledger
+    order, parents = robot_tree(problem, parts)
     assert ledger is not None
-    # Poses, penalties and forces, three times: of the relaxation, of its translations, and of SOC; one round before the
-    # first step of the former two, and one a step.
-    assert ledger.rounds == len(tree_traffic(problem, parts)) + 2 * 3 + 2 + solution.stages[0].iterations
+    # Poses, penalties and forces, three times: of the relaxation, of its translations, and of SOC;
+    # one round before the first step of the former two, and one a step.
+    assert (
+        ledger.rounds
+        == len(tree_traffic(problem, parts)) + 2 * 3 + 2 + solution.stages[0].iterations
+    )
     assert ledger.all_reduces == 3 * 3 + 2 + solution.stages[0].iterations
     sender, receiver, _, _ = ledger.by_link()
     assert DRIVER not in sender
@@ -144,8 +174,13 @@ def test_what_is_gathered_adds_up_on_the_way_and_what_is_summed_does_not() -> No
 
 def test_the_penalties_are_taken_anew_at_the_poses_agreed_on() -> None:
     problem = varied_problem(5, 20, 3)
-    parts, engine = metis(problem.graph, 5), Recording()
-    soc = SOC(robots=parts, penalty=MultiplierPenalty(stall_window=2, stall_ratio=1e-9), tolerance=TOLERANCE)
+    parts = metis(problem.graph, 5)
+    engine = Recording()
+    soc = SOC(
+        robots=parts,
+        penalty=MultiplierPenalty(stall_window=2, stall_ratio=1e-9),
+        tolerance=TOLERANCE,
+    )
     solution = solve(problem, alone(soc), robots=parts, engine=engine)
     assert engine.times(ConsensusRobot.begin_here) == 2 + engine.times(ConsensusRobot.travel) == 3
     assert solution.status is Status.CONVERGED
@@ -155,12 +190,18 @@ def test_the_penalties_are_taken_anew_at_the_poses_agreed_on() -> None:
 
 def test_given_poses_are_the_start_and_stay_where_nothing_is_better() -> None:
     problem = varied_problem(1, 20, 2)
-    parts, best = metis(problem.graph, 3), polish(problem, chordal_start(problem))
+    parts = metis(problem.graph, 3)
+    best = polish(problem, chordal_start(problem))
     solution = solve(problem, alone(SOC(robots=parts, max_iterations=2)), best, robots=parts)
     assert solution.stages[0].name == "given start"
     assert solution.objective <= problem.objective(best) * (1 + 1e-12)
     with pytest.raises(GraphError, match="give one pose for every pose"):
-        solve(problem, alone(SOC(robots=parts)), Poses(np.eye(2)[None], np.zeros((1, 2))), robots=parts)
+        solve(
+            problem,
+            alone(SOC(robots=parts)),
+            Poses(np.eye(2)[None], np.zeros((1, 2))),
+            robots=parts,
+        )
 
 
 def test_lost_messages_need_no_driver_either() -> None:
@@ -169,13 +210,16 @@ def test_lost_messages_need_no_driver_either() -> None:
     soc = SOC(robots=parts, tolerance=TOLERANCE)
     solution = solve(problem, alone(soc, Faults(loss=0.2, seed=1)), robots=parts)
     assert solution.status is Status.CONVERGED
-    assert solution.objective == pytest.approx(problem.objective(polish(problem, chordal_start(problem))), rel=1e-4)
+    assert solution.objective == pytest.approx(
+        problem.objective(polish(problem, chordal_start(problem))), rel=1e-4
+    )
     assert solution.objective < problem.objective(spanning_tree_start(problem.graph))
 
 
 def test_a_run_without_a_driver_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     problem = varied_problem(3, 20, 3)
-    parts, file = metis(problem.graph, 4), Checkpoint(tmp_path / "run.ckpt", rounds=3)
+    parts = metis(problem.graph, 4)
+    file = Checkpoint(tmp_path / "run.ckpt", rounds=3)
     pipeline = alone(SOC(robots=parts, tolerance=TOLERANCE))
 
     def stop(state: object, record: Record) -> bool:
@@ -196,7 +240,10 @@ def test_the_memory_of_the_driver_is_a_setting_and_the_refusal_says_the_way_out(
     graph = grid(np.random.default_rng(0))
     parts = metis(graph, 3)
     soc = SOC(robots=parts)
-    too_little = r"start, Newton and the certificate, whatever the coupling; .* set it to 0: CONSENSUS without a driver"
+    too_little = (
+        r"start, Newton and the certificate, whatever the coupling; "
+        r".* set it to 0: CONSENSUS without a driver"
+    )
     with pytest.raises(SettingError, match=too_little):
         solve(graph, Pipeline(soc=soc, driver_memory=1e3), robots=parts)
     assert solve(graph, Pipeline(soc=soc, driver_memory=1e9), robots=parts).is_certified

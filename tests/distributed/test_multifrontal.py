@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import SEEDS
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from robots import interface_of
 
 from pgo_models.errors import NotPositiveDefiniteError
@@ -28,12 +27,17 @@ def random_team(seed: int, robots: int, separators: int) -> tuple[IntArray, ...]
 def random_contributions(seed: int, touched: tuple[IntArray, ...], width: int) -> list[Array]:
     """Positive semidefinite matrices, each of half rank, their rows separator by separator."""
     rng = np.random.default_rng([seed, 1])
-    halves = [rng.standard_normal((width * len(poses), max(1, width * len(poses) // 2))) for poses in touched]
+    halves = [
+        rng.standard_normal((width * len(poses), max(1, width * len(poses) // 2)))
+        for poses in touched
+    ]
     return [half @ half.T for half in halves]
 
 
 def rows_of(poses: IntArray, width: int) -> IntArray:
-    return np.concatenate([np.zeros(0, dtype=int), *(np.arange(width * p, width * (p + 1)) for p in poses)])
+    return np.concatenate(
+        [np.zeros(0, dtype=int), *(np.arange(width * p, width * (p + 1)) for p in poses)]
+    )
 
 
 def dense(touched: tuple[IntArray, ...], contributions: list[Array], own: Array) -> Array:
@@ -50,9 +54,11 @@ def dense(touched: tuple[IntArray, ...], contributions: list[Array], own: Array)
 
 def check_tree(tree: tuple[Front, ...], touched: tuple[IntArray, ...], separators: int) -> None:
     eliminated = np.concatenate([front.eliminated for front in tree])
-    np.testing.assert_array_equal(np.sort(eliminated), np.arange(separators))  # every separator once
+    # every separator once
+    np.testing.assert_array_equal(np.sort(eliminated), np.arange(separators))
     assert sorted(robot for front in tree for robot in front.robots) == list(range(len(touched)))
-    assert sorted(child for front in tree for child in front.children) == list(range(len(tree) - 1))  # one parent each
+    # one parent each
+    assert sorted(child for front in tree for child in front.children) == list(range(len(tree) - 1))
     assert len(tree[-1].boundary) == 0
     below: list[set[int]] = []
     for number, front in enumerate(tree):
@@ -60,15 +66,29 @@ def check_tree(tree: tuple[Front, ...], touched: tuple[IntArray, ...], separator
         below.append(set(front.robots).union(*(below[child] for child in front.children)))
         assert front.level > max((tree[child].level for child in front.children), default=0)
         inside = {int(pose) for robot in below[number] for pose in touched[robot]}
-        outside = {int(pose) for robot in range(len(touched)) if robot not in below[number] for pose in touched[robot]}
+        outside = {
+            int(pose)
+            for robot in range(len(touched))
+            if robot not in below[number]
+            for pose in touched[robot]
+        }
         assert not set(front.eliminated.tolist()) & outside  # where nobody else touches it ..
         assert set(front.boundary.tolist()) == inside & outside  # .. and no later
-        assert set(front.separators.tolist()) == set(front.eliminated.tolist()) | set(front.boundary.tolist())
+        assert set(front.separators.tolist()) == set(front.eliminated.tolist()) | set(
+            front.boundary.tolist()
+        )
 
 
 @settings(max_examples=examples(40))
-@given(seed=SEEDS, robots=st.integers(1, 12), separators=st.integers(1, 15), width=st.sampled_from([1, 3, 4]))
-def test_factor_and_solve_are_those_of_the_dense_sum(seed: int, robots: int, separators: int, width: int) -> None:
+@given(
+    seed=SEEDS,
+    robots=st.integers(1, 12),
+    separators=st.integers(1, 15),
+    width=st.sampled_from([1, 3, 4]),
+)
+def test_factor_and_solve_are_those_of_the_dense_sum(
+    seed: int, robots: int, separators: int, width: int
+) -> None:
     touched = random_team(seed, robots, separators)
     check_system(seed, touched, separators, width)
 
@@ -96,19 +116,27 @@ def check_system(seed: int, touched: tuple[IntArray, ...], separators: int, widt
     for poses, part in zip(touched, on_parts, strict=True):
         np.testing.assert_array_equal(part, x[rows_of(poses, width)])
     assert energy == pytest.approx(np.vdot(b, expected), rel=1e-9 * np.linalg.cond(total))
-    logs = [2.0 * np.log(np.diag(front.factors[str((width,))].L_EE)).sum() for front in fronts.held.values()]
+    logs = [
+        2.0 * np.log(np.diag(front.factors[str((width,))].L_EE)).sum()
+        for front in fronts.held.values()
+    ]
     assert sum(logs) == pytest.approx(np.linalg.slogdet(total)[1], rel=1e-9, abs=1e-9)
 
 
 @given(seed=SEEDS, robots=st.integers(2, 10), separators=st.integers(1, 10))
-def test_a_sum_that_is_not_positive_definite_is_refused(seed: int, robots: int, separators: int) -> None:
-    touched, width = random_team(seed, robots, separators), 2
+def test_a_sum_that_is_not_positive_definite_is_refused(
+    seed: int, robots: int, separators: int
+) -> None:
+    touched = random_team(seed, robots, separators)
+    width = 2
     contributions = random_contributions(seed, touched, width)
     own = np.zeros((separators, width, width))
     values = np.linalg.eigvalsh(dense(touched, contributions, own))
-    fronts, near = FrontOwners(touched, separators), 1e-6 * values[-1] + 1e-9
+    fronts = FrontOwners(touched, separators)
+    near = 1e-6 * values[-1] + 1e-9
     blocks = np.broadcast_to(np.eye(width), own.shape)
-    interface, given = Interface(separators, (width,), touched, fronts), [packed(one) for one in contributions]
+    interface = Interface(separators, (width,), touched, fronts)
+    given = [packed(one) for one in contributions]
     columns = np.arange(width * separators).reshape(separators, width)
     interface.factorize(given, [(columns, (near - values[0]) * blocks)])
     with pytest.raises(NotPositiveDefiniteError, match="pivot that is not positive"):
@@ -116,11 +144,14 @@ def test_a_sum_that_is_not_positive_definite_is_refused(seed: int, robots: int, 
 
 
 def test_robots_on_a_ring_need_only_small_fronts() -> None:
-    # Robots a and a + 1 share separators 3 a .. 3 a + 2: the driver's dense matrix would have 3 x 64 of them.
-    number, each = 64, 3
+    # Robots a and a + 1 share separators 3 a .. 3 a + 2: the driver's dense matrix would have 3 x
+    # 64 of them.
+    number = 64
+    each = 3
     shared = [np.arange(each * a, each * (a + 1)) for a in range(number)]
     touched = tuple(np.union1d(shared[a - 1], shared[a]) for a in range(number))
-    order = np.random.default_rng(0).permutation(number)  # the tree finds out who is whose neighbour
+    # the tree finds out who is whose neighbour
+    order = np.random.default_rng(0).permutation(number)
     tree = separator_tree([touched[a] for a in order], each * number)
     check_tree(tree, tuple(touched[a] for a in order), each * number)
     assert max(len(front.separators) for front in tree) <= 5 * each
@@ -128,8 +159,10 @@ def test_robots_on_a_ring_need_only_small_fronts() -> None:
 
 
 @pytest.mark.parametrize("most", [0, 5])
-def test_teams_too_large_for_the_spectral_cut_are_halved_in_order(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rooms, "_SPECTRAL", most)
+def test_teams_too_large_for_the_spectral_cut_are_halved_in_order(
+    most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rooms, "_MOST_SPECTRAL", most)
     for seed in range(5):
         touched = random_team(seed, 23, 17)
         check_system(seed, touched, 17, 3)
@@ -139,7 +172,7 @@ def test_teams_too_large_for_the_spectral_cut_are_halved_in_order(most: int, mon
 
 
 def test_more_robots_than_the_spectral_cut_takes() -> None:
-    number = rooms._SPECTRAL + 25
+    number = rooms._MOST_SPECTRAL + 25
     touched = tuple(np.array([a, (a + 1) % number]) for a in range(number))
     tree = separator_tree(touched, number)
     check_tree(tree, touched, number)
@@ -147,8 +180,12 @@ def test_more_robots_than_the_spectral_cut_takes() -> None:
 
 
 @settings(max_examples=examples(30))
-@given(seed=SEEDS, robots=st.integers(1, 12), separators=st.integers(1, 30), least=st.integers(1, 20))
-def test_small_fronts_are_left_to_those_above(seed: int, robots: int, separators: int, least: int) -> None:
+@given(
+    seed=SEEDS, robots=st.integers(1, 12), separators=st.integers(1, 30), least=st.integers(1, 20)
+)
+def test_small_fronts_are_left_to_those_above(
+    seed: int, robots: int, separators: int, least: int
+) -> None:
     touched = random_team(seed, robots, separators)
     tree = separator_tree(touched, separators, least)
     check_tree(tree, touched, separators)

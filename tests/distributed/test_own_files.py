@@ -1,4 +1,4 @@
-"""Robots with files of their own: the answer of the whole graph, and what the driver's process learns of it."""
+"""Robots with files of their own: the solution of the whole graph, and what the driver learns."""
 
 import math
 import shutil
@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from graphs import DIMENSIONS, SEEDS, varied_graph
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from processes import LimitedProcesses, under_limit
 from robots import PARTITIONERS, Partitioner, Recording, arrays_in
 
@@ -26,39 +25,46 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, observe
 from solvers import folder_solve
 from solvers.distributed import staircase, substructured
-from solvers.distributed.driver import Driver
 from solvers.distributed.robots import climbing
 from solvers.distributed.robots.interior import Interior
+from solvers.distributed.stages import ClimbByRobots, NewtonByRobots, SOCByRobots
 from solvers.folder_solve import FolderSolution, solve_folder
-from solvers.pipeline import HANDOVER
+from solvers.pipeline import WARM_START
 from solvers.result import Status
 from solvers.soc.settings import Coupling
+from solvers.stages import Answer
+
+pytestmark = pytest.mark.slow  # solves by robots from end to end
 
 ROBOTS = Path(pgo.__file__).parent.parent / "data" / "robots"
 LIMIT = 27.0  # MB beside the program itself
 
 
 def tower(num_robots: int, poses_each: int) -> PoseGraph:
-    """Robots one above the other on a spiral stair, six steps a turn: six poses of one see the next robot's first."""
-    k, turn, noise = np.arange(num_robots * poses_each), 6, NoiseModel(0.002, 0.0005)
+    """Robots above each other on a spiral stair; six poses of each see the next robot's first."""
+    k = np.arange(num_robots * poses_each)
+    turn = 6
+    noise = NoiseModel(0.002, 0.0005)
     angle = 2.0 * np.pi * k / turn
-    t, axis = np.stack([np.cos(angle), np.sin(angle), 0.1 * k], axis=1), np.array([0.0, 0.0, 1.0])
-    i, j = np.concatenate([k[:-1], k[:-turn]]), np.concatenate([k[1:], k[turn:]])
+    t = np.stack([np.cos(angle), np.sin(angle), 0.1 * k], axis=1)
+    axis = np.array([0.0, 0.0, 1.0])
+    i = np.concatenate([k[:-1], k[:-turn]])
+    j = np.concatenate([k[1:], k[turn:]])
     poses = Poses(exp_map(angle[:, None] * axis), t)
     graph = observe("tower", poses, i, j, noise, 2.5e5, 4e6, np.random.default_rng(0))
     return graph.with_robots(k // poses_each)
 
 
-def check_same(found: FolderSolution, graph: PoseGraph, out: Path) -> None:
+def check_same(solution: FolderSolution, graph: PoseGraph, out: Path) -> None:
     """Objective and bound of the central solve, and files with poses that have this objective."""
     central = solvers.solve(graph, robots=pgo.partition(graph, graph.num_robots))
-    certificate = found.certificate
-    assert found.status.is_success
+    certificate = solution.certificate
+    assert solution.status.is_success
     assert certificate.verdict is central.certificate.verdict
     level = central.certificate.rounding_level
     assert certificate.objective == pytest.approx(central.objective, rel=1e-9, abs=level)
     assert certificate.lower_bound == pytest.approx(central.lower_bound, rel=1e-6, abs=level)
-    assert found.sizes.sum(axis=1).tolist() == [graph.num_poses, graph.num_edges]
+    assert solution.sizes.sum(axis=1).tolist() == [graph.num_poses, graph.num_edges]
     written = read_g2o(out)
     assert (written.num_poses, written.num_edges) == (graph.num_poses, graph.num_edges)
     np.testing.assert_array_equal(written.robots, graph.robots)
@@ -71,9 +77,15 @@ def check_same(found: FolderSolution, graph: PoseGraph, out: Path) -> None:
 @settings(max_examples=12, deadline=None)
 @given(seed=SEEDS, n=st.integers(4, 30), d=DIMENSIONS, partitioner=PARTITIONERS, drop=st.booleans())
 def test_folders_are_solved_as_the_whole_graph(
-    tmp_path_factory: pytest.TempPathFactory, seed: int, n: int, d: int, partitioner: Partitioner, drop: bool
+    tmp_path_factory: pytest.TempPathFactory,
+    seed: int,
+    n: int,
+    d: int,
+    partitioner: Partitioner,
+    drop: bool,
 ) -> None:
-    graph, folder = varied_graph(seed, n, d), tmp_path_factory.mktemp("folder")
+    graph = varied_graph(seed, n, d)
+    folder = tmp_path_factory.mktemp("folder")
     graph = graph.with_robots(partitioner(graph, seed).robot)
     graph = replace(graph, initial=Poses.of_points(np.zeros((n, d))))
     write_g2o_folder(graph, folder)
@@ -90,14 +102,17 @@ def test_folders_are_solved_as_the_whole_graph(
 
 
 @pytest.mark.parametrize("away", [1e6, 1e12, 9e14])
-def test_what_is_certified_is_what_is_written_however_far_its_frame(away: float, tmp_path: Path) -> None:
+def test_what_is_certified_is_what_is_written_however_far_its_frame(
+    away: float, tmp_path: Path
+) -> None:
     graph = varied_graph(1, 20, 2).with_robots(np.arange(20) // 7)
     assert graph.truth is not None
     write_g2o_folder(graph, tmp_path / "in", graph.truth.moved(np.eye(2), np.array([away, -away])))
     certificate = solve_folder(tmp_path / "in", out=tmp_path / "out").certificate
     written = read_g2o(tmp_path / "out")
     assert written.initial is not None
-    F, level = pgo.PGOProblem(written).objective(written.initial), certificate.rounding_level
+    F = pgo.PGOProblem(written).objective(written.initial)
+    level = certificate.rounding_level
     assert certificate.objective == pytest.approx(F, rel=1e-9, abs=level)
     assert certificate.gap == pytest.approx((F - certificate.lower_bound) / F, rel=1e-6, abs=1e-9)
     assert certificate.is_certified == (certificate.gap <= certificate.wanted_gap)
@@ -106,11 +121,16 @@ def test_what_is_certified_is_what_is_written_however_far_its_frame(away: float,
 def test_an_edge_that_no_end_has_counts_all_the_same(tmp_path: Path) -> None:
     """Edges between robots 0 and 1 stand in the file of robot 2, twice in that of robot 3."""
     shutil.copytree(ROBOTS, tmp_path / "in")
-    graph, moved = read_g2o(ROBOTS), []
+    graph = read_g2o(ROBOTS)
+    moved = []
     for robot in (0, 1):
         path = tmp_path / "in" / f"{robot}.g2o"
         lines = path.read_text().splitlines(keepends=True)
-        cut = [k for k, line in enumerate(lines) if {word >> 56 for word in ends_of(line)} == {ord("a"), ord("b")}]
+        cut = [
+            k
+            for k, line in enumerate(lines)
+            if {word >> 56 for word in ends_of(line)} == {ord("a"), ord("b")}
+        ]
         moved += [lines[k] for k in cut] if robot == 0 else []
         path.write_text("".join(line for k, line in enumerate(lines) if k not in cut))
     assert moved
@@ -133,9 +153,9 @@ def test_the_frame_is_that_of_a_fixed_pose(tmp_path: Path) -> None:
     for pose in (100, 130):
         with (tmp_path / "in" / f"{graph.robots[pose]}.g2o").open("a") as file:
             file.write(f"FIX {graph.pose_ids[pose]}\n")
-    found = solve_folder(tmp_path / "in", out=tmp_path / "out")
+    solution = solve_folder(tmp_path / "in", out=tmp_path / "out")
     written = read_g2o(tmp_path / "out")
-    assert found.frame == f"pose {graph.pose_ids[100]} where its file has it"
+    assert solution.frame == f"pose {graph.pose_ids[100]} where its file has it"
     assert written.initial is not None
     assert written.fixed.tolist() == [100, 130]
     np.testing.assert_allclose(written.initial.t[100], graph.initial.t[100], rtol=0, atol=1e-9)
@@ -146,38 +166,55 @@ def test_the_frame_is_that_of_a_fixed_pose(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("climbs", [False, True])
-def test_messages_do_not_grow_with_the_interiors(climbs: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_do_not_grow_with_the_interiors(
+    climbs: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Nor do requests and answers that are off the ledger, in the staircase or before."""
     monkeypatch.setattr(substructured, "ENOUGH_NORMS", 60)
-    pipeline, largest, width = solvers.Pipeline(), [], 6
-    if climbs:  # no bound is good enough for it, and so it goes up a dimension, where it finds no way down
+    pipeline = solvers.Pipeline()
+    largest = []
+    width = 6
+    # no bound is good enough for it, and so it goes up a dimension, where it finds no way down
+    if climbs:
         monkeypatch.setattr(staircase, "smallest_shift", lambda *_: 1e-30)
-        pipeline, width = replace(pipeline, newton=solvers.Newton(max_iterations=0), second_try=False), 10
+        pipeline = replace(pipeline, newton=solvers.Newton(max_iterations=0), second_try=False)
+        width = 10
     for poses_each in (100, 800):
-        graph, engine, folder = tower(3, poses_each), Recording(), tmp_path / str(poses_each)
+        graph = tower(3, poses_each)
+        engine = Recording()
+        folder = tmp_path / str(poses_each)
         write_g2o_folder(graph, folder)
-        found = solve_folder(folder, pipeline, engine=engine, out=folder / "out")
-        assert found.certificate.is_certified
+        solution = solve_folder(folder, pipeline, engine=engine, out=folder / "out")
+        assert solution.certificate.is_certified
         assert (engine.times(climbing.climb) > 0) == climbs
         assert max(agent.subgraph.graph.num_edges for agent in engine.agents) >= 2 * poses_each - 10
-        on_ledger = max(int(traffic.num_bytes.max(initial=0)) for traffic, _ in found.ledger.counted)
-        sizes = [np.size(value) for _, *both in engine.log for one in both for _, value in arrays_in(tuple(one))]
+        on_ledger = max(
+            int(traffic.num_bytes.max(initial=0)) for traffic, _ in solution.ledger.counted
+        )
+        sizes = [
+            np.size(value)
+            for _, *both in engine.log
+            for messages in both
+            for _, value in arrays_in(tuple(messages))
+        ]
         largest.append((on_ledger, max(sizes)))
-    # Of 12 poses in the cover, 6 at most with one robot twice: a triangle of 72 rows. Norms are at most 60 + 3.
+    # Of 12 poses in the cover, 6 at most with one robot twice: a triangle of 72 rows. Norms are at
+    # most 60 + 3.
     assert largest[0] == largest[1]
     assert largest[1][1] <= 12 * width * (12 * width + 1) // 2
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_DATA counts private memory on Linux alone")
-@pytest.mark.slow
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="RLIMIT_DATA counts private memory on Linux alone"
+)
 def test_no_process_has_room_for_the_whole_graph(tmp_path: Path) -> None:
     graph = tower(16, 600)
     write_g2o_folder(graph, tmp_path / "in")
     with pytest.raises(MemoryError):
         under_limit(LIMIT, read_size, tmp_path / "in")
-    found = under_limit(LIMIT, solve_limited, tmp_path / "in", tmp_path / "out")
-    assert found.certificate.is_certified
-    check_same(found, graph, tmp_path / "out")
+    solution = under_limit(LIMIT, solve_limited, tmp_path / "in", tmp_path / "out")
+    assert solution.certificate.is_certified
+    check_same(solution, graph, tmp_path / "out")
 
 
 def read_size(folder: Path) -> int:
@@ -185,11 +222,11 @@ def read_size(folder: Path) -> int:
 
 
 def solve_limited(folder: Path, out: Path) -> FolderSolution:
-    found = solve_folder(folder, engine=LimitedProcesses(LIMIT), out=out)
-    return replace(found, stages=found.stages[-1:])
+    solution = solve_folder(folder, engine=LimitedProcesses(LIMIT), out=out)
+    return replace(solution, stages=solution.stages[-1:])
 
 
-# What is refused, and what is said.
+# Errors and their messages.
 
 
 def test_what_takes_the_whole_graph_is_refused(tmp_path: Path) -> None:
@@ -197,12 +234,17 @@ def test_what_takes_the_whole_graph_is_refused(tmp_path: Path) -> None:
     for soc in (solvers.SOC(robots=robots), solvers.PaperSOC()):
         with pytest.raises(SettingError, match="own run SUBSTRUCTURED SOC"):
             solve_folder(ROBOTS, solvers.Pipeline(soc=soc))
-    for soc in (solvers.SOC(robots=robots, coupling=Coupling.SUBSTRUCTURED), solvers.SOC(r_step=solvers.RStep.FISTA)):
+    for soc in (
+        solvers.SOC(robots=robots, coupling=Coupling.SUBSTRUCTURED),
+        solvers.SOC(r_step=solvers.RStep.FISTA),
+    ):
         with pytest.raises(SettingError, match="are those of the files, and factor"):
             solve_folder(ROBOTS, solvers.Pipeline(soc=soc))
     shutil.copytree(ROBOTS, tmp_path / "in")
     graph = read_g2o(ROBOTS)
-    write_g2o_folder(graph.with_position_prior(np.arange(5), np.eye(3)[np.arange(5) % 3], 1.0), tmp_path / "in")
+    write_g2o_folder(
+        graph.with_position_prior(np.arange(5), np.eye(3)[np.arange(5) % 3], 1.0), tmp_path / "in"
+    )
     with pytest.raises(GraphError, match=r"0\.g2o has priors or landmarks, .* --split given"):
         solve_folder(tmp_path / "in")
 
@@ -230,58 +272,84 @@ def test_the_staircase_is_run_by_the_robots(d: int, tmp_path: Path) -> None:
     graph = varied_graph(1, 30, d, NoiseModel(translation_std=1.0, rotation_std=1.5))
     graph = graph.with_robots(pgo.partition(graph, 4).robot)
     write_g2o_folder(graph, tmp_path / "in")
-    found = solve_folder(tmp_path / "in", out=tmp_path / "out")
+    solution = solve_folder(tmp_path / "in", out=tmp_path / "out")
     central = solvers.solve(graph, robots=pgo.partition(graph, 4))
-    assert [stage.name for stage in found.stages] == [stage.name for stage in central.stages]
-    assert "Staircase" in [stage.name for stage in found.stages]
-    assert found.certificate.source is central.certificate.source is BoundSource.RELAXATION
-    assert found.certificate.lower_bound == pytest.approx(central.lower_bound, rel=1e-6)
+    assert [stage.name for stage in solution.stages] == [stage.name for stage in central.stages]
+    assert "Staircase" in [stage.name for stage in solution.stages]
+    assert solution.certificate.source is central.certificate.source is BoundSource.RELAXATION
+    assert solution.certificate.lower_bound == pytest.approx(central.lower_bound, rel=1e-6)
     written = read_g2o(tmp_path / "out")
     assert written.initial is not None
-    assert pgo.PGOProblem(written).objective(written.initial) == pytest.approx(found.certificate.objective, rel=1e-9)
-    unfinished = solvers.Pipeline(soc=None, newton=solvers.Newton(max_iterations=0), second_try=False, staircase=None)
+    assert pgo.PGOProblem(written).objective(written.initial) == pytest.approx(
+        solution.certificate.objective, rel=1e-9
+    )
+    unfinished = solvers.Pipeline(
+        soc=None, newton=solvers.Newton(max_iterations=0), second_try=False, staircase=None
+    )
     without = solve_folder(tmp_path / "in", unfinished).certificate
     assert without.lower_bound == 0.0  # none was found, so it is no relaxation's
     assert without.source is BoundSource.GIVEN
 
 
 def test_the_staircase_follows_where_newton_has_had_no_step() -> None:
-    unfinished = solvers.Pipeline(soc=None, newton=solvers.Newton(max_iterations=0), second_try=False)
-    found, without = solve_folder(ROBOTS, unfinished), solve_folder(ROBOTS, replace(unfinished, staircase=None))
+    unfinished = solvers.Pipeline(
+        soc=None, newton=solvers.Newton(max_iterations=0), second_try=False
+    )
+    solution = solve_folder(ROBOTS, unfinished)
+    without = solve_folder(ROBOTS, replace(unfinished, staircase=None))
     assert not without.certificate.is_certified
-    assert found.certificate.gap < without.certificate.gap
+    assert solution.certificate.gap < without.certificate.gap
 
 
-def test_the_staircase_climbs_from_the_best(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_staircase_climbs_from_the_best(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     graph = varied_graph(1, 30, 2, NoiseModel(translation_std=1.0, rotation_std=1.5))
     graph = graph.with_robots(pgo.partition(graph, 4).robot)
     write_g2o_folder(graph, tmp_path / "in")
     began: list[float] = []
-    climb = folder_solve.climb_distributed
+    climb = ClimbByRobots.run
+    soc = SOCByRobots.run
+    newton = NewtonByRobots.run
+    tolerances: list[float] = []
     away = np.random.default_rng(0).standard_normal((2, 2))
 
-    def noted(driver: Driver, *args: Any) -> Any:
-        began.extend([driver.at.objective, math.fsum(part.objective for part in driver.ask(Interior.evaluate, None))])
-        return climb(driver, *args)
+    def noted(stage: ClimbByRobots, answer: Answer) -> Answer:
+        driver = stage.job.driver
+        began.extend(
+            [
+                driver.at.objective,
+                math.fsum(part.objective for part in driver.ask(Interior.evaluate, None)),
+            ]
+        )
+        return climb(stage, answer)
 
-    def worse(driver: Driver, *args: Any) -> float:
-        decrement = refine(driver, *args)
-        if len(began) == 0 and args[-1].tolerance < HANDOVER.tolerance:  # of the second try
+    def remembered(stage: SOCByRobots, answer: Answer) -> Answer:
+        tolerances.append(stage.soc.tolerance)
+        return soc(stage, answer)
+
+    def worse(stage: NewtonByRobots, answer: Answer) -> Answer:
+        refined = newton(stage, answer)
+        driver = stage.job.driver
+        if len(began) == 0 and tolerances[-1] < WARM_START.tolerance:  # of the second try
             driver.adopt(np.broadcast_to(project_to_rotations(away), driver.at.R.shape))
-        return decrement
+        return refined
 
-    refine = folder_solve.refine
-    monkeypatch.setattr(folder_solve, "climb_distributed", noted)
-    monkeypatch.setattr(folder_solve, "refine", worse)
-    found = solve_folder(tmp_path / "in")
-    best = min(stage.objective for stage in found.stages if stage.name == "Newton")
+    monkeypatch.setattr(ClimbByRobots, "run", noted)
+    monkeypatch.setattr(SOCByRobots, "run", remembered)
+    monkeypatch.setattr(NewtonByRobots, "run", worse)
+    solution = solve_folder(tmp_path / "in")
+    best = min(stage.objective for stage in solution.stages if stage.name == "Newton")
     assert began == pytest.approx([best, best], rel=1e-9)
 
 
-def test_ctrl_c_between_the_loops_keeps_what_was_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_between_the_loops_keeps_what_was_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     graph = varied_graph(1, 30, 2, NoiseModel(translation_std=1.0, rotation_std=1.5))
     write_g2o_folder(graph.with_robots(pgo.partition(graph, 4).robot), tmp_path / "in")
-    bound, calls = folder_solve.best_bound_distributed, list[int]()
+    bound = folder_solve.best_bound_distributed
+    calls = list[int]()
 
     def interrupted(*args: Any) -> Any:
         calls.append(len(calls))
@@ -290,11 +358,13 @@ def test_ctrl_c_between_the_loops_keeps_what_was_found(tmp_path: Path, monkeypat
         return bound(*args)
 
     monkeypatch.setattr(folder_solve, "best_bound_distributed", interrupted)
-    found = solve_folder(tmp_path / "in", out=tmp_path / "out")
-    assert found.status is Status.INTERRUPTED
+    solution = solve_folder(tmp_path / "in", out=tmp_path / "out")
+    assert solution.status is Status.INTERRUPTED
     written = read_g2o(tmp_path / "out")
     assert written.initial is not None
-    assert pgo.PGOProblem(written).objective(written.initial) == pytest.approx(found.certificate.objective, rel=1e-9)
+    assert pgo.PGOProblem(written).objective(written.initial) == pytest.approx(
+        solution.certificate.objective, rel=1e-9
+    )
 
 
 def test_a_second_try_keeps_the_better(monkeypatch: pytest.MonkeyPatch) -> None:

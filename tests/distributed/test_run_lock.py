@@ -40,12 +40,15 @@ def test_refusals_and_releases_leave_no_file_open(tmp_path):
 
 
 def test_a_lock_that_is_removed_before_it_is_had_is_none(tmp_path, monkeypatch):
-    first, taken, lock = RunLock(tmp_path / "a"), [], run_lock._lock
+    first = RunLock(tmp_path / "a")
+    taken = []
+    lock = run_lock._lock
 
     def slow(file):
         monkeypatch.setattr(run_lock, "_lock", lock)
         first.release()
-        taken.append(RunLock(tmp_path / "a"))  # a third run, on a new file; `file` is of the one that was removed
+        # a third run, on a new file; `file` is of the one that was removed
+        taken.append(RunLock(tmp_path / "a"))
         return lock(file)
 
     monkeypatch.setattr(run_lock, "_lock", slow)
@@ -64,7 +67,10 @@ RunLock(Path({str(tmp_path / "a")!r}))
 os._exit(9)
 """
     environment = {**os.environ, "PYTHONPATH": str(Path(solvers.__file__).parent.parent)}
-    assert subprocess.run([sys.executable, "-c", program], env=environment, check=False).returncode == 9
+    assert (
+        subprocess.run([sys.executable, "-c", program], env=environment, check=False).returncode
+        == 9
+    )
     assert [file.name for file in tmp_path.iterdir()] == ["a.lock"]
     RunLock(tmp_path / "a").release()
     assert list(tmp_path.iterdir()) == []

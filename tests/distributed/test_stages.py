@@ -1,4 +1,4 @@
-"""A whole solve by driver and robots: the certificate and the solution are those of one computer."""
+"""A whole solve by driver and robots: its certificate and solution are those of one computer."""
 
 import math
 from collections.abc import Callable
@@ -19,8 +19,7 @@ from graphs import (
     varied_problem,
     wound_ring,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, driver_at, metis, scattered
 
 from pgo_models.certificates.certificate import DEFAULT_GAP
@@ -41,7 +40,7 @@ from solvers.distributed.lower_bound import best_bound_distributed, prove_with_e
 from solvers.distributed.robots.interior import Interior
 from solvers.network.engine import InProcess
 from solvers.network.faults import Faults
-from solvers.pipeline import HANDOVER, Pipeline, solve
+from solvers.pipeline import WARM_START, Pipeline, solve
 from solvers.result import Record, Status
 from solvers.riemannian.newton import Newton, gauss_newton
 from solvers.soc.anderson import Anderson
@@ -49,10 +48,13 @@ from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
 from solvers.solution import Solution
 
+pytestmark = pytest.mark.slow  # solves by robots from end to end
+
 ROOT = Path(__file__).parents[2]
 SIZES = st.integers(2, 20)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
-BY_SOC = replace(HANDOVER, max_iterations=99)  # in one place, too, where the default goes to Newton at once
+# in one place, too, where the default goes to Newton at once
+BY_SOC = replace(WARM_START, max_iterations=99)
 SHORT = Pipeline(soc=BY_SOC, second_try=False, staircase=None)
 
 
@@ -63,7 +65,9 @@ def check_certificate(problem: PGOProblem, parts: Partition, poses: Poses) -> No
     central = best_bound(problem, Lambda, poses, DEFAULT_GAP, objective)
     found = best_bound_distributed(driver, DEFAULT_GAP)
     if not math.isnan(central.eta):
-        np.testing.assert_allclose(collect(driver)[1], Lambda, rtol=0, atol=1e-11 * problem.M.diagonal().max())
+        np.testing.assert_allclose(
+            collect(driver)[1], Lambda, rtol=0, atol=1e-11 * problem.M.diagonal().max()
+        )
     off = relative_decrement(problem, poses)
     if off > 1e-6:  # grounded at another pose, off an optimum, it is another bound: both hold
         best = problem.objective(polish(problem, poses))
@@ -71,12 +75,20 @@ def check_certificate(problem: PGOProblem, parts: Partition, poses: Poses) -> No
         return
     assert found.is_grounded == central.is_grounded
     assert found.eta == pytest.approx(central.eta, rel=1e-9, nan_ok=True)
-    assert found.value == pytest.approx(central.value, rel=1e-9 + off, abs=found.rounding + central.rounding)
+    assert found.value == pytest.approx(
+        central.value, rel=1e-9 + off, abs=found.rounding + central.rounding
+    )
 
 
 @settings(max_examples=examples(40))
 @given(
-    seed=SEEDS, n=SIZES, d=DIMENSIONS, noise=NOISES, partitioner=PARTITIONERS, backend=BACKENDS, polished=st.booleans()
+    seed=SEEDS,
+    n=SIZES,
+    d=DIMENSIONS,
+    noise=NOISES,
+    partitioner=PARTITIONERS,
+    backend=BACKENDS,
+    polished=st.booleans(),
 )
 def test_the_bound_is_the_central_one_at_any_poses(
     seed: int,
@@ -89,7 +101,9 @@ def test_the_bound_is_the_central_one_at_any_poses(
 ) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, noise), backend)
     start = chordal_start(problem)
-    check_certificate(problem, partitioner(problem.graph, seed), polish(problem, start) if polished else start)
+    check_certificate(
+        problem, partitioner(problem.graph, seed), polish(problem, start) if polished else start
+    )
 
 
 @pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)
@@ -114,8 +128,10 @@ def test_a_shift_is_proved_by_all_together_where_one_proves_it(
         rows = slice(n + d * i, n + d * (i + 1))
         S[rows, rows] -= Lambda[i]
     S[0, 0] *= 2.0
-    weight = np.concatenate([np.full(n, 1e-7), np.ones(d * n)])  # the shift is on the rotations alone
-    low, high = 0.0, scale
+    # the shift is on the rotations alone
+    weight = np.concatenate([np.full(n, 1e-7), np.ones(d * n)])
+    low = 0.0
+    high = scale
     for _ in range(60):
         middle = 0.5 * (low + high)
         rotations = S + middle * np.diag(weight > 0.5)
@@ -123,7 +139,8 @@ def test_a_shift_is_proved_by_all_together_where_one_proves_it(
     for eta in (0.99 * high, 1.01 * high + 1e-9 * scale):
         if min(abs(eta - high), eta) <= 1e-11 * scale:
             continue
-        found, central = prove_with_eta(driver, eta), prove_bound(problem, Lambda, eta)
+        found = prove_with_eta(driver, eta)
+        central = prove_bound(problem, Lambda, eta)
         assert (found is not None) == (central is not None) == (eta > high)
         assert found is None or found.value == pytest.approx(central, rel=1e-12, abs=1e-12 * scale)
 
@@ -136,10 +153,14 @@ def check_equal(distributed: Solution, central: Solution) -> None:
     rounding = rounding_of_objective(problem, central.poses.stacked()) + 1e-12 * central.objective
     assert abs(distributed.objective - central.objective) <= rounding
     rounding += (
-        central.certificate.rounding_level + central.certificate.bound.rounding + distributed.certificate.bound.rounding
+        central.certificate.rounding_level
+        + central.certificate.bound.rounding
+        + distributed.certificate.bound.rounding
     )
     assert abs(distributed.lower_bound - central.lower_bound) <= rounding
-    assert distributed.gap == pytest.approx(central.gap, abs=2 * rounding / max(central.objective, 1e-300))
+    assert distributed.gap == pytest.approx(
+        central.gap, abs=2 * rounding / max(central.objective, 1e-300)
+    )
     assert distributed.certificate.verdict is central.certificate.verdict
     assert distributed.status is central.status
     assert [stage.name for stage in distributed.stages] == [stage.name for stage in central.stages]
@@ -157,7 +178,8 @@ def test_the_solution_is_the_central_one(
 ) -> None:
     problem = PGOProblem(varied_graph(seed, n, d), backend)
     parts = partitioner(problem.graph, seed)
-    distributed, central = solve(problem, SHORT, robots=parts), solve(problem, SHORT)
+    distributed = solve(problem, SHORT, robots=parts)
+    central = solve(problem, SHORT)
     check_equal(distributed, central)
     assert distributed.is_certified
     assert distributed.robots is parts
@@ -178,21 +200,28 @@ def test_the_solution_is_the_central_one(
     ],
     ids=["SOC", "no SOC", "Gauss-Newton", "SOC to the end"],
 )
-def test_every_pipeline_ends_at_the_central_solution(pipeline: Pipeline, d: int, given_start: bool) -> None:
+def test_every_pipeline_ends_at_the_central_solution(
+    pipeline: Pipeline, d: int, given_start: bool
+) -> None:
     problem = varied_problem(3, 25, d)
     start = problem.graph.truth if given_start else None
     central = solve(problem, pipeline, start)
     for partitioner in (metis, scattered):
         distributed = solve(problem, pipeline, start, robots=partitioner(problem.graph, 3))
         check_equal(distributed, central)
-        first, other = distributed.stages[0], central.stages[0]
+        first = distributed.stages[0]
+        other = central.stages[0]
         assert first.objective == pytest.approx(other.objective, rel=1e-12)
 
 
 @settings(max_examples=examples(8))
 @given(seed=SEEDS, n=st.integers(4, 10), d=DIMENSIONS, partitioner=PARTITIONERS)
-def test_a_bound_holds_where_nothing_is_certified(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
-    problem = PGOProblem(varied_graph(seed, n, d, NoiseModel(translation_std=1.0, rotation_std=1.5)))
+def test_a_bound_holds_where_nothing_is_certified(
+    seed: int, n: int, d: int, partitioner: Partitioner
+) -> None:
+    problem = PGOProblem(
+        varied_graph(seed, n, d, NoiseModel(translation_std=1.0, rotation_std=1.5))
+    )
     solution = solve(problem, SHORT, robots=partitioner(problem.graph, seed))
     assert 0 <= solution.lower_bound <= best_known(problem, seed)
     assert solution.objective == pytest.approx(problem.objective(solution.poses), rel=1e-12)
@@ -200,7 +229,8 @@ def test_a_bound_holds_where_nothing_is_certified(seed: int, n: int, d: int, par
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_a_second_try_and_the_staircase_follow_where_the_gap_stays_wide(d: int) -> None:
-    # The cycle closes with half a turn too much: the chordal start is at a local minimum or the relaxation is loose.
+    # The cycle closes with half a turn too much: the chordal start is at a local minimum or the
+    # relaxation is loose.
     problem = PGOProblem(varied_graph(11, 14, d, NoiseModel(translation_std=1.0, rotation_std=1.5)))
     solution = solve(problem, robots=3)
     central = solve(problem, Pipeline(soc=BY_SOC))
@@ -222,13 +252,23 @@ def test_a_number_of_robots_stands_for_the_default_partition() -> None:
 def test_the_staircase_is_watched_wherever_it_runs(robots: int | None) -> None:
     (problem, wound), seen = wound_ring(20, 2), list[str]()
     short = Pipeline(soc=None, second_try=False)
-    solve(problem, short, wound, robots=robots, callback=lambda state, _: seen.append(type(state).__name__))
+    solve(
+        problem,
+        short,
+        wound,
+        robots=robots,
+        callback=lambda state, _: seen.append(type(state).__name__),
+    )
     assert {name for name in seen if "Staircase" in name}
 
 
 def test_an_anchor_is_a_pose() -> None:
     graph = victoria_park(np.random.default_rng(0), num_poses=30)
-    for anchor, said in ((1.5, "whole number"), (True, "whole number"), (int(graph.landmarks[0]), "a landmark")):
+    for anchor, said in (
+        (1.5, "whole number"),
+        (True, "whole number"),
+        (int(graph.landmarks[0]), "a landmark"),
+    ):
         with pytest.raises(SettingError, match=said):
             solve(graph, anchor=anchor)
 
@@ -242,8 +282,11 @@ def test_a_start_or_a_partition_of_another_graph_is_refused() -> None:
 
 
 @pytest.mark.parametrize("robot", [0, 2])
-def test_ctrl_c_while_robots_go_to_a_trial_leaves_none_behind(robot: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    accept, calls = Interior.accept, list[int]()
+def test_ctrl_c_while_robots_go_to_a_trial_leaves_none_behind(
+    robot: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    accept = Interior.accept
+    calls = list[int]()
 
     def interrupted(interior: Interior, request: None) -> tuple[Interior, None]:
         calls.append(len(calls))
@@ -280,7 +323,9 @@ def interrupt(state: object, record: Record) -> None:
     ],
 )
 def test_a_run_that_is_cut_short_gives_poses_and_a_bound_that_holds(
-    callback: Callable[[object, Record], bool | None] | None, time_limit: float, expected: list[Status]
+    callback: Callable[[object, Record], bool | None] | None,
+    time_limit: float,
+    expected: list[Status],
 ) -> None:
     problem = varied_problem(6, 25, 3, LOUD_NOISE)
     parts = metis(problem.graph, 4)
@@ -298,10 +343,16 @@ def test_a_run_that_is_cut_short_gives_poses_and_a_bound_that_holds(
 STAGES = {
     "substructured": (SOC(coupling=Coupling.SUBSTRUCTURED, max_iterations=4), None),
     "consensus": (SOC(max_iterations=4), None),
-    "consensus, each accelerates alone": (SOC(max_iterations=4, acceleration=Anderson(per_robot=True)), None),
+    "consensus, each accelerates alone": (
+        SOC(max_iterations=4, acceleration=Anderson(per_robot=True)),
+        None,
+    ),
     "consensus, loss": (SOC(max_iterations=9), Faults(loss=0.3, seed=1)),
     "consensus, delay": (SOC(max_iterations=9), Faults(max_delay=4, seed=2)),
-    "consensus, silence": (SOC(max_iterations=9), Faults(silent_robot=1, silent_from=2, silent_rounds=9)),
+    "consensus, silence": (
+        SOC(max_iterations=9),
+        Faults(silent_robot=1, silent_from=2, silent_rounds=9),
+    ),
 }
 
 
@@ -324,10 +375,14 @@ def test_every_stage_reports_f_of_its_poses(stage: str, d: int, threads: int) ->
             short = replace(pipeline, second_try=False, staircase=None)
             solution = solve(problem, short, start, robots=parts, engine=InProcess(threads))
             rounding = 1e-12 * solution.objective
-            assert solution.objective == pytest.approx(problem.objective(solution.poses), abs=rounding)
+            assert solution.objective == pytest.approx(
+                problem.objective(solution.poses), abs=rounding
+            )
             assert solution.stages[-1].objective == pytest.approx(solution.objective, abs=rounding)
             if pipeline.newton is stay:
-                assert solution.stages[-2].objective == pytest.approx(solution.objective, abs=rounding)
+                assert solution.stages[-2].objective == pytest.approx(
+                    solution.objective, abs=rounding
+                )
 
 
 # Folders with one file a robot.

@@ -1,4 +1,4 @@
-"""SOC by driver and robots takes the steps of JOINT, whatever the partition and the penalty rule."""
+"""SOC by driver and robots takes the steps of JOINT, for every partition and penalty rule."""
 
 from dataclasses import replace
 from itertools import islice
@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph, varied_problem
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from robots import (
     BACKENDS,
     PARTITIONERS,
@@ -27,25 +26,27 @@ from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.stationarity import rotation_scale
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
 from solvers.loop import iterate, run
 from solvers.result import Status
 from solvers.soc.anderson import Anderson
-from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule, rotation_scale
+from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC, SOCState
 
 SIZES = st.integers(2, 20)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
 CONVERGED = 1e-8
-STALLED = MultiplierPenalty(stall_window=3, stall_ratio=1e-6)  # anything counts as stalled after three steps
+# anything counts as stalled after three steps
+STALLED = MultiplierPenalty(stall_window=3, stall_ratio=1e-6)
 
 
 def pairs(
     problem: PGOProblem, parts: Partition, soc: SOC, steps: int
 ) -> tuple[list[SOCState], list[SubstructuredState], Driver]:
-    """Iterates of the central recursion, until only rounding is left, and as many of the distributed one."""
+    """Iterates of the central recursion until only rounding is left, and as many by robots."""
     start = chordal_start(problem)
     driver = driver_at(problem, parts, start)
     central = []
@@ -61,11 +62,19 @@ def pairs(
 def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> tuple[int, int]:
     """Compare iterate by iterate; the refreshes and raises that took place."""
     central, distributed, driver = pairs(problem, parts, soc, steps)
-    for one, other in zip(central, distributed, strict=True):
-        assert (other.k, other.refreshes, other.raises) == (one.k, one.refreshes, one.raises)
-        np.testing.assert_allclose(other.primal_residual, one.primal_residual, rtol=1e-6, atol=1e-8)
-        np.testing.assert_allclose(other.dual_residual, one.dual_residual, rtol=1e-6, atol=1e-8)
-        ratio = one.rho / rotation_scale(problem)
+    for expected, other in zip(central, distributed, strict=True):
+        assert (other.k, other.refreshes, other.raises) == (
+            expected.k,
+            expected.refreshes,
+            expected.raises,
+        )
+        np.testing.assert_allclose(
+            other.primal_residual, expected.primal_residual, rtol=1e-6, atol=1e-8
+        )
+        np.testing.assert_allclose(
+            other.dual_residual, expected.dual_residual, rtol=1e-6, atol=1e-8
+        )
+        ratio = expected.rho / rotation_scale(problem)
         np.testing.assert_allclose(np.sort(other.ratio), np.sort(ratio), rtol=1e-6, atol=0)
     SubstructuredSOC(soc).finish(driver)
     poses, _ = collect(driver)
@@ -89,9 +98,13 @@ def small_penalty(problem: PGOProblem) -> FixedPenalty:
     noise=NOISES,
     partitioner=PARTITIONERS,
     backend=BACKENDS,
-    rule=st.sampled_from([MultiplierPenalty(), STALLED, BalancedPenalty(), BalancedPenalty(scale=30.0)]),
+    rule=st.sampled_from(
+        [MultiplierPenalty(), STALLED, BalancedPenalty(), BalancedPenalty(scale=30.0)]
+    ),
     alpha=st.sampled_from([1.0, 1.6]),
-    acceleration=st.sampled_from([None, Anderson(), Anderson(memory=2, restart_ratio=1.01), Anderson(per_robot=True)]),
+    acceleration=st.sampled_from(
+        [None, Anderson(), Anderson(memory=2, restart_ratio=1.01), Anderson(per_robot=True)]
+    ),
 )
 def test_the_iterates_are_those_of_joint(
     seed: int,
@@ -149,14 +162,17 @@ def test_a_long_accelerated_run_ends_where_joint_ends(d: int) -> None:
 def test_a_state_that_is_not_finite_is_said_to_be_and_leaves_the_last_one_behind() -> None:
     problem = varied_problem(0, 12, 3)
     driver = driver_at(problem, metis(problem.graph, 2), None)
-    start, method = driver.at.objective, SubstructuredSOC()
+    start = driver.at.objective
+    method = SubstructuredSOC()
     state = method.init(driver, None)
     assert driver.block is not None
     driver.block = replace(driver.block, s=np.full_like(driver.block.s, np.nan))
     broken = method.step(driver, state)
     assert broken.k == 1
     measurement = method.measure(driver, broken)
-    assert np.isnan([measurement.objective, measurement.primal_residual, measurement.dual_residual]).all()
+    assert np.isnan(
+        [measurement.objective, measurement.primal_residual, measurement.dual_residual]
+    ).all()
     assert method.converged(broken, measurement) is None
     method.finish(driver)
     assert driver.at.objective == pytest.approx(start, rel=1e-12)

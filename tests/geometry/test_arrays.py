@@ -1,4 +1,4 @@
-"""What frozen objects hold is theirs: copied on the way in, read-only after, never cast silently."""
+"""Frozen objects copy their arrays, keep them read-only, and never cast them silently."""
 
 import copy
 import pickle
@@ -9,8 +9,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from graphs import DIMENSIONS, SEEDS, SIZES, varied_graph
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.sparse import issparse
 
@@ -34,7 +33,11 @@ def writable_graph(seed: int, n: int, d: int) -> tuple[PoseGraph, dict[str, np.n
     graph = varied_graph(seed, n, d)
     k = 3 if d == 2 else 6
     own = {name: getattr(graph, name).copy() for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")}
-    own |= {"information": np.tile(np.eye(k), (graph.num_edges, 1, 1)), "ids": np.arange(n), "fixed": np.arange(1)}
+    own |= {
+        "information": np.tile(np.eye(k), (graph.num_edges, 1, 1)),
+        "ids": np.arange(n),
+        "fixed": np.arange(1),
+    }
     own["robot"] = np.zeros(n, dtype=np.int64)
     return PoseGraph(n, **own), own
 
@@ -45,7 +48,9 @@ def assert_cannot_be_written(array: np.ndarray) -> None:
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
-def test_a_graph_is_not_changed_through_the_arrays_it_was_made_of(seed: int, n: int, d: int) -> None:
+def test_a_graph_is_not_changed_through_the_arrays_it_was_made_of(
+    seed: int, n: int, d: int
+) -> None:
     graph, own = writable_graph(seed, n, d)
     before = PGOProblem(graph).M.toarray()
     for name in FIELDS:
@@ -54,9 +59,13 @@ def test_a_graph_is_not_changed_through_the_arrays_it_was_made_of(seed: int, n: 
     np.testing.assert_array_equal(PGOProblem(graph).M.toarray(), before)
 
 
-@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value)), replace])
+@pytest.mark.parametrize(
+    "again", [copy.copy, copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value)), replace]
+)
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
-def test_copies_and_pickles_are_read_only_too(again: Callable[[object], object], seed: int, n: int, d: int) -> None:
+def test_copies_and_pickles_are_read_only_too(
+    again: Callable[[object], object], seed: int, n: int, d: int
+) -> None:
     graph, _ = writable_graph(seed, n, d)
     poses = Poses.identity(n, d)
     halves = partition(graph, 2)
@@ -68,20 +77,35 @@ def test_copies_and_pickles_are_read_only_too(again: Callable[[object], object],
 
 
 def test_poses_and_robots_are_not_changed_through_the_arrays_they_were_made_of() -> None:
-    R, t, robot = np.tile(np.eye(2), (3, 1, 1)), np.zeros((3, 2)), np.array([0, 1, 1])
-    poses, owners = Poses(R, t), Partition(robot, PartitionMethod.GIVEN)
-    R[...], t[...], robot[...] = 5.0, 5.0, 5
+    R = np.tile(np.eye(2), (3, 1, 1))
+    t = np.zeros((3, 2))
+    robot = np.array([0, 1, 1])
+    poses = Poses(R, t)
+    owners = Partition(robot, PartitionMethod.GIVEN)
+    R[...] = 5.0
+    t[...] = 5.0
+    robot[...] = 5
     np.testing.assert_array_equal(poses.R, np.tile(np.eye(2), (3, 1, 1)))
     np.testing.assert_array_equal(poses.t, np.zeros((3, 2)))
     np.testing.assert_array_equal(owners.robot, [0, 1, 1])
     X = poses.stacked()
     X[...] = 1.0  # a new array: the caller's
     view = poses.with_translations(t * 0)
-    for array in (poses.R, poses.t, owners.robot, view.R, view.t, poses[1:].R, poses.moved(np.eye(2), np.ones(2)).t):
+    for array in (
+        poses.R,
+        poses.t,
+        owners.robot,
+        view.R,
+        view.t,
+        poses[1:].R,
+        poses.moved(np.eye(2), np.ones(2)).t,
+    ):
         assert_cannot_be_written(array)
 
 
-@pytest.mark.parametrize("name", ["M", "L", "Q", "residual_matrix", "diagonal_positions", "block_positions"])
+@pytest.mark.parametrize(
+    "name", ["M", "L", "Q", "residual_matrix", "diagonal_positions", "block_positions"]
+)
 def test_what_a_problem_keeps_cannot_be_changed(name: str) -> None:
     kept = getattr(PGOProblem(GRAPH), name)
     for value in kept if isinstance(kept, tuple) else (kept,):
@@ -90,12 +114,19 @@ def test_what_a_problem_keeps_cannot_be_changed(name: str) -> None:
 
 
 def test_what_the_convex_models_hold_is_theirs() -> None:
-    x, K, f, copies = cp.Variable(3), np.ones((1, 3)), np.ones(1), np.eye(3)
+    x = cp.Variable(3)
+    K = np.ones((1, 3))
+    f = np.ones(1)
+    copies = np.eye(3)
     problem = BregmanProblem(cp.sum_squares(x), x, K, f)
-    point, orthogonal = BregmanPoint(K[0], f), OrthogonalPoint((copies,), (copies,))
+    point = BregmanPoint(K[0], f)
+    orthogonal = OrthogonalPoint((copies,), (copies,))
     Y = np.swapaxes(GRAPH.truth.R, 1, 2).copy()
     lifted = lifted_point(PGOProblem(GRAPH), Y)
-    K[...], f[...], copies[...], Y[...] = 7.0, 7.0, 7.0, 7.0
+    K[...] = 7.0
+    f[...] = 7.0
+    copies[...] = 7.0
+    Y[...] = 7.0
     np.testing.assert_array_equal(problem.K.toarray(), np.ones((1, 3)))
     np.testing.assert_array_equal(lifted.Y, np.swapaxes(GRAPH.truth.R, 1, 2))
     held = (problem.K.data, problem.f, point.x, point.lam, *orthogonal.copies, *orthogonal.normals)
@@ -150,7 +181,9 @@ def test_what_is_no_whole_number_is_refused(values: object, message: str) -> Non
 
 def test_floats_below_2_to_the_53_are_whole_numbers() -> None:
     largest = 2**53 - 1
-    np.testing.assert_array_equal(whole_array([float(largest), -float(largest)], "x"), [largest, -largest])
+    np.testing.assert_array_equal(
+        whole_array([float(largest), -float(largest)], "x"), [largest, -largest]
+    )
 
 
 @pytest.mark.parametrize("value", [True, np.True_, 2.5, 2.0, "2", None, np.array([1, 2]), 1j])
@@ -172,11 +205,23 @@ def test_integers_of_any_kind_are_counts() -> None:
         (lambda: replace(GRAPH, ids=np.arange(27) + 0.25), "ids has 0.25 among them"),
         (lambda: replace(GRAPH, fixed=[0.5]), "fixed has 0.5 among them"),
         (lambda: replace(GRAPH, robot=np.full(27, np.nan)), "robot has nan among them"),
-        (lambda: replace(GRAPH, R_ij=GRAPH.R_ij + 0j), r"R_ij must be .* numbers, got type complex128"),
+        (
+            lambda: replace(GRAPH, R_ij=GRAPH.R_ij + 0j),
+            r"R_ij must be .* numbers, got type complex128",
+        ),
         (lambda: replace(GRAPH, tau=GRAPH.tau > 0), r"tau must be .* numbers, got type bool"),
-        (lambda: replace(GRAPH, information=np.full((108, 6, 6), np.nan)), r"information of edge 0 .* nan or inf"),
-        (lambda: Poses(1j * GRAPH.truth.R, GRAPH.truth.t), r"R must be .* numbers, got type complex128"),
-        (lambda: Poses(GRAPH.truth.R, GRAPH.truth.t.astype(str)), r"t must be .* numbers, got type <U"),
+        (
+            lambda: replace(GRAPH, information=np.full((108, 6, 6), np.nan)),
+            r"information of edge 0 .* nan or inf",
+        ),
+        (
+            lambda: Poses(1j * GRAPH.truth.R, GRAPH.truth.t),
+            r"R must be .* numbers, got type complex128",
+        ),
+        (
+            lambda: Poses(GRAPH.truth.R, GRAPH.truth.t.astype(str)),
+            r"t must be .* numbers, got type <U",
+        ),
         (lambda: Partition(np.arange(27) / 2, PartitionMethod.GIVEN), "robot has 0.5 among them"),
         (lambda: Partition(np.array([0, 2]), PartitionMethod.GIVEN), "without a gap"),
         (lambda: Partition(np.array([1, 2]), PartitionMethod.GIVEN), "without a gap"),

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses, absolute_trajectory_error, relative_pose_error
@@ -49,7 +48,11 @@ def assert_same(a: Poses, b: Poses) -> None:
         (np.diag([1.0, -1.0])[None], np.zeros((1, 2)), "R of pose 0 is no rotation"),
         (np.full((1, 2, 2), 1e200), np.zeros((1, 2)), "R of pose 0 is no rotation"),
         (np.full((1, 3, 3), 1e308), np.zeros((1, 3)), "R of pose 0 is no rotation"),
-        (np.stack([np.eye(2), (1 + 1e-6) * np.eye(2)]), np.zeros((2, 2)), "R of pose 1 is no rotation"),
+        (
+            np.stack([np.eye(2), (1 + 1e-6) * np.eye(2)]),
+            np.zeros((2, 2)),
+            "R of pose 1 is no rotation",
+        ),
     ],
 )
 def test_what_is_no_pose_is_refused(R: Array, t: Array, message: str) -> None:
@@ -64,7 +67,9 @@ def test_identity_and_emptiness() -> None:
 
 
 @given(seed=SEEDS, n=COUNTS, d=DIMENSIONS, exponent=st.floats(-13.5, -6.5))
-def test_what_is_a_rotation_only_nearly_is_projected(seed: int, n: int, d: int, exponent: float) -> None:
+def test_what_is_a_rotation_only_nearly_is_projected(
+    seed: int, n: int, d: int, exponent: float
+) -> None:
     rng = np.random.default_rng(seed)
     exact = random_rotations(n, d, rng)
     off = rng.standard_normal((n, d, d))
@@ -110,9 +115,14 @@ def test_moving_leaves_relative_poses_alone(seed: int, n: int, d: int) -> None:
     poses = random_poses(n, d, rng)
     moved = poses.moved(*random_motion(d, rng))
     np.testing.assert_allclose(
-        np.swapaxes(moved.R[:1], 1, 2) @ moved.R, np.swapaxes(poses.R[:1], 1, 2) @ poses.R, rtol=0, atol=ROUNDING
+        np.swapaxes(moved.R[:1], 1, 2) @ moved.R,
+        np.swapaxes(poses.R[:1], 1, 2) @ poses.R,
+        rtol=0,
+        atol=ROUNDING,
     )
-    np.testing.assert_allclose((moved.t - moved.t[0]) @ moved.R[0], (poses.t - poses.t[0]) @ poses.R[0], atol=ROUNDING)
+    np.testing.assert_allclose(
+        (moved.t - moved.t[0]) @ moved.R[0], (poses.t - poses.t[0]) @ poses.R[0], atol=ROUNDING
+    )
 
 
 @given(seed=SEEDS, n=COUNTS, d=DIMENSIONS, data=st.data())
@@ -132,8 +142,11 @@ def test_the_gauge_is_at_pose_0_unless_another_is_named() -> None:
 
 
 @pytest.mark.parametrize(("ratio", "positions_decide"), [(1.1e-9, True), (0.9e-9, False)])
-def test_positions_on_a_line_to_nine_digits_do_not_fix_the_rotation(ratio: float, positions_decide: bool) -> None:
-    # The covariance of these positions is diag(2, 2 ratio, 0); the poses are turned around the line, the positions not.
+def test_positions_on_a_line_to_nine_digits_do_not_fix_the_rotation(
+    ratio: float, positions_decide: bool
+) -> None:
+    # The covariance of these positions is diag(2, 2 ratio, 0); the poses are turned around the
+    # line, the positions not.
     off = np.sqrt(ratio)
     t = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, off, 0.0], [0.0, -off, 0.0]])
     turned = Poses(exp_map(np.tile([0.3, 0.0, 0.0], (4, 1))), t)
@@ -151,7 +164,9 @@ def test_alignment_undoes_a_motion(seed: int, n: int, d: int) -> None:
 
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("line", [True, False])
-def test_alignment_of_poses_on_a_line_or_in_a_point_uses_their_rotations(d: int, line: bool) -> None:
+def test_alignment_of_poses_on_a_line_or_in_a_point_uses_their_rotations(
+    d: int, line: bool
+) -> None:
     rng = np.random.default_rng(0)
     t = np.outer(np.arange(5.0) * line, np.ones(d)) + 1.0
     truth = Poses(random_rotations(5, d, rng), t)
@@ -161,19 +176,25 @@ def test_alignment_of_poses_on_a_line_or_in_a_point_uses_their_rotations(d: int,
 @given(seed=SEEDS, n=st.integers(4, 12), d=DIMENSIONS)
 def test_no_motion_fits_better_than_the_alignment(seed: int, n: int, d: int) -> None:
     rng = np.random.default_rng(seed)
-    truth, estimate = random_poses(n, d, rng), random_poses(n, d, rng)
+    truth = random_poses(n, d, rng)
+    estimate = random_poses(n, d, rng)
     best = absolute_trajectory_error(estimate, truth)
     aligned = estimate.aligned_to(truth)
     for _ in range(5):
-        nudged = aligned.moved(exp_map(0.1 * rng.standard_normal((1, tangent_dimension(d))))[0], np.zeros(d))
+        nudged = aligned.moved(
+            exp_map(0.1 * rng.standard_normal((1, tangent_dimension(d))))[0], np.zeros(d)
+        )
         shift = 0.1 * rng.standard_normal(d)
-        assert np.sqrt(np.mean(np.sum((nudged.t + shift - truth.t) ** 2, axis=1))) >= best - ROUNDING
+        assert (
+            np.sqrt(np.mean(np.sum((nudged.t + shift - truth.t) ** 2, axis=1))) >= best - ROUNDING
+        )
 
 
 @given(seed=SEEDS, n=st.integers(2, 12), d=DIMENSIONS)
 def test_errors_vanish_at_the_truth_and_ignore_the_gauge(seed: int, n: int, d: int) -> None:
     rng = np.random.default_rng(seed)
-    truth, estimate = random_poses(n, d, rng), random_poses(n, d, rng)
+    truth = random_poses(n, d, rng)
+    estimate = random_poses(n, d, rng)
     moved = estimate.moved(*random_motion(d, rng))
     assert absolute_trajectory_error(truth.moved(*random_motion(d, rng)), truth) < ROUNDING
     assert (
@@ -182,7 +203,9 @@ def test_errors_vanish_at_the_truth_and_ignore_the_gauge(seed: int, n: int, d: i
     assert absolute_trajectory_error(moved, truth) == pytest.approx(
         absolute_trajectory_error(estimate, truth), rel=1e-9
     )
-    assert relative_pose_error(moved, truth) == pytest.approx(relative_pose_error(estimate, truth), rel=1e-6)
+    assert relative_pose_error(moved, truth) == pytest.approx(
+        relative_pose_error(estimate, truth), rel=1e-6
+    )
 
 
 def test_errors_by_hand() -> None:
@@ -214,9 +237,13 @@ def test_indexing() -> None:
 
 
 @given(seed=SEEDS, n=st.integers(1, 6), d=DIMENSIONS)
-def test_an_anchored_pose_is_where_the_other_has_it_to_the_last_bit(seed: int, n: int, d: int) -> None:
+def test_an_anchored_pose_is_where_the_other_has_it_to_the_last_bit(
+    seed: int, n: int, d: int
+) -> None:
     rng = np.random.default_rng(seed)
-    poses, other, at = random_poses(n, d, rng), random_poses(n, d, rng), seed % n
+    poses = random_poses(n, d, rng)
+    other = random_poses(n, d, rng)
+    at = seed % n
     found = poses.anchored_to(other, at)
     np.testing.assert_array_equal(found.R[at], other.R[at])
     np.testing.assert_array_equal(found.t[at], other.t[at])

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pgo_models.geometry import rotations
 from pgo_models.geometry.rotations import (
@@ -24,7 +23,10 @@ from pgo_models.geometry.rotations import (
 EPS = np.finfo(float).eps
 SEEDS = st.integers(0, 2**32 - 1)
 DIMENSIONS = st.sampled_from([2, 3])
-COUNTS = st.integers(1, 6) | st.integers(rotations._FEW, rotations._FEW + 10)  # few by the SVD, more by iteration
+# few by the SVD, more by iteration
+COUNTS = st.integers(1, 6) | st.integers(
+    rotations._FEWEST_FOR_POLAR, rotations._FEWEST_FOR_POLAR + 10
+)
 
 
 def distance(A: Array, R: Array) -> Array:
@@ -47,7 +49,8 @@ def test_random_rotations_are_rotations(seed: int, count: int, d: int) -> None:
 def test_random_rotations_are_uniform(d: int) -> None:
     count = 20000
     R = random_rotations(count, d, np.random.default_rng(0))
-    # By the Haar measure every entry has mean 0 and variance 1/d, and tr(R)^2 has mean 1 (2 in the plane).
+    # By the Haar measure every entry has mean 0 and variance 1/d, and tr(R)^2 has mean 1 (2 in the
+    # plane).
     five_sigma = 5 / np.sqrt(count)
     assert np.abs(R.mean(axis=0)).max() < five_sigma
     assert np.abs((R**2).mean(axis=0) - 1 / d).max() < five_sigma
@@ -63,8 +66,13 @@ def test_projection_is_the_nearest_rotation(seed: int, count: int, d: int, scale
     # Nearest: tr(A^T omega) is the sum of the singular values, the last one with the sign of det A.
     singular = np.linalg.svd(A / scale, compute_uv=False)
     singular[:, -1] *= np.sign(np.linalg.det(A / scale))
-    np.testing.assert_allclose(np.sum(A / scale * omega, axis=(1, 2)), singular.sum(axis=1), rtol=0, atol=1e-13 * 10)
-    for other in (random_rotations(count, d, rng), omega @ exp_map(1e-3 * np.ones((count, tangent_dimension(d))))):
+    np.testing.assert_allclose(
+        np.sum(A / scale * omega, axis=(1, 2)), singular.sum(axis=1), rtol=0, atol=1e-13 * 10
+    )
+    for other in (
+        random_rotations(count, d, rng),
+        omega @ exp_map(1e-3 * np.ones((count, tangent_dimension(d)))),
+    ):
         assert (distance(A / scale, omega) <= distance(A / scale, other) + 1e-12).all()
 
 
@@ -76,28 +84,40 @@ def test_projection_agrees_with_the_svd(seed: int, count: int, d: int) -> None:
 
 
 @given(seed=SEEDS, count=COUNTS, d=DIMENSIONS)
-def test_projection_leaves_rotations_alone_and_turns_with_them(seed: int, count: int, d: int) -> None:
+def test_projection_leaves_rotations_alone_and_turns_with_them(
+    seed: int, count: int, d: int
+) -> None:
     rng = np.random.default_rng(seed)
-    R, A = random_rotations(count, d, rng), random_rotations(count, d, rng) + 0.1 * rng.standard_normal((count, d, d))
+    R = random_rotations(count, d, rng)
+    A = random_rotations(count, d, rng) + 0.1 * rng.standard_normal((count, d, d))
     np.testing.assert_allclose(project_to_rotations(R), R, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(project_to_rotations(R @ A), R @ project_to_rotations(A), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(
+        project_to_rotations(R @ A), R @ project_to_rotations(A), rtol=0, atol=1e-13
+    )
 
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_projection_of_degenerate_matrices_is_a_rotation(d: int) -> None:
-    reflection, rank_one = np.diag([-1.0] + [1.0] * (d - 1)), np.ones((d, d))
-    A = np.stack([np.zeros((d, d)), reflection, -np.eye(d), rank_one, 1e-320 * np.eye(d), np.eye(d)])
+    reflection = np.diag([-1.0] + [1.0] * (d - 1))
+    rank_one = np.ones((d, d))
+    A = np.stack(
+        [np.zeros((d, d)), reflection, -np.eye(d), rank_one, 1e-320 * np.eye(d), np.eye(d)]
+    )
     omega = project_to_rotations(A)
     assert is_rotation(omega)
     np.testing.assert_allclose(omega[-1], np.eye(d), rtol=0, atol=4 * EPS)
 
 
 def test_well_conditioned_matrices_take_the_fast_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    # An iteration that is wrong does not settle, and the SVD then hides it: what it hands on is counted.
+    # An iteration that is wrong does not settle, and the SVD then hides it: what it hands on is
+    # counted.
     rng = np.random.default_rng(0)
     A = random_rotations(1000, 3, rng) + 0.1 * rng.standard_normal((1000, 3, 3))
-    expected, handed_on = project_by_svd(A), []
-    monkeypatch.setattr(rotations, "project_by_svd", lambda bad: handed_on.append(bad) or project_by_svd(bad))
+    expected = project_by_svd(A)
+    handed_on = []
+    monkeypatch.setattr(
+        rotations, "project_by_svd", lambda bad: handed_on.append(bad) or project_by_svd(bad)
+    )
     np.testing.assert_allclose(project_to_rotations(A), expected, rtol=0, atol=1e-13)
     assert handed_on == []
     project_to_rotations(-A)
@@ -105,7 +125,8 @@ def test_well_conditioned_matrices_take_the_fast_way(monkeypatch: pytest.MonkeyP
 
 
 def test_many_matrices_are_projected_some_at_a_time() -> None:
-    rng, count = np.random.default_rng(0), 5 * rotations._MANY // 2
+    rng = np.random.default_rng(0)
+    count = 5 * rotations._BATCH // 2
     A = rng.standard_normal((count, 3, 3))  # half of them of negative determinant
     np.testing.assert_allclose(project_to_rotations(A), project_by_svd(A), rtol=0, atol=1e-9)
     assert is_rotation(project_to_rotations(A))
@@ -131,7 +152,8 @@ def test_exp_and_log_are_inverse(seed: int, count: int, d: int) -> None:
 @given(seed=SEEDS, d=DIMENSIONS)
 def test_exp_is_the_exponential_of_hat(seed: int, d: int) -> None:
     w = np.random.default_rng(seed).standard_normal((1, tangent_dimension(d)))
-    series, term = np.eye(d), np.eye(d)
+    series = np.eye(d)
+    term = np.eye(d)
     for k in range(1, 60):
         term = term @ hat(w)[0] / k
         series = series + term
@@ -141,7 +163,8 @@ def test_exp_is_the_exponential_of_hat(seed: int, d: int) -> None:
 @given(seed=SEEDS, count=COUNTS, d=DIMENSIONS)
 def test_hat_and_vee(seed: int, count: int, d: int) -> None:
     rng = np.random.default_rng(seed)
-    w, v = rng.standard_normal((count, tangent_dimension(d))), rng.standard_normal((count, d))
+    w = rng.standard_normal((count, tangent_dimension(d)))
+    v = rng.standard_normal((count, d))
     np.testing.assert_array_equal(vee(hat(w)), w)
     np.testing.assert_array_equal(hat(w), -np.swapaxes(hat(w), 1, 2))
     expected = np.cross(w, v) if d == 3 else w * np.stack([-v[:, 1], v[:, 0]], axis=1)
@@ -154,7 +177,9 @@ def test_quaternions(seed: int, count: int, scale: float) -> None:
     quaternions = quaternions_from_rotations(R)
     assert (quaternions[:, 3] >= 0).all()
     np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1, rtol=0, atol=8 * EPS)
-    np.testing.assert_allclose(rotations_from_quaternions(-scale * quaternions), R, rtol=0, atol=16 * EPS)
+    np.testing.assert_allclose(
+        rotations_from_quaternions(-scale * quaternions), R, rtol=0, atol=16 * EPS
+    )
 
 
 def test_quaternions_are_ordered_x_y_z_w() -> None:
@@ -167,7 +192,9 @@ def test_quaternions_are_ordered_x_y_z_w() -> None:
 @pytest.mark.parametrize("d", [2, 3])
 def test_orthogonality_error_sees_what_is_no_rotation(d: int) -> None:
     reflection = np.diag([-1.0] + [1.0] * (d - 1))
-    error = orthogonality_error(np.stack([np.eye(d), reflection, 2 * np.eye(d), np.full((d, d), np.nan)]))
+    error = orthogonality_error(
+        np.stack([np.eye(d), reflection, 2 * np.eye(d), np.full((d, d), np.nan)])
+    )
     assert error[0] == 0
     assert (error[1:3] >= 1).all()
     assert np.isnan(error[3])

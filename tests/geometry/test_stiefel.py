@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from graphs import DIMENSIONS, SEEDS
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pgo_models.geometry.rotations import random_rotations
 from pgo_models.geometry.stiefel import append_rank, project_to_tangent, retract, row_products
@@ -33,7 +32,9 @@ def test_the_projection_is_the_nearest_tangent(seed: int, d: int, extra: int) ->
 def test_a_retraction_stays_on_the_manifold(seed: int, d: int, extra: int, length: float) -> None:
     Y, V = stacks(seed, d, extra)
     moved = retract(Y, length * project_to_tangent(Y, V))
-    np.testing.assert_allclose(row_products(moved, moved), np.broadcast_to(np.eye(d), (6, d, d)), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(
+        row_products(moved, moved), np.broadcast_to(np.eye(d), (6, d, d)), rtol=0, atol=1e-10
+    )
 
 
 @given(seed=SEEDS, d=DIMENSIONS, extra=EXTRA)
@@ -45,7 +46,9 @@ def test_a_retraction_is_the_nearest_point(seed: int, d: int, extra: int) -> Non
 
 
 @given(seed=SEEDS, d=DIMENSIONS, extra=EXTRA)
-def test_a_retraction_has_no_acceleration_in_the_tangent_space(seed: int, d: int, extra: int) -> None:
+def test_a_retraction_has_no_acceleration_in_the_tangent_space(
+    seed: int, d: int, extra: int
+) -> None:
     Y, V = stacks(seed, d, extra)
     V = project_to_tangent(Y, V)
     h = np.logspace(-1.5, -3, 4)

@@ -64,10 +64,16 @@ def assert_regenerated(committed: PoseGraph, graph: PoseGraph) -> None:
     np.testing.assert_array_equal(committed.i, graph.i)
     np.testing.assert_array_equal(committed.j, graph.j)
     for name in ("R_ij", "t_ij", "kappa", "tau"):
-        np.testing.assert_allclose(getattr(committed, name), getattr(graph, name), rtol=ROUNDING, atol=ROUNDING)
+        np.testing.assert_allclose(
+            getattr(committed, name), getattr(graph, name), rtol=ROUNDING, atol=ROUNDING
+        )
     for name in ("initial", "truth"):
-        np.testing.assert_allclose(getattr(committed, name).t, getattr(graph, name).t, rtol=0, atol=ROUNDING)
-        np.testing.assert_allclose(getattr(committed, name).R, getattr(graph, name).R, rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(
+            getattr(committed, name).t, getattr(graph, name).t, rtol=0, atol=ROUNDING
+        )
+        np.testing.assert_allclose(
+            getattr(committed, name).R, getattr(graph, name).R, rtol=0, atol=ROUNDING
+        )
 
 
 @pytest.mark.parametrize("scene", [circle, grid, sphere])
@@ -82,7 +88,11 @@ def test_the_readme_regenerates_the_data_folder(tmp_path: Path) -> None:
     assert code is not None
     (tmp_path / "data").mkdir()
     exec(compile(code[1], "data/README.md", "exec"), {})
-    made = sorted(file.relative_to(tmp_path / "data") for file in (tmp_path / "data").rglob("*") if file.is_file())
+    made = sorted(
+        file.relative_to(tmp_path / "data")
+        for file in (tmp_path / "data").rglob("*")
+        if file.is_file()
+    )
     kept = {file.relative_to(DATA) for file in DATA.rglob("*") if file.is_file()}
     assert kept - set(made) == {Path("README.md"), Path("reference.json")}
     for name in ("circle", "grid", "sphere", "robots"):
@@ -99,7 +109,10 @@ def test_the_robots_example_has_owners_and_truth() -> None:
     assert graph.is_connected
     between = graph.robots[graph.i] != graph.robots[graph.j]
     assert between.any()
-    lines = sum(text.count("EDGE") for text in ((DATA / "robots" / f"{r}.g2o").read_text() for r in range(4)))
+    lines = sum(
+        text.count("EDGE")
+        for text in ((DATA / "robots" / f"{r}.g2o").read_text() for r in range(4))
+    )
     assert lines == graph.num_edges + between.sum()
 
 
@@ -160,11 +173,16 @@ def test_unknown_names_list_the_known(monkeypatch: pytest.MonkeyPatch) -> None:
         load("nothing")
 
 
-def test_without_download_only_what_is_here_is_taken(server: tuple[Path, str], tmp_path: Path) -> None:
+def test_without_download_only_what_is_here_is_taken(
+    server: tuple[Path, str], tmp_path: Path
+) -> None:
     folder, url = server
     (folder / "far.g2o").write_bytes(GRAPH)
     registry = Registry(url, {"far": sha256(GRAPH)}, tmp_path / "cache")
-    with pytest.raises(DatasetError, match=rf"far is not here; download it with: pgo info far, or .*{DATA_VARIABLE}"):
+    with pytest.raises(
+        DatasetError,
+        match=rf"far is not here; download it with: pgo info far, or .*{DATA_VARIABLE}",
+    ):
         load("far", registry, download=False)
     assert not (tmp_path / "cache").exists()
     load("far", registry)
@@ -192,7 +210,9 @@ def test_downloads_are_checked_and_kept(
 
 
 @pytest.mark.parametrize("checksum", [sha256, blob])
-def test_a_corrupt_download_is_not_kept(server: tuple[Path, str], tmp_path: Path, checksum: object) -> None:
+def test_a_corrupt_download_is_not_kept(
+    server: tuple[Path, str], tmp_path: Path, checksum: object
+) -> None:
     folder, url = server
     assert callable(checksum)
     (folder / "far.g2o").write_bytes(GRAPH)

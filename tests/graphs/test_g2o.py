@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOError, SettingError
 from pgo_models.geometry.poses import Poses
@@ -48,7 +47,14 @@ def random_graph(seed: int, num_poses: int, d: int) -> PoseGraph:
     ids = np.sort(rng.choice(2**62, num_poses, replace=False) - 2**40)
     fixed = rng.choice(num_poses, 2, replace=False)
     return dataclasses.replace(
-        graph, information=information, kappa=kappa, tau=tau, ids=ids, fixed=np.sort(fixed), truth=None, name="graph"
+        graph,
+        information=information,
+        kappa=kappa,
+        tau=tau,
+        ids=ids,
+        fixed=np.sort(fixed),
+        truth=None,
+        name="graph",
     )
 
 
@@ -115,19 +121,23 @@ def test_precisions_follow_their_formulas(seed: int, d: int) -> None:
     np.testing.assert_allclose(again, [kappa, tau], rtol=8 * EPS, atol=0)
 
 
-@pytest.mark.parametrize(("weights", "share"), [(RotationWeight.SE_SYNC, 2.0), (RotationWeight.GAUSSIAN, 1.0)])
+@pytest.mark.parametrize(
+    ("weights", "share"), [(RotationWeight.SE_SYNC, 2.0), (RotationWeight.GAUSSIAN, 1.0)]
+)
 @given(seed=SEEDS, d=DIMENSIONS)
 def test_gaussian_weights_give_the_chi_square_of_a_small_error(
     weights: RotationWeight, share: float, seed: int, d: int
 ) -> None:
-    # One edge of identities, its end pose off by a small turn and a step: I_theta theta^2 + I_t |t|^2, no 1/2.
+    # One edge of identities, its end pose off by a small turn and a step: I_theta theta^2 + I_t
+    # |t|^2, no 1/2.
     rng = np.random.default_rng(seed)
     I_t, I_theta = np.exp(rng.uniform(-5, 5, 2))
     information = np.diag([I_t] * d + [I_theta] * (d * (d - 1) // 2))[None]
     kappa, tau = edge_precisions(information, weights)
     one = np.array([0])
     graph = PoseGraph(2, one, one + 1, np.eye(d)[None], np.zeros((1, d)), kappa, tau)
-    turn, step = 1e-4 * rng.standard_normal(d * (d - 1) // 2), rng.standard_normal(d)
+    turn = 1e-4 * rng.standard_normal(d * (d - 1) // 2)
+    step = rng.standard_normal(d)
     poses = Poses(np.stack([np.eye(d), exp_map(turn[None])[0]]), np.stack([np.zeros(d), step]))
     chi_square = I_t * step @ step + (share if d == 2 else 1.0) * I_theta * turn @ turn
     np.testing.assert_allclose(PGOProblem(graph).objective(poses), chi_square, rtol=1e-6, atol=0)
@@ -137,7 +147,11 @@ def test_a_file_is_read_with_the_weights_asked_for(tmp_path: Path) -> None:
     path = tmp_path / "plane.g2o"
     path.write_text("EDGE_SE2 0 1 1 0 0 4 0 0 4 0 6\n")
     kappas = [float(load(path, weights=weights).kappa[0]) for weights in RotationWeight]
-    assert kappas == [6.0, 3.0] == [float(read_g2o(path, weights).kappa[0]) for weights in RotationWeight]
+    assert (
+        kappas
+        == [6.0, 3.0]
+        == [float(read_g2o(path, weights).kappa[0]) for weights in RotationWeight]
+    )
     assert read_g2o(path).kappa[0] == load(path).kappa[0] == 6.0
     with pytest.raises(SettingError, match="weights is 'gaussian'; give RotationWeight"):
         read_g2o(path, "gaussian")
@@ -174,7 +188,11 @@ def test_folders_of_robots_load_as_one_graph(
 ) -> None:
     folder = benchmark_data / f"example_{num_robots}robots"
     graph = read_g2o(folder)
-    assert (graph.num_robots, graph.num_poses, graph.num_edges) == (num_robots, num_poses, num_edges)
+    assert (graph.num_robots, graph.num_poses, graph.num_edges) == (
+        num_robots,
+        num_poses,
+        num_edges,
+    )
     assert graph.initial is not None
     assert graph.is_connected
     for pose in range(num_poses):
@@ -188,7 +206,9 @@ def test_folders_of_robots_load_as_one_graph(
 
 def sorted_edges(graph: PoseGraph) -> PoseGraph:
     order = np.lexsort((graph.t_ij[:, 0], graph.j, graph.i))
-    changes = {name: getattr(graph, name)[order] for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")}
+    changes = {
+        name: getattr(graph, name)[order] for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")
+    }
     return dataclasses.replace(graph, information=None, **changes)
 
 
@@ -201,7 +221,9 @@ def test_a_folder_written_is_the_graph_read(
         graph = dataclasses.replace(graph, ids=symbol_ids(graph.robots))
     # A repeated measurement stands twice in each file it is in, and counts twice.
     twice = np.append(np.arange(graph.num_edges), graph.num_edges - 1)
-    changes = {name: getattr(graph, name)[twice] for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")}
+    changes = {
+        name: getattr(graph, name)[twice] for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")
+    }
     graph = dataclasses.replace(graph, **changes)
     folder = tmp_path_factory.mktemp("robots")
     write_g2o_folder(graph, folder)
@@ -215,7 +237,9 @@ EDGE = "EDGE_SE2 {} {} 1 0 0 1 0 0 1 0 1\n"
 VERTEX = "VERTEX_SE2 {} {} 0 0\n"
 
 
-def test_a_folder_without_symbols_goes_by_vertex_lines_then_by_first_mention(tmp_path: Path) -> None:
+def test_a_folder_without_symbols_goes_by_vertex_lines_then_by_first_mention(
+    tmp_path: Path,
+) -> None:
     (tmp_path / "2.g2o").write_text(VERTEX.format(5, 1) + EDGE.format(5, 6))
     (tmp_path / "10.g2o").write_text(VERTEX.format(6, 2) + EDGE.format(6, 7) + EDGE.format(5, 6))
     graph = read_g2o(tmp_path)
@@ -225,7 +249,10 @@ def test_a_folder_without_symbols_goes_by_vertex_lines_then_by_first_mention(tmp
     assert graph.initial is None
 
 
-NAMINGS = {"the same ids": lambda ids: ids, "ids of its own": lambda ids: np.unique(ids, return_inverse=True)[1]}
+NAMINGS = {
+    "the same ids": lambda ids: ids,
+    "ids of its own": lambda ids: np.unique(ids, return_inverse=True)[1],
+}
 
 
 @pytest.mark.parametrize("naming", NAMINGS)
@@ -242,11 +269,18 @@ def test_the_whole_graph_beside_the_robots_is_said_and_left_out(
     write_g2o_folder(graph, tmp_path)
     expected = read_g2o(tmp_path)
     order = np.random.default_rng(0).permutation(graph.num_edges)
-    shuffled = {key: getattr(graph, key)[order] for key in ("i", "j", "R_ij", "t_ij", "kappa", "tau")}
+    shuffled = {
+        key: getattr(graph, key)[order] for key in ("i", "j", "R_ij", "t_ij", "kappa", "tau")
+    }
     information = graph.information[order] if graph.information is not None else None
-    whole = dataclasses.replace(graph, **shuffled, information=information, ids=NAMINGS[naming](graph.pose_ids))
+    whole = dataclasses.replace(
+        graph, **shuffled, information=information, ids=NAMINGS[naming](graph.pose_ids)
+    )
     write_g2o(whole, tmp_path / name)
-    with pytest.warns(GraphWarning, match=f"{name}: left out, it repeats the edges of the other 3 files; remove it"):
+    with pytest.warns(
+        GraphWarning,
+        match=f"{name}: left out, it repeats the edges of the other 3 files; remove it",
+    ):
         found = read_g2o(tmp_path)
     assert found.num_robots == 3
     np.testing.assert_array_equal(found.pose_ids, expected.pose_ids)
@@ -277,10 +311,16 @@ def test_two_files_with_the_same_edges_are_two_robots(tmp_path: Path) -> None:
 def test_the_own_robot_says_where_a_pose_is(tmp_path: Path) -> None:
     a, b = symbol_ids(np.array([0, 0, 1, 1])).reshape(2, 2)
     (tmp_path / "0.g2o").write_text(
-        VERTEX.format(a[0], 1) + VERTEX.format(a[1], 2) + VERTEX.format(b[0], 77) + EDGE.format(a[0], a[1])
+        VERTEX.format(a[0], 1)
+        + VERTEX.format(a[1], 2)
+        + VERTEX.format(b[0], 77)
+        + EDGE.format(a[0], a[1])
     )
     (tmp_path / "1.g2o").write_text(
-        VERTEX.format(a[1], 88) + VERTEX.format(b[0], 3) + VERTEX.format(b[1], 4) + EDGE.format(a[1], b[0])
+        VERTEX.format(a[1], 88)
+        + VERTEX.format(b[0], 3)
+        + VERTEX.format(b[1], 4)
+        + EDGE.format(a[1], b[0])
     )
     graph = read_g2o(tmp_path)
     assert graph.initial is not None
@@ -308,11 +348,28 @@ def test_poses_without_vertex_lines_leave_no_initial_guess(tmp_path: Path) -> No
 def test_quaternions_are_normalised(tmp_path: Path) -> None:
     path = tmp_path / "a.g2o"
     path.write_text("EDGE_SE3:QUAT 0 1 0 0 0 0 0 2 2 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n")
-    np.testing.assert_allclose(read_g2o(path).R_ij[0], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], rtol=0, atol=4 * EPS)
+    np.testing.assert_allclose(
+        read_g2o(path).R_ij[0], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], rtol=0, atol=4 * EPS
+    )
 
 
 NOISE = st.sampled_from(
-    ["", "-", "x", "nan", "1e400", "0", "-1", "1 2", "\n", "#", "\0", "\u00e9", "1_0", "99999999999999999999"]
+    [
+        "",
+        "-",
+        "x",
+        "nan",
+        "1e400",
+        "0",
+        "-1",
+        "1 2",
+        "\n",
+        "#",
+        "\0",
+        "\u00e9",
+        "1_0",
+        "99999999999999999999",
+    ]
 )
 
 
@@ -350,11 +407,20 @@ def test_bad_folders_and_files_are_refused(tmp_path: Path) -> None:
         read_g2o(tmp_path)
 
 
+def test_a_folder_without_edges_is_refused(tmp_path: Path) -> None:
+    for robot in range(3):
+        (tmp_path / f"{robot}.g2o").write_text(VERTEX.format(robot, 0))
+    with pytest.raises(FileFormatError, match="no edges; a pose graph needs at least one"):
+        read_g2o(tmp_path)
+
+
 def test_poses_are_read_in_the_order_of_the_graph(tmp_path: Path) -> None:
     graph = random_graph(0, 6, 2)
     assert graph.initial is not None
     write_g2o(graph, tmp_path / "a.g2o")
-    lines = [line for line in (tmp_path / "a.g2o").read_text().splitlines() if line.startswith("VERTEX")]
+    lines = [
+        line for line in (tmp_path / "a.g2o").read_text().splitlines() if line.startswith("VERTEX")
+    ]
     (tmp_path / "b.g2o").write_text("\n".join(reversed(lines)))
     assert_same_poses(read_g2o_poses(tmp_path / "b.g2o", graph), graph.initial)
     (tmp_path / "b.g2o").write_text("\n".join(lines[1:]))

@@ -37,7 +37,11 @@ def write(folder: Path, *lines: str) -> Path:
         ([EDGE_3D, EDGE_3D.replace("2 3", "-inf 3")], ":2", ["-inf is not finite"]),
         ([EDGE_3D, EDGE_3D.replace("2 3", "1e999 3")], ":2", ["1e999 is not finite"]),
         ([EDGE_3D, EDGE_3D.replace("2 3", "1e300 3")], ":2", ["1e300 is beyond 1e+100"]),
-        ([EDGE_3D, EDGE_3D.replace("2 3", "-1e100 3")], ":2", ["1e+100 m is beyond 1e+15 m", "correct the line"]),
+        (
+            [EDGE_3D, EDGE_3D.replace("2 3", "-1e100 3")],
+            ":2",
+            ["1e+100 m is beyond 1e+15 m", "correct the line"],
+        ),
         ([EDGE_2D, "VERTEX_SE2 0 2e15 0 0"], ":2", ["2e+15 m is beyond 1e+15 m"]),
         ([EDGE_3D, EDGE_3D + " 1" * 10_000], ":2", ["characters", "break or remove it"]),
         ([EDGE_3D, EDGE_3D[:-1] + "1e-320"], ":2", ["rotation block"]),
@@ -48,27 +52,53 @@ def write(folder: Path, *lines: str) -> Path:
         ([EDGE_3D, EDGE_3D[:-1] + "nan"], ":2", ["nan is not finite"]),
         ([EDGE_3D, EDGE_3D[:-1] + "1+0j"], ":2", ["'1+0j' is no number"]),
         ([EDGE_3D, "FIX 0_1"], ":2", ["id '0_1' is no integer"]),
-        ([EDGE_3D, EDGE_3D.replace(" 0 1 1 ", f" 0 {2**64} 1 ", 1)], ":2", ["does not fit 64 bits"]),
-        ([EDGE_3D, EDGE_3D.replace("3 0 0 0 1", "3 0 0 0 0")], ":2", ["zero quaternion", "0 0 0 1"]),
+        (
+            [EDGE_3D, EDGE_3D.replace(" 0 1 1 ", f" 0 {2**64} 1 ", 1)],
+            ":2",
+            ["does not fit 64 bits"],
+        ),
+        (
+            [EDGE_3D, EDGE_3D.replace("3 0 0 0 1", "3 0 0 0 0")],
+            ":2",
+            ["zero quaternion", "0 0 0 1"],
+        ),
         ([EDGE_3D, VERTEX_3D[:-1] + "0"], ":2", ["zero quaternion"]),
         ([EDGE_3D, EDGE_3D.replace(" 0 1 ", " 1 1 ", 1)], ":2", ["from pose 1 to itself"]),
-        ([EDGE_3D, EDGE_3D[:-1] + "0"], ":2", ["rotation block", "positive definite", "eigenvalue 0"]),
-        ([EDGE_3D, EDGE_3D.replace("1 1 0 0 0 0 0 1", "1 -1 0 0 0 0 0 1")], ":2", ["translation block", "-1"]),
+        (
+            [EDGE_3D, EDGE_3D[:-1] + "0"],
+            ":2",
+            ["rotation block", "positive definite", "eigenvalue 0"],
+        ),
+        (
+            [EDGE_3D, EDGE_3D.replace("1 1 0 0 0 0 0 1", "1 -1 0 0 0 0 0 1")],
+            ":2",
+            ["translation block", "-1"],
+        ),
         ([EDGE_2D, EDGE_2D[:-1] + "-9"], ":2", ["rotation block", "-9"]),
         ([EDGE_2D, EDGE_2D.replace("4 0 0 4", "4 4 0 4")], ":2", ["translation block"]),
         ([EDGE_3D, EDGE_3D.replace("3 0 0 0 1", "3 0 0 0 9e-10")], ":2", ["zero quaternion"]),
         ([EDGE_3D, VERTEX_3D[:-7] + "6e-10 0 6e-10 -3e-10"], ":2", ["zero quaternion"]),
-        ([EDGE_2D, EDGE_2D.replace("4 0 0 4", "1 1 0 1.0000000000000004")], ":2", ["translation block"]),
+        (
+            [EDGE_2D, EDGE_2D.replace("4 0 0 4", "1 1 0 1.0000000000000004")],
+            ":2",
+            ["translation block"],
+        ),
         ([EDGE_3D, EDGE_3D[:-5] + "1 1 1.0000000000000004"], ":2", ["rotation block"]),
         ([VERTEX_3D, EDGE_3D, VERTEX_3D], ":3", ["second VERTEX line of pose 0", "line 1"]),
         ([EDGE_3D, EDGE_3D, EDGE_2D], ":3", ["2D and 3D", "line 1"]),
         ([EDGE_3D, "FIX first"], ":2", ["id 'first' is no integer"]),
-        ([EDGE_3D, "EDGE_SE3_EXPMAP 0 1 2 3"], ":2", ["'EDGE_SE3_EXPMAP'", "--skip-unknown", "EDGE_SE3:QUAT", "FIX"]),
+        (
+            [EDGE_3D, "EDGE_SE3_EXPMAP 0 1 2 3"],
+            ":2",
+            ["'EDGE_SE3_EXPMAP'", "--skip-unknown", "EDGE_SE3:QUAT", "FIX"],
+        ),
         ([EDGE_3D, "garbage"], ":2", ["'garbage'"]),
         (["# nothing", ""], "", ["no measurement"]),
     ],
 )
-def test_every_fault_has_file_line_and_value(tmp_path: Path, lines: list[str], where: str, words: list[str]) -> None:
+def test_every_fault_has_file_line_and_value(
+    tmp_path: Path, lines: list[str], where: str, words: list[str]
+) -> None:
     path = write(tmp_path, *lines)
     with pytest.raises(FileFormatError) as caught:
         read_lines(path)
@@ -77,7 +107,13 @@ def test_every_fault_has_file_line_and_value(tmp_path: Path, lines: list[str], w
 
 def test_everything_that_is_no_measurement_is_skipped(tmp_path: Path) -> None:
     path = write(
-        tmp_path, "# a comment", "", "   ", "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1", "\t" + EDGE_3D + "  \r", "FIX 0 1"
+        tmp_path,
+        "# a comment",
+        "",
+        "   ",
+        "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1",
+        "\t" + EDGE_3D + "  \r",
+        "FIX 0 1",
     )
     found = read_lines(path)
     assert found.d == 3
@@ -90,8 +126,14 @@ def test_numbers_that_all_lines_end_with_are_read_like_others(tmp_path: Path) ->
     lines = [EDGE_2D.replace("0.5", angle) for angle in ("0.5", "-0.25", "10.5")]
     expected = [[1, 2, angle, 4, 0, 0, 4, 0, 9] for angle in (0.5, -0.25, 10.5)]
     np.testing.assert_array_equal(read_lines(write(tmp_path, *lines)).edges, expected)
-    np.testing.assert_array_equal(read_lines(write(tmp_path, *(f"{line} " for line in lines))).edges, expected)
-    for end, words in (("4 0 x", "'x' is no number"), ("4 0 inf", "not finite"), ("4 0", "cut off")):
+    np.testing.assert_array_equal(
+        read_lines(write(tmp_path, *(f"{line} " for line in lines))).edges, expected
+    )
+    for end, words in (
+        ("4 0 x", "'x' is no number"),
+        ("4 0 inf", "not finite"),
+        ("4 0", "cut off"),
+    ):
         with pytest.raises(FileFormatError, match=words):
             read_lines(write(tmp_path, *(line.replace("4 0 9", end) for line in lines)))
 
@@ -114,13 +156,19 @@ def test_a_block_of_a_file_knows_its_lines(tmp_path: Path, monkeypatch: pytest.M
 
 def test_large_ids_are_exact(tmp_path: Path) -> None:
     ids = [(ord("a") << 56) + 1, (ord("a") << 56) + 2]
-    path = write(tmp_path, EDGE_2D.replace(" 0 1 ", f" {ids[0]} {ids[1]} ", 1), EDGE_2D.replace(" 0 1 ", " -5 7 ", 1))
+    path = write(
+        tmp_path,
+        EDGE_2D.replace(" 0 1 ", f" {ids[0]} {ids[1]} ", 1),
+        EDGE_2D.replace(" 0 1 ", " -5 7 ", 1),
+    )
     np.testing.assert_array_equal(read_lines(path).edge_ids, [ids, [-5, 7]])
 
 
 def test_information_is_the_upper_triangle_by_rows(tmp_path: Path) -> None:
     found = read_lines(write(tmp_path, "EDGE_SE2 0 1 1 2 0.5 10 2 3 40 5 60"))
-    np.testing.assert_array_equal(information_of(2, found.edges)[0], [[10, 2, 3], [2, 40, 5], [3, 5, 60]])
+    np.testing.assert_array_equal(
+        information_of(2, found.edges)[0], [[10, 2, 3], [2, 40, 5], [3, 5, 60]]
+    )
 
 
 def test_coupling_blocks_may_be_anything(tmp_path: Path) -> None:
@@ -129,9 +177,14 @@ def test_coupling_blocks_may_be_anything(tmp_path: Path) -> None:
 
 
 def test_what_is_just_no_fault_is_read(tmp_path: Path) -> None:
-    # Two pivots above the level at which a block counts as singular, and a short quaternion with a direction.
+    # Two pivots above the level at which a block counts as singular, and a short quaternion with a
+    # direction.
     almost = EDGE_2D.replace("4 0 0 4", "1 1 0 1.000000000000002")
     assert information_of(2, read_lines(write(tmp_path, almost)).edges)[0, 1, 1] > 1
-    found = read_lines(write(tmp_path, EDGE_3D.replace("3 0 0 0 1", "3 0 0 1.1e-9 0"), VERTEX_3D[:-1] + "-1.1e-9"))
-    np.testing.assert_allclose(poses_of(3, found.edges)[0][0], np.diag([-1.0, -1.0, 1.0]), rtol=0, atol=1e-15)
+    found = read_lines(
+        write(tmp_path, EDGE_3D.replace("3 0 0 0 1", "3 0 0 1.1e-9 0"), VERTEX_3D[:-1] + "-1.1e-9")
+    )
+    np.testing.assert_allclose(
+        poses_of(3, found.edges)[0][0], np.diag([-1.0, -1.0, 1.0]), rtol=0, atol=1e-15
+    )
     np.testing.assert_allclose(poses_of(3, found.vertices)[0][0], np.eye(3), rtol=0, atol=1e-15)

@@ -28,7 +28,8 @@ def read(folder: Path, *lines: str, **options: bool) -> PoseGraph:
 
 
 def at(x: float, y: float, theta: float) -> tuple[np.ndarray, np.ndarray]:
-    c, s = np.cos(theta), np.sin(theta)
+    c = np.cos(theta)
+    s = np.sin(theta)
     return np.array([[c, -s], [s, c]]), np.array([x, y])
 
 
@@ -46,17 +47,24 @@ def test_a_prior_of_a_pose_in_the_plane(tmp_path: Path, tag: str) -> None:
     e = np.append(Z.T @ (t - [3, 4]), 0.3)
     poses = graph.completed(Poses(np.stack([R, R]), np.stack([t - R @ [1, 0], t])))
     cost = e @ graph.information[1] @ e
-    np.testing.assert_allclose(chi2(graph, poses, Chi2Convention.GEODESIC), cost, rtol=1e-12, atol=0)
+    np.testing.assert_allclose(
+        chi2(graph, poses, Chi2Convention.GEODESIC), cost, rtol=1e-12, atol=0
+    )
 
 
 @pytest.mark.parametrize("offset", ["", "0 "])
 @pytest.mark.parametrize("tag", ["EDGE_SE3_PRIOR", "EDGE_PRIOR_SE3"])
-def test_a_prior_of_a_pose_in_space_with_or_without_an_offset_id(tmp_path: Path, tag: str, offset: str) -> None:
+def test_a_prior_of_a_pose_in_space_with_or_without_an_offset_id(
+    tmp_path: Path, tag: str, offset: str
+) -> None:
     q = "0 0 0.6 0.8"
     offsets = ["PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1"] if offset else []
     graph = read(tmp_path, *offsets, ODOMETRY_3D, f"{tag} 1 {offset}3 4 5 {q} {TRIANGLE_3D}")
-    c, s = 0.8**2 - 0.6**2, 2 * 0.6 * 0.8
-    np.testing.assert_allclose(graph.R_ij[1], [[c, -s, 0], [s, c, 0], [0, 0, 1]], rtol=0, atol=1e-15)
+    c = 0.8**2 - 0.6**2
+    s = 2 * 0.6 * 0.8
+    np.testing.assert_allclose(
+        graph.R_ij[1], [[c, -s, 0], [s, c, 0], [0, 0, 1]], rtol=0, atol=1e-15
+    )
     np.testing.assert_array_equal(graph.t_ij[1], [3, 4, 5])
     np.testing.assert_array_equal(graph.information[1][0], [1, 2, 3, 4, 5, 6])
     np.testing.assert_array_equal(graph.information[1].diagonal(), [1, 70, 120, 160, 190, 210])
@@ -65,21 +73,29 @@ def test_a_prior_of_a_pose_in_space_with_or_without_an_offset_id(tmp_path: Path,
 
 def test_positions_in_the_plane_are_in_the_axes_of_the_world(tmp_path: Path) -> None:
     # g2o's EDGE_PRIOR_SE2_XY: e = t_i - z, information 2 x 2.
-    graph = read(tmp_path, ODOMETRY_2D, "EDGE_PRIOR_SE2_XY 0 3 4 10 1 20", "EDGE_PRIOR_SE2_XY 1 5 6 1 0 1")
+    graph = read(
+        tmp_path, ODOMETRY_2D, "EDGE_PRIOR_SE2_XY 0 3 4 10 1 20", "EDGE_PRIOR_SE2_XY 1 5 6 1 0 1"
+    )
     np.testing.assert_array_equal(graph.kappa[1:], [0, 0])
-    np.testing.assert_allclose(graph.tau[1], 2 * 199 / 30, rtol=1e-12, atol=0)  # the inverse has trace 30 / 199
+    # the inverse has trace 30 / 199
+    np.testing.assert_allclose(graph.tau[1], 2 * 199 / 30, rtol=1e-12, atol=0)
     np.testing.assert_array_equal(graph.R_ij[1], np.eye(2))
     np.testing.assert_array_equal(graph.information[1], [[10, 1, 0], [1, 20, 0], [0, 0, 0]])
     R, t = at(3.5, 4.2, 1.1)
     poses = graph.completed(Poses(np.stack([R, R]), np.stack([t, t + R @ [1, 0]])))
-    e, f = np.array([0.5, 0.2]), poses.t[1] - [5, 6]
+    e = np.array([0.5, 0.2])
+    f = poses.t[1] - [5, 6]
     expected = e @ [[10, 1], [1, 20]] @ e + f @ f
     np.testing.assert_allclose(chi2(graph, poses), expected, rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("offset", ["", "7 "])
 def test_positions_in_space(tmp_path: Path, offset: str) -> None:
-    graph = read(tmp_path, ODOMETRY_3D, *(f"EDGE_SE3_XYZ_PRIOR {k} {offset}3 4 {k} 2 0 0 2 0 2" for k in (0, 1)))
+    graph = read(
+        tmp_path,
+        ODOMETRY_3D,
+        *(f"EDGE_SE3_XYZ_PRIOR {k} {offset}3 4 {k} 2 0 0 2 0 2" for k in (0, 1)),
+    )
     np.testing.assert_array_equal(graph.t_ij[1:], [[3, 4, 0], [3, 4, 1]])
     np.testing.assert_allclose(graph.tau[1:], 2.0, rtol=1e-15, atol=0)
     np.testing.assert_array_equal(graph.information[1].diagonal(), [2, 2, 2, 0, 0, 0])
@@ -96,9 +112,15 @@ def test_landmarks_in_the_plane_are_seen_in_the_frame_of_the_pose(tmp_path: Path
     assert graph.kappa[1] > 0 == graph.kappa[2]
     R, t = at(0.5, 0.1, 0.7)
     poses = Poses(np.stack([R, R, R]), np.stack([t, t + R @ [1, 0], [2.0, 3.0]]))
-    e, f = R.T @ ([2, 3] - t) - [1, 2], R.T @ ([2, 3] - t - R @ [1, 0]) - [0, 2]
+    e = R.T @ ([2, 3] - t) - [1, 2]
+    f = R.T @ ([2, 3] - t - R @ [1, 0]) - [0, 2]
     expected = e @ [[10, 1], [1, 20]] @ e + 5 * f @ f
-    for convention in (Chi2Convention.CHORDAL, Chi2Convention.GEODESIC, Chi2Convention.G2O, Chi2Convention.GTSAM):
+    for convention in (
+        Chi2Convention.CHORDAL,
+        Chi2Convention.GEODESIC,
+        Chi2Convention.G2O,
+        Chi2Convention.GTSAM,
+    ):
         np.testing.assert_allclose(chi2(graph, poses, convention), expected, rtol=1e-12, atol=0)
 
 
@@ -107,14 +129,18 @@ def test_landmarks_in_space(tmp_path: Path, offset: str) -> None:
     lines = (f"EDGE_SE3_TRACKXYZ {k} 9 {offset}1 2 3 10 1 2 20 3 30" for k in (0, 1))
     graph = read(tmp_path, ODOMETRY_3D, *lines, "VERTEX_TRACKXYZ 9 1 1 1")
     assert graph.landmarks.tolist() == [2]
-    np.testing.assert_array_equal(graph.information[2][:3, :3], [[10, 1, 2], [1, 20, 3], [2, 3, 30]])
+    np.testing.assert_array_equal(
+        graph.information[2][:3, :3], [[10, 1, 2], [1, 20, 3], [2, 3, 30]]
+    )
     assert not graph.information[2][3:].any()
     np.testing.assert_array_equal(graph.R_ij[1:], np.tile(np.eye(3), (2, 1, 1)))
 
 
 def test_priors_of_landmarks(tmp_path: Path) -> None:
     sights = ["EDGE_SE2_XY 0 7 1 2 1 0 1", "EDGE_SE2_XY 1 7 1 2 1 0 1"]
-    graph = read(tmp_path, ODOMETRY_2D, *sights, "EDGE_PRIOR_XY 7 8 9 2 0 2", "EDGE_PRIOR_SE2_XY 0 0 0 1 0 1")
+    graph = read(
+        tmp_path, ODOMETRY_2D, *sights, "EDGE_PRIOR_XY 7 8 9 2 0 2", "EDGE_PRIOR_SE2_XY 0 0 0 1 0 1"
+    )
     assert (graph.i[3], graph.j[3], graph.tau[3]) == (graph.world, 2, 2)
     in_space = (f"EDGE_SE3_TRACKXYZ {k} 9 0 1 2 3 1 0 0 1 0 1" for k in (0, 1))
     graph = read(tmp_path, ODOMETRY_3D, *in_space, "EDGE_POINTXYZ_PRIOR 9 8 9 10 2 0 0 2 0 2")
@@ -123,18 +149,29 @@ def test_priors_of_landmarks(tmp_path: Path) -> None:
 
 def test_toro_in_the_plane_has_its_own_order_of_the_information(tmp_path: Path) -> None:
     # EDGE2 i j forward sideward rotate inf_ff inf_fs inf_ss inf_rr inf_fr inf_sr
-    graph = read(tmp_path, "VERTEX2 0 0 0 0", "VERTEX2 1 1 2 0.5", "EDGE2 0 1 1 2 0.5 10 1 20 30 2 3")
+    graph = read(
+        tmp_path, "VERTEX2 0 0 0 0", "VERTEX2 1 1 2 0.5", "EDGE2 0 1 1 2 0.5 10 1 20 30 2 3"
+    )
     np.testing.assert_array_equal(graph.information[0], [[10, 1, 2], [1, 20, 3], [2, 3, 30]])
     np.testing.assert_array_equal(graph.t_ij[0], [1, 2])
     np.testing.assert_allclose(graph.initial.R[1], at(0, 0, 0.5)[0], rtol=0, atol=1e-15)
 
 
 def test_toro_in_space_has_roll_pitch_yaw(tmp_path: Path) -> None:
-    roll, pitch, yaw = 0.3, -0.4, 1.2
+    roll = 0.3
+    pitch = -0.4
+    yaw = 1.2
     numbers = f"1 2 3 {roll} {pitch} {yaw}"
-    graph = read(tmp_path, f"VERTEX3 1 {numbers}", "VERTEX3 0 0 0 0 0 0 0", f"EDGE3 0 1 {numbers} {TRIANGLE_3D}")
+    graph = read(
+        tmp_path,
+        f"VERTEX3 1 {numbers}",
+        "VERTEX3 0 0 0 0 0 0 0",
+        f"EDGE3 0 1 {numbers} {TRIANGLE_3D}",
+    )
     Rx = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
-    Ry = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
+    Ry = np.array(
+        [[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]]
+    )
     Rz = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
     np.testing.assert_allclose(graph.R_ij[0], Rz @ Ry @ Rx, rtol=0, atol=1e-14)
     np.testing.assert_allclose(graph.initial.R[1], Rz @ Ry @ Rx, rtol=0, atol=1e-14)
@@ -142,7 +179,9 @@ def test_toro_in_space_has_roll_pitch_yaw(tmp_path: Path) -> None:
 
 
 def test_tags_of_two_kinds_keep_the_order_of_the_lines(tmp_path: Path) -> None:
-    graph = read(tmp_path, "EDGE_PRIOR_SE2 1 3 4 0 1 0 0 1 0 1", ODOMETRY_2D, "EDGE2 1 2 1 0 0 1 0 1 1 0 0")
+    graph = read(
+        tmp_path, "EDGE_PRIOR_SE2 1 3 4 0 1 0 0 1 0 1", ODOMETRY_2D, "EDGE2 1 2 1 0 0 1 0 1 1 0 0"
+    )
     np.testing.assert_array_equal(graph.i, [3, 0, 1])
     np.testing.assert_array_equal(graph.j, [1, 1, 2])
     assert pose_names(graph) == ["0", "1", "2", "the world"]
@@ -154,8 +193,16 @@ SEEN = "EDGE_SE2_XY 0 7 1 2 1 0 1"
 @pytest.mark.parametrize(
     ("lines", "where", "words"),
     [
-        ([ODOMETRY_2D, "EDGE_PRIOR_SE2_XY 0 1 2 1 0"], ":2", ["EDGE_PRIOR_SE2_XY needs 1 id and 5 numbers", "found 5"]),
-        ([ODOMETRY_2D, "EDGE_PRIOR_SE2_XY 0 1 2 1 0 0"], ":2", ["translation block", "positive definite"]),
+        (
+            [ODOMETRY_2D, "EDGE_PRIOR_SE2_XY 0 1 2 1 0"],
+            ":2",
+            ["EDGE_PRIOR_SE2_XY needs 1 id and 5 numbers", "found 5"],
+        ),
+        (
+            [ODOMETRY_2D, "EDGE_PRIOR_SE2_XY 0 1 2 1 0 0"],
+            ":2",
+            ["translation block", "positive definite"],
+        ),
         ([ODOMETRY_2D, "EDGE_PRIOR_SE2 0 1 2 0 0 0 0 0 0 0"], ":2", ["zero", "remove it"]),
         ([ODOMETRY_2D, "EDGE_SE2_XY 0 x 1 2 1 0 1"], ":2", ["id 'x'"]),
         ([ODOMETRY_2D, SEEN, "EDGE_SE2 7 1 1 0 0 4 0 0 4 0 9"], ":3", ["landmark", "renumber"]),
@@ -167,14 +214,24 @@ SEEN = "EDGE_SE2_XY 0 7 1 2 1 0 1"
         ([ODOMETRY_3D, SEEN], ":2", ["2D and 3D"]),
         ([ODOMETRY_2D, f"EDGE_PRIOR_SE2_XY {2**63 - 1} 1 2 1 0 1"], ":2", ["does not fit 64 bits"]),
         (
-            ["PARAMS_SE3OFFSET 3 0 0 0.5 0 0 0 1", ODOMETRY_3D, "EDGE_SE3_TRACKXYZ 0 9 3 1 2 3 1 0 0 1 0 1"],
+            [
+                "PARAMS_SE3OFFSET 3 0 0 0.5 0 0 0 1",
+                ODOMETRY_3D,
+                "EDGE_SE3_TRACKXYZ 0 9 3 1 2 3 1 0 0 1 0 1",
+            ],
             ":1",
             ["sensor", "frame of the pose"],
         ),
-        (["BR 1 2", ODOMETRY_2D], ":1", ["unknown tag 'BR'", "EDGE_SE3_TRACKXYZ", "--skip-unknown"]),
+        (
+            ["BR 1 2", ODOMETRY_2D],
+            ":1",
+            ["unknown tag 'BR'", "EDGE_SE3_TRACKXYZ", "--skip-unknown"],
+        ),
     ],
 )
-def test_every_fault_has_its_line_and_a_way_out(tmp_path: Path, lines: list[str], where: str, words: list[str]) -> None:
+def test_every_fault_has_its_line_and_a_way_out(
+    tmp_path: Path, lines: list[str], where: str, words: list[str]
+) -> None:
     with pytest.raises(FileFormatError) as caught:
         read(tmp_path, *lines)
     assert_says(caught.value, f"{tmp_path / 'graph.g2o'}{where}: ", words)
@@ -204,8 +261,12 @@ def with_everything(d: int, information: bool, tmp_path: Path) -> PoseGraph:
         write_g2o(graph, tmp_path / "plain.g2o")
         graph = read_g2o(tmp_path / "plain.g2o")
     graph = graph.with_landmark(np.array([0, 1, 2]), rng.standard_normal((3, d)), 3.0)
-    graph = graph.with_position_prior(np.arange(5), rng.standard_normal((5, d)), rng.uniform(1, 2, 5))
-    graph = graph.with_prior(np.array([6]), Poses(graph.initial.R[6:7], graph.initial.t[6:7]), 2.0, 3.0)
+    graph = graph.with_position_prior(
+        np.arange(5), rng.standard_normal((5, d)), rng.uniform(1, 2, 5)
+    )
+    graph = graph.with_prior(
+        np.array([6]), Poses(graph.initial.R[6:7], graph.initial.t[6:7]), 2.0, 3.0
+    )
     return graph.with_position_prior(graph.landmarks[-1:], rng.standard_normal((1, d)), 5.0)
 
 
@@ -221,7 +282,8 @@ def test_what_is_written_reads_back(tmp_path: Path, d: int, information: bool) -
     of_file = np.lexsort((again.t_ij[:, 0], again.j, again.i))
     own = np.lexsort((graph.t_ij[:, 0], number[graph.j], number[graph.i]))
     for name in ("t_ij", "R_ij", "kappa", "tau"):
-        ours, theirs = getattr(graph, name)[own], getattr(again, name)[of_file]
+        ours = getattr(graph, name)[own]
+        theirs = getattr(again, name)[of_file]
         np.testing.assert_allclose(theirs, ours, rtol=1e-12, atol=1e-14)
     np.testing.assert_array_equal(number[graph.i[own]], again.i[of_file])
     np.testing.assert_array_equal(number[graph.landmarks], again.landmarks)

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pgo_models.errors import SettingError
 from pgo_models.graphs.grid_worlds import grid_world
@@ -20,8 +19,12 @@ def consecutive(graph: PoseGraph) -> np.ndarray:
 
 
 @given(seed=SEEDS, num_robots=ROBOTS, poses=POSES, d=DIMENSIONS, probability=PROBABILITY)
-def test_a_world_is_connected_and_walked(seed: int, num_robots: int, poses: int, d: int, probability: float) -> None:
-    graph = grid_world(num_robots, poses, np.random.default_rng(seed), d=d, loop_closure_probability=probability)
+def test_a_world_is_connected_and_walked(
+    seed: int, num_robots: int, poses: int, d: int, probability: float
+) -> None:
+    graph = grid_world(
+        num_robots, poses, np.random.default_rng(seed), d=d, loop_closure_probability=probability
+    )
     assert graph.is_connected
     assert (graph.num_poses, graph.num_robots, graph.d) == (num_robots * poses, num_robots, d)
     np.testing.assert_array_equal(graph.robots, np.repeat(np.arange(num_robots), poses))
@@ -34,10 +37,12 @@ def test_a_world_is_connected_and_walked(seed: int, num_robots: int, poses: int,
     np.testing.assert_array_equal(truth.t, np.rint(truth.t))
     np.testing.assert_array_equal(np.abs(truth.R), np.rint(np.abs(truth.R)))
     assert truth.t.min() >= 0
-    # Odometry: one cell ahead along the x axis of the later pose, which is turned by 0 or 90 degrees.
+    # Odometry: one cell ahead along the x axis of the later pose, which is turned by 0 or 90
+    # degrees.
     odometry = consecutive(graph)
     assert odometry.sum() == num_robots * (poses - 1)
-    i, j = graph.i[odometry], graph.j[odometry]
+    i = graph.i[odometry]
+    j = graph.j[odometry]
     np.testing.assert_array_equal(truth.t[j] - truth.t[i], truth.R[j][:, :, 0])
     assert (np.einsum("ma,ma->m", truth.R[i][:, :, 0], truth.R[j][:, :, 0]) >= 0).all()
 
@@ -46,7 +51,9 @@ def test_a_world_is_connected_and_walked(seed: int, num_robots: int, poses: int,
 def test_with_probability_one_all_that_see_each_other_are_linked(
     seed: int, num_robots: int, poses: int, d: int
 ) -> None:
-    graph = grid_world(num_robots, poses, np.random.default_rng(seed), d=d, loop_closure_probability=1.0)
+    graph = grid_world(
+        num_robots, poses, np.random.default_rng(seed), d=d, loop_closure_probability=1.0
+    )
     assert graph.truth is not None
     distance = np.linalg.norm(graph.truth.t[:, None] - graph.truth.t, axis=2)
     linked = np.zeros(distance.shape, dtype=bool)
@@ -61,7 +68,9 @@ def test_with_probability_one_all_that_see_each_other_are_linked(
 
 @given(seed=SEEDS, num_robots=ROBOTS, d=DIMENSIONS)
 def test_with_probability_zero_the_world_is_a_tree(seed: int, num_robots: int, d: int) -> None:
-    graph = grid_world(num_robots, 10, np.random.default_rng(seed), d=d, loop_closure_probability=0.0)
+    graph = grid_world(
+        num_robots, 10, np.random.default_rng(seed), d=d, loop_closure_probability=0.0
+    )
     assert graph.num_edges == graph.num_poses - 1
     assert graph.is_connected
 
@@ -69,7 +78,9 @@ def test_with_probability_zero_the_world_is_a_tree(seed: int, num_robots: int, d
 @pytest.mark.parametrize("d", [2, 3])
 def test_loop_closures_come_with_their_probability(d: int) -> None:
     def count(probability: float) -> int:
-        graph = grid_world(10, 200, np.random.default_rng(0), d=d, loop_closure_probability=probability)
+        graph = grid_world(
+            10, 200, np.random.default_rng(0), d=d, loop_closure_probability=probability
+        )
         return int((~consecutive(graph)).sum())
 
     all_of_them = count(1.0)
@@ -101,6 +112,10 @@ def test_the_same_seed_gives_the_same_bits() -> None:
         (2, 5, 3, np.nan, "between 0 and 1, got nan"),
     ],
 )
-def test_settings_are_checked(num_robots: int, poses: int, d: int, probability: float, message: str) -> None:
+def test_settings_are_checked(
+    num_robots: int, poses: int, d: int, probability: float, message: str
+) -> None:
     with pytest.raises(SettingError, match=message):
-        grid_world(num_robots, poses, np.random.default_rng(0), d=d, loop_closure_probability=probability)
+        grid_world(
+            num_robots, poses, np.random.default_rng(0), d=d, loop_closure_probability=probability
+        )

@@ -1,4 +1,4 @@
-"""Landmarks, priors and positions, whatever the order of their edges; and what of them is counted."""
+"""Landmarks, priors and positions count the same whatever the order of their edges."""
 
 import numpy as np
 import pytest
@@ -23,10 +23,14 @@ def survey(tmp_path, priors_first):
         t, angle = poses[-1]
         poses.append((t + np.array([np.cos(angle), np.sin(angle)]), angle + 0.5))
     known = np.array([[0.0, 3.0], [4.0, 1.0], [2.0, -3.0]])
-    sights, priors = [], [PRIOR.format(k, f"{x!r} {y!r}") for k, (x, y) in enumerate(known.tolist())]
+    sights = []
+    priors = [PRIOR.format(k, f"{x!r} {y!r}") for k, (x, y) in enumerate(known.tolist())]
     for i, (t, angle) in enumerate(poses):
         turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-        sights += [SIGHT.format(i, k, " ".join(map(repr, (turn @ (x - t)).tolist()))) for k, x in enumerate(known)]
+        sights += [
+            SIGHT.format(i, k, " ".join(map(repr, (turn @ (x - t)).tolist())))
+            for k, x in enumerate(known)
+        ]
     lines = [ODOMETRY.format(i, i + 1) for i in range(3)]
     lines += priors + sights if priors_first else sights + priors
     path = tmp_path / f"survey{priors_first}.g2o"

@@ -4,8 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from graphs import DIMENSIONS, SEEDS, varied_graph
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.graphs.grid_worlds import grid_world
@@ -17,7 +16,9 @@ METHODS = st.sampled_from([PartitionMethod.CONTIGUOUS, PartitionMethod.METIS])
 
 
 @given(seed=SEEDS, n=st.integers(2, 60), d=DIMENSIONS, share=st.floats(0, 1), method=METHODS)
-def test_every_robot_owns_a_pose(seed: int, n: int, d: int, share: float, method: PartitionMethod) -> None:
+def test_every_robot_owns_a_pose(
+    seed: int, n: int, d: int, share: float, method: PartitionMethod
+) -> None:
     graph = varied_graph(seed, n, d)
     num_robots = 1 + int(share * (n - 1))
     parts = partition(graph, num_robots, method)
@@ -39,7 +40,9 @@ def test_metis_gives_the_robots_asked_for_and_balances_them(num_robots: int) -> 
     assert metis.sizes.max() <= 1.3 * 500 / num_robots
     contiguous = partition(graph, num_robots, PartitionMethod.CONTIGUOUS)
     assert metis.cut_edges(graph).sum() < contiguous.cut_edges(graph).sum()
-    np.testing.assert_array_equal(partition(graph, num_robots, PartitionMethod.METIS).robot, metis.robot)
+    np.testing.assert_array_equal(
+        partition(graph, num_robots, PartitionMethod.METIS).robot, metis.robot
+    )
 
 
 @pytest.mark.parametrize("num_robots", [20, 26, 27])
@@ -53,7 +56,11 @@ def test_metis_leaves_no_robot_out_on_a_dense_graph(num_robots: int) -> None:
 def test_cut_edges_and_separators(seed: int, n: int, share: float, method: PartitionMethod) -> None:
     graph = varied_graph(seed, n, 2)
     parts = partition(graph, 1 + int(share * (n - 1)), method)
-    cut = {(int(i), int(j)) for i, j in zip(graph.i, graph.j, strict=True) if parts.robot[i] != parts.robot[j]}
+    cut = {
+        (int(i), int(j))
+        for i, j in zip(graph.i, graph.j, strict=True)
+        if parts.robot[i] != parts.robot[j]
+    }
     mask = parts.cut_edges(graph)
     assert {(int(i), int(j)) for i, j in zip(graph.i[mask], graph.j[mask], strict=True)} == cut
     assert parts.separators(graph).tolist() == sorted({pose for edge in cut for pose in edge})
@@ -76,7 +83,11 @@ def test_singletons_need_no_number() -> None:
 
 def test_robots_that_the_graph_names_are_the_default() -> None:
     graph = grid_world(3, 10, np.random.default_rng(0))
-    for parts in (partition(graph), partition(graph, 3), partition(graph, method=PartitionMethod.GIVEN)):
+    for parts in (
+        partition(graph),
+        partition(graph, 3),
+        partition(graph, method=PartitionMethod.GIVEN),
+    ):
         assert parts.method is PartitionMethod.GIVEN
         np.testing.assert_array_equal(parts.robot, graph.robots)
     other = partition(graph, 5)
@@ -109,7 +120,9 @@ def test_a_partition_of_another_graph_is_refused() -> None:
     parts = partition(grid(np.random.default_rng(0)), 3)
     other = random_geometric(28, np.random.default_rng(0))
     for function in (parts.cut_edges, parts.separators):
-        with pytest.raises(SettingError, match=r"of 27 poses beside PoseGraph\(.*; give one robot for every pose"):
+        with pytest.raises(
+            SettingError, match=r"of 27 poses beside PoseGraph\(.*; give one robot for every pose"
+        ):
             function(other)
 
 

@@ -2,8 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
@@ -18,7 +17,9 @@ def path_graph(n: int, d: int = 2) -> PoseGraph:
     """Poses 0 - 1 - .. - n-1."""
     i = np.arange(n - 1)
     R = np.tile(np.eye(d), (n - 1, 1, 1))
-    return PoseGraph(n, i, i + 1, R, np.ones((n - 1, d)), np.ones(n - 1), np.ones(n - 1), name="path")
+    return PoseGraph(
+        n, i, i + 1, R, np.ones((n - 1, d)), np.ones(n - 1), np.ones(n - 1), name="path"
+    )
 
 
 def test_defaults_and_properties() -> None:
@@ -47,7 +48,10 @@ def test_defaults_and_properties() -> None:
         ({"R_ij": np.full((3, 2, 2), np.nan)}, "R_ij of edge 0 .* nan or inf"),
         ({"t_ij": np.ones((3, 3))}, "t_ij has shape"),
         ({"t_ij": [[1, 1], [1, np.inf], [1, 1]]}, r"t_ij of edge 1 \(1 -> 2\) has nan or inf"),
-        ({"kappa": [1, -0.5, 1]}, r"kappa of edge 1 \(1 -> 2\) is -0.5; a precision must not be negative"),
+        (
+            {"kappa": [1, -0.5, 1]},
+            r"kappa of edge 1 \(1 -> 2\) is -0.5; a precision must not be negative",
+        ),
         ({"kappa": [1, 0, 1], "tau": [0, 0, 1]}, r"kappa and tau of edge 1 \(1 -> 2\) are 0"),
         ({"tau": [1, 1, -2.5]}, r"tau of edge 2 \(2 -> 3\) is -2.5"),
         ({"tau": [1, 1, np.nan]}, "tau of edge 2"),
@@ -77,7 +81,9 @@ def test_components_are_the_parts_edges_join(seed: int, n: int, d: int) -> None:
     graph = random_geometric(n, rng, d=d)
     kept = rng.random(graph.num_edges) < 0.5
     kept[0] = True
-    changes = {name: getattr(graph, name)[kept] for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")}
+    changes = {
+        name: getattr(graph, name)[kept] for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")
+    }
     graph = dataclasses.replace(graph, **changes)
     parts = graph.components()
     np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(n))
@@ -95,9 +101,13 @@ def test_disconnected_graphs_are_named() -> None:
     graph = dataclasses.replace(path_graph(4), num_poses=6)
     with pytest.raises(GraphError, match=r"3 components \(sizes 4, 1, 1; with poses 0, 4, 5\)"):
         graph.check_connected()
-    with pytest.raises(GraphError, match=r"5 components \(sizes 2, 1, 1, 1, 1; with poses 0, 2, 3, 4, 5\)"):
+    with pytest.raises(
+        GraphError, match=r"5 components \(sizes 2, 1, 1, 1, 1; with poses 0, 2, 3, 4, 5\)"
+    ):
         dataclasses.replace(path_graph(2), num_poses=6).check_connected()
-    with pytest.raises(GraphError, match=r"sizes 2, 1, 1, 1, 1 and 1 more; with poses 0, 2, 3, 4, 5 and 1 more"):
+    with pytest.raises(
+        GraphError, match=r"sizes 2, 1, 1, 1, 1 and 1 more; with poses 0, 2, 3, 4, 5 and 1 more"
+    ):
         dataclasses.replace(path_graph(2), num_poses=7).check_connected()
 
 
@@ -112,13 +122,17 @@ def test_subgraph_keeps_what_lies_in_it(seed: int, n: int, d: int) -> None:
         fixed=[0, 1],
     )
     e = int(rng.integers(graph.num_edges))
-    chosen = np.unique(np.concatenate([[graph.i[e], graph.j[e]], rng.choice(n, n // 2, replace=False)]))
+    chosen = np.unique(
+        np.concatenate([[graph.i[e], graph.j[e]], rng.choice(n, n // 2, replace=False)])
+    )
     part = graph.subgraph(rng.permutation(chosen))
     np.testing.assert_array_equal(part.pose_ids, graph.pose_ids[chosen])
     inside = np.isin(graph.i, chosen) & np.isin(graph.j, chosen)
     np.testing.assert_array_equal(part.pose_ids[part.i], graph.pose_ids[graph.i[inside]])
     np.testing.assert_array_equal(part.t_ij, graph.t_ij[inside])
-    np.testing.assert_array_equal(part.pose_ids[part.fixed], graph.pose_ids[[p for p in (0, 1) if p in chosen]])
+    np.testing.assert_array_equal(
+        part.pose_ids[part.fixed], graph.pose_ids[[p for p in (0, 1) if p in chosen]]
+    )
     assert part.truth is not None
     assert graph.truth is not None
     np.testing.assert_array_equal(part.truth.t, graph.truth.t[chosen])
@@ -145,7 +159,8 @@ def test_unit_weights() -> None:
 
 @pytest.mark.parametrize("name", ["initial", "truth"])
 def test_its_table_says_what_came_with_it(name: str) -> None:
-    bare, given = path_graph(4), dataclasses.replace(path_graph(4), **{name: Poses.identity(4, 2)})
+    bare = path_graph(4)
+    given = dataclasses.replace(path_graph(4), **{name: Poses.identity(4, 2)})
     assert bare._repr_html_().count("none") == 2
     assert given._repr_html_().count("none") == given._repr_html_().count("with the graph") == 1
 

@@ -1,4 +1,4 @@
-"""Weights that are too far apart for doubles: which edge is to blame, and where it stands in the file."""
+"""Weights that are too far apart for doubles: the edge to blame, and its line in the file."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +25,9 @@ def weighted(graph: PoseGraph, factors: dict[int, float]) -> PoseGraph:
 def two_joined(factor: float) -> PoseGraph:
     """Two copies of a scene, joined by one edge whose weights have a factor: its last."""
     one = pgo.grid(np.random.default_rng(0))
-    n, i, j = one.num_poses, one.i, one.j
+    n = one.num_poses
+    i = one.i
+    j = one.j
     return PoseGraph(
         num_poses=2 * n,
         i=np.concatenate([i, i + n, [0]]),
@@ -41,7 +43,8 @@ def test_a_light_edge_is_to_blame_where_it_alone_joins_poses() -> None:
     graph = pgo.grid(np.random.default_rng(0))
     spread, edge, text = extreme_weight(weighted(graph, {5: 1e12, 9: 1e-15}))
     assert (edge, round(np.log10(spread))) == (5, 12)
-    assert text == f"kappa of edge {graph.i[5]} -> {graph.j[5]} is {1e12 * graph.kappa[5]:.3g}, 1e+12 times the median"
+    blamed = f"kappa of edge {graph.i[5]} -> {graph.j[5]}"
+    assert text == f"{blamed} is {1e12 * graph.kappa[5]:.3g}, 1e+12 times the median"
     spread, edge, _ = extreme_weight(two_joined(1e-11))
     assert (edge, round(np.log10(spread))) == (2 * graph.num_edges, 11)
     assert extreme_weight(graph)[0] == 1.0
@@ -52,10 +55,15 @@ def test_a_light_edge_is_to_blame_where_it_alone_joins_poses() -> None:
 
 @pytest.mark.parametrize(
     ("graph", "edge"),
-    [(weighted(pgo.grid(np.random.default_rng(0)), {5: 1e15, 9: 1e-18}), 5), (two_joined(1e-12), -1)],
+    [
+        (weighted(pgo.grid(np.random.default_rng(0)), {5: 1e15, 9: 1e-18}), 5),
+        (two_joined(1e-12), -1),
+    ],
     ids=["heavy", "light"],
 )
-def test_a_solution_without_a_bound_names_the_weight_that_is_the_cause(graph: PoseGraph, edge: int) -> None:
+def test_a_solution_without_a_bound_names_the_weight_that_is_the_cause(
+    graph: PoseGraph, edge: int
+) -> None:
     solution = solvers.solve(graph)
     assert solution.certificate.verdict is Verdict.TRIVIAL
     assert f"kappa of edge {graph.i[edge]} -> {graph.j[edge]} is" in solution.note
@@ -74,9 +82,13 @@ def test_a_weight_is_not_named_where_it_is_not_the_cause() -> None:
 def test_the_place_of_an_edge_is_that_of_its_own_line(tmp_path: Path) -> None:
     graph = pgo.grid(np.random.default_rng(0))
     twice = np.concatenate([np.arange(graph.num_edges), [4, 4]])
-    parts = {name: getattr(graph, name)[twice] for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")}
+    parts = {
+        name: getattr(graph, name)[twice] for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")
+    }
     repeated = weighted(replace(graph, **parts, information=None), {-1: 1e15})
-    repeated = replace(repeated, information=isotropic_information(repeated.kappa, repeated.tau, graph.d))
+    repeated = replace(
+        repeated, information=isotropic_information(repeated.kappa, repeated.tau, graph.d)
+    )
     path = tmp_path / "repeated.g2o"
     pgo.write_g2o(repeated, path)
     last = len(path.read_text().splitlines())

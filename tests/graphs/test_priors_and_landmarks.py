@@ -6,30 +6,35 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from graphs import DIMENSIONS, SEEDS, varied_graph
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import grid, victoria_park
+from pgo_models.problem.hessian import riemannian_hessian
 from pgo_models.problem.problem import PGOProblem
 
 
 def chain(d: int = 3, n: int = 4) -> PoseGraph:
-    steps, ones = np.tile(np.eye(d), (n - 1, 1, 1)), np.ones(n - 1)
+    steps = np.tile(np.eye(d), (n - 1, 1, 1))
+    ones = np.ones(n - 1)
     t_ij = np.tile(np.eye(d)[0], (n - 1, 1))
     return PoseGraph(n, np.arange(n - 1), np.arange(1, n), steps, t_ij, ones, ones, name="chain")
 
 
 @given(
-    seed=SEEDS, d=DIMENSIONS, draws=st.lists(st.tuples(st.sampled_from([0.0, -1.0, 2.0]), st.sampled_from([0.0, 3.0])))
+    seed=SEEDS,
+    d=DIMENSIONS,
+    draws=st.lists(st.tuples(st.sampled_from([0.0, -1.0, 2.0]), st.sampled_from([0.0, 3.0]))),
 )
 def test_precisions_may_be_zero_but_not_both_and_not_negative(seed, d, draws):
     graph = varied_graph(seed, 8, d)
-    kappa, tau = graph.kappa.copy(), graph.tau.copy()
+    kappa = graph.kappa.copy()
+    tau = graph.tau.copy()
     for e, (one, other) in enumerate(draws[: graph.num_edges]):
-        kappa[e], tau[e] = one, other
+        kappa[e] = one
+        tau[e] = other
     if (kappa < 0).any() or ((kappa == 0) & (tau == 0)).any():
         with pytest.raises(GraphError, match=r"a precision must not be negative|are 0; remove it"):
             graph.with_weights(kappa, tau)
@@ -45,13 +50,20 @@ def test_precisions_may_be_zero_but_not_both_and_not_negative(seed, d, draws):
 def test_the_cost_is_the_sum_of_squares_of_odometry_gps_and_sights(seed, d):
     rng = np.random.default_rng(seed)
     graph = varied_graph(seed, 6, d)
-    points, sights, tau = rng.standard_normal((4, d)), rng.standard_normal((3, d)), rng.uniform(1, 2, 4)
+    points = rng.standard_normal((4, d))
+    sights = rng.standard_normal((3, d))
+    tau = rng.uniform(1, 2, 4)
     seen_from = np.array([5, 0, 3])
-    more = graph.with_position_prior(np.arange(4), points, tau).with_landmark(seen_from, sights, 2.0)
-    R, t = graph.truth.R, rng.standard_normal((6, d))
+    more = graph.with_position_prior(np.arange(4), points, tau).with_landmark(
+        seen_from, sights, 2.0
+    )
+    R = graph.truth.R
+    t = rng.standard_normal((6, d))
     landmark = rng.standard_normal(d)
     poses = more.completed(Poses(np.concatenate([R, R[:1]]), np.concatenate([t, landmark[None]])))
-    expected = PGOProblem(graph).objective(Poses(R, t)) + tau @ np.sum((t[:4] - points) ** 2, axis=1)
+    expected = PGOProblem(graph).objective(Poses(R, t)) + tau @ np.sum(
+        (t[:4] - points) ** 2, axis=1
+    )
     seen = np.einsum("nba,nb->na", R[seen_from], landmark - t[seen_from])
     expected += 2.0 * np.sum((seen - sights) ** 2)
     problem = PGOProblem(more)
@@ -89,7 +101,9 @@ def test_edits_keep_what_they_do_not_touch():
     assert named.pose_ids[-1] == 5
     np.testing.assert_array_equal(named.bodies, np.arange(27))
     np.testing.assert_array_equal(named.times, graph.times)
-    back = named.without_edges(named.is_prior).without_edges(np.zeros(named.num_edges - 3, dtype=bool))
+    back = named.without_edges(named.is_prior).without_edges(
+        np.zeros(named.num_edges - 3, dtype=bool)
+    )
     assert back.world is None
     bare = back.subgraph(np.arange(27))
     assert repr(bare) == repr(graph)
@@ -133,13 +147,34 @@ def line(k: int, d: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("graph", "message"),
     [
-        (chain(3).with_position_prior(np.arange(4), line(4, 3), 1.0), "on a line, leave turns of the world open"),
-        (chain(3).with_position_prior(np.arange(2), np.eye(3)[:2], 1.0), "the priors do not fix the gauge"),
-        (chain(2).with_position_prior(np.arange(1), np.ones((1, 2)), 1.0), "the priors do not fix the gauge"),
-        (chain(2).with_position_prior(np.zeros(3, int), np.eye(3)[:, :2], 1.0), "positions of 1 poses"),
-        (chain().with_prior(np.array([1]), Poses.identity(1, 3), 1.0, 0.0), r"position of 1 poses \(with the world\)"),
-        (chain().with_weights(np.array([1.0, 0, 1]), np.ones(3)), r"rotation of 2 poses \(with 2\).*kappa > 0"),
-        (chain().with_weights(np.ones(3), np.array([1.0, 0, 1])), r"position of 2 poses \(with 2\).*tau > 0"),
+        (
+            chain(3).with_position_prior(np.arange(4), line(4, 3), 1.0),
+            "on a line, leave turns of the world open",
+        ),
+        (
+            chain(3).with_position_prior(np.arange(2), np.eye(3)[:2], 1.0),
+            "the priors do not fix the gauge",
+        ),
+        (
+            chain(2).with_position_prior(np.arange(1), np.ones((1, 2)), 1.0),
+            "the priors do not fix the gauge",
+        ),
+        (
+            chain(2).with_position_prior(np.zeros(3, int), np.eye(3)[:, :2], 1.0),
+            "positions of 1 poses",
+        ),
+        (
+            chain().with_prior(np.array([1]), Poses.identity(1, 3), 1.0, 0.0),
+            r"position of 1 poses \(with the world\)",
+        ),
+        (
+            chain().with_weights(np.array([1.0, 0, 1]), np.ones(3)),
+            r"rotation of 2 poses \(with 2\).*kappa > 0",
+        ),
+        (
+            chain().with_weights(np.ones(3), np.array([1.0, 0, 1])),
+            r"position of 2 poses \(with 2\).*tau > 0",
+        ),
     ],
 )
 def test_what_is_not_determined_is_said(graph, message):
@@ -151,15 +186,30 @@ def test_what_is_not_determined_is_said(graph, message):
 @pytest.mark.parametrize(
     ("add", "message"),
     [
-        (lambda graph: graph.with_prior([], Poses.identity(0, 3), 1.0, 1.0), r"are \[\]; give one or more, 0 to 3"),
-        (lambda graph: graph.with_position_prior([9], np.ones((1, 3)), 1.0), r"are \[9\]; give one or more, 0 to 3"),
-        (lambda graph: graph.with_position_prior([0.5], np.ones((1, 3)), 1.0), "poses has 0.5 among them"),
-        (lambda graph: graph.with_landmark([-1], np.ones((1, 3)), 1.0), r"are \[-1\]; give one or more"),
+        (
+            lambda graph: graph.with_prior([], Poses.identity(0, 3), 1.0, 1.0),
+            r"are \[\]; give one or more, 0 to 3",
+        ),
+        (
+            lambda graph: graph.with_position_prior([9], np.ones((1, 3)), 1.0),
+            r"are \[9\]; give one or more, 0 to 3",
+        ),
+        (
+            lambda graph: graph.with_position_prior([0.5], np.ones((1, 3)), 1.0),
+            "poses has 0.5 among them",
+        ),
+        (
+            lambda graph: graph.with_landmark([-1], np.ones((1, 3)), 1.0),
+            r"are \[-1\]; give one or more",
+        ),
         (
             lambda graph: graph.with_landmark([0, 1], np.ones((1, 3)), 1.0),
             r"\(1, 3\) positions seen from 2 poses in 3D",
         ),
-        (lambda graph: graph.with_landmark([0], np.ones((1, 2)), 1.0), r"\(1, 2\) positions seen from 1 poses in 3D"),
+        (
+            lambda graph: graph.with_landmark([0], np.ones((1, 2)), 1.0),
+            r"\(1, 2\) positions seen from 1 poses in 3D",
+        ),
     ],
 )
 def test_poses_that_are_not_there_cannot_be_measured(add, message):
@@ -171,10 +221,19 @@ def test_poses_that_are_not_there_cannot_be_measured(add, message):
 def test_as_few_positions_as_fix_the_world_do(d):
     positions = line(4, d)
     positions[3, 1] = 1.0
-    PGOProblem(
-        chain(d).with_position_prior(np.arange(d) if d == 2 else np.array([0, 1, 3]), positions[[0, 1, 3]][:d], 1.0)
-    )
-    PGOProblem(chain(d).with_prior(np.array([2]), Poses.identity(1, d), 1.0, 1.0))
+    truth = Poses(np.tile(np.eye(d), (4, 1, 1)), positions)
+    odometry = replace(chain(d), t_ij=np.diff(positions, axis=0))
+    measured = np.array([0, 1]) if d == 2 else np.array([0, 1, 3])
+    by_positions = odometry.with_position_prior(measured, positions[measured], 1.0)
+    by_a_pose = odometry.with_prior(np.array([2]), truth[2:3], 1.0, 1.0)
+    for graph in (by_positions, by_a_pose):
+        problem = PGOProblem(graph)
+        poses = graph.completed(truth)
+        assert problem.objective(poses) == pytest.approx(0.0, abs=1e-12)
+        curvatures = np.linalg.eigvalsh(riemannian_hessian(problem, poses, None).toarray())
+        is_open = curvatures < 1e-9 * curvatures[-1]
+        # Only a motion of the poses together with the world costs nothing.
+        assert is_open.sum() == d + d * (d - 1) // 2
 
 
 def test_victoria_park_is_the_same_for_the_same_seed_and_sees_every_landmark_twice():
@@ -185,4 +244,21 @@ def test_victoria_park_is_the_same_for_the_same_seed_and_sees_every_landmark_twi
     assert len(graph.landmarks) > 3
     assert np.bincount(graph.j)[graph.landmarks].min() >= 2
     graph.check_connected()
-    np.testing.assert_array_equal(graph.initial.R[graph.landmarks[0]], graph.initial.R[graph.i[graph.first_sights[0]]])
+    np.testing.assert_array_equal(
+        graph.initial.R[graph.landmarks[0]], graph.initial.R[graph.i[graph.first_sights[0]]]
+    )
+
+
+def test_a_landmark_seen_again_without_a_position_is_no_measurement() -> None:
+    arrays = {
+        "i": np.array([0, 0, 1]),
+        "j": np.array([1, 2, 2]),
+        "R_ij": np.tile(np.eye(2), (3, 1, 1)),
+        "t_ij": np.ones((3, 2)),
+        "kappa": np.ones(3),
+        "landmarks": np.array([2]),
+    }
+    graph = PoseGraph(3, tau=np.ones(3), **arrays)
+    np.testing.assert_array_equal(graph.kappa, [1.0, 1.0, 0.0])
+    with pytest.raises(GraphError, match=r"kappa and tau of edge 2 \(1 -> 2\) are 0"):
+        PoseGraph(3, tau=np.array([1.0, 1.0, 0.0]), **arrays)

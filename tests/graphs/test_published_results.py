@@ -11,7 +11,11 @@ from pgo_models.graphs.published_results import published_run
 def test_the_papers_scenes_have_their_row(name):
     row = REFERENCE["paper_tables"][name]
     found = published_run(pgo.load(name))
-    assert (found.objective, found.optimum, found.iterations) == (row["F_soc"], row["F_star"], row["iterations_soc"])
+    assert (found.objective, found.optimum, found.iterations) == (
+        row["F_soc"],
+        row["F_star"],
+        row["iterations_soc"],
+    )
     assert 0 < found.gap < 1
 
 

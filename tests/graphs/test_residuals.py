@@ -3,8 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from graphs import REFERENCE, random_poses
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
@@ -29,7 +28,8 @@ def test_costs_are_the_summands_of_F(seed, d):
 def test_an_edge_off_by_a_known_motion_has_that_residual(d):
     rng = np.random.default_rng(1)
     pose = random_poses(2, d, 1)
-    angle, shift = 0.3, rng.standard_normal(d)
+    angle = 0.3
+    shift = rng.standard_normal(d)
     turn = pgo.exp_map(np.array([[angle]]) if d == 2 else np.array([[0.0, angle, 0.0]]))[0]
     R_ij = pose.R[0].T @ pose.R[1] @ turn
     t_ij = pose.R[0].T @ (pose.t[1] - pose.t[0]) + shift
@@ -41,16 +41,22 @@ def test_an_edge_off_by_a_known_motion_has_that_residual(d):
 
 def test_residuals_do_not_see_the_gauge():
     graph = pgo.circle(np.random.default_rng(0))
-    moved = graph.truth.moved(pgo.random_rotations(1, 3, np.random.default_rng(2))[0], np.array([1.0, -2.0, 3.0]))
-    ours, theirs = pgo.edge_residuals(graph, graph.truth), pgo.edge_residuals(graph, moved)
+    moved = graph.truth.moved(
+        pgo.random_rotations(1, 3, np.random.default_rng(2))[0], np.array([1.0, -2.0, 3.0])
+    )
+    ours = pgo.edge_residuals(graph, graph.truth)
+    theirs = pgo.edge_residuals(graph, moved)
     for name in ("translation", "rotation", "cost"):
-        np.testing.assert_allclose(getattr(theirs, name), getattr(ours, name), rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(
+            getattr(theirs, name), getattr(ours, name), rtol=1e-9, atol=1e-12
+        )
 
 
 @pytest.mark.parametrize("weak", ["kappa", "tau"])
 def test_an_edge_is_uncertain_by_either_precision(weak):
     graph = pgo.circle(np.random.default_rng(0))
-    kappa, tau = graph.kappa.copy(), graph.tau.copy()
+    kappa = graph.kappa.copy()
+    tau = graph.tau.copy()
     {"kappa": kappa, "tau": tau}[weak][[3, 8]] *= 0.05
     assert np.flatnonzero(uncertain_edges(graph.with_weights(kappa, tau))).tolist() == [3, 8]
     assert not uncertain_edges(graph).any()
@@ -73,13 +79,17 @@ def test_poses_of_another_graph_are_refused():
 # chi2 with the file's information.
 
 
-def one_edge(d: int, turn: Array, shift: Array, information: Array) -> tuple[pgo.PoseGraph, pgo.Poses]:
-    """An edge that the second pose misses by a turn and a shift, both in the frame of the measured end pose."""
+def one_edge(
+    d: int, turn: Array, shift: Array, information: Array
+) -> tuple[pgo.PoseGraph, pgo.Poses]:
+    """Edge whose second pose is off by a rotation and a shift, in the frame of the measured end."""
     pose = random_poses(2, d, 1)
     E = pgo.exp_map(turn[None])[0]
     R_ij = pose.R[0].T @ pose.R[1] @ E.T
     t_ij = pose.R[0].T @ (pose.t[1] - pose.t[0]) - R_ij @ shift
-    graph = pgo.PoseGraph(2, [0], [1], R_ij[None], t_ij[None], [1.0], [1.0], information=information[None])
+    graph = pgo.PoseGraph(
+        2, [0], [1], R_ij[None], t_ij[None], [1.0], [1.0], information=information[None]
+    )
     return graph, pose
 
 
@@ -90,21 +100,31 @@ def random_information(k: int, rng: np.random.Generator) -> Array:
 
 def test_chi2_in_the_plane_by_hand():
     rng = np.random.default_rng(0)
-    info, r, theta = random_information(3, rng), np.array([0.3, -0.2]), 0.7
+    info = random_information(3, rng)
+    r = np.array([0.3, -0.2])
+    theta = 0.7
     graph, pose = one_edge(2, np.array([theta]), r, info)
     residual = np.append(r, theta)
     for convention in (Chi2Convention.GEODESIC, Chi2Convention.G2O):
         assert chi2(graph, pose, convention) == pytest.approx(residual @ info @ residual, rel=1e-12)
-    chordal = r @ info[:2, :2] @ r + 2 * (r @ info[:2, 2]) * np.sin(theta) + 2 * (1 - np.cos(theta)) * info[2, 2]
+    chordal = (
+        r @ info[:2, :2] @ r
+        + 2 * (r @ info[:2, 2]) * np.sin(theta)
+        + 2 * (1 - np.cos(theta)) * info[2, 2]
+    )
     assert chi2(graph, pose) == pytest.approx(chordal, rel=1e-12)
     V = np.array([[np.sin(theta), np.cos(theta) - 1], [1 - np.cos(theta), np.sin(theta)]]) / theta
     logarithm = np.append(np.linalg.solve(V, r), theta)
-    assert chi2(graph, pose, Chi2Convention.GTSAM) == pytest.approx(logarithm @ info @ logarithm, rel=1e-12)
+    assert chi2(graph, pose, Chi2Convention.GTSAM) == pytest.approx(
+        logarithm @ info @ logarithm, rel=1e-12
+    )
 
 
 def test_chi2_in_space_by_hand():
     rng = np.random.default_rng(1)
-    info, r, w = random_information(6, rng), rng.standard_normal(3), np.array([0.4, -0.8, 0.5])
+    info = random_information(6, rng)
+    r = rng.standard_normal(3)
+    w = np.array([0.4, -0.8, 0.5])
     graph, pose = one_edge(3, w, r, info)
     theta = np.linalg.norm(w)
     a = w / theta
@@ -117,15 +137,20 @@ def test_chi2_in_space_by_hand():
     twice = 2 * (1 - np.cos(theta)) * (a @ info[3:, 3:] @ a)
     chordal = r @ info[:3, :3] @ r + 2 * r @ info[:3, 3:] @ a * np.sin(theta) + twice
     assert chi2(graph, pose) == pytest.approx(chordal, rel=1e-12)
-    # 2 (1 - cos theta) a^T I_rr a is tr(W (2 I - E - E^T)), quadratic in the rotations, with W = tr(I_rr) / 2 I - I_rr.
-    W, E = 0.5 * np.trace(info[3:, 3:]) * np.eye(3) - info[3:, 3:], pgo.exp_map(w[None])[0]
+    # 2 (1 - cos theta) a^T I_rr a is tr(W (2 I - E - E^T)), quadratic in the rotations, with W =
+    # tr(I_rr) / 2 I - I_rr.
+    W = 0.5 * np.trace(info[3:, 3:]) * np.eye(3) - info[3:, 3:]
+    E = pgo.exp_map(w[None])[0]
     assert twice == pytest.approx(np.trace(W @ (2 * np.eye(3) - E - E.T)), rel=1e-12)
     twist = np.zeros((4, 4))
-    twist[:3, :3], twist[:3, 3] = pgo.exp_map(w[None])[0], r
+    twist[:3, :3] = pgo.exp_map(w[None])[0]
+    twist[:3, 3] = r
     twist[3, 3] = 1.0
     logarithm = np.real(logm(twist))
     residual = np.concatenate([logarithm[:3, 3], w])
-    assert chi2(graph, pose, Chi2Convention.GTSAM) == pytest.approx(residual @ info @ residual, rel=1e-10)
+    assert chi2(graph, pose, Chi2Convention.GTSAM) == pytest.approx(
+        residual @ info @ residual, rel=1e-10
+    )
 
 
 @given(seed=st.integers(0, 2**32 - 1), d=st.sampled_from([2, 3]))
@@ -156,7 +181,9 @@ def test_without_information_chi2_is_of_the_isotropic_one():
 def test_chi2_at_the_optimum_of_F_is_the_measured_one(name, benchmark_data, benchmark_optimum):
     graph = pgo.read_g2o(benchmark_data / f"{name}.g2o")
     information = graph.information.copy()
-    information[:, :2, 2], information[:, 2, :2] = 0.0, 0.0  # the reference leaves out what couples the blocks
+    # the reference leaves out what couples the blocks
+    information[:, :2, 2] = 0.0
+    information[:, 2, :2] = 0.0
     found = chi2(replace(graph, information=information), benchmark_optimum(name))
     assert found == pytest.approx(REFERENCE["full_information_optimum"][name][0], rel=1e-5)
 
@@ -165,5 +192,7 @@ def test_chi2_refuses_other_poses_and_conventions():
     graph = pgo.circle(np.random.default_rng(0))
     with pytest.raises(GraphError, match="give one pose for every pose of the graph"):
         chi2(graph, random_poses(3, 3, 0))
-    with pytest.raises(SettingError, match=r"convention is 'g2o'; give one of Chi2Convention\.CHORDAL, "):
+    with pytest.raises(
+        SettingError, match=r"convention is 'g2o'; give one of Chi2Convention\.CHORDAL, "
+    ):
         chi2(graph, graph.truth, "g2o")

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
@@ -23,7 +22,8 @@ Scene = Callable[[np.random.Generator], PoseGraph]
 
 def errors(graph: PoseGraph) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Noise of t_ij and R_ij (tangent), and of t and R of the initial guess."""
-    truth, initial = graph.truth, graph.initial
+    truth = graph.truth
+    initial = graph.initial
     assert truth is not None
     assert initial is not None
     R_inverse = np.swapaxes(truth.R[graph.i], 1, 2)
@@ -50,7 +50,11 @@ def test_networks_are_those_of_the_reference(scene: Scene, seed: int) -> None:
     linked[graph.i, graph.j] = True
     slack = 1e-9
     assert (distance[linked] <= expected["comm_radius"] + slack).all()
-    apart = ~linked & ~np.eye(graph.num_poses, dtype=bool) & (distance <= expected["comm_radius"] + slack)
+    apart = (
+        ~linked
+        & ~np.eye(graph.num_poses, dtype=bool)
+        & (distance <= expected["comm_radius"] + slack)
+    )
     left_out = {(0, 12), (12, 0)} if graph.name == "sphere" else set()
     assert set(zip(*(index.tolist() for index in np.nonzero(apart)), strict=True)) == left_out
 
@@ -76,7 +80,9 @@ def test_the_same_seed_gives_the_same_bits(scene: Scene) -> None:
 def test_both_directions_have_noise_of_their_own() -> None:
     graph = circle(np.random.default_rng(0))
     t, R, _, _ = errors(graph)
-    back = {(i, j): e for e, (i, j) in enumerate(zip(graph.i.tolist(), graph.j.tolist(), strict=True))}
+    back = {
+        (i, j): e for e, (i, j) in enumerate(zip(graph.i.tolist(), graph.j.tolist(), strict=True))
+    }
     other = [back[j, i] for i, j in zip(graph.i.tolist(), graph.j.tolist(), strict=True)]
     for noise in (t, R):
         correlation = np.sum(noise * noise[other]) / np.sum(noise**2)
@@ -89,7 +95,8 @@ def test_noise_has_its_standard_deviations(d: int) -> None:
     graph = random_geometric(2000, np.random.default_rng(0), d=d, noise=noise)
     t, R, t_initial, R_initial = errors(graph)
     for values, std in ((t, 0.2), (R, 0.1), (t_initial, 0.2), (R_initial, 0.1)):
-        # The standard deviation of an estimated standard deviation is std / sqrt(2 size); five of them.
+        # The standard deviation of an estimated standard deviation is std / sqrt(2 size); five of
+        # them.
         assert values.std() == pytest.approx(std, rel=5 / np.sqrt(2 * values.size))
         assert abs(values.mean()) < 5 * std / np.sqrt(values.size)
     assert (graph.tau == noise.tau).all()
@@ -121,7 +128,9 @@ def test_noise_must_be_positive(value: float) -> None:
 
 
 @given(seed=SEEDS, n=st.integers(2, 60), d=DIMENSIONS, mean_degree=st.sampled_from([0.1, 2.0, 8.0]))
-def test_random_geometric_is_connected_and_links_the_close(seed: int, n: int, d: int, mean_degree: float) -> None:
+def test_random_geometric_is_connected_and_links_the_close(
+    seed: int, n: int, d: int, mean_degree: float
+) -> None:
     graph = random_geometric(n, np.random.default_rng(seed), d=d, mean_degree=mean_degree)
     assert graph.is_connected
     assert (graph.num_poses, graph.d) == (n, d)
@@ -137,7 +146,8 @@ def test_random_geometric_is_connected_and_links_the_close(seed: int, n: int, d:
 
 def test_random_geometric_has_about_its_mean_degree() -> None:
     graph = random_geometric(20000, np.random.default_rng(0), d=2, mean_degree=6.0)
-    # One pose in about 30 is nearer to a wall than the radius and misses up to half of its neighbours.
+    # One pose in about 30 is nearer to a wall than the radius and misses up to half of its
+    # neighbours.
     assert 2 * graph.num_edges / graph.num_poses == pytest.approx(6.0, rel=0.1)
 
 
@@ -145,7 +155,9 @@ def test_random_geometric_has_about_its_mean_degree() -> None:
     ("num_poses", "d", "mean_degree", "message"),
     [(1, 3, 6.0, "at least 2, got 1"), (5, 4, 6.0, "2 or 3, got 4"), (5, 3, 0.0, "mean_degree")],
 )
-def test_random_geometric_settings_are_checked(num_poses: int, d: int, mean_degree: float, message: str) -> None:
+def test_random_geometric_settings_are_checked(
+    num_poses: int, d: int, mean_degree: float, message: str
+) -> None:
     with pytest.raises(SettingError, match=message):
         random_geometric(num_poses, np.random.default_rng(0), d=d, mean_degree=mean_degree)
 
@@ -155,7 +167,8 @@ def test_without_noise_measurements_are_relative_poses(seed: int, d: int) -> Non
     rng = np.random.default_rng(seed)
     truth = random_geometric(8, rng, d=d).truth
     assert isinstance(truth, Poses)
-    i, j = np.array([0, 3, 5]), np.array([1, 2, 0])
+    i = np.array([0, 3, 5])
+    j = np.array([1, 2, 0])
     graph = observe("exact", truth, i, j, NoiseModel(1e-300, 1e-300), 2.0, 3.0, rng)
     # x_j = x_i (R_ij, t_ij)
     np.testing.assert_allclose(truth.R[i] @ graph.R_ij, truth.R[j], rtol=0, atol=1e-14)

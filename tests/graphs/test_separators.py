@@ -3,8 +3,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 from graphs import DIMENSIONS, SEEDS, varied_graph
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from robots import PARTITIONERS, Partitioner, graph_of, one_robot, singletons, star
 
 from pgo_models.errors import SettingError
@@ -32,7 +31,9 @@ def smallest_cover(pairs: set[tuple[int, int]]) -> int:
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
-def test_a_cover_covers_and_no_pose_of_it_is_superfluous(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
+def test_a_cover_covers_and_no_pose_of_it_is_superfluous(
+    seed: int, n: int, d: int, partitioner: Partitioner
+) -> None:
     graph = varied_graph(seed, n, d)
     parts = partitioner(graph, seed)
     pairs = cut_pairs(parts, graph)
@@ -40,13 +41,17 @@ def test_a_cover_covers_and_no_pose_of_it_is_superfluous(seed: int, n: int, d: i
     assert cover == sorted(set(cover))
     assert all(i in cover or j in cover for i, j in pairs)
     for pose in cover:
-        assert any((i == pose and j not in cover) or (j == pose and i not in cover) for i, j in pairs)
+        assert any(
+            (i == pose and j not in cover) or (j == pose and i not in cover) for i, j in pairs
+        )
     assert set(cover) <= set(parts.separators(graph).tolist())
     assert vertex_cover(parts, graph).tolist() == cover
 
 
 @given(seed=SEEDS, n=st.integers(2, 9), partitioner=PARTITIONERS)
-def test_on_few_poses_a_cover_is_at_most_twice_the_smallest(seed: int, n: int, partitioner: Partitioner) -> None:
+def test_on_few_poses_a_cover_is_at_most_twice_the_smallest(
+    seed: int, n: int, partitioner: Partitioner
+) -> None:
     graph = varied_graph(seed, n, 2)
     parts = partitioner(graph, seed)
     smallest = smallest_cover(cut_pairs(parts, graph))
@@ -85,16 +90,21 @@ def test_a_report_counts_what_there_is(seed: int, n: int, partitioner: Partition
     assert report.num_robots == len(set(robot))
     assert report.sizes.tolist() == [robot.count(a) for a in range(report.num_robots)]
     assert (report.num_cut_edges, report.num_edges) == (sum(cut), graph.num_edges)
-    assert report.separators.tolist() == [sum(robot[pose] == a for pose in ends) for a in range(report.num_robots)]
+    assert report.separators.tolist() == [
+        sum(robot[pose] == a for pose in ends) for a in range(report.num_robots)
+    ]
     assert report.cover == len(vertex_cover(parts, graph))
-    assert report.copies == len({(robot[i], j) for i, j in pairs} | {(robot[j], i) for i, j in pairs})
+    assert report.copies == len(
+        {(robot[i], j) for i, j in pairs} | {(robot[j], i) for i, j in pairs}
+    )
     assert report.balance == pytest.approx(max(report.sizes) * report.num_robots / n)
 
 
 def test_a_report_shows_the_same_facts_as_text_and_as_html() -> None:
     graph = grid(np.random.default_rng(0))
     report = report_partition(partition(graph, 3), graph)
-    text, html = str(report), report._repr_html_()
+    text = str(report)
+    html = report._repr_html_()
     assert len(text.splitlines()) == 6
     for line in text.splitlines():
         assert line[13:] in html

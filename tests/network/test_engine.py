@@ -19,18 +19,21 @@ from solvers.soc.subgraph import split_graph
 @pytest.mark.parametrize("seed", range(3))
 def test_threads_give_the_same_numbers(seed):
     graph = varied_graph(seed, 40, 2 + seed % 2)
-    one, many = (solvers.solve(graph, robots=4, engine=InProcess(threads)) for threads in (1, 3))
-    np.testing.assert_array_equal(one.poses.R, many.poses.R)
-    np.testing.assert_array_equal(one.poses.t, many.poses.t)
-    assert repr(one.ledger) == repr(many.ledger)
-    assert one.lower_bound == many.lower_bound
+    in_order, in_threads = (
+        solvers.solve(graph, robots=4, engine=InProcess(threads)) for threads in (1, 3)
+    )
+    np.testing.assert_array_equal(in_order.poses.R, in_threads.poses.R)
+    np.testing.assert_array_equal(in_order.poses.t, in_threads.poses.t)
+    assert repr(in_order.ledger) == repr(in_threads.ledger)
+    assert in_order.lower_bound == in_threads.lower_bound
 
 
 class Slow:
     """A worker that fails at once, or obeys later."""
 
     def __init__(self, fails: bool) -> None:
-        self.fails, self.done = fails, []
+        self.fails = fails
+        self.done = []
 
 
 def obey_slowly(worker, word):
@@ -83,17 +86,28 @@ def test_robots_restored_from_snapshots_answer_as_those_that_were_asked():
     shares = split_graph(graph, partition(graph, 3))
     nothing = [None] * len(shares)
     make = partial(Agent, backend=None)
-    old, new = InProcess().open(make, shares), InProcess().open(make, shares)
+    old = InProcess().open(make, shares)
+    new = InProcess().open(make, shares)
     chordal = old.ask(partial(order_interior, Interior.chordal), nothing)
-    old.ask(partial(order_interior, Interior.project), [np.ones_like(answer.right.b) for answer in chordal])
+    old.ask(
+        partial(order_interior, Interior.project),
+        [np.ones_like(answer.right.b) for answer in chordal],
+    )
     new.ask(restore, old.ask(take_snapshot, nothing))
-    orders = (Interior.eliminated, Interior.translations, Interior.multiplier_norms, Interior.evaluate)
+    orders = (
+        Interior.eliminated,
+        Interior.translations,
+        Interior.multiplier_norms,
+        Interior.evaluate,
+    )
     for method in (*orders, Interior.eliminated_translations):
         order = partial(order_interior, method)
         for before, after in zip(old.ask(order, nothing), new.ask(order, nothing), strict=True):
-            for (name, one), (other_name, other) in zip(arrays_in(before), arrays_in(after), strict=True):
+            for (name, value), (other_name, other) in zip(
+                arrays_in(before), arrays_in(after), strict=True
+            ):
                 assert name == other_name
-                np.testing.assert_array_equal(one, other)
+                np.testing.assert_array_equal(value, other)
 
 
 def test_engine_and_checkpoint_need_robots():

@@ -13,11 +13,13 @@ from graphs import varied_graph
 
 import pgo_models as pgo
 from pgo_models.errors import EngineError
-from solvers import cli
+from solvers.cli import app as cli
 from solvers.distributed.robots.agent import Agent
 from solvers.network import ray_engine
 from solvers.network.ray_engine import RayEngine
 from solvers.soc.subgraph import split_graph
+
+pytestmark = pytest.mark.slow  # starts Ray
 
 pytest.importorskip("ray")
 
@@ -27,11 +29,13 @@ def processes(root):
     children = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):  # it has ended meanwhile
-            children.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(int(stat.parent.name))
-    found = [root]
-    for process in found:
-        found += children.get(process, [])
-    return found
+            children.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(
+                int(stat.parent.name)
+            )
+    tree = [root]
+    for process in tree:
+        tree += children.get(process, [])
+    return tree
 
 
 def listening(pids):
@@ -41,30 +45,42 @@ def listening(pids):
         for link in Path(f"/proc/{pid}/fd").glob("*"):
             with contextlib.suppress(OSError):
                 links.add(os.readlink(link))
-    rows = [row.split() for name in ("tcp", "tcp6") for row in Path("/proc/net", name).read_text().splitlines()[1:]]
-    return [row[1].partition(":")[0] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in links]
+    rows = [
+        row.split()
+        for name in ("tcp", "tcp6")
+        for row in Path("/proc/net", name).read_text().splitlines()[1:]
+    ]
+    return [
+        row[1].partition(":")[0] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in links
+    ]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc is Linux's")
 def test_without_an_address_all_listen_on_the_loopback_alone():
     graph = varied_graph(0, 60, 3)
-    pool = RayEngine(num_cpus=2).open(partial(Agent, backend=None), split_graph(graph, pgo.partition(graph, 2)))
+    pool = RayEngine(num_cpus=2).open(
+        partial(Agent, backend=None), split_graph(graph, pgo.partition(graph, 2))
+    )
     try:
-        found = listening(processes(os.getpid()))
+        addresses = listening(processes(os.getpid()))
     finally:
         pool.close()
-    assert len(found) >= 6  # this process, two actors, the raylet, the GCS, the agent
-    assert set(found) <= {"0100007F", "0000000000000000FFFF00000100007F", "0" * 24 + "01000000"}
+    assert len(addresses) >= 6  # this process, two actors, the raylet, the GCS, the agent
+    assert set(addresses) <= {"0100007F", "0000000000000000FFFF00000100007F", "0" * 24 + "01000000"}
 
 
-TOLD = {
+OUTPUTS = {
     "authentication": (
-        "[2026-01-01 W 1 1] gcs_client.cc:210: Failed\nRuntimeError: Failed to connect to GCS. Last:\n"
-        "ray.exceptions.AuthenticationError: the token is missing\n\nConnectionError: Failed to connect to Ray\n",
+        "[2026-01-01 W 1 1] gcs_client.cc:210: Failed\n"
+        "RuntimeError: Failed to connect to GCS. Last:\n"
+        "ray.exceptions.AuthenticationError: the token is missing\n\n"
+        "ConnectionError: Failed to connect to Ray\n",
         "the token is missing; check",
     ),
     "version": (
-        "[2026-01-01 W 1 1] gcs_client.cc:210: slow\nTraceback\nRuntimeError: Version mismatch: started with:\n"
+        "[2026-01-01 W 1 1] gcs_client.cc:210: slow\n"
+        "Traceback\n"
+        "RuntimeError: Version mismatch: started with:\n"
         "    Ray: 2.9\nThis process:\n    Ray: 2.60\n",
         "Version mismatch: started with: Ray: 2.9 This process: Ray: 2.60; check",
     ),
@@ -78,12 +94,12 @@ TOLD = {
 }
 
 
-@pytest.mark.parametrize("case", TOLD)
+@pytest.mark.parametrize("case", OUTPUTS)
 def test_the_reason_is_rays_own(case, monkeypatch):
-    told, expected = TOLD[case]
+    output, expected = OUTPUTS[case]
 
     def fail(command, **options):
-        raise subprocess.CalledProcessError(1, command, stderr=told.encode())
+        raise subprocess.CalledProcessError(1, command, stderr=output.encode())
 
     monkeypatch.setattr(subprocess, "run", fail)
     with pytest.raises(EngineError, match=rf"can be joined from here: {expected}") as refused:
@@ -100,7 +116,7 @@ def head(tmp_path):
         port = free.getsockname()[1]
     environment = {
         **os.environ,
-        "PYTHONPATH": str(Path(cli.__file__).parent.parent),
+        "PYTHONPATH": str(Path(cli.__file__).parents[2]),
         "RAY_AUTH_MODE": "token",
         "RAY_AUTH_TOKEN": "a" * 32,
         "RAY_USAGE_STATS_ENABLED": "0",
@@ -129,19 +145,40 @@ def wait_for(is_done, seconds=60):
         time.sleep(0.1)
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="Ray has clusters on Linux alone")
 def test_a_cluster_that_refuses_and_one_that_dies_are_one_line_each(head, tmp_path):
     process, address, environment = head
     path = tmp_path / "run.ckpt"
-    command = [sys.executable, "-c", "from solvers.cli import main; main()", "solve", "circle", "--robots", "2"]
-    command += ["--address", address, "--resume", str(path), "--tolerance", "1e-300", "--max-iterations", "1000000"]
+    command = [
+        sys.executable,
+        "-c",
+        "from solvers.cli.app import main; main()",
+        "solve",
+        "circle",
+        "--robots",
+        "2",
+    ]
+    command += [
+        "--address",
+        address,
+        "--resume",
+        str(path),
+        "--tolerance",
+        "1e-300",
+        "--max-iterations",
+        "1000000",
+    ]
     wait_for(lambda: "Ray runtime started" in (tmp_path / "head.log").read_text())
     stranger = {**environment, "RAY_AUTH_MODE": "disabled"}
     refused = subprocess.run(command, env=stranger, capture_output=True, text=True, check=False)
     assert (refused.returncode, refused.stdout, refused.stderr.count("\n")) == (1, "", 1)
-    assert "can be joined from here: RPC error: InvalidAuthToken: Authentication token is missing" in refused.stderr
-    solving = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert (
+        "can be joined from here: RPC error: InvalidAuthToken: Authentication token is missing"
+        in refused.stderr
+    )
+    solving = subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     try:
         wait_for(path.exists)
         for pid in processes(process.pid)[1:]:
@@ -153,5 +190,7 @@ def test_a_cluster_that_refuses_and_one_that_dies_are_one_line_each(head, tmp_pa
         solving.communicate()
     assert (solving.returncode, out, err.count("\n")) == (1, "", 1)
     assert err.startswith("pgo: the Ray cluster at ")
-    assert err.endswith("solve again when there is one: a run with --resume FILE goes on from its last checkpoint\n")
+    assert err.endswith(
+        "solve again when there is one: a run with --resume FILE goes on from its last checkpoint\n"
+    )
     assert path.exists()

@@ -17,7 +17,7 @@ from solvers.soc.subgraph import split_graph
 
 @dataclass(eq=False)
 class Leaky:
-    """A place that loses the group of every order whose number is in `losses`, before or after it has obeyed."""
+    """A place that loses the group of every order with a number in `losses`, before or after it."""
 
     shares: tuple
     losses: set
@@ -32,7 +32,9 @@ class Leaky:
 
     def start(self, groups):
         for group in groups:
-            self.agents[group] = [Agent(replace(self.shares[robot]), None) for robot in self.groups[group]]
+            self.agents[group] = [
+                Agent(replace(self.shares[robot]), None) for robot in self.groups[group]
+            ]
 
     def send(self, group, order, requests):
         return order, requests
@@ -74,31 +76,43 @@ class LeakyEngine:
 
 def pipeline(coupling, robots):
     chosen = solvers.Pipeline()
-    return replace(chosen, soc=replace(chosen.soc, coupling=coupling, robots=robots, tolerance=1e-5))
+    return replace(
+        chosen, soc=replace(chosen.soc, coupling=coupling, robots=robots, tolerance=1e-5)
+    )
 
 
 @pytest.mark.parametrize("coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS])
 @pytest.mark.parametrize("orders", [1, 7, 1000])
 @pytest.mark.parametrize(
     ("is_before", "least", "groups"),
-    [(True, 200, ()), (False, 200, ()), (True, 0, ()), (True, 200, ((0, 2, 3), (1,))), (False, 0, ((0, 2), (1, 3)))],
+    [
+        (True, 200, ()),
+        (False, 200, ()),
+        (True, 0, ()),
+        (True, 200, ((0, 2, 3), (1,))),
+        (False, 0, ((0, 2), (1, 3))),
+    ],
 )
 def test_lost_robots_change_nothing(coupling, orders, is_before, least, groups, monkeypatch):
-    monkeypatch.setattr(multifrontal, "LEAST", least)  # with 0 robots hold the fronts, too
-    monkeypatch.setattr(multifrontal, "FEW", 1 if least == 0 else multifrontal.FEW)
+    monkeypatch.setattr(
+        multifrontal, "LEAST_SEPARATORS", least
+    )  # with 0 robots hold the fronts, too
+    monkeypatch.setattr(
+        multifrontal, "LEAST_FRONTS", 1 if least == 0 else multifrontal.LEAST_FRONTS
+    )
     graph = varied_graph(orders, 60, 2 + orders % 2)
     robots = partition(graph, 4, PartitionMethod.CONTIGUOUS)
     expected = solvers.solve(graph, pipeline(coupling, robots), robots=robots)
     losses = frozenset(np.random.default_rng(orders).integers(1, 300, 12).tolist())
     engine = LeakyEngine(losses, Recovery(orders, max_restarts=1000), is_before, groups)
-    found = solvers.solve(graph, pipeline(coupling, robots), robots=robots, engine=engine)
+    solution = solvers.solve(graph, pipeline(coupling, robots), robots=robots, engine=engine)
     (pool,) = engine.opened
     assert pool.place.lost > 3
     assert sum(pool.restarts) == pool.place.lost
-    np.testing.assert_array_equal(found.poses.R, expected.poses.R)
-    np.testing.assert_array_equal(found.poses.t, expected.poses.t)
-    assert found.lower_bound == expected.lower_bound
-    assert repr(found.ledger) == repr(expected.ledger)
+    np.testing.assert_array_equal(solution.poses.R, expected.poses.R)
+    np.testing.assert_array_equal(solution.poses.t, expected.poses.t)
+    assert solution.lower_bound == expected.lower_bound
+    assert repr(solution.ledger) == repr(expected.ledger)
 
 
 @pytest.mark.parametrize("orders", [7, 1000])
@@ -110,17 +124,18 @@ def test_a_run_that_goes_on_from_a_checkpoint_can_lose_robots(orders, tmp_path):
         if record.k == 9:
             raise KilledError
 
-    graph, checkpoint = varied_graph(6, 60, 3), solvers.Checkpoint(tmp_path / "run.ckpt", rounds=2)
+    graph = varied_graph(6, 60, 3)
+    checkpoint = solvers.Checkpoint(tmp_path / "run.ckpt", rounds=2)
     settings = pipeline(solvers.Coupling.SUBSTRUCTURED, None)
     expected = solvers.solve(graph, settings, robots=4)
     losses = frozenset(np.random.default_rng(orders).integers(5, 100, 8).tolist())
     first, second = (LeakyEngine(losses, Recovery(orders, max_restarts=1000)) for _ in range(2))
     with pytest.raises(KilledError):
         solvers.solve(graph, settings, robots=4, engine=first, checkpoint=checkpoint, callback=kill)
-    found = solvers.solve(graph, settings, robots=4, engine=second, checkpoint=checkpoint)
+    solution = solvers.solve(graph, settings, robots=4, engine=second, checkpoint=checkpoint)
     assert second.opened[0].place.lost > 3
-    np.testing.assert_array_equal(found.poses.t, expected.poses.t)
-    assert found.lower_bound == expected.lower_bound
+    np.testing.assert_array_equal(solution.poses.t, expected.poses.t)
+    assert solution.lower_bound == expected.lower_bound
 
 
 class Obeyed:
@@ -129,11 +144,13 @@ class Obeyed:
     def __init__(self, monkeypatch):
         self.log = []
         monkeypatch.setattr(Agent, "snapshot", lambda agent: self.note("snapshot", agent, None))
-        monkeypatch.setattr(Agent, "restore", lambda agent, snapshot: self.note("restore", agent, snapshot) and None)
+        monkeypatch.setattr(
+            Agent, "restore", lambda agent, snapshot: self.note("restore", agent, snapshot) and None
+        )
 
     def note(self, name, agent, request):
         self.log.append((name, request))
-        return {"of": agent.subgraph.robot}
+        return {"of": np.int64(agent.subgraph.robot)}
 
     def order(self, name):
         return partial(self.note, name)
@@ -173,7 +190,13 @@ def test_a_snapshot_is_taken_after_so_many_orders(monkeypatch):
     for _ in range(7):
         pool.ask(obeyed.order("go"), [None])
         assert len(pool._log) < 3
-    assert [name for name, _ in obeyed.log] == [*3 * ["go"], "snapshot", *3 * ["go"], "snapshot", "go"]
+    assert [name for name, _ in obeyed.log] == [
+        *3 * ["go"],
+        "snapshot",
+        *3 * ["go"],
+        "snapshot",
+        "go",
+    ]
 
 
 def test_of_two_refusals_the_first_robots_is_told():
@@ -186,10 +209,61 @@ def test_of_two_refusals_the_first_robots_is_told():
         RecoveringPool(place, Recovery()).ask(refuse, [None] * 2)
 
 
+@pytest.mark.parametrize("coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS])
+def test_the_ledger_has_the_bytes_of_all_snapshots(coupling, monkeypatch):
+    graph = varied_graph(3, 40, 3)
+    robots = partition(graph, 4, PartitionMethod.CONTIGUOUS)
+    taken = []
+    snapshot = Agent.snapshot
+
+    def counted(agent):
+        record = snapshot(agent)
+        taken.append(sum(array.nbytes for array in record.values()))
+        return record
+
+    monkeypatch.setattr(Agent, "snapshot", counted)
+    here = solvers.solve(graph, pipeline(coupling, robots), robots=robots)
+    assert here.ledger.snapshot_bytes == sum(taken) == 0
+    solution = solvers.solve(
+        graph, pipeline(coupling, robots), robots=robots, engine=LeakyEngine(recovery=Recovery(7))
+    )
+    assert solution.ledger.snapshot_bytes == sum(taken) > 0
+    assert solution.ledger.num_bytes == here.ledger.num_bytes
+    assert f"{sum(taken):,} bytes to the driver's process" in str(solution)
+
+
+def test_a_checkpoint_counts_the_snapshots_in_it(tmp_path, monkeypatch):
+    graph = varied_graph(6, 40, 3)
+    checkpoint = solvers.Checkpoint(tmp_path / "run.ckpt", rounds=2)
+    taken = []
+    snapshot = Agent.snapshot
+
+    def counted(agent):
+        record = snapshot(agent)
+        taken.append(sum(array.nbytes for array in record.values()))
+        return record
+
+    class KilledError(BaseException):
+        pass
+
+    def kill(state, record):
+        if record.k == 9:
+            raise KilledError
+
+    monkeypatch.setattr(Agent, "snapshot", counted)
+    settings = pipeline(solvers.Coupling.SUBSTRUCTURED, None)
+    with pytest.raises(KilledError):
+        solvers.solve(graph, settings, robots=4, checkpoint=checkpoint, callback=kill)
+    resumed = solvers.solve(graph, settings, robots=4, checkpoint=checkpoint)
+    assert resumed.ledger.snapshot_bytes == sum(taken) > 0  # the first run's, too
+
+
 def test_a_robot_that_is_lost_again_and_again_ends_the_run():
     graph = varied_graph(4, 30, 2)
     engine = LeakyEngine(frozenset(range(20, 10_000)), Recovery(max_restarts=2))
-    with pytest.raises(EngineError, match=r"the process of robots \d was lost 3 times \(gone\); look at the memory"):
+    with pytest.raises(
+        EngineError, match=r"the process of robots \d was lost 3 times \(gone\); look at the memory"
+    ):
         solvers.solve(graph, robots=3, engine=engine)
 
 

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from graphs import SEEDS, random_poses
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import stack_transposes
@@ -18,15 +17,15 @@ from solvers.soc.recursion_block import Rotations, StepSettings, block_at
 PLAIN = st.none() | st.booleans() | st.integers() | st.floats() | st.text()
 
 
-def same(one, other):
-    return one == other or (isinstance(one, float) and math.isnan(one) and math.isnan(other))
+def same(value, other):
+    return value == other or (isinstance(value, float) and math.isnan(value) and math.isnan(other))
 
 
 @given(values=st.lists(PLAIN, max_size=6))
 def test_plain_values_come_back_the_same(values):
-    found = deserialize(serialize(values), ())
-    assert isinstance(found, tuple)
-    assert all(map(same, values, found))
+    restored = deserialize(serialize(values), ())
+    assert isinstance(restored, tuple)
+    assert all(map(same, values, restored))
 
 
 @given(seed=SEEDS)
@@ -35,19 +34,22 @@ def test_arrays_and_classes_come_back_bit_by_bit_and_apart_from_the_original(see
     start = block_at(stack_transposes(poses.R), np.ones(9), np.ones(9), StepSettings(memory=2))
     block, _ = start.after_solve(np.ones((9, 3)))
     classes = (Poses, AndersonShare, StepSettings, Rotations, type(block))
-    found = deserialize(serialize({"block": block, "poses": (poses, None)}), classes)
-    assert found["block"].anderson.residual_differences == ()
+    restored = deserialize(serialize({"block": block, "poses": (poses, None)}), classes)
+    assert restored["block"].anderson.residual_differences == ()
     for name in ("penalty", "z", "s", "x", "best"):
-        np.testing.assert_array_equal(getattr(found["block"], name), getattr(block, name))
-    np.testing.assert_array_equal(found["block"].anderson.image, block.anderson.image)
-    np.testing.assert_array_equal(found["poses"][0].t, poses.t)
-    found["block"].z[:] = 0.0
+        np.testing.assert_array_equal(getattr(restored["block"], name), getattr(block, name))
+    np.testing.assert_array_equal(restored["block"].anderson.image, block.anderson.image)
+    np.testing.assert_array_equal(restored["poses"][0].t, poses.t)
+    restored["block"].z[:] = 0.0
     assert block.z.any()
 
 
 def test_enums_and_nested_classes_come_back():
     record = Record(3, 0.5, Measurement(2.0, math.inf, 0.1, rounds=7))
-    assert deserialize(serialize((record, Status.STALLED)), (Record, Measurement, Status)) == (record, Status.STALLED)
+    assert deserialize(serialize((record, Status.STALLED)), (Record, Measurement, Status)) == (
+        record,
+        Status.STALLED,
+    )
 
 
 def test_only_arrays_of_plain_numbers_and_one_text_are_made():

@@ -50,15 +50,18 @@ def test_doubtful_edges_stand_out(d):
     graph = pgo.grid_world(2, 12, np.random.default_rng(0), d=d)
     cost = pgo.edge_residuals(graph, graph.truth).cost
     wrong, unsure = np.argsort(cost)[:2]  # made to be what they are not
-    kappa, tau = graph.kappa.copy(), graph.tau.copy()
-    tau[unsure], kappa[wrong] = 0.01 * tau[unsure], 1e4 * kappa[wrong]
+    kappa = graph.kappa.copy()
+    tau = graph.tau.copy()
+    tau[unsure] = 0.01 * tau[unsure]
+    kappa[wrong] = 1e4 * kappa[wrong]
     marked = graph.with_weights(kappa, tau)
     assert pgo.edge_residuals(marked, graph.truth).is_misfit[wrong]
     axes = Figure().add_subplot(projection="3d" if d == 3 else None)
     draw_graph(marked, graph.truth, axes)
     (lines,) = axes.collections
     misfits = int(pgo.edge_residuals(marked, graph.truth).is_misfit.sum())
-    widths, styles = np.asarray(lines.get_linewidth()), lines.get_linestyle()
+    widths = np.asarray(lines.get_linewidth())
+    styles = lines.get_linestyle()
     assert (widths == widths.max()).sum() == misfits
     assert sum(pattern is not None for _, pattern in styles) == 1
     colours = [tuple(colour) for colour in np.asarray(lines.get_colors())]
@@ -81,7 +84,10 @@ def test_errors_to_the_truth_are_those_after_alignment(d):
     figure = plot_against_truth(graph, estimate)
     metres = figure.axes[1].lines[0].get_ydata()
     np.testing.assert_allclose(
-        np.sqrt(np.mean(metres**2)), pgo.absolute_trajectory_error(estimate, graph.truth), rtol=1e-12, atol=0
+        np.sqrt(np.mean(metres**2)),
+        pgo.absolute_trajectory_error(estimate, graph.truth),
+        rtol=1e-12,
+        atol=0,
     )
 
 
@@ -108,7 +114,9 @@ def test_a_large_graph_is_drawn_as_paths_and_some_of_its_edges():
         known = set(map(tuple, every))
         for (a, b), one in zip(ends, kinds, strict=True):
             steps = [(pose, pose + 1) for pose in range(a, b)]
-            assert (a, b) in known or (one == OWN and b - a <= k and all(step in known for step in steps))
+            assert (a, b) in known or (
+                one == OWN and b - a <= k and all(step in known for step in steps)
+            )
     drawn = {pose for (a, b), one in zip(ends, kinds, strict=True) if one == OWN for pose in (a, b)}
     assert {0, 39, 40, 79, 80, 119} <= drawn  # every path has its ends
 
@@ -159,7 +167,9 @@ def test_figures_are_a_column_wide_and_readable_there(tmp_path):
     for figure in figures:
         save_figure(figure, tmp_path / "figure.png")  # the texts are made when it is drawn
         assert figure.get_figwidth() == 3.4
-        small = [text for text in figure.findobj(Text) if text.get_text() and text.get_fontsize() < 7]
+        small = [
+            text for text in figure.findobj(Text) if text.get_text() and text.get_fontsize() < 7
+        ]
         assert not small
 
 
@@ -200,15 +210,21 @@ def test_ellipses_hold_what_their_covariance_says(d, poses):
     covariances[0] = 0.0
     outlines = confidence_ellipses(graph.truth, covariances)
     assert outlines.shape == (min(poses, 100), 49, d)
-    chosen = [int(np.argmin(np.abs(graph.truth.t - middle).sum(axis=1))) for middle in outlines[:, :-1].mean(axis=1)]
+    chosen = [
+        int(np.argmin(np.abs(graph.truth.t - middle).sum(axis=1)))
+        for middle in outlines[:, :-1].mean(axis=1)
+    ]
     assert chosen == sorted(set(chosen))
     assert (chosen[0], chosen[-1]) == (0, poses - 1)
     np.testing.assert_array_equal(outlines[0], np.tile(graph.truth.t[0], (49, 1)))
     for one, outline in zip(chosen[1:], outlines[1:], strict=True):
         away = outline - graph.truth.t[one]
         assert not away[:, 2:].any()
-        square = np.sum(away[:, :2] * np.linalg.solve(covariances[one, :2, :2], away[:, :2].T).T, axis=1)
-        np.testing.assert_allclose(square, 5.991464547107979, rtol=1e-9, atol=0)  # 95 % of chi2 with 2 degrees
+        square = np.sum(
+            away[:, :2] * np.linalg.solve(covariances[one, :2, :2], away[:, :2].T).T, axis=1
+        )
+        # 95 % of chi2 with 2 degrees
+        np.testing.assert_allclose(square, 5.991464547107979, rtol=1e-9, atol=0)
     figure = pgo.plot_graph(graph, graph.truth, covariances=covariances)
     (axes,) = figure.axes
     assert len(axes.collections) == 2

@@ -25,9 +25,16 @@ def test_every_edge_and_pose_is_drawn_once(d):
     drawn = np.concatenate([ends(trace, d) for trace in traces if trace.mode == "lines"])
     expected = np.stack([graph.truth.t[graph.i], graph.truth.t[graph.j]], axis=1)
     weights = np.random.default_rng(1).standard_normal(2 * d)  # tell segments apart in any order
-    found, wanted = (np.sort(segments.reshape(-1, 2 * d) @ weights) for segments in (drawn, expected))
+    found, wanted = (
+        np.sort(segments.reshape(-1, 2 * d) @ weights) for segments in (drawn, expected)
+    )
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-5)
-    named = [text for trace in traces if trace.mode == "markers" and trace.name != "misfit" for text in trace.text]
+    named = [
+        text
+        for trace in traces
+        if trace.mode == "markers" and trace.name != "misfit"
+        for text in trace.text
+    ]
     assert len(named) == len(set(named)) == graph.num_poses
     assert named[0] == "pose 0, robot 0"
 
@@ -35,14 +42,18 @@ def test_every_edge_and_pose_is_drawn_once(d):
 def test_positions_are_drawn_to_seven_digits():
     graph = pgo.circle(np.random.default_rng(0))
     far = graph.truth.moved(np.eye(3), np.array([1000.0, 0.0, 0.0]))
-    (dots,) = [trace for trace in pgo.explore_graph(graph, far).data if trace.name == "edges and poses"][1:]
+    (dots,) = [
+        trace for trace in pgo.explore_graph(graph, far).data if trace.name == "edges and poses"
+    ][1:]
     np.testing.assert_allclose(np.asarray(dots.x), far.t[:, 0], rtol=1e-7, atol=0)
 
 
 def test_a_misfit_says_how_bad_it_is():
     graph = pgo.circle(np.random.default_rng(0))
     graph = graph.with_weights(np.where(np.arange(300) == 5, 1e3, 1.0) * graph.kappa, graph.tau)
-    (misfit,) = [trace for trace in pgo.explore_graph(graph, graph.truth).data if trace.name == "misfit"]
+    (misfit,) = [
+        trace for trace in pgo.explore_graph(graph, graph.truth).data if trace.name == "misfit"
+    ]
     residuals = pgo.edge_residuals(graph, graph.truth)
     assert len(misfit.text) == residuals.is_misfit.sum()
     (text,) = [text for text in misfit.text if text.startswith("edge 5:")]
@@ -56,7 +67,9 @@ def test_a_film_has_a_frame_and_a_step_of_the_slider_for_every_iterate():
     assert [frame.name for frame in film.frames] == ["k = 0", "k = 1", "k = 2", "k = 3"]
     (slider,) = film.layout.sliders
     assert [list(step.args[0]) for step in slider.steps] == [[frame.name] for frame in film.frames]
-    np.testing.assert_allclose(ends(film.frames[-1].data[0], 3)[:, 0], iterates[-1].t[graph.i], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        ends(film.frames[-1].data[0], 3)[:, 0], iterates[-1].t[graph.i], rtol=1e-6, atol=1e-6
+    )
 
 
 def test_long_films_of_large_graphs_are_thinned_but_keep_their_ends():
@@ -79,7 +92,9 @@ def test_films_of_nothing_are_refused(iterates, labels, message):
 
 def test_a_page_escapes_its_title_and_has_no_button_that_uploads(tmp_path):
     graph = pgo.circle(np.random.default_rng(0))
-    save_page(pgo.explore_graph(graph, graph.truth, "<script>alert(1)</script>"), tmp_path / "page.html")
+    save_page(
+        pgo.explore_graph(graph, graph.truth, "<script>alert(1)</script>"), tmp_path / "page.html"
+    )
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "<script>alert" not in text
     assert re.search(r'"showSendToCloud":\s*false', text)
@@ -101,4 +116,6 @@ def test_ellipses_of_covariances_are_one_trace(d):
     assert (trace.name, len(trace.x)) == ("95 % of x, y", 100 * 50)
     outlines = np.asarray(trace.x).reshape(100, 50)
     assert np.isnan(outlines[:, -1]).all()
-    np.testing.assert_allclose(np.ptp(outlines[:, :-1], axis=1), 2 * np.sqrt(5.991464547107979), rtol=1e-5, atol=0)
+    np.testing.assert_allclose(
+        np.ptp(outlines[:, :-1], axis=1), 2 * np.sqrt(5.991464547107979), rtol=1e-5, atol=0
+    )

@@ -6,7 +6,12 @@ import pgo_models as pgo
 import solvers
 from pgo_models.errors import SettingError
 from pgo_models.graphs.scenes import NoiseModel
-from pgo_models.plots.matrix_plots import factor_of_M, plot_sparsity, plot_spectrum, smallest_eigenvalues
+from pgo_models.plots.matrix_plots import (
+    factor_of_M,
+    plot_sparsity,
+    plot_spectrum,
+    smallest_eigenvalues,
+)
 from pgo_models.problem.matrices import marginalized_matrix
 
 

@@ -2,21 +2,28 @@ import sys
 
 import numpy as np
 import pytest
+from budget import examples
 from cvxopt import cholmod
 from graphs import DIMENSIONS, EPS, SEEDS, SIZES, varied_problem
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.sparse import csc_array
 
 from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError
 from pgo_models.graphs.scenes import random_geometric
-from pgo_models.problem.cholesky import CholeskyBackend, _Cholmod, analyze, default_backend, factorize
+from pgo_models.problem.cholesky import (
+    CholeskyBackend,
+    _Cholmod,
+    analyze,
+    default_backend,
+    factorize,
+)
 from pgo_models.problem.cholmod import import_cvxopt
 from pgo_models.problem.ordering import row_order
 from pgo_models.problem.problem import PGOProblem
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
 COLUMNS = st.sampled_from([None, 1, 3])
+EXPONENTS = st.floats(-150.0, 300.0)
 
 
 def pattern_of(seed: int, side: int) -> csc_array:
@@ -33,7 +40,9 @@ def definite(pattern: csc_array, rng: np.random.Generator, scale: float = 1.0) -
     np.fill_diagonal(off, 0.0)
     dense = scale * (off + np.diag(1e-3 + np.abs(off).sum(axis=1)))
     columns = np.repeat(np.arange(pattern.shape[1]), np.diff(pattern.indptr))
-    return csc_array((dense[pattern.indices, columns], pattern.indices, pattern.indptr), shape=pattern.shape)
+    return csc_array(
+        (dense[pattern.indices, columns], pattern.indices, pattern.indptr), shape=pattern.shape
+    )
 
 
 def is_positive_definite(matrix: csc_array, backend: CholeskyBackend) -> bool:
@@ -48,7 +57,8 @@ def is_positive_definite(matrix: csc_array, backend: CholeskyBackend) -> bool:
 def dense_matrix(dense: np.ndarray) -> csc_array:
     """Matrix with every entry stored."""
     side = len(dense)
-    rows, columns = np.tile(np.arange(side), side), np.repeat(np.arange(side), side)
+    rows = np.tile(np.arange(side), side)
+    columns = np.repeat(np.arange(side), side)
     return csc_array((dense.T.ravel(), (rows, columns)), shape=dense.shape)
 
 
@@ -64,7 +74,9 @@ def assert_solves(matrix: csc_array, x: np.ndarray, b: np.ndarray) -> None:
 
 @BACKENDS
 @given(seed=SEEDS, side=st.integers(1, 30), columns=COLUMNS)
-def test_the_factor_solves(backend: CholeskyBackend, seed: int, side: int, columns: int | None) -> None:
+def test_the_factor_solves(
+    backend: CholeskyBackend, seed: int, side: int, columns: int | None
+) -> None:
     rng = np.random.default_rng(seed)
     matrix = definite(pattern_of(seed, side), rng)
     b = right_hand_side(rng, side, columns)
@@ -80,7 +92,9 @@ def test_the_backends_agree(seed: int, side: int, columns: int | None) -> None:
     b = right_hand_side(rng, side, columns)
     superlu, cholmod = (factorize(matrix, backend).solve(b) for backend in CholeskyBackend)
     condition = np.linalg.cond(matrix.toarray())
-    assert np.linalg.norm(superlu - cholmod) <= 64 * side * EPS * condition * np.linalg.norm(superlu)
+    assert np.linalg.norm(superlu - cholmod) <= 64 * side * EPS * condition * np.linalg.norm(
+        superlu
+    )
 
 
 @BACKENDS
@@ -88,7 +102,8 @@ def test_the_backends_agree(seed: int, side: int, columns: int | None) -> None:
 def test_one_analysis_serves_many_matrices(backend: CholeskyBackend, seed: int, side: int) -> None:
     rng = np.random.default_rng(seed)
     pattern = pattern_of(seed, side)
-    first, second = definite(pattern, rng), definite(pattern, rng, scale=1e3)
+    first = definite(pattern, rng)
+    second = definite(pattern, rng, scale=1e3)
     b = rng.standard_normal((side, 2))
     analysis = analyze(pattern, backend)
     kept = analysis.factorize(first)
@@ -115,7 +130,9 @@ def test_the_memory_of_a_factor_out_of_use_is_taken_over_without_a_finaliser() -
 
 @BACKENDS
 @given(seed=SEEDS, side=st.integers(2, 20))
-def test_a_failed_factorisation_leaves_the_analysis_as_it_was(backend: CholeskyBackend, seed: int, side: int) -> None:
+def test_a_failed_factorisation_leaves_the_analysis_as_it_was(
+    backend: CholeskyBackend, seed: int, side: int
+) -> None:
     rng = np.random.default_rng(seed)
     pattern = pattern_of(seed, side)
     good = definite(pattern, rng)
@@ -147,9 +164,12 @@ def test_identity_less_a_short_vector_is_definite(
 
 @BACKENDS
 @given(seed=SEEDS, side=st.integers(1, 40), below=st.floats(1e-9, 1.0))
-def test_identity_less_a_long_vector_is_not(backend: CholeskyBackend, seed: int, side: int, below: float) -> None:
+def test_identity_less_a_long_vector_is_not(
+    backend: CholeskyBackend, seed: int, side: int, below: float
+) -> None:
     x = np.random.default_rng(seed).standard_normal(side)
-    x *= np.sqrt(1.0 + below) / np.linalg.norm(x)  # the smallest eigenvalue is -below; 1 is I - 2 x x^T
+    # the smallest eigenvalue is -below; 1 is I - 2 x x^T
+    x *= np.sqrt(1.0 + below) / np.linalg.norm(x)
     assert not is_positive_definite(dense_matrix(np.eye(side) - np.outer(x, x)), backend)
 
 
@@ -167,7 +187,9 @@ def test_identity_less_a_long_vector_is_not(backend: CholeskyBackend, seed: int,
         [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
     ],
 )
-def test_singular_and_indefinite_matrices_are_rejected(backend: CholeskyBackend, rows: list[list[float]]) -> None:
+def test_singular_and_indefinite_matrices_are_rejected(
+    backend: CholeskyBackend, rows: list[list[float]]
+) -> None:
     matrix = dense_matrix(np.array(rows))
     assert not is_positive_definite(matrix, backend)
     with pytest.raises(NotPositiveDefiniteError, match=r"singular|pivot"):
@@ -179,7 +201,8 @@ def test_singular_and_indefinite_matrices_are_rejected(backend: CholeskyBackend,
 def test_an_option_that_others_set_lets_no_indefinite_matrix_pass(
     others: int, rows: list[list[float]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(cholmod.options, "supernodal", others)  # L D L^T, which indefinite matrices have
+    # L D L^T, which indefinite matrices have
+    monkeypatch.setitem(cholmod.options, "supernodal", others)
     assert not is_positive_definite(dense_matrix(np.array(rows)), CholeskyBackend.CHOLMOD)
     assert cholmod.options["supernodal"] == others
 
@@ -194,6 +217,58 @@ def test_nan_and_inf_are_rejected(backend: CholeskyBackend, value: float) -> Non
     assert not is_positive_definite(dense_matrix(dense), backend)
 
 
+def overflowing(side: int) -> np.ndarray:
+    """Finite matrix whose factor has an inf at (side, 0).
+
+    It meets the zeros beside it as nan.
+    """
+    dense = np.eye(side)
+    dense[0, 0] = 1e-20
+    dense[0, -1] = dense[-1, 0] = 1e304
+    return dense
+
+
+@BACKENDS
+@pytest.mark.parametrize("side", [3, 4, 8, 40])
+def test_pivots_that_are_nan_are_rejected(backend: CholeskyBackend, side: int) -> None:
+    matrix = dense_matrix(overflowing(side))
+    good = dense_matrix(np.eye(side))
+    analysis = analyze(matrix, backend, np.arange(side))
+    kept = analysis.factorize(good)
+    for overwritten in (None, kept):
+        with pytest.raises(NotPositiveDefiniteError, match=r"pivot|singular"):
+            analysis.factorize(matrix, overwrite=overwritten)
+    np.testing.assert_array_equal(analysis.factorize(good).solve(np.ones(side)), np.ones(side))
+
+
+@BACKENDS
+@settings(max_examples=examples(400))
+@given(
+    seed=SEEDS,
+    side=st.integers(2, 40),
+    count=st.integers(1, 4),
+    exponents=st.tuples(EXPONENTS, EXPONENTS),
+)
+def test_a_factor_that_goes_through_is_finite(
+    backend: CholeskyBackend, seed: int, side: int, count: int, exponents: tuple[float, float]
+) -> None:
+    """Off the diagonal, too, where nothing looks."""
+    rng = np.random.default_rng(seed)
+    least, most = sorted(exponents)
+    dense = np.diag(10.0 ** rng.uniform(least, most, side))
+    for _ in range(count):
+        a, b = rng.choice(side, 2, replace=False)
+        dense[a, b] = dense[b, a] = 10.0 ** rng.uniform(least, most)
+    try:
+        factor = factorize(dense_matrix(dense), backend)
+    except NotPositiveDefiniteError:
+        return
+    L, order = factor.take_apart()
+    assert np.isfinite(L.data).all()
+    diagonal = np.diagonal(dense)[order]
+    assert (np.sqrt(L.multiply(L).sum(axis=1)) <= (1.0 + 1e-9) * np.sqrt(diagonal)).all()
+
+
 @BACKENDS
 def test_another_pattern_is_rejected(backend: CholeskyBackend) -> None:
     diagonal = csc_array(np.eye(3))
@@ -205,7 +280,9 @@ def test_another_pattern_is_rejected(backend: CholeskyBackend) -> None:
 
 @BACKENDS
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
-def test_the_same_matrix_gives_the_same_bits(backend: CholeskyBackend, seed: int, n: int, d: int) -> None:
+def test_the_same_matrix_gives_the_same_bits(
+    backend: CholeskyBackend, seed: int, n: int, d: int
+) -> None:
     problem = varied_problem(seed, n, d)
     matrix = problem.M.copy()
     matrix.setdiag(1.001 * matrix.diagonal())
@@ -219,20 +296,26 @@ def test_superlu_is_the_default_without_cvxopt(monkeypatch: pytest.MonkeyPatch) 
     assert default_backend() is CholeskyBackend.CHOLMOD
     monkeypatch.setitem(sys.modules, "cvxopt", None)
     assert default_backend() is CholeskyBackend.SUPERLU
-    np.testing.assert_array_equal(factorize(csc_array(2.0 * np.eye(2))).solve(np.ones(2)), [0.5, 0.5])
+    np.testing.assert_array_equal(
+        factorize(csc_array(2.0 * np.eye(2))).solve(np.ones(2)), [0.5, 0.5]
+    )
 
 
 def test_asking_for_cholmod_without_cvxopt_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     import_cvxopt.cache_clear()
     monkeypatch.setitem(sys.modules, "cvxopt", None)
-    with pytest.raises(MissingExtraError, match=r"cvxopt is not installed; run: pip install .*\[fast\]") as caught:
+    with pytest.raises(
+        MissingExtraError, match=r"cvxopt is not installed; run: pip install .*\[fast\]"
+    ) as caught:
         analyze(csc_array(np.eye(2)), CholeskyBackend.CHOLMOD)
     assert caught.value.extra == "fast"
 
 
 @BACKENDS
 @pytest.mark.parametrize("d", [2, 3])
-def test_an_order_of_poses_solves_as_well_and_fills_as_little(backend: CholeskyBackend, d: int) -> None:
+def test_an_order_of_poses_solves_as_well_and_fills_as_little(
+    backend: CholeskyBackend, d: int
+) -> None:
     problem = PGOProblem(random_geometric(200, np.random.default_rng(d), d=d), backend)
     matrix = problem.M.copy()
     matrix.setdiag(1.01 * matrix.diagonal())

@@ -1,8 +1,16 @@
 import numpy as np
 import pytest
-from graphs import DIMENSIONS, LOUD_NOISE, SEEDS, SIZES, median_slope, random_poses, varied_graph, varied_problem
-from hypothesis import given
-from hypothesis import strategies as st
+from graphs import (
+    DIMENSIONS,
+    LOUD_NOISE,
+    SEEDS,
+    SIZES,
+    median_slope,
+    random_poses,
+    varied_graph,
+    varied_problem,
+)
+from hypothesis import given, strategies as st
 
 from pgo_models.certificates.dual_variables import certificate_matrix, multipliers
 from pgo_models.certificates.newton_polish import polish
@@ -24,7 +32,8 @@ def stacked_move(poses: Poses, w: Array, v: Array) -> Array:
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, theta=st.sampled_from([None, 0.0, 0.5, 1.0]))
 def test_the_form_is_twice_that_of_S(seed: int, n: int, d: int, theta: float | None) -> None:
-    problem, poses = varied_problem(seed, n, d), random_poses(n, d, seed)
+    problem = varied_problem(seed, n, d)
+    poses = random_poses(n, d, seed)
     rng = np.random.default_rng(seed)
     w, v = move(rng, n, d)
     Lambda = None if theta is None else theta * multipliers(problem, poses)
@@ -33,12 +42,15 @@ def test_the_form_is_twice_that_of_S(seed: int, n: int, d: int, theta: float | N
     step = TangentLayout(n, d).join(w, v)
     hessian = riemannian_hessian(problem, poses, Lambda)
     terms = float(np.sum(np.abs(V) * (abs(S) @ np.abs(V))))
-    assert step @ (hessian @ step) == pytest.approx(2.0 * float(np.sum(V * (S @ V))), rel=0, abs=1e-12 * terms)
+    assert step @ (hessian @ step) == pytest.approx(
+        2.0 * float(np.sum(V * (S @ V))), rel=0, abs=1e-12 * terms
+    )
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_gradient_and_hessian_have_taylor_slope_three(seed: int, n: int, d: int) -> None:
-    problem, poses = varied_problem(seed, n, d), random_poses(n, d, seed)
+    problem = varied_problem(seed, n, d)
+    poses = random_poses(n, d, seed)
     layout = TangentLayout(n, d)
     gradient = layout.join(*problem.riemannian_gradient(poses))
     hessian = riemannian_hessian(problem, poses, multipliers(problem, poses))
@@ -47,15 +59,20 @@ def test_gradient_and_hessian_have_taylor_slope_three(seed: int, n: int, d: int)
     def error(w: Array, v: Array, h: float) -> float:
         step = h * layout.join(w, v)
         there = problem.objective(Poses(poses.R @ exp_map(h * w), poses.t + h * v))
-        return abs(there - problem.objective(poses) - gradient @ step - 0.5 * step @ (hessian @ step))
+        return abs(
+            there - problem.objective(poses) - gradient @ step - 0.5 * step @ (hessian @ step)
+        )
 
     # The median over moves, as the third derivative is nearly zero along some.
-    assert median_slope(error, [move(rng, n, d) for _ in range(7)], (-1.5, -3.0)) == pytest.approx(3.0, abs=0.2)
+    assert median_slope(error, [move(rng, n, d) for _ in range(7)], (-1.5, -3.0)) == pytest.approx(
+        3.0, abs=0.2
+    )
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_gauss_newton_is_newton_where_edges_fit(seed: int, n: int, d: int) -> None:
-    # J^T J is the Hessian when the residuals vanish: any other poses, measured exactly by the edges of the graph.
+    # J^T J is the Hessian when the residuals vanish: any other poses, measured exactly by the edges
+    # of the graph.
     graph = varied_graph(seed, n, d)
     poses = random_poses(n, d, seed)
     R_i = np.swapaxes(poses.R[graph.i], 1, 2)
@@ -79,7 +96,8 @@ def test_gauss_newton_is_newton_where_edges_fit(seed: int, n: int, d: int) -> No
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_it_is_symmetric_and_its_pattern_is_the_graph_s(seed: int, n: int, d: int) -> None:
-    problem, poses = varied_problem(seed, n, d), random_poses(n, d, seed)
+    problem = varied_problem(seed, n, d)
+    poses = random_poses(n, d, seed)
     hessian = riemannian_hessian(problem, poses, multipliers(problem, poses))
     dense = hessian.toarray()
     np.testing.assert_allclose(dense, dense.T, rtol=0, atol=1e-13 * np.abs(dense).max())
@@ -90,7 +108,9 @@ def test_it_is_symmetric_and_its_pattern_is_the_graph_s(seed: int, n: int, d: in
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
-def test_rigid_motions_are_in_the_null_space_at_stationary_points(seed: int, n: int, d: int) -> None:
+def test_rigid_motions_are_in_the_null_space_at_stationary_points(
+    seed: int, n: int, d: int
+) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE))
     poses = polish(problem, chordal_start(problem))
     hessian = riemannian_hessian(problem, poses, multipliers(problem, poses))
@@ -114,9 +134,13 @@ def test_double_cross_is_its_definition_in_space(seed: int, n: int) -> None:
     A, B = rng.standard_normal((2, n, 3, 3))
     u, v = rng.standard_normal((2, n, 3))
     expected = np.sum((hat(u) @ A @ np.swapaxes(hat(v), 1, 2)) * B, axis=(1, 2))
-    np.testing.assert_allclose(np.einsum("na,nab,nb->n", u, double_cross(A, B), v), expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        np.einsum("na,nab,nb->n", u, double_cross(A, B), v), expected, rtol=0, atol=1e-12
+    )
     cofactors = np.linalg.det(A)[:, None, None] * np.swapaxes(np.linalg.inv(A), 1, 2)
-    np.testing.assert_allclose(double_cross(A, A), 2 * cofactors, rtol=0, atol=1e-9 * (1 + np.abs(cofactors).max()))
+    np.testing.assert_allclose(
+        double_cross(A, A), 2 * cofactors, rtol=0, atol=1e-9 * (1 + np.abs(cofactors).max())
+    )
 
 
 @given(seed=SEEDS, n=st.integers(1, 5))

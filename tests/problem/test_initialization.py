@@ -2,9 +2,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from graphs import DIMENSIONS, EPS, SEEDS, SIZES, exact_graph, random_poses, varied_graph, varied_problem
-from hypothesis import given
-from hypothesis import strategies as st
+from graphs import (
+    DIMENSIONS,
+    EPS,
+    SEEDS,
+    SIZES,
+    exact_graph,
+    random_poses,
+    varied_graph,
+    varied_problem,
+)
+from hypothesis import given, strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import shortest_path
 
@@ -28,18 +36,23 @@ def chain(seed: int, n: int, d: int, noise: NoiseModel = MILD_NOISE) -> PoseGrap
     order = rng.permutation(n - 1)
     extra = rng.integers(0, n, (3, 2))
     extra = extra[extra[:, 0] != extra[:, 1]]
-    i, j = np.concatenate([order, extra[:, 0]]), np.concatenate([order + 1, extra[:, 1]])
+    i = np.concatenate([order, extra[:, 0]])
+    j = np.concatenate([order + 1, extra[:, 1]])
     return observe("chain", random_poses(n, d, seed), i, j, noise, 2.0, 3.0, rng)
 
 
 def hops(graph: PoseGraph, root: int, edges: np.ndarray) -> np.ndarray:
     """Number of the chosen edges from the root to every pose."""
-    adjacency = coo_array((np.ones(edges.sum()), (graph.i[edges], graph.j[edges])), (graph.num_poses,) * 2)
+    ends = np.stack([graph.i, graph.j])[:, edges].astype(np.int32)  # SciPy 1.14 takes no others
+    adjacency = coo_array((np.ones(edges.sum()), tuple(ends)), (graph.num_poses,) * 2)
     return shortest_path(adjacency.tocsr(), directed=False, unweighted=True, indices=root)
 
 
 def assert_costs_nothing(graph: PoseGraph, poses: Poses) -> None:
-    """F is at the rounding level: every residual is below about n eps times the size of the world."""
+    """F is at the rounding level.
+
+    Every residual is below about n eps times the size of the world.
+    """
     size = 1.0 + np.abs(poses.t).max()
     w = residual_matrix(graph)[1]
     assert PGOProblem(graph).objective(poses) <= w.sum() * (1e3 * graph.num_poses * EPS * size) ** 2
@@ -54,7 +67,9 @@ def test_without_noise_every_start_is_the_truth(seed: int, n: int, d: int) -> No
         assert_costs_nothing(graph, start)
         aligned = start.with_gauge_at(0)
         np.testing.assert_allclose(aligned.R, truth.R, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(aligned.t, truth.t, rtol=0, atol=1e-9 * (1 + np.abs(truth.t).max()))
+        np.testing.assert_allclose(
+            aligned.t, truth.t, rtol=0, atol=1e-9 * (1 + np.abs(truth.t).max())
+        )
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
@@ -67,7 +82,8 @@ def test_without_noise_odometry_is_the_truth(seed: int, n: int, d: int) -> None:
 def test_odometry_composes_the_first_link_of_every_pair(seed: int, n: int, d: int) -> None:
     graph = chain(seed, n, d)
     poses = odometry_start(graph)
-    R, t = np.eye(d), np.zeros(d)
+    R = np.eye(d)
+    t = np.zeros(d)
     for pose in range(n):
         np.testing.assert_allclose(poses.R[pose], R, rtol=0, atol=1e-13)
         np.testing.assert_allclose(poses.t[pose], t, rtol=0, atol=1e-12 * (1 + np.abs(t).max()))
@@ -79,13 +95,19 @@ def test_odometry_composes_the_first_link_of_every_pair(seed: int, n: int, d: in
 def test_odometry_with_a_gap_names_it() -> None:
     graph = chain(0, 6, 3)
     keep = ~((graph.i == 2) & (graph.j == 3))
-    parts = {name: getattr(graph, name)[keep] for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")}
-    with pytest.raises(GraphError, match=r"no odometry from pose 12 to 13; use spanning_tree_start\(\)"):
+    parts = {
+        name: getattr(graph, name)[keep] for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")
+    }
+    with pytest.raises(
+        GraphError, match=r"no odometry from pose 12 to 13; use spanning_tree_start\(\)"
+    ):
         odometry_start(replace(graph, ids=np.arange(10, 16), **parts))
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, root=st.integers(0, 11))
-def test_a_spanning_tree_composes_edges_along_shortest_paths(seed: int, n: int, d: int, root: int) -> None:
+def test_a_spanning_tree_composes_edges_along_shortest_paths(
+    seed: int, n: int, d: int, root: int
+) -> None:
     graph = varied_graph(seed, n, d)  # with edges in both directions and repeated ones
     root %= n
     poses = spanning_tree_start(graph, root)
@@ -93,8 +115,11 @@ def test_a_spanning_tree_composes_edges_along_shortest_paths(seed: int, n: int, 
     np.testing.assert_array_equal(poses.t[root], np.zeros(d))
     costs = PGOProblem(graph).edge_costs(poses)
     fits = costs <= (graph.kappa + graph.tau) * (1e3 * n * EPS * (1.0 + np.abs(poses.t).max())) ** 2
-    # Noise leaves only the edges of the tree, and their copies, to fit; between them they reach every pose.
-    np.testing.assert_array_equal(hops(graph, root, fits), hops(graph, root, np.ones(graph.num_edges, dtype=bool)))
+    # Noise leaves only the edges of the tree, and their copies, to fit; between them they reach
+    # every pose.
+    np.testing.assert_array_equal(
+        hops(graph, root, fits), hops(graph, root, np.ones(graph.num_edges, dtype=bool))
+    )
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
@@ -120,24 +145,33 @@ def test_starts_are_rotations(seed: int, n: int, d: int) -> None:
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_the_chordal_start_is_gauge_free(seed: int, n: int, d: int) -> None:
-    # Relative measurements know no world: turning the truth, and with it the estimate of the file, changes nothing.
+    # Relative measurements know no world: turning the truth, and with it the estimate of the file,
+    # changes nothing.
     graph = varied_graph(seed, n, d)
     rng = np.random.default_rng(seed)
     assert graph.truth is not None
-    turned = replace(graph, truth=graph.truth.moved(random_rotations(1, d, rng)[0], rng.standard_normal(d)))
-    np.testing.assert_array_equal(chordal_start(PGOProblem(turned)).R, chordal_start(PGOProblem(graph)).R)
+    turned = replace(
+        graph, truth=graph.truth.moved(random_rotations(1, d, rng)[0], rng.standard_normal(d))
+    )
+    np.testing.assert_array_equal(
+        chordal_start(PGOProblem(turned)).R, chordal_start(PGOProblem(graph)).R
+    )
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_turning_the_body_frames_turns_the_chordal_start(seed: int, n: int, d: int) -> None:
-    # x_i -> x_i y_i turns every measurement to y_i^-1 x_ij y_j; the relaxation, with x_0 y_0 = I, follows.
+    # x_i -> x_i y_i turns every measurement to y_i^-1 x_ij y_j; the relaxation, with x_0 y_0 = I,
+    # follows.
     problem = varied_problem(seed, n, d)
     graph = problem.graph
     G = random_rotations(n, d, np.random.default_rng(seed))
     G[0] = np.eye(d)
     R_i = np.swapaxes(G[graph.i], 1, 2)
-    turned = replace(graph, R_ij=R_i @ graph.R_ij @ G[graph.j], t_ij=np.einsum("mab,mb->ma", R_i, graph.t_ij))
-    before, after = chordal_start(problem), chordal_start(PGOProblem(turned))
+    turned = replace(
+        graph, R_ij=R_i @ graph.R_ij @ G[graph.j], t_ij=np.einsum("mab,mb->ma", R_i, graph.t_ij)
+    )
+    before = chordal_start(problem)
+    after = chordal_start(PGOProblem(turned))
     np.testing.assert_allclose(after.R, before.R @ G, rtol=0, atol=1e-8)
     np.testing.assert_allclose(after.t, before.t, rtol=0, atol=1e-8 * (1 + np.abs(before.t).max()))
 
@@ -169,9 +203,14 @@ def rotation_cost(problem: PGOProblem, poses: Poses) -> float:
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, std=st.sampled_from([0.05, 0.5, 3.0]))
 def test_averaging_never_costs_rotations(seed: int, n: int, d: int, std: float) -> None:
-    problem = varied_problem(seed, n, d, NoiseModel(1.0, std))  # kappa / tau differs from edge to edge
-    before, after = chordal_start(problem), chordal_start(problem, averaged=True)
-    assert rotation_cost(problem, after) <= rotation_cost(problem, before) + 1e-12 * problem.weights.kappa.sum()
+    # kappa / tau differs from edge to edge
+    problem = varied_problem(seed, n, d, NoiseModel(1.0, std))
+    before = chordal_start(problem)
+    after = chordal_start(problem, averaged=True)
+    assert (
+        rotation_cost(problem, after)
+        <= rotation_cost(problem, before) + 1e-12 * problem.weights.kappa.sum()
+    )
     np.testing.assert_array_equal(after.t, problem.recover_translations(after.R))
     np.testing.assert_allclose(after.R[0], before.R[0], rtol=0, atol=1e-14)
     if d == 3:
@@ -180,17 +219,24 @@ def test_averaging_never_costs_rotations(seed: int, n: int, d: int, std: float) 
 
 def test_averaging_is_near_the_least_cost_of_rotations_and_nearer_the_optimum() -> None:
     problem = PGOProblem(grid_world(100, 100, np.random.default_rng(1), d=2))
-    chordal, averaged = chordal_start(problem), chordal_start(problem, averaged=True)
+    chordal = chordal_start(problem)
+    averaged = chordal_start(problem, averaged=True)
     without = replace(problem.graph, tau=1e-9 * problem.graph.tau, t_ij=0.0 * problem.graph.t_ij)
     least = rotation_cost(problem, polish(PGOProblem(without), replace(chordal, t=0.0 * chordal.t)))
-    assert least <= rotation_cost(problem, averaged) <= least + 0.01 * (rotation_cost(problem, chordal) - least)
-    F, starts = problem.objective(polish(problem, averaged)), (averaged, chordal)
+    assert (
+        least
+        <= rotation_cost(problem, averaged)
+        <= least + 0.01 * (rotation_cost(problem, chordal) - least)
+    )
+    F = problem.objective(polish(problem, averaged))
+    starts = (averaged, chordal)
     near, far = (problem.objective(start) / F - 1.0 for start in starts)
     assert near <= 0.9 * far
 
 
 def test_the_chordal_start_of_a_large_grid_world_is_near_the_optimum() -> None:
-    # Relaxed jointly with the translations it costs 2.9 times as much, and more the larger the world is.
+    # Relaxed jointly with the translations it costs 2.9 times as much, and more the larger the
+    # world is.
     problem = PGOProblem(grid_world(25, 600, np.random.default_rng(0), d=2))
     start = chordal_start(problem)
     best = polish(problem, start)

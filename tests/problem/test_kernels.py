@@ -1,4 +1,4 @@
-"""CHOLMOD runs on the kernels of the CPU, numpy and scipy keep theirs, and the environment stays as it was."""
+"""CHOLMOD runs on the kernels of the CPU, and the environment stays as it was."""
 
 import ctypes
 import os
@@ -39,7 +39,9 @@ def openblas() -> ctypes.CDLL | None:
 def kernels_in_a_process(**environment: str) -> list[str]:
     kept = {name: value for name, value in os.environ.items() if name != kernels.VARIABLE}
     command = [sys.executable, "-c", PROGRAM]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env={**kept, **environment})
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=True, env={**kept, **environment}
+    )
     return done.stdout.split()
 
 
@@ -80,5 +82,7 @@ def test_kernels_are_asked_for_where_the_cpu_has_them(
 
 def test_kernels_are_said_beside_the_back_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(kernels.VARIABLE, "Zen")
-    assert installed_versions(CholeskyBackend.CHOLMOD)["cholesky"] == "CHOLMOD (CVXOPT), Zen kernels"
+    assert (
+        installed_versions(CholeskyBackend.CHOLMOD)["cholesky"] == "CHOLMOD (CVXOPT), Zen kernels"
+    )
     assert installed_versions(CholeskyBackend.SUPERLU)["cholesky"] == "SuperLU (scipy)"

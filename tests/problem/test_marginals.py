@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, SEEDS, exact_graph, random_poses, varied_graph, varied_problem
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.sparse import csc_array
 
 from pgo_models.certificates.dual_variables import multipliers
@@ -21,7 +20,9 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.marginals import Marginals, write_covariances
 from pgo_models.problem.problem import PGOProblem
 
-needs_gtsam = pytest.mark.skipif(importlib.util.find_spec("gtsam") is None, reason="GTSAM is an optional rival")
+needs_gtsam = pytest.mark.skipif(
+    importlib.util.find_spec("gtsam") is None, reason="GTSAM is an optional rival"
+)
 BACKENDS = st.sampled_from(CholeskyBackend)
 SIZES = st.integers(2, 30)
 
@@ -35,13 +36,16 @@ def marginals_at(
 
 def dense_covariance(marginals: Marginals) -> Array:
     """All of the inverse, (n, p, n, p), the anchor's part zero."""
-    layout, n = marginals.layout, marginals.layout.num_poses
+    layout = marginals.layout
+    n = marginals.layout.num_poses
     every = np.arange(n)
     columns = np.concatenate([layout.translations(every), layout.rotations(every)], axis=1)
     free = np.delete(columns, marginals.anchor, axis=0).ravel()
     whole = np.zeros((layout.side, layout.side))
     whole[np.ix_(free, free)] = np.linalg.inv(0.5 * marginals.hessian.toarray()[np.ix_(free, free)])
-    return whole[columns.ravel()][:, columns.ravel()].reshape(n, layout.side // n, n, layout.side // n)
+    return whole[columns.ravel()][:, columns.ravel()].reshape(
+        n, layout.side // n, n, layout.side // n
+    )
 
 
 def in_body_axes(blocks: Array, poses: Poses) -> Array:
@@ -57,12 +61,17 @@ def cross(t: Array) -> Array:
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, backend=BACKENDS)
-def test_blocks_and_joints_are_those_of_the_dense_inverse(seed: int, n: int, d: int, backend: CholeskyBackend) -> None:
-    problem, rng = varied_problem(seed, n, d), np.random.default_rng(seed)
+def test_blocks_and_joints_are_those_of_the_dense_inverse(
+    seed: int, n: int, d: int, backend: CholeskyBackend
+) -> None:
+    problem = varied_problem(seed, n, d)
+    rng = np.random.default_rng(seed)
     anchor = int(rng.integers(n))
     marginals = marginals_at(problem, polish(problem, chordal_start(problem)), anchor, backend)
     dense = dense_covariance(marginals)
-    allowed, p, every = 1e-8 * np.abs(dense).max(), 3 * d - 3, np.arange(n)
+    allowed = 1e-8 * np.abs(dense).max()
+    p = 3 * d - 3
+    every = np.arange(n)
     picked = rng.integers(0, n, int(rng.integers(1, 5))).tolist()
     joint = dense[picked][:, :, picked].reshape(p * len(picked), -1)
     for _ in range(2):  # before and after the factor is used up
@@ -75,7 +84,9 @@ def test_blocks_and_joints_are_those_of_the_dense_inverse(seed: int, n: int, d: 
 @given(seed=SEEDS, d=DIMENSIONS)
 def test_one_edge_says_what_the_precisions_mean(seed: int, d: int) -> None:
     graph = exact_graph(seed, 2, d)
-    graph = PoseGraph(2, graph.i[:1], graph.j[:1], graph.R_ij[:1], graph.t_ij[:1], graph.kappa[:1], graph.tau[:1])
+    graph = PoseGraph(
+        2, graph.i[:1], graph.j[:1], graph.R_ij[:1], graph.t_ij[:1], graph.kappa[:1], graph.tau[:1]
+    )
     problem = PGOProblem(graph)
     poses = chordal_start(problem)
     # The measuring pose is held: what it measures is the other's place and turn.
@@ -92,7 +103,8 @@ def test_two_poses_know_as_much_of_each_other(seed: int, n: int, d: int) -> None
     a, b = np.random.default_rng(seed).choice(n, 2, replace=False).tolist()
     beside_a = in_body_axes(marginals_at(problem, poses, a).diagonal, poses)[b]
     beside_b = in_body_axes(marginals_at(problem, poses, b).diagonal, poses)[a]
-    R, t = poses.R[a].T @ poses.R[b], poses.R[a].T @ (poses.t[b] - poses.t[a])
+    R = poses.R[a].T @ poses.R[b]
+    t = poses.R[a].T @ (poses.t[b] - poses.t[a])
     turn = R.T if d == 3 else np.eye(1)
     adjoint = np.block([[R.T, -R.T @ cross(t)], [np.zeros((2 * d - 3, d)), turn]])
     expected = adjoint @ beside_b @ adjoint.T
@@ -102,10 +114,13 @@ def test_two_poses_know_as_much_of_each_other(seed: int, n: int, d: int) -> None
 @pytest.mark.parametrize("name", ["sphere2500", "city10000"])
 def test_public_graphs(name, benchmark_problem, benchmark_optimum) -> None:
     marginals = marginals_at(benchmark_problem(name), benchmark_optimum(name))
-    p, picked = marginals.diagonal.shape[1], [1, 700, marginals.layout.num_poses - 1]
+    p = marginals.diagonal.shape[1]
+    picked = [1, 700, marginals.layout.num_poses - 1]
     scale = np.abs(marginals.diagonal).max()
     for pose in picked:
-        np.testing.assert_allclose(marginals.diagonal[pose], marginals.joint(pose), rtol=0, atol=1e-8 * scale)
+        np.testing.assert_allclose(
+            marginals.diagonal[pose], marginals.joint(pose), rtol=0, atol=1e-8 * scale
+        )
     assert np.linalg.eigvalsh(marginals.joint(*picked))[0] > 0.0
     assert (np.linalg.eigvalsh(np.delete(marginals.diagonal, 0, axis=0))[:, 0] > 0.0).all()
     assert marginals.joint(*picked).shape == (3 * p, 3 * p)
@@ -125,7 +140,10 @@ def test_away_from_a_minimum_there_are_none(backend: CholeskyBackend) -> None:
     problem = varied_problem(0, 12, 3)
     marginals = marginals_at(problem, random_poses(12, 3, 0), backend=backend)
     for ask in (lambda: marginals.diagonal, lambda: marginals.joint(1)):
-        with pytest.raises(NotPositiveDefiniteError, match="at no strict minimum; solve to the end first, or polish"):
+        with pytest.raises(
+            NotPositiveDefiniteError,
+            match="at no strict minimum; solve to the end first, or polish",
+        ):
             ask()
 
 
@@ -133,7 +151,8 @@ def test_away_from_a_minimum_there_are_none(backend: CholeskyBackend) -> None:
 def test_the_table_reads_back(d: int, tmp_path: Path) -> None:
     problem = varied_problem(0, 6, d)
     blocks = marginals_at(problem, polish(problem, chordal_start(problem))).diagonal
-    ids, path = np.arange(6) + 2**60, tmp_path / "covariances.csv"
+    ids = np.arange(6) + 2**60
+    path = tmp_path / "covariances.csv"
     write_covariances(blocks, ids, path)
     head, *lines = path.read_text().splitlines()
     heads = head.split(",")
@@ -149,12 +168,17 @@ def test_the_table_reads_back(d: int, tmp_path: Path) -> None:
 
 
 def gtsam_marginals(problem: PGOProblem, poses: Poses) -> tuple[Array, Array, csc_array]:
-    """GTSAM's covariances of poses at its linearisation, pose 0 held, of (0, 1) and its Hessian; our order and axes."""
+    """GTSAM's covariances of poses at its linearisation, pose 0 held, in our order and axes.
+
+    With them come the joint one of (0, 1) and its Hessian.
+    """
     import gtsam
 
     from solvers.baselines.gtsam import factor_graph
 
-    n, d, p = problem.num_poses, problem.d, 3 * problem.d - 3
+    n = problem.num_poses
+    d = problem.d
+    p = 3 * problem.d - 3
     values = gtsam.Values()
     for key, (R, t) in enumerate(zip(poses.R, poses.t, strict=True)):
         angle = 0.0 if d == 3 else float(log_map(R[None])[0, 0])
@@ -162,7 +186,11 @@ def gtsam_marginals(problem: PGOProblem, poses: Poses) -> tuple[Array, Array, cs
     factors = factor_graph(problem)
     factors.remove(factors.size() - 1)  # the prior, which is not of the problem
     information = factors.linearize(values).hessian()[0]
-    prior, at = (gtsam.PriorFactorPose3, values.atPose3(0)) if d == 3 else (gtsam.PriorFactorPose2, values.atPose2(0))
+    prior, at = (
+        (gtsam.PriorFactorPose3, values.atPose3(0))
+        if d == 3
+        else (gtsam.PriorFactorPose2, values.atPose2(0))
+    )
     factors.add(prior(0, at, gtsam.noiseModel.Isotropic.Sigma(p, 1e-8)))
     found = gtsam.Marginals(factors, values)
     order = np.r_[3:6, 0:3] if d == 3 else np.arange(3)  # its Pose3 turns first
@@ -170,7 +198,8 @@ def gtsam_marginals(problem: PGOProblem, poses: Poses) -> tuple[Array, Array, cs
     axes = np.tile(np.eye(p), (n, 1, 1))
     axes[:, :d, :d] = poses.R
     # Moves (v, w) of ours, field by field, in terms of its own.
-    layout, every = TangentLayout(n, d), np.arange(n)
+    layout = TangentLayout(n, d)
+    every = np.arange(n)
     ours = np.concatenate([layout.translations(every), layout.rotations(every)], axis=1)
     into = np.zeros((n * p, n * p))
     for k in range(n):
@@ -197,9 +226,13 @@ def test_they_are_gtsams_where_edges_fit(seed: int, n: int, d: int) -> None:
     poses = problem.graph.truth
     marginals = marginals_at(problem, poses)
     blocks, joint, hessian = gtsam_marginals(problem, poses)
-    np.testing.assert_allclose(hessian.toarray(), marginals.hessian.toarray(), rtol=0, atol=1e-8 * abs(hessian).max())
+    np.testing.assert_allclose(
+        hessian.toarray(), marginals.hessian.toarray(), rtol=0, atol=1e-8 * abs(hessian).max()
+    )
     np.testing.assert_allclose(marginals.diagonal, blocks, rtol=0, atol=1e-8 * np.abs(blocks).max())
-    np.testing.assert_allclose(marginals.joint(n - 2, n - 1), joint, rtol=0, atol=1e-8 * np.abs(joint).max())
+    np.testing.assert_allclose(
+        marginals.joint(n - 2, n - 1), joint, rtol=0, atol=1e-8 * np.abs(joint).max()
+    )
 
 
 @needs_gtsam
@@ -210,4 +243,6 @@ def test_they_are_gtsams_on_its_own_linearisation(seed: int, n: int, d: int) -> 
     blocks, joint, hessian = gtsam_marginals(problem, polish(problem, chordal_start(problem)))
     marginals = Marginals(hessian, TangentLayout(n, d))
     np.testing.assert_allclose(marginals.diagonal, blocks, rtol=0, atol=1e-8 * np.abs(blocks).max())
-    np.testing.assert_allclose(marginals.joint(n - 2, n - 1), joint, rtol=0, atol=1e-8 * np.abs(joint).max())
+    np.testing.assert_allclose(
+        marginals.joint(n - 2, n - 1), joint, rtol=0, atol=1e-8 * np.abs(joint).max()
+    )

@@ -33,7 +33,8 @@ def rotation_cost(graph: PoseGraph, R: np.ndarray) -> float:
 def translation_cost(graph: PoseGraph, R: np.ndarray, t: np.ndarray) -> float:
     """Sum of tau ||t_j - t_i - R_i t_ij||^2, edge by edge."""
     return sum(
-        graph.tau[e] * np.linalg.norm(t[graph.j[e]] - t[graph.i[e]] - R[graph.i[e]] @ graph.t_ij[e]) ** 2
+        graph.tau[e]
+        * np.linalg.norm(t[graph.j[e]] - t[graph.i[e]] - R[graph.i[e]] @ graph.t_ij[e]) ** 2
         for e in range(graph.num_edges)
     )
 
@@ -57,7 +58,8 @@ def test_M_is_A_transposed_w_A(seed: int, n: int, d: int) -> None:
     A, w = residual_matrix(graph)
     assert A.shape == ((d + 1) * graph.num_edges, (d + 1) * n)
     A = A.toarray()
-    # M has kappa I where A has kappa R_ij R_ij^T, whose entries beside the diagonal are off by its rounding, too.
+    # M has kappa I where A has kappa R_ij R_ij^T, whose entries beside the diagonal are off by its
+    # rounding, too.
     sizes = np.sqrt(w @ A**2)
     allowed = 16 * graph.num_edges * EPS * np.outer(sizes, sizes)
     assert (np.abs(M - (A.T * w) @ A) <= allowed).all()
@@ -69,7 +71,9 @@ def test_rows_of_A_are_the_residuals(seed: int, n: int, d: int) -> None:
     graph = varied_graph(seed, n, d)
     poses = random_poses(n, d, seed)
     residuals = residual_matrix(graph)[0] @ poses.stacked()
-    m, R_i, R_j = graph.num_edges, poses.R[graph.i], poses.R[graph.j]
+    m = graph.num_edges
+    R_i = poses.R[graph.i]
+    R_j = poses.R[graph.j]
     translation = poses.t[graph.j] - poses.t[graph.i] - np.einsum("mab,mb->ma", R_i, graph.t_ij)
     np.testing.assert_allclose(residuals[:m], translation, rtol=0, atol=1e-12)
     rotation = np.swapaxes(R_j - R_i @ graph.R_ij, 1, 2)
@@ -123,7 +127,11 @@ def test_without_noise_the_truth_is_in_the_null_space(seed: int, n: int, d: int)
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_matrices_are_positive_semidefinite(seed: int, n: int, d: int) -> None:
     graph = varied_graph(seed, n, d)
-    for matrix in (joint_matrix(graph).toarray(), connection_laplacian(graph).toarray(), marginalized_matrix(graph)):
+    for matrix in (
+        joint_matrix(graph).toarray(),
+        connection_laplacian(graph).toarray(),
+        marginalized_matrix(graph),
+    ):
         values = np.linalg.eigvalsh(0.5 * (matrix + matrix.T))
         assert values[0] >= -1e-12 * values[-1]
 
@@ -133,10 +141,16 @@ def test_repeated_edges_all_count(seed: int, n: int, d: int) -> None:
     graph = varied_graph(seed, n, d)
     twice = replace(
         graph,
-        **{name: np.concatenate([getattr(graph, name)] * 2) for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")},
+        **{
+            name: np.concatenate([getattr(graph, name)] * 2)
+            for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")
+        },
     )
     np.testing.assert_allclose(
-        joint_matrix(twice).toarray(), 2 * joint_matrix(graph).toarray(), rtol=1e-13, atol=1e-13 * graph.kappa.max()
+        joint_matrix(twice).toarray(),
+        2 * joint_matrix(graph).toarray(),
+        rtol=1e-13,
+        atol=1e-13 * graph.kappa.max(),
     )
 
 
@@ -144,12 +158,15 @@ def test_repeated_edges_all_count(seed: int, n: int, d: int) -> None:
 def test_the_pattern_of_M_is_the_graph_s(seed: int, n: int, d: int) -> None:
     graph = varied_graph(seed, n, d)
     M = joint_matrix(graph)
-    plain = replace(graph, R_ij=np.broadcast_to(np.eye(d), graph.R_ij.shape), t_ij=np.zeros_like(graph.t_ij))
+    plain = replace(
+        graph, R_ij=np.broadcast_to(np.eye(d), graph.R_ij.shape), t_ij=np.zeros_like(graph.t_ij)
+    )
     other = joint_matrix(plain)
     np.testing.assert_array_equal(M.indptr, other.indptr)
     np.testing.assert_array_equal(M.indices, other.indices)
     assert M.has_canonical_format
-    # Diagonal blocks in full, and the diagonal of the translations, though many of the plain graph's are zero.
+    # Diagonal blocks in full, and the diagonal of the translations, though many of the plain
+    # graph's are zero.
     stored = set(zip(*(index.tolist() for index in other.tocoo().coords), strict=True))
     blocks = rotation_columns(np.arange(n), n, d)
     for block in blocks.tolist():
@@ -167,7 +184,10 @@ def test_the_largest_side_is_allowed_and_takes_288_MB(monkeypatch: pytest.Monkey
     assert 8 * matrices.MAX_DENSE_SIDE**2 == 288_000_000
     monkeypatch.setattr(matrices, "MAX_DENSE_SIDE", 30)
     assert marginalized_matrix(random_geometric(10, np.random.default_rng(0))).shape == (30, 30)
-    assert marginalized_matrix(random_geometric(15, np.random.default_rng(0), d=2)).shape == (30, 30)
+    assert marginalized_matrix(random_geometric(15, np.random.default_rng(0), d=2)).shape == (
+        30,
+        30,
+    )
     for n, d, largest in ((11, 3, 30), (16, 2, 30), (10, 3, 29), (15, 2, 29)):
         monkeypatch.setattr(matrices, "MAX_DENSE_SIDE", largest)
         with pytest.raises(SettingError, match=r"use PGOProblem\.apply_Q"):
@@ -179,7 +199,9 @@ def test_rotation_columns_are_where_stacking_puts_them(seed: int, n: int, d: int
     poses = random_poses(n, d, seed)
     chosen = np.random.default_rng(seed).integers(0, n, 5)
     X = poses.stacked()
-    np.testing.assert_array_equal(X[rotation_columns(chosen, n, d)], np.swapaxes(poses.R[chosen], 1, 2))
+    np.testing.assert_array_equal(
+        X[rotation_columns(chosen, n, d)], np.swapaxes(poses.R[chosen], 1, 2)
+    )
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
@@ -195,7 +217,9 @@ def test_entry_positions_find_stored_entries(seed: int, n: int, d: int) -> None:
 
 def test_assemble_sums_repeated_entries_and_keeps_zeros() -> None:
     index = np.array([0, 1, 0])
-    matrix = assemble([(index, index, np.array([1.0, 0.0, 2.0])), (index[:1], index[1:2], np.array([0.0]))], 2)
+    matrix = assemble(
+        [(index, index, np.array([1.0, 0.0, 2.0])), (index[:1], index[1:2], np.array([0.0]))], 2
+    )
     assert isinstance(matrix, csc_array)
     np.testing.assert_array_equal(matrix.toarray(), [[3.0, 0.0], [0.0, 0.0]])
     assert matrix.nnz == 3

@@ -11,24 +11,39 @@ from graphs import (
     median_slope,
     random_poses,
     rounding_of_objective,
+    spread_graph,
     varied_problem,
 )
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from pgo_models.errors import GraphError
+from pgo_models.errors import GraphError, NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, exp_map, random_rotations, stack_transposes, tangent_dimension
+from pgo_models.geometry.rotations import (
+    Array,
+    exp_map,
+    random_rotations,
+    stack_transposes,
+    tangent_dimension,
+)
+from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import random_geometric
-from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.matrices import connection_laplacian, joint_matrix, marginalized_matrix, residual_matrix
+from pgo_models.problem.cholesky import CholeskyBackend, factorize
+from pgo_models.problem.initialization import chordal_start, relaxed_rotations
+from pgo_models.problem.matrices import (
+    connection_laplacian,
+    joint_matrix,
+    marginalized_matrix,
+    residual_matrix,
+)
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 
 
 def cost_of_edge(problem: PGOProblem, poses: Poses, e: int) -> float:
     """kappa ||R_j - R_i R_ij||^2 + tau ||t_j - t_i - R_i t_ij||^2."""
     graph = problem.graph
-    i, j = graph.i[e], graph.j[e]
+    i = graph.i[e]
+    j = graph.j[e]
     rotation = poses.R[j] - poses.R[i] @ graph.R_ij[e]
     translation = poses.t[j] - poses.t[i] - poses.R[i] @ graph.t_ij[e]
     return float(graph.kappa[e] * np.sum(rotation**2) + graph.tau[e] * np.sum(translation**2))
@@ -36,7 +51,8 @@ def cost_of_edge(problem: PGOProblem, poses: Poses, e: int) -> float:
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_objective_is_the_sum_over_edges(seed: int, n: int, d: int) -> None:
-    problem, poses = varied_problem(seed, n, d), random_poses(n, d, seed)
+    problem = varied_problem(seed, n, d)
+    poses = random_poses(n, d, seed)
     expected = [cost_of_edge(problem, poses, e) for e in range(problem.graph.num_edges)]
     np.testing.assert_allclose(problem.edge_costs(poses), expected, rtol=1e-12, atol=0)
     assert problem.objective(poses) == pytest.approx(sum(expected), rel=1e-12)
@@ -50,23 +66,37 @@ def test_objective_is_the_sum_over_edges(seed: int, n: int, d: int) -> None:
 def test_the_objective_of_any_matrix_is_the_quadratic_form(seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)
     X = np.random.default_rng(seed).standard_normal((problem.side, d))
-    assert problem.objective_stacked(X) == pytest.approx(float(np.sum(X * (problem.M @ X))), rel=1e-11)
+    assert problem.objective_stacked(X) == pytest.approx(
+        float(np.sum(X * (problem.M @ X))), rel=1e-11
+    )
     np.testing.assert_allclose(
-        problem.apply_M(X), problem.M @ X, rtol=0, atol=1e-13 * float(abs(problem.M).sum(axis=0).max())
+        problem.apply_M(X),
+        problem.M @ X,
+        rtol=0,
+        atol=1e-13 * float(abs(problem.M).sum(axis=0).max()),
     )
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, spread=st.sampled_from([1.0, 1e3]))
 def test_the_gauge_does_not_matter(seed: int, n: int, d: int, spread: float) -> None:
-    problem, poses = varied_problem(seed, n, d), random_poses(n, d, seed)
+    problem = varied_problem(seed, n, d)
+    poses = random_poses(n, d, seed)
     rng = np.random.default_rng(seed)
     moved = poses.moved(random_rotations(1, d, rng)[0], spread * rng.standard_normal(d))
     objective = problem.objective(poses)
     # A residual loses eps times the coordinates that cancel in it.
     largest = np.abs(moved.t).max() + 1.0
-    allowed = 64 * EPS * largest * float(np.sum(residual_matrix(problem.graph)[1])) ** 0.5 * objective**0.5
+    allowed = (
+        64
+        * EPS
+        * largest
+        * float(np.sum(residual_matrix(problem.graph)[1])) ** 0.5
+        * objective**0.5
+    )
     assert abs(problem.objective(moved) - objective) <= allowed + 64 * EPS * objective
-    for before, after in zip(problem.riemannian_gradient(poses), problem.riemannian_gradient(moved), strict=True):
+    for before, after in zip(
+        problem.riemannian_gradient(poses), problem.riemannian_gradient(moved), strict=True
+    ):
         np.testing.assert_allclose(
             np.linalg.norm(after, axis=1),
             np.linalg.norm(before, axis=1),
@@ -85,9 +115,13 @@ def test_without_noise_the_truth_costs_nothing(seed: int, n: int, d: int) -> Non
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_the_gradient_has_taylor_slope_two(seed: int, n: int, d: int) -> None:
-    problem, poses = varied_problem(seed, n, d), random_poses(n, d, seed)
+    problem = varied_problem(seed, n, d)
+    poses = random_poses(n, d, seed)
     rng = np.random.default_rng(seed)
-    moves = [(rng.standard_normal((n, tangent_dimension(d))), rng.standard_normal((n, d))) for _ in range(5)]
+    moves = [
+        (rng.standard_normal((n, tangent_dimension(d))), rng.standard_normal((n, d)))
+        for _ in range(5)
+    ]
     grad_w, grad_v = problem.riemannian_gradient(poses)
 
     def error(w: Array, v: Array, h: float) -> float:
@@ -116,7 +150,9 @@ def test_recovered_translations_are_the_best(seed: int, n: int, d: int) -> None:
 def test_apply_Q_multiplies_with_Q(seed: int, n: int, d: int, columns: int) -> None:
     problem = varied_problem(seed, n, d)
     Y = np.random.default_rng(seed).standard_normal((d * n, columns))
-    np.testing.assert_allclose(problem.apply_Q(Y), problem.Q @ Y, rtol=0, atol=1e-9 * np.abs(problem.M.data).max())
+    np.testing.assert_allclose(
+        problem.apply_Q(Y), problem.Q @ Y, rtol=0, atol=1e-9 * np.abs(problem.M.data).max()
+    )
     R = random_poses(n, d, seed).R
     rows = stack_transposes(R)
     least = problem.objective(problem.with_best_translations(R))
@@ -127,7 +163,9 @@ def test_apply_Q_multiplies_with_Q(seed: int, n: int, d: int, columns: int) -> N
 def test_matrices_are_those_of_the_graph(seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)
     np.testing.assert_array_equal(problem.M.toarray(), joint_matrix(problem.graph).toarray())
-    np.testing.assert_array_equal(problem.L.toarray(), connection_laplacian(problem.graph).toarray())
+    np.testing.assert_array_equal(
+        problem.L.toarray(), connection_laplacian(problem.graph).toarray()
+    )
     np.testing.assert_array_equal(problem.Q, marginalized_matrix(problem.graph))
     assert (problem.num_poses, problem.d, problem.side) == (n, d, (d + 1) * n)
 
@@ -159,7 +197,10 @@ def test_unit_weights_are_the_paper_s_equation() -> None:
     graph = problem.graph
     plain = sum(
         np.linalg.norm(poses.R[graph.j[e]] - poses.R[graph.i[e]] @ graph.R_ij[e]) ** 2
-        + np.linalg.norm(poses.t[graph.j[e]] - poses.t[graph.i[e]] - poses.R[graph.i[e]] @ graph.t_ij[e]) ** 2
+        + np.linalg.norm(
+            poses.t[graph.j[e]] - poses.t[graph.i[e]] - poses.R[graph.i[e]] @ graph.t_ij[e]
+        )
+        ** 2
         for e in range(graph.num_edges)
     )
     assert unit.objective(poses) == pytest.approx(plain, rel=1e-12)
@@ -175,6 +216,52 @@ def test_a_graph_in_pieces_is_no_problem() -> None:
 @pytest.mark.parametrize("poses", [Poses.identity(4, 3), Poses.identity(5, 2)])
 def test_poses_must_fit_the_graph(poses: Poses) -> None:
     problem = PGOProblem(random_geometric(5, np.random.default_rng(0)))
-    for function in (problem.objective, problem.edge_costs, problem.riemannian_gradient, problem.stacked):
+    for function in (
+        problem.objective,
+        problem.edge_costs,
+        problem.riemannian_gradient,
+        problem.stacked,
+    ):
         with pytest.raises(GraphError, match="give one pose for every pose of the graph"):
             function(poses)
+
+
+@pytest.mark.parametrize("seed", range(25, 35))
+def test_refinement_ends_where_chi2_comes_out_below_zero(seed: int) -> None:
+    """With an indefinite W chi2 of poses that fit is rounding of either sign.
+
+    Seed 31 is below zero.
+    """
+    n = 4
+    rng = np.random.default_rng(seed)
+    truth = Poses(random_rotations(n, 3, rng), rng.standard_normal((n, 3)))
+    i = np.arange(n - 1)
+    j = np.arange(1, n)
+    back = np.swapaxes(truth.R[i], 1, 2)
+    t_ij = np.einsum("mab,mb->ma", back, truth.t[j] - truth.t[i])
+    information = np.broadcast_to(np.diag([1.0, 1.0, 1.0, 100.0, 1.0, 1.0]), (n - 1, 6, 6))
+    ones = np.ones(n - 1)
+    graph = PoseGraph(n, i, j, back @ truth.R[j], t_ij, ones, ones, information=information)
+    problem = PGOProblem(graph, weighting=Weighting.INFORMATION)
+    assert not problem.weights.is_convex
+    assert seed != 31 or problem.objective(truth) < 0.0
+    refined = problem.with_refined_translations(truth)
+    assert problem.objective(refined) <= problem.objective(truth)
+
+
+@pytest.mark.parametrize(("d", "seed"), [(2, 5), (2, 16), (3, 4), (3, 8)])
+def test_starts_and_translations_are_there_whatever_the_weights(d: int, seed: int) -> None:
+    """Two Laplacians have no factor in doubles.
+
+    They are that of the translations (5, 4), and that of the rotations (16, 8).
+    """
+    graph = spread_graph(seed, 9, d)
+    problem = PGOProblem(graph)
+    is_of_translations = seed in (4, 5)
+    matrix = problem.M[1:9, 1:9].tocsc() if is_of_translations else relaxed_rotations(problem, 0)[0]
+    with pytest.raises(NotPositiveDefiniteError):
+        factorize(matrix)
+    poses = chordal_start(problem)
+    assert np.isfinite(poses.t).all()
+    again = problem.with_best_translations(poses.R)
+    np.testing.assert_array_equal(again.t, poses.t)

@@ -1,10 +1,13 @@
-"""Chi-square thresholds are exceeded as often as they say: against simulated measurements, in both weightings."""
+"""Chi-square thresholds are exceeded as often as they say.
+
+They are held against simulated measurements, in both weightings.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from graphs import informed
+from graphs import informed, varied_graph
 from scipy.stats import chi2
 
 import pgo_models as pgo
@@ -20,7 +23,10 @@ DRAWS = 20_000
 
 
 def simulated(d, rng, weights=RotationWeight.SE_SYNC, diagonal=None):
-    """Problems, in F and in chi2, of one edge measured many times with one information matrix, and the true poses."""
+    """Problems of one edge measured many times with one information matrix.
+
+    They are in F and in chi2; with them come the true poses.
+    """
     p = 3 if d == 2 else 6
     A = rng.standard_normal((p, p))
     information = 1e4 * (np.diag(diagonal) if diagonal else A @ A.T + 0.1 * np.eye(p))
@@ -44,11 +50,14 @@ def test_a_threshold_is_exceeded_as_often_as_it_says(d, weights):
         for quantile in (0.5, 0.9, 0.99, 0.999):
             exceeded = np.mean(costs > chi2_thresholds(problem, quantile))
             noise = 4.0 * np.sqrt(quantile * (1.0 - quantile) / DRAWS)
-            assert abs(exceeded - (1.0 - quantile)) < noise + 0.25 * (1.0 - quantile)  # the approximation's, at 0.999
+            # the approximation's, at 0.999
+            assert abs(exceeded - (1.0 - quantile)) < noise + 0.25 * (1.0 - quantile)
 
 
 def test_a_single_large_weight_is_within_a_quarter_too():
-    problems, truth = simulated(3, np.random.default_rng(5), diagonal=[1.0, 1e3, 1e3, 1e3, 1e3, 1.0])
+    problems, truth = simulated(
+        3, np.random.default_rng(5), diagonal=[1.0, 1e3, 1e3, 1e3, 1e3, 1.0]
+    )
     for problem in problems:
         exceeded = np.mean(problem.edge_costs(truth) > chi2_thresholds(problem, 0.99))
         assert exceeded == pytest.approx(0.01, abs=0.0025)
@@ -74,7 +83,9 @@ def test_thresholds_scale_with_the_weights_and_an_edge_without_has_zero():
     (of_F, _), truth = simulated(2, np.random.default_rng(1))
     share = np.where(np.arange(DRAWS) < 3, [0.0], [0.25])
     scaled = replace(of_F, weighting=of_F.weights.scaled(share))
-    np.testing.assert_allclose(chi2_thresholds(scaled), share * chi2_thresholds(of_F), rtol=1e-9, atol=0)
+    np.testing.assert_allclose(
+        chi2_thresholds(scaled), share * chi2_thresholds(of_F), rtol=1e-9, atol=0
+    )
     assert not (scaled.edge_costs(truth)[:3] > chi2_thresholds(scaled)[:3]).any()
 
 
@@ -86,7 +97,17 @@ def test_a_quantile_is_a_probability(quantile):
 
 # Misfits.
 
-CLEAN = ("smallGrid3D", "sphere2500", "torus3D", "parking-garage", "CSAIL", "intel", "MIT", "kitti_00", "manhattan")
+CLEAN = (
+    "smallGrid3D",
+    "sphere2500",
+    "torus3D",
+    "parking-garage",
+    "CSAIL",
+    "intel",
+    "MIT",
+    "kitti_00",
+    "manhattan",
+)
 
 
 def optimum(graph, weighting=Weighting.ISOTROPIC):
@@ -96,7 +117,9 @@ def optimum(graph, weighting=Weighting.ISOTROPIC):
 
 def test_one_wrong_edge_stands_out_and_no_other():
     graph = pgo.grid(np.random.default_rng(0))
-    t_ij = np.einsum("mba,mb->ma", graph.truth.R[graph.i], graph.truth.t[graph.j] - graph.truth.t[graph.i])
+    t_ij = np.einsum(
+        "mba,mb->ma", graph.truth.R[graph.i], graph.truth.t[graph.j] - graph.truth.t[graph.i]
+    )
     R_ij = np.swapaxes(graph.truth.R[graph.i], 1, 2) @ graph.truth.R[graph.j]
     t_ij[17] += 10.0
     exact = replace(graph, R_ij=R_ij, t_ij=t_ij, information=None)
@@ -112,7 +135,8 @@ def test_right_measurements_give_no_misfit_and_cost_what_is_expected(d):
         graph = pgo.grid_world(2, 40, np.random.default_rng(seed), d=d)
         found += [edge_residuals(*optimum(graph, weighting)) for weighting in Weighting]
     assert np.mean([one.overall for one in found]) == pytest.approx(1.0, abs=0.1)
-    assert sum(one.is_doubtful for one in found) <= 2  # of 20; each of the two tests has a chance of 1 in 100
+    # of 20; each of the two tests has a chance of 1 in 100
+    assert sum(one.is_doubtful for one in found) <= 2
 
 
 def test_the_problem_says_which_cost_is_tested():
@@ -122,7 +146,8 @@ def test_the_problem_says_which_cost_is_tested():
     np.testing.assert_allclose(found.cost, problem.edge_costs(poses), rtol=1e-12, atol=0)
     level = chi2_thresholds(problem, 1.0 - 0.01 / graph.num_edges)
     np.testing.assert_allclose(found.allowed, found.scale * level, rtol=1e-12)
-    of_F, again = edge_residuals(graph, poses), edge_residuals(pgo.PGOProblem(graph), poses)
+    of_F = edge_residuals(graph, poses)
+    again = edge_residuals(pgo.PGOProblem(graph), poses)
     np.testing.assert_allclose(of_F.cost, again.cost, rtol=1e-9, atol=1e-9)
     assert (of_F.allowed / found.allowed).std() > 0.1
     assert of_F.overall == pytest.approx(again.overall, rel=1e-9)
@@ -134,7 +159,9 @@ def test_where_the_median_edge_contradicts_its_matrix_only_what_is_worse_stands_
     found = pgo.edge_residuals(overconfident, graph.truth)
     assert 1e3 < found.scale < 1e4
     assert not found.is_misfit.any()
-    assert found.overall == pytest.approx(1e4 * pgo.edge_residuals(graph, graph.truth).overall, rel=1e-6)
+    assert found.overall == pytest.approx(
+        1e4 * pgo.edge_residuals(graph, graph.truth).overall, rel=1e-6
+    )
     assert found.is_doubtful
 
 
@@ -148,7 +175,9 @@ def test_a_tree_has_nothing_to_test_by():
 
 def test_where_nothing_costs_anything_no_edge_has_a_share():
     def of(cost):
-        return EdgeResiduals(np.zeros(2), np.zeros(2), np.array(cost), np.full(2, 12.0), 1.0, 0.0, 2.0)
+        return EdgeResiduals(
+            np.zeros(2), np.zeros(2), np.array(cost), np.full(2, 12.0), 1.0, 0.0, 2.0
+        )
 
     assert of([0.0, 0.0]).share.tolist() == [0.0, 0.0]
     assert of([0.0, 12.0]).is_misfit.tolist() == [False, False]
@@ -166,9 +195,23 @@ def test_no_edge_of_a_public_graph_is_a_misfit(name, benchmark_problem, benchmar
 
 def test_a_wrong_edge_that_no_edge_shows_is_seen_in_their_sum(benchmark_problem):
     mit = benchmark_problem("MIT").graph
-    ends, measured = (np.array([100]), np.array([600])), pgo.Poses.identity(1, 2)
+    ends = (np.array([100]), np.array([600]))
+    measured = pgo.Poses.identity(1, 2)
     problem, poses = optimum(mit.with_edges(*ends, measured, mit.kappa.max(), mit.tau.max()))
     found = edge_residuals(problem, poses)
     assert not found.is_misfit.any()
     assert found.is_doubtful
     assert found.overall > 1.5 * found.overall_allowed
+
+
+@pytest.mark.parametrize("rank", [4, 5])
+def test_what_rounding_leaves_of_a_singular_matrix_is_not_known(rank):
+    """A matrix of this rank has eigenvalues of rounding size, which are no degrees of freedom."""
+    rng = np.random.default_rng(rank)
+    graph = varied_graph(0, 8, 3)
+    half = rng.standard_normal((graph.num_edges, 6, rank))
+    information = half @ np.swapaxes(half, 1, 2)
+    problem = pgo.PGOProblem(
+        replace(graph, information=information), weighting=Weighting.INFORMATION
+    )
+    np.testing.assert_allclose(chi2_thresholds(problem), chi2.ppf(0.99, rank), rtol=1e-6)

@@ -2,15 +2,16 @@ from dataclasses import replace
 
 import numpy as np
 from graphs import DIMENSIONS, SEEDS, varied_graph
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pgo_models.graphs.scenes import grid
 from pgo_models.relaxations.clique_tree import build_clique_tree, clique_side
 
 
 @given(seed=SEEDS, n=st.integers(2, 40), d=DIMENSIONS)
-def test_every_edge_is_in_a_clique_and_the_intersections_run_along_the_tree(seed: int, n: int, d: int) -> None:
+def test_every_edge_is_in_a_clique_and_the_intersections_run_along_the_tree(
+    seed: int, n: int, d: int
+) -> None:
     graph = varied_graph(seed, n, d)
     tree = build_clique_tree(graph)
     agents = [set(clique.tolist()) for clique in tree.cliques]

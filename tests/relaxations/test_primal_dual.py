@@ -1,4 +1,4 @@
-"""The semidefinite relaxation in its three forms; the optimum by three roads; the bound where it is not tight."""
+"""The semidefinite relaxation in its three forms: its optimum, and its bound if it is not tight."""
 
 import math
 
@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, LOUD_NOISE, OPTIMUM, SEEDS, exact_graph, random_poses, varied_problem
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pgo_models.certificates.certificate import Verdict, relative_gap
 from pgo_models.certificates.dual_variables import multipliers
@@ -32,25 +31,30 @@ from solvers.pipeline import solve
 from solvers.studies.tightness import SweptScene, noisy_scene
 
 FORMS = st.sampled_from(list(RelaxationForm))
-NOT_TIGHT_DEGREES, NOT_TIGHT_SEED = 70.0, 0
+NOT_TIGHT_DEGREES = 70.0
+NOT_TIGHT_SEED = 0
 
 
 def restarts(problem: PGOProblem, count: int, seed: int) -> float:
     """Lowest F that polishing from random rotations finds."""
     starts = (random_poses(problem.num_poses, problem.d, seed + k) for k in range(count))
-    return min(problem.objective(polish(problem, problem.with_best_translations(s.R))) for s in starts)
+    return min(
+        problem.objective(polish(problem, problem.with_best_translations(s.R))) for s in starts
+    )
 
 
 @settings(max_examples=examples(9))
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, form=FORMS)
 def test_three_roads_lead_to_one_optimum(seed: int, n: int, d: int, form: RelaxationForm) -> None:
     problem = varied_problem(seed, n, d)
-    relaxed, solved = solve_relaxation(problem, form, "CLARABEL"), solve(problem)
+    relaxed = solve_relaxation(problem, form, "CLARABEL")
+    solved = solve(problem)
     F = solved.objective
     allowed = DEFAULT_RELAXATION_GAP * max(1.0, F)
     assert solved.is_certified
     assert restarts(problem, 12, seed) == pytest.approx(F, abs=1e-6 * max(1.0, F))
-    if solved.certificate.verdict is not Verdict.EXACT:  # else the relaxation's poses are exact to its accuracy alone
+    # else the relaxation's poses are exact to its accuracy alone
+    if solved.certificate.verdict is not Verdict.EXACT:
         assert relaxed.verdict is Verdict.CERTIFIED
         assert relative_gap(solved.objective, relaxed.lower_bound) <= DEFAULT_RELAXATION_GAP
     assert relaxed.lower_bound <= F
@@ -61,7 +65,9 @@ def test_three_roads_lead_to_one_optimum(seed: int, n: int, d: int, form: Relaxa
 
 @settings(max_examples=examples(9))
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, form=FORMS)
-def test_the_duals_are_the_multipliers_with_their_sign(seed: int, n: int, d: int, form: RelaxationForm) -> None:
+def test_the_duals_are_the_multipliers_with_their_sign(
+    seed: int, n: int, d: int, form: RelaxationForm
+) -> None:
     problem = varied_problem(seed, n, d, LOUD_NOISE)
     solution = solve_relaxation(problem, form, "CLARABEL")
     Lambda = solution.certificate.Lambda
@@ -78,7 +84,8 @@ def test_the_duals_are_the_multipliers_with_their_sign(seed: int, n: int, d: int
 @settings(max_examples=examples(25))
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS)
 def test_weak_duality_for_any_multipliers(seed: int, n: int, d: int) -> None:
-    problem, rng = varied_problem(seed, n, d), np.random.default_rng(seed)
+    problem = varied_problem(seed, n, d)
+    rng = np.random.default_rng(seed)
     Lambda = rng.standard_normal((n, d, d)) * np.exp(rng.uniform(-4, 4))
     Lambda = 0.5 * (Lambda + np.swapaxes(Lambda, 1, 2))
     eta = float(np.abs(Lambda).sum(axis=2).max()) * 1.1
@@ -95,7 +102,9 @@ def test_the_centre_and_the_form_do_not_change_the_value(form: RelaxationForm) -
     assert solve_relaxation(problem, form).value == pytest.approx(F, rel=1e-5)
     if form is RelaxationForm.CLIQUES:
         for seed in range(2):
-            far = clique_relaxation(problem, centre=problem.with_best_translations(random_poses(8, 3, seed).R))
+            far = clique_relaxation(
+                problem, centre=problem.with_best_translations(random_poses(8, 3, seed).R)
+            )
             far.model.solve(solver=cp.CLARABEL, max_threads=1)
             assert far.model.value * far.scale == pytest.approx(F, rel=1e-4)
 
@@ -140,7 +149,8 @@ def test_time_is_limited() -> None:
 @pytest.mark.parametrize("form", list(RelaxationForm))
 def test_measurements_without_noise_cost_nothing(form: RelaxationForm) -> None:
     solution = solve_relaxation(PGOProblem(exact_graph(3, 6, 3)), form, "CLARABEL")
-    assert solution.verdict in (Verdict.EXACT, Verdict.TRIVIAL)  # of zero nothing better than zero is a bound
+    # of zero nothing better than zero is a bound
+    assert solution.verdict in (Verdict.EXACT, Verdict.TRIVIAL)
     assert solution.lower_bound == 0.0
     assert solution.objective <= 1e-6
     assert abs(solution.value) <= 1e-5
@@ -163,12 +173,15 @@ def test_the_rank_report() -> None:
 @settings(max_examples=examples(20))
 @given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS)
 def test_rounding_the_gram_matrix_of_rotations_gives_them_back(seed: int, n: int, d: int) -> None:
-    problem, R = varied_problem(seed, n, d), random_poses(n, d, seed).R
+    problem = varied_problem(seed, n, d)
+    R = random_poses(n, d, seed).R
     Y = problem.with_best_translations(R).stacked()[n:]
     poses, report = round_gram(problem, Y @ Y.T)
     assert report.is_tight
     relative = np.swapaxes(R[:1], 1, 2) @ R
-    np.testing.assert_allclose(np.swapaxes(poses.R[:1], 1, 2) @ poses.R, relative, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        np.swapaxes(poses.R[:1], 1, 2) @ poses.R, relative, rtol=0, atol=1e-9
+    )
 
 
 def choice(problem: PGOProblem) -> tuple[str, str]:
@@ -207,7 +220,12 @@ def test_what_is_beyond_reach_is_refused_with_an_estimate() -> None:
 
 def test_settings_are_checked() -> None:
     problem = varied_problem(0, 3, 2)
-    for name, value in (("gap", 0.0), ("gap", math.inf), ("time_limit", -1.0), ("memory_limit", math.nan)):
+    for name, value in (
+        ("gap", 0.0),
+        ("gap", math.inf),
+        ("time_limit", -1.0),
+        ("memory_limit", math.nan),
+    ):
         with pytest.raises(SettingError, match=f"{name} is"):
             solve_relaxation(problem, **{name: value})
 
@@ -222,7 +240,11 @@ def certified(problem: PGOProblem) -> RelaxationSolution:
 
 @pytest.mark.parametrize("scene", [circle, grid, sphere])
 def test_the_scenes_are_certified(scene) -> None:
-    certified(PGOProblem(scene(np.random.default_rng(0))))
+    solution = certified(PGOProblem(scene(np.random.default_rng(0))))
+    # Clarabel may stop at rounding, short of its own tolerance; what counts is what is proven.
+    assert solution.status in (RelaxationStatus.OPTIMAL, RelaxationStatus.INACCURATE)
+    assert solution.verdict is Verdict.CERTIFIED
+    assert solution.gap <= DEFAULT_RELAXATION_GAP
 
 
 def test_tinyGrid3D_has_its_published_optimum(benchmark_data) -> None:

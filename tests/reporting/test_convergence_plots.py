@@ -19,7 +19,10 @@ PAPER = PublishedRun("some", objective=12.0, optimum=10.0, iterations=20)
 
 def history(length, factor=0.5):
     return History(
-        tuple(Record(k, 0.25 * k, Measurement(10.0 + factor**k, factor**k, 2 * factor**k)) for k in range(length))
+        tuple(
+            Record(k, 0.25 * k, Measurement(10.0 + factor**k, factor**k, 2 * factor**k))
+            for k in range(length)
+        )
     )
 
 
@@ -50,7 +53,8 @@ def test_an_effort_that_was_not_counted_is_refused(effort):
 
 
 def test_stages_follow_each_other_and_what_has_no_logarithm_is_left_out():
-    first, second = history(5), history(4, 0.1)
+    first = history(5)
+    second = history(4, 0.1)
     nothing = Measurement(10.0, 0.0, np.inf)
     second = replace(second, records=(Record(0, 0.0, nothing), *second.records[1:]))
     figure = plot_convergence([("start", History()), ("SOC", first), ("Newton", second)], 10.0)
@@ -58,7 +62,9 @@ def test_stages_follow_each_other_and_what_has_no_logarithm_is_left_out():
     assert [line.get_label() for line in below.lines] == ["SOC, gap", "Newton, gap"]
     assert below.lines[0].get_xdata().tolist() == [0, 1, 2, 3, 4]
     assert below.lines[1].get_xdata().tolist() == [5, 6, 7]  # F is the bound itself at the first
-    np.testing.assert_allclose(below.lines[0].get_ydata(), Curve("", first, 10.0).gap, rtol=1e-12, atol=0)
+    np.testing.assert_allclose(
+        below.lines[0].get_ydata(), Curve("", first, 10.0).gap, rtol=1e-12, atol=0
+    )
     assert len(above.lines) == 4
 
 
@@ -90,11 +96,18 @@ def test_a_run_without_records_is_refused(picture):
 
 @pytest.mark.parametrize("effort", [Effort.ITERATIONS, Effort.SECONDS])
 def test_methods_are_told_apart_by_more_than_colour(effort):
-    figure = plot_efforts([Curve(name, history(9, factor), 9.5) for name, factor in (("a", 0.5), ("b", 0.3))], [effort])
-    one, other = figure.axes[0].lines
-    assert one.get_color() != other.get_color()
-    assert one.get_marker() != other.get_marker()
-    assert (figure.axes[0].get_xscale() == "linear") == (effort is Effort.ITERATIONS) == (0 in one.get_xdata())
+    figure = plot_efforts(
+        [Curve(name, history(9, factor), 9.5) for name, factor in (("a", 0.5), ("b", 0.3))],
+        [effort],
+    )
+    first, second = figure.axes[0].lines
+    assert first.get_color() != second.get_color()
+    assert first.get_marker() != second.get_marker()
+    assert (
+        (figure.axes[0].get_xscale() == "linear")
+        == (effort is Effort.ITERATIONS)
+        == (0 in first.get_xdata())
+    )
     assert effort.value in figure.axes[0].get_xlabel()
 
 

@@ -12,13 +12,20 @@ def chain(n, closures, d):
     i = np.append(np.arange(n - 1), np.arange(closures) % (n - 10))
     j = np.append(np.arange(1, n), np.arange(closures) % (n - 10) + 10)
     ones = np.ones(len(i))
-    return pgo.PoseGraph(n, i, j, np.tile(np.eye(d), (len(i), 1, 1)), np.ones((len(i), d)), ones, ones)
+    return pgo.PoseGraph(
+        n, i, j, np.tile(np.eye(d), (len(i), 1, 1)), np.ones((len(i), d)), ones, ones
+    )
 
 
 # Peaks of `pgo solve` on grid worlds of so many poses and edges, less 80 MB of the program, in GB.
 @pytest.mark.parametrize(
     ("d", "n", "m", "measured"),
-    [(2, 100_000, 167_400, 0.70), (2, 300_000, 518_997, 2.22), (3, 30_000, 50_927, 1.19), (3, 50_000, 84_830, 2.36)],
+    [
+        (2, 100_000, 167_400, 0.70),
+        (2, 300_000, 518_997, 2.22),
+        (3, 30_000, 50_927, 1.19),
+        (3, 50_000, 84_830, 2.36),
+    ],
 )
 def test_the_memory_of_a_large_graph_is_said_as_it_was_measured(d, n, m, measured):
     words = memory_note(chain(n, m - n + 1, d)).split()

@@ -12,11 +12,13 @@ import solvers
 from pgo_models.certificates.certificate import BoundSource
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.errors import SettingError
-from solvers import cli
+from pgo_models.figures import rounded_up
+from solvers.cli import app as cli
 from solvers.network.ledger import Ledger, Traffic
+from solvers.reporting.edge_fit import EdgeFit, fit_sentence
 from solvers.reporting.fit_plots import explore_fit
 from solvers.reporting.report import report_page
-from solvers.reporting.report_text import advice, fit, headline, meaning, percent
+from solvers.reporting.report_text import advice, headline, meaning, percent
 
 pytest.importorskip("plotly")
 
@@ -27,15 +29,18 @@ def page(solution):
 
 
 def test_the_numbers_are_those_of_the_solution(solution, page):
-    for figure in (solution.objective, solution.lower_bound):
-        assert f"{figure:.10g}" in page.text
-    assert f"{solution.gap:.3g}" in page.text
+    certificate = solution.certificate
+    for figure in (certificate.cost_text, certificate.bound_text, certificate.gap_text):
+        assert figure in page.text
     assert "CERTIFIED" in page.text
     head, *stages = page.tables["stages"]
     assert head == ["stage", "iterations", "F", "seconds", "ended"]
     assert [row[0] for row in stages] == [stage.name for stage in solution.stages]
-    assert [row[2] for row in stages] == [f"{stage.objective:.10g}" for stage in solution.stages]
-    assert f"{pgo.absolute_trajectory_error(solution.poses, solution.problem.graph.truth):.4g} m" in page.text
+    assert [row[2] for row in stages] == [rounded_up(stage.objective) for stage in solution.stages]
+    assert (
+        f"{pgo.absolute_trajectory_error(solution.poses, solution.problem.graph.truth):.4g} m"
+        in page.text
+    )
 
 
 def test_the_worst_edges_come_first_with_their_figures(solution, page):
@@ -47,8 +52,15 @@ def test_the_worst_edges_come_first_with_their_figures(solution, page):
     assert costs == sorted(costs, reverse=True)
     for row in rows:
         e = int(row[0])
-        figures = [residuals.cost[e], residuals.allowed[e], residuals.translation[e], np.rad2deg(residuals.rotation[e])]
-        shown = [float(row[head.index(name)]) for name in ("cost", "allowed", "error (m)", "error (deg)")]
+        figures = [
+            residuals.cost[e],
+            residuals.allowed[e],
+            residuals.translation[e],
+            np.rad2deg(residuals.rotation[e]),
+        ]
+        shown = [
+            float(row[head.index(name)]) for name in ("cost", "allowed", "error (m)", "error (deg)")
+        ]
         np.testing.assert_allclose(shown, figures, rtol=1e-3, atol=0)
         assert (
             row[head.index("from pose")]
@@ -61,7 +73,10 @@ def test_the_worst_edges_come_first_with_their_figures(solution, page):
 def test_the_robots_share_everything(solution, page):
     graph = solution.problem.graph
     head, *rows = page.tables["robots"]
-    columns = {name: [float(row[k].rstrip(" %").replace(",", "")) for row in rows] for k, name in enumerate(head)}
+    columns = {
+        name: [float(row[k].rstrip(" %").replace(",", "")) for row in rows]
+        for k, name in enumerate(head)
+    }
     assert sum(columns["poses"]) == graph.num_poses
     assert sum(columns["own edges"]) + sum(columns["edges to others"]) / 2 == graph.num_edges
     assert sum(columns["share of F"]) == pytest.approx(100, abs=0.5 * len(rows))
@@ -98,37 +113,46 @@ def test_communication_is_shown_when_it_was_counted(solution):
     ring = np.arange(count)
     traffic = Traffic(ring, (ring + 1) % count, 80 * (1 + ring))
     ledger = Ledger(count).after_round(traffic).after_round(traffic).after_all_reduce(10)
-    page = Page(report_page(replace(solution, ledger=ledger, robots=pgo.partition(solution.problem.graph))))
+    page = Page(
+        report_page(replace(solution, ledger=ledger, robots=pgo.partition(solution.problem.graph)))
+    )
     assert f"2 rounds, {2 * count} messages, {ledger.num_bytes:,} bytes, 1 all-reduces" in page.text
     head, *rows = page.tables["robots"]
-    for name, expected in (("bytes sent", ledger.bytes_sent), ("bytes received", ledger.bytes_received)):
+    for name, expected in (
+        ("bytes sent", ledger.bytes_sent),
+        ("bytes received", ledger.bytes_received),
+    ):
         assert [int(row[head.index(name)].replace(",", "")) for row in rows] == expected.tolist()
     assert "bytes sent" not in Page(report_page(solution)).tables["robots"][0]
 
 
 def test_settings_and_versions_are_on_the_page(solution, page):
-    newton = next(stage.method for stage in solution.stages if isinstance(stage.method, solvers.Newton))
+    newton = next(
+        stage.method for stage in solution.stages if isinstance(stage.method, solvers.Newton)
+    )
     assert f"tolerance {newton.tolerance}" in page.text
     assert f"numpy {np.__version__}" in page.text
 
 
-@pytest.mark.parametrize("name", ["</script><script>alert(1)</script>", "<img src=x onerror=alert(1)>", "a&b\"c'd"])
+@pytest.mark.parametrize(
+    "name", ["</script><script>alert(1)</script>", "<img src=x onerror=alert(1)>", "a&b\"c'd"]
+)
 def test_names_are_escaped_wherever_they_stand(name, solution):
     graph = replace(solution.problem.graph, name=name)
     renamed = replace(solution, problem=pgo.PGOProblem(graph))
     text = own_part(report_page(renamed))
-    found = Page(text)
-    assert name in found.text
-    assert found.scripts == 4
-    assert found.asked == ["data:,"]
+    page = Page(text)
+    assert name in page.text
+    assert page.scripts == 4
+    assert page.asked == ["data:,"]
     assert text.count("</script>") == 4
 
 
 def test_the_page_asks_for_nothing_online(solution):
     text = report_page(solution)
     assert text.count("plotly.js v") == 1
-    found = Page(own_part(text))
-    assert found.asked == ["data:,"]  # the icon, which browsers would else ask for
+    page = Page(own_part(text))
+    assert page.asked == ["data:,"]  # the icon, which browsers would else ask for
     assert "default-src 'none'" in text
     assert "@import" not in own_part(text)
     assert "url(" not in own_part(text)
@@ -151,7 +175,9 @@ def test_a_report_is_written_whole_under_a_pages_name_only(solution, tmp_path):
 
 
 @pytest.mark.parametrize("package", ["plotly", "jinja2"])
-def test_without_its_package_one_line_names_the_extra_before_anything_is_solved(package, monkeypatch, tmp_path, capsys):
+def test_without_its_package_one_line_names_the_extra_before_anything_is_solved(
+    package, monkeypatch, tmp_path, capsys
+):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(SystemExit) as end:
         cli.main(["solve", "no-such-graph", "--report", str(tmp_path / "out.html")])
@@ -169,13 +195,16 @@ def test_the_command_line_writes_one_whose_commands_can_be_typed(unit_weights, t
         cli.main(["solve", "grid", *options, "--report", str(tmp_path / "out.html")])
     assert end.value.code == 0
     assert f"written: {tmp_path / 'out.html'}" in capsys.readouterr().out
-    commands = re.findall("<code>(.*?)</code>", own_part((tmp_path / "out.html").read_text(encoding="utf-8")))
+    commands = re.findall(
+        "<code>(.*?)</code>", own_part((tmp_path / "out.html").read_text(encoding="utf-8"))
+    )
     assert commands[0].split()[:3] == ["pgo", "solve", "grid"]
     assert all(("--unit-weights" in command) == unit_weights for command in commands)
 
 
 def cases(solution, uncertain):
-    graph, certificate = solution.problem.graph, solution.certificate
+    graph = solution.problem.graph
+    certificate = solution.certificate
     yield graph, certificate, solvers.Status.CONVERGED
     yield graph, replace(certificate, wanted_gap=1e-9), solvers.Status.CONVERGED
     yield graph, replace(certificate, verdict=pgo.Verdict.EXACT, gap=0.0), solvers.Status.CONVERGED
@@ -185,53 +214,82 @@ def cases(solution, uncertain):
     yield graph, wide, solvers.Status.CONVERGED
     yield graph, replace(wide, source=BoundSource.RELAXATION), solvers.Status.CONVERGED
     yield graph, replace(wide, gap=3e-9, wanted_gap=1e-12), solvers.Status.CONVERGED
-    yield graph, replace(wide, verdict=pgo.Verdict.TRIVIAL, gap=1.0, bound=NO_BOUND), solvers.Status.CONVERGED
+    yield (
+        graph,
+        replace(wide, verdict=pgo.Verdict.TRIVIAL, gap=1.0, bound=NO_BOUND),
+        solvers.Status.CONVERGED,
+    )
 
 
 def test_every_case_has_a_verdict_and_something_to_try(solution, uncertain, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    known = {option for command in ("solve", "certify") for option in options_of(command)} | {"--robust"}
+    known = {option for command in ("solve", "certify") for option in options_of(command)} | {
+        "--robust"
+    }
     residuals = solution.edge_residuals
     doubtful = replace(residuals, allowed=np.where(np.arange(212) < 3, -1.0, np.inf))
     for graph, certificate, status in cases(solution, uncertain):
         assert certificate.is_certified == headline(certificate).startswith("Certified")
-        assert f"{certificate.objective:.10g}" in meaning(certificate)[0]
-        found = advice(graph, certificate, status, doubtful)
-        assert any(one.command.endswith("--robust gnc") and "3 edges cost" in one.text for one in found)
-        for one in found:
-            words = shlex.split(one.command)
+        assert certificate.cost_text in meaning(certificate)[0]
+        suggestions = advice(graph, certificate, status, EdgeFit("F", doubtful))
+        assert any(
+            piece.command.endswith("--robust gnc") and "3 edges cost" in piece.text
+            for piece in suggestions
+        )
+        for piece in suggestions:
+            words = shlex.split(piece.command)
             assert not words or words[0] == "pgo"
             assert {word for word in words if word.startswith("--")} <= known
-        assert status.is_success or "run" in found[0].text or "overflowed" in found[0].text
+        assert (
+            status.is_success or "run" in suggestions[0].text or "overflowed" in suggestions[0].text
+        )
 
 
 def options_of(command):
     import typer
 
-    return [text for parameter in typer.main.get_command(cli.app).commands[command].params for text in parameter.opts]
+    return [
+        text
+        for parameter in typer.main.get_command(cli.app).commands[command].params
+        for text in parameter.opts
+    ]
 
 
 def test_a_gap_that_was_nearly_reached_is_offered(solution):
-    residuals = solution.edge_residuals
-    nearly = replace(solution.certificate, verdict=pgo.Verdict.NOT_CERTIFIED, gap=3e-9, wanted_gap=1e-12)
+    fit = EdgeFit("F", solution.edge_residuals)
+    nearly = replace(
+        solution.certificate, verdict=pgo.Verdict.NOT_CERTIFIED, gap=3e-9, wanted_gap=1e-12
+    )
     commands = [
-        one.command for one in advice(solution.problem.graph, nearly, solvers.Status.CONVERGED, residuals, "x y.g2o")
+        piece.command
+        for piece in advice(
+            solution.problem.graph, nearly, solvers.Status.CONVERGED, fit, "x y.g2o"
+        )
     ]
     assert "pgo solve x y.g2o --gap 1e-08" in commands
 
 
 def test_what_the_edges_say_together_is_said(solution):
-    residuals = replace(solution.edge_residuals, allowed=np.full(212, np.inf), scale=1.0, overall=1.0)
+    residuals = replace(
+        solution.edge_residuals, allowed=np.full(212, np.inf), scale=1.0, overall=1.0
+    )
     assert not residuals.is_doubtful
-    assert fit(residuals, "F").startswith("No edge costs more than errors as its information matrix says (F is 1 times")
-    assert "by chance" not in fit(residuals, "F")
+    assert fit_sentence(residuals, "F").startswith(
+        "No edge costs more than errors as its information matrix says (F is 1 times"
+    )
+    assert "by chance" not in fit_sentence(residuals, "F")
     bent = replace(residuals, overall=2.0, scale=7.0)
     assert bent.is_doubtful
-    assert "times 7, which half of all edges exceed" in fit(bent, "chi2")
-    assert f"(chi2 is 2 times what is expected, and over {bent.overall_allowed:.3g} by chance" in fit(bent, "chi2")
-    assert "errors are 10 times smaller than the matrices say" in fit(replace(residuals, overall=0.01), "F")
-    one = replace(residuals, allowed=np.where(np.arange(212) == 7, -1.0, np.inf))
-    assert fit(one, "F").startswith("1 edge costs")
+    assert "times 7, which half of all edges exceed" in fit_sentence(bent, "chi2")
+    assert (
+        f"(chi2 is 2 times what is expected, and over {bent.overall_allowed:.3g} by chance"
+        in fit_sentence(bent, "chi2")
+    )
+    assert "errors are 10 times smaller than the matrices say" in fit_sentence(
+        replace(residuals, overall=0.01), "F"
+    )
+    with_one_misfit = replace(residuals, allowed=np.where(np.arange(212) == 7, -1.0, np.inf))
+    assert fit_sentence(with_one_misfit, "F").startswith("1 edge costs")
 
 
 def test_exact_measurements_are_reported_too():
@@ -239,7 +297,9 @@ def test_exact_measurements_are_reported_too():
     exact = replace(
         graph,
         R_ij=np.swapaxes(graph.truth.R[graph.i], 1, 2) @ graph.truth.R[graph.j],
-        t_ij=np.einsum("mba,mb->ma", graph.truth.R[graph.i], graph.truth.t[graph.j] - graph.truth.t[graph.i]),
+        t_ij=np.einsum(
+            "mba,mb->ma", graph.truth.R[graph.i], graph.truth.t[graph.j] - graph.truth.t[graph.i]
+        ),
         information=None,
     )
     solution = solvers.solve(exact)
@@ -252,16 +312,25 @@ def test_exact_measurements_are_reported_too():
 
 @pytest.mark.parametrize(
     ("share", "text"),
-    [(0.0, "0 %"), (1.0, "100 %"), (0.123456, "12 %"), (1e-3, "0.1 %"), (4.6e-3, "0.46 %"), (1.28e-14, "1.3e-12 %")],
+    [
+        (0.0, "0 %"),
+        (1.0, "100 %"),
+        (0.123456, "13 %"),
+        (2.0**-10, "0.098 %"),
+        (4.51e-3, "0.46 %"),
+        (1.21e-14, "1.3e-12 %"),
+    ],
 )
-def test_percentages_have_two_digits(share, text):
+def test_percentages_have_two_digits_and_are_rounded_up(share, text):
     assert percent(share) == text
 
 
 def test_the_histogram_counts_every_edge(solution):
     residuals = solution.edge_residuals
     for shown, misfits in ((residuals, 0), (replace(residuals, allowed=0.5 * residuals.cost), 212)):
-        bars = {trace.name: sum(trace.y) for trace in explore_fit(shown, 3).data if trace.type == "bar"}
+        bars = {
+            trace.name: sum(trace.y) for trace in explore_fit(shown, 3).data if trace.type == "bar"
+        }
         assert (bars.get("misfits", 0), sum(bars.values())) == (misfits, 212)
     (curve,) = [trace for trace in explore_fit(residuals, 3).data if trace.type == "scatter"]
     assert sum(value or 0.0 for value in curve.y) == pytest.approx(212, rel=0.01)

@@ -9,21 +9,27 @@ import pgo_models as pgo
 import solvers
 from pgo_models.plots.interactive_plots import animate_poses, save_page
 
+pytestmark = pytest.mark.slow  # clicks in a browser
+
 pytest.importorskip("plotly")
 
 
 def test_the_browser_hears_what_goes_wrong(browser, tmp_path):
     page = tmp_path / "wrong.html"
-    page.write_text("<img src='missing.png'><script>console.error('one'); throw Error('two')</script>")
+    page.write_text(
+        "<img src='missing.png'><script>console.error('one'); throw Error('two')</script>"
+    )
     browser.open(page)
     browser.wait_for("true")
-    told = " ".join(browser.errors)
-    assert all(word in told for word in ("one", "two", "missing.png"))
+    errors = " ".join(browser.errors)
+    assert all(word in errors for word in ("one", "two", "missing.png"))
     assert (tmp_path / "missing.png").as_uri() in browser.requests
 
 
 @pytest.mark.parametrize("which", ["solution", "uncertain", "plane"])
-def test_a_browser_shows_it_without_a_complaint_and_sorts_the_table(which, browser, tmp_path, request):
+def test_a_browser_shows_it_without_a_complaint_and_sorts_the_table(
+    which, browser, tmp_path, request
+):
     if which == "plane":
         solved = solvers.solve(pgo.random_geometric(40, np.random.default_rng(0), d=2))
     else:
@@ -34,26 +40,37 @@ def test_a_browser_shows_it_without_a_complaint_and_sorts_the_table(which, brows
     place = "graph2d" if which == "plane" else "graph3d"
     for plot in (place, "convergence"):
         browser.wait_for(f"document.getElementById('{plot}')._fullData?.length > 0")
-        assert browser.value(f"document.getElementById('{plot}').getBoundingClientRect().height") > 300
+        assert (
+            browser.value(f"document.getElementById('{plot}').getBoundingClientRect().height") > 300
+        )
     # WebGL has drawn: no message in its place.
     assert browser.value(f"document.querySelectorAll('#{place} canvas').length") > 0
     assert "WebGL is not supported" not in browser.value("document.body.innerText")
     column = browser.value(
-        "[...document.querySelectorAll('#edges th')].findIndex(head => head.innerText.startsWith('error (m)'))"
+        "[...document.querySelectorAll('#edges th')]"
+        ".findIndex(head => head.innerText.startsWith('error (m)'))"
     )
-    cells = f"[...document.querySelectorAll('#edges tbody tr')].map(row => +row.cells[{column}].dataset.value)"
+    cells = (
+        "[...document.querySelectorAll('#edges tbody tr')]"
+        f".map(row => +row.cells[{column}].dataset.value)"
+    )
     before = browser.value(cells)
     for descending in (True, False):
         browser.click(f"#edges th:nth-child({column + 1}) button")
         assert browser.value(cells) == sorted(before, reverse=descending)
-    assert browser.value("document.querySelector('#edges th[aria-sort]').getAttribute('aria-sort')") == "ascending"
+    assert (
+        browser.value("document.querySelector('#edges th[aria-sort]').getAttribute('aria-sort')")
+        == "ascending"
+    )
     assert browser.errors == []
     assert browser.requests == [(tmp_path / "out.html").as_uri()]
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [390, 1150])
-def test_it_fits_a_phone_and_follows_the_colours_of_the_system(width, scheme, browser, solution, tmp_path):
+def test_it_fits_a_phone_and_follows_the_colours_of_the_system(
+    width, scheme, browser, solution, tmp_path
+):
     solution.report(tmp_path / "out.html")
     with browser.showing(width, scheme):
         browser.open(tmp_path / "out.html")
@@ -65,7 +82,14 @@ def test_it_fits_a_phone_and_follows_the_colours_of_the_system(width, scheme, br
         )
         assert max(edges) <= width
         ground, ink = (
-            sum(map(int, re.findall(r"\d+", browser.value(f"getComputedStyle(document.body).{name}"))[:3]))
+            sum(
+                map(
+                    int,
+                    re.findall(r"\d+", browser.value(f"getComputedStyle(document.body).{name}"))[
+                        :3
+                    ],
+                )
+            )
             for name in ("backgroundColor", "color")
         )
         assert (ground < ink) == (scheme == "dark")
@@ -78,7 +102,8 @@ def test_the_page_is_painted_before_the_library_is_parsed(browser, solution, tmp
     solution.report(tmp_path / "out.html")
     browser.open(tmp_path / "out.html")
     browser.wait_for(
-        "performance.getEntriesByName('library').length + performance.getEntriesByType('paint').length > 2"
+        "performance.getEntriesByName('library').length"
+        " + performance.getEntriesByType('paint').length > 2"
     )
     painted = browser.value("performance.getEntriesByName('first-contentful-paint')[0].startTime")
     assert painted <= browser.value("performance.getEntriesByName('library')[0].startTime")
@@ -94,7 +119,8 @@ def test_a_large_graph_is_thinned_and_its_page_can_be_opened(browser, solution, 
     browser.open(tmp_path / "out.html")
     browser.wait_for("document.getElementById('graph2d')._fullData?.length > 0")
     entries = browser.value(
-        "document.getElementById('graph2d')._fullData.filter(one => one.showlegend).map(one => one.name)"
+        "document.getElementById('graph2d')._fullData"
+        ".filter(trace => trace.showlegend).map(trace => trace.name)"
     )
     assert entries[:2] == ["before", "poses 0 to 7420"]
     assert browser.errors == []

@@ -15,7 +15,9 @@ RECORDS = (
     {"graph": "grid", "objective": 97.01402085123456, "rounds": 32},
     {"graph": "rim", "objective": math.nan, "rounds": None},
 )
-TABLE = ResultTable((TablePart(HEADS, ROWS, "Cost"), TablePart(HEADS[:2], (("x", "1"),))), RECORDS, ("a note",))
+TABLE = ResultTable(
+    (TablePart(HEADS, ROWS, "Cost"), TablePart(HEADS[:2], (("x", "1"),))), RECORDS, ("a note",)
+)
 
 
 def test_markdown_has_every_part_with_figures_to_the_right_and_bars_escaped():
@@ -58,7 +60,9 @@ def test_nothing_is_cut_off_at_any_width(width, capsys):
 def test_a_wide_table_is_printed_in_blocks_within_80_columns(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     heads = ("graph", "method", *(f"figure {k}" for k in range(12)), "remark")
-    rows = tuple((name, "SOC", *(f"{k}.123456" for k in range(12)), "why " * 60) for name in ("grid", "rim"))
+    rows = tuple(
+        (name, "SOC", *(f"{k}.123456" for k in range(12)), "why " * 60) for name in ("grid", "rim")
+    )
     table = ResultTable((TablePart(heads, rows),), RECORDS, ("note " * 40,))
     table.print()
     lines = capsys.readouterr().out.splitlines()
@@ -98,6 +102,8 @@ def test_a_row_has_a_cell_for_every_head():
         TablePart(HEADS, (("a", "b"),))
 
 
-@pytest.mark.parametrize(("gap", "text"), [(0.0, "0"), (0.5, "50"), (0.123456, "12"), (3.2e-9, "3.2e-07")])
-def test_gaps_are_in_percent(gap, text):
+@pytest.mark.parametrize(
+    ("gap", "text"), [(0.0, "0"), (0.5, "50"), (0.123456, "13"), (3.11e-9, "3.2e-07")]
+)
+def test_gaps_are_in_percent_rounded_up(gap, text):
     assert gap_percent(gap) == text

@@ -1,4 +1,4 @@
-"""The Riemannian staircase: published optima, bad starts that it leaves, and the bound where rounding is not tight."""
+"""The Riemannian staircase: published optima, bad starts, and bounds of loose relaxations."""
 
 from collections.abc import Callable
 
@@ -16,10 +16,15 @@ from graphs import (
     varied_graph,
     wound_ring,
 )
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 
-from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, Verdict, certify_at, certify_with
+from pgo_models.certificates.certificate import (
+    DEFAULT_GAP,
+    BoundSource,
+    Verdict,
+    certify_at,
+    certify_with,
+)
 from pgo_models.certificates.lower_bound import prove_bound
 from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import SettingError
@@ -38,11 +43,15 @@ SDP_TOLERANCE = 1e4 * TOLERANCE
 def assert_bound_is_proven(problem: PGOProblem, state: StaircaseState) -> None:
     assert state.bound is not None
     assert not state.bound.bound.is_grounded
-    assert prove_bound(problem, state.bound.Lambda, state.bound.bound.eta) == state.bound.lower_bound
+    assert (
+        prove_bound(problem, state.bound.Lambda, state.bound.bound.eta) == state.bound.lower_bound
+    )
 
 
 @pytest.mark.parametrize("name", OPTIMUM)
-def test_the_published_optimum_is_reached_and_proven(name: str, benchmark_problem: Callable[[str], PGOProblem]) -> None:
+def test_the_published_optimum_is_reached_and_proven(
+    name: str, benchmark_problem: Callable[[str], PGOProblem]
+) -> None:
     problem = benchmark_problem(name)
     result = run(Staircase(), problem)
     assert result.status is Status.CONVERGED
@@ -54,7 +63,9 @@ def test_the_published_optimum_is_reached_and_proven(name: str, benchmark_proble
 
 
 @pytest.mark.parametrize("name", ["smallGrid3D", "intel"])
-def test_random_rotations_are_as_good_a_start(name: str, benchmark_problem: Callable[[str], PGOProblem]) -> None:
+def test_random_rotations_are_as_good_a_start(
+    name: str, benchmark_problem: Callable[[str], PGOProblem]
+) -> None:
     problem = benchmark_problem(name)
     result = run(Staircase(), problem, random_poses(problem.num_poses, problem.d, 0))
     assert result.status is Status.CONVERGED
@@ -103,7 +114,8 @@ def test_where_the_relaxation_is_not_tight_its_optimum_is_that_of_the_semidefini
     problem = PGOProblem(noisy_scene(scene, np.deg2rad(degrees), np.random.default_rng(seed)))
     result = run(Staircase(), problem)
     program = solve_relaxation(problem, gap=DEFAULT_GAP)
-    value, bound = result.state.point.value, result.state.bound
+    value = result.state.point.value
+    bound = result.state.bound
     assert result.status is Status.CONVERGED
     assert bound is not None
     assert value == pytest.approx(program.value, rel=SDP_TOLERANCE)
@@ -111,7 +123,9 @@ def test_where_the_relaxation_is_not_tight_its_optimum_is_that_of_the_semidefini
     assert_bound_is_proven(problem, result.state)
     # Rounding loses something, and the point of rank d knows of no bound as good.
     assert value < 0.999 * result.objective
-    assert result.history.primal_residual[-1] == pytest.approx((result.objective - value) / result.objective)
+    assert result.history.primal_residual[-1] == pytest.approx(
+        (result.objective - value) / result.objective
+    )
     poses = polish(problem, result.poses)
     at_rank_d = certify_at(problem, poses)
     relaxed = certify_with(problem, poses, bound.Lambda, DEFAULT_GAP, 0.0, BoundSource.RELAXATION)
@@ -121,13 +135,16 @@ def test_where_the_relaxation_is_not_tight_its_optimum_is_that_of_the_semidefini
 
 
 @settings(max_examples=examples(25))
-@example(seed=15590, n=2, d=2)  # one edge: F wavers about its rounding level, and there may be nothing to climb from
+@example(
+    seed=15590, n=2, d=2
+)  # one edge: F wavers about its rounding level, and there may be nothing to climb from
 @given(seed=SEEDS, n=st.integers(2, 10), d=DIMENSIONS)
 def test_its_bound_holds_at_any_noise_and_start(seed: int, n: int, d: int) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE))
     result = run(Staircase(), problem, random_poses(n, d, seed))
     bound = result.state.bound
-    if bound is None or not result.objective > 1e-15:  # a tree, or as good as one: no bound is better than zero
+    # a tree, or as good as one: no bound is better than zero
+    if bound is None or not result.objective > 1e-15:
         assert result.objective <= 1e-15
         assert bound is None or bound.lower_bound <= 1e-15
         return

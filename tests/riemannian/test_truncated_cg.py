@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from graphs import SEEDS
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from solvers.riemannian.truncated_cg import TruncatedStep, truncated_conjugate_gradients
 
@@ -18,8 +17,12 @@ def spectrum(seed: int, low: float, high: float) -> tuple[np.ndarray, np.ndarray
     return (V * rng.uniform(low, high, SIDE)) @ V.T, rng.standard_normal(SIDE)
 
 
-def solve(H: np.ndarray, P: np.ndarray, g: np.ndarray, radius: float, forcing: float = 1e-10) -> TruncatedStep:
-    return truncated_conjugate_gradients(g, lambda v: H @ v, lambda v: np.linalg.solve(P, v), radius, forcing, 0.0, 200)
+def solve(
+    H: np.ndarray, P: np.ndarray, g: np.ndarray, radius: float, forcing: float = 1e-10
+) -> TruncatedStep:
+    return truncated_conjugate_gradients(
+        g, lambda v: H @ v, lambda v: np.linalg.solve(P, v), radius, forcing, 0.0, 200
+    )
 
 
 @given(seed=SEEDS)
@@ -35,7 +38,9 @@ def test_in_a_wide_region_it_is_the_newton_step(seed: int) -> None:
 
 
 @given(seed=SEEDS, low=st.sampled_from([-5.0, 0.5]), radius=st.floats(1e-3, 1.0))
-def test_at_the_boundary_it_is_better_than_the_cauchy_point(seed: int, low: float, radius: float) -> None:
+def test_at_the_boundary_it_is_better_than_the_cauchy_point(
+    seed: int, low: float, radius: float
+) -> None:
     H, g = spectrum(seed, low, 10.0)
     P, _ = spectrum(seed + 1, 0.5, 5.0)
     found = solve(H, P, g, radius)
@@ -62,8 +67,15 @@ def test_negative_curvature_leads_to_the_boundary(seed: int) -> None:
 @given(seed=SEEDS)
 def test_it_ends_as_roughly_as_it_may(seed: int) -> None:
     H, g = spectrum(seed, 0.5, 50.0)
-    rough, fine = solve(H, np.eye(SIDE), g, 1e6, 0.3), solve(H, np.eye(SIDE), g, 1e6, 1e-8)
+    rough = solve(H, np.eye(SIDE), g, 1e6, 0.3)
+    fine = solve(H, np.eye(SIDE), g, 1e6, 1e-8)
     assert rough.iterations <= fine.iterations
     assert np.linalg.norm(H @ rough.step + g) <= 0.3 * np.linalg.norm(g) * (1 + 1e-9)
-    assert truncated_conjugate_gradients(g, lambda v: H @ v, lambda v: v, 1e6, 1e-8, 0.0, 2).iterations == 2
-    assert truncated_conjugate_gradients(g, lambda v: H @ v, lambda v: v, 1e6, 1e-8, 1e9, 9).iterations == 0
+    assert (
+        truncated_conjugate_gradients(g, lambda v: H @ v, lambda v: v, 1e6, 1e-8, 0.0, 2).iterations
+        == 2
+    )
+    assert (
+        truncated_conjugate_gradients(g, lambda v: H @ v, lambda v: v, 1e6, 1e-8, 1e9, 9).iterations
+        == 0
+    )

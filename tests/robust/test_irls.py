@@ -1,4 +1,4 @@
-"""Huber's loss by reweighting: its majorant, its minimum, and the same from SOC and from a cvxpy model."""
+"""Huber's loss by reweighting: its majorant, and its minimum by Newton, SOC and a cvxpy model."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pgo_models.certificates.newton_polish import relative_decrement
 from pgo_models.convex.graph_subproblem import Neighbours, Unknowns, graph_qp, robot_qp
@@ -37,36 +36,42 @@ def spoiled(seed: int, n: int = 8) -> PoseGraph:
 
 
 @given(st.floats(0.0, 1e6), st.floats(1e-3, 1e6), st.floats(1e-3, 1e3))
-def test_the_weighted_square_lies_above_the_loss_and_touches_it(square: float, at: float, threshold: float) -> None:
-    s, s_0, c = (np.array([x]) for x in (square, at, threshold))
+def test_the_weighted_square_lies_above_the_loss_and_touches_it(
+    square: float, contact: float, threshold: float
+) -> None:
+    s = np.array([square])
+    s_0 = np.array([contact])
+    c = np.array([threshold])  # c^2 of the loss
     weight = np.sqrt(c / np.maximum(s_0, c))
-    assert (huber(s, c) <= huber(s_0, c) + weight * (s - s_0) + 1e-9 * (1.0 + s + s_0)).all()
+    majorant = huber(s_0, c) + weight * (s - s_0)
+    assert (huber(s, c) <= majorant + 1e-9 * (1.0 + s + s_0)).all()
     assert huber(c, c) == pytest.approx(c)
     assert huber(4.0 * c, c) == pytest.approx(3.0 * c)  # r = 2 c: 2 c r - c^2
     step = 1e-6 * s_0
-    np.testing.assert_allclose((huber(s_0 + step, c) - huber(s_0 - step, c)) / (2.0 * step), weight, rtol=1e-4, atol=0)
+    slope = (huber(s_0 + step, c) - huber(s_0 - step, c)) / (2.0 * step)
+    np.testing.assert_allclose(slope, weight, rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("weighting", list(Weighting))
 def test_the_cost_falls_to_a_stationary_point(weighting: Weighting) -> None:
     problem = PGOProblem(spoiled(0, 20), weighting=weighting)
-    found = run(IRLS(tolerance=1e-14), problem)
-    assert found.status is Status.CONVERGED
-    objective = np.array(found.history.objective)
+    result = run(IRLS(tolerance=1e-14), problem)
+    assert result.status is Status.CONVERGED
+    objective = np.array(result.history.objective)
     assert (np.diff(objective) <= 1e-12 * objective[0]).all()
     thresholds = chi2_thresholds(problem)
-    costs = problem.edge_costs(found.poses)
+    costs = problem.edge_costs(result.poses)
     assert (costs > thresholds).any()
     assert objective[-1] == pytest.approx(float(huber(costs, thresholds).sum()), rel=1e-12)
     weights = np.sqrt(thresholds / np.maximum(costs, thresholds))
     weighted = replace(problem, weighting=problem.weights.scaled(weights))
-    assert relative_decrement(weighted, found.poses) < 1e-8
+    assert relative_decrement(weighted, result.poses) < 1e-8
 
 
 def test_without_large_residuals_it_is_least_squares() -> None:
     problem = PGOProblem(random_geometric(12, np.random.default_rng(1)))
-    found = run(IRLS(quantile=1.0 - 1e-12), problem)
-    assert relative_decrement(problem, found.poses) < 1e-12
+    result = run(IRLS(quantile=1.0 - 1e-12), problem)
+    assert relative_decrement(problem, result.poses) < 1e-12
 
 
 def test_soc_and_a_cvxpy_model_find_the_same_minimum() -> None:
@@ -75,7 +80,8 @@ def test_soc_and_a_cvxpy_model_find_the_same_minimum() -> None:
     newton = run(IRLS(tolerance=1e-14), problem).state.objective
     soc = SOC(penalty=MultiplierPenalty(max_refreshes=0), tolerance=1e-6)
     by_weights = run(IRLS(inner=soc, inner_steps=soc.max_iterations), problem)
-    model = run(ExtendedSOC(huber_change(np.arange(problem.graph.num_edges), thresholds), soc=soc), problem)
+    every_edge = np.arange(problem.graph.num_edges)
+    model = run(ExtendedSOC(huber_change(every_edge, thresholds), soc=soc), problem)
     for poses in (by_weights.poses, model.poses):
         cost = float(huber(problem.edge_costs(poses), thresholds).sum())
         assert cost == pytest.approx(float(newton), rel=1e-6)
@@ -83,9 +89,11 @@ def test_soc_and_a_cvxpy_model_find_the_same_minimum() -> None:
 
 def test_the_model_keeps_the_squares_of_other_edges() -> None:
     graph = spoiled(5)
-    problem, edges = PGOProblem(graph), np.array([1, 4, 5])
+    problem = PGOProblem(graph)
+    edges = np.array([1, 4, 5])
     thresholds = 0.1 * chi2_thresholds(problem)
-    model = graph_qp(graph, np.full(graph.num_poses, 3.0), changer=huber_change(edges, thresholds))
+    rho = np.full(graph.num_poses, 3.0)
+    model = graph_qp(graph, rho, changer=huber_change(edges, thresholds))
     poses = run(IRLS(), problem).poses
     expected = problem.edge_costs(poses)
     expected[edges] = huber(expected[edges], thresholds[edges])
@@ -96,7 +104,8 @@ def test_the_model_keeps_the_squares_of_other_edges() -> None:
 def test_refusals() -> None:
     graph = spoiled(2)
     problem = PGOProblem(graph)
-    change, rho = huber_change(np.arange(graph.num_edges), chi2_thresholds(problem)), np.ones(graph.num_poses)
+    change = huber_change(np.arange(graph.num_edges), chi2_thresholds(problem))
+    rho = np.ones(graph.num_poses)
     with pytest.raises(SettingError, match=r"Unknowns\.POSES"):
         graph_qp(graph, rho, Unknowns.ROTATIONS, change)
     shared = graph.with_robots(partition(graph, 2).robot)

@@ -4,8 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from graphs import EPS, SEEDS
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
@@ -23,11 +22,14 @@ def quadratic(seed: int, side: int, condition: float) -> tuple[Array, float, flo
     rng = np.random.default_rng(seed)
     basis = np.linalg.qr(rng.standard_normal((side, side)))[0]
     values = np.exp(rng.uniform(0.0, np.log(condition), side))
-    values[0], values[-1] = 1.0, condition
+    values[0] = 1.0
+    values[-1] = condition
     return (basis * values) @ basis.T, condition, 1.0
 
 
-@given(seed=SEEDS, side=st.integers(2, 20), columns=st.integers(1, 3), condition=st.floats(1.0, 1e3))
+@given(
+    seed=SEEDS, side=st.integers(2, 20), columns=st.integers(1, 3), condition=st.floats(1.0, 1e3)
+)
 def test_it_solves_to_its_tolerance(seed: int, side: int, columns: int, condition: float) -> None:
     H, lipschitz, convexity = quadratic(seed, side, condition)
     b, start = np.random.default_rng(seed).standard_normal((2, side, columns))
@@ -42,13 +44,17 @@ def test_it_stays_at_the_solution(seed: int, side: int, condition: float) -> Non
     H, lipschitz, convexity = quadratic(seed, side, condition)
     solution = np.random.default_rng(seed).standard_normal((side, 2))
     b = H @ solution
-    np.testing.assert_array_equal(minimize_with_fista(lambda x: H @ x, b, solution, lipschitz, convexity), solution)
+    np.testing.assert_array_equal(
+        minimize_with_fista(lambda x: H @ x, b, solution, lipschitz, convexity), solution
+    )
 
 
 @given(seed=SEEDS, side=st.integers(2, 20))
 def test_it_takes_about_the_root_of_the_condition_in_steps(seed: int, side: int) -> None:
-    # O(sqrt(L / mu) log(1 / tolerance)); plain gradients would take O(L / mu), a hundred times as many here.
-    condition, tolerance = 1e4, 1e-8
+    # O(sqrt(L / mu) log(1 / tolerance)); plain gradients would take O(L / mu), a hundred times as
+    # many here.
+    condition = 1e4
+    tolerance = 1e-8
     H, lipschitz, convexity = quadratic(seed, side, condition)
     b = np.random.default_rng(seed).standard_normal((side, 1))
     count = 0
@@ -83,14 +89,20 @@ def test_the_limit_is_kept(seed: int, side: int, limit: int) -> None:
     assert len(said) == (reached > 1e-12)
     if said:
         assert said[0].category is RuntimeWarning
-        assert f"ended at its {limit} iterations with ||H x - b|| = {reached:.0e} ||b||, asked" in str(said[0].message)
+        assert (
+            f"ended at its {limit} iterations with ||H x - b|| = {reached:.0e} ||b||, asked"
+            in str(said[0].message)
+        )
 
 
 def test_a_run_that_ends_too_early_says_so() -> None:
     graph = circle(np.random.default_rng(0))
     problem = PGOProblem(replace(graph, kappa=np.logspace(-5, 5, graph.num_edges)))
     soc = SOC(r_step=RStep.FISTA, penalty=FixedPenalty(1e-7), max_iterations=1)
-    with pytest.warns(RuntimeWarning, match=r"FISTA ended at its 20000 iterations with .*; use RStep\.FACTORIZED or"):
+    with pytest.warns(
+        RuntimeWarning,
+        match=r"FISTA ended at its 20000 iterations with .*; use RStep\.FACTORIZED or",
+    ):
         run(soc, problem)
 
 
@@ -106,7 +118,9 @@ def test_inputs_are_left_alone() -> None:
 def test_nothing_on_the_right_hand_side() -> None:
     H, lipschitz, convexity = quadratic(0, 5, 10.0)
     b = np.zeros((5, 1))
-    np.testing.assert_array_equal(minimize_with_fista(lambda x: H @ x, b, b, lipschitz, convexity), b)
+    np.testing.assert_array_equal(
+        minimize_with_fista(lambda x: H @ x, b, b, lipschitz, convexity), b
+    )
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, REFERENCE, SEEDS, exact_graph, random_poses, varied_problem
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import (
@@ -25,7 +24,7 @@ from solvers.loop import iterate, run
 from solvers.pipeline import solve
 from solvers.result import Status
 from solvers.riemannian.newton import gauss_newton
-from solvers.soc.paper import PaperSOC
+from solvers.soc.paper import PaperSOC, PaperStop
 from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty, MultiplierPenalty
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
@@ -40,13 +39,17 @@ def paper(**changes: object) -> SOC:
     return PaperSOC(**changes)
 
 
-def algorithm_one(problem: PGOProblem, R: Array, omega: Array, B: Array, rho: float) -> tuple[Array, Array, Array]:
-    """One pass of Algorithm 1, pose by pose, every pose with its neighbours frozen, and det = +1."""
+def algorithm_one(
+    problem: PGOProblem, R: Array, omega: Array, B: Array, rho: float
+) -> tuple[Array, Array, Array]:
+    """One pass of Algorithm 1, pose by pose, each with its neighbours frozen, and det = +1."""
     graph = problem.graph
     following = np.empty_like(R)
     for pose in range(problem.num_poses):
-        # argmin of sum kappa ||R_j - R_i R_ij||^2 + rho/2 ||R_i - omega_i + B_i||^2 over this one R_i.
-        weight, total = 0.5 * rho, 0.5 * rho * (omega[pose] - B[pose])
+        # argmin of sum kappa ||R_j - R_i R_ij||^2 + rho/2 ||R_i - omega_i + B_i||^2 over this one
+        # R_i.
+        weight = 0.5 * rho
+        total = 0.5 * rho * (omega[pose] - B[pose])
         for e in range(graph.num_edges):
             if graph.i[e] == pose:
                 weight += graph.kappa[e]
@@ -65,18 +68,26 @@ def algorithm_one(problem: PGOProblem, R: Array, omega: Array, B: Array, rho: fl
 
 
 @given(
-    seed=SEEDS, n=SIZES, d=DIMENSIONS, rho=st.floats(0.1, 10.0), r_step=st.sampled_from([RStep.FACTORIZED, RStep.FISTA])
+    seed=SEEDS,
+    n=SIZES,
+    d=DIMENSIONS,
+    rho=st.floats(0.1, 10.0),
+    r_step=st.sampled_from([RStep.FACTORIZED, RStep.FISTA]),
 )
-def test_one_pose_a_robot_is_algorithm_one(seed: int, n: int, d: int, rho: float, r_step: RStep) -> None:
+def test_one_pose_a_robot_is_algorithm_one(
+    seed: int, n: int, d: int, rho: float, r_step: RStep
+) -> None:
     problem = varied_problem(seed, n, d)
     rho *= float(problem.L.diagonal().mean())
     start = random_poses(n, d, seed)
-    R, omega, B = start.R, start.R, np.zeros_like(start.R)
+    R = start.R
+    omega = start.R
+    B = np.zeros_like(start.R)
     states = iterate(paper(penalty=FixedPenalty(rho), r_step=r_step), problem, start)
     for k, state in enumerate(islice(states, 8)):
         assert state.k == k
-        for one, other in ((state.R, R), (state.omega, omega), (state.B, B)):
-            np.testing.assert_allclose(one, other, rtol=0, atol=1e-8)
+        for actual, expected in ((state.R, R), (state.omega, omega), (state.B, B)):
+            np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-8)
         R, omega, B = algorithm_one(problem, R, omega, B, rho)
 
 
@@ -85,9 +96,12 @@ def test_one_robot_is_the_joint_step_in_rotations(seed: int, n: int, d: int, rho
     problem = varied_problem(seed, n, d)
     rho *= float(problem.L.diagonal().mean())
     start = random_poses(n, d, seed)
-    omega, B = stack_transposes(start.R), np.zeros((d * n, d))
+    omega = stack_transposes(start.R)
+    B = np.zeros((d * n, d))
     K = problem.L.toarray() + 0.5 * rho * np.eye(d * n)
-    states = iterate(paper(penalty=FixedPenalty(rho), robots=partition(problem.graph, 1)), problem, start)
+    states = iterate(
+        paper(penalty=FixedPenalty(rho), robots=partition(problem.graph, 1)), problem, start
+    )
     for state in islice(states, 1, 8):
         x = np.linalg.solve(K, 0.5 * rho * (omega - B))
         omega = stack_transposes(project_by_svd(unstack_transposes(x + B)))
@@ -97,21 +111,29 @@ def test_one_robot_is_the_joint_step_in_rotations(seed: int, n: int, d: int, rho
         np.testing.assert_allclose(stack_transposes(state.B), B, rtol=0, atol=1e-8)
 
 
-@given(seed=SEEDS, n=st.integers(3, 12), d=DIMENSIONS, method=st.sampled_from(["CONTIGUOUS", "METIS"]))
-def test_every_robot_solves_with_its_neighbours_frozen(seed: int, n: int, d: int, method: str) -> None:
+@given(
+    seed=SEEDS, n=st.integers(3, 12), d=DIMENSIONS, method=st.sampled_from(["CONTIGUOUS", "METIS"])
+)
+def test_every_robot_solves_with_its_neighbours_frozen(
+    seed: int, n: int, d: int, method: str
+) -> None:
     problem = varied_problem(seed, n, d)
     robots = partition(problem.graph, 1 + seed % n, PartitionMethod[method])
     rho = float(problem.L.diagonal().mean())
     start = random_poses(n, d, seed)
-    before, state = islice(iterate(paper(penalty=FixedPenalty(rho), robots=robots), problem, start), 1, 3)
+    before, state = islice(
+        iterate(paper(penalty=FixedPenalty(rho), robots=robots), problem, start), 1, 3
+    )
     L = problem.L.toarray()
     frozen = stack_transposes(before.R)
     shift = stack_transposes(before.omega - before.B)
     for a in range(robots.num_robots):
-        mine = np.repeat(robots.robot == a, d)
-        K = L[np.ix_(mine, mine)] + 0.5 * rho * np.eye(mine.sum())
-        b = 0.5 * rho * shift[mine] - L[np.ix_(mine, ~mine)] @ frozen[~mine]
-        np.testing.assert_allclose(stack_transposes(state.R)[mine], np.linalg.solve(K, b), rtol=0, atol=1e-8)
+        own = np.repeat(robots.robot == a, d)
+        K = L[np.ix_(own, own)] + 0.5 * rho * np.eye(own.sum())
+        b = 0.5 * rho * shift[own] - L[np.ix_(own, ~own)] @ frozen[~own]
+        np.testing.assert_allclose(
+            stack_transposes(state.R)[own], np.linalg.solve(K, b), rtol=0, atol=1e-8
+        )
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, count=st.integers(1, 4))
@@ -119,8 +141,11 @@ def test_blocks_add_up_to_L(seed: int, n: int, d: int, count: int) -> None:
     problem = varied_problem(seed, n, d)
     robots = partition(problem.graph, min(count, n))
     blocks = paper(robots=robots).init(problem, None).blocks
-    own, between = blocks.own.toarray(), blocks.between.toarray()
-    np.testing.assert_allclose(own + between, problem.L.toarray(), rtol=0, atol=1e-12 * np.abs(own).max())
+    own = blocks.own.toarray()
+    between = blocks.between.toarray()
+    np.testing.assert_allclose(
+        own + between, problem.L.toarray(), rtol=0, atol=1e-12 * np.abs(own).max()
+    )
     same = np.repeat(np.repeat(robots.robot[:, None] == robots.robot, d, axis=0), d, axis=1)
     assert (own[~same] == 0).all()
     np.testing.assert_allclose(between[same], 0.0, rtol=0, atol=1e-12 * np.abs(own).max())
@@ -137,11 +162,15 @@ def test_residuals_are_the_paper_s(seed: int, n: int, d: int) -> None:
         measurement = soc.measure(problem, state)
         orthogonality = np.swapaxes(state.omega, 1, 2) @ state.omega - np.eye(d)
         p_res = np.sqrt(np.sum(orthogonality**2) + np.sum((state.omega - state.R) ** 2))
-        assert measurement.primal_residual == pytest.approx(p_res / np.sqrt(n), rel=1e-12, abs=1e-15)
+        assert measurement.primal_residual == pytest.approx(
+            p_res / np.sqrt(n), rel=1e-12, abs=1e-15
+        )
         neighbours = 2 * (state.blocks.between @ stack_transposes(state.R - before.R))
         change = neighbours - state.rho * stack_transposes(state.omega - before.omega)
         scale = np.sqrt(n * d) * problem.L.diagonal().mean()
-        assert measurement.dual_residual == pytest.approx(np.linalg.norm(change) / scale, rel=1e-9, abs=1e-14)
+        assert measurement.dual_residual == pytest.approx(
+            np.linalg.norm(change) / scale, rel=1e-9, abs=1e-14
+        )
         poses = soc.poses(problem, state)
         assert measurement.objective == problem.objective(poses)
         np.testing.assert_array_equal(poses.R, state.omega)
@@ -150,21 +179,30 @@ def test_residuals_are_the_paper_s(seed: int, n: int, d: int) -> None:
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, count=st.integers(1, 4))
 def test_where_it_ends_the_lagrangian_is_stationary(seed: int, n: int, d: int, count: int) -> None:
-    # 2 L R + rho B by entries, whatever the recursion says of itself; omega is the projection of omega + B.
+    # 2 L R + rho B by entries, whatever the recursion says of itself; omega is the projection of
+    # omega + B.
     problem = varied_problem(seed, n, d)
-    rule, robots = FixedPenalty(float(problem.L.diagonal().mean())), partition(problem.graph, min(count, n))
+    rule = FixedPenalty(float(problem.L.diagonal().mean()))
+    robots = partition(problem.graph, min(count, n))
     soc = paper(penalty=rule, robots=robots)
     result = run(soc, problem)
     if result.status is not Status.CONVERGED:
         return
-    state, L = result.state, problem.L.toarray()
+    state = result.state
+    L = problem.L.toarray()
     gradient = 2 * L @ stack_transposes(state.R) + state.rho * stack_transposes(state.B)
-    assert np.linalg.norm(gradient) <= soc.tolerance * L.diagonal().mean() * np.sqrt(n * d) * (1 + 1e-9)
-    np.testing.assert_allclose(project_by_svd(state.omega + state.B), state.omega, rtol=0, atol=1e-9)
+    assert np.linalg.norm(gradient) <= soc.tolerance * L.diagonal().mean() * np.sqrt(n * d) * (
+        1 + 1e-9
+    )
+    np.testing.assert_allclose(
+        project_by_svd(state.omega + state.B), state.omega, rtol=0, atol=1e-9
+    )
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, scale=st.sampled_from([1e-3, 0.3, 1e3]))
-def test_an_adapted_rho_keeps_the_unscaled_multiplier(seed: int, n: int, d: int, scale: float) -> None:
+def test_an_adapted_rho_keeps_the_unscaled_multiplier(
+    seed: int, n: int, d: int, scale: float
+) -> None:
     problem = varied_problem(seed, n, d)
     rule = BalancedPenalty(scale=scale)
     changes = []
@@ -178,9 +216,13 @@ def test_an_adapted_rho_keeps_the_unscaled_multiplier(seed: int, n: int, d: int,
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, scale=st.sampled_from([1e-2, 1.0, 1e2]))
-def test_boyd_s_rule_is_section_3_4_1_to_the_letter(seed: int, n: int, d: int, scale: float) -> None:
+def test_boyd_s_rule_is_section_3_4_1_to_the_letter(
+    seed: int, n: int, d: int, scale: float
+) -> None:
     problem = varied_problem(seed, n, d)
-    for before, state in pairwise(islice(iterate(paper(penalty=BoydPenalty(scale=scale)), problem), 30)):
+    for before, state in pairwise(
+        islice(iterate(paper(penalty=BoydPenalty(scale=scale)), problem), 30)
+    ):
         r = np.linalg.norm(state.R - state.omega)
         s = before.rho * np.linalg.norm(state.omega - before.omega)
         expected = 2 * before.rho if r > 10 * s else before.rho / 2 if s > 10 * r else before.rho
@@ -190,9 +232,51 @@ def test_boyd_s_rule_is_section_3_4_1_to_the_letter(seed: int, n: int, d: int, s
         np.testing.assert_allclose(state.rho * state.B, literal, rtol=0, atol=1e-9 * before.rho)
 
 
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_as_published_rho_follows_the_paper_s_rule_and_only_p_res_stops(
+    seed: int, n: int, d: int
+) -> None:
+    # "If the primal residual is large, then a greater rho will be adopted; if the dual residual is
+    # large, rho will be decreased": Boyd et al. 2011, (3.13), which the paper names, with Boyd's
+    # constants.
+    problem = varied_problem(seed, n, d)
+    soc = PaperSOC.as_published()
+    assert (soc.penalty, soc.r_step) == (BoydPenalty(), RStep.FISTA)
+    states = list(islice(iterate(soc, problem), 20))
+    assert states[0].rho == pytest.approx(
+        float(BoydPenalty(1.0).initial(problem, soc.poses(problem, states[0])).mean())
+    )
+    for before, state in pairwise(states):
+        r = np.linalg.norm(state.R - state.omega)
+        s = before.rho * np.linalg.norm(state.omega - before.omega)
+        ratio = state.rho / before.rho
+        assert ratio in (0.5, 1.0, 2.0)
+        assert r > (1 - 1e-9) * 10 * s or ratio != 2.0
+        assert s > (1 - 1e-9) * 10 * r or ratio != 0.5
+        assert (r <= (1 + 1e-9) * 10 * s and s <= (1 + 1e-9) * 10 * r) or ratio != 1.0
+    measured = [soc.measure(problem, state) for state in states]
+    for state, measurement in zip(states[1:], measured[1:], strict=True):
+        is_small = measurement.primal_residual <= soc.tolerance
+        assert soc.converged(state, measurement) is (Status.CONVERGED if is_small else None)
+    # omega^0 = R^0: p_res is zero before anything is done
+    assert soc.converged(states[0], measured[0]) is None
+
+
+def test_a_small_p_res_alone_is_not_stationary() -> None:
+    problem = varied_problem(0, 8, 3)
+    rule = FixedPenalty(1e9 * float(problem.L.diagonal().mean()))  # which holds R at omega
+    start = random_poses(8, 3, 0)
+    literal = run(paper(penalty=rule, stop=PaperStop.PRIMAL_RESIDUAL), problem, start)
+    both = run(paper(penalty=rule, max_iterations=20), problem, start)
+    assert (literal.status, literal.iterations) == (Status.CONVERGED, 1)
+    assert both.status is Status.MAX_ITERATIONS
+    assert literal.history.records[-1].measurement.dual_residual > 1e-3
+
+
 @pytest.mark.parametrize("name", NETWORKS)
 def test_on_the_scenes_boyd_s_rule_acts_where_relative_residuals_do_not(name: str) -> None:
-    problem, iterations = PGOProblem(NETWORKS[name](np.random.default_rng(0))), PAPER_TABLES[name]["iterations_soc"]
+    problem = PGOProblem(NETWORKS[name](np.random.default_rng(0)))
+    iterations = PAPER_TABLES[name]["iterations_soc"]
     moves = {}
     for rule in (BoydPenalty(), BalancedPenalty(1.0)):
         states = islice(iterate(paper(penalty=rule), problem, problem.graph.initial), iterations)
@@ -221,7 +305,8 @@ def test_graphs_without_noise_end_at_zero(seed: int, n: int, d: int) -> None:
 @settings(max_examples=examples(20))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_where_it_converges_the_split_does_not_matter(seed: int, n: int, d: int) -> None:
-    # It minimises the rotations' part of F alone. With frozen neighbours it need not converge in time.
+    # It minimises the rotations' part of F alone. With frozen neighbours it need not converge in
+    # time.
     problem = varied_problem(seed, n, d)
     rule = FixedPenalty(0.3 * float(problem.L.diagonal().mean()))
     results = [
@@ -229,24 +314,35 @@ def test_where_it_converges_the_split_does_not_matter(seed: int, n: int, d: int)
         for robots in (partition(problem.graph, 1), partition(problem.graph, min(3, n)), None)
     ]
     assert results[0].status is Status.CONVERGED
-    rows = [stack_transposes(result.state.omega) for result in results if result.status is Status.CONVERGED]
+    rows = [
+        stack_transposes(result.state.omega)
+        for result in results
+        if result.status is Status.CONVERGED
+    ]
     costs = [float(np.sum(Y * (problem.L @ Y))) for Y in rows]
     assert costs == pytest.approx([costs[0]] * len(costs), rel=1e-6, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_the_networks_come_within_the_paper_s_relative_error(name: str) -> None:
-    # The paper's scenes are random: its tables give one draw, F_soc over F_star being what can be compared.
+    # The paper's scenes are random: its tables give one draw, F_soc over F_star being what can be
+    # compared.
     problem = PGOProblem(NETWORKS[name](np.random.default_rng(0)))
     soc = run(paper(max_iterations=PAPER_TABLES[name]["iterations_soc"]), problem)
     best = run(gauss_newton(), problem).objective
     second_layer = run(gauss_newton(), problem, soc.poses)
-    assert second_layer.objective / best <= PAPER_TABLES[name]["F_soc"] / PAPER_TABLES[name]["F_star"]
+    assert (
+        second_layer.objective / best <= PAPER_TABLES[name]["F_soc"] / PAPER_TABLES[name]["F_star"]
+    )
 
 
 @pytest.mark.parametrize(
     ("name", "max_iterations"),
-    [("parking-garage", PAPER_TABLES["parking-garage"]["iterations_soc"]), ("torus3D", 150), ("cubicle", 250)],
+    [
+        ("parking-garage", PAPER_TABLES["parking-garage"]["iterations_soc"]),
+        ("torus3D", 150),
+        ("cubicle", 250),
+    ],
 )
 def test_with_gauss_newton_it_beats_the_paper_s_value_on_benchmarks(
     name: str, max_iterations: int, benchmark_problem: Callable[[str], PGOProblem]
@@ -274,12 +370,16 @@ def test_an_iterate_that_is_not_finite_is_said_to_be() -> None:
     state = soc.init(problem, None)
     broken = soc.step(problem, replace(state, B=np.full_like(state.B, np.inf)))
     measurement = soc.measure(problem, broken)
-    assert np.isnan([measurement.objective, measurement.primal_residual, measurement.dual_residual]).all()
+    assert np.isnan(
+        [measurement.objective, measurement.primal_residual, measurement.dual_residual]
+    ).all()
     assert soc.converged(broken, measurement) is None
 
 
 def test_a_penalty_for_every_pose_is_not_the_paper_s() -> None:
-    with pytest.raises(SettingError, match="must be FixedPenalty or BalancedPenalty or BoydPenalty"):
+    with pytest.raises(
+        SettingError, match="must be FixedPenalty or BalancedPenalty or BoydPenalty"
+    ):
         paper(penalty=MultiplierPenalty()).init(varied_problem(0, 5, 2), None)
 
 

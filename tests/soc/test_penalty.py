@@ -2,9 +2,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from graphs import DIMENSIONS, SEEDS, SIZES, exact_graph, random_poses, translation_scale, varied_graph, varied_problem
-from hypothesis import given
-from hypothesis import strategies as st
+from graphs import (
+    DIMENSIONS,
+    SEEDS,
+    SIZES,
+    exact_graph,
+    random_poses,
+    translation_scale,
+    varied_graph,
+    varied_problem,
+)
+from hypothesis import given, strategies as st
 
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.errors import PGOError, SettingError
@@ -22,19 +30,29 @@ RESIDUALS = st.floats(1e-12, 1e3)
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, factor=st.floats(1.0, 20.0), quantile=st.floats(0.0, 1.0))
-def test_the_multiplier_penalty_is_its_formula(seed: int, n: int, d: int, factor: float, quantile: float) -> None:
-    problem, poses = varied_problem(seed, n, d), random_poses(n, d, seed)
+def test_the_multiplier_penalty_is_its_formula(
+    seed: int, n: int, d: int, factor: float, quantile: float
+) -> None:
+    problem = varied_problem(seed, n, d)
+    poses = random_poses(n, d, seed)
     M = problem.M.toarray()
     Lambda = multipliers(problem, poses)
     norms = np.array([np.linalg.norm(block, 2) for block in Lambda])
-    m = np.array([np.trace(M[n + d * i : n + d * (i + 1), n + d * i : n + d * (i + 1)]) / d for i in range(n)])
+    m = np.array(
+        [
+            np.trace(M[n + d * i : n + d * (i + 1), n + d * i : n + d * (i + 1)]) / d
+            for i in range(n)
+        ]
+    )
     q = np.quantile(norms / m, quantile)
     rho = MultiplierPenalty(factor=factor, quantile=quantile).initial(problem, poses)
     np.testing.assert_allclose(rho, factor * np.maximum(norms, q * m), rtol=1e-9, atol=0)
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, exponent=st.integers(-20, 20))
-def test_rules_without_a_unit_scale_with_the_weights(seed: int, n: int, d: int, exponent: int) -> None:
+def test_rules_without_a_unit_scale_with_the_weights(
+    seed: int, n: int, d: int, exponent: int
+) -> None:
     graph = varied_graph(seed, n, d)
     scale = 2.0**exponent
     problem = PGOProblem(graph)
@@ -48,12 +66,16 @@ def test_rules_without_a_unit_scale_with_the_weights(seed: int, n: int, d: int, 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, translation=st.floats(0.0, 1e3))
 def test_the_world_does_not_matter(seed: int, n: int, d: int, translation: float) -> None:
-    problem, poses = varied_problem(seed, n, d), random_poses(n, d, seed)
+    problem = varied_problem(seed, n, d)
+    poses = random_poses(n, d, seed)
     world = random_poses(1, d, seed + 1)
     moved = poses.moved(world.R[0], translation * world.t[0])
     rule = MultiplierPenalty()
     np.testing.assert_allclose(
-        rule.initial(problem, moved), rule.initial(problem, poses), rtol=1e-9 * (1 + translation), atol=0
+        rule.initial(problem, moved),
+        rule.initial(problem, poses),
+        rtol=1e-9 * (1 + translation),
+        atol=0,
     )
 
 
@@ -71,11 +93,16 @@ def test_scales_are_diagonals_of_M(seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)
     diagonal = problem.M.toarray().diagonal()
     np.testing.assert_array_equal(translation_scale(problem), diagonal[:n])
-    np.testing.assert_allclose(rotation_scale(problem), diagonal[n:].reshape(n, d).mean(axis=1), rtol=1e-15, atol=0)
-    np.testing.assert_array_equal(
-        BalancedPenalty(scale=0.5).initial(problem, random_poses(n, d, 0)), 0.5 * rotation_scale(problem)
+    np.testing.assert_allclose(
+        rotation_scale(problem), diagonal[n:].reshape(n, d).mean(axis=1), rtol=1e-15, atol=0
     )
-    np.testing.assert_array_equal(FixedPenalty(7.0).initial(problem, random_poses(n, d, 0)), np.full(n, 7.0))
+    np.testing.assert_array_equal(
+        BalancedPenalty(scale=0.5).initial(problem, random_poses(n, d, 0)),
+        0.5 * rotation_scale(problem),
+    )
+    np.testing.assert_array_equal(
+        FixedPenalty(7.0).initial(problem, random_poses(n, d, 0)), np.full(n, 7.0)
+    )
 
 
 @given(primal=RESIDUALS, dual=RESIDUALS)
@@ -95,7 +122,9 @@ def test_balancing_moves_rho_towards_the_larger_residual(primal: float, dual: fl
     assert factor == 1 or max(factor, 1 / factor) == pytest.approx(rule.refactor_ratio)
 
 
-@pytest.mark.parametrize(("primal", "dual", "direction"), [(1.0, 0.0, 1), (0.0, 1.0, -1), (0.0, 0.0, 0)])
+@pytest.mark.parametrize(
+    ("primal", "dual", "direction"), [(1.0, 0.0, 1), (0.0, 1.0, -1), (0.0, 0.0, 0)]
+)
 def test_balancing_bears_residuals_of_zero(primal: float, dual: float, direction: int) -> None:
     assert np.sign(np.log(BalancedPenalty().factor(primal, dual))) == direction
 

@@ -3,27 +3,31 @@
 import numpy as np
 import pytest
 from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, translation_scale, varied_problem
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyFactor
 from pgo_models.problem.problem import PGOProblem
-from solvers.soc.penalty import rotation_scale
+from pgo_models.problem.stationarity import rotation_scale
 from solvers.soc.separator_stiffness import GROUND, adapted_penalty, stiffness_of_separators, travel
 
 PROBES = 32
 SIZES = st.integers(2, 20)
 
 
-def system(problem: PGOProblem, held: IntArray, weight: float, unit: float = 1.0) -> tuple[Array, CholeskyFactor]:
+def system(
+    problem: PGOProblem, held: IntArray, weight: float, unit: float = 1.0
+) -> tuple[Array, CholeskyFactor]:
     """D, and the factor of unit (M + rho/2) with GROUND times D on the held translations."""
-    n, d = problem.num_poses, problem.d
+    n = problem.num_poses
+    d = problem.d
     half_scale = 0.25 * unit * translation_scale(problem)[held]
     data = unit * problem.M.data
-    added = np.concatenate([np.zeros(n), 0.5 * weight * unit * np.repeat(rotation_scale(problem), d)])
+    added = np.concatenate(
+        [np.zeros(n), 0.5 * weight * unit * np.repeat(rotation_scale(problem), d)]
+    )
     added[held] = GROUND * half_scale
     data[problem.diagonal_positions] += added
     return half_scale, problem.analysis.factorize(problem.with_pattern_of_M(data))
@@ -54,8 +58,11 @@ def test_the_estimate_is_within_its_statistical_error(
     held = np.sort(rng.choice(n, rng.integers(2, n + 1), replace=False))
     half_scale, factor = system(problem, held, weight)
     C = exact(half_scale, factor, problem.side, held)
-    stiffness = stiffness_of_separators(factor, problem.side, held, half_scale, np.zeros(len(held), dtype=int))
-    trace, degrees = float(np.trace(C)), len(held) - 1
+    stiffness = stiffness_of_separators(
+        factor, problem.side, held, half_scale, np.zeros(len(held), dtype=int)
+    )
+    trace = float(np.trace(C))
+    degrees = len(held) - 1
     # z^T C z for signs z has the variance 2 sum_(i != j) C_ij^2 (Hutchinson 1990).
     deviation = np.sqrt(2.0 * (np.sum(C**2) - np.sum(np.diag(C) ** 2)) / PROBES)
     assert abs(degrees / stiffness - trace) <= 6.0 * deviation + 1e-6 * trace
@@ -64,19 +71,25 @@ def test_the_estimate_is_within_its_statistical_error(
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, exponent=st.integers(-12, 12))
 def test_a_factor_on_all_weights_changes_nothing(seed: int, n: int, d: int, exponent: int) -> None:
     problem = varied_problem(seed, n, d)
-    held, together = np.arange(0, n, 2), np.zeros((n + 1) // 2, dtype=int)
-    found = []
+    held = np.arange(0, n, 2)
+    together = np.zeros((n + 1) // 2, dtype=int)
+    stiffnesses = []
     for unit in (1.0, 2.0**exponent):
         half_scale, factor = system(problem, held, 1.0, unit)
-        found.append(stiffness_of_separators(factor, problem.side, held, half_scale, together))
-    assert found[1] == pytest.approx(found[0], rel=1e-6)
+        stiffnesses.append(
+            stiffness_of_separators(factor, problem.side, held, half_scale, together)
+        )
+    assert stiffnesses[1] == pytest.approx(stiffnesses[0], rel=1e-6)
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
-def test_four_times_the_weights_beside_the_same_scale_are_four_times_as_stiff(seed: int, n: int, d: int) -> None:
+def test_four_times_the_weights_beside_the_same_scale_are_four_times_as_stiff(
+    seed: int, n: int, d: int
+) -> None:
     # D is kept: only what holds the separators grows.
     problem = varied_problem(seed, n, d)
-    held, together = np.arange(n), np.zeros(n, dtype=int)
+    held = np.arange(n)
+    together = np.zeros(n, dtype=int)
     half_scale, factor = system(problem, held, 1.0)
     _, stronger = system(problem, held, 1.0, 4.0)
     soft = stiffness_of_separators(factor, problem.side, held, half_scale, together)
@@ -98,13 +111,29 @@ def test_the_adapted_penalty_falls_by_the_square_of_the_ratio_of_the_ways(
     seed: int, q: int, d: int, penalty: float
 ) -> None:
     rng = np.random.default_rng(seed)
-    scale, moved = rng.uniform(0.5, 2.0, q), rng.standard_normal((q, d))
+    scale = rng.uniform(0.5, 2.0, q)
+    moved = rng.standard_normal((q, d))
     moved -= (scale @ moved) / scale.sum()
-    shift, half = rng.standard_normal(d), q // 2
-    for ratio, expected in ((0.5, 0.25), (0.57, 0.3249), (0.58, 1.0), (0.01, 0.1), (1.0, 1.0), (7.0, 1.0)):
+    shift = rng.standard_normal(d)
+    half = q // 2
+    for ratio, expected in (
+        (0.5, 0.25),
+        (0.57, 0.3249),
+        (0.58, 1.0),
+        (0.01, 0.1),
+        (1.0, 1.0),
+        (7.0, 1.0),
+    ):
         pulled = ratio * penalty * scale[:, None] * moved
         for other in (moved, moved + shift):  # a common shift is no way
-            parts = [travel(other[part], pulled[part], scale[part]) for part in (slice(half), slice(half, q))]
-            assert adapted_penalty(penalty, np.sum(parts, axis=0)) == pytest.approx(expected * penalty, rel=1e-9)
+            parts = [
+                travel(other[part], pulled[part], scale[part])
+                for part in (slice(half), slice(half, q))
+            ]
+            assert adapted_penalty(penalty, np.sum(parts, axis=0)) == pytest.approx(
+                expected * penalty, rel=1e-9
+            )
     assert adapted_penalty(penalty, travel(np.zeros((q, d)), pulled, scale)) == penalty
-    assert adapted_penalty(penalty, travel(np.zeros((0, d)), np.zeros((0, d)), np.zeros(0))) == penalty
+    assert (
+        adapted_penalty(penalty, travel(np.zeros((0, d)), np.zeros((0, d)), np.zeros(0))) == penalty
+    )

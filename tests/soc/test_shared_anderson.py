@@ -3,8 +3,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from budget import examples
 from graphs import SEEDS
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.matrices import inner, norm
@@ -52,7 +51,7 @@ def extrapolate(
 
 
 class Parties:
-    """Rows spread over parties at random, and the two sums and one answer by which they accelerate together."""
+    """Rows spread over parties at random, and the sums by which they accelerate together."""
 
     def __init__(self, rng: np.random.Generator, rows: int, number: int) -> None:
         self.owner = rng.integers(0, number, rows)  # some may own none
@@ -61,12 +60,12 @@ class Parties:
         self.restarts = 0
 
     def extrapolate(self, settings: Anderson, residual: Array, image: Array) -> Array:
-        told = []
+        sums_of_parties = []
         for party, share in enumerate(self.shares):
             rows = self.owner == party
             sums, self.shares[party] = share.observe(residual[rows], image[rows], settings.memory)
-            told.append(sums)
-        gamma, self.sums = self.sums.coefficients(settings, np.sum(told, axis=0))
+            sums_of_parties.append(sums)
+        gamma, self.sums = self.sums.coefficients(settings, np.sum(sums_of_parties, axis=0))
         self.restarts += gamma is None
         following = np.empty_like(image)
         for party, share in enumerate(self.shares):
@@ -77,22 +76,33 @@ class Parties:
 
 @settings(max_examples=examples(40))
 @given(seed=SEEDS, rows=st.integers(1, 40), number=st.integers(1, 6), memory=st.integers(1, 8))
-def test_parties_take_the_steps_that_one_would_take(seed: int, rows: int, number: int, memory: int) -> None:
-    # Residuals without order, so that the memory fills, is emptied again and again, and fills again.
+def test_parties_take_the_steps_that_one_would_take(
+    seed: int, rows: int, number: int, memory: int
+) -> None:
+    # Residuals without order, so that the memory fills, is emptied again and again, and fills
+    # again.
     rng = np.random.default_rng(seed)
     rule = Anderson(memory=memory, restart_ratio=3.0, regularization=1e-6)
-    parties, alone, restarts = Parties(rng, rows, number), AndersonMemory(), 0
+    parties = Parties(rng, rows, number)
+    alone = AndersonMemory()
+    restarts = 0
     for _ in range(40):
         residual = np.exp(rng.normal(0.0, 0.7)) * rng.standard_normal((rows, 3)) / np.sqrt(3 * rows)
         image = rng.standard_normal((rows, 3))
         before = alone
         expected, alone = extrapolate(rule, alone, residual, image)
         restarts += before.residual is not None and not alone.residual_differences
-        found = parties.extrapolate(rule, residual, image)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * (1 + np.abs(expected).max()))
+        shared = parties.extrapolate(rule, residual, image)
+        np.testing.assert_allclose(
+            shared, expected, rtol=0, atol=1e-9 * (1 + np.abs(expected).max())
+        )
         assert parties.restarts == restarts
         for share in parties.shares:
-            assert len(share.residual_differences) == len(share.image_differences) == len(alone.residual_differences)
+            assert (
+                len(share.residual_differences)
+                == len(share.image_differences)
+                == len(alone.residual_differences)
+            )
     np.testing.assert_allclose(parties.sums.gram, alone.gram, rtol=1e-9, atol=1e-9)
 
 
@@ -130,7 +140,12 @@ def test_what_was_is_left_alone() -> None:
     for _ in range(5):
         kept = (share.residual_differences, share.image_differences, share.residual, share.image)
         _, following = share.observe(rng.standard_normal((4, 2)), rng.standard_normal((4, 2)), 3)
-        assert (share.residual_differences, share.image_differences, share.residual, share.image) == kept
+        assert (
+            share.residual_differences,
+            share.image_differences,
+            share.residual,
+            share.image,
+        ) == kept
         image = following.image.copy()
         following.extrapolated(np.ones(len(following.image_differences)))
         np.testing.assert_array_equal(following.image, image)

@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -13,30 +13,37 @@ from graphs import (
     varied_graph,
     varied_problem,
 )
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.newton_polish import polish, relative_decrement
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import orthogonality_error, project_by_svd, stack_transposes, unstack_transposes
+from pgo_models.geometry.rotations import (
+    orthogonality_error,
+    project_by_svd,
+    stack_transposes,
+    unstack_transposes,
+)
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import grid
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import joint_matrix
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.stationarity import rotation_scale
 from solvers.loop import iterate, run
 from solvers.result import Measurement, Status
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus import ConsensusIterate
 from solvers.soc.paper import PaperSOC
-from solvers.soc.penalty import FixedPenalty, rotation_scale
+from solvers.soc.penalty import FixedPenalty
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC, SOCState
 
 SIZES = st.integers(3, 12)
-METHODS = st.sampled_from([PartitionMethod.CONTIGUOUS, PartitionMethod.METIS, PartitionMethod.SINGLETONS])
+METHODS = st.sampled_from(
+    [PartitionMethod.CONTIGUOUS, PartitionMethod.METIS, PartitionMethod.SINGLETONS]
+)
 
 
 def robots_of(problem: PGOProblem, seed: int, method: PartitionMethod) -> Partition:
@@ -61,15 +68,80 @@ def test_joint_is_algorithm_one_with_translations(alpha: float, seed: int, n: in
     start = chordal_start(problem)
     D = np.concatenate([np.zeros(n), np.full(d * n, rule.rho)])
     K = problem.M.toarray() + 0.5 * np.diag(D)
-    omega, B = stack_transposes(start.R), np.zeros((d * n, d))
+    omega = stack_transposes(start.R)
+    B = np.zeros((d * n, d))
     for state in islice(iterate(soc, problem, start), 1, 12):
-        X = np.linalg.lstsq(K, 0.5 * D[:, None] * np.concatenate([np.zeros((n, d)), omega - B]), rcond=1e-14)[0]
+        X = np.linalg.lstsq(
+            K, 0.5 * D[:, None] * np.concatenate([np.zeros((n, d)), omega - B]), rcond=1e-14
+        )[0]
         x = alpha * X[n:] + (1 - alpha) * omega  # (a)
         omega = stack_transposes(project_by_svd(unstack_transposes(x + B)))  # (b)
         B = B + x - omega  # (c)
         np.testing.assert_allclose(stack_transposes(state.omega), omega, rtol=0, atol=1e-8)
-        np.testing.assert_allclose(state.x, X[n:], rtol=0, atol=1e-8)
-        np.testing.assert_allclose(state.B, B, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(stack_transposes(state.x), X[n:], rtol=0, atol=1e-8)
+        np.testing.assert_allclose(stack_transposes(state.B), B, rtol=0, atol=1e-8)
+
+
+@dataclass
+class Part:
+    """What one robot knows, written down from the graph: half of the edges between two robots."""
+
+    matrix: np.ndarray  # M of its edges
+    known: np.ndarray  # rows of X of its poses
+    held: np.ndarray  # those with a penalty: rotations, and translations of separators
+
+
+def part_of(problem: PGOProblem, robots: Partition, robot: int) -> Part:
+    graph = problem.graph
+    n = graph.num_poses
+    d = graph.d
+    separators = set(robots.separators(graph).tolist())
+    num_ends = (robots.robot[graph.i] == robot).astype(float) + (robots.robot[graph.j] == robot)
+    kept = num_ends > 0
+    kappa, tau = (0.5 * (num_ends * weight)[kept] for weight in (graph.kappa, graph.tau))
+    edges = PoseGraph(
+        n, graph.i[kept], graph.j[kept], graph.R_ij[kept], graph.t_ij[kept], kappa, tau
+    )
+    own = np.flatnonzero(robots.robot == robot).tolist()
+    poses = sorted({*own, *edges.i.tolist(), *edges.j.tolist()})
+    rotations = [n + d * i + r for i in poses for r in range(d)]
+    translations = [i for i in poses if i in separators]
+    known = np.array([*poses, *rotations])
+    return Part(joint_matrix(edges).toarray(), known, np.array([*translations, *rotations]))
+
+
+def local_passes_of(
+    part: Part,
+    penalty: np.ndarray,
+    count: np.ndarray,
+    z: np.ndarray,
+    B: np.ndarray,
+    passes: int,
+    n: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """x of the last pass, and z and B before it: (b) and (c) on the poses of this robot alone."""
+    d = z.shape[1]
+    held = part.held
+    share = penalty[held] / count[held]
+    positions = np.searchsorted(part.known, held)
+    assert (part.known[positions] == held).all()
+    z = z.copy()
+    B = B.copy()
+    for remaining in range(passes)[::-1]:
+        K = part.matrix[np.ix_(part.known, part.known)].copy()
+        b = np.zeros((len(part.known), d))
+        K[positions, positions] += 0.5 * share
+        b[positions] = 0.5 * share[:, None] * (z - B)
+        x = np.linalg.solve(K, b)[positions]
+        for row in range(len(held) if remaining else 0):
+            if held[row] < n or (held[row] - n) % d or count[held[row]] > 1:
+                continue
+            # No other robot knows this pose: its omega is its robot's own affair.
+            pose = slice(row, row + d)
+            s = (x + B)[pose]
+            z[pose] = project_by_svd(s.T[None])[0].T
+            B[pose] = s - z[pose]
+    return x, z, B
 
 
 @given(
@@ -96,54 +168,28 @@ def test_consensus_is_its_recursion_robot_by_robot(
     )
     states = iterate(soc, problem)
     first = next(states)
-    # Written down from the graph: who holds which poses, each robot's matrix by its edges, half of those between two.
-    graph, separators = problem.graph, set(robots.separators(problem.graph).tolist())
-    whole = np.concatenate([0.1 * translation_scale(problem), np.full(d * n, rule.rho)])
-    matrices, rows = [], []
-    for a in range(robots.num_robots):
-        mine = (robots.robot[graph.i] == a).astype(float) + (robots.robot[graph.j] == a)
-        kept = mine > 0
-        weights = [0.5 * (mine * weight)[kept] for weight in (graph.kappa, graph.tau)]
-        part = PoseGraph(n, graph.i[kept], graph.j[kept], graph.R_ij[kept], graph.t_ij[kept], *weights)
-        matrices.append(joint_matrix(part).toarray())
-        poses = sorted({*np.flatnonzero(robots.robot == a).tolist(), *part.i.tolist(), *part.j.tolist()})
-        held = [*(i for i in poses if i in separators), *(n + d * i + r for i in poses for r in range(d))]
-        rows.append((np.array([*poses, *(row for row in held if row >= n)]), np.array(held)))
-    count = np.bincount(np.concatenate([held for _, held in rows]), minlength=problem.side)
+    penalty = np.concatenate([0.1 * translation_scale(problem), np.full(d * n, rule.rho)])
+    parts = [part_of(problem, robots, robot) for robot in range(robots.num_robots)]
+    count = np.bincount(np.concatenate([part.held for part in parts]), minlength=problem.side)
     z = [robot.block.z[robot.layout.held[:, 0]] for robot in first.robots]
     B = [robot.block.B[robot.layout.held[:, 0]] for robot in first.robots]
     for state in islice(states, 8):
         total = np.zeros((problem.side, d))
         relaxed = []
-        for a, (known, held) in enumerate(rows):
-            share = whole[held] / count[held]
-            at = np.searchsorted(known, held)
-            assert (known[at] == held).all()
-            za, Ba = z[a].copy(), B[a].copy()
-            for left in range(local_passes)[::-1]:
-                K, b = matrices[a][np.ix_(known, known)].copy(), np.zeros((len(known), d))
-                K[at, at] += 0.5 * share
-                b[at] = 0.5 * share[:, None] * (za - Ba)
-                x = np.linalg.solve(K, b)[at]
-                for row in range(len(held) if left else 0):
-                    if held[row] < n or (held[row] - n) % d or count[held[row]] > 1:
-                        continue
-                    pose = slice(row, row + d)  # no other robot knows it: its omega is its robot's own affair
-                    s = (x + Ba)[pose]
-                    za[pose] = project_by_svd(s.T[None])[0].T
-                    Ba[pose] = s - za[pose]
-            relaxed.append(alpha * x + (1 - alpha) * za + Ba)
-            total[held] += relaxed[a]
+        for a, part in enumerate(parts):
+            x, z_a, B_a = local_passes_of(part, penalty, count, z[a], B[a], local_passes, n)
+            relaxed.append(alpha * x + (1 - alpha) * z_a + B_a)
+            total[part.held] += relaxed[a]
         mean = total / np.maximum(count, 1)[:, None]
         mean[n:] = stack_transposes(project_by_svd(unstack_transposes(mean[n:])))
-        z = [mean[held] for _, held in rows]
-        B = [s - za for s, za in zip(relaxed, z, strict=True)]
-        scale = 1 + np.abs(mean).max()
+        z = [mean[part.held] for part in parts]
+        B = [s - z_a for s, z_a in zip(relaxed, z, strict=True)]
+        atol = 1e-7 * (1 + np.abs(mean).max())
         for a, robot in enumerate(state.robots):
-            mine = robot.layout.held[:, 0]
-            np.testing.assert_allclose(robot.block.z[mine], z[a], rtol=0, atol=1e-7 * scale)
-            np.testing.assert_allclose(robot.block.B[mine], B[a], rtol=0, atol=1e-7 * scale)
-        np.testing.assert_allclose(stack_transposes(state.omega), mean[n:], rtol=0, atol=1e-7 * scale)
+            held = robot.layout.held[:, 0]
+            np.testing.assert_allclose(robot.block.z[held], z[a], rtol=0, atol=atol)
+            np.testing.assert_allclose(robot.block.B[held], B[a], rtol=0, atol=atol)
+        np.testing.assert_allclose(stack_transposes(state.omega), mean[n:], rtol=0, atol=atol)
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, accelerated=st.booleans())
@@ -154,25 +200,30 @@ def test_what_a_state_says_of_itself(seed: int, n: int, d: int, accelerated: boo
     for k, state in enumerate(states):
         assert state.k == k
         assert orthogonality_error(state.omega).max() <= 1e-13
-        np.testing.assert_array_equal(state.block.z, stack_transposes(state.omega))
-        np.testing.assert_array_equal(state.B, state.block.s - state.block.z)
         poses = soc.poses(problem, state)
         np.testing.assert_array_equal(poses.R, state.omega)
         assert soc.measure(problem, state).objective == problem.objective(poses)
         if k:
             before = states[k - 1]
-            root = np.sqrt(np.repeat(state.rho, d))[:, None]
-            size = np.linalg.norm(root * state.block.z)
-            assert state.primal_residual == pytest.approx(np.linalg.norm(root * (state.x - state.block.z)) / size)
-            stiff = np.maximum(1.0, root**2 / problem.M.diagonal()[n:, None])
-            change, back = root * (state.block.z - before.block.z), root * (state.x - state.block.z)
+            root = np.sqrt(state.rho)[:, None, None]
+            size = np.linalg.norm(root * state.omega)
+            primal = root * (state.x - state.omega)
+            assert state.primal_residual == pytest.approx(np.linalg.norm(primal) / size)
+            # Row b of R_i^T is column b of R_i.
+            stiff = np.maximum(1.0, root**2 / problem.M.diagonal()[n:].reshape(n, 1, d))
+            change = root * (state.omega - before.omega)
+            back = primal
             dual = np.hypot(np.linalg.norm(stiff * change), np.linalg.norm((stiff - 1.0) * back))
             assert state.dual_residual == pytest.approx(dual / size)
-            assert state.merits[-1] == pytest.approx(np.linalg.norm(root * (state.x - before.block.z)))
+            assert state.merits[-1] == pytest.approx(
+                np.linalg.norm(root * (state.x - before.omega))
+            )
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, method=METHODS)
-def test_anderson_per_robot_sums_nothing_over_the_robots(seed: int, n: int, d: int, method: PartitionMethod) -> None:
+def test_anderson_per_robot_sums_nothing_over_the_robots(
+    seed: int, n: int, d: int, method: PartitionMethod
+) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE))
     robots = robots_of(problem, seed, method)
     soc = SOC(robots=robots, acceleration=Anderson(per_robot=True), local_passes=1)
@@ -188,8 +239,8 @@ def test_anderson_per_robot_sums_nothing_over_the_robots(seed: int, n: int, d: i
             x = moved.state.ahead[1].x
             residual = np.sqrt(before.block.penalty)[:, None] * (x - before.block.z)
             share, sums = known[a]
-            told, share = share.observe(residual, x + before.block.B, Anderson().memory)
-            gamma, sums = sums.coefficients(Anderson(), told)
+            observed, share = share.observe(residual, x + before.block.B, Anderson().memory)
+            gamma, sums = sums.coefficients(Anderson(), observed)
             s, share = share.extrapolated(gamma)
             known[a] = share, sums
             np.testing.assert_allclose(after.block.s, s, rtol=0, atol=1e-12 * (1 + np.abs(s).max()))
@@ -204,15 +255,18 @@ def test_one_robot_accelerates_the_same_whether_alone_or_together(alone: bool) -
         for acceleration in (Anderson(per_robot=alone), None)
     )
     expected = list(islice(iterate(SOC(), problem), 12))
-    for one, other in zip(states, expected, strict=True):
-        np.testing.assert_array_equal(one.omega, other.omega)
+    for state, expected_state in zip(states, expected, strict=True):
+        np.testing.assert_array_equal(state.omega, expected_state.omega)
     assert np.abs(states[-1].omega - plain[-1].omega).max() > 1e-9
 
 
 def with_settings(soc: SOC, state: ConsensusIterate) -> ConsensusIterate:
     """State whose robots have other settings."""
     robots = [
-        replace(robot, state=replace(robot.state, block=replace(robot.block, settings=soc.step_settings)))
+        replace(
+            robot,
+            state=replace(robot.state, block=replace(robot.block, settings=soc.step_settings)),
+        )
         for robot in state.robots
     ]
     return replace(state, robots=tuple(robots))
@@ -230,7 +284,9 @@ def test_without_noise_state_zero_is_a_fixed_point() -> None:
 
 @settings(max_examples=examples(40))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, method=METHODS)
-def test_graphs_without_noise_end_at_zero(seed: int, n: int, d: int, method: PartitionMethod) -> None:
+def test_graphs_without_noise_end_at_zero(
+    seed: int, n: int, d: int, method: PartitionMethod
+) -> None:
     problem = PGOProblem(exact_graph(seed, n, d))
     for robots in (None, robots_of(problem, seed, method)):
         for start in (None, problem.graph.truth):
@@ -244,10 +300,12 @@ def test_graphs_without_noise_end_at_zero(seed: int, n: int, d: int, method: Par
 
 def spoiled(state: SOCState | ConsensusIterate) -> SOCState | ConsensusIterate:
     if isinstance(state, SOCState):
-        return replace(state, block=replace(state.block, s=np.full_like(state.block.s, np.inf)))
+        return replace(state, B=np.full_like(state.B, np.inf))
     robot = state.robots[0]
     block = replace(robot.block, s=np.full_like(robot.block.s, np.inf))
-    return replace(state, robots=(replace(robot, state=replace(robot.state, block=block)), *state.robots[1:]))
+    return replace(
+        state, robots=(replace(robot, state=replace(robot.state, block=block)), *state.robots[1:])
+    )
 
 
 @pytest.mark.parametrize("robots", [1, 3])
@@ -258,19 +316,24 @@ def test_an_iterate_that_is_not_finite_is_said_to_be(robots: int) -> None:
     broken = soc.step(problem, spoiled(state))
     assert broken.k == 1
     measurement = soc.measure(problem, broken)
-    assert np.isnan([measurement.objective, measurement.primal_residual, measurement.dual_residual]).all()
+    assert np.isnan(
+        [measurement.objective, measurement.primal_residual, measurement.dual_residual]
+    ).all()
     assert soc.converged(broken, measurement) is None
 
 
 def test_the_refreshed_multiplier_is_the_stationary_one() -> None:
-    # At a stationary point 2 Lambda_i R_i^T + rho_i B_i = 0, which makes it a fixed point of the recursion.
+    # At a stationary point 2 Lambda_i R_i^T + rho_i B_i = 0, which makes it a fixed point of the
+    # recursion.
     problem = PGOProblem(varied_graph(0, 10, 3, LOUD_NOISE))
     best = polish(problem, chordal_start(problem))
     soc = SOC(tolerance=1e-10, max_iterations=2000)
     state = run(soc, problem, best).state
     poses = soc.poses(problem, state)
-    B = np.swapaxes(unstack_transposes(state.B), 1, 2)
-    expected = -2.0 * multipliers(problem, poses) @ np.swapaxes(poses.R, 1, 2) / state.rho[:, None, None]
+    B = np.swapaxes(state.B, 1, 2)
+    expected = (
+        -2.0 * multipliers(problem, poses) @ np.swapaxes(poses.R, 1, 2) / state.rho[:, None, None]
+    )
     np.testing.assert_allclose(B, expected, rtol=0, atol=1e-6)
     assert relative_decrement(problem, poses) <= 1e-12
 
@@ -279,7 +342,10 @@ def test_couplings_follow_from_the_robots() -> None:
     graph = grid(np.random.default_rng(0))
     assert SOC().effective_coupling is Coupling.JOINT
     assert SOC(robots=partition(graph, 3)).effective_coupling is Coupling.CONSENSUS
-    assert SOC(coupling=Coupling.JOINT, robots=partition(graph, 1)).effective_coupling is Coupling.JOINT
+    assert (
+        SOC(coupling=Coupling.JOINT, robots=partition(graph, 1)).effective_coupling
+        is Coupling.JOINT
+    )
 
 
 @pytest.mark.parametrize(
@@ -296,7 +362,10 @@ def test_couplings_follow_from_the_robots() -> None:
         ({"max_iterations": -1}, "max_iterations must not be negative"),
         ({"coupling": Coupling.CONSENSUS}, r"CONSENSUS needs robots; see pgo_models\.partition"),
         (
-            {"coupling": Coupling.JOINT, "robots": Partition(np.array([0, 1]), PartitionMethod.CONTIGUOUS)},
+            {
+                "coupling": Coupling.JOINT,
+                "robots": Partition(np.array([0, 1]), PartitionMethod.CONTIGUOUS),
+            },
             "JOINT has one robot",
         ),
     ],

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from budget import examples
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import pgo_models as pgo
 from pgo_models.certificates.certificate import relative_gap
@@ -25,7 +24,11 @@ BY_ROBOTS = {
     BenchmarkMethod.SUBSTRUCTURED,
     BenchmarkMethod.GAUSS_SEIDEL,
 }
-HERE = [one for one in BenchmarkMethod if one is not BenchmarkMethod.GTSAM or importlib.util.find_spec("gtsam")]
+HERE = [
+    method
+    for method in BenchmarkMethod
+    if method is not BenchmarkMethod.GTSAM or importlib.util.find_spec("gtsam")
+]
 SCENES = {"circle": pgo.circle, "grid": pgo.grid, "sphere": pgo.sphere}
 
 
@@ -39,7 +42,7 @@ def bound(problem):
     return solve(problem).lower_bound
 
 
-@pytest.mark.parametrize("contender", HERE, ids=lambda one: one.value)
+@pytest.mark.parametrize("contender", HERE, ids=lambda method: method.value)
 def test_every_contender_has_an_answer_and_counts_what_it_spent(contender, problem, bound):
     trial = run_benchmark(contender, problem)
     assert trial.contender is contender
@@ -47,7 +50,8 @@ def test_every_contender_has_an_answer_and_counts_what_it_spent(contender, probl
     assert trial.is_answer
     assert trial.remark == ""
     assert trial.objective == pytest.approx(problem.objective(trial.poses), rel=1e-12)
-    # DGS is chordal and one Gauss-Newton step, GTSAM minimises angles; the others reach the optimum.
+    # DGS is chordal and one Gauss-Newton step, GTSAM minimises angles; the others reach the
+    # optimum.
     wanted = 0.1 if contender in (BenchmarkMethod.GAUSS_SEIDEL, BenchmarkMethod.GTSAM) else 1e-5
     assert 0 <= relative_gap(trial.objective, bound) < wanted
     assert 0 < trial.seconds_per_robot <= trial.seconds * (1 + 1e-12)
@@ -61,7 +65,7 @@ def test_every_contender_has_an_answer_and_counts_what_it_spent(contender, probl
         assert trial.seconds_per_robot == trial.seconds
 
 
-@pytest.mark.parametrize("contender", HERE, ids=lambda one: one.value)
+@pytest.mark.parametrize("contender", HERE, ids=lambda method: method.value)
 def test_the_curve_of_a_trial_ends_where_the_trial_does(contender, problem, bound):
     trial = run_benchmark(contender, problem)
     curve = trial.curve(bound)
@@ -85,9 +89,11 @@ def test_the_curve_of_a_trial_ends_where_the_trial_does(contender, problem, boun
 @settings(max_examples=examples(6))
 def test_the_papers_method_keeps_to_its_rounds(scene, seed, rounds):
     problem = pgo.PGOProblem(SCENES[scene](np.random.default_rng(seed)))
-    trial = run_benchmark(BenchmarkMethod.PAPER, problem, BenchmarkSettings(max_rounds=rounds), problem.graph.initial)
+    trial = run_benchmark(
+        BenchmarkMethod.PAPER, problem, BenchmarkSettings(max_rounds=rounds), problem.graph.initial
+    )
     assert sum(trial.iterations) <= trial.rounds <= rounds
-    if trial.legs[-1].status is not Status.CONVERGED:
+    if trial.stages[-1].status is not Status.CONVERGED:
         assert trial.remark == f"stopped within {rounds} rounds"
     assert trial.objective == pytest.approx(problem.objective(trial.poses), rel=1e-12)
 
@@ -97,10 +103,14 @@ def test_the_papers_method_hands_its_last_iterate_on_even_where_an_earlier_one_i
     for seed in range(3):
         graph = pgo.circle(np.random.default_rng(seed))
         trial = run_benchmark(
-            BenchmarkMethod.PAPER, pgo.PGOProblem(graph), BenchmarkSettings(max_rounds=rounds), graph.initial
+            BenchmarkMethod.PAPER,
+            pgo.PGOProblem(graph),
+            BenchmarkSettings(max_rounds=rounds),
+            graph.initial,
         )
         assert trial.iterations[0] == rounds // 2
-        assert trial.first_objective == pytest.approx(trial.legs[0].history.objective[-1], rel=1e-9)
+        last_of_first_stage = trial.stages[0].history.objective[-1]
+        assert trial.first_objective == pytest.approx(last_of_first_stage, rel=1e-9)
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -111,7 +121,10 @@ def test_the_papers_method_beats_the_papers_gap_within_its_iterations(scene):
         graph = SCENES[scene](np.random.default_rng(100 + seed))
         problem = pgo.PGOProblem(graph)
         trial = run_benchmark(
-            BenchmarkMethod.PAPER, problem, BenchmarkSettings(max_rounds=row.soc.iterations), graph.initial
+            BenchmarkMethod.PAPER,
+            problem,
+            BenchmarkSettings(max_rounds=row.soc.iterations),
+            graph.initial,
         )
         assert trial.rounds <= row.soc.iterations
         assert relative_gap(trial.objective, solve(problem).lower_bound) <= theirs
@@ -125,11 +138,13 @@ def test_dgs_that_is_cut_short_in_its_first_stage_is_no_answer(problem, monkeypa
 
 
 def test_a_stage_that_did_not_converge_is_said(problem, monkeypatch):
-    monkeypatch.setattr(trial_runs, "HANDOVER", replace(trial_runs.HANDOVER, max_iterations=2))
+    monkeypatch.setattr(trial_runs, "WARM_START", replace(trial_runs.WARM_START, max_iterations=2))
     assert run_benchmark(BenchmarkMethod.JOINT, problem).remark == "SOC: MAX_ITERATIONS"
 
 
-@pytest.mark.parametrize("contender", [BenchmarkMethod.STAIRCASE, BenchmarkMethod.CONSENSUS, BenchmarkMethod.PAPER])
+@pytest.mark.parametrize(
+    "contender", [BenchmarkMethod.STAIRCASE, BenchmarkMethod.CONSENSUS, BenchmarkMethod.PAPER]
+)
 def test_time_runs_out_for_all_stages_together(contender, problem):
     trial = run_benchmark(contender, problem, BenchmarkSettings(time_limit=1e-9))
     assert trial.status is Status.TIME_LIMIT
@@ -138,7 +153,9 @@ def test_time_runs_out_for_all_stages_together(contender, problem):
 
 
 @pytest.mark.parametrize(
-    "contender", [one for one in HERE if one is not BenchmarkMethod.GTSAM], ids=lambda one: one.value
+    "contender",
+    [method for method in HERE if method is not BenchmarkMethod.GTSAM],
+    ids=lambda method: method.value,
 )
 def test_ctrl_c_leaves_no_half_trial(contender, problem, monkeypatch):
     def as_if_interrupted(true):
@@ -154,7 +171,9 @@ def _interrupted(result):
     """A run or solution as the loop hands it back after Ctrl-C."""
     if isinstance(result, Run):
         return replace(result, status=Status.INTERRUPTED)
-    return replace(result, stages=tuple(replace(stage, status=Status.INTERRUPTED) for stage in result.stages))
+    return replace(
+        result, stages=tuple(replace(stage, status=Status.INTERRUPTED) for stage in result.stages)
+    )
 
 
 @pytest.mark.parametrize(
@@ -184,11 +203,17 @@ def test_robots_are_at_most_one_a_pose_and_contiguous_without_metis(monkeypatch)
     assert BenchmarkSettings().robots(graph).method is pgo.PartitionMethod.CONTIGUOUS
 
 
-def test_a_leg_that_is_not_counted_leaves_the_sum_open(problem):
+def test_a_stage_that_is_not_counted_leaves_the_sum_unknown(problem):
     trial = run_benchmark(BenchmarkMethod.PAPER, problem)
-    first = trial.legs[0]
-    open_leg = StageRecord(first.name, first.status, first.history)
-    mixed = BenchmarkRun(BenchmarkMethod.PAPER, (open_leg, trial.legs[1]), trial.poses, trial.objective, trial.status)
+    first = trial.stages[0]
+    uncounted = StageRecord(first.name, first.status, first.history)
+    mixed = BenchmarkRun(
+        BenchmarkMethod.PAPER,
+        (uncounted, trial.stages[1]),
+        trial.poses,
+        trial.objective,
+        trial.status,
+    )
     assert mixed.rounds is None
     assert mixed.num_bytes is None
     assert mixed.curve(0.0).rounds is None

@@ -16,23 +16,33 @@ from solvers.studies.comparison import ComparisonSettings, check_plot_format
 pytest.importorskip("matplotlib")
 pytest.importorskip("plotly")
 
-CHOSEN = (BenchmarkMethod.JOINT, BenchmarkMethod.CONSENSUS, BenchmarkMethod.SUBSTRUCTURED, BenchmarkMethod.GAUSS_SEIDEL)
+CHOSEN = (
+    BenchmarkMethod.JOINT,
+    BenchmarkMethod.CONSENSUS,
+    BenchmarkMethod.SUBSTRUCTURED,
+    BenchmarkMethod.GAUSS_SEIDEL,
+)
 
 
 @pytest.fixture(scope="module")
 def compared():
-    return compare_methods(pgo.grid(np.random.default_rng(1)), ComparisonSettings(CHOSEN, BenchmarkSettings(3)))
+    return compare_methods(
+        pgo.grid(np.random.default_rng(1)), ComparisonSettings(CHOSEN, BenchmarkSettings(3))
+    )
 
 
 def curve(name, length=9, rounds=None, num_bytes=None):
-    records = tuple(Record(k, 0.1 * k, Measurement(2.0 + 0.5**k, 0.5**k, 0.5**k)) for k in range(length))
+    records = tuple(
+        Record(k, 0.1 * k, Measurement(2.0 + 0.5**k, 0.5**k, 0.5**k)) for k in range(length)
+    )
     return Curve(name, History(records), 2.0, rounds, num_bytes)
 
 
 def test_all_methods_stand_in_one_table_against_one_bound(compared):
     assert compared.is_complete
     assert [trial.contender for trial in compared.trials] == list(CHOSEN)
-    assert compared.lower_bound <= compared.optimum <= min(trial.objective for trial in compared.trials)
+    best = min(trial.objective for trial in compared.trials)
+    assert compared.lower_bound <= compared.optimum <= best * (1.0 + 1e-9)
     table = compared.table()
     for record, trial in zip(table.records, compared.trials, strict=True):
         assert record["method"] == trial.contender.value
@@ -40,12 +50,18 @@ def test_all_methods_stand_in_one_table_against_one_bound(compared):
         assert record["gap"] == (trial.objective - compared.lower_bound) / trial.objective
         assert (record["rounds"], record["bytes"]) == (trial.rounds, trial.num_bytes)
     assert table.parts[0].rows[0][4:7] == ("-", "-", "-")
-    consensus = next(trial for trial in compared.trials if trial.contender is BenchmarkMethod.CONSENSUS)
+    consensus = next(
+        trial for trial in compared.trials if trial.contender is BenchmarkMethod.CONSENSUS
+    )
     # Three to begin with and two an iteration of SOC, which robots wait for as they do for rounds.
     assert consensus.all_reduces is not None
     assert consensus.all_reduces >= 3 + consensus.iterations[0]
-    at = [trial.contender for trial in compared.trials].index(BenchmarkMethod.CONSENSUS)
-    assert table.parts[0].rows[at][5] == str(table.records[at]["all_reduces"]) == str(consensus.all_reduces)
+    row = [trial.contender for trial in compared.trials].index(BenchmarkMethod.CONSENSUS)
+    assert (
+        table.parts[0].rows[row][5]
+        == str(table.records[row]["all_reduces"])
+        == str(consensus.all_reduces)
+    )
 
 
 def test_all_that_can_be_run_here_are_run_unless_chosen():
@@ -57,9 +73,9 @@ def test_all_that_can_be_run_here_are_run_unless_chosen():
 @pytest.mark.skipif(importlib.util.find_spec("gtsam") is not None, reason="GTSAM is installed")
 def test_a_method_that_cannot_be_run_leaves_its_reason():
     settings = ComparisonSettings((BenchmarkMethod.GTSAM, BenchmarkMethod.NEWTON))
-    found = compare_methods(pgo.grid(np.random.default_rng(1)), settings)
-    assert [trial.contender for trial in found.trials] == [BenchmarkMethod.NEWTON]
-    rows = found.table().parts[0].rows
+    compared = compare_methods(pgo.grid(np.random.default_rng(1)), settings)
+    assert [trial.contender for trial in compared.trials] == [BenchmarkMethod.NEWTON]
+    rows = compared.table().parts[0].rows
     assert rows[1][:2] == ("GTSAM", "-")
     assert "pip install 'pgo-splitting[peers]'" in rows[1][-1]
 
@@ -73,19 +89,23 @@ def test_ctrl_c_keeps_the_methods_that_are_done(monkeypatch):
         return true(contender, *rest)
 
     monkeypatch.setattr(comparison, "run_benchmark", run_benchmark)
-    settings = ComparisonSettings((BenchmarkMethod.STAIRCASE, BenchmarkMethod.NEWTON, BenchmarkMethod.JOINT))
-    found = compare_methods(pgo.grid(np.random.default_rng(1)), settings)
-    assert not found.is_complete
-    assert [trial.contender for trial in found.trials] == [BenchmarkMethod.STAIRCASE]
-    assert "interrupted: the methods left out were not run" in found.table().notes
+    settings = ComparisonSettings(
+        (BenchmarkMethod.STAIRCASE, BenchmarkMethod.NEWTON, BenchmarkMethod.JOINT)
+    )
+    compared = compare_methods(pgo.grid(np.random.default_rng(1)), settings)
+    assert not compared.is_complete
+    assert [trial.contender for trial in compared.trials] == [BenchmarkMethod.STAIRCASE]
+    assert "interrupted: the methods left out were not run" in compared.table().notes
 
 
 def test_a_dgs_without_poses_has_no_figures_and_no_curve(monkeypatch):
     monkeypatch.setattr("solvers.studies.benchmark_runs._MOST_SWEEPS", 2)
-    found = compare_methods(pgo.grid(np.random.default_rng(1)), ComparisonSettings((BenchmarkMethod.GAUSS_SEIDEL,)))
-    assert found.curves == []
-    assert found.table().parts[0].rows[0][1:3] == ("-", "-")
-    assert found.table().records[0]["objective"] is None
+    compared = compare_methods(
+        pgo.grid(np.random.default_rng(1)), ComparisonSettings((BenchmarkMethod.GAUSS_SEIDEL,))
+    )
+    assert compared.curves == []
+    assert compared.table().parts[0].rows[0][1:3] == ("-", "-")
+    assert compared.table().records[0]["objective"] is None
 
 
 def test_plots_are_written_as_pictures_and_pages(compared, tmp_path):
@@ -103,7 +123,8 @@ def test_another_suffix_is_refused(name, compared, tmp_path):
 
 
 def test_a_panel_holds_the_methods_whose_effort_is_counted():
-    central, robots = curve("central"), curve("robots", rounds=np.arange(9.0), num_bytes=800 * np.arange(9.0))
+    central = curve("central")
+    robots = curve("robots", rounds=np.arange(9.0), num_bytes=800 * np.arange(9.0))
     rounds_only = curve("rounds only", rounds=np.arange(9.0))
     figure = plot_efforts([central, robots, rounds_only])
     labels = [axes.get_xlabel() for axes in figure.axes]
@@ -111,14 +132,21 @@ def test_a_panel_holds_the_methods_whose_effort_is_counted():
     assert [len(axes.lines) for axes in figure.axes] == [2, 1, 3]
     page = explore_efforts([central, robots, rounds_only])
     assert len(page.data) == 6
-    assert sorted(trace.name for trace in page.data if trace.showlegend) == ["central", "robots", "rounds only"]
+    assert sorted(trace.name for trace in page.data if trace.showlegend) == [
+        "central",
+        "robots",
+        "rounds only",
+    ]
     assert [axes.get_xlabel() for axes in plot_efforts([central]).axes] == labels[2:]
 
 
 def test_a_method_looks_the_same_in_all_panels_and_unlike_the_others():
     counts = np.arange(9.0)
-    curves = [curve(one.label, rounds=counts, num_bytes=counts) for one in BenchmarkMethod]
-    looks = [[(line.get_color(), line.get_marker()) for line in axes.lines] for axes in plot_efforts(curves).axes]
+    curves = [curve(method.label, rounds=counts, num_bytes=counts) for method in BenchmarkMethod]
+    looks = [
+        [(line.get_color(), line.get_marker()) for line in axes.lines]
+        for axes in plot_efforts(curves).axes
+    ]
     assert looks[0] == looks[1] == looks[2]
     assert len(set(looks[0])) == len(BenchmarkMethod)
 
@@ -141,4 +169,4 @@ def test_there_must_be_something_to_draw():
 def test_records_are_plain_json(compared, tmp_path):
     compared.table().save(tmp_path / "table.json")
     content = json.loads((tmp_path / "table.json").read_text())
-    assert [row["method"] for row in content["rows"]] == [one.value for one in CHOSEN]
+    assert [row["method"] for row in content["rows"]] == [method.value for method in CHOSEN]

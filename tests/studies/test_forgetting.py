@@ -18,7 +18,9 @@ def test_errors_of_the_first_steps_are_forgotten_and_the_penalty_alone_keeps_its
 
 def test_without_errors_both_runs_are_the_same_bits():
     problem, solution = sparse_signal(1)
-    runs = error_forgetting(problem, solution, np.random.default_rng(0), error_std=0.0, iterations=4)
+    runs = error_forgetting(
+        problem, solution, np.random.default_rng(0), error_std=0.0, iterations=4
+    )
     np.testing.assert_array_equal(runs.undisturbed, runs.disturbed)
 
 

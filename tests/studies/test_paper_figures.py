@@ -27,7 +27,9 @@ def drawn(tmp_path_factory):
 def test_there_is_a_picture_and_a_page_of_everything_that_is_here(drawn):
     folder, written, reasons = drawn
     names = ["scenes", "convergence-circle", "convergence-sphere", "convergence-grid"]
-    assert [path.name for path in written] == [f"{name}{suffix}" for name in names for suffix in (".png", ".html")]
+    assert [path.name for path in written] == [
+        f"{name}{suffix}" for name in names for suffix in (".png", ".html")
+    ]
     assert sorted(folder.iterdir()) == sorted(written)
     for path in written:
         assert (b"\x89PNG" if path.suffix == ".png" else b"<html") in path.read_bytes()[:100]
@@ -55,7 +57,8 @@ def test_truth_stands_above_the_result():
     assert len({trace.name for trace in page.data if trace.showlegend}) == sum(
         bool(trace.showlegend) for trace in page.data
     )
-    above, below = page.layout.scene.domain.y, page.layout.scene2.domain.y
+    above = page.layout.scene.domain.y
+    below = page.layout.scene2.domain.y
     assert above[0] > below[1]
 
 
@@ -67,7 +70,8 @@ def test_without_plotly_nothing_is_run(monkeypatch, tmp_path):
 
 
 def test_what_is_drawn_before_an_interruption_is_there(monkeypatch, tmp_path):
-    shown, names = paper_figures._run(next(row for row in published_rows() if row.name == "grid"), False), []
+    shown = paper_figures._run(next(row for row in published_rows() if row.name == "grid"), False)
+    names = []
 
     def run(row, download):
         names.append(row.name)

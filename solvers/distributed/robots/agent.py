@@ -28,7 +28,7 @@ A = TypeVar("A")
 
 @dataclass(frozen=True, eq=False)
 class AgentRecord:
-    """All that orders left with an agent: what a checkpoint holds of it."""
+    """State that orders leave with an agent; a checkpoint contains it."""
 
     interior: InteriorState | None
     copies: CopiesState | None
@@ -37,57 +37,82 @@ class AgentRecord:
 
 @dataclass(frozen=True, eq=False)
 class CoverRotations:
-    """Omega of own poses that the driver solves for, and where they are among its poses."""
+    """Omega of the own poses that are in the cover, and their positions there."""
 
     in_cover: IntArray
     R: np.ndarray
 
 
+# Classes of the records in a snapshot.
 CLASSES = (
-    *(AgentRecord, InteriorState, CopiesState, Poses, LiftedPoses, RecursionBlock, StepSettings, Rotations, Anderson),
-    *(AndersonShare, AndersonSums, RobotProof, Eliminated, Waiting, TurnSettings, HeldFront, FrontFactor),
+    AgentRecord,
+    InteriorState,
+    CopiesState,
+    Waiting,
+    TurnSettings,
+    Poses,
+    LiftedPoses,
+    RecursionBlock,
+    StepSettings,
+    Rotations,
+    Anderson,
+    AndersonShare,
+    AndersonSums,
+    RobotProof,
+    Eliminated,
+    HeldFront,
+    FrontFactor,
 )
 
 
 class Agent:
-    """A robot that obeys orders: each replaces what it has by what the order makes of it."""
+    """A robot that obeys orders: an order replaces its state by the one that the order returns."""
 
     def __init__(self, subgraph: Subgraph, backend: CholeskyBackend | None) -> None:
-        self.subgraph, self.backend = subgraph, backend
-        self.interior = interior_of(subgraph, backend)  # None when it counts no edge
-        self.copies: ConsensusRobot | None = None  # before CONSENSUS begins
-        self.front: HeldFront | None = None  # when it holds none of the separator tree
+        self.subgraph = subgraph
+        self.backend = backend
+        self.interior = interior_of(subgraph, backend)  # None if it counts no edge
+        self.copies: ConsensusRobot | None = None  # None before CONSENSUS begins
+        self.front: HeldFront | None = None  # None if it holds no front of the separator tree
 
     def snapshot(self) -> Snapshot:
-        """All that earlier orders left here, as arrays; matrices instead of their factors."""
+        """State that earlier orders left, as arrays, with matrices instead of their factors."""
         interior = self.interior.state if self.interior is not None else None
-        return serialize(AgentRecord(interior, self.copies.state if self.copies is not None else None, self.front))
+        copies = self.copies.state if self.copies is not None else None
+        return serialize(AgentRecord(interior, copies, self.front))
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Go on from a snapshot of this robot."""
+        """Continue from a snapshot of this robot."""
         record: AgentRecord = deserialize(snapshot, CLASSES)
         if self.interior is not None and record.interior is not None:
             self.interior = replace(self.interior, state=record.interior).restored()
-        self.copies = self._no_copies.restored(record.copies) if record.copies is not None else None
+        self.copies = None
+        if record.copies is not None:
+            self.copies = self._new_copies.restored(record.copies)
         self.front = record.front
 
     @property
-    def _no_copies(self) -> ConsensusRobot:
+    def _new_copies(self) -> ConsensusRobot:
+        """Copies without a state."""
         return ConsensusRobot(CopyLayout(self.subgraph, self.backend), CopiesState())
 
 
-# Orders: with the first argument given, functions of an agent and a request.
+# Orders are functions of an agent and a request, some of them once their first argument is given.
 
 
-def order_interior(order: Callable[[Interior, Q], tuple[Interior, A]], agent: Agent, request: Q) -> A | None:
-    """Give the interior an order; None where a robot counts no edge."""
+def order_interior(
+    order: Callable[[Interior, Q], tuple[Interior, A]], agent: Agent, request: Q
+) -> A | None:
+    """Give the interior an order; None if the robot counts no edge."""
     if agent.interior is None:
         return None
     agent.interior, answer = order(agent.interior, request)
     return answer
 
 
-def order_copies(order: Callable[[ConsensusRobot, Q], tuple[ConsensusRobot, A]], agent: Agent, request: Q) -> A:
+def order_copies(
+    order: Callable[[ConsensusRobot, Q], tuple[ConsensusRobot, A]], agent: Agent, request: Q
+) -> A:
     """Give the copies an order."""
     assert agent.copies is not None
     agent.copies, answer = order(agent.copies, request)
@@ -95,44 +120,57 @@ def order_copies(order: Callable[[ConsensusRobot, Q], tuple[ConsensusRobot, A]],
 
 
 def take_front(agent: Agent, front: HeldFront | None) -> None:
-    """Hold a front of the separator tree from now on."""
+    """Hold this front of the separator tree from now on."""
     agent.front = front
 
 
-def order_front(order: Callable[[HeldFront, Q], tuple[HeldFront, A]], agent: Agent, request: Q) -> A:
-    """Give the front that is held an order."""
+def order_front(
+    order: Callable[[HeldFront, Q], tuple[HeldFront, A]], agent: Agent, request: Q
+) -> A:
+    """Give an order to the front that the robot holds."""
     assert agent.front is not None
     agent.front, answer = order(agent.front, request)
     return answer
 
 
 def begin_copies(agent: Agent, cover: Poses) -> Rows:
-    """Give the poses at hand to the copies: interior ones, and those of the cover, which the driver sends."""
+    """Start the copies at the current poses, of which the driver sends those of the cover."""
     if agent.copies is None:
-        agent.copies = agent._no_copies
+        agent.copies = agent._new_copies
     return order_copies(ConsensusRobot.begin, agent, held_poses(agent, cover))
 
 
 def held_poses(agent: Agent, cover: Poses) -> Poses:
-    """Poses at hand of all that the robot holds, others' at the identity unless they are of the cover."""
-    subgraph, d = agent.subgraph, agent.subgraph.graph.d
-    n, in_cover = len(subgraph.poses), subgraph.in_cover >= 0
-    R, t = np.broadcast_to(np.eye(d), (n, d, d)).copy(), np.zeros((n, d))
-    R[in_cover], t[in_cover] = cover.R, cover.t
+    """Current poses of all that the robot holds, (n_a).
+
+    Other robots' poses are at the identity unless they are in the cover.
+    """
+    subgraph = agent.subgraph
+    d = subgraph.graph.d
+    n = len(subgraph.poses)
+    in_cover = subgraph.in_cover >= 0
+    R = np.broadcast_to(np.eye(d), (n, d, d)).copy()
+    t = np.zeros((n, d))
+    R[in_cover] = cover.R
+    t[in_cover] = cover.t
     if agent.interior is not None:
-        part, poses = agent.interior.part, agent.interior.state.poses
-        place = np.searchsorted(subgraph.poses, part.poses[part.interior])
-        R[place], t[place] = poses.R[part.interior], poses.t[part.interior]
+        part = agent.interior.part
+        poses = agent.interior.state.poses
+        position = np.searchsorted(subgraph.poses, part.poses[part.interior])
+        R[position] = poses.R[part.interior]
+        t[position] = poses.t[part.interior]
     return Poses(R, t)
 
 
 def finish_copies(agent: Agent, _: None) -> CoverRotations:
-    """Take omega for the interior; the own rotations of the cover."""
+    """Take omega for the rotations of the interior; return those of the own poses in the cover."""
     assert agent.copies is not None
-    subgraph, omega = agent.subgraph, agent.copies.omega
-    if agent.interior is not None:
-        interior, state = agent.interior, agent.interior.state
-        place = np.searchsorted(subgraph.poses, interior.part.poses)
-        agent.interior = replace(interior, state=replace(state, poses=Poses(omega[place], state.poses.t)))
+    subgraph = agent.subgraph
+    omega = agent.copies.omega
+    interior = agent.interior
+    if interior is not None:
+        position = np.searchsorted(subgraph.poses, interior.part.poses)
+        poses = Poses(omega[position], interior.state.poses.t)
+        agent.interior = replace(interior, state=replace(interior.state, poses=poses))
     own = np.flatnonzero(subgraph.is_own & (subgraph.in_cover >= 0))
     return CoverRotations(subgraph.in_cover[own], omega[own])

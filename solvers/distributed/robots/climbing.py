@@ -1,6 +1,7 @@
-"""Orders of the staircase: a direction down, one dimension more, and back to rotations (Rosen et al. 2019).
+"""What a robot does for the staircase: find a direction down, climb, and round (Rosen et al. 2019).
 
-Directions need the elimination of S + eta blockdiag(0, I) at hand, which a proof has left.
+The orders about a direction need the elimination of S + eta blockdiag(0, I) that the robot has kept
+from a proof.
 """
 
 from dataclasses import dataclass
@@ -16,59 +17,80 @@ from solvers.distributed.robots.records import CostParts, Move, ReducedTranslati
 
 @dataclass(frozen=True, eq=False)
 class PowerStep:
-    """Right-hand side of the next inverse iteration; squared norm of its interior part, and of the largest block."""
+    """Right-hand side of the next inverse iteration, and figures of the interior part of v."""
 
     right: RightHandSide
-    square: float
-    largest: float
+    square: float  # squared norm of the interior part
+    largest: float  # largest squared norm of a block
 
 
 def begin_direction(robot: Interior, _: None) -> tuple[Interior, PowerStep]:
     """Begin inverse iteration at a random direction of the interior's rotations."""
     rng = np.random.default_rng(robot.part.poses[0])
-    return _power_step(robot, rng.standard_normal(len(robot.interior_rows)))
+    num_rows = len(robot.interior_rows)
+    v = rng.standard_normal(num_rows)
+    return _power_step(robot, v)
 
 
 def follow_direction(robot: Interior, order: Move) -> tuple[Interior, PowerStep]:
-    """One inverse iteration, from its solution on the boundary, times a length."""
-    return _power_step(robot, order.length * robot.back_substitute(order.x)[robot.interior_rows, 0])
+    """Take one inverse iteration, from its solution on the boundary, times a length."""
+    x = robot.back_substitute(order.x)
+    v = order.length * x[robot.interior_rows, 0]
+    return _power_step(robot, v)
 
 
 def climb(robot: Interior, order: Move) -> tuple[Interior, float]:
-    """One dimension more, and x in it that a solution on the boundary, times a length, gives: part of x^T S x."""
-    x, poses = order.length * robot.back_substitute(order.x), append_dimension(robot.state.poses)
+    """Go to one dimension more, with a direction x in it; answer the robot's part of x^T S x.
+
+    The order has the solution on the boundary that gives x, and the length that it is scaled by.
+    """
+    x = order.length * robot.back_substitute(order.x)
+    poses = append_dimension(robot.state.poses)
     Lambda = robot.multipliers()[robot.part.interior]
-    value = robot.problem.objective_stacked(x) - pulled(Lambda, x[robot.interior_rows])
-    return robot.with_changes(poses=poses, step=poses.upwards(x[:, 0])), value
+    own_rows = x[robot.interior_rows]
+    objective = robot.problem.objective_stacked(x)
+    value = objective - pulled(Lambda, own_rows)
+    step = poses.upwards(x[:, 0])
+    return robot.with_changes(poses=poses, step=step), value
 
 
 def pulled(Lambda: Array, x: Array) -> float:
-    """sum_i x_i^T Lambda_i x_i of Lambda, (n, d, d), and rows x, (d n, 1)."""
-    blocks = x.reshape(-1, Lambda.shape[-1])
+    """Compute sum_i x_i^T Lambda_i x_i of Lambda, (n, d, d), and rows x, (d n, 1)."""
+    d = Lambda.shape[-1]
+    blocks = x.reshape(-1, d)
     return float(np.einsum("na,nab,nb->", blocks, Lambda, blocks))
 
 
 def try_climb(robot: Interior, length: float) -> tuple[Interior, CostParts]:
-    """Trial a length along the direction: parts of F there."""
+    """Move a length along the direction: a trial, and the parts of F there."""
     trial = robot.moved(length)
     return robot.with_changes(trial=trial), robot.evaluation(trial)
 
 
 def gram(robot: Interior, _: None) -> tuple[Interior, Array]:
-    """Sum of R_i R_i^T over the interior, (r, r)."""
-    return robot, gram_matrix(robot.state.poses.R[robot.part.interior])
+    """Compute the sum of R_i R_i^T over the interior, (r, r)."""
+    interior = robot.part.interior
+    return robot, gram_matrix(robot.state.poses.R[interior])
 
 
 def round_to(robot: Interior, V: Array) -> tuple[Interior, ReducedTranslations]:
-    """Poses of V^T R_i, projected to rotations; then `translations`."""
+    """Project the poses V^T R_i to rotations; then as `Interior.translations`."""
     poses = robot.state.poses
-    rounded = Poses(project_to_rotations(V.T @ poses.R), poses.t @ V)
-    return robot.with_changes(poses=rounded, trial=rounded, kept=rounded, step=None).translations(None)
+    R = project_to_rotations(V.T @ poses.R)
+    rounded = Poses(R, poses.t @ V)
+    following = robot.with_changes(poses=rounded, trial=rounded, kept=rounded, step=None)
+    return following.translations(None)
 
 
 def _power_step(robot: Interior, v: Array) -> tuple[Interior, PowerStep]:
-    problem, b = robot.part.problem, np.zeros((robot.part.problem.side, 1))
+    """Reduce the right-hand side that is v on the rotations of the interior, zero elsewhere."""
+    problem = robot.part.problem
+    b = np.zeros((problem.side, 1))
     b[robot.interior_rows, 0] = v
     following, right = robot.reduced(b)
-    squares = np.sum(v.reshape(-1, problem.d) ** 2, axis=1)
-    return following, PowerStep(right, float(squares.sum()), float(squares.max(initial=0.0)))
+    blocks = v.reshape(-1, problem.d)
+    squares = np.sum(blocks**2, axis=1)
+    square = float(squares.sum())
+    largest = float(squares.max(initial=0.0))
+    step = PowerStep(right, square, largest)
+    return following, step

@@ -1,4 +1,7 @@
-"""Factors of the matrices of a robot's interior; what a state holds is the matrix, so that they can be found again."""
+"""Factors of the matrices of a robot's interior.
+
+A state holds the matrix alone, from which its factors can be computed again.
+"""
 
 from dataclasses import dataclass
 
@@ -14,7 +17,7 @@ from solvers.soc.subgraph import Part
 
 @dataclass(frozen=True, eq=False)
 class Eliminated:
-    """The matrix that was eliminated last, as arrays, and its unknowns a pose."""
+    """The matrix that was eliminated last, as arrays, and its unknowns per pose."""
 
     data: Array
     indices: IntArray
@@ -28,52 +31,65 @@ class Eliminated:
 
 
 class Factors:
-    """Factors of what is in a state: they are found again when they are not those of the state that asks."""
+    """Factors of the matrices in a robot's state.
+
+    They are computed again where the state that asks holds another matrix than the one that was
+    factored last.
+    """
 
     def __init__(self, part: Part, backend: CholeskyBackend | None) -> None:
-        self.part, self.backend = part, backend
+        self.part = part
+        self.backend = backend
         self._cuts: dict[Widths, Cut] = {}
-        self._of: tuple[Eliminated, Elimination] | None = None
+        self._last: tuple[Eliminated, Elimination] | None = None
         self._laplacian: Elimination | None = None
 
     @property
     def grounds(self) -> bool:
-        """Whether pose 0 is in the interior; else another robot or the driver holds it down."""
-        return bool(self.part.poses[0] == 0) and bool(self.part.in_cover[0] < 0)
+        """Whether pose 0 is in the interior; else another robot or the driver grounds it."""
+        has_pose_0 = bool(self.part.poses[0] == 0)
+        is_interior = bool(self.part.in_cover[0] < 0)
+        return has_pose_0 and is_interior
 
     def cut(self, *widths: int) -> Cut:
-        """Where unknowns with so many numbers a pose are cut."""
+        """Cut of unknowns with these numbers per pose into interior and boundary."""
         if widths not in self._cuts:
-            part, p = self.part, self.part.problem.num_poses
-            own, boundary = columns_of(part.interior, p, widths), columns_of(part.boundary, p, widths)
-            self._cuts[widths] = Cut(own, boundary, None)
+            part = self.part
+            p = part.problem.num_poses
+            interior = columns_of(part.interior, p, widths)
+            boundary = columns_of(part.boundary, p, widths)
+            self._cuts[widths] = Cut(interior, boundary, None)
         return self._cuts[widths]
 
     def eliminate(self, K: csc_array, widths: Widths) -> tuple[Eliminated, Elimination]:
         """Eliminate the interior of K x = b."""
-        self._of = None  # its memory may be needed
-        found = eliminate(K, self.cut(*widths), self.backend)
-        return self.keep(K, widths, found), found
+        self._last = None  # its memory may be needed
+        elimination = eliminate(K, self.cut(*widths), self.backend)
+        return self.keep(K, widths, elimination), elimination
 
-    def keep(self, K: csc_array, widths: Widths, found: Elimination) -> Eliminated:
+    def keep(self, K: csc_array, widths: Widths, elimination: Elimination) -> Eliminated:
         """Remember an elimination of K; its analysis is the same the next time."""
         eliminated = Eliminated(K.data, K.indices, K.indptr, widths)
-        self._cuts[widths], self._of = found.cut, (eliminated, found)
+        self._cuts[widths] = elimination.cut
+        self._last = (eliminated, elimination)
         return eliminated
 
     def of(self, eliminated: Eliminated | None) -> Elimination:
-        """Elimination of a matrix that was eliminated."""
+        """Elimination of the matrix in a state, computed again if it is not the last one."""
         assert eliminated is not None
-        if self._of is None or self._of[0] is not eliminated:
-            self._of = eliminated, eliminate(eliminated.matrix, self.cut(*eliminated.widths), self.backend)
-        return self._of[1]
+        if self._last is None or self._last[0] is not eliminated:
+            cut = self.cut(*eliminated.widths)
+            elimination = eliminate(eliminated.matrix, cut, self.backend)
+            self._last = (eliminated, elimination)
+        return self._last[1]
 
     @property
     def laplacian(self) -> Elimination:
         """Elimination of the matrix of the translations."""
         if self._laplacian is None:
             problem = self.part.problem
-            M_tt = problem.M[: problem.num_poses, : problem.num_poses].tocsc()
+            p = problem.num_poses
+            M_tt = problem.M[:p, :p].tocsc()
             if self.grounds:
                 M_tt[0, 0] *= 2.0
             self._laplacian = eliminate(M_tt, self.cut(1), self.backend)

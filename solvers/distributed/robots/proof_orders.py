@@ -1,11 +1,13 @@
-"""Orders about a robot's part of the lower bound: eliminate S for a proof, begin one at a point, move it."""
+"""What a robot does for its part of the lower bound: eliminate S, begin a proof, and move it."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 
+from pgo_models.certificates.rounding_errors import fits_to_rounding
 from pgo_models.geometry.rotations import Array
+from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.robots.elimination import row_sums, unpacked
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.proof import begin_proof, verify_interior
@@ -14,36 +16,58 @@ from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofSte
 
 def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofAnswer]:
     """Eliminate S for a proof, and at a point begin one (`solvers.distributed.robots.proof`)."""
-    problem, Lambda, factors = robot.tangent_problem, robot.multipliers(), robot.factors
-    Lambda[robot.part.boundary] = 0.0
-    constant, constant_error = problem.weights.constant
-    trace = math.fsum([*np.einsum("naa->na", Lambda).ravel(), constant, -constant_error])
+    problem = robot.tangent_problem
+    factors = robot.factors
+    Lambda = robot.multipliers()
+    Lambda[robot.part.boundary] = 0.0  # those are the driver's
+    trace = _trace(problem, Lambda)
     widths = (1, problem.d)
     cut = factors.cut(*widths)
     fixed = cut.boundary[order.fixed > 0]
-    fixed = np.append(fixed, 0) if order.point is None and factors.grounds else fixed
-    found = verify_interior(problem, Lambda, order.eta, cut, fixed, order.share, factors.backend)
-    if found is None:
+    if order.point is None and factors.grounds:
+        fixed = np.append(fixed, 0)
+    verified = verify_interior(problem, Lambda, order.eta, cut, fixed, order.share, factors.backend)
+    if verified is None:
         return robot.with_changes(proof=None), ProofAnswer(None, None, trace, None)
-    matrix, elimination, slack = found
-    following = robot.with_changes(proof=None, eliminated=factors.keep(matrix, widths, elimination))
-    sizes = row_sums(unpacked(elimination.schur, len(cut.boundary)), order.diagonal)
+    matrix, elimination, slack = verified
+    eliminated = factors.keep(matrix, widths, elimination)
+    following = robot.with_changes(proof=None, eliminated=eliminated)
+    schur = unpacked(elimination.schur, len(cut.boundary))
+    sizes = row_sums(schur, order.diagonal)
     if order.point is None:
         return following, ProofAnswer(elimination.schur, sizes, trace, None)
-    proof = begin_proof(robot.part, robot.state.poses, Lambda, slack, elimination.cut, order.point, order.fixed)
+    proof = begin_proof(
+        robot.part, robot.state.poses, Lambda, slack, elimination.cut, order.point, order.fixed
+    )
     following, step = _evaluated(following.with_changes(proof=proof))
     return following, ProofAnswer(elimination.schur, sizes, trace, step)
 
 
+def fits_part(robot: Interior, _: None) -> tuple[Interior, bool]:
+    """Whether every edge of the robot fits to its rounding at the poses."""
+    return robot, fits_to_rounding(robot.problem, robot.state.poses)
+
+
 def move_proof(robot: Interior, x: Array) -> tuple[Interior, ProofStep]:
     """Move X by -S_r^-1 G, from its rows on the boundary: parts of the bound there."""
-    assert robot.state.proof is not None
-    return _evaluated(robot.with_changes(proof=robot.state.proof.moved(robot.back_substitute(x))))
+    proof = robot.state.proof
+    assert proof is not None
+    moved = proof.moved(robot.back_substitute(x))
+    return _evaluated(robot.with_changes(proof=moved))
+
+
+def _trace(problem: PGOProblem, Lambda: Array) -> float:
+    """Compute the robot's part of tr(Lambda), with the constant of its cost, rounded down."""
+    constant, constant_error = problem.weights.constant
+    diagonals = np.einsum("naa->na", Lambda).ravel()
+    return math.fsum([*diagonals, constant, -constant_error])
 
 
 def _evaluated(robot: Interior) -> tuple[Interior, ProofStep]:
+    """Evaluate the proof at its X, and reduce S X without the rows that are left out."""
     proof = robot.state.proof
     assert proof is not None
     sums, product = proof.evaluated(robot.tangent_problem, robot.boundary_rows)
     following, right = robot.reduced(product)
-    return following, ProofStep(sums, replace(right, b=np.where(proof.fixed[:, None] > 0, 0.0, right.b)))
+    b = np.where(proof.fixed[:, None] > 0, 0.0, right.b)
+    return following, ProofStep(sums, replace(right, b=b))

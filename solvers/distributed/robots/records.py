@@ -1,4 +1,7 @@
-"""What the driver asks a robot's interior, and what it answers; g boundary poses, vectors of w unknowns a pose."""
+"""What the driver asks a robot's interior, and what it answers.
+
+Shapes are those of a robot with g boundary poses, and of vectors with w unknowns per pose.
+"""
 
 from dataclasses import dataclass
 
@@ -46,12 +49,12 @@ class CostParts:
 
 @dataclass(frozen=True)
 class Reweigh:
-    """Control mu of a robust loss's surrogate, scale of the thresholds, weight under which an edge hardly counts."""
+    """How edges are weighed by their residuals in a robust solve."""
 
     is_truncated: bool
-    mu: float
-    scale: float
-    least: float
+    mu: float  # control of the robust loss's surrogate
+    scale: float  # of the thresholds
+    least: float  # weight under which an edge hardly counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +67,7 @@ class Reweighed:
 
 @dataclass(frozen=True)
 class RatioSums:
-    """Of the edges that may be wrong: counts, and the least and largest r^2 / c^2; and the robust cost of all."""
+    """Counts and ratios r^2 / c^2 of the edges that may be wrong, and the robust cost of all."""
 
     count: float
     undecided: float
@@ -85,41 +88,27 @@ class TrialEvaluation:
 
 @dataclass(frozen=True)
 class RescaleInterior:
-    """Factor on rho, and whether all go back to their best iterate."""
+    """Change of the penalty in SOC."""
 
-    factor: float
-    from_best: bool
+    factor: float  # on rho
+    from_best: bool  # whether all go back to their best iterate
 
 
 @dataclass(frozen=True, eq=False)
 class Agree:
-    """What all parties learn from step (a), and the rows of the next omega on the boundary, (dg, d)."""
+    """What all parties learn from step (a)."""
 
     agreement: Agreement
-    measured_at: Array
+    measured_at: Array  # (dg, d): rows of the next omega on the boundary
 
 
 @dataclass(frozen=True, eq=False)
 class Agreed:
-    """Squared residuals, (2,), the right-hand side of the next step (a), and part of F at omega."""
+    """What a robot answers to `Agree`."""
 
-    sums: Array
-    right: RightHandSide
-    measured: float
-
-
-@dataclass(frozen=True)
-class ModelOrder:
-    """Newton's matrix, that of S + eta blockdiag(0, I), or the Gauss-Newton one with a share of its diagonal added."""
-
-    second_order: bool
-    damping: float
-    eta: float = 0.0
-
-    @property
-    def is_newton(self) -> bool:
-        """Whether it is the Hessian."""
-        return self.second_order and not self.eta
+    sums: Array  # (2,): squared residuals
+    right: RightHandSide  # of the next step (a)
+    measured: float  # part of F at omega
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,12 +140,12 @@ class ProofStep:
 
 @dataclass(frozen=True, eq=False)
 class ProofAnswer:
-    """S with the interior eliminated, None where it is not definite; part of tr(Lambda); the first step of a proof."""
+    """S with the interior eliminated for a proof."""
 
-    schur: Array | None
+    schur: Array | None  # None where the interior is not definite
     sizes: Array | None  # ((d+1) g,): `row_sums` of it
-    trace: float
-    step: ProofStep | None
+    trace: float  # part of tr(Lambda)
+    step: ProofStep | None  # the first one, where the proof begins at a point
 
 
 @dataclass(frozen=True, eq=False)

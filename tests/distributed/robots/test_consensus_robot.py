@@ -1,4 +1,4 @@
-"""What crosses between robots that hold copies: rows of poses that both hold, and sums; and what is counted of it."""
+"""What crosses between robots that hold copies, rows of shared poses and sums, and its count."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -8,9 +8,17 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
-from robots import PARTITIONERS, Partitioner, Recording, arrays_in, contiguous, metis, name_of, scattered
+from hypothesis import example, given, settings, strategies as st
+from robots import (
+    PARTITIONERS,
+    Partitioner,
+    Recording,
+    arrays_in,
+    contiguous,
+    metis,
+    name_of,
+    scattered,
+)
 
 from pgo_models.geometry.rotations import Array, exp_map, tangent_dimension
 from pgo_models.graphs.partitioning import partition
@@ -18,7 +26,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, grid
 from solvers.distributed.robots.agent import begin_copies
 from solvers.distributed.robots.interior import Interior
-from solvers.distributed.robots.proof_orders import move_proof, prove_interior
+from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.network.ledger import DRIVER
 from solvers.pipeline import Pipeline, solve
 from solvers.soc.anderson import Anderson
@@ -30,27 +38,75 @@ from solvers.soc.subgraph import middle_separator
 from solvers.solution import Solution
 
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
-STALLED = MultiplierPenalty(stall_window=3, stall_ratio=1e-6)  # anything counts as stalled after three steps
+# anything counts as stalled after three steps
+STALLED = MultiplierPenalty(stall_window=3, stall_ratio=1e-6)
 
 STAR = {  # to and from whoever sums up: settings, figures of all poses in no order, and sums
-    *("per_norm", "per_scale", "least", "is_stationary", "alpha", "memory", "local_passes", "per_robot"),
-    *("regularization", "restart_ratio", "norms", "scale", "translation", "rotation", "factor", "size", "ratio"),
-    *("gamma", "is_best", "sums", "squares", "measured", "rotations", "value"),
+    *(
+        "per_norm",
+        "per_scale",
+        "least",
+        "is_stationary",
+        "alpha",
+        "memory",
+        "local_passes",
+        "per_robot",
+    ),
+    *(
+        "regularization",
+        "restart_ratio",
+        "norms",
+        "scale",
+        "translation",
+        "rotation",
+        "factor",
+        "size",
+        "ratio",
+    ),
+    *("gamma", "is_best", "sums", "squares", "gradient", "cost", "rotations", "value"),
 }
-Copies, Inner = ConsensusRobot, Interior
+Copies = ConsensusRobot
+Inner = Interior
 ROUNDS = (  # orders that are, or end, a round
-    *(Inner.project, Inner.set_translations, Inner.move, Inner.evaluate_trial, prove_interior),
-    *(move_proof, Inner.adopt, begin_copies, Copies.penalize, Copies.solve, Copies.step, Copies.back_at_best),
+    *(
+        Inner.project,
+        Inner.set_translations,
+        Inner.move,
+        Inner.evaluate_trial,
+        fits_part,
+        prove_interior,
+    ),
+    *(
+        move_proof,
+        Inner.adopt,
+        begin_copies,
+        Copies.penalize,
+        Copies.solve,
+        Copies.step,
+        Copies.back_at_best,
+    ),
 )
-ENDS, POSES = ("begin_copies", "finish_copies"), ("R", "t", "in_cover")  # with the driver, at the cover
-ALL_REDUCES = (*(Copies.travel, Copies.multiplier_norms, Copies.stiffness, Copies.start, Copies.solve, Copies.step),)
-OFF = ("Interior.describe", "Interior.set_poses", "Interior.cost", "ConsensusRobot.cost", "Interior.result")
+# with the driver, at the cover
+ENDS = ("begin_copies", "finish_copies")
+POSES = ("R", "t", "in_cover")
+ALL_REDUCES = (
+    *(
+        Copies.travel,
+        Copies.multiplier_norms,
+        Copies.stiffness,
+        Copies.start,
+        Copies.solve,
+        Copies.step,
+    ),
+)
+OFF = ("Interior.describe", "Interior.set_poses", "Interior.cost", "Interior.result")
 
 
 class Watching(Recording):
     """Writes down, too, what robots find out about poses that another robot does not hold.
 
-    The pose from which all are seen in a proof is no secret: pose 0, at the identity, is the inverse of it there.
+    The pose from which all are seen in a proof is no secret: pose 0, at the identity, is the
+    inverse of it there.
     """
 
     def __init__(self, graph: PoseGraph) -> None:
@@ -63,7 +119,8 @@ class Watching(Recording):
         if name_of(order) == "Interior.describe":
             self.secrets: list[list[Array]] = [[] for _ in self.agents]
         for agent in self.agents:
-            holder, share = agent.copies, agent.subgraph
+            holder = agent.copies
+            share = agent.subgraph
             if holder is not None:
                 for other, secrets in zip(self.shares, self.secrets, strict=True):
                     hidden = ~np.isin(share.poses, other.poses) & (share.in_cover != grounded)
@@ -78,7 +135,13 @@ Engine = TypeVar("Engine", bound=Recording)
 
 
 def solved(
-    seed: int, n: int, d: int, partitioner: Partitioner, noise: NoiseModel, engine: Engine, soc: SOC | None = None
+    seed: int,
+    n: int,
+    d: int,
+    partitioner: Partitioner,
+    noise: NoiseModel,
+    engine: Engine,
+    soc: SOC | None = None,
 ) -> tuple[Solution, Engine]:
     return solved_graph(varied_graph(seed, n, d, noise), seed, partitioner, engine, soc)
 
@@ -87,7 +150,9 @@ def solved_graph(
     graph: PoseGraph, seed: int, partitioner: Partitioner, engine: Engine, soc: SOC | None = None
 ) -> tuple[Solution, Engine]:
     parts = partitioner(graph, seed)
-    soc = replace(soc if soc is not None else SOC(tolerance=1e-4), coupling=Coupling.CONSENSUS, robots=parts)
+    soc = replace(
+        soc if soc is not None else SOC(tolerance=1e-4), coupling=Coupling.CONSENSUS, robots=parts
+    )
     pipeline = Pipeline(soc=soc, second_try=False, staircase=None)
     return solve(graph, pipeline, robots=parts, engine=engine), engine
 
@@ -98,16 +163,19 @@ def test_the_ledger_counts_what_was_sent(
     seed: int, n: int, d: int, noise: NoiseModel, partitioner: Partitioner
 ) -> None:
     solution, engine = solved(seed, n, d, partitioner, noise, Recording())
-    ledger, number = solution.ledger, len(engine.shares)
+    ledger = solution.ledger
+    number = len(engine.shares)
     assert ledger is not None
-    sent, received = np.zeros((2, number)), np.zeros((2, number))
+    sent = np.zeros((2, number))
+    received = np.zeros((2, number))
     links: dict[tuple[int, int], int] = {}
     for order, down, up in engine.log:
         if order in OFF:
             continue
         for robot in range(number):
             for name, value in arrays_in(down[robot]):
-                received[:, robot] += 8 * np.size(value) * (">" not in name)  # from robots: counted where it is sent
+                # from robots: counted where it is sent
+                received[:, robot] += 8 * np.size(value) * (">" not in name)
             for name, value in arrays_in(up[robot]):
                 if name == "measured":
                     continue
@@ -118,14 +186,17 @@ def test_the_ledger_counts_what_was_sent(
                     links[link] = links.get(link, 0) + 8 * np.size(value)
     np.testing.assert_array_equal(ledger.bytes_sent, sent[0])
     np.testing.assert_array_equal(ledger.bytes_received, received[0])
-    between = {(a, b): size for a, b, _, size in zip(*(x.tolist() for x in ledger.by_link()), strict=True)}
+    between = {
+        (a, b): size for a, b, _, size in zip(*(x.tolist() for x in ledger.by_link()), strict=True)
+    }
     assert {link: size for link, size in between.items() if DRIVER not in link} == links
     assert ledger.rounds == engine.times(*ROUNDS)
     assert ledger.all_reduces == engine.times(*ALL_REDUCES)
 
 
 def test_rounds_of_a_whole_solve_are_as_documented() -> None:
-    graph, engine = grid(np.random.default_rng(0)), Recording()
+    graph = grid(np.random.default_rng(0))
+    engine = Recording()
     parts = partition(graph, 3)
     soc = SOC(robots=parts, tolerance=2e-3)
     solution = solve(graph, Pipeline(soc=soc), robots=parts, engine=engine)
@@ -134,9 +205,12 @@ def test_rounds_of_a_whole_solve_are_as_documented() -> None:
     assert engine.times(begin_copies, Copies.back_at_best) == 1  # no refresh, no raise
     rounds = [record.measurement.rounds for record in stage.history.records]
     assert rounds == [4, *range(6, 5 + len(rounds))]
-    # 2 to start, 2 for poses and penalties, 1 before the first step and 1 a step, 2 for the result of SOC, 2 a move of
-    # Newton, 2 for the proof.
-    assert solution.ledger.rounds == 2 + (2 + 1 + stage.iterations + 2) + 2 * engine.times(Interior.move) + 2
+    # 2 to start, 2 for poses and penalties, 1 before the first step and 1 a step, 2 for the result
+    # of SOC, 2 a move of Newton, 2 for the proof.
+    assert (
+        solution.ledger.rounds
+        == 2 + (2 + 1 + stage.iterations + 2) + 2 * engine.times(Interior.move) + 2
+    )
     assert solution.ledger.all_reduces == 3 + 1 + stage.iterations
 
 
@@ -146,7 +220,9 @@ def test_rounds_of_a_whole_solve_are_as_documented() -> None:
 def test_neighbours_send_rows_of_common_poses_and_sums_go_to_all(
     d: int, partitioner: Partitioner, per_robot: bool
 ) -> None:
-    soc = SOC(acceleration=Anderson(memory=5, per_robot=per_robot), max_iterations=8, penalty=STALLED)
+    soc = SOC(
+        acceleration=Anderson(memory=5, per_robot=per_robot), max_iterations=8, penalty=STALLED
+    )
     solution, engine = solved(7, 24, d, partitioner, LOUD_NOISE, Recording(), soc)
     parts = solution.robots
     assert parts is not None
@@ -162,13 +238,20 @@ def test_neighbours_send_rows_of_common_poses_and_sums_go_to_all(
                     if not between:
                         assert name in (STAR if order not in ENDS else POSES), (order, name)
                         if name in ("value", "gamma", "sums", "squares"):
-                            assert np.size(value) <= (3 + d if order.endswith("travel") else 2 if per_robot else 11)
+                            assert np.size(value) <= (
+                                3 + d if order.endswith("travel") else 2 if per_robot else 11
+                            )
                         continue
                     poses = common[int(other)]
                     owner = share.robot if is_sent else int(other)
                     known = int((share.owner[poses] == owner).sum())
                     rows = {((d + 1) * len(poses), d), ((d + 1) * known, d)}
-                    allowed = {"force": rows, "rows": rows, "value": rows, "of_own": {(known, 1 + (d + 1) + d * d)}}
+                    allowed = {
+                        "force": rows,
+                        "rows": rows,
+                        "value": rows,
+                        "of_own": {(known, 1 + (d + 1) + d * d)},
+                    }
                     assert np.shape(value) in allowed[kind], (order, name)
                     seen.add(kind)
     assert seen == {"value", "force", "of_own", "rows"}
@@ -176,7 +259,10 @@ def test_neighbours_send_rows_of_common_poses_and_sums_go_to_all(
 
 
 def measured_twice(graph: PoseGraph, rng: np.random.Generator) -> PoseGraph:
-    """Graph with a second measurement of every edge: else a pose beyond a bridge, seen from it, is a measurement."""
+    """Graph with a second measurement of every edge.
+
+    Without it a pose beyond a bridge, seen from it, is a measurement.
+    """
     shape = graph.num_edges, tangent_dimension(graph.d)
     twice = {name: np.tile(getattr(graph, name), 2) for name in ("i", "j", "kappa", "tau")}
     R_ij = np.concatenate([graph.R_ij, graph.R_ij @ exp_map(0.1 * rng.standard_normal(shape))])
@@ -197,5 +283,9 @@ def test_no_robot_is_sent_a_pose_that_it_does_not_hold_or_an_edge_between_such_p
         edges = [graph.R_ij[theirs], graph.t_ij[theirs], graph.kappa[theirs], graph.tau[theirs]]
         secret = np.concatenate([*secrets, *(np.ravel(values) for values in edges)])
         secret = secret[~np.isin(np.abs(secret), [0.0, 1.0])]  # which anything may be
-        told = [np.ravel(value) for _, down, _ in engine.log for _, value in arrays_in(down[share.robot])]
+        told = [
+            np.ravel(value)
+            for _, down, _ in engine.log
+            for _, value in arrays_in(down[share.robot])
+        ]
         assert not np.isin(secret, np.concatenate([np.zeros(0), *told])).any()

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, EPS, LOUD_NOISE, SEEDS, random_poses, varied_problem
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from robots import BACKENDS, PARTITIONERS, Partitioner, interface_of
 from scipy.sparse import csc_array, diags_array
 
@@ -21,7 +20,15 @@ from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.interface import Interface
 from solvers.distributed.multifrontal import FrontOwners
-from solvers.distributed.robots.elimination import Cut, Elimination, eliminate, packed, unpacked
+from solvers.distributed.robots.elimination import (
+    Cut,
+    Elimination,
+    FrontParts,
+    HeldFront,
+    eliminate,
+    packed,
+    unpacked,
+)
 from solvers.soc.subgraph import Part, split_graph
 
 SIZES = st.integers(2, 30)
@@ -53,7 +60,10 @@ class Split:
     cover_columns: IntArray
 
     def eliminate(self, backend: CholeskyBackend) -> tuple[list[Elimination], Interface]:
-        robots = [eliminate(piece, cut, backend) for piece, cut in zip(self.pieces, self.cuts, strict=True)]
+        robots = [
+            eliminate(piece, cut, backend)
+            for piece, cut in zip(self.pieces, self.cuts, strict=True)
+        ]
         return robots, self.interface.factorize([robot.schur for robot in robots], self.own)
 
     def is_positive_definite(self, backend: CholeskyBackend) -> bool:
@@ -65,11 +75,18 @@ class Split:
 
 
 def split(problem: PGOProblem, parts: Partition, kind: str, seed: int, diagonal: Array) -> Split:
-    """Matrix of a kind plus a diagonal, (side,): each robot adds it in its interior, the driver on the cover."""
-    n, widths, poses = problem.num_poses, widths_of(kind, problem.d), random_poses(problem.num_poses, problem.d, seed)
+    """Matrix of a kind plus a diagonal, (side,).
+
+    Each robot adds it in its interior, the driver on the cover.
+    """
+    n = problem.num_poses
+    widths = widths_of(kind, problem.d)
+    poses = random_poses(problem.num_poses, problem.d, seed)
     working = [share.part for share in split_graph(problem.graph, parts) if share.part is not None]
     cover = np.unique(np.concatenate([part.poses[part.boundary] for part in working]))
-    pieces, cuts, columns = [], [], []
+    pieces = []
+    cuts = []
+    columns = []
     for part in working:
         p = part.problem.num_poses
         local = Poses(poses.R[part.poses], poses.t[part.poses])
@@ -107,11 +124,16 @@ def test_elimination_and_back_substitution_solve_the_whole_system(
     rng = np.random.default_rng(seed)
     scale = float(problem.M.diagonal().max())
     system = split(
-        problem, partitioner(problem.graph, seed), kind, seed, scale * rng.uniform(1e-3, 1.0, side_of(problem, kind))
+        problem,
+        partitioner(problem.graph, seed),
+        kind,
+        seed,
+        scale * rng.uniform(1e-3, 1.0, side_of(problem, kind)),
     )
     robots, driver = system.eliminate(backend)
     b = rng.standard_normal((len(system.whole), 3))
-    shares = []  # every part of b is somebody's: of the robot inside, of the first who touches it on the cover
+    # every part of b is somebody's: of the robot inside, of the first who touches it on the cover
+    shares = []
     left = b.copy()
     for mine in system.columns:
         shares.append(left[mine])
@@ -136,21 +158,29 @@ def test_robots_hold_the_matrix_between_them(
     seed: int, n: int, d: int, partitioner: Partitioner, kind: str, backend: CholeskyBackend
 ) -> None:
     problem = varied_problem(seed, n, d)
-    system = split(problem, partitioner(problem.graph, seed), kind, seed, np.ones(side_of(problem, kind)))
+    system = split(
+        problem, partitioner(problem.graph, seed), kind, seed, np.ones(side_of(problem, kind))
+    )
     total = np.zeros_like(system.whole)
     for mine, piece in zip(system.columns, system.pieces, strict=True):
         total[np.ix_(mine, mine)] += piece.toarray()
     total[system.cover_columns, system.cover_columns] += 1.0
     scale = np.abs(system.whole).max()
     np.testing.assert_allclose(total, system.whole, rtol=0, atol=100 * EPS * scale)
-    for robot, piece, cut in zip(system.eliminate(backend)[0], system.pieces, system.cuts, strict=True):
-        K, inside, g = piece.toarray(), cut.interior, cut.boundary
+    for robot, piece, cut in zip(
+        system.eliminate(backend)[0], system.pieces, system.cuts, strict=True
+    ):
+        K = piece.toarray()
+        inside = cut.interior
+        g = cut.boundary
         expected = K[np.ix_(g, g)]
         if len(inside):
             expected = expected - K[np.ix_(g, inside)] @ np.linalg.solve(
                 K[np.ix_(inside, inside)], K[np.ix_(inside, g)]
             )
-        np.testing.assert_allclose(unpacked(robot.schur, len(g)), expected, rtol=0, atol=1e-9 * scale)
+        np.testing.assert_allclose(
+            unpacked(robot.schur, len(g)), expected, rtol=0, atol=1e-9 * scale
+        )
         np.testing.assert_array_equal(robot.diagonal, K.diagonal()[g])
 
 
@@ -159,9 +189,11 @@ def test_robots_hold_the_matrix_between_them(
 def test_the_whole_is_positive_definite_where_all_parts_of_it_are(
     seed: int, n: int, d: int, partitioner: Partitioner, kind: str, backend: CholeskyBackend
 ) -> None:
-    # Inertia is additive: just above and just below its smallest eigenvalue the verdict is that of the whole.
+    # Inertia is additive: just above and just below its smallest eigenvalue the verdict is that of
+    # the whole.
     problem = varied_problem(seed, n, d, LOUD_NOISE)
-    parts, side = partitioner(problem.graph, seed), side_of(problem, kind)
+    parts = partitioner(problem.graph, seed)
+    side = side_of(problem, kind)
     rng = np.random.default_rng(seed)
     rough = float(problem.M.diagonal().max()) * rng.standard_normal(side)
     whole = split(problem, parts, kind, seed, rough).whole
@@ -194,7 +226,9 @@ def test_unknowns_by_field_and_by_separator_are_the_same(count: int, widths: lis
     order = Interface(count, tuple(widths), (), FrontOwners((), 0)).order
     assert sorted(order.tolist()) == list(range(count * sum(widths)))
     for separator, columns in enumerate(order.reshape(count, sum(widths))):
-        np.testing.assert_array_equal(columns, columns_of(np.array([separator]), count, tuple(widths)))
+        np.testing.assert_array_equal(
+            columns, columns_of(np.array([separator]), count, tuple(widths))
+        )
 
 
 @given(seed=SEEDS, side=st.integers(0, 12))
@@ -209,7 +243,7 @@ def test_a_packed_matrix_is_unpacked_as_it_was(seed: int, side: int) -> None:
 
 
 def copies(seed: int, number: int, separators: int, each: int) -> tuple[IntArray, ...]:
-    """Robots that each touch some separators: half of them side by side on a ring, half anywhere."""
+    """Robots that each touch some separators: half of them along a ring, half anywhere."""
     rng = np.random.default_rng(seed)
     touched = []
     for robot in range(number):
@@ -219,7 +253,8 @@ def copies(seed: int, number: int, separators: int, each: int) -> tuple[IntArray
 
 
 @pytest.mark.parametrize(
-    ("number", "separators", "each"), [(1, 90, 90), (2, 120, 80), (5, 160, 70), (32, 260, 24), (64, 90, 40)]
+    ("number", "separators", "each"),
+    [(1, 90, 90), (2, 120, 80), (5, 160, 70), (32, 260, 24), (64, 90, 40)],
 )
 @pytest.mark.parametrize("widths", [(1,), (1, 3), (3, 3)], ids=str)
 def test_factoring_takes_no_more_memory_than_was_said(
@@ -227,11 +262,14 @@ def test_factoring_takes_no_more_memory_than_was_said(
 ) -> None:
     touched = copies(0, number, separators, each)
     interface = interface_of(touched, separators, widths)
-    interface.factorize([packed(np.eye(len(columns))) for columns in interface.columns])  # imports and caches
+    # imports and caches
+    interface.factorize([packed(np.eye(len(columns))) for columns in interface.columns])
     said = interface.num_bytes
     tracemalloc.start()
     try:
-        factor = interface.factorize([packed(np.eye(len(columns))) for columns in interface.columns])
+        factor = interface.factorize(
+            [packed(np.eye(len(columns))) for columns in interface.columns]
+        )
         most = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -245,7 +283,17 @@ def test_what_would_not_fit_is_refused_with_the_way_out() -> None:
     touched = copies(0, 5, 160, 70)
     interface = interface_of(touched, 160, (3, 3))
     interface.check_memory(interface.num_bytes)
-    with pytest.raises(
-        SettingError, match=r"for 160 separators, more than .* METIS partition or fewer robots, raise driver_memory"
-    ):
+    too_large = r"for 160 separators, more than .* METIS partition or fewer robots, "
+    with pytest.raises(SettingError, match=too_large + "raise driver_memory"):
         interface.check_memory(interface.num_bytes - 1)
+
+
+@pytest.mark.parametrize("side", [3, 8, 40])
+def test_a_front_whose_pivots_are_nan_is_rejected(side: int) -> None:
+    """The matrix is finite, and LAPACK finds no pivot that is negative."""
+    dense = np.eye(side)
+    dense[0, 0] = 1e-20
+    dense[0, -1] = dense[-1, 0] = 1e304
+    front = HeldFront(side, side, (np.arange(side),), 1)
+    with pytest.raises(NotPositiveDefiniteError, match="pivot"):
+        front.eliminate(FrontParts((1,), (packed(dense),), None))

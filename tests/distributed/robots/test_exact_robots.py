@@ -8,8 +8,7 @@ import pytest
 from budget import examples
 from exact_arithmetic import ExactGraph, exact, is_positive_definite, less_diagonal, without
 from graphs import DIMENSIONS, SEEDS, random_poses, turned_away, varied_graph, wound_ring
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from roads import Shape, road
 from robots import BACKENDS, PARTITIONERS, Partitioner, contiguous, driver_at, metis
 
@@ -27,13 +26,25 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.distributed import lower_bound as distributed_bound
 from solvers.distributed.driver import collect
 from solvers.distributed.interface import Interface
-from solvers.distributed.lower_bound import InterfaceProof, best_bound_distributed, prove_grounded, prove_with_eta
+from solvers.distributed.lower_bound import (
+    InterfaceProof,
+    best_bound_distributed,
+    prove_grounded,
+    prove_with_eta,
+)
 from solvers.distributed.robots.proof import ProofSums
 from solvers.distributed.robots.records import ProofStep, RightHandSide
 
 
 @settings(max_examples=examples(12))
-@given(seed=SEEDS, n=st.integers(4, 14), d=DIMENSIONS, cut=PARTITIONERS, backend=BACKENDS, noise=st.floats(0.01, 2.0))
+@given(
+    seed=SEEDS,
+    n=st.integers(4, 14),
+    d=DIMENSIONS,
+    cut=PARTITIONERS,
+    backend=BACKENDS,
+    noise=st.floats(0.01, 2.0),
+)
 def test_no_bound_of_robots_is_above_F(
     seed: int, n: int, d: int, cut: Partitioner, backend: CholeskyBackend, noise: float
 ) -> None:
@@ -52,7 +63,13 @@ def test_no_bound_of_robots_is_above_F(
 
 @pytest.mark.parametrize("cut", [contiguous, metis])
 @settings(max_examples=examples(10))
-@given(seed=SEEDS, n=st.integers(30, 150), spacing=st.floats(1.0, 100.0), d=DIMENSIONS, shape=st.sampled_from(Shape))
+@given(
+    seed=SEEDS,
+    n=st.integers(30, 150),
+    spacing=st.floats(1.0, 100.0),
+    d=DIMENSIONS,
+    shape=st.sampled_from(Shape),
+)
 def test_no_bound_of_robots_is_above_F_on_long_roads(
     cut: Partitioner, seed: int, n: int, spacing: float, d: int, shape: Shape
 ) -> None:
@@ -65,8 +82,10 @@ def test_no_bound_of_robots_is_above_F_on_long_roads(
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_the_bound_of_robots_holds_wherever_it_is_grounded(d: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a move G is not rounding, and its quadratic terms are all that keeps the bound below F."""
+def test_the_bound_of_robots_holds_wherever_it_is_grounded(
+    d: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a move G is not rounding; its quadratic terms alone keep the bound below F."""
     monkeypatch.setattr(distributed_bound.central, "MOST_MOVES", 0)
     problem = PGOProblem(varied_graph(0, 12, d))
     best = polish(problem, chordal_start(problem))
@@ -82,7 +101,8 @@ def test_the_bound_of_robots_holds_wherever_it_is_grounded(d: int, monkeypatch: 
 @pytest.mark.parametrize("d", [2, 3])
 def test_what_eta_adds_is_taken_off_by_robots(d: int) -> None:
     problem, start = wound_ring(12, d)
-    local, best = polish(problem, start), polish(problem, chordal_start(problem))
+    local = polish(problem, start)
+    best = polish(problem, chordal_start(problem))
     F = ExactGraph.of_doubles(problem.graph).objective_of(best)
     with closing(driver_at(problem, contiguous(problem.graph, 2), local)) as driver:
         found = [prove_with_eta(driver, float(eta)) for eta in 2.0 ** np.arange(-20, 10)]
@@ -99,7 +119,8 @@ def test_what_a_driver_says_to_be_definite_is(
     problem = PGOProblem(varied_graph(seed, n, d), backend)
     poses = polish(problem, chordal_start(problem))
     with closing(driver_at(problem, cut(problem.graph, seed), poses)) as driver:
-        g, r = len(driver.cover), driver.grounded
+        g = len(driver.cover)
+        r = driver.grounded
         fixed = columns_of(np.array([r]), g, (1, d))
         X = Poses(driver.at.R, driver.at.t).stacked()
         proof = distributed_bound.eliminate_S(driver, fixed, 0.0, 1e-9, X)
@@ -110,13 +131,20 @@ def test_what_a_driver_says_to_be_definite_is(
     slack = np.zeros(problem.side)
     slack[rows] = proof.slack
     S = ExactGraph.of_doubles(problem.graph).certificate_matrix(Lambda)
-    assert is_positive_definite(less_diagonal(without(S, left_out), exact(np.delete(slack, left_out))))
+    assert is_positive_definite(
+        less_diagonal(without(S, left_out), exact(np.delete(slack, left_out)))
+    )
 
 
 def test_an_eta_costs_for_the_poses_of_driver_and_robots_alike() -> None:
-    problem, eta = PGOProblem(varied_graph(3, 16, 3)), 1e-5
-    with closing(driver_at(problem, contiguous(problem.graph, 3), polish(problem, chordal_start(problem)))) as driver:
-        without_eta, with_eta = (distributed_bound.prove_grounded(driver, shift) for shift in (0.0, eta))
+    problem = PGOProblem(varied_graph(3, 16, 3))
+    eta = 1e-5
+    with closing(
+        driver_at(problem, contiguous(problem.graph, 3), polish(problem, chordal_start(problem)))
+    ) as driver:
+        without_eta, with_eta = (
+            distributed_bound.prove_grounded(driver, shift) for shift in (0.0, eta)
+        )
         assert 0 < len(driver.cover) < 16
     assert without_eta is not None
     assert with_eta is not None
@@ -134,32 +162,55 @@ def test_weights_that_could_underflow_prove_nothing_by_robots_either() -> None:
     assert prove_bound(problem, multipliers(problem, poses), poses=poses) is None
 
 
-def test_every_term_of_a_driver_s_errors_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    u, enough = 2.0**-53, 1.0 - 1e-12
+def test_every_term_of_the_errors_of_a_driver_s_sums_is_there() -> None:
+    u = 2.0**-53
+    enough = 1.0 - 1e-12
     problem = PGOProblem(varied_graph(3, 16, 3))
     poses = polish(problem, chordal_start(problem))
     with closing(driver_at(problem, contiguous(problem.graph, 3), poses)) as driver:
-        g, d, rng = len(driver.cover), driver.d, np.random.default_rng(0)
+        g = len(driver.cover)
+        d = driver.d
+        rng = np.random.default_rng(0)
         space = driver.interface(1, d)
         X = Poses(driver.at.R, driver.at.t).stacked()
-        Lambda, slack = driver.at.multipliers, rng.uniform(1.0, 2.0, len(X))
+        Lambda = driver.at.multipliers
+        slack = rng.uniform(1.0, 2.0, len(X))
         blocks = evaluate_multipliers(Lambda, X[g:].reshape(g, d, d))
-        own, error = np.zeros_like(X), np.zeros_like(X)
-        own[g:], error[g:] = blocks.product, blocks.product_error
-        # Robots that leave nothing of S X, so that only errors are left, and of the values the driver's own alone.
-        parts, left = [], own.copy()
+        own = np.zeros_like(X)
+        error = np.zeros_like(X)
+        own[g:] = blocks.product
+        error[g:] = blocks.product_error
+        # Robots that leave nothing of S X, so that only errors are left, and of the values the
+        # driver's own alone.
+        parts = []
+        left = own.copy()
         for columns in space.columns:
             parts.append(-left[columns])
             left[columns] = 0.0
         nothing = RightHandSide(np.zeros(0), 0.0)
-        steps = [ProofStep(ProofSums(1.0, 0.0, 0.0, 0.0, 0.0, p, 1e-15 * abs(p)), nothing) for p in parts]
+        steps = [
+            ProofStep(ProofSums(1.0, 0.0, 0.0, 0.0, 0.0, p, 1e-15 * abs(p)), nothing) for p in parts
+        ]
         proof = InterfaceProof(None, slack, [], Lambda, [])  # type: ignore[arg-type]
         sums = distributed_bound._sum_up(driver, proof, X, steps, np.ones(len(X), dtype=bool))
         assert (left == 0.0).all()
         error += 1e-15 * abs(own) + gamma(len(parts) + 2.0) * 2.0 * abs(own)
         assert sums.quadratic >= enough * np.sum(error**2 / slack[:, None]) > 0.0
         assert sums.value_error >= enough * (blocks.value_error + u * abs(sums.value)) > 0.0
-        monkeypatch.setattr(Interface, "rounding", lambda self, sizes, own, diagonal: 0.0 * diagonal)
+
+
+def test_every_term_of_the_errors_of_a_driver_s_elimination_is_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    u = 2.0**-53
+    enough = 1.0 - 1e-12
+    problem = PGOProblem(varied_graph(3, 16, 3))
+    poses = polish(problem, chordal_start(problem))
+    with closing(driver_at(problem, contiguous(problem.graph, 3), poses)) as driver:
+        Lambda = driver.at.multipliers
+        monkeypatch.setattr(
+            Interface, "rounding", lambda self, sizes, own, diagonal: 0.0 * diagonal
+        )
         fixed = driver.ground(1).ravel()
         found = distributed_bound.eliminate_S(driver, fixed, 1.0, 1e-13, None)
         assert found is not None
@@ -170,4 +221,5 @@ def test_every_term_of_a_driver_s_errors_is_there(monkeypatch: pytest.MonkeyPatc
         monkeypatch.undo()
         bound = prove_with_eta(driver, 1.0)
         assert bound is not None
-        assert bound.rounding >= enough * 4 * u * (sum(map(abs, found.traces)) + driver.num_poses * d)
+        size = sum(map(abs, found.traces)) + driver.num_poses * driver.d
+        assert bound.rounding >= enough * 4 * u * size

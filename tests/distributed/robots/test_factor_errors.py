@@ -1,4 +1,4 @@
-"""Rounding of factorisations, of eliminations by robots, and of the driver's, held against exact arithmetic."""
+"""Rounding of factorisations and eliminations, held against exact arithmetic."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ from exact_arithmetic import (
     total,
 )
 from graphs import DIMENSIONS, SEEDS, still_ring, varied_graph
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from roads import road
 from robots import interface_of
 from scipy.sparse import csc_array
@@ -51,14 +50,16 @@ BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
 
 def stored_matrix(matrix: Array) -> csc_array:
     side = len(matrix)
-    rows, columns = np.tile(np.arange(side), side), np.repeat(np.arange(side), side)
+    rows = np.tile(np.arange(side), side)
+    columns = np.repeat(np.arange(side), side)
     return csc_array((matrix.T.ravel(), (rows, columns)), shape=matrix.shape)
 
 
 def square_of(factor: CholeskyFactor, analysis: SymbolicCholesky) -> Exact:
     """R^T R of a factor in the order of its matrix, taken exactly."""
     if isinstance(factor, _SuperLUFactor):
-        L, order = exact(factor._lu.L.toarray()), factor._rows
+        L = exact(factor._lu.L.toarray())
+        order = factor._rows
         product = (L * exact(factor._lu.U.diagonal())) @ L.T
     else:
         assert isinstance(factor, _CholmodFactor)
@@ -126,7 +127,8 @@ def test_counts_of_a_pattern_do_not_depend_on_numbers() -> None:
 def bordered(seed: int, coupling: float) -> tuple[Array, Cut]:
     """A matrix whose boundary hangs on its interior weakly or not, and the cut between."""
     rng = np.random.default_rng(seed)
-    i, g = int(rng.integers(3, 12)), int(rng.integers(2, 8))
+    i = int(rng.integers(3, 12))
+    g = int(rng.integers(2, 8))
     K = well_conditioned(seed, i + g - 1, 1)
     K[:i, i:] *= coupling
     K[i:, :i] *= coupling
@@ -155,17 +157,28 @@ def test_an_elimination_is_below_its_matrix(backend: CholeskyBackend, coupling: 
 
 
 def is_true_of_robot(
-    problem: PGOProblem, part: Part, Lambda: Array, eta: float, share: float, backend: CholeskyBackend
+    problem: PGOProblem,
+    part: Part,
+    Lambda: Array,
+    eta: float,
+    share: float,
+    backend: CholeskyBackend,
 ) -> bool | None:
-    """Whether the exact S of a robot is above its Schur complement and slack; None where it proves nothing."""
-    p, d = problem.num_poses, problem.d
+    """Whether the exact S of a robot is above its Schur complement and slack.
+
+    None where the robot proves nothing.
+    """
+    p = problem.num_poses
+    d = problem.d
     cut = Cut(columns_of(part.interior, p, (1, d)), columns_of(part.boundary, p, (1, d)), None)
     proved = verify_interior(problem, Lambda, eta, cut, np.zeros(0, dtype=np.int64), share, backend)
     if proved is None:
         return None
     _, found, slack = proved
     rows = ExactGraph.of_doubles(problem.graph).certificate_matrix(Lambda)
-    S = np.array([[row.get(column, MP.mpf(0)) for column in range(len(rows))] for row in rows], dtype=object)
+    S = np.array(
+        [[row.get(column, MP.mpf(0)) for column in range(len(rows))] for row in rows], dtype=object
+    )
     inside = cut.interior
     S[inside, inside] += np.where(inside >= p, exact(eta), MP.mpf(0)) - exact(slack)
     S[np.ix_(cut.boundary, cut.boundary)] -= exact(unpacked(found.schur, len(cut.boundary)))
@@ -174,8 +187,11 @@ def is_true_of_robot(
 
 @BACKENDS
 @pytest.mark.parametrize("exponent", range(24, 34))
-def test_no_rounding_is_lost_between_multipliers_and_eta_by_a_robot(backend: CholeskyBackend, exponent: int) -> None:
-    graph, d = still_ring(12, 2), 2
+def test_no_rounding_is_lost_between_multipliers_and_eta_by_a_robot(
+    backend: CholeskyBackend, exponent: int
+) -> None:
+    graph = still_ring(12, 2)
+    d = 2
     eta = 0.75 * 2.0**exponent
     for share in split_graph(graph, partition(graph, 2)):
         assert share.part is not None
@@ -183,7 +199,10 @@ def test_no_rounding_is_lost_between_multipliers_and_eta_by_a_robot(backend: Cho
         Lambda = np.zeros((share.part.problem.num_poses, d, d))
         above = np.where(np.arange(len(interior)) % 4 == 0, np.spacing(eta), 0.0)
         Lambda[interior] = (eta + above)[:, None, None] * np.eye(d)
-        assert is_true_of_robot(share.part.problem, share.part, Lambda, eta, 1e-11, backend) is not False
+        assert (
+            is_true_of_robot(share.part.problem, share.part, Lambda, eta, 1e-11, backend)
+            is not False
+        )
 
 
 @BACKENDS
@@ -192,11 +211,13 @@ def test_no_rounding_is_lost_between_multipliers_and_eta_by_a_robot(backend: Cho
 def test_what_a_robot_hands_on_is_below_its_part_of_S(
     backend: CholeskyBackend, seed: int, n: int, d: int, eta: float
 ) -> None:
-    graph, rng = varied_graph(seed, n, d), np.random.default_rng(seed)
+    graph = varied_graph(seed, n, d)
+    rng = np.random.default_rng(seed)
     for share in split_graph(graph, partition(graph, 2)):
         if share.part is None:
             continue
-        problem, part = share.part.problem, share.part
+        problem = share.part.problem
+        part = share.part
         p = problem.num_poses
         Lambda = np.zeros((p, d, d))
         Lambda[part.interior] = rng.uniform(0.0, 2.0) * eta * np.eye(d)
@@ -207,13 +228,19 @@ def test_what_a_robot_hands_on_is_below_its_part_of_S(
 def test_the_drivers_factor_is_within_its_rounding(cancelling: float) -> None:
     for seed in range(12):
         rng = np.random.default_rng(seed)
-        g, d = int(rng.integers(3, 7)), int(rng.integers(2, 4))
-        touched = tuple(np.arange(g) if a < 2 else np.sort(rng.permutation(g)[:2]) for a in range(4))
+        g = int(rng.integers(3, 7))
+        d = int(rng.integers(2, 4))
+        touched = tuple(
+            np.arange(g) if a < 2 else np.sort(rng.permutation(g)[:2]) for a in range(4)
+        )
         space = interface_of(touched, g, (1, d))
-        contributions, K = [], np.full((space.side, space.side), MP.mpf(0), dtype=object)
+        contributions = []
+        K = np.full((space.side, space.side), MP.mpf(0), dtype=object)
         for a, columns in enumerate(space.columns):
             W = rng.standard_normal((len(columns), len(columns)))
-            C = W @ W.T + (cancelling if a == 0 else -cancelling if a == 1 else 0.0) * np.eye(len(columns))
+            C = W @ W.T + (cancelling if a == 0 else -cancelling if a == 1 else 0.0) * np.eye(
+                len(columns)
+            )
             contributions.append(packed(C))
             K[np.ix_(columns, columns)] += exact(unpacked(contributions[-1], len(columns)))
         values = np.broadcast_to(np.eye(d + 1), (g, d + 1, d + 1)) * rng.uniform(0.1, 1.0)
@@ -221,7 +248,10 @@ def test_the_drivers_factor_is_within_its_rounding(cancelling: float) -> None:
         for block in zip(columns, values, strict=True):
             K[np.ix_(block[0], block[0])] += exact(block[1])
         diagonal = np.asarray(K.diagonal(), dtype=float) * (1.0 + 1e-12)
-        sides = [(unpacked(one, len(at)), diagonal[at]) for one, at in zip(contributions, space.columns, strict=True)]
+        sides = [
+            (unpacked(one, len(at)), diagonal[at])
+            for one, at in zip(contributions, space.columns, strict=True)
+        ]
         lost = space.rounding([row_sums(*side) for side in sides], [(columns, values)], diagonal)
         factor = space.factorize(contributions, [(columns, values)])
         difference = square_of_tree(factor) - K
@@ -231,7 +261,9 @@ def test_the_drivers_factor_is_within_its_rounding(cancelling: float) -> None:
 
 def square_of_tree(factor: Interface) -> Exact:
     """R^T R of the driver's factor, taken exactly, in the order of its unknowns."""
-    tree, width, side = factor.fronts.tree, sum(factor.widths), factor.side
+    tree = factor.fronts.tree
+    width = sum(factor.widths)
+    side = factor.side
     order = factor.order
     product = np.full((side, side), MP.mpf(0), dtype=object)
     for number, front in enumerate(tree):
@@ -246,11 +278,14 @@ def square_of_tree(factor: Interface) -> Exact:
 @BACKENDS
 def test_a_long_column_takes_as_many_roundings_as_it_has_entries(backend: CholeskyBackend) -> None:
     """An arrow: every square that is subtracted from the last pivot is rounded up on its own."""
-    side, corner = 401, 1.5 * 2.0**30
-    k, last = np.arange(side - 1), np.full(side - 1, side - 1)
+    side = 401
+    corner = 1.5 * 2.0**30
+    k = np.arange(side - 1)
+    last = np.full(side - 1, side - 1)
     edge = np.full(side - 1, np.sqrt(2.0**-23 + 2.0**-40))
     values = np.concatenate([np.ones(side - 1), [corner], edge, edge])
-    rows, columns = np.concatenate([np.arange(side), k, last]), np.concatenate([np.arange(side), last, k])
+    rows = np.concatenate([np.arange(side), k, last])
+    columns = np.concatenate([np.arange(side), last, k])
     A = csc_array((values, (rows, columns)), shape=(side, side))
     analysis = analyze(A, backend)
     factor = analysis.factorize(A)

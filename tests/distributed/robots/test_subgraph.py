@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, SEEDS, random_poses, varied_graph, varied_problem
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from robots import PARTITIONERS, Partitioner, complete, corner_cases, star
 
 from pgo_models.geometry.poses import Poses
@@ -38,7 +37,9 @@ def check_shares(graph: PoseGraph, parts: Partition) -> None:
         for name in ("R_ij", "t_ij", "kappa", "tau"):
             np.testing.assert_array_equal(getattr(local, name), getattr(graph, name)[edges])
         own = np.flatnonzero(parts.robot == subgraph.robot)
-        assert subgraph.poses.tolist() == sorted({*own.tolist(), *graph.i[edges].tolist(), *graph.j[edges].tolist()})
+        assert subgraph.poses.tolist() == sorted(
+            {*own.tolist(), *graph.i[edges].tolist(), *graph.j[edges].tolist()}
+        )
         np.testing.assert_array_equal(subgraph.owner, parts.robot[subgraph.poses])
         np.testing.assert_array_equal(local.pose_ids, graph.pose_ids[subgraph.poses])
         inside = subgraph.in_cover >= 0
@@ -61,7 +62,9 @@ def check_shares(graph: PoseGraph, parts: Partition) -> None:
 
 @settings(max_examples=examples(50))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
-def test_edges_are_counted_once_and_interiors_are_private(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
+def test_edges_are_counted_once_and_interiors_are_private(
+    seed: int, n: int, d: int, partitioner: Partitioner
+) -> None:
     graph = varied_graph(seed, n, d)
     check_shares(graph, partitioner(graph, seed))
 

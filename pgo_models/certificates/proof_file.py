@@ -1,0 +1,138 @@
+"""The proof behind a certificate as a file, which `pgo verify` checks trusting nobody."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from pgo_models.certificates.certificate import BoundSource, Certificate
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.lower_bound import prove_at
+from pgo_models.errors import SettingError
+from pgo_models.files import replace_when_done
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.pose_graph import PoseGraph, middle_pose
+from pgo_models.graphs.precisions import edge_precisions
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
+
+FORMAT = "pgo-splitting proof 1"
+
+
+def save_proof(problem: PGOProblem, certificate: Certificate, path: Path | str) -> None:
+    """Write what proves the bound of a certificate, as JSON; `verify_proof` checks it.
+
+    All digits are written of poses, multipliers Lambda and the shift eta, and what they claim: the
+    cost of the poses, and the lower bound. Of a tangent of chi2 the multipliers are left out: they
+    depend on how it was chosen, and the verifier has its own.
+
+    Parameters
+    ----------
+    problem : PGOProblem
+        The problem that the certificate is of, its graph as a g2o file has it, or of unit weights.
+    certificate : Certificate
+        The certificate.
+    path : Path or str
+        The file; it is written whole or not at all.
+
+    Raises
+    ------
+    SettingError
+        When the weights of the problem are not those of a g2o file, or the bound is that of smaller
+        information matrices.
+    PGOError
+        When the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pgo_models import PGOProblem, certify, load, save_proof, verify_proof
+    >>> from pgo_models.graphs.datasets import locate
+    >>> problem, path = PGOProblem(load("sphere")), Path(tempfile.mkdtemp()) / "proof.json"
+    >>> certificate = certify(problem, problem.graph.truth)
+    >>> save_proof(problem, certificate, path)
+    >>> found = verify_proof(locate("sphere"), path)
+    >>> found.is_verified, bool(found.bound >= certificate.lower_bound)
+    (True, True)
+    """
+    record = proof_json(problem, certificate)
+    with replace_when_done(path) as temporary:
+        temporary.write_text(json.dumps(record, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, object]:
+    """Return what a file of `save_proof` holds; errors as of `save_proof`."""
+    graph = problem.graph
+    d = problem.d
+    cost = _cost_name(problem)
+    if certificate.source is BoundSource.SOFTENED:
+        what = "the bound is that of smaller information matrices, not the file's"
+        way_out = "leave out --proof, or --information to prove F"
+        raise SettingError(f"no proof to write: {what}; {way_out}")
+    poses = _poses_of_bound(problem, certificate)
+    Lambda = 0.5 * (certificate.Lambda + np.swapaxes(certificate.Lambda, 1, 2))
+    rows: list[dict[str, object]] = []
+    for pose in range(graph.num_poses):
+        row: dict[str, object] = {"id": _name(graph, pose), "t": poses.t[pose].tolist()}
+        if pose not in graph.landmarks:
+            row["R"] = poses.R[pose].tolist()
+            if problem.is_quadratic:
+                row["Lambda"] = Lambda[pose][np.triu_indices(d)].tolist()
+        rows.append(row)
+    return {
+        "format": FORMAT,
+        "cost": cost,
+        "d": d,
+        "objective": problem.objective(poses),
+        "lower_bound": certificate.lower_bound,
+        "rounding_level": certificate.rounding_level,
+        "eta": None if math.isnan(certificate.eta) else certificate.eta,
+        "ground": _name(graph, _ground(graph)),
+        "poses": rows,
+    }
+
+
+def _poses_of_bound(problem: PGOProblem, certificate: Certificate) -> Poses:
+    """Poses with the translations that the bound was found at: their own, or the best ones.
+
+    Where M hardly holds a direction that chi2 holds, a tangent elsewhere proves much less.
+    """
+    best = problem.at_best_translations(certificate.poses)
+    if problem.is_quadratic or certificate.eta != 0.0:
+        return best
+    bounds = []
+    for poses in (best, certificate.poses):
+        bound = prove_at(problem.tangent_at(poses), multipliers(problem, poses), poses)
+        bounds.append(-math.inf if bound is None else bound.value)
+    return best if bounds[0] >= bounds[1] else certificate.poses
+
+
+def _ground(graph: PoseGraph) -> int:
+    """A pose in the middle of the graph, or the first that sees the landmark there."""
+    middle = middle_pose(graph)
+    return middle if middle not in graph.landmarks else int(graph.i[graph.j == middle][0])
+
+
+def _name(graph: PoseGraph, pose: int) -> int | str:
+    return "world" if pose == graph.world else int(graph.pose_ids[pose])
+
+
+def _cost_name(problem: PGOProblem) -> str:
+    """Name of the cost in a proof; a SettingError where no file states it."""
+    graph = problem.graph
+    if problem.weighting is Weighting.INFORMATION and graph.information is not None:
+        return "chi2"
+    turns = ~np.isin(graph.j, graph.landmarks)  # of a landmark no rotation is measured
+    if problem.weighting is Weighting.ISOTROPIC:
+        kappa = graph.kappa[turns]
+        tau = graph.tau
+        if np.isin(kappa, (0.0, 1.0)).all() and np.isin(tau, (0.0, 1.0)).all():
+            return "unit"
+        if graph.information is None:
+            return "F"
+        kappa_of_file, tau_of_file = edge_precisions(graph.information)
+        if np.allclose(kappa, kappa_of_file[turns]) and np.allclose(tau, tau_of_file):
+            return "F"
+    way_out = "write the graph with write_g2o, and solve that file"
+    raise SettingError(f"no proof to write: no g2o file has the weights of the problem; {way_out}")

@@ -1,0 +1,276 @@
+"""The cost of a graph as a quadratic form: F, which is one, or a tangent of chi2, nowhere above it.
+
+The rows of pose i are X_i = (t_i^T; R_i^T). An edge has the residual rho = X_j - T X_i, where
+T = (1, t_ij^T; 0, R_ij^T); that of a position is the first row alone.
+
+**F** is the sum of tr(rho^T W rho) with W = diag(tau, kappa I), tau = d / tr(I_tt^-1), and
+kappa = 3 / (2 tr(I_rr^-1)) in space, I_theta in the plane (SE-Sync).
+
+**chi2.** In the frame of pose i let r = R_i^T (t_j - t_i) - t_ij, and let E = R_i^T R_j R_ij^T be a
+turn by theta about a. Both s = a sin theta and H = (1 - cos theta) a a^T are linear in E. With the
+blocks of the information matrix turned into that frame, the cost of an edge is
+
+    r^T I_tt r + 2 r^T I_tr s + 2 tr(I_rr H) = tr(rho^T W rho) + u^T J u + tr(H K H),
+    u = (r, s),   J = (I_tt - tau I, I_tr; I_tr^T, K),   W = blockdiag(tau, V),
+
+for any tau and K, where V = tr(I_rr - K) / 2 I - (I_rr - K), in the plane (I_theta - K) / 2 I:
+tr(V (2 I - E - E^T)) = 2 (1 - cos theta) a^T (I_rr - K) a by Rodrigues' formula, and
+2 (1 - cos theta) a^T K a = s^T K s + tr(H K H). For K = I_tr^T (I_tt - tau I)^-1 I_tr and a tau
+below the smallest eigenvalue of I_tt both J and K are positive semidefinite, so that the last two
+terms are a convex function of Z = rho R_i, in which u and H are linear. Where 2 C is its gradient,
+at some Z', it is at least 2 <C, Z> less its value there, and <C, rho R_i> = <C R_i^T, rho> is
+bilinear in the rows of X.
+"""
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+from pgo_models.verification.balls import (
+    Number,
+    above,
+    arb,
+    arb_mat,
+    beside,
+    blocks_on_diagonal,
+    diagonal,
+    first_bad_pivot,
+    fmpq,
+    fmpq_mat,
+    identity,
+    is_semidefinite,
+    part,
+    sum_of,
+    symmetric,
+)
+from pgo_models.verification.measurements import Edge
+
+RESOLUTION = 2.0**-26  # of a bisection, relative
+BELOW = 1.0 - 2.0**-24  # of the largest tau: what is left of the matrix is well above rounding
+COUPLED_SHARE = 0.5  # of the largest tau, so that K stays moderate
+SINGULAR_SHARE = 2.0**-20  # of it where the coupling leaves nothing of a matrix
+KEPT = 2**16  # information matrices whose weights are remembered
+
+
+class StepFailedError(Exception):
+    """A step of the verification fails: which, and why."""
+
+
+class UndecidedError(StepFailedError):
+    """A ball is too wide to tell its sign; with more bits it may not be."""
+
+
+@dataclass(eq=False)
+class QuadraticForm:
+    """q(X) = tr(X^T S X) + constant; S in blocks, both S_ij and its transpose S_ji."""
+
+    S: dict[int, dict[int, arb_mat]] = field(default_factory=dict)
+    constant: arb = field(default_factory=arb)
+
+    def add(self, i: int, j: int, block: arb_mat) -> None:
+        """Add a block to S_ij, and where i is not j its transpose to S_ji."""
+        row = self.S.setdefault(i, {})
+        row[j] = row[j] + block if j in row else block
+        if i != j:
+            self.S.setdefault(j, {})[i] = row[j].transpose()
+
+    def product(self, X: dict[int, arb_mat]) -> dict[int, arb_mat]:
+        """S X."""
+        return {i: sum_of(block * X[j] for j, block in row.items()) for i, row in self.S.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """2 <C, Z> - value, nowhere above a convex function that has this value at some Z'."""
+
+    C: arb_mat
+    value: arb
+
+
+def add_edge(form: QuadraticForm, edge: Edge, cost: str, X: dict[int, arb_mat]) -> arb:
+    """Add an edge to the form, and return its share of the cost at X, from the definition."""
+    begin, end = residual_matrices(edge, X[edge.j].nrows())
+    tangent: Tangent | None = None
+    if cost == "chi2":
+        share, W, tangent = information_cost(edge, X[edge.i], X[edge.j])
+    else:
+        share, W = isotropic_cost(edge, cost, end * X[edge.j] - begin * X[edge.i])
+    form.add(edge.i, edge.i, begin.transpose() * W * begin)
+    form.add(edge.i, edge.j, -(begin.transpose() * W * end))
+    form.add(edge.j, edge.j, end.transpose() * W * end)
+    if tangent is not None:
+        # 2 <C, rho R_i> = 2 <(0, C) X_i, rho>
+        pull = beside(arb_mat(tangent.C.nrows(), 1), tangent.C).transpose()
+        form.add(edge.i, edge.i, -(pull * begin + (pull * begin).transpose()))
+        form.add(edge.i, edge.j, pull * end)
+        form.constant -= tangent.value
+    return share
+
+
+def residual_matrices(edge: Edge, rows_j: int) -> tuple[arb_mat, arb_mat]:
+    """T and the matrix before X_j in rho, the identity; of a position their first rows."""
+    d = edge.tag.d
+    top = beside(identity(1), edge.t.transpose())
+    if edge.tag.is_point:
+        return top, part(identity(d + 1), range(1), range(rows_j))
+    return above(top, beside(arb_mat(d, 1), edge.R.transpose())), identity(d + 1)
+
+
+def isotropic_cost(edge: Edge, cost: str, rho: arb_mat) -> tuple[arb, arb_mat]:
+    """Share of an edge in F, and W."""
+    kappa, tau = precisions(edge.triangle, edge.tag.d, edge.tag.is_point)
+    if cost == "unit":
+        kappa = fmpq(kappa != 0)
+        tau = fmpq(tau != 0)
+    W = diagonal([tau, *[kappa] * (rho.nrows() - 1)])
+    return (rho.transpose() * W * rho).trace(), W
+
+
+@lru_cache(maxsize=KEPT)
+def precisions(triangle: tuple[fmpq, ...], d: int, is_point: bool) -> tuple[fmpq, fmpq]:
+    """(kappa, tau) of F, exactly, from the upper triangle of an information matrix."""
+    rows = symmetric(triangle, d if is_point else 3 * d - 3)
+    tau = d * one_over_trace_of_inverse([row[:d] for row in rows[:d]])
+    if is_point:
+        return fmpq(0), tau
+    kappa = one_over_trace_of_inverse([row[d:] for row in rows[d:]])
+    return (kappa if d == 2 else fmpq(3, 2) * kappa), tau
+
+
+def one_over_trace_of_inverse(rows: list[list[fmpq]]) -> fmpq:
+    """1 / tr(A^-1) of a positive definite matrix; 0 of zeros, which say nothing."""
+    if not any(map(any, rows)):
+        return fmpq(0)
+    if first_bad_pivot(rows) is not None:
+        raise StepFailedError("the weights: a block of an information matrix is not definite")
+    inverse = fmpq_mat(rows).inv()
+    return 1 / sum((inverse[k, k] for k in range(len(rows))), fmpq(0))
+
+
+def information_cost(edge: Edge, X_i: arb_mat, X_j: arb_mat) -> tuple[arb, arb_mat, Tangent | None]:
+    """Share of an edge in chi2, W, and the tangent of what W leaves of it, if anything."""
+    d = edge.tag.d
+    R = edge.R
+    I_tt = edge.block(range(d), range(d))
+    tau = translation_weight(edge.triangle, d, edge.tag.is_point)
+    rest = fmpq_mat(less_tau(I_tt.tolist(), tau, d))
+    P_i = part(X_i, range(1, d + 1), range(d))  # R_i^T
+    moved = part(X_j, range(1), range(d)) - part(X_i, range(1), range(d))
+    r = P_i * moved.transpose() - edge.t
+    D = R * arb_mat(rest) * R.transpose()
+    share = inner(r, R * arb_mat(I_tt) * R.transpose() * r)
+    if edge.tag.is_point:
+        return share, diagonal([tau]), Tangent((D * r).transpose(), inner(r, D * r))
+    axes = range(d, edge.tag.side)
+    I_tr = edge.block(range(d), axes)
+    I_rr = edge.block(axes, axes)
+    is_coupled = any(I_tr.entries())
+    K = I_tr.transpose() * rest.inv() * I_tr if is_coupled else 0 * I_rr
+    W = blocks_on_diagonal(diagonal([tau]), rotation_weight(arb_mat(I_rr - K), d))
+    turn = R if d == 3 else identity(1)  # of axes of rotations
+    E = P_i * part(X_j, range(1, d + 1), range(d)).transpose() * R.transpose()
+    s = axis_times_sine(E)
+    H = axis_times_versine(E)
+    B = R * arb_mat(I_tr) * turn.transpose()
+    share += 2 * inner(r, B * s) + 2 * inner(H, turn * arb_mat(I_rr) * turn.transpose())
+    if not (is_coupled or any(rest.entries())):
+        return share, W, None
+    K_i = turn * arb_mat(K) * turn.transpose()
+    y_r = D * r + B * s
+    y_s = B.transpose() * r + K_i * s
+    N = K_i * H
+    of_E = (skew(y_s) + versine_adjoint(N + N.transpose(), d)) * arb(0.5)
+    C = above(y_r.transpose(), (of_E * R).transpose())
+    return share, W, Tangent(C, inner(r, y_r) + inner(s, y_s) + inner(H, N))
+
+
+@lru_cache(maxsize=KEPT)
+def translation_weight(triangle: tuple[fmpq, ...], d: int, is_point: bool) -> fmpq:
+    """The tau of an edge: I_tt where that is isotropic and not coupled, else as large as it may be.
+
+    What it may be is below the largest tau with I - blockdiag(tau I, 0) positive definite, which
+    keeps the term with V convex. A coupled I that is only semidefinite leaves no such tau: there it
+    is a small share of the smallest eigenvalue of I_tt, and V a little indefinite, of which the
+    proof asks nothing. An indefinite I, whose chi2 can be negative, is refused.
+    """
+    rows = symmetric(triangle, d if is_point else 3 * d - 3)
+    I_tt = [row[:d] for row in rows[:d]]
+    I_rr = [row[d:] for row in rows[d:]]
+    is_coupled = any(map(any, (row[d:] for row in rows[:d])))
+    for block in [I_tt, I_rr]:
+        if any(map(any, block)) and first_bad_pivot(block) is not None:
+            raise StepFailedError("the weights: a block of an information matrix is not definite")
+    if not is_semidefinite(rows):
+        raise StepFailedError("the weights: an information matrix is indefinite")
+    if not is_coupled and not any(map(any, less_tau(I_tt, I_tt[0][0], d))):
+        return I_tt[0][0]
+    tau = definite_tau(rows, d, COUPLED_SHARE) if is_coupled else definite_tau(I_tt, d, BELOW)
+    if tau is None and is_coupled:
+        tau = definite_tau(I_tt, d, SINGULAR_SHARE)
+    if tau is None:
+        raise StepFailedError("the weights: an information matrix is all but singular")
+    return tau
+
+
+def definite_tau(rows: list[list[fmpq]], d: int, share: float) -> fmpq | None:
+    """A share of the largest tau with I - blockdiag(tau I, 0) positive definite, shown to be one.
+
+    It is sought by bisection in doubles, and what comes of it is checked exactly; None where that
+    fails, as it does of a singular matrix.
+    """
+    doubles = [[float(arb(x)) for x in row] for row in rows]
+    low = 0.0
+    high = min(doubles[a][a] for a in range(d))
+    while high - low > RESOLUTION * high:
+        middle = 0.5 * (low + high)
+        if first_bad_pivot(less_tau(doubles, middle, d)) is None:
+            low = middle
+        else:
+            high = middle
+    tau = fmpq(*(share * low).as_integer_ratio())
+    is_shown = tau > 0 and first_bad_pivot(less_tau(rows, tau, d)) is None
+    return tau if is_shown else None
+
+
+def less_tau(rows: list[list[Number]], tau: Number, d: int) -> list[list[Number]]:
+    """A matrix less tau on the first d places of its diagonal."""
+    return [[x - tau if a == b < d else x for b, x in enumerate(row)] for a, row in enumerate(rows)]
+
+
+def inner(A: arb_mat, B: arb_mat) -> arb:
+    """<A, B> = tr(A^T B)."""
+    return (A.transpose() * B).trace()
+
+
+def rotation_weight(I_rr: arb_mat, d: int) -> arb_mat:
+    """V with tr(V (2 I - E - E^T)) = 2 (1 - cos theta) a^T I_rr a."""
+    half_trace = I_rr.trace() / 2
+    return identity(2) * half_trace if d == 2 else identity(3) * half_trace - I_rr
+
+
+def axis_times_sine(E: arb_mat) -> arb_mat:
+    """Return a sin theta of a rotation E by theta about a."""
+    planes = [(1, 0)] if E.nrows() == 2 else [(2, 1), (0, 2), (1, 0)]
+    return arb_mat([[(E[a, b] - E[b, a]) / 2] for a, b in planes])
+
+
+def skew(w: arb_mat) -> arb_mat:
+    """Return the matrix with <skew(w), E> = 2 <w, axis_times_sine(E)>."""
+    if w.nrows() == 1:
+        return arb_mat([[0, -w[0, 0]], [w[0, 0], 0]])
+    x, y, z = w.entries()
+    return arb_mat([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def axis_times_versine(E: arb_mat) -> arb_mat:
+    """(1 - cos theta) a a^T of a rotation E by theta about a; in the plane 1 - cos theta."""
+    D = E - identity(E.nrows())
+    half_trace = D.trace() / 2
+    if E.nrows() == 2:
+        return arb_mat([[-half_trace]])
+    return (D + D.transpose()) * arb(0.5) - identity(3) * half_trace
+
+
+def versine_adjoint(N: arb_mat, d: int) -> arb_mat:
+    """Return the matrix with <versine_adjoint(N), E - I> = <N, axis_times_versine(E)>, N = N^T."""
+    half_trace = N.trace() / 2
+    return -half_trace * identity(2) if d == 2 else N - identity(3) * half_trace

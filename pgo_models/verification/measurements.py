@@ -1,0 +1,239 @@
+"""Measurements of a g2o file as exact numbers: the verifier's own reader, which nothing else uses.
+
+A number of the file is the rational number that its digits say. Tags and conventions are those of
+g2o, GTSAM and TORO: information is in the frame measured, of a position prior in the world's, of a
+landmark in the pose's.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from pgo_models.errors import FileFormatError
+from pgo_models.verification.balls import (
+    angles_rotation,
+    arb_mat,
+    fmpq,
+    fmpq_mat,
+    identity,
+    plane_rotation,
+    quaternion_rotation,
+    symmetric,
+)
+
+
+@dataclass(frozen=True)
+class Tag:
+    """What stands behind a tag: ids, the measurement, and the triangle of its information matrix.
+
+    `has_offset`: the id of a PARAMS_SE3OFFSET line may follow the ids. `is_toro`: in space angles
+    roll, pitch, yaw instead of a quaternion, in the plane another order of the triangle.
+    """
+
+    d: int
+    num_ids: int = 2  # with one, what is measured is the pose in the frame of the world
+    is_point: bool = False  # a position without a rotation
+    to_landmark: bool = False
+    has_offset: bool = False
+    is_toro: bool = False
+
+    @property
+    def num_measured(self) -> int:
+        """How many numbers the measurement has."""
+        if self.is_point:
+            return self.d
+        if self.d == 2:
+            return 3
+        return 6 if self.is_toro else 7
+
+    @property
+    def side(self) -> int:
+        """Rows of the information matrix."""
+        return self.d if self.is_point else 3 * self.d - 3
+
+
+TAGS = {
+    "EDGE_SE2": Tag(2),
+    "EDGE_SE3:QUAT": Tag(3),
+    "EDGE_SE2_XY": Tag(2, is_point=True, to_landmark=True),
+    "EDGE_SE3_TRACKXYZ": Tag(3, is_point=True, to_landmark=True, has_offset=True),
+    "EDGE_PRIOR_SE2": Tag(2, num_ids=1),
+    "EDGE_SE2_PRIOR": Tag(2, num_ids=1),
+    "EDGE_SE3_PRIOR": Tag(3, num_ids=1, has_offset=True),
+    "EDGE_PRIOR_SE3": Tag(3, num_ids=1, has_offset=True),
+    "EDGE_PRIOR_SE2_XY": Tag(2, num_ids=1, is_point=True),
+    "EDGE_SE3_XYZ_PRIOR": Tag(3, num_ids=1, is_point=True, has_offset=True),
+    "EDGE_PRIOR_XY": Tag(2, num_ids=1, is_point=True, to_landmark=True),
+    "EDGE_POINTXYZ_PRIOR": Tag(3, num_ids=1, is_point=True, to_landmark=True),
+    "EDGE2": Tag(2, is_toro=True),
+    "EDGE3": Tag(3, is_toro=True),
+}
+LANDMARK_TAGS = ("VERTEX_XY", "VERTEX_TRACKXYZ")
+# They are no part of the cost.
+IGNORED_TAGS = ("VERTEX_SE2", "VERTEX_SE3:QUAT", "VERTEX2", "VERTEX3", "FIX")
+# Places of xx xy xr yy yr rr in TORO's order of the plane, xx xy yy rr xr yr.
+TORO_TRIANGLE = (0, 1, 4, 2, 5, 3)
+WORLD = 2**63  # the pose that priors are measured from; ids have 64 bits, with a sign
+NUMBER = re.compile(r"([+-]?)(\d*)\.?(\d*)(?:[eE]([+-]?\d{1,3}))?", re.ASCII)
+LONGEST_WORD = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """A measurement of pose or landmark j in the frame of pose i."""
+
+    line: int
+    tag: Tag
+    i: int
+    j: int
+    measured: tuple[fmpq, ...]
+    triangle: tuple[fmpq, ...]
+
+    @property
+    def t(self) -> arb_mat:
+        """t_ij, (d, 1)."""
+        return arb_mat([[number] for number in self.measured[: self.tag.d]])
+
+    @property
+    def R(self) -> arb_mat:
+        """R_ij, (d, d), that of a normalised quaternion; of a position the identity."""
+        if self.tag.is_point:
+            return identity(self.tag.d)
+        if self.tag.d == 2:
+            return plane_rotation(self.measured[2])
+        if self.tag.is_toro:
+            return angles_rotation(*self.measured[3:])
+        return quaternion_rotation(*self.measured[3:])
+
+    def block(self, rows: range, columns: range) -> fmpq_mat:
+        """Some rows and columns of the information matrix, translation first."""
+        information = symmetric(self.triangle, self.tag.side)
+        return fmpq_mat([[information[a][b] for b in columns] for a in rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """What a file says of the cost: its edges, and which of the ids they name are landmarks."""
+
+    d: int
+    edges: list[Edge]
+    landmarks: set[int]
+
+    @property
+    def nodes(self) -> set[int]:
+        """Poses, landmarks, and where there are priors the world."""
+        return {node for edge in self.edges for node in (edge.i, edge.j)}
+
+
+def read_graph(path: Path, skip_unknown: bool) -> Graph:
+    """Edges of a g2o file; a FileFormatError names the line that is wrong."""
+    edges: list[Edge] = []
+    landmarks: set[int] = set()
+    offset_line = 0  # of a sensor that is not at its pose
+    for number, line in enumerate(read_text(path).split("\n"), 1):
+        tag, *words = line.split() or ["#"]
+        if tag in TAGS:
+            edges.append(read_edge(path, number, TAGS[tag], words))
+            if TAGS[tag].to_landmark:
+                landmarks.add(edges[-1].j)
+        elif tag in LANDMARK_TAGS:
+            landmarks.add(read_id(path, number, words[0] if words else ""))
+        elif tag == "PARAMS_SE3OFFSET":
+            if any(exact_number(path, number, word) != 0 for word in words[1:7]):
+                offset_line = number
+        elif not skip_unknown:
+            check_ignored_tag(path, number, tag)
+    if not edges:
+        raise FileFormatError(path, None, "no measurement in it; give the file that was solved")
+    check_offset(path, edges, offset_line)
+    graph = Graph(edges[0].tag.d, edges, landmarks)
+    for edge in edges:
+        check_edge(path, graph, edge)
+    return graph
+
+
+def check_ignored_tag(path: Path, line: int, tag: str) -> None:
+    """Raise a FileFormatError unless a tag is one of those whose lines say nothing of edges."""
+    if tag in IGNORED_TAGS or tag.startswith(("#", "PARAMS_")):
+        return
+    known = ", ".join([*TAGS, *LANDMARK_TAGS, *IGNORED_TAGS])
+    problem = f"unknown tag {tag[:40]!r}; known are {known}; or use --skip-unknown"
+    raise FileFormatError(path, line, problem)
+
+
+def check_offset(path: Path, edges: list[Edge], offset_line: int) -> None:
+    """Raise a FileFormatError where edges are seen from a sensor that is not at its pose.
+
+    `offset_line` is the line that says so of a sensor, 0 where there is none.
+    """
+    if offset_line and any(edge.tag.has_offset for edge in edges):
+        problem = "a sensor that is not at its pose; give measurements in the frame of the pose"
+        raise FileFormatError(path, offset_line, problem)
+
+
+def check_edge(path: Path, graph: Graph, edge: Edge) -> None:
+    """Raise a FileFormatError where an edge does not go with the rest of its file."""
+    problem = ""
+    if edge.tag.d != graph.d:
+        problem = "2D and 3D lines in one file; give one file for each"
+    elif edge.i == edge.j:
+        problem = "an edge from a pose to itself; remove it"
+    elif edge.i in graph.landmarks or (edge.j in graph.landmarks and not edge.tag.is_point):
+        problem = "an edge that takes a landmark for a pose; renumber one of them"
+    if problem:
+        raise FileFormatError(path, edge.line, problem)
+
+
+def read_edge(path: Path, line: int, tag: Tag, words: list[str]) -> Edge:
+    """Edge of the words behind its tag."""
+    num_words = tag.num_ids + tag.num_measured + tag.side * (tag.side + 1) // 2
+    if tag.has_offset and len(words) == num_words + 1:
+        words = words[: tag.num_ids] + words[tag.num_ids + 1 :]
+    if len(words) != num_words:
+        problem = f"{len(words)} words behind the tag, {num_words} belong there; complete the line"
+        raise FileFormatError(path, line, problem)
+    ids = [read_id(path, line, word) for word in words[: tag.num_ids]]
+    numbers = [exact_number(path, line, word) for word in words[tag.num_ids :]]
+    measured = numbers[: tag.num_measured]
+    triangle = numbers[tag.num_measured :]
+    if tag.num_measured == 7 and not any(measured[3:]):
+        problem = "zero quaternion; it is no rotation: 0 0 0 1 is the unrotated one"
+        raise FileFormatError(path, line, problem)
+    if tag.is_toro and tag.d == 2:
+        triangle = [triangle[place] for place in TORO_TRIANGLE]
+    i, j = ids if tag.num_ids == 2 else (WORLD, ids[0])
+    return Edge(line, tag, i, j, tuple(measured), tuple(triangle))
+
+
+def read_id(path: Path, line: int, word: str) -> int:
+    """Id of a pose, an integer of 64 bits."""
+    if not re.fullmatch(r"[+-]?[0-9]{1,19}", word) or abs(int(word)) >= WORLD:
+        problem = f"id {word[:40]!r} is no integer of 64 bits; number the poses"
+        raise FileFormatError(path, line, problem)
+    return int(word)
+
+
+def exact_number(path: Path, line: int, word: str) -> fmpq:
+    """The rational number that a word like -1.5e-3 stands for."""
+    parts = NUMBER.fullmatch(word) if len(word) <= LONGEST_WORD else None
+    if parts is None or not (parts[2] or parts[3]):
+        problem = f"{word[:40]!r} is no finite number; correct or remove the line"
+        raise FileFormatError(path, line, problem)
+    sign, whole, fraction, exponent = parts.groups(default="0")
+    digits = int(f"{sign}{whole}{fraction}")
+    power = int(exponent) - len(fraction)
+    return fmpq(digits * 10**power) if power >= 0 else fmpq(digits, 10**-power)
+
+
+def read_text(path: Path) -> str:
+    """Text of a UTF-8 file; a FileFormatError where there is none."""
+    if path.is_dir():
+        problem = "a folder; verify the file that pgo solve --out one.g2o writes of it"
+        raise FileFormatError(path, None, problem)
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        problem = f"cannot be read: {error.strerror}; give a readable file"
+        raise FileFormatError(path, None, problem) from error
+    except UnicodeDecodeError as error:
+        raise FileFormatError(path, None, "bytes that are no text; give a text file") from error

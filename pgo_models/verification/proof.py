@@ -1,0 +1,106 @@
+"""A proof as its file has it: poses, multipliers, ground and shift. The verifier believes none."""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pgo_models.errors import FileFormatError
+from pgo_models.verification.measurements import WORLD, read_text
+
+FORMAT = "pgo-splitting proof 1"
+COSTS = {
+    "F": "F, two precisions an edge, as in SE-Sync",
+    "unit": "F with kappa = tau = 1, as in the paper",
+    "chi2": "chi2 of the information matrices",
+}
+WAY_OUT = "give a file of pgo solve --proof, as it was written"
+
+
+@dataclass(frozen=True, eq=False)
+class Proof:
+    """What a proof file says; all numbers are doubles, exactly."""
+
+    cost: str
+    objective: float
+    lower_bound: float
+    rounding_level: float  # cost that the solver could not tell from zero
+    eta: float | None  # None: nothing is claimed but that the cost is never negative
+    ground: int
+    t: dict[int, list[float]]
+    R: dict[int, list[list[float]]]  # not of landmarks
+    # Upper triangles, row by row. Where there are none, those of a stationary point are taken.
+    Lambda: dict[int, list[float]]
+
+
+def read_proof(path: Path, d: int) -> Proof:
+    """Proof in a JSON file, shapes and numbers checked; a FileFormatError says what is wrong."""
+    try:
+        record = json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(path, None, f"no JSON: {error}; {WAY_OUT}") from error
+    if entry(path, record, "format") != FORMAT:
+        raise FileFormatError(path, None, f"its format is not {FORMAT!r}; {WAY_OUT}")
+    cost = entry(path, record, "cost")
+    if cost not in list(COSTS) or entry(path, record, "d") != d:
+        problem = f"not the proof of {', '.join(COSTS)} in {d}D; give the proof of this graph"
+        raise FileFormatError(path, None, problem)
+    t: dict[int, list[float]] = {}
+    R: dict[int, list[list[float]]] = {}
+    Lambda: dict[int, list[float]] = {}
+    poses = entry(path, record, "poses")
+    for pose in poses if isinstance(poses, list) else [poses]:
+        name = name_of(path, entry(path, pose, "id"))
+        t[name] = numbers(path, entry(path, pose, "t"), f"t of pose {name}", d)
+        if "R" in pose:
+            R[name] = numbers(path, pose["R"], f"R of pose {name}", d, d)
+        if "Lambda" in pose:
+            size = d * (d + 1) // 2
+            Lambda[name] = numbers(path, pose["Lambda"], f"Lambda of pose {name}", size)
+    return Proof(
+        cost=cost,
+        objective=numbers(path, entry(path, record, "objective"), "objective"),
+        lower_bound=numbers(path, entry(path, record, "lower_bound"), "lower_bound"),
+        rounding_level=numbers(path, entry(path, record, "rounding_level"), "rounding_level"),
+        eta=read_shift(path, entry(path, record, "eta")),
+        ground=name_of(path, entry(path, record, "ground")),
+        t=t,
+        R=R,
+        Lambda=Lambda,
+    )
+
+
+def entry(path: Path, record: object, name: str) -> Any:  # noqa: ANN401 - of JSON
+    """Entry of a JSON object."""
+    if not isinstance(record, dict) or name not in record:
+        raise FileFormatError(path, None, f"no entry {name!r} where one belongs; {WAY_OUT}")
+    return record[name]
+
+
+def numbers(path: Path, value: Any, what: str, *shape: int) -> Any:  # noqa: ANN401 - of JSON
+    """A finite number, or as many of them in lists as a shape says."""
+    if shape and isinstance(value, list) and len(value) == shape[0]:
+        return [numbers(path, inner, what, *shape[1:]) for inner in value]
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not shape and is_number and abs(value) <= sys.float_info.max:
+        return float(value)
+    expected = f"{' x '.join(map(str, shape))} finite numbers" if shape else "a finite number"
+    raise FileFormatError(path, None, f"{what}: {value!s:.40} is not {expected}; {WAY_OUT}")
+
+
+def read_shift(path: Path, value: object) -> float | None:
+    """The shift eta, or None; the theorem is for shifts that are not negative."""
+    eta: float | None = None if value is None else numbers(path, value, "eta")
+    if eta is not None and eta < 0:
+        raise FileFormatError(path, None, f"eta is {eta}, and must not be negative; {WAY_OUT}")
+    return eta
+
+
+def name_of(path: Path, value: object) -> int:
+    """Id of a pose, or that of the world."""
+    if value == "world":
+        return WORLD
+    if type(value) is int and abs(value) < WORLD:
+        return value
+    raise FileFormatError(path, None, f"{value!s:.40} is no id of a pose; {WAY_OUT}")

@@ -1,0 +1,107 @@
+"""`pgo certify`: a proven bound for poses from anywhere."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pgo_models.certificates.certificate import DEFAULT_GAP, Certificate, certify
+from pgo_models.certificates.proof_file import save_proof
+from pgo_models.errors import SettingError
+from pgo_models.files import check_writable
+from pgo_models.geometry.poses import Poses
+from pgo_models.problem.problem import PGOProblem
+from solvers.cli.explanations import edge_fit, explained_by_its_graph, show_advice, warn_of_weights
+from solvers.cli.inputs import GraphOptions, estimated_poses, graph_in_commands
+from solvers.cli.options import (
+    DropCouplingOption,
+    GapOption,
+    GraphArgument,
+    InformationOption,
+    ProofOption,
+    SkipUnknownOption,
+)
+from solvers.cli.shell import (
+    DONE,
+    NOT_CERTIFIED,
+    JsonOption,
+    QuietOption,
+    save_then_show,
+    wrapped,
+)
+from solvers.cli.study_commands import DropEdgeOption, UnitWeightsOption
+from solvers.reporting.versions import installed_versions
+from solvers.solution import both_costs, certificate_json, other_cost, write_json
+
+_INDENT = 13  # columns of the labels of a certificate
+
+
+@explained_by_its_graph
+def certify_command(
+    graph: GraphArgument,
+    estimate: Annotated[
+        Path | None,
+        typer.Option(
+            "--estimate",
+            "-e",
+            help="Poses to judge: .g2o, .tum or .kitti; else the graph's VERTEX lines.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Write the certificate as .json.")
+    ] = None,
+    proof: ProofOption = None,
+    gap: GapOption = DEFAULT_GAP,
+    unit_weights: UnitWeightsOption = False,
+    information: InformationOption = False,
+    drop_coupling: DropCouplingOption = False,
+    skip_unknown: SkipUnknownOption = False,
+    drop_edge: DropEdgeOption = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Judge poses from anywhere: how far their cost can be above the global optimum."""
+    if out is not None and out.suffix.lower() != ".json":
+        raise SettingError(f"cannot write {out}: a certificate is written as .json")
+    for path in (out, proof):
+        if path is not None:
+            check_writable(path)
+    source = GraphOptions(graph, unit_weights, information, drop_coupling, skip_unknown, drop_edge)
+    problem = source.problem(source.loaded())
+    poses = estimated_poses(problem.graph, estimate)
+    certificate = certify(problem, poses, gap)
+    record = _record(problem, poses, certificate)
+    files = ((out, partial(write_json, record)), (proof, partial(save_proof, problem, certificate)))
+    targets = [(path, save) for path, save in files if path is not None]
+
+    def show() -> None:
+        typer.echo(_text(problem, poses, certificate, str(record["note"])))
+        name = graph_in_commands(graph, {"--skip-unknown": skip_unknown}, drop_edge)
+        fit = edge_fit(problem, poses, graph, drop_edge)
+        show_advice(fit.advice_on_cost(f"pgo solve {name}"))
+
+    save_then_show(targets, show, (lambda: record) if as_json else None, quiet)
+    warn_of_weights(graph, problem, certificate, drop_edge)
+    raise typer.Exit(DONE if certificate.is_certified else NOT_CERTIFIED)
+
+
+def _record(problem: PGOProblem, poses: Poses, certificate: Certificate) -> dict[str, object]:
+    """What `.json` files hold of poses and their certificate."""
+    return {
+        "objective": certificate.objective,
+        **both_costs(problem, poses),
+        **certificate_json(certificate),
+        "source": certificate.source.name,
+        "best_known_objective": certificate.poses_objective,
+        "versions": installed_versions(problem.backend),
+    }
+
+
+def _text(problem: PGOProblem, poses: Poses, certificate: Certificate, note: str) -> str:
+    """The certificate as it is printed, with a note and with the cost that is not bounded."""
+    rows = [("note", note)] if note else []
+    rows += other_cost(problem, poses)
+    lines = [str(certificate)]
+    lines += [f"{label:<12} {text}" for label, text in rows]
+    return wrapped("\n".join(lines), _INDENT)

@@ -1,0 +1,161 @@
+"""Errors and results of a command, explained by lines of its graph's file.
+
+A weight that is too far from the others, which cannot be factored or leaves no bound, is named by
+file and line, and so are edges that do not fit.
+"""
+
+import functools
+import sys
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import ParamSpec, TypeVar, cast
+
+import numpy as np
+import typer
+
+from pgo_models.certificates.certificate import Certificate
+from pgo_models.errors import GraphWarning, NotPositiveDefiniteError, PGOError, is_out_of_memory
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.datasets import locate
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.precisions import extreme_weight
+from pgo_models.memory import check_memory
+from pgo_models.problem.problem import PGOProblem
+from solvers.cli.inputs import Dropped, indefinite_matrices, kept_edges, load_graph
+from solvers.cli.shell import command_to_type, wrapped
+from solvers.reporting.edge_fit import Advice, EdgeFit, judge_edges
+from solvers.reporting.graph_facts import memory_note, memory_of_a_solve
+from solvers.solution import Solution, note_of_weights
+
+MORE_MEMORY = (
+    "raise the limit, or share it among machines: pgo solve --robots K --address HOST:PORT"
+)
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def explained_by_its_graph(command: Callable[P, T]) -> Callable[P, T]:
+    """Wrap a command with an argument `graph`, so that its errors name that graph and its lines."""
+
+    @functools.wraps(command)
+    def explained(*args: P.args, **kwargs: P.kwargs) -> T:
+        graph = str(kwargs["graph"])
+        dropped = cast("Dropped", kwargs.get("drop_edge"))
+        try:
+            return command(*args, **kwargs)
+        except NotPositiveDefiniteError as error:
+            place = place_of_weight(graph, dropped)
+            raise NotPositiveDefiniteError(f"{place} ({error})") from error
+        except (MemoryError, ImportError) as error:
+            # A library that is imported when it is used fails with an ImportError.
+            if isinstance(error, ImportError) and not is_out_of_memory(error):
+                raise
+            raise PGOError(f"{graph} takes more memory than there is; {MORE_MEMORY}") from error
+
+    return explained
+
+
+def say_memory_of_solve(name: str, graph: PoseGraph, is_shared: bool) -> None:
+    """Print on stderr how much memory a solve takes, if it is a lot.
+
+    Raises a PGOError if it is more than there is. If robots share the graph it does not, since they
+    may run on other machines.
+    """
+    if not is_shared:
+        check_memory(memory_of_a_solve(graph), f"{name}: a solve", MORE_MEMORY)
+    note = memory_note(graph)
+    if note:
+        print(f"pgo: {note}", file=sys.stderr)
+
+
+def warn_of_weights(
+    graph: str, problem: PGOProblem, certificate: Certificate, dropped: Dropped = None
+) -> None:
+    """Warn of the weight that `note_of_weights` speaks of, with its file and line."""
+    if note_of_weights(problem.graph, certificate):
+        # The file may have changed since it was read.
+        with suppress(PGOError):
+            warnings.warn(place_of_weight(graph, dropped), GraphWarning, stacklevel=2)
+
+
+def places_of_edges(graph: str, dropped: Dropped, num_edges: int) -> tuple[str, ...]:
+    """`file:line` of every edge; empty if the graph cannot be read again.
+
+    That is so of a pipe, and of a file that has changed.
+    """
+    try:
+        if not _can_be_read_again(graph):
+            return ()
+        _, places = kept_edges(graph, dropped)
+    except PGOError:
+        return ()
+    return tuple(places) if len(places) == num_edges else ()
+
+
+def _can_be_read_again(graph: str) -> bool:
+    """Whether a graph is a file or a folder, not a pipe."""
+    path = locate(graph)
+    return path.is_file() or path.is_dir()
+
+
+def edge_fit(problem: PGOProblem, poses: Poses, graph: str, dropped: Dropped) -> EdgeFit:
+    """How well the edges fit, with `file:line` of the first indefinite matrix."""
+    fit = judge_edges(problem, poses)
+    if fit.no_chi2:
+        # The file may have changed since it was read.
+        with suppress(PGOError):
+            return replace(fit, no_chi2=indefinite_matrices(problem.graph, graph, dropped))
+    return fit
+
+
+def edge_fit_of_solution(solution: Solution, graph: str, dropped: Dropped) -> EdgeFit:
+    """How well the edges fit, with `file:line` of every edge if the advice is to leave one out."""
+    fit = edge_fit(solution.problem, solution.poses, graph, dropped)
+    if solution.robust is not None or not fit.suspected.is_misfit.any():
+        return fit
+    num_edges = len(fit.residuals.cost)
+    return replace(fit, places=places_of_edges(graph, dropped, num_edges))
+
+
+def show_advice(advice: list[Advice]) -> None:
+    """Print every piece of advice, and below it the command to type."""
+    for piece in advice:
+        typer.echo(f"\n{wrapped(piece.text)}\n{command_to_type(piece.command)}")
+
+
+def with_places(solution: Solution, graph: str, dropped: Dropped = None) -> Solution:
+    """The solution, where a robust one is given `file:line` of every edge of the graph."""
+    if solution.robust is None:
+        return solution
+    num_edges = len(solution.robust.rejected)
+    places = places_of_edges(graph, dropped, num_edges)
+    return replace(solution, robust=replace(solution.robust, places=places))
+
+
+def with_covariances(solution: Solution) -> Solution:
+    """The solution with the marginal covariances of its poses, if they can be computed."""
+    with suppress(NotPositiveDefiniteError, MemoryError):
+        return replace(solution, covariances=solution.marginals())
+    return solution
+
+
+def place_of_weight(graph: str, dropped: Dropped = None) -> str:
+    """Sentence on the weight that is too far from the others.
+
+    It has file and line, edge, value, and the way out.
+    """
+    if not _can_be_read_again(graph):
+        return f"{graph}: weights too far apart for doubles; give it as a file to see which"
+    with warnings.catch_warnings(action="ignore"):
+        loaded = load_graph(graph, False, True, dropped)
+    _, edge, problem = extreme_weight(loaded)
+    _, places = kept_edges(graph, dropped)
+    weights = np.concatenate([loaded.kappa, loaded.tau])
+    length = np.abs(loaded.t_ij).max()
+    ranges = (
+        f"weights from {weights.min():.3g} to {weights.max():.3g} and lengths up to {length:.3g} m"
+    )
+    way_out = "correct the information matrix, or use --unit-weights"
+    return f"{places[edge]}: {problem}; {ranges} are too far apart for doubles; {way_out}"

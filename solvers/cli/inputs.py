@@ -1,0 +1,232 @@
+"""What the arguments of `pgo` name: graphs, edges, problems, poses and their times."""
+
+import os
+import shlex
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pgo_models.errors import FileFormatError, GraphError, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import BoolArray
+from pgo_models.graphs.datasets import load, locate
+from pgo_models.graphs.g2o import edge_places, read_g2o_poses
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.precisions import (
+    indefinite_edges,
+    text_of_indefinite,
+    without_indefinite_coupling,
+)
+from pgo_models.graphs.trajectories import read_kitti, read_times, read_tum
+from pgo_models.problem.cholesky import CholeskyBackend, default_backend
+from pgo_models.problem.cholmod import import_cvxopt
+from pgo_models.problem.kernels import take_buffers
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
+
+Dropped = list[str] | None  # edges to leave out, by LINE or FILE:LINE
+
+
+@dataclass(frozen=True)
+class GraphOptions:
+    """A graph as the command line names it, and the options that change its problem.
+
+    `graph` is a file, folder or data set. `drop_edge` are edges to leave out, by LINE or FILE:LINE.
+    """
+
+    graph: str
+    unit_weights: bool = False
+    information: bool = False
+    drop_coupling: bool = False
+    skip_unknown: bool = False
+    drop_edge: Dropped = None
+
+    def loaded(self) -> PoseGraph:
+        """The graph, without the edges to leave out."""
+        return load_graph(self.graph, self.unit_weights, self.skip_unknown, self.drop_edge)
+
+    def problem(self, loaded: PoseGraph) -> PGOProblem:
+        """Problem of the loaded graph, with the cost that was asked for.
+
+        A SettingError where there are no information matrices for chi2, or where its coupling
+        blocks are to be left out and it is not asked for. A GraphError names the first indefinite
+        matrix by `file:line`, unless the coupling blocks of such matrices are to be left out.
+        """
+        if self.drop_coupling and not self.information:
+            raise SettingError(
+                "--drop-coupling is for the information matrices of chi2; add --information"
+            )
+        if not self.information:
+            return PGOProblem(loaded)
+        if self.unit_weights or loaded.information is None:
+            why = f"{loaded.name} has none"
+            if self.unit_weights:
+                why = "--unit-weights takes them away"
+            raise SettingError(
+                f"--information asks for information matrices, and {why}; leave it out"
+            )
+        if self.drop_coupling:
+            loaded = without_indefinite_coupling(loaded)
+        elif indefinite := indefinite_matrices(loaded, self.graph, self.drop_edge):
+            raise GraphError(
+                f"{indefinite}, so that chi2 can be negative: correct them, "
+                "add --drop-coupling to go without their coupling blocks, "
+                "or leave out --information"
+            )
+        return PGOProblem(loaded, weighting=Weighting.INFORMATION)
+
+    @property
+    def in_commands(self) -> str:
+        """The name of the graph with all these options, as one types them."""
+        options = {
+            "--unit-weights": self.unit_weights,
+            "--information": self.information,
+            "--drop-coupling": self.drop_coupling,
+            "--skip-unknown": self.skip_unknown,
+        }
+        return graph_in_commands(self.graph, options, self.drop_edge)
+
+
+def graph_in_commands(graph: str, options: Mapping[str, bool], dropped: Dropped) -> str:
+    """The name of a graph in commands to type, with the options that change the problem."""
+    words = [graph]
+    words += [name for name, is_given in options.items() if is_given]
+    for edge in dropped or ():
+        words += ["--drop-edge", edge]
+    return shlex.join(words)
+
+
+def check_outputs_differ(outputs: Mapping[str, Path | list[Path] | None]) -> None:
+    """Raise a SettingError where two options, or one given twice, write the same file."""
+    option_of: dict[Path, str] = {}
+    for option, given in outputs.items():
+        paths = given if isinstance(given, list) else [given]
+        for path in paths:
+            if path is None:
+                continue
+            target = Path(os.path.realpath(path))
+            earlier = option_of.get(target)
+            if earlier is not None:
+                both = f"{option} twice" if earlier == option else f"{earlier} and {option}"
+                raise SettingError(f"{path} would be written by {both}; give two names")
+            option_of[target] = option
+
+
+def load_graph(
+    graph: str, unit_weights: bool, skip_unknown: bool = False, dropped: Dropped = None
+) -> PoseGraph:
+    """Graph of a file, folder or data set, without the edges to leave out.
+
+    Its weights are its own, or with `unit_weights` those of the paper.
+    """
+    # Both need memory, which the graph might leave none of.
+    take_buffers()
+    if default_backend() is CholeskyBackend.CHOLMOD:
+        import_cvxopt()
+    loaded = load(graph, skip_unknown=skip_unknown)
+    if dropped:
+        kept, _ = kept_edges(graph, dropped)
+        loaded = loaded.without_edges(~kept)
+    return loaded.unit_weights() if unit_weights else loaded
+
+
+def kept_edges(graph: str, dropped: Dropped) -> tuple[BoolArray, list[str]]:
+    """Whether each edge is kept, (m,), and `file:line` of those that are.
+
+    An edge is named by its line, in a folder by `FILE:LINE`, with or without the folder. A
+    SettingError where a name is that of no edge, or of several.
+    """
+    path = locate(graph)
+    if not (path.is_file() or path.is_dir()):
+        raise SettingError(f"{graph} can be read only once; give it as a file to name its edges")
+    with warnings.catch_warnings(action="ignore"):
+        places = edge_places(path)
+    kept = np.ones(len(places), dtype=bool)
+    for name in dropped or ():
+        kept[_edge_named(name, graph, places)] = False
+    return kept, [place for place, is_kept in zip(places, kept, strict=True) if is_kept]
+
+
+def _edge_named(name: str, graph: str, places: Sequence[str]) -> int:
+    """Number of the edge with this name; a SettingError where it is not that of one edge."""
+    endings = (f"/{name}", f":{name}")
+    named = [e for e, place in enumerate(places) if f"/{place}".endswith(endings)]
+    if len(named) == 1:
+        return named[0]
+    count = f"{len(named)} edges are" if named else "no edge is"
+    raise SettingError(f"{count} at {name} of {graph}; name it LINE or FILE:LINE, as {places[0]}")
+
+
+def indefinite_matrices(loaded: PoseGraph, graph: str, dropped: Dropped = None) -> str:
+    """How many information matrices are indefinite, and `file:line` of the first; "" for none."""
+    is_indefinite = indefinite_edges(loaded)
+    if not is_indefinite.any():
+        return ""
+    path = locate(graph)
+    place = ""
+    if path.is_file() or path.is_dir():
+        _, places = kept_edges(graph, dropped)
+        place = places[int(np.argmax(is_indefinite))]
+    return text_of_indefinite(loaded, is_indefinite, place)
+
+
+def with_times(graph: PoseGraph, path: Path | None) -> PoseGraph:
+    """Graph with the times in a file, one for every pose."""
+    if path is None:
+        return graph
+    times = read_times(path)
+    if len(times) != len(graph.bodies):
+        problem = f"{len(times)} times, {graph.name} has {len(graph.bodies)} poses; give one each"
+        raise FileFormatError(path, None, problem)
+    return replace(graph, times=times)
+
+
+def pose_named(graph: PoseGraph, name: int) -> int:
+    """Number of the pose with this id; a SettingError where there is none."""
+    ids = graph.pose_ids
+    numbers = np.flatnonzero(ids == name)
+    if not len(numbers):
+        raise SettingError(
+            f"{graph.name} has no pose {name} to anchor; "
+            f"its ids are from {ids.min()} to {ids.max()}"
+        )
+    return int(numbers[0])
+
+
+def estimated_poses(graph: PoseGraph, path: Path | None) -> Poses:
+    """Poses in a file, else those that came with the graph.
+
+    A FileFormatError unless the file has a pose for each of the graph's, and no others; a
+    SettingError where the graph has no poses, or the suffix is that of no format.
+    """
+    if path is None:
+        if graph.initial is None:
+            raise SettingError(
+                f"{graph.name} has no VERTEX line for every pose; give --estimate FILE"
+            )
+        return graph.initial
+    suffix = path.suffix.lower()
+    if suffix == ".g2o":
+        return read_g2o_poses(path, graph)
+    poses = _read_trajectory(path, graph.d)
+    if poses.num_poses != len(graph.in_files):
+        known = f"{graph.name} has {len(graph.in_files)}"
+        known += ", with its landmarks" if len(graph.landmarks) else ""
+        problem = f"{poses.num_poses} poses, {known}; give one each, or a .g2o file"
+        raise FileFormatError(path, None, problem)
+    return graph.completed(poses)
+
+
+def _read_trajectory(path: Path, d: int) -> Poses:
+    """Poses of a TUM or KITTI trajectory, as the suffix says; a SettingError for another suffix."""
+    suffix = path.suffix.lower()
+    if suffix in (".tum", ".txt"):
+        return read_tum(path, d)
+    if suffix == ".kitti":
+        return read_kitti(path, d)
+    raise SettingError(
+        f"cannot read {path}: no format has suffix {suffix!r}; use .g2o, .tum or .kitti"
+    )

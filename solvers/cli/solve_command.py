@@ -1,0 +1,505 @@
+"""`pgo solve`: a pose graph solved and certified, with what is written and printed of it."""
+
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pgo_models.certificates.certificate import DEFAULT_GAP
+from pgo_models.errors import SettingError
+from pgo_models.files import check_writable
+from pgo_models.geometry.poses import absolute_trajectory_error
+from pgo_models.graphs.datasets import locate
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.problem.marginals import write_covariances
+from solvers.cli import options as choices
+from solvers.cli.explanations import (
+    edge_fit_of_solution,
+    explained_by_its_graph,
+    say_memory_of_solve,
+    show_advice,
+    warn_of_weights,
+    with_covariances,
+    with_places,
+)
+from solvers.cli.inputs import GraphOptions, check_outputs_differ, pose_named, with_times
+from solvers.cli.options import (
+    BackEndName,
+    DropCouplingOption,
+    FirstStage,
+    GapOption,
+    GraphArgument,
+    InformationOption,
+    ProofOption,
+    Robust,
+    Runner,
+    SkipUnknownOption,
+    SplitOption,
+    Start,
+)
+from solvers.cli.shell import (
+    DONE,
+    NOT_CERTIFIED,
+    NOT_CONVERGED,
+    JsonOption,
+    QuietOption,
+    ThreadsOption,
+    save_then_show,
+    wrapped,
+)
+from solvers.cli.study_commands import DropEdgeOption, UnitWeightsOption
+from solvers.distributed.checkpoint import Checkpoint
+from solvers.folder_solve import solve_folder
+from solvers.network.engine import Engine
+from solvers.pipeline import WARM_START, Pipeline, solve
+from solvers.progress_bars import JobBar
+from solvers.reporting.report import check_report, write_report
+from solvers.result import Status
+from solvers.soc.soc import SOC
+from solvers.solution import Solution, check_format, check_target
+
+_INDENT = 13  # columns of the labels of a solution
+
+
+@explained_by_its_graph
+def solve_command(
+    graph: GraphArgument,
+    out: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Write .g2o, .tum, .kitti, .json, .png, .svg or .pdf; may be repeated.",
+        ),
+    ] = None,
+    method: Annotated[
+        FirstStage | None,
+        typer.Option(
+            help="First stage: joint SOC (one robot), substructured SOC (robots and a driver, the "
+            "same iterates), consensus SOC (robots alone), SOC as in the paper, or none before "
+            "Newton. Joint unless given, or substructured where an option is about robots; joint "
+            "is left out where Newton alone is faster."
+        ),
+    ] = None,
+    robots: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Robots that share the poses; as the file has them (paper: one a pose) unless "
+            "given.",
+        ),
+    ] = None,
+    split: SplitOption = None,
+    engine: Annotated[
+        Runner | None,
+        typer.Option(help="Where robots run: in this process, in its threads, or as Ray actors."),
+    ] = None,
+    address: Annotated[
+        str | None,
+        typer.Option(
+            help="HOST:PORT of a Ray cluster that this machine is part of; this machine unless "
+            "given."
+        ),
+    ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            help="File to go on from, if it is there, and to write checkpoints to, for --resume "
+            "after the run was broken off. Removed when the solve has converged."
+        ),
+    ] = None,
+    driver_memory: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="GB that the driver of a solve by robots may take, 4 unless given; 0 is no "
+            "driver, with --method consensus: poses, and no certificate.",
+        ),
+    ] = None,
+    start: Annotated[
+        Start | None,
+        typer.Option(help="Start: chordal relaxation (tree for the paper's method) unless given."),
+    ] = None,
+    r_step: Annotated[
+        BackEndName | None,
+        typer.Option("--r-step", help="Back end of SOC's R-subproblem; factorized unless given."),
+    ] = None,
+    gap: GapOption = DEFAULT_GAP,
+    max_iterations: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help=f"Most SOC iterations; default {WARM_START.max_iterations}, "
+            f"paper {SOC.max_iterations}.",
+        ),
+    ] = None,
+    tolerance: Annotated[
+        float | None, typer.Option(help="Residual at which Newton takes over from SOC.")
+    ] = None,
+    time_limit: Annotated[float, typer.Option(help="Seconds for the iterations.")] = math.inf,
+    unit_weights: UnitWeightsOption = False,
+    information: InformationOption = False,
+    drop_coupling: DropCouplingOption = False,
+    skip_unknown: SkipUnknownOption = False,
+    anchor: Annotated[
+        int | None,
+        typer.Option(
+            metavar="ID",
+            help="Pose held where the file has it, as by FIX; else aligned with the file's.",
+        ),
+    ] = None,
+    times: Annotated[
+        Path | None,
+        typer.Option(
+            help="Seconds of the poses, for .tum: a TUM file, or one number a line, in the order "
+            "of the ids."
+        ),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write a report as .html: one page that opens offline, with pictures, tables and "
+            "advice."
+        ),
+    ] = None,
+    covariances: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write covariances as .csv: id, upper triangle; x y (z) in world axes, m, then "
+            "turn, rad."
+        ),
+    ] = None,
+    proof: ProofOption = None,
+    robust: Annotated[
+        Robust | None,
+        typer.Option(
+            help="Find wrong edges and leave them out, odometry taken to be right: graduated "
+            "non-convexity with truncated least squares (gnc) or Geman-McClure (gm), pairwise "
+            "consistency (pcm), or both (pcm-gnc)."
+        ),
+    ] = None,
+    drop_edge: DropEdgeOption = None,
+    threads: ThreadsOption = None,  # `solvers.command` reads it, before BLAS is imported
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Print a line an iteration.")
+    ] = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Solve a pose graph: poses, their cost, a proven lower bound on the optimum, and the gap."""
+    given = _given_options(locals())
+    source = GraphOptions(graph, unit_weights, information, drop_coupling, skip_unknown, drop_edge)
+    stages = StageOptions(method, start, r_step, gap, max_iterations, tolerance, time_limit, robust)
+    network = RobotOptions(robots, split, engine, address, resume, driver_memory)
+    display = Display(verbose, quiet, as_json)
+    outputs = Outputs(out or [], report, covariances, proof, resume)
+    if network.reads_own_files(graph):
+        _refuse_what_needs_the_graph(given, outputs)
+        raise typer.Exit(_solve_own_files(graph, stages, network, display, outputs))
+    outputs.check_pages()
+    with JobBar(1, None, f"reading {graph}"):
+        loaded = with_times(source.loaded(), times)
+    problem = source.problem(loaded)
+    outputs.check_writable(problem.graph.num_robots)
+    stages.check_robust()
+    say_memory_of_solve(graph, problem.graph, network.is_given)
+    place = network.chosen_for(problem.graph, stages)
+    solution = solve(
+        problem,
+        stages.pipeline(place.method, place.partition, driver_memory),
+        choices.chosen_start(problem, start),
+        robust=choices.ROBUST[robust] if robust is not None else None,
+        robots=place.partition if place.engine is not None else None,
+        engine=place.engine,
+        checkpoint=Checkpoint(resume) if resume is not None else None,
+        anchor=pose_named(problem.graph, anchor) if anchor is not None else None,
+        time_limit=time_limit,
+        verbose=verbose,
+        progress=display.has_bar,
+    )
+    solution = with_places(solution, graph, drop_edge)
+    _save_and_show(solution, source, stages, outputs, display)
+    warn_of_weights(graph, problem, solution.certificate, drop_edge)
+    raise typer.Exit(_exit_code(solution.status, solution.is_certified))
+
+
+@dataclass(frozen=True)
+class StageOptions:
+    """Options about the stages of a solve."""
+
+    method: FirstStage | None
+    start: Start | None
+    r_step: BackEndName | None
+    gap: float
+    max_iterations: int | None
+    tolerance: float | None
+    time_limit: float
+    robust: Robust | None
+
+    def check_robust(self) -> None:
+        """Raise a SettingError where a robust solve is to have a first stage."""
+        if self.robust is None or self.method in (None, FirstStage.NEWTON):
+            return
+        raise SettingError(
+            f"--robust goes from its own start straight to Newton, got --method {self.method.value}"
+        )
+
+    def pipeline(
+        self, method: FirstStage, robots: Partition | None, driver_memory: float | None
+    ) -> Pipeline:
+        """Pipeline of these options with the method that was chosen."""
+        return choices.chosen_pipeline(
+            method,
+            robots,
+            self.r_step,
+            self.gap,
+            self.max_iterations,
+            self.tolerance,
+            driver_memory,
+        )
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a solve is run: the method, the robots if it has any, and where these run.
+
+    Without an engine everything is run in one place, also a method that has robots.
+    """
+
+    method: FirstStage
+    partition: Partition | None
+    engine: Engine | None
+
+
+@dataclass(frozen=True)
+class RobotOptions:
+    """Options about robots."""
+
+    robots: int | None
+    split: choices.Split | None
+    engine: Runner | None
+    address: str | None
+    resume: Path | None
+    driver_memory: float | None
+
+    @property
+    def is_given(self) -> bool:
+        """Whether any of these options was given."""
+        return self.robots is not None or self.split is not None or self.is_about_network
+
+    @property
+    def is_about_network(self) -> bool:
+        """Whether one of the options was given that need robots of an engine."""
+        options = (self.engine, self.address, self.resume, self.driver_memory)
+        return any(option is not None for option in options)
+
+    def reads_own_files(self, graph: str) -> bool:
+        """Whether the robots are on a Ray cluster, and each is to read its own file of a folder."""
+        is_on_ray = self.engine is Runner.RAY or bool(self.address)
+        is_shared_anew = bool(self.robots or self.split)
+        return is_on_ray and not is_shared_anew and locate(graph).is_dir()
+
+    def chosen_for(self, graph: PoseGraph, stages: StageOptions) -> Place:
+        """Where the solve is run; a SettingError when the options do not go together."""
+        method = choices.chosen_method(stages.method, self.robots, self.is_given)
+        if method is FirstStage.JOINT and self.split is not None:
+            raise SettingError(
+                f"--method joint has one robot, got --split {self.split.value}; "
+                "use substructured or consensus"
+            )
+        has_checkpoint = self.resume is not None
+        engine = choices.chosen_engine(method, self.engine, self.address, has_checkpoint)
+        partition = None
+        if self.is_given or method in (FirstStage.SUBSTRUCTURED, FirstStage.CONSENSUS):
+            partition = choices.chosen_partition(graph, self.robots, self.split)
+        # Robots factor; the other back ends of CONSENSUS have all robots in one place.
+        is_factorized = stages.r_step in (None, BackEndName.FACTORIZED)
+        if partition is not None and engine is not None and is_factorized:
+            return Place(method, partition, engine)
+        if stages.r_step is not None and self.is_about_network:
+            raise SettingError(
+                f"robots of an engine factor, got --r-step {stages.r_step.value}; "
+                "leave out --engine, --resume and --driver-memory"
+            )
+        return Place(method, partition, None)
+
+
+@dataclass(frozen=True)
+class Display:
+    """What is printed: a line an iteration, the result, errors and warnings alone, or JSON."""
+
+    verbose: bool
+    quiet: bool
+    as_json: bool
+
+    def __post_init__(self) -> None:
+        if self.verbose and (self.quiet or self.as_json):
+            raise SettingError(
+                "--verbose prints a line an iteration, and --quiet and --json do not; "
+                "give one of them"
+            )
+
+    @property
+    def has_bar(self) -> bool:
+        """Whether bars show the progress, on a terminal."""
+        return sys.stderr.isatty() and not self.quiet
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Files that are to be written; they are checked before a long solve, not after it."""
+
+    out: list[Path]
+    report: Path | None
+    covariances: Path | None
+    proof: Path | None
+    resume: Path | None
+
+    def __post_init__(self) -> None:
+        check_outputs_differ(
+            {
+                "--out": self.out,
+                "--resume": self.resume,
+                "--report": self.report,
+                "--covariances": self.covariances,
+                "--proof": self.proof,
+            }
+        )
+        for path in self.out:
+            check_format(path)
+
+    def check_pages(self) -> None:
+        """Raise an error where report or covariances have a name of another format."""
+        if self.report is not None:
+            check_report(self.report)
+        if self.covariances is not None and self.covariances.suffix.lower() != ".csv":
+            raise SettingError(f"cannot write {self.covariances}: covariances are written as .csv")
+
+    def check_writable(self, num_robots: int) -> None:
+        """Raise an error for the first file or folder that cannot be written."""
+        for path in self.out:
+            check_target(path, num_robots)
+        for other in (self.report, self.resume, self.covariances, self.proof):
+            if other is not None:
+                check_writable(other)
+
+
+def _given_options(arguments: dict[str, object]) -> set[str]:
+    """Names of the arguments that were given, or have a default that is not empty."""
+    return {name for name, value in arguments.items() if value is not None and value is not False}
+
+
+def _refuse_what_needs_the_graph(given: set[str], outputs: Outputs) -> None:
+    """Raise a SettingError for an option that robots with own files cannot serve.
+
+    Nobody has the whole graph then.
+    """
+    others = sorted(given - choices.FOR_OWN_FILES)
+    out = outputs.out
+    if not others and (len(out) > 1 or (out and out[0].suffix)):
+        others = ["out FILE"]
+    if others:
+        option = others[0].removeprefix("as_").replace("_", "-")
+        raise SettingError(
+            f"--{option} takes the whole graph in one process; to have it read: --split given"
+        )
+
+
+def _solve_own_files(
+    graph: str,
+    stages: StageOptions,
+    network: RobotOptions,
+    display: Display,
+    outputs: Outputs,
+) -> int:
+    """Solve a folder whose files the robots read themselves; the exit code."""
+    method = choices.chosen_method(stages.method, None, True)
+    pipeline = stages.pipeline(method, None, network.driver_memory)
+    solution = solve_folder(
+        graph,
+        pipeline,
+        engine=choices.chosen_engine(method, network.engine, network.address, False),
+        out=outputs.out[0] if outputs.out else None,
+        time_limit=stages.time_limit,
+        verbose=display.verbose,
+        progress=display.has_bar,
+    )
+    if not display.quiet:
+        typer.echo(f"{solution}")
+    return _exit_code(solution.status, solution.certificate.is_certified)
+
+
+def _save_and_show(
+    solution: Solution,
+    source: GraphOptions,
+    stages: StageOptions,
+    outputs: Outputs,
+    display: Display,
+) -> None:
+    """Write every file, then print the solution and what to try next, or JSON."""
+    command_source = source.in_commands
+    if stages.robust is not None:
+        command_source += f" --robust {stages.robust.value}"
+    # The edges are judged once, and only where that is shown.
+    judged = cache(partial(edge_fit_of_solution, solution, source.graph, source.drop_edge))
+    targets = _files_of_solution(solution, outputs)
+    if outputs.report is not None:
+
+        def save_report(path: Path) -> None:
+            has_covariances = outputs.covariances is not None
+            reported = with_covariances(solution) if has_covariances else solution
+            write_report(reported, path, source=command_source, fit=judged())
+
+        targets.append((outputs.report, save_report))
+
+    def show() -> None:
+        typer.echo(wrapped(_text_with_error(solution), _INDENT))
+        is_robust = stages.robust is not None
+        show_advice(judged().advice(f"pgo solve {command_source}", is_robust=is_robust))
+
+    record = solution.as_json if display.as_json else None
+    save_then_show(targets, show, record, display.quiet)
+
+
+def _files_of_solution(
+    solution: Solution, outputs: Outputs
+) -> list[tuple[Path, Callable[[Path], None]]]:
+    """Files that need the solution alone, and the functions that write them."""
+    targets: list[tuple[Path, Callable[[Path], None]]] = []
+    for path in outputs.out:
+        targets.append((path, solution.save))
+    if outputs.proof is not None:
+        targets.append((outputs.proof, solution.save_proof))
+    if outputs.covariances is not None:
+        graph = solution.problem.graph
+        named = graph.in_files
+        ids = graph.pose_ids[named]
+
+        def save_covariances(path: Path) -> None:
+            write_covariances(solution.marginals()[named], ids, path)
+
+        targets.append((outputs.covariances, save_covariances))
+    return targets
+
+
+def _text_with_error(solution: Solution) -> str:
+    """The printed solution, with the distance to the truth of a generated scene."""
+    graph = solution.problem.graph
+    if graph.truth is None:
+        return str(solution)
+    bodies = graph.bodies
+    error = absolute_trajectory_error(solution.poses[bodies], graph.truth[bodies])
+    return f"{solution}\n\nerror to the truth (ATE): {error:.4g} m"
+
+
+def _exit_code(status: Status, is_certified: bool) -> int:
+    """Exit code of a solve that has ended."""
+    if not status.is_success:
+        return NOT_CONVERGED
+    return DONE if is_certified else NOT_CERTIFIED

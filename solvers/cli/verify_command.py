@@ -1,0 +1,30 @@
+"""`pgo verify`: a written proof of a lower bound, checked in ball arithmetic."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pgo_models.graphs.datasets import locate
+from solvers.cli.options import SkipUnknownOption
+from solvers.cli.shell import DONE, JsonOption, QuietOption, save_then_show, wrapped
+
+NOT_VERIFIED = 3
+_INDENT = 13  # columns of the labels of a verification
+
+
+def verify_command(
+    graph: Annotated[str, typer.Argument(help="The g2o file, or the name of a data set.")],
+    proof: Annotated[Path, typer.Argument(help="The proof, of pgo solve --proof.")],
+    skip_unknown: SkipUnknownOption = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Check the proof of a lower bound, trusting nobody: exact numbers, ball arithmetic."""
+    from pgo_models.verification.verify import verify_proof  # needs the extra `verify`
+
+    verification = verify_proof(locate(graph), proof, skip_unknown=skip_unknown)
+    text = wrapped(str(verification), _INDENT)
+    record = verification.as_json if as_json else None
+    save_then_show([], lambda: typer.echo(text), record, quiet)
+    raise typer.Exit(DONE if verification.is_verified else NOT_VERIFIED)

@@ -1,0 +1,237 @@
+"""How well the edges fit by the information matrices of the file, and what to try otherwise.
+
+The advice on edges in the report and on the command line is from here, so that it is the same.
+"""
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pgo_models.certificates.newton_polish import polish
+from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.figures import rounded_up
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.precisions import indefinite_edges, text_of_indefinite
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
+from pgo_models.problem.weighting import Weighting
+
+_SAME_COST = 1e-9  # relative difference below which chi2 and F are one cost
+_CLEARLY_LOWER = 1.01  # ratio of chi2 to a lower value, above which there is advice on it
+_POLISHING_STEPS = 20  # factorisations towards the minimum of chi2, before edges are suspected
+# Ratio of the cost to the expected one below which the standard deviations in the file are at least
+# twice too large.
+_PESSIMISTIC = 0.25
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Advice on what to try next, and the command to type for it, empty if there is none."""
+
+    text: str
+    command: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeFit:
+    """Costs of the edges at some poses, in the cost that shows best whether the edges fit.
+
+    That cost is chi2 wherever the file has information matrices. F has only two precisions for an
+    edge, so that it cannot see an error in a direction that only the matrix calls precise.
+
+    Parameters
+    ----------
+    cost : str
+        "F" or "chi2".
+    residuals : EdgeResiduals
+        Residuals at the poses.
+    lowered : EdgeResiduals, optional
+        Residuals at poses of clearly lower chi2, if the poses minimise F and such poses were found
+        nearby.
+    places : sequence of str
+        file:line of every edge, if the graph is a file.
+    no_chi2 : str
+        Why the file has no chi2, if its matrices are indefinite.
+    """
+
+    cost: str
+    residuals: EdgeResiduals
+    lowered: EdgeResiduals | None = None
+    places: Sequence[str] = ()
+    no_chi2: str = ""
+
+    @property
+    def suspected(self) -> EdgeResiduals:
+        """Residuals at the best poses known, which say whether measurements may be wrong."""
+        return self.residuals if self.lowered is None else self.lowered
+
+    def sentence(self) -> str:
+        """Return the result of the chi-square tests of the edges at the poses.
+
+        Returns
+        -------
+        str
+            A sentence.
+        """
+        return fit_sentence(self.residuals, self.cost)
+
+    def advice_on_cost(self, solve: str) -> list[Advice]:
+        """Return the advice to minimise chi2, or on matrices of which there is no chi2.
+
+        There is advice to minimise chi2 if it is clearly above its minimum.
+
+        Parameters
+        ----------
+        solve : str
+            Command that solves the graph, to which options are added.
+
+        Returns
+        -------
+        list of Advice
+            At most one piece.
+        """
+        if self.no_chi2:
+            text = (
+                f"There is no chi2 beside F: {self.no_chi2}. Solve without their coupling blocks."
+            )
+            return [Advice(text, f"{solve} --information --drop-coupling")]
+        if self.lowered is None:
+            return []
+        cost_here = _total_cost(self.residuals)
+        lower_cost = _total_cost(self.lowered)
+        costs = f"is {cost_here} at these poses; its minimum is at most {lower_cost}"
+        text = f"chi2, the file's own cost, {costs}. Solve for it."
+        return [Advice(text, f"{solve} --information")]
+
+    def advice_on_edges(self, solve: str) -> list[Advice]:
+        """Return the advice to look for wrong measurements, if the edges cost too much.
+
+        Parameters
+        ----------
+        solve : str
+            Command that solves the graph, to which options are added.
+
+        Returns
+        -------
+        list of Advice
+            Empty if the edges fit; else a robust solve, and to leave out the worst edge.
+        """
+        residuals = self.suspected
+        if not residuals.is_doubtful:
+            return []
+        text = fit_sentence(residuals, self.cost)
+        if self.lowered is not None:
+            solve = f"{solve} --information"
+            text = f"With less chi2, too, the edges do not fit: {text[0].lower()}{text[1:]}"
+        text = f"{text} Look for wrong loop closures, which need not be the worst edges."
+        suggestions = [Advice(text, f"{solve} --robust gnc")]
+        if self.places and residuals.is_misfit.any():
+            worst = self.places[int((residuals.cost / residuals.allowed).argmax())]
+            name = shlex.quote(worst.rpartition("/")[2])
+            text = f"The worst edge is {worst}: solve without it."
+            suggestions.append(Advice(text, f"{solve} --drop-edge {name}"))
+        return suggestions
+
+    def advice(self, solve: str, is_robust: bool) -> list[Advice]:
+        """Return all advice; on edges only if the solve was not robust, else it has tried that.
+
+        Parameters
+        ----------
+        solve : str
+            Command that solves the graph, to which options are added.
+        is_robust : bool
+            Whether the solve was robust.
+
+        Returns
+        -------
+        list of Advice
+            Advice on the cost, then on the edges.
+        """
+        suggestions = self.advice_on_cost(solve)
+        if not is_robust:
+            suggestions += self.advice_on_edges(solve)
+        return suggestions
+
+
+def judge_edges(problem: PGOProblem, poses: Poses) -> EdgeFit:
+    """Judge the edges at poses: by chi2 if the graph has matrices, else by the problem's cost.
+
+    If F was minimised, one more factorisation shows whether chi2 can be lowered.
+
+    Parameters
+    ----------
+    problem : PGOProblem
+        The problem that was solved.
+    poses : Poses
+        Its solution.
+
+    Returns
+    -------
+    EdgeFit
+        Residuals at the poses, and at poses of lower chi2 if such were found.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pgo_models.graphs.scenes import circle
+    >>> graph = circle(np.random.default_rng(0))
+    >>> judge_edges(PGOProblem(graph), graph.truth).cost
+    'F'
+    """
+    own = edge_residuals(problem, poses)
+    if problem.weighting is not Weighting.ISOTROPIC or problem.graph.information is None:
+        cost = "chi2" if problem.weighting is Weighting.INFORMATION else "F"
+        return EdgeFit(cost, own)
+    is_indefinite = indefinite_edges(problem.graph)
+    if is_indefinite.any():
+        return EdgeFit("F", own, no_chi2=text_of_indefinite(problem.graph, is_indefinite))
+    whole = PGOProblem(problem.graph, problem.backend, Weighting.INFORMATION)
+    chi2 = whole.objective(poses)
+    if abs(chi2 - own.cost.sum()) <= _SAME_COST * chi2:
+        return EdgeFit("F", own)
+    return EdgeFit("chi2", edge_residuals(whole, poses), _lowered(whole, poses, chi2))
+
+
+def fit_sentence(residuals: EdgeResiduals, cost: str) -> str:
+    """Return the result of the chi-square tests of the edges, one by one and together."""
+    count = int(residuals.is_misfit.sum())
+    overall = residuals.overall
+    if count > 1:
+        text = f"{count} edges cost more than errors as their information matrices say"
+    else:
+        subject = "1 edge costs" if count == 1 else "No edge costs"
+        text = f"{subject} more than errors as its information matrix says"
+    if residuals.scale > 1.0:
+        text += f", times {residuals.scale:.3g}, which half of all edges exceed"
+    text += f" ({cost} is {overall:.3g} times what is expected"
+    if overall > residuals.overall_allowed:
+        text += f", and over {residuals.overall_allowed:.3g} by chance in one of 100 graphs"
+    elif 0.0 < overall < _PESSIMISTIC:
+        smaller = f"{overall**-0.5:.3g} times smaller than the matrices say"
+        text += f": errors are {smaller}, and wrong edges hide in that"
+    return text + ")."
+
+
+def _lowered(whole: PGOProblem, poses: Poses, chi2: float) -> EdgeResiduals | None:
+    """Residuals in chi2 at poses that cost clearly less; None if one factorisation finds none.
+
+    If the edges do not fit there either, more factorisations show whether they fit at the minimum.
+    """
+    try:
+        better = polish(whole, poses, max_steps=1)
+        if not chi2 > _CLEARLY_LOWER * whole.objective(better):
+            return None
+        residuals = edge_residuals(whole, better)
+        if not residuals.is_doubtful:
+            return residuals
+        return edge_residuals(whole, polish(whole, better, max_steps=_POLISHING_STEPS))
+    except NotPositiveDefiniteError:
+        return None
+
+
+def _total_cost(residuals: EdgeResiduals) -> str:
+    """Total cost, and its ratio to the expected cost if that is known."""
+    text = rounded_up(float(residuals.cost.sum()), 4)
+    if residuals.overall > 0.0:
+        text += f" ({residuals.overall:.3g} times what is expected)"
+    return text

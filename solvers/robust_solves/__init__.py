@@ -1,0 +1,1 @@
+"""A robust solve: attempts to find the wrong edges, the choice among them, revision and verdict."""

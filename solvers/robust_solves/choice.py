@@ -1,0 +1,108 @@
+"""Choice between the attempts of a robust solve: the least truncated cost decides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import BoolArray
+from solvers.robust.rejection import Attempt
+from solvers.robust_solves.attempts import DoubtedProblem, Estimate
+
+# Attempts where they are cheap, or where most closures were rejected.
+_SEVERAL_ATTEMPTS = 3
+# Factor on the error scale of the edges kept: real errors have heavier tails than Gaussian ones,
+# and an attempt that keeps the best edges alone has smaller ones. In cubicle no right edge costs
+# ten times its threshold so scaled.
+_TAIL_FACTOR = 10.0
+# Attempts that are revised where that is cheap, at most; their truncated cost over the least; and
+# the share of the closures kept on which any two of them differ.
+_MAX_REVISED = 3
+_MAX_RELATIVE_COST = 1.25
+_DISPUTED_SHARE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The attempts made so far, compared by the truncated cost of all edges.
+
+    The cost of poses X is
+
+        TLS(X) = sum over known inliers of r_e^2 + sum over the other edges of min(r_e^2, s c_e^2)
+
+    with c_e^2 the quantile of what a right edge costs and s, at most 1, ten times the least
+    `error_scale` of all attempts. s is below 1 where errors are far smaller than the matrices
+    claim: with s = 1 a map that deforms to fit wrong edges would then be the cheapest.
+    """
+
+    doubted: DoubtedProblem
+    estimates: tuple[Estimate, ...]
+
+    @property
+    def threshold_scale(self) -> float:
+        """Scale s of the thresholds."""
+        least = min((estimate.error_scale for estimate in self.estimates), default=1.0)
+        return min(1.0, _TAIL_FACTOR * least)
+
+    def cost(self, poses: Poses) -> float:
+        """Truncated cost TLS of poses."""
+        return self.doubted.truncated_cost(poses, self.threshold_scale)
+
+    @property
+    def by_cost(self) -> list[Estimate]:
+        """The attempts, the cheapest first."""
+        return sorted(self.estimates, key=lambda estimate: self.cost(estimate.poses))
+
+    @property
+    def cheapest(self) -> Estimate:
+        """The attempt of the least truncated cost."""
+        return self.by_cost[0]
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether no further attempt is needed.
+
+        The cheapest attempt has to be certified, the edges that it keeps may not form a tree, and
+        where attempts are cheap, or it rejects more than half of the closures, three have to be
+        made.
+        """
+        cheapest = self.cheapest
+        is_tree = int(cheapest.kept.sum()) < self.doubted.problem.num_poses
+        if is_tree or not cheapest.certificate.is_certified:
+            return False
+        keeps_most = 2 * self._num_closures_kept(cheapest) >= self.doubted.num_closures
+        needs_several = self.doubted.is_cheap or not keeps_most
+        return len(self.estimates) >= (_SEVERAL_ATTEMPTS if needs_several else 1)
+
+    def worth_revising(self, is_central: bool) -> list[Estimate]:
+        """The cheapest attempt, and where revisions are cheap the next ones that differ from it."""
+        cheapest, *others = self.by_cost
+        chosen = [cheapest]
+        if not self.doubted.is_cheap or not is_central:
+            return chosen
+        max_cost = _MAX_RELATIVE_COST * self.cost(cheapest.poses)
+        num_tolerated = _DISPUTED_SHARE * self._num_closures_kept(cheapest)
+        for estimate in others:
+            if self.cost(estimate.poses) > max_cost:
+                break
+            if all((estimate.kept != other.kept).sum() > num_tolerated for other in chosen):
+                chosen.append(estimate)
+        return chosen[:_MAX_REVISED]
+
+    def is_disputed(self, estimate: Estimate) -> bool:
+        """Whether another attempt keeps other edges."""
+        return any((other.kept != estimate.kept).any() for other in self.estimates)
+
+    def attempts_beside(self, kept: BoolArray) -> tuple[Attempt, ...]:
+        """Records of the attempts, each with the number of its edges that the answer rejects."""
+        return tuple(
+            replace(
+                estimate.attempt,
+                cost=self.cost(estimate.poses),
+                others=int((estimate.kept & ~kept).sum()),
+            )
+            for estimate in self.estimates
+        )
+
+    def _num_closures_kept(self, estimate: Estimate) -> int:
+        return int((estimate.kept & ~self.doubted.known).sum())

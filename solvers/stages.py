@@ -1,0 +1,372 @@
+"""The stages that a solve is made of, and those that run in one place.
+
+A solve is a list of planned stages. Each takes the answer so far and returns the next one: a start,
+SOC, Newton, the certificate, and where that leaves a wide gap a second attempt and the staircase.
+Stages run by robots are in `solvers.distributed.stages`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from pgo_models.certificates.certificate import (
+    BoundSource,
+    Certificate,
+    certify_at,
+    certify_with,
+    judge,
+    with_shrunk_information,
+)
+from pgo_models.certificates.lower_bound import NO_BOUND
+from pgo_models.certificates.newton_polish import polish
+from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.geometry.poses import Poses
+from pgo_models.problem.initialization import chordal_start, spanning_tree_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.loop import RunMonitor
+from solvers.result import OUT_OF_TIME, History, Record, Run, Stage, Status
+from solvers.riemannian.newton import Newton
+from solvers.riemannian.staircase import DualBound, Staircase, StaircaseState
+from solvers.soc.paper import PaperSOC
+from solvers.soc.soc import SOC
+
+SECOND_TRY_TOLERANCE = 1e-6
+AnySOC = TypeVar("AnySOC", bound=SOC | PaperSOC)
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What a solve has found so far, and what its next stage begins with.
+
+    The `poses` are None before the start, and while robots hold them. `decrement` is the relative
+    Newton decrement there, inf where it was not measured. `certificate` is that of the poses.
+    `dual_bound` is the bound on the relaxation that a staircase has proven, with its multipliers.
+    """
+
+    poses: Poses | None = None
+    decrement: float = math.inf
+    certificate: Certificate | None = None
+    dual_bound: DualBound | None = None
+
+    @property
+    def current_poses(self) -> Poses:
+        """The poses, after a start."""
+        assert self.poses is not None
+        return self.poses
+
+    @property
+    def current_certificate(self) -> Certificate:
+        """The certificate, after the stage that finds it."""
+        assert self.certificate is not None
+        return self.certificate
+
+
+class PlannedStage(Protocol):
+    """A stage of a solve that can be run: settings, and what it shares with the other stages."""
+
+    @property
+    def name(self) -> str:
+        """Name of the stage, as progress bars show it."""
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the answer after this stage; the given one stays as it is."""
+
+
+Plan = Callable[[SOC | PaperSOC | None, Poses | None], Sequence[PlannedStage]]
+
+
+def run_stages(planned: Iterable[PlannedStage], answer: Answer) -> Answer:
+    """Run stages one after the other, each from the answer of the one before."""
+    for stage in planned:
+        answer = stage.run(answer)
+    return answer
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What the stages of one solve share.
+
+    `stages` are those done so far, `gap` is the relative one to certify.
+    """
+
+    problem: PGOProblem
+    gap: float
+    monitor: RunMonitor
+    stages: list[Stage] = field(default_factory=list)
+
+    @property
+    def is_out_of_time(self) -> bool:
+        """Whether the last stage was interrupted or reached the time limit."""
+        return self.stages[-1].status in OUT_OF_TIME
+
+    def better(self, answer: Answer, other: Certificate) -> Answer:
+        """The cheaper poses and the better bound of an answer and another certificate."""
+        certificate = answer.current_certificate
+        poses = answer.current_poses
+        stationarity = certificate.stationarity
+        if other.poses_objective < certificate.objective:
+            poses = other.poses
+            stationarity = other.stationarity
+        highest = max(certificate, other, key=lambda known: known.lower_bound)
+        judged = judge(self.problem, poses, highest)
+        return Answer(poses, certificate=replace(judged, stationarity=stationarity))
+
+    def broken_off(self, ending: Callable[[float], Stage]) -> Answer:
+        """The best poses found so far, or those along a spanning tree, with the bound F >= 0.
+
+        `ending` makes the stage that says why the solve was broken off, from the cost of the poses.
+        """
+        candidates = self.monitor.poses_found or [spanning_tree_start(self.problem.graph)]
+        poses = min(candidates, key=self.problem.objective)
+        self.stages.append(ending(self.problem.objective(poses)))
+        certificate = certify_with(
+            self.problem,
+            poses,
+            np.zeros_like(poses.R),
+            self.gap,
+            math.inf,
+            BoundSource.GIVEN,
+            NO_BOUND,
+        )
+        return Answer(poses, certificate=certificate)
+
+
+@dataclass(frozen=True, eq=False)
+class FindStart:
+    """Start: poses that `find` returns. `began` is the time at which the choice of them began."""
+
+    job: Job
+    name: str
+    find: Callable[[], Poses]
+    began: float
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the poses of the start."""
+        job = self.job
+        with job.monitor.showing(self.name, job.problem):
+            poses = self.find()
+        seconds = time.perf_counter() - self.began
+        objective = job.problem.objective(poses)
+        job.stages.append(Stage(self.name, Status.CONVERGED, 0, objective, seconds, History()))
+        job.monitor.poses_found.append(poses)
+        return Answer(poses)
+
+
+@dataclass(frozen=True, eq=False)
+class RunSOC:
+    """Splitting of the orthogonality constraints, on the convex part of the problem."""
+
+    job: Job
+    soc: SOC | PaperSOC
+
+    @property
+    def name(self) -> str:
+        """Name of the method."""
+        return type(self.soc).__name__
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the poses of SOC, or the given ones where these cost less in the convex part.
+
+        This happens: on the data set CSAIL the chordal start costs less than every iterate of SOC.
+        """
+        job = self.job
+        convex_part = job.problem.convex_part
+        poses = answer.current_poses
+        finished: Run[Any] = job.monitor.run(self.soc, convex_part, poses)
+        if finished.objective <= convex_part.objective(poses):
+            poses = finished.poses
+        stage = Stage.of(finished)
+        if convex_part is not job.problem:
+            objective = job.problem.objective(poses)
+            stage = replace(stage, name=f"{stage.name}, convex", objective=objective)
+        job.stages.append(stage)
+        return Answer(poses)
+
+
+@dataclass(frozen=True, eq=False)
+class RunNewton:
+    """Newton to rounding level on the cost that is asked for, unless time is up."""
+
+    job: Job
+    newton: Newton
+
+    @property
+    def name(self) -> str:
+        """Name of the method."""
+        return "Newton"
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the stationary poses near the given ones, and the decrement there."""
+        job = self.job
+        if job.is_out_of_time:
+            return replace(answer, decrement=math.inf)
+        finished = job.monitor.run(self.newton, job.problem, answer.current_poses)
+        job.stages.append(Stage.of(finished))
+        decrement = finished.state.polish.decrement
+        return replace(answer, poses=finished.poses, decrement=decrement)
+
+
+@dataclass(frozen=True, eq=False)
+class FindCertificate:
+    """The dual certificate at the poses as they are."""
+
+    job: Job
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return "certificate"
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the answer with its certificate."""
+        job = self.job
+        poses = answer.current_poses
+        with job.monitor.showing(self.name, job.problem):
+            certificate = certify_at(job.problem, poses, job.gap, answer.decrement)
+        return replace(answer, certificate=certificate)
+
+
+@dataclass(frozen=True, eq=False)
+class RunStaircase:
+    """The Riemannian staircase from the current poses; its solution is rounded to poses."""
+
+    job: Job
+    staircase: Staircase
+
+    @property
+    def name(self) -> str:
+        """Name of the method."""
+        return "Staircase"
+
+    def run(self, answer: Answer) -> Answer:
+        """Return rounded poses, and the last bound that was proven on the relaxation.
+
+        Of a run that was cut short the state with the best poses is kept, not the one with the best
+        bound: so the bound is that of the last state that was seen.
+        """
+        job = self.job
+        bounds: list[DualBound | None] = [None]
+        asked = job.monitor.callback
+
+        def remember_bound(state: StaircaseState, record: Record) -> bool | None:
+            bounds.append(state.bound)
+            return asked(state, record) if asked is not None else None
+
+        monitor = replace(job.monitor, callback=remember_bound)
+        finished = monitor.run(self.staircase, job.problem, answer.current_poses)
+        job.stages.append(Stage.of(finished))
+        return Answer(finished.poses, dual_bound=bounds[-1])
+
+
+@dataclass(frozen=True, eq=False)
+class SecondAttempt:
+    """Another attempt, where the gap of the first is wider than asked for.
+
+    It runs SOC to a finer tolerance or, for a cost that is not quadratic, starts at the optimum of
+    F. `plan` returns the stages of an attempt with a SOC and a start.
+    """
+
+    job: Job
+    plan: Plan
+    soc: SOC | PaperSOC | None
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return "second attempt"
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the better poses and the better bound of both attempts.
+
+        An attempt that ends for want of a Cholesky factor leaves the answer as it is.
+        """
+        job = self.job
+        has_ended_well = job.stages[-1].status.is_success
+        if not (answer.current_certificate.can_improve and has_ended_well):
+            return answer
+        try:
+            other = run_stages(self._planned(), Answer())
+        except NotPositiveDefiniteError:
+            objective = job.problem.objective(answer.current_poses)
+            job.stages.append(Stage.without_factor(objective))
+            return answer
+        return job.better(answer, other.current_certificate)
+
+    def _planned(self) -> Sequence[PlannedStage]:
+        """Stages of the attempt."""
+        problem = self.job.problem
+        if problem.is_quadratic:
+            soc = self.soc if self.soc is not None else SOC()
+            return self.plan(finer(soc), None)
+        isotropic = PGOProblem(problem.graph, problem.backend)
+        return self.plan(None, polish(isotropic, chordal_start(isotropic)))
+
+
+@dataclass(frozen=True, eq=False)
+class ImproveBound:
+    """Stages for a better bound, where the certificate can still improve.
+
+    For a quadratic and convex cost these are the stages `climb`: the staircase from the best poses,
+    Newton from what it rounds to, and a certificate. Then smaller information matrices are tried,
+    which change nothing where the cost is F.
+    """
+
+    job: Job
+    climb: Sequence[PlannedStage]
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return "better bound"
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the better poses and the best bound of all."""
+        job = self.job
+        problem = job.problem
+        if job.is_out_of_time or not answer.current_certificate.can_improve:
+            return answer
+        try:
+            if problem.convex_part is problem:
+                answer = self._climbed(answer)
+            improved = with_shrunk_information(problem, answer.current_certificate)
+            answer = replace(answer, certificate=improved)
+        except KeyboardInterrupt:
+            objective = problem.objective(answer.current_poses)
+            job.stages.append(Stage.interruption(objective))
+        except NotPositiveDefiniteError:
+            objective = problem.objective(answer.current_poses)
+            job.stages.append(Stage.without_factor(objective))
+        return answer
+
+    def _climbed(self, answer: Answer) -> Answer:
+        """The answer after the climb, with the relaxation's bound if that is still needed."""
+        job = self.job
+        climbed = run_stages(self.climb, answer)
+        answer = job.better(answer, climbed.current_certificate)
+        certificate = answer.current_certificate
+        dual_bound = climbed.dual_bound
+        if dual_bound is None or certificate.is_certified:
+            return answer
+        relaxed = certify_with(
+            job.problem,
+            answer.current_poses,
+            dual_bound.Lambda,
+            job.gap,
+            certificate.stationarity,
+            BoundSource.RELAXATION,
+            dual_bound.bound,
+        )
+        highest = max(certificate, relaxed, key=lambda known: known.lower_bound)
+        return replace(answer, certificate=highest)
+
+
+def finer(soc: AnySOC) -> AnySOC:
+    """SOC of a second attempt: a finer tolerance, and the default limit of iterations of `SOC`."""
+    tolerance = min(soc.tolerance, SECOND_TRY_TOLERANCE)
+    return replace(soc, tolerance=tolerance, max_iterations=SOC.max_iterations)

@@ -1,0 +1,253 @@
+"""EXACT is said where every edge fits to its rounding, in 300 bits.
+
+It is never said where a heavy edge hides light ones.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from budget import examples
+from exact_arithmetic import MP, Exact, ExactGraph, exact, nearest_rotations
+from graphs import DIMENSIONS, SEEDS, exact_graph, informed, random_poses, turned_away, varied_graph
+from hypothesis import given, settings, strategies as st
+
+import solvers
+from pgo_models.certificates import rounding_errors
+from pgo_models.certificates.certificate import (
+    BoundSource,
+    Certificate,
+    Verdict,
+    certify,
+    certify_with,
+)
+from pgo_models.certificates.lower_bound import NO_BOUND
+from pgo_models.certificates.newton_polish import polish
+from pgo_models.certificates.rounding_errors import (
+    fits_to_rounding,
+    objective_rounding,
+    rounding_level,
+)
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
+
+SPREADS = st.sampled_from([0.0, 1.0, 3.0, 10.0, 30.0])
+
+
+def judged(problem: PGOProblem, poses: Poses) -> Certificate:
+    """What is said of poses without a bound: EXACT or nothing."""
+    nothing = np.zeros_like(poses.R)
+    return certify_with(problem, poses, nothing, 1e-6, math.nan, BoundSource.GIVEN, NO_BOUND)
+
+
+def exact_residuals(graph: PoseGraph, poses: Poses) -> tuple[Exact, Exact]:
+    """Squares of ||r_t|| and ||r_R||_F at the exact rotations nearest to the poses, (m,) each."""
+    R = nearest_rotations(poses.R)
+    t = exact(poses.t)
+    R_ij = exact(graph.R_ij)
+    moved = (R[graph.i] @ exact(graph.t_ij)[:, :, None])[:, :, 0]
+    shift = t[graph.j] - t[graph.i] - moved
+    turn = R[graph.j] - R[graph.i] @ R_ij
+    return (shift**2).sum(axis=1), (turn**2).sum(axis=(1, 2))
+
+
+def allowed_residuals(problem: PGOProblem, poses: Poses) -> tuple[Exact, Exact]:
+    """What residuals are at most where the verdict is EXACT.
+
+    The formula is that of the docstring, its numbers are computed here.
+    """
+    graph = problem.graph
+    d = problem.d
+    u = MP.mpf(2) ** -53
+    t = exact(poses.t)
+    count = 8 * MP.sqrt(graph.num_edges) + 1
+    extent = 2 * MP.sqrt(max(((t - t[:1]) ** 2).sum(axis=1)))
+    omega = exact(poses.orthogonality_error) + (d * (d + 2) + 1) * u
+    length = np.array([MP.sqrt(square) for square in (exact(graph.t_ij) ** 2).sum(axis=1)])
+    e_t = (2 * d + 3) * u * (extent + length) + omega * length
+    e_R = 2 * MP.sqrt(d) * (2 * d + 3) * u + 2 * omega
+    rounding_up = 1 + MP.mpf(2) ** -20
+    return count * e_t * rounding_up, count * e_R * rounding_up
+
+
+def assert_exact_is_true(problem: PGOProblem, poses: Poses) -> bool:
+    """Whether EXACT is said, and if so that it is so."""
+    certificate = judged(problem, poses)
+    if certificate.verdict is not Verdict.EXACT:
+        assert certificate.gap > 0.0
+        return False
+    assert certificate.gap == 0.0
+    graph = problem.graph
+    (square_t, square_R), (e_t, e_R) = (
+        exact_residuals(graph, poses),
+        allowed_residuals(problem, poses),
+    )
+    assert (square_t[graph.tau > 0] <= (e_t**2)[graph.tau > 0]).all()
+    assert (square_R[graph.kappa > 0] <= e_R**2).all()
+    assert ExactGraph.of_doubles(graph).objective_of(poses) <= 4 * exact(certificate.rounding_level)
+    return True
+
+
+@settings(max_examples=examples(120))
+@given(
+    seed=SEEDS,
+    n=st.integers(2, 8),
+    d=DIMENSIONS,
+    spread=SPREADS,
+    noise=st.floats(-17.0, 0.0),
+    away=st.floats(-17.0, 0.0),
+)
+def test_what_is_said_to_be_exact_is(
+    seed: int, n: int, d: int, spread: float, noise: float, away: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    graph = exact_graph(seed, n, d)
+    m = graph.num_edges
+    t_ij = graph.t_ij + 10.0**noise * rng.standard_normal((m, d)) * (rng.random((m, 1)) < 0.3)
+    kappa, tau = 10.0 ** rng.uniform(-spread, spread, (2, m))
+    graph = replace(graph, kappa=kappa, tau=tau, t_ij=t_ij)
+    problem = PGOProblem(graph)
+    assert graph.truth is not None
+    off = Poses(graph.truth.R, graph.truth.t + 10.0**away * rng.standard_normal((n, d)))
+    for poses in (graph.truth, off, random_poses(n, d, seed)):
+        assert_exact_is_true(problem, poses)
+
+
+@settings(max_examples=examples(60))
+@given(
+    seed=SEEDS,
+    n=st.integers(3, 10),
+    d=DIMENSIONS,
+    size=st.floats(-9.0, -2.0),
+    weight=st.sampled_from([1e15, 1e30]),
+)
+def test_a_heavy_edge_does_not_hide_light_ones(
+    seed: int, n: int, d: int, size: float, weight: float
+) -> None:
+    """F is nothing but the rounding of one edge, as far as a sum can tell."""
+    graph = exact_graph(seed, n, d)
+    assert graph.truth is not None
+    heavy = np.arange(graph.num_edges) == seed % graph.num_edges
+    kappa = np.where(heavy, weight, 1.0)
+    problem = PGOProblem(replace(graph, kappa=kappa, tau=np.ones(graph.num_edges)))
+    assert judged(problem, graph.truth).verdict is Verdict.EXACT
+    i = int(graph.i[heavy][0])
+    shift = np.zeros((n, d))
+    shift[i, 0] = 10.0**size
+    away = Poses(graph.truth.R, graph.truth.t + shift)
+    assert weight < 1e30 or problem.objective(away) <= rounding_level(problem, away)
+    assert judged(problem, away).verdict is Verdict.TRIVIAL
+    assert certify(problem, away).verdict is not Verdict.EXACT
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_poses_two_hundred_times_as_expensive_as_the_optimum_are_not_exact(d: int) -> None:
+    """One kappa of 1e30: sum kappa e_R^2 is above F of all other edges."""
+    graph = varied_graph(0, 10, d, NoiseModel(1e-3, 1e-3))
+    ones = np.full(graph.num_edges, 1.0)
+    first = np.arange(graph.num_edges) == 0
+    problem = PGOProblem(replace(graph, kappa=np.where(first, 1e30, ones), tau=ones))
+    assert graph.truth is not None
+    R = graph.truth.R.copy()
+    i = graph.i[0]
+    j = graph.j[0]
+    R[j] = R[i] @ graph.R_ij[0]
+    near = Poses(R, problem.with_best_translations(R).t)
+    poor = Poses(R, near.t + 0.1 * np.random.default_rng(0).standard_normal(near.t.shape))
+    assert problem.edge_costs(poor)[1:].sum() > 200.0 * problem.edge_costs(near)[1:].sum()
+    for poses in (near, poor):
+        assert problem.objective(poses) <= rounding_level(problem, poses)
+        assert not fits_to_rounding(problem, poses)
+        certificate = certify(problem, poses)
+        assert certificate.verdict in (Verdict.TRIVIAL, Verdict.NOT_CERTIFIED)
+        assert certificate.gap > 1e-6
+    assert solvers.solve(problem, progress=False).certificate.verdict is not Verdict.EXACT
+
+
+@settings(max_examples=examples(40))
+@given(seed=SEEDS, n=st.integers(2, 12), d=DIMENSIONS, spread=st.floats(0.0, 3.0))
+def test_graphs_without_noise_are_exact_whatever_their_weights(
+    seed: int, n: int, d: int, spread: float
+) -> None:
+    graph = exact_graph(seed, n, d)
+    kappa, tau = 10.0 ** np.random.default_rng(seed).uniform(-spread, spread, (2, graph.num_edges))
+    problem = PGOProblem(replace(graph, kappa=kappa, tau=tau))
+    poses = polish(problem, chordal_start(problem))
+    assert certify(problem, poses).verdict is Verdict.EXACT
+    assert assert_exact_is_true(problem, poses)
+
+
+@settings(max_examples=examples(40))
+@given(
+    seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, coupled=st.booleans(), away=st.floats(-17.0, 0.0)
+)
+def test_chi2_that_is_said_to_be_exact_is(
+    seed: int, n: int, d: int, coupled: bool, away: float
+) -> None:
+    pattern = informed(seed, n, d, coupled, 2.0)
+    rng = np.random.default_rng(seed)
+    assert pattern.truth is not None
+    R = pattern.truth.R
+    t = pattern.truth.t
+    back = np.swapaxes(R[pattern.i], 1, 2)
+    t_ij = np.einsum("mab,mb->ma", back, t[pattern.j] - t[pattern.i])
+    graph = replace(pattern, R_ij=back @ R[pattern.j], t_ij=t_ij)
+    problem = PGOProblem(graph, weighting=Weighting.INFORMATION)
+    assert judged(problem, pattern.truth).verdict is Verdict.EXACT
+    off = Poses(R, t + 10.0**away * rng.standard_normal((n, d)))
+    for poses in (pattern.truth, off):
+        certificate = judged(problem, poses)
+        if certificate.verdict is Verdict.EXACT:
+            (square_t, square_R), (e_t, e_R) = (
+                exact_residuals(graph, poses),
+                allowed_residuals(problem, poses),
+            )
+            assert (square_t <= e_t**2).all()
+            assert (square_R <= e_R**2).all()
+    assert (
+        judged(problem, turned_away(problem, pattern.truth, 1e-3, seed)).verdict is Verdict.TRIVIAL
+    )
+
+
+def test_an_edge_without_weight_may_be_violated() -> None:
+    graph = exact_graph(0, 8, 3)
+    assert graph.truth is not None
+    i = np.append(graph.i, 0)
+    j = np.append(graph.j, 1)
+    R_ij = np.concatenate([graph.R_ij, graph.R_ij[:1]])
+    t_ij = np.concatenate([graph.t_ij, [[9.0, 9.0, 9.0]]])
+    for kappa, tau, expected in ((1.0, 0.0, Verdict.TRIVIAL), (0.0, 1.0, Verdict.TRIVIAL)):
+        weights = {"kappa": np.append(graph.kappa, kappa), "tau": np.append(graph.tau, tau)}
+        more = replace(graph, i=i, j=j, R_ij=R_ij, t_ij=t_ij, information=None, **weights)
+        assert more.truth is not None
+        turned = more.truth.R[more.i[-1]].T @ more.truth.R[more.j[-1]]
+        R_of_edge = np.concatenate([graph.R_ij, turned[None]])
+        fitting = replace(more, R_ij=R_of_edge)
+        is_light = tau == 0.0
+        verdict = judged(PGOProblem(fitting), more.truth).verdict
+        assert verdict is (Verdict.EXACT if is_light else expected)
+
+
+def test_the_sum_of_all_edges_is_held_against_the_level(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every edge within its share of the error is not enough: F would be 64 m levels."""
+    graph = exact_graph(1, 8, 3)
+    assert graph.truth is not None
+    problem = PGOProblem(graph)
+    rng = np.random.default_rng(0)
+    sizes = 2.0 ** np.arange(-56.0, -40.0)
+    moves = rng.standard_normal(graph.truth.t.shape)
+    found = [Poses(graph.truth.R, graph.truth.t + size * moves) for size in sizes]
+    said = [objective_rounding(problem, poses).is_exact for poses in found]
+    assert said == sorted(said, reverse=True)
+    assert 0 < sum(said) < len(said)
+    for poses in found:
+        assert_exact_is_true(problem, poses)
+    monkeypatch.setattr(rounding_errors, "_NEARLY", math.inf)
+    assert [objective_rounding(problem, poses).is_exact for poses in found] == said

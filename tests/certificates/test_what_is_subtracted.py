@@ -1,0 +1,246 @@
+"""What a bound gives up, term by term: nothing of it may be missing."""
+
+import math
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, SEEDS, varied_graph
+from hypothesis import given
+from robots import contiguous, driver_at
+
+from pgo_models.certificates import lower_bound
+from pgo_models.certificates.certificate import certify_at, judge
+from pgo_models.certificates.definiteness import DefiniteProof, prove_definite, shifted_certificate
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.lower_bound import prove_bound
+from pgo_models.certificates.newton_polish import polish
+from pgo_models.certificates.rounding_errors import Evaluation, matrix_errors
+from pgo_models.errors import ProofError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, random_rotations
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed import lower_bound as distributed_bound
+from solvers.distributed.robots import proof as robot_proof
+from solvers.distributed.robots.elimination import Cut
+
+
+def one_edge(kappa: float) -> PGOProblem:
+    """Two poses that are measured to be the same."""
+    edge = np.array([0]), np.array([1]), np.eye(3)[None], np.zeros((1, 3))
+    return PGOProblem(PoseGraph(2, *edge, np.array([kappa]), np.ones(1)))
+
+
+def optimum(problem: PGOProblem) -> Poses:
+    return polish(problem, chordal_start(problem))
+
+
+@pytest.mark.parametrize("share", [1.001, 1.5, 2.0])
+def test_a_shift_costs_what_rotations_half_a_turn_apart_cost(share: float) -> None:
+    """At poses half a turn apart F is 8 kappa, which is a maximum; the least F is 0."""
+    kappa = 3.0
+    problem = one_edge(kappa)
+    opposite = Poses(np.stack([np.eye(3), np.diag([-1.0, -1.0, 1.0])]), np.zeros((2, 3)))
+    Lambda = multipliers(problem, opposite)
+    assert problem.objective(opposite) == pytest.approx(8.0 * kappa)
+    bound = prove_bound(problem, Lambda, share * kappa, opposite)
+    assert bound is None or bound == 0.0
+
+
+class FactorOfKnownError(CholeskyFactor):
+    """A factor whose backward error is given."""
+
+    def __init__(self, error: Array) -> None:
+        self.error = error
+
+    def solve(self, right_hand_side: Array) -> Array:
+        return right_hand_side
+
+    def half_solve(self, right_hand_side: Array) -> Array:
+        return right_hand_side
+
+    def backward_error(self, beside: Array | int = 0) -> Array:
+        return self.error
+
+    def take_apart(self) -> tuple[object, np.ndarray]:  # type: ignore[override]
+        raise NotImplementedError
+
+    def most_in_row(self, beside: Array | int = 0) -> float:
+        return 1.0
+
+
+@pytest.mark.parametrize("backend", CholeskyBackend)
+def test_slack_and_solve_may_be_asked_for_in_either_order(backend: CholeskyBackend) -> None:
+    graph = varied_graph(0, 8, 3)
+    product = np.random.default_rng(0).standard_normal((32, 3))
+    steps = []
+    slacks = []
+    for is_slack_first in (True, False):
+        problem = PGOProblem(graph, backend)
+        proof = prove_definite(problem, np.zeros((8, 3, 3)), 1.0, np.zeros(1, dtype=np.int64))
+        assert proof is not None
+        if is_slack_first:
+            slacks.append(proof.slack())
+        steps.append(proof.solve(product))
+        slacks.append(proof.slack())
+        np.testing.assert_array_equal(proof.solve(product), steps[-1])
+    np.testing.assert_array_equal(*steps)
+    for other in slacks[1:]:
+        np.testing.assert_array_equal(other, slacks[0])
+
+
+@pytest.mark.parametrize("is_known", [False, True])
+@pytest.mark.parametrize(
+    ("of_entries", "of_factor"), [(0.3, 0.1), (0.1, 0.3), (0.6, 0.0), (0.0, 0.6), (1.5, 1.5)]
+)
+def test_slack_is_the_shift_less_both_errors_or_none(
+    of_entries: float, of_factor: float, is_known: bool
+) -> None:
+    problem = PGOProblem(varied_graph(0, 5, 3))
+    shift = np.full(problem.side, 1e-9)
+    diagonal = np.linspace(1.0, 2.0, problem.side)
+    entries = of_entries * shift
+    error = of_factor * shift
+    factor = FactorOfKnownError(np.full(problem.side, math.nan) if is_known else error)
+    proof = DefiniteProof(
+        problem.M, factor, diagonal, shift, entries, False, error if is_known else None
+    )
+    slack = proof.slack()
+    if of_entries + of_factor > 0.5:
+        assert slack is None
+    else:
+        assert slack is not None
+        assert (slack > 0.0).all()
+        assert (slack <= (shift - entries - error) * diagonal).all()
+
+
+@given(seed=SEEDS, d=DIMENSIONS)
+def test_the_diagonal_of_errors_is_no_smaller_than_what_was_rounded(seed: int, d: int) -> None:
+    """M - Lambda is rounded before the shifts are added.
+
+    Either can be far larger than what is stored in the end.
+    """
+    problem = PGOProblem(varied_graph(seed, 6, d))
+    rng = np.random.default_rng(seed)
+    positions = problem.diagonal_positions
+    of_M = problem.M.data[positions]
+    rotations = of_M[problem.num_poses :].reshape(-1, d)
+    # Lambda takes nearly all of the diagonal of M, or adds far more than there is.
+    for share in (1.0 - 1e-9, -1e6):
+        Lambda = share * rotations[:, :, None] * np.eye(d)
+        shifts = rng.uniform(0.0, 1.0, problem.side) * of_M
+        stored, diagonal = shifted_certificate(problem, Lambda, shifts)
+        assert (diagonal >= of_M + shifts).all()
+        assert (diagonal >= np.abs(stored.data[positions])).all()
+        before = of_M.copy()
+        before[problem.num_poses :] -= np.einsum("naa->na", Lambda).ravel()
+        assert (diagonal >= np.abs(before) * (1.0 - 1e-12)).all()
+
+
+@given(seed=SEEDS, d=DIMENSIONS)
+def test_a_proof_counts_the_rounding_of_the_entries(seed: int, d: int) -> None:
+    problem = PGOProblem(varied_graph(seed, 6, d))
+    Lambda = multipliers(problem, optimum(problem))
+    fixed = lower_bound.pose_rows(0, 6, d)
+    proof = prove_definite(problem, Lambda, 0.0, fixed)
+    if proof is None or (slack := proof.slack()) is None:
+        return
+    _, diagonal = shifted_certificate(problem, Lambda, np.zeros(problem.side))
+    entries = matrix_errors(problem, diagonal)
+    assert (entries > 0.0).all()
+    assert (slack <= (proof.shift - entries) * proof.diagonal).all()
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_rounding_of_the_value_is_subtracted(d: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = PGOProblem(varied_graph(1, 8, d))
+    poses = optimum(problem)
+    Lambda = multipliers(problem, poses)
+    known = prove_bound(problem, Lambda, poses=poses)
+    lost = 0.25 * problem.objective(poses)
+    evaluate = lower_bound.evaluate_certificate
+
+    def less_known(*arguments: object) -> Evaluation:
+        found = evaluate(*arguments)  # type: ignore[arg-type]
+        return replace(found, value_error=found.value_error + lost)
+
+    monkeypatch.setattr(lower_bound, "evaluate_certificate", less_known)
+    found = prove_bound(problem, Lambda, poses=poses)
+    assert known is not None
+    assert found is not None
+    assert found == pytest.approx(known - lost, rel=1e-9)
+
+
+@given(seed=SEEDS, d=DIMENSIONS)
+def test_the_grounded_pose_is_exactly_at_the_origin(seed: int, d: int) -> None:
+    problem = PGOProblem(varied_graph(seed, 6, d))
+    rng = np.random.default_rng(seed)
+    poses = Poses(random_rotations(6, d, rng), 1e3 * rng.standard_normal((6, d)))
+    ground = lower_bound._grounded_at(problem, poses)
+    expected = np.concatenate([np.zeros((1, d)), np.eye(d)])
+    np.testing.assert_array_equal(ground.X[ground.rows], expected)
+
+
+SCALES = pytest.mark.parametrize("exponent", [-600, -400, 400, 600])
+
+
+def scaled_problem(exponent: int) -> PGOProblem:
+    graph = varied_graph(2, 8, 3)
+    size = 2.0**exponent
+    return PGOProblem(replace(graph, kappa=size * graph.kappa, tau=size * graph.tau))
+
+
+@SCALES
+def test_weights_near_the_ends_of_the_doubles_prove_nothing(exponent: int) -> None:
+    problem = scaled_problem(exponent)
+    Lambda = np.zeros((8, 3, 3))
+    poses = Poses(np.broadcast_to(np.eye(3), (8, 3, 3)), np.zeros((8, 3)))
+    for at in (None, poses):
+        assert (
+            lower_bound._prove(
+                problem, Lambda, 2.0**exponent, lower_bound._grounded_at(problem, poses)
+            )
+            is None
+        )
+        assert prove_bound(problem, Lambda, 2.0**exponent, at) is None
+
+
+@SCALES
+def test_weights_near_the_ends_of_the_doubles_prove_nothing_to_a_robot(exponent: int) -> None:
+    problem = scaled_problem(exponent)
+    inside = np.arange(problem.side) % 8 >= 2
+    cut = Cut(np.flatnonzero(inside), np.flatnonzero(~inside), None)
+    nothing_fixed = np.zeros(0, dtype=np.int64)
+    found = robot_proof.verify_interior(
+        problem, np.zeros((8, 3, 3)), 0.0, cut, nothing_fixed, 1e-12, None
+    )
+    assert found is None
+
+
+def test_a_bound_above_F_is_said_to_be_a_defect() -> None:
+    problem = PGOProblem(varied_graph(3, 8, 3))
+    poses = optimum(problem)
+    certificate = certify_at(problem, poses)
+    too_high = replace(certificate.bound, value=1.001 * certificate.objective)
+    with pytest.raises(ProofError, match=r"is above F = .* a defect of pgo_models"):
+        judge(problem, poses, replace(certificate, bound=too_high))
+
+
+def test_a_driver_counts_the_rounding_of_the_separators_entries(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem = PGOProblem(varied_graph(3, 16, 3))
+    with closing(driver_at(problem, contiguous(problem.graph, 3), optimum(problem))) as driver:
+        no_rounding = np.zeros(4 * len(driver.cover))
+        monkeypatch.setattr(distributed_bound.Interface, "rounding", lambda *_: no_rounding)
+        fixed = driver.ground(1).ravel()
+        proof = distributed_bound.eliminate_S(driver, fixed, 1.0, 0.0)
+        assert proof is not None
+        # With nothing else to subtract, the shift is a multiple of these eight roundings, and slack
+        # is left over.
+        free = np.delete(np.arange(len(proof.slack)), fixed)
+        assert (proof.slack[free] >= 8.0 * 2.0**-53 * driver.diagonal[free]).all()

@@ -1,0 +1,149 @@
+"""What `pgo` prints where, for people and programs, and the edges that it leaves out by their lines
+in the file.
+"""
+
+import json
+import re
+from dataclasses import replace
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pgo_models as pgo
+from pgo_models.graphs.g2o import edge_places
+
+ROOT = Path(__file__).parents[2]
+
+
+def printed_json(text: str) -> dict[str, object]:
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is no JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def line_of(path: Path, edge: int) -> str:
+    return edge_places(path)[edge].rpartition(":")[2]
+
+
+def test_the_version_is_the_installed_one(pgo_command):
+    assert pgo_command("--version") == (0, f"pgo {metadata.version('pgo-splitting')}\n", "")
+    for word in ("-h", "--help"):
+        assert "--version" in pgo_command(word)[1]
+        assert "--quiet" in pgo_command("solve", word)[1]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("solve", "grid"), ("certify", "grid"), ("compare", "grid", "--methods", "newton,joint")],
+)
+def test_json_on_standard_output_is_what_the_file_holds(arguments, pgo_command, tmp_path):
+    code, out, err = pgo_command(*arguments, "--json", "--out", tmp_path / "x.json")
+    plain = pgo_command(*arguments)
+    assert (code, err) == (plain[0], "")
+    record = printed_json(out)
+    held = printed_json((tmp_path / "x.json").read_text())
+    assert set(record) == set(held)
+    changing = {"seconds", "stages"}
+    if "rows" in record:
+        assert [row["objective"] for row in record["rows"]] == [
+            row["objective"] for row in held["rows"]
+        ]
+    else:
+        assert {key: record[key] for key in set(record) - changing} == {
+            key: held[key] for key in set(held) - changing
+        }
+    quiet = pgo_command(*arguments, "--quiet", "--out", tmp_path / "y.json")
+    assert quiet == (plain[0], "", "")
+    assert set(printed_json((tmp_path / "y.json").read_text())) == set(held)
+    assert printed_json(pgo_command(*arguments, "-q", "--json")[1]).keys() == held.keys()
+
+
+@pytest.mark.parametrize("option", ["--quiet", "--json"])
+def test_a_line_an_iteration_does_not_go_with_silence_or_json(option, pgo_command):
+    code, out, err = pgo_command("solve", "grid", "--verbose", option)
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert "--verbose prints a line an iteration" in err
+
+
+def test_info_without_a_graph_says_what_is_installed(pgo_command, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    out = pgo_command("info")[1]
+    assert re.search(rf"^numpy +{re.escape(np.__version__)}$", out, re.M)
+    assert re.search(r"^cholesky +(CHOLMOD|SuperLU)", out, re.M)
+    assert re.search(r"^threads +\d+ CPUs, .*OMP_NUM_THREADS=1", " ".join(out.split("\n  ")), re.M)
+    for extra, name in (("fast", "cvxopt"), ("plot", "plotly"), ("ray", "ray"), ("peers", "gtsam")):
+        assert re.search(rf"^extra {extra} .*{name} ([\d.]+|missing)", out, re.M)
+
+
+def test_edges_are_left_out_by_their_lines(pgo_command, tmp_path):
+    path = tmp_path / "sphere.g2o"
+    graph = pgo.load("sphere")
+    pgo.write_g2o(graph, path)
+    gone = [60, 200]
+    words = ["--drop-edge", line_of(path, 60), "--drop-edge", f"sphere.g2o:{line_of(path, 200)}"]
+    record = printed_json(pgo_command("solve", path, "--json", *words)[1])
+    mask = np.zeros(graph.num_edges, dtype=bool)
+    mask[gone] = True
+    assert record["graph"]["edges"] == graph.num_edges - 2
+    kept = pgo.PGOProblem(pgo.read_g2o(path).without_edges(mask))
+    poses = pgo.Poses(np.array(record["R"]), np.array(record["t"]))
+    assert record["objective"] == pytest.approx(kept.objective(poses), rel=1e-9)
+    judged = printed_json(pgo_command("certify", path, "--json", *words)[1])
+    assert judged["objective"] == pytest.approx(kept.objective(graph.initial), rel=1e-9)
+    compared = printed_json(
+        pgo_command("compare", path, "--methods", "newton", "--json", *words)[1]
+    )
+    assert compared["rows"][0]["objective"] == pytest.approx(record["objective"], rel=1e-9)
+
+
+def test_in_a_folder_edges_are_named_by_file_and_line(pgo_command):
+    folder = ROOT / "data" / "robots"
+    places = edge_places(folder)
+    assert len(places) == pgo.load(folder).num_edges
+    twice = next(
+        line for line in (place.rpartition(":")[2] for place in places) if _count(places, line) > 1
+    )
+    code, out, err = pgo_command("certify", folder, "--drop-edge", twice)
+    assert (code, out) == (1, "")
+    assert f"edges are at {twice} of {folder}; name it LINE or FILE:LINE, as {places[0]}" in err
+    closure = places[-1].rpartition("/")[2]
+    record = printed_json(pgo_command("certify", folder, "--drop-edge", closure, "--json")[1])
+    whole = printed_json(pgo_command("certify", folder, "--json")[1])
+    assert record["objective"] < whole["objective"]
+
+
+def _count(places: list[str], line: str) -> int:
+    return sum(place.endswith(f":{line}") for place in places)
+
+
+def test_a_line_without_an_edge_is_refused(pgo_command, tmp_path):
+    for name in ("0", "1000000", "other.g2o:60", "word", ""):
+        code, out, err = pgo_command("solve", "sphere", "--drop-edge", name)
+        assert (code, out, err.count("\n")) == (1, "", 1), name
+
+
+def test_the_worst_edge_is_named_with_the_option_that_leaves_it_out(
+    pgo_command, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("COLUMNS", "500")  # for commands with long paths on one line
+    graph = pgo.load("grid")
+    path = tmp_path / "grid.g2o"
+    t_ij = graph.t_ij.copy()
+    t_ij[90] += 30.0
+    pgo.write_g2o(replace(graph, t_ij=t_ij), path)
+    out = " ".join(pgo_command("solve", path)[1].split())
+    line = line_of(path, 90)
+    assert (
+        f"Look for wrong loop closures, which need not be the worst edges. pgo solve {path}"
+        " --robust gnc" in out
+    )
+    assert (
+        f"The worst edge is {path}:{line}: solve without it. pgo solve {path} --drop-edge"
+        f" grid.g2o:{line}" in out
+    )
+    assert "loop closures" not in pgo_command("solve", path, "--drop-edge", f"grid.g2o:{line}")[1]
+    robust = pgo_command("solve", path, "--robust", "gnc", "--drop-edge", line)[1]
+    assert "rejected" not in robust or f":{line}" not in robust

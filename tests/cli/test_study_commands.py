@@ -1,0 +1,161 @@
+import csv
+import inspect
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import typer
+
+import pgo_models as pgo
+from solvers.cli import app as cli, study_commands
+from solvers.studies.benchmark import BenchmarkSettings
+from solvers.studies.paper_tables import ReproductionSettings
+
+PGO = [sys.executable, "-c", "from solvers.cli.app import main; main()"]
+
+
+@pytest.fixture
+def pgo_command(pgo_command, tmp_path, monkeypatch):
+    """Runs `pgo` as everywhere, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return pgo_command
+
+
+def test_tables_prints_and_writes_every_format(pgo_command, tmp_path):
+    outs = [word for suffix in ("md", "csv", "json") for word in ("--out", f"t.{suffix}")]
+    code, out, err = pgo_command("tables", "--only", "grid", "--seeds", "1", *outs)
+    assert (code, err) == (0, "")
+    assert "SOC as in the paper" in out
+    assert "within 0.01 % of the optimum: yes, on grid" in " ".join(out.split())
+    assert "written: t.md" in out
+    assert "| grid | 27 | 108 |" in (tmp_path / "t.md").read_text()
+    rows = list(csv.DictReader((tmp_path / "t.csv").read_text().splitlines()))
+    records = json.loads((tmp_path / "t.json").read_text())["rows"]
+    assert [float(row["objective"]) for row in rows] == [record["objective"] for record in records]
+    assert len(json.loads(study_commands.KEPT_FILE.read_text())["results"]) == 5
+
+
+def test_a_missing_graph_is_a_row_and_no_failure(pgo_command, monkeypatch):
+    monkeypatch.delenv("PGO_DATA", raising=False)
+    monkeypatch.setattr("pooch.os_cache", lambda name: "cache")
+    code, out, err = pgo_command("tables", "--only", "rim")
+    assert (code, err) == (0, "")
+    assert "pgo info rim" in out
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are sent as POSIX has them")
+def test_ctrl_c_prints_what_is_done_and_the_same_command_goes_on(tmp_path):
+    command = [*PGO, "tables", "--only", "grid", "--seeds", "400"]
+    process = subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    kept = tmp_path / study_commands.KEPT_FILE
+    end = time.monotonic() + 60
+    while not (kept.exists() and len(json.loads(kept.read_text())["results"]) >= 6):
+        assert time.monotonic() < end
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "pgo: interrupted before it was done\n")
+    assert "the same command goes on where it was" in out
+    assert "of 400 not run yet" in out
+    done = json.loads(kept.read_text())["results"]
+    finished = subprocess.run(
+        [*PGO, "tables", "--only", "grid", "--seeds", "1"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "not run yet" not in finished.stdout
+    assert json.loads(kept.read_text())["results"] == done
+
+
+def test_compare_prints_a_table_and_draws(pgo_command, tmp_path):
+    arguments = (
+        "--methods",
+        "newton,consensus",
+        "--robots",
+        "3",
+        "--out",
+        "t.csv",
+        "--plot",
+        "p.html",
+    )
+    pytest.importorskip("plotly")
+    code, out, err = pgo_command("compare", "grid", *arguments)
+    assert (code, err) == (0, "")
+    assert "SOC consensus + Newton" in out
+    assert "proven lower bound 97.01" in out
+    assert (tmp_path / "p.html").exists()
+    rows = list(csv.DictReader((tmp_path / "t.csv").read_text().splitlines()))
+    assert [row["method"] for row in rows] == ["newton", "consensus"]
+
+
+def test_compare_with_unit_weights_is_of_another_cost(pgo_command):
+    _, out, _ = pgo_command("compare", "grid", "--methods", "newton", "--unit-weights")
+    weighted = pgo.PGOProblem(pgo.load("grid").unit_weights())
+    best = weighted.objective(pgo.polish(weighted, pgo.chordal_start(weighted)))
+    assert f"best F {best:.6g}"[:12] in out
+
+
+def test_figures_are_written_into_a_folder(pgo_command, tmp_path):
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("plotly")
+    code, out, err = pgo_command("figures", "--only", "scenes", "--out", "pictures")
+    assert (code, err) == (0, "")
+    assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == [
+        "scenes.html",
+        "scenes.png",
+    ]
+    assert "written: pictures/scenes.png" in out.replace(os.sep, "/")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("tables", "--only", "torus"), "no row 'torus'"),
+        (("tables", "--out", "table.txt"), "use .md, .csv or .json"),
+        (("tables", "--seeds", "0"), "seeds"),
+        (
+            ("compare", "grid", "--methods", "newton,best"),
+            "there is no method 'best'; there are joint",
+        ),
+        (("compare", "grid", "--out", "table"), "use .md, .csv or .json"),
+        (("compare", "grid", "--plot", "plot.gif"), "use .html, .png"),
+        (("compare", "nothing-here"), "no file and no data set"),
+        (("compare", "grid", "--time-limit", "0"), "time_limit must be positive, got 0"),
+        (("figures", "--only", "scene"), "there is no figure 'scene'; there are scenes"),
+    ],
+)
+def test_bad_input_is_one_line_and_nothing_is_run(arguments, message, pgo_command, tmp_path):
+    code, out, err = pgo_command(*arguments)
+    assert (code, out) == (1, "")
+    assert err.startswith("pgo: ")
+    assert err.count("\n") == 1
+    assert message in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_names_between_commas_are_taken_once_and_blanks_do_not_count():
+    assert study_commands._split(" a, b,,a ") == ("a", "b")
+
+
+def test_defaults_are_those_of_the_settings():
+    tables, compare = (
+        inspect.signature(f).parameters for f in (cli.tables_command, cli.compare_command)
+    )
+    assert tables["seeds"].default == ReproductionSettings.num_seeds
+    assert tables["robots"].default == compare["robots"].default == BenchmarkSettings.num_robots
+    assert compare["time_limit"].default == BenchmarkSettings.time_limit
+
+
+def test_help_names_the_three():
+    names = {command.name for command in cli.app.registered_commands}
+    assert {"tables", "compare", "figures"} <= names
+    assert isinstance(cli.app, typer.Typer)

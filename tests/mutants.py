@@ -1,0 +1,323 @@
+"""Mutation testing of what a proof rests on: small defects that the tests must notice.
+
+Each mutant replaces one piece of text in a copy of the project and runs the tests that should fail
+then. A mutant whose tests pass all the same has survived: those tests do not hold what they are
+there to hold.
+
+    python tests/mutants.py                      all mutants
+    python tests/mutants.py --sample 6 --seed 3  six of them, drawn at random
+    python tests/mutants.py slack growth         those whose name contains a word
+
+It prints one line a mutant and exits with 1 if one survived. `tests/test_mutants.py` holds that
+every text that is to be replaced still stands exactly once in its file.
+"""
+
+import argparse
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+COPIED = ("pgo_models", "solvers", "tests", "data", "pyproject.toml")
+KILLED_BY_PYTEST = 1  # exit code of a run in which a test failed
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One defect: `old` becomes `new` in `file`, and one of `tests` must fail."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+
+BOUNDS = (
+    "tests/certificates/test_what_is_subtracted.py",
+    "tests/certificates/test_error_formulas.py",
+    "tests/certificates/test_prove_bound.py",
+)
+MUTANTS = (
+    # The lower bound, central and by robots.
+    Mutant(
+        "robots: the rounding of the separators' own entries is not counted",
+        "solvers/distributed/lower_bound.py",
+        " + 8.0 * UNIT_ROUNDOFF * diagonal",
+        "",
+        ("tests/distributed/robots/test_exact_robots.py",),
+    ),
+    Mutant(
+        "rotations are taken to be no more than 1 apart",
+        "pgo_models/certificates/lower_bound.py",
+        "apart = math.sqrt(8.0) +",
+        "apart = 1.0 +",
+        BOUNDS,
+    ),
+    Mutant(
+        "an eta costs nothing in a bound grounded at a pose",
+        "pgo_models/certificates/lower_bound.py",
+        "return bound_from([value, -lost], value_error",
+        "return bound_from([value], value_error",
+        BOUNDS,
+    ),
+    Mutant(
+        "an eta costs nothing in a bound without poses",
+        "pgo_models/certificates/lower_bound.py",
+        "[*traces, constant, -lost]",
+        "[*traces, constant]",
+        BOUNDS,
+    ),
+    Mutant(
+        "the rounding of the value is not subtracted",
+        "pgo_models/certificates/lower_bound.py",
+        "[value, -lost], value_error + quadratic",
+        "[value, -lost], quadratic",
+        BOUNDS,
+    ),
+    Mutant(
+        "the rows of the grounded pose are left as they were computed",
+        "pgo_models/certificates/lower_bound.py",
+        "    X[rows] = np.concatenate([np.zeros((1, d)), np.eye(d)])\n",
+        "",
+        BOUNDS,
+    ),
+    Mutant(
+        "weights of any size count as safe",
+        "pgo_models/certificates/lower_bound.py",
+        "np.isfinite(Lambda).all() and has_safe_scale(problem)",
+        "np.isfinite(Lambda).all()",
+        BOUNDS,
+    ),
+    Mutant(
+        "robots: weights of any size count as safe",
+        "solvers/distributed/robots/proof.py",
+        "if not has_safe_scale(problem):",
+        "if False:",
+        BOUNDS,
+    ),
+    Mutant(
+        "a bound above F is not a defect",
+        "pgo_models/certificates/certificate.py",
+        "if bound.value > F + rounding.error:",
+        "if False:",
+        ("tests/certificates/test_what_is_subtracted.py", "tests/certificates/test_certificate.py"),
+    ),
+    # Positive definiteness.
+    Mutant(
+        "slack is found where rounding takes all of the shift",
+        "pgo_models/certificates/definiteness.py",
+        "if (2.0 * error <= self.shift).all()",
+        "if (error <= 2.0 * self.shift).all()",
+        BOUNDS,
+    ),
+    Mutant(
+        "the diagonal that rounding is a share of is that of the stored entries",
+        "pgo_models/certificates/definiteness.py",
+        "np.maximum(problem.M.data[problem.diagonal_positions], stored) + shifts",
+        "stored",
+        (*BOUNDS, "tests/certificates/test_exact_bounds.py"),
+    ),
+    Mutant(
+        "the shift is not added to that diagonal",
+        "pgo_models/certificates/definiteness.py",
+        "np.maximum(problem.M.data[problem.diagonal_positions], stored) + shifts",
+        "np.maximum(problem.M.data[problem.diagonal_positions], stored)",
+        (*BOUNDS, "tests/certificates/test_exact_bounds.py"),
+    ),
+    Mutant(
+        "the rounding of the entries of S is not counted",
+        "pgo_models/certificates/definiteness.py",
+        "self.entries + self.factor_error()",
+        "0.0 * self.entries + self.factor_error()",
+        BOUNDS,
+    ),
+    # Cholesky factors and floating point.
+    Mutant(
+        "a pivot that is nan counts as one",
+        "pgo_models/problem/floating_point.py",
+        "if not (np.isfinite(pivots).all() and (pivots > 0.0).all()):",
+        "if (pivots <= 0.0).any():",
+        ("tests/problem/test_cholesky.py", *BOUNDS),
+    ),
+    Mutant(
+        "a pivot that is not positive counts as one",
+        "pgo_models/problem/floating_point.py",
+        "if not (np.isfinite(pivots).all() and (pivots > 0.0).all()):",
+        "if not np.isfinite(pivots).all():",
+        ("tests/problem/test_cholesky.py", *BOUNDS),
+    ),
+    Mutant(
+        "an error formula forgets how many non-zeros a row has",
+        "pgo_models/problem/floating_point.py",
+        "OUTWARD * most_in_row * each / (1.0",
+        "OUTWARD * each / (1.0",
+        ("tests/certificates/test_error_formulas.py", "tests/problem/test_cholesky.py"),
+    ),
+    Mutant(
+        "three roundings beside the sum are forgotten",
+        "pgo_models/problem/floating_point.py",
+        "each = gamma(in_column + 3.0)",
+        "each = gamma(in_column)",
+        ("tests/certificates/test_error_formulas.py", "tests/problem/test_cholesky.py"),
+    ),
+    # Weights.
+    Mutant(
+        "a tangent loses nothing to rounding",
+        "pgo_models/problem/excess.py",
+        "OUTWARD * 32.0 * (share * length) ** 2 * sizes",
+        "0.0 * sizes",
+        ("tests/certificates/test_tangent_formulas.py", "tests/certificates/test_tangent.py"),
+    ),
+    Mutant(
+        "a tangent's value is exact",
+        "pgo_models/problem/excess.py",
+        "return OUTWARD * share * length**2",
+        "return 0.0 * length",
+        ("tests/certificates/test_tangent_formulas.py", "tests/certificates/test_tangent.py"),
+    ),
+    Mutant(
+        "tau is all of the smallest eigenvalue",
+        "pgo_models/problem/weighting.py",
+        "self.smallest - 2.0 * self.margin",
+        "self.smallest",
+        ("tests/problem/test_weighting.py", "tests/certificates/test_tangent_formulas.py"),
+    ),
+    Mutant(
+        "the error of W costs nothing in the value of an edge",
+        "pgo_models/problem/edge_cost.py",
+        "value_error += of_form",
+        "value_error += 0.0 * of_form",
+        ("tests/certificates/test_tangent_formulas.py",),
+    ),
+    Mutant(
+        "the error of W costs nothing in S X",
+        "pgo_models/problem/edge_cost.py",
+        "G_error[:, 1:] += of_product",
+        "G_error[:, 1:] += 0.0 * of_product",
+        ("tests/certificates/test_tangent_formulas.py",),
+    ),
+    Mutant(
+        "the gradient of a tangent in the rotations counts as exact",
+        "pgo_models/problem/information_costs.py",
+        "at_beginning(self.own_error + count * np.abs(self.own))",
+        "at_beginning(0.0 * self.own_error)",
+        ("tests/certificates/test_tangent_formulas.py",),
+    ),
+    # Rounding errors of the entries, of S X and of F.
+    Mutant(
+        "rotations of the measurements count as exact in the entries of S",
+        "pgo_models/certificates/rounding_errors.py",
+        "slant = float(orthogonality_error(graph.R_ij).max()) + d * gamma(d + 2)\n    return",
+        "slant = 0.0\n    return",
+        ("tests/certificates/test_rounding_errors.py", "tests/certificates/test_error_formulas.py"),
+    ),
+    Mutant(
+        "the rounding of residuals is not counted in S X",
+        "pgo_models/certificates/rounding_errors.py",
+        "errors = gamma(d) * product_sizes + UNIT_ROUNDOFF * np.abs(rho)",
+        "errors = UNIT_ROUNDOFF * np.abs(rho)",
+        ("tests/certificates/test_rounding_errors.py", "tests/certificates/test_error_formulas.py"),
+    ),
+    # Elsewhere.
+    Mutant(
+        "multipliers of sets other than X^T X = I have the wrong sign",
+        "pgo_models/convex/orthogonality.py",
+        "isinstance(term.constraint, Orthonormal) else -normal",
+        "isinstance(term.constraint, Orthonormal) else normal",
+        ("tests/convex/test_orthogonality.py",),
+    ),
+    Mutant(
+        "robots: a shift that was too small is tried smaller",
+        "pgo_models/certificates/newton_step.py",
+        "SHIFT_GROWTH * order.eta))",
+        "SHIFT_GROWTH / max(order.eta, 1e-300)))",
+        ("tests/distributed/test_distributed_newton.py",),
+    ),
+    Mutant(
+        "a matrix on the edge of definiteness counts as definite",
+        "pgo_models/graphs/precisions.py",
+        "LEAST_SCALED = 1e-12",
+        "LEAST_SCALED = 0.0",
+        ("tests/graphs/test_precisions.py", "tests/problem/test_thresholds.py"),
+    ),
+)
+
+
+def copy_project(folder: Path) -> None:
+    """Put what the tests need into a folder."""
+    ignored = shutil.ignore_patterns("__pycache__", "*.egg-info")
+    for name in COPIED:
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, folder / name, ignore=ignored)
+        else:
+            shutil.copy(ROOT / name, folder / name)
+
+
+def is_killed(mutant: Mutant, folder: Path) -> bool:
+    """Whether a test fails in the copy of the project that has the mutant in it.
+
+    The copy is mended again.
+    """
+    path = folder / mutant.file
+    text = path.read_text(encoding="utf-8")
+    if text.count(mutant.old) != 1:
+        raise SystemExit(
+            f"{mutant.file} has {text.count(mutant.old)} times, not once: {mutant.old!r}"
+        )
+    path.write_text(text.replace(mutant.old, mutant.new), encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        command = [sys.executable, "-m", "pytest", "-q", "-x", *mutant.tests]
+        ended = subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+        )
+    finally:
+        path.write_text(text, encoding="utf-8")
+    if ended.returncode not in (0, KILLED_BY_PYTEST):
+        raise SystemExit(
+            f"{mutant.name}: pytest ended with {ended.returncode}\n{ended.stdout}{ended.stderr}"
+        )
+    return ended.returncode == KILLED_BY_PYTEST
+
+
+def chosen_mutants(words: list[str], sample: int | None, seed: int) -> list[Mutant]:
+    """Mutants whose names contain one of the words, if any are given.
+
+    So many of them are drawn at random, if that is asked for.
+    """
+    chosen = [one for one in MUTANTS if not words or any(word in one.name for word in words)]
+    return (
+        chosen if sample is None else random.Random(seed).sample(chosen, min(sample, len(chosen)))
+    )
+
+
+def main() -> None:
+    """Apply the mutants that are asked for and report survivors."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument(
+        "words", nargs="*", help="parts of the names of mutants; all mutants without"
+    )
+    parser.add_argument("--sample", type=int, help="draw so many of them at random")
+    parser.add_argument("--seed", type=int, default=0, help="of the draw")
+    arguments = parser.parse_args()
+    survivors = 0
+    with tempfile.TemporaryDirectory() as scratch:
+        copy_project(Path(scratch))
+        for mutant in chosen_mutants(arguments.words, arguments.sample, arguments.seed):
+            killed = is_killed(mutant, Path(scratch))
+            survivors += not killed
+            print(
+                f"{'killed  ' if killed else 'SURVIVED'}  {mutant.file}: {mutant.name}", flush=True
+            )
+    print(f"{survivors} survived")
+    raise SystemExit(1 if survivors else 0)
+
+
+if __name__ == "__main__":
+    main()

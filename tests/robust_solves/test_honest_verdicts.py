@@ -1,0 +1,302 @@
+"""A robust solve claims no more than is known: the choice of an attempt, and the verdict."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from wrong_edges import noisy_sphere, spoiled
+
+import pgo_models as pgo
+import solvers
+from pgo_models.certificates.certificate import Verdict
+from pgo_models.certificates.newton_polish import polish
+from pgo_models.geometry.rotations import BoolArray
+from pgo_models.graphs.scenes import NoiseModel
+from solvers.cli import app as cli
+from solvers.robust.rejection import Attempt, Support
+from solvers.robust.revision import (
+    readmit_clusters,
+    readmit_edges,
+    truncated_cost,
+)
+from solvers.robust.weighted_edges import known_inliers
+from solvers.robust_solves import attempts as robust_attempts, robust_solve
+from solvers.robust_solves.attempts import Plan
+
+pytestmark = pytest.mark.slow  # robust solves from end to end
+
+ENOUGH = 0.95  # precision and recall below which a run may not be silent
+KINDS = pytest.mark.parametrize("kind", ["random", "aliased"])
+
+
+def world(num_poses: int, probability: float, seed: int = 0) -> pgo.PoseGraph:
+    noise = NoiseModel(0.05, np.deg2rad(1.0))
+    rng = np.random.default_rng(seed)
+    return pgo.grid_world(1, num_poses, rng, d=2, loop_closure_probability=probability, noise=noise)
+
+
+def open_chain(num_poses: int = 40) -> tuple[pgo.PoseGraph, BoolArray]:
+    """Odometry and nothing but wrong closures: all that can be kept is a tree."""
+    chain = world(num_poses, 0.0)
+    chain = chain.without_edges(np.arange(chain.num_edges) >= num_poses - 1)
+    rng = np.random.default_rng(0)
+    i = np.arange(0, 6)
+    R = pgo.random_rotations(6, 2, rng)
+    t = rng.uniform(50.0, 90.0, (6, 2))
+    graph = chain.with_edges(i, i + 20, pgo.Poses(R, t), chain.kappa[:6], chain.tau[:6])
+    return graph, np.arange(graph.num_edges) >= chain.num_edges
+
+
+def quality(solution: solvers.Solution, is_wrong: BoolArray) -> float:
+    """The lesser of precision and recall of the closures kept."""
+    robust = solution.robust
+    kept = robust.kept & ~robust.known
+    right = int((kept & ~is_wrong).sum())
+    num_right = int((~is_wrong & ~robust.known).sum())
+    return min(right / max(1, int(kept.sum())), right / max(1, num_right))
+
+
+def assert_not_silent(solution: solvers.Solution, is_wrong: BoolArray) -> None:
+    """Where too many closures are wrongly kept or rejected, first line and JSON say so."""
+    if quality(solution, is_wrong) >= ENOUGH:
+        return
+    assert not solution.is_certified
+    assert not solution.robust.headline.startswith(("CERTIFIED", "EXACT"))
+    assert solution.as_json()["verdict"] not in ("CERTIFIED", "EXACT")
+
+
+def run_cli(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:
+    with pytest.raises(SystemExit) as end:
+        cli.main([str(word) for word in words])
+    return end.value.code, capsys.readouterr().out
+
+
+@KINDS
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+def test_no_attempt_is_cheaper_than_the_answer(share: float, kind: str) -> None:
+    for seed in range(2):
+        graph, _ = spoiled(world(120, 0.05, seed), share, kind, seed)
+        solution = solvers.solve(graph, robust=solvers.GNC())
+        robust = solution.robust
+        problem = pgo.PGOProblem(graph)
+        allowed = robust.threshold_scale * pgo.chi2_thresholds(problem)
+        cost = truncated_cost(problem, robust.known, allowed, solution.poses)
+        assert robust.cost == pytest.approx(cost, rel=1e-12)
+        # A contradicted edge may cost its threshold.
+        num_contradicted = int((robust.rejected & (robust.ratio <= 1.0)).sum())
+        slack = num_contradicted * float(allowed.max()) + 1e-9 * cost
+        assert all(cost <= attempt.cost + slack for attempt in robust.attempts)
+
+
+def test_the_certificate_does_not_choose(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cheapest attempt is the answer, be it the only one without a certificate."""
+    graph, _ = spoiled(world(120, 0.05), 0.6, "aliased", 0)
+    attempt = robust_attempts.InOnePlace.attempt
+    estimates = []
+
+    def recorded(self, plan, start):
+        estimate = attempt(self, plan, start)
+        verdict = Verdict.CERTIFIED if estimates else Verdict.NOT_CERTIFIED
+        certificate = replace(estimate.certificate, verdict=verdict)
+        # The first attempt keeps all right closures; each one after it is certified and dearer.
+        worse = estimate.kept.copy()
+        if estimates:
+            worse[np.flatnonzero(worse & ~self.doubted.known)[: 5 * len(estimates)]] = False
+            poses = polish(self.doubted.with_edges(worse), certificate.poses)
+            certificate = replace(certificate, poses=poses)
+        estimates.append(replace(estimate, kept=worse, certificate=certificate))
+        return estimates[-1]
+
+    monkeypatch.setattr(robust_attempts.InOnePlace, "attempt", recorded)
+    solution = solvers.solve(graph, robust=solvers.GNC())
+    assert len(estimates) > 1
+    np.testing.assert_array_equal(solution.robust.kept & estimates[0].kept, estimates[0].kept)
+
+
+def test_an_attempt_that_keeps_the_best_edges_alone_is_not_cheaper(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Small errors with heavy tails: thresholds at their mean would reject a fifth."""
+    right = world(150, 0.2)
+    rng = np.random.default_rng(0)
+    closures = np.flatnonzero(~known_inliers(right, None))
+    far = rng.choice(closures, len(closures) // 5, replace=False)
+    t_ij = right.t_ij.copy()
+    t_ij[far] += 0.15 * rng.standard_normal((len(far), 2))
+    graph = replace(
+        right, t_ij=t_ij, kappa=1e-2 * right.kappa, tau=1e-2 * right.tau, information=None
+    )
+    graph, is_wrong = spoiled(graph, 0.3, "random", 0)
+    every = np.ones(graph.num_edges, dtype=bool)
+    plans = [
+        Plan("as set", solvers.GNC(), every),
+        Plan("few", solvers.GNC(scale=1e-2, spread=2.0), every),
+    ]
+    monkeypatch.setattr(robust_solve, "plans_in_order", lambda *_: plans)
+    robust = solvers.solve(graph, robust=solvers.GNC()).robust
+    assert robust.attempts[1].rejected > is_wrong.sum() + 5
+    np.testing.assert_array_equal(robust.rejected, is_wrong)
+
+
+@pytest.mark.parametrize("robots", [None, 2])
+def test_a_tree_is_never_certified(robots: int | None) -> None:
+    graph, is_wrong = open_chain()
+    solution = solvers.solve(graph, robust=solvers.GNC(), robots=robots)
+    np.testing.assert_array_equal(solution.robust.rejected, is_wrong)
+    assert solution.certificate.is_certified  # of a tree anything is
+    assert not solution.is_certified
+    assert solution.verdict is Support.UNCHECKED
+    verdict = "UNCHECKED, the edges kept form a tree: nothing checks them"
+    support = "0 of 6 closures hold the map (0 cycles)"
+    for text in (repr(solution), str(solution)):
+        assert f"{verdict}; {support}" in text
+    record = solution.as_json()
+    assert record["verdict"] == "UNCHECKED"
+    assert record["robust"]["cycles"] == record["robust"]["closures_kept"] == 0
+
+
+def test_odometry_alone_is_unchecked() -> None:
+    graph, is_wrong = open_chain()
+    solution = solvers.solve(graph.without_edges(is_wrong), robust=solvers.GNC())
+    assert solution.robust.kept.all()
+    assert solution.verdict is Support.UNCHECKED
+
+
+def test_the_command_ends_with_3_where_nothing_checks_the_edges(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("plotly")
+    graph, _ = open_chain()
+    file = tmp_path / "chain.g2o"
+    page = tmp_path / "page.html"
+    pgo.write_g2o(graph, file)
+    code, output = run_cli(capsys, "solve", file, "--robust", "gnc", "--report", page)
+    assert code == 3
+    (line,) = [line for line in output.splitlines() if line.startswith("verdict")]
+    assert line.startswith(
+        "verdict      UNCHECKED, the edges kept form a tree: nothing checks them"
+    )
+    assert 'class="verdict UNCHECKED"' in page.read_text()
+    assert "nothing checks them" in page.read_text()
+    code, output = run_cli(capsys, "solve", file, "--robust", "gnc", "--json")
+    assert code == 3
+    assert json.loads(output)["verdict"] == "UNCHECKED"
+
+
+def test_more_than_half_rejected_is_said_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph, is_wrong = spoiled(world(150, 0.1), 0.7, "random", 0)
+    solution = solvers.solve(graph, robust=solvers.GNC())
+    np.testing.assert_array_equal(solution.robust.rejected, is_wrong)
+    assert solution.verdict is Support.DOUBTFUL
+    assert not solution.is_certified
+    robust = solution.robust
+    gone = f"{is_wrong.sum()} of {robust.num_closures}"
+    first = f"DOUBTFUL, more than half of the closures were rejected, {gone}: CERTIFIED for"
+    assert robust.headline.startswith(first)
+    assert solution.as_json()["robust"]["doubts"] == list(robust.doubts)
+    file = tmp_path / "wrong.g2o"
+    pgo.write_g2o(graph, file)
+    assert run_cli(capsys, "solve", file, "--robust", "gnc", "--quiet")[0] == 3
+
+
+@KINDS
+@pytest.mark.parametrize("share", [0.3, 0.5])
+def test_nothing_is_doubted_where_all_is_well(share: float, kind: str) -> None:
+    for seed in range(2):
+        graph, is_wrong = spoiled(world(150, 0.1, seed), share, kind, seed)
+        solution = solvers.solve(graph, robust=solvers.GNC())
+        np.testing.assert_array_equal(solution.robust.rejected, is_wrong)
+        assert solution.robust.doubts == ()
+        assert solution.is_certified
+
+
+def test_what_speaks_against_the_edges_kept() -> None:
+    graph, is_wrong = spoiled(world(150, 0.1), 0.3, "random", 0)
+    robust = solvers.solve(graph, robust=solvers.GNC()).robust
+    assert robust.support is Support.CHECKED
+    near = replace(robust, ratio=np.where(is_wrong, 2.0, robust.ratio))
+    assert "rejected edges are near their thresholds" in near.headline
+    misfit = replace(robust, is_misfit=True)
+    assert misfit.headline.startswith("DOUBTFUL, the edges kept do not fit together: CERTIFIED")
+    rival = Attempt("rival", 1.01 * robust.cost, 0, 0.0, True, 0.0, others=40)
+    disputed = replace(robust, attempts=(rival,))
+    assert "kept by an attempt of nearly the same cost, rival" in disputed.headline
+    dearer = replace(rival, cost=2.0 * robust.cost)
+    assert replace(robust, attempts=(dearer,)).support is Support.CHECKED
+    uncertified = replace(misfit, verdict=Verdict.NOT_CERTIFIED)
+    assert uncertified.headline.startswith("NOT_CERTIFIED for the ")
+    assert uncertified.headline.endswith("; the edges kept do not fit together")
+    assert uncertified.standing is Verdict.NOT_CERTIFIED
+
+
+def test_closures_that_fit_only_together_come_back_together() -> None:
+    """A long way round a square ends far from its beginning: each closure alone costs too much."""
+    right = world(1500, 0.02)
+    problem = pgo.PGOProblem(right)
+    known = known_inliers(right, None)
+    poses = pgo.odometry_start(right)
+    settled = partial(polish, max_steps=4)
+    alone = readmit_edges(problem, known, poses, settled)
+    assert alone.sum() == known.sum()  # nothing comes back into a tree one by one
+    allowed = pgo.chi2_thresholds(problem)
+    far = partial(polish, max_steps=20)
+    kept, moved = readmit_clusters(problem, known, allowed, known, poses, far)
+    assert (kept & ~known).sum() > 0.9 * (~known).sum()
+    cost = truncated_cost(problem, known, allowed, moved)
+    assert cost < 0.5 * truncated_cost(problem, known, allowed, poses)
+
+
+@pytest.mark.parametrize("start", ["odometry", None])
+def test_a_noisy_sphere_is_not_certified_without_its_closures(start: str | None) -> None:
+    """Odometry is a bad start, and graduated non-convexity from there may reject every closure."""
+    graph = noisy_sphere(200, 15, NoiseModel(0.2, 0.2), 0)
+    given = pgo.odometry_start(graph) if start else None
+    solution = solvers.solve(graph, start=given, robust=solvers.GNC())
+    assert_not_silent(solution, np.zeros(graph.num_edges, dtype=bool))
+
+
+def test_least_squares_is_a_start_where_odometry_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tight thresholds on a noisy sphere leave a certified tree: not enough, and not cheap."""
+    graph = noisy_sphere(300, 15, NoiseModel(0.4, 0.4), 0)
+    every = np.ones(graph.num_edges, dtype=bool)
+    plans = [
+        Plan("tight", solvers.GNC(scale=1e-3, spread=30.0), every),
+        Plan("least squares", solvers.GNC(), every, starts_at_least_squares=True),
+    ]
+    # as on a large graph: no plain solution at first
+    monkeypatch.setattr(robust_attempts, "_CHEAP_ROWS", -1)
+    monkeypatch.setattr(robust_solve, "plans_in_order", lambda *_: plans)
+    robust = solvers.solve(graph, robust=solvers.GNC()).robust
+    tight, plain = robust.attempts
+    assert tight.is_certified
+    assert tight.rejected == robust.num_closures
+    assert robust.start == "least squares"
+    assert robust.kept.mean() > 0.99
+    assert plain.cost < 0.5 * tight.cost
+
+
+@KINDS
+def test_half_of_the_closures_of_a_world_are_wrong(kind: str) -> None:
+    graph, is_wrong = spoiled(world(1500, 0.02), 0.5, kind, 0)
+    assert_not_silent(solvers.solve(graph, robust=solvers.GNC()), is_wrong)
+
+
+def test_half_of_the_closures_of_a_large_world_are_wrong() -> None:
+    graph, is_wrong = spoiled(world(15_000, 0.015), 0.5, "aliased", 0)
+    assert_not_silent(solvers.solve(graph, robust=solvers.GNC()), is_wrong)
+
+
+@KINDS
+@pytest.mark.parametrize("name", ["kitti_07", "kitti_00", "MIT"])
+def test_nine_closures_of_ten_are_wrong(benchmark_problem, name: str, kind: str) -> None:
+    graph, is_wrong = spoiled(benchmark_problem(name).graph, 0.9, kind, 0)
+    solution = solvers.solve(graph, robust=solvers.GNC())
+    assert_not_silent(solution, is_wrong)
+    assert not solution.is_certified  # most were rejected

@@ -1,0 +1,336 @@
+"""Written proofs, checked in ball arithmetic: true ones are verified, and a false one never is."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from budget import examples
+from graphs import (
+    DIMENSIONS,
+    LOUD_NOISE,
+    SEEDS,
+    best_known,
+    exact_graph,
+    informed,
+    varied_graph,
+    wound_ring,
+)
+from hypothesis import given, settings, strategies as st
+from proofs import PLANE, SPACE, assert_verified, edited, proof_of, written
+
+import solvers
+from pgo_models.certificates.certificate import BoundSource, certify, certify_at
+from pgo_models.certificates.proof_file import save_proof
+from pgo_models.graphs.datasets import load, locate
+from pgo_models.graphs.g2o import read_g2o, write_g2o
+from pgo_models.graphs.residuals import chi2
+from pgo_models.graphs.scenes import victoria_park
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
+from pgo_models.verification.verify import verify_proof
+
+WEIGHTINGS = st.sampled_from(Weighting)
+BOTH = list(Weighting)
+
+
+@pytest.mark.parametrize("weighting", BOTH)
+@pytest.mark.parametrize("name", ["sphere", "circle", "grid"])
+def test_proofs_of_the_graphs_here_are_verified(
+    name: str,
+    weighting: Weighting,
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / f"{name}.g2o"
+    path.write_bytes(locate(name).read_bytes())
+    certificate, proof = proof_of(path, weighting)
+    found = verify_proof(path, proof)
+    assert_verified(found, certificate)
+    assert found.bound is not None
+    assert found.bound >= certificate.lower_bound  # which has its rounding taken off
+
+
+@pytest.mark.parametrize("name", ["MIT", "tinyGrid3D"])
+@pytest.mark.parametrize("weighting", BOTH)
+def test_proofs_of_public_graphs_are_verified(
+    name: str, weighting: Weighting, tmp_path: Path, benchmark_data: Path
+) -> None:
+    path = tmp_path / f"{name}.g2o"
+    path.write_bytes((benchmark_data / f"{name}.g2o").read_bytes())
+    certificate, proof = proof_of(path, weighting)
+    assert_verified(verify_proof(path, proof), certificate)
+
+
+@given(SEEDS, st.integers(3, 7), DIMENSIONS, st.booleans(), WEIGHTINGS)
+@settings(max_examples=examples(12))
+def test_any_proof_that_is_written_is_verified(
+    tmp_path_factory: pytest.TempPathFactory,
+    seed: int,
+    n: int,
+    d: int,
+    coupled: bool,
+    weighting: Weighting,
+) -> None:
+    path = written(tmp_path_factory.mktemp("proof"), informed(seed, n, d, coupled, spread=0.3))
+    problem = PGOProblem(read_g2o(path), weighting=weighting)
+    certificate = certify(problem, solvers.solve(problem).poses)
+    if certificate.source is BoundSource.SOFTENED or not certificate.is_certified:
+        return
+    save_proof(problem, certificate, path.with_suffix(".json"))
+    found = verify_proof(path, path.with_suffix(".json"))
+    assert_verified(found, certificate)
+    assert found.objective is not None
+    if weighting is Weighting.INFORMATION:
+        of_definition = chi2(problem.graph, certificate.poses)
+        assert float(found.objective) == pytest.approx(of_definition, rel=1e-9)
+
+
+@given(SEEDS, DIMENSIONS, st.floats(0.0, 0.5))
+@settings(max_examples=examples(12))
+def test_a_bound_from_poses_that_are_no_optimum_is_a_bound(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, d: int, size: float
+) -> None:
+    path = written(tmp_path_factory.mktemp("proof"), varied_graph(seed, 6, d, LOUD_NOISE))
+    problem = PGOProblem(read_g2o(path))
+    rng = np.random.default_rng(seed)
+    start = solvers.solve(problem).poses
+    turned = replace(start, t=start.t + size * rng.standard_normal(start.t.shape))
+    certificate = certify_at(problem, turned)
+    save_proof(problem, certificate, path.with_suffix(".json"))
+    found = verify_proof(path, path.with_suffix(".json"))
+    assert_verified(found, certificate)
+    assert found.bound is not None
+    assert found.bound <= best_known(problem, seed)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_shifted_and_ungrounded_bounds_are_verified(seed: int, tmp_path: Path) -> None:
+    from solvers.studies.tightness import SweptScene, noisy_scene
+
+    graph = noisy_scene(SweptScene.GRID, np.deg2rad(60), np.random.default_rng(seed))
+    path = written(tmp_path, graph)
+    certificate, proof = proof_of(path)
+    assert certificate.eta > 0
+    assert_verified(verify_proof(path, proof), certificate)
+    problem = PGOProblem(read_g2o(path))
+    kinds = {certificate.bound.is_grounded}
+    for poses in (certificate.poses, graph.truth):
+        other = certify_at(problem, poses)
+        save_proof(problem, other, proof)
+        assert_verified(verify_proof(path, proof), other)
+        kinds.add(other.bound.is_grounded)
+
+
+def test_unit_weights_priors_and_landmarks_are_verified(tmp_path: Path) -> None:
+    gps = load("sphere")
+    assert gps.truth is not None
+    gps = gps.with_position_prior([0, 20, 40], gps.truth.t[[0, 20, 40]], tau=4.0)
+    park = victoria_park(np.random.default_rng(0), num_poses=30)
+    for graph in (gps, park):
+        path = written(tmp_path, graph)
+        for weighting in Weighting:
+            certificate, proof = proof_of(path, weighting)
+            assert_verified(verify_proof(path, proof), certificate)
+        problem = PGOProblem(read_g2o(path).unit_weights())
+        certificate = solvers.solve(problem).certificate
+        save_proof(problem, certificate, proof)
+        found = verify_proof(path, proof)
+        assert found.cost == "unit"
+        assert_verified(found, certificate)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "EDGE_PRIOR_SE2 1 3 4 0.5 10 1 2 20 3 30",
+        "EDGE_SE2_PRIOR 1 3 4 0.5 10 1 0 20 0 30",
+        "EDGE_PRIOR_SE2_XY 1 3 4 10 1 20\nEDGE_PRIOR_SE2_XY 2 3 5 10 1 20",
+        "EDGE_SE2_XY 0 7 3 4 10 1 20\nEDGE_SE2_XY 2 7 1 4 10 1 20",
+        "VERTEX_XY 7 0 0\nEDGE_SE2_XY 0 7 3 4 10 1 20\nEDGE_PRIOR_XY 7 3.1 4 10 1 20\n"
+        "EDGE_PRIOR_SE2 0 0.1 0 0 10 1 2 20 3 30",
+        "EDGE2 2 0 -2 0.5 0.25 10 1 20 30 2 3",
+        "FIX 0\nVERTEX_SE2 0 0 0 0\nPARAMS_X 1\n# a comment",
+    ],
+)
+def test_every_tag_of_the_plane(line: str, tmp_path: Path) -> None:
+    path = tmp_path / "graph.g2o"
+    path.write_text(f"{PLANE}{line}\n")
+    for weighting in Weighting:
+        certificate, proof = proof_of(path, weighting)
+        assert_verified(verify_proof(path, proof), certificate)
+
+
+TRIANGLE = "10 1 0 1 0 0  20 0 0 1 0  30 0 0 2  40 1 0  50 0  60"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        f"EDGE_SE3_PRIOR 1 3 4 5 0.1 0.2 0.3 2 {TRIANGLE}",
+        f"PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1\nEDGE_PRIOR_SE3 1 0 3 4 5 0.1 0.2 0.3 2 {TRIANGLE}",
+        "EDGE_SE3_XYZ_PRIOR 1 3 4 5 10 1 0 20 0 30\nEDGE_SE3_XYZ_PRIOR 0 3 4 4 10 1 0 20 0 30\n"
+        "EDGE_SE3_XYZ_PRIOR 2 4 4 4 10 1 0 20 0 30",
+        "VERTEX_TRACKXYZ 7 0 0 0\nEDGE_SE3_TRACKXYZ 0 7 0 3 4 5 10 1 0 20 0 30\n"
+        "EDGE_SE3_TRACKXYZ 2 7 3 4 4 10 1 0 20 0 30",
+        "EDGE_SE3_TRACKXYZ 0 7 3 4 5 10 1 0 20 0 30\nEDGE_POINTXYZ_PRIOR 7 1 1 1 9 0 0 9 0 9\n"
+        f"EDGE_SE3_PRIOR 1 3 4 5 0.1 0.2 0.3 2 {TRIANGLE}",
+        f"EDGE3 2 0 -2 0.5 0.25 0.3 0.2 0.1 {TRIANGLE}",
+    ],
+)
+def test_every_tag_of_space(line: str, tmp_path: Path) -> None:
+    path = tmp_path / "graph.g2o"
+    path.write_text(f"{SPACE}{line}\n")
+    for weighting in Weighting:
+        certificate, proof = proof_of(path, weighting)
+        assert_verified(verify_proof(path, proof), certificate)
+
+
+def test_a_cost_of_zero_is_verified_as_zero(tmp_path: Path) -> None:
+    path = written(tmp_path, exact_graph(0, 5, 3))
+    certificate, proof = proof_of(path)
+    assert certificate.verdict.name == "EXACT"
+    found = verify_proof(path, proof)
+    assert found.is_verified
+    assert found.bound == 0
+    assert "no better bound is proven" in found.verdict
+    assert found.objective is not None
+    assert found.objective < 1e-20
+
+
+# What is changed in a proof or a file is either harmless or noticed.
+
+
+@pytest.fixture(scope="module")
+def examined(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Path, Path, float]]:
+    """Files, their proofs, and their least cost, from above."""
+    found = []
+    for seed, d in ((0, 2), (1, 3)):
+        for weighting in Weighting:
+            folder = tmp_path_factory.mktemp("proof")
+            path = written(folder, informed(seed, 5, d, coupled=True, spread=0.3))
+            certificate, proof = proof_of(path, weighting)
+            assert_verified(verify_proof(path, proof), certificate)
+            found.append((path, proof, certificate.poses_objective * (1 + 1e-12)))
+    return found
+
+
+SIZES_OF_CHANGES = st.sampled_from([1e-12, 1e-7, 1e-4, 0.1, 1.0, -10.0, 1e6, 1e200])
+
+
+@given(st.data(), st.integers(0, 3), SIZES_OF_CHANGES)
+@settings(max_examples=examples(80))
+def test_a_proof_that_was_changed_proves_nothing_false(
+    examined: list[tuple[Path, Path, float]], data: st.DataObject, case: int, change: float
+) -> None:
+    path, proof, least = examined[case]
+    record = json.loads(proof.read_text())
+    pose = data.draw(st.sampled_from(record["poses"]))
+    what = data.draw(st.sampled_from([*pose, "eta", "ground", "objective", "lower_bound"]))
+    if what == "eta":
+        record["eta"] += abs(change)
+    elif what == "ground":
+        record["ground"] = pose["id"]
+    elif what == "id":
+        pose["id"] += 1
+    elif what in ("objective", "lower_bound"):
+        record[what] += change * record[what]
+    else:
+        row = pose[what] if what != "R" else data.draw(st.sampled_from(pose[what]))
+        row[data.draw(st.integers(0, len(row) - 1))] += change
+    path_of_change = proof.with_name("changed.json")
+    path_of_change.write_text(json.dumps(record))
+    found = verify_proof(path, path_of_change)
+    if found.bound is not None:
+        # What is proven is the lower end of the ball, which is wide where the poses are far away.
+        assert found.bound.lower() <= least
+    if found.is_verified:
+        assert found.bound is not None
+        assert found.bound <= least
+        assert found.bound >= record["lower_bound"] - 2e-9 * least
+    if what == "id" or (what in ("objective", "lower_bound") and change > 1e-8):
+        assert not found.is_verified
+    is_used = what != "Lambda" or pose["id"] != record["ground"]
+    if what in ("t", "Lambda", "eta") and abs(change) >= 0.1 and is_used:
+        assert not found.is_verified
+    if what == "R" and abs(change) >= 1e-4:
+        assert found.failure.startswith("the poses")
+
+
+@given(st.data(), st.integers(0, 3))
+@settings(max_examples=examples(20))
+def test_a_measurement_that_was_changed_is_noticed(
+    examined: list[tuple[Path, Path, float]], data: st.DataObject, case: int
+) -> None:
+    path, proof, _ = examined[case]
+    lines = path.read_text().splitlines()
+    edges = [k for k, line in enumerate(lines) if line.startswith("EDGE")]
+    line = data.draw(st.sampled_from(edges))
+    words = lines[line].split()
+    place = data.draw(st.integers(3, 4))  # x or y
+    words[place] = repr(float(words[place]) * (1 + 1e-4) + 1e-4)
+    changed = path.with_name("changed.g2o")
+    changed.write_text("\n".join([*lines[:line], " ".join(words), *lines[line + 1 :]]))
+    found = verify_proof(changed, proof)
+    assert found.failure.startswith("the claims")
+
+
+def test_the_proof_of_another_graph_fails(tmp_path: Path) -> None:
+    path = written(tmp_path, varied_graph(0, 6, 3))
+    _, proof = proof_of(path)
+    other = tmp_path / "other.g2o"
+    write_g2o(varied_graph(1, 6, 3), other)
+    assert verify_proof(other, proof).failure.startswith("the ")
+    write_g2o(varied_graph(1, 7, 3), other)
+    assert verify_proof(other, proof).failure == "the poses: pose 6 is not in both files"
+
+
+def test_a_multiplier_beyond_all_bounds_is_no_proof(tmp_path: Path) -> None:
+    # In doubles it makes a pivot that is not a number, which was once taken for a positive one.
+    path = tmp_path / "chain.g2o"
+    information = "2 0 0 0 0 0 2 0 0 0 0 2 0 0 0 2 0 0 2 0 2"
+    edges = [f"EDGE_SE3:QUAT {k} {k + 1} 1 0 0 0 0 0 1 {information}\n" for k in range(2)]
+    path.write_text("".join(edges))
+    _, proof = proof_of(path)
+    record = json.loads(proof.read_text())
+    record["poses"][0]["Lambda"] = [1, 0, 1e304, 0, 0, 0]
+    for pose in (0, 1, 2):
+        claims = dict(lower_bound=600.99, objective=601.0, eta=1e-9, ground=pose)
+        found = verify_proof(path, edited(proof, poses=record["poses"], **claims))
+        assert not found.is_verified
+        assert found.bound is None or found.bound <= 1e-9
+        assert pose == 0 or found.failure.startswith("the elimination: H is not positive definite")
+
+
+def test_a_local_minimum_proves_no_more_than_it_can(tmp_path: Path) -> None:
+
+    ring, wound = wound_ring(12, 2)
+    path = written(tmp_path, ring.graph)
+    certificate, proof = proof_of(path)
+    record = json.loads(proof.read_text())
+    for pose, R, t in zip(record["poses"], wound.R, wound.t, strict=True):
+        pose["R"], pose["t"] = R.tolist(), t.tolist()
+        del pose["Lambda"]  # the verifier takes those of the poses
+    found = verify_proof(path, edited(proof, poses=record["poses"]))
+    assert found.failure.startswith("the elimination: H is not positive definite")
+    assert certificate.is_certified
+
+
+SEMIDEFINITE = "EDGE_SE2 0 1 1 0 0 100 0 100 100 0 100\nEDGE_SE2 0 1 2 0 -1 100 0 100 100 0 100\n"
+
+
+def test_semidefinite_matrices_are_verified_whole_and_indefinite_ones_refused(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "coupled.g2o"
+    path.write_text(SEMIDEFINITE)
+    certificate, proof = proof_of(path, Weighting.INFORMATION)
+    found = verify_proof(path, proof)
+    assert_verified(found, certificate)
+    # The poses 1.73, 0.13, -0.69 cost 10.735.
+    assert found.bound is not None
+    assert 10.72 < float(found.bound) < 10.735
+    path.write_text(SEMIDEFINITE.replace("100 0 100 100", "100 0 101 100"))
+    assert "an information matrix is indefinite" in verify_proof(path, proof).failure
