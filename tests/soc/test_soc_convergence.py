@@ -23,7 +23,11 @@ from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, circle, grid
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.stationarity import relative_gradient
+from pgo_models.problem.stationarity import (
+    gradient_squares,
+    relative_gradient,
+    rotation_squares,
+)
 from solvers.loop import iterate, run
 from solvers.result import Record, Status
 from solvers.soc.anderson import Anderson
@@ -106,6 +110,12 @@ def test_consensus_without_acceleration_ends_there_too() -> None:
     assert_same_end(problem, [SOC(**TIGHT), SOC(robots=robots, acceleration=None, **TIGHT)])
 
 
+def gradient_beside_rotations(problem: PGOProblem, poses: Poses) -> float:
+    """Length of the gradient of F at poses, relative to that of the rotations."""
+    gradient = gradient_squares(problem, poses).sum()
+    return float(np.sqrt(gradient / rotation_squares(problem).sum()))
+
+
 def assert_same_end(problem: PGOProblem, solvers: list[SOC]) -> None:
     results = [run(solver, problem) for solver in solvers]
     for result in results:
@@ -160,8 +170,11 @@ def test_it_ends_at_a_stationary_point_which_with_mild_noise_is_that_of_newton(
     ):
         result = run(soc, problem)
         assert result.status is Status.CONVERGED
-        # Residuals are measured in a norm that is a few times smaller than that of the gradient.
-        assert relative_gradient(problem, result.poses) <= 10.0 * SOC.tolerance
+        if soc.is_split:  # the dual residual of CONSENSUS is this gradient
+            assert relative_gradient(problem, result.poses) <= SOC.tolerance
+        # Residuals are relative to the rotations, in the norm of rho. The gradient at omega is at
+        # most a few times the residuals, as 2 diag(M) >= M and rho / diag(M) varies little.
+        assert gradient_beside_rotations(problem, result.poses) <= 10.0 * SOC.tolerance
         if noise is LOUD_NOISE:  # F has several stationary points, and SOC may end at another one
             continue
         # The tolerance is on rotations, 1e-5, and F is flat to second order; the square is lost to
