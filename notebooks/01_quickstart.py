@@ -171,7 +171,7 @@ print(f"gap   {certificate.gap_text}")
 # finds that 7.6 % of its $F$ could be saved.
 
 # %%
-pgo.certify(problem, graph.truth)
+solvers.certify(problem, graph.truth)
 
 # %% [markdown]
 # ## Where a method fails and the certificate shows it
@@ -203,8 +203,8 @@ def random_start(seed):
     return pgo.Poses(pgo.random_rotations(count, 2, rng), rng.normal(0.0, 3.0, (count, 2)))
 
 
-descents = [pgo.polish(ring_problem, random_start(seed)) for seed in range(8)]
-certificates = [pgo.certify(ring_problem, poses) for poses in descents]
+descents = [solvers.polish(ring_problem, random_start(seed)) for seed in range(8)]
+certificates = [solvers.certify(ring_problem, poses) for poses in descents]
 for seed, (poses, certificate) in enumerate(zip(descents, certificates, strict=True)):
     gradient = np.concatenate([part.ravel() for part in ring_problem.riemannian_gradient(poses)])
     print(f"start {seed}: gradient {np.abs(gradient).max():.0e}, {certificate!r}")

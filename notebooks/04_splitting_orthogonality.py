@@ -278,7 +278,7 @@ twice = ring_problem.with_best_translations(
 )
 stuck = solvers.run(solvers.SOC(acceleration=None), ring_problem, twice)
 print(stuck)
-pgo.certify(ring_problem, stuck.poses)
+solvers.certify(ring_problem, stuck.poses)
 
 # %% [markdown]
 # ## Exercises

@@ -135,7 +135,7 @@ candidates = [
     ("8 poses, optimum", problem, answer.poses),
     ("8 poses, random", problem, problem.with_best_translations(pgo.random_rotations(n, d, rng))),
     ("ring, optimum", ring, solvers.solve(ring).poses),
-    ("ring, local minimum", ring, pgo.polish(ring, twice_round)),
+    ("ring, local minimum", ring, solvers.polish(ring, twice_round)),
 ]
 rows = {}
 for name, judged, poses in candidates:
@@ -184,7 +184,7 @@ print("smallest eigenvalues, one grounded:", *(f"{value:8.2g}" for value in smal
 # follows such directions.
 
 # %%
-stuck = pgo.certify(ring, candidates[3][2])
+stuck = solvers.certify(ring, candidates[3][2])
 eigenvalues = smallest_eigenvalues(ring, pgo.multipliers(ring, candidates[3][2]), count=6)
 climbed = solvers.run(solvers.Staircase(), ring, candidates[3][2])
 print("smallest eigenvalues there:", eigenvalues.round(2))

@@ -112,7 +112,7 @@ theirs_path = Path(folder.name) / "theirs.tum"
 pgo.write_tum(pgo.chordal_start(problem), theirs_path)
 
 theirs = pgo.read_tum(theirs_path, d=2)
-certificate = pgo.certify(problem, theirs)
+certificate = solvers.certify(problem, theirs)
 print(certificate)
 
 # %% [markdown]
@@ -378,7 +378,7 @@ print(f"KITTI {problem.objective(kitti):.9f}, g2o {problem.objective(again.initi
 # ```python
 # R = pgo.exp_map(np.array([[np.deg2rad(1.0)]]))[0]
 # elsewhere = pgo.Poses(R @ theirs.R, theirs.t @ R.T + 1000.0)
-# assert np.isclose(pgo.certify(problem, elsewhere).gap, certificate.gap, rtol=1e-5)
+# assert np.isclose(solvers.certify(problem, elsewhere).gap, certificate.gap, rtol=1e-5)
 # ```
 #
 # </details>

@@ -177,7 +177,7 @@ def by_hand(graph):
         w[free] = np.clip(np.sqrt(mu * (mu + 1.0) / ratio) - mu, 0.0, 1.0)
         weighted, v = graph.without_edges(w == 0.0), w[w > 0.0]
         weighted = weighted.with_weights(v * weighted.kappa, v * weighted.tau)
-        poses = pgo.polish(pgo.PGOProblem(weighted), poses)
+        poses = solvers.polish(pgo.PGOProblem(weighted), poses)
         ratio = (problem.edge_costs(poses) / allowed)[free]
         film.append(w[free].copy())
         mu *= 2.0

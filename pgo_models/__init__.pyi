@@ -2,7 +2,6 @@ from pgo_models.certificates.certificate import (
     BoundSource as BoundSource,
     Certificate as Certificate,
     Verdict as Verdict,
-    certify as certify,
     certify_at as certify_at,
 )
 from pgo_models.certificates.dual_variables import (
@@ -10,7 +9,6 @@ from pgo_models.certificates.dual_variables import (
     multipliers as multipliers,
 )
 from pgo_models.certificates.lower_bound import LowerBound as LowerBound, prove_bound as prove_bound
-from pgo_models.certificates.newton_polish import polish as polish
 from pgo_models.certificates.proof_file import save_proof as save_proof
 from pgo_models.convex.bregman import BregmanProblem as BregmanProblem
 from pgo_models.convex.convex_solver import ConvexSolver as ConvexSolver
@@ -115,8 +113,8 @@ __all__ += ["read_kitti", "read_tum", "write_tum"]
 __all__ += ["circle", "grid", "grid_world", "random_geometric", "sphere", "victoria_park"]
 __all__ += ["CholeskyBackend", "Marginals", "PGOProblem", "Weighting"]
 __all__ += ["chordal_start", "odometry_start", "spanning_tree_start"]
-__all__ += ["Certificate", "Verdict", "certificate_matrix", "certify", "certify_at"]
-__all__ += ["multipliers", "polish", "prove_bound"]
+__all__ += ["Certificate", "Verdict", "certificate_matrix", "certify_at"]
+__all__ += ["multipliers", "prove_bound"]
 __all__ += ["Verification", "save_proof", "verify_proof"]
 __all__ += ["BregmanProblem", "ConvexSolver", "ModelChange", "OrthogonalProblem"]
 __all__ += ["graph_qp", "rotation_qp", "solve_relaxation"]

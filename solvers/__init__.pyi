@@ -39,7 +39,9 @@ from solvers.result import (
     Stage as Stage,
     Status as Status,
 )
+from solvers.riemannian.certify import certify as certify
 from solvers.riemannian.newton import Newton as Newton, gauss_newton as gauss_newton
+from solvers.riemannian.polish import polish as polish
 from solvers.riemannian.staircase import Staircase as Staircase
 from solvers.robust.consistency import PCM as PCM, pairwise_consistent as pairwise_consistent
 from solvers.robust.gnc import GNC as GNC
@@ -108,6 +110,7 @@ __all__ += [
     "FolderSolution",
     "Pipeline",
     "Solution",
+    "certify",
     "extend",
     "solve",
     "solve_folder",
@@ -115,7 +118,7 @@ __all__ += [
 ]
 __all__ += ["SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "PaperStop", "RStep"]
 __all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty"]
-__all__ += ["Newton", "Staircase", "gauss_newton"]
+__all__ += ["Newton", "Staircase", "gauss_newton", "polish"]
 __all__ += ["GNC", "IRLS", "PCM", "RobustLoss", "pairwise_consistent"]
 __all__ += ["GaussSeidel", "LevenbergMarquardt"]
 __all__ += ["Checkpoint", "Faults", "InProcess", "Ledger", "RayEngine"]

@@ -21,17 +21,17 @@ from pgo_models.certificates.certificate import (
     certify_at,
     certify_with,
     judge,
-    with_shrunk_information,
 )
 from pgo_models.certificates.lower_bound import NO_BOUND
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.loop import RunMonitor
 from solvers.result import OUT_OF_TIME, History, Record, Run, Stage, Status
+from solvers.riemannian.certify import with_shrunk_information
 from solvers.riemannian.newton import Newton
+from solvers.riemannian.polish import polish
 from solvers.riemannian.staircase import DualBound, Staircase, StaircaseState
 from solvers.soc.paper import PaperSOC
 from solvers.soc.soc import SOC

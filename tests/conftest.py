@@ -10,12 +10,12 @@ from browser import Browser, find_browser
 from budget import EXAMPLES, PROFILE
 from hypothesis import settings
 
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.g2o import read_g2o
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.cli import app as cli
+from solvers.riemannian.polish import polish
 
 # Speed is measured in benchmarks.
 settings.register_profile(PROFILE, max_examples=EXAMPLES, deadline=None)

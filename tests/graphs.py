@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from hypothesis import strategies as st
 
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, random_rotations, tangent_dimension
@@ -16,6 +15,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, observe, random_geometric
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from solvers.riemannian.polish import polish
 
 EPS = float(np.finfo(float).eps)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -234,7 +234,7 @@ MUTANTS = (
     ),
     Mutant(
         "robots: a shift that was too small is tried smaller",
-        "pgo_models/certificates/newton_step.py",
+        "solvers/riemannian/newton_step.py",
         "SHIFT_GROWTH * order.eta))",
         "SHIFT_GROWTH / max(order.eta, 1e-300)))",
         ("tests/distributed/test_distributed_newton.py",),

@@ -43,7 +43,7 @@ def test_a_graph_shows_what_it_is_made_of(d):
 
 def test_a_certificate_shows_the_same_as_it_prints():
     problem = pgo.PGOProblem(pgo.circle(np.random.default_rng(0)))
-    certificate = pgo.certify(problem, problem.graph.truth)
+    certificate = solvers.certify(problem, problem.graph.truth)
     shown = cells(certificate._repr_html_())
     assert [
         f"{label:<12} {text}" for label, text in zip(shown[::2], shown[1::2], strict=True)

@@ -252,7 +252,7 @@ def test_what_is_computed_from_a_copy_has_the_same_bits(
     once = solvers.solve(solution.problem)
     np.testing.assert_array_equal(again.poses.R, once.poses.R)
     assert (again.objective, again.lower_bound) == (once.objective, once.lower_bound)
-    bounds = [pgo.certify(one.problem, one.poses).lower_bound for one in (solution, other)]
+    bounds = [solvers.certify(one.problem, one.poses).lower_bound for one in (solution, other)]
     assert bounds[0] == bounds[1]
 
 

@@ -51,7 +51,7 @@ def test_the_bound_holds_and_the_solution_is_no_worse_than_the_start_at_any_nois
     problem = pgo.PGOProblem(graph)
     start = pgo.chordal_start(problem)
     solution = solvers.solve(problem)
-    from_truth = problem.objective(pgo.polish(problem, graph.truth))
+    from_truth = problem.objective(solvers.polish(problem, graph.truth))
     assert solution.objective <= problem.objective(start) * (1 + 1e-12)
     assert solution.lower_bound <= min(solution.objective, from_truth) * (1 + 1e-12)
     assert solution.is_certified == (solution.gap <= solution.certificate.wanted_gap)
@@ -189,7 +189,7 @@ def test_settings_out_of_range_are_refused():
         ),
         (lambda problem: solvers.solve(problem, robots="2"), "robots is '2'; give a whole number"),
         (
-            lambda problem: pgo.certify(problem, problem.graph.truth.R),
+            lambda problem: solvers.certify(problem, problem.graph.truth.R),
             r"poses are a ndarray; give Poses\(R, t\), or",
         ),
         (
@@ -267,8 +267,8 @@ def test_units_change_neither_verdict_nor_iterations_nor_digits(seed, weights, m
     assert other.objective == pytest.approx(weights * one.objective, rel=1e-9)
     assert abs(other.certificate.digits - one.certificate.digits) <= 1
     for poses in (pgo.spanning_tree_start(graph), pgo.chordal_start(one.problem)):
-        theirs = pgo.certify(one.problem, poses)
-        moved = pgo.certify(other.problem, pgo.Poses(poses.R, metres * poses.t))
+        theirs = solvers.certify(one.problem, poses)
+        moved = solvers.certify(other.problem, pgo.Poses(poses.R, metres * poses.t))
         assert moved.verdict is theirs.verdict
         assert moved.gap == pytest.approx(theirs.gap, rel=1e-6)
 

@@ -64,7 +64,7 @@ def test_the_summary_of_a_solution(solution) -> None:
 
 def test_a_certificate_of_other_poses(solution) -> None:
     before = solution.before()[0]
-    certificate = pgo.certify(solution.problem, before)
+    certificate = solvers.certify(solution.problem, before)
     cost = exact_cost(solution, before)
     check(str(certificate), cost, certificate.lower_bound)
     assert Fraction(re.search(rf"F={NUMBER}", repr(certificate))[1]) >= cost

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 def judged(graph: pgo.PoseGraph, poses: pgo.Poses) -> pgo.Certificate:
     """Certificate of anyone's poses."""
     problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.ISOTROPIC)
-    certificate = pgo.certify(problem, pgo.polish(problem, poses))
+    certificate = solvers.certify(problem, solvers.polish(problem, poses))
     assert_type(certificate.lower_bound, float)
     assert_type(certificate.verdict, pgo.Verdict)
     assert_type(pgo.multipliers(problem, poses), Array)

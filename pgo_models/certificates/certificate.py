@@ -13,24 +13,19 @@ from dataclasses import dataclass, replace
 
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, best_bound
-from pgo_models.certificates.newton_polish import polish, relative_decrement
-from pgo_models.certificates.newton_step import STATIONARY_DECREMENT
 from pgo_models.certificates.rounding_errors import (
     ObjectiveRounding,
-    fits_to_rounding,
     objective_rounding,
 )
-from pgo_models.certificates.tangent import bound_by_shrinking
 from pgo_models.errors import ProofError, SettingError
 from pgo_models.figures import gap_above, proven_digits, rounded_down, rounded_up, sum_above
 from pgo_models.geometry.arrays import ReadOnly, real_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import check_poses
 from pgo_models.html_tables import facts_table
-from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem, as_problem
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.problem.weighting import Weighting
 
 DEFAULT_GAP = 1e-6
@@ -266,74 +261,13 @@ class Certificate(ReadOnly):
         return f"proved {form}{shift}{cap}, less {rounded_up(self.bound.rounding, 2)} for rounding"
 
 
-def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_GAP) -> Certificate:
-    """Judge anybody's poses by a proven lower bound on the global optimum.
-
-    The bound is found at a stationary point. Poses that are not stationary are polished first
-    (damped Newton, `polish`); where that point does not give the gap, the one that the chordal
-    start polishes to is tried, and the better bound is taken. `source` says what was done; the gap
-    is always that of the poses given. `certify_at` bounds at the poses as they are. Of a problem
-    with `Weighting.INFORMATION` all of this is chi2 instead of F, bounded by its tangent at the
-    stationary point, and where that fails by smaller information matrices (`bound_by_shrinking`).
-
-    Parameters
-    ----------
-    problem : PGOProblem or PoseGraph
-        The problem; of a graph it is F.
-    poses : Poses
-        The poses to judge.
-    gap : float
-        The relative gap to certify.
-
-    Returns
-    -------
-    Certificate
-        The bound, and how far the cost of the poses is above it.
-
-    Raises
-    ------
-    SettingError
-        Unless the gap is positive and finite.
-    GraphError
-        When the poses do not fit the graph.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> certificate = certify(problem, chordal_start(problem))
-    >>> certificate
-    Certificate(F=118.6633298, gap=0.183, NOT_CERTIFIED)
-    >>> certificate.source.name, bool(0 < certificate.lower_bound <= certificate.poses_objective)
-    ('POLISHED', True)
-    """
-    problem = as_problem(problem)
-    stationarity = relative_decrement(problem, poses)
-    if stationarity <= STATIONARY_DECREMENT and problem.is_quadratic:
-        certificate = certify_at(problem, poses, gap, stationarity)
-    else:
-        polished = certify_at(problem, polish(problem, poses), gap, stationarity)
-        certificate = judge(problem, poses, replace(polished, source=BoundSource.POLISHED))
-    if not _bound_is_tight(problem, certificate):
-        start = polish(problem.convex_part, chordal_start(problem.convex_part))
-        other = certify_at(problem, polish(problem, start), gap, stationarity)
-        # Of equal bounds, as two zeros, the one with the better poses.
-        if (other.lower_bound, -other.poses_objective) > (
-            certificate.lower_bound,
-            -certificate.poses_objective,
-        ):
-            certificate = judge(problem, poses, replace(other, source=BoundSource.CHORDAL))
-        certificate = with_shrunk_information(problem, certificate)
-    return certificate
-
-
 def certify_at(
     problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP, stationarity: float = math.nan
 ) -> Certificate:
     """Judge poses by the bound of the multipliers at these poses as they are.
 
-    It is valid anywhere, and sharp near an optimum.
+    It is valid anywhere, and sharp near an optimum. `solvers.certify` moves poses that are not
+    stationary to the stationary point nearby, and bounds there.
 
     Parameters
     ----------
@@ -353,16 +287,18 @@ def certify_at(
 
     Raises
     ------
-    SettingError, GraphError
-        As of `certify`.
+    SettingError
+        Unless the gap is positive and finite.
+    GraphError
+        When the poses do not fit the graph.
 
     Examples
     --------
     >>> import numpy as np
     >>> from pgo_models.graphs.scenes import grid
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> certificate = certify_at(problem, polish(problem, chordal_start(problem), max_steps=3))
-    >>> bool(0.9 * certificate.objective < certificate.lower_bound <= certificate.objective)
+    >>> certificate = certify_at(problem, problem.graph.truth)
+    >>> bool(0 < certificate.lower_bound <= certificate.objective)
     True
     """
     check_poses(problem.graph, poses)
@@ -376,22 +312,6 @@ def certify_at(
         BoundSource.GIVEN,
         ground=best,
     )
-
-
-def with_shrunk_information(problem: PGOProblem, certificate: Certificate) -> Certificate:
-    """The certificate, or a better one by `bound_by_shrinking` where its bound on chi2 is loose."""
-    if problem.weighting is not Weighting.INFORMATION or _bound_is_tight(problem, certificate):
-        return certificate
-    shrunk = bound_by_shrinking(problem, certificate.poses)
-    if shrunk.bound.value <= certificate.lower_bound:
-        return certificate
-    by_smaller_cost = replace(
-        certificate, bound=shrunk.bound, Lambda=shrunk.Lambda, source=BoundSource.SOFTENED
-    )
-    is_exact = certificate.verdict is Verdict.EXACT
-    # Of the poses given, which need not be those that the bound was found at.
-    rounding = ObjectiveRounding(certificate.rounding_level, certificate.objective_error, is_exact)
-    return judge_cost(problem, by_smaller_cost, certificate.objective, rounding)
 
 
 def certify_with(
@@ -489,9 +409,3 @@ def relative_gap(objective: float, lower_bound: float, is_exact: bool = False) -
     if is_exact:
         return 0.0
     return (objective - lower_bound) / objective if 0.0 < objective < math.inf else 1.0
-
-
-def _bound_is_tight(problem: PGOProblem, certificate: Certificate) -> bool:
-    """Whether the poses that the bound was found at have the gap asked for, or are exact."""
-    gap = relative_gap(certificate.poses_objective, certificate.lower_bound)
-    return gap <= certificate.wanted_gap or fits_to_rounding(problem, certificate.poses)

@@ -84,7 +84,7 @@ class LowerBound:
         Sum of what was subtracted for rounding and, when grounded, for the G_r that moving has
         left; not the loss to eta.
     cap : float
-        Condition that the information matrices were cut down to (`certificates.tangent`).
+        Condition that the information matrices were cut down to (`shrunk_information`).
     is_definite : bool
         Whether S_r is definite in doubles, where this could not be proved: no other poses would
         help.
@@ -138,7 +138,8 @@ def prove_bound(
 
     Examples
     --------
-    >>> from pgo_models import chordal_start, grid, multipliers, polish
+    >>> from pgo_models import chordal_start, grid, multipliers
+    >>> from solvers import polish
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
     >>> poses = polish(problem, chordal_start(problem))
     >>> Lambda = multipliers(problem, poses)

@@ -47,10 +47,10 @@ def save_proof(problem: PGOProblem, certificate: Certificate, path: Path | str) 
     Examples
     --------
     >>> import tempfile
-    >>> from pgo_models import PGOProblem, certify, load, save_proof, verify_proof
+    >>> from pgo_models import PGOProblem, certify_at, load, save_proof, verify_proof
     >>> from pgo_models.graphs.datasets import locate
     >>> problem, path = PGOProblem(load("sphere")), Path(tempfile.mkdtemp()) / "proof.json"
-    >>> certificate = certify(problem, problem.graph.truth)
+    >>> certificate = certify_at(problem, problem.graph.truth)
     >>> save_proof(problem, certificate, path)
     >>> found = verify_proof(locate("sphere"), path)
     >>> found.is_verified, bool(found.bound >= certificate.lower_bound)

@@ -13,6 +13,7 @@ from pgo_models.errors import GraphError
 from pgo_models.geometry.arrays import ReadOnly, read_only, real_array
 from pgo_models.geometry.rotations import (
     Array,
+    exp_map,
     log_map,
     orthogonality_error,
     project_to_rotations,
@@ -168,6 +169,24 @@ class Poses(ReadOnly):
             The moved poses. F of them is the same.
         """
         return Poses(R @ self.R, self.t @ R.T + t)
+
+    def moved_along(self, w: Array, v: Array) -> Poses:
+        """Return the poses (R_i Exp(hat(w_i)), t_i + v_i), the rotations cleaned of rounding.
+
+        Parameters
+        ----------
+        w : Array, (n, 1) or (n, 3)
+            Rotation vectors in the frames of the poses, radians.
+        v : Array, (n, d)
+            Moves of the positions in the world, metres.
+
+        Returns
+        -------
+        Poses
+            The poses after the move.
+        """
+        R = project_to_rotations(self.R @ exp_map(w))
+        return Poses(R, self.t + v)
 
     def with_gauge_at(self, index: int = 0) -> Poses:
         """Move the world so that one pose is the identity.

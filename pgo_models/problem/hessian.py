@@ -75,8 +75,7 @@ def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) 
     `Lambda`, (n, d, d), is theta Lambda; without it the result is Gauss-Newton's.
 
     Its pattern depends on the graph alone. A rigid motion of all poses is in its null space at
-    stationary points: ground a pose before factoring, as `pgo_models.certificates.newton_polish`
-    does.
+    stationary points: ground a pose before factoring (`ground_pose`).
     """
     graph = problem.graph
     d = problem.d
@@ -116,6 +115,20 @@ def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) 
         columns = np.concatenate([v_i, v_j, w_i, w_j], axis=1)[:, : curvature.shape[1]]
         blocks.append((*block_entries(columns, columns), _in_world_axes(curvature, R[i])))
     return assemble(blocks, layout.side)
+
+
+def ground_pose(matrix: csc_array, problem: PGOProblem) -> None:
+    """Double the diagonal of pose 0, so that the matrix is not singular.
+
+    Rigid motions leave F as it is, so that at a stationary point the step keeps pose 0.
+    """
+    layout = TangentLayout(problem.num_poses, problem.d)
+    zero = np.zeros(1, dtype=np.int64)
+    for column in np.concatenate([layout.translations(zero)[0], layout.rotations(zero)[0]]):
+        begin = matrix.indptr[column]
+        end = matrix.indptr[column + 1]
+        position = begin + np.searchsorted(matrix.indices[begin:end], column)
+        matrix.data[position] += abs(matrix.data[position])
 
 
 def _in_world_axes(curvature: Array, R_i: Array) -> Array:

@@ -11,6 +11,8 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 
+# Half the squared Newton decrement of a stationary point of F, as a share of F.
+STATIONARY_DECREMENT = 1e-13
 _EPS = float(np.finfo(float).eps)
 
 

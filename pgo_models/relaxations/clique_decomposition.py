@@ -23,7 +23,6 @@ import cvxpy as cp
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.convex.convex_solver import HoldsModel
 from pgo_models.geometry.arrays import triangle_places
 from pgo_models.geometry.poses import Poses
@@ -120,12 +119,12 @@ def clique_relaxation(
 ) -> CliqueRelaxation:
     """Pose the relaxation over cliques.
 
-    Unless given, the centre is the stationary point that the chordal start polishes to, and the
-    tree is `build_clique_tree(problem.graph)`. A centre far from the optimum costs digits. Fukuda,
-    Kojima, Murota & Nakata, 2001; Vandenberghe & Andersen 2015, chapter 14.
+    Unless given, the centre is the chordal start, and the tree is
+    `build_clique_tree(problem.graph)`. A centre far from the optimum costs digits and iterations.
+    Fukuda, Kojima, Murota & Nakata, 2001; Vandenberghe & Andersen 2015, chapter 14.
     """
     tree = tree if tree is not None else build_clique_tree(problem.graph)
-    centre = centre if centre is not None else polish(problem, chordal_start(problem))
+    centre = centre if centre is not None else chordal_start(problem)
     layout = _Layout.of(problem, tree, centre)
     least_scale = _LEAST_SCALE * float(problem.L.diagonal().mean())
     scale = max(problem.objective(centre), least_scale)

@@ -14,7 +14,6 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.certificates import newton_polish
 from pgo_models.certificates.dual_variables import certificate_matrix
 from pgo_models.geometry.arrays import read_only, real_array
 from pgo_models.geometry.poses import Poses
@@ -145,13 +144,6 @@ def poses_from(R: Array, t: Array) -> Poses:
 
 
 # What Newton needs at poses of either kind.
-
-
-def move_poses(poses: Poses, w: Array, v: Array) -> Poses:
-    """Return the poses after a move."""
-    if isinstance(poses, LiftedPoses):
-        return poses.moved_along(w, v)
-    return newton_polish.move_poses(poses, w, v)
 
 
 def gradient_at(problem: PGOProblem, poses: Poses) -> tuple[Array, Array]:

@@ -80,8 +80,8 @@ def plan_relaxation(
         raise SettingError(
             f"the relaxation of {problem!r} as {form.name} with {chosen.name} needs about "
             f"{_bytes(memory)}, above the limit of {_bytes(memory_limit)} ({reason}); use "
-            "certify(problem, poses), which proves the same bound by one factorisation, or raise "
-            "memory_limit"
+            "solvers.certify(problem, poses), which proves the same bound by one factorisation, "
+            "or raise memory_limit"
         )
     seconds = _seconds(problem, tree, form, chosen)
     return RelaxationPlan(form, chosen, tree, seconds, memory, reason)

@@ -202,10 +202,11 @@ def verify_proof(
     Examples
     --------
     >>> import tempfile
-    >>> from pgo_models import PGOProblem, certify, load, save_proof
+    >>> from pgo_models import PGOProblem, load, save_proof
     >>> from pgo_models.graphs.datasets import locate
+    >>> from solvers import solve
     >>> problem, path = PGOProblem(load("grid")), Path(tempfile.mkdtemp()) / "proof.json"
-    >>> save_proof(problem, certify(problem, problem.graph.truth), path)
+    >>> save_proof(problem, solve(problem).certificate, path)
     >>> found = verify_proof(locate("grid"), path)
     >>> found.is_verified, found.bound.str(10, radius=False)
     (True, '97.01402085')

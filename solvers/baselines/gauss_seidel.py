@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from pgo_models.certificates.newton_polish import move_poses
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
@@ -354,7 +353,7 @@ def _moved(problem: PGOProblem, state: GaussSeidelState) -> Poses:
     w, v = TangentLayout(n - 1, d).split(state.x[:, 0])
     origin = Poses(state.R, np.broadcast_to(state.t[0], (n, d)))
     pose_0_first = ((1, 0), (0, 0))
-    return move_poses(origin, np.pad(w, pose_0_first), np.pad(v, pose_0_first))
+    return origin.moved_along(np.pad(w, pose_0_first), np.pad(v, pose_0_first))
 
 
 def _change(problem: PGOProblem, state: GaussSeidelState, x: Array) -> tuple[float, int]:

@@ -11,18 +11,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.certificates.newton_polish import ground_pose, move_poses
-from pgo_models.certificates.newton_step import STATIONARY_DECREMENT, scaled_decrement
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.errors import NotPositiveDefiniteError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.cholesky import SymbolicCholesky, analyze
-from pgo_models.problem.hessian import TangentLayout, riemannian_hessian, tangent_order
+from pgo_models.problem.hessian import TangentLayout, ground_pose, riemannian_hessian, tangent_order
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from solvers.result import Measurement, Status
+from solvers.riemannian.newton_step import scaled_decrement
 
 _SMALLEST_FACTOR = 1.0 / 3.0  # on the damping, after a step that the model predicted well
 _GROWTH = 2.0  # of the damping after a refused step; it doubles with each refusal in a row
@@ -165,7 +165,7 @@ class LevenbergMarquardt:
         if not np.isfinite(state.step).all():
             return -math.inf, state.poses, state.objective
         w, v = TangentLayout(problem.num_poses, problem.d).split(state.step)
-        poses = move_poses(state.poses, w, v)
+        poses = state.poses.moved_along(w, v)
         objective = problem.objective(poses)
         actual = state.objective - objective
         damped = state.damping * inner(state.step, state.matrix.diagonal() * state.step)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pgo_models.certificates.certificate import DEFAULT_GAP, Certificate, certify
+from pgo_models.certificates.certificate import DEFAULT_GAP, Certificate
 from pgo_models.certificates.proof_file import save_proof
 from pgo_models.errors import SettingError
 from pgo_models.files import check_writable
@@ -32,6 +32,7 @@ from solvers.cli.shell import (
 )
 from solvers.cli.study_commands import DropEdgeOption, UnitWeightsOption
 from solvers.reporting.versions import installed_versions
+from solvers.riemannian.certify import certify
 from solvers.solution import both_costs, certificate_json, other_cost, write_json
 
 _INDENT = 13  # columns of the labels of a certificate

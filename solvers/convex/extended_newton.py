@@ -15,8 +15,6 @@ from cvxpy.atoms.affine.index import index
 from cvxpy.atoms.elementwise.power import Power
 from cvxpy.atoms.pnorm import Pnorm
 
-from pgo_models.certificates import newton_step
-from pgo_models.certificates.newton_polish import factorize_gauss_newton, move_poses
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.convex.graph_subproblem import Changer, GraphQP
 from pgo_models.errors import SettingError, check_settings
@@ -27,8 +25,11 @@ from pgo_models.problem.hessian import TangentLayout
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from solvers.convex.extended_soc import ExtendedSOC
 from solvers.result import Measurement, Status
+from solvers.riemannian import newton_step
+from solvers.riemannian.polish import factorize_gauss_newton
 from solvers.riemannian.truncated_cg import truncated_conjugate_gradients
 
 _DIFFERENCE = 1e-7  # step of the differences of gradients, relative to the coordinates
@@ -94,7 +95,7 @@ class ExtendedNewton:
     """
 
     changer: Changer
-    tolerance: float = newton_step.STATIONARY_DECREMENT
+    tolerance: float = STATIONARY_DECREMENT
     max_iterations: int = 100
 
     def __post_init__(self) -> None:
@@ -120,7 +121,7 @@ class ExtendedNewton:
         """
         w, v = TangentLayout(problem.num_poses, problem.d).split(state.direction)
         for length in 0.5 ** np.arange(newton_step.HALVINGS):
-            poses = move_poses(state.poses, length * w, length * v)
+            poses = state.poses.moved_along(length * w, length * v)
             change = state.model.cost(poses.stacked()) - state.objective
             allowed_change = newton_step.SUFFICIENT * length * state.slope
             if length == 1.0:
@@ -218,7 +219,7 @@ def _state_at(
     objective = model.cost(X)
     gradient = tangent.gradient
     radius = _RADIUS * np.sqrt(inner(gradient, factor.solve(gradient)))
-    floor = 0.1 * newton_step.STATIONARY_DECREMENT * abs(objective)
+    floor = 0.1 * STATIONARY_DECREMENT * abs(objective)
     solution = truncated_conjugate_gradients(
         gradient, tangent.hessian, factor.solve, radius, _FORCING, floor, _MAX_PRODUCTS
     )

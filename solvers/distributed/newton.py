@@ -1,6 +1,6 @@
 """Newton's method by a driver and its robots: `newton_step` on matrices eliminated to separators.
 
-The rules are those of `pgo_models.certificates.newton_step`; here are its algebra, which asks the
+The rules are those of `solvers.riemannian.newton_step`; here are its algebra, which asks the
 robots for their parts and solves for the separators, and the method that the loop runs.
 """
 
@@ -10,19 +10,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pgo_models.certificates.newton_step import (
-    ModelOrder,
-    NewtonFigures,
-    StepRules,
-    first_shift,
-    newton_step,
-    stationary_tolerance,
-)
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.hessian import TangentLayout
-from pgo_models.relaxations.low_rank import LiftedPoses, move_poses, poses_from
+from pgo_models.relaxations.low_rank import LiftedPoses, poses_from
 from solvers.distributed.driver import CoverPoses, Driver
 from solvers.distributed.interface import Interface
 from solvers.distributed.robots.interior import Interior
@@ -30,6 +22,14 @@ from solvers.distributed.robots.records import Move, Reduced, RightHandSide, Tri
 from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Status
 from solvers.riemannian.newton import Newton, newton_status
+from solvers.riemannian.newton_step import (
+    ModelOrder,
+    NewtonFigures,
+    StepRules,
+    first_shift,
+    newton_step,
+    stationary_tolerance,
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -137,7 +137,7 @@ class EliminatedAlgebra:
         driver = self.driver
         layout = TangentLayout(len(driver.cover), *driver.tangent)
         w, v = layout.split(-model.y[:, 0])
-        moved = move_poses(poses_from(model.at.R, model.at.t), length * w, length * v)
+        moved = poses_from(model.at.R, model.at.t).moved_along(length * w, length * v)
         return moved.R, moved.t
 
     def _trial(self, R: Array, t: Array, answers: Sequence[TrialEvaluation]) -> CoverTrial:

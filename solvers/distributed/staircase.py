@@ -15,7 +15,7 @@ from pgo_models.certificates.definiteness import smallest_eta
 from pgo_models.certificates.lower_bound import UNGROUNDED_SHIFT, LowerBound, smallest_shift
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations
-from pgo_models.relaxations.low_rank import append_dimension, gram_matrix, move_poses, poses_from
+from pgo_models.relaxations.low_rank import append_dimension, gram_matrix, poses_from
 from solvers.distributed.driver import CoverPoses, Driver, collect
 from solvers.distributed.lower_bound import eliminate_S, prove_with_eta
 from solvers.distributed.newton import SubstructuredNewton, SubstructuredNewtonState
@@ -203,7 +203,7 @@ class EliminatedClimb:
         """Return F after a move along the direction, and the poses there."""
         driver = self.driver
         answers = driver.ask(climbing.try_climb, length)
-        moved = move_poses(direction.flat, length * direction.w, length * direction.v)
+        moved = direction.flat.moved_along(length * direction.w, length * direction.v)
         trial = driver.with_sums(replace(driver.at, R=moved.R, t=moved.t), answers)
         return trial.objective, trial
 

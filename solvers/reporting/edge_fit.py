@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
@@ -15,6 +14,7 @@ from pgo_models.graphs.precisions import indefinite_edges, text_of_indefinite
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from pgo_models.problem.weighting import Weighting
+from solvers.riemannian.polish import polish
 
 _SAME_COST = 1e-9  # relative difference below which chi2 and F are one cost
 _CLEARLY_LOWER = 1.01  # ratio of chi2 to a lower value, above which there is advice on it

@@ -20,9 +20,9 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, smallest_shift
-from pgo_models.certificates.newton_step import HALVINGS, ROUNDING
 from pgo_models.geometry.rotations import Array
 from solvers.result import Status
+from solvers.riemannian.newton_step import HALVINGS, ROUNDING
 
 SUFFICIENT = 0.25  # share of the decrease promised to second order that a move has to bring
 

@@ -5,24 +5,25 @@ F never rises but by rounding.
 
 from dataclasses import dataclass
 
-from pgo_models.certificates.newton_polish import (
-    PolishState,
-    polish_step,
-    start_polish,
-)
-from pgo_models.certificates.newton_step import STATIONARY_DECREMENT, NewtonFigures
 from pgo_models.errors import check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from solvers.result import Measurement, Status
+from solvers.riemannian.newton_step import NewtonFigures
+from solvers.riemannian.polish import (
+    PolishState,
+    polish_step,
+    start_polish,
+)
 
 SMALL = 1000  # poses in space up to which Newton alone is faster
 
 
 @dataclass(frozen=True, eq=False)
 class NewtonState:
-    """State k: the poses and factorisations of `pgo_models.certificates.newton_polish`."""
+    """State k: the poses and factorisations of `solvers.riemannian.polish`."""
 
     k: int
     polish: PolishState
@@ -33,7 +34,7 @@ class Newton:
     """Riemannian Newton on SE(d)^n, one factorisation a step.
 
     `dual_residual` is the relative Newton decrement: half its square, less the rounding level of F,
-    over F (`pgo_models.certificates.newton_step`).
+    over F (`solvers.riemannian.newton_step`).
 
     Parameters
     ----------

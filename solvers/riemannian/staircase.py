@@ -14,7 +14,6 @@ import numpy as np
 from pgo_models.certificates.certificate import DEFAULT_GAP
 from pgo_models.certificates.dual_variables import factorize_certificate
 from pgo_models.certificates.lower_bound import LowerBound, best_bound
-from pgo_models.certificates.newton_step import ROUNDING, STATIONARY_DECREMENT, scaled_decrement
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.certificates.spectrum import negative_curvature
 from pgo_models.errors import check_settings
@@ -25,6 +24,7 @@ from pgo_models.problem.cholesky import CholeskyFactor
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.relaxations.low_rank import LiftedPoint, hessian_product, lifted_point
 from pgo_models.relaxations.rounding import round_factor
 from solvers.result import Measurement, Status
@@ -35,6 +35,7 @@ from solvers.riemannian.climb import (
     staircase_status,
     turning_length,
 )
+from solvers.riemannian.newton_step import ROUNDING, scaled_decrement
 from solvers.riemannian.truncated_cg import TruncatedStep, truncated_conjugate_gradients
 
 # of the mean diagonal entry of M over the rotations: makes Q, which is singular, definite

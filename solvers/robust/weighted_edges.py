@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pgo_models.certificates.newton_polish import PolishState, polish_step, start_polish
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
@@ -17,6 +16,7 @@ from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
 from pgo_models.problem.weighting import Weighting
+from solvers.riemannian.polish import PolishState, polish_step, start_polish
 from solvers.robust.consistency import odometry
 from solvers.robust.losses import RobustLoss
 

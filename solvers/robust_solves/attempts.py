@@ -14,7 +14,6 @@ from typing import ClassVar
 import numpy as np
 
 from pgo_models.certificates.certificate import Certificate, certify_at
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
@@ -24,6 +23,7 @@ from solvers.distributed.robust import SharedEstimate
 from solvers.loop import RunMonitor
 from solvers.network.ledger import Ledger
 from solvers.result import Stage
+from solvers.riemannian.polish import polish
 from solvers.robust.consistency import pairwise_consistent
 from solvers.robust.gnc import GNC, LAST_STEPS
 from solvers.robust.losses import RobustLoss

@@ -23,7 +23,6 @@ from hypothesis import given, settings, strategies as st
 from scipy.sparse.linalg import spsolve
 from test_sweep_order import scattered
 
-from pgo_models.certificates.newton_polish import move_poses, polish
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import project_to_rotations, random_rotations, unstack_transposes
@@ -38,6 +37,7 @@ from solvers.baselines.sweep_order import Sweep, schedule
 from solvers.loop import iterate, run
 from solvers.network.ledger import Ledger
 from solvers.result import Status
+from solvers.riemannian.polish import polish
 
 WANTED = 1e-8
 METHODS = {
@@ -93,7 +93,7 @@ def centralized(problem: PGOProblem) -> Poses:
     w, v = TangentLayout(n - 1, d).split(
         gauss_newton_move(problem, np.concatenate([np.eye(d)[None], projected]))[:, 0]
     )
-    moved = move_poses(Poses(projected, np.zeros((n - 1, d))), w, v)
+    moved = Poses(projected, np.zeros((n - 1, d))).moved_along(w, v)
     return Poses(
         np.concatenate([np.eye(d)[None], moved.R]), np.concatenate([np.zeros((1, d)), moved.t])
     )

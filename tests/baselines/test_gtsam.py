@@ -20,8 +20,6 @@ from graphs import (
 )
 from hypothesis import given, settings, strategies as st
 
-from pgo_models.certificates.certificate import certify
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import GraphError, MissingExtraError, NotPositiveDefiniteError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map
@@ -32,6 +30,8 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.baselines.gtsam import Gtsam, GtsamMethod, factor_graph, run_gtsam
 from solvers.result import Status
+from solvers.riemannian.certify import certify
+from solvers.riemannian.polish import polish
 
 needs_gtsam = pytest.mark.skipif(
     importlib.util.find_spec("gtsam") is None, reason="GTSAM is an optional rival"

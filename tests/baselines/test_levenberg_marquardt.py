@@ -17,7 +17,6 @@ from graphs import (
 )
 from hypothesis import given, settings, strategies as st
 
-from pgo_models.certificates.newton_polish import polish, relative_decrement
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
@@ -26,6 +25,7 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
 from solvers.loop import run
 from solvers.result import Status
+from solvers.riemannian.polish import polish, relative_decrement
 
 ROUNDING = 1e-14
 ZERO = np.zeros(1, dtype=np.int64)

@@ -26,13 +26,10 @@ from pgo_models.certificates.certificate import (
     BoundSource,
     Certificate,
     Verdict,
-    certify,
     certify_at,
     judge,
 )
 from pgo_models.certificates.lower_bound import prove_bound
-from pgo_models.certificates.newton_polish import polish, relative_decrement
-from pgo_models.certificates.newton_step import STATIONARY_DECREMENT
 from pgo_models.certificates.rounding_errors import fits_to_rounding, objective_rounding
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
@@ -42,6 +39,9 @@ from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, circle, grid, obser
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.stationarity import STATIONARY_DECREMENT
+from solvers.riemannian.certify import certify
+from solvers.riemannian.polish import polish, relative_decrement
 
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE, NoiseModel(0.5, 0.8), NoiseModel(0.1, 2.0)])
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)

@@ -4,10 +4,10 @@ from graphs import DIMENSIONS, SEEDS, SIZES, random_poses, rounding_of_objective
 from hypothesis import given, strategies as st
 
 from pgo_models.certificates.dual_variables import certificate_matrix, multipliers
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from solvers.riemannian.polish import polish
 
 
 def symmetric(seed: int, n: int, d: int, scale: float = 1.0) -> Array:

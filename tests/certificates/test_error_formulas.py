@@ -17,7 +17,6 @@ from pgo_models.certificates import lower_bound
 from pgo_models.certificates.definiteness import shifted_certificate
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import bound_from, squared_distances
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.certificates.rounding_errors import (
     evaluate_certificate,
     evaluate_edges,
@@ -38,6 +37,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.robots import elimination as substructure, proof as robot_proof
 from solvers.distributed.robots.elimination import Cut, eliminate, row_sums
+from solvers.riemannian.polish import polish
 
 ENOUGH = 1.0 - 1e-12  # the formulas here are rounded, too; the bounds are rounded up by 2^-30
 SIZES = [(t, low, P) for t in (1e-6, 1.0, 1e6) for low in (0.0, 1.0, 1e9) for P in (1e-6, 1.0, 1e4)]

@@ -21,11 +21,10 @@ from hypothesis import given, settings, strategies as st
 from roads import Shape, road
 
 import solvers
-from pgo_models.certificates.certificate import Certificate, Verdict, certify, certify_at
+from pgo_models.certificates.certificate import Certificate, Verdict, certify_at
 from pgo_models.certificates.definiteness import prove_definite
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import LowerBound, best_bound, pose_rows, prove_bound
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.g2o import read_g2o
 from pgo_models.graphs.pose_graph import PoseGraph, middle_pose
@@ -33,6 +32,8 @@ from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from solvers.riemannian.certify import certify
+from solvers.riemannian.polish import polish
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
 DATA = Path(__file__).parents[2] / "data"

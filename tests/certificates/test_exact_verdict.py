@@ -21,11 +21,9 @@ from pgo_models.certificates.certificate import (
     BoundSource,
     Certificate,
     Verdict,
-    certify,
     certify_with,
 )
 from pgo_models.certificates.lower_bound import NO_BOUND
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.certificates.rounding_errors import (
     fits_to_rounding,
     objective_rounding,
@@ -37,6 +35,8 @@ from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from solvers.riemannian.certify import certify
+from solvers.riemannian.polish import polish
 
 SPREADS = st.sampled_from([0.0, 1.0, 3.0, 10.0, 30.0])
 

@@ -27,7 +27,6 @@ from roads import road
 from pgo_models.certificates import lower_bound
 from pgo_models.certificates.dual_variables import certificate_matrix, multipliers
 from pgo_models.certificates.lower_bound import prove_bound
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.certificates.rounding_errors import (
     evaluate_certificate,
     evaluate_edges,
@@ -42,6 +41,7 @@ from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from solvers.riemannian.polish import polish
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
 

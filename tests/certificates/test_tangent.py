@@ -14,17 +14,16 @@ from hypothesis import given, settings, strategies as st
 from roads import Shape, road
 
 import solvers
-from pgo_models.certificates.certificate import BoundSource, certify, certify_at
+from pgo_models.certificates.certificate import BoundSource, certify_at
 from pgo_models.certificates.definiteness import shifted_certificate
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import best_bound, prove_bound
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.certificates.rounding_errors import (
     evaluate_edges,
     matrix_errors,
     objective_rounding,
 )
-from pgo_models.certificates.tangent import bound_by_shrinking, shrink_information
+from pgo_models.certificates.shrunk_information import shrink_information
 from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -38,6 +37,9 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import rotation_columns
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from solvers.riemannian.certify import certify
+from solvers.riemannian.polish import polish
+from solvers.riemannian.shrunk_bound import bound_by_shrinking
 
 COUPLED = st.booleans()
 
@@ -289,7 +291,7 @@ def test_smaller_matrices_are_below_whatever_share_was_computed(
     graph = informed(3, 8, d, coupled=True, spread=2.0)
     information = proper_information(graph)
     monkeypatch.setattr(
-        "pgo_models.certificates.tangent.uncoupled_share",
+        "pgo_models.certificates.shrunk_information.uncoupled_share",
         lambda blocks, d: np.minimum(1.0, uncoupled_share(blocks, d) + 0.3),
     )
     softer = shrink_information(graph, 1e9).information

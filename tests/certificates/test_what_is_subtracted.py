@@ -15,7 +15,6 @@ from pgo_models.certificates.certificate import certify_at, judge
 from pgo_models.certificates.definiteness import DefiniteProof, prove_definite, shifted_certificate
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import prove_bound
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.certificates.rounding_errors import Evaluation, matrix_errors
 from pgo_models.errors import ProofError
 from pgo_models.geometry.poses import Poses
@@ -27,6 +26,7 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.distributed import lower_bound as distributed_bound
 from solvers.distributed.robots import proof as robot_proof
 from solvers.distributed.robots.elimination import Cut
+from solvers.riemannian.polish import polish
 
 
 def one_edge(kappa: float) -> PGOProblem:

@@ -11,7 +11,6 @@ from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph, vari
 from hypothesis import given, settings, strategies as st
 from robots import PARTITIONERS, Partitioner, Recording, arrays_in, driver_at, metis, spoil
 
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import SettingError
 from pgo_models.graphs.partitioning import Partition, partition
 from pgo_models.graphs.scenes import NoiseModel, circle, grid
@@ -27,6 +26,7 @@ from solvers.network.faults import Faults
 from solvers.network.ledger import Ledger
 from solvers.pipeline import Pipeline, solve
 from solvers.result import Record, Status
+from solvers.riemannian.polish import polish
 from solvers.soc.consensus import LocalConsensus, ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.paper import PaperSOC

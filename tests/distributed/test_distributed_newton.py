@@ -1,4 +1,4 @@
-"""Newton by driver and robots takes the steps of `pgo_models.certificates.newton_polish`."""
+"""Newton by driver and robots takes the steps of `solvers.riemannian.polish`."""
 
 from dataclasses import replace
 from itertools import islice
@@ -20,8 +20,6 @@ from hypothesis import given, settings, strategies as st
 from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, driver_at, metis
 
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.newton_polish import ground_pose, move_poses
-from pgo_models.certificates.newton_step import STATIONARY_DECREMENT, ModelOrder
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import tangent_dimension
@@ -29,15 +27,17 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
+from pgo_models.problem.hessian import TangentLayout, ground_pose, riemannian_hessian
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.relaxations.low_rank import LiftedPoses, append_dimension
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.newton import SubstructuredNewton, model_at
 from solvers.loop import iterate, run
 from solvers.result import Status
 from solvers.riemannian.newton import Newton
+from solvers.riemannian.newton_step import ModelOrder
 
 SIZES = st.integers(2, 20)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
@@ -50,7 +50,7 @@ def near(problem: PGOProblem, seed: int, spread: float) -> Poses:
         spread * rng.standard_normal((problem.num_poses, k))
         for k in (tangent_dimension(problem.d), problem.d)
     ]
-    return move_poses(chordal_start(problem), *moves)
+    return chordal_start(problem).moved_along(*moves)
 
 
 def check(problem: PGOProblem, parts: Partition, start: Poses, newton: Newton, steps: int) -> None:

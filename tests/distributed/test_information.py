@@ -16,7 +16,6 @@ from robots import driver_at
 
 import solvers
 from pgo_models.certificates.certificate import Verdict
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import partition
@@ -30,6 +29,7 @@ from solvers.distributed.checkpoint import Checkpoint
 from solvers.distributed.interface import Interface
 from solvers.distributed.lower_bound import prove_with_eta
 from solvers.network.counted_pool import Count
+from solvers.riemannian.polish import polish
 from solvers.soc.settings import Coupling
 
 QUIET = NoiseModel(0.02, 0.02)

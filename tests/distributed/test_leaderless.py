@@ -21,7 +21,6 @@ from robots import (
 )
 
 from pgo_models.certificates.certificate import Verdict
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import project_to_rotations, unstack_transposes
@@ -38,6 +37,7 @@ from solvers.network.faults import Faults
 from solvers.network.ledger import DRIVER
 from solvers.pipeline import Pipeline, solve
 from solvers.result import Record, Status
+from solvers.riemannian.polish import polish
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.paper import PaperSOC
 from solvers.soc.penalty import MultiplierPenalty

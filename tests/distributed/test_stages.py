@@ -25,7 +25,6 @@ from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, driver_at,
 from pgo_models.certificates.certificate import DEFAULT_GAP
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import best_bound, prove_bound
-from pgo_models.certificates.newton_polish import polish, relative_decrement
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.g2o import read_g2o
@@ -43,6 +42,7 @@ from solvers.network.faults import Faults
 from solvers.pipeline import WARM_START, Pipeline, solve
 from solvers.result import Record, Status
 from solvers.riemannian.newton import Newton, gauss_newton
+from solvers.riemannian.polish import polish, relative_decrement
 from solvers.soc.anderson import Anderson
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC

@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from robots import Recording, metis, scattered
 from shared_gradients import dense_relative_gradient
 
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
@@ -30,6 +29,7 @@ from solvers.network.engine import InProcess
 from solvers.network.faults import Faults
 from solvers.pipeline import Pipeline, solve
 from solvers.result import History, Measurement, Outcome, Record, Status
+from solvers.riemannian.polish import polish
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC

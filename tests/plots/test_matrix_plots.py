@@ -17,7 +17,7 @@ from pgo_models.problem.matrices import marginalized_matrix
 
 def certificate_of(graph):
     problem = pgo.PGOProblem(graph)
-    return problem, pgo.certify(problem, pgo.polish(problem, pgo.chordal_start(problem)))
+    return problem, solvers.certify(problem, solvers.polish(problem, pgo.chordal_start(problem)))
 
 
 @pytest.mark.parametrize("num_poses", [6, 120])  # all at once, and by Lanczos

@@ -17,7 +17,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import shortest_path
 
 from pgo_models.certificates.certificate import certify_at
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import orthogonality_error, random_rotations, unstack_transposes
@@ -28,6 +27,7 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
 from pgo_models.problem.matrices import residual_matrix
 from pgo_models.problem.problem import PGOProblem
+from solvers.riemannian.polish import polish
 
 
 def chain(seed: int, n: int, d: int, noise: NoiseModel = MILD_NOISE) -> PoseGraph:

@@ -9,7 +9,6 @@ from hypothesis import given, settings, strategies as st
 from scipy.sparse import csc_array
 
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import NotPositiveDefiniteError, PGOError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, hat, log_map
@@ -19,6 +18,7 @@ from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.marginals import Marginals, write_covariances
 from pgo_models.problem.problem import PGOProblem
+from solvers.riemannian.polish import polish
 
 needs_gtsam = pytest.mark.skipif(
     importlib.util.find_spec("gtsam") is None, reason="GTSAM is an optional rival"

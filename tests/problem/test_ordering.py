@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 import pgo_models as pgo
-from pgo_models.certificates.newton_polish import ground_pose
 from pgo_models.problem import ordering
 from pgo_models.problem.cholesky import CholeskyBackend, analyze
-from pgo_models.problem.hessian import riemannian_hessian, tangent_order
+from pgo_models.problem.hessian import ground_pose, riemannian_hessian, tangent_order
 from pgo_models.problem.ordering import most_counts, pose_order, row_order
 
 WORLD = pgo.grid_world(4, 40, np.random.default_rng(0), d=3)

@@ -10,7 +10,6 @@ from graphs import DIMENSIONS, SEEDS, informed, random_poses, varied_graph
 from hypothesis import given, strategies as st
 
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.newton_polish import move_poses, polish
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import tangent_dimension
@@ -22,6 +21,7 @@ from pgo_models.problem.information_costs import TangentCost
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from solvers.riemannian.polish import polish
 
 COUPLED = st.booleans()
 
@@ -29,8 +29,7 @@ COUPLED = st.booleans()
 def moved(poses: Poses, size: float, seed: int) -> Poses:
     rng = np.random.default_rng(seed)
     (n, d) = poses.t.shape
-    return move_poses(
-        poses,
+    return poses.moved_along(
         size * rng.standard_normal((n, tangent_dimension(d))),
         size * rng.standard_normal((n, d)),
     )
@@ -84,7 +83,7 @@ def test_gradient_and_hessian_of_chi2(seed: int, n: int, d: int, coupled: bool) 
     )
     errors = []
     for h in (1e-2, 5e-3):
-        ahead, behind = (problem.objective(move_poses(poses, s * w, s * v)) for s in (h, -h))
+        ahead, behind = (problem.objective(poses.moved_along(s * w, s * v)) for s in (h, -h))
         errors.append(
             (
                 abs((ahead - behind) / (2 * h) - slope),

@@ -12,7 +12,6 @@ from hypothesis import given, settings, strategies as st
 from pgo_models.certificates.certificate import Verdict, relative_gap
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import prove_bound
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.convex.convex_solver import ConvexSolver
 from pgo_models.errors import SettingError
 from pgo_models.graphs.g2o import read_g2o
@@ -28,6 +27,7 @@ from pgo_models.relaxations.solve_sdp import (
     solve_relaxation,
 )
 from solvers.pipeline import solve
+from solvers.riemannian.polish import polish
 from solvers.studies.tightness import SweptScene, noisy_scene
 
 FORMS = st.sampled_from(list(RelaxationForm))
@@ -209,7 +209,7 @@ def test_the_reason_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
 def test_what_is_beyond_reach_is_refused_with_an_estimate() -> None:
     problem = PGOProblem(sphere(np.random.default_rng(0)))
     with pytest.raises(
-        SettingError, match=r"needs about [\d.]+ GB, above the limit of 4 GB .* use certify\("
+        SettingError, match=r"needs about [\d.]+ GB, above the limit of 4 GB .* use solvers.certify\("
     ) as caught:
         solve_relaxation(problem, RelaxationForm.PRIMAL, "CLARABEL")
     assert "PRIMAL and CLARABEL as asked for" in str(caught.value)

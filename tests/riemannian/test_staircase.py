@@ -26,13 +26,13 @@ from pgo_models.certificates.certificate import (
     certify_with,
 )
 from pgo_models.certificates.lower_bound import prove_bound
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import SettingError
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.solve_sdp import TOLERANCE, solve_relaxation
 from solvers.loop import run
 from solvers.result import Status
 from solvers.riemannian.newton import Newton, gauss_newton
+from solvers.riemannian.polish import polish
 from solvers.riemannian.staircase import Staircase, StaircaseState
 from solvers.studies.tightness import SweptScene, noisy_scene
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from pgo_models.certificates.newton_polish import relative_decrement
 from pgo_models.convex.graph_subproblem import Neighbours, Unknowns, graph_qp, robot_qp
 from pgo_models.convex.huber import huber_change
 from pgo_models.errors import SettingError
@@ -21,6 +20,7 @@ from pgo_models.problem.weighting import Weighting
 from solvers.convex.extended_soc import ExtendedSOC
 from solvers.loop import run
 from solvers.result import Status
+from solvers.riemannian.polish import relative_decrement
 from solvers.robust.irls import IRLS, huber
 from solvers.soc.penalty import MultiplierPenalty
 from solvers.soc.soc import SOC

@@ -14,10 +14,10 @@ from wrong_edges import noisy_sphere, spoiled
 import pgo_models as pgo
 import solvers
 from pgo_models.certificates.certificate import Verdict
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.scenes import NoiseModel
 from solvers.cli import app as cli
+from solvers.riemannian.polish import polish
 from solvers.robust.rejection import Attempt, Support
 from solvers.robust.revision import (
     readmit_clusters,

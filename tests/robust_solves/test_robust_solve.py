@@ -8,10 +8,10 @@ from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.graphs.scenes import NoiseModel
 from solvers.cli import app as cli
+from solvers.riemannian.polish import polish
 from solvers.robust.revision import drop_contradicted, inlier_problem, readmit_edges
 from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves import attempts as robust_attempts, robust_solve

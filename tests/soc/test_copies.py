@@ -8,7 +8,6 @@ from graphs import DIMENSIONS, LOUD_NOISE, SEEDS, random_poses, translation_scal
 from hypothesis import given, strategies as st
 from robots import PARTITIONERS, Partitioner
 
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
@@ -23,6 +22,7 @@ from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
 from solvers.network.counted_pool import Count
+from solvers.riemannian.polish import polish
 from solvers.soc.consensus import ConsensusIterate, LocalConsensus, LocalRobots
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.penalty import FixedPenalty, MultiplierPenalty

@@ -16,7 +16,6 @@ from graphs import (
 from hypothesis import assume, given, settings, strategies as st
 
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.newton_polish import polish, relative_decrement
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import (
     orthogonality_error,
@@ -33,6 +32,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
 from solvers.loop import iterate, run
 from solvers.result import Measurement, Status
+from solvers.riemannian.polish import polish, relative_decrement
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus import ConsensusIterate
 from solvers.soc.paper import PaperSOC

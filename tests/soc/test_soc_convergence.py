@@ -17,7 +17,6 @@ from graphs import (
 )
 from hypothesis import assume, example, given, settings, strategies as st
 
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, circle, grid
@@ -30,6 +29,7 @@ from pgo_models.problem.stationarity import (
 )
 from solvers.loop import iterate, run
 from solvers.result import Record, Status
+from solvers.riemannian.polish import polish
 from solvers.soc.anderson import Anderson
 from solvers.soc.consensus import ConsensusIterate
 from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule

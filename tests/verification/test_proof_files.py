@@ -15,7 +15,7 @@ from graphs import varied_graph
 from proofs import PLANE, SPACE, edited, proof_of, written
 
 import solvers
-from pgo_models.certificates.certificate import BoundSource, certify
+from pgo_models.certificates.certificate import BoundSource
 from pgo_models.certificates.proof_file import proof_json, save_proof
 from pgo_models.errors import SettingError
 from pgo_models.graphs.datasets import locate
@@ -24,6 +24,7 @@ from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.verification.verify import verify_proof
+from solvers.riemannian.certify import certify
 
 Call = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parents[2]

@@ -23,7 +23,7 @@ from hypothesis import given, settings, strategies as st
 from proofs import PLANE, SPACE, assert_verified, edited, proof_of, written
 
 import solvers
-from pgo_models.certificates.certificate import BoundSource, certify, certify_at
+from pgo_models.certificates.certificate import BoundSource, certify_at
 from pgo_models.certificates.proof_file import save_proof
 from pgo_models.graphs.datasets import load, locate
 from pgo_models.graphs.g2o import read_g2o, write_g2o
@@ -32,6 +32,7 @@ from pgo_models.graphs.scenes import victoria_park
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.verification.verify import verify_proof
+from solvers.riemannian.certify import certify
 
 WEIGHTINGS = st.sampled_from(Weighting)
 BOTH = list(Weighting)

@@ -14,7 +14,6 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from pgo_models.certificates.dual_variables import multiplier_norms, multipliers
-from pgo_models.certificates.newton_step import ModelOrder
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
@@ -29,7 +28,7 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout
 from pgo_models.problem.initialization import relaxed_rotations
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.relaxations.low_rank import gradient_at, hessian_at, move_poses, tangent_widths
+from pgo_models.relaxations.low_rank import gradient_at, hessian_at, tangent_widths
 from solvers.distributed.robots.elimination import Widths
 from solvers.distributed.robots.factors import Eliminated, Factors
 from solvers.distributed.robots.proof import RobotProof
@@ -45,6 +44,7 @@ from solvers.distributed.robots.records import (
     RightHandSide,
     TrialEvaluation,
 )
+from solvers.riemannian.newton_step import ModelOrder
 from solvers.soc.copies import Norms, subsampled
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.recursion_block import RecursionBlock
@@ -312,7 +312,7 @@ class Interior:
         """Return the current poses, moved a length along the direction."""
         assert self.state.step is not None
         w, v = self.state.step
-        return move_poses(self.state.poses, length * w, length * v)
+        return self.state.poses.moved_along(length * w, length * v)
 
     @property
     def block(self) -> RecursionBlock:

@@ -14,7 +14,6 @@ from robots import BACKENDS, PARTITIONERS, Partitioner, contiguous, driver_at, m
 
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import pose_rows, prove_bound
-from pgo_models.certificates.newton_polish import polish
 from pgo_models.certificates.rounding_errors import evaluate_multipliers
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.scenes import NoiseModel
@@ -34,6 +33,7 @@ from solvers.distributed.lower_bound import (
 )
 from solvers.distributed.robots.proof import ProofSums
 from solvers.distributed.robots.records import ProofStep, RightHandSide
+from solvers.riemannian.polish import polish
 
 
 @settings(max_examples=examples(12))

@@ -2,7 +2,7 @@
 
 The rules of the method are here: which matrix is factored, how far a move goes, when another move
 takes the same factor, and when the iteration has come to its end. What they need of poses and
-matrices is `NewtonAlgebra`. There are two: `pgo_models.certificates.newton_polish` in one place,
+matrices is `NewtonAlgebra`. There are two: `solvers.riemannian.polish` in one place,
 with sparse Cholesky, and `solvers.distributed.newton` by a driver and its robots, which eliminate
 to separators and send messages.
 """
@@ -14,9 +14,10 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 
-STATIONARY_DECREMENT = 1e-13  # decrement of a stationary point of F
-# and of chi2, where what is left weighs more in the bound: its tangent is softer than chi2 itself
+# Decrement of a stationary point of chi2. What is left weighs more in its bound than in that of F,
+# because the tangent is softer than chi2 itself.
 STATIONARY_FOR_TANGENTS = 1e-16
 SMALL_DECREMENT = 1e-9  # decrement that a Newton step squares
 ROUNDING = 1e-14  # relative change of F that is not told apart from none

@@ -1,39 +1,28 @@
-"""Bounds on chi2 of information matrices for which the tangent at its minimum proves little.
+"""Smaller information matrices, whose chi2 is below that of the file and easier to bound.
 
-Such matrices are too far from isotropic.
-
-For smaller information matrices, I' <= I, the cost is below chi2 at all poses, so that a bound on
-it is one on chi2. Two things stand in the way of the tangent. Where the largest eigenvalue of I_rr
-is above the sum of the others, W is indefinite, and a reflection, which the relaxation cannot tell
+For I' <= I the cost is below chi2 at all poses, so that a bound on it is one on chi2. Two things
+stand in the way of the tangent at the minimum of chi2. Where the largest eigenvalue of I_rr is
+above the sum of the others, W is indefinite, and a reflection, which the relaxation cannot tell
 from a rotation, costs less than nothing: the largest eigenvalue of I'_rr is at most the second and
 half the smallest. And the tangent leaves of I_tt but its smallest eigenvalue: those of I'_tt are at
-most `cap` times that. The largest cap is sought with which the tangent at the minimum gives a bound
-without a shift.
+most `cap` times that. `solvers.riemannian.shrunk_bound` seeks the cap.
 """
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, prove_at
-from pgo_models.certificates.newton_polish import polish
-from pgo_models.errors import GraphError, NotPositiveDefiniteError
-from pgo_models.geometry.poses import Poses
+from pgo_models.errors import GraphError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import (
     LEAST_SCALED,
     are_definite,
-    filled,
     proper_information,
     uncoupled_share,
 )
-from pgo_models.problem.problem import PGOProblem
 
-BISECTIONS = 5
 _SHOWN = 2.0**-45  # smallest eigenvalue of a matrix with ones on its diagonal that is not rounding
 _HALVINGS = 60  # of a share that rounding makes too large: nothing is left of the matrix then
 # of the trace: above the rounding of a block, so that I' is below I all the same
@@ -75,55 +64,6 @@ def shrink_information(graph: PoseGraph, cap: float) -> PoseGraph:
             return shrunk.without_edges(is_singular) if is_singular.any() else shrunk
         share = np.where(is_below, share, 0.5 * share)  # was rounded
     raise GraphError("rounding hides that smaller information matrices are below the graph's own")
-
-
-@dataclass(frozen=True, eq=False)
-class ShrunkBound:
-    """A bound on chi2 by smaller information matrices, and where it was found."""
-
-    bound: LowerBound
-    poses: Poses  # the minimum of the smaller cost
-    Lambda: Array  # (n, d, d): the multipliers there
-
-
-def bound_by_shrinking(problem: PGOProblem, poses: Poses) -> ShrunkBound:
-    """Bound on chi2 with the largest cap that gives one, by bisection of its logarithm.
-
-    The search for the minima of the smaller costs begins at the poses given.
-    """
-    best = ShrunkBound(NO_BOUND, poses, np.zeros_like(poses.R))
-    I_tt = filled(proper_information(problem.graph)[:, : problem.d, : problem.d])
-    low = 0.0
-    high = math.log(1.0 + float(np.linalg.cond(I_tt).max()))
-    has_bound, best = _try_cap(problem, math.exp(low), best)
-    if not has_bound:
-        return best
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        has_bound, best = _try_cap(problem, math.exp(middle), best)
-        if has_bound:
-            low = middle
-        else:
-            high = middle
-    return best
-
-
-def _try_cap(problem: PGOProblem, cap: float, best: ShrunkBound) -> tuple[bool, ShrunkBound]:
-    """Whether a cap gives a bound without a shift, and the better one of it and the best so far."""
-    try:
-        smaller = PGOProblem(
-            shrink_information(problem.graph, cap), problem.backend, problem.weighting
-        )
-        minimum = polish(smaller, best.poses)
-    except (GraphError, NotPositiveDefiniteError):
-        return False, best
-    Lambda = multipliers(smaller, minimum)
-    bound = prove_at(smaller.tangent_at(minimum), Lambda, minimum)
-    if bound is None:
-        return False, best
-    if bound.value <= best.bound.value:
-        return True, best
-    return True, ShrunkBound(replace(bound, cap=cap), minimum, Lambda)
 
 
 def _clipped(block: Array, limit: Callable[[Array], Array]) -> Array:

@@ -18,15 +18,6 @@ from graphs import (
 )
 from hypothesis import given, strategies as st
 
-from pgo_models.certificates.newton_polish import (
-    _apply_inverse,
-    move_poses,
-    polish,
-    polish_step,
-    relative_decrement,
-    start_polish,
-)
-from pgo_models.certificates.newton_step import STATIONARY_DECREMENT
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, orthogonality_error, tangent_dimension
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -34,7 +25,15 @@ from pgo_models.problem.cholesky import CholeskyBackend, factorize
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from solvers.loop import run
+from solvers.riemannian.polish import (
+    _apply_inverse,
+    polish,
+    polish_step,
+    relative_decrement,
+    start_polish,
+)
 from solvers.soc.soc import SOC
 
 ROUNDING = 1e-14  # the relative change of F that polish does not tell apart from none
@@ -107,8 +106,7 @@ def test_the_decrement_predicts_what_is_left(seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)
     best = polish(problem, chordal_start(problem))
     rng = np.random.default_rng(seed)
-    near = move_poses(
-        best,
+    near = best.moved_along(
         1e-4 * rng.standard_normal((n, tangent_dimension(d))),
         1e-4 * rng.standard_normal((n, d)),
     )
@@ -146,8 +144,7 @@ def test_without_noise_nothing_is_left(seed: int, n: int, d: int) -> None:
     problem = PGOProblem(exact_graph(seed, n, d))
     near = chordal_start(problem)
     rng = np.random.default_rng(seed)
-    shaken = move_poses(
-        near,
+    shaken = near.moved_along(
         0.05 * rng.standard_normal((n, tangent_dimension(d))),
         0.05 * rng.standard_normal((n, d)),
     )
@@ -239,10 +236,10 @@ def test_retract_moves_along_the_exponential(seed: int, n: int, d: int) -> None:
     rng = np.random.default_rng(seed)
     w = rng.standard_normal((n, tangent_dimension(d)))
     v = rng.standard_normal((n, d))
-    there = move_poses(poses, w, v)
+    there = poses.moved_along(w, v)
     np.testing.assert_allclose(there.R, poses.R @ exp_map(w), rtol=0, atol=16 * EPS)
     np.testing.assert_array_equal(there.t, poses.t + v)
-    back = move_poses(there, -w, -v)
+    back = there.moved_along(-w, -v)
     np.testing.assert_allclose(back.R, poses.R, rtol=0, atol=32 * EPS)
 
 

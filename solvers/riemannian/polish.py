@@ -12,8 +12,21 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.newton_step import (
-    STATIONARY_DECREMENT,
+from pgo_models.certificates.rounding_errors import fits_to_rounding, rounding_level
+from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, vee
+from pgo_models.problem.cholesky import CholeskyFactor, SymbolicCholesky, analyze
+from pgo_models.problem.hessian import (
+    TangentLayout,
+    ground_pose,
+    riemannian_hessian,
+    tangent_order,
+)
+from pgo_models.problem.matrices import inner
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.stationarity import STATIONARY_DECREMENT
+from solvers.riemannian.newton_step import (
     ModelOrder,
     NewtonFigures,
     StepRules,
@@ -22,14 +35,6 @@ from pgo_models.certificates.newton_step import (
     newton_step,
     stationary_tolerance,
 )
-from pgo_models.certificates.rounding_errors import fits_to_rounding, rounding_level
-from pgo_models.errors import NotPositiveDefiniteError
-from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, exp_map, project_to_rotations, vee
-from pgo_models.problem.cholesky import CholeskyFactor, SymbolicCholesky, analyze
-from pgo_models.problem.hessian import TangentLayout, riemannian_hessian, tangent_order
-from pgo_models.problem.matrices import inner
-from pgo_models.problem.problem import PGOProblem
 
 NEARLY_STRAIGHT = 1e-7  # decrement below which the path of the best translations of chi2 is a line
 NEARLY_EXACT = 1e4  # times its rounding level: then F is what the solve for the translations leaves
@@ -119,7 +124,7 @@ class CentralAlgebra:
         """
         problem = self.problem
         w, v = self.layout.split(model.step)
-        poses = move_poses(model.poses, length * w, length * v)
+        poses = model.poses.moved_along(length * w, length * v)
         if problem.is_quadratic or decrement_of(model) > NEARLY_STRAIGHT:
             poses = problem.at_best_translations(poses)
         objective = problem.objective(poses)
@@ -221,7 +226,7 @@ def _fit_every_edge(problem: PGOProblem, poses: Poses, factor: CholeskyFactor) -
         if fits_to_rounding(problem, moved):
             return moved
         gradient = layout.join(*problem.riemannian_gradient(moved))
-        moved = move_poses(moved, *layout.split(-factor.solve(gradient)))
+        moved = moved.moved_along(*layout.split(-factor.solve(gradient)))
     return moved if fits_to_rounding(problem, moved) else poses
 
 
@@ -254,7 +259,7 @@ def polish(problem: PGOProblem, poses: Poses, max_steps: int = 100) -> Poses:
 
     Examples
     --------
-    >>> from pgo_models import chordal_start, grid
+    >>> from pgo_models import PGOProblem, chordal_start, grid
     >>> problem = PGOProblem(grid(np.random.default_rng(0)))
     >>> start = chordal_start(problem)
     >>> bool(problem.objective(polish(problem, start)) < problem.objective(start))
@@ -287,12 +292,6 @@ def relative_decrement(problem: PGOProblem, poses: Poses) -> float:
     return max(decrement, 2.0 * STATIONARY_DECREMENT)
 
 
-def move_poses(poses: Poses, w: Array, v: Array) -> Poses:
-    """Return the poses (R_i Exp(hat(w_i)), t_i + v_i), the rotations cleaned of rounding."""
-    R = project_to_rotations(poses.R @ exp_map(w))
-    return Poses(R, poses.t + v)
-
-
 def factorize_gauss_newton(problem: PGOProblem, poses: Poses) -> CholeskyFactor:
     """Factor the Gauss-Newton matrix, damped by as little as makes it positive definite.
 
@@ -301,20 +300,6 @@ def factorize_gauss_newton(problem: PGOProblem, poses: Poses) -> CholeskyFactor:
     state = start_polish(problem, poses)
     rules = StepRules(state.tolerance, second_order=False)
     return factorize_definite(CentralAlgebra(problem, state, has_secants=False), rules).factor
-
-
-def ground_pose(matrix: csc_array, problem: PGOProblem) -> None:
-    """Double the diagonal of pose 0, so that the matrix is not singular.
-
-    Rigid motions leave F as it is, so that at a stationary point the step keeps pose 0.
-    """
-    layout = TangentLayout(problem.num_poses, problem.d)
-    zero = np.zeros(1, dtype=np.int64)
-    for column in np.concatenate([layout.translations(zero)[0], layout.rotations(zero)[0]]):
-        begin = matrix.indptr[column]
-        end = matrix.indptr[column + 1]
-        position = begin + np.searchsorted(matrix.indices[begin:end], column)
-        matrix.data[position] += abs(matrix.data[position])
 
 
 def _apply_inverse(

@@ -1,0 +1,72 @@
+"""The best bound on chi2 that smaller information matrices give, sought by bisection.
+
+The matrices are those of `pgo_models.certificates.shrunk_information`, which keeps the condition of
+every I'_tt below a cap. A larger cap leaves more of the cost, but with it the tangent at the
+minimum may prove nothing without a shift.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, prove_at
+from pgo_models.certificates.shrunk_information import shrink_information
+from pgo_models.errors import GraphError, NotPositiveDefiniteError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.precisions import filled, proper_information
+from pgo_models.problem.problem import PGOProblem
+from solvers.riemannian.polish import polish
+
+BISECTIONS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class ShrunkBound:
+    """A bound on chi2 by smaller information matrices, and where it was found."""
+
+    bound: LowerBound
+    poses: Poses  # the minimum of the smaller cost
+    Lambda: Array  # (n, d, d): the multipliers there
+
+
+def bound_by_shrinking(problem: PGOProblem, poses: Poses) -> ShrunkBound:
+    """Bound on chi2 with the largest cap that gives one, by bisection of its logarithm.
+
+    The search for the minima of the smaller costs begins at the poses given.
+    """
+    best = ShrunkBound(NO_BOUND, poses, np.zeros_like(poses.R))
+    I_tt = filled(proper_information(problem.graph)[:, : problem.d, : problem.d])
+    low = 0.0
+    high = math.log(1.0 + float(np.linalg.cond(I_tt).max()))
+    has_bound, best = _try_cap(problem, math.exp(low), best)
+    if not has_bound:
+        return best
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        has_bound, best = _try_cap(problem, math.exp(middle), best)
+        if has_bound:
+            low = middle
+        else:
+            high = middle
+    return best
+
+
+def _try_cap(problem: PGOProblem, cap: float, best: ShrunkBound) -> tuple[bool, ShrunkBound]:
+    """Whether a cap gives a bound without a shift, and the better one of it and the best so far."""
+    try:
+        smaller = PGOProblem(
+            shrink_information(problem.graph, cap), problem.backend, problem.weighting
+        )
+        minimum = polish(smaller, best.poses)
+    except (GraphError, NotPositiveDefiniteError):
+        return False, best
+    Lambda = multipliers(smaller, minimum)
+    bound = prove_at(smaller.tangent_at(minimum), Lambda, minimum)
+    if bound is None:
+        return False, best
+    if bound.value <= best.bound.value:
+        return True, best
+    return True, ShrunkBound(replace(bound, cap=cap), minimum, Lambda)
