@@ -16,6 +16,9 @@ from solvers.convex.orthogonal import (
 from solvers.distributed.checkpoint import Checkpoint as Checkpoint
 from solvers.folder_solve import FolderSolution as FolderSolution, solve_folder as solve_folder
 from solvers.growing import extend as extend
+from solvers.handedness.ascent import HandednessAscent as HandednessAscent
+from solvers.handedness.barrier import HandednessBarrier as HandednessBarrier
+from solvers.handedness.search import HandednessSearch as HandednessSearch
 from solvers.loop import Method as Method, Solver as Solver, iterate as iterate, run as run
 from solvers.network.engine import (
     Engine as Engine,
@@ -118,7 +121,7 @@ __all__ += [
 ]
 __all__ += ["SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "PaperStop", "RStep"]
 __all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty"]
-__all__ += ["Newton", "Staircase", "gauss_newton", "polish"]
+__all__ += ["HandednessSearch", "Newton", "Staircase", "gauss_newton", "polish"]
 __all__ += ["GNC", "IRLS", "PCM", "RobustLoss", "pairwise_consistent"]
 __all__ += ["GaussSeidel", "LevenbergMarquardt"]
 __all__ += ["Checkpoint", "Faults", "InProcess", "Ledger", "RayEngine"]
@@ -132,6 +135,7 @@ __all__ += [
     "reproduce_tables",
 ]
 # Types in the signatures of the names above.
+__all__ += ["HandednessAscent", "HandednessBarrier"]
 __all__ += ["EdgeFit", "Outcome", "Rejection", "Support"]
 __all__ += ["CustomRStep", "RSubproblem", "RotationStep"]
 __all__ += ["OrthogonalSolution", "Sweep"]

@@ -89,7 +89,7 @@ def solve_extended(
         poses=answer.current_poses,
         objective=certificate.objective,
         certificate=certificate,
-        status=job.stages[-1].status,
+        status=job.status,
         stages=tuple(job.stages),
         seconds=time.perf_counter() - monitor.began,
         note="; ".join(note for note in notes if note),

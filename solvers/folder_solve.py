@@ -330,7 +330,7 @@ class _FolderJob:
         assert best is not None
         driver = self.shared.driver
         driver.network.ask(return_to_answer, [None] * len(best.robots), Count.PIGGYBACKED)
-        driver.at = best.cover
+        driver.current = best.cover
         planned: list[PlannedStage] = [
             ClimbByRobots(self.shared, staircase),
             NewtonByRobots(self.shared, newton),
@@ -348,10 +348,12 @@ class _FolderJob:
         if answer.dual_bound is not None and answer.dual_bound.lower_bound > bound.value:
             bound = answer.dual_bound.bound
             source = BoundSource.RELAXATION
-        if best is None or driver.at.objective < best.objective:
+        if best is None or driver.current.objective < best.objective:
             robots = driver.network.ask(keep_answer, driver.poses_of_cover(), Count.ROUND)
             rounding = _sum_of_roundings([robot.rounding for robot in robots])
-            best = _Best(driver.at.objective, answer.decrement, rounding, robots, driver.at)
+            best = _Best(
+                driver.current.objective, answer.decrement, rounding, robots, driver.current
+            )
         self.best = replace(best, bound=bound, source=source)
 
 

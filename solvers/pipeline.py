@@ -38,6 +38,7 @@ from solvers.distributed.stages import (
     StartByRobots,
     open_driver,
 )
+from solvers.handedness.search import HandednessSearch
 from solvers.loop import RunMonitor
 from solvers.network.engine import Engine, InProcess
 from solvers.network.faults import Faults
@@ -64,6 +65,7 @@ from solvers.stages import (
     RunSOC,
     RunStaircase,
     SecondAttempt,
+    SeekHandednessTerms,
     run_stages,
 )
 
@@ -94,7 +96,10 @@ class Pipeline:
     second_try : bool
         Whether a second attempt is made where the certificate of the first is wider than `gap`.
     staircase : Staircase or None
-        The last stage, where the certificate is still wider; None leaves it out.
+        The next stage, where the certificate is still wider; None leaves it out.
+    handedness : HandednessSearch or None
+        The last stage, where the relaxation is not tight, of solves in one place; None leaves it
+        out.
     faults : Faults, optional
         What goes wrong between the robots of a CONSENSUS stage, which then does not wait
         (`solvers.distributed.asynchronous`).
@@ -122,6 +127,7 @@ class Pipeline:
     gap: float = DEFAULT_GAP
     second_try: bool = True
     staircase: Staircase | None = field(default_factory=Staircase)
+    handedness: HandednessSearch | None = field(default_factory=HandednessSearch)
     faults: Faults | None = None
     driver_memory: float = DEFAULT_MEMORY
 
@@ -178,7 +184,8 @@ def solve(
     4. the dual certificate at the result: a proven lower bound on the cost of all poses;
     5. where the certificate is wider than asked for, a second attempt from the start on;
     6. where it is still wider, the Riemannian staircase, whose optimum is the best bound that the
-       semidefinite relaxation has.
+       semidefinite relaxation has;
+    7. where that is not tight, in space, handedness terms: what tells rotations from reflections.
 
     In one place, SOC with its default settings is left out where Newton alone is faster: in the
     plane, where the start is averaged; on small graphs; and for chi2 that is not quadratic and
@@ -430,7 +437,9 @@ def _solve_without_wrong_edges(request: _Request, robust: GNC | PCM) -> Solution
     newton = pipeline.newton
     if isinstance(robust, GNC):
         newton = replace(newton, max_iterations=LAST_STEPS)
-    newton_alone = replace(pipeline, soc=None, newton=newton, second_try=False, staircase=None)
+    newton_alone = replace(
+        pipeline, soc=None, newton=newton, second_try=False, staircase=None, handedness=None
+    )
     solve_once = partial(request.solve_once(), pipeline=newton_alone)
     estimate: Callable[..., SharedEstimate] | None = None
     if request.robots is not None:
@@ -479,6 +488,7 @@ def _solve_by_robots(request: _Request, robots: Partition | int) -> Solution:
     pipeline = request.pipeline
     problem = request.problem
     monitor = request.monitor
+    pipeline = replace(pipeline, handedness=None)
     if not pipeline.has_driver:
         pipeline = replace(pipeline, second_try=False, staircase=None)
     partition = robots_of_solve(pipeline.soc, robots, problem.graph)
@@ -576,6 +586,8 @@ def _plan_improvements(
         planned.append(SecondAttempt(job, plan, pipeline.soc))
     if pipeline.staircase is not None:
         planned.append(ImproveBound(job, climb))
+    if pipeline.handedness is not None:
+        planned.append(SeekHandednessTerms(job, pipeline.handedness))
     return planned
 
 
@@ -651,7 +663,7 @@ def _solution(
         poses=poses,
         objective=certificate.objective,
         certificate=certificate,
-        status=job.stages[-1].status,
+        status=job.status,
         stages=tuple(job.stages),
         seconds=time.perf_counter() - request.monitor.began,
         ledger=ledger,

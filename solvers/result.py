@@ -228,6 +228,9 @@ class Stage:
         Figures of all iterates; empty for a start.
     method : object
         The method that ran, which is its settings; None for a start.
+    finds_poses : bool
+        False for a search for a better bound, which leaves the poses as they are: how it ended says
+        nothing of them.
     """
 
     name: str
@@ -237,6 +240,7 @@ class Stage:
     seconds: float
     history: History
     method: object = None
+    finds_poses: bool = True
 
     @classmethod
     def of(cls, run: Run[S]) -> "Stage":

@@ -21,12 +21,14 @@ from pgo_models.certificates.certificate import (
     certify_at,
     certify_with,
     judge,
+    with_terms,
 )
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
+from solvers.handedness.search import HandednessSearch
 from solvers.loop import RunMonitor
 from solvers.result import OUT_OF_TIME, History, Record, Run, Stage, Status
 from solvers.riemannian.certify import with_shrunk_information
@@ -99,6 +101,15 @@ class Job:
     gap: float
     monitor: RunMonitor
     stages: list[Stage] = field(default_factory=list)
+
+    @property
+    def status(self) -> Status:
+        """How the solve ended: as the last stage, but for searches for a bound that had time."""
+        return next(
+            stage.status
+            for stage in reversed(self.stages)
+            if stage.finds_poses or stage.status in OUT_OF_TIME
+        )
 
     @property
     def is_out_of_time(self) -> bool:
@@ -364,6 +375,39 @@ class ImproveBound:
         )
         highest = max(certificate, relaxed, key=lambda known: known.lower_bound)
         return replace(answer, certificate=highest)
+
+
+@dataclass(frozen=True, eq=False)
+class SeekHandednessTerms:
+    """Handedness terms at the best poses, where the certificate can still improve in space."""
+
+    job: Job
+    search: HandednessSearch
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return "handedness terms"
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the same poses, with the better bound."""
+        job = self.job
+        problem = job.problem
+        certificate = answer.current_certificate
+        if problem.d == 2 or job.is_out_of_time or not certificate.can_improve:
+            return answer
+        poses = problem.at_best_translations(answer.current_poses)
+        try:
+            terms, stages = self.search.run(problem, poses, job.monitor)
+        except KeyboardInterrupt:
+            objective = problem.objective(answer.current_poses)
+            job.stages.append(Stage.interruption(objective))
+            return answer
+        except NotPositiveDefiniteError:
+            return answer
+        job.stages.extend(stages)
+        judged = judge(problem, answer.current_poses, certificate)
+        return replace(answer, certificate=with_terms(problem, judged, terms, poses))
 
 
 def finer(soc: AnySOC) -> AnySOC:

@@ -180,6 +180,14 @@ def best_known(problem: PGOProblem, seed: int = 0) -> float:
     return min(rounded_up(problem, polish(problem, start)) for start in starts)
 
 
+def restarts(problem: PGOProblem, count: int, seed: int) -> float:
+    """Lowest F that polishing from random rotations finds."""
+    starts = (random_poses(problem.num_poses, problem.d, seed + k) for k in range(count))
+    return min(
+        problem.objective(polish(problem, problem.with_best_translations(s.R))) for s in starts
+    )
+
+
 def rounded_up(problem: PGOProblem, poses: Poses) -> float:
     """F of poses, and what it can be off by."""
     return problem.objective(poses) + objective_rounding(problem, poses).error

@@ -104,7 +104,7 @@ def driver_at(
     """Driver and robots, in this process, at poses, or at their own chordal start."""
     driver = open_driver(problem, parts, engine if engine is not None else InProcess())
     if poses is None:
-        driver.start()
+        driver.go_to_chordal_start()
     else:
         driver.set_poses(poses)
     return driver

@@ -154,7 +154,7 @@ ROOMS_OF_AN_ITERATION = (
     "solvers.soc.subgraph",
 )
 # Fields that `__init__` sets, which a class does not show, and which the examples below them read.
-SET_AT_WORK = {"Driver.block", "Driver.right", "Agent.interior", "Agent.copies"}
+SET_AT_WORK = {"Driver.block", "Driver.right_hand_sides", "Agent.interior", "Agent.copies"}
 DATA_SETS = {"robots"}
 
 

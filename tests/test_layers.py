@@ -38,6 +38,7 @@ ORDER = {
         "riemannian",
         "robust",
         "loop",
+        "handedness",
         "convex",
         "baselines",
         "stages",

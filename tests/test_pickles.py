@@ -86,6 +86,12 @@ def comparison() -> solvers.Comparison:
     return solvers.compare_methods(pgo.PGOProblem(GRAPH))
 
 
+def handedness_terms() -> object:
+    graph = pgo.circle(np.random.default_rng(0))
+    P = np.tile(np.eye(3), (graph.num_edges, 1, 1))
+    return pgo.HandednessTerms.at(graph.truth, graph.i, graph.j, P)
+
+
 def subproblem() -> solvers.RSubproblem:
     """Subproblem that a back end of the user is given."""
     given = []
@@ -153,6 +159,7 @@ MADE: dict[str, Make] = {
     "Rejection": lambda: solvers.solve(GRAPH, robust=solvers.GNC()).robust,
     "EdgeFit": lambda: judge_edges(solved().problem, solved().poses),
     "RSubproblem": subproblem,
+    "HandednessTerms": handedness_terms,
     "Traffic": lambda: solvers.Traffic(np.array([0]), np.array([1]), np.array([8])),
     "ErrorForgetting": lambda: solvers.ErrorForgetting(np.ones(3), np.ones(3), np.ones(3), 1),
     "NoiseSweep": lambda: solvers.noise_sweep(
@@ -181,6 +188,9 @@ SETTINGS = (
 SETTINGS += (
     "Newton",
     "Staircase",
+    "HandednessAscent",
+    "HandednessBarrier",
+    "HandednessSearch",
     "GNC",
     "IRLS",
     "PCM",

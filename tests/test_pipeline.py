@@ -370,7 +370,7 @@ def test_where_rounding_alone_is_in_the_way_no_other_poses_are_looked_for(monkey
     """As on planes of 360,000 poses: S_r has a factor, whose rounding may be more than what it is
     definite by.
     """
-    monkeypatch.setattr(definiteness, "MARGIN", 1e16)
+    monkeypatch.setattr(definiteness, "ROUNDING_MULTIPLE", 1e16)
     solution = solvers.solve(pgo.grid(np.random.default_rng(0)))
     assert [stage.name for stage in solution.stages] == ["chordal start", "Newton"]
     certificate = solution.certificate

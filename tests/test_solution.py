@@ -99,7 +99,7 @@ def test_the_uncertified_solution_of_an_impossible_graph_saves_too(tmp_path):
     from pgo_models.graphs.scenes import NoiseModel
 
     graph = pgo.random_geometric(12, np.random.default_rng(5), noise=NoiseModel(1.0, 2.5))
-    solution = solvers.solve(graph)
+    solution = solvers.solve(graph, solvers.Pipeline(handedness=None))  # they would certify it
     assert not solution.is_certified
     solution.save(tmp_path / "solution.json")
     record = json.loads((tmp_path / "solution.json").read_text())

@@ -12,7 +12,13 @@ import math
 from dataclasses import dataclass, replace
 
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, best_bound
+from pgo_models.certificates.handedness import HandednessTerms, closed_form_terms
+from pgo_models.certificates.lower_bound import (
+    NO_BOUND,
+    LowerBound,
+    best_bound,
+    best_bound_with_terms,
+)
 from pgo_models.certificates.rounding_errors import (
     ObjectiveRounding,
     objective_rounding,
@@ -258,7 +264,14 @@ class Certificate(ReadOnly):
         form = "grounded at a pose" if self.bound.is_grounded else "with a shift"
         shift = f", eta = {rounded_up(self.eta, 3)}" if self.eta > 0 else ""
         cap = f", conditions cut to {self.bound.cap:.3g}" if self.bound.cap < math.inf else ""
-        return f"proved {form}{shift}{cap}, less {rounded_up(self.bound.rounding, 2)} for rounding"
+        rounding = rounded_up(self.bound.rounding, 2)
+        return f"proved {form}{shift}{cap}{self._terms_text}, less {rounding} for rounding"
+
+    @property
+    def _terms_text(self) -> str:
+        """What the proof says of handedness terms, if it has any."""
+        terms = self.bound.terms
+        return "" if terms is None else f", with handedness terms of {terms.num_pairs} pairs"
 
 
 def certify_at(
@@ -303,7 +316,7 @@ def certify_at(
     """
     check_poses(problem.graph, poses)
     best = poses if stationarity <= STATIONARY_DECREMENT else problem.at_best_translations(poses)
-    return certify_with(
+    certificate = certify_with(
         problem,
         poses,
         multipliers(problem, best),
@@ -311,6 +324,29 @@ def certify_at(
         stationarity,
         BoundSource.GIVEN,
         ground=best,
+    )
+    if problem.d == 2 or not certificate.can_improve:
+        return certificate
+    terms = closed_form_terms(problem.tangent_at(best), best)
+    return certificate if terms is None else with_terms(problem, certificate, terms, best)
+
+
+def with_terms(
+    problem: PGOProblem, certificate: Certificate, terms: HandednessTerms, ground: Poses
+) -> Certificate:
+    """The certificate, or a better one by handedness terms that vanish at the poses `ground`.
+
+    These are the poses of the certificate with their best translations.
+    """
+    Lambda = multipliers(problem, ground)
+    gap = certificate.wanted_gap
+    tangent = problem.tangent_at(ground)
+    bound = best_bound_with_terms(tangent, Lambda, ground, gap, certificate.objective, terms)
+    if bound.value <= certificate.lower_bound:
+        return certificate
+    stationarity = certificate.stationarity
+    return certify_with(
+        problem, certificate.poses, Lambda, gap, stationarity, BoundSource.GIVEN, bound
     )
 
 

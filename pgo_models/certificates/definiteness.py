@@ -1,11 +1,12 @@
 """A proof in exact arithmetic that the certificate matrix, without some rows, is definite.
 
-S without the rows of one translation, or of one whole pose, is stored and factored in double
-precision with a share `shift` of its diagonal subtracted. When that factorisation goes through, R^T
-R of the computed factor is positive definite, and what it differs by from the exact S, the rounding
-of the entries (`matrix_error`) and of the factorisation (`CholeskyFactor.backward_error`), is at
-most `error` times the diagonal. So S - (shift - error) diag is positive definite (Rump 2006,
-*Verification of positive definiteness*; Jansson, Chaykin & Keil 2007, VSDP).
+S without the rows and columns of one translation, or of one whole pose, is stored in double
+precision. A share of its diagonal, the margin, is subtracted, and the rest is factored. When that
+factorisation goes through, R^T R of the computed factor is positive definite. It differs from the
+exact S - margin diag by the rounding of the entries (`matrix_errors`) and of the factorisation
+(`CholeskyFactor.backward_error`), together at most `error` times the diagonal. So S - (margin -
+error) diag is positive definite (Rump 2006, *Verification of positive definiteness*; Jansson,
+Chaykin & Keil 2007, VSDP). The word shift is for eta, which is added to the rows of rotations.
 """
 
 import math
@@ -28,11 +29,15 @@ from pgo_models.problem.problem import PGOProblem
 
 T = TypeVar("T")
 
-FIRST_SHIFT = 1e-9  # of the diagonal; what is not needed for rounding makes the bound sharper
-SHRINK = 1.0 / 32.0
+# Shares of the diagonal: the first margin, and the least one, which is below the rounding of any
+# matrix with a few non-zeros in a row. A margin that rounding does not need sharpens the bound.
+FIRST_MARGIN = 1e-9
+LEAST_MARGIN = 1e-15
+SHRINK = 1.0 / 32.0  # of a margin that was too large
 ROOM = 1.0 / 8.0  # share of the softest energy that may be subtracted at once
-LEAST_SHIFT = 1e-15  # below the rounding of any matrix with a few non-zeros in a row
-MARGIN = 2.125  # twice the rounding, and what the estimate of it may be off by
+# A margin is at least this multiple of the rounding that is expected: twice the rounding, and what
+# the estimate of it may be off by.
+ROUNDING_MULTIPLE = 2.125
 ETA_GROWTH = 10.0
 ETA_BISECTIONS = 3
 _CG_TOLERANCE = 1e-4
@@ -48,11 +53,11 @@ class DefiniteProof:
 
     # the matrix in double precision, (N, N); only its diagonal in the rows left out
     stored: csc_array
-    factor: CholeskyFactor  # of `stored` with the shift subtracted
+    factor: CholeskyFactor  # of `stored` with the margin subtracted
     diagonal: Array  # that it is a share of, (N,); 0 in the rows left out
-    shift: Array  # share that is subtracted, (N,)
+    margin: Array  # share that is subtracted, (N,)
     entries: Array  # share that the rounding of the entries takes, (N,)
-    # whether a larger shift failed: the factor may be far from one of the matrix without a shift
+    # whether a larger margin failed: the factor may be far from one of the matrix without a margin
     is_marginal: bool
     # share that the rounding of the factorisation takes, where the factor need not be asked
     error: Array | None = None
@@ -63,17 +68,19 @@ class DefiniteProof:
         return np.asarray(self.diagonal > 0.0)
 
     def slack(self) -> Array | None:
-        """Diagonal that the exact matrix is at least, (N,), positive in free rows.
+        """Diagonal that can be subtracted from the exact matrix, (N,), positive in free rows.
 
-        It is None if rounding takes over half of the shift.
+        The exact matrix less diag(slack) is positive semidefinite in the free rows. It is None if
+        rounding takes over half of the margin.
 
-        The stored matrix without the shift is at least (shift - factor's error) diag, and the exact
-        one differs from it by at most entries diag. The factor may be taken apart for it, so that
-        solving first is cheaper.
+        The stored matrix is at least (margin - factor's error) diag, and the exact one differs from
+        it by at most entries diag. The factor may be taken apart for it, so that solving first is
+        cheaper.
         """
         error = OUTWARD * (self.entries + self.factor_error())
-        if (2.0 * error <= self.shift).all():
-            return (self.shift - error) / OUTWARD * self.diagonal
+        if (2.0 * error <= self.margin).all():
+            share_left = (self.margin - error) / OUTWARD
+            return share_left * self.diagonal
         return None
 
     def factor_error(self) -> Array:
@@ -83,11 +90,12 @@ class DefiniteProof:
     def solve(self, product: Array) -> Array:
         """About S^-1 product, (N, d), in the rows that are not left out, and zero in those.
 
-        By the factor, or where that is marginal by conjugate gradients with the factor as
-        preconditioner.
+        It is a solve with the factor. Where that is marginal, conjugate gradients on the matrix
+        without the margin follow, with the factor as preconditioner.
         """
         free = self.free
-        step = self.factor.solve(np.where(free[:, None], product, 0.0))
+        right_hand_side = np.where(free[:, None], product, 0.0)
+        step = self.factor.solve(right_hand_side)
         if self.is_marginal:
             inverse = LinearOperator(self.stored.shape, matvec=self.factor.solve, dtype=float)
             for column in range(step.shape[1]):
@@ -105,19 +113,20 @@ def prove_definite(
     Lambda: Array,
     eta: float,
     fixed: IntArray,
-    first_shift: float = FIRST_SHIFT,
+    first_margin: float = FIRST_MARGIN,
     turned: Array | None = None,
     factor_error: Array | None = None,
 ) -> DefiniteProof | None:
     """Proof that S + eta blockdiag(0, I) is definite without the rows `fixed`, or None.
 
-    The share `first_shift` of the diagonal is subtracted first; less where the matrix is not
+    The share `first_margin` of the diagonal is subtracted first; less where the matrix is not
     definite with it, more where rounding needs more. `turned`, (N, d), are moves that leave F
-    almost as it is, as a turn of all poses but those left out, which S then holds but weakly: what
-    is subtracted takes but little of their energy. Where that is enough for rounding whatever the
-    factor's non-zeros are, or as many as they can be, they are not counted. `factor_error`, (N,),
-    is the share that the rounding of the factorisation takes, as of `DefiniteProof.factor_error`,
-    where it is known from another factor of the same pattern.
+    almost as it is, as a turn of all poses but those left out. S holds them only weakly: their
+    energy is small, and the margin has to take little of it. A bound on the rounding of the
+    factorisation may be known for any number of non-zeros in the factor, or for the most that there
+    can be; where the margin for that takes little enough, the non-zeros are not counted.
+    `factor_error`, (N,), is the share that the rounding of the factorisation takes, as of
+    `DefiniteProof.factor_error`, where it is known from another factor of the same pattern.
     """
     shifts = np.zeros(problem.side)
     shifts[problem.num_poses :] = eta
@@ -126,36 +135,73 @@ def prove_definite(
         return None
     problem.leave_out(stored.data, fixed, 2.0 * diagonal[fixed])
 
-    def attempt(shift: Array) -> CholeskyFactor | None:
+    def attempt(margin: Array) -> CholeskyFactor | None:
         data = stored.data.copy()
-        data[problem.diagonal_positions] -= shift * diagonal
+        data[problem.diagonal_positions] -= margin * diagonal
         return _factor(problem, problem.with_pattern_of_M(data))
 
-    free = diagonal.copy()
-    free[fixed] = 0.0
+    free_diagonal = diagonal.copy()
+    free_diagonal[fixed] = 0.0
     entries = matrix_errors(problem, diagonal)
-    analysis = problem.analysis
-    expected = factor_error if factor_error is not None else analysis.expected_error()
+    expected = factor_error
+    if expected is None:
+        expected = problem.analysis.expected_error()
     if turned is not None:
-        energies, weights = _softness(stored, free, turned)
-        # A uniform share takes share * weights of the energies: little of the softest one.
-        softest = float(np.min(SHRINK * energies / weights.sum(axis=0)))
-        first_shift = min(first_shift, max(softest, LEAST_SHIFT))
-    if turned is not None and expected is None:
-        for bound_error in (analysis.crude_error, analysis.error_before):
-            error = bound_error()
-            shift = np.maximum(first_shift, MARGIN * (entries + error))
-            is_small = np.isfinite(shift).all() and (shift @ weights <= ROOM * energies).all()
-            factor = attempt(shift) if is_small else None
-            if factor is not None:
-                return DefiniteProof(stored, factor, free, shift, entries, False, error)
+        softness = _softness(stored, free_diagonal, turned)
+        # A uniform margin takes margin * sum(weights) of each energy: little of the softest one.
+        weight_sums = softness.weights.sum(axis=0)
+        softest = float(np.min(SHRINK * softness.energies / weight_sums))
+        first_margin = min(first_margin, max(softest, LEAST_MARGIN))
+        if expected is None:
+            uncounted = _factor_without_counts(problem, attempt, entries, first_margin, softness)
+            if uncounted is not None:
+                factor, margin, error = uncounted
+                return DefiniteProof(stored, factor, free_diagonal, margin, entries, False, error)
     if expected is None:
         expected = np.zeros_like(entries)
-    chosen = search_shift(attempt, entries, expected, first_shift)
+    chosen = search_margin(attempt, entries, expected, first_margin)
     if chosen is None:
         return None
-    factor, shift, is_marginal = chosen
-    return DefiniteProof(stored, factor, free, shift, entries, is_marginal)
+    factor, margin, is_marginal = chosen
+    return DefiniteProof(stored, factor, free_diagonal, margin, entries, is_marginal)
+
+
+@dataclass(frozen=True, eq=False)
+class _Softness:
+    """How weakly a matrix S holds moves v, one a column: rows left out count as zero."""
+
+    energies: Array  # (d,): v^T S v
+    weights: Array  # (N, d): margin @ weights is what a margin, (N,), takes of the energies
+
+
+def _softness(stored: csc_array, free_diagonal: Array, moves: Array) -> _Softness:
+    moves = np.where(free_diagonal[:, None] > 0.0, moves, 0.0)
+    energies = np.einsum("rc,rc->c", moves, stored @ moves)
+    weights = free_diagonal[:, None] * moves**2
+    return _Softness(energies, weights)
+
+
+def _factor_without_counts(
+    problem: PGOProblem,
+    attempt: Callable[[Array], CholeskyFactor | None],
+    entries: Array,
+    first_margin: float,
+    softness: _Softness,
+) -> tuple[CholeskyFactor, Array, Array] | None:
+    """Factor, margin and bound on the factor's rounding that holds before non-zeros are counted.
+
+    None where the margin for such a bound takes too much of the softest energy, or does not factor.
+    """
+    analysis = problem.analysis
+    room = ROOM * softness.energies
+    for bound_error in (analysis.crude_error, analysis.error_before):
+        error = bound_error()
+        margin = np.maximum(first_margin, ROUNDING_MULTIPLE * (entries + error))
+        is_small = np.isfinite(margin).all() and (margin @ softness.weights <= room).all()
+        factor = attempt(margin) if is_small else None
+        if factor is not None:
+            return factor, margin, error
+    return None
 
 
 def is_in_range(entries: Array, diagonal: Array) -> bool:
@@ -165,7 +211,8 @@ def is_in_range(entries: Array, diagonal: Array) -> bool:
     is nan.
     """
     is_diagonal_in_range = diagonal.min() >= _SMALLEST and diagonal.max() <= _LARGEST
-    return bool(is_diagonal_in_range and entries.min() >= -_LARGEST and entries.max() <= _LARGEST)
+    are_entries_in_range = entries.min() >= -_LARGEST and entries.max() <= _LARGEST
+    return bool(is_diagonal_in_range and are_entries_in_range)
 
 
 def is_definite_in_doubles(problem: PGOProblem, Lambda: Array, fixed: IntArray) -> bool:
@@ -190,55 +237,47 @@ def shifted_certificate(
 ) -> tuple[csc_array, Array]:
     """S + diag(shifts) in double precision, (N, N), and a diagonal to measure rounding by.
 
-    The diagonal, (N,), is no smaller than any that the rounding of an entry comes from.
-
-    M - Lambda was rounded before the shifts were added, and can be as large.
+    The diagonal, (N,), is no smaller than any that the rounding of an entry comes from: M - Lambda
+    was rounded before the shifts were added, and its diagonal can be larger than the stored one.
     """
+    positions = problem.diagonal_positions
     S = certificate_matrix(problem, Lambda)
-    S.data[problem.diagonal_positions] += shifts
-    stored = S.data[problem.diagonal_positions]
-    return S, np.maximum(problem.M.data[problem.diagonal_positions], stored) + shifts
+    S.data[positions] += shifts
+    stored = S.data[positions]
+    diagonal = np.maximum(problem.M.data[positions], stored) + shifts
+    return S, diagonal
 
 
-def _softness(stored: csc_array, free: Array, moves: Array) -> tuple[Array, Array]:
-    """Energies of the moves, (d,), and what a share of the diagonal takes of each, (N, d).
-
-    Both count no row that is left out.
-    """
-    moves = np.where(free[:, None] > 0.0, moves, 0.0)
-    return np.einsum("rc,rc->c", moves, stored @ moves), free[:, None] * moves**2
-
-
-def search_shift(
+def search_margin(
     attempt: Callable[[Array], CholeskyFactor | None],
     entries: Array,
     expected: Array,
-    first_shift: float,
+    first_margin: float,
 ) -> tuple[CholeskyFactor, Array, bool] | None:
-    """First factor found that leaves at least half of its shift over, or None.
+    """First factor found for which rounding takes at most half of the margin, or None.
 
-    Returned with it are the shift, (N,), and whether a larger one failed.
+    Returned with it are the margin, (N,), and whether a larger one failed.
 
-    A factor with the first shift whose error is not known before it is taken apart
+    A factor with the first margin whose error is not known before it is taken apart
     (`CholeskyFactor.known_error`) is returned as it is. `attempt` factors with shares, (N,), of the
     diagonal subtracted, or gives None when that does not go through; `entries` and `expected`,
     (N,), are the shares that rounding the entries takes, and factoring may take.
     """
-    uniform = first_shift
+    uniform = first_margin
     is_marginal = False
-    while uniform >= LEAST_SHIFT:
-        shift = np.maximum(uniform, MARGIN * (entries + expected))
-        factor = attempt(shift)
+    while uniform >= LEAST_MARGIN:
+        margin = np.maximum(uniform, ROUNDING_MULTIPLE * (entries + expected))
+        factor = attempt(margin)
         if factor is None:
             uniform = SHRINK * uniform
             is_marginal = True
             continue
         known = factor.backward_error() if is_marginal else factor.known_error()
         if known is None:
-            return factor, shift, is_marginal
+            return factor, margin, is_marginal
         error = OUTWARD * (entries + known)
-        if (2.0 * error <= shift).all():
-            return factor, shift, is_marginal
+        if (2.0 * error <= margin).all():
+            return factor, margin, is_marginal
         expected = np.maximum(expected, error)
     return None
 
@@ -253,9 +292,10 @@ def smallest_eta(
 
     The result is None when no such eta is `below` the limit.
 
-    It grows from the eta given, and the last step is bisected: to within a third of the smallest
-    that would do. An eta of zero cannot grow, so that nothing but zero is tried. `too_small` is an
-    eta below the first for which there is known to be none.
+    Eta grows from the one given by factors of ten until it is large enough. The last step is then
+    bisected, to within a third of the smallest eta that would do. An eta of zero cannot grow, so
+    that nothing but zero is tried. `too_small` is an eta below the first for which there is known
+    to be none.
     """
     proof = None
     while proof is None:

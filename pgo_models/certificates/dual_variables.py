@@ -37,13 +37,17 @@ def multipliers(problem: PGOProblem, poses: Poses) -> Array:
     """
     n = problem.num_poses
     d = problem.d
-    product = problem.apply_M_at(poses)[n:].reshape(n, d, -1) @ poses.R
-    return 0.5 * (product + np.swapaxes(product, 1, 2))
+    half_gradient = problem.apply_M_at(poses)
+    rotation_blocks = half_gradient[n:].reshape(n, d, -1)
+    product = rotation_blocks @ poses.R
+    transposed = np.swapaxes(product, 1, 2)
+    return 0.5 * (product + transposed)
 
 
 def check_multipliers(problem: PGOProblem, Lambda: Array) -> None:
     """Raise a SettingError unless there is one block for every pose, (n, d, d)."""
-    shape = (problem.num_poses, problem.d, problem.d)
+    d = problem.d
+    shape = (problem.num_poses, d, d)
     if Lambda.shape != shape:
         raise SettingError(
             f"Lambda has shape {Lambda.shape}; give one block for every pose, {shape}"
@@ -52,7 +56,9 @@ def check_multipliers(problem: PGOProblem, Lambda: Array) -> None:
 
 def multiplier_norms(Lambda: Array) -> Array:
     """||Lambda_i||_2, (n,), of symmetric (n, d, d)."""
-    return np.asarray(np.abs(np.linalg.eigvalsh(Lambda)).max(axis=1, initial=0.0))
+    eigenvalues = np.linalg.eigvalsh(Lambda)
+    sizes = np.abs(eigenvalues)
+    return np.asarray(sizes.max(axis=1, initial=0.0))
 
 
 def certificate_matrix(problem: PGOProblem, Lambda: Array, eta: float = 0.0) -> csc_array:
@@ -86,9 +92,10 @@ def certificate_matrix(problem: PGOProblem, Lambda: Array, eta: float = 0.0) -> 
     True
     """
     check_multipliers(problem, Lambda)
+    rotation_rows = slice(problem.num_poses, None)
     data = problem.M.data.copy()
     data[problem.block_positions] -= Lambda
-    data[problem.diagonal_positions[problem.num_poses :]] += eta
+    data[problem.diagonal_positions[rotation_rows]] += eta
     return problem.with_pattern_of_M(data)
 
 
@@ -102,5 +109,6 @@ def factorize_certificate(problem: PGOProblem, Lambda: Array, eta: float) -> Cho
     it has a negative eigenvalue, or a zero one beside that of the common shift.
     """
     shifted = certificate_matrix(problem, Lambda, eta)
-    shifted.data[problem.diagonal_positions[0]] *= 2.0
+    position_of_t_0 = problem.diagonal_positions[0]
+    shifted.data[position_of_t_0] *= 2.0
     return problem.analysis.factorize(shifted)

@@ -1,36 +1,55 @@
-"""Lower bounds on F that hold in exact arithmetic, from any multipliers.
+"""Lower bounds on F that hold in exact arithmetic, from any multipliers Lambda.
 
-They are grounded at a pose, or use a shift eta.
+**Notation.** A graph has n poses in dimension d. X, (N, d) with N = (d + 1) n, stacks the rows
+t_i^T of all poses and then the blocks R_i^T. It is feasible if every R_i is a rotation. What is
+bounded is a quadratic cost F(X) = tr(X^T M X) + constant; the constant is zero but for a tangent of
+chi2 (below). A common shift of all translations changes neither M X nor F. Lambda consists of
+symmetric blocks Lambda_i, (d, d), and S = M - blockdiag(0, Lambda). As R_i R_i^T = I, every
+feasible X has
 
-For feasible X, tr(X^T M X) = tr(X^T S X) + tr(Lambda) with S = M - blockdiag(0, Lambda) and any
-symmetric Lambda_i.
+    F(X) = tr(X^T S X) + tr(Lambda) + constant.
 
-**Grounded at pose r.** Take any X' with X'_r = (0, I), feasible elsewhere or not, and G = S X'.
-Move a feasible X so that its pose r is at the origin, which leaves S X as it is; then X_r = X'_r Q
-for an orthogonal Q, and Z = X - X' Q vanishes at r. Here X_r are the rows of pose r, while S_r and
-G_r are S and G without the rows (and columns) of pose r. With S_r positive definite,
+**Grounded at pose r.** Let X' be any matrix whose rows of pose r are (0, I), feasible elsewhere or
+not, and G = S X'. An index r on S, G and Z means that pose r is left out: S_r is S without the rows
+and columns of pose r, G_r is G without its rows. Shift a feasible X so that its pose r is at the
+origin; that leaves S X and F as they are. With the rotation Q = R_r^T, X and X' Q have the same
+rows of pose r, so that Z = X - X' Q vanishes there. As Q Q^T = I,
 
-    tr(X^T S X) = tr(X'^T S X') + 2 tr((G Q)^T Z) + tr(Z^T S_r Z) >= tr(X'^T S X') - tr(G_r^T S_r^-1
-    G_r).
+    tr(X^T S X) = tr(X'^T S X') + 2 tr((G_r Q)^T Z_r) + tr(Z_r^T S_r Z_r).
 
-X' begins at the poses and is moved by -S_r^-1 G_r, at most MOST_MOVES times
-(`move_until_settled`); after that G_r is little more than rounding. What is then subtracted, all of
-it bounded: the rounding of tr(X'^T S X') + tr(Lambda), summed edge by edge
-(`evaluate_certificate`), and sum (|G_r| + its error)^2 / slack with S_r >= diag(slack) proved by
-one factorisation (`prove_definite`). At an optimum S X' = 0. If only the translation of pose r were
-left out, S would keep this null space and need a shift to be positive definite; so the rotation of
-pose r is left out, too. (Compare Carlone, Calafiore, Tommolillo & Dellaert 2016, on when the dual
-is tight.)
+If S_r is positive definite, the right side is least at Z_r = -S_r^-1 G_r Q, and Q cancels there:
 
-**chi2.** What is bounded here is a quadratic cost tr(X^T M X) + constant; that of a tangent
-(`PGOProblem.tangent_at`) is at most chi2 at all poses, and so is its bound. At the minimum of chi2
-both have one value and one gradient.
+    tr(X^T S X) >= tr(X'^T S X') - tr(G_r^T S_r^-1 G_r).
 
-**With a shift.** Where S_r is not positive definite, S_r + eta blockdiag(0, I) may be; the bound
-then loses eta sum_i ||X_i - X'_i Q||_F^2 <= eta sum_i (sqrt(8) + ||X'_i - R_i^T||)^2, as rotations
-are at most sqrt(8) apart. Or, asking nothing of poses: if S + eta blockdiag(0, I) is positive
-definite without the row of one translation, F >= tr(Lambda) - eta n d (Rosen et al. 2019, theorem
-7; Carlone et al. 2015).
+X' begins at given poses, turned and shifted so that pose r is at (0, I). The rows of the other
+poses are moved by -S_r^-1 G_r, at most MOST_MOVES times (`move_until_settled`); after that G_r is
+little more than rounding. Then the bound is the computed tr(X'^T S X') + tr(Lambda) + constant less
+two upper bounds: one on its rounding error, for it is summed edge by edge (`evaluate_certificate`);
+and tr(G_r^T S_r^-1 G_r) <= sum (|G_r| + error of G_r)^2 / slack, where one factorisation proves
+that S_r - diag(slack) is positive semidefinite (`prove_definite`).
+
+At an optimum S X' = 0. If only the translation of pose r were left out, S would keep this null
+space and need a shift to be positive definite; so the rotation of pose r is left out, too. (Compare
+Carlone, Calafiore, Tommolillo & Dellaert 2016, on when the dual is tight.)
+
+**chi2** is not quadratic. What is bounded in its place is its tangent (`PGOProblem.tangent_at`), a
+quadratic cost that is at most chi2 at all poses and touches it at given ones, with equal value and
+equal gradient there. So a bound on the tangent is one on chi2, and where chi2 has its minimum the
+tangent made there is stationary, too.
+
+**With a shift eta.** Where S_r is not positive definite, H = S_r + eta blockdiag(0, I) may be. With
+H in place of S_r the bound also loses eta times the squared norm of the rotation blocks of Z,
+
+    sum_i ||R_i^T - P_i Q||_F^2 <= sum_i (sqrt(8) + ||P_i - P^_i||_F)^2,
+
+where P_i is the rotation block of X' for pose i, and P^_i the rotation at which it began: the
+rotations R_i^T and P^_i Q are at most sqrt(8) apart, in the plane and in space. Another form asks
+nothing of poses: if S + eta blockdiag(0, I) is positive definite without the row and column of one
+translation, F >= tr(Lambda) + constant - eta n d (Rosen et al. 2019, theorem 7; Carlone et al.
+2015).
+
+The word shift is for eta alone. The share of the diagonal that a proof of definiteness subtracts to
+make up for rounding is its margin (`pgo_models.certificates.definiteness`).
 """
 
 import math
@@ -47,6 +66,7 @@ from pgo_models.certificates.definiteness import (
     smallest_eta,
 )
 from pgo_models.certificates.dual_variables import check_multipliers
+from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.rounding_errors import Evaluation, evaluate_certificate, has_safe_scale
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
@@ -58,13 +78,15 @@ from pgo_models.problem.problem import PGOProblem
 
 # Share of the wanted gap that eta may cost; the rest is for poses a little off the optimum.
 _ETA_SHARE = 0.5
-# Shift, relative to the diagonal, of the form with eta alone: it makes up for rounding.
-UNGROUNDED_SHIFT = 1e-11
+# First margin of the form with eta alone, as a share of the diagonal.
+UNGROUNDED_MARGIN = 1e-11
 MOST_MOVES = 3
-# X' is not moved again once the loss to G_r is below one of these: SETTLED times the value, HIDDEN
-# times the loss with the rounding of G_r, or NEGLIGIBLE times what moving has gained.
+# Stop moving X' once the remaining loss to G_r is below this share of the value of the bound ..
 SETTLED = 1e-13
+# .. or below this share of the loss that is counted with the rounding of G_r: moving again would
+# leave nearly the same loss ..
 HIDDEN = 0.1
+# .. or below this share of what the moves have gained so far.
 NEGLIGIBLE = 0.01
 
 
@@ -77,17 +99,22 @@ class LowerBound:
     value : float
         The bound. It is never negative: F is a sum of squares.
     eta : float
-        Shift with which it was proved; nan when nothing better than F >= 0 was.
+        Shift of the rows of rotations with which it was proved; nan when nothing better than F >= 0
+        was proved.
     is_grounded : bool
-        Whether the proof leaves out one whole pose; otherwise it is one with eta alone.
+        Whether the proof leaves out one whole pose; otherwise it is the form with eta alone.
     rounding : float
-        Sum of what was subtracted for rounding and, when grounded, for the G_r that moving has
-        left; not the loss to eta.
+        Sum of what was subtracted for rounding and, when grounded, for the G_r that remains after
+        the last move; not the loss to eta.
     cap : float
         Condition that the information matrices were cut down to (`shrunk_information`).
     is_definite : bool
-        Whether S_r is definite in doubles, where this could not be proved: no other poses would
-        help.
+        Whether S_r has a Cholesky factor in doubles although no bound above zero was proved with
+        eta = 0. Rounding is then taken to be what is in the way, and no other poses are looked for
+        (`Certificate.can_improve`). It is False where such a bound was proved, too: the question is
+        asked only where the proof fails.
+    terms : HandednessTerms or None
+        What was taken off the cost before the proof, if anything.
     """
 
     value: float
@@ -96,6 +123,7 @@ class LowerBound:
     rounding: float
     cap: float = math.inf
     is_definite: bool = False
+    terms: HandednessTerms | None = None
 
 
 NO_BOUND = LowerBound(0.0, math.nan, False, 0.0)
@@ -104,13 +132,14 @@ NO_BOUND = LowerBound(0.0, math.nan, False, 0.0)
 def prove_bound(
     problem: PGOProblem, Lambda: Array, eta: float = 0.0, poses: Poses | None = None
 ) -> float | None:
-    """Prove a bound on F over all poses from multipliers, a shift and, if given, poses.
+    """Prove a bound on F over all poses from multipliers, a shift eta and, if given, poses.
 
     It holds in exact arithmetic for the graph whose measurements and weights are the stored
     numbers: F is the sum with `problem.graph.R_ij` as written, rotations but for 64 eps, not with
     the rotations nearest to them. Rounding of the entries, of the factorisation and of the sums is
     bounded and subtracted (this file's opening, `pgo_models.certificates.rounding_errors`,
-    `pgo_models.problem.cholesky`). Lambda is made symmetric first.
+    `pgo_models.problem.cholesky`). Lambda is made symmetric first. The proof is grounded at the
+    poses with their best translations; of chi2 the tangent there is bounded.
 
     Parameters
     ----------
@@ -149,44 +178,78 @@ def prove_bound(
     >>> bool(prove_bound(problem, Lambda, eta=1e-6) < bound), prove_bound(problem, Lambda, eta=0.0)
     (True, None)
     """
+    ground = None
     if poses is not None:
         poses = problem.at_best_translations(poses)
         problem = problem.tangent_at(poses)
-    point = _grounded_at(problem, poses) if poses is not None else None
-    proven = _prove(problem, _symmetric(problem, Lambda), eta, point)
+        ground = _grounded_at(problem, poses)
+    proven = _prove(problem, _symmetric(problem, Lambda), eta, ground)
     return proven.value if proven is not None else None
 
 
 def prove_at(problem: PGOProblem, Lambda: Array, poses: Poses) -> LowerBound | None:
-    """Bound grounded at poses without a shift, or None."""
-    return _prove(problem, _symmetric(problem, Lambda), 0.0, _grounded_at(problem, poses))
+    """Bound grounded at the poses as they are, with eta = 0; None where S_r is not proved definite.
+
+    The problem has to be quadratic: for chi2 the caller passes a tangent (`PGOProblem.tangent_at`),
+    whose bound is one on chi2.
+    """
+    ground = _grounded_at(problem, poses)
+    return _prove(problem, _symmetric(problem, Lambda), 0.0, ground)
 
 
 def best_bound(
     problem: PGOProblem, Lambda: Array, poses: Poses | None, gap: float, objective: float
 ) -> LowerBound:
-    """Best bound from multipliers: grounded without eta where that goes through.
+    """Best bound from multipliers: the one grounded at a pose with eta = 0 if it is above zero.
 
     Otherwise it is the better of both forms, each with the smallest eta found.
 
-    It is grounded at one of the poses, which have their best translations; None leaves the form
-    that asks nothing of poses. The smallest eta that is tried follows from gap and objective.
+    The problem has to be quadratic: for chi2 the caller passes the tangent at the poses. The poses
+    are taken as they are; the bound is sharpest if the caller has given them their best
+    translations. Without poses only the form with eta alone is tried. The smallest eta that is
+    tried follows from gap and objective.
     """
     Lambda = _symmetric(problem, Lambda)
-    point = _grounded_at(problem, poses) if poses is not None else None
-    grounded = _prove(problem, Lambda, 0.0, point) if point is not None else None
-    if grounded is not None and grounded.value > 0.0:
-        return grounded
     count = problem.num_poses * problem.d
-    best = search_forms(
-        lambda eta: _prove(problem, Lambda, eta, None),
-        (lambda eta: _prove(problem, Lambda, eta, point)) if point is not None else None,
-        smallest_shift(gap, objective, count),
-        _trace(Lambda),
-        count,
-    )
-    is_definite = point is not None and is_definite_in_doubles(problem, Lambda, point.rows)
+    smallest = smallest_shift(gap, objective, count)
+    trace = _trace(Lambda)
+
+    def prove_with_eta(eta: float) -> LowerBound | None:
+        return _prove(problem, Lambda, eta, None)
+
+    if poses is None:
+        return search_forms(prove_with_eta, None, smallest, trace, count)
+    ground = _grounded_at(problem, poses)
+
+    def prove_grounded(eta: float) -> LowerBound | None:
+        return _prove(problem, Lambda, eta, ground)
+
+    without_shift = prove_grounded(0.0)
+    if without_shift is not None and without_shift.value > 0.0:
+        return without_shift
+    best = search_forms(prove_with_eta, prove_grounded, smallest, trace, count)
+    is_definite = is_definite_in_doubles(problem, Lambda, ground.rows)
     return replace(best, is_definite=is_definite)
+
+
+def best_bound_with_terms(
+    problem: PGOProblem,
+    Lambda: Array,
+    poses: Poses,
+    gap: float,
+    objective: float,
+    terms: HandednessTerms,
+) -> LowerBound:
+    """`best_bound` of the cost less handedness terms, which is one on the cost.
+
+    What rounding can make of the terms (`HandednessTerms.loss`) is subtracted.
+    """
+    found = best_bound(terms.taken_off(problem), Lambda, poses, gap, objective)
+    lost = terms.loss()
+    value = math.nextafter(found.value - lost, -math.inf)
+    if not value > 0.0:
+        return NO_BOUND
+    return replace(found, value=value, rounding=found.rounding + lost, terms=terms)
 
 
 def search_forms(
@@ -217,11 +280,14 @@ def search_bound(
     The search begins with the eta `smallest` (`smallest_eta`); trace and count are tr(Lambda) and n
     d.
     """
-    first = max(smallest, UNIT_ROUNDOFF * trace / count)  # at F = 0 the smallest would never grow
-    smallest_found = smallest_eta(prove, first, below=trace / count)
-    if smallest_found is None:
+    # At F = 0 the smallest eta is zero and would never grow.
+    least_eta = UNIT_ROUNDOFF * trace / count
+    first = max(smallest, least_eta)
+    useless_eta = trace / count
+    eta_and_bound = smallest_eta(prove, first, below=useless_eta)
+    if eta_and_bound is None:
         return NO_BOUND
-    _, bound = smallest_found
+    _, bound = eta_and_bound
     return bound if bound.value > 0.0 else NO_BOUND
 
 
@@ -231,38 +297,43 @@ def smallest_shift(gap: float, objective: float, count: int) -> float:
 
 
 def quadratic_loss(product: Array, error: Array | float, slack: Array) -> float:
-    """Bound on tr(G^T S_r^-1 G) for S_r >= diag(slack) and G known to an error, rounded up.
+    """Bound on tr(G_r^T S_r^-1 G_r), rounded up, for G_r known to an error.
 
-    It is sum (|G| + error)^2 / slack.
+    It is sum (|G_r| + error)^2 / slack, where S_r - diag(slack) is positive semidefinite.
     """
-    return OUTWARD * float(np.sum((np.abs(product) + error) ** 2 / slack[:, None]))
+    size = np.abs(product) + error
+    terms = size**2 / slack[:, None]
+    return OUTWARD * float(np.sum(terms))
 
 
 def squared_distances(moved: Array, rotations: Array) -> float:
     """Bound on sum_i ||R_i^T - P_i Q||_F^2 over all rotations R_i and Q, rounded up.
 
-    The blocks P_i were moved away from rotations P^_i.
+    The blocks P_i were moved away from stored rotations P^_i; rows of both, (d n, d), are given.
 
-    Two rotations are at most sqrt(8) apart, P_i is ||P_i - P^_i|| from P^_i, and that ||P^_i P^_i^T
-    - I|| from one. Rounding of these, a few u beside sqrt(8), is what `OUTWARD` is for. Rows of P_i
-    and of P^_i, (d n, d), are given.
+    By the triangle inequality the norm is at most a sum of three distances. Two rotations are at
+    most sqrt(8) apart. A stored P^_i is at most ||P^_i P^_i^T - I|| from the nearest rotation, and
+    P_i is ||P_i - P^_i|| from P^_i. The rounding of these, a few u beside sqrt(8), is covered by
+    `OUTWARD`.
     """
     d = rotations.shape[1]
     blocks = rotations.reshape(-1, d, d)
-    away = np.linalg.norm((moved - rotations).reshape(-1, d * d), axis=1)
+    moves = (moved - rotations).reshape(-1, d * d)
+    away = np.linalg.norm(moves, axis=1)
     apart = math.sqrt(8.0) + orthogonality_error(blocks) + away
     return OUTWARD * float(np.sum(apart**2))
 
 
 @dataclass(frozen=True, eq=False)
 class _Ground:
-    """X with pose r at (0, I) exactly, and the rows of that pose."""
+    """X' at which a proof begins, with pose r at (0, I) exactly, and the rows of that pose."""
 
     X: Array
     rows: IntArray
 
 
 def _grounded_at(problem: PGOProblem, poses: Poses) -> _Ground:
+    """X' of poses turned and shifted so that a pose in the middle of the graph is at (0, I)."""
     n = problem.num_poses
     d = problem.d
     r = middle_pose(problem.graph)
@@ -276,31 +347,33 @@ def _grounded_at(problem: PGOProblem, poses: Poses) -> _Ground:
 
 def pose_rows(pose: int, n: int, d: int) -> IntArray:
     """Rows of one pose in X, (d + 1,)."""
-    return np.concatenate([[pose], rotation_columns(np.array([pose]), n, d)[0]])
+    rotation_rows = rotation_columns(np.array([pose]), n, d)[0]
+    return np.concatenate([[pose], rotation_rows])
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what overflows is inf or nan, which proves nothing
 def _prove(
     problem: PGOProblem, Lambda: Array, eta: float, ground: _Ground | None
 ) -> LowerBound | None:
+    """Bound of the form grounded at a pose, or without one of the form with eta alone."""
     if not 0.0 <= eta < math.inf:
         raise SettingError(f"eta is {eta}; a shift must not be negative, and finite")
     if not (np.isfinite(Lambda).all() and has_safe_scale(problem)):
         return None
-    return (
-        _prove_with_eta(problem, Lambda, eta)
-        if ground is None
-        else _prove_grounded(problem, Lambda, eta, ground)
-    )
+    if ground is None:
+        return _prove_with_eta(problem, Lambda, eta)
+    return _prove_grounded(problem, Lambda, eta, ground)
 
 
 def _prove_with_eta(problem: PGOProblem, Lambda: Array, eta: float) -> LowerBound | None:
-    first = np.zeros(1, dtype=np.int64)
-    proof = prove_definite(problem, Lambda, eta, first, UNGROUNDED_SHIFT)
+    """Form with eta alone, the first translation left out; None where definiteness is not shown."""
+    fixed = np.zeros(1, dtype=np.int64)
+    proof = prove_definite(problem, Lambda, eta, fixed, UNGROUNDED_MARGIN)
     if proof is not None and proof.slack() is None:
-        # The shift was chosen before the rounding of the factorisation was known.
+        # The margin was too small for the rounding of the factorisation, which nobody knew yet. It
+        # depends on the pattern alone: the second proof begins with it and has a slack.
         error = proof.factor_error()
-        proof = prove_definite(problem, Lambda, eta, first, UNGROUNDED_SHIFT, factor_error=error)
+        proof = prove_definite(problem, Lambda, eta, fixed, UNGROUNDED_MARGIN, factor_error=error)
     if proof is None:
         return None
     trace = _trace(Lambda)
@@ -318,7 +391,8 @@ def bound_with_eta(
 ) -> LowerBound:
     """Bound tr(Lambda) + constant - eta n d, from parts of tr(Lambda); count = n d."""
     lost = eta * count
-    rounding = OUTWARD * 4.0 * UNIT_ROUNDOFF * (sum(map(abs, traces)) + lost)
+    sizes = sum(map(abs, traces)) + lost
+    rounding = OUTWARD * 4.0 * UNIT_ROUNDOFF * sizes
     terms = [*traces, constant, -lost]
     return bound_from(terms, rounding + constant_error, eta, is_grounded=False)
 
@@ -330,38 +404,46 @@ def _prove_grounded(
     ground: _Ground,
     factor_error: Array | None = None,
 ) -> LowerBound | None:
+    """Form grounded at a pose; None where S_r + eta blockdiag(0, I) is not shown to be definite."""
     proof = prove_definite(
         problem, Lambda, eta, ground.rows, turned=ground.X, factor_error=factor_error
     )
     if proof is None:
         return None
-    point = move_until_settled(
-        _first_point(problem, Lambda, ground.X),
-        lambda point: _moved(problem, Lambda, proof, point),
-    )
+
+    def move(point: _Point) -> tuple[_Point, float]:
+        return _moved(problem, Lambda, proof, point)
+
+    point = move_until_settled(_first_point(problem, Lambda, ground.X), move)
     slack = proof.slack()
     if slack is None:
-        # The shift was chosen before the rounding of the factorisation was known. Now it is.
+        # The margin was too small for the rounding of the factorisation, which nobody knew yet. It
+        # depends on the pattern alone, and the backend keeps it: every proof that is found from now
+        # on has a slack, so that this happens once.
         return _prove_grounded(problem, Lambda, eta, ground, proof.factor_error())
-    found = point.evaluation
-    if found is None:
-        found = evaluate_certificate(problem, Lambda, point.X, point.low)
+    evaluation = point.evaluation
+    if evaluation is None:
+        evaluation = evaluate_certificate(problem, Lambda, point.X, point.low)
     free = proof.free
+    product = evaluation.product[free]
+    product_error = evaluation.product_error[free]
+    # The bound is value - tr(G_r^T H^-1 G_r) - eta sum_i ||R_i^T - P_i Q||_F^2 with G = S X' after
+    # the last move (this file's opening). Both losses, and the error of the value, are replaced by
+    # upper bounds: H - diag(slack) is positive semidefinite.
+    quadratic = quadratic_loss(product, product_error, slack[free])
     n = problem.num_poses
-    # The bound is value - tr(G^T S_r^-1 G) - eta sum_i ||R_i^T - P_i Q||_F^2, G = S X being what
-    # the moves have left (this file's opening). Both losses, and the error of the value, are
-    # replaced by upper bounds: S_r is at least diag(slack).
-    quadratic = quadratic_loss(found.product[free], found.product_error[free], slack[free])
     distances = squared_distances(point.X[n:], ground.X[n:])
-    return grounded_bound(found.value, found.value_error, quadratic, eta, distances)
+    return grounded_bound(evaluation.value, evaluation.value_error, quadratic, eta, distances)
 
 
 def grounded_bound(
     value: float, value_error: float, quadratic: float, eta: float, distances: float
 ) -> LowerBound:
-    """Bound tr(X'^T S X') + tr(Lambda), the value, less what its error, G and eta can take.
+    """Bound value - eta distances, less the error of the value and the loss to G_r.
 
-    `quadratic` is that of G (`quadratic_loss`), `distances` are `squared_distances`.
+    The value is tr(X'^T S X') + tr(Lambda) + constant, as `evaluate_certificate` computes it: the
+    constant of a tangent is in the costs of the edges, and nothing is added here. `quadratic` is
+    the loss to G_r (`quadratic_loss`), `distances` are `squared_distances`.
     """
     lost = OUTWARD * eta * distances
     return bound_from([value, -lost], value_error + quadratic, eta, is_grounded=True)
@@ -372,29 +454,31 @@ class ProofPoint(Protocol):
 
     @property
     def value(self) -> float:
-        """Value of the certificate, tr(X'^T S X') + tr(Lambda)."""
+        """Value of the certificate, tr(X'^T S X') + tr(Lambda) + constant."""
 
     @property
     def left(self) -> float:
-        """About what is lost to G = S X', as `quadratic_loss` without an error."""
+        """Estimate of the loss tr(G_r^T S_r^-1 G_r): `quadratic_loss` without an error of G_r."""
 
     @property
     def quadratic(self) -> float:
-        """The same with the error of G."""
+        """The same with the error of G_r."""
 
 
 P = TypeVar("P", bound=ProofPoint)
 
 
 def move_until_settled(point: P, move: Callable[[P], tuple[P, float]]) -> P:
-    """Move X' by -S_r^-1 G, again while that helps.
+    """Move X' by -S_r^-1 G_r, again while that lowers the loss to G_r.
 
-    `move` gives the next point, and the gain tr(G^T S_r^-1 G) that was expected of it.
+    `move` gives the next point, and the gain tr(G_r^T S_r^-1 G_r) that was expected of it.
     """
     gained = 0.0
     for _ in range(MOST_MOVES):
-        negligible = max(SETTLED * abs(point.value), NEGLIGIBLE * gained, HIDDEN * point.quadratic)
-        if point.left <= negligible:
+        of_value = SETTLED * abs(point.value)
+        of_gains = NEGLIGIBLE * gained
+        of_rounding = HIDDEN * point.quadratic
+        if point.left <= max(of_value, of_gains, of_rounding):
             break
         moved, gain = move(point)
         gained += gain
@@ -406,12 +490,18 @@ def move_until_settled(point: P, move: Callable[[P], tuple[P, float]]) -> P:
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """X' and S X' there, to be moved; `low` is to be added to its translations."""
+    """X' and S X' there, to be moved (`ProofPoint`).
+
+    X' has the translations X[:n] + low. A move adds to `low` alone, so that one that is small
+    beside the coordinates is not rounded away.
+    """
 
     X: Array
     low: Array
     product: Array
-    evaluation: Evaluation | None  # of the certificate; None at the poses, where nothing is lost
+    # Of the certificate. None at the first point, whose losses are not known: `left` is infinite
+    # there, so that the first point is moved in any case.
+    evaluation: Evaluation | None
     value: float = 0.0
     left: float = math.inf
     quadratic: float = 0.0
@@ -419,32 +509,54 @@ class _Point:
 
 
 def _first_point(problem: PGOProblem, Lambda: Array, X: Array) -> _Point:
+    """The point before any move; its S X' is computed without a bound on its error."""
     n = problem.num_poses
     d = problem.d
     product = problem.apply_M(X)
-    product[n:] -= (Lambda @ X[n:].reshape(n, d, d)).reshape(-1, d)
-    return _Point(X, np.zeros((n, d)), product, None)
+    of_multipliers = Lambda @ X[n:].reshape(n, d, d)
+    product[n:] -= of_multipliers.reshape(-1, d)
+    no_move = np.zeros((n, d))
+    return _Point(X, no_move, product, None)
 
 
 def _moved(
     problem: PGOProblem, Lambda: Array, proof: DefiniteProof, point: _Point
 ) -> tuple[_Point, float]:
-    """Point at X - S_r^-1 S X, and the gain."""
+    """Point at X' - H^-1 S X', where H = S_r + eta blockdiag(0, I), and the gain."""
     n = problem.num_poses
     step = proof.solve(point.product)
     gain = inner(step, point.product)
-    if gain > point.last_gain:  # the shift takes most of the softest energy
+    if gain > point.last_gain:
+        # The factor is that of H less the margin. Gains that grow from move to move show that the
+        # smallest eigenvalues of H are about as small as the margin, so that its inverse is far
+        # from H^-1. A marginal proof solves with H itself, by conjugate gradients with the factor
+        # as preconditioner.
         step = replace(proof, is_marginal=True).solve(point.product)
         gain = inner(step, point.product)
     X = point.X.copy()
     X[n:] -= step[n:]
     low = point.low - step[:n]
-    found = evaluate_certificate(problem, Lambda, X, low)
+    evaluation = evaluate_certificate(problem, Lambda, X, low)
     free = proof.free
-    weight = (proof.shift * proof.diagonal)[free]
-    left = quadratic_loss(found.product[free], 0.0, weight)
-    quadratic = quadratic_loss(found.product[free], found.product_error[free], weight)
-    return _Point(X, low, found.product, found, found.value, left, quadratic, gain), gain
+    product = evaluation.product[free]
+    product_error = evaluation.product_error[free]
+    # The margin stands in for the slack, which lies between about half of it and all of it. To know
+    # the slack the factor may have to be taken apart, and these two losses only decide whether X'
+    # is moved again.
+    cheap_slack = (proof.margin * proof.diagonal)[free]
+    left = quadratic_loss(product, 0.0, cheap_slack)
+    quadratic = quadratic_loss(product, product_error, cheap_slack)
+    moved = _Point(
+        X=X,
+        low=low,
+        product=evaluation.product,
+        evaluation=evaluation,
+        value=evaluation.value,
+        left=left,
+        quadratic=quadratic,
+        last_gain=gain,
+    )
+    return moved, gain
 
 
 def bound_from(terms: list[float], rounding: float, eta: float, is_grounded: bool) -> LowerBound:
@@ -452,15 +564,22 @@ def bound_from(terms: list[float], rounding: float, eta: float, is_grounded: boo
 
     It is 0, which is trivial, where that is nan or negative.
     """
-    value = math.nextafter(exact_sum([*terms, -rounding]), -math.inf)
-    return LowerBound(value if value > 0.0 else 0.0, eta, is_grounded, rounding)
+    total = exact_sum([*terms, -rounding])
+    value = math.nextafter(total, -math.inf)
+    if not value > 0.0:
+        value = 0.0
+    return LowerBound(value, eta, is_grounded, rounding)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # as of `_prove`
 def _symmetric(problem: PGOProblem, Lambda: Array) -> Array:
+    """Symmetric part of each block, (n, d, d)."""
     check_multipliers(problem, Lambda)
-    return np.asarray(0.5 * (Lambda + np.swapaxes(Lambda, 1, 2)))
+    transposed = np.swapaxes(Lambda, 1, 2)
+    return np.asarray(0.5 * (Lambda + transposed))
 
 
 def _trace(Lambda: Array) -> float:
-    return exact_sum(np.einsum("naa->na", Lambda).ravel())
+    """Trace of all blocks together, rounded once."""
+    diagonals = np.einsum("naa->na", Lambda)
+    return exact_sum(diagonals.ravel())

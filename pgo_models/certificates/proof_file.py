@@ -8,6 +8,7 @@ import numpy as np
 
 from pgo_models.certificates.certificate import BoundSource, Certificate
 from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.lower_bound import prove_at
 from pgo_models.errors import SettingError
 from pgo_models.files import replace_when_done
@@ -71,26 +72,47 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
         way_out = "leave out --proof, or --information to prove F"
         raise SettingError(f"no proof to write: {what}; {way_out}")
     poses = _poses_of_bound(problem, certificate)
-    Lambda = 0.5 * (certificate.Lambda + np.swapaxes(certificate.Lambda, 1, 2))
+    transposed = np.swapaxes(certificate.Lambda, 1, 2)
+    Lambda = 0.5 * (certificate.Lambda + transposed)
+    upper_triangle = np.triu_indices(d)
     rows: list[dict[str, object]] = []
     for pose in range(graph.num_poses):
         row: dict[str, object] = {"id": _name(graph, pose), "t": poses.t[pose].tolist()}
         if pose not in graph.landmarks:
             row["R"] = poses.R[pose].tolist()
             if problem.is_quadratic:
-                row["Lambda"] = Lambda[pose][np.triu_indices(d)].tolist()
+                row["Lambda"] = Lambda[pose][upper_triangle].tolist()
         rows.append(row)
-    return {
+    eta = None if math.isnan(certificate.eta) else certificate.eta
+    record: dict[str, object] = {
         "format": FORMAT,
         "cost": cost,
         "d": d,
         "objective": problem.objective(poses),
         "lower_bound": certificate.lower_bound,
         "rounding_level": certificate.rounding_level,
-        "eta": None if math.isnan(certificate.eta) else certificate.eta,
+        "eta": eta,
         "ground": _name(graph, _ground(graph)),
         "poses": rows,
     }
+    terms = certificate.bound.terms
+    if terms is not None:
+        record["handedness"] = _rows_of_terms(graph, terms)
+    return record
+
+
+def _rows_of_terms(graph: PoseGraph, terms: HandednessTerms) -> list[dict[str, object]]:
+    """Rows of handedness terms: the ids of their poses, T, and the upper triangle of P."""
+    upper_triangle = np.triu_indices(3)
+    return [
+        {
+            "i": _name(graph, int(i)),
+            "j": _name(graph, int(j)),
+            "T": T.tolist(),
+            "P": P[upper_triangle].tolist(),
+        }
+        for i, j, T, P in zip(terms.i, terms.j, terms.T, terms.P, strict=True)
+    ]
 
 
 def _poses_of_bound(problem: PGOProblem, certificate: Certificate) -> Poses:
@@ -101,17 +123,26 @@ def _poses_of_bound(problem: PGOProblem, certificate: Certificate) -> Poses:
     best = problem.at_best_translations(certificate.poses)
     if problem.is_quadratic or certificate.eta != 0.0:
         return best
+    terms = certificate.bound.terms
     bounds = []
     for poses in (best, certificate.poses):
-        bound = prove_at(problem.tangent_at(poses), multipliers(problem, poses), poses)
+        tangent = problem.tangent_at(poses)
+        if terms is not None:
+            tangent = terms.taken_off(tangent)
+        Lambda = multipliers(problem, poses)
+        bound = prove_at(tangent, Lambda, poses)
         bounds.append(-math.inf if bound is None else bound.value)
-    return best if bounds[0] >= bounds[1] else certificate.poses
+    bound_at_best, bound_at_own = bounds
+    return best if bound_at_best >= bound_at_own else certificate.poses
 
 
 def _ground(graph: PoseGraph) -> int:
     """A pose in the middle of the graph, or the first that sees the landmark there."""
     middle = middle_pose(graph)
-    return middle if middle not in graph.landmarks else int(graph.i[graph.j == middle][0])
+    if middle not in graph.landmarks:
+        return middle
+    observers = graph.i[graph.j == middle]
+    return int(observers[0])
 
 
 def _name(graph: PoseGraph, pose: int) -> int | str:
@@ -127,12 +158,15 @@ def _cost_name(problem: PGOProblem) -> str:
     if problem.weighting is Weighting.ISOTROPIC:
         kappa = graph.kappa[turns]
         tau = graph.tau
-        if np.isin(kappa, (0.0, 1.0)).all() and np.isin(tau, (0.0, 1.0)).all():
+        has_unit_kappa = np.isin(kappa, (0.0, 1.0)).all()
+        has_unit_tau = np.isin(tau, (0.0, 1.0)).all()
+        if has_unit_kappa and has_unit_tau:
             return "unit"
         if graph.information is None:
             return "F"
         kappa_of_file, tau_of_file = edge_precisions(graph.information)
-        if np.allclose(kappa, kappa_of_file[turns]) and np.allclose(tau, tau_of_file):
+        has_kappa_of_file = np.allclose(kappa, kappa_of_file[turns])
+        if has_kappa_of_file and np.allclose(tau, tau_of_file):
             return "F"
     way_out = "write the graph with write_g2o, and solve that file"
     raise SettingError(f"no proof to write: no g2o file has the weights of the problem; {way_out}")

@@ -36,14 +36,15 @@ _LARGEST = 1e100
 def has_safe_scale(problem: PGOProblem) -> bool:
     """Whether no product of weights and lengths can underflow or overflow.
 
-    Weights, and tau ||t_ij||^2, have to be between 1e-100 and 1e100.
-
-    In size; a weight of zero does no harm.
+    The sizes of weights, and tau ||t_ij||^2, have to be between 1e-100 and 1e100. A weight of zero
+    does no harm.
     """
     offsets = problem.weights.seen_offsets(problem.graph.t_ij)
-    longest = np.maximum(1.0, np.sum(offsets**2, axis=1))
+    squared_lengths = np.sum(offsets**2, axis=1)
+    longest = np.maximum(1.0, squared_lengths)
     sizes = problem.weights.weight_sizes(longest)
-    return bool(sizes[sizes > 0.0].min(initial=np.inf) >= _SMALLEST and sizes.max() <= _LARGEST)
+    smallest = sizes[sizes > 0.0].min(initial=np.inf)
+    return bool(smallest >= _SMALLEST and sizes.max() <= _LARGEST)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,36 +72,41 @@ def evaluate_edges(problem: PGOProblem, X: Array, low: Array) -> Evaluation:
     t = X[:n]
     P = X[n:].reshape(n, d, d)
     P_i = P[graph.i]
-    # Residuals, and bounds on their errors: a product is a sum of d products, and every difference
-    # is rounded once more.
-    offsets = weights.seen_offsets(graph.t_ij)
+    # Residuals.
+    offsets = weights.seen_offsets(graph.t_ij)[:, None, :]
     transposed = np.swapaxes(graph.R_ij, 1, 2)
     high_difference = t[graph.j] - t[graph.i]
     low_difference = low[graph.j] - low[graph.i]
     difference = high_difference + low_difference
-    moved = offsets[:, None, :] @ P_i
-    turned = transposed @ P_i
-    rho = np.concatenate([difference[:, None] - moved, P[graph.j] - turned], axis=1)
-    absolute = np.abs(P_i)
-    product_sizes = np.concatenate(
-        [np.abs(offsets)[:, None, :] @ absolute, np.abs(transposed) @ absolute], axis=1
-    )
+    rho_t = difference[:, None] - offsets @ P_i
+    rho_R = P[graph.j] - transposed @ P_i
+    rho = np.concatenate([rho_t, rho_R], axis=1)
+    # Bounds on their errors: a product is a sum of d products, and every difference is rounded once
+    # more.
+    P_i_size = np.abs(P_i)
+    sizes_t = np.abs(offsets) @ P_i_size
+    sizes_R = np.abs(transposed) @ P_i_size
+    product_sizes = np.concatenate([sizes_t, sizes_R], axis=1)
     errors = gamma(d) * product_sizes + UNIT_ROUNDOFF * np.abs(rho)
-    errors[:, 0] += UNIT_ROUNDOFF * (
-        np.abs(high_difference) + np.abs(low_difference) + np.abs(difference)
-    )
+    # The translations take two more differences and their sum.
+    difference_sizes = np.abs(high_difference) + np.abs(low_difference) + np.abs(difference)
+    errors[:, 0] += UNIT_ROUNDOFF * difference_sizes
     terms = weights.evaluate_edges(rho, errors, P_i)
     # M X = A^T G: an entry is a sum over the edges of a pose of products of an entry of A and G,
     # which is itself a sum of at most d + 1 terms.
     A = problem.plain_residual_matrix
-    most = int(np.bincount(A.indices, minlength=1).max()) + d + 2
-    G_error = terms.G_error + gamma(most) * terms.G_size
-    product = A.T @ rows_of_blocks(terms.G)
-    product_error = abs(A).T @ rows_of_blocks(G_error)
-    product, product_error = terms.with_pose_gradients(problem, gamma(most), product, product_error)
-    return Evaluation(
-        exact_sum(terms.value), OUTWARD * terms.value_error, product, OUTWARD * product_error
+    most_entries = int(np.bincount(A.indices, minlength=1).max())
+    count = most_entries + d + 2
+    G_error = terms.G_error + gamma(count) * terms.G_size
+    product, product_error = terms.complete_half_gradient(
+        problem,
+        gamma(count),
+        A.T @ rows_of_blocks(terms.G),
+        abs(A).T @ rows_of_blocks(G_error),
     )
+    value = exact_sum(terms.value)
+    value_error = OUTWARD * terms.value_error
+    return Evaluation(value, value_error, product, OUTWARD * product_error)
 
 
 def evaluate_multipliers(Lambda: Array, P: Array) -> Evaluation:
@@ -110,19 +116,24 @@ def evaluate_multipliers(Lambda: Array, P: Array) -> Evaluation:
     """
     d = P.shape[-1]
     transposed = np.swapaxes(P, 1, 2)
+    P_size = np.abs(P)
+    Lambda_size = np.abs(Lambda)
     defect = np.eye(d) - P @ transposed
     # Errors of the defect: a product of sums of d, and one subtraction.
-    sizes = gamma(d) * (np.abs(P) @ np.abs(transposed)) + UNIT_ROUNDOFF * np.abs(defect)
-    absolute = np.abs(Lambda)
+    product_size = P_size @ np.abs(transposed)
+    defect_error = gamma(d) * product_size + UNIT_ROUNDOFF * np.abs(defect)
     terms = Lambda * defect
-    value = exact_sum(terms.reshape(-1, d * d).sum(axis=1))
+    term_sums = terms.reshape(-1, d * d).sum(axis=1)
+    value = exact_sum(term_sums)
     # They enter with the weights |Lambda|; the products and the sum of d^2 of them round, too.
-    value_error = float(np.sum(absolute * sizes)) + gamma(d * d + 3) * float(np.sum(np.abs(terms)))
+    of_defects = float(np.sum(Lambda_size * defect_error))
+    size_of_terms = float(np.sum(np.abs(terms)))
+    value_error = of_defects + gamma(d * d + 3) * size_of_terms
     product = -(Lambda @ P)
-    product_error = OUTWARD * gamma(d) * (absolute @ np.abs(P))
-    return Evaluation(
-        value, OUTWARD * value_error, product.reshape(-1, d), product_error.reshape(-1, d)
-    )
+    product_error = OUTWARD * gamma(d) * (Lambda_size @ P_size)
+    rows = product.reshape(-1, d)
+    row_errors = product_error.reshape(-1, d)
+    return Evaluation(value, OUTWARD * value_error, rows, row_errors)
 
 
 def evaluate_certificate(problem: PGOProblem, Lambda: Array, X: Array, low: Array) -> Evaluation:
@@ -135,8 +146,9 @@ def evaluate_certificate(problem: PGOProblem, Lambda: Array, X: Array, low: Arra
     """
     n = problem.num_poses
     d = problem.d
+    P = X[n:].reshape(n, d, d)
     edges = evaluate_edges(problem, X, low)
-    blocks = evaluate_multipliers(Lambda, X[n:].reshape(n, d, d))
+    blocks = evaluate_multipliers(Lambda, P)
     product = edges.product
     product_error = edges.product_error
     product[n:] += blocks.product
@@ -160,11 +172,17 @@ def matrix_error(graph: PoseGraph) -> float:
     whose entries are at most the geometric mean of the diagonal entries when it is definite.
     """
     d = graph.d
-    most = int(np.bincount(np.concatenate([graph.i, graph.j])).max())
+    most = _most_edges(graph)
     slant = float(orthogonality_error(graph.R_ij).max()) + d * gamma(d + 2)
-    return float(
-        OUTWARD * ((d + 2) * gamma(most + 4.0) * (1.0 + slant) + slant + 4 * d * UNIT_ROUNDOFF)
-    )
+    of_terms = (d + 2) * gamma(most + 4.0) * (1.0 + slant)
+    of_blocks = 4 * d * UNIT_ROUNDOFF
+    return float(OUTWARD * (of_terms + slant + of_blocks))
+
+
+def _most_edges(graph: PoseGraph) -> int:
+    """Largest number of edges that meet at a pose."""
+    ends = np.concatenate([graph.i, graph.j])
+    return int(np.bincount(ends).max())
 
 
 def matrix_errors(problem: PGOProblem, diagonal: Array) -> Array:
@@ -179,18 +197,17 @@ def matrix_errors(problem: PGOProblem, diagonal: Array) -> Array:
     """
     graph = problem.graph
     d = problem.d
-    if problem.weights.sums_within_diagonal:
+    if problem.weights.diagonal_bounds_terms:
         return np.full(problem.side, matrix_error(graph))
     u = 1.0 / np.sqrt(diagonal)
-    most = int(np.bincount(np.concatenate([graph.i, graph.j])).max())
-    count = (
-        gamma(most + 3.0 * d + 6.0)
-        + float(orthogonality_error(graph.R_ij).max())
-        + d * gamma(d + 2)
-    )
+    most = _most_edges(graph)
+    of_terms = gamma(most + 3.0 * d + 6.0)
+    of_rotations = float(orthogonality_error(graph.R_ij).max())
+    relative_error = of_terms + of_rotations + d * gamma(d + 2)
     # v^T E v <= sum_a v_a^2 (E u)_a / u_a for any positive u; here 1 / u_a = u_a diagonal_a.
-    E_u = problem.weights.entry_errors(problem, u, count)
-    return np.asarray(OUTWARD * (E_u * u + 4 * d * UNIT_ROUNDOFF))
+    E_u = problem.weights.entry_errors(problem, u, relative_error)
+    of_blocks = 4 * d * UNIT_ROUNDOFF
+    return np.asarray(OUTWARD * (E_u * u + of_blocks))
 
 
 @dataclass(frozen=True)
@@ -228,28 +245,34 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     graph = problem.graph
     d = problem.d
     m = problem.graph.num_edges
-    e_t, e_R = _residual_errors(
-        problem, poses, np.linalg.norm(poses.t[graph.j] - poses.t[graph.i], axis=1)
-    )
+    offsets = poses.t[graph.j] - poses.t[graph.i]
+    distances = np.linalg.norm(offsets, axis=1)
+    e_t, e_R = _residual_errors(problem, poses, distances)
     _, residuals = problem.evaluated(poses)
     _, w = problem.residual_matrix
-    # Along the axes of W, which turn no norm, kappa weighs row by row.
-    weighted = np.sum((w[:, None] * residuals) ** 2, axis=1)
-    cross = float(np.sum(np.sqrt(weighted[:m]) * e_t))
-    cross += e_R * float(np.sum(np.sqrt(weighted[m:].reshape(m, d).sum(axis=1))))
-    F = float(np.sum(np.abs(w) * np.sum(residuals**2, axis=1)))
-    error = (
-        problem.weights.bound_of_norms(e_t, e_R) + 2.0 * cross + PAIRWISE_SUM * UNIT_ROUNDOFF * F
-    )
+    # sum ||D r|| e, the terms that are linear in the errors. Along the axes of W, which turn no
+    # norm, kappa weighs row by row.
+    squared_rows = np.sum((w[:, None] * residuals) ** 2, axis=1)
+    norms_t = np.sqrt(squared_rows[:m])
+    norms_R = np.sqrt(squared_rows[m:].reshape(m, d).sum(axis=1))
+    cross = float(np.sum(norms_t * e_t))
+    cross += e_R * float(np.sum(norms_R))
+    # The terms that are quadratic in the errors, and the rounding of the sum F.
+    quadratic = problem.weights.bound_of_norms(e_t, e_R)
+    squares = np.sum(residuals**2, axis=1)
+    F = float(np.sum(np.abs(w) * squares))
+    error = quadratic + 2.0 * cross + PAIRWISE_SUM * UNIT_ROUNDOFF * F
     for of_cost in problem.weights.value_errors(problem, poses, e_t, e_R):
         error += of_cost
     level = rounding_level(problem, poses)
-    return ObjectiveRounding(level, OUTWARD * error, _is_exact(problem, poses, level))
+    is_exact = _is_exact(problem, poses, level)
+    return ObjectiveRounding(level, OUTWARD * error, is_exact)
 
 
 def rounding_level(problem: PGOProblem, poses: Poses) -> float:
     """Level of `objective_rounding`."""
-    return problem.weights.bound_of_norms(*_last_bits(problem, poses))
+    e_t, e_R = _last_bits(problem, poses)
+    return problem.weights.bound_of_norms(e_t, e_R)
 
 
 def fits_to_rounding(problem: PGOProblem, poses: Poses) -> bool:
@@ -294,17 +317,19 @@ def fits_to_rounding(problem: PGOProblem, poses: Poses) -> bool:
 
 def _is_exact(problem: PGOProblem, poses: Poses, level: float) -> bool:
     """Both conditions of `fits_to_rounding`, for poses with this rounding level."""
-    if not problem.objective(poses) <= _NEARLY * level:  # which costs little, and mostly settles it
+    # The cost as a whole is cheap to compute, and mostly settles it.
+    if not problem.objective(poses) <= _NEARLY * level:
         return False
     graph = problem.graph
     t = poses.t
     R = poses.R
     R_i = R[graph.i]
     offsets = problem.weights.seen_offsets(graph.t_ij)
-    shift = t[graph.j] - t[graph.i] - (R_i @ offsets[:, :, None])[:, :, 0]
-    turn = R[graph.j] - R_i @ graph.R_ij
-    r_t = np.linalg.norm(shift, axis=1)
-    r_R = np.linalg.norm(turn, axis=(1, 2))
+    turned_offsets = (R_i @ offsets[:, :, None])[:, :, 0]
+    residuals_t = t[graph.j] - t[graph.i] - turned_offsets
+    residuals_R = R[graph.j] - R_i @ graph.R_ij
+    r_t = np.linalg.norm(residuals_t, axis=1)
+    r_R = np.linalg.norm(residuals_R, axis=(1, 2))
     is_seen_t, is_seen_R = problem.weights.is_seen()
     e_t, e_R = _last_bits(problem, poses)
     share = _SHARE_OF_ONE * math.sqrt(graph.num_edges)
@@ -317,13 +342,19 @@ def _is_exact(problem: PGOProblem, poses: Poses, level: float) -> bool:
 
 def _last_bits(problem: PGOProblem, poses: Poses) -> tuple[Array, float]:
     """Errors e_t, (m,), and e_R of residuals, with the last bits of the farthest coordinates."""
-    extent = 2.0 * np.linalg.norm(poses.t - poses.t[:1], axis=1).max()
-    return _residual_errors(problem, poses, np.full(problem.graph.num_edges, extent))
+    from_first = poses.t - poses.t[:1]
+    extent = 2.0 * np.linalg.norm(from_first, axis=1).max()
+    distances = np.full(problem.graph.num_edges, extent)
+    return _residual_errors(problem, poses, distances)
 
 
 def _residual_errors(problem: PGOProblem, poses: Poses, distance: Array) -> tuple[Array, float]:
+    """Errors e_t, (m,), and e_R of `objective_rounding`, with distances for ||t_j - t_i||, (m,)."""
     d = problem.d
     share = (2 * d + 3) * UNIT_ROUNDOFF
     omega = poses.orthogonality_error + d * gamma(d + 2)
-    length = np.linalg.norm(problem.weights.seen_offsets(problem.graph.t_ij), axis=1)
-    return share * (distance + length) + omega * length, 2.0 * math.sqrt(d) * share + 2.0 * omega
+    offsets = problem.weights.seen_offsets(problem.graph.t_ij)
+    length = np.linalg.norm(offsets, axis=1)
+    e_t = share * (distance + length) + omega * length
+    e_R = 2.0 * math.sqrt(d) * share + 2.0 * omega
+    return e_t, e_R

@@ -24,6 +24,7 @@ from pgo_models.graphs.precisions import (
 )
 
 _SHOWN = 2.0**-45  # smallest eigenvalue of a matrix with ones on its diagonal that is not rounding
+_SHARE_ROUNDING = 2.0**-20  # taken off the share that the coupling leaves, as it is rounded
 _HALVINGS = 60  # of a share that rounding makes too large: nothing is left of the matrix then
 # of the trace: above the rounding of a block, so that I' is below I all the same
 _MARGIN = 2.0**-40
@@ -44,32 +45,42 @@ def shrink_information(graph: PoseGraph, cap: float) -> PoseGraph:
     I_tt = information[:, :d, :d]
     I_tr = information[:, :d, d:]
     I_rr = information[:, d:, d:]
-    is_singular = I_tr.any(axis=(1, 2)) & ~are_definite(information, LEAST_SCALED)
-    share = uncoupled_share(information, d) - 2.0**-20
-    # W is convex if the largest eigenvalue of I_rr is at most the second and half the smallest.
-    limit = np.array([0.5, 1.0]) if d == 3 else np.ones(1)
-    share = np.where(I_tr.any(axis=(1, 2)), np.maximum(share, 0.0), 1.0)
-    is_below = ~I_tr.any(axis=(1, 2))
+    is_coupled = I_tr.any(axis=(1, 2))
+    is_singular = is_coupled & ~are_definite(information, LEAST_SCALED)
+    # Weights of the two smallest eigenvalues of I_rr in the limit of the largest: W is convex if
+    # the largest is at most the second and half the smallest.
+    limit_weights = np.array([0.5, 1.0]) if d == 3 else np.ones(1)
+
+    def largest_of_tt(values: Array) -> Array:
+        return np.asarray(cap * values[:, 0])
+
+    def largest_of_rr(values: Array) -> Array:
+        return np.asarray(values[:, :2] @ limit_weights)
+
+    coupled_share = uncoupled_share(information, d) - _SHARE_ROUNDING
+    share = np.where(is_coupled, np.maximum(coupled_share, 0.0), 1.0)
+    is_below = ~is_coupled
     for _ in range(_HALVINGS):
+        shares = share[:, None, None]
         smaller = np.zeros_like(information)
-        smaller[:, :d, :d] = _clipped(
-            share[:, None, None] * I_tt, lambda values: cap * values[:, 0]
-        )
-        smaller[:, d:, d:] = _clipped(
-            share[:, None, None] * I_rr, lambda values: values[:, :2] @ limit
-        )
+        smaller[:, :d, :d] = _clipped(shares * I_tt, largest_of_tt)
+        smaller[:, d:, d:] = _clipped(shares * I_rr, largest_of_rr)
         is_below = is_below | are_definite(information - smaller, _SHOWN) | is_singular
         if is_below.all():
             shrunk = replace(graph, information=smaller)
             return shrunk.without_edges(is_singular) if is_singular.any() else shrunk
-        share = np.where(is_below, share, 0.5 * share)  # was rounded
+        # Rounding hides that the others are below; half of them is tried.
+        share = np.where(is_below, share, 0.5 * share)
     raise GraphError("rounding hides that smaller information matrices are below the graph's own")
 
 
 def _clipped(block: Array, limit: Callable[[Array], Array]) -> Array:
     """Blocks with their eigenvalues, ascending, cut to a limit; below them for all rounding."""
     values, axes = np.linalg.eigh(block)
-    margin = _MARGIN * np.einsum("mkk->m", block)[:, None]
-    smaller = np.minimum(values, limit(values)[:, None]) - margin
-    product = (axes * smaller[:, None, :]) @ np.swapaxes(axes, 1, 2)
+    traces = np.einsum("mkk->m", block)
+    margin = _MARGIN * traces[:, None]
+    largest = limit(values)[:, None]
+    smaller = np.minimum(values, largest) - margin
+    scaled_axes = axes * smaller[:, None, :]
+    product = scaled_axes @ np.swapaxes(axes, 1, 2)
     return np.asarray(0.5 * (product + np.swapaxes(product, 1, 2)))

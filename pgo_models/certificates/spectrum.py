@@ -34,9 +34,7 @@ class NegativeCurvature:
 def negative_curvature(
     problem: PGOProblem, Lambda: Array, eta: float, rng: np.random.Generator
 ) -> NegativeCurvature:
-    """Smallest eigenvalue of Q - blockdiag(Lambda), with its eigenvector.
-
-    It is below -eta < 0.
+    """Smallest eigenvalue of Q - blockdiag(Lambda), below -eta < 0, with its eigenvector.
 
     With eta about the smallest for which S + eta blockdiag(0, I) has a Cholesky factor, the inverse
     of Q - Lambda + eta I has the wanted eigenvalue far above all others, so that Lanczos needs a
@@ -47,10 +45,13 @@ def negative_curvature(
     d = problem.d
     shift, factor = smallest_definite_shift(problem, Lambda, ETA_GROWTH * eta, too_small=eta)
     first = rng.standard_normal(n * d)
-    _, vectors = eigsh(rotation_inverse(problem, factor), k=1, which="LA", v0=first, tol=_ACCURACY)
-    v = vectors[:, 0] / np.linalg.norm(vectors[:, 0])
+    inverse = rotation_inverse(problem, factor)
+    _, vectors = eigsh(inverse, k=1, which="LA", v0=first, tol=_ACCURACY)
+    direction = vectors[:, 0]
+    v = direction / np.linalg.norm(direction)
     blocks = v.reshape(n, d)
-    curvature = inner(v, problem.apply_Q(v[:, None])[:, 0])
+    Qv = problem.apply_Q(v[:, None])[:, 0]
+    curvature = inner(v, Qv)
     curvature -= float(np.einsum("na,nab,nb->", blocks, Lambda, blocks))
     return NegativeCurvature(curvature, blocks, shift, factor)
 
@@ -69,12 +70,12 @@ def smallest_definite_shift(
         except NotPositiveDefiniteError:
             return None
 
-    found = smallest_eta(attempt, eta, too_small=too_small)
-    if found is None:
+    shift_and_factor = smallest_eta(attempt, eta, too_small=too_small)
+    if shift_and_factor is None:
         raise NotPositiveDefiniteError(
             "no shift makes the certificate matrix positive definite; check Lambda for nan"
         )
-    return found
+    return shift_and_factor
 
 
 def rotation_inverse(problem: PGOProblem, factor: CholeskyFactor) -> LinearOperator:

@@ -41,7 +41,9 @@ class BregmanPoint(ReadOnly):
 
     def __post_init__(self) -> None:
         for name in ("x", "lam"):
-            object.__setattr__(self, name, real_array(getattr(self, name), name, SettingError))
+            given = getattr(self, name)
+            array = real_array(given, name, SettingError)
+            object.__setattr__(self, name, array)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +92,15 @@ class BregmanProblem(HoldsModel):
         f = np.atleast_1d(finite_array(self.f, "f"))
         K = _sparse_matrix(self.K)
         m = sum(int(variable.size) for variable in variables)
-        if f.ndim != 1 or K.shape != (len(f), m):
+        expected_shape = (len(f), m)
+        if f.ndim != 1 or K.shape != expected_shape:
             raise SettingError(
                 f"K has shape {K.shape} and f {f.shape}; "
                 f"with m = {m} they must be (s, {m}) and (s,)"
             )
-        for name, value in (("variables", variables), ("K", read_only(K)), ("f", read_only(f))):
-            object.__setattr__(self, name, value)
+        object.__setattr__(self, "variables", variables)
+        object.__setattr__(self, "K", read_only(K))
+        object.__setattr__(self, "f", read_only(f))
 
     def __repr__(self) -> str:
         s, m = self.K.shape
@@ -105,8 +109,9 @@ class BregmanProblem(HoldsModel):
     @property
     def blocks(self) -> tuple[slice, ...]:
         """Where each variable is in x."""
-        ends = np.cumsum([0, *(variable.size for variable in self.variables)])
-        return tuple(slice(int(start), int(end)) for start, end in pairwise(ends))
+        sizes = [variable.size for variable in self.variables]
+        ends = np.cumsum([0, *sizes]).tolist()
+        return tuple(slice(start, end) for start, end in pairwise(ends))
 
     def stacked(self, values: Sequence[Array]) -> Array:
         """Stack the values of all variables.
@@ -136,8 +141,10 @@ class BregmanProblem(HoldsModel):
         tuple of arrays
             One array for every variable, in its shape.
         """
-        blocks_and_variables = zip(self.blocks, self.variables, strict=True)
-        return tuple(x[block].reshape(variable.shape) for block, variable in blocks_and_variables)
+        values = []
+        for block, variable in zip(self.blocks, self.variables, strict=True):
+            values.append(x[block].reshape(variable.shape))
+        return tuple(values)
 
     def objective(self, x: Array) -> float:
         """Evaluate J.
@@ -152,7 +159,8 @@ class BregmanProblem(HoldsModel):
         float
             J(x); inf outside the domain of J.
         """
-        for variable, value in zip(self.variables, self.unstacked(x), strict=True):
+        values = self.unstacked(x)
+        for variable, value in zip(self.variables, values, strict=True):
             variable.save_value(value)
         with np.errstate(all="ignore"):  # outside the domain the value is nan or inf
             value_of_J = float(self.J.value)
@@ -194,7 +202,8 @@ def _checked_variables(J: Any, given: Any) -> tuple[cp.Variable, ...]:  # noqa: 
 def _sparse_matrix(given: Any) -> csr_array:  # noqa: ANN401 - dense or sparse
     """A sparse copy of a matrix, whose entries are finite."""
     if not issparse(given):
-        return csr_array(np.atleast_2d(finite_array(given, "K")))
+        dense = np.atleast_2d(finite_array(given, "K"))
+        return csr_array(dense)
     K = csr_array(cast(Any, given), copy=True)
     K.data = finite_array(K.data, "the entries of K")
     return K
@@ -220,7 +229,8 @@ class Subproblem(HoldsModel):
         convex_solver.solve_compiled(
             self.problem, "Bregman subproblem", self.tolerance, self.solver
         )
-        return np.concatenate([np.ravel(variable.value) for variable in self.variables])
+        values = [np.ravel(variable.value) for variable in self.variables]
+        return np.concatenate(values)
 
 
 def bregman_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
@@ -228,28 +238,39 @@ def bregman_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
 
     The constants J(x^k) and <p, x^k> are dropped.
     """
-    p = cp.Parameter(problem.K.shape[1], name="p")
+    _, m = problem.K.shape
+    p = cp.Parameter(m, name="p")
     x = _stack(problem.variables)
-    penalty = cp.sum_squares(np.sqrt(alpha / 2) * (problem.K @ x - problem.f))
-    model = cp.Problem(cp.Minimize(problem.J - p @ x + penalty))
+    root = np.sqrt(alpha / 2)
+    residual = problem.K @ x - problem.f
+    penalty = cp.sum_squares(root * residual)
+    objective = problem.J - p @ x + penalty
+    model = cp.Problem(cp.Minimize(objective))
     return Subproblem(model, problem.variables, p, 1.0)
 
 
 def two_line_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
     """Compile f - b -> argmin J(x) + alpha/2 ||K x - f + b||^2 (paper: `bregman update`)."""
     root = float(np.sqrt(alpha / 2))
-    shift = cp.Parameter(problem.K.shape[0], name="shift")
-    penalty = cp.sum_squares((root * problem.K) @ _stack(problem.variables) - shift)
+    s, _ = problem.K.shape
+    shift = cp.Parameter(s, name="shift")
+    x = _stack(problem.variables)
+    scaled_K = root * problem.K
+    penalty = cp.sum_squares(scaled_K @ x - shift)
     model = cp.Problem(cp.Minimize(problem.J + penalty))
     return Subproblem(model, problem.variables, shift, root)
 
 
 def augmented_lagrangian_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
     """Compile lam -> argmin J(x) + <lam, f - K x> + alpha/2 ||f - K x||^2 (paper: `minbregman`)."""
-    lam = cp.Parameter(problem.K.shape[0], name="lam")
-    residual = problem.f - problem.K @ _stack(problem.variables)
-    penalty = cp.sum_squares(np.sqrt(alpha / 2) * residual)
-    model = cp.Problem(cp.Minimize(problem.J + lam @ residual + penalty))
+    s, _ = problem.K.shape
+    lam = cp.Parameter(s, name="lam")
+    x = _stack(problem.variables)
+    residual = problem.f - problem.K @ x
+    root = np.sqrt(alpha / 2)
+    penalty = cp.sum_squares(root * residual)
+    objective = problem.J + lam @ residual + penalty
+    model = cp.Problem(cp.Minimize(objective))
     return Subproblem(model, problem.variables, lam, 1.0)
 
 
@@ -261,14 +282,18 @@ def block_subproblems(problem: BregmanProblem, alpha: float) -> tuple[Subproblem
     sum of terms of one variable each.
     """
     root = float(np.sqrt(alpha / 2))
+    s, _ = problem.K.shape
     terms = _terms_by_variable(problem)
+    blocks = zip(problem.variables, problem.blocks, terms, strict=True)
     subproblems = []
-    for variable, block, J_i in zip(problem.variables, problem.blocks, terms, strict=True):
-        c = cp.Parameter(problem.K.shape[0], name="c")
-        K_i = problem.K[:, block]
-        penalty = cp.sum_squares((root * K_i) @ _stack((variable,)) - c)
+    for variable, block, J_i in blocks:
+        c = cp.Parameter(s, name="c")
+        x_i = _stack((variable,))
+        scaled_K_i = root * problem.K[:, block]
+        penalty = cp.sum_squares(scaled_K_i @ x_i - c)
         model = cp.Problem(cp.Minimize(J_i + penalty))
-        subproblems.append(Subproblem(model, (variable,), c, root))
+        subproblem = Subproblem(model, (variable,), c, root)
+        subproblems.append(subproblem)
     return tuple(subproblems)
 
 
@@ -277,7 +302,9 @@ def _terms_by_variable(problem: BregmanProblem) -> list[cp.Expression]:
     position = {variable.id: index for index, variable in enumerate(problem.variables)}
     separated: list[Any] = [cp.Constant(0.0) for _ in problem.variables]
     addition = type(problem.J + 1.0)
-    for term in problem.J.args if isinstance(problem.J, addition) else [problem.J]:
+    is_sum = isinstance(problem.J, addition)
+    terms = problem.J.args if is_sum else [problem.J]
+    for term in terms:
         owners = term.variables()
         if len(owners) > 1:
             names = ", ".join(map(str, owners))
@@ -286,9 +313,11 @@ def _terms_by_variable(problem: BregmanProblem) -> list[cp.Expression]:
                 "one variable each, with copies of shared ones that K x = f ties"
             )
         if owners:
-            separated[position[owners[0].id]] += term
+            owner = position[owners[0].id]
+            separated[owner] += term
     return separated
 
 
 def _stack(variables: Sequence[cp.Variable]) -> cp.Expression:
-    return cp.hstack([cp.vec(variable, order="C") for variable in variables])
+    vectors = [cp.vec(variable, order="C") for variable in variables]
+    return cp.hstack(vectors)

@@ -1,4 +1,4 @@
-"""Worked models of the form min J(x) subject to K x = f, for the Bregman iterations.
+"""Example models of the form min J(x) subject to K x = f, for the Bregman iterations.
 
 The iterations are in solvers/convex/bregman.py.
 """
@@ -17,12 +17,13 @@ def basis_pursuit(K: Array, f: Array) -> BregmanProblem:
     """Minimise ||x||_1 subject to K x = f.
 
     The solution is the sparsest x, when K is incoherent and x sparse enough. Bregman iteration ends
-    after finitely many steps, and forgets errors on the way (Yin et al. 2008; Yin & Osher 2013).
+    after finitely many steps, and errors of its steps do not accumulate (Yin et al. 2008; Yin &
+    Osher 2013).
 
     Parameters
     ----------
     K : (s, m) array
-        Measurement matrix, mostly with fewer rows than columns.
+        Measurement matrix, usually with fewer rows than columns.
     f : (s,) array
         Measurements.
 
@@ -38,7 +39,8 @@ def basis_pursuit(K: Array, f: Array) -> BregmanProblem:
     """
     num_unknowns = np.shape(K)[-1]
     x = cp.Variable(num_unknowns, name="x")
-    return BregmanProblem(cp.norm1(x), x, K, f)
+    one_norm = cp.norm1(x)
+    return BregmanProblem(one_norm, x, K, f)
 
 
 def differences(shape: tuple[int, ...]) -> csr_array:
@@ -65,10 +67,12 @@ def differences(shape: tuple[int, ...]) -> csr_array:
     >>> differences((3,)).toarray().tolist()
     [[-1.0, 1.0, 0.0], [0.0, -1.0, 1.0]]
     """
-    if len(shape) not in (1, 2) or int(np.prod(shape)) < 2:
+    num_entries = int(np.prod(shape))
+    if len(shape) not in (1, 2) or num_entries < 2:
         raise SettingError(f"shape is {shape}; give a signal or an image of two entries or more")
     if len(shape) == 1:
-        return _forward_differences(shape[0])
+        (length,) = shape
+        return _forward_differences(length)
     height, width = shape
     down = kron(_forward_differences(height), eye_array(width))
     across = kron(eye_array(height), _forward_differences(width))
@@ -113,17 +117,19 @@ def total_variation_denoising(noisy: Array, weight: float) -> BregmanProblem:
     d = cp.Variable(num_differences, name="d")
     misfit = 0.5 * cp.sum_squares(u - noisy)
     total_variation = weight * cp.norm1(d)
+    # D u - d = 0.
     K = hstack([D, -eye_array(num_differences)])
     f = np.zeros(num_differences)
-    return BregmanProblem(misfit + total_variation, (u, d), K, f)
+    J = misfit + total_variation
+    return BregmanProblem(J, (u, d), K, f)
 
 
 def total_variation_scale_space(noisy: Array) -> BregmanProblem:
     """Minimise TV(u) subject to u = noisy.
 
-    Its solution is known; its Bregman iterates are what is wanted. They begin over-smoothed and
-    take detail back, large contrasts first and noise last: stop when ||u - noisy|| falls below the
-    norm of the noise (Osher et al. 2005).
+    The solution is u = noisy; the denoised signal is one of the Bregman iterates. The first are
+    over-smoothed. Later ones recover detail, large contrasts first and noise last: stop when ||u -
+    noisy|| falls below the norm of the noise (Osher et al. 2005).
 
     Parameters
     ----------
@@ -148,11 +154,16 @@ def total_variation_scale_space(noisy: Array) -> BregmanProblem:
     noisy = finite_array(noisy, "noisy")
     u = cp.Variable(noisy.shape, name="u")
     flat_u = cp.vec(u, order="C")
-    total_variation = cp.norm1(differences(noisy.shape) @ flat_u)
-    return BregmanProblem(total_variation, u, eye_array(noisy.size), noisy.ravel())
+    D = differences(noisy.shape)
+    total_variation = cp.norm1(D @ flat_u)
+    K = eye_array(noisy.size)
+    f = noisy.ravel()
+    return BregmanProblem(total_variation, u, K, f)
 
 
 def _forward_differences(length: int) -> csr_array:
+    """Matrix, (length - 1, length), of the differences x_{k+1} - x_k."""
     num_differences = max(length - 1, 0)
+    current = eye_array(num_differences, length)
     following = eye_array(num_differences, length, k=1)
-    return csr_array(following - eye_array(num_differences, length))
+    return csr_array(following - current)

@@ -44,7 +44,8 @@ class ConstraintSet(ABC):
 
         Its distribution is uniform for orthonormal columns, rotations and unit vectors.
         """
-        return self.project(rng.standard_normal(shape))
+        normal_entries = rng.standard_normal(shape)
+        return self.project(normal_entries)
 
 
 @dataclass(frozen=True)
@@ -65,19 +66,23 @@ class Orthonormal(ConstraintSet):
 
     def normal_part(self, P: Array, G: Array) -> Array:
         """P Lambda, with Lambda = sym(P^T G)."""
-        return np.asarray(P @ _symmetric(P.T @ G))
+        Lambda = _symmetric(P.T @ G)
+        return np.asarray(P @ Lambda)
 
     def least_penalty(self, P: Array, N: Array) -> float:
         """Largest eigenvalue of -Lambda, with N = P Lambda.
 
         The polar factor of P (I + Lambda / rho) must be P.
         """
-        eigenvalues = np.linalg.eigvalsh(_symmetric(P.T @ N))
-        return max(0.0, float(-eigenvalues[0]))
+        Lambda = _symmetric(P.T @ N)
+        smallest = np.linalg.eigvalsh(Lambda)[0]
+        return max(0.0, float(-smallest))
 
     def distance(self, P: Array) -> float:
         """||P^T P - I||_F."""
-        return float(np.linalg.norm(P.T @ P - np.eye(P.shape[1])))
+        gram = P.T @ P
+        identity = np.eye(len(gram))
+        return float(np.linalg.norm(gram - identity))
 
 
 @dataclass(frozen=True)
@@ -104,13 +109,15 @@ class Rotations(Orthonormal):
 
         P (I + Lambda / rho) may have one negative singular value and still be nearest to P.
         """
-        eigenvalues = np.linalg.eigvalsh(_symmetric(P.T @ N))
-        return max(0.0, float(-np.mean(eigenvalues[:2])))
+        Lambda = _symmetric(P.T @ N)
+        two_smallest = np.linalg.eigvalsh(Lambda)[:2]
+        return max(0.0, float(-np.mean(two_smallest)))
 
     def distance(self, P: Array) -> float:
         """max(||P^T P - I||_F, 1 - det P)."""
         not_orthogonal = super().distance(P)
-        return max(not_orthogonal, 1.0 - float(np.linalg.det(P)))
+        determinant = float(np.linalg.det(P))
+        return max(not_orthogonal, 1.0 - determinant)
 
 
 @dataclass(frozen=True)
@@ -128,20 +135,24 @@ class UnitColumns(ConstraintSet):
 
     def normal_part(self, P: Array, G: Array) -> Array:
         """P diag(Lambda), with Lambda_j = <p_j, g_j>."""
-        columns = self._columns(P) * self._products(P, G)
+        Lambda = self._products(P, G)
+        columns = self._columns(P) * Lambda
         return self._columns(columns).reshape(P.shape)
 
     def least_penalty(self, P: Array, N: Array) -> float:
         """Largest -Lambda_j, with N = P diag(Lambda)."""
-        return max(0.0, float(-np.min(self._products(P, N))))
+        Lambda = self._products(P, N)
+        return max(0.0, float(-np.min(Lambda)))
 
     def distance(self, P: Array) -> float:
         """Norm of the vector of ||p_j||^2 - 1."""
-        return float(np.linalg.norm(self._products(P, P) - 1.0))
+        squared_norms = self._products(P, P)
+        return float(np.linalg.norm(squared_norms - 1.0))
 
     def _products(self, P: Array, G: Array) -> Array:
         """<p_j, g_j> of all columns."""
-        return np.asarray(np.sum(self._columns(P) * self._columns(G), axis=0))
+        products = self._columns(P) * self._columns(G)
+        return np.asarray(np.sum(products, axis=0))
 
 
 @dataclass(frozen=True)
@@ -149,7 +160,9 @@ class UnitRows(UnitColumns):
     """||x_i|| = 1 for every row x_i; of a vector, every entry is -1 or 1."""
 
     def _columns(self, V: Array) -> Array:
-        return V.reshape(1, -1) if V.ndim == 1 else V.T
+        if V.ndim == 1:
+            return V.reshape(1, -1)
+        return V.T
 
 
 @dataclass(frozen=True)
@@ -181,7 +194,8 @@ class Sparse(ConstraintSet):
 
     def distance(self, P: Array) -> float:
         """Norm of the entries that hard thresholding would drop."""
-        return float(np.linalg.norm(P - self.project(P)))
+        dropped = P - self.project(P)
+        return float(np.linalg.norm(dropped))
 
 
 def _symmetric(A: Array) -> Array:

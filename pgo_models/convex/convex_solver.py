@@ -50,14 +50,16 @@ class HoldsModel(ReadOnly):
     """
 
     def __getstate__(self) -> dict[str, object]:
-        state = {name: _as_posed(value) for name, value in super().__getstate__().items()}
-        return {**state, _LAST_NUMBER: get_id()}
+        state = super().__getstate__()
+        posed = {name: _as_posed(value) for name, value in state.items()}
+        return {**posed, _LAST_NUMBER: get_id()}
 
     def __setstate__(self, state: dict[str, object]) -> None:
         last = cast("int", state[_LAST_NUMBER])
         while get_id() < last:
             pass
-        super().__setstate__({name: value for name, value in state.items() if name != _LAST_NUMBER})
+        fields = {name: value for name, value in state.items() if name != _LAST_NUMBER}
+        super().__setstate__(fields)
 
 
 def _as_posed(value: object) -> object:
@@ -223,7 +225,8 @@ class ConvexSolver:
 
 def _solver_error() -> type[Exception]:
     """The error of a solve: cvxpy's, or MOSEK's own, which it raises for a missing licence."""
-    error: type[Exception] = getattr(sys.modules.get("mosek"), "Error", cp.SolverError)
+    mosek = sys.modules.get("mosek")
+    error: type[Exception] = getattr(mosek, "Error", cp.SolverError)
     return error
 
 
@@ -262,9 +265,8 @@ def solve_compiled(
         if status == cp.OPTIMAL or (is_last and status == accepted):
             return
         if status in _WHY or is_last:
-            raise PGOError(
-                f"{solver.name} ended with status {status} on the {name}: {_WHY.get(status, why)}"
-            )
+            reason = _WHY.get(status, why)
+            raise PGOError(f"{solver.name} ended with status {status} on the {name}: {reason}")
         tolerance = min(100.0 * tolerance, LOOSEST_TOLERANCE)
 
 

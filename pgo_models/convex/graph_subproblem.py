@@ -68,7 +68,8 @@ class Stack:
         """Expression of shape (d,) or (d, d) for a number, (k, d) or (k, d, d) for k numbers."""
         count = self.whole.shape[0] // self.side
         numbers: Any = np.arange(count)[which]
-        rows = self.whole[rotation_columns(np.atleast_1d(numbers), 0, self.side).ravel()]
+        row_numbers = rotation_columns(np.atleast_1d(numbers), 0, self.side)
+        rows = self.whole[row_numbers.ravel()]
         rows_of_program = rows[:, self.columns]
         if rows_of_program.nnz < rows.nnz:
             raise SettingError(
@@ -156,7 +157,8 @@ class ModelChange(HoldsModel):
     def __post_init__(self) -> None:
         check_terms(self.terms, self.constraints)
         edges = np.asarray(self.replaced_edges)
-        chosen = np.flatnonzero(edges) if edges.dtype == bool else edges.astype(int)
+        is_mask = edges.dtype == bool
+        chosen = np.flatnonzero(edges) if is_mask else edges.astype(int)
         object.__setattr__(self, "replaced_edges", tuple(chosen.tolist()))
 
 
@@ -240,7 +242,8 @@ class GraphQP:
         residuals = self.A @ X
         self.variables.X.value = X
         added = sum(float(term.value) for term in self.change.terms)
-        return float(self.w @ np.einsum("rc,rc->r", residuals, residuals)) + added
+        squares = np.einsum("rc,rc->r", residuals, residuals)
+        return float(self.w @ squares) + added
 
     def gradient(self, X: Array) -> Array:
         """Compute the gradient of `cost`.
@@ -256,7 +259,8 @@ class GraphQP:
             The gradient in X.
         """
         self.variables.X.value = X
-        weighted_residuals = 2.0 * self.w[:, None] * (self.A @ X)
+        residuals = self.A @ X
+        weighted_residuals = 2.0 * self.w[:, None] * residuals
         gradient_of_edges = np.asarray(self.A.T @ weighted_residuals)
         return sum(map(self.gradient_of, self.change.terms), gradient_of_edges)
 
@@ -274,8 +278,10 @@ class GraphQP:
             The gradient in X; zeros where the term does not depend on X.
         """
         X = self.variables.X
-        gradient = term.grad.get(X, csr_array((X.size, 1)))
-        return np.asarray(gradient.toarray().reshape(X.shape, order="F"))
+        zeros = csr_array((X.size, 1))
+        gradient = term.grad.get(X, zeros)
+        stacked_columns = gradient.toarray()
+        return np.asarray(stacked_columns.reshape(X.shape, order="F"))
 
 
 def graph_qp(
@@ -351,7 +357,8 @@ def robot_qp(
         raise SettingError(
             f"robot {robot} owns no pose; the graph has robots 0 to {graph.num_robots - 1}"
         )
-    num_own_ends = owned[graph.i].astype(int) + owned[graph.j]
+    owns_i = owned[graph.i].astype(int)
+    num_own_ends = owns_i + owned[graph.j]
     touches = num_own_ends > 0
     if neighbours is Neighbours.FROZEN:
         shares = touches.astype(float)
@@ -394,7 +401,8 @@ def _posed(
     shares = shares.copy()
     shares[np.array(change.replaced_edges, dtype=int)] = 0.0
     shares_of_translations = shares if has_translations else np.zeros(m)
-    weights = weights * np.concatenate([shares_of_translations, np.repeat(shares, d)])
+    shares_of_rotations = np.repeat(shares, d)
+    weights = weights * np.concatenate([shares_of_translations, shares_of_rotations])
     is_counted = weights > 0
     w = weights[is_counted]
     A_counted = A_whole[is_counted]

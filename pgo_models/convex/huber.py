@@ -29,18 +29,20 @@ def huber_change(edges: IntArray, thresholds: Array) -> Changer:
     def change(unknown: PoseVariables) -> ModelChange:
         graph = unknown.graph
         t_residuals = unknown.translation_residual[edges]
-        R_residuals = cp.reshape(
-            unknown.rotation_residual[edges], (len(edges), graph.d**2), order="C"
-        )
+        matrices = unknown.rotation_residual[edges]
+        shape_of_rows = (len(edges), graph.d**2)
+        R_residuals = cp.reshape(matrices, shape_of_rows, order="C")
         root_tau = np.sqrt(graph.tau[edges])[:, None]
         root_kappa = np.sqrt(graph.kappa[edges])[:, None]
-        weighted = cp.hstack(
-            [cp.multiply(root_tau, t_residuals), cp.multiply(root_kappa, R_residuals)]
-        )
+        weighted_t = cp.multiply(root_tau, t_residuals)
+        weighted_R = cp.multiply(root_kappa, R_residuals)
+        weighted = cp.hstack([weighted_t, weighted_R])
         r = cp.norm(weighted, 2, axis=1)
         c = np.sqrt(thresholds[edges])
         # cp.huber(x) is x^2, and 2 |x| - 1 beyond 1.
-        losses = cp.multiply(c**2, cp.huber(cp.multiply(1.0 / c, r)))
-        return ModelChange(terms=[cp.sum(losses)], replaced_edges=edges.tolist())
+        relative = cp.multiply(1.0 / c, r)
+        losses = cp.multiply(c**2, cp.huber(relative))
+        total = cp.sum(losses)
+        return ModelChange(terms=[total], replaced_edges=edges.tolist())
 
     return change

@@ -148,9 +148,11 @@ class OrthogonalProblem(HoldsModel):
                 positions[variable.id] = len(variables)
                 variables.append(variable)
             terms.append(Term(positions[variable.id], constraint))
-        others = [variable for variable in self.problem.variables() if variable.id not in positions]
-        for variable in others:
-            check_variable(variable, "a variable of the problem")
+        others = []
+        for variable in self.problem.variables():
+            if variable.id not in positions:
+                check_variable(variable, "a variable of the problem")
+                others.append(variable)
         object.__setattr__(self, "J", _minimised(self.problem))
         object.__setattr__(self, "variables", tuple(variables))
         object.__setattr__(self, "others", tuple(others))
@@ -198,15 +200,22 @@ class OrthogonalProblem(HoldsModel):
         SettingError
             If the number or the shapes of the values do not fit, or entries are not finite.
         """
-        checked = [finite_array(value, f"values[{place}]") for place, value in enumerate(values)]
+        checked = []
+        for place, value in enumerate(values):
+            checked.append(finite_array(value, f"values[{place}]"))
         given = [value.shape for value in checked]
         needed = [variable.shape for variable in self.variables]
         if given != needed:
             raise SettingError(
                 f"{len(given)} values for {len(needed)} variables, of shapes {given}; need {needed}"
             )
-        copies = tuple(term.constraint.project(checked[term.variable]) for term in self.terms)
-        return OrthogonalPoint(copies, tuple(np.zeros(copy.shape) for copy in copies))
+        copies = []
+        normals = []
+        for term in self.terms:
+            copy = term.constraint.project(checked[term.variable])
+            copies.append(copy)
+            normals.append(np.zeros(copy.shape))
+        return OrthogonalPoint(tuple(copies), tuple(normals))
 
     def check_point(self, point: OrthogonalPoint) -> None:
         """Check that a point fits this problem.
@@ -223,7 +232,8 @@ class OrthogonalProblem(HoldsModel):
             sets.
         """
         needed = [self.variables[term.variable].shape for term in self.terms]
-        for name, arrays in (("copies", point.copies), ("normals", point.normals)):
+        for name in ("copies", "normals"):
+            arrays = getattr(point, name)
             shapes = [np.shape(array) for array in arrays]
             if shapes != needed:
                 raise SettingError(f"the point's {name} have shapes {shapes}; need {needed}")
@@ -300,7 +310,8 @@ class OrthogonalProblem(HoldsModel):
             For every variable of `others`, in its shape.
         """
         variables = (*self.variables, *self.others)
-        for variable, value in zip(variables, (*values, *others), strict=False):
+        all_values = (*values, *others)
+        for variable, value in zip(variables, all_values, strict=False):
             variable.save_value(value)
 
     def objective(self, values: Sequence[Array], others: Sequence[Array] = ()) -> float:
@@ -342,10 +353,12 @@ class OrthogonalProblem(HoldsModel):
         of_terms = list(zip(self.terms, copies, strict=True))
         violations = [term.constraint.distance(copy) for term, copy in of_terms]
         for term, copy in of_terms:
-            violations.append(float(np.linalg.norm(copy - values[term.variable])))
+            difference = copy - values[term.variable]
+            violations.append(float(np.linalg.norm(difference)))
         self.assign(values, others)
         for constraint in self.problem.constraints:
-            violations.append(float(np.linalg.norm(constraint.violation())))
+            violation = constraint.violation()
+            violations.append(float(np.linalg.norm(violation)))
         return float(np.linalg.norm(violations))
 
     def split(self, solver: ConvexSolver | str = COLD) -> "SplitProblem":
@@ -369,10 +382,13 @@ class OrthogonalProblem(HoldsModel):
         root = cp.Parameter(nonneg=True, name="root")
         shifts = tuple(cp.Parameter(variable.shape, name="shift") for variable in self.variables)
         penalty: Any = 0
-        for position, (variable, shift) in enumerate(zip(self.variables, shifts, strict=True)):
+        variables_and_shifts = zip(self.variables, shifts, strict=True)
+        for position, (variable, shift) in enumerate(variables_and_shifts):
             num_terms = len(self.terms_of(position))
-            penalty += 0.5 * num_terms * cp.sum_squares(root * variable - shift)
-        problem = cp.Problem(cp.Minimize(self.J + penalty), self.problem.constraints)
+            squares = cp.sum_squares(root * variable - shift)
+            penalty += 0.5 * num_terms * squares
+        objective = cp.Minimize(self.J + penalty)
+        problem = cp.Problem(objective, self.problem.constraints)
         if not problem.is_dcp(dpp=True):
             raise SettingError(
                 "a Parameter of the problem is not used by the rules of DPP; see cvxpy's manual"
@@ -404,14 +420,15 @@ class SplitProblem(HoldsModel):
         of rho (V_term - X) is a subgradient at X of J minimised over y and the convex constraints.
         A PGOError when the convex constraints contradict each other, or J has no minimum over y.
         """
-        self.root.value = np.sqrt(rho)
+        root = np.sqrt(rho)
+        self.root.value = root
         for position, shift in enumerate(self.shifts):
-            V_of_variable = [
-                V_term
-                for term, V_term in zip(self.terms, V, strict=True)
-                if term.variable == position
-            ]
-            shift.value = np.sqrt(rho) * np.mean(V_of_variable, axis=0)
+            V_of_variable = []
+            for term, V_term in zip(self.terms, V, strict=True):
+                if term.variable == position:
+                    V_of_variable.append(V_term)
+            mean_V = np.mean(V_of_variable, axis=0)
+            shift.value = root * mean_V
         convex_solver.solve_compiled(self.problem, "split subproblem", solver=self.solver)
         return _values(self.variables), _values(self.others)
 
@@ -454,15 +471,19 @@ def kkt_residuals(
     subgradient at Z (times the number of terms of the variable), so rho ||X - Z|| is what
     stationarity lacks.
     """
-    terms = zip(problem.terms, point.copies, point.normals, strict=True)
-    normals = [term.constraint.normal_part(copy, normal) for term, copy, normal in terms]
-    V = [copy - normal / rho for copy, normal in zip(point.copies, normals, strict=True)]
+    normals = []
+    V = []
+    for term, copy, given in zip(problem.terms, point.copies, point.normals, strict=True):
+        normal = term.constraint.normal_part(copy, given)
+        normals.append(normal)
+        V.append(copy - normal / rho)
     Z, others = problem.split(solver).solve(V, rho)
     values = problem.values(point.copies)
     gaps = []
     for position, X in enumerate(values):
         num_terms = len(problem.terms_of(position))
-        gaps.append(num_terms * rho * (X - Z[position]))
+        difference = X - Z[position]
+        gaps.append(num_terms * rho * difference)
     gradients = [np.zeros(X.shape) for X in values]
     multipliers = []
     for term, copy, normal in zip(problem.terms, point.copies, normals, strict=True):
@@ -471,12 +492,15 @@ def kkt_residuals(
             -copy.T @ normal if isinstance(term.constraint, Orthonormal) else -normal
         )
     feasibility = problem.infeasibility(point.copies, others)
-    return KKTResiduals(feasibility, norm_of_all(gaps), norm_of_all(gradients), tuple(multipliers))
+    stationarity = norm_of_all(gaps)
+    gradient_norm = norm_of_all(gradients)
+    return KKTResiduals(feasibility, stationarity, gradient_norm, tuple(multipliers))
 
 
 def norm_of_all(arrays: Sequence[Array]) -> float:
     """Norm of all entries of several arrays."""
-    return float(np.sqrt(sum(float(np.sum(array**2)) for array in arrays)))
+    sums_of_squares = [float(np.sum(array**2)) for array in arrays]
+    return float(np.sqrt(sum(sums_of_squares)))
 
 
 def _real_arrays(arrays: Sequence[Array], name: str) -> tuple[Array, ...]:

@@ -1,4 +1,4 @@
-"""Worked models with orthogonality constraints whose answers are known, for `solve_orthogonal`."""
+"""Example models with orthogonality constraints, for `solve_orthogonal`."""
 
 from collections.abc import Sequence
 
@@ -10,23 +10,24 @@ from pgo_models.convex.orthogonality import OrthogonalProblem
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 
-_ROUNDING = 1e-10  # relative: what a symmetric positive semidefinite matrix may be off by
+# Relative tolerance for symmetry and for negative eigenvalues of a positive semidefinite matrix.
+_ROUNDING = 1e-10
 
 
 def procrustes(A: Array, B: Array, *, rotation: bool = False) -> OrthogonalProblem:
     """Minimise ||A X - B||_F^2 subject to X^T X = I, or X in SO(d).
 
-    If A and B have the same shape (l, n) the answer is U V^T of the SVD of A^T B, with the sign of
-    the last singular pair changed for SO(d) when det(U V^T) < 0 (Schoenemann 1966; Lai & Osher
+    If A and B have the same shape (l, n) the solution is U V^T of the SVD of A^T B, with the sign
+    of the last singular pair changed for SO(d) when det(U V^T) < 0 (Schoenemann 1966; Lai & Osher
     2014, section 4). With A = I it is the nearest orthonormal matrix to B. If B is (l, p) with p <
     n the problem is unbalanced and has no closed form (Elden & Park 1999).
 
     Parameters
     ----------
     A : (l, n) array
-        What is rotated.
+        The matrix that X is applied to.
     B : (l, p) array
-        What it is to agree with.
+        The matrix to fit.
     rotation : bool
         Whether X must be a rotation.
 
@@ -49,8 +50,11 @@ def procrustes(A: Array, B: Array, *, rotation: bool = False) -> OrthogonalProbl
     B = _matrix(B, "B")
     if len(A) != len(B):
         raise SettingError(f"A has {len(A)} rows and B {len(B)}; they must agree")
-    X = cp.Variable((A.shape[1], B.shape[1]), name="X")
-    problem = cp.Problem(cp.Minimize(cp.sum_squares(A @ X - B)))
+    n = A.shape[1]
+    p = B.shape[1]
+    X = cp.Variable((n, p), name="X")
+    squared_error = cp.sum_squares(A @ X - B)
+    problem = cp.Problem(cp.Minimize(squared_error))
     if rotation:
         return OrthogonalProblem(problem, rotations=[X])
     return OrthogonalProblem(problem, orthogonal=[X])
@@ -59,9 +63,9 @@ def procrustes(A: Array, B: Array, *, rotation: bool = False) -> OrthogonalProbl
 def sparse_components(A: Array, count: int, weight: float) -> OrthogonalProblem:
     """Minimise tr(X^T A X) + weight * sum |X| subject to X^T X = I: compressed modes.
 
-    With weight 0 they span the eigenvectors of the smallest eigenvalues. No answer is below the sum
-    of these + weight * count, since a unit column has 1-norm at least 1 (Ozolins, Lai, Caflisch,
-    Osher 2013).
+    With weight 0 the columns span the eigenvectors of the smallest eigenvalues. The minimum is at
+    least the sum of these plus weight * count, since a unit column has 1-norm at least 1 (Ozolins,
+    Lai, Caflisch, Osher 2013).
 
     Parameters
     ----------
@@ -88,10 +92,13 @@ def sparse_components(A: Array, count: int, weight: float) -> OrthogonalProblem:
     OrthogonalProblem((3, 2) Orthonormal)
     """
     A = _matrix(A, "A")
-    X = cp.Variable((len(A), count), name="X")
-    quadratic = cp.sum_squares(_root(A) @ X)
+    n = len(A)
+    X = cp.Variable((n, count), name="X")
+    root = _root(A)
+    trace = cp.sum_squares(root @ X)
     one_norm = cp.sum(cp.abs(X))
-    problem = cp.Problem(cp.Minimize(quadratic + weight * one_norm))
+    objective = trace + weight * one_norm
+    problem = cp.Problem(cp.Minimize(objective))
     return OrthogonalProblem(problem, orthogonal=[X])
 
 
@@ -99,14 +106,15 @@ def sparse_low_rank(Y: Array, rank: int, nonzeros: int) -> OrthogonalProblem:
     """Minimise ||Y - B C||_F^2 subject to B^T B = I and ||B||_0 <= nonzeros.
 
     This is sparse low-rank approximation, which a remark of the paper mentions (SLRMA: Hou, Chau,
-    Magnenat-Thalmann, He 2017). For B given C = B^T Y is best, which leaves ||Y||_F^2 - ||B^T
-    Y||_F^2. It is concave in B, but on B^T B = I it is tr(B^T (c I - Y Y^T) B) + ||Y||_F^2 - c
-    rank, convex with c = ||Y||_2^2. This is J: the squared error. B is in two sets and has a copy
-    for each, one from the SVD step and one from hard thresholding.
+    Magnenat-Thalmann, He 2017). For a given B the minimum over C is at C = B^T Y, with the value
+    ||Y||_F^2 - ||B^T Y||_F^2. That is concave in B, but on B^T B = I it is equal to tr(B^T (c I - Y
+    Y^T) B) + ||Y||_F^2 - c rank, which is convex with c = ||Y||_2^2. This is the objective J. B is
+    constrained to two sets and has a copy for each: the SVD step projects one, hard thresholding
+    the other.
 
-    Start at the left singular vectors of Y, with a fixed penalty of 3 c or more: two non-convex
-    sets have many stationary points, and from a random start SOC mostly ends at a poor one, or does
-    not end.
+    Start at the left singular vectors of Y, with a fixed penalty of 3 c or more. With two
+    non-convex sets there are many stationary points, and from a random start SOC usually ends at a
+    poor one, or does not converge.
 
     Parameters
     ----------
@@ -115,7 +123,7 @@ def sparse_low_rank(Y: Array, rank: int, nonzeros: int) -> OrthogonalProblem:
     rank : int
         Number of columns of B.
     nonzeros : int
-        How many entries of B may differ from zero.
+        Largest number of entries of B that differ from zero.
 
     Returns
     -------
@@ -136,8 +144,10 @@ def sparse_low_rank(Y: Array, rank: int, nonzeros: int) -> OrthogonalProblem:
     n = len(Y)
     c = float(np.linalg.norm(Y, 2)) ** 2
     B = cp.Variable((n, rank), name="B")
-    quadratic = cp.sum_squares(_root(c * np.eye(n) - Y @ Y.T) @ B)
-    objective = quadratic + float(np.sum(Y**2)) - c * rank
+    root = _root(c * np.eye(n) - Y @ Y.T)
+    trace = cp.sum_squares(root @ B)
+    squared_norm = float(np.sum(Y**2))
+    objective = trace + squared_norm - c * rank
     problem = cp.Problem(cp.Minimize(objective))
     return OrthogonalProblem(problem, orthogonal=[B], sparse=[(B, nonzeros)])
 
@@ -147,22 +157,29 @@ def _root(A: Array) -> Array:
     if not _is_symmetric(A):
         raise SettingError(f"A, {A.shape}, is not symmetric")
     eigenvalues, eigenvectors = np.linalg.eigh(A)
-    if eigenvalues[0] < -_ROUNDING * max(1.0, float(eigenvalues[-1])):
+    smallest = eigenvalues[0]
+    largest = float(eigenvalues[-1])
+    if smallest < -_ROUNDING * max(1.0, largest):
         raise SettingError(
-            f"A has the eigenvalue {eigenvalues[0]:.3g}; it must be positive semidefinite, add c I"
+            f"A has the eigenvalue {smallest:.3g}; it must be positive semidefinite, add c I"
         )
-    roots = np.sqrt(np.maximum(eigenvalues, 0.0))
-    return np.asarray((eigenvectors * roots) @ eigenvectors.T)
+    nonnegative = np.maximum(eigenvalues, 0.0)
+    scaled_columns = eigenvectors * np.sqrt(nonnegative)
+    return np.asarray(scaled_columns @ eigenvectors.T)
 
 
 def _is_symmetric(A: Array) -> bool:
-    if A.shape[0] != A.shape[1]:
+    """Whether A is square and symmetric to `_ROUNDING`."""
+    num_rows, num_columns = A.shape
+    if num_rows != num_columns:
         return False
     largest = float(np.abs(A).max())
-    return np.allclose(A, A.T, rtol=_ROUNDING, atol=_ROUNDING * max(1.0, largest))
+    tolerance = _ROUNDING * max(1.0, largest)
+    return np.allclose(A, A.T, rtol=_ROUNDING, atol=tolerance)
 
 
 def _matrix(A: Array | Sequence[Sequence[float]], name: str) -> Array:
+    """Finite entries as a matrix; a SettingError for any other shape."""
     matrix = finite_array(A, name)
     if matrix.ndim != 2:
         raise SettingError(f"{name} has shape {matrix.shape}; give a matrix")

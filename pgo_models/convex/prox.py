@@ -1,12 +1,12 @@
-"""Proximal operators in closed form, of which splittings are made.
+"""Proximal operators in closed form, for splitting methods.
 
     prox_sf(v) = argmin over x of  s f(x) + 1/2 ||x - v||^2
 
-Each is a function of the point v and the step s. The proximal operator of the indicator of a set is
-the projection onto it, whatever the step. Sparse arrays, unit columns, orthonormal columns and
-SO(d) are not convex: there it is one of the nearest points. Numbers in brackets are sections of
-Parikh & Boyd, Proximal Algorithms, 2014. The projection onto SO(d), step (b) of SOC, is
-`project_to_rotations`.
+Each is a function of the point v and the step s. The proximal operator of the indicator function of
+a set is the projection onto it, for every step. The sets of sparse arrays, of unit columns, of
+orthonormal columns and SO(d) are not convex: the projection is one of the nearest points. Numbers
+in brackets are sections of Parikh & Boyd, Proximal Algorithms, 2014. The projection onto SO(d),
+step (b) of SOC, is `project_to_rotations`.
 """
 
 import numpy as np
@@ -62,8 +62,9 @@ def group_soft_threshold(v: Array, step: float) -> Array:
     [[2.4, 3.2], [0.0, 0.0]]
     """
     norms = np.linalg.norm(v, axis=-1, keepdims=True)
+    shortened = soft_threshold(norms, step)
     divisors = np.where(norms > 0, norms, 1.0)
-    scale = soft_threshold(norms, step) / divisors
+    scale = shortened / divisors
     return np.asarray(v * scale)
 
 
@@ -167,6 +168,7 @@ def project_ball(v: Array, radius: float) -> Array:
     [0.6, 0.8]
     """
     norm = float(np.linalg.norm(v))
+    # The smallest positive number avoids 0 / 0 for v = 0 and a radius of zero.
     divisor = max(radius, norm, np.finfo(float).tiny)
     scale = radius / divisor
     return np.asarray(v * scale)
@@ -245,10 +247,11 @@ def project_unit_columns(v: Array) -> Array:
     [[0.6, 1.0], [0.8, 0.0]]
     """
     norms = np.linalg.norm(v, axis=0)
+    is_nonzero = norms > 0
     first_unit_vector = np.zeros(v.shape)
     first_unit_vector[0] = 1.0
-    columns = np.where(norms > 0, v, first_unit_vector)
-    divisors = np.where(norms > 0, norms, 1.0)
+    columns = np.where(is_nonzero, v, first_unit_vector)
+    divisors = np.where(is_nonzero, norms, 1.0)
     return np.asarray(columns / divisors)
 
 
@@ -260,12 +263,12 @@ def project_sparse(v: Array, nonzeros: int) -> Array:
     v : array
         The point, of any shape.
     nonzeros : int
-        How many entries may differ from zero.
+        Largest number of entries that differ from zero.
 
     Returns
     -------
     array
-        v with its largest entries only; of equal ones the first are kept.
+        The entries of v of largest magnitude, and zeros; of equal ones the first are kept.
 
     Examples
     --------

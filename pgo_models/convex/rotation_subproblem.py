@@ -67,7 +67,8 @@ class RotationQP(HoldsModel):
             When the solver does not end with a solution; the message has its status.
         """
         held = self.penalty > 0
-        self.shift.value = np.sqrt(self.penalty[held])[:, None] * V[held]
+        root_D = np.sqrt(self.penalty[held])
+        self.shift.value = root_D[:, None] * V[held]
         key = self.shift.value.tobytes()
         # SOC solves twice for the same shift: it wants the translations of an iterate, and in its
         # next step the rotations.
@@ -141,13 +142,18 @@ def rotation_qp(
     """
     if not ((penalty >= 0).all() and (penalty > 0).any()):
         raise SettingError("penalties must not be negative, and one must be positive")
-    X = X if X is not None else cp.Variable((A.shape[1], d), name="X")
+    if X is None:
+        X = cp.Variable((A.shape[1], d), name="X")
     held = np.flatnonzero(penalty > 0)
-    select = diags_array(np.sqrt(penalty)).tocsr()[held]
+    root_D = diags_array(np.sqrt(penalty)).tocsr()
+    root_D_of_held = root_D[held]
     shift = cp.Parameter((len(held), d), name="shift")
-    weighted = diags_array(np.sqrt(w)).tocsr() @ A
-    objective = cp.sum_squares(weighted @ X) + 0.5 * cp.sum_squares(select @ X - shift)
-    problem = cp.Problem(cp.Minimize(sum(terms, objective)), list(constraints))
+    root_w = diags_array(np.sqrt(w)).tocsr()
+    weighted_A = root_w @ A
+    cost = cp.sum_squares(weighted_A @ X)
+    penalty_term = 0.5 * cp.sum_squares(root_D_of_held @ X - shift)
+    objective = sum(terms, cost + penalty_term)
+    problem = cp.Problem(cp.Minimize(objective), list(constraints))
     if not problem.is_dcp(dpp=True):
         raise SettingError(
             "an added term or constraint is not convex by cvxpy's rules "

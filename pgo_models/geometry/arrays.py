@@ -75,8 +75,8 @@ def whole_array(values: object, name: str, error: type[PGOError] = GraphError) -
     if array.dtype.kind == "f":
         is_wrong |= ~(np.abs(array) < _EXACT)
     if is_wrong.any():
-        first = array[is_wrong][0]
-        raise error(f"{name} has {first!s} among them; give whole numbers, as integers of 64 bits")
+        wrong = array[is_wrong][0]
+        raise error(f"{name} has {wrong!s} among them; give whole numbers, as integers of 64 bits")
     if not _needs_copy(array, np.int64):
         return array
     return read_only(np.array(array, dtype=np.int64, order="C"))
@@ -98,9 +98,11 @@ def triangle_places(side: int) -> NDArray[np.int64]:
 
     The places are a symmetric matrix, (side, side).
     """
-    place = np.zeros((side, side), dtype=np.int64)
     rows, columns = np.triu_indices(side)
-    place[rows, columns] = place[columns, rows] = np.arange(len(rows))
+    numbers = np.arange(len(rows))
+    place = np.zeros((side, side), dtype=np.int64)
+    place[rows, columns] = numbers
+    place[columns, rows] = numbers
     return place
 
 

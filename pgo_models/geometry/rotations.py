@@ -12,21 +12,22 @@ from pgo_models.errors import SettingError
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-# The polar iteration is quadratic: a last change below this leaves an error below 1e-15.
+# The polar iteration converges quadratically: a last change below this leaves an error below 1e-15.
 _POLAR_TOLERANCE = 1e-8
 _POLAR_ITERATIONS = 10
 # Below this determinant, of a matrix scaled to Frobenius norm sqrt(3), the SVD is used.
 _POLAR_MIN_DETERMINANT = 1e-2
-_FEWEST_FOR_POLAR = 20  # fewer matrices than these are projected faster by the SVD
-_BATCH = 4000  # about as many matrices stay in the cache during the polar iteration
+_FEWEST_FOR_POLAR = 20  # below this number of matrices the SVD is faster
+_BATCH = 4000  # about this number of matrices fit into the cache during the polar iteration
 
-_ROW, _COLUMN = np.divmod(np.arange(9), 3)  # of the entries of a 3 x 3 matrix, row by row
+# Row and column of the entries of a 3 x 3 matrix that is stored row by row.
+_ROW, _COLUMN = np.divmod(np.arange(9), 3)
 
 
-def _entries(rows_on: int, columns_on: int) -> NDArray[np.int64]:
-    """Place of the entry that is so many rows and columns further, cyclically, of every entry."""
-    row = (_ROW + rows_on) % 3
-    column = (_COLUMN + columns_on) % 3
+def _entries(row_shift: int, column_shift: int) -> NDArray[np.int64]:
+    """Index of the entry so many rows and columns further, cyclically, for every entry, (9,)."""
+    row = (_ROW + row_shift) % 3
+    column = (_COLUMN + column_shift) % 3
     return np.asarray(3 * row + column)
 
 
@@ -77,7 +78,8 @@ def project_to_rotations(A: Array) -> Array:
         return project_by_svd(A)
     if len(A) < 2 * _BATCH:
         return _project_3d(A)
-    batches = np.array_split(A, len(A) // _BATCH)
+    num_batches = len(A) // _BATCH
+    batches = np.array_split(A, num_batches)
     return np.concatenate([project_to_rotations(batch) for batch in batches])
 
 
@@ -88,14 +90,16 @@ def _project_3d(A: Array) -> Array:
     X /= np.where(norm > 0, norm, 1.0)
     cofactors, determinant = _cofactors(X)
     is_regular = determinant > _POLAR_MIN_DETERMINANT
-    chosen = slice(None) if is_regular.all() else is_regular  # a slice copies nothing
+    # A slice makes views, where a mask makes copies.
+    chosen = slice(None) if is_regular.all() else is_regular
+    polar, converged = _polar(X[:, chosen], cofactors[:, chosen], determinant[chosen])
     has_converged = np.zeros(len(A), dtype=bool)
-    X[:, chosen], has_converged[chosen] = _polar(
-        X[:, chosen], cofactors[:, chosen], determinant[chosen]
-    )
+    has_converged[chosen] = converged
+    X[:, chosen] = polar
     omega = np.ascontiguousarray(X.T).reshape(A.shape)
     if not has_converged.all():
-        omega[~has_converged] = project_by_svd(A[~has_converged])
+        has_failed = ~has_converged
+        omega[has_failed] = project_by_svd(A[has_failed])
     return omega
 
 
@@ -103,7 +107,8 @@ def project_by_svd(A: Array) -> Array:
     """Nearest rotations of (n, d, d) matrices through the SVD, whatever their determinant."""
     U, _, Vt = np.linalg.svd(A)
     is_reflection = np.linalg.det(U @ Vt) < 0
-    U[..., :, -1] *= np.where(is_reflection, -1.0, 1.0)[..., None]
+    sign = np.where(is_reflection, -1.0, 1.0)
+    U[..., :, -1] *= sign[..., None]
     return np.asarray(U @ Vt)
 
 
@@ -119,6 +124,7 @@ def _project_2d(A: Array) -> Array:
 
 
 def _from_cosine_sine(cosine: Array, sine: Array) -> Array:
+    """Matrices [c, -s; s, c], (.., 2, 2), of cosines and sines, (..)."""
     first_row = np.stack([cosine, -sine], -1)
     second_row = np.stack([sine, cosine], -1)
     return np.stack([first_row, second_row], -2)
@@ -143,12 +149,22 @@ def _polar(X: Array, cofactors: Array, determinant: Array) -> tuple[Array, BoolA
 def _determinants(X: Array) -> Array:
     """Determinants of (.., d, d) matrices, expanded along the first row."""
     if X.shape[-1] == 2:
-        return np.asarray(X[..., 0, 0] * X[..., 1, 1] - X[..., 0, 1] * X[..., 1, 0])
-    u, v, w = np.moveaxis(X, -2, 0)  # rows; numpy's cross product takes twice as long
-    minor_0 = v[..., 1] * w[..., 2] - v[..., 2] * w[..., 1]
-    minor_1 = v[..., 2] * w[..., 0] - v[..., 0] * w[..., 2]
-    minor_2 = v[..., 0] * w[..., 1] - v[..., 1] * w[..., 0]
-    return np.asarray(u[..., 0] * minor_0 + u[..., 1] * minor_1 + u[..., 2] * minor_2)
+        a, b = _columns(X[..., 0, :])
+        c, d = _columns(X[..., 1, :])
+        return np.asarray(a * d - b * c)
+    u_0, u_1, u_2 = _columns(X[..., 0, :])
+    v_0, v_1, v_2 = _columns(X[..., 1, :])
+    w_0, w_1, w_2 = _columns(X[..., 2, :])
+    # The cross product of v and w, in half the time of numpy's.
+    minor_0 = v_1 * w_2 - v_2 * w_1
+    minor_1 = v_2 * w_0 - v_0 * w_2
+    minor_2 = v_0 * w_1 - v_1 * w_0
+    return np.asarray(u_0 * minor_0 + u_1 * minor_1 + u_2 * minor_2)
+
+
+def _columns(rows: Array) -> Array:
+    """Views of the columns of rows (.., k), k of them."""
+    return np.moveaxis(rows, -1, 0)
 
 
 def _cofactors(X: Array) -> tuple[Array, Array]:
@@ -169,14 +185,16 @@ def hat(w: Array) -> Array:
     In space hat(w) v = w x v; in the plane hat(w) is w times the rotation by 90 degrees.
     """
     if w.shape[-1] == 1:
-        return _from_cosine_sine(np.zeros_like(w[..., 0]), w[..., 0])
+        angle = w[..., 0]
+        return _from_cosine_sine(np.zeros_like(angle), angle)
+    x, y, z = _columns(w)
     W = np.zeros((*w.shape, 3))
-    W[..., 2, 1] = w[..., 0]
-    W[..., 0, 2] = w[..., 1]
-    W[..., 1, 0] = w[..., 2]
-    W[..., 1, 2] = -w[..., 0]
-    W[..., 2, 0] = -w[..., 1]
-    W[..., 0, 1] = -w[..., 2]
+    W[..., 2, 1] = x
+    W[..., 0, 2] = y
+    W[..., 1, 0] = z
+    W[..., 1, 2] = -x
+    W[..., 2, 0] = -y
+    W[..., 0, 1] = -z
     return W
 
 
@@ -215,11 +233,14 @@ def exp_map(w: Array) -> Array:
     """
     _check_ends(w, (1,), (3,))
     if w.shape[-1] == 1:
-        return _from_cosine_sine(np.cos(w[..., 0]), np.sin(w[..., 0]))
+        angle = w[..., 0]
+        return _from_cosine_sine(np.cos(angle), np.sin(angle))
+    shape = (*w.shape, 3)
     if w.size == 0:
-        return np.empty((*w.shape, 3))
-    turns = scipy.spatial.transform.Rotation.from_rotvec(_writable(w.reshape(-1, 3)))
-    return np.asarray(turns.as_matrix()).reshape((*w.shape, 3))
+        return np.empty(shape)
+    vectors = _writable(w.reshape(-1, 3))
+    rotations = scipy.spatial.transform.Rotation.from_rotvec(vectors)
+    return np.asarray(rotations.as_matrix()).reshape(shape)
 
 
 def log_map(R: Array) -> Array:
@@ -249,25 +270,31 @@ def log_map(R: Array) -> Array:
     if R.shape[-1] == 2:
         sine = R[..., 1, 0] - R[..., 0, 1]
         cosine = R[..., 0, 0] + R[..., 1, 1]
-        return np.arctan2(sine, cosine)[..., None]
+        angle = np.arctan2(sine, cosine)
+        return angle[..., None]
+    shape = R.shape[:-1]
     if R.size == 0:
-        return np.empty(R.shape[:-1])
-    turns = scipy.spatial.transform.Rotation.from_matrix(_writable(R.reshape(-1, 3, 3)))
-    return np.asarray(turns.as_rotvec()).reshape(R.shape[:-1])
+        return np.empty(shape)
+    matrices = _writable(R.reshape(-1, 3, 3))
+    rotations = scipy.spatial.transform.Rotation.from_matrix(matrices)
+    return np.asarray(rotations.as_rotvec()).reshape(shape)
 
 
 def _writable(A: Array) -> Array:
     """Return the array, or a copy where it is read-only.
 
     The arrays of poses are read-only, and SciPy 1.14 refuses such arrays. It refuses empty arrays,
-    too.
+    too; callers treat these before.
     """
-    return A if A.flags.writeable else A.copy()
+    if A.flags.writeable:
+        return A
+    return A.copy()
 
 
 def _check_ends(A: Array, *ends: tuple[int, ...]) -> None:
     """Raise a SettingError unless the shape of an array ends in one of these."""
-    if not isinstance(A, np.ndarray) or A.shape[-len(ends[0]) :] not in ends:
+    num_axes = len(ends[0])
+    if not isinstance(A, np.ndarray) or A.shape[-num_axes:] not in ends:
         raise SettingError(
             f"{type(A).__name__} of shape {np.shape(A)}; give an array whose last axes are {ends}"
         )
@@ -297,24 +324,27 @@ def random_rotations(count: int, d: int, rng: np.random.Generator) -> Array:
     ((4, 3, 3), True)
     """
     if d == 2:
-        return exp_map(rng.uniform(-np.pi, np.pi, (count, 1)))
-    return rotations_from_quaternions(rng.standard_normal((count, 4)))
+        angles = rng.uniform(-np.pi, np.pi, (count, 1))
+        return exp_map(angles)
+    # The direction of a normal vector is uniform on the sphere of unit quaternions.
+    quaternions = rng.standard_normal((count, 4))
+    return rotations_from_quaternions(quaternions)
 
 
 def rotations_from_quaternions(quaternions: Array) -> Array:
     """Rotations of (n, 4) quaternions (x, y, z, w), normalised first; none may be zero."""
     if quaternions.size == 0:
         return np.empty((0, 3, 3))
-    turns = scipy.spatial.transform.Rotation.from_quat(_writable(quaternions))
-    return np.asarray(turns.as_matrix()).reshape(-1, 3, 3)
+    rotations = scipy.spatial.transform.Rotation.from_quat(_writable(quaternions))
+    return np.asarray(rotations.as_matrix()).reshape(-1, 3, 3)
 
 
 def quaternions_from_rotations(R: Array) -> Array:
     """Unit quaternions (n, 4), ordered (x, y, z, w) with w >= 0, of (n, 3, 3) rotations."""
     if R.size == 0:
         return np.empty((0, 4))
-    turns = scipy.spatial.transform.Rotation.from_matrix(_writable(R))
-    return np.asarray(turns.as_quat(canonical=True)).reshape(-1, 4)
+    rotations = scipy.spatial.transform.Rotation.from_matrix(_writable(R))
+    return np.asarray(rotations.as_quat(canonical=True)).reshape(-1, 4)
 
 
 def orthogonality_error(R: Array) -> Array:
@@ -324,31 +354,37 @@ def orthogonality_error(R: Array) -> Array:
     """
     with np.errstate(invalid="ignore", over="ignore"):
         defect = np.sqrt(_squared_defect(R))
-        return np.asarray(np.maximum(defect, 1.0 - _determinants(R)))
+        determinant_error = 1.0 - _determinants(R)
+        return np.asarray(np.maximum(defect, determinant_error))
 
 
 def _squared_defect(R: Array) -> Array:
     """||R^T R - I||_F^2 of every matrix.
 
-    It is summed entry by entry of all matrices at once, which is much faster for thousands of them
-    than a product of stacked matrices.
+    Every entry of R^T R is computed for all matrices at once. For thousands of matrices this is
+    much faster than a product of stacked matrices.
     """
     d = R.shape[-1]
-    entries = np.ascontiguousarray(np.moveaxis(R.reshape(-1, d, d), 0, -1))
+    matrices = R.reshape(-1, d, d)
+    entries = np.ascontiguousarray(np.moveaxis(matrices, 0, -1))
+    # E = R^T R - I, (d, d, n), as a sum of outer products of the rows of R.
     E = entries[0, :, None] * entries[0]
     for row in entries[1:]:
         E += row[:, None] * row
     diagonal = E.reshape(d * d, -1)[:: d + 1]
     diagonal -= 1.0
-    return np.asarray(np.einsum("abn,abn->n", E, E)).reshape(R.shape[:-2])
+    squares = np.asarray(np.einsum("abn,abn->n", E, E))
+    return squares.reshape(R.shape[:-2])
 
 
 def stack_transposes(R: Array) -> Array:
     """The (d n, d) matrix whose rows d i .. d i + d - 1 are R_i^T."""
-    return np.swapaxes(R, -1, -2).reshape(-1, R.shape[-2])
+    d = R.shape[-2]
+    return np.swapaxes(R, -1, -2).reshape(-1, d)
 
 
 def unstack_transposes(Y: Array) -> Array:
     """The (n, d, d) matrices R of `stack_transposes`."""
     d = Y.shape[-1]
-    return np.swapaxes(Y.reshape(-1, d, d), -1, -2)
+    transposed = Y.reshape(-1, d, d)
+    return np.swapaxes(transposed, -1, -2)

@@ -22,17 +22,19 @@ def project_to_tangent(Y: Array, V: Array) -> Array:
 
     V is tangent where every V_i Y_i^T is skew.
     """
-    return np.asarray(V - row_products(V, Y) @ Y)
+    normal_part = row_products(V, Y) @ Y
+    return np.asarray(V - normal_part)
 
 
 def retract(Y: Array, V: Array) -> Array:
     """Nearest point to A = Y + V for V tangent at Y: the polar factors (A_i A_i^T)^(-1/2) A_i.
 
     A_i A_i^T = I + V_i V_i^T has a root for every V. The map agrees with a geodesic to second
-    order. Of blocks above 1e6, rounding errors remain.
+    order. Where blocks of V are larger than 1e6, rounding errors remain.
     """
     A = Y + V
-    eigenvalues, eigenvectors = np.linalg.eigh(row_products(A, A))
+    gram = row_products(A, A)
+    eigenvalues, eigenvectors = np.linalg.eigh(gram)
     scaled_vectors = eigenvectors / np.sqrt(eigenvalues)[:, None, :]
     inverse_root = scaled_vectors @ np.swapaxes(eigenvectors, 1, 2)
     moved = inverse_root @ A
@@ -49,5 +51,6 @@ def append_rank(Y: Array, last: Array | None = None) -> Array:
 
     Without a column it is zero, which embeds St(d, r)^n.
     """
-    column = np.zeros(Y.shape[:2]) if last is None else last
-    return np.concatenate([Y, column[:, :, None]], axis=2)
+    if last is None:
+        last = np.zeros(Y.shape[:2])
+    return np.concatenate([Y, last[:, :, None]], axis=2)

@@ -1,4 +1,4 @@
-"""g2o files, one for all robots or a folder with one for each, as a PoseGraph and back.
+"""Reader and writer of g2o files: one file for all robots, or a folder with one for each robot.
 
 Information matrices become the precisions of SE-Sync (Rosen et al. 2019), see `edge_precisions`.
 """
@@ -36,25 +36,36 @@ def read_g2o(
 ) -> PoseGraph:
     """Read a g2o file, or a folder with one g2o file for each robot.
 
-    Read are FIX lines, and those of poses, landmarks and priors as g2o, GTSAM and TORO write them.
-    Poses are numbered by ascending id, the world pose of priors last. Quaternions are normalised,
-    and repeated edges all count. `PoseGraph.initial` is set when every pose has a VERTEX line.
-    Edges to poses without one are accepted; then `initial` is left out.
+    The reader takes FIX lines, and the lines of poses, landmarks and priors that g2o, GTSAM and
+    TORO write. It numbers the poses by ascending id; the world pose of priors comes last. It
+    normalises quaternions, and counts every copy of an edge that a file repeats. An edge may lead
+    to a pose that has no VERTEX line. `PoseGraph.initial` is set if every pose has a VERTEX line,
+    and is None otherwise.
 
-    Robots: when every id is a GTSAM symbol (a letter in the top byte), the rank of its letter is
-    the robot. Otherwise a pose of a folder belongs to the file with its VERTEX line, the first of
-    them in the order 0, 1, .., 9, 10, or else to the first file that names it. An edge that stands
-    in two files of a folder is one measurement, and the VERTEX line that counts is that of the
-    pose's own robot. A file beside those of two robots or more whose edges are those of all others
-    once more, under the same ids or others, is the whole graph, no robot: a `GraphWarning` names
-    it, and it is left out (`fullGraph.g2o` of distributed-mapper's folders).
+    The robot of a pose is found in one of three ways:
+
+    (a) Every id is a GTSAM symbol, which has a letter in its top byte. The letters in use, sorted,
+        number the robots.
+    (b) Some id is no symbol, and the folder has several files. A pose belongs to the first file
+        with a VERTEX line of it, or, if there is none, to the first file with an edge of it. The
+        order of the files is 0, 1, .., 9, 10.
+    (c) Some id is no symbol, and there is one file. One robot owns all poses.
+
+    An edge that two files of a folder contain is one measurement. If several files have a VERTEX
+    line of a pose, the file of the robot that owns the pose decides where the pose is.
+
+    Some folders also contain the whole graph, such as `fullGraph.g2o` in those of
+    distributed-mapper. This file is not that of a robot: it is left out, and a `GraphWarning` names
+    it. It is recognised in a folder of three files or more, when its edges are all edges of the
+    other files, each once. It may number the poses in its own way.
 
     Parameters
     ----------
     path : Path or str
         File or folder. Translations are in the file's unit, taken as metres.
     weights : RotationWeight
-        Which kappa stands for the information of a heading in the plane.
+        How the information I_theta of the heading, in the matrix of a 2D edge, becomes kappa: as
+        kappa = I_theta (SE_SYNC) or kappa = I_theta / 2 (GAUSSIAN). It has no effect on 3D edges.
     skip_unknown : bool
         Whether lines with other tags are skipped with a warning.
 
@@ -66,8 +77,9 @@ def read_g2o(
     Raises
     ------
     FileFormatError
-        With file:line, for a line that cannot be read or measures nothing, for FIX of an unknown
-        pose, for a file in the plane beside one in space, and where there are no edges or no files.
+        With file:line, for a line that cannot be read or measures nothing, and for FIX of an
+        unknown pose. Also for a folder with a 2D file and a 3D file, and if there are no edges or
+        no files.
 
     References
     ----------
@@ -80,14 +92,16 @@ def read_g2o(
     PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
     """
     path = Path(path)
-    files = _files_of_robots([read_lines(file, skip_unknown) for file in g2o_files(path)])
+    files = [read_lines(file, skip_unknown) for file in g2o_files(path)]
+    files = _files_of_robots(files)
     d = _common_dimension(files)
     edge_ids, rows = _joined_edges(files)
     if not len(rows):
         raise FileFormatError(
             path, None, "no edges; a pose graph needs at least one EDGE_SE2 or EDGE_SE3:QUAT line"
         )
-    ids = _distinct([edge_ids.ravel(), *(file.vertex_ids for file in files)])
+    ids_of_vertices = [file.vertex_ids for file in files]
+    ids = _distinct([edge_ids.ravel(), *ids_of_vertices])
     file_ids = ids[ids != WORLD_ID]  # the world pose, if there is one, has the largest id
     edges = np.searchsorted(ids, edge_ids)
     robot = _robots(file_ids, files)
@@ -96,12 +110,16 @@ def read_g2o(
     if len(file_ids) < len(ids):
         world = len(file_ids)
         if robot is not None:
+            # Every pose needs an owner, and no file says whose the world pose is. It is given,
+            # arbitrarily, to the robot of the pose that the first prior measures.
             first_prior = np.argmax(edges[:, 0] == world)
-            robot = np.append(robot, robot[edges[first_prior, 1]])
+            measured_pose = edges[first_prior, 1]
+            robot = np.append(robot, robot[measured_pose])
     information = information_of(d, rows)
     kappa, tau = edge_precisions(information, weights)
     R_ij, t_ij = poses_of(d, rows)
     landmark_ids = np.concatenate([file.landmarks for file in files])
+    is_landmark = np.isin(ids, landmark_ids)
     return PoseGraph(
         len(ids),
         i=edges[:, 0],
@@ -117,19 +135,21 @@ def read_g2o(
         fixed=_fixed(ids, files),
         name=printable(name_of(path)),
         world=world,
-        landmarks=np.flatnonzero(np.isin(ids, landmark_ids)),
+        landmarks=np.flatnonzero(is_landmark),
     )
 
 
 def _common_dimension(files: list[G2OLines]) -> int:
     """Dimension of all files; a FileFormatError where they differ."""
-    d = files[0].d
+    first = files[0]
     for file in files:
-        if file.d != d:
-            raise FileFormatError(
-                file.path, None, f"{file.d}D, but {files[0].path} is {d}D; part the folder"
+        if file.d != first.d:
+            problem = (
+                f"{file.d}D, but {first.path} is {first.d}D; "
+                "put 2D files and 3D files into folders of their own"
             )
-    return d
+            raise FileFormatError(file.path, None, problem)
+    return first.d
 
 
 def _distinct(ids: list[IntArray]) -> IntArray:
@@ -140,32 +160,33 @@ def _distinct(ids: list[IntArray]) -> IntArray:
 
 
 def edge_places(path: Path | str) -> list[str]:
-    """`file:line` of every edge of the graph that `read_g2o` has read from a file or folder."""
-    files = _files_of_robots(
-        [read_lines(file, skip_unknown=True) for file in g2o_files(Path(path))]
-    )
+    """`file:line` of every edge of the graph that `read_g2o` reads from a file or folder."""
+    files = [read_lines(file, skip_unknown=True) for file in g2o_files(Path(path))]
+    files = _files_of_robots(files)
+    kept_rows = _rows_to_keep(files)
     places = []
-    for file, kept in zip(files, _edges_to_keep(files), strict=True):
-        places += [f"{file.path}:{line}" for line in file.edge_lines[kept]]
+    for file, kept in zip(files, kept_rows, strict=True):
+        lines = file.edge_lines[kept]
+        places += [f"{file.path}:{line}" for line in lines]
     return places
 
 
 def read_g2o_poses(path: Path | str, graph: PoseGraph) -> Poses:
     """Poses of the VERTEX lines of a g2o file, in the order of `graph`; its edges are ignored.
 
-    A FileFormatError as of `read_lines`; also when the file has another dimension, and unless every
-    pose and landmark of the graph has a VERTEX line there and the file has no others: poses of
-    another graph are no estimate of this one.
+    The VERTEX lines must be those of the poses and landmarks of the graph, each of them and no
+    others: poses of another graph are no estimate of this one. A FileFormatError if they are not,
+    if the file has another dimension, and for the faults that `read_lines` finds.
     """
     file = read_lines(path)
     if file.d != graph.d:
-        raise FileFormatError(
-            path, None, f"{file.d}D, but {graph.name} is {graph.d}D; give poses of this graph"
-        )
+        problem = f"{file.d}D, but {graph.name} is {graph.d}D; give poses of this graph"
+        raise FileFormatError(path, None, problem)
     _check_same_poses(file, graph)
     ids = graph.pose_ids[graph.in_files]
     order = np.argsort(file.vertex_ids)
-    row = order[np.searchsorted(file.vertex_ids[order], ids)]
+    ascending_ids = file.vertex_ids[order]
+    row = order[np.searchsorted(ascending_ids, ids)]
     R, t = poses_of(file.d, file.vertices[row])
     return graph.completed(Poses(R, t))
 
@@ -173,6 +194,7 @@ def read_g2o_poses(path: Path | str, graph: PoseGraph) -> Poses:
 def _check_same_poses(file: G2OLines, graph: PoseGraph) -> None:
     """Raise a FileFormatError unless the file has the poses and landmarks of a graph, no others."""
     ids = graph.pose_ids[graph.in_files]
+    landmark_ids = graph.pose_ids[graph.landmarks]
     sizes = f"the file has {len(file.vertex_ids)}, {graph.name} {len(ids)}"
     way_out = "give an estimate of this graph"
     is_unknown = ~np.isin(file.vertex_ids, ids)
@@ -182,24 +204,25 @@ def _check_same_poses(file: G2OLines, graph: PoseGraph) -> None:
             f"pose {file.vertex_ids[first]} is not in {graph.name} "
             f"({is_unknown.sum()} are not; {sizes}); {way_out}"
         )
-        raise FileFormatError(file.path, int(file.vertex_lines[first]), problem)
+        line = int(file.vertex_lines[first])
+        raise FileFormatError(file.path, line, problem)
     is_absent = ~np.isin(ids, file.vertex_ids)
     if is_absent.any():
+        first_absent = ids[np.argmax(is_absent)]
         problem = (
-            f"no VERTEX line for pose {ids[np.argmax(is_absent)]} "
+            f"no VERTEX line for pose {first_absent} "
             f"({is_absent.sum()} missing; {sizes}); {way_out}"
         )
         raise FileFormatError(file.path, None, problem)
     is_landmark = np.isin(file.vertex_ids, file.landmarks)
-    is_landmark_of_graph = np.isin(file.vertex_ids, graph.pose_ids[graph.landmarks])
+    is_landmark_of_graph = np.isin(file.vertex_ids, landmark_ids)
     differs = is_landmark != is_landmark_of_graph
     if differs.any():
         first = int(np.argmax(differs))
-        here, in_graph = ("landmark", "pose") if is_landmark[first] else ("pose", "landmark")
-        problem = (
-            f"{file.vertex_ids[first]} is a {here} here and a {in_graph} of {graph.name}; {way_out}"
-        )
-        raise FileFormatError(file.path, int(file.vertex_lines[first]), problem)
+        kinds = "a landmark here and a pose" if is_landmark[first] else "a pose here and a landmark"
+        problem = f"{file.vertex_ids[first]} is {kinds} of {graph.name}; {way_out}"
+        line = int(file.vertex_lines[first])
+        raise FileFormatError(file.path, line, problem)
 
 
 def write_g2o(
@@ -207,9 +230,10 @@ def write_g2o(
 ) -> None:
     """Write a graph as one g2o file: VERTEX lines, FIX lines and EDGE lines.
 
-    The numbers have all digits of the doubles. Without `graph.information` the matrices are tau I,
-    2 kappa I in space and diag(tau, tau, kappa) in the plane, which read back as the same kappa and
-    tau (RotationWeight.SE_SYNC). A file that exists is replaced when the new one is complete.
+    The numbers have all digits of the doubles. If the graph has no information matrices, they are
+    made of its precisions: diag(tau, tau, kappa) in 2D and blockdiag(tau I_3, 2 kappa I_3) in 3D.
+    Read with `RotationWeight.SE_SYNC`, they give the same kappa and tau again. An existing file is
+    replaced when the new one is complete.
 
     Parameters
     ----------
@@ -218,8 +242,8 @@ def write_g2o(
     path : Path or str
         File to write.
     poses : Poses, optional
-        Poses of the VERTEX lines; `graph.initial` unless given. Without either there are no VERTEX
-        lines.
+        Poses of the VERTEX lines; `graph.initial` unless given. The file has no VERTEX lines if
+        both are None.
     mine : BoolArray, (n,), optional
         Poses that have VERTEX and FIX lines; all unless given.
 
@@ -239,19 +263,22 @@ def write_g2o(
     >>> read_g2o(path)
     PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
     """
+    written_poses = _poses_to_write(graph, poses)
     all_edges = np.ones(graph.num_edges, dtype=bool)
     if mine is None:
         mine = np.ones(graph.num_poses, dtype=bool)
-    _write(graph, Path(path), _poses_to_write(graph, poses), mine, all_edges)
+    _write(graph, Path(path), written_poses, mine, all_edges)
 
 
 def write_g2o_folder(graph: PoseGraph, folder: Path | str, poses: Poses | None = None) -> None:
     """Write one file 0.g2o, 1.g2o, .. for each robot: its poses, and all edges that touch them.
 
-    Edges between two robots stand in both files. Reading the folder gives the graph back, up to the
-    order of its edges; without VERTEX lines, the owners come back only if the ids are symbols
-    (`symbol_ids`). Errors as of `write_g2o`. Also a PGOError when the folder, which is made if need
-    be, holds other g2o files: reading it would join them to this graph.
+    An edge between two robots is written to the files of both. Reading the folder gives the graph
+    back, up to the order of its edges. If the files have no VERTEX lines, the owners of the poses
+    come back only if the ids are symbols (`symbol_ids`).
+
+    The folder is made if it does not exist. A PGOError if it has other g2o files, which a reader
+    would take for a part of this graph; other errors are those of `write_g2o`.
     """
     written_poses = _poses_to_write(graph, poses)
     folder = Path(folder)
@@ -259,25 +286,27 @@ def write_g2o_folder(graph: PoseGraph, folder: Path | str, poses: Poses | None =
     make_folder(folder)
     for robot in range(graph.num_robots):
         mine = graph.robots == robot
-        # A prior belongs to the robot of the pose that it measures.
-        edges = (mine[graph.i] & ~graph.is_prior) | mine[graph.j]
-        _write(graph, folder / f"{robot}.g2o", written_poses, mine, edges)
+        # A prior begins at the world pose. It belongs to the robot of the pose that it measures.
+        begins_here = mine[graph.i] & ~graph.is_prior
+        ends_here = mine[graph.j]
+        path = folder / f"{robot}.g2o"
+        _write(graph, path, written_poses, mine, begins_here | ends_here)
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder if it is not there; a PGOError when that cannot be."""
+    """Make a folder unless it exists; a PGOError if it cannot be made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise PGOError(
-            f"cannot write {folder}: {error.strerror}; choose a place that can be written"
-        ) from error
+        problem = f"cannot write {folder}: {error.strerror}"
+        raise PGOError(f"{problem}; choose a place that can be written") from error
 
 
 def check_g2o_folder(folder: Path | str, num_robots: int) -> None:
-    """Raise what `write_g2o_folder` would for this folder, before there is anything to write."""
+    """Raise the PGOError that `write_g2o_folder` would raise, before there is anything to write."""
     folder = Path(folder)
-    # The nearest folder that exists has to take the next one on the way to the first file.
+    # Folders of the path that do not exist yet have to be made. `existing` is the innermost folder
+    # that exists, and `new_entry` is what would be made in it: a folder, or the first file.
     existing = folder.absolute()
     new_entry = existing / "0.g2o"
     while not os.path.lexists(existing):
@@ -285,15 +314,16 @@ def check_g2o_folder(folder: Path | str, num_robots: int) -> None:
         existing = existing.parent
     if not existing.is_dir():
         raise PGOError(
-            f"cannot write {folder}: {existing} is no folder, "
-            "and a name without a suffix stands for one"
+            f"cannot write {folder}: a name without a suffix is that of a folder, "
+            f"and {existing} is not a folder; choose another name, or one that ends in .g2o"
         )
     check_writable(new_entry)
-    expected = {f"{robot}.g2o" for robot in range(num_robots)}
-    strangers = {file.name for file in folder.glob("*.g2o")} - expected
-    if strangers:
+    expected_names = {f"{robot}.g2o" for robot in range(num_robots)}
+    names = {file.name for file in folder.glob("*.g2o")}
+    other_names = names - expected_names
+    if other_names:
         raise PGOError(
-            f"cannot write {folder}: it holds another graph's {min(strangers)}; "
+            f"cannot write {folder}: it holds another graph's {min(other_names)}; "
             "choose an empty folder"
         )
 
@@ -312,7 +342,8 @@ def symbol_ids(robots: IntArray) -> IntArray:
     ids = np.zeros(len(robots), dtype=np.int64)
     for robot in range(count):
         mine = robots == robot
-        ids[mine] = (ord(letters[robot]) << _LETTER_SHIFT) + np.arange(mine.sum())
+        first_symbol = ord(letters[robot]) << _LETTER_SHIFT
+        ids[mine] = first_symbol + np.arange(mine.sum())
     return ids
 
 
@@ -323,13 +354,17 @@ def pose_names(graph: PoseGraph) -> list[str]:
     name.
     """
     names = [graph.pose_name(pose) for pose in range(graph.num_poses)]
-    ids = {pose: int(names[pose]) for pose in graph.in_files.tolist()}
+    poses = graph.in_files.tolist()
+    ids = {pose: int(names[pose]) for pose in poses}
     letter_codes = {ord(letter) for letter in _LETTERS}
-    if not all(symbol >> _LETTER_SHIFT in letter_codes for symbol in ids.values()):
+    codes = {symbol >> _LETTER_SHIFT for symbol in ids.values()}
+    if not codes <= letter_codes:
         return names
+    index_bits = (1 << _LETTER_SHIFT) - 1
     for pose, symbol in ids.items():
-        index = symbol & ((1 << _LETTER_SHIFT) - 1)
-        names[pose] = f"{chr(symbol >> _LETTER_SHIFT)}{index}"
+        letter = chr(symbol >> _LETTER_SHIFT)
+        index = symbol & index_bits
+        names[pose] = f"{letter}{index}"
     return names
 
 
@@ -337,18 +372,19 @@ def name_of(path: Path) -> str:
     """Name of the graph in a file or folder, as the system has it."""
     if path.is_dir():
         return path.resolve().name
-    # a pipe has no better name than that it was asked by
+    # The resolved path of a pipe is no name. What is no regular file has the name that was given.
     return path.resolve().stem if path.is_file() else path.stem
 
 
 def g2o_files(path: Path) -> list[Path]:
-    """A file itself, or those of a folder in the order 0, 1, .., 9, 10.
+    """The path itself if it is a file; the g2o files of a folder, in the order 0, 1, .., 9, 10.
 
-    A FileFormatError where the folder has none.
+    A FileFormatError if the folder has none.
     """
     if not path.is_dir():
         return [path]
-    files = [file for file in path.iterdir() if file.suffix == ".g2o" and file.is_file()]
+    entries = [entry for entry in path.iterdir() if entry.suffix == ".g2o"]
+    files = [entry for entry in entries if entry.is_file()]
     if not files:
         raise FileFormatError(
             path, None, "a folder without g2o files; give a file, or a folder with a file a robot"
@@ -358,11 +394,12 @@ def g2o_files(path: Path) -> list[Path]:
 
 def _natural_order(file: Path) -> list[tuple[int, str]]:
     """Key by which 9 comes before 10: shorter runs of digits first."""
-    return [(len(part), part) for part in re.findall(r"\d+|\D+", file.name)]
+    parts = re.findall(r"\d+|\D+", file.name)
+    return [(len(part), part) for part in parts]
 
 
 def _files_of_robots(files: list[G2OLines]) -> list[G2OLines]:
-    """All files but one that repeats the others, which a GraphWarning names."""
+    """All files but that of the whole graph, if there is one, which a GraphWarning names."""
     most_edges = max(len(file.edges) for file in files)
     if len(files) < 3 or most_edges == 0:
         return files
@@ -382,40 +419,57 @@ def _files_of_robots(files: list[G2OLines]) -> list[G2OLines]:
 
 
 def _is_whole_graph(whole: G2OLines, others: list[G2OLines]) -> bool:
-    """Whether a file has the edges of all others, and is not that of a robot.
+    """Whether a file is the whole graph: it has the edges of all other files, and is no robot's.
 
-    A robot's file also has all edges where every edge of the others touches its poses.
+    The edges alone are no proof. If every edge of the graph touches a pose of one robot, as in a
+    star with this robot in the middle, the file of this robot has all edges, too. The ids and the
+    VERTEX lines then tell the two cases apart.
     """
     if not _may_have_edges_of(whole, others):
         return False
     edge_ids, edges = _joined_edges(others)
     if not _are_same_measurements(whole.d, whole.edges, edges):
         return False
-    same_ids = np.array_equal(np.unique(whole.edge_ids, axis=0), np.unique(edge_ids, axis=0))
-    if not same_ids:
-        return True  # it numbers the poses in its own way
-    # An edge that stands in two of the others does not touch the poses of a robot of its own.
-    if sum(len(file.edges) for file in others) > len(edges):
+    # The files of robots use the same ids for the same poses. A file with other ids is no robot's.
+    id_pairs = np.unique(whole.edge_ids, axis=0)
+    id_pairs_of_others = np.unique(edge_ids, axis=0)
+    if not np.array_equal(id_pairs, id_pairs_of_others):
         return True
+    # An edge is in the files of the robots that own its two ends. If two of the other files have
+    # an edge, their robots own its ends, so that a third robot's file would not have it.
+    num_written = sum(len(file.edges) for file in others)
+    some_edge_is_in_two_files = num_written > len(edges)
+    if some_edge_is_in_two_files:
+        return True
+    # The file of a robot has VERTEX lines of poses that no other robot owns. The whole graph has
+    # those of the other files alone. Without VERTEX lines the file counts as a robot's.
     others_ids = np.concatenate([file.vertex_ids for file in others])
-    return len(whole.vertex_ids) > 0 and bool(np.isin(whole.vertex_ids, others_ids).all())
+    repeats_others = np.isin(whole.vertex_ids, others_ids)
+    return len(repeats_others) > 0 and bool(repeats_others.all())
 
 
 def _exact_columns(d: int, num_columns: int) -> IntArray:
-    """Columns of edges that are the same in two files; rotations may be normalised, or -q for q."""
+    """Columns whose numbers must be the same for two rows to be the same measurement.
+
+    A row is x y theta in 2D, x y z qx qy qz qw in 3D, and then the upper triangle of the
+    information matrix. The translation and the triangle are compared exactly. The rotation is not:
+    one file may have the quaternion q and the other its multiple or -q. It is compared as a matrix,
+    with the tolerance `_SAME_ROTATION`.
+    """
     num_measured = 3 if d == 2 else 7
     return np.asarray(np.r_[:d, num_measured:num_columns])
 
 
 def _may_have_edges_of(whole: G2OLines, others: list[G2OLines]) -> bool:
-    """Whether a file has the first edge of every other file, which is quickly found out."""
+    """Whether a file has the first edge of every other file: a quick test before the full one."""
     columns = _exact_columns(whole.d, whole.edges.shape[1])
     for file in others:
         if file.d != whole.d:
             return False
         if len(file.edges):
-            is_first = (whole.edges[:, columns] == file.edges[0, columns]).all(axis=1)
-            if not is_first.any():
+            first_edge = file.edges[0, columns]
+            is_equal = whole.edges[:, columns] == first_edge
+            if not is_equal.all(axis=1).any():
                 return False
     return True
 
@@ -425,42 +479,54 @@ def _are_same_measurements(d: int, edges: Array, others: Array) -> bool:
     if len(edges) != len(others):
         return False
     columns = _exact_columns(d, edges.shape[1])
-    ours = edges[np.lexsort(edges[:, columns].T)]
-    theirs = others[np.lexsort(others[:, columns].T)]
+    our_order = np.lexsort(edges[:, columns].T)
+    their_order = np.lexsort(others[:, columns].T)
+    ours = edges[our_order]
+    theirs = others[their_order]
     if not np.array_equal(ours[:, columns], theirs[:, columns]):
         return False
     our_R, _ = poses_of(d, ours)
     their_R, _ = poses_of(d, theirs)
-    return bool(np.abs(our_R - their_R).max() <= _SAME_ROTATION)
+    largest_difference = np.abs(our_R - their_R).max()
+    return bool(largest_difference <= _SAME_ROTATION)
 
 
-def _edges_to_keep(files: list[G2OLines]) -> list[IntArray | slice]:
-    return join_edges([(file.edge_ids, file.edges) for file in files])
+def _rows_to_keep(files: list[G2OLines]) -> list[IntArray | slice]:
+    ids_and_rows = [(file.edge_ids, file.edges) for file in files]
+    return edge_rows_to_keep(ids_and_rows)
 
 
 def _joined_edges(files: list[G2OLines]) -> tuple[IntArray, Array]:
     """Ids and rows of the edges of all files, each measurement once."""
-    kept = _edges_to_keep(files)
-    edge_ids = [file.edge_ids[rows] for file, rows in zip(files, kept, strict=True)]
-    edges = [file.edges[rows] for file, rows in zip(files, kept, strict=True)]
+    kept_rows = _rows_to_keep(files)
+    edge_ids = []
+    edges = []
+    for file, kept in zip(files, kept_rows, strict=True):
+        edge_ids.append(file.edge_ids[kept])
+        edges.append(file.edges[kept])
     return np.concatenate(edge_ids), np.concatenate(edges)
 
 
-def join_edges(files: Sequence[tuple[IntArray, Array]]) -> list[IntArray | slice]:
-    """Rows of every file to keep, so that an edge that stands in two files counts once.
+def edge_rows_to_keep(files: Sequence[tuple[IntArray, Array]]) -> list[IntArray | slice]:
+    """Rows of every file to keep, so that an edge that is in two files counts once.
 
-    An edge may be repeated within a file, where every copy counts: the k-th copy of an edge counts
-    in the first file that has k copies of it.
+    A file is given as the ids, (m, 2), and the numbers, (m, k), of its edges. Two rows are copies
+    of one edge if their ids and numbers are equal.
+
+    Copies within a file are measurements of their own, and all count. An edge with a copies in one
+    file and b in another is kept max(a, b) times: the k-th copy of an edge is kept in the first
+    file that has k copies or more.
     """
     if len(files) == 1:
         return [slice(None)]
-    seen: set[tuple[bytes, int]] = set()
+    seen: set[tuple[bytes, int]] = set()  # an edge, and which of its copies
     kept: list[IntArray | slice] = []
     for edge_ids, edges in files:
         num_copies: dict[bytes, int] = {}
         new_rows = []
         positive_zeros = edges + 0.0  # -0.0 becomes 0.0, so that equal numbers have equal bytes
-        for row, (ids, numbers) in enumerate(zip(edge_ids, positive_zeros, strict=True)):
+        rows = zip(edge_ids, positive_zeros, strict=True)
+        for row, (ids, numbers) in enumerate(rows):
             edge = ids.tobytes() + numbers.tobytes()
             num_copies[edge] = num_copies.get(edge, 0) + 1
             copy = (edge, num_copies[edge])
@@ -472,19 +538,23 @@ def join_edges(files: Sequence[tuple[IntArray, Array]]) -> list[IntArray | slice
 
 
 def _robots(ids: IntArray, files: list[G2OLines]) -> IntArray | None:
-    """Robot of every pose, as `read_g2o` says; None where one file names no robots."""
+    """Robot of every pose by the cases (a) and (b) of `read_g2o`; None in case (c)."""
     letters = ids >> _LETTER_SHIFT
-    if np.isin(letters, [ord(letter) for letter in _LETTERS]).all():
+    letter_codes = [ord(letter) for letter in _LETTERS]
+    if np.isin(letters, letter_codes).all():
         return _ranks(letters)
     if len(files) == 1:
         return None
     owner = np.full(len(ids), -1, dtype=np.int64)
     ids_of_vertices = [file.vertex_ids for file in files]
     ids_of_edges = [file.edge_ids.ravel() for file in files]
+    # The VERTEX lines of all files come before the edges of any.
     for ids_of_files in (ids_of_vertices, ids_of_edges):
         for robot, ids_of_file in enumerate(ids_of_files):
-            poses = np.searchsorted(ids, ids_of_file[ids_of_file != WORLD_ID])
-            owner[poses[owner[poses] < 0]] = robot
+            is_in_files = ids_of_file != WORLD_ID
+            poses = np.searchsorted(ids, ids_of_file[is_in_files])
+            has_no_owner = owner[poses] < 0
+            owner[poses[has_no_owner]] = robot
     return _ranks(owner)
 
 
@@ -495,9 +565,14 @@ def _ranks(values: IntArray) -> IntArray:
 
 
 def _initial(ids: IntArray, robot: IntArray | None, files: list[G2OLines]) -> Poses | None:
-    """Estimate of the VERTEX lines; None unless every pose has one."""
+    """Estimate of the VERTEX lines; None unless every pose has one.
+
+    Of several VERTEX lines of a pose, the first in a file of its own robot counts; if there is no
+    such line, the first in any file.
+    """
     d = files[0].d
-    numbers = np.zeros((len(ids), files[0].vertices.shape[1]))
+    num_columns = files[0].vertices.shape[1]
+    numbers = np.zeros((len(ids), num_columns))
     is_known = np.zeros(len(ids), dtype=bool)
     is_from_owner = np.zeros(len(ids), dtype=bool)
     for file in files:
@@ -506,13 +581,18 @@ def _initial(ids: IntArray, robot: IntArray | None, files: list[G2OLines]) -> Po
         poses = np.searchsorted(ids, file.vertex_ids)
         is_own = np.ones(len(poses), dtype=bool)
         if robot is not None:
-            # The robot of a file is the one that most of its VERTEX lines belong to.
-            robot_of_file = np.bincount(robot[poses]).argmax()
-            is_own = robot[poses] == robot_of_file
+            # Nothing in a file names its robot: the letters of symbols need not follow the order
+            # of the files, and a file may also have VERTEX lines of neighbours. The robot that
+            # owns most of the poses on its VERTEX lines is taken for that of the file.
+            owners = robot[poses]
+            robot_of_file = np.bincount(owners).argmax()
+            is_own = owners == robot_of_file
+        # A line replaces nothing, or, in a file of the own robot, a line of another robot's file.
         is_better = ~is_known[poses] | (is_own & ~is_from_owner[poses])
-        numbers[poses[is_better]] = file.vertices[is_better]
+        replaced = poses[is_better]
+        numbers[replaced] = file.vertices[is_better]
         is_known[poses] = True
-        is_from_owner[poses[is_better]] = is_own[is_better]
+        is_from_owner[replaced] = is_own[is_better]
     if not is_known.all():
         return None
     R, t = poses_of(d, numbers)
@@ -526,15 +606,18 @@ def _fixed(ids: IntArray, files: list[G2OLines]) -> IntArray:
         if is_unknown.any():
             first = int(np.argmax(is_unknown))
             problem = f"FIX names pose {file.fixed[first]}, which has no other line; remove it"
-            raise FileFormatError(file.path, int(file.fixed_lines[first]), problem)
+            line = int(file.fixed_lines[first])
+            raise FileFormatError(file.path, line, problem)
     fixed_ids = np.concatenate([file.fixed for file in files])
-    return np.unique(np.searchsorted(ids, fixed_ids))
+    fixed_poses = np.searchsorted(ids, fixed_ids)
+    return np.unique(fixed_poses)
 
 
 def _poses_to_write(graph: PoseGraph, poses: Poses | None) -> Poses | None:
     """Given poses, else the estimate; a GraphError when they do not have the size of the graph."""
     written = graph.initial if poses is None else poses
-    if written is not None and written.t.shape != (graph.num_poses, graph.d):
+    expected_shape = (graph.num_poses, graph.d)
+    if written is not None and written.t.shape != expected_shape:
         raise GraphError(
             f"poses are {written}; {graph.name} needs {graph.num_poses} of them in {graph.d}D"
         )
@@ -549,33 +632,40 @@ def _write(
         replace_when_done(path) as temporary,
         temporary.open("w", encoding="ascii", newline="\n") as file,
     ):
+        # Lines of priors and landmarks in space name the offset 0, of a sensor at its pose.
         to_landmark = np.isin(graph.j, graph.landmarks)
-        if graph.d == 3 and (edges & (graph.is_prior | to_landmark)).any():
+        needs_offset = edges & (graph.is_prior | to_landmark)
+        if graph.d == 3 and needs_offset.any():
             file.write("PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1\n")
         if poses is not None:
             file.writelines(_vertex_lines(graph, poses, mine))
-        ids = graph.pose_ids
-        file.writelines(f"FIX {ids[pose]}\n" for pose in graph.fixed if mine[pose])
+        fixed = graph.fixed[mine[graph.fixed]]
+        fixed_ids = graph.pose_ids[fixed]
+        file.writelines(f"FIX {pose_id}\n" for pose_id in fixed_ids)
         file.writelines(_edge_lines(graph, edges))
 
 
 def _written_tags(d: int, is_edge: bool) -> dict[str, Tag]:
     """Tags of the VERTEX or EDGE lines that are written in d dimensions."""
-    return {
-        tag: kind
-        for tag, kind in TAGS.items()
-        if kind.d == d and kind.is_edge == is_edge and not kind.is_toro
-    }
+    written = {}
+    for tag, kind in TAGS.items():
+        if kind.d == d and kind.is_edge == is_edge and not kind.is_toro:
+            written[tag] = kind
+    return written
 
 
 def _vertex_lines(graph: PoseGraph, poses: Poses, mine: BoolArray) -> Iterator[str]:
     """VERTEX lines of the poses `mine`, (n,)."""
     pose = np.arange(graph.num_poses)
     is_landmark = np.isin(pose, graph.landmarks)
-    for tag, kind in _written_tags(graph.d, is_edge=False).items():
-        chosen = np.flatnonzero(mine & (is_landmark == kind.is_point) & (pose != graph.world))
+    is_written = mine & (pose != graph.world)
+    tags = _written_tags(graph.d, is_edge=False)
+    for tag, kind in tags.items():
+        is_of_kind = is_landmark == kind.is_point
+        chosen = np.flatnonzero(is_written & is_of_kind)
+        ids = graph.pose_ids[chosen, None]
         numbers = _numbers(poses[chosen], kind)
-        yield from _lines(tag, graph.pose_ids[chosen, None], numbers)
+        yield from _lines(tag, ids, numbers)
 
 
 def _edge_lines(graph: PoseGraph, edges: BoolArray) -> Iterator[str]:
@@ -585,37 +675,49 @@ def _edge_lines(graph: PoseGraph, edges: BoolArray) -> Iterator[str]:
     if information is None:
         information = isotropic_information(graph.kappa, graph.tau, d)
     to_landmark = np.isin(graph.j, graph.landmarks)
+    # The line of a position prior has no rotation, and is read as R_ij = I with kappa = 0. A prior
+    # with another R_ij, whose information is in that frame, is therefore written with a rotation.
     is_unturned = (graph.R_ij == np.eye(d)).all(axis=(1, 2))
     is_position_prior = graph.is_prior & (graph.kappa == 0) & is_unturned
     is_point = to_landmark | is_position_prior
-    end_ids = np.stack([graph.pose_ids[graph.i], graph.pose_ids[graph.j]], axis=1)
-    for tag, kind in _written_tags(d, is_edge=True).items():
+    ids_i = graph.pose_ids[graph.i]
+    ids_j = graph.pose_ids[graph.j]
+    end_ids = np.stack([ids_i, ids_j], axis=1)
+    tags = _written_tags(d, is_edge=True)
+    for tag, kind in tags.items():
         is_of_kind = (
             (graph.is_prior == (kind.num_ids == 1))
             & (to_landmark == kind.to_landmark)
             & (is_point == kind.is_point)
         )
         chosen = np.flatnonzero(edges & is_of_kind)
-        measured = _numbers(Poses(graph.R_ij[chosen], graph.t_ij[chosen]), kind)
-        k = d if kind.is_point else information.shape[-1]
-        triangles = information[chosen][:, *np.triu_indices(k)]
+        measured_poses = Poses(graph.R_ij[chosen], graph.t_ij[chosen])
+        measured = _numbers(measured_poses, kind)
+        # The line of a point has the d x d block of the translation alone.
+        side = d if kind.is_point else information.shape[-1]
+        triangles = information[chosen][:, *np.triu_indices(side)]
         numbers = np.concatenate([measured, triangles], axis=1)
+        # The line of a prior names the measured pose alone, which is the second end of the edge.
+        ids = end_ids[chosen, -kind.num_ids :]
         offset = "0 " if kind.has_offset else ""
-        yield from _lines(tag, end_ids[chosen, -kind.num_ids :], numbers, offset)
+        yield from _lines(tag, ids, numbers, offset)
 
 
 def _numbers(poses: Poses, kind: Tag) -> Array:
     """Numbers of poses, (n, ..), as they stand on lines of a kind."""
     if kind.is_point:
         return poses.t
-    if poses.d == 2:
-        return np.concatenate([poses.t, log_map(poses.R)], axis=1)
-    return np.concatenate([poses.t, quaternions_from_rotations(poses.R)], axis=1)
+    rotations = log_map(poses.R) if poses.d == 2 else quaternions_from_rotations(poses.R)
+    return np.concatenate([poses.t, rotations], axis=1)
 
 
 def _lines(tag: str, ids: IntArray, numbers: Array, offset: str = "") -> Iterator[str]:
     """Lines `tag ids offset numbers`; `repr` of a double gives the digits that bring it back."""
     for first in range(0, len(ids), _ROWS_AT_A_TIME):
         rows = slice(first, first + _ROWS_AT_A_TIME)
-        for row_ids, row in zip(ids[rows].tolist(), numbers[rows].tolist(), strict=True):
-            yield f"{tag} {' '.join(map(str, row_ids))} {offset}{' '.join(map(repr, row))}\n"
+        ids_of_rows = ids[rows].tolist()
+        numbers_of_rows = numbers[rows].tolist()
+        for row_ids, row in zip(ids_of_rows, numbers_of_rows, strict=True):
+            words_of_ids = " ".join(map(str, row_ids))
+            words = " ".join(map(repr, row))
+            yield f"{tag} {words_of_ids} {offset}{words}\n"

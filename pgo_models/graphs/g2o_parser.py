@@ -101,7 +101,8 @@ def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
     d = source.dimension()
     vertices = source.joined(d, is_edge=False)
     edges = source.joined(d, is_edge=True)
-    fixed, fixed_lines = np.array(source.fixed, dtype=np.int64).reshape(-1, 2).T
+    fixed_rows = np.array(source.fixed, dtype=np.int64).reshape(-1, 2)
+    fixed, fixed_lines = fixed_rows.T
     file = G2OLines(
         path,
         d,
@@ -116,9 +117,11 @@ def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
         landmarks=_landmarks(path, vertices, edges),
     )
     for rows in (vertices, edges):
-        check_metres(path, rows.lines, rows.numbers[:, :d])
+        translations = rows.numbers[:, :d]
+        check_metres(path, rows.lines, translations)
         if d == 3:
-            check_quaternions(path, rows.lines, rows.numbers[:, 3:7])
+            quaternions = rows.numbers[:, 3:7]
+            check_quaternions(path, rows.lines, quaternions)
     for line, problem in _faults(file):
         raise FileFormatError(path, line, problem)
     return file
@@ -129,15 +132,20 @@ def poses_of(d: int, numbers: Array) -> tuple[Array, Array]:
 
     The rows open with x y theta, or x y z qx qy qz qw.
     """
+    t = numbers[:, :d].copy()
     if d == 2:
-        return exp_map(numbers[:, 2:3]), numbers[:, :2].copy()
-    return rotations_from_quaternions(numbers[:, 3:7]), numbers[:, :3].copy()
+        angles = numbers[:, 2:3]
+        return exp_map(angles), t
+    quaternions = numbers[:, 3:7]
+    return rotations_from_quaternions(quaternions), t
 
 
 def information_of(d: int, edges: Array) -> Array:
     """Information matrices (m, k, k) of EDGE rows, k = 3 in the plane and 6 in space."""
-    k, first = (3, 3) if d == 2 else (6, 7)
-    return np.asarray(edges[:, first + triangle_places(k)])
+    k = 3 if d == 2 else 6
+    num_measured = 3 if d == 2 else 7
+    columns = num_measured + triangle_places(k)
+    return np.asarray(edges[:, columns])
 
 
 class _Source:
@@ -163,13 +171,17 @@ class _Source:
         """Parse long runs of lines of one tag; return how many lines these are."""
         start = 0
         while start < len(lines):
-            tag = "".join(lines[start].split(None, 1)[:1])
+            first_word = lines[start].split(None, 1)[:1]
+            tag = "".join(first_word)  # empty on a blank line
             # Bisection takes for granted that all lines of a tag follow each other. Where other
             # lines stand between them, parsing fails, and the lines are sorted by their tags.
             end = bisect_left(lines, True, start, key=lambda line: not line.startswith(tag))
-            is_run = tag in TAGS and not TAGS[tag].has_offset and end - start >= _LONG_RUN
+            is_simple = tag in TAGS and not TAGS[tag].has_offset
+            if not is_simple or end - start < _LONG_RUN:
+                break
             numbers = np.arange(first_line + start, first_line + end)
-            if not is_run or not self._parse(tag, tag, numbers, lines[start:end]):
+            is_sound = self._parse(tag, tag, numbers, lines[start:end])
+            if not is_sound:
                 break
             start = end
         return start
@@ -193,8 +205,10 @@ class _Source:
         self, tag: str, written_tag: str, numbers: IntArray, lines: list[str]
     ) -> None:
         """Take VERTEX or EDGE lines, whose tag may be written as an alias."""
-        if TAGS[tag].has_offset:
-            lines = [" ".join([written_tag, *_words(TAGS[tag], line)]) for line in lines]
+        kind = TAGS[tag]
+        if kind.has_offset:
+            words_of_lines = [_words(kind, line) for line in lines]
+            lines = [" ".join([written_tag, *words]) for words in words_of_lines]
         if not self._parse(tag, written_tag, numbers, lines):
             self._diagnose(tag, numbers.tolist(), lines)
 
@@ -202,11 +216,13 @@ class _Source:
         """Take lines of a tag that is no measurement's."""
         if tag == "FIX":
             for number, line in zip(numbers, lines, strict=True):
-                self.fixed += [(self._id(number, word), number) for word in line.split()[1:]]
+                for word in line.split()[1:]:
+                    pose_id = self._id(number, word)
+                    self.fixed.append((pose_id, number))
         elif tag == "PARAMS_SE3OFFSET":
             for number, line in zip(numbers, lines, strict=True):
-                offset = line.split()[2:8]
-                if any(finite_number(self.path, number, word) for word in offset):
+                words = line.split()[2:8]
+                if any(finite_number(self.path, number, word) for word in words):
                     self._offset_line = number
         elif tag.startswith("PARAMS_"):
             return
@@ -216,11 +232,11 @@ class _Source:
             self.unknown[shown_tag] = (count + len(numbers), first)
         else:
             known = f"{', '.join(TAGS)} and FIX"
-            raise self._error(
-                numbers[0],
+            problem = (
                 f"unknown tag {tag[:_SHOWN]!r}; supported are {known}: remove the line, "
-                "or have such lines skipped with --skip-unknown",
+                "or have such lines skipped with --skip-unknown"
             )
+            raise self._error(numbers[0], problem)
 
     def text_of_unknown(self) -> str:
         """Text of the warning for lines with unknown tags."""
@@ -236,8 +252,14 @@ class _Source:
         return text
 
     def joined(self, d: int, is_edge: bool) -> _Rows:
-        """All VERTEX or all EDGE lines, line by line; what was parsed of them is given away."""
-        kinds = {tag: kind for tag, kind in TAGS.items() if (kind.d, kind.is_edge) == (d, is_edge)}
+        """All VERTEX or all EDGE lines in the order of the file.
+
+        What was parsed of them is removed from `parsed`, so that it takes no memory any more.
+        """
+        kinds = {}
+        for tag, kind in TAGS.items():
+            if kind.d == d and kind.is_edge == is_edge:
+                kinds[tag] = kind
         parts = []
         for tag, kind in kinds.items():
             parts += [_as_rows(kind, part) for part in self.parsed.pop(tag)]
@@ -245,13 +267,16 @@ class _Source:
             kind = next(iter(kinds.values()))
             no_ids = np.zeros((0, kind.num_ids), dtype=np.int64)
             no_lines = np.zeros(0, dtype=np.int64)
-            none = _ParsedLines(no_lines, no_ids, np.zeros((0, kind.num_numbers)))
+            no_numbers = np.zeros((0, kind.num_numbers))
+            none = _ParsedLines(no_lines, no_ids, no_numbers)
             parts = [_as_rows(kind, none)]
-        ids, numbers, lines, is_point = map(np.concatenate, zip(*parts, strict=True))
-        if (np.diff(lines) < 0).any():
-            order = np.argsort(lines)
-            return _Rows(ids[order], numbers[order], lines[order], is_point[order])
-        return _Rows(ids, numbers, lines, is_point)
+        fields = zip(*parts, strict=True)
+        ids, numbers, lines, is_point = map(np.concatenate, fields)
+        is_sorted = not (np.diff(lines) < 0).any()
+        if is_sorted:
+            return _Rows(ids, numbers, lines, is_point)
+        order = np.argsort(lines)
+        return _Rows(ids[order], numbers[order], lines[order], is_point[order])
 
     def dimension(self) -> int:
         """Dimension of the lines, 2 or 3.
@@ -259,7 +284,8 @@ class _Source:
         A FileFormatError where lines are of neither or of both, or measured by a sensor that is not
         at its pose.
         """
-        uses_offset = any(self.parsed[tag] for tag, kind in TAGS.items() if kind.has_offset)
+        tags_with_offset = [tag for tag, kind in TAGS.items() if kind.has_offset]
+        uses_offset = any(self.parsed[tag] for tag in tags_with_offset)
         if self._offset_line and uses_offset:
             raise self._error(
                 self._offset_line,
@@ -295,10 +321,11 @@ class _Source:
         if max(map(len, lines)) > LONGEST:
             return False
         shared_end = _shared_end(lines, kind.num_numbers - 1)
-        num_own = kind.num_numbers - len(shared_end.split())
-        row_type = np.dtype(
-            [("tag", "S20"), ("ids", "i8", (kind.num_ids,)), ("numbers", "f8", (num_own,))]
-        )
+        num_shared = len(shared_end.split())
+        num_own = kind.num_numbers - num_shared
+        ids_field = ("ids", "i8", (kind.num_ids,))
+        numbers_field = ("numbers", "f8", (num_own,))
+        row_type = np.dtype([("tag", "S20"), ids_field, numbers_field])
         own_ends = [line.removesuffix(shared_end) for line in lines]
         shared = np.zeros((1, 0))
         try:
@@ -310,11 +337,16 @@ class _Source:
         except (ValueError, DeprecationWarning):
             return False
         ids = rows["ids"]
-        values = np.concatenate([rows["numbers"], shared.repeat(len(rows), axis=0)], axis=1)
-        has_tag = len(ids) == len(numbers) and (rows["tag"] == written_tag.encode()).all()
-        if not has_tag or (ids == WORLD_ID).any() or not (np.abs(values) <= LARGEST).all():
+        repeated = shared.repeat(len(rows), axis=0)
+        values = np.concatenate([rows["numbers"], repeated], axis=1)
+        has_tag = rows["tag"] == written_tag.encode()
+        if len(ids) != len(numbers) or not has_tag.all():
             return False
-        self.parsed[tag].append(_ParsedLines(numbers, ids.copy(), values))
+        is_finite = np.abs(values) <= LARGEST
+        if (ids == WORLD_ID).any() or not is_finite.all():
+            return False
+        parsed = _ParsedLines(numbers, ids.copy(), values)
+        self.parsed[tag].append(parsed)
         return True
 
     def _diagnose(self, tag: str, numbers: list[int], lines: list[str]) -> NoReturn:
@@ -331,26 +363,29 @@ class _Source:
         """Raise a FileFormatError when a word of a line is wrong, or there are not enough."""
         kind = TAGS[tag]
         words = _words(kind, line)
-        for word in words[: kind.num_ids]:
+        words_of_ids = words[: kind.num_ids]
+        words_of_numbers = words[kind.num_ids :]
+        for word in words_of_ids:
             self._id(number, word)
-        for word in words[kind.num_ids :]:
+        for word in words_of_numbers:
             finite_number(self.path, number, word)
         expected = kind.num_ids + kind.num_numbers
         if len(words) == expected:
             return
         ids = "1 id" if kind.num_ids == 1 else f"{kind.num_ids} ids"
         cause = "the line is cut off" if len(words) < expected else "the line is too long"
-        raise self._error(
-            number,
+        problem = (
             f"{tag} needs {ids} and {kind.num_numbers} numbers, {expected} in all, "
-            f"found {len(words)}; {cause}: complete or remove it",
+            f"found {len(words)}; {cause}: complete or remove it"
         )
+        raise self._error(number, problem)
 
     def _id(self, line: int, word: str) -> int:
         """Id of a pose, which has 64 bits."""
+        # int() also takes 1_000 and the digits of other scripts; number files do not.
+        is_plain = word.isascii() and "_" not in word
         try:
-            # int() also takes 1_000 and the digits of other scripts; number files do not.
-            value = int(word if word.isascii() and "_" not in word else "")
+            value = int(word if is_plain else "")
         except ValueError:
             problem = f"id {word[:_SHOWN]!r} is no integer; number the poses"
             raise self._error(line, problem) from None
@@ -369,28 +404,33 @@ class _Source:
 def _words(kind: Tag, line: str) -> list[str]:
     """Ids and numbers on a line, without the id of an offset."""
     words = line.split()[1:]
-    if kind.has_offset and len(words) == kind.num_ids + 1 + kind.num_numbers:
+    num_with_offset = kind.num_ids + 1 + kind.num_numbers
+    if kind.has_offset and len(words) == num_with_offset:
         words.pop(kind.num_ids)
     return words
 
 
 def _as_rows(kind: Tag, part: _ParsedLines) -> _Rows:
     """Lines of a tag in the common form: edges of one pose are priors, which begin at the world."""
-    two_ids = np.insert(part.ids, 0, WORLD_ID, axis=1)[:, -2:]
+    ids_behind_world = np.insert(part.ids, 0, WORLD_ID, axis=1)
+    last_two_ids = ids_behind_world[:, -2:]
+    numbers = kind.rows(part.numbers)
     is_point = np.full(len(part.lines), kind.to_landmark)
-    return _Rows(two_ids, kind.rows(part.numbers), part.lines, is_point)
+    return _Rows(last_two_ids, numbers, part.lines, is_point)
 
 
 def _landmarks(path: Path, vertices: _Rows, edges: _Rows) -> IntArray:
     """Ids of landmarks; a FileFormatError where one stands for a pose in another line."""
     vertex_ids = vertices.ids[:, 1]
-    landmarks = np.unique(
-        np.concatenate([vertex_ids[vertices.is_point], edges.ids[edges.is_point, 1]])
-    )
+    ids_of_vertices = vertex_ids[vertices.is_point]
+    ids_of_edges = edges.ids[edges.is_point, 1]
+    landmarks = np.unique(np.concatenate([ids_of_vertices, ids_of_edges]))
     is_posed_vertex = np.isin(vertex_ids, landmarks) & ~vertices.is_point
     # The first id of an edge is always that of a pose, the second one unless it ends at a point.
-    may_be_landmark = np.stack([np.zeros_like(edges.is_point), edges.is_point], axis=1)
-    is_posed_edge = (np.isin(edges.ids, landmarks) & ~may_be_landmark).any(axis=1)
+    never = np.zeros_like(edges.is_point)
+    may_be_landmark = np.stack([never, edges.is_point], axis=1)
+    is_posed_end = np.isin(edges.ids, landmarks) & ~may_be_landmark
+    is_posed_edge = is_posed_end.any(axis=1)
     posed = [*vertices.lines[is_posed_vertex], *edges.lines[is_posed_edge]]
     if posed:
         problem = (
@@ -406,59 +446,71 @@ def _shared_end(lines: list[str], most: int) -> str:
 
     It is empty where these words are more than `most`.
     """
+    # The first and the last line are compared word by word, from the end on.
     first = lines[0].split(" ")[::-1]
     last = lines[-1].split(" ")[::-1]
-    differs = (place for place, (a, b) in enumerate(zip(first, last, strict=False)) if a != b)
-    count = next(differs, 0)
-    shared_end = " " + " ".join(first[:count][::-1])
-    if not 0 < len(shared_end.split()) <= most:
+    pairs = enumerate(zip(first, last, strict=False))
+    differences = (place for place, (a, b) in pairs if a != b)
+    count = next(differences, 0)
+    shared_words = first[:count][::-1]
+    shared_end = " " + " ".join(shared_words)
+    num_shared = len(shared_end.split())
+    if not 0 < num_shared <= most:
         return ""
-    return shared_end if all(line.endswith(shared_end) for line in lines) else ""
+    is_shared = all(line.endswith(shared_end) for line in lines)
+    return shared_end if is_shared else ""
 
 
 def _faults(file: G2OLines) -> Iterator[tuple[int, str]]:
     """Line and description of what the numbers of a file cannot be."""
     order = np.argsort(file.vertex_ids, kind="stable")
-    repeated = np.flatnonzero(np.diff(file.vertex_ids[order]) == 0)
+    steps = np.diff(file.vertex_ids[order])
+    repeated = np.flatnonzero(steps == 0)
     if repeated.size:
         earlier = order[repeated[0]]
         later = order[repeated[0] + 1]
         first = f"(the first is line {file.vertex_lines[earlier]})"
         problem = f"a second VERTEX line of pose {file.vertex_ids[later]} {first}; remove one"
         yield int(file.vertex_lines[later]), problem
-    loops = file.edge_ids[:, 0] == file.edge_ids[:, 1]
+    ids_i, ids_j = file.edge_ids.T
+    loops = ids_i == ids_j
     if loops.any():
         e = int(np.argmax(loops))
-        problem = f"an edge from pose {file.edge_ids[e, 0]} to itself; remove it"
+        problem = f"an edge from pose {ids_i[e]} to itself; remove it"
         yield int(file.edge_lines[e]), problem
     # Only the two blocks are checked: the precisions use nothing else, and the coupling blocks of
     # the public cubicle graph make 5,021 of its whole matrices indefinite.
     information = information_of(file.d, file.edges)
     is_zero = ~information.any(axis=(1, 2))
     if is_zero.any():
+        e = int(np.argmax(is_zero))
         problem = "the information matrix is zero; the edge says nothing: remove it"
-        yield int(file.edge_lines[int(np.argmax(is_zero))]), problem
+        yield int(file.edge_lines[e]), problem
     d = file.d
-    yield from _faults_of_blocks(file, "translation", information[:, :d, :d])
-    yield from _faults_of_blocks(file, "rotation", information[:, d:, d:])
+    translation_blocks = information[:, :d, :d]
+    rotation_blocks = information[:, d:, d:]
+    yield from _faults_of_blocks(file, "translation", translation_blocks)
+    yield from _faults_of_blocks(file, "rotation", rotation_blocks)
 
 
 def _faults_of_blocks(file: G2OLines, name: str, blocks: Array) -> Iterator[tuple[int, str]]:
     """Line and description of a block, (m, k, k), that is neither zero nor positive definite."""
-    is_wrong = blocks.any(axis=(1, 2)) & ~_is_positive_definite(blocks)
+    is_nonzero = blocks.any(axis=(1, 2))
+    is_wrong = is_nonzero & ~_is_positive_definite(blocks)
     if is_wrong.any():
         e = int(np.argmax(is_wrong))
         smallest = np.linalg.eigvalsh(blocks[e])[0]
-        yield (
-            int(file.edge_lines[e]),
+        problem = (
             f"{name} block of the information matrix is not positive definite "
             f"(smallest eigenvalue {smallest:.3g}); "
-            "give the upper triangle row by row, or remove the line",
+            "give the upper triangle row by row, or remove the line"
         )
+        yield int(file.edge_lines[e]), problem
 
 
 def _is_positive_definite(A: Array) -> BoolArray:
     """Whether matrices (m, k, k) are positive definite, (m,), beyond rounding and underflow."""
-    is_positive = (np.einsum("mkk->mk", A) > 1.0 / LARGEST).all(axis=1)
+    diagonals = np.einsum("mkk->mk", A)
+    is_positive = (diagonals > 1.0 / LARGEST).all(axis=1)
     is_positive[is_positive] = are_definite(A[is_positive], _SINGULAR)
     return np.asarray(is_positive)

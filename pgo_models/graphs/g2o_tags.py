@@ -53,7 +53,9 @@ class Tag:
             return numbers
         if self.d == 3:
             return _with_quaternions(numbers)
-        return numbers[:, _TORO] if self.is_edge else numbers
+        if self.is_edge:
+            return numbers[:, _TORO]
+        return numbers
 
     def _rows_of_points(self, numbers: Array) -> Array:
         """Points as poses that are not turned, with no information on their rotation."""
@@ -75,12 +77,15 @@ class Tag:
 
 def _with_quaternions(numbers: Array) -> Array:
     """Rows of TORO in space, with a quaternion in place of roll, pitch and yaw."""
-    axes = np.eye(3)
-    roll = exp_map(numbers[:, 3, None] * axes[0])
-    pitch = exp_map(numbers[:, 4, None] * axes[1])
-    yaw = exp_map(numbers[:, 5, None] * axes[2])
-    quaternions = quaternions_from_rotations(yaw @ pitch @ roll)
-    return np.concatenate([numbers[:, :3], quaternions, numbers[:, 6:]], axis=1)
+    x_axis, y_axis, z_axis = np.eye(3)
+    roll = exp_map(numbers[:, 3, None] * x_axis)
+    pitch = exp_map(numbers[:, 4, None] * y_axis)
+    yaw = exp_map(numbers[:, 5, None] * z_axis)
+    R = yaw @ pitch @ roll
+    quaternions = quaternions_from_rotations(R)
+    translations = numbers[:, :3]
+    triangles = numbers[:, 6:]
+    return np.concatenate([translations, quaternions, triangles], axis=1)
 
 
 TAGS = {

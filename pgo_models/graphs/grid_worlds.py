@@ -14,7 +14,13 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, check_dimension, observe
+from pgo_models.graphs.scenes import (
+    MILD_NOISE,
+    NoiseModel,
+    check_dimension,
+    observe,
+    sorted_pairs,
+)
 
 # Sets the size of the world: enough meetings to close loops, and room to walk.
 _POSES_PER_CELL = 2.0
@@ -85,11 +91,13 @@ def grid_world(
         )
     truth = _walks(num_robots, poses_per_robot, d, rng)
     robot = np.repeat(np.arange(num_robots), poses_per_robot)
-    not_first = np.flatnonzero(np.arange(len(robot)) % poses_per_robot)
+    step = np.arange(len(robot)) % poses_per_robot
+    not_first = np.flatnonzero(step)
     odometry = np.column_stack([not_first - 1, not_first])
     closures = _loop_closures(truth.t, robot, loop_closure_probability, rng)
     meetings = _meetings(truth.t, robot, closures)
-    i, j = np.concatenate([odometry, closures, meetings]).T
+    edges = np.concatenate([odometry, closures, meetings])
+    i, j = edges.T
     kappa = noise.kappa(d)
     return observe("grid_world", truth, i, j, noise, kappa, noise.tau, rng, robot=robot)
 
@@ -97,25 +105,31 @@ def grid_world(
 def _walks(num_robots: int, num_steps: int, d: int, rng: np.random.Generator) -> Poses:
     """Truth of all robots, robot by robot; all take a step at a time."""
     num_cells = num_robots * num_steps / _POSES_PER_CELL
-    side = max(2, math.ceil(num_cells ** (1 / d)))
+    exact_side = num_cells ** (1 / d)
+    side = max(2, math.ceil(exact_side))
     turns = _quarter_turns(d)
     num_turns = len(turns) - 1
-    probability = np.array([_STRAIGHT] + [(1 - _STRAIGHT) / num_turns] * num_turns)
+    probability_of_turn = (1 - _STRAIGHT) / num_turns
+    probability = np.array([_STRAIGHT] + [probability_of_turn] * num_turns)
     robots = np.arange(num_robots)
     R = np.empty((num_steps, num_robots, d, d))
     cell = np.empty((num_steps, num_robots, d))
     R[0] = np.eye(d)
     for _ in range(3):  # three turns lead to every heading
-        R[0] = R[0] @ turns[rng.integers(0, len(turns), num_robots)]
+        drawn = rng.integers(0, len(turns), num_robots)
+        R[0] = R[0] @ turns[drawn]
     cell[0] = rng.integers(0, side, (num_robots, d))
     for k in range(1, num_steps):
         options = R[k - 1][:, None] @ turns
-        next_cells = cell[k - 1][:, None] + options[..., 0]
-        is_inside = ((next_cells >= 0) & (next_cells <= side - 1)).all(axis=2)
+        x_axes = options[..., 0]
+        next_cells = cell[k - 1][:, None] + x_axes
+        is_within = (next_cells >= 0) & (next_cells <= side - 1)
+        is_inside = is_within.all(axis=2)
         # A draw with these probabilities among the options inside: the smallest of exponential
         # variables whose rates are the probabilities.
         wait = rng.exponential(size=is_inside.shape) / probability
-        choice = np.argmin(np.where(is_inside, wait, np.inf), axis=1)
+        wait_inside = np.where(is_inside, wait, np.inf)
+        choice = np.argmin(wait_inside, axis=1)
         R[k] = options[robots, choice]
         cell[k] = next_cells[robots, choice]
     R_by_robot = R.swapaxes(0, 1).reshape(-1, d, d)
@@ -136,10 +150,12 @@ def _loop_closures(
     t: Array, robot: IntArray, probability: float, rng: np.random.Generator
 ) -> IntArray:
     """Pairs, (k, 2), of poses that see each other and are measured, without odometry."""
-    near = scipy.spatial.KDTree(t).query_pairs(_REACH, output_type="ndarray").astype(np.int64)
-    i, j = near[np.lexsort((near[:, 1], near[:, 0]))].T
-    is_odometry = (j == i + 1) & (robot[i] == robot[j])
-    pairs = np.column_stack([i, j])[~is_odometry]
+    pairs_in_reach = scipy.spatial.KDTree(t).query_pairs(_REACH, output_type="ndarray")
+    near = sorted_pairs(pairs_in_reach.astype(np.int64))
+    i, j = near.T
+    is_same_robot = robot[i] == robot[j]
+    is_odometry = (j == i + 1) & is_same_robot
+    pairs = near[~is_odometry]
     is_measured = rng.random(len(pairs)) < probability
     return np.asarray(pairs[is_measured])
 
@@ -148,20 +164,25 @@ def _meetings(t: Array, robot: IntArray, closures: IntArray) -> IntArray:
     """Edges (k, 2) that join the groups of robots which the closures leave apart."""
     num_robots = int(robot[-1]) + 1
     robots_i, robots_j = robot[closures].T
-    met = coo_array((np.ones(len(closures)), (robots_i, robots_j)), (num_robots, num_robots))
+    ones = np.ones(len(closures))
+    met = coo_array((ones, (robots_i, robots_j)), shape=(num_robots, num_robots))
     num_groups, labels = connected_components(met, directed=False)
     group: IntArray = np.asarray(labels, dtype=np.int64)
     added = np.zeros((0, 2), dtype=np.int64)
     while num_groups > 1:
         sizes = np.bincount(group)
-        smallest = int(np.argmin(np.where(sizes > 0, sizes, num_robots + 1)))
-        inside = np.flatnonzero(group[robot] == smallest)
-        outside = np.flatnonzero(group[robot] != smallest)
-        distance, nearest = scipy.spatial.KDTree(t[outside]).query(t[inside])
+        sizes_of_groups = np.where(sizes > 0, sizes, num_robots + 1)  # a joined group has size 0
+        smallest = int(np.argmin(sizes_of_groups))
+        group_of_pose = group[robot]
+        inside = np.flatnonzero(group_of_pose == smallest)
+        outside = np.flatnonzero(group_of_pose != smallest)
+        tree = scipy.spatial.KDTree(t[outside])
+        distance, nearest = tree.query(t[inside])
         closest = int(np.argmin(distance))
         pose = int(inside[closest])
         other = int(outside[np.asarray(nearest)[closest]])
-        added = np.concatenate([added, [sorted((pose, other))]])
+        pair = sorted((pose, other))
+        added = np.concatenate([added, [pair]])
         group[group == smallest] = group[robot[other]]
         num_groups -= 1
     return added

@@ -149,7 +149,8 @@ class PoseGraph(ReadOnly):
         if self.information is None:
             self._set("uncoupled", None)
         elif self.uncoupled is not None:
-            self._set("uncoupled", read_only(np.array(self.uncoupled, dtype=bool)))
+            uncoupled = np.array(self.uncoupled, dtype=bool)
+            self._set("uncoupled", read_only(uncoupled))
         self._check_shapes()
         self._check_ends()
         self._check_poses()
@@ -194,17 +195,23 @@ class PoseGraph(ReadOnly):
     @property
     def pose_ids(self) -> IntArray:
         """Names of the poses, (n,)."""
-        return np.arange(self.num_poses) if self.ids is None else self.ids
+        if self.ids is not None:
+            return self.ids
+        return np.arange(self.num_poses)
 
     @property
     def robots(self) -> IntArray:
         """Owner of every pose, (n,)."""
-        return np.zeros(self.num_poses, dtype=np.int64) if self.robot is None else self.robot
+        if self.robot is not None:
+            return self.robot
+        return np.zeros(self.num_poses, dtype=np.int64)
 
     @property
     def num_robots(self) -> int:
         """Number of robots that own the poses."""
-        return 1 if self.robot is None else int(self.robot.max()) + 1
+        if self.robot is None:
+            return 1
+        return int(self.robot.max()) + 1
 
     def pose_name(self, pose: int) -> str:
         """Return the id of a pose, for messages.
@@ -238,13 +245,20 @@ class PoseGraph(ReadOnly):
         str
             Text such as "edge 3 (17 -> 18)".
         """
-        return f"edge {e} ({self.pose_name(self.i[e])} -> {self.pose_name(self.j[e])})"
+        name_i = self.pose_name(self.i[e])
+        name_j = self.pose_name(self.j[e])
+        return f"edge {e} ({name_i} -> {name_j})"
 
     @property
     def extras(self) -> str:
         """Text with the number of landmarks and of priors, empty if there are none."""
-        counts = {"landmarks": len(self.landmarks), "priors": int(self.is_prior.sum())}
-        return "".join(f", {name}={count}" for name, count in counts.items() if count)
+        text = ""
+        if len(self.landmarks):
+            text += f", landmarks={len(self.landmarks)}"
+        num_priors = int(self.is_prior.sum())
+        if num_priors:
+            text += f", priors={num_priors}"
+        return text
 
     def __repr__(self) -> str:
         size = f"poses={len(self.bodies)}, edges={self.num_edges}{self.extras}"
@@ -280,12 +294,14 @@ class PoseGraph(ReadOnly):
         """Poses that are neither the world pose nor landmarks, (b,)."""
         is_body = np.arange(self.num_poses) != self.world
         is_body[self.landmarks] = False
-        return read_only(np.flatnonzero(is_body))
+        bodies = np.flatnonzero(is_body)
+        return read_only(bodies)
 
     @property
     def in_files(self) -> IntArray:
         """All poses but the world pose, which files do not name."""
-        return np.flatnonzero(np.arange(self.num_poses) != self.world)
+        is_in_files = np.arange(self.num_poses) != self.world
+        return np.flatnonzero(is_in_files)
 
     @property
     def is_prior(self) -> BoolArray:
@@ -298,8 +314,11 @@ class PoseGraph(ReadOnly):
 
         Then no single prior fixes the rotation of the world frame, only all of them together.
         """
-        to_poses = self.is_prior & ~np.isin(self.j, self.landmarks)
-        return self.world is not None and not self.kappa[to_poses].any()
+        if self.world is None:
+            return False
+        to_landmarks = np.isin(self.j, self.landmarks)
+        kappa_of_priors = self.kappa[self.is_prior & ~to_landmarks]
+        return not kappa_of_priors.any()
 
     @cached_property
     def first_sights(self) -> IntArray:
@@ -307,7 +326,8 @@ class PoseGraph(ReadOnly):
         to_landmarks = np.flatnonzero(np.isin(self.j, self.landmarks))
         priors_last = np.argsort(self.is_prior[to_landmarks], kind="stable")
         candidates = to_landmarks[priors_last]
-        _, first = np.unique(self.j[candidates], return_index=True)
+        seen = self.j[candidates]
+        _, first = np.unique(seen, return_index=True)
         return read_only(candidates[first])
 
     def completed(self, poses: Poses) -> Poses:
@@ -329,12 +349,16 @@ class PoseGraph(ReadOnly):
             return poses
         R = poses.R
         t = poses.t
-        if self.world is not None and len(t) == self.num_poses - 1:
-            R = np.insert(R, self.world, np.eye(poses.d), axis=0)
+        num_given = poses.num_poses
+        if self.world is not None and num_given == self.num_poses - 1:
+            identity = np.eye(poses.d)
+            R = np.insert(R, self.world, identity, axis=0)
             t = np.insert(t, self.world, 0.0, axis=0)
         if len(first) and len(t) == self.num_poses:
+            landmarks = self.j[first]
+            seen_from = self.i[first]
             R = R.copy()
-            R[self.j[first]] = R[self.i[first]]
+            R[landmarks] = R[seen_from]
         return Poses(R, t)
 
     def _settle_landmarks(self) -> None:
@@ -345,15 +369,17 @@ class PoseGraph(ReadOnly):
         to_landmarks = np.isin(self.j, self.landmarks)
         kappa = np.where(to_landmarks, 0.0, self.kappa)
         usual = np.median(kappa[kappa > 0]) if kappa.any() else 1.0
-        kappa[first] = np.where(self.kappa[first] > 0, self.kappa[first], usual)
+        kappa_of_first = self.kappa[first]
+        kappa[first] = np.where(kappa_of_first > 0, kappa_of_first, usual)
         self._set("kappa", read_only(kappa))
         if self.information is None:
             return
         d = self.d
+        isotropic = isotropic_information(kappa, kappa, d)
         information = self.information.copy()
         information[to_landmarks, d:] = 0.0
         information[to_landmarks, :, d:] = 0.0
-        information[first, d:, d:] = isotropic_information(kappa, kappa, d)[first, d:, d:]
+        information[first, d:, d:] = isotropic[first, d:, d:]
         self._set("information", read_only(information))
 
     # Checks when a graph is made, in the order in which they are called
@@ -368,7 +394,8 @@ class PoseGraph(ReadOnly):
                 f"landmarks are poses {self.landmarks}, "
                 f"not all of them of 0 .. {self.num_poses - 1}"
             )
-        if self.R_ij.ndim != 3 or self.R_ij.shape[1:] not in ((2, 2), (3, 3)):
+        matrix_shape = self.R_ij.shape[1:]
+        if self.R_ij.ndim != 3 or matrix_shape not in ((2, 2), (3, 3)):
             raise GraphError(f"R_ij has shape {self.R_ij.shape}; give (m, 2, 2) or (m, 3, 3)")
         for name, shape in self._expected_shapes().items():
             value = getattr(self, name)
@@ -383,7 +410,8 @@ class PoseGraph(ReadOnly):
                 raise GraphError(f"{name} is {poses}; give {self.num_poses} poses in {self.d}D")
 
     def _has_poses(self, poses: IntArray) -> bool:
-        return bool(((poses >= 0) & (poses < self.num_poses)).all())
+        is_pose = (poses >= 0) & (poses < self.num_poses)
+        return bool(is_pose.all())
 
     def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of every array."""
@@ -408,7 +436,8 @@ class PoseGraph(ReadOnly):
 
     def _fits(self, poses: Poses) -> bool:
         """Whether poses are as many as those of the graph, with or without the world pose."""
-        return poses.d == self.d and poses.num_poses in (self.num_poses, len(self.in_files))
+        possible_sizes = (self.num_poses, len(self.in_files))
+        return poses.d == self.d and poses.num_poses in possible_sizes
 
     def _refuse_edges(self, wrong: BoolArray, problem: str) -> None:
         """Raise a GraphError for the first edge of a mask, (m,); `{edge}` stands for its label."""
@@ -418,7 +447,8 @@ class PoseGraph(ReadOnly):
 
     def _check_ends(self) -> None:
         ends = np.stack([self.i, self.j])
-        is_outside = np.asarray(((ends < 0) | (ends >= self.num_poses)).any(axis=0))
+        is_end_outside = (ends < 0) | (ends >= self.num_poses)
+        is_outside = np.asarray(is_end_outside.any(axis=0))
         self._refuse_edges(is_outside, f"{{edge}} names a pose outside 0 .. {self.num_poses - 1}")
         is_loop = self.i == self.j
         self._refuse_edges(is_loop, "{edge} leads from a pose to itself; remove it")
@@ -433,7 +463,8 @@ class PoseGraph(ReadOnly):
             )
         num_worlds = 0 if self.world is None else 1
         # Landmarks that are named twice, or a world pose among them, make this sum too large.
-        if len(self.bodies) + len(self.landmarks) + num_worlds != self.num_poses:
+        sum_of_kinds = len(self.bodies) + len(self.landmarks) + num_worlds
+        if sum_of_kinds != self.num_poses:
             raise GraphError(
                 "world and landmarks are not different poses, "
                 f"0 to {self.num_poses - 1}; name each once"
@@ -442,10 +473,11 @@ class PoseGraph(ReadOnly):
     def _check_landmark_edges(self) -> None:
         """Check that no edge ends at the world, begins at a landmark or turns one."""
         is_turned = (self.R_ij != np.eye(self.d)).any(axis=(1, 2))
-        turns_landmark = np.isin(self.j, self.landmarks) & is_turned
+        to_landmark = np.isin(self.j, self.landmarks)
         from_landmark = np.isin(self.i, self.landmarks)
+        to_world = self.j == self.world
         self._refuse_edges(
-            turns_landmark | from_landmark | (self.j == self.world),
+            (to_landmark & is_turned) | from_landmark | to_world,
             "{edge} begins at a landmark, has R_ij of one, or ends at the world; turn it, R_ij = I",
         )
 
@@ -454,18 +486,16 @@ class PoseGraph(ReadOnly):
         for name in ("R_ij", "t_ij", "kappa", "tau", "information"):
             values = getattr(self, name)
             if values is not None:
-                is_finite = np.isfinite(values.reshape(self.num_edges, -1)).all(axis=1)
-                self._refuse_edges(
-                    ~is_finite, f"{name} of {{edge}} has nan or inf; remove the edge"
-                )
+                numbers_of_edges = values.reshape(self.num_edges, -1)
+                is_finite = np.isfinite(numbers_of_edges).all(axis=1)
+                problem = f"{name} of {{edge}} has nan or inf; remove the edge"
+                self._refuse_edges(~is_finite, problem)
         for name in ("kappa", "tau"):
             values = getattr(self, name)
             is_negative = values < 0
-            worst = values[int(np.argmax(is_negative))]
-            self._refuse_edges(
-                is_negative,
-                f"{name} of {{edge}} is {worst:.6g}; a precision must not be negative",
-            )
+            first = values[int(np.argmax(is_negative))]
+            problem = f"{name} of {{edge}} is {first:.6g}; a precision must not be negative"
+            self._refuse_edges(is_negative, problem)
 
     def _check_not_empty(self) -> None:
         """Check that every edge measures something, before and after landmarks are settled."""
@@ -473,8 +503,10 @@ class PoseGraph(ReadOnly):
         self._refuse_edges(is_empty, "kappa and tau of {edge} are 0; remove it")
 
     def _check_names(self) -> None:
-        if self.ids is not None and not np.diff(np.sort(self.ids)).all():
-            raise GraphError("ids are not unique; every pose needs a name of its own")
+        if self.ids is not None:
+            steps = np.diff(np.sort(self.ids))
+            if not steps.all():
+                raise GraphError("ids are not unique; every pose needs a name of its own")
         if self.robot is not None and not has_no_gap(self.robot):
             raise GraphError(
                 "robot must number the robots 0, 1, .. without a gap; see numpy.unique"
@@ -485,7 +517,8 @@ class PoseGraph(ReadOnly):
     @cached_property
     def adjacency(self) -> csr_array:
         """Number of edges between every two poses, a sparse (n, n) matrix."""
-        return read_only(edge_counts(self.i, self.j, self.num_poses))
+        counts = edge_counts(self.i, self.j, self.num_poses)
+        return read_only(counts)
 
     def components(self, edges: BoolArray | None = None) -> list[IntArray]:
         """Return the poses of every connected component, the largest component first.
@@ -513,7 +546,11 @@ class PoseGraph(ReadOnly):
         # The matrix is symmetric, so that strong components are the components; they are faster.
         count, label = connected_components(adjacency, connection="strong")
         parts = [np.flatnonzero(label == c) for c in range(count)]
-        return sorted(parts, key=lambda part: (-len(part), int(part[0])))
+
+        def largest_then_first(part: IntArray) -> tuple[int, int]:
+            return -len(part), int(part[0])
+
+        return sorted(parts, key=largest_then_first)
 
     @property
     def is_connected(self) -> bool:
@@ -557,7 +594,8 @@ class PoseGraph(ReadOnly):
             # Priors of positions fix this rotation together, see _check_priors_fix_world.
             parts = [part for part in parts if part[0] != self.world]
         if len(parts) > 1:
-            poses = f"{len(parts[1])} poses (with {self.pose_name(parts[1][0])})"
+            untied = parts[1]
+            poses = f"{len(untied)} poses (with {self.pose_name(untied[0])})"
             raise GraphError(
                 f"the {quantity} of {poses} is not tied to that of the others: "
                 f"no edge between has {precision} > 0; add one, or leave these out"
@@ -565,9 +603,12 @@ class PoseGraph(ReadOnly):
 
     def _check_priors_fix_world(self) -> None:
         """Raise a GraphError when priors of positions lie in a point or, in space, on a line."""
-        _, first = np.unique(self.j[self.is_prior], return_index=True)
+        # One position of every pose that has priors.
+        measured_poses = self.j[self.is_prior]
+        _, first = np.unique(measured_poses, return_index=True)
         measured = self.t_ij[self.is_prior][first]
-        spread = np.linalg.svd(measured - measured.mean(axis=0), compute_uv=False)
+        centred = measured - measured.mean(axis=0)
+        spread = np.linalg.svd(centred, compute_uv=False)
         rounding = _ROUNDING * np.abs(measured).max(initial=0.0)
         threshold = max(_COLLINEAR * spread[0], rounding, 1e-300)
         if len(measured) < self.d or not spread[self.d - 2] > threshold:
@@ -598,7 +639,7 @@ class PoseGraph(ReadOnly):
             When there is no pose, or one that the graph does not have, or no edge among them.
         """
         chosen = np.unique(whole_array(poses, "poses"))
-        if not len(chosen) or chosen[0] < 0 or chosen[-1] >= self.num_poses:
+        if not len(chosen) or not self._has_poses(chosen):
             raise GraphError(
                 f"poses of a subgraph are some of 0 .. {self.num_poses - 1}, got {chosen}"
             )
@@ -615,6 +656,11 @@ class PoseGraph(ReadOnly):
         world = None
         if self.world is not None and is_kept[self.world]:
             world = int(new_number[self.world])
+        times = None
+        if self.times is not None:
+            times = self.times[is_kept[self.bodies]]
+        fixed = new_number[self.fixed]
+        landmarks = new_number[self.landmarks]
         return replace(
             self,
             num_poses=len(chosen),
@@ -623,10 +669,10 @@ class PoseGraph(ReadOnly):
             robot=robot,
             initial=None if self.initial is None else self.initial[chosen],
             truth=None if self.truth is None else self.truth[chosen],
-            fixed=new_number[self.fixed[is_kept[self.fixed]]],
-            times=None if self.times is None else self.times[is_kept[self.bodies]],
+            fixed=fixed[fixed >= 0],
+            times=times,
             world=world,
-            landmarks=new_number[self.landmarks[is_kept[self.landmarks]]],
+            landmarks=landmarks[landmarks >= 0],
         )
 
     def unit_weights(self) -> PoseGraph:
@@ -641,7 +687,9 @@ class PoseGraph(ReadOnly):
         ----------
         Ebrahimi & Deghat, problem `min overall`.
         """
-        return self.with_weights((self.kappa > 0).astype(float), (self.tau > 0).astype(float))
+        kappa = (self.kappa > 0).astype(float)
+        tau = (self.tau > 0).astype(float)
+        return self.with_weights(kappa, tau)
 
     def with_weights(self, kappa: Array, tau: Array) -> PoseGraph:
         """Return the graph with other precisions.
@@ -736,8 +784,9 @@ class PoseGraph(ReadOnly):
             raise GraphError(
                 f"{measured} for {len(i)} edges in {self.d}D; give one measured pose for every edge"
             )
-        kappa_rows = np.array(np.broadcast_to(kappa, np.shape(i)), dtype=float)
-        tau_rows = np.array(np.broadcast_to(tau, np.shape(i)), dtype=float)
+        shape = np.shape(i)
+        kappa_rows = np.array(np.broadcast_to(kappa, shape), dtype=float)
+        tau_rows = np.array(np.broadcast_to(tau, shape), dtype=float)
         new_rows = {
             "i": i,
             "j": j,
@@ -748,10 +797,11 @@ class PoseGraph(ReadOnly):
             "information": isotropic_information(kappa_rows, tau_rows, self.d),
             "uncoupled": np.zeros(len(kappa_rows), dtype=bool),
         }
-        own_rows = self._edge_rows(np.ones(self.num_edges, dtype=bool))
-        extended: dict[str, Any] = {
-            name: np.concatenate([rows, new_rows[name]]) for name, rows in own_rows.items()
-        }
+        all_edges = np.ones(self.num_edges, dtype=bool)
+        own_rows = self._edge_rows(all_edges)
+        extended: dict[str, Any] = {}
+        for name, rows in own_rows.items():
+            extended[name] = np.concatenate([rows, new_rows[name]])
         return replace(self, **extended)
 
     def with_prior(
@@ -784,7 +834,8 @@ class PoseGraph(ReadOnly):
         graph = self
         if self.world is None:
             graph = self._with_node(poses[0], WORLD_ID, {"world": self.num_poses})
-        return graph.with_edges(np.full(len(poses), graph.world), poses, measured, kappa, tau)
+        world = np.full(len(poses), graph.world)
+        return graph.with_edges(world, poses, measured, kappa, tau)
 
     def with_position_prior(self, poses: IntArray, positions: Array, tau: Weights) -> PoseGraph:
         """Return the graph with priors of positions, as measured by GPS.
@@ -814,7 +865,8 @@ class PoseGraph(ReadOnly):
         >>> load("grid").with_position_prior(np.array([0, 5, 9]), np.eye(3), tau=1.0)
         PoseGraph('grid', d=3, poses=27, edges=111, priors=3, robots=1)
         """
-        return self.with_prior(poses, Poses.of_points(positions), 0.0, tau)
+        measured = Poses.of_points(positions)
+        return self.with_prior(poses, measured, kappa=0.0, tau=tau)
 
     def with_landmark(
         self, seen_from: IntArray, positions: Array, tau: Weights, name: int | None = None
@@ -850,20 +902,23 @@ class PoseGraph(ReadOnly):
                 f"{points.t.shape} positions seen from {len(seen_from)} poses in {self.d}D; "
                 "give one each"
             )
-        n = self.num_poses
         first = seen_from[0]
         if name is None:
-            name = int(self.pose_ids[self.in_files].max()) + 1
+            ids = self.pose_ids[self.in_files]
+            name = int(ids.max()) + 1
         initial = self.initial
         if initial is not None:
-            position = initial.t[first] + initial.R[first] @ points.t[0]
-            R = initial.R[[*range(n), first]]
-            initial = Poses(R, np.append(initial.t, position[None], axis=0))
-        landmarks = np.append(self.landmarks, n)
-        graph = self._with_node(
-            first, name, {"landmarks": landmarks, "initial": initial, "truth": None}
-        )
-        return graph.with_edges(seen_from, np.full(len(seen_from), n), points, 0.0, tau)
+            R_first = initial.R[first]
+            position = initial.t[first] + R_first @ points.t[0]
+            R = np.append(initial.R, R_first[None], axis=0)
+            t = np.append(initial.t, position[None], axis=0)
+            initial = Poses(R, t)
+        landmark = self.num_poses
+        landmarks = np.append(self.landmarks, landmark)
+        fields = {"landmarks": landmarks, "initial": initial, "truth": None}
+        graph = self._with_node(first, name, fields)
+        j = np.full(len(seen_from), landmark)
+        return graph.with_edges(seen_from, j, points, kappa=0.0, tau=tau)
 
     def _checked_poses(self, poses: IntArray) -> IntArray:
         """Poses (k,), k > 0, as whole numbers; a GraphError unless the graph has them."""
@@ -876,8 +931,12 @@ class PoseGraph(ReadOnly):
 
     def _edge_rows(self, edges: BoolArray) -> dict[str, Any]:
         """Rows of the given edges, (m,), of every field that has a row for each edge."""
-        fields = {name: getattr(self, name) for name in _EDGE_FIELDS}
-        return {name: values[edges] for name, values in fields.items() if values is not None}
+        rows = {}
+        for name in _EDGE_FIELDS:
+            values = getattr(self, name)
+            if values is not None:
+                rows[name] = values[edges]
+        return rows
 
     def _with_node(self, beside: int, name: int, others: Mapping[str, Any]) -> PoseGraph:
         """Return the graph with one more pose, owned by the robot of `beside`, and other fields."""
@@ -893,21 +952,30 @@ def isotropic_information(kappa: Array, tau: Array, d: int) -> Array:
 
     k is 3 in the plane and 6 in space.
     """
-    diagonal = [tau, tau, kappa] if d == 2 else [tau, tau, tau, 2 * kappa, 2 * kappa, 2 * kappa]
+    if d == 2:
+        diagonal = [tau, tau, kappa]
+    else:
+        rotation = 2 * kappa
+        diagonal = [tau, tau, tau, rotation, rotation, rotation]
     rows = np.stack(diagonal, axis=1)
-    return np.asarray(rows[:, :, None] * np.eye(len(diagonal)))
+    identity = np.eye(len(diagonal))
+    return np.asarray(rows[:, :, None] * identity)
 
 
 def has_no_gap(robot: IntArray) -> bool:
     """Whether the robots are numbered 0, 1, .. and every one owns a pose."""
     if not len(robot) or robot.min() != 0 or robot.max() >= len(robot):
         return False
-    return bool(np.bincount(robot).all())
+    num_owned = np.bincount(robot)
+    return bool(num_owned.all())
 
 
 def is_ascending(times: Array) -> bool:
     """Whether times are finite, and each is later than the one before."""
-    return bool(np.isfinite(times).all() and (np.diff(times) > 0).all())
+    if not np.isfinite(times).all():
+        return False
+    is_later = np.diff(times) > 0
+    return bool(is_later.all())
 
 
 def middle_pose(graph: PoseGraph) -> int:
@@ -919,15 +987,18 @@ def middle_pose(graph: PoseGraph) -> int:
     end = poses_by_distance(graph, 0)[-1]
     order, parents = breadth_first_order(graph.adjacency, end)
     parent = parents.tolist()
-    path = [int(order[-1])]
-    while path[-1] != end:
-        path.append(parent[path[-1]])
+    pose = int(order[-1])
+    path = [pose]
+    while pose != end:
+        pose = parent[pose]
+        path.append(pose)
     return path[len(path) // 2]
 
 
 def poses_by_distance(graph: PoseGraph, pose: int) -> IntArray:
     """Poses of a connected graph, (n,), by their number of edges to a pose, which is the first."""
-    return np.asarray(breadth_first_order(graph.adjacency, pose, return_predecessors=False))
+    order = breadth_first_order(graph.adjacency, pose, return_predecessors=False)
+    return np.asarray(order)
 
 
 def bridges(graph: PoseGraph, kept: BoolArray, ratio: Array) -> IntArray:
@@ -939,18 +1010,22 @@ def bridges(graph: PoseGraph, kept: BoolArray, ratio: Array) -> IntArray:
     kept_edges = edge_counts(graph.i[kept], graph.j[kept], graph.num_poses)
     count, part = connected_components(kept_edges, directed=False)
     order = np.argsort(ratio, kind="stable")
-    parts = np.stack([part[graph.i[order]], part[graph.j[order]]])
-    ends = np.sort(parts.astype(np.int64), axis=0)
+    part_i = part[graph.i[order]]
+    part_j = part[graph.j[order]]
+    parts = np.stack([part_i, part_j]).astype(np.int64)
+    ends = np.sort(parts, axis=0)
     is_between = ends[0] != ends[1]
     order = order[is_between]
     ends = ends[:, is_between]
     # Of several edges between two components the first, with the smallest ratio, is enough.
-    _, first = np.unique(ends[0] * count + ends[1], return_index=True)
+    pair = ends[0] * count + ends[1]
+    _, first = np.unique(pair, return_index=True)
     links = ends[:, first].astype(np.int32)  # SciPy 1.14 finds no trees with indices of 64 bits
     # The place in the order is the length of a link. It is positive, since 0 would be no link.
     lengths = csr_array((first + 1.0, links), shape=(count, count))
     tree = minimum_spanning_tree(lengths)
-    return np.asarray(order[tree.data.astype(np.int64) - 1])
+    places = tree.data.astype(np.int64) - 1
+    return np.asarray(order[places])
 
 
 def edge_counts(i: IntArray, j: IntArray, size: int) -> csr_array:
@@ -958,5 +1033,7 @@ def edge_counts(i: IntArray, j: IntArray, size: int) -> csr_array:
 
     Its indices have 32 bits: SciPy 1.14 finds no shortest paths with others.
     """
-    ends = np.concatenate([[i, j], [j, i]], axis=1).astype(np.int32)
-    return csr_array((np.ones(2 * len(i)), tuple(ends)), shape=(size, size))
+    both_ways = np.concatenate([[i, j], [j, i]], axis=1)
+    rows, columns = both_ways.astype(np.int32)
+    ones = np.ones(2 * len(i))
+    return csr_array((ones, (rows, columns)), shape=(size, size))

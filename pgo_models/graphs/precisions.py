@@ -77,7 +77,8 @@ def proper_information(graph: PoseGraph) -> Array:
     information = _symmetric_information(graph)
     raised, is_indefinite = _semidefinite(information, graph.d)
     if is_indefinite.any():
-        raise GraphError(f"{text_of_indefinite(graph, is_indefinite)}, {_WAYS_OUT}")
+        problem = text_of_indefinite(graph, is_indefinite)
+        raise GraphError(f"{problem}, {_WAYS_OUT}")
     return raised
 
 
@@ -125,7 +126,9 @@ def indefinite_edges(graph: PoseGraph) -> BoolArray:
     >>> np.flatnonzero(indefinite_edges(coupled)).tolist()
     [5]
     """
-    return _semidefinite(_symmetric_information(graph), graph.d)[1]
+    information = _symmetric_information(graph)
+    _, is_indefinite = _semidefinite(information, graph.d)
+    return is_indefinite
 
 
 def without_indefinite_coupling(graph: PoseGraph) -> PoseGraph:
@@ -172,11 +175,13 @@ def text_of_indefinite(graph: PoseGraph, is_indefinite: BoolArray, place: str = 
     first_matrix = _symmetric_information(graph)[first : first + 1]
     scaled, _ = scaled_blocks(first_matrix)
     smallest = np.linalg.eigvalsh(scaled)[0, 0]
-    count = (
-        f"information matrices of {is_indefinite.sum()} of {graph.num_edges} edges are indefinite"
+    share = f"{is_indefinite.sum()} of {graph.num_edges} edges"
+    label = graph.edge_label(first)
+    which = f"{place}, {label}" if place else label
+    return (
+        f"information matrices of {share} are indefinite "
+        f"(first {which}: eigenvalue {smallest:.3g} beside ones on the diagonal)"
     )
-    which = f"{place}, {graph.edge_label(first)}" if place else graph.edge_label(first)
-    return f"{count} (first {which}: eigenvalue {smallest:.3g} beside ones on the diagonal)"
 
 
 def are_definite(blocks: Array, least: float) -> BoolArray:
@@ -189,15 +194,18 @@ def are_definite(blocks: Array, least: float) -> BoolArray:
     try:
         np.linalg.cholesky(shifted)
     except np.linalg.LinAlgError:  # some are not; eigenvalues say which
-        return np.asarray(np.linalg.eigvalsh(shifted)[:, 0] > 0.0)
+        smallest = np.linalg.eigvalsh(shifted)[:, 0]
+        return np.asarray(smallest > 0.0)
     return np.ones(len(blocks), dtype=bool)
 
 
 def scaled_blocks(blocks: Array) -> tuple[Array, Array]:
     """Blocks D A D, (m, k, k), with ones on the diagonal where that is positive, and D, (m, k)."""
     diagonal = np.einsum("mkk->mk", blocks)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    return blocks * scale[:, :, None] * scale[:, None, :], scale
+    positive = np.where(diagonal > 0.0, diagonal, 1.0)
+    scale = 1.0 / np.sqrt(positive)
+    scaled_rows = blocks * scale[:, :, None]
+    return scaled_rows * scale[:, None, :], scale
 
 
 def uncoupled_share(information: Array, d: int) -> Array:
@@ -209,22 +217,27 @@ def uncoupled_share(information: Array, d: int) -> Array:
     I_tt = information[:, :d, :d]
     I_tr = information[:, :d, d:]
     I_rr = information[:, d:, d:]
-    left = np.linalg.solve(filled(I_rr), np.swapaxes(I_tr, 1, 2))
+    I_rt = np.swapaxes(I_tr, 1, 2)
+    left = np.linalg.solve(filled(I_rr), I_rt)
     right = np.linalg.solve(filled(I_tt), I_tr)
-    squared_norm = np.abs(np.linalg.eigvals(left @ right)).max(axis=1)
+    eigenvalues = np.linalg.eigvals(left @ right)
+    squared_norm = np.abs(eigenvalues).max(axis=1)
     return np.asarray(1.0 - np.sqrt(squared_norm))
 
 
 def condition(blocks: Array) -> Array:
     """Largest over smallest eigenvalue, (m,), of definite blocks (m, k, k); 1 of zero blocks."""
     values = np.linalg.eigvalsh(filled(blocks))
-    return np.asarray(values[:, -1] / values[:, 0])
+    smallest = values[:, 0]
+    largest = values[:, -1]
+    return np.asarray(largest / smallest)
 
 
 def filled(A: Array) -> Array:
     """Blocks (m, k, k) with the identity in place of those that are zero."""
     is_zero = ~A.any(axis=(1, 2), keepdims=True)
-    return np.asarray(A + is_zero * np.eye(A.shape[1]))
+    identity = np.eye(A.shape[1])
+    return np.asarray(A + is_zero * identity)
 
 
 def _trace_of_inverse(A: Array) -> Array:
@@ -234,11 +247,16 @@ def _trace_of_inverse(A: Array) -> Array:
     trace is the sum of the squares of D^-1/2 L^-1.
     """
     # The edges come last, (k, k, m): then every operation runs through contiguous memory.
-    U = np.ascontiguousarray(np.moveaxis(filled(A), 0, -1))
-    L_inverse = np.eye(len(U))[:, :, None] + np.zeros(len(A))
-    trace = np.where(A.any(axis=(1, 2)), 0.0, np.inf)
-    for k, pivot in enumerate(np.einsum("kkm->km", U)):
-        trace += np.sum(L_inverse[k] ** 2, axis=0) / pivot
+    edges_last = np.moveaxis(filled(A), 0, -1)
+    U = np.ascontiguousarray(edges_last)
+    identity = np.eye(len(U))
+    L_inverse = identity[:, :, None] + np.zeros(len(A))
+    is_nonzero = A.any(axis=(1, 2))
+    trace = np.where(is_nonzero, 0.0, np.inf)
+    pivots = np.einsum("kkm->km", U)  # a view: the pivots change with U
+    for k, pivot in enumerate(pivots):
+        squares = L_inverse[k] ** 2
+        trace += np.sum(squares, axis=0) / pivot
         multiplier = U[k + 1 :, k, None] / pivot
         U[k + 1 :] -= multiplier * U[k]
         L_inverse[k + 1 :] -= multiplier * L_inverse[k]
@@ -268,13 +286,16 @@ def extreme_weight(graph: PoseGraph) -> tuple[float, int, str]:
 
 def _extreme_weight_of(graph: PoseGraph, kind: str, weight: Array) -> tuple[float, int, str]:
     """Like `extreme_weight`, for the positive kappa or tau of the graph alone."""
-    ratio = weight / np.median(weight)
-    tree = bridges(graph, np.zeros(graph.num_edges, dtype=bool), -weight)
+    ratio_to_median = weight / np.median(weight)
+    no_edges = np.zeros(graph.num_edges, dtype=bool)
+    maximum_tree = bridges(graph, no_edges, -weight)
     heaviest = int(np.argmax(weight))
-    lightest = int(tree[np.argmin(weight[tree])])
-    e = max(heaviest, lightest, key=lambda end: abs(np.log(ratio[end])))
-    i, j = graph.pose_ids[[graph.i[e], graph.j[e]]]
-    text = f"{kind} of edge {i} -> {j} is {weight[e]:.3g}, {ratio[e]:.3g} times the median"
+    lightest = int(maximum_tree[np.argmin(weight[maximum_tree])])
+    e = max(heaviest, lightest, key=lambda edge: abs(np.log(ratio_to_median[edge])))
+    id_i = graph.pose_ids[graph.i[e]]
+    id_j = graph.pose_ids[graph.j[e]]
+    size = f"{weight[e]:.3g}, {ratio_to_median[e]:.3g} times the median"
+    text = f"{kind} of edge {id_i} -> {id_j} is {size}"
     return float(weight[heaviest] / weight[lightest]), e, text
 
 
@@ -299,21 +320,25 @@ def _semidefinite(information: Array, d: int) -> tuple[Array, BoolArray]:
     Matrices without coupling blocks are left alone.
     """
     is_indefinite = np.zeros(len(information), dtype=bool)
-    coupled = np.flatnonzero(information[:, :d, d:].any(axis=(1, 2)))
-    doubtful = coupled[~are_definite(information[coupled], LEAST_SCALED)]
+    coupling_blocks = information[:, :d, d:]
+    coupled = np.flatnonzero(coupling_blocks.any(axis=(1, 2)))
+    is_definite = are_definite(information[coupled], LEAST_SCALED)
+    doubtful = coupled[~is_definite]
     if not len(doubtful):
         return information, is_indefinite
     information = information.copy()
     # Edges often share a matrix: each is judged once.
     matrices, which = np.unique(information[doubtful], axis=0, return_inverse=True)
+    matrix_of_edge = which.ravel()
     scaled, _ = scaled_blocks(matrices)
     lowest = np.linalg.eigvalsh(scaled)[:, 0]
     for k, matrix in enumerate(matrices):
-        same = doubtful[which.ravel() == k]
+        same = doubtful[matrix_of_edge == k]
         if lowest[k] < _SURELY_NEGATIVE:
             is_indefinite[same] = True
         elif not is_semidefinite_exactly(matrix):
-            raised = matrix + _ROUNDED_ENTRIES * np.diag(np.diag(matrix))
+            diagonal = np.diag(np.diag(matrix))
+            raised = matrix + _ROUNDED_ENTRIES * diagonal
             is_indefinite[same] = not is_semidefinite_exactly(raised)
             information[same] = raised
     return information, is_indefinite
@@ -338,15 +363,19 @@ def is_semidefinite_exactly(matrix: Array) -> bool:
 
 def _as_whole_numbers(matrix: Array) -> list[list[int]]:
     """Entries of a matrix of doubles, all times one power of two that makes them whole."""
-    fractions = [[entry.as_integer_ratio() for entry in row] for row in matrix.tolist()]
+    entries = matrix.tolist()
+    fractions = [[entry.as_integer_ratio() for entry in row] for row in entries]
     # Denominators of doubles are powers of two, so that the largest is a common one.
     common = max(denominator for row in fractions for _, denominator in row)
-    return [
-        [numerator * (common // denominator) for numerator, denominator in row] for row in fractions
-    ]
+    rows = []
+    for row in fractions:
+        whole = [numerator * (common // denominator) for numerator, denominator in row]
+        rows.append(whole)
+    return rows
 
 
 def _eliminated(row: list[int], pivot_row: list[int], factor: int) -> list[int]:
     """`factor` times a row, less its first entry times the row of the pivot, without column one."""
     first, *others = row
-    return [factor * entry - first * above for entry, above in zip(others, pivot_row, strict=True)]
+    columns = zip(others, pivot_row, strict=True)
+    return [factor * entry - first * above for entry, above in columns]

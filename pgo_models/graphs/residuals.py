@@ -28,10 +28,13 @@ def edge_errors(graph: PoseGraph, poses: Poses) -> tuple[Array, Array, Array]:
     R_i = poses.R[graph.i]
     R_j = poses.R[graph.j]
     predicted = R_i @ graph.R_ij
-    shift = poses.t[graph.j] - poses.t[graph.i] - np.einsum("mab,mb->ma", R_i, graph.t_ij)
+    measured_step = np.einsum("mab,mb->ma", R_i, graph.t_ij)
+    shift = poses.t[graph.j] - poses.t[graph.i] - measured_step
     squared_shift = np.sum(shift**2, axis=1)
-    squared_chord = np.sum((R_j - predicted) ** 2, axis=(1, 2))
-    angle = np.linalg.norm(log_map(np.swapaxes(predicted, 1, 2) @ R_j), axis=1)
+    chord = R_j - predicted
+    squared_chord = np.sum(chord**2, axis=(1, 2))
+    R_error = np.swapaxes(predicted, 1, 2) @ R_j
+    angle = np.linalg.norm(log_map(R_error), axis=1)
     cost = graph.kappa * squared_chord + graph.tau * squared_shift
     return np.sqrt(squared_shift), angle, cost
 
@@ -47,7 +50,8 @@ def uncertain_edges(graph: PoseGraph) -> BoolArray:
 
 def _is_far_below_median(precision: Array) -> BoolArray:
     measured = np.where(precision > 0, precision, np.nan)
-    return np.asarray(measured < UNCERTAIN_RATIO * np.nanmedian(measured))
+    threshold = UNCERTAIN_RATIO * np.nanmedian(measured)
+    return np.asarray(measured < threshold)
 
 
 class Chi2Convention(enum.Enum):
@@ -128,10 +132,12 @@ def chi2(
     R_j = poses.R[graph.j]
     R_ji = np.swapaxes(graph.R_ij, 1, 2)
     E = R_ji @ np.swapaxes(R_i, 1, 2) @ R_j
-    t_in_i = np.einsum("mba,mb->ma", R_i, poses.t[graph.j] - poses.t[graph.i])
-    r_t = np.einsum("mab,mb->ma", R_ji, t_in_i - graph.t_ij)
+    shift = poses.t[graph.j] - poses.t[graph.i]
+    shift_in_i = np.einsum("mba,mb->ma", R_i, shift)
+    r_t = np.einsum("mab,mb->ma", R_ji, shift_in_i - graph.t_ij)
     w = log_map(E)
-    half_angle = 0.5 * np.linalg.norm(w, axis=1)[:, None]
+    angle = np.linalg.norm(w, axis=1)
+    half_angle = 0.5 * angle[:, None]
     chord = w * np.sinc(half_angle / np.pi)  # 2 a sin(theta / 2)
     # What stands beside r_t in the term of the coupling block; equal to r_r but for CHORDAL.
     r_coupled = r_r = w
@@ -146,16 +152,20 @@ def chi2(
     I_rr = information[:, d:, d:]
     if convention is Chi2Convention.GTSAM:
         # Where only a position is measured, the error is r_t itself.
-        has_rotation = ~np.isin(graph.j, graph.landmarks) & I_rr.any(axis=(1, 2))
-        r_t = logarithm_translation(np.where(has_rotation[:, None], w, 0.0), r_t)
+        to_landmark = np.isin(graph.j, graph.landmarks)
+        has_rotation = ~to_landmark & I_rr.any(axis=(1, 2))
+        measured_w = np.where(has_rotation[:, None], w, 0.0)
+        r_t = logarithm_translation(measured_w, r_t)
     of_translations = _sum_of_forms(r_t, I_tt, r_t)
     of_coupling = _sum_of_forms(2.0 * r_t, I_tr, r_coupled)
-    return of_translations + of_coupling + _sum_of_forms(r_r, I_rr, r_r)
+    of_rotations = _sum_of_forms(r_r, I_rr, r_r)
+    return of_translations + of_coupling + of_rotations
 
 
 def _sum_of_forms(left: Array, blocks: Array, right: Array) -> float:
     """Sum over the edges of left^T block right."""
-    return float(np.einsum("ma,mab,mb->", left, blocks, right, optimize=True))
+    total = np.einsum("ma,mab,mb->", left, blocks, right, optimize=True)
+    return float(total)
 
 
 def check_poses(graph: PoseGraph, poses: Poses) -> None:
@@ -174,9 +184,11 @@ def logarithm_translation(w: Array, t: Array) -> Array:
     is_small = ~(theta > _SMALL_ANGLE)
     safe_theta = np.where(is_small, 1.0, theta)
     half = 0.5 * safe_theta
-    quotient = (1.0 - half * np.cos(half) / np.sin(half)) / safe_theta**2
+    half_cotangent = half * np.cos(half) / np.sin(half)
+    quotient = (1.0 - half_cotangent) / safe_theta**2
     series = 1.0 / 12.0 + theta**2 / 720.0
     c = np.where(is_small, series, quotient)
     W = hat(w)
     W_t = np.einsum("mab,mb->ma", W, t)
-    return np.asarray(t - 0.5 * W_t + c[:, None] * np.einsum("mab,mb->ma", W, W_t))
+    W_W_t = np.einsum("mab,mb->ma", W, W_t)
+    return np.asarray(t - 0.5 * W_t + c[:, None] * W_W_t)

@@ -103,7 +103,10 @@ def circle(rng: np.random.Generator) -> PoseGraph:
     PoseGraph('circle', d=3, poses=25, edges=300, robots=1)
     """
     angle = 2 * np.pi * np.arange(25) / 25
-    t = 2.6 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    x = np.cos(angle)
+    y = np.sin(angle)
+    unit_circle = np.column_stack([x, y, 0 * angle])
+    t = 2.6 * unit_circle
     return _network("circle", t, radius=4.0, rng=rng)
 
 
@@ -132,7 +135,8 @@ def grid(rng: np.random.Generator) -> PoseGraph:
     PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
     """
     steps = np.arange(3.0)
-    lattice = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    coordinates = np.meshgrid(steps, steps, steps, indexing="ij")
+    lattice = np.stack(coordinates, axis=-1).reshape(-1, 3)
     return _network("grid", 1.66 * lattice, radius=1.66, rng=rng)
 
 
@@ -224,24 +228,24 @@ def random_geometric(
     t = rng.uniform(0.0, side, (num_poses, d))
     unit_ball = np.pi if d == 2 else 4 * np.pi / 3
     radius = (mean_degree / unit_ball) ** (1 / d)
-    pairs = scipy.spatial.KDTree(t).query_pairs(radius, output_type="ndarray").astype(np.int64)
-    alone = np.setdiff1d(np.arange(1, num_poses), pairs[:, 1])
-    nearest = [_nearest_earlier(t, pose) for pose in alone]
-    added = np.column_stack([np.array(nearest, dtype=np.int64), alone])
-    i, j = _sorted_pairs(np.concatenate([pairs, added])).T
-    truth = Poses(random_rotations(num_poses, d, rng), t)
-    return observe("random_geometric", truth, i, j, noise, noise.kappa(d), noise.tau, rng)
+    pairs_in_radius = scipy.spatial.KDTree(t).query_pairs(radius, output_type="ndarray")
+    pairs = pairs_in_radius.astype(np.int64)
+    later_poses = np.arange(1, num_poses)
+    alone = np.setdiff1d(later_poses, pairs[:, 1])
+    nearest = np.array([_nearest_earlier(t, pose) for pose in alone], dtype=np.int64)
+    added = np.column_stack([nearest, alone])
+    edges = sorted_pairs(np.concatenate([pairs, added]))
+    i, j = edges.T
+    R = random_rotations(num_poses, d, rng)
+    truth = Poses(R, t)
+    kappa = noise.kappa(d)
+    return observe("random_geometric", truth, i, j, noise, kappa, noise.tau, rng)
 
 
 def _nearest_earlier(t: Array, pose: int) -> int:
-    squared_distance = np.sum((t[:pose] - t[pose]) ** 2, axis=1)
+    shifts = t[:pose] - t[pose]
+    squared_distance = np.sum(shifts**2, axis=1)
     return int(np.argmin(squared_distance))
-
-
-def _sorted_pairs(pairs: IntArray) -> IntArray:
-    """Pairs, (k, 2), by their first entry, then by their second."""
-    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
-    return np.asarray(pairs[order])
 
 
 def victoria_park(
@@ -286,26 +290,39 @@ def victoria_park(
     """
     if num_poses < 20:
         raise SettingError(f"num_poses must be at least 20, got {num_poses}")
-    angle = 4 * np.pi * np.arange(num_poses) / num_poses
-    radius = num_poses / (4 * np.pi) * (1 + 0.2 * np.cos(3 * angle))
-    t = radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-    dx, dy = np.gradient(t, axis=0).T
-    heading = np.arctan2(dy, dx)
+    t, heading = _wavy_loop(num_poses)
     num_trees = num_poses // _POSES_PER_TREE
     beside = t[rng.integers(0, num_poses, num_trees)]
     trees = beside + rng.uniform(-reach / 2, reach / 2, (num_trees, 2))
-    is_seen = np.linalg.norm(t[:, None] - trees, axis=2) <= reach
+    distance = np.linalg.norm(t[:, None] - trees, axis=2)
+    is_seen = distance <= reach
     is_kept = is_seen.sum(axis=0) > 1
     trees = trees[is_kept]
     seen_from, tree = np.nonzero(is_seen[:, is_kept])
-    i = np.append(np.arange(num_poses - 1), seen_from)
-    j = np.append(np.arange(1, num_poses), num_poses + tree)
-    R = exp_map(np.append(heading, np.zeros(len(trees)))[:, None])
+    poses = np.arange(num_poses)
+    i = np.append(poses[:-1], seen_from)
+    j = np.append(poses[1:], num_poses + tree)
+    angles = np.append(heading, np.zeros(len(trees)))
+    R = exp_map(angles[:, None])
     truth = Poses(R, np.concatenate([t, trees]))
-    graph = observe("victoria_park", truth, i, j, noise, noise.kappa(2), noise.tau, rng)
+    kappa = noise.kappa(2)
+    graph = observe("victoria_park", truth, i, j, noise, kappa, noise.tau, rng)
+    # A tree has no rotation to measure.
     is_odometry = (j < num_poses)[:, None, None]
     R_ij = np.where(is_odometry, graph.R_ij, np.eye(2))
-    return replace(graph, R_ij=R_ij, landmarks=np.arange(num_poses, truth.num_poses))
+    landmarks = np.arange(num_poses, truth.num_poses)
+    return replace(graph, R_ij=R_ij, landmarks=landmarks)
+
+
+def _wavy_loop(num_poses: int) -> tuple[Array, Array]:
+    """Positions, (n, 2), about 1 m apart along two rounds of a loop, and the headings, (n,)."""
+    angle = 4 * np.pi * np.arange(num_poses) / num_poses
+    mean_radius = num_poses / (4 * np.pi)
+    radius = mean_radius * (1 + 0.2 * np.cos(3 * angle))
+    directions = np.column_stack([np.cos(angle), np.sin(angle)])
+    t = radius[:, None] * directions
+    dx, dy = np.gradient(t, axis=0).T
+    return t, np.arctan2(dy, dx)
 
 
 def observe(
@@ -326,11 +343,14 @@ def observe(
     independent (Ebrahimi & Deghat, `SIMULATION RESULTS`).
     """
     R_i_inverse = np.swapaxes(truth.R[i], 1, 2)
-    t_ij = np.einsum("mab,mb->ma", R_i_inverse, truth.t[j] - truth.t[i])
-    t_ij += noise.translation_std * rng.standard_normal(t_ij.shape)
-    R_ij = _random_turns(len(i), truth.d, noise, rng) @ R_i_inverse @ truth.R[j]
-    guessed_R = truth.R @ _random_turns(truth.num_poses, truth.d, noise, rng)
-    guessed_t = truth.t + noise.translation_std * rng.standard_normal(truth.t.shape)
+    shift = truth.t[j] - truth.t[i]
+    t_ij = np.einsum("mab,mb->ma", R_i_inverse, shift)
+    t_ij += _random_shifts(t_ij.shape, noise, rng)
+    turns = _random_turns(len(i), truth.d, noise, rng)
+    R_ij = turns @ R_i_inverse @ truth.R[j]
+    guessed_turns = _random_turns(truth.num_poses, truth.d, noise, rng)
+    guessed_R = truth.R @ guessed_turns
+    guessed_t = truth.t + _random_shifts(truth.t.shape, noise, rng)
     return PoseGraph(
         truth.num_poses,
         i,
@@ -352,6 +372,17 @@ def check_dimension(d: int) -> None:
         raise SettingError(f"d must be 2 or 3, got {d}")
 
 
+def sorted_pairs(pairs: IntArray) -> IntArray:
+    """Pairs, (k, 2), by their first entry, then by their second."""
+    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+    return np.asarray(pairs[order])
+
+
+def _random_shifts(shape: tuple[int, ...], noise: NoiseModel, rng: np.random.Generator) -> Array:
+    """Errors of translations."""
+    return noise.translation_std * rng.standard_normal(shape)
+
+
 def _random_turns(count: int, d: int, noise: NoiseModel, rng: np.random.Generator) -> Array:
     """Rotations (count, d, d) near the identity."""
     tangents = rng.standard_normal((count, tangent_dimension(d)))
@@ -369,7 +400,8 @@ def _network(
 
     Each of the two has noise of its own. One pair may be left out.
     """
-    distance = np.linalg.norm(t[:, None] - t[None], axis=2)
+    shifts = t[:, None] - t[None]
+    distance = np.linalg.norm(shifts, axis=2)
     is_edge: NDArray[np.bool_] = distance <= radius + _SLACK
     np.fill_diagonal(is_edge, False)
     if left_out is not None:
@@ -377,8 +409,10 @@ def _network(
         is_edge[a, b] = False
         is_edge[b, a] = False
     i, j = np.nonzero(is_edge)
-    truth = Poses(random_rotations(len(t), 3, rng), t)
-    return observe(name, truth, i, j, NoiseModel(), NETWORK_KAPPA, NETWORK_TAU, rng)
+    R = random_rotations(len(t), 3, rng)
+    truth = Poses(R, t)
+    noise = NoiseModel()
+    return observe(name, truth, i, j, noise, NETWORK_KAPPA, NETWORK_TAU, rng)
 
 
 def _equal_area_points(count: int) -> Array:
@@ -389,8 +423,10 @@ def _equal_area_points(count: int) -> Array:
     area = 4 * np.pi / count
     num_circles = round(np.pi / np.sqrt(area))
     circles = []
-    for theta in np.pi * (np.arange(num_circles) + 0.5) / num_circles:
-        num_points = round(2 * np.pi * np.sin(theta) * np.pi / num_circles / area)
+    polar_angles = np.pi * (np.arange(num_circles) + 0.5) / num_circles
+    for theta in polar_angles:
+        circumference = 2 * np.pi * np.sin(theta)
+        num_points = round(circumference * np.pi / num_circles / area)
         phi = 2 * np.pi * np.arange(num_points) / num_points
         x = np.sin(theta) * np.cos(phi)
         y = np.sin(theta) * np.sin(phi)

@@ -24,8 +24,11 @@ def vertex_cover(partition: Partition, graph: PoseGraph) -> IntArray:
 
 def cover_of_edges(i: IntArray, j: IntArray) -> IntArray:
     """Vertex cover, like `vertex_cover`, of the edges (i, j), all of which join two robots."""
-    poses, ends = np.unique(np.concatenate([i, j]), return_inverse=True)
-    adjacency = edge_counts(ends[: len(i)], ends[len(i) :], len(poses))
+    all_ends = np.concatenate([i, j])
+    poses, ends = np.unique(all_ends, return_inverse=True)
+    ends_i = ends[: len(i)]
+    ends_j = ends[len(i) :]
+    adjacency = edge_counts(ends_i, ends_j, len(poses))
     neighbours_of = np.split(adjacency.indices, adjacency.indptr[1:-1])
     order = _greedy_cover(neighbours_of)
     is_chosen = np.zeros(len(poses), dtype=bool)

@@ -67,7 +67,8 @@ def write_tum(poses: Poses, path: Path | str, timestamps: Array | None = None) -
         )
     R, t = _lifted(poses)
     quaternions = rotations.quaternions_from_rotations(R)
-    _write_rows(np.column_stack([seconds, t, quaternions]), path)
+    rows = np.column_stack([seconds, t, quaternions])
+    _write_rows(rows, path)
 
 
 def read_tum(path: Path | str, d: int = 3) -> Poses:
@@ -114,16 +115,19 @@ def read_times(path: Path | str) -> Array:
     A FileFormatError with file:line, for a row that is not 8 finite numbers, or 1, like the first,
     or does not ascend.
     """
-    all_rows = (line.split() for line in read_text(path).split("\n"))
+    text_lines = read_text(path).split("\n")
+    all_rows = (line.split() for line in text_lines)
     rows_of_numbers = (words for words in all_rows if words and not words[0].startswith("#"))
-    is_tum = len(next(rows_of_numbers, [])) == 8
+    first_row = next(rows_of_numbers, [])
+    is_tum = len(first_row) == 8
     rows, lines = read_table(path, 8 if is_tum else 1)
     times = rows[:, 0]
-    late = np.flatnonzero(np.diff(times) <= 0)
-    if len(late):
-        before = int(late[0])
-        times_of_two = f"time {times[before + 1].item()!r} is not after {times[before].item()!r}"
-        raise FileFormatError(path, lines[before + 1], f"{times_of_two}; sort the lines")
+    not_after = np.flatnonzero(np.diff(times) <= 0)
+    if len(not_after):
+        first = int(not_after[0])
+        earlier, later = times[first : first + 2].tolist()
+        problem = f"time {later!r} is not after {earlier!r}; sort the lines"
+        raise FileFormatError(path, lines[first + 1], problem)
     return times
 
 
@@ -134,8 +138,10 @@ def write_kitti(poses: Poses, path: Path | str) -> None:
     complete. A PGOError when the file cannot be written.
     """
     R, t = _lifted(poses)
-    matrices = np.concatenate([R, t[:, :, None]], axis=2)
-    _write_rows(matrices.reshape(-1, 12), path)
+    columns = t[:, :, None]
+    matrices = np.concatenate([R, columns], axis=2)
+    rows = matrices.reshape(-1, 12)
+    _write_rows(rows, path)
 
 
 def read_kitti(path: Path | str, d: int = 3) -> Poses:
@@ -197,7 +203,8 @@ def _lifted(poses: Poses) -> tuple[Array, Array]:
         return poses.R, poses.t
     R = np.tile(np.eye(3), (poses.num_poses, 1, 1))
     R[:, :2, :2] = poses.R
-    return R, np.column_stack([poses.t, np.zeros(poses.num_poses)])
+    z = np.zeros(poses.num_poses)
+    return R, np.column_stack([poses.t, z])
 
 
 def _in_dimension(R: Array, t: Array, d: int, path: Path | str, lines: Sequence[int]) -> Poses:
@@ -205,14 +212,16 @@ def _in_dimension(R: Array, t: Array, d: int, path: Path | str, lines: Sequence[
     check_metres(path, lines, t)
     if d == 3:
         return Poses(R, t)
-    out_of_plane = np.abs(t[:, 2])
-    tilt = np.abs(R[:, 2, :] - [0.0, 0.0, 1.0]).max(axis=1)
-    distance = np.maximum(out_of_plane, tilt)
+    height = np.abs(t[:, 2])
+    tilt_of_z_axis = R[:, 2, :] - [0.0, 0.0, 1.0]
+    tilt = np.abs(tilt_of_z_axis).max(axis=1)
+    distance = np.maximum(height, tilt)
     worst = int(np.argmax(distance))
     if distance[worst] > _PLANE_TOLERANCE:
         problem = f"pose is out of the x-y plane by {distance[worst]:.3g}; read with d = 3"
         raise FileFormatError(path, lines[worst], problem)
-    return Poses(project_to_rotations(R[:, :2, :2]), t[:, :2])
+    R_in_plane = project_to_rotations(R[:, :2, :2])
+    return Poses(R_in_plane, t[:, :2])
 
 
 def _write_rows(rows: Array, path: Path | str) -> None:
@@ -222,4 +231,5 @@ def _write_rows(rows: Array, path: Path | str) -> None:
         temporary.open("w", encoding="ascii", newline="\n") as file,
     ):
         for row in rows.tolist():
-            file.write(" ".join(map(repr, row)) + "\n")
+            words = " ".join(map(repr, row))
+            file.write(words + "\n")

@@ -40,7 +40,8 @@ def plot_decay(curves: list[tuple[str, Array]], quantity: str) -> "Figure":
     A curve is a label and its values from iterate 0 on; `quantity` is the name of the values, with
     their unit.
     """
-    longest_label = max((len(label) for label, _ in curves), default=0)
+    lengths = [len(label) for label, _ in curves]
+    longest_label = max(lengths, default=0)
     with column_figure(height=0.8) as figure:
         axes = figure.add_subplot()
         for (label, values), (colour, marker) in zip(curves, _styles(), strict=False):

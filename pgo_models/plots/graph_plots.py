@@ -51,8 +51,9 @@ def edge_kinds(
     `residuals` are given. Priors, which are not drawn, are -1. A GraphError if sizes differ.
     """
     check_poses(graph, poses)
-    same_robot = graph.robots[graph.i] == graph.robots[graph.j]
-    kind = np.where(same_robot, OWN, BETWEEN)
+    robot_i = graph.robots[graph.i]
+    robot_j = graph.robots[graph.j]
+    kind = np.where(robot_i == robot_j, OWN, BETWEEN)
     kind[np.isin(graph.j, graph.landmarks)] = SIGHTING
     if mark:
         if residuals is None:
@@ -76,16 +77,21 @@ def lines_to_draw(
     ends = np.stack([graph.i, graph.j], axis=1)
     step = thinning_step(graph.num_edges, most)
     if step > 1:
-        is_on_path = (kind == OWN) & (graph.j == graph.i + 1)
+        is_consecutive = graph.j == graph.i + 1
+        is_on_path = (kind == OWN) & is_consecutive
         paths = _thinned_paths(graph, is_on_path, step)
-        misfits = np.flatnonzero(kind == MISFIT)
-        others = np.flatnonzero((kind != _NOT_DRAWN) & (kind != MISFIT) & ~is_on_path)
-        misfit_step = thinning_step(len(misfits), most)
-        drawn = np.append(others[::step], misfits[::misfit_step])
+        is_misfit = kind == MISFIT
+        is_other = (kind != _NOT_DRAWN) & ~is_misfit & ~is_on_path
+        misfits = np.flatnonzero(is_misfit)
+        others = np.flatnonzero(is_other)
+        drawn_misfits = misfits[:: thinning_step(len(misfits), most)]
+        drawn = np.append(others[::step], drawn_misfits)
+        kind_of_paths = np.full(len(paths), OWN)
         ends = np.concatenate([paths, ends[drawn]])
-        kind = np.append(np.full(len(paths), OWN), kind[drawn])
+        kind = np.append(kind_of_paths, kind[drawn])
     order = np.argsort(kind, kind="stable")
-    order = order[int(np.sum(kind == _NOT_DRAWN)) :]
+    num_not_drawn = int(np.sum(kind == _NOT_DRAWN))  # their kind is the lowest
+    order = order[num_not_drawn:]
     return ends[order], kind[order]
 
 
@@ -99,10 +105,14 @@ def _thinned_paths(graph: PoseGraph, is_on_path: BoolArray, step: int) -> IntArr
     has_edge_before[graph.j[is_on_path]] = True
     is_first = ~has_edge_before[:-1]
     is_last = ~has_edge_before[1:]
-    first_of_path = np.maximum.accumulate(np.where(is_first, pose, 0))
-    kept = np.flatnonzero(((pose - first_of_path) % step == 0) | is_last)
-    lines = np.stack([kept[:-1], kept[1:]], axis=1)
-    same_path = first_of_path[kept[1:]] == first_of_path[kept[:-1]]
+    first_so_far = np.where(is_first, pose, 0)
+    first_of_path = np.maximum.accumulate(first_so_far)
+    place_in_path = pose - first_of_path
+    kept = np.flatnonzero((place_in_path % step == 0) | is_last)
+    before = kept[:-1]
+    after = kept[1:]
+    lines = np.stack([before, after], axis=1)
+    same_path = first_of_path[before] == first_of_path[after]
     return np.asarray(lines[same_path])
 
 
@@ -119,12 +129,17 @@ def confidence_ellipses(poses: Poses, covariances: Array) -> Array:
     evenly chosen.
     """
     num_ellipses = min(poses.num_poses, _MOST_ELLIPSES)
-    chosen = np.linspace(0, poses.num_poses - 1, num_ellipses).astype(int)
+    evenly = np.linspace(0, poses.num_poses - 1, num_ellipses)
+    chosen = evenly.astype(int)
     angle = np.linspace(0.0, 2.0 * np.pi, _ELLIPSE_POINTS)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    variances, axes = np.linalg.eigh(covariances[chosen, :2, :2])
+    x = np.cos(angle)
+    y = np.sin(angle)
+    circle = np.stack([x, y], axis=1)
+    covariances_of_xy = covariances[chosen, :2, :2]
+    variances, axes = np.linalg.eigh(covariances_of_xy)
+    variances = np.maximum(variances, 0.0)
     # The squared radius is exponential, with mean 2 in units of the variance.
-    radii = np.sqrt(-2.0 * np.log(0.05) * np.maximum(variances, 0.0))
+    radii = np.sqrt(-2.0 * np.log(0.05) * variances)
     scaled_axes = axes * radii[:, None]
     outlines = np.repeat(poses.t[chosen, None], _ELLIPSE_POINTS, axis=1)
     outlines[:, :, :2] += circle @ np.swapaxes(scaled_axes, 1, 2)
@@ -146,15 +161,19 @@ def draw_graph(
     """
     from matplotlib.colors import to_rgb
 
-    ends, kind = lines_to_draw(graph, edge_kinds(graph, poses, mark_edges, residuals))
-    palette = np.array([to_rgb(name) for name in (*COLOURS, QUIET_COLOUR, ALARM_COLOUR)])
+    kind_of_edge = edge_kinds(graph, poses, mark_edges, residuals)
+    ends, kind = lines_to_draw(graph, kind_of_edge)
+    names = (*COLOURS, QUIET_COLOUR, ALARM_COLOUR)
+    palette = np.array([to_rgb(name) for name in names])
     quiet = len(COLOURS)
     alarm = quiet + 1
     robot_i, robot_j = graph.robots[ends].T
-    colour = np.where(robot_i == robot_j, robot_i % len(COLOURS), quiet)
+    colour_of_robot = robot_i % len(COLOURS)
+    colour = np.where(robot_i == robot_j, colour_of_robot, quiet)
     colour[kind == SIGHTING] = quiet
     colour[kind == MISFIT] = alarm
-    dashes = [(0, (1, 1.5)) if is_dotted else "solid" for is_dotted in kind == UNCERTAIN]
+    dotted = (0, (1, 1.5))
+    dashes = [dotted if is_dotted else "solid" for is_dotted in kind == UNCERTAIN]
     collection = _line_collection(graph.d)
     lines = collection(
         list(poses.t[ends]),
@@ -215,7 +234,8 @@ def plot_graph(
         axes = _add_axes(figure, graph)
         draw_graph(graph, poses, axes, residuals=residuals)
         axes.set_title(title or graph.name)
-        handles: list[Artist] = list(_legend(graph, edge_kinds(graph, poses, residuals=residuals)))
+        kind = edge_kinds(graph, poses, residuals=residuals)
+        handles: list[Artist] = list(_legend(graph, kind))
         if covariances is not None:
             shown = graph.in_files
             outlines = confidence_ellipses(poses[shown], covariances[shown])
@@ -268,7 +288,8 @@ def compare_poses(
     >>> [axes.get_title() for axes in figure.axes]
     ['truth', 'start']
     """
-    return plot_panels([[(title, graph, poses) for title, poses in panels]], residuals)
+    row = [(title, graph, poses) for title, poses in panels]
+    return plot_panels([row], residuals)
 
 
 def plot_panels(
@@ -278,20 +299,22 @@ def plot_panels(
 
     `residuals` are those of the last panel, whose edges are marked by them.
     """
+    num_rows = len(panels)
     num_columns = max(len(row) for row in panels)
-    with column_figure(height=1.0 * len(panels), width=num_columns) as figure:
+    with column_figure(height=1.0 * num_rows, width=num_columns) as figure:
         for r, row in enumerate(panels):
-            is_last_row = r == len(panels) - 1
+            is_last_row = r == num_rows - 1
             for column, (title, graph, poses) in enumerate(row):
                 is_last = is_last_row and column == len(row) - 1
                 is_marked = is_last and residuals is not None
-                place = (len(panels), num_columns, r * num_columns + column + 1)
-                axes = _add_axes(figure, graph, *place)
+                place = r * num_columns + column + 1
+                axes = _add_axes(figure, graph, num_rows, num_columns, place)
                 draw_graph(graph, poses, axes, is_marked, residuals if is_marked else None)
                 axes.set_title(title)
         if residuals is not None:
             _, graph, poses = panels[-1][-1]
-            handles = _legend(graph, edge_kinds(graph, poses, residuals=residuals))
+            kind = edge_kinds(graph, poses, residuals=residuals)
+            handles = _legend(graph, kind)
             if handles:
                 figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
@@ -312,9 +335,11 @@ def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = Non
     poses = poses[graph.bodies]
     truth = truth[graph.bodies]
     aligned = poses.aligned_to(truth)
-    metres = np.linalg.norm(aligned.t - truth.t, axis=1)
+    t_error = aligned.t - truth.t
+    metres = np.linalg.norm(t_error, axis=1)
     R_error = np.swapaxes(truth.R, 1, 2) @ aligned.R
-    degrees = np.rad2deg(np.linalg.norm(log_map(R_error), axis=1))
+    radians = np.linalg.norm(log_map(R_error), axis=1)
+    degrees = np.rad2deg(radians)
     ate = absolute_trajectory_error(poses, truth)
     rotation_rms = np.sqrt(np.mean(degrees**2))
     with column_figure(height=1.6) as figure:
@@ -330,7 +355,8 @@ def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = Non
         _draw_error_curve(lower, degrees, "rotation (deg)")
         lower.set_xlabel("pose")
         count_along_x(lower)
-        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        handles, labels = axes.get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=3)
     return figure
 
 
@@ -342,7 +368,8 @@ def _draw_errors(axes: Axes, estimate: Poses, truth: Poses) -> None:
     errors = np.stack([estimate.t, truth.t], axis=1)
     lines = collection(list(errors), colors=ALARM_COLOUR, linewidths=0.5, label="error")
     axes.add_collection(lines)
-    _frame(axes, np.concatenate([estimate.t, truth.t]))
+    all_points = np.concatenate([estimate.t, truth.t])
+    _frame(axes, all_points)
 
 
 def _draw_error_curve(axes: Axes, errors: Array, label: str) -> None:
@@ -365,9 +392,11 @@ def _frame(axes: Axes, points: Array) -> None:
 
     lower = points.min(axis=0)
     upper = points.max(axis=0)
-    margin = 1.0 if points.shape[1] == 3 else 1.04  # in space the axes have a margin of their own
+    extent = float((upper - lower).max())
+    is_in_space = points.shape[1] == 3
+    margin = 1.0 if is_in_space else 1.04  # in space the axes have a margin of their own
     middle = (lower + upper) / 2
-    half = max(margin * float((upper - lower).max()) / 2, 1e-9)
+    half = max(margin * extent / 2, 1e-9)
     for letter, centre in zip("xyz", middle, strict=False):
         getattr(axes, f"set_{letter}lim")(centre - half, centre + half)
         getattr(axes, f"set_{letter}label")(f"{letter} (m)")
@@ -391,7 +420,8 @@ def _legend(graph: PoseGraph, kind: IntArray) -> list[Line2D]:
     handles = []
     if 1 < graph.num_robots <= _MOST_NAMED_ROBOTS:
         for robot in range(graph.num_robots):
-            handles.append(Line2D([], [], color=COLOURS[robot], label=f"robot {robot}"))
+            line = Line2D([], [], color=COLOURS[robot], label=f"robot {robot}")
+            handles.append(line)
     styles = {
         SIGHTING: (QUIET_COLOUR, "solid"),
         BETWEEN: (QUIET_COLOUR, "solid"),
@@ -402,7 +432,6 @@ def _legend(graph: PoseGraph, kind: IntArray) -> list[Line2D]:
         if (kind == this_kind).any():
             colour, dash = styles[this_kind]
             width = 2 * _WIDTHS[this_kind]
-            handles.append(
-                Line2D([], [], color=colour, linestyle=dash, linewidth=width, label=label)
-            )
+            line = Line2D([], [], color=colour, linestyle=dash, linewidth=width, label=label)
+            handles.append(line)
     return handles

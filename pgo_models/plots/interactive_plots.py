@@ -113,7 +113,8 @@ def explore_graph(
     kind = graph_plots.edge_kinds(graph, poses, residuals=residuals)
     traces: list[Trace] = []
     if before is not None:
-        traces.append(_lines_before(graph, before.aligned_to(poses), kind))
+        aligned = before.aligned_to(poses)
+        traces.append(_lines_before(graph, aligned, kind))
     ends, line_kind = graph_plots.lines_to_draw(graph, kind)
     own_ends = ends[line_kind == graph_plots.OWN]
     traces += _traces_of_parts(graph, poses, own_ends)
@@ -143,7 +144,8 @@ def _traces_of_parts(graph: PoseGraph, poses: Poses, ends: IntArray) -> list[Tra
     names = np.array(pose_names(graph))
     part, labels = _parts(graph, names)
     poses_in_files = graph.in_files
-    dots = poses_in_files[:: graph_plots.thinning_step(len(poses_in_files), MOST_DOTS)]
+    step = graph_plots.thinning_step(len(poses_in_files), MOST_DOTS)
+    dots = poses_in_files[::step]
     traces = []
     for a, label in enumerate(labels):
         colour = COLOURS[a % len(COLOURS)]
@@ -151,9 +153,11 @@ def _traces_of_parts(graph: PoseGraph, poses: Poses, ends: IntArray) -> list[Tra
         texts = [f"pose {names[pose]}" for pose in own_dots]
         if graph.num_robots > 1:
             texts = [f"pose {names[pose]}, robot {graph.robots[pose]}" for pose in own_dots]
-        own_ends = ends[part[ends[:, 0]] == a]
-        lines = _lines(poses.t, own_ends, label, _Line(colour, 1.0))
-        points = _dots(poses.t[own_dots], texts, label, colour, 4.0)
+        is_own = part[ends[:, 0]] == a
+        line = _Line(colour, 1.0)
+        lines = _lines(poses.t, ends[is_own], label, line)
+        positions = poses.t[own_dots]
+        points = _dots(positions, texts, label, colour, 4.0)
         # One entry of the legend shows and hides both. It is that of the dots: a robot has poses,
         # but perhaps no edge of its own.
         traces.append({**lines, "legendgroup": label, "showlegend": False})
@@ -164,8 +168,11 @@ def _traces_of_parts(graph: PoseGraph, poses: Poses, ends: IntArray) -> list[Tra
 def _misfit_dots(graph: PoseGraph, poses: Poses, kind: IntArray, residuals: EdgeResiduals) -> Trace:
     """Dots in the middle of misfits, which show what is known of them."""
     misfits = np.flatnonzero(kind == graph_plots.MISFIT)
-    misfits = misfits[:: graph_plots.thinning_step(len(misfits), MOST_DOTS)]
-    middles = 0.5 * (poses.t[graph.i[misfits]] + poses.t[graph.j[misfits]])
+    step = graph_plots.thinning_step(len(misfits), MOST_DOTS)
+    misfits = misfits[::step]
+    t_i = poses.t[graph.i[misfits]]
+    t_j = poses.t[graph.j[misfits]]
+    middles = 0.5 * (t_i + t_j)
     texts = _misfit_texts(graph, misfits, residuals)
     return _dots(middles, texts, "misfit", ALARM_COLOUR, 6.0)
 
@@ -173,9 +180,11 @@ def _misfit_dots(graph: PoseGraph, poses: Poses, kind: IntArray, residuals: Edge
 def _ellipses(poses: Poses, covariances: Array) -> Trace:
     """Outlines of ellipses as one trace, with gaps between them."""
     ellipses = graph_plots.confidence_ellipses(poses, covariances)
-    with_gaps = np.pad(ellipses, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+    one_point_behind = ((0, 0), (0, 1), (0, 0))
+    with_gaps = np.pad(ellipses, one_point_behind, constant_values=np.nan)
+    outlines = with_gaps.reshape(-1, poses.d)
     return {
-        **_points(with_gaps.reshape(-1, poses.d)),
+        **_points(outlines),
         "mode": "lines",
         "line": {"color": QUIET_COLOUR, "width": 1.0},
         "name": "95 % of x, y",
@@ -206,12 +215,16 @@ def animate_poses(
     for poses in iterates:
         check_poses(graph, poses)
     shown = _frames_to_keep(graph, len(iterates))
-    names = [labels[k] for k in shown]
-    positions = [iterates[k].aligned_to(iterates[-1]).t for k in shown]
-    frames = [
-        go.Frame(data=_frame_traces(graph, t), name=name)
-        for t, name in zip(positions, names, strict=True)
-    ]
+    last = iterates[-1]
+    names = []
+    positions = []
+    frames = []
+    for k in shown:
+        t = iterates[k].aligned_to(last).t
+        traces = _frame_traces(graph, t)
+        frames.append(go.Frame(data=traces, name=labels[k]))
+        names.append(labels[k])
+        positions.append(t)
     figure = go.Figure(data=_frame_traces(graph, positions[0]), frames=frames)
     _arrange(figure, np.concatenate(positions), f"{graph.name}: {len(iterates)} iterates")
     _add_controls(figure, names)
@@ -222,23 +235,28 @@ def _frames_to_keep(graph: PoseGraph, num_iterates: int) -> list[int]:
     """Iterates of a film that is not too large, evenly chosen."""
     numbers_per_frame = 3 * graph.d * graph.num_edges  # start, end and gap of every line
     most = max(2, int(_FILM_BYTES / (numbers_per_frame * _BYTES_PER_NUMBER)))
-    evenly = np.linspace(0, num_iterates - 1, min(num_iterates, most))
-    return [int(k) for k in np.unique(evenly.round().astype(int))]
+    count = min(num_iterates, most)
+    evenly = np.linspace(0, num_iterates - 1, count)
+    numbers = evenly.round().astype(int)
+    return [int(k) for k in np.unique(numbers)]
 
 
 def _frame_traces(graph: PoseGraph, t: Array) -> list[Trace]:
     """Lines of one iterate, robot by robot, then those between robots; priors are not drawn."""
     ends = np.stack([graph.i, graph.j], axis=1)
     robot_i = graph.robots[graph.i]
-    is_own = (robot_i == graph.robots[graph.j]) & ~graph.is_prior
+    robot_j = graph.robots[graph.j]
+    is_drawn = ~graph.is_prior
+    is_own = (robot_i == robot_j) & is_drawn
     traces = []
     for robot in range(graph.num_robots):
         own_ends = ends[is_own & (robot_i == robot)]
         if len(own_ends):
-            line = _Line(COLOURS[robot % len(COLOURS)], 1.0)
+            colour = COLOURS[robot % len(COLOURS)]
+            line = _Line(colour, 1.0)
             in_legend = graph.num_robots > 1 and robot < _MOST_NAMED_ROBOTS
             traces.append(_lines(t, own_ends, f"robot {robot}", line, in_legend))
-    ends_between = ends[~is_own & ~graph.is_prior]
+    ends_between = ends[~is_own & is_drawn]
     if len(ends_between):
         in_legend = graph.num_robots > 1
         line = _Line(QUIET_COLOUR, 1.0)
@@ -284,7 +302,8 @@ def _parts(graph: PoseGraph, names: NDArray[np.str_]) -> tuple[IntArray, list[st
         return _grouped(graph.robots, _MOST_NAMED_ROBOTS, "robot", robot_names)
     if graph.num_edges <= graph_plots.MOST_LINES:
         return graph.robots, ["edges and poses"]
-    return _grouped(np.arange(graph.num_poses), len(COLOURS), "pose", names)
+    poses = np.arange(graph.num_poses)
+    return _grouped(poses, len(COLOURS), "pose", names)
 
 
 def _grouped(
@@ -377,14 +396,17 @@ def _arrange(figure: Figure, points: Array, title: str) -> None:
     if d == 2:
         margin = 0.04 * extent
         ranges = np.stack([lower - margin, upper + margin], axis=1)
+        x_range = list(ranges[0])
+        y_range = list(ranges[1])
         style = {"zeroline": False, "gridcolor": "#eeeeee"}
-        figure.update_xaxes(title_text="x (m)", range=list(ranges[0]), **style)
-        figure.update_yaxes(title_text="y (m)", range=list(ranges[1]), scaleanchor="x", **style)
+        figure.update_xaxes(title_text="x (m)", range=x_range, **style)
+        figure.update_yaxes(title_text="y (m)", range=y_range, scaleanchor="x", **style)
         return
     middle = (lower + upper) / 2
     half = max(0.52 * extent, 1e-9)
     for letter, centre in zip("xyz", middle.tolist(), strict=True):
-        axis = {"title": {"text": f"{letter} (m)"}, "range": [centre - half, centre + half]}
+        title_of_axis = {"text": f"{letter} (m)"}
+        axis = {"title": title_of_axis, "range": [centre - half, centre + half]}
         figure.update_scenes({f"{letter}axis": axis})
     figure.update_scenes(aspectmode="cube")
 
@@ -405,9 +427,11 @@ def _button(label: str, args: list[object]) -> dict[str, object]:
 
 def _add_controls(figure: Figure, names: list[str]) -> None:
     """Add a slider over the frames, and buttons to play and to pause."""
-    steps = [_button(name, [[name], _frame_options(0)]) for name in names]
-    play: list[object] = [None, {**_frame_options(_FRAME_MILLISECONDS), "fromcurrent": True}]
-    pause: list[object] = [[None], _frame_options(0)]
+    at_once = _frame_options(0)
+    steps = [_button(name, [[name], at_once]) for name in names]
+    play_options = {**_frame_options(_FRAME_MILLISECONDS), "fromcurrent": True}
+    play_button = _button("play", [None, play_options])
+    pause_button = _button("pause", [[None], at_once])
     slider = {
         "steps": steps,
         "x": 0.16,
@@ -418,7 +442,7 @@ def _add_controls(figure: Figure, names: list[str]) -> None:
     menu = {
         "type": "buttons",
         "direction": "left",
-        "buttons": [_button("play", play), _button("pause", pause)],
+        "buttons": [play_button, pause_button],
         "x": 0.13,
         "y": 0,
         "pad": {"t": 60},

@@ -63,20 +63,27 @@ def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12
     """Figure of the `smallest_eigenvalues` of S at the point of a certificate.
 
     Eigenvalues stand on a logarithmic axis, negative ones as vermilion triangles. Where the proof
-    needs an eta, a shaded band shows what it leaves open, |lambda| <= eta.
+    needs an eta, a shaded band shows what it leaves open, |lambda| <= eta. With handedness terms S
+    is the matrix less them, as in the proof.
     """
     tangent = problem.tangent_at(certificate.poses)
+    terms = certificate.bound.terms
+    if terms is not None:
+        tangent = terms.taken_off(tangent)
     eigenvalues = smallest_eigenvalues(tangent, certificate.Lambda, count)
     k = np.arange(1, count + 1)
     is_negative = eigenvalues < 0
     with column_figure(height=0.8) as figure:
         axes = figure.add_subplot()
         axes.set_yscale("log")
-        size = np.maximum(np.abs(eigenvalues), np.finfo(float).tiny)
-        axes.plot(k[~is_negative], size[~is_negative], "o", color=COLOURS[0], label="positive")
-        axes.plot(
-            k[is_negative], size[is_negative], "v", color=ALARM_COLOUR, label="negative (size)"
-        )
+        smallest_number = np.finfo(float).tiny  # a logarithmic axis shows no zeros
+        size = np.maximum(np.abs(eigenvalues), smallest_number)
+        marks = [
+            (~is_negative, "o", COLOURS[0], "positive"),
+            (is_negative, "v", ALARM_COLOUR, "negative (size)"),
+        ]
+        for chosen, marker, colour, label in marks:
+            axes.plot(k[chosen], size[chosen], marker, color=colour, label=label)
         lowest = 0.3 * size.min()
         if certificate.eta > 0:
             lowest = min(lowest, 0.3 * certificate.eta)
@@ -133,11 +140,13 @@ def _draw_pattern(axes: Axes, matrix: csc_array) -> None:
     """
     side = matrix.shape[0]
     num_cells = min(side, _CELLS)
-    columns = np.repeat(np.arange(side), np.diff(matrix.indptr))
+    entries_of_column = np.diff(matrix.indptr)
+    columns = np.repeat(np.arange(side), entries_of_column)
     cell_row = matrix.indices * num_cells // side
     cell_column = columns * num_cells // side
     cell = cell_row * num_cells + cell_column
-    counts = np.bincount(cell, minlength=num_cells * num_cells).reshape(num_cells, num_cells)
+    counts_of_cells = np.bincount(cell, minlength=num_cells * num_cells)
+    counts = counts_of_cells.reshape(num_cells, num_cells)
     shades = np.where(counts > 0, np.log1p(counts), np.nan)
     darkest = float(np.nanmax(shades))
     axes.imshow(

@@ -151,10 +151,12 @@ class SymbolicCholesky(ABC):
         return np.full(self._shape[0], np.inf)
 
     def _check(self, matrix: csc_array) -> None:
-        same = np.array_equal(matrix.indptr, self._indptr) and np.array_equal(
-            matrix.indices, self._indices
+        has_same_pattern = (
+            matrix.shape == self._shape
+            and np.array_equal(matrix.indptr, self._indptr)
+            and np.array_equal(matrix.indices, self._indices)
         )
-        if not same or matrix.shape != self._shape:
+        if not has_same_pattern:
             raise ValueError(
                 "the matrix has another sparsity pattern than the one that was analysed"
             )
@@ -185,11 +187,9 @@ def analyze(
     """
     pattern.sort_indices()
     chosen = backend or default_backend()
-    return (
-        _Cholmod(pattern, order, most_counts)
-        if chosen is CholeskyBackend.CHOLMOD
-        else _SuperLU(pattern, order)
-    )
+    if chosen is CholeskyBackend.CHOLMOD:
+        return _Cholmod(pattern, order, most_counts)
+    return _SuperLU(pattern, order)
 
 
 def factorize(
@@ -243,18 +243,22 @@ class _SuperLUFactor(CholeskyFactor):
         return _SuperLU.factorize, (self._analysis, self._matrix)
 
     def take_apart(self) -> tuple[csc_array, np.ndarray]:
-        L = self._lu.L @ diags_array(np.sqrt(self._lu.U.diagonal()))
-        # to and fro, which sorts rows
-        return (L + self._analysis.tiny_factor()).tocsr().tocsc(), self._rows
+        root_pivots = np.sqrt(self._lu.U.diagonal())
+        L = self._lu.L @ diags_array(root_pivots)
+        whole = L + self._analysis.tiny_factor()
+        # The conversion to rows and back sorts the rows of every column.
+        return whole.tocsr().tocsc(), self._rows
 
     def half_solve(self, right_hand_side: Array) -> Array:
         L = self._lu.L.tocsr()
         columns = np.asfortranarray(right_hand_side[self._rows], dtype=float)
         half = spsolve_triangular(L, columns, lower=True, overwrite_b=True, unit_diagonal=True)
-        return np.asarray(half / np.sqrt(self._lu.U.diagonal())[:, None])
+        root_pivots = np.sqrt(self._lu.U.diagonal())
+        return np.asarray(half / root_pivots[:, None])
 
     def most_in_row(self, beside: Array | int = 0) -> float:
-        return float((np.diff(self._lu.L.tocsc().indptr) + beside).max(initial=0))
+        in_row = np.diff(self._lu.L.tocsc().indptr) + beside
+        return float(in_row.max(initial=0))
 
     def backward_error(self, beside: Array | int = 0) -> Array:
         """Bound as for Cholesky, with R = diag(u)^(1/2) L^T, u the pivots.
@@ -280,8 +284,10 @@ class _SuperLUFactor(CholeskyFactor):
         W = abs(product - U) + UNIT_ROUNDOFF * abs(product) + abs(U) @ diags_array(count)
         W.data **= 2
         L.data **= 2
-        # in the sums of Cauchy-Schwarz
-        most = np.maximum(L.astype(bool).sum(axis=0), W.astype(bool).sum(axis=1))
+        # Number of terms in the sums of Cauchy-Schwarz.
+        in_columns_of_L = L.astype(bool).sum(axis=0)
+        in_rows_of_W = W.astype(bool).sum(axis=1)
+        most = np.maximum(in_columns_of_L, in_rows_of_W)
         of_L = (L @ (pivots * most)) / a
         of_W = ((most / pivots) @ W) / a
         balance = np.sqrt(of_L.mean() / max(of_W.mean(), np.finfo(float).tiny))
@@ -292,9 +298,10 @@ class _SuperLUFactor(CholeskyFactor):
         return error
 
     def solve(self, right_hand_side: Array) -> Array:
-        solution = np.empty_like(right_hand_side, dtype=float)
         order = self._analysis.order
-        solution[order] = self._lu.solve(np.asfortranarray(right_hand_side[order], dtype=float))
+        permuted = np.asfortranarray(right_hand_side[order], dtype=float)
+        solution = np.empty_like(right_hand_side, dtype=float)
+        solution[order] = self._lu.solve(permuted)
         return solution
 
 
@@ -421,7 +428,9 @@ class _CholmodFactor(CholeskyFactor):
     def take_apart(self) -> tuple[csc_array, np.ndarray]:
         parts, order = self._analysis.take_apart(self._give_up())
         pointers, rows, values = (np.array(part).ravel() for part in parts)
-        return csc_array((values, rows, pointers), shape=(len(order), len(order))), order
+        side = len(order)
+        L = csc_array((values, rows, pointers), shape=(side, side))
+        return L, order
 
     def known_error(self) -> Array | None:
         return self._analysis.expected_error()
@@ -460,7 +469,9 @@ class _Cholmod(SymbolicCholesky):
         return self._counts.error(beside) if self._counts is not None else None
 
     def crude_error(self) -> Array:
-        return error_of_counts(np.full(self._shape[0], float(self._shape[0])), self._shape[0])
+        side = self._shape[0]
+        full_columns = np.full(side, float(side))
+        return error_of_counts(full_columns, side)
 
     def error_before(self) -> Array:
         if self._error_before is None:
@@ -472,18 +483,20 @@ class _Cholmod(SymbolicCholesky):
 
     def counts(self) -> FactorCounts:
         """Counts of every factor with this pattern, if need be of one that is out of use."""
-        return self._counts if self._counts is not None else self.count(self._spare())
+        if self._counts is not None:
+            return self._counts
+        return self.count(self._spare())
 
     def count(self, capsule: _Capsule) -> FactorCounts:
         """Find the counts of a numeric factor, which is used up for it."""
         try:
-            (pointers, rows, _), order = self.take_apart(capsule)
-        except (
-            ValueError,
-            ArithmeticError,
-        ):  # it is symbolic, or of a matrix that was not positive definite
-            self._fill(np.where(self._is_diagonal, 1.0, 0.0), capsule)
-            (pointers, rows, _), order = self.take_apart(capsule)
+            parts, order = self.take_apart(capsule)
+        except (ValueError, ArithmeticError):
+            # It is symbolic, or of a matrix that was not positive definite: factor the identity.
+            identity = np.where(self._is_diagonal, 1.0, 0.0)
+            self._fill(identity, capsule)
+            parts, order = self.take_apart(capsule)
+        pointers, rows, _ = parts
         self._counts = FactorCounts.of(np.array(pointers).ravel(), np.array(rows).ravel(), order)
         return self._counts
 
@@ -502,8 +515,11 @@ class _Cholmod(SymbolicCholesky):
         with supernodal() as cholmod:
             if self._order is None:
                 return cholmod.symbolic(self._matrix)
-            with set_option(cholmod, "nmethods", 1):  # else it compares the order with its own
-                return cholmod.symbolic(self._matrix, p=import_cvxopt()[0].matrix(self._order))
+            cvxopt, _ = import_cvxopt()
+            order = cvxopt.matrix(self._order)
+            # With more methods it would compare the order with its own.
+            with set_option(cholmod, "nmethods", 1):
+                return cholmod.symbolic(self._matrix, p=order)
 
     def factorize(
         self, matrix: csc_array, overwrite: CholeskyFactor | None = None

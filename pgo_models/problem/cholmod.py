@@ -1,4 +1,4 @@
-"""CHOLMOD and AMD as CVXOPT has them, with its options set for a while, and its matrices."""
+"""CHOLMOD and AMD of CVXOPT, with its matrices and its options."""
 
 import sys
 from collections.abc import Iterator
@@ -24,27 +24,28 @@ _ROOM_FOR_AN_ENTRY = 100
 
 
 def lower_triangle(pattern: csc_array) -> tuple[Any, IntArray, BoolArray]:
-    """CVXOPT's matrix of ones on a lower triangle.
+    """CVXOPT's matrix of ones on the lower triangle of a pattern.
 
-    With it come the positions of its entries in the pattern, and which of them are diagonal.
+    Returned as well are the positions of its entries in the pattern, and which are diagonal.
     """
     cvxopt, _ = import_cvxopt()
     check_room(_ROOM_FOR_AN_ENTRY * len(pattern.indices))
-    columns = np.repeat(np.arange(pattern.shape[1], dtype=np.int32), np.diff(pattern.indptr))
+    every_column = np.arange(pattern.shape[1], dtype=np.int32)
+    columns = np.repeat(every_column, np.diff(pattern.indptr))
     lower = np.flatnonzero(pattern.indices >= columns)
-    places = [of_all[lower].astype(np.int64) for of_all in (pattern.indices, columns)]
-    return (
-        cvxopt.spmatrix(1.0, *map(cvxopt.matrix, places), pattern.shape),
-        lower,
-        places[0] == places[1],
+    lower_rows = pattern.indices[lower].astype(np.int64)
+    lower_columns = columns[lower].astype(np.int64)
+    matrix = cvxopt.spmatrix(
+        1.0, cvxopt.matrix(lower_rows), cvxopt.matrix(lower_columns), pattern.shape
     )
+    return matrix, lower, lower_rows == lower_columns
 
 
 @contextmanager
 def supernodal() -> Iterator[ModuleType]:
-    """CHOLMOD set to L L^T, which exists for positive definite matrices only.
+    """CHOLMOD with the option for L L^T, which exists for positive definite matrices only.
 
-    To analyse for L D L^T accepts others.
+    Without it CHOLMOD may factor other matrices as L D L^T.
     """
     _, cholmod = import_cvxopt()
     with set_option(cholmod, "supernodal", 2):
@@ -53,7 +54,7 @@ def supernodal() -> Iterator[ModuleType]:
 
 @contextmanager
 def set_option(cholmod: ModuleType, name: str, value: int) -> Iterator[None]:
-    """An option of CHOLMOD for a while, in which other threads wait: there is one set of them."""
+    """Set an option of CHOLMOD within the context. Other threads wait, as all share the options."""
     with _OPTIONS:
         saved = dict(cholmod.options)
         cholmod.options[name] = value
@@ -72,8 +73,8 @@ def import_cvxopt() -> tuple[ModuleType, ModuleType]:
     with kernels_of_the_cpu():
         cvxopt = extra_module("cvxopt", "fast")
         cholmod = extra_module("cvxopt.cholmod", "fast")
-    # Where OpenBLAS gets no memory for its buffer it crashes: it has it before a large matrix takes
-    # all.
+    # OpenBLAS crashes if it gets no memory for its buffer: a first call allocates it now, before
+    # large matrices take the memory.
     extra_module("cvxopt.lapack", "fast").potrf(cvxopt.matrix(1.0))
     return cvxopt, cholmod
 
@@ -83,4 +84,6 @@ def amd_order(pattern: csc_array) -> IntArray:
     import_cvxopt()  # on the kernels chosen
     from cvxopt import amd
 
-    return np.array(amd.order(lower_triangle(pattern)[0])).ravel().astype(np.int64)
+    matrix, _, _ = lower_triangle(pattern)
+    order = np.array(amd.order(matrix)).ravel()
+    return order.astype(np.int64)

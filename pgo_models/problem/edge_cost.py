@@ -1,14 +1,24 @@
-"""EdgeCost: what the edges cost as a function of the poses, with all that follows from it.
+"""EdgeCost: the cost of the edges as a function of the poses, its derivatives and its rounding.
 
-With the residual rows rho_t = t_j^T - t_i^T - t_ij^T R_i^T and rho_R = R_j^T - R_ij^T R_i^T of an
-edge, stacked as rho, (d + 1, d), every cost here has a quadratic part
+Notation. X, (N, d) with N = (d + 1) n, stacks the n rows t_i^T and then the d rows of every R_i^T.
+Edge e = (i, j), of m, has the residuals
 
-    tau ||rho_t||^2 + tr(W rho_R rho_R^T).
+    rho_t = t_j^T - t_i^T - t_ij^T R_i^T,  (1, d),     rho_R = R_j^T - R_ij^T R_i^T,  (d, d),
 
-`EdgeCost` is a cost that has no other part: F (equation `min overall` of the paper) for W = kappa
+which are stacked as rho = (rho_t; rho_R), (d + 1, d). Its weights are a scalar tau and a symmetric
+matrix W, (d, d), with the eigenvectors U and the eigenvalues kappa: W = U diag(kappa) U^T. Every
+cost here has the quadratic part
+
+    sum_e tau ||rho_t||^2 + tr(W rho_R rho_R^T) = sum_rows w ||A X||^2 = tr(X^T M X),
+    M = A^T diag(w) A.
+
+A, ((d + 1) m, N), is the residual matrix: its first m rows give rho_t of all edges, with w = tau,
+and the d rows of every edge that follow give U^T rho_R, with w = kappa. Where W = kappa I, U = I.
+
+`EdgeCost` is a cost without any other part: F (equation `min overall` of the paper) for W = kappa
 I, or chi2 where it is quadratic in the poses. Costs with another part are subclasses
 (`pgo_models.problem.information_costs`): they override the methods below and call them for the
-quadratic part. A cost knows no graph; what it needs of the problem is passed to its methods.
+quadratic part. A cost does not hold the graph; the problem is passed to the methods that need it.
 """
 
 from collections.abc import Sequence
@@ -28,23 +38,33 @@ from pgo_models.problem.rotation_weights import RotationWeights, ScaledIdentitie
 
 @dataclass(frozen=True, eq=False)
 class EdgeTerms:
-    """Costs of the edges and their half gradients in the residuals, with bounds on their errors."""
+    """Computed costs of the edges and their half gradients in rho, with bounds on their errors."""
 
     value: Array  # (m,): cost of every edge
-    value_error: float  # bound on the error of the sum of the exact costs
-    G: Array  # (m, d + 1, d): half the gradient in rho
-    G_error: Array  # bound on the error of G, entry by entry, beside that of adding its terms
-    G_size: Array  # bound on the absolute values that an entry of G is summed from
+    # Bound on the difference between the sum of `value` and the sum of the costs in exact
+    # arithmetic.
+    value_error: float
+    G: Array  # (m, d + 1, d): half the gradient of the cost in rho
+    # (m, d + 1, d): bound on the error of G, entry by entry, but for the rounding of the sum that
+    # an entry of G is. The caller bounds that rounding by a gamma times `G_size`.
+    G_error: Array
+    G_size: Array  # (m, d + 1, d): sum of the absolute values of the terms of that sum
 
-    def with_pose_gradients(
-        self, problem: EdgeProblem, count: float, product: Array, product_error: Array
+    def complete_half_gradient(
+        self,
+        problem: EdgeProblem,
+        relative_error: float,
+        half_gradient: Array,
+        half_gradient_error: Array,
     ) -> tuple[Array, Array]:
-        """Half gradient and its error, (N, d), with the terms that depend on X other than by rho.
+        """Half gradient in X, (N, d), and a bound on its error, from A^T G and a bound on its.
 
-        `product` is A^T G and `product_error` a bound on its error. A quadratic form of rho has no
-        such terms. `count` bounds the relative error of a sum over the edges of a pose.
+        This is a hook. A cost that depends on X through rho alone has the half gradient A^T G,
+        which is returned as it is. `TangentTerms`, whose cost depends on R_i beside rho, overrides
+        the method and adds the derivative in R_i; `relative_error` bounds the relative error of a
+        sum over the edges of a pose.
         """
-        return product, product_error
+        return half_gradient, half_gradient_error
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +84,7 @@ class EdgeCost:
 
     @property
     def kappa(self) -> Array:
-        """Eigenvalues of W, (m,) if all of an edge are equal, (m, d) else."""
+        """Eigenvalues of W, (m,) if W = kappa I on every edge, (m, d) else."""
         return self.rotation.kappa
 
     def W(self, d: int) -> Array:
@@ -73,18 +93,28 @@ class EdgeCost:
 
     def of_edges(self, chosen: IntArray | BoolArray) -> Self:
         """The cost of the chosen edges."""
-        return replace(self, tau=self.tau[chosen], rotation=self.rotation.of_edges(chosen))
+        rotation = self.rotation.of_edges(chosen)
+        return replace(self, tau=self.tau[chosen], rotation=rotation)
+
+    def with_rotation_terms(self, R_ij: Array, W: Array) -> Self:
+        """The cost with further edges, whose rotation residuals alone cost something.
+
+        Their R_ij, (k, d, d), and weights W, (k, d, d), symmetric, are meant as they are stored.
+        """
+        tau = np.concatenate([self.tau, np.zeros(len(W))])
+        return replace(self, tau=tau, rotation=self.rotation.with_matrices(W))
 
     def scaled(self, share: Array) -> Self:
-        """The weighted cost: that of every edge times its share, (m,), of zero or more."""
-        return replace(self, tau=share * self.tau, rotation=self.rotation.scaled(share))
+        """The cost with that of every edge multiplied by its share, (m,), of zero or more."""
+        rotation = self.rotation.scaled(share)
+        return replace(self, tau=share * self.tau, rotation=rotation)
 
     def arrays(self, d: int) -> list[Array]:
-        """The numbers that the cost is made of, for a fingerprint."""
+        """The arrays that determine the cost, for a fingerprint."""
         return [self.W(d), self.tau]
 
     def seen_offsets(self, t_ij: Array) -> Array:
-        """The measured translations that the residuals are taken from, (m, d)."""
+        """The vectors, (m, d), that take the place of t_ij in rho_t: here t_ij itself."""
         return t_ij
 
     # Convexity.
@@ -96,21 +126,31 @@ class EdgeCost:
 
     @property
     def is_convex(self) -> bool:
-        """Whether the quadratic part is strictly convex in the residuals that it is of."""
+        """Whether W is positive definite on every edge where it is not zero.
+
+        Then the quadratic part is a convex function of X, as no tau is negative.
+        """
         return self.rotation.is_convex
 
     @property
     def is_chi2(self) -> bool:
-        """Whether this is known to be chi2 or a minorant of it; a quadratic cost does not know."""
+        """Whether the cost is known to be chi2, or a tangent of chi2.
+
+        False means unknown: tau and W of F and of a quadratic chi2 are stored in the same form, and
+        `PGOProblem.weighting` tells which of the two they are.
+        """
         return False
 
     @property
     def constant(self) -> tuple[float, float]:
-        """What a quadratic cost has beside tr(X^T M X), and a bound on its rounding error."""
+        """The constant that a quadratic cost adds to tr(X^T M X), and a bound on its error."""
         return 0.0, 0.0
 
     def minorant(self, problem: EdgeProblem, poses: Poses) -> "EdgeCost":
-        """A quadratic cost that is nowhere above this one and touches it at the poses: this one."""
+        """A quadratic cost that is at most this one everywhere and equal to it at the poses.
+
+        Of a quadratic cost it is the cost itself.
+        """
         return self
 
     # Value and gradient.
@@ -118,86 +158,133 @@ class EdgeCost:
     def value(self, problem: EdgeProblem, X: Array, residuals: Array) -> float:
         """Sum of the costs at X, (N, d), with residuals A X, ((d + 1) m, d).
 
-        The problem is the one of this cost: its residual matrix has the weights.
+        The problem is the one of this cost: its residual matrix comes with the weights w.
         """
         _, w = problem.residual_matrix
-        # in pairs: off by a few dozen roundings, not by one an edge
-        return float(np.sum(w[:, None] * residuals**2))
+        weighted_squares = w[:, None] * residuals**2
+        # numpy sums in pairs: the result is off by a few dozen roundings, not by one an edge.
+        return float(np.sum(weighted_squares))
 
     def edge_values(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
         """Cost of every edge, (m,)."""
         m = problem.graph.num_edges
         _, w = problem.residual_matrix
-        squares = w * np.sum(residuals**2, axis=1)
-        return np.asarray(squares[:m] + squares[m:].reshape(m, problem.d).sum(axis=1))
+        row_costs = w * np.sum(residuals**2, axis=1)
+        translation_costs = row_costs[:m]
+        rotation_costs = row_costs[m:].reshape(m, problem.d).sum(axis=1)
+        return np.asarray(translation_costs + rotation_costs)
 
     def half_gradient(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
-        """Half the gradient in X of a quadratic cost, M X = A^T (w A X), (N, d)."""
+        """Half the gradient in X of a quadratic cost, M X = A^T diag(w) A X, (N, d)."""
         _, w = problem.residual_matrix
-        return np.asarray(problem.residual_adjoint @ (w[:, None] * residuals))
+        weighted = w[:, None] * residuals
+        return np.asarray(problem.residual_adjoint @ weighted)
 
     def edge_products(self, graph: PoseGraph, X: Array, residuals: Array) -> Array:
         """Z = rho R_i, (m, d + 1, d): the residuals of every edge in the frame of pose i."""
         rho = self.residual_blocks(residuals)
-        return np.asarray(rho @ unstack_transposes(X[graph.num_poses :])[graph.i])
+        R = unstack_transposes(X[graph.num_poses :])
+        R_i = R[graph.i]
+        return np.asarray(rho @ R_i)
 
     def best_translations(self, problem: EdgeProblem, poses: Poses) -> Poses:
         """Poses with the translations of least cost for their rotations."""
-        return poses.with_translations(problem.recover_translations(poses.R))
+        t = problem.recover_translations(poses.R)
+        return poses.with_translations(t)
 
     # Matrices: rows of A and blocks of M.
 
     def with_unit_weights(self) -> "EdgeCost":
-        """Return this cost with W = I and the same tau: the rotation rows of A are those of rho."""
-        return replace(self, rotation=ScaledIdentities(np.ones(len(self.tau))))
+        """Return this cost with W = I and the same tau.
+
+        Its residual matrix has rho_R itself in the rotation rows, as U = I.
+        """
+        ones = np.ones(len(self.tau))
+        return replace(self, rotation=ScaledIdentities(ones))
 
     def row_weights(self, d: int) -> Array:
         """Weights w, ((d + 1) m,), of the rows of A.
 
-        First come the translation residuals, then d rows of every edge.
+        First come the m weights tau of the rows rho_t, then for every edge the d eigenvalues kappa
+        of W, which are the weights of the rows U^T rho_R: with W = U diag(kappa) U^T the sum
+        sum_rows kappa ||U^T rho_R||^2 is tr(W rho_R rho_R^T).
         """
         return np.concatenate([self.tau, self.rotation.row_weights(d)])
 
     def residual_blocks(self, rows: Array) -> Array:
-        """rho, (m, d + 1, k), of the rows of A, ((d + 1) m, k)."""
+        """rho, (m, d + 1, k), of the rows of A X, ((d + 1) m, k).
+
+        The rotation rows are U^T rho_R and are multiplied by U.
+        """
         m = len(self.tau)
-        along = rows[m:].reshape(m, -1, rows.shape[1])
-        return np.concatenate([rows[:m, None], self.rotation.off_axes(along)], axis=1)
+        num_columns = rows.shape[1]
+        rho_t = rows[:m, None]
+        in_eigenbasis = rows[m:].reshape(m, -1, num_columns)
+        rho_R = self.rotation.from_eigenbasis(in_eigenbasis)
+        return np.concatenate([rho_t, rho_R], axis=1)
 
     def residual_rows(self, rho: Array) -> Array:
-        """The rows of A, ((d + 1) m, k), of rho, (m, d + 1, k)."""
-        along = self.rotation.along_axes(rho[:, 1:])
-        return np.concatenate([rho[:, 0], along.reshape(-1, rho.shape[2])])
+        """The rows of A X, ((d + 1) m, k), of rho, (m, d + 1, k): rho_t, then U^T rho_R."""
+        num_columns = rho.shape[2]
+        in_eigenbasis = self.rotation.to_eigenbasis(rho[:, 1:])
+        rotation_rows = in_eigenbasis.reshape(-1, num_columns)
+        return np.concatenate([rho[:, 0], rotation_rows])
 
     def matrix_blocks(self, R_ij: Array, t_ij: Array) -> tuple[Array, Array, Array, Array]:
-        """Blocks that edges (i, j) add to M, apart from the entries of tau between translations.
+        """What every edge (i, j) adds to the rotation rows and columns of M.
 
-        They are tau t_ij for (t_i, R_i), whose negative is that for (t_j, R_i);
-        R_ij W R_ij^T + tau t_ij t_ij^T for (R_i, R_i); R_ij W for -(R_i, R_j); and W for
-        (R_j, R_j). Where W = kappa I, R_ij R_ij^T is taken to be the identity.
+        With M[a, b] the block of M in the rows of a and the columns of b, edge (i, j) adds
+
+            M[t_i, R_i] += c^T,    M[t_j, R_i] -= c^T,    c = tau t_ij,
+            M[R_i, R_i] += D_i,    D_i = R_ij W R_ij^T + tau t_ij t_ij^T,
+            M[R_i, R_j] -= K,      K = R_ij W,
+            M[R_j, R_j] += D_j,    D_j = W,
+
+        and the transposes of the first, second and fourth. The entries of tau between t_i and t_j
+        are not among them. Where W = kappa I, R_ij R_ij^T is taken to be the identity.
+
+        Returns
+        -------
+        translation_coupling : (m, d) array
+            c of every edge.
+        diagonal_i : (m, d, d) array
+            D_i.
+        rotation_coupling : (m, d, d) array
+            K.
+        diagonal_j : (m, d, d) array
+            D_j.
         """
         offset = self.seen_offsets(t_ij)
-        arm = self.tau[:, None] * offset
-        between, turned, W = self.rotation.turned_measurements(R_ij)
-        own_i = arm[:, :, None] * offset[:, None, :]
-        own_i += turned
-        return arm, own_i, between, W
+        translation_coupling = self.tau[:, None] * offset
+        rotation_coupling, R_W_Rt, W = self.rotation.measurement_products(R_ij)
+        diagonal_i = translation_coupling[:, :, None] * offset[:, None, :]
+        diagonal_i += R_W_Rt
+        return translation_coupling, diagonal_i, rotation_coupling, W
 
     def added_curvatures(self, graph: PoseGraph, poses: Poses) -> Sequence[Array]:
-        """Hessians of parts that are not quadratic, (m, k, k), in the first k unknowns.
+        """Second derivatives of the parts of the cost that are not quadratic in X, (m, k, k) each.
 
-        The unknowns are R_i^T v_i, R_i^T v_j, w_i, w_j, in this order: v is the change of a
-        translation, w the rotation vector of a change of rotation. Empty for a quadratic cost.
+        Edge (i, j) has the unknowns (R_i^T v_i, R_i^T v_j, w_i, w_j) of the moves t <- t + v and R
+        <- R exp([w]_x) of its two poses. The matrices are in the first k of these numbers. The
+        sequence is empty for a quadratic cost.
         """
         return ()
 
-    # Rounding errors. The bounds hold in exact arithmetic; each is rounded up by its user.
+    # Rounding errors.
+    #
+    # The formulas below bound errors if they are evaluated in exact arithmetic. What
+    # `evaluate_edges`, `entry_errors` and `value_errors` return is not rounded up: the caller,
+    # `pgo_models.certificates.rounding_errors`, multiplies the sum of its bounds by OUTWARD.
+    # `bound_of_norms` is rounded up here.
 
     @property
-    def sums_within_diagonal(self) -> bool:
-        """Whether W is exact, and M's diagonal bounds the terms that its entries are sums of.
+    def diagonal_bounds_terms(self) -> bool:
+        """Whether the lemma of `pgo_models.certificates.rounding_errors.matrix_error` holds for M.
 
-        This is what the lemma of `pgo_models.certificates.rounding_errors.matrix_error` asks for.
+        It needs two things: W has no error, and the sums of absolute values |A|^T diag(w) |A| have
+        the same diagonal as M, so that the diagonal of M bounds them. Both are true of the weights
+        of F: kappa is what is given, and no kappa is negative. `RotationWeights.is_exact` is true
+        of these weights only.
         """
         return self.rotation.is_exact
 
@@ -206,7 +293,8 @@ class EdgeCost:
 
         `longest`, (m,), is max(1, ||t_ij||^2).
         """
-        return np.concatenate([np.abs(self.kappa).ravel(), self.tau, self.tau * longest])
+        kappa_sizes = np.abs(self.kappa).ravel()
+        return np.concatenate([kappa_sizes, self.tau, self.tau * longest])
 
     def apply_weights(self, rho: Array) -> Array:
         """(tau rho_t; W rho_R) of edges, (m, d + 1, d)."""
@@ -223,14 +311,22 @@ class EdgeCost:
         return product
 
     def evaluate_edges(self, rho: Array, errors: Array, P_i: Array) -> EdgeTerms:
-        """Costs and half gradients at residuals that are known to errors, (m, d + 1, d) each.
+        """Costs and half gradients at the computed residuals rho, (m, d + 1, d).
 
-        P_i is R_i^T.
+        The exact residuals are rho + e with |e| <= errors, (m, d + 1, d), entry by entry. P_i is
+        R_i^T. With D = diag(tau, W) and G = D rho the exact cost of an edge is
 
-        With G = (tau rho_t; W rho_R), an exact residual rho + e, |e| <= errors, costs <G, rho> + 2
-        <G, e> + e^T diag(tau, W) e: off by at most <2 |diag(tau, W)| |rho| + |diag(tau, W)| errors,
-        errors>. The rounding of <G, rho>, a sum of (d + 1) d products of sums of d, is at most
-        gamma_(d^2 + 2 d + 2) times the sum of its absolute values. The error of W is added to both.
+            <G, rho> + 2 <G, e> + <e, D e>,
+
+        which differs from <G, rho> by at most <2 |D| |rho| + |D| errors, errors>. The half gradient
+        D (rho + e) differs from G by at most |D| errors.
+
+        <G, rho>, as computed, is off by at most gamma_k <|D| |rho|, |rho|> with k = d^2 + 2 d + 2.
+        The index k counts d roundings in an entry of G, (d + 1) d in the sum of products, one when
+        the terms of a tangent are added and one in the sum over the edges, by `exact_sum`.
+
+        The error of W adds to the bound on the value and to the bound on G
+        (`RotationWeights.effect_of_error`).
         """
         d = rho.shape[2]
         rho_size = np.abs(rho)
@@ -238,41 +334,55 @@ class EdgeCost:
         G_size = self.apply_absolute_weights(rho_size)
         G_error = self.apply_absolute_weights(errors)
         value = np.sum(G * rho, axis=(1, 2))
+        # Errors of rho.
         value_error = float(np.sum((2.0 * G_size + G_error) * errors))
-        value_error += gamma(d * d + 2 * d + 2) * float(np.sum(G_size * rho_size))
-        of_form, of_product = self.rotation.effect_of_error(rho_size[:, 1:], errors[:, 1:])
-        value_error += of_form
+        # Rounding of <G, rho>.
+        sum_of_sizes = float(np.sum(G_size * rho_size))
+        value_error += gamma(d * d + 2 * d + 2) * sum_of_sizes
+        # Error of W.
+        of_value, of_product = self.rotation.effect_of_error(rho_size[:, 1:], errors[:, 1:])
+        value_error += of_value
         G_error[:, 1:] += of_product
         return EdgeTerms(value, value_error, G, G_error, G_size)
 
-    def entry_errors(self, problem: EdgeProblem, u: Array, count: float) -> Array:
-        """E u, (N,), where E bounds the errors of the stored entries of M, entry by entry.
+    def entry_errors(self, problem: EdgeProblem, u: Array, relative_error: float) -> Array:
+        """The vector E u, (N,): E, (N, N), bounds the errors of the stored entries of M.
 
-        The vector u, (N,), is positive.
+        The vector u, (N,), is positive, and E bounds the errors entry by entry.
 
-        The terms that an entry is summed from are at most (|A|^T |diag(tau, W)| |A|) there, and
-        each is off by at most `count` of itself; the error e of W adds |A|^T e 1 1^T |A|.
+        Here A has rho_R in its rotation rows, not U^T rho_R (`EdgeProblem.plain_residual_matrix`),
+        so that M = A^T D A with D = diag(tau, W), block by block. The absolute values of the terms
+        that an entry of M is a sum of add up to at most that entry of |A|^T |D| |A|. Every term is
+        off by at most `relative_error` of itself. The error of W, at most e in every entry of W,
+        adds |A|^T e 1 1^T |A|, 1 the vector of ones in the d rotation rows of an edge. So
+
+            E = relative_error |A|^T |D| |A| + |A|^T e 1 1^T |A|.
         """
         A = abs(problem.plain_residual_matrix)
-        rho = blocks_of_rows((A @ u)[:, None], len(self.tau))
-        E = count * (A.T @ rows_of_blocks(self.apply_absolute_weights(rho)))[:, 0]
-        of_W = np.zeros_like(rho)
-        of_W[:, 1:] = (self.rotation.norm_of_error() * rho[:, 1:, 0].sum(axis=1))[:, None, None]
-        E += (A.T @ rows_of_blocks(of_W))[:, 0]
-        return np.asarray(E)
+        A_u = blocks_of_rows((A @ u)[:, None], len(self.tau))
+        weighted = self.apply_absolute_weights(A_u)
+        E_u = relative_error * (A.T @ rows_of_blocks(weighted))[:, 0]
+        of_W = np.zeros_like(A_u)
+        row_sums = A_u[:, 1:, 0].sum(axis=1)
+        of_W[:, 1:] = (self.rotation.norm_of_error() * row_sums)[:, None, None]
+        E_u += (A.T @ rows_of_blocks(of_W))[:, 0]
+        return np.asarray(E_u)
 
     def value_errors(
         self, problem: EdgeProblem, poses: Poses, e_t: Array, e_R: float
     ) -> list[float]:
-        """Bounds on errors of the value at poses with residuals off by e_t, (m,), and e_R in norm.
+        """Bounds on the errors of the value that `objective_rounding` does not count itself.
 
-        Those that are in no other bound of `objective_rounding`: here, what W and its axes are off.
+        There is one for each source of errors. A quadratic cost has one: the errors of W and of its
+        stored eigenvectors. The norms of the residuals at the poses are off by at most e_t, (m,),
+        and e_R; subclasses need these.
         """
+        m = len(self.tau)
         _, residuals = problem.evaluated(poses)
-        return [self.rotation.error_of_rows(residuals[len(self.tau) :])]
+        return [self.rotation.error_of_rows(residuals[m:])]
 
     def is_seen(self) -> tuple[BoolArray, BoolArray]:
-        """Whether the cost sees the translation residual, and the rotation residual, of every edge.
+        """Whether the cost depends on rho_t, and whether it depends on rho_R, of every edge.
 
         Both have shape (m,).
         """
@@ -286,8 +396,10 @@ class EdgeCost:
         return OUTWARD * self.quadratic_bound(r_t, r_R)
 
     def quadratic_bound(self, r_t: Array, r_R: Array | float) -> float:
-        """sum_e tau r_t^2 + ||W|| r_R^2."""
-        return float(np.sum(self.tau * r_t**2 + self.rotation.norm_bound * r_R**2))
+        """sum_e tau r_t^2 + ||W|| r_R^2, not rounded up."""
+        of_translations = self.tau * r_t**2
+        of_rotations = self.rotation.norm_bound * r_R**2
+        return float(np.sum(of_translations + of_rotations))
 
 
 def isotropic_cost(tau: Array, kappa: Array) -> EdgeCost:

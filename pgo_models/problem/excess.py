@@ -1,24 +1,25 @@
 """Excess: the convex part of chi2 that is not quadratic in the poses, and its tangents.
 
-In the frame of pose i, r = R_i^T (t_j - t_i) - t_ij and E = R_i^T R_j R_ij^T, a turn by theta about
-a. With s = a sin theta and H = (1 - cos theta) a a^T, chi2 of an edge is
+In the frame of pose i, r = R_i^T (t_j - t_i) - t_ij and E = R_i^T R_j R_ij^T, a rotation by theta
+about a. With s = a sin theta and H = (1 - cos theta) a a^T, chi2 of an edge is
 
     r^T I_tt r + 2 r^T I_tr s + tr(W (2 I - E - E^T))
       = tau ||r||^2 + tr(W' (2 I - E - E^T)) + u^T J u + tr(H K H),
     u = (r, s),   J = [I_tt - tau I, I_tr; ., K]
 
 for W' that of I_rr - K, since 2 (1 - cos theta) a^T K a = s^T K s + (1 - cos theta)^2 a^T K a. The
-last two terms are the excess. r, s and H are linear in Z = rho R_i, as Z = (r^T; R_ij^T (E^T - I)):
-the excess is a convex quadratic function of Z where J and K are positive semidefinite, and so it is
-above its tangents, which are quadratic in the poses and have the pattern of M. That is what a
-relaxation with matrix weights gains only by many redundant constraints (Holmes, Duembgen & Barfoot
-2024).
+last two terms are the excess. r, s and H are linear in Z = rho R_i, as Z = (r^T; R_ij^T (E^T - I)).
+Where J and K are positive semidefinite, the excess is a convex quadratic function of Z, so that its
+tangents are lower bounds on it. They are quadratic in the poses and have the pattern of M. A
+relaxation with matrix weights needs many redundant constraints to obtain the same (Holmes, Duembgen
+& Barfoot 2024).
 
 For a tau below the smallest eigenvalue of I_tt, a K above I_tr^T (I_tt - tau I)^-1 I_tr makes J
-positive definite, whatever I is. W' is convex only where I_rr - K >= 0, so that tau has to stay
-below what the coupling leaves of I_tt: nothing, where I is only semidefinite. There tau is 2^-20 of
-the smallest eigenvalue, and W' negative by about such a share; the proof asks of J alone that it is
-definite, and goes through where other edges outweigh W'.
+positive definite, whatever I is. The term of W' is convex only where I_rr - K >= 0, which bounds
+tau by a share of I_tt that depends on the coupling I_tr. Where I is only semidefinite, no positive
+tau satisfies that: there tau is 2^-20 of the smallest eigenvalue of I_tt, and W' has a negative
+eigenvalue of about the same share of I_rr. The certificate needs a definite J only, and it can
+still succeed where other edges outweigh W'.
 """
 
 import math
@@ -39,10 +40,12 @@ class Excess:
 
     R_ij: Array  # (m, d, d)
     J: Array  # (m, q, q), q = d, or d + 1 or d + 3 with coupling blocks
-    # (m, 2), of translations and rotations, each in its units: absolute values that a block (a, b)
-    # of J or K is computed from have norms of at most size_a size_b.
+    # (m, 2), for translations and rotations, each in its unit: the absolute values that a block
+    # (a, b) of J or K is computed from have norms of at most size_a size_b.
     size: Array
-    least: Array  # (m, 2): J is at least the diagonal matrix of these, K at least the second
+    # (m, 2): lower bounds on the eigenvalues of the translation and the rotation blocks. J is at
+    # least the diagonal matrix of both, K at least the second.
+    least: Array
 
     def of_edges(self, chosen: IntArray | BoolArray) -> Self:
         """The excess of the chosen edges."""
@@ -54,12 +57,25 @@ class Excess:
             least=self.least[chosen],
         )
 
+    def with_silent_edges(self, R_ij: Array) -> Self:
+        """The excess with further edges, on which it is zero; R_ij, (k, d, d), is theirs."""
+        k = len(R_ij)
+        no_J = np.zeros((k, *self.J.shape[1:]))
+        return replace(
+            self,
+            R_ij=np.concatenate([self.R_ij, R_ij]),
+            J=np.concatenate([self.J, no_J]),
+            size=np.concatenate([self.size, np.zeros((k, 2))]),
+            least=np.concatenate([self.least, np.ones((k, 2))]),
+        )
+
     def scaled(self, share: Array) -> Self:
         """The excess times shares, (m,)."""
+        root = OUTWARD * np.sqrt(share)[:, None]
         return replace(
             self,
             J=share[:, None, None] * self.J,
-            size=OUTWARD * np.sqrt(share)[:, None] * self.size,
+            size=root * self.size,
             least=share[:, None] * self.least,
         )
 
@@ -69,42 +85,50 @@ class Excess:
 
     def gradient_in_u(self, Z: Array) -> Array:
         """J u, (m, q): half the gradient of u^T J u."""
-        return np.asarray(np.einsum("mab,mb->ma", self.J, self.argument(Z)))
+        u = self.argument(Z)
+        return np.asarray(np.einsum("mab,mb->ma", self.J, u))
 
     def values(self, Z: Array) -> Array:
         """The excess of every edge, (m,)."""
-        return np.asarray(np.einsum("ma,ma->m", self.argument(Z), self.gradient_in_u(Z)))
+        u = self.argument(Z)
+        J_u = self.gradient_in_u(Z)
+        return np.asarray(np.einsum("ma,ma->m", u, J_u))
 
     def half_gradient(self, Z: Array) -> Array:
         """C, (m, d + 1, d): half the gradient of the excess in Z."""
+        d = Z.shape[2]
         C = np.zeros_like(Z)
-        C[:, 0] = self.gradient_in_u(Z)[:, : Z.shape[2]]
+        C[:, 0] = self.gradient_in_u(Z)[:, :d]
         return C
 
     def tangent(self, Z: Array) -> "Tangent":
         """Tangent at Z, (m, d + 1, d)."""
-        return Tangent(self.half_gradient(Z), Z, self)
+        C = self.half_gradient(Z)
+        return Tangent(C, Z, self)
 
-    def derivative_of_argument(self, relative: Array, apart: Array) -> Array:
+    def derivative_of_argument(self, relative_R: Array, relative_t: Array) -> Array:
         """Derivative of u in (R_i^T v_i, R_i^T v_j, w_i), (m, d, 2 d + p).
 
-        Of the poses, R_i^T R_j, (m, d, d), and R_i^T (t_j - t_i), (m, d), are given.
+        The relative pose of an edge is R_i^T R_j, (m, d, d), and R_i^T (t_j - t_i), (m, d).
         """
-        m, d = apart.shape
-        eye = np.broadcast_to(np.eye(d), (m, d, d))
-        in_w_i = -np.einsum("mkab,mb->mak", _generators(m, d), apart)
-        return np.concatenate([-eye, eye, in_w_i], axis=2)
+        m, d = relative_t.shape
+        in_v_j = np.broadcast_to(np.eye(d), (m, d, d))
+        in_w_i = -np.einsum("mkab,mb->mak", _generators(m, d), relative_t)
+        return np.concatenate([-in_v_j, in_v_j, in_w_i], axis=2)
 
-    def curvature(self, relative: Array, apart: Array) -> Array:
+    def curvature(self, relative_R: Array, relative_t: Array) -> Array:
         """The Gauss-Newton matrix of the excess, 2 (du)^T J (du).
 
         Its unknowns are those of the derivative of u.
         """
-        J_u = self.derivative_of_argument(relative, apart)
-        return np.asarray(2.0 * np.swapaxes(J_u, 1, 2) @ self.J @ J_u)
+        du = self.derivative_of_argument(relative_R, relative_t)
+        return np.asarray(2.0 * np.swapaxes(du, 1, 2) @ self.J @ du)
 
     def relative_rounding(self, d: int) -> float:
-        """Share of the absolute values in them by which values and gradients are off at most."""
+        """Bound on the rounding errors of values and gradients.
+
+        It is relative to the sums of the absolute values of their terms.
+        """
         return gamma(16.0 * d)
 
 
@@ -116,77 +140,97 @@ class CoupledExcess(Excess):
 
     def of_edges(self, chosen: IntArray | BoolArray) -> Self:
         """The excess of the chosen edges."""
-        return replace(super().of_edges(chosen), K=self.K[chosen])
+        excess = super().of_edges(chosen)
+        return replace(excess, K=self.K[chosen])
+
+    def with_silent_edges(self, R_ij: Array) -> Self:
+        """The excess with further edges, on which it is zero; R_ij, (k, d, d), is theirs."""
+        excess = super().with_silent_edges(R_ij)
+        no_K = np.zeros((len(R_ij), *self.K.shape[1:]))
+        return replace(excess, K=np.concatenate([self.K, no_K]))
 
     def scaled(self, share: Array) -> Self:
         """The excess times shares, (m,)."""
-        return replace(super().scaled(share), K=share[:, None, None] * self.K)
+        excess = super().scaled(share)
+        return replace(excess, K=share[:, None, None] * self.K)
 
-    def _turn_defect(self, Z: Array) -> Array:
+    def _rotation_defect(self, Z: Array) -> Array:
         """D = E - I, (m, d, d)."""
-        return np.swapaxes(self.R_ij @ Z[:, 1:], 1, 2)
+        transposed = self.R_ij @ Z[:, 1:]
+        return np.swapaxes(transposed, 1, 2)
 
     def argument(self, Z: Array) -> Array:
-        """U = (r, s), (m, d + p)."""
-        return np.concatenate([Z[:, 0], vee(self._turn_defect(Z))], axis=1)
+        """The vectors (r, s), (m, d + p)."""
+        s = vee(self._rotation_defect(Z))
+        return np.concatenate([Z[:, 0], s], axis=1)
 
     def values(self, Z: Array) -> Array:
         """The excess of every edge, (m,)."""
-        H = _bend(self._turn_defect(Z))
-        return np.asarray(super().values(Z) + np.einsum("mab,mab->m", H, self.K @ H))
+        H = _defect_to_H(self._rotation_defect(Z))
+        K_H = self.K @ H
+        return np.asarray(super().values(Z) + np.einsum("mab,mab->m", H, K_H))
 
     def half_gradient(self, Z: Array) -> Array:
-        """C, (m, d + 1, d): J u and K H, taken back to the rows of Z by the adjoint maps."""
+        """C, (m, d + 1, d): the adjoints of Z -> u and Z -> H, applied to J u and K H."""
         d = Z.shape[2]
         C = super().half_gradient(Z)
-        N = self.K @ _bend(self._turn_defect(Z))
-        in_D = hat(self.gradient_in_u(Z)[:, d:]) + _bend_adjoint(N + np.swapaxes(N, 1, 2), d)
+        # The gradient in D = (R_ij Z_R)^T.
+        K_H = self.K @ _defect_to_H(self._rotation_defect(Z))
+        J_u_s = self.gradient_in_u(Z)[:, d:]
+        from_s = hat(J_u_s)
+        from_H = _adjoint_of_defect_to_H(K_H + np.swapaxes(K_H, 1, 2), d)
+        in_D = from_s + from_H
         C[:, 1:] = 0.5 * np.swapaxes(in_D @ self.R_ij, 1, 2)
         return C
 
-    def _derivative_of_defect(self, relative: Array) -> Array:
+    def _derivative_of_defect(self, relative_R: Array) -> Array:
         """Derivatives of D in (w_i, w_j), (m, 2 p, d, d)."""
-        m, d, _ = relative.shape
+        m, d, _ = relative_R.shape
         generators = _generators(m, d)
-        turned_back = np.swapaxes(self.R_ij, 1, 2)
-        E = (relative @ turned_back)[:, None]
-        in_w_i = -generators @ E
-        in_w_j = relative[:, None] @ generators @ turned_back[:, None]
+        R_ij_transposed = np.swapaxes(self.R_ij, 1, 2)
+        E = relative_R @ R_ij_transposed
+        in_w_i = -generators @ E[:, None]
+        in_w_j = relative_R[:, None] @ generators @ R_ij_transposed[:, None]
         return np.concatenate([in_w_i, in_w_j], axis=1)
 
-    def derivative_of_argument(self, relative: Array, apart: Array) -> Array:
+    def derivative_of_argument(self, relative_R: Array, relative_t: Array) -> Array:
         """Derivative of u in (R_i^T v_i, R_i^T v_j, w_i, w_j), (m, d + p, 2 d + 2 p)."""
-        m, d = apart.shape
+        m, d = relative_t.shape
         p = tangent_dimension(d)
-        of_r = super().derivative_of_argument(relative, apart)
-        of_r = np.concatenate([of_r, np.zeros((m, d, p))], axis=2)
-        D = self._derivative_of_defect(relative)
-        s = vee(D.reshape(-1, d, d)).reshape(m, 2 * p, p)
-        of_s = np.concatenate([np.zeros((m, p, 2 * d)), np.swapaxes(s, 1, 2)], axis=2)
-        return np.concatenate([of_r, of_s], axis=1)
+        dr = super().derivative_of_argument(relative_R, relative_t)
+        dr_in_w_j = np.zeros((m, d, p))
+        dr = np.concatenate([dr, dr_in_w_j], axis=2)
+        dD = self._derivative_of_defect(relative_R).reshape(-1, d, d)
+        ds_in_w = vee(dD).reshape(m, 2 * p, p)
+        ds_in_v = np.zeros((m, p, 2 * d))
+        ds = np.concatenate([ds_in_v, np.swapaxes(ds_in_w, 1, 2)], axis=2)
+        return np.concatenate([dr, ds], axis=1)
 
-    def curvature(self, relative: Array, apart: Array) -> Array:
+    def curvature(self, relative_R: Array, relative_t: Array) -> Array:
         """The Gauss-Newton matrix, with that of tr(H K H) in (w_i, w_j)."""
-        m, d = apart.shape
+        m, d = relative_t.shape
         p = tangent_dimension(d)
-        D = self._derivative_of_defect(relative).reshape(-1, d, d)
-        J_H = np.moveaxis(_bend(D).reshape(m, 2 * p, p, p), 1, 3)
-        K_H = np.einsum("mab,mbck->mack", self.K, J_H)
-        curvature = super().curvature(relative, apart)
-        curvature[:, 2 * d :, 2 * d :] += 2.0 * np.einsum("mabk,mabl->mkl", J_H, K_H)
+        dD = self._derivative_of_defect(relative_R).reshape(-1, d, d)
+        dH = _defect_to_H(dD).reshape(m, 2 * p, p, p)
+        dH = np.moveaxis(dH, 1, 3)
+        K_dH = np.einsum("mab,mbck->mack", self.K, dH)
+        curvature = super().curvature(relative_R, relative_t)
+        of_w = curvature[:, 2 * d :, 2 * d :]
+        of_w += 2.0 * np.einsum("mabk,mabl->mkl", dH, K_dH)
         return curvature
 
     def relative_rounding(self, d: int) -> float:
-        """At most 8 d times that without s and H, each of which is a sum of entries of R_ij Z_R."""
+        """8 d times that of r alone, as every entry of s and H is a sum of entries of R_ij Z_R."""
         return super().relative_rounding(d) * (8.0 * d)
 
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
-    """A quadratic minorant of the excess, equal to it at Z*: sum_e value + 2 <C, Z - Z*> - loss.
+    """A quadratic minorant of the excess: sum_e value + 2 <C, Z - Z*> - loss.
 
-    It holds for whatever numbers C has: `loss` is what those that are stored can be off by, so that
-    the minorant is below the convex function that the exact ones touch.
+    C is half the gradient of the excess at Z*, where the minorant is equal to the excess but for
+    `loss`. The loss makes up for the rounding error of the stored C: without it the tangent could
+    be above the excess.
     """
 
     C: Array  # (m, d + 1, d)
@@ -195,11 +239,22 @@ class Tangent:
 
     def of_edges(self, chosen: IntArray | BoolArray) -> "Tangent":
         """The tangent of the chosen edges."""
-        return Tangent(self.C[chosen], self.Z[chosen], self.excess.of_edges(chosen))
+        excess = self.excess.of_edges(chosen)
+        return Tangent(self.C[chosen], self.Z[chosen], excess)
+
+    def with_silent_edges(self, R_ij: Array) -> "Tangent":
+        """The tangent with further edges, which have no excess; R_ij, (k, d, d), is theirs."""
+        silent = np.zeros((len(R_ij), *self.C.shape[1:]))
+        return Tangent(
+            np.concatenate([self.C, silent]),
+            np.concatenate([self.Z, silent]),
+            self.excess.with_silent_edges(R_ij),
+        )
 
     def scaled(self, share: Array) -> "Tangent":
         """The tangent times shares, (m,)."""
-        return Tangent(share[:, None, None] * self.C, self.Z, self.excess.scaled(share))
+        C = share[:, None, None] * self.C
+        return Tangent(C, self.Z, self.excess.scaled(share))
 
     @cached_property
     def value(self) -> Array:
@@ -214,58 +269,71 @@ class Tangent:
 
     @cached_property
     def loss(self) -> Array:
-        """What the minorant gives up for the rounding of C, (m,).
+        """Bound on what the error of C can add to the tangent, (m,): it is subtracted.
 
         Let the stored C be off by e from half the gradient at Z*. With D = Z - Z*, the excess is
-        value + 2 <C - e, D> + q(D), q its quadratic form, and so at least value + 2 <C, D> less the
-        largest 2 <e, D> - q(D). As q(D) is at least least_t ||D_t||^2 + least_R ||D_R||^2 / 4, in
-        the plane for D_R in the span of R_ij^T and its quarter turn, where it is but for rounding,
-        that is at most ||e_t||^2 / least_t + 4 ||e_R||^2 / least_R.
+        value + 2 <C - e, D> + q(D), q its quadratic form, and so at least value + 2 <C, D> minus
+        the maximum over D of 2 <e, D> - q(D). As q(D) is at least least_t ||D_t||^2 + least_R
+        ||D_R||^2 / 4, the maximum is at most ||e_t||^2 / least_t + 4 ||e_R||^2 / least_R. In the
+        plane the bound on q holds for D_R in the span of R_ij^T and its rotation by 90 degrees,
+        where D_R is but for rounding.
         """
         share, length = self._rounding
-        sizes = np.sum(self.excess.size**2 / self.excess.least, axis=1)
+        ratios = self.excess.size**2 / self.excess.least
+        sizes = np.sum(ratios, axis=1)
         return np.asarray(OUTWARD * 32.0 * (share * length) ** 2 * sizes)
 
     @cached_property
     def _rounding(self) -> tuple[float, Array]:
-        """Share of rounding, and l = sum_a size_a ||Z_a||, (m,).
+        """Relative rounding error, and l = sum_a size_a ||Z_a||, (m,).
 
-        Absolute values sum to at most l^2 in the value, and to size_a l in C_a.
+        The absolute values of the terms sum to at most l^2 in the value, and to size_a l in C_a.
         """
+        d = self.Z.shape[2]
         size = self.excess.size
-        length = size[:, 0] * np.linalg.norm(self.Z[:, 0], axis=1)
-        length += size[:, 1] * np.linalg.norm(self.Z[:, 1:], axis=(1, 2))
-        return self.excess.relative_rounding(self.Z.shape[2]), length
+        norm_t = np.linalg.norm(self.Z[:, 0], axis=1)
+        norm_R = np.linalg.norm(self.Z[:, 1:], axis=(1, 2))
+        length = size[:, 0] * norm_t
+        length += size[:, 1] * norm_R
+        return self.excess.relative_rounding(d), length
 
     def values(self, Z: Array) -> Array:
         """The minorant of every edge, (m,)."""
-        return np.asarray(self.value - self.loss + 2.0 * np.sum(self.C * (Z - self.Z), axis=(1, 2)))
+        slopes = np.sum(self.C * (Z - self.Z), axis=(1, 2))
+        return np.asarray(self.value - self.loss + 2.0 * slopes)
 
     @property
     def constant(self) -> tuple[float, float]:
         """The sum of value - loss - 2 <C, Z*>, and a bound on its rounding error."""
-        terms = 2.0 * self.C * self.Z
-        sizes = np.abs(self.value) + self.loss + np.sum(np.abs(terms), axis=(1, 2))
-        error = float(np.sum(self.value_error + gamma(terms[0].size + 8.0) * sizes))
-        return math.fsum(self.value - self.loss - np.sum(terms, axis=(1, 2))), OUTWARD * error
+        products = 2.0 * self.C * self.Z
+        of_edges = self.value - self.loss - np.sum(products, axis=(1, 2))
+        total = math.fsum(of_edges)
+        # Rounding: of the sum over the entries of an edge, and of a few operations beside it.
+        sizes = np.abs(self.value) + self.loss + np.sum(np.abs(products), axis=(1, 2))
+        num_products = products[0].size
+        errors = self.value_error + gamma(num_products + 8.0) * sizes
+        return total, OUTWARD * float(np.sum(errors))
 
 
 def _generators(m: int, d: int) -> Array:
-    """Hat of the unit vectors, (m, p, d, d), for every edge."""
+    """Skew matrices hat(e_k) of the unit vectors, (m, p, d, d), repeated for every edge."""
     p = tangent_dimension(d)
-    return np.broadcast_to(hat(np.eye(p)), (m, p, d, d))
+    generators = hat(np.eye(p))
+    return np.broadcast_to(generators, (m, p, d, d))
 
 
-def _bend(D: Array) -> Array:
+def _defect_to_H(D: Array) -> Array:
     """H of D = E - I, (m, p, p): sym(D) - tr(D) / 2 I in space, -tr(D) / 2 in the plane."""
     half_trace = 0.5 * np.einsum("maa->m", D)[:, None, None]
     if D.shape[1] == 2:
         return np.asarray(-half_trace)
-    return np.asarray(0.5 * (D + np.swapaxes(D, 1, 2)) - half_trace * np.eye(3))
+    symmetric_part = 0.5 * (D + np.swapaxes(D, 1, 2))
+    return np.asarray(symmetric_part - half_trace * np.eye(3))
 
 
-def _bend_adjoint(N: Array, d: int) -> Array:
-    """B, (m, d, d), with <B, D> = <N, _bend(D)> for symmetric N, (m, p, p)."""
+def _adjoint_of_defect_to_H(N: Array, d: int) -> Array:
+    """B, (m, d, d), with <B, D> = <N, _defect_to_H(D)> for symmetric N, (m, p, p)."""
     if d == 2:
         return np.asarray(-0.5 * N * np.eye(2))
-    return np.asarray(N - 0.5 * np.einsum("maa->m", N)[:, None, None] * np.eye(3))
+    half_trace = 0.5 * np.einsum("maa->m", N)[:, None, None]
+    return np.asarray(N - half_trace * np.eye(3))

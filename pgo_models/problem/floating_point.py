@@ -53,9 +53,9 @@ def exact_sum(terms: Iterable[float]) -> float:
 
 
 def column_error(in_column: Array, most_in_row: float) -> Array:
-    """Share p gamma of the squares in columns with so many non-zeros, (N,).
+    """Share p gamma, (N,), of the squares in a column with so many non-zeros, which bounds E.
 
-    It is the bound on E there (the file's opening).
+    See the docstring of the module.
     """
     # Beside the sum: a root or division, one by a rounded reciprocal, scaling, and underflow, which
     # is less than these.
@@ -64,9 +64,9 @@ def column_error(in_column: Array, most_in_row: float) -> Array:
 
 
 def error_of_counts(in_column: Array, most_in_row: Array | float) -> Array:
-    """Bound epsilon of the file's opening from the non-zeros of R.
+    """Bound epsilon_j of the module's docstring from the numbers of non-zeros of R.
 
-    These are c_j, (N,), and p_j, or one p for all.
+    They are c_j, (N,), and p_j, (N,) or one p for all.
     """
     # Beside the sum: a root or division, one by a rounded reciprocal, and underflow, which is less
     # than a rounding.
@@ -98,17 +98,12 @@ def check_pivots(pivots: Array) -> None:
 
 @dataclass(frozen=True, eq=False)
 class FactorCounts:
-    """Non-zeros in the columns and rows of R, in the order of elimination.
+    """Numbers of non-zeros in the columns and rows of R, in the order of elimination."""
 
-    With them it has which row of A comes when.
-
-    `widest` are the most in a row that has a non-zero in that column: p_j of the file's opening.
-    """
-
-    in_column: Array
-    in_row: Array
-    widest: Array
-    order: IntArray
+    in_column: Array  # (N,): c_j of the module's docstring
+    in_row: Array  # (N,)
+    widest: Array  # (N,): p_j, the most in a row that has a non-zero in column j
+    order: IntArray  # (N,): rows of A in the order of elimination
 
     @classmethod
     def of(cls, pointers: IntArray, rows: IntArray, order: IntArray) -> "FactorCounts":
@@ -116,18 +111,23 @@ class FactorCounts:
 
         Column k has the rows rows[pointers[k]:pointers[k + 1]].
         """
-        in_row = np.diff(pointers).astype(float)
-        widest = np.zeros(len(in_row))
-        np.maximum.at(widest, rows, np.repeat(in_row, np.diff(pointers)))
-        return cls(np.bincount(rows, minlength=len(in_row)).astype(float), in_row, widest, order)
+        lengths = np.diff(pointers)
+        side = len(lengths)
+        in_row = lengths.astype(float)
+        in_column = np.bincount(rows, minlength=side).astype(float)
+        widest = np.zeros(side)
+        np.maximum.at(widest, rows, np.repeat(in_row, lengths))
+        return cls(in_column, in_row, widest, order)
 
     def most_in_row(self, beside: Array | int) -> float:
-        """Most non-zeros in a row, with so many beside it in further columns."""
-        return float((self.in_row + beside).max(initial=0))
+        """Most non-zeros in a row, with `beside` more of them in further columns."""
+        in_row = self.in_row + beside
+        return float(in_row.max(initial=0))
 
     def error(self, beside: Array | int) -> Array:
         """Bound epsilon in the order of the rows of A."""
+        most_in_row = self.most_in_row(beside)
+        widest = np.minimum(self.widest + np.max(beside), most_in_row)
         error = np.empty(len(self.order))
-        widest = np.minimum(self.widest + np.max(beside), self.most_in_row(beside))
         error[self.order] = error_of_counts(self.in_column, widest)
         return error

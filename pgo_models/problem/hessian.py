@@ -1,6 +1,4 @@
-"""Riemannian Hessian of F as one sparse matrix, from the certificate matrix S.
-
-Its Gauss-Newton part is made in the same way.
+"""Riemannian Hessian of F, and its Gauss-Newton part, as one sparse matrix.
 
 For moves R_i Exp(hat(w_i)), t_i + v_i the second derivative is 2 tr(V^T (M - theta blockdiag(0,
 Lambda)) V) with V_{t_i} = v_i^T and V_{R_i} = -hat(w_i) R_i^T: theta = 1 is Newton; theta = 0 is
@@ -29,7 +27,7 @@ from pgo_models.problem.problem import PGOProblem
 class TangentLayout:
     """Unknowns of a step: first v, d numbers a pose, then w, `turns` numbers a pose.
 
-    These are 1 or 3 unless given.
+    `turns` is the dimension of SO(d), 1 or 3, unless given.
     """
 
     num_poses: int
@@ -50,10 +48,11 @@ class TangentLayout:
 
     def split(self, step: Array) -> tuple[Array, Array]:
         """Move (w, v) of a vector."""
-        count = self.num_poses * self.d
-        return step[count:].reshape(self.num_poses, self.turns), step[:count].reshape(
-            self.num_poses, self.d
-        )
+        n = self.num_poses
+        size_of_v = n * self.d
+        v = step[:size_of_v].reshape(n, self.d)
+        w = step[size_of_v:].reshape(n, self.turns)
+        return w, v
 
     def translations(self, pose: IntArray) -> IntArray:
         """Columns (m, d) of v."""
@@ -61,70 +60,86 @@ class TangentLayout:
 
     def rotations(self, pose: IntArray) -> IntArray:
         """Columns (m, turns) of w."""
-        return rotation_columns(pose, self.num_poses * self.d, self.turns)
+        size_of_v = self.num_poses * self.d
+        return rotation_columns(pose, size_of_v, self.turns)
 
 
 def tangent_order(problem: PGOProblem) -> IntArray:
     """Order of elimination of the Hessian's rows."""
-    return row_order(problem.pose_order, problem.d, tangent_dimension(problem.d))
+    p = tangent_dimension(problem.d)
+    return row_order(problem.pose_order, problem.d, p)
 
 
 def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) -> csc_array:
     """Hessian of F(R Exp(hat(w)), t + v) in (v, w), (side, side).
 
-    `Lambda`, (n, d, d), is theta Lambda; without it the result is Gauss-Newton's.
+    `Lambda`, (n, d, d), is theta Lambda; without it the result is the Gauss-Newton matrix.
 
-    Its pattern depends on the graph alone. A rigid motion of all poses is in its null space at
+    The pattern depends on the graph alone. A rigid motion of all poses is in the null space at
     stationary points: ground a pose before factoring (`ground_pose`).
     """
     graph = problem.graph
+    incidence = problem.incidence
     d = problem.d
-    layout = TangentLayout(problem.num_poses, d)
-    i = graph.i
-    j = graph.j
-    R = poses.R
-    v_i, v_j, w_i, w_j = (
-        columns(short(end)) for columns in (layout.translations, layout.rotations) for end in (i, j)
-    )
+    R_i = poses.R[graph.i]
+    R_j = poses.R[graph.j]
+    # Blocks of M. For the Hessian of chi2 they are those of its tangent; the Gauss-Newton matrix of
+    # the excess is added below in either case.
     weights = problem.weights if Lambda is None else problem.tangent_at(poses).weights
+    coupling_t, diagonal_i, coupling_R, diagonal_j = weights.matrix_blocks(graph.R_ij, graph.t_ij)
+    S_ii = incidence.at_both(diagonal_i, diagonal_j)
+    if Lambda is not None:
+        S_ii = S_ii - Lambda
+    # The same blocks in the unknowns v and w.
     tau = np.repeat(2.0 * weights.tau[:, None], d, axis=1)
-    at_both = problem.incidence.at_both
-    arm, own_i, between, own_j = weights.matrix_blocks(graph.R_ij, graph.t_ij)
-    lever = 2.0 * R[i] @ _lever(arm)
-    relative = np.swapaxes(R[i], 1, 2) @ R[j]
-    coupling = -2.0 * double_cross(relative, between)
-    S_ii = at_both(own_i, own_j)
-    levers = problem.incidence.at_beginning(lever).reshape(-1, *lever.shape[1:])
-    own = _of_turns(S_ii if Lambda is None else S_ii - Lambda)
-    every = short(np.arange(problem.num_poses))
-    v = layout.translations(every)
-    w = layout.rotations(every)
+    tau_sums = incidence.at_both(tau[:, None], tau[:, None])[:, 0]
+    coupling_vw = 2.0 * R_i @ _translation_generator(coupling_t)
+    coupling_vw_sums = incidence.at_beginning(coupling_vw).reshape(-1, *coupling_vw.shape[1:])
+    relative_R = np.swapaxes(R_i, 1, 2) @ R_j
+    coupling_ww = -2.0 * double_cross(relative_R, coupling_R)
+    diagonal_ww = _curvature_of_rotations(S_ii)
+    # Rows and columns: of the poses, then of the two ends of every edge.
+    layout = TangentLayout(problem.num_poses, d)
+    every_pose = short(np.arange(problem.num_poses))
+    i = short(graph.i)
+    j = short(graph.j)
+    v = layout.translations(every_pose)
+    w = layout.rotations(every_pose)
+    v_i = layout.translations(i)
+    v_j = layout.translations(j)
+    w_i = layout.rotations(i)
+    w_j = layout.rotations(j)
     blocks = [
-        (v, v, at_both(tau[:, None], tau[:, None])[:, 0]),
+        (v, v, tau_sums),
         (v_i, v_j, -tau),
         (v_j, v_i, -tau),
-        (*block_entries(v, w), -levers),
-        (*block_entries(w, v), -np.swapaxes(levers, 1, 2)),
-        (*block_entries(v_j, w_i), lever),
-        (*block_entries(w_i, v_j), np.swapaxes(lever, 1, 2)),
-        (*block_entries(w_i, w_j), coupling),
-        (*block_entries(w_j, w_i), np.swapaxes(coupling, 1, 2)),
-        (*block_entries(w, w), own),
+        (*block_entries(v, w), -coupling_vw_sums),
+        (*block_entries(w, v), -np.swapaxes(coupling_vw_sums, 1, 2)),
+        (*block_entries(v_j, w_i), coupling_vw),
+        (*block_entries(w_i, v_j), np.swapaxes(coupling_vw, 1, 2)),
+        (*block_entries(w_i, w_j), coupling_ww),
+        (*block_entries(w_j, w_i), np.swapaxes(coupling_ww, 1, 2)),
+        (*block_entries(w, w), diagonal_ww),
     ]
     for curvature in problem.weights.added_curvatures(graph, poses):
-        columns = np.concatenate([v_i, v_j, w_i, w_j], axis=1)[:, : curvature.shape[1]]
-        blocks.append((*block_entries(columns, columns), _in_world_axes(curvature, R[i])))
+        num_unknowns = curvature.shape[1]
+        unknowns = np.concatenate([v_i, v_j, w_i, w_j], axis=1)
+        columns = unknowns[:, :num_unknowns]
+        blocks.append((*block_entries(columns, columns), _in_world_axes(curvature, R_i)))
     return assemble(blocks, layout.side)
 
 
 def ground_pose(matrix: csc_array, problem: PGOProblem) -> None:
     """Double the diagonal of pose 0, so that the matrix is not singular.
 
-    Rigid motions leave F as it is, so that at a stationary point the step keeps pose 0.
+    Rigid motions do not change F, so that a Newton step with the grounded matrix does not move pose
+    0 near a stationary point.
     """
     layout = TangentLayout(problem.num_poses, problem.d)
-    zero = np.zeros(1, dtype=np.int64)
-    for column in np.concatenate([layout.translations(zero)[0], layout.rotations(zero)[0]]):
+    pose_0 = np.zeros(1, dtype=np.int64)
+    columns_v = layout.translations(pose_0)[0]
+    columns_w = layout.rotations(pose_0)[0]
+    for column in np.concatenate([columns_v, columns_w]):
         begin = matrix.indptr[column]
         end = matrix.indptr[column + 1]
         position = begin + np.searchsorted(matrix.indices[begin:end], column)
@@ -132,14 +147,17 @@ def ground_pose(matrix: csc_array, problem: PGOProblem) -> None:
 
 
 def _in_world_axes(curvature: Array, R_i: Array) -> Array:
-    """Curvature, (m, k, k), in (v_i, v_j, ..), of that in (R_i^T v_i, R_i^T v_j, ..)."""
+    """Matrix, (m, k, k), in (v_i, v_j, ..) from that in (R_i^T v_i, R_i^T v_j, ..)."""
     d = R_i.shape[1]
-    turned = curvature.copy()
-    for block in (slice(0, d), slice(d, 2 * d)):
-        turned[:, block] = R_i @ turned[:, block]
-    for block in (slice(0, d), slice(d, 2 * d)):
-        turned[:, :, block] = turned[:, :, block] @ np.swapaxes(R_i, 1, 2)
-    return turned
+    R_i_transposed = np.swapaxes(R_i, 1, 2)
+    of_v_i = slice(0, d)
+    of_v_j = slice(d, 2 * d)
+    rotated = curvature.copy()
+    for block in (of_v_i, of_v_j):
+        rotated[:, block] = R_i @ rotated[:, block]
+    for block in (of_v_i, of_v_j):
+        rotated[:, :, block] = rotated[:, :, block] @ R_i_transposed
+    return rotated
 
 
 def double_cross(A: Array, B: Array) -> Array:
@@ -162,25 +180,31 @@ def double_cross(A: Array, B: Array) -> Array:
     AB = A @ B
     trace_A = _trace(A)
     trace_B = _trace(B)
-    symmetric_part = np.swapaxes(AB + B @ A - trace_A * B - trace_B * A, 1, 2)
-    return np.asarray((trace_A * trace_B - _trace(AB)) * np.eye(3) + symmetric_part)
+    transposed_part = AB + B @ A - trace_A * B - trace_B * A
+    isotropic_part = (trace_A * trace_B - _trace(AB)) * np.eye(3)
+    return np.asarray(isotropic_part + np.swapaxes(transposed_part, 1, 2))
 
 
-def _of_turns(S_ii: Array) -> Array:
+def _curvature_of_rotations(S_ii: Array) -> Array:
     """2 (tr(S_ii) I - S_ii) in space, 2 tr(S_ii) in the plane.
 
     S_ii are the diagonal rotation blocks of S.
     """
     trace = _trace(S_ii)
-    return 2.0 * trace if S_ii.shape[1] == 2 else 2.0 * (trace * np.eye(3) - S_ii)
+    if S_ii.shape[1] == 2:
+        return 2.0 * trace
+    return 2.0 * (trace * np.eye(3) - S_ii)
 
 
-def _lever(t_ij: Array) -> Array:
-    """T with R_i hat(w) t_ij = -R_i T w: hat(t_ij) in space, -hat(1) t_ij in the plane."""
-    if t_ij.shape[1] == 2:
-        return np.stack([t_ij[:, 1], -t_ij[:, 0]], axis=1)[:, :, None]
-    return hat(t_ij)
+def _translation_generator(c: Array) -> Array:
+    """T with hat(w) c = -T w for c, (m, d): hat(c) in space, -hat(1) c in the plane."""
+    if c.shape[1] == 2:
+        minus_rotated = np.stack([c[:, 1], -c[:, 0]], axis=1)
+        return minus_rotated[:, :, None]
+    return hat(c)
 
 
 def _trace(A: Array) -> Array:
-    return np.asarray(np.einsum("naa->n", A))[:, None, None]
+    """Traces of matrices (n, a, a), (n, 1, 1)."""
+    traces = np.asarray(np.einsum("naa->n", A))
+    return traces[:, None, None]

@@ -1,7 +1,4 @@
-"""Arrays of edges against arrays of poses.
-
-Residual rows become blocks of edges, and blocks are summed over the edges of a pose.
-"""
+"""Incidence of edges and poses: sums over the edges of a pose, and blocks of residual rows."""
 
 from dataclasses import dataclass
 
@@ -14,49 +11,52 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 
 @dataclass(frozen=True, eq=False)
 class Incidence:
-    """Which edges begin and which end at a pose.
+    """Which edges begin and which end at a pose."""
 
-    These are sparse matrices of ones, (n, m), and the poses, (m,).
-    """
-
-    begins: csc_array
-    ends: csc_array
-    i: IntArray
-    j: IntArray
+    begins: csc_array  # (n, m): one where edge e begins at the pose, i_e
+    ends: csc_array  # (n, m): one where it ends at the pose, j_e
+    i: IntArray  # (m,)
+    j: IntArray  # (m,)
 
     @classmethod
     def of(cls, graph: PoseGraph) -> "Incidence":
         """Incidence of a graph."""
-        n = graph.num_poses
         m = graph.num_edges
-        i = graph.i
-        j = graph.j
-        begins, ends = (
-            csc_array((np.ones(m), pose, np.arange(m + 1)), shape=(n, m)) for pose in (i, j)
-        )
-        return cls(begins, ends, i, j)
+        shape = (graph.num_poses, m)
+        column_starts = np.arange(m + 1)
+        begins = csc_array((np.ones(m), graph.i, column_starts), shape=shape)
+        ends = csc_array((np.ones(m), graph.j, column_starts), shape=shape)
+        return cls(begins, ends, graph.i, graph.j)
 
     def at_beginning(self, blocks: Array) -> Array:
         """Sums of blocks (m, a, b) over the edges that begin at a pose, (n a, b)."""
-        return np.asarray(
-            (self.begins @ blocks.reshape(len(blocks), -1)).reshape(-1, blocks.shape[2])
-        )
+        m, _, width = blocks.shape
+        sums = self.begins @ blocks.reshape(m, -1)
+        return np.asarray(sums.reshape(-1, width))
 
     def at_both(self, of_i: Array, of_j: Array) -> Array:
-        """Sums of blocks over the edges that begin, and those that end, at a pose, (n, a, b).
+        """Sums of `of_i` over the edges that begin at a pose and `of_j` over those that end at it.
 
-        The blocks have shape (m, a, b).
+        The blocks of the edges have shape (m, a, b), the sums (n, a, b).
         """
-        beginning = self.begins @ of_i.reshape(len(of_i), -1)
-        ending = self.ends @ of_j.reshape(len(of_j), -1)
-        return np.asarray((beginning + ending).reshape(-1, *of_i.shape[1:]))
+        m = len(of_i)
+        block_shape = of_i.shape[1:]
+        beginning = self.begins @ of_i.reshape(m, -1)
+        ending = self.ends @ of_j.reshape(m, -1)
+        sums = beginning + ending
+        return np.asarray(sums.reshape(-1, *block_shape))
 
 
 def blocks_of_rows(rows: Array, m: int) -> Array:
     """Rows of A, ((d + 1) m, k), as blocks of edges, (m, d + 1, k): translation, then rotation."""
-    return np.concatenate([rows[:m, None], rows[m:].reshape(m, -1, rows.shape[1])], axis=1)
+    num_columns = rows.shape[1]
+    translation_rows = rows[:m, None]
+    rotation_rows = rows[m:].reshape(m, -1, num_columns)
+    return np.concatenate([translation_rows, rotation_rows], axis=1)
 
 
 def rows_of_blocks(blocks: Array) -> Array:
     """Rows of A, ((d + 1) m, k), of blocks of edges, (m, d + 1, k)."""
-    return np.concatenate([blocks[:, 0], blocks[:, 1:].reshape(-1, blocks.shape[2])])
+    num_columns = blocks.shape[2]
+    rotation_rows = blocks[:, 1:].reshape(-1, num_columns)
+    return np.concatenate([blocks[:, 0], rotation_rows])

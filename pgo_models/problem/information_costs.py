@@ -1,8 +1,8 @@
 """chi2 of information matrices where it is not quadratic in the poses, and its tangents, which are.
 
-Both are an `EdgeCost`, the quadratic part, and something beside it: a convex excess
-(`pgo_models.problem.excess`), or the tangent of one. Every method adds what that brings to what the
-quadratic part gives.
+Each is an `EdgeCost`, the quadratic part, plus a second part: a convex excess
+(`pgo_models.problem.excess`), or a tangent of one. Every method adds the contribution of the second
+part to that of the quadratic part. The notation is that of `pgo_models.problem.edge_cost`.
 """
 
 from collections.abc import Sequence
@@ -34,21 +34,23 @@ class ExcessCost(EdgeCost):
     rotation : RotationWeights
         Weights W of the rotation residuals.
     excess : Excess
-        What of chi2 is left: a convex function of Z.
+        The rest of chi2: a convex function of Z.
     """
 
     excess: Excess
 
     def of_edges(self, chosen: IntArray | BoolArray) -> Self:
         """The cost of the chosen edges."""
-        return replace(super().of_edges(chosen), excess=self.excess.of_edges(chosen))
+        excess = self.excess.of_edges(chosen)
+        return replace(super().of_edges(chosen), excess=excess)
 
     def scaled(self, share: Array) -> Self:
-        """The weighted cost: that of every edge times its share, (m,)."""
-        return replace(super().scaled(share), excess=self.excess.scaled(share))
+        """The cost with that of every edge multiplied by its share, (m,)."""
+        excess = self.excess.scaled(share)
+        return replace(super().scaled(share), excess=excess)
 
     def arrays(self, d: int) -> list[Array]:
-        """The numbers that the cost is made of."""
+        """The arrays that determine the cost."""
         return [*super().arrays(d), self.excess.J]
 
     @property
@@ -62,121 +64,148 @@ class ExcessCost(EdgeCost):
         return True
 
     def minorant(self, problem: EdgeProblem, poses: Poses) -> EdgeCost:
-        """The cost with the tangent of the excess at the poses in its place."""
+        """The cost with the excess replaced by its tangent at the poses."""
         X, residuals = problem.evaluated(poses)
-        tangent = self.excess.tangent(self.edge_products(problem.graph, X, residuals))
+        Z = self.edge_products(problem.graph, X, residuals)
+        tangent = self.excess.tangent(Z)
         return TangentCost(self.tau, self.rotation, tangent)
 
     def value(self, problem: EdgeProblem, X: Array, residuals: Array) -> float:
         """chi2 at X."""
         Z = self.edge_products(problem.graph, X, residuals)
-        return super().value(problem, X, residuals) + float(np.sum(self.excess.values(Z)))
+        quadratic_part = super().value(problem, X, residuals)
+        excess = float(np.sum(self.excess.values(Z)))
+        return quadratic_part + excess
 
     def edge_values(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
         """chi2 of every edge, (m,)."""
         Z = self.edge_products(problem.graph, X, residuals)
-        return super().edge_values(problem, X, residuals) + self.excess.values(Z)
+        quadratic_part = super().edge_values(problem, X, residuals)
+        return quadratic_part + self.excess.values(Z)
 
     def best_translations(self, problem: EdgeProblem, poses: Poses) -> Poses:
-        """Poses with the translations of least chi2 for their rotations, t_0 where it is.
+        """Poses with the translations of least chi2 for their rotations; t_0 does not change.
 
-        For given rotations chi2 is a quadratic function of the translations, with the matrices R_i
-        (J_tt + tau I) R_i^T on its edges and the half gradient tau rho_t + R_i (J u)_t: one step of
+        For given rotations chi2 is a quadratic function of the translations. Its half Hessian is
+        the Laplacian with the matrices R_i (J_tt + tau I) R_i^T on its edges, and edge (i, j) adds
+        tau rho_t + R_i (J u)_t to the half gradient at t_j and subtracts it at t_i. One step of
         Newton's method is exact.
         """
-        d = problem.d
-        tau = self.tau
-        X, residuals = problem.evaluated(poses)
-        R_i = poses.R[problem.graph.i]
-        J_tt = self.excess.J[:, :d, :d]
-        of_edges = R_i @ (J_tt + tau[:, None, None] * np.eye(d)) @ np.swapaxes(R_i, 1, 2)
-        u = self.excess.argument(self.edge_products(problem.graph, X, residuals))
-        of_excess = (R_i @ (self.excess.J[:, :d] @ u[:, :, None]))[:, :, 0]
-        pull = tau[:, None] * residuals[: len(tau)] + of_excess
+        graph = problem.graph
         incidence = problem.incidence
-        laplacian = matrices.block_laplacian(incidence, of_edges)
+        d = problem.d
+        m = graph.num_edges
+        X, residuals = problem.evaluated(poses)
+        R_i = poses.R[graph.i]
+        # Half Hessian.
+        J_tt = self.excess.J[:, :d, :d]
+        in_frame_i = J_tt + self.tau[:, None, None] * np.eye(d)
+        edge_matrices = R_i @ in_frame_i @ np.swapaxes(R_i, 1, 2)
+        laplacian = matrices.block_laplacian(incidence, edge_matrices)
+        # Half gradient.
+        Z = self.edge_products(graph, X, residuals)
+        u = self.excess.argument(Z)
+        J_u_t = self.excess.J[:, :d] @ u[:, :, None]
+        of_excess = (R_i @ J_u_t)[:, :, 0]
+        of_edges = self.tau[:, None] * residuals[:m] + of_excess
+        half_gradient = incidence.ends @ of_edges - incidence.begins @ of_edges
+        # Newton step.
         factor = factorize_damped(problem.translation_information_analysis, laplacian)
-        half_gradient = incidence.ends @ pull - incidence.begins @ pull
         step = factor.solve(half_gradient.ravel()).reshape(-1, d)
         return poses.with_translations(poses.t - (step - step[0]))
 
     def added_curvatures(self, graph: PoseGraph, poses: Poses) -> Sequence[Array]:
         """The Gauss-Newton matrix of the excess.
 
-        The rest of its Hessian is in that of its tangent.
+        The rest of the Hessian of the excess is that of its tangent, which is quadratic in X.
         """
         R_i = poses.R[graph.i]
-        relative = np.swapaxes(R_i, 1, 2) @ poses.R[graph.j]
-        apart = np.einsum("mba,mb->ma", R_i, poses.t[graph.j] - poses.t[graph.i])
-        return (self.excess.curvature(relative, apart),)
+        relative_R = np.swapaxes(R_i, 1, 2) @ poses.R[graph.j]
+        difference = poses.t[graph.j] - poses.t[graph.i]
+        relative_t = np.einsum("mba,mb->ma", R_i, difference)
+        return (self.excess.curvature(relative_R, relative_t),)
 
     def value_errors(
         self, problem: EdgeProblem, poses: Poses, e_t: Array, e_R: float
     ) -> list[float]:
-        """Bounds on errors of chi2 at poses with residuals off by e_t, (m,), and e_R in norm.
+        """Bounds on the errors of chi2 that `objective_rounding` does not count itself.
 
-        Where Z = rho R_i moves by e, with ||e_t|| <= e_t + slant ||Z_t|| and so on for the slant of
-        the stored R_i, a convex quadratic function of it moves by at most 2 <|C|, |e|> and its
-        quadratic form at e. The latter is in `bound_of_norms`. Its value is rounded, too.
+        The residuals at the poses are off by at most e_t, (m,), and e_R in norm. With omega the
+        orthogonality error of the stored R_i, the first row of Z = rho R_i is off by at most e_t +
+        omega ||Z_t||, and the rotation rows likewise. An error e of Z changes the excess, a convex
+        quadratic function of Z with the half gradient C, by at most 2 <|C|, |e|> and its quadratic
+        form at e. The quadratic form is counted in `bound_of_norms`. The last bound is on the
+        rounding of the excess.
         """
         d = problem.d
         X, residuals = problem.evaluated(poses)
-        tangent = self.excess.tangent(self.edge_products(problem.graph, X, residuals))
+        Z = self.edge_products(problem.graph, X, residuals)
+        tangent = self.excess.tangent(Z)
         C = tangent.C
-        rows = np.linalg.norm(tangent.Z, axis=2)
-        slant = poses.orthogonality_error + d * gamma(d + 2)
-        moved_t = e_t + slant * rows[:, 0]
-        moved_R = e_R + slant * rows[:, 1:].sum(axis=1)
-        rounded = tangent.value_error + PAIRWISE_SUM * UNIT_ROUNDOFF * np.abs(tangent.value)
+        C_norm_t = np.linalg.norm(C[:, 0], axis=1)
+        C_norm_R = np.linalg.norm(C[:, 1:], axis=(1, 2))
+        row_norms = np.linalg.norm(tangent.Z, axis=2)
+        omega = poses.orthogonality_error + d * gamma(d + 2)
+        error_t = e_t + omega * row_norms[:, 0]
+        error_R = e_R + omega * row_norms[:, 1:].sum(axis=1)
+        summation_error = PAIRWISE_SUM * UNIT_ROUNDOFF * np.abs(tangent.value)
+        rounding = tangent.value_error + summation_error
         return [
             *super().value_errors(problem, poses, e_t, e_R),
-            2.0 * float(np.sum(np.linalg.norm(C[:, 0], axis=1) * moved_t)),
-            2.0 * float(np.sum(np.linalg.norm(C[:, 1:], axis=(1, 2)) * moved_R)),
-            float(np.sum(rounded)),
+            2.0 * float(np.sum(C_norm_t * error_t)),
+            2.0 * float(np.sum(C_norm_R * error_R)),
+            float(np.sum(rounding)),
         ]
 
     def is_seen(self) -> tuple[BoolArray, BoolArray]:
-        """Whether chi2 sees the translation residual, and the rotation residual, of every edge.
+        """Whether chi2 depends on rho_t, and whether it depends on rho_R, of every edge.
 
         Both have shape (m,).
         """
         is_seen_t, is_seen_R = super().is_seen()
-        size = self.excess.size
-        return is_seen_t | (size[:, 0] != 0.0), is_seen_R | (size[:, 1] != 0.0)
+        is_in_excess = self.excess.size != 0.0
+        return is_seen_t | is_in_excess[:, 0], is_seen_R | is_in_excess[:, 1]
 
     def bound_of_norms(self, r_t: Array, r_R: Array | float) -> float:
-        """Bound on chi2 for residuals with these norms.
+        """Bound on chi2 for residuals with these norms, rounded up.
 
         The excess is at most (size_t r_t + size_R r_R)^2.
         """
         size = self.excess.size
-        of_excess = float(np.sum((size[:, 0] * r_t + size[:, 1] * r_R) ** 2))
+        root_of_excess = size[:, 0] * r_t + size[:, 1] * r_R
+        of_excess = float(np.sum(root_of_excess**2))
         return OUTWARD * (self.quadratic_bound(r_t, r_R) + of_excess)
 
 
 @dataclass(frozen=True, eq=False)
 class TangentTerms(EdgeTerms):
-    """Terms of edges with a tangent, whose cost <C, rho P_i^T> has a gradient in P_i, too.
+    """Terms of edges with a tangent, whose cost <C, rho P_i^T> depends on rho and on P_i = R_i^T.
 
-    P_i is R_i^T.
+    The half gradient in P_i, for a fixed rho, is C^T rho.
     """
 
-    own: Array  # (m, d, d): half the gradient in P_i
+    own: Array  # (m, d, d): C^T rho
     own_error: Array  # bound on its error, entry by entry
 
-    def with_pose_gradients(
-        self, problem: EdgeProblem, count: float, product: Array, product_error: Array
+    def complete_half_gradient(
+        self,
+        problem: EdgeProblem,
+        relative_error: float,
+        half_gradient: Array,
+        half_gradient_error: Array,
     ) -> tuple[Array, Array]:
-        """Half gradient in X and its error, (N, d), with C^T rho in the rows of R_i^T.
+        """Half gradient in X and its error, (N, d): C^T rho is added in the rows of R_i^T.
 
-        Adding it to what is there rounds once more.
+        `relative_error` bounds that of the sum over the edges of a pose. The addition to A^T G
+        rounds once more. Both arrays are changed.
         """
         n = problem.num_poses
         at_beginning = problem.incidence.at_beginning
-        product[n:] += at_beginning(self.own)
-        product_error[n:] += at_beginning(self.own_error + count * np.abs(self.own))
-        product_error += UNIT_ROUNDOFF * np.abs(product)
-        return product, product_error
+        half_gradient[n:] += at_beginning(self.own)
+        term_errors = self.own_error + relative_error * np.abs(self.own)
+        half_gradient_error[n:] += at_beginning(term_errors)
+        half_gradient_error += UNIT_ROUNDOFF * np.abs(half_gradient)
+        return half_gradient, half_gradient_error
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,11 +228,18 @@ class TangentCost(EdgeCost):
 
     def of_edges(self, chosen: IntArray | BoolArray) -> Self:
         """The cost of the chosen edges."""
-        return replace(super().of_edges(chosen), tangent=self.tangent.of_edges(chosen))
+        tangent = self.tangent.of_edges(chosen)
+        return replace(super().of_edges(chosen), tangent=tangent)
+
+    def with_rotation_terms(self, R_ij: Array, W: Array) -> Self:
+        """The cost with further edges, whose rotation residuals alone cost something."""
+        tangent = self.tangent.with_silent_edges(R_ij)
+        return replace(super().with_rotation_terms(R_ij, W), tangent=tangent)
 
     def scaled(self, share: Array) -> Self:
-        """The weighted cost: that of every edge times its share, (m,)."""
-        return replace(super().scaled(share), tangent=self.tangent.scaled(share))
+        """The cost with that of every edge multiplied by its share, (m,)."""
+        tangent = self.tangent.scaled(share)
+        return replace(super().scaled(share), tangent=tangent)
 
     @property
     def is_chi2(self) -> bool:
@@ -218,87 +254,119 @@ class TangentCost(EdgeCost):
     def value(self, problem: EdgeProblem, X: Array, residuals: Array) -> float:
         """The minorant at X."""
         Z = self.edge_products(problem.graph, X, residuals)
-        return super().value(problem, X, residuals) + float(np.sum(self.tangent.values(Z)))
+        quadratic_part = super().value(problem, X, residuals)
+        tangent = float(np.sum(self.tangent.values(Z)))
+        return quadratic_part + tangent
 
     def edge_values(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
         """The minorant of every edge, (m,)."""
         Z = self.edge_products(problem.graph, X, residuals)
-        return super().edge_values(problem, X, residuals) + self.tangent.values(Z)
+        quadratic_part = super().edge_values(problem, X, residuals)
+        return quadratic_part + self.tangent.values(Z)
 
     def half_gradient(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
-        """M X, (N, d): A^T (w A X + C P_i), and C^T rho in the rows of P_i = R_i^T."""
+        """M X, (N, d): A^T (diag(w) A X + C P_i), and C^T rho in the rows of P_i = R_i^T."""
         n = problem.num_poses
         d = problem.d
         C = self.tangent.C
-        P_i = X[n:].reshape(n, d, d)[problem.graph.i]
+        P = X[n:].reshape(n, d, d)
+        P_i = P[problem.graph.i]
         _, w = problem.residual_matrix
-        pull = w[:, None] * residuals + self.residual_rows(C @ P_i)
-        product = problem.residual_adjoint @ pull
-        own = np.swapaxes(C, 1, 2) @ self.residual_blocks(residuals)
-        product[n:] += problem.incidence.at_beginning(own)
-        return np.asarray(product)
+        in_residuals = w[:, None] * residuals + self.residual_rows(C @ P_i)
+        half_gradient = problem.residual_adjoint @ in_residuals
+        rho = self.residual_blocks(residuals)
+        in_P_i = np.swapaxes(C, 1, 2) @ rho
+        half_gradient[n:] += problem.incidence.at_beginning(in_P_i)
+        return np.asarray(half_gradient)
 
     def matrix_blocks(self, R_ij: Array, t_ij: Array) -> tuple[Array, Array, Array, Array]:
-        """Blocks of M with those of 2 <C, rho R_i>, which is bilinear in the poses of the edge."""
-        arm, own_i, between, own_j = super().matrix_blocks(R_ij, t_ij)
-        C = self.tangent.C
-        half = self.seen_offsets(t_ij)[:, :, None] * C[:, :1] + R_ij @ C[:, 1:]
-        own_i -= half + np.swapaxes(half, 1, 2)
-        return arm - C[:, 0], own_i, between - np.swapaxes(C[:, 1:], 1, 2), own_j
+        """Blocks of M with those of 2 <C, rho R_i>, which is bilinear in the poses of the edge.
+
+        C_t is the first row of C, and C_R are the others. C_t is subtracted from the coupling of
+        translations with R_i, C_R^T from that of R_i with R_j, and the symmetric part of 2 (t_ij
+        C_t + R_ij C_R) from the diagonal block of R_i.
+        """
+        translation_coupling, diagonal_i, rotation_coupling, diagonal_j = super().matrix_blocks(
+            R_ij, t_ij
+        )
+        C_t = self.tangent.C[:, :1]
+        C_R = self.tangent.C[:, 1:]
+        offset = self.seen_offsets(t_ij)[:, :, None]
+        half = offset * C_t + R_ij @ C_R
+        diagonal_i -= half + np.swapaxes(half, 1, 2)
+        translation_coupling = translation_coupling - C_t[:, 0]
+        rotation_coupling = rotation_coupling - np.swapaxes(C_R, 1, 2)
+        return translation_coupling, diagonal_i, rotation_coupling, diagonal_j
 
     @property
-    def sums_within_diagonal(self) -> bool:
-        """False: the tangent's entries are of either sign."""
+    def diagonal_bounds_terms(self) -> bool:
+        """False: the entries of C are of either sign and may cancel on the diagonal of M."""
         return False
 
     def weight_sizes(self, longest: Array) -> Array:
         """Absolute values that must be far from underflow and overflow, those of C among them."""
-        of_C = np.abs(self.tangent.C).max(axis=(1, 2)) * longest
+        largest_of_C = np.abs(self.tangent.C).max(axis=(1, 2))
+        of_C = largest_of_C * longest
         return np.concatenate([super().weight_sizes(longest), of_C])
 
     def evaluate_edges(self, rho: Array, errors: Array, P_i: Array) -> TangentTerms:
         """Costs and half gradients, with value + 2 <C, rho P_i^T - Z*> - loss, C P_i and C^T rho.
 
-        `apart`, Z - Z*, is off by the errors of rho times |P_i^T|, by the rounding of the product,
-        sums of d, and by that of the difference and of the sum <C, apart> of (d + 1) d products.
+        The error of the difference Z - Z* = rho P_i^T - Z* has these parts: the errors of rho times
+        |P_i^T|; the rounding of the product, whose entries are sums of d; the rounding of the
+        difference. The rounding of the sum <C, Z - Z*>, of (d + 1) d products, is counted with it.
         """
         terms = super().evaluate_edges(rho, errors, P_i)
         tangent = self.tangent
         C = tangent.C
         d = rho.shape[2]
+        P_transposed = np.swapaxes(P_i, 1, 2)
         C_size = np.abs(C)
         rho_size = np.abs(rho)
-        P_size = np.abs(np.swapaxes(P_i, 1, 2))
-        apart = rho @ np.swapaxes(P_i, 1, 2) - tangent.Z
-        apart_error = (errors + gamma(d + 1) * rho_size) @ P_size
-        apart_error += gamma(d * d + d + 4) * np.abs(apart)
+        P_size = np.abs(P_transposed)
+        # The value, and its error.
+        difference = rho @ P_transposed - tangent.Z
+        linear_part = 2.0 * np.sum(C * difference, axis=(1, 2))
         constant = tangent.value - tangent.loss
-        constant_error = tangent.value_error
-        constant_error = constant_error + 4.0 * UNIT_ROUNDOFF * (
-            np.abs(constant) + np.abs(tangent.loss)
-        )
-        value_error = float(np.sum(2.0 * C_size * apart_error)) + float(np.sum(constant_error))
+        product_errors = errors + gamma(d + 1) * rho_size
+        difference_error = product_errors @ P_size
+        difference_error += gamma(d * d + d + 4) * np.abs(difference)
+        linear_error = float(np.sum(2.0 * C_size * difference_error))
+        constant_size = np.abs(constant) + np.abs(tangent.loss)
+        constant_errors = tangent.value_error + 4.0 * UNIT_ROUNDOFF * constant_size
+        value_error = linear_error + float(np.sum(constant_errors))
+        # The half gradient in rho, C P_i.
         G = C @ P_i
         G_error = gamma(d) * C_size @ np.swapaxes(P_size, 1, 2)
+        # The half gradient in P_i, C^T rho.
+        own = np.swapaxes(C, 1, 2) @ rho
+        own_error = np.swapaxes(C_size, 1, 2) @ product_errors
         return TangentTerms(
-            value=terms.value + (2.0 * np.sum(C * apart, axis=(1, 2)) + constant),
+            value=terms.value + (linear_part + constant),
             value_error=terms.value_error + value_error,
             G=terms.G + G,
             G_error=terms.G_error + G_error,
             G_size=terms.G_size + np.abs(G),
-            own=np.swapaxes(C, 1, 2) @ rho,
-            own_error=np.swapaxes(C_size, 1, 2) @ (errors + gamma(d + 1) * rho_size),
+            own=own,
+            own_error=own_error,
         )
 
-    def entry_errors(self, problem: EdgeProblem, u: Array, count: float) -> Array:
-        """E u, (N,), with the terms |A|^T |C| and its transpose, each off by `count` of itself."""
+    def entry_errors(self, problem: EdgeProblem, u: Array, relative_error: float) -> Array:
+        """E u, (N,), with the terms |A|^T |C| and its transpose beside those of W.
+
+        Every term is off by at most `relative_error` of itself.
+        """
         n = problem.num_poses
         d = problem.d
         A = abs(problem.plain_residual_matrix)
         C_size = np.abs(self.tangent.C)
-        E = super().entry_errors(problem, u, count)
-        u_i = u[n:].reshape(n, d, 1)[problem.graph.i]
-        E += count * (A.T @ rows_of_blocks(C_size @ u_i))[:, 0]
-        rho = blocks_of_rows((A @ u)[:, None], len(self.tau))
-        E[n:] += count * problem.incidence.at_beginning(np.swapaxes(C_size, 1, 2) @ rho)[:, 0]
-        return E
+        E_u = super().entry_errors(problem, u, relative_error)
+        # |A|^T |C|: C couples the residuals with the rows of R_i^T.
+        u_R = u[n:].reshape(n, d, 1)
+        C_u = C_size @ u_R[problem.graph.i]
+        E_u += relative_error * (A.T @ rows_of_blocks(C_u))[:, 0]
+        # Its transpose, |C|^T |A|.
+        A_u = blocks_of_rows((A @ u)[:, None], len(self.tau))
+        Ct_A_u = np.swapaxes(C_size, 1, 2) @ A_u
+        E_u[n:] += relative_error * problem.incidence.at_beginning(Ct_A_u)[:, 0]
+        return E_u

@@ -1,4 +1,4 @@
-"""Starts: noisy truth (GPS / IMU), odometry, a spanning tree, and the chordal relaxation."""
+"""Initial poses: from odometry, from a spanning tree, and from the chordal relaxation."""
 
 from dataclasses import replace
 
@@ -22,12 +22,13 @@ from pgo_models.problem.matrices import rotation_columns
 from pgo_models.problem.ordering import row_order
 from pgo_models.problem.problem import PGOProblem
 
-# poses up to which the analysis of M, which others need, saves more than its larger factor costs
+# Up to this number of poses the symbolic analysis of M, which others need as well, is used for the
+# chordal relaxation. Its factor is larger than that of the rotations alone.
 _SHARED = 10_000
 
 
 def odometry_start(graph: PoseGraph) -> Poses:
-    """Compose the measurements i -> i + 1 from pose 0 on; the first of repeated ones counts.
+    """Compose the measurements i -> i + 1 from pose 0 on; of repeated ones the first is used.
 
     Parameters
     ----------
@@ -42,7 +43,7 @@ def odometry_start(graph: PoseGraph) -> Poses:
     Raises
     ------
     GraphError
-        When a link i -> i + 1 is missing: `spanning_tree_start` needs none.
+        When a link i -> i + 1 is missing; `spanning_tree_start` does not need one.
 
     Examples
     --------
@@ -54,13 +55,18 @@ def odometry_start(graph: PoseGraph) -> Poses:
     """
     n = graph.num_poses
     forward = np.flatnonzero(graph.j == graph.i + 1)
+    # Written last to first, so that the first of repeated edges remains.
+    backwards = forward[::-1]
     edge = np.full(n - 1, -1)
-    edge[graph.i[forward][::-1]] = forward[::-1]
+    edge[graph.i[backwards]] = backwards
     if n > 1 and edge.min() < 0:
         missing = int(np.argmin(edge))
         link = f"from pose {graph.pose_name(missing)} to {graph.pose_name(missing + 1)}"
         raise GraphError(f"no odometry {link}; use spanning_tree_start() or chordal_start()")
-    return _compose(graph, np.arange(n), np.arange(-1, n - 1), edge, np.ones(n - 1, dtype=bool))
+    order = np.arange(n)
+    parent = np.arange(-1, n - 1)
+    is_forward = np.ones(n - 1, dtype=bool)
+    return _compose(graph, order, parent, edge, is_forward)
 
 
 def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
@@ -98,26 +104,32 @@ def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
     if root == graph.world and graph.is_world_loose:
         raise SettingError("root is the world, of which positions alone are known; give a pose")
     order, parent, edge = spanning_tree(graph, root)
-    return _with_world_fitted(
-        graph, _compose(graph, order, parent, edge, graph.j[edge] == order[1:])
-    )
+    is_forward = graph.j[edge] == order[1:]
+    poses = _compose(graph, order, parent, edge, is_forward)
+    return _with_world_fitted(graph, poses)
 
 
 def spanning_tree(graph: PoseGraph, root: int) -> tuple[IntArray, IntArray, IntArray]:
     """Breadth-first tree: poses in its order, the parent of every pose, and the edges to order[1:].
 
-    Of edges that say something of rotations: a loose world pose is not in it.
+    The tree has edges with a rotation weight only, so that a world pose of which positions alone
+    are known is not in it.
     """
     n = graph.num_poses
-    turning = np.flatnonzero(graph.kappa > 0)
-    order, parent = breadth_first_order(
-        edge_counts(graph.i[turning], graph.j[turning], n), root, directed=False
-    )
-    ends = np.stack([graph.i, graph.j])[:, turning]
+    usable = np.flatnonzero(graph.kappa > 0)
+    i = graph.i[usable]
+    j = graph.j[usable]
+    order, parent = breadth_first_order(edge_counts(i, j, n), root, directed=False)
+    # Every pair of poses has a number: n times the smaller plus the larger.
+    edge_pairs = np.minimum(i, j) * n + np.maximum(i, j)
+    distinct_pairs, first_edge = np.unique(edge_pairs, return_index=True)
     child = order[1:]
-    pairs, first = np.unique(ends.min(axis=0) * n + ends.max(axis=0), return_index=True)
-    branches = np.minimum(child, parent[child]) * np.int64(n) + np.maximum(child, parent[child])
-    return order, parent, turning[first[np.searchsorted(pairs, branches)]]
+    parent_of_child = parent[child]
+    smaller = np.minimum(child, parent_of_child)
+    larger = np.maximum(child, parent_of_child)
+    branch_pairs = smaller * np.int64(n) + larger
+    places = np.searchsorted(distinct_pairs, branch_pairs)
+    return order, parent, usable[first_edge[places]]
 
 
 def chordal_start(problem: PGOProblem, averaged: bool = False) -> Poses:
@@ -125,18 +137,19 @@ def chordal_start(problem: PGOProblem, averaged: bool = False) -> Poses:
 
     The sum sum_e kappa ||R_j - R_i R_ij||_F^2 is minimised with R_0 = I. This is the chordal
     relaxation of rotation averaging (Martinec & Pajdla 2007; Carlone, Tron, Daniilidis & Dellaert
-    2015). Jointly with translations the relaxed R_i would shrink, as noise makes a smaller map fit
-    better, the more the larger it is. Position measurements alone leave the rotation of the world
-    open: it is fitted to positions found without.
+    2015). Translations are not among the unknowns: with them the relaxed R_i would shrink, since
+    with noise a smaller map fits better, and more so the larger the map is. Where the measurements
+    to the world are positions alone, the rotation of the world is fitted to positions that are
+    computed without it.
 
     Parameters
     ----------
     problem : PGOProblem
         A problem with a quadratic cost, such as the convex part of one.
     averaged : bool
-        Whether in the plane the rotations take a step of rotation averaging, too: the constrained
-        minimum of the same sum is often near, and Newton from it needs a factorisation less on
-        large graphs.
+        Whether the rotations in the plane take a step of rotation averaging. The result is often
+        near the constrained minimum of the same sum, and on large graphs Newton's method needs a
+        factorisation less from there.
 
     Returns
     -------
@@ -152,48 +165,60 @@ def chordal_start(problem: PGOProblem, averaged: bool = False) -> Poses:
     True
     """
     graph = problem.graph
-    world = problem.graph.world
-    if world is not None and graph.is_world_loose:
-        inner = np.delete(np.arange(graph.num_poses), world)
-        weights = problem.weights.of_edges(~graph.is_prior)
-        inner_start = chordal_start(
-            replace(problem, graph=graph.subgraph(inner), weighting=weights), averaged
-        )
-        poses = Poses(
-            np.insert(inner_start.R, world, np.eye(problem.d), axis=0),
-            np.insert(inner_start.t, world, 0.0, axis=0),
-        )
-        return problem.with_best_translations(_with_world_fitted(graph, poses).R)
+    if graph.world is not None and graph.is_world_loose:
+        return _start_with_loose_world(problem, graph.world, averaged)
     n = problem.num_poses
-    (K, b) = relaxed_rotations(problem, 0)
+    K, b = relaxed_rotations(problem, 0)
     if n <= _SHARED:
-        Y = factorize_damped(problem.analysis, K).solve(b)[n:]
+        factor = factorize_damped(problem.analysis, K)
+        Y = factor.solve(b)[n:]
     else:
         K_RR = K[n:, n:].tocsc()
-        analysis = analyze(K_RR, problem.backend, row_order(problem.pose_order, problem.d))
-        Y = factorize_damped(analysis, K_RR).solve(b[n:])
+        order = row_order(problem.pose_order, problem.d)
+        analysis = analyze(K_RR, problem.backend, order)
+        factor = factorize_damped(analysis, K_RR)
+        Y = factor.solve(b[n:])
     R = project_to_rotations(unstack_transposes(Y))
-    return problem.with_best_translations(_averaged(problem, R) if averaged else R)
+    if averaged:
+        R = _averaged(problem, R)
+    return problem.with_best_translations(R)
+
+
+def _start_with_loose_world(problem: PGOProblem, world: int, averaged: bool) -> Poses:
+    """Chordal start without the world pose, to whose positions its rotation is then fitted."""
+    graph = problem.graph
+    inner_poses = np.delete(np.arange(graph.num_poses), world)
+    inner_weights = problem.weights.of_edges(~graph.is_prior)
+    inner_graph = graph.subgraph(inner_poses)
+    inner_problem = replace(problem, graph=inner_graph, weighting=inner_weights)
+    inner_start = chordal_start(inner_problem, averaged)
+    R = np.insert(inner_start.R, world, np.eye(problem.d), axis=0)
+    t = np.insert(inner_start.t, world, 0.0, axis=0)
+    fitted = _with_world_fitted(graph, Poses(R, t))
+    return problem.with_best_translations(fitted.R)
 
 
 def _averaged(problem: PGOProblem, R: Array) -> Array:
     """Rotations, (n, 2, 2), at the minimum of a majorant of sum_e kappa ||R_j - R_i R_ij||^2.
 
-    The sum is no larger there.
+    The sum is no larger there than at the given R.
 
-    An edge off by the angle r costs 4 kappa (1 - cos r), whose second derivative is at most 4
-    kappa. Where that is 4 s tau instead, s the largest kappa / tau, the turns of least cost have
-    the matrix of the translations, M_tt.
+    An edge with the residual angle r costs 4 kappa (1 - cos r), whose second derivative is at most
+    4 kappa. The majorant has 4 s tau in its place, s the largest kappa / tau, so that its minimum
+    solves a system with the matrix of the translations, M_tt, whose factor is known.
     """
     graph = problem.graph
     weights = problem.weights
+    incidence = problem.incidence
     if problem.d != 2 or weights.rotation.has_own_axes or not (weights.tau > 0.0).all():
         return R
-    sine = vee(np.swapaxes(R[graph.i] @ graph.R_ij, 1, 2) @ R[graph.j])
-    pull = weights.kappa[:, None] * sine / (weights.kappa / weights.tau).max()
-    return R @ exp_map(
-        problem.solve_translations(problem.incidence.begins @ pull - problem.incidence.ends @ pull)
-    )
+    predicted_R_j = R[graph.i] @ graph.R_ij
+    sine = vee(np.swapaxes(predicted_R_j, 1, 2) @ R[graph.j])
+    largest_ratio = (weights.kappa / weights.tau).max()
+    of_edges = weights.kappa[:, None] * sine / largest_ratio
+    right_hand_side = incidence.begins @ of_edges - incidence.ends @ of_edges
+    angles = problem.solve_translations(right_hand_side)
+    return R @ exp_map(angles)
 
 
 def relaxed_rotations(problem: PGOProblem, held: int | None) -> tuple[csc_array, Array]:
@@ -207,12 +232,14 @@ def relaxed_rotations(problem: PGOProblem, held: int | None) -> tuple[csc_array,
     graph = problem.graph
     n = problem.num_poses
     d = problem.d
-    _, own_i, _, own_j = problem.weights.matrix_blocks(graph.R_ij, np.zeros_like(graph.t_ij))
+    no_offsets = np.zeros_like(graph.t_ij)
+    _, diagonal_i, _, diagonal_j = problem.weights.matrix_blocks(graph.R_ij, no_offsets)
     data = problem.M.data.copy()
-    b = np.zeros((problem.side, d))
-    data[problem.block_positions] = problem.incidence.at_both(own_i, own_j)
+    data[problem.block_positions] = problem.incidence.at_both(diagonal_i, diagonal_j)
     problem.leave_out(data, np.arange(n), 1.0)
+    b = np.zeros((problem.side, d))
     if held is not None:
+        # R = I of the held pose: its columns go to the right-hand side.
         fixed = rotation_columns(np.array([held]), n, d)[0]
         b -= problem.with_pattern_of_M(data)[:, fixed].toarray()
         problem.leave_out(data, fixed, 1.0)
@@ -221,16 +248,15 @@ def relaxed_rotations(problem: PGOProblem, held: int | None) -> tuple[csc_array,
 
 
 def _with_world_fitted(graph: PoseGraph, poses: Poses) -> Poses:
-    """Poses with that of a loose world where the positions fit.
-
-    There sum_e ||t_j - t_w - R_w t_wj||^2 is least.
-    """
+    """Poses with a loose world pose w at the minimum of sum_e ||t_j - t_w - R_w t_wj||^2."""
     if graph.world is None or not graph.is_world_loose:
         return poses
+    seen_poses = graph.j[graph.is_prior]
     measured = Poses.of_points(graph.t_ij[graph.is_prior])
+    estimated = Poses.of_points(poses.t[seen_poses])
+    fitted = measured.aligned_to(estimated)
     R = poses.R.copy()
     t = poses.t.copy()
-    fitted = measured.aligned_to(Poses.of_points(t[graph.j[graph.is_prior]]))
     R[graph.world] = fitted.R[0]
     t[graph.world] = fitted.t[0] - fitted.R[0] @ measured.t[0]
     return Poses(R, t)
@@ -239,10 +265,10 @@ def _with_world_fitted(graph: PoseGraph, poses: Poses) -> Poses:
 def _compose(
     graph: PoseGraph, order: IntArray, parent: IntArray, edge: IntArray, forward: BoolArray
 ) -> Poses:
-    """Poses of a tree: order[k] hangs on its parent by edge[k-1], which ends at it if forward[k-1].
+    """Poses of a tree: edge[k-1] joins order[k] with its parent and ends at it if forward[k-1].
 
-    Pointer jumping: every pose holds its transform from an ancestor, which doubles its distance
-    until it is the root.
+    The method is pointer jumping: R and t of a pose are relative to one of its ancestors. Every
+    round replaces the ancestor by the ancestor of the ancestor, until it is the root.
     """
     n = graph.num_poses
     d = graph.d
@@ -259,7 +285,8 @@ def _compose(
     t[child] = t_step
     ancestor = np.where(parent >= 0, parent, root)
     while (ancestor != root).any():
-        t = t[ancestor] + np.einsum("nab,nb->na", R[ancestor], t)
-        R = project_to_rotations(R[ancestor] @ R)
+        R_ancestor = R[ancestor]
+        t = t[ancestor] + np.einsum("nab,nb->na", R_ancestor, t)
+        R = project_to_rotations(R_ancestor @ R)
         ancestor = ancestor[ancestor]
     return Poses(R, t)

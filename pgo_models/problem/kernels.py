@@ -1,11 +1,11 @@
-"""BLAS kernels of CVXOPT's CHOLMOD.
+"""Choice of the BLAS kernels that CHOLMOD runs in CVXOPT.
 
-Its wheel brings an OpenBLAS of 2021, which runs SSE3 on CPUs that came later.
-
-OpenBLAS knows CPUs by their model, and looks at OPENBLAS_CORETYPE once, as it is loaded: those of
-numpy and scipy, loaded before, keep what they chose. Fused multiply-adds and sums in another order
-change the last bits of a factor; the bounds on its error are for any order, with or without them
-(`pgo_models.problem.floating_point`).
+The wheel of CVXOPT contains an OpenBLAS of 2021, which does not recognise later CPUs and runs its
+SSE3 kernels on them. The environment variable OPENBLAS_CORETYPE names the kernels to use instead.
+OpenBLAS reads it once, when it is loaded: numpy and scipy are loaded before, and the OpenBLAS of
+either keeps its kernels. Other kernels use fused multiply-adds and sum in another order, which
+changes the last bits of a factor. The bounds on its error hold for any order, with or without fused
+multiply-adds (`pgo_models.problem.floating_point`).
 """
 
 import os
@@ -19,28 +19,31 @@ from scipy.linalg.lapack import dpotrf
 from pgo_models.memory import check_room
 
 VARIABLE = "OPENBLAS_CORETYPE"
-_BUFFER = 2**26  # bytes: twice what is taken
-# those for AVX-512 are as fast; numpy says AVX2 by either name
+_BUFFER = 2**26  # bytes: twice the size of the buffer of OpenBLAS
+# Kernels for AVX2; those for AVX-512 are as fast.
 _KERNELS = "Haswell"
-_NEEDED = {"AVX2", "X86_V3"}
+# Names of AVX2 in `numpy.show_config`, of older and newer versions.
+_AVX2 = {"AVX2", "X86_V3"}
 
 
 def chosen_kernels() -> str | None:
     """Kernels that OpenBLAS is asked for: the user's, else those for AVX2.
 
-    None, which leaves it its own, where the CPU has no AVX2.
+    The result is None if the CPU has no AVX2: then OpenBLAS chooses.
     """
-    has = np.show_config(mode="dicts").get("SIMD Extensions", {})
-    has_needed = not _NEEDED.isdisjoint([*has.get("baseline", ()), *has.get("found", ())])
-    return os.environ.get(VARIABLE, _KERNELS if has_needed else None)
+    extensions = np.show_config(mode="dicts").get("SIMD Extensions", {})
+    baseline = extensions.get("baseline", ())
+    detected = extensions.get("found", ())
+    has_avx2 = not _AVX2.isdisjoint([*baseline, *detected])
+    default = _KERNELS if has_avx2 else None
+    return os.environ.get(VARIABLE, default)
 
 
 def take_buffers() -> None:
-    """Have the OpenBLAS of numpy and that of scipy take the memory that they work in.
+    """Make the OpenBLAS of numpy and that of scipy allocate their buffers now.
 
-    A MemoryError is raised without it.
-
-    Where there is none when they first need it, they ask again and again, and no signal ends that.
+    A MemoryError is raised where there is not enough memory. OpenBLAS itself, if it finds no memory
+    at its first call, tries again in a loop that no signal ends.
     """
     for factorize in (np.linalg.cholesky, dpotrf):
         check_room(_BUFFER)
@@ -49,11 +52,13 @@ def take_buffers() -> None:
 
 @contextmanager
 def kernels_of_the_cpu() -> Iterator[None]:
-    """Have an OpenBLAS that CVXOPT loads meanwhile run `chosen_kernels`.
+    """Within the context, an OpenBLAS that CVXOPT loads runs `chosen_kernels`.
 
-    The environment is as before afterwards.
+    The environment is restored afterwards.
     """
-    kernels = None if "cvxopt" in sys.modules or VARIABLE in os.environ else chosen_kernels()
+    is_loaded = "cvxopt" in sys.modules
+    is_chosen_by_user = VARIABLE in os.environ
+    kernels = None if is_loaded or is_chosen_by_user else chosen_kernels()
     if kernels:
         os.environ[VARIABLE] = kernels
     try:

@@ -3,9 +3,9 @@
 The gauge is fixed at one pose.
 
 A cost F without a factor 1/2, such as sum kappa ||..||_F^2 + tau ||..||^2 or chi2, is twice a
-negative log-likelihood: to second order (Laplace) moves have the covariance (Hess F / 2)^-1. That
-takes tau for the information of a coordinate and 2 kappa for that of an angle: I_theta with
-`RotationWeight.GAUSSIAN`; SE-Sync's kappa in the plane says 2 I_theta.
+negative log-likelihood. To second order (Laplace approximation) the moves have the covariance (Hess
+F / 2)^-1. Here tau is the information of a coordinate and 2 kappa that of an angle: 2 kappa is
+I_theta with `RotationWeight.GAUSSIAN`, and 2 I_theta with the kappa of SE-Sync in the plane.
 """
 
 from dataclasses import dataclass
@@ -30,15 +30,16 @@ from pgo_models.problem.selected_inversion import selected_inverse
 class Marginals(ReadOnly):
     """Covariances of moves t_i + v_i, R_i Exp(hat(w_i)) of the poses.
 
-    The p = 3 or 6 numbers (v_i, w_i) of a pose are in metres and radians: v is along the axes of
-    the world, w about the pose's own. GTSAM and g2o have R_i^T v_i, and Pose3 that after w.
+    The p = 3 or 6 numbers (v_i, w_i) of a pose are in metres and radians: v is in the world frame,
+    w in the frame of the pose. GTSAM and g2o use R_i^T v_i in place of v_i, and Pose3 of GTSAM has
+    it after w.
 
     Parameters
     ----------
     hessian : (n p, n p) csc_array
         The second derivative of a cost without a factor 1/2, such as `riemannian_hessian`.
     layout : TangentLayout
-        What its rows are.
+        The unknowns of its rows.
     anchor : int
         The pose that does not move, the gauge; its covariances are zero.
     backend : CholeskyBackend, optional
@@ -47,9 +48,9 @@ class Marginals(ReadOnly):
     Raises
     ------
     SettingError
-        When the anchor, or a pose asked for, is none.
+        When the anchor, or a requested pose, is not one of the poses.
     NotPositiveDefiniteError
-        When a covariance is asked for where the Hessian is that of no strict minimum.
+        When a covariance is requested and the Hessian is not that of a strict minimum.
     """
 
     hessian: csc_array
@@ -76,76 +77,91 @@ class Marginals(ReadOnly):
             When one of them is no pose.
         """
         self._check(*poses)
+        chosen = list(poses)
         n = self.layout.num_poses
-        k = len(poses)
-        p = self.layout.side // self.layout.num_poses
+        k = len(chosen)
+        p = self.layout.side // n
+        # Unit vectors of the numbers of the chosen poses, as columns.
         unit = np.zeros((n, p, k, p))
-        unit[list(poses), :, np.arange(k)] = np.eye(p)
-        columns = self._factor.solve(np.delete(unit, self.anchor, axis=0).reshape(-1, k * p))
-        whole = np.insert(columns.reshape(n - 1, p, k * p), self.anchor, 0.0, axis=0)
-        block = whole[list(poses)].reshape(k * p, k * p)
+        unit[chosen, :, np.arange(k)] = np.eye(p)
+        # The anchor has no unknowns: its rows are left out of the system, and zero in the solution.
+        right_hand_sides = np.delete(unit, self.anchor, axis=0).reshape(-1, k * p)
+        solution = self._factor.solve(right_hand_sides).reshape(n - 1, p, k * p)
+        columns = np.insert(solution, self.anchor, 0.0, axis=0)
+        block = columns[chosen].reshape(k * p, k * p)
         return 0.5 * (block + block.T)
 
     @cached_property
     def diagonal(self) -> Array:
         """Covariance of every pose, (n, p, p), by selected inversion."""
-        L, order = self._factorize().take_apart()  # of its own, whose memory is free again after
-        place = np.argsort(order).reshape(self.layout.num_poses - 1, -1)
-        rows, columns = block_entries(place, place)
-        positions = entry_positions(L, np.maximum(rows, columns), np.minimum(rows, columns))
-        return np.insert(selected_inverse(L)[positions], self.anchor, 0.0, axis=0)
+        # A factor of its own, whose memory is freed at the end.
+        L, order = self._factorize().take_apart()
+        num_free = self.layout.num_poses - 1
+        # Rows of L that belong to every pose.
+        pose_rows = np.argsort(order).reshape(num_free, -1)
+        rows, columns = block_entries(pose_rows, pose_rows)
+        # Entries of the lower triangle; those above the diagonal are equal by symmetry.
+        lower_rows = np.maximum(rows, columns)
+        lower_columns = np.minimum(rows, columns)
+        positions = entry_positions(L, lower_rows, lower_columns)
+        covariances = selected_inverse(L)[positions]
+        return np.insert(covariances, self.anchor, 0.0, axis=0)
 
     @cached_property
     def _information(self) -> csc_array:
         """Half the Hessian, pose by pose without the anchor.
 
-        Blocks are stored whole, as their entries are asked for.
+        The blocks of poses are stored in full, as `diagonal` reads all entries of the covariances.
         """
         self._check(self.anchor)
         free = np.delete(np.arange(self.layout.num_poses), self.anchor)
-        columns = np.concatenate(
-            [self.layout.translations(free), self.layout.rotations(free)], axis=1
-        )
-        half = 0.5 * self.hessian[columns.ravel()][:, columns.ravel()]
-        return half.tobsr((columns.shape[1], columns.shape[1])).tocsc()
+        translations = self.layout.translations(free)
+        rotations = self.layout.rotations(free)
+        columns = np.concatenate([translations, rotations], axis=1)
+        pose_by_pose = columns.ravel()
+        half = 0.5 * self.hessian[pose_by_pose][:, pose_by_pose]
+        p = columns.shape[1]
+        return half.tobsr((p, p)).tocsc()
 
     @cached_property
     def _factor(self) -> CholeskyFactor:
-        """Factor that `joint` solves with, kept from one call to the next."""
+        """Factor that `joint` solves with, kept between calls."""
         return self._factorize()
 
     def _factorize(self) -> CholeskyFactor:
         try:
             return factorize(self._information, self.backend)
         except NotPositiveDefiniteError as error:
-            way_out = "solve to the end first, or polish() the poses"
             raise NotPositiveDefiniteError(
-                f"no covariances, the poses are at no strict minimum; {way_out}"
+                "no covariances, the poses are at no strict minimum; "
+                "solve to the end first, or polish() the poses"
             ) from error
 
     def _check(self, *poses: int) -> None:
+        last = self.layout.num_poses - 1
         for pose in poses:
-            if not 0 <= pose < self.layout.num_poses:
-                raise SettingError(
-                    f"there is no pose {pose}; give one of 0 to {self.layout.num_poses - 1}"
-                )
+            if not 0 <= pose <= last:
+                raise SettingError(f"there is no pose {pose}; give one of 0 to {last}")
 
 
 def write_covariances(covariances: Array, ids: IntArray, path: Path | str) -> None:
-    """Write blocks (n, p, p) as CSV: id, upper triangle by rows; units in the head.
+    """Write blocks (n, p, p) as CSV: the id and the upper triangle by rows, units in the heading.
 
     Errors: `replace_when_done`.
     """
-    names = ("x", "y", "theta") if covariances.shape[1] == 3 else ("x", "y", "z", "rx", "ry", "rz")
+    is_planar = covariances.shape[1] == 3
+    names = ("x", "y", "theta") if is_planar else ("x", "y", "z", "rx", "ry", "rz")
     units = ["m" if name in "xyz" else "rad" for name in names]
     rows, columns = np.triu_indices(len(names))
-    heads = [
-        f"{names[a]}*{names[b]} ({units[a]} {units[b]})" for a, b in zip(rows, columns, strict=True)
-    ]
-    values = zip(ids.tolist(), covariances[:, rows, columns].tolist(), strict=True)
+    heading = ["id"]
+    for a, b in zip(rows, columns, strict=True):
+        heading.append(f"{names[a]}*{names[b]} ({units[a]} {units[b]})")
+    triangles = covariances[:, rows, columns].tolist()
     with (
         replace_when_done(path) as temporary,
         temporary.open("w", encoding="ascii", newline="\n") as file,
     ):
-        file.write(",".join(["id", *heads]) + "\n")
-        file.writelines(",".join([str(name), *map(repr, row)]) + "\n" for name, row in values)
+        file.write(",".join(heading) + "\n")
+        for pose_id, triangle in zip(ids.tolist(), triangles, strict=True):
+            words = [str(pose_id), *map(repr, triangle)]
+            file.write(",".join(words) + "\n")

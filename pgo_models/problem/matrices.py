@@ -26,10 +26,10 @@ MAX_DENSE_SIDE = 6000  # a dense Q of this side takes 288 MB
 def residual_matrix(graph: PoseGraph, weights: EdgeCost | None = None) -> tuple[csr_array, Array]:
     """A, ((d+1) m, N), and weights w, ((d+1) m,), with F = sum_rows w ||A X||^2.
 
-    Its first m rows give t_j^T - t_i^T - t_ij^T R_i^T with weight tau; then d rows an edge give
-    R_j^T - R_ij^T R_i^T with weight kappa (equations `translation` and `rotation` of the paper), or
-    U^T times them with weights kappa of their own where the weights are W = U diag(kappa) U^T; F's
-    unless given.
+    Its first m rows give t_j^T - t_i^T - t_ij^T R_i^T with weight tau. Then d rows of every edge
+    give R_j^T - R_ij^T R_i^T with weight kappa (equations `translation` and `rotation` of the
+    paper). Where the weights are W = U diag(kappa) U^T, the latter are multiplied by U^T, and their
+    weights are the d eigenvalues kappa of the edge. The weights are those of F unless given.
     """
     n = graph.num_poses
     m = graph.num_edges
@@ -37,21 +37,28 @@ def residual_matrix(graph: PoseGraph, weights: EdgeCost | None = None) -> tuple[
     weights = weights if weights is not None else isotropic_weights(graph)
     block_i = rotation_columns(graph.i, n, d)
     block_j = rotation_columns(graph.j, n, d)
-    at_i, at_j, columns_j = weights.rotation.row_entries(graph.R_ij, block_j)
-    # Columns and values of the entries, row by row: of the translation residuals, (m, 2 + d), then
-    # of the rotation residuals, (m, d, d + 1) or (m, d, 2 d).
+    # Entries of the translation rows, (m, 2 + d): in the columns of t_i, t_j and R_i.
     columns_t = np.concatenate([graph.i[:, None], graph.j[:, None], block_i], axis=1)
-    columns_R = np.concatenate([np.repeat(block_i[:, None], d, axis=1), columns_j], axis=2)
-    values_t = np.concatenate(
-        [np.full((m, 1), -1.0), np.ones((m, 1)), -weights.seen_offsets(graph.t_ij)], axis=1
-    )
-    values_R = np.concatenate([at_i, at_j], axis=2)
+    minus_ones = np.full((m, 1), -1.0)
+    ones = np.ones((m, 1))
+    minus_offsets = -weights.seen_offsets(graph.t_ij)
+    values_t = np.concatenate([minus_ones, ones, minus_offsets], axis=1)
+    # Entries of the rotation rows, (m, d, d + 1) or (m, d, 2 d): in the columns of R_i and R_j.
+    values_i, values_j, columns_j = weights.rotation.row_entries(graph.R_ij, block_j)
+    columns_i = np.repeat(block_i[:, None], d, axis=1)
+    columns_R = np.concatenate([columns_i, columns_j], axis=2)
+    values_R = np.concatenate([values_i, values_j], axis=2)
+    # All entries, row by row.
     columns = np.concatenate([columns_t.ravel(), columns_R.ravel()])
     values = np.concatenate([values_t.ravel(), values_R.ravel()])
-    lengths = np.repeat([2 + d, d + at_j.shape[2]], [m, d * m])
-    starts = np.append(0, np.cumsum(lengths))
-    A = csr_array((values, columns, starts), shape=((d + 1) * m, (d + 1) * n))
-    A.sum_duplicates()  # of which there are none, but rows are sorted, too
+    length_t = columns_t.shape[1]
+    length_R = columns_R.shape[2]
+    row_lengths = np.repeat([length_t, length_R], [m, d * m])
+    row_starts = np.append(0, np.cumsum(row_lengths))
+    shape = ((d + 1) * m, (d + 1) * n)
+    A = csr_array((values, columns, row_starts), shape=shape)
+    # No entry is stored twice; the call sorts the rows.
+    A.sum_duplicates()
     return A, weights.row_weights(d)
 
 
@@ -76,25 +83,33 @@ def joint_matrix(graph: PoseGraph, weights: EdgeCost | None = None) -> csc_array
     n = graph.num_poses
     d = graph.d
     weights = weights if weights is not None else isotropic_weights(graph)
-    i, j, t, tau = *map(short, (graph.i, graph.j, np.arange(n))), weights.tau
+    tau = weights.tau
+    coupling_t, diagonal_i, coupling_R, diagonal_j = weights.matrix_blocks(graph.R_ij, graph.t_ij)
+    # Sums over the edges of every pose.
+    incidence = Incidence.of(graph)
+    tau_sums = incidence.begins @ tau + incidence.ends @ tau
+    coupling_sums = incidence.begins @ coupling_t
+    diagonal_sums = incidence.at_both(diagonal_i, diagonal_j)
+    # Rows and columns of M: of the poses, then of the two ends of every edge.
+    poses = short(np.arange(n))
+    i = short(graph.i)
+    j = short(graph.j)
+    block = rotation_columns(poses, n, d)
     block_i = rotation_columns(i, n, d)
     block_j = rotation_columns(j, n, d)
-    lever, own_i, between, own_j = weights.matrix_blocks(graph.R_ij, graph.t_ij)
-    incidence = Incidence.of(graph)
-    block = rotation_columns(t, n, d)
-    levers = incidence.begins @ lever
-    t_own, t_j = (np.repeat(pose[:, None], d, axis=1) for pose in (t, j))
+    repeated_poses = np.repeat(poses[:, None], d, axis=1)
+    repeated_j = np.repeat(j[:, None], d, axis=1)
     blocks = [
-        (t, t, incidence.begins @ tau + incidence.ends @ tau),
+        (poses, poses, tau_sums),
         (i, j, -tau),
         (j, i, -tau),
-        (t_own, block, levers),
-        (block, t_own, levers),
-        (t_j, block_i, -lever),
-        (block_i, t_j, -lever),
-        (*block_entries(block, block), incidence.at_both(own_i, own_j)),
-        (*block_entries(block_i, block_j), -between),
-        (*block_entries(block_j, block_i), -np.swapaxes(between, 1, 2)),
+        (repeated_poses, block, coupling_sums),
+        (block, repeated_poses, coupling_sums),
+        (repeated_j, block_i, -coupling_t),
+        (block_i, repeated_j, -coupling_t),
+        (*block_entries(block, block), diagonal_sums),
+        (*block_entries(block_i, block_j), -coupling_R),
+        (*block_entries(block_j, block_i), -np.swapaxes(coupling_R, 1, 2)),
     ]
     return assemble(blocks, (d + 1) * n)
 
@@ -104,8 +119,10 @@ def connection_laplacian(graph: PoseGraph, weights: EdgeCost | None = None) -> c
 
     With Y the rows R_i^T, tr(Y^T L Y) = sum_e kappa ||R_j - R_i R_ij||_F^2.
     """
-    M = joint_matrix(replace(graph, t_ij=np.zeros_like(graph.t_ij)), weights)
-    return M[graph.num_poses :, graph.num_poses :].tocsc()
+    n = graph.num_poses
+    without_offsets = replace(graph, t_ij=np.zeros_like(graph.t_ij))
+    M = joint_matrix(without_offsets, weights)
+    return M[n:, n:].tocsc()
 
 
 def marginalized_matrix(graph: PoseGraph, weights: EdgeCost | None = None) -> Array:
@@ -118,36 +135,46 @@ def marginalized_matrix(graph: PoseGraph, weights: EdgeCost | None = None) -> Ar
     n = graph.num_poses
     side = graph.d * graph.num_poses
     if side > MAX_DENSE_SIDE:
+        gigabytes = 8e-9 * side**2
         raise SettingError(
-            f"Q has side {side}, {8e-9 * side**2:.1f} GB; use PGOProblem.apply_Q, which forms no Q"
+            f"Q has side {side}, {gigabytes:.1f} GB; use PGOProblem.apply_Q, which forms no Q"
         )
     M = joint_matrix(graph, weights)
-    M_Rt = M[n:, :n]
     M_RR = M[n:, n:].toarray()
-    # columns of M_tR sum to zero, so t_0 = 0 loses nothing
-    grounded = factorize(M[1:n, 1:n].tocsc())
-    return np.asarray(M_RR - M_Rt[:, 1:] @ grounded.solve(M_Rt[:, 1:].toarray().T))
+    # The columns of M_tR sum to zero, so that t_0 = 0 can be fixed: row and column 0 of M_tt are
+    # left out, which makes it positive definite.
+    factor = factorize(M[1:n, 1:n].tocsc())
+    M_Rt = M[n:, 1:n]
+    M_tR = M_Rt.toarray().T
+    product = M_Rt @ factor.solve(M_tR)
+    return np.asarray(M_RR - product)
 
 
 def block_laplacian(incidence: Incidence, of_edges: Array) -> csc_array:
-    """Laplacian with weights (m, d, d) on the edges, grounded at pose 0.
+    """Laplacian with the weights `of_edges`, (m, d, d), with the diagonal block of pose 0 doubled.
 
-    It is the matrix of translations with such information.
+    It is the matrix of translations whose edges have such information matrices. Doubling a block
+    makes it positive definite.
     """
-    own = incidence.at_both(of_edges, of_edges)
     d = of_edges.shape[1]
-    own[0] *= 2.0
-    t_i, t_j, t = (
-        rotation_columns(k, 0, d) for k in (incidence.i, incidence.j, np.arange(len(own)))
-    )
-    signed = ((t, t, own), (t_i, t_j, -of_edges), (t_j, t_i, -of_edges))
-    blocks = [(*block_entries(rows, columns), values) for rows, columns, values in signed]
-    return assemble(blocks, d * len(own))
+    diagonal = incidence.at_both(of_edges, of_edges)
+    diagonal[0] *= 2.0
+    n = len(diagonal)
+    columns = rotation_columns(np.arange(n), 0, d)
+    columns_i = rotation_columns(incidence.i, 0, d)
+    columns_j = rotation_columns(incidence.j, 0, d)
+    blocks = [
+        (*block_entries(columns, columns), diagonal),
+        (*block_entries(columns_i, columns_j), -of_edges),
+        (*block_entries(columns_j, columns_i), -of_edges),
+    ]
+    return assemble(blocks, d * n)
 
 
 def rotation_columns(pose: IntArray, first: int, d: int) -> IntArray:
     """Columns (m, d) that the rows of R_i^T have in X when rotations begin at `first`."""
-    return np.asarray(first + d * pose[:, None] + np.arange(d, dtype=pose.dtype))
+    within_block = np.arange(d, dtype=pose.dtype)
+    return np.asarray(first + d * pose[:, None] + within_block)
 
 
 def columns_of(poses: IntArray, num_poses: int, widths: tuple[int, ...]) -> IntArray:
@@ -155,16 +182,19 @@ def columns_of(poses: IntArray, num_poses: int, widths: tuple[int, ...]) -> IntA
 
     A field has `widths[f]` numbers a pose.
     """
-    fields = zip(num_poses * np.cumsum((0, *widths[:-1])), widths, strict=True)
-    return np.concatenate(
-        [rotation_columns(poses, first, width).ravel() for first, width in fields]
-    )
+    starts = num_poses * np.cumsum((0, *widths[:-1]))
+    columns = []
+    for start, width in zip(starts, widths, strict=True):
+        of_field = rotation_columns(poses, start, width)
+        columns.append(of_field.ravel())
+    return np.concatenate(columns)
 
 
 def inner(A: Array, B: Array) -> float:
     """Frobenius inner product sum_ab A_ab B_ab of two arrays of one shape.
 
-    einsum, not BLAS: a sum of this size is over before a pool of threads has woken up to share it.
+    It is computed by einsum, not by BLAS: for these sizes starting the threads of BLAS takes longer
+    than the sum.
     """
     return float(np.einsum("r,r->", A.ravel(), B.ravel()))
 
@@ -177,31 +207,28 @@ def norm(A: Array) -> float:
 def assemble(blocks: list[tuple[IntArray, IntArray, Array]], side: int) -> csc_array:
     """Sum triplets (rows, columns, values), each of one shape, into a canonical CSC matrix.
 
-    Its pattern keeps zeros.
+    Zeros are stored, too.
     """
-    rows, columns = (
-        np.concatenate([short(np.ravel(block[k])) for block in blocks]) for k in range(2)
-    )
+    rows = np.concatenate([short(np.ravel(block[0])) for block in blocks])
+    columns = np.concatenate([short(np.ravel(block[1])) for block in blocks])
     values = np.concatenate([np.ravel(block[2]) for block in blocks])
     return csc_array((values, (rows, columns)), shape=(side, side))
 
 
 def short(indices: IntArray) -> IntArray:
-    """The same numbers in 32 bits, as scipy has them in matrices.
-
-    Triplets take most of the memory of `assemble`.
-    """
+    """The same numbers in 32 bits, as scipy has them in matrices, to save memory in `assemble`."""
     return cast("IntArray", indices.astype(np.int32, copy=False))
 
 
 def entry_positions(matrix: csc_array, rows: IntArray, columns: IntArray) -> IntArray:
     """Positions in `matrix.data` of stored entries (rows, columns) of a canonical CSC matrix."""
     side = np.int64(matrix.shape[0])
-    stored = (
-        np.repeat(np.arange(matrix.shape[1], dtype=np.int64), np.diff(matrix.indptr)) * side
-        + matrix.indices
-    )
-    return np.searchsorted(stored, columns.astype(np.int64) * side + rows)
+    all_columns = np.arange(matrix.shape[1], dtype=np.int64)
+    column_lengths = np.diff(matrix.indptr)
+    # Entry (row, column) has the number column side + row, which ascends in the order of the data.
+    stored = np.repeat(all_columns, column_lengths) * side + matrix.indices
+    wanted = columns.astype(np.int64) * side + rows
+    return np.searchsorted(stored, wanted)
 
 
 def meets(matrix: csc_array, rows: IntArray) -> BoolArray:
@@ -209,9 +236,11 @@ def meets(matrix: csc_array, rows: IntArray) -> BoolArray:
 
     The answer has shape (nnz,), the rows (k,).
     """
-    is_one = np.zeros(matrix.shape[0], dtype=bool)
-    is_one[rows] = True
-    return np.asarray(is_one[matrix.indices] | np.repeat(is_one, np.diff(matrix.indptr)))
+    is_chosen = np.zeros(matrix.shape[0], dtype=bool)
+    is_chosen[rows] = True
+    in_row = is_chosen[matrix.indices]
+    in_column = np.repeat(is_chosen, np.diff(matrix.indptr))
+    return np.asarray(in_row | in_column)
 
 
 def block_entries(rows: IntArray, columns: IntArray) -> tuple[IntArray, IntArray]:
@@ -219,6 +248,8 @@ def block_entries(rows: IntArray, columns: IntArray) -> tuple[IntArray, IntArray
 
     The blocks have rows (m, a) and columns (m, b).
     """
-    return np.repeat(rows[:, :, None], columns.shape[1], axis=2), np.repeat(
-        columns[:, None, :], rows.shape[1], axis=1
-    )
+    num_rows = rows.shape[1]
+    num_columns = columns.shape[1]
+    entry_rows = np.repeat(rows[:, :, None], num_columns, axis=2)
+    entry_columns = np.repeat(columns[:, None, :], num_rows, axis=1)
+    return entry_rows, entry_columns

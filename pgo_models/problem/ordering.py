@@ -1,11 +1,9 @@
-"""Orders of elimination that keep Cholesky factors sparse.
+"""Orders of elimination that keep Cholesky factors sparse: one of the poses, for all matrices.
 
-One is found for the poses, and used by all matrices of a graph.
-
-M, the Hessian and the matrices of translations couple two poses wherever an edge does, so that one
-order of the poses serves all of them: minimum degree (Amestoy, Davis & Duff 2004), or on large
-graphs nested dissection by METIS (Karypis & Kumar 1998), whose factors of a grid world of 12,500
-poses in space have half the entries.
+M, the Hessian and the matrices of translations couple two poses where an edge does, so that one
+order of the poses can be used for all of them: minimum degree (Amestoy, Davis & Duff 2004), or on
+large graphs nested dissection by METIS (Karypis & Kumar 1998), whose factors of a grid world of
+12,500 poses in space have half the entries.
 """
 
 import importlib.util
@@ -17,8 +15,9 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import CholeskyBackend, factorize, minimum_degree
 from pgo_models.problem.floating_point import FactorCounts
 
-# Poses, by the dimension of space, from which METIS pays: it takes six to ten times as long as
-# minimum degree, 0.25 s for 50,000 poses in the plane, and what it saves grows faster in space.
+# Number of poses, by the dimension of space, from which METIS saves time. It takes six to ten times
+# as long as minimum degree, 0.25 s for 50,000 poses in the plane; the time that it saves in the
+# factorisations grows faster in space.
 DISSECTED_FROM = {2: 75_000, 3: 10_000}
 
 
@@ -34,20 +33,20 @@ def pose_order(graph: PoseGraph) -> IntArray:
 
 
 def row_order(poses: IntArray, *widths: int) -> IntArray:
-    """Rows in an order of the poses, when the unknowns stand field by field.
+    """Order of the rows that belongs to an order of the poses.
 
-    A field has `widths[f]` numbers a pose.
+    The unknowns are stacked field by field; a field has `widths[f]` numbers a pose.
     """
     rank = np.argsort(poses)
-    return np.argsort(np.concatenate([np.repeat(rank, width) for width in widths]), kind="stable")
+    row_ranks = np.concatenate([np.repeat(rank, width) for width in widths])
+    return np.argsort(row_ranks, kind="stable")
 
 
 def most_counts(graph: PoseGraph, poses: IntArray, *widths: int) -> FactorCounts:
     """Most non-zeros that factors in the order `row_order(poses, *widths)` can have.
 
-    They are all of the blocks that fill in.
-
-    Zeros that CHOLMOD stores beside them, to have wider blocks, come out exact and add no rounding.
+    All entries of every block that fills in are counted. CHOLMOD stores further zeros to have wider
+    supernodes; they are exact and add no rounding.
     """
     pattern = _pattern(graph)
     width = sum(widths)
@@ -66,8 +65,11 @@ def most_counts(graph: PoseGraph, poses: IntArray, *widths: int) -> FactorCounts
 
 def _pattern(graph: PoseGraph) -> csc_array:
     """Lower triangle, positive where two poses share an edge, and on the diagonal."""
-    i = graph.i
-    j = graph.j
-    every = np.arange(graph.num_poses)
-    places = np.append(np.maximum(i, j), every), np.append(np.minimum(i, j), every)
-    return csc_array((np.ones(len(places[0])), places), shape=(len(every), len(every)))
+    n = graph.num_poses
+    diagonal = np.arange(n)
+    larger = np.maximum(graph.i, graph.j)
+    smaller = np.minimum(graph.i, graph.j)
+    rows = np.append(larger, diagonal)
+    columns = np.append(smaller, diagonal)
+    ones = np.ones(len(rows))
+    return csc_array((ones, (rows, columns)), shape=(n, n))

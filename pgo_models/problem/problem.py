@@ -181,6 +181,40 @@ class PGOProblem(ReadOnly):
             self._tangents[poses] = tangent
         return tangent
 
+    def with_rotation_terms(self, i: IntArray, j: IntArray, R_ij: Array, W: Array) -> "PGOProblem":
+        """Return the problem with terms tr(W rho_R rho_R^T), rho_R = R_j^T - R_ij^T R_i^T.
+
+        Parameters
+        ----------
+        i, j : (k,) array of int
+            The poses of every term; its block is in the pattern of M already.
+        R_ij : (k, d, d) array
+            Rotations, as measurements are.
+        W : (k, d, d) array
+            Symmetric weights of either sign.
+
+        Returns
+        -------
+        PGOProblem
+            Its cost is quadratic if that of this one is.
+        """
+        graph = self.graph
+        ones = np.ones(len(i))
+        extended = replace(
+            graph,
+            i=np.concatenate([graph.i, i]),
+            j=np.concatenate([graph.j, j]),
+            R_ij=np.concatenate([graph.R_ij, R_ij]),
+            t_ij=np.concatenate([graph.t_ij, np.zeros((len(i), graph.d))]),
+            kappa=np.concatenate([graph.kappa, ones]),
+            tau=np.concatenate([graph.tau, ones]),
+            information=None,
+            initial=None,
+            truth=None,
+        )
+        cost = self.weights.with_rotation_terms(R_ij, W)
+        return _ExtendedProblem(extended, self.backend, cost, original=self)
+
     @cached_property
     def _tangents(self) -> "WeakKeyDictionary[Poses, PGOProblem]":
         """`tangent_at` of the poses that are still in use: it goes when they do."""
@@ -692,6 +726,29 @@ class _TangentProblem(PGOProblem):
     def incidence(self) -> Incidence:
         """Which edges begin and end at a pose."""
         return self.original.incidence
+
+    @cached_property
+    def pose_order(self) -> IntArray:
+        """Order of elimination of the poses."""
+        return self.original.pose_order
+
+    @cached_property
+    def analysis(self) -> SymbolicCholesky:
+        """Symbolic factorisation of the pattern of M, which both have."""
+        return self.original.analysis
+
+
+@dataclass(frozen=True, eq=False)
+class _ExtendedProblem(PGOProblem):
+    """A problem with further terms between poses that share an edge in the `original`.
+
+    Its M has the pattern of the original's, and so has every factor.
+    """
+
+    original: PGOProblem = field(kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Accept what the original was accepted with."""
 
     @cached_property
     def pose_order(self) -> IntArray:

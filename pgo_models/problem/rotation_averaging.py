@@ -18,11 +18,10 @@ from pgo_models.problem.rotation_weights import ScaledIdentities
 class RotationAveraging(EdgeCost):
     """Cost kappa ||R_j - R_i R_ij||_F^2 + tau ||t_j - t_i||^2 of every edge.
 
-    No measured translation counts.
-
-    The second term makes the translations equal, at no cost, whatever the rotations are. So minima
-    and lower bounds over poses are those over rotations alone, and all that works for F works here:
-    M is blockdiag of a positive semidefinite Laplacian and L.
+    Measured translations are ignored. For any rotations the second term is zero at its minimum,
+    where all translations are equal. So minima and lower bounds over poses are those over rotations
+    alone. All methods for F apply: M is block diagonal, with a positive semidefinite Laplacian for
+    the translations and L for the rotations.
 
     Parameters
     ----------
@@ -57,7 +56,8 @@ class RotationAveraging(EdgeCost):
         RotationAveraging
             Its cost, to be given to a `PGOProblem` as its weighting.
         """
-        return cls(graph.tau, ScaledIdentities(graph.kappa))
+        rotation = ScaledIdentities(graph.kappa)
+        return cls(graph.tau, rotation)
 
     def seen_offsets(self, t_ij: Array) -> Array:
         """Zeros, (m, d): every edge asks for t_j = t_i."""

@@ -4,12 +4,13 @@ The residual is rho_R = R_j^T - R_ij^T R_i^T.
 
 They come in three forms, one class each with the same methods:
 
-- `ScaledIdentities`: W = kappa I, the numbers of F, which are what they are;
-- `RoundedIdentities`: W = kappa I, computed from information matrices, and so off by rounding;
+- `ScaledIdentities`: W = kappa I, the given precisions of F, without an error;
+- `RoundedIdentities`: W = kappa I, computed from information matrices, with a rounding error;
 - `SymmetricMatrices`: W = U diag(kappa) U^T, computed from information matrices.
 
-The rows of a rotation residual are weighed along the axes U, where W is diagonal: the matrix A of
-`pgo_models.problem.matrices.residual_matrix` has the rows U^T rho_R, with weights kappa.
+The columns of U are the eigenvectors of W, "axes" in the names below. The residual matrix A of
+`pgo_models.problem.matrices.residual_matrix` has the rows U^T rho_R, in which W is diagonal: their
+weights are the eigenvalues kappa.
 """
 
 from abc import ABC, abstractmethod
@@ -25,7 +26,7 @@ from pgo_models.problem.floating_point import OUTWARD, gamma
 
 @dataclass(frozen=True, eq=False)
 class RotationWeights(ABC):
-    """Weights W of the rotation residuals of m edges: what every form of them can do."""
+    """Weights W of the rotation residuals of m edges: the methods that every form has."""
 
     kappa: Array  # (m,) for W = kappa I, (m, d) for W = U diag(kappa) U^T; may be negative
 
@@ -35,11 +36,15 @@ class RotationWeights(ABC):
 
     @abstractmethod
     def scaled(self, share: Array) -> Self:
-        """Weights times shares, (m,)."""
+        """Weights multiplied by shares, (m,)."""
+
+    @abstractmethod
+    def with_matrices(self, W: Array) -> "SymmetricMatrices":
+        """Weights of further edges after these: W, (k, d, d), meant as they are stored."""
 
     @abstractmethod
     def raised_to(self, least: Array) -> "RotationWeights":
-        """Exact weights near these, whose eigenvalues along axes are at least `least`, (m,)."""
+        """Weights near these, without an error, whose eigenvalues are at least `least`, (m,)."""
 
     @property
     @abstractmethod
@@ -64,7 +69,7 @@ class RotationWeights(ABC):
     @property
     @abstractmethod
     def has_own_axes(self) -> bool:
-        """Whether the rows of A are along axes other than those of the world."""
+        """Whether U is not the identity, so that A has U^T rho_R in place of rho_R."""
 
     @abstractmethod
     def matrices(self, d: int) -> Array:
@@ -79,7 +84,7 @@ class RotationWeights(ABC):
         """|W| times sizes, (m, d, k): bound on W rho_R where |rho_R| <= sizes, entry by entry."""
 
     @abstractmethod
-    def turned_measurements(self, R_ij: Array) -> tuple[Array, Array, Array]:
+    def measurement_products(self, R_ij: Array) -> tuple[Array, Array, Array]:
         """R_ij W, R_ij W R_ij^T and W, (m, d, d) each."""
 
     @abstractmethod
@@ -95,30 +100,29 @@ class RotationWeights(ABC):
         """
 
     @abstractmethod
-    def along_axes(self, rho_R: Array) -> Array:
-        """U^T rho_R for rho_R of shape (m, d, k): the residual as the rows of A have it."""
+    def to_eigenbasis(self, rho_R: Array) -> Array:
+        """U^T rho_R for rho_R of shape (m, d, k): the rotation rows of A."""
 
     @abstractmethod
-    def off_axes(self, rows: Array) -> Array:
-        """U times rows, (m, d, k): the residual of rows as A has them."""
+    def from_eigenbasis(self, rows: Array) -> Array:
+        """rho_R = U rows for rotation rows of A, (m, d, k)."""
 
     @abstractmethod
     def effect_of_error(self, sizes: Array, errors: Array) -> tuple[float, Array | float]:
-        """What the error of W moves at residuals of sizes |rho_R|, known to errors, (m, d, d).
+        """Bounds on what the error of W changes in the value and in W rho_R, both rounded up.
 
-        With ||W_exact - W||_F <= e and s = ||sizes + errors||_F, the sum over all edges of tr(W
-        rho_R rho_R^T) moves by at most sum_e e s^2, and an entry of W rho_R by at most e s.
-        Returned are the sum and the second bound, one number for every edge, (m, 1, 1), both
-        rounded up.
+        The residuals have the sizes |rho_R| and are known up to errors, (m, d, d) each. With
+        ||W_exact - W||_F <= e and s = ||sizes + errors||_F, the sum over all edges of tr(W rho_R
+        rho_R^T) changes by at most sum_e e s^2, which is returned first. An entry of W rho_R
+        changes by at most e s, which is returned second, one number for every edge, (m, 1, 1).
         """
 
     @abstractmethod
     def error_of_rows(self, rows: Array) -> float:
-        """Bound on how far sum_rows kappa ||row||^2 is from the sum of tr(W_exact rho_R rho_R^T).
+        """Bound on the difference of sum_rows kappa ||row||^2 and sum_e tr(W_exact rho_R rho_R^T).
 
-        The rows of A have shape (d m, d).
-
-        It counts the error of W and that of its stored axes, not the rounding of the sum.
+        The rows are those of A X, (d m, d). The bound counts the error of W and that of its stored
+        eigenvectors, but not the rounding of the sum.
         """
 
     @abstractmethod
@@ -135,8 +139,17 @@ class ScaledIdentities(RotationWeights):
         return replace(self, kappa=self.kappa[chosen])
 
     def scaled(self, share: Array) -> Self:
-        """Weights times shares, (m,)."""
+        """Weights multiplied by shares, (m,)."""
         return replace(self, kappa=share * self.kappa)
+
+    def with_matrices(self, W: Array) -> "SymmetricMatrices":
+        """These as matrices kappa I, and W, (k, d, d), of further edges after them."""
+        m = len(self.kappa)
+        d = W.shape[2]
+        kappa = np.repeat(self.kappa[:, None], d, axis=1)
+        axes = np.broadcast_to(np.eye(d), (m, d, d))
+        own = SymmetricMatrices(kappa, self.norm_of_error(), axes, self.matrices(d))
+        return own.with_matrices(W)
 
     def raised_to(self, least: Array) -> RotationWeights:
         """The same kappa: with a multiple of the identity chi2 is convex in the rotations."""
@@ -145,11 +158,12 @@ class ScaledIdentities(RotationWeights):
     @property
     def is_convex(self) -> bool:
         """Whether every kappa that is not zero is positive."""
-        return bool((self.kappa[self.kappa != 0.0] > 0.0).all())
+        nonzero = self.kappa[self.kappa != 0.0]
+        return bool((nonzero > 0.0).all())
 
     @property
     def is_exact(self) -> bool:
-        """True: kappa is what is given."""
+        """True: kappa is given, not computed."""
         return True
 
     @property
@@ -179,13 +193,14 @@ class ScaledIdentities(RotationWeights):
         """|kappa| times sizes."""
         return np.abs(self.kappa)[:, None, None] * sizes
 
-    def turned_measurements(self, R_ij: Array) -> tuple[Array, Array, Array]:
+    def measurement_products(self, R_ij: Array) -> tuple[Array, Array, Array]:
         """Blocks kappa R_ij, and kappa I twice.
 
-        What R_ij R_ij^T is off I is counted in the bound on the rounding of M.
+        The difference of R_ij R_ij^T and I is counted in the bound on the rounding of M.
         """
+        R_W = self.kappa[:, None, None] * R_ij
         W = self.matrices(R_ij.shape[1])
-        return self.kappa[:, None, None] * R_ij, W, W
+        return R_W, W, W
 
     def row_weights(self, d: int) -> Array:
         """Every kappa d times, (d m,)."""
@@ -193,15 +208,16 @@ class ScaledIdentities(RotationWeights):
 
     def row_entries(self, R_ij: Array, columns_j: IntArray) -> tuple[Array, Array, IntArray]:
         """Entries -R_ij^T, and a single 1 a row in the columns of R_j."""
-        ones = np.ones((*columns_j.shape, 1))
-        return -np.swapaxes(R_ij, 1, 2), ones, columns_j[:, :, None]
+        at_i = -np.swapaxes(R_ij, 1, 2)
+        at_j = np.ones((*columns_j.shape, 1))
+        return at_i, at_j, columns_j[:, :, None]
 
-    def along_axes(self, rho_R: Array) -> Array:
-        """rho_R itself."""
+    def to_eigenbasis(self, rho_R: Array) -> Array:
+        """rho_R itself, as U = I."""
         return rho_R
 
-    def off_axes(self, rows: Array) -> Array:
-        """The rows themselves."""
+    def from_eigenbasis(self, rows: Array) -> Array:
+        """The rows themselves, as U = I."""
         return rows
 
     def effect_of_error(self, sizes: Array, errors: Array) -> tuple[float, Array | float]:
@@ -219,7 +235,7 @@ class ScaledIdentities(RotationWeights):
 
 @dataclass(frozen=True, eq=False)
 class _Rounded(RotationWeights):
-    """What weights that were computed from information matrices have in common: an error."""
+    """Weights with an error: those that were computed from information matrices."""
 
     error: Array  # (m,): bound on the Frobenius norm of W_exact - W
 
@@ -231,17 +247,20 @@ class _Rounded(RotationWeights):
     def effect_of_error(self, sizes: Array, errors: Array) -> tuple[float, Array | float]:
         """Bounds sum_e e s^2 and e s for s = ||sizes + errors||_F, rounded up."""
         length = np.linalg.norm(sizes + errors, axis=(1, 2))
-        of_form = OUTWARD * float(np.sum(self.error * length**2))
-        of_product = OUTWARD * (self.error * length)[:, None, None]
-        return of_form, of_product
+        of_value = float(np.sum(self.error * length**2))
+        of_product = self.error * length
+        return OUTWARD * of_value, OUTWARD * of_product[:, None, None]
 
     def error_of_rows(self, rows: Array) -> float:
-        """Bound sum_e (e + error of the axes) ||rho_R||_F^2.
+        """Bound sum_e (e + error of the eigenvectors) ||rho_R||_F^2.
 
-        The rows along U have the norm of rho_R.
+        U^T rho_R has the norm of rho_R.
         """
-        squares = np.sum(rows**2, axis=1).reshape(len(self.kappa), -1).sum(axis=1)
-        return float(np.sum((self.error + self._error_of_axes(rows.shape[1])) * squares))
+        m = len(self.kappa)
+        row_squares = np.sum(rows**2, axis=1)
+        squares = row_squares.reshape(m, -1).sum(axis=1)
+        error = self.error + self._error_of_axes(rows.shape[1])
+        return float(np.sum(error * squares))
 
     def _error_of_axes(self, d: int) -> Array | float:
         """Bound on ||U diag(kappa) U^T - W|| for the U that is stored."""
@@ -261,12 +280,12 @@ class RoundedIdentities(_Rounded, ScaledIdentities):
         return replace(self, kappa=self.kappa[chosen], error=self.error[chosen])
 
     def scaled(self, share: Array) -> Self:
-        """Weights times shares, (m,)."""
+        """Weights multiplied by shares, (m,)."""
         return replace(self, kappa=share * self.kappa, error=share * self.error)
 
     @property
     def norm_bound(self) -> Array:
-        """|kappa| and the error of W, (m,)."""
+        """|kappa| plus the error of W, (m,)."""
         return np.abs(self.kappa) + self.error
 
 
@@ -288,7 +307,7 @@ class SymmetricMatrices(_Rounded):
         )
 
     def scaled(self, share: Array) -> Self:
-        """Weights times shares, (m,)."""
+        """Weights multiplied by shares, (m,)."""
         return replace(
             self,
             kappa=share[:, None] * self.kappa,
@@ -296,19 +315,32 @@ class SymmetricMatrices(_Rounded):
             W=share[:, None, None] * self.W,
         )
 
-    def raised_to(self, least: Array) -> RotationWeights:
-        """Weights with the eigenvalues max(kappa, least) along the same axes.
+    def with_matrices(self, W: Array) -> "SymmetricMatrices":
+        """Weights of further edges after these: W, (k, d, d), meant as they are stored."""
+        kappa, axes = np.linalg.eigh(W)
+        return SymmetricMatrices(
+            np.concatenate([self.kappa, kappa]),
+            np.concatenate([self.error, np.zeros(len(W))]),
+            np.concatenate([self.axes, axes]),
+            np.concatenate([self.W, W]),
+        )
 
-        They are meant as they are stored, so that they have no error.
+    def raised_to(self, least: Array) -> RotationWeights:
+        """Weights with the eigenvalues max(kappa, least) and the same eigenvectors.
+
+        The stored numbers define these weights, so that they have no error.
         """
         kappa = np.maximum(self.kappa, least[:, None])
-        W = (self.axes * kappa[:, None, :]) @ np.swapaxes(self.axes, 1, 2)
-        return SymmetricMatrices(kappa, np.zeros(len(kappa)), self.axes, W)
+        scaled_axes = self.axes * kappa[:, None, :]
+        W = scaled_axes @ np.swapaxes(self.axes, 1, 2)
+        no_error = np.zeros(len(kappa))
+        return SymmetricMatrices(kappa, no_error, self.axes, W)
 
     @property
     def is_convex(self) -> bool:
-        """Whether all kappa of every edge with a W are positive."""
-        return bool((self.kappa[self.kappa.any(axis=1)] > 0.0).all())
+        """Whether all kappa of every edge with a nonzero W are positive."""
+        is_nonzero = self.kappa.any(axis=1)
+        return bool((self.kappa[is_nonzero] > 0.0).all())
 
     @property
     def is_used(self) -> BoolArray:
@@ -317,12 +349,13 @@ class SymmetricMatrices(_Rounded):
 
     @property
     def norm_bound(self) -> Array:
-        """The largest |kappa| and the error of W, (m,)."""
-        return np.asarray(np.abs(self.kappa).max(axis=1) + self.error)
+        """The largest |kappa| plus the error of W, (m,)."""
+        largest = np.abs(self.kappa).max(axis=1)
+        return np.asarray(largest + self.error)
 
     @property
     def has_own_axes(self) -> bool:
-        """True: the rows of A are along U."""
+        """True: the rotation rows of A are U^T rho_R."""
         return True
 
     def matrices(self, d: int) -> Array:
@@ -337,10 +370,11 @@ class SymmetricMatrices(_Rounded):
         """|W| sizes, with the absolute values of the entries."""
         return np.abs(self.W) @ sizes
 
-    def turned_measurements(self, R_ij: Array) -> tuple[Array, Array, Array]:
+    def measurement_products(self, R_ij: Array) -> tuple[Array, Array, Array]:
         """R_ij W, R_ij W R_ij^T and W, (m, d, d) each."""
-        turned = R_ij @ self.W
-        return turned, turned @ np.swapaxes(R_ij, 1, 2), self.W
+        R_W = R_ij @ self.W
+        R_W_Rt = R_W @ np.swapaxes(R_ij, 1, 2)
+        return R_W, R_W_Rt, self.W
 
     def row_weights(self, d: int) -> Array:
         """The kappa of every edge, (d m,)."""
@@ -350,15 +384,19 @@ class SymmetricMatrices(_Rounded):
         """Entries -U^T R_ij^T and U^T, each row of which has entries in all columns of R_j."""
         at_i = -np.swapaxes(R_ij @ self.axes, 1, 2)
         at_j = np.swapaxes(self.axes, 1, 2)
-        return at_i, at_j, np.repeat(columns_j[:, None], columns_j.shape[1], axis=1)
+        d = columns_j.shape[1]
+        columns = np.repeat(columns_j[:, None], d, axis=1)
+        return at_i, at_j, columns
 
-    def along_axes(self, rho_R: Array) -> Array:
+    def to_eigenbasis(self, rho_R: Array) -> Array:
         """U^T rho_R."""
-        return np.swapaxes(self.axes, 1, 2) @ rho_R
+        transposed_axes = np.swapaxes(self.axes, 1, 2)
+        return transposed_axes @ rho_R
 
-    def off_axes(self, rows: Array) -> Array:
+    def from_eigenbasis(self, rows: Array) -> Array:
         """U times rows, (m, d, k)."""
         return self.axes @ rows
 
     def _error_of_axes(self, d: int) -> Array:
-        return np.asarray(gamma(4.0 * d) * np.abs(self.kappa).max(axis=1))
+        largest = np.abs(self.kappa).max(axis=1)
+        return np.asarray(gamma(4.0 * d) * largest)

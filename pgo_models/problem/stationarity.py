@@ -1,7 +1,4 @@
-"""How far poses are from a stationary point of F.
-
-It is the length of the Riemannian gradient, without a unit.
-"""
+"""Relative length of the Riemannian gradient: how far poses are from a stationary point of F."""
 
 import math
 
@@ -11,32 +8,36 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 
-# Half the squared Newton decrement of a stationary point of F, as a share of F.
+# Poses count as a stationary point if half the squared Newton decrement is at most this share of F.
 STATIONARY_DECREMENT = 1e-13
 _EPS = float(np.finfo(float).eps)
 
 
 def rotation_scale(problem: PGOProblem) -> Array:
     """m_i, (n,): the mean diagonal of M over the rotation rows of every pose."""
-    diagonal = problem.M.data[problem.diagonal_positions[problem.num_poses :]]
-    return np.asarray(diagonal.reshape(problem.num_poses, problem.d).mean(axis=1))
+    n = problem.num_poses
+    positions = problem.diagonal_positions[n:]
+    diagonal = problem.M.data[positions].reshape(n, problem.d)
+    return np.asarray(diagonal.mean(axis=1))
 
 
 def gradient_squares(problem: PGOProblem, poses: Poses) -> Array:
-    """Squared length of the gradient's part at every pose, (n,).
+    """Squared length of the gradient of every pose, (n,), in the metric of the diagonal of 2 M.
 
-    The metric is that of the diagonal of 2 M.
-
-    It is |g_t|^2 / (2 M_tt) + |g_w|^2 / (4 m), where g_t and g_w are the gradient over the
-    translation and the rotation vector of the pose, and m is the mean diagonal of M on its rotation
-    rows. A square is a cost, in the unit of F.
+    It is |g_t|^2 / (2 M_tt) + |g_w|^2 / (4 m), where g_t and g_w are the gradient in the
+    translation and in the rotation vector of the pose, and m is the mean diagonal of M on its
+    rotation rows. It has the unit of F.
     """
-    of_rotations, of_translations = problem.riemannian_gradient(poses)
-    of_positions = problem.M.data[problem.diagonal_positions[: problem.num_poses]]
-    # A landmark has no rotation, and a pose of rotation averaging no translation: both entries are
-    # zero.
-    turning = _quotient(np.sum(of_rotations**2, axis=1), 4.0 * rotation_scale(problem))
-    return turning + _quotient(np.sum(of_translations**2, axis=1), 2.0 * of_positions)
+    n = problem.num_poses
+    g_w, g_t = problem.riemannian_gradient(poses)
+    squares_w = np.sum(g_w**2, axis=1)
+    squares_t = np.sum(g_t**2, axis=1)
+    M_tt = problem.M.data[problem.diagonal_positions[:n]]
+    # A landmark has no rotation, and a pose of rotation averaging no translation: gradient and
+    # diagonal are zero there, and so is the quotient.
+    of_rotations = _quotient(squares_w, 4.0 * rotation_scale(problem))
+    of_translations = _quotient(squares_t, 2.0 * M_tt)
+    return of_rotations + of_translations
 
 
 def rotation_squares(problem: PGOProblem) -> Array:
@@ -45,18 +46,18 @@ def rotation_squares(problem: PGOProblem) -> Array:
 
 
 def relative_length(gradient_square: float, objective: float, rotation_square: float) -> float:
-    """Length of the gradient relative to those of the residuals and of the rotations.
+    """Length of the gradient over the geometric mean of the lengths of residuals and rotations.
 
-    It is divided by their geometric mean.
-
-    Its arguments are sums over all poses of `gradient_squares` and `rotation_squares`, and F, which
-    is half of the squared length of the residuals in the same unit. Where measurements fit exactly
-    F and its gradient are rounding: F counts as no less than what residuals of sqrt(`_EPS`),
-    relative to the rotations, cost.
+    `gradient_square` and `rotation_square` are the sums of `gradient_squares` and
+    `rotation_squares` over all poses. The objective F is half of the squared length of the
+    residuals in the same unit. Where the measurements fit exactly, F and its gradient are rounding
+    errors: then 2 F is replaced by `_EPS` times `rotation_square`.
     """
     residual_square = max(2.0 * objective, _EPS * rotation_square)
     scale = math.sqrt(residual_square * rotation_square)
-    return math.sqrt(gradient_square / scale) if scale > 0.0 else math.inf
+    if scale > 0.0:
+        return math.sqrt(gradient_square / scale)
+    return math.inf
 
 
 def relative_gradient(problem: PGOProblem, poses: Poses) -> float:
@@ -71,9 +72,14 @@ def relative_gradient(problem: PGOProblem, poses: Poses) -> float:
     >>> relative_gradient(problem, problem.graph.truth) < 1.0
     True
     """
-    square = float(gradient_squares(problem, poses).sum())
-    return relative_length(square, problem.objective(poses), float(rotation_squares(problem).sum()))
+    gradient_square = float(gradient_squares(problem, poses).sum())
+    rotation_square = float(rotation_squares(problem).sum())
+    objective = problem.objective(poses)
+    return relative_length(gradient_square, objective, rotation_square)
 
 
 def _quotient(numerator: Array, denominator: Array) -> Array:
-    return np.divide(numerator, denominator, out=np.zeros_like(numerator), where=denominator > 0)
+    """Quotients, entry by entry; zero where the denominator is zero."""
+    quotient = np.zeros_like(numerator)
+    is_positive = denominator > 0
+    return np.divide(numerator, denominator, out=quotient, where=is_positive)

@@ -1,6 +1,6 @@
-"""Chi-square tests: what edges may cost before their measurements are doubted.
+"""Chi-square tests of the costs of the edges, each on its own and all together.
 
-They are made for every edge and for all of them, in either weighting.
+They are made for either weighting, F or chi2.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from pgo_models.problem.edge_cost import isotropic_cost
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 
-# probability that right measurements with errors as their matrices say give a misfit at all
+# Probability of any misfit when all measurement errors have the covariances of their matrices.
 FALSE_ALARM = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeResiduals:
-    """How well every edge fits some poses, and whether its errors may be so large.
+    """Residuals and costs of every edge at some poses, with the thresholds of chi-square tests.
 
     Parameters
     ----------
@@ -37,14 +37,14 @@ class EdgeResiduals:
     cost : Array, (m,)
         Summand of F, or of chi2.
     allowed : Array, (m,)
-        What an edge may cost: `chi2_thresholds` at 1 - FALSE_ALARM / m (Bonferroni), times `scale`.
+        Threshold of the cost: `chi2_thresholds` at 1 - FALSE_ALARM / m (Bonferroni), times `scale`.
     scale : float
-        Median of the cost over its threshold at one half, at least 1: where the median edge costs
-        too much, the matrices are to blame, and not the edges.
+        Median of the cost over its threshold at one half, at least 1. It is larger than 1 where the
+        information matrices are too large for the errors of most edges.
     overall : float
-        Sum of the costs over the expected one, about 1 where errors are as the matrices say; 0
-        without redundancy. It is large where one wrong loop closure among few bends the odometry,
-        so that no edge exceeds its own threshold.
+        Sum of the costs over its expectation, about 1 where errors have the covariances of the
+        matrices; 0 without redundancy. It is large where one wrong loop closure among few deforms
+        the odometry, so that no edge exceeds its own threshold.
     overall_allowed : float
         Bound that `overall` exceeds with probability FALSE_ALARM.
     """
@@ -60,42 +60,43 @@ class EdgeResiduals:
     @property
     def share(self) -> Array:
         """Share of the cost, (m,); zeros where it is zero."""
-        return np.asarray(self.cost / max(float(self.cost.sum()), np.finfo(float).tiny))
+        total = max(float(self.cost.sum()), np.finfo(float).tiny)
+        return np.asarray(self.cost / total)
 
     @property
     def is_misfit(self) -> BoolArray:
-        """Whether an edge costs more than it may, (m,)."""
+        """Whether the cost of an edge exceeds its threshold, (m,)."""
         return self.cost > self.allowed
 
     @property
     def is_overall_misfit(self) -> bool:
-        """Whether all edges together cost more than they may."""
+        """Whether the sum of the costs exceeds its threshold."""
         return self.overall > self.overall_allowed
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether there is a misfit, or all edges together cost more than they may."""
+        """Whether an edge is a misfit, or all edges together are."""
         return bool(self.is_misfit.any()) or self.is_overall_misfit
 
 
 def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResiduals:
     """Compute and test the residuals and the cost of every edge at poses.
 
-    The costs are the summands of `min overall` in the paper. Expected of their sum is sum_e sum w
-    (1 - u / r), with r the rank of all information and u the number of unknowns (`chi2_thresholds`
-    has the w).
+    The costs are the summands of `min overall` in the paper. The expectation of their sum is sum_e
+    sum w (1 - u / r), with r the rank of all information, u the number of unknowns, and w as in
+    `chi2_thresholds`.
 
     Parameters
     ----------
     problem : PGOProblem or PoseGraph
-        The problem; of a graph it is F.
+        The problem; for a graph the cost is F.
     poses : Poses
         One pose for every pose of the graph.
 
     Returns
     -------
     EdgeResiduals
-        Residuals, costs, and what these may be.
+        Residuals, costs and thresholds.
 
     Raises
     ------
@@ -112,27 +113,49 @@ def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResidua
     """
     graph = problem if isinstance(problem, PoseGraph) else problem.graph
     translation, rotation, cost = edge_errors(graph, poses)
-    w = _chi2_weights(problem)
     if isinstance(problem, PGOProblem):
         cost = problem.edge_costs(poses)
-    d = graph.d
-    p = tangent_dimension(graph.d)
-    points = len(graph.landmarks)
-    unknowns = (d + p) * (graph.num_poses - points - 1) + d * points
-    redundancy = 1.0 - unknowns / max(int(np.sum(w > 0.0)), 1)
+    w = _chi2_weights(problem)
+    scale = _median_ratio(cost, w)
+    quantile = 1.0 - FALSE_ALARM / max(graph.num_edges, 1)
+    allowed = scale * _quantiles(w, quantile)
+    # All edges together: the sum is taken for a scaled chi^2 with the same mean and variance.
+    redundancy = _redundancy(graph, w)
     mean = redundancy * np.sum(w)
-    square = redundancy * np.sum(w**2)
-    overall, dof = (float(cost.sum() / mean), mean**2 / square) if mean > 0.0 else (0.0, 1.0)
-    typical = _quantiles(w, 0.5)
-    counted = typical > 0.0
-    scale = max(1.0, float(np.median(cost[counted] / typical[counted]))) if counted.any() else 1.0
-    allowed = scale * _quantiles(w, 1.0 - FALSE_ALARM / max(graph.num_edges, 1))
+    half_variance = redundancy * np.sum(w**2)
+    overall = 0.0
+    dof = 1.0
+    if mean > 0.0:
+        overall = float(cost.sum() / mean)
+        dof = mean**2 / half_variance
     overall_allowed = float(scipy.special.chdtri(dof, FALSE_ALARM) / dof)
     return EdgeResiduals(translation, rotation, cost, allowed, scale, overall, overall_allowed)
 
 
+def _median_ratio(cost: Array, w: Array) -> float:
+    """Median over the edges of the cost over its median, at least 1."""
+    median_cost = _quantiles(w, 0.5)
+    is_counted = median_cost > 0.0
+    if not is_counted.any():
+        return 1.0
+    ratios = cost[is_counted] / median_cost[is_counted]
+    return max(1.0, float(np.median(ratios)))
+
+
+def _redundancy(graph: PoseGraph, w: Array) -> float:
+    """1 - u / r for u unknowns and measurements of rank r."""
+    d = graph.d
+    p = tangent_dimension(d)
+    num_points = len(graph.landmarks)
+    num_other_poses = graph.num_poses - num_points
+    # One pose is fixed.
+    unknowns = (d + p) * (num_other_poses - 1) + d * num_points
+    rank = int(np.sum(w > 0.0))
+    return 1.0 - unknowns / max(rank, 1)
+
+
 def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
-    """Compute what the edges' costs at the true poses exceed with probability 1 - quantile.
+    """Compute thresholds that edge costs at the true poses exceed with probability 1 - quantile.
 
     Measurement errors r = (r_t, r_r) are N(0, Sigma), Sigma the inverse of the edge's information
     matrix I (of kappa and tau where the graph has none). The cost with these matrices, r^T I r, is
@@ -145,10 +168,11 @@ def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
 
         c_1 + c_3 / c_2 (chi^2_l - l),  c_k = sum w^k,  l = c_2^3 / c_3^2,
 
-    exact where the w are equal; else at the quantile 0.99 within 7 %, at 1 - 2e-6 within 2.5 times,
-    of 1 - quantile. F of SE-Sync's kappa in the plane has w = 2 of the angle. Least squares fits
-    the poses to the errors, so that the residuals of an optimum are smaller than these where few
-    edges say the same.
+    It is exact where the w are equal. Otherwise the probability of exceeding it differs from 1 -
+    quantile by at most 7 % at the quantile 0.99, and by at most a factor of 2.5 at 1 - 2e-6. For F
+    with the kappa of SE-Sync in the plane, the w of the angle is 2. Least squares fits the poses to
+    the errors, so that the costs at an optimum are smaller than these where there is little
+    redundancy.
 
     Parameters
     ----------
@@ -181,11 +205,12 @@ def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
 def _quantiles(w: Array, quantile: float) -> Array:
     """Quantiles of sums of w chi^2_1, (m,)."""
     c_1, c_2, c_3 = (np.sum(w**k, axis=1) for k in (1, 2, 3))
-    ratio = c_3 / np.where(c_2 > 0.0, c_2, 1.0)  # of an edge without weight all are zero
-    dof = c_2 / np.where(ratio > 0.0, ratio, 1.0) ** 2
-    return np.asarray(
-        c_1 + ratio * (scipy.special.chdtri(np.maximum(dof, 1.0), 1.0 - quantile) - dof)
-    )
+    # An edge without weight has c_1 = c_2 = c_3 = 0.
+    ratio = c_3 / np.where(c_2 > 0.0, c_2, 1.0)
+    divisor = np.where(ratio > 0.0, ratio, 1.0)
+    dof = c_2 / divisor**2
+    chi2_quantile = scipy.special.chdtri(np.maximum(dof, 1.0), 1.0 - quantile)
+    return np.asarray(c_1 + ratio * (chi2_quantile - dof))
 
 
 def _chi2_weights(problem: PGOProblem | PoseGraph) -> Array:
@@ -202,26 +227,38 @@ def _chi2_weights(problem: PGOProblem | PoseGraph) -> Array:
         weights = problem.weights
         is_chi2 = problem.weighting is Weighting.INFORMATION or weights.is_chi2
     d = graph.d
-    information = gaussian_information(graph)
-    if len(graph.first_sights):  # what ties a landmark's rotation measures nothing
-        information = information.copy()
-        information[graph.first_sights, d:] = 0.0
-        information[graph.first_sights, :, d:] = 0.0
-    scaled, scale = scaled_blocks(information)
-    values, axes = np.linalg.eigh(scaled)
-    is_known = values > LEAST_SCALED
+    scaled, scale = scaled_blocks(_measured_information(graph))
+    eigenvalues, eigenvectors = np.linalg.eigh(scaled)
+    is_known = eigenvalues > LEAST_SCALED
     if is_chi2:
         return is_known.astype(float)
-    half = (
-        scale[:, :, None] * axes * (is_known / np.sqrt(np.where(is_known, values, 1.0)))[:, None, :]
-    )
+    # A root of Sigma = root root^T, where the information is known.
+    inverse_roots = is_known / np.sqrt(np.where(is_known, eigenvalues, 1.0))
+    root = scale[:, :, None] * eigenvectors * inverse_roots[:, None, :]
+    root_t = root[:, :d]
+    root_r = root[:, d:]
+    # The matrix root^T blockdiag(tau I, V) root.
     W = weights.W(d)
     trace = np.einsum("mkk->m", W)[:, None, None]
     V = trace if d == 2 else trace * np.eye(3) - W
-    r_t = half[:, :d]
-    r_r = half[:, d:]
-    form = (
-        weights.tau[:, None, None] * np.swapaxes(r_t, 1, 2) @ r_t + np.swapaxes(r_r, 1, 2) @ V @ r_r
-    )
-    w = np.linalg.eigvalsh(form)
-    return np.where(w > LEAST_SCALED * w[:, -1:], w, 0.0)
+    of_translations = weights.tau[:, None, None] * np.swapaxes(root_t, 1, 2) @ root_t
+    of_rotations = np.swapaxes(root_r, 1, 2) @ V @ root_r
+    w = np.linalg.eigvalsh(of_translations + of_rotations)
+    least = LEAST_SCALED * w[:, -1:]
+    return np.where(w > least, w, 0.0)
+
+
+def _measured_information(graph: PoseGraph) -> Array:
+    """Information matrices, (m, d + p, d + p), without those that fix rotations of landmarks.
+
+    A landmark has no rotation; its first edge holds the rotation of its pose, which is no
+    measurement.
+    """
+    d = graph.d
+    information = gaussian_information(graph)
+    if len(graph.first_sights) == 0:
+        return information
+    information = information.copy()
+    information[graph.first_sights, d:] = 0.0
+    information[graph.first_sights, :, d:] = 0.0
+    return information

@@ -2,12 +2,12 @@
 
 **F**: tau ||rho_t||^2 + kappa ||rho_R||_F^2 (`pgo_models.problem.edge_cost`).
 
-**chi2** (`pgo_models.graphs.residuals.chi2`, CHORDAL): for a turn E by theta about a, 2 (1 - cos
-theta) a^T I_rr a = tr(W (2 I - E - E^T)) with W = tr(I_rr) / 2 I - I_rr in space and I_theta / 2 I
-in the plane: quadratic in the rotations, convex where no eigenvalue of I_rr is above the sum of the
-others. What is left of the translations, r^T (I_tt - tau I) r for a tau below the smallest
-eigenvalue, is a convex function of Z, as is what couples them with the rotation: see
-`pgo_models.problem.excess`.
+**chi2** (`pgo_models.graphs.residuals.chi2`, CHORDAL): for a rotation E by theta about a, 2 (1 -
+cos theta) a^T I_rr a = tr(W (2 I - E - E^T)) with W = tr(I_rr) / 2 I - I_rr in space and I_theta /
+2 I in the plane. This term is quadratic in the rotations, and convex where no eigenvalue of I_rr is
+above the sum of the others. The rest of the translation term, r^T (I_tt - tau I) r for a tau below
+the smallest eigenvalue of I_tt, is a convex function of Z, and so is the coupling of translations
+with rotations: see `pgo_models.problem.excess`.
 """
 
 import enum
@@ -34,14 +34,17 @@ from pgo_models.problem.rotation_weights import (
     SymmetricMatrices,
 )
 
-# of the smallest eigenvalue: stays between tau and it, so that the excess is strictly convex
+# Distance of tau from the smallest eigenvalue, as a share of it: with it the excess is strictly
+# convex.
 _MARGIN = 2.0**-24
-# of the trace: far above the rounding of a block, which so cannot make it indefinite
+# Share of the trace of a block, far above the rounding error of its eigenvalues.
 _ROUNDED = 2.0**-42
-_LEAST_CONVEX = 0.1  # of the kappa of F: the least weight of a rotation row in the convex cost
-_COUPLED_SHARE = 0.5  # of what the coupling leaves of the smallest eigenvalue of I_tt stays in tau
-# Share of it that stays in tau where the coupling leaves nothing: so small that W' is hardly
-# indefinite, and far above rounding.
+# Least weight of a rotation row in the convex cost, as a share of the kappa of F.
+_LEAST_CONVEX = 0.1
+# tau of an edge with coupling: share of `uncoupled_share` times the smallest eigenvalue of I_tt.
+_COUPLED_SHARE = 0.5
+# tau of an edge whose information matrix is only semidefinite, as a share of the smallest
+# eigenvalue of I_tt: so small that W' is hardly indefinite, and far above rounding.
 _SINGULAR_SHARE = 2.0**-20
 
 
@@ -54,7 +57,7 @@ class Weighting(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class _Information:
-    """Information matrices of the edges by block, with what is known of their eigenvalues."""
+    """Blocks of the information matrices of the edges, with extreme eigenvalues and traces."""
 
     I_tt: Array  # (m, d, d)
     I_tr: Array  # (m, d, p)
@@ -68,15 +71,18 @@ class _Information:
     def of(cls, information: Array, d: int) -> "_Information":
         """Blocks of information matrices, (m, d + p, d + p)."""
         I_tt = information[:, :d, :d]
+        I_tr = information[:, :d, d:]
         I_rr = information[:, d:, d:]
+        eigenvalues = np.linalg.eigvalsh(I_tt)
+        eigenvalues_R = np.linalg.eigvalsh(I_rr)
         return cls(
             I_tt,
-            information[:, :d, d:],
+            I_tr,
             I_rr,
-            np.asarray(np.linalg.eigvalsh(I_tt)[:, 0]),
-            np.einsum("mkk->m", I_tt),
-            np.asarray(np.linalg.eigvalsh(I_rr)[:, 0]),
-            np.einsum("mkk->m", I_rr),
+            smallest=np.asarray(eigenvalues[:, 0]),
+            trace=np.einsum("mkk->m", I_tt),
+            smallest_R=np.asarray(eigenvalues_R[:, 0]),
+            trace_R=np.einsum("mkk->m", I_rr),
         )
 
     @property
@@ -87,15 +93,17 @@ class _Information:
     def check_definite(self, graph: PoseGraph) -> None:
         """Raise a GraphError where a block is neither definite nor zero.
 
-        It is zero of landmarks and of priors of one kind.
+        Edges to landmarks and priors on a position or a rotation alone have a zero block.
         """
-        is_definite = (self.trace == 0.0) | (self.smallest > _ROUNDED * self.trace)
-        is_definite_R = (self.trace_R == 0.0) | (self.smallest_R > _ROUNDED * self.trace_R)
-        _check(graph, is_definite & is_definite_R)
+        is_zero = self.trace == 0.0
+        is_zero_R = self.trace_R == 0.0
+        is_definite = self.smallest > _ROUNDED * self.trace
+        is_definite_R = self.smallest_R > _ROUNDED * self.trace_R
+        _check(graph, (is_zero | is_definite) & (is_zero_R | is_definite_R))
 
     @property
     def margin(self) -> Array:
-        """Half of what stays between tau and the smallest eigenvalue of I_tt, (m,)."""
+        """Half the distance of tau from the smallest eigenvalue of I_tt, (m,)."""
         return _MARGIN * self.smallest + _ROUNDED * self.trace
 
     @property
@@ -105,23 +113,21 @@ class _Information:
 
 
 def information_cost(graph: PoseGraph, information: Array) -> EdgeCost:
-    """chi2 of the information matrices, (m, k, k), of a graph's edges.
+    """chi2 of the information matrices, (m, k, k), of a graph's edges (`proper_information`).
 
-    They are as of `proper_information`.
-
-    Blocks I_tt and I_rr are definite or zero. A GraphError names the edge where one is neither, or
-    is too far from isotropic for double precision, or that has no position beside one that is not
-    isotropic.
+    The blocks I_tt and I_rr are definite or zero. A GraphError names an edge with a block that is
+    neither or whose eigenvalues span more orders of magnitude than doubles carry. It also names an
+    edge with I_tt = 0 if the cost is not quadratic because of the others.
     """
     d = graph.d
     blocks = _Information.of(information, d)
     blocks.check_definite(graph)
-    is_isotropic = bool((blocks.I_tt == blocks.I_tt[:, :1, :1] * np.eye(d)).all())
+    multiples_of_identity = blocks.I_tt[:, :1, :1] * np.eye(d)
+    is_isotropic = bool((blocks.I_tt == multiples_of_identity).all())
     is_coupled = bool(blocks.is_coupled.any())
     if is_isotropic and not is_coupled:
-        return EdgeCost(
-            blocks.I_tt[:, 0, 0].copy(), _rotation_weights(blocks.I_rr, np.zeros_like(blocks.I_rr))
-        )
+        tau = blocks.I_tt[:, 0, 0].copy()
+        return EdgeCost(tau, _uncoupled_rotation_weights(blocks.I_rr))
     _check_positions(graph, blocks)
     if is_coupled:
         return _coupled_cost(graph, information, blocks)
@@ -133,62 +139,80 @@ def _uncoupled_cost(graph: PoseGraph, blocks: _Information) -> ExcessCost:
     d = graph.d
     margin = np.repeat(blocks.margin[:, None], d, axis=1)
     tau = blocks.uncoupled_tau
-    J = blocks.I_tt - tau[:, None, None] * np.eye(d)
-    J = graph.R_ij @ J @ np.swapaxes(graph.R_ij, 1, 2)
+    in_frame_j = blocks.I_tt - tau[:, None, None] * np.eye(d)
+    J = graph.R_ij @ in_frame_j @ np.swapaxes(graph.R_ij, 1, 2)
     _check_excess(graph, tau, J, margin)
-    size = _block_sizes(d, blocks.trace + d * tau, np.zeros_like(tau))
-    excess = Excess(graph.R_ij, J, size, 0.5 * margin[:, [0, -1]])
-    return ExcessCost(tau, _rotation_weights(blocks.I_rr, np.zeros_like(blocks.I_rr)), excess)
+    trace_of_sizes = blocks.trace + d * tau
+    size = _block_sizes(d, trace_of_sizes, np.zeros_like(tau))
+    least = 0.5 * margin[:, [0, -1]]
+    excess = Excess(graph.R_ij, J, size, least)
+    return ExcessCost(tau, _uncoupled_rotation_weights(blocks.I_rr), excess)
 
 
 def _coupled_cost(graph: PoseGraph, information: Array, blocks: _Information) -> ExcessCost:
     """chi2 with the excess u^T J u + tr(H K H), u = (r, s)."""
     d = graph.d
     p = tangent_dimension(d)
-    margin = np.repeat(blocks.margin[:, None], d, axis=1)
     tau = _coupled_tau(information, blocks)
     J_tt = blocks.I_tt - tau[:, None, None] * np.eye(d)
-    bearing = np.swapaxes(blocks.I_tr, 1, 2) @ np.linalg.solve(J_tt, blocks.I_tr)
-    # K costs nothing where I_rr is zero: W' is -K's.
-    is_empty = blocks.trace_R == 0.0
-    usual = np.median(blocks.smallest_R[~is_empty])
-    spare = _MARGIN * np.where(is_empty, usual, blocks.smallest_R) + _ROUNDED * blocks.trace_R
-    share = 0.5 + 4.0 * margin[:, 0] / blocks.smallest + _MARGIN
-    K = share[:, None, None] * (bearing + np.swapaxes(bearing, 1, 2))
-    K = K + 2.0 * spare[:, None, None] * np.eye(p)
-    margin = np.concatenate([margin, np.repeat(spare[:, None], p, axis=1)], axis=1)
+    margin_t = np.repeat(blocks.margin[:, None], d, axis=1)
+    margin_R = _rotation_margin(blocks)
+    # K is above the Schur complement I_tr^T J_tt^-1 I_tr, so that J is positive definite.
+    schur = np.swapaxes(blocks.I_tr, 1, 2) @ np.linalg.solve(J_tt, blocks.I_tr)
+    share = 0.5 + 4.0 * margin_t[:, 0] / blocks.smallest + _MARGIN
+    K = share[:, None, None] * (schur + np.swapaxes(schur, 1, 2))
+    K = K + 2.0 * margin_R[:, None, None] * np.eye(p)
     upper = np.concatenate([J_tt, blocks.I_tr], axis=2)
     lower = np.concatenate([np.swapaxes(blocks.I_tr, 1, 2), K], axis=2)
-    J = np.concatenate([upper, lower], axis=1)
-    turn = np.zeros_like(J)
-    turn[:, :d, :d] = graph.R_ij
-    turn[:, d:, d:] = graph.R_ij if d == 3 else 1.0
-    J = turn @ J @ np.swapaxes(turn, 1, 2)
+    in_frame_j = np.concatenate([upper, lower], axis=1)
+    # From the measured frame of pose j to that of pose i. In the plane both have the same axis.
+    to_frame_i = np.zeros_like(in_frame_j)
+    to_frame_i[:, :d, :d] = graph.R_ij
+    to_frame_i[:, d:, d:] = graph.R_ij if d == 3 else 1.0
+    J = to_frame_i @ in_frame_j @ np.swapaxes(to_frame_i, 1, 2)
+    margin = np.concatenate([margin_t, np.repeat(margin_R[:, None], p, axis=1)], axis=1)
     _check_excess(graph, tau, J, margin)
-    size = _block_sizes(d, blocks.trace + d * tau, np.einsum("mkk->m", K))
-    excess = CoupledExcess(graph.R_ij, J, size, 0.5 * margin[:, [0, -1]], J[:, d:, d:])
+    trace_of_sizes = blocks.trace + d * tau
+    size = _block_sizes(d, trace_of_sizes, np.einsum("mkk->m", K))
+    least = 0.5 * margin[:, [0, -1]]
+    excess = CoupledExcess(graph.R_ij, J, size, least, J[:, d:, d:])
     return ExcessCost(tau, _rotation_weights(blocks.I_rr, K), excess)
+
+
+def _rotation_margin(blocks: _Information) -> Array:
+    """Half of what K exceeds the Schur complement by, (m,).
+
+    It is a small share of the smallest eigenvalue of I_rr. Where I_rr is zero, the median over the
+    other edges takes the place of that eigenvalue, and W' is that of -K.
+    """
+    is_zero = blocks.trace_R == 0.0
+    median = np.median(blocks.smallest_R[~is_zero])
+    smallest_R = np.where(is_zero, median, blocks.smallest_R)
+    return np.asarray(_MARGIN * smallest_R + _ROUNDED * blocks.trace_R)
 
 
 def _coupled_tau(information: Array, blocks: _Information) -> Array:
     """The tau of every edge, (m,).
 
-    It is below what the coupling leaves of the smallest eigenvalue of I_tt.
+    With coupling it is a share of the smallest eigenvalue of I_tt (`uncoupled_share`).
     """
+    d = blocks.I_tt.shape[1]
     is_coupled = blocks.is_coupled
     is_definite = np.ones(len(information), dtype=bool)
     is_definite[is_coupled] = are_definite(information[is_coupled], LEAST_SCALED)
-    left = _COUPLED_SHARE * uncoupled_share(information, blocks.I_tt.shape[1])
-    of_coupled = np.where(is_definite, left, _SINGULAR_SHARE) * blocks.smallest
-    return np.where(is_coupled, of_coupled, blocks.uncoupled_tau)
+    definite_share = _COUPLED_SHARE * uncoupled_share(information, d)
+    share = np.where(is_definite, definite_share, _SINGULAR_SHARE)
+    coupled_tau = share * blocks.smallest
+    return np.where(is_coupled, coupled_tau, blocks.uncoupled_tau)
 
 
 def _block_sizes(d: int, trace: Array, trace_R: Array) -> Array:
-    """Sizes of the blocks of J and K, (m, 2), by the traces of their absolute parts, rounded up.
+    """Sizes of the blocks of J and K, (m, 2), from the traces of their terms, rounded up.
 
     Blocks of a definite J have ||J_ab||^2 <= tr(J_aa) tr(J_bb); and || |R_ij| ||^2 = d.
     """
-    return OUTWARD * np.sqrt(d * np.stack([trace, trace_R], axis=1))
+    traces = np.stack([trace, trace_R], axis=1)
+    return OUTWARD * np.sqrt(d * traces)
 
 
 def _check_excess(graph: PoseGraph, tau: Array, J: Array, margin: Array) -> None:
@@ -202,9 +226,10 @@ def _check_excess(graph: PoseGraph, tau: Array, J: Array, margin: Array) -> None
 
 def _check_positions(graph: PoseGraph, blocks: _Information) -> None:
     """Raise a GraphError for an edge of a rotation alone, whose I_tt is zero."""
-    is_silent = ~blocks.I_tt.any(axis=(1, 2))
-    if is_silent.any():
-        edge = graph.edge_label(int(np.argmax(is_silent)))
+    is_zero = ~blocks.I_tt.any(axis=(1, 2))
+    if is_zero.any():
+        first = int(np.argmax(is_zero))
+        edge = graph.edge_label(first)
         raise GraphError(
             f"chi2 of {edge}, of a rotation alone, is unknown beside others' matrices; "
             "leave out one kind"
@@ -214,33 +239,41 @@ def _check_positions(graph: PoseGraph, blocks: _Information) -> None:
 def convex_cost(information: Array, d: int) -> EdgeCost:
     """A strictly convex quadratic cost near chi2.
 
-    It has the tau of F, and of W what is well above zero.
+    It has the tau of F, and W with its eigenvalues raised to a share of the kappa of F.
     """
     kappa_F, tau_F = edge_precisions(information)
-    I_rr = information[:, d:, d:]
-    rotation = _rotation_weights(I_rr, np.zeros_like(I_rr))
+    rotation = _uncoupled_rotation_weights(information[:, d:, d:])
     return EdgeCost(tau_F, rotation.raised_to(_LEAST_CONVEX * kappa_F))
+
+
+def _uncoupled_rotation_weights(I_rr: Array) -> RotationWeights:
+    """The W that belongs to I_rr, (m, p, p)."""
+    return _rotation_weights(I_rr, np.zeros_like(I_rr))
 
 
 def _rotation_weights(I_rr: Array, K: Array) -> RotationWeights:
     """The W that belongs to I_rr - K, (m, p, p), with a bound on its rounding error."""
     p = I_rr.shape[1]
-    rest = I_rr - K
+    difference = I_rr - K
     sizes = np.linalg.norm(I_rr, axis=(1, 2)) + np.linalg.norm(K, axis=(1, 2))
     error = OUTWARD * gamma(4.0 * p) * p * sizes
-    if p == 1 or (rest == rest[:, :1, :1] * np.eye(p)).all():
-        return RoundedIdentities(0.5 * rest[:, 0, 0], error)
-    W = 0.5 * np.einsum("mkk->m", rest)[:, None, None] * np.eye(p) - rest
+    multiples_of_identity = difference[:, :1, :1] * np.eye(p)
+    if p == 1 or (difference == multiples_of_identity).all():
+        return RoundedIdentities(0.5 * difference[:, 0, 0], error)
+    traces = np.einsum("mkk->m", difference)[:, None, None]
+    W = 0.5 * traces * np.eye(p) - difference
     kappa, axes = np.linalg.eigh(W)
     return SymmetricMatrices(kappa, error, axes, W)
 
 
-def _check(graph: PoseGraph, good: BoolArray) -> None:
-    if not good.all():
-        edge = graph.edge_label(int(np.argmin(good)))
-        what = f"a block of the information matrix of {edge} is singular or indefinite"
-        what += ", or spans more orders of magnitude than doubles carry"
-        raise GraphError(
-            f"{what}; give it a larger smallest eigenvalue, "
-            "or solve without the information matrices"
-        )
+def _check(graph: PoseGraph, is_definite: BoolArray) -> None:
+    """Raise a GraphError that names the first edge without definite blocks, if there is one."""
+    if is_definite.all():
+        return
+    first = int(np.argmin(is_definite))
+    edge = graph.edge_label(first)
+    raise GraphError(
+        f"a block of the information matrix of {edge} is singular or indefinite, "
+        "or spans more orders of magnitude than doubles carry; "
+        "give it a larger smallest eigenvalue, or solve without the information matrices"
+    )

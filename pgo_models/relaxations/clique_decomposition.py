@@ -72,7 +72,9 @@ class CliqueRelaxation(HoldsModel):
 
     def W(self, k: int) -> Array:
         """W_C of clique k, (side, side), as solved."""
-        return np.asarray(self.upper[k].value[triangle_places(self._layout.sides[k])])
+        triangle = self.upper[k].value
+        places = triangle_places(self._layout.sides[k])
+        return np.asarray(triangle[places])
 
     def Lambda(self) -> Array:
         """Multipliers of R_i^T R_i = I, (n, d, d).
@@ -83,17 +85,21 @@ class CliqueRelaxation(HoldsModel):
         n = self.problem.num_poses
         d = self.problem.d
         R = self.centre.R
-        centred = (self._to_Lambda @ (-self.scale * self.equalities.dual_value)).reshape(n, d, d)
-        return np.asarray(np.swapaxes(R, 1, 2) @ centred @ R)
+        R_inverse = np.swapaxes(R, 1, 2)
+        multipliers = -self.scale * self.equalities.dual_value
+        centred = (self._to_Lambda @ multipliers).reshape(n, d, d)
+        return np.asarray(R_inverse @ centred @ R)
 
     def rounded(self) -> tuple[Poses, RankReport]:
         """Rounded poses, and the rank report of the clique that is farthest from rank d."""
-        poses = self.problem.with_best_translations(self._rounded_rotations())
+        R = self._rounded_rotations()
+        poses = self.problem.with_best_translations(R)
         reports = []
         for k in range(len(self.tree.cliques)):
             gram = self._layout.gram(k, self.W(k))
             reports.append(rank_report(gram, self.problem.d))
-        return poses, max(reports, key=lambda report: report.tightness)
+        farthest = max(reports, key=lambda report: report.tightness)
+        return poses, farthest
 
     def _rounded_rotations(self) -> Array:
         """Pass the relative rotations of the cliques down the tree.
@@ -103,14 +109,17 @@ class CliqueRelaxation(HoldsModel):
         n = self.problem.num_poses
         d = self.problem.d
         layout = self._layout
-        P = np.broadcast_to(np.eye(d), (n, d, d)).copy()
+        identity = np.eye(d)
+        P = np.broadcast_to(identity, (n, d, d)).copy()
         for k in range(len(self.tree.cliques)):
             W = self.W(k)
             reference = layout.reference[k]
             for u, column in layout.columns[k].items():
                 if layout.home[u] == k:
-                    relative = np.eye(d) + W[:d, column : column + d] / layout.sigma
-                    P[u] = P[reference] @ project_to_rotations(relative[None])[0]
+                    W_ru = W[:d, column : column + d]
+                    relative = identity + W_ru / layout.sigma
+                    (projected,) = project_to_rotations(relative[None])
+                    P[u] = P[reference] @ projected
         return project_to_rotations(P @ self.centre.R)
 
 
@@ -123,10 +132,13 @@ def clique_relaxation(
     `build_clique_tree(problem.graph)`. A centre far from the optimum costs digits and iterations.
     Fukuda, Kojima, Murota & Nakata, 2001; Vandenberghe & Andersen 2015, chapter 14.
     """
-    tree = tree if tree is not None else build_clique_tree(problem.graph)
-    centre = centre if centre is not None else chordal_start(problem)
+    if tree is None:
+        tree = build_clique_tree(problem.graph)
+    if centre is None:
+        centre = chordal_start(problem)
     layout = _Layout.of(problem, tree, centre)
-    least_scale = _LEAST_SCALE * float(problem.L.diagonal().mean())
+    mean_diagonal = float(problem.L.diagonal().mean())
+    least_scale = _LEAST_SCALE * mean_diagonal
     scale = max(problem.objective(centre), least_scale)
     equations = _Equations(layout)
     _add_orthogonality(equations)
@@ -135,17 +147,21 @@ def clique_relaxation(
     upper = []
     cones = []
     for k, side in enumerate(layout.sides):
-        w_k = cp.Variable(side * (side + 1) // 2, name=f"W_{k}")
+        num_entries = side * (side + 1) // 2
+        w_k = cp.Variable(num_entries, name=f"W_{k}")
+        W_k = w_k[triangle_places(side)]
         upper.append(w_k)
-        cones.append(w_k[triangle_places(side)] >> 0)
+        cones.append(W_k >> 0)
     w = cp.hstack(upper)
     equalities = A @ w == b
-    objective = (_costs(layout) / scale) @ w
+    costs = _costs(layout) / scale
+    objective = cp.Minimize(costs @ w)
+    model = cp.Problem(objective, [equalities, *cones])
     return CliqueRelaxation(
         problem=problem,
         tree=tree,
         centre=centre,
-        model=cp.Problem(cp.Minimize(objective), [equalities, *cones]),
+        model=model,
         upper=tuple(upper),
         equalities=equalities,
         scale=scale,
@@ -202,20 +218,25 @@ class _Layout:
         home = np.full(problem.num_poses, -1)
         for k, clique in enumerate(tree.cliques):
             shared = tree.separator(k)
-            r = int(shared[0]) if len(shared) else int(clique[0])
+            candidates = shared if len(shared) else clique
+            r = int(candidates[0])
             reference.append(r)
             others = [u for u in clique.tolist() if u != r]
-            columns.append({u: d + (d + 1) * number for number, u in enumerate(others)})
-            home[clique[home[clique] < 0]] = k
+            first_columns = range(d, d + (d + 1) * len(others), d + 1)
+            columns.append(dict(zip(others, first_columns, strict=True)))
+            is_new = home[clique] < 0
+            home[clique[is_new]] = k
         sides = [clique_side(len(clique), d) for clique in tree.cliques]
         lengths = [side * (side + 1) // 2 for side in sides]
         ends = np.cumsum(lengths).tolist()
+        median_kappa = np.median(graph.kappa[graph.kappa > 0])
+        median_tau = np.median(graph.tau[graph.tau > 0])
         return cls(
             problem,
             tree,
             centre,
-            sigma=float(np.sqrt(np.median(graph.kappa[graph.kappa > 0]))),
-            sigma_t=float(np.sqrt(np.median(graph.tau[graph.tau > 0]))),
+            sigma=float(np.sqrt(median_kappa)),
+            sigma_t=float(np.sqrt(median_tau)),
             reference=reference,
             columns=columns,
             sides=sides,
@@ -243,17 +264,20 @@ class _Layout:
 
     def rotation_deviation(self, k: int, u: int, A: Array) -> Array:
         """Coefficients of (P_u - P_r) A."""
-        return self._placed(k, self.columns[k].get(u), A / self.sigma)
+        column = self.columns[k].get(u)
+        return self._placed(k, column, A / self.sigma)
 
     def translation_deviation(self, k: int, u: int) -> Array:
         """Coefficients of t_u - t_r - P_r (t^_u - t^_r)."""
         column = self.columns[k].get(u)
         row = None if column is None else column + self.problem.d
-        return self._placed(k, row, np.array([[1.0 / self.sigma_t]]))
+        scale = np.array([[1.0 / self.sigma_t]])
+        return self._placed(k, row, scale)
 
     def _placed(self, k: int, first: int | None, A: Array) -> Array:
         """A in the rows of clique k from `first` on; zero for its reference, which has no rows."""
-        coefficients = np.zeros((self.sides[k], A.shape[1]))
+        num_columns = A.shape[1]
+        coefficients = np.zeros((self.sides[k], num_columns))
         if first is not None:
             coefficients[first : first + len(A)] = A
         return coefficients
@@ -268,8 +292,9 @@ class _Equations:
     def __init__(self, layout: _Layout) -> None:
         self.layout = layout
         # Position in w of every entry of every W_C, (side, side).
-        offsets_and_sides = zip(layout.offsets, layout.sides, strict=True)
-        self._positions = [offset + triangle_places(side) for offset, side in offsets_and_sides]
+        self._positions: list[IntArray] = []
+        for offset, side in zip(layout.offsets, layout.sides, strict=True):
+            self._positions.append(offset + triangle_places(side))
         self._rows: list[IntArray] = []
         self._columns: list[IntArray] = []
         self._values: list[Array] = []
@@ -278,13 +303,16 @@ class _Equations:
 
     def add(self, terms: list[tuple[int, Array, Array, float]], right: float) -> None:
         """Sum of factor a^T W_k b over (k, a, b, factor) equals `right`."""
+        equation = len(self._right)
         for k, a, b, factor in terms:
             rows = np.flatnonzero(a)
             columns = np.flatnonzero(b)
-            positions = self._positions[k][np.ix_(rows, columns)].ravel()
-            self._rows.append(np.full(len(positions), len(self._right)))
+            entries = np.ix_(rows, columns)
+            positions = self._positions[k][entries].ravel()
+            products = np.outer(a[rows], b[columns]).ravel()
+            self._rows.append(np.full(len(positions), equation))
             self._columns.append(positions)
-            self._values.append(factor * np.outer(a[rows], b[columns]).ravel())
+            self._values.append(factor * products)
         self._right.append(right)
 
     def note_orthogonality(self, pose: int, a: int, b: int, factor: float) -> None:
@@ -298,19 +326,25 @@ class _Equations:
     def matrix(self) -> tuple[csr_array, Array]:
         """A and b of A w = b."""
         values = np.concatenate(self._values)
-        entries = (np.concatenate(self._rows), np.concatenate(self._columns))
+        rows = np.concatenate(self._rows)
+        columns = np.concatenate(self._columns)
         shape = (len(self._right), self.layout.num_entries)
-        A = csr_array(coo_array((values, entries), shape=shape))
-        return A, np.array(self._right)
+        A = coo_array((values, (rows, columns)), shape=shape)
+        b = np.array(self._right)
+        return csr_array(A), b
 
     def to_Lambda(self) -> csr_array:
         """Matrix from the multipliers of the equations to Lambda, (n d d, equations).
 
         Lambda is in the coordinates of the centre.
         """
-        rows, columns, values = (np.array(part) for part in zip(*self._multipliers, strict=True))
-        shape = (self.layout.problem.num_poses * self.layout.problem.d**2, len(self._right))
-        return csr_array(coo_array((values, (rows, columns)), shape=shape))
+        problem = self.layout.problem
+        parts = zip(*self._multipliers, strict=True)
+        rows, columns, values = (np.array(part) for part in parts)
+        num_entries = problem.num_poses * problem.d**2
+        shape = (num_entries, len(self._right))
+        matrix = coo_array((values, (rows, columns)), shape=shape)
+        return csr_array(matrix)
 
 
 def _add_orthogonality(equations: _Equations) -> None:
@@ -326,7 +360,9 @@ def _add_orthogonality(equations: _Equations) -> None:
         unit = np.eye(side)
         r = layout.reference[k]
         for a, b in _upper_entries(d):
-            equations.add([(k, unit[a], unit[b], 1.0)], float(a == b))
+            term = (k, unit[a], unit[b], 1.0)
+            entry_of_identity = float(a == b)
+            equations.add([term], entry_of_identity)
             equations.note_orthogonality(r, a, b, 1.0)
         for u, column in layout.columns[k].items():
             if layout.home[u] != k:
@@ -355,7 +391,9 @@ def _add_agreement(equations: _Equations) -> None:
         for a, b in _upper_entries(len(columns)):
             if b < d:  # P_r^T P_r = I is an equation of its own
                 continue
-            in_clique = (k, unit[columns[a]], unit[columns[b]], 1.0)
+            unit_a = unit[columns[a]]
+            unit_b = unit[columns[b]]
+            in_clique = (k, unit_a, unit_b, 1.0)
             minus_in_parent = (parent, in_parent[:, a], in_parent[:, b], -1.0)
             equations.add([in_clique, minus_in_parent], 0.0)
 
@@ -370,52 +408,72 @@ def _separator_vectors(layout: _Layout, k: int, parent: int) -> tuple[list[int],
     P_r_deviation = layout.rotation_deviation(parent, r, identity)
     t_r_deviation = layout.translation_deviation(parent, r)
     columns = list(range(d))
-    in_parent = [layout.reference_rotation(parent, identity) + P_r_deviation]
-    for u in np.setdiff1d(layout.tree.separator(k), r).tolist():
+    P_parent = layout.reference_rotation(parent, identity)
+    in_parent = [P_parent + P_r_deviation]
+    others = np.setdiff1d(layout.tree.separator(k), r)
+    for u in others.tolist():
         first = layout.columns[k][u]
         columns += range(first, first + d + 1)
         P_u_deviation = layout.rotation_deviation(parent, u, identity)
-        in_parent.append(layout.sigma * (P_u_deviation - P_r_deviation))
+        rotation = P_u_deviation - P_r_deviation
+        in_parent.append(layout.sigma * rotation)
         t_u_deviation = layout.translation_deviation(parent, u)
-        turned = P_r_deviation @ (t[u] - t[r])[:, None]
-        in_parent.append(layout.sigma_t * (t_u_deviation - t_r_deviation - turned))
+        shift = (t[u] - t[r])[:, None]
+        turned = P_r_deviation @ shift
+        translation = t_u_deviation - t_r_deviation - turned
+        in_parent.append(layout.sigma_t * translation)
     return columns, np.concatenate(in_parent, axis=1)
 
 
 def _costs(layout: _Layout) -> Array:
     """Coefficients of w in F.
 
-    Every edge is counted in the clique of its two poses that is nearest to the root. With E = R^_i
-    R_ij R^_j^T the residuals of an edge are P_j - P_i E, up to a rotation, and t_j - t_i - P_i R^_i
-    t_ij.
+    Every edge is counted in the clique of its two poses that is nearest to the root.
     """
     graph = layout.problem.graph
-    R = layout.centre.R
-    t = layout.centre.t
-    identity = np.eye(layout.problem.d)
-    weights = layout.problem.weights
-    W = weights.W(layout.problem.d)
+    W = layout.problem.weights.W(layout.problem.d)
     H = [np.zeros((side, side)) for side in layout.sides]
     for e in range(graph.num_edges):
-        i = int(graph.i[e])
-        j = int(graph.j[e])
-        k = int(max(layout.home[i], layout.home[j]))
-        E = R[i] @ graph.R_ij[e] @ R[j].T
-        step = (R[i] @ graph.t_ij[e])[:, None]
-        rotation = layout.reference_rotation(k, identity - E)
-        rotation += layout.rotation_deviation(k, j, identity) - layout.rotation_deviation(k, i, E)
-        translation = layout.reference_rotation(k, (t[j] - t[i])[:, None] - step)
-        translation += layout.translation_deviation(k, j) - layout.translation_deviation(k, i)
-        translation -= layout.rotation_deviation(k, i, step)
-        rotation_cost = rotation @ (R[j] @ W[e] @ R[j].T) @ rotation.T
-        translation_cost = weights.tau[e] * translation @ translation.T
-        H[k] += rotation_cost + translation_cost
+        home_of_i = layout.home[graph.i[e]]
+        home_of_j = layout.home[graph.j[e]]
+        k = int(max(home_of_i, home_of_j))
+        H[k] += _cost_of_edge(layout, k, e, W[e])
     costs = []
     for matrix in H:
         rows, columns = np.triu_indices(len(matrix))
         multiplicity = np.where(rows == columns, 1.0, 2.0)
         costs.append(multiplicity * matrix[rows, columns])
     return np.concatenate(costs)
+
+
+def _cost_of_edge(layout: _Layout, k: int, e: int, W_e: Array) -> Array:
+    """Matrix H, (side, side): edge e costs <H, W_C> in clique k, which has both of its poses.
+
+    W_e, (d, d), is the weight of the rotation residual. With E = R^_i R_ij R^_j^T the residuals of
+    the edge are P_j - P_i E, up to a rotation, and t_j - t_i - P_i R^_i t_ij.
+    """
+    problem = layout.problem
+    graph = problem.graph
+    i = int(graph.i[e])
+    j = int(graph.j[e])
+    R_i = layout.centre.R[i]
+    R_j = layout.centre.R[j]
+    identity = np.eye(problem.d)
+    E = R_i @ graph.R_ij[e] @ R_j.T
+    P_j_deviation = layout.rotation_deviation(k, j, identity)
+    P_i_deviation = layout.rotation_deviation(k, i, E)
+    rotation = layout.reference_rotation(k, identity - E)
+    rotation += P_j_deviation - P_i_deviation
+    shift = (layout.centre.t[j] - layout.centre.t[i])[:, None]
+    step = (R_i @ graph.t_ij[e])[:, None]
+    t_j_deviation = layout.translation_deviation(k, j)
+    t_i_deviation = layout.translation_deviation(k, i)
+    translation = layout.reference_rotation(k, shift - step)
+    translation += t_j_deviation - t_i_deviation
+    translation -= layout.rotation_deviation(k, i, step)
+    rotation_cost = rotation @ (R_j @ W_e @ R_j.T) @ rotation.T
+    translation_cost = problem.weights.tau[e] * translation @ translation.T
+    return np.asarray(rotation_cost + translation_cost)
 
 
 def _upper_entries(side: int) -> Iterator[tuple[int, int]]:

@@ -38,9 +38,12 @@ class CliqueTree:
 
     def separator(self, k: int) -> IntArray:
         """Poses that clique k shares with its parent; empty for the root."""
-        if self.parent[k] < 0:
+        parent = self.parent[k]
+        if parent < 0:
             return np.zeros(0, dtype=np.int64)
-        return np.intersect1d(self.cliques[k], self.cliques[self.parent[k]], assume_unique=True)
+        clique = self.cliques[k]
+        clique_of_parent = self.cliques[parent]
+        return np.intersect1d(clique, clique_of_parent, assume_unique=True)
 
 
 def build_clique_tree(graph: PoseGraph) -> CliqueTree:
@@ -66,7 +69,8 @@ def _eliminate(graph: PoseGraph) -> tuple[list[set[int]], list[int]]:
     adjacency = graph.adjacency
     rows = np.split(adjacency.indices, adjacency.indptr[1:-1])
     neighbours = [set(row.tolist()) for row in rows]
-    heap = [(len(adjacent), pose) for pose, adjacent in enumerate(neighbours)]
+    degrees = [len(adjacent) for adjacent in neighbours]
+    heap = [(degree, pose) for pose, degree in enumerate(degrees)]
     heapq.heapify(heap)
     position: dict[int, int] = {}  # of every pose, in the order of elimination
     members: list[set[int]] = []
@@ -78,13 +82,15 @@ def _eliminate(graph: PoseGraph) -> tuple[list[set[int]], list[int]]:
         remaining = neighbours[pose]
         members.append({pose, *remaining})
         for other in remaining:
-            neighbours[other] |= remaining
-            neighbours[other] -= {other, pose}
-            heapq.heappush(heap, (len(neighbours[other]), other))
+            adjacent = neighbours[other]
+            adjacent |= remaining
+            adjacent -= {other, pose}
+            heapq.heappush(heap, (len(adjacent), other))
     parent = []
     for k, clique in enumerate(members):
         # The parent is the clique of the pose that is eliminated next.
-        later = [position[pose] for pose in clique if position[pose] > k]
+        positions = [position[pose] for pose in clique]
+        later = [place for place in positions if place > k]
         parent.append(min(later, default=-1))
     return members, parent
 
@@ -97,24 +103,31 @@ def _merge(members: list[set[int]], parent: list[int], d: int) -> CliqueTree:
         if parent_of_k < 0:
             continue
         union = members[k] | members[parent_of_k]
-        work_apart = _work(members[k], d) + _work(members[parent_of_k], d)
-        if _work(union, d) <= work_apart:
+        work_of_child = _work(members[k], d)
+        work_of_parent = _work(members[parent_of_k], d)
+        if _work(union, d) <= work_of_child + work_of_parent:
             members[parent_of_k] = union
             merged_into[k] = parent_of_k
     # A clique that was merged is represented by the one that its parent was merged into at last.
     # Parents come later in the elimination, and earlier in the tree.
     representative = list(range(len(members)))
+    kept = []
     for k in reversed(range(len(members))):
-        if merged_into[k] != k:
+        if merged_into[k] == k:
+            kept.append(k)
+        else:
             representative[k] = representative[merged_into[k]]
-    kept = [k for k in reversed(range(len(members))) if merged_into[k] == k]
     number = {k: new for new, k in enumerate(kept)}
+    cliques = []
     parents = []
     for k in kept:
-        is_root = parent[k] < 0
-        parents.append(-1 if is_root else number[representative[parent[k]]])
-    cliques = tuple(np.array(sorted(members[k])) for k in kept)
-    return CliqueTree(cliques, np.array(parents))
+        poses = sorted(members[k])
+        cliques.append(np.array(poses))
+        if parent[k] < 0:
+            parents.append(-1)
+        else:
+            parents.append(number[representative[parent[k]]])
+    return CliqueTree(tuple(cliques), np.array(parents))
 
 
 def _work(clique: set[int], d: int) -> float:

@@ -37,13 +37,15 @@ class LiftedPoses(Poses):
     def orthogonality_error(self) -> float:
         """Largest ||R_i^T R_i - I||_F."""
         products = np.swapaxes(self.R, 1, 2) @ self.R
-        errors = np.linalg.norm(products - np.eye(self.d), axis=(1, 2))
+        differences = products - np.eye(self.d)
+        errors = np.linalg.norm(differences, axis=(1, 2))
         return float(errors.max(initial=0.0))
 
     @property
     def layout(self) -> TangentLayout:
         """Layout of a move: r numbers v and r d - d (d + 1) / 2 numbers w per pose."""
-        return TangentLayout(self.num_poses, *tangent_widths(self.R))
+        width_of_v, width_of_w = tangent_widths(self.R)
+        return TangentLayout(self.num_poses, width_of_v, width_of_w)
 
     @cached_property
     def basis(self) -> Array:
@@ -56,15 +58,18 @@ class LiftedPoses(Poses):
         turns = np.einsum("nra,kab->nrbk", self.R, generators)
         columns, _ = np.linalg.qr(self.R, mode="complete")
         beyond = columns[:, :, d:]
-        across = np.einsum("nrf,ab->nrafb", beyond, np.eye(d))
-        return np.concatenate([turns, across.reshape(n, r, d, -1)], axis=3)
+        across_by_column = np.einsum("nrf,ab->nrafb", beyond, np.eye(d))
+        across = across_by_column.reshape(n, r, d, -1)
+        return np.concatenate([turns, across], axis=3)
 
     def moved_along(self, w: Array, v: Array) -> LiftedPoses:
         """Return the poses after a move of w, (n, k), and v, (n, r)."""
         Y = np.swapaxes(self.R, 1, 2)
         step = np.einsum("nrak,nk->nar", self.basis, w)
-        moved = retract(Y, step)
-        return LiftedPoses(np.swapaxes(moved, 1, 2), self.t + v)
+        moved_Y = retract(Y, step)
+        R = np.swapaxes(moved_Y, 1, 2)
+        t = self.t + v
+        return LiftedPoses(R, t)
 
     def upwards(self, x: Array) -> tuple[Array, Array]:
         """Return the move (w, v) along x, ((d+1) n,), as a column of X in the last dimension.
@@ -84,12 +89,14 @@ class LiftedPoses(Poses):
         G = 2.0 * problem.apply_M_at(self)
         n, r, d = self.R.shape
         of_rotations = G[n:].reshape(n, d, r)
-        return np.einsum("nrak,nar->nk", self.basis, of_rotations), G[:n]
+        gradient_w = np.einsum("nrak,nar->nk", self.basis, of_rotations)
+        return gradient_w, G[:n]
 
     def curvature(self, Lambda: Array) -> Array:
         """Compute what Lambda takes of the Hessian: 2 B_i^T (Lambda_i (x) I_r) B_i, (n, k, k)."""
         B = self.basis
-        return np.asarray(2.0 * np.einsum("nrak,nab,nrbl->nkl", B, Lambda, B, optimize=True))
+        form = np.einsum("nrak,nab,nrbl->nkl", B, Lambda, B, optimize=True)
+        return np.asarray(2.0 * form)
 
     def hessian(self, problem: PGOProblem, Lambda: Array | None) -> csc_array:
         """Compute the Hessian of F in (v, w), 2 B^T ((M - blockdiag(0, Lambda)) (x) I_r) B.
@@ -101,13 +108,17 @@ class LiftedPoses(Poses):
         every = np.arange(n)
         S = problem.M if Lambda is None else certificate_matrix(problem, Lambda)
         # S pose by pose: one block of d + 1 rows for each, its translation first
-        rows_of_poses = np.concatenate([every[:, None], rotation_columns(every, n, d)], axis=1)
+        rows_of_rotations = rotation_columns(every, n, d)
+        rows_of_poses = np.concatenate([every[:, None], rows_of_rotations], axis=1)
         rows = rows_of_poses.ravel()
-        blocks = S[rows][:, rows].tobsr((d + 1, d + 1))
-        i = np.repeat(every, np.diff(blocks.indptr))
+        reordered = S[rows][:, rows]
+        blocks = reordered.tobsr((d + 1, d + 1))
+        blocks_of_row = np.diff(blocks.indptr)
+        i = np.repeat(every, blocks_of_row)
         j = blocks.indices
         # C_i, how the rows of pose i move with its unknowns: v in the translation, B_i w elsewhere
-        C = np.zeros((n, d + 1, r, r + layout.turns))
+        num_unknowns = r + layout.turns
+        C = np.zeros((n, d + 1, r, num_unknowns))
         C[:, 0, :, :r] = np.eye(r)
         C[:, 1:, :, r:] = np.swapaxes(self.basis, 1, 2)
         products = np.einsum("mxrk,mxy,myrl->mkl", C[i], blocks.data, C[j], optimize=True)
@@ -115,26 +126,31 @@ class LiftedPoses(Poses):
         w = layout.rotations(every)
         unknowns = np.concatenate([v, w], axis=1)
         row, column = block_entries(unknowns[i], unknowns[j])
-        return assemble([(row, column, 2.0 * products)], layout.side)
+        values = 2.0 * products
+        return assemble([(row, column, values)], layout.side)
 
 
 def tangent_widths(R: Array) -> tuple[int, int]:
     """Count the numbers v and w of a pose at R, (n, r, d): r, and the dimension of St(d, r)."""
     _, r, d = R.shape
-    return r, r * d - d * (d + 1) // 2
+    num_constraints = d * (d + 1) // 2
+    return r, r * d - num_constraints
 
 
 def append_dimension(poses: Poses) -> LiftedPoses:
     """Return the poses in a space of one dimension more."""
     n, _, d = poses.R.shape
-    R = np.concatenate([poses.R, np.zeros((n, 1, d))], axis=1)
-    t = np.concatenate([poses.t, np.zeros((n, 1))], axis=1)
+    row_of_zeros = np.zeros((n, 1, d))
+    zeros = np.zeros((n, 1))
+    R = np.concatenate([poses.R, row_of_zeros], axis=1)
+    t = np.concatenate([poses.t, zeros], axis=1)
     return LiftedPoses(R, t)
 
 
 def gram_matrix(R: Array) -> Array:
     """Compute sum_i R_i R_i^T, (r, r), of R, (n, r, d)."""
-    return np.asarray(np.einsum("nra,nsa->rs", R, R))
+    gram = np.einsum("nra,nsa->rs", R, R)
+    return np.asarray(gram)
 
 
 def poses_from(R: Array, t: Array) -> Poses:
@@ -183,12 +199,16 @@ def lifted_point(problem: PGOProblem, Y: Array) -> LiftedPoint:
     """Evaluate f, its multipliers and its gradient at Y, (n, d, r), blocks of orthonormal rows."""
     Y = real_array(Y, "Y")
     n, d, r = Y.shape
-    translations = problem.translations_for(Y.reshape(n * d, r))
+    stacked = Y.reshape(n * d, r)
+    translations = problem.translations_for(stacked)
     poses = LiftedPoses(np.swapaxes(Y, 1, 2), translations)
-    QY = problem.apply_M_at(poses)[n:].reshape(n, d, r)
+    # The translations are the best ones for Y, so that the rotation rows of M X are Q Y.
+    MX = problem.apply_M_at(poses)
+    QY = MX[n:].reshape(n, d, r)
     Lambda = row_products(QY, Y)
     gradient = 2.0 * (QY - Lambda @ Y)
-    return LiftedPoint(Y, problem.objective(poses), read_only(Lambda), read_only(gradient))
+    value = problem.objective(poses)
+    return LiftedPoint(Y, value, read_only(Lambda), read_only(gradient))
 
 
 def hessian_product(problem: PGOProblem, point: LiftedPoint, V: Array) -> Array:
@@ -197,6 +217,7 @@ def hessian_product(problem: PGOProblem, point: LiftedPoint, V: Array) -> Array:
     It is P(2 Q V - 2 Lambda V) with P the projection to the tangent space.
     """
     n, d, r = V.shape
-    QV = problem.apply_Q(V.reshape(n * d, r)).reshape(n, d, r)
+    stacked = V.reshape(n * d, r)
+    QV = problem.apply_Q(stacked).reshape(n, d, r)
     product = QV - point.Lambda @ V
     return 2.0 * project_to_tangent(point.Y, product)

@@ -49,11 +49,13 @@ class PrimalRelaxation(HoldsModel):
 
     def Lambda(self) -> Array:
         """Multipliers of Z_ii = I, (n, d, d), as solved."""
-        return -self.scale * np.stack([constraint.dual_value for constraint in self.orthogonality])
+        dual_values = [constraint.dual_value for constraint in self.orthogonality]
+        return -self.scale * np.stack(dual_values)
 
     def rounded(self) -> tuple[Poses, RankReport]:
         """Poses of Z as solved, and its rank report."""
-        return round_gram(self.problem, np.asarray(self.Z.value))
+        gram = np.asarray(self.Z.value)
+        return round_gram(self.problem, gram)
 
 
 def primal_relaxation(problem: PGOProblem) -> PrimalRelaxation:
@@ -63,15 +65,20 @@ def primal_relaxation(problem: PGOProblem) -> PrimalRelaxation:
     """
     n = problem.num_poses
     d = problem.d
+    side = d * n
     scale = float(np.abs(problem.Q).max())
-    Z = cp.Variable((d * n, d * n), name="Z", PSD=True)
-    blocks = [slice(d * i, d * i + d) for i in range(n)]
-    orthogonality = tuple(Z[block, block] == np.eye(d) for block in blocks)
+    Z = cp.Variable((side, side), name="Z", PSD=True)
+    identity = np.eye(d)
+    orthogonality = []
+    for first in range(0, side, d):
+        block = slice(first, first + d)
+        orthogonality.append(Z[block, block] == identity)
     # tr(Q Z) is the sum of the entries of Q o Z, because both are symmetric: no product of matrices
     # is formed.
-    objective = cp.sum(cp.multiply(problem.Q / scale, Z))
-    model = cp.Problem(cp.Minimize(objective), list(orthogonality))
-    return PrimalRelaxation(problem, model, Z, orthogonality, scale)
+    products = cp.multiply(problem.Q / scale, Z)
+    objective = cp.sum(products)
+    model = cp.Problem(cp.Minimize(objective), orthogonality)
+    return PrimalRelaxation(problem, model, Z, tuple(orthogonality), scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,14 +109,17 @@ class DualRelaxation(HoldsModel):
 
     def Lambda(self) -> Array:
         """Multipliers, (n, d, d), as solved."""
-        triangles = self.scale * self.upper.value.reshape(self.problem.num_poses, -1)
-        return np.asarray(triangles[:, triangle_places(self.problem.d)])
+        scaled = self.upper.value.reshape(self.problem.num_poses, -1)
+        triangles = self.scale * scaled
+        places = triangle_places(self.problem.d)
+        return np.asarray(triangles[:, places])
 
     def rounded(self) -> tuple[Poses, RankReport]:
         """Poses of the rotation part of the constraint's dual value, and its rank report."""
         num_translations = self.problem.num_poses - 1
         gram = np.asarray(self.certificate.dual_value)
-        return round_gram(self.problem, gram[num_translations:, num_translations:])
+        gram_of_rotations = gram[num_translations:, num_translations:]
+        return round_gram(self.problem, gram_of_rotations)
 
 
 def dual_relaxation(problem: PGOProblem) -> DualRelaxation:
@@ -122,11 +132,14 @@ def dual_relaxation(problem: PGOProblem) -> DualRelaxation:
     grounded = problem.M[1:, 1:].tocsc()
     side = grounded.shape[0]
     scale = float(grounded.diagonal().max())
-    upper = cp.Variable(n * d * (d + 1) // 2, name="Lambda")
+    num_entries = n * d * (d + 1) // 2
+    upper = cp.Variable(num_entries, name="Lambda")
     # blockdiag(0, Lambda), its columns below each other, is a sparse matrix times `upper`.
-    Lambda = cp.reshape(_block_diagonal(n, d) @ upper, (side, side), order="F")
+    stacked_columns = _block_diagonal(n, d) @ upper
+    Lambda = cp.reshape(stacked_columns, (side, side), order="F")
     certificate = (grounded / scale - Lambda) >> 0
-    is_diagonal = np.equal(*np.triu_indices(d)).astype(float)
+    row, column = np.triu_indices(d)
+    is_diagonal = (row == column).astype(float)
     sum_of_traces = np.tile(is_diagonal, n) @ upper
     model = cp.Problem(cp.Maximize(sum_of_traces), [certificate])
     return DualRelaxation(problem, model, upper, certificate, scale)
@@ -140,9 +153,11 @@ def _block_diagonal(n: int, d: int) -> csc_array:
     side = n - 1 + d * n
     length = d * (d + 1) // 2
     pose = np.arange(n)[:, None, None]
-    row = n - 1 + d * pose + np.arange(d)[:, None]  # (n, d, 1)
+    first_row = n - 1 + d * pose
+    row = first_row + np.arange(d)[:, None]  # (n, d, 1)
     column = np.swapaxes(row, 1, 2)
-    entries = (row + side * column).ravel()
-    in_triangles = (length * pose + triangle_places(d)).ravel()
+    entries = row + side * column
+    in_triangles = length * pose + triangle_places(d)
     ones = np.ones(entries.size)
-    return csc_array((ones, (entries, in_triangles)), shape=(side * side, n * length))
+    indices = (entries.ravel(), in_triangles.ravel())
+    return csc_array((ones, indices), shape=(side * side, n * length))

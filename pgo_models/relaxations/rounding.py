@@ -30,7 +30,8 @@ class RankReport:
         return self.rank <= self.d
 
     def __str__(self) -> str:
-        leading = ", ".join(f"{value:.3g}" for value in self.singular_values[: self.d + 2])
+        leading_values = self.singular_values[: self.d + 2]
+        leading = ", ".join(f"{value:.3g}" for value in leading_values)
         rank = f"rank {self.rank} (d = {self.d})"
         return f"{rank}; ratio {self.tightness:.2g}; singular values {leading}, .."
 
@@ -40,8 +41,10 @@ def rank_report(Z: Array, d: int) -> RankReport:
     magnitudes = np.abs(np.linalg.eigvalsh(Z))
     values = np.sort(magnitudes)[::-1]
     following = float(values[d]) if len(values) > d else 0.0
-    rank = int(np.count_nonzero(values > RANK_TOLERANCE * values[0]))
-    return RankReport(values, d, rank, following / float(values[d - 1]))
+    threshold = RANK_TOLERANCE * values[0]
+    rank = int(np.count_nonzero(values > threshold))
+    tightness = following / float(values[d - 1])
+    return RankReport(values, d, rank, tightness)
 
 
 def round_gram(problem: PGOProblem, Z: Array) -> tuple[Poses, RankReport]:
@@ -54,9 +57,10 @@ def round_gram(problem: PGOProblem, Z: Array) -> tuple[Poses, RankReport]:
     d = problem.d
     symmetric = 0.5 * (Z + Z.T)
     values, vectors = np.linalg.eigh(symmetric)
-    scale = np.sqrt(np.maximum(values[-d:], 0.0))
-    Y = vectors[:, -d:] * scale
-    return _rounded(problem, Y), rank_report(symmetric, d)
+    largest = np.maximum(values[-d:], 0.0)
+    Y = vectors[:, -d:] * np.sqrt(largest)
+    poses = _rounded(problem, Y)
+    return poses, rank_report(symmetric, d)
 
 
 def round_factor(problem: PGOProblem, Y: Array) -> tuple[Poses, RankReport]:
@@ -70,17 +74,21 @@ def round_factor(problem: PGOProblem, Y: Array) -> tuple[Poses, RankReport]:
     report = rank_report(gram, d)
     are_rotations = r == d and (np.linalg.det(Y) > 0).all()
     if are_rotations:
-        return problem.with_best_translations(np.swapaxes(Y, 1, 2)), report
+        R = np.swapaxes(Y, 1, 2)
+        return problem.with_best_translations(R), report
     _, vectors = np.linalg.eigh(gram)
-    return _rounded(problem, stacked @ vectors[:, -d:]), report
+    leading = vectors[:, -d:]
+    return _rounded(problem, stacked @ leading), report
 
 
 def _rounded(problem: PGOProblem, Y: Array) -> Poses:
     """Round a factor of rank d, (dn, d), turned over if most of its blocks reflect."""
     d = problem.d
-    determinants = np.linalg.det(Y.reshape(-1, d, d))
+    blocks = Y.reshape(-1, d, d)
+    determinants = np.linalg.det(blocks)
     num_reflections = np.count_nonzero(determinants < 0)
     if num_reflections > problem.num_poses / 2:
-        Y = Y * np.where(np.arange(d) == 0, -1.0, 1.0)
+        signs = np.where(np.arange(d) == 0, -1.0, 1.0)
+        Y = Y * signs
     R = project_to_rotations(unstack_transposes(Y))
     return problem.with_best_translations(R)

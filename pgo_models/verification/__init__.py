@@ -1,1 +1,1 @@
-"""A check of written proofs in ball arithmetic, which imports nothing of other rooms but errors."""
+"""A check of written proofs in ball arithmetic; of other rooms it imports `errors` alone."""

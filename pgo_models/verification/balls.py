@@ -28,39 +28,50 @@ def identity(side: int) -> arb_mat:
 
 def diagonal(entries: Sequence[arb | fmpq]) -> arb_mat:
     """Matrix with these entries on its diagonal."""
-    found = arb_mat(len(entries), len(entries))
+    side = len(entries)
+    matrix = arb_mat(side, side)
     for k, entry in enumerate(entries):
-        found[k, k] = arb(entry)
-    return found
+        matrix[k, k] = arb(entry)
+    return matrix
 
 
 def blocks_on_diagonal(first: arb_mat, second: arb_mat) -> arb_mat:
     """Matrix with two blocks on its diagonal."""
-    right = arb_mat(first.nrows(), second.ncols())
-    left = arb_mat(second.nrows(), first.ncols())
-    return above(beside(first, right), beside(left, second))
+    upper_right = arb_mat(first.nrows(), second.ncols())
+    lower_left = arb_mat(second.nrows(), first.ncols())
+    top = beside(first, upper_right)
+    bottom = beside(lower_left, second)
+    return above(top, bottom)
 
 
 def beside(left: arb_mat, right: arb_mat) -> arb_mat:
     """Two matrices of as many rows, side by side."""
-    return arb_mat([a + b for a, b in zip(left.tolist(), right.tolist(), strict=True)])
+    rows = zip(left.tolist(), right.tolist(), strict=True)
+    return arb_mat([of_left + of_right for of_left, of_right in rows])
 
 
 def above(top: arb_mat, bottom: arb_mat) -> arb_mat:
     """Two matrices of as many columns, one above the other."""
-    return arb_mat(top.tolist() + bottom.tolist())
+    rows = top.tolist() + bottom.tolist()
+    return arb_mat(rows)
 
 
 def part(A: arb_mat, rows: range, columns: range) -> arb_mat:
     """Some rows and columns of a matrix."""
-    return arb_mat([[A[a, b] for b in columns] for a in rows])
+    entries = [[A[a, b] for b in columns] for a in rows]
+    return arb_mat(entries)
 
 
 def symmetric(triangle: Sequence[Entry], side: int) -> list[list[Entry]]:
     """Rows of the symmetric matrix that has this upper triangle, row by row."""
-    places = iter(range(len(triangle)))
-    place = {(a, b): next(places) for a in range(side) for b in range(a, side)}
-    return [[triangle[place[min(a, b), max(a, b)]] for b in range(side)] for a in range(side)]
+    matrix = [[triangle[0]] * side for _ in range(side)]
+    entries = iter(triangle)
+    for a in range(side):
+        for b in range(a, side):
+            entry = next(entries)
+            matrix[a][b] = entry
+            matrix[b][a] = entry
+    return matrix
 
 
 def sum_of(matrices: Iterable[arb_mat]) -> arb_mat:
@@ -77,11 +88,13 @@ def first_bad_pivot(rows: Sequence[Sequence[Number]]) -> Number | None:
     LDL^T without exchanges: of rational numbers it is exact, and of balls it holds for all
     matrices in them. Of doubles it is a guess.
     """
-    left = [list(row) for row in rows]
-    for k, row in enumerate(left):
-        if not row[k] > 0:
-            return row[k]
-        _eliminate(left, k)
+    remaining = [list(row) for row in rows]
+    for k, row in enumerate(remaining):
+        pivot = row[k]
+        # Not `pivot <= 0`, which is False of a ball that contains zero.
+        if not pivot > 0:
+            return pivot
+        _eliminate(remaining, k)
     return None
 
 
@@ -90,21 +103,32 @@ def is_semidefinite(rows: Sequence[Sequence[fmpq]]) -> bool:
 
     LDL^T as in `first_bad_pivot`; beside a pivot of zero there may be nothing but zeros.
     """
-    left = [list(row) for row in rows]
-    for k, row in enumerate(left):
-        if row[k] < 0 or (row[k] == 0 and any(row[k + 1 :])):
+    remaining = [list(row) for row in rows]
+    for k, row in enumerate(remaining):
+        pivot = row[k]
+        beside_pivot = row[k + 1 :]
+        if pivot < 0:
             return False
-        if row[k] > 0:
-            _eliminate(left, k)
+        if pivot == 0 and any(beside_pivot):
+            return False
+        if pivot > 0:
+            _eliminate(remaining, k)
     return True
 
 
-def _eliminate(left: list[list[Number]], k: int) -> None:
-    """Take row k, with a pivot that is not zero, off all that follow."""
-    for a in range(k + 1, len(left)):
-        share = left[a][k] / left[k][k]
+def _eliminate(rows: list[list[Number]], k: int) -> None:
+    """Subtract multiples of row k, with a pivot that is not zero, from all rows that follow.
+
+    Only columns after k are updated, in the lower triangle and by symmetry in the upper one.
+    """
+    pivot = rows[k][k]
+    for a in range(k + 1, len(rows)):
+        row = rows[a]
+        share = row[k] / pivot
         for b in range(k + 1, a + 1):
-            left[a][b] = left[b][a] = left[a][b] - share * left[b][k]
+            updated = row[b] - share * rows[b][k]
+            row[b] = updated
+            rows[b][a] = updated
 
 
 def plane_rotation(theta: arb | fmpq) -> arb_mat:
@@ -116,20 +140,31 @@ def plane_rotation(theta: arb | fmpq) -> arb_mat:
 def angles_rotation(roll: fmpq, pitch: fmpq, yaw: fmpq) -> arb_mat:
     """Rotation by roll about x, then by pitch about y, then by yaw about z."""
     one = identity(1)
-    swap = arb_mat([[1, 0, 0], [0, 0, 1], [0, 1, 0]])  # of y and z
+    swap_y_and_z = arb_mat([[1, 0, 0], [0, 0, 1], [0, 1, 0]])
     about_x = blocks_on_diagonal(one, plane_rotation(roll))
-    about_y = swap * blocks_on_diagonal(plane_rotation(-pitch), one) * swap
+    about_z_by_minus_pitch = blocks_on_diagonal(plane_rotation(-pitch), one)
+    about_y = swap_y_and_z * about_z_by_minus_pitch * swap_y_and_z
     about_z = blocks_on_diagonal(plane_rotation(yaw), one)
     return about_z * about_y * about_x
 
 
 def quaternion_rotation(x: fmpq, y: fmpq, z: fmpq, w: fmpq) -> arb_mat:
     """Rotation of a quaternion of any length: a rational function of its entries."""
-    s = 2 / (x * x + y * y + z * z + w * w)
+    # Rational numbers: exact in whatever order.
+    xx = x * x
+    yy = y * y
+    zz = z * z
+    xy = x * y
+    xz = x * z
+    yz = y * z
+    xw = x * w
+    yw = y * w
+    zw = z * w
+    s = 2 / (xx + yy + zz + w * w)
     rows = [
-        [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
-        [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
-        [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
+        [1 - s * (yy + zz), s * (xy - zw), s * (xz + yw)],
+        [s * (xy + zw), 1 - s * (xx + zz), s * (yz - xw)],
+        [s * (xz - yw), s * (yz + xw), 1 - s * (xx + yy)],
     ]
     return arb_mat(fmpq_mat(rows))
 
@@ -141,8 +176,11 @@ def exact_parts(ball: arb | None) -> Parts | None:
     """Midpoint and radius of a ball, each man 2^exp, exactly; None of none."""
     if ball is None:
         return None
-    (man, exp), (rad_man, rad_exp) = ball.mid().man_exp(), ball.rad().man_exp()
-    return (int(man), int(exp)), (int(rad_man), int(rad_exp))
+    mantissa, exponent = ball.mid().man_exp()
+    midpoint = int(mantissa), int(exponent)
+    mantissa, exponent = ball.rad().man_exp()
+    radius = int(mantissa), int(exponent)
+    return midpoint, radius
 
 
 def ball_of_parts(parts: Parts | None) -> arb | None:

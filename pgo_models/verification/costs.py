@@ -17,9 +17,10 @@ for any tau and K, where V = tr(I_rr - K) / 2 I - (I_rr - K), in the plane (I_th
 tr(V (2 I - E - E^T)) = 2 (1 - cos theta) a^T (I_rr - K) a by Rodrigues' formula, and
 2 (1 - cos theta) a^T K a = s^T K s + tr(H K H). For K = I_tr^T (I_tt - tau I)^-1 I_tr and a tau
 below the smallest eigenvalue of I_tt both J and K are positive semidefinite, so that the last two
-terms are a convex function of Z = rho R_i, in which u and H are linear. Where 2 C is its gradient,
-at some Z', it is at least 2 <C, Z> less its value there, and <C, rho R_i> = <C R_i^T, rho> is
-bilinear in the rows of X.
+terms are a convex function of Z = rho R_i, in which u and H are linear. Let 2 C be its gradient at
+some Z'. The function is quadratic, so that its value at Z' is <C, Z'>, and being convex it is at
+least its tangent 2 <C, Z> - <C, Z'>. There <C, rho R_i> = <C R_i^T, rho> is bilinear in the rows of
+X.
 """
 
 from dataclasses import dataclass, field
@@ -75,7 +76,10 @@ class QuadraticForm:
 
     def product(self, X: dict[int, arb_mat]) -> dict[int, arb_mat]:
         """S X."""
-        return {i: sum_of(block * X[j] for j, block in row.items()) for i, row in self.S.items()}
+        product = {}
+        for i, row in self.S.items():
+            product[i] = sum_of(block * X[j] for j, block in row.items())
+        return product
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +98,17 @@ def add_edge(form: QuadraticForm, edge: Edge, cost: str, X: dict[int, arb_mat]) 
         share, W, tangent = information_cost(edge, X[edge.i], X[edge.j])
     else:
         share, W = isotropic_cost(edge, cost, end * X[edge.j] - begin * X[edge.i])
-    form.add(edge.i, edge.i, begin.transpose() * W * begin)
-    form.add(edge.i, edge.j, -(begin.transpose() * W * end))
-    form.add(edge.j, edge.j, end.transpose() * W * end)
+    weighted_begin = begin.transpose() * W
+    weighted_end = end.transpose() * W
+    form.add(edge.i, edge.i, weighted_begin * begin)
+    form.add(edge.i, edge.j, -(weighted_begin * end))
+    form.add(edge.j, edge.j, weighted_end * end)
     if tangent is not None:
-        # 2 <C, rho R_i> = 2 <(0, C) X_i, rho>
-        pull = beside(arb_mat(tangent.C.nrows(), 1), tangent.C).transpose()
-        form.add(edge.i, edge.i, -(pull * begin + (pull * begin).transpose()))
+        # 2 <C, rho R_i> = 2 <(0, C) X_i, rho>: S gets half of each product and of its transpose.
+        no_translation = arb_mat(tangent.C.nrows(), 1)
+        pull = beside(no_translation, tangent.C).transpose()
+        pull_begin = pull * begin
+        form.add(edge.i, edge.i, -(pull_begin + pull_begin.transpose()))
         form.add(edge.i, edge.j, pull * end)
         form.constant -= tangent.value
     return share
@@ -111,8 +119,11 @@ def residual_matrices(edge: Edge, rows_j: int) -> tuple[arb_mat, arb_mat]:
     d = edge.tag.d
     top = beside(identity(1), edge.t.transpose())
     if edge.tag.is_point:
-        return top, part(identity(d + 1), range(1), range(rows_j))
-    return above(top, beside(arb_mat(d, 1), edge.R.transpose())), identity(d + 1)
+        first_row = part(identity(d + 1), range(1), range(rows_j))
+        return top, first_row
+    bottom = beside(arb_mat(d, 1), edge.R.transpose())
+    T = above(top, bottom)
+    return T, identity(d + 1)
 
 
 def isotropic_cost(edge: Edge, cost: str, rho: arb_mat) -> tuple[arb, arb_mat]:
@@ -121,66 +132,116 @@ def isotropic_cost(edge: Edge, cost: str, rho: arb_mat) -> tuple[arb, arb_mat]:
     if cost == "unit":
         kappa = fmpq(kappa != 0)
         tau = fmpq(tau != 0)
-    W = diagonal([tau, *[kappa] * (rho.nrows() - 1)])
-    return (rho.transpose() * W * rho).trace(), W
+    kappas = [kappa] * (rho.nrows() - 1)
+    W = diagonal([tau, *kappas])
+    share = (rho.transpose() * W * rho).trace()
+    return share, W
 
 
 @lru_cache(maxsize=KEPT)
 def precisions(triangle: tuple[fmpq, ...], d: int, is_point: bool) -> tuple[fmpq, fmpq]:
     """(kappa, tau) of F, exactly, from the upper triangle of an information matrix."""
-    rows = symmetric(triangle, d if is_point else 3 * d - 3)
-    tau = d * one_over_trace_of_inverse([row[:d] for row in rows[:d]])
+    rows = symmetric(triangle, information_side(d, is_point))
+    I_tt = [row[:d] for row in rows[:d]]
+    tau = d * one_over_trace_of_inverse(I_tt)
     if is_point:
         return fmpq(0), tau
-    kappa = one_over_trace_of_inverse([row[d:] for row in rows[d:]])
-    return (kappa if d == 2 else fmpq(3, 2) * kappa), tau
+    I_rr = [row[d:] for row in rows[d:]]
+    kappa = one_over_trace_of_inverse(I_rr)
+    if d == 3:
+        kappa = fmpq(3, 2) * kappa
+    return kappa, tau
+
+
+def information_side(d: int, is_point: bool) -> int:
+    """Rows of the information matrix of a relative pose, or of a position."""
+    return d if is_point else 3 * d - 3
+
+
+def is_nonzero(rows: list[list[fmpq]]) -> bool:
+    """Whether a matrix has an entry that is not zero."""
+    return any(map(any, rows))
+
+
+def check_weights(block: list[list[fmpq]]) -> None:
+    """Raise an error unless a block of an information matrix is zero or positive definite."""
+    if is_nonzero(block) and first_bad_pivot(block) is not None:
+        raise StepFailedError("the weights: a block of an information matrix is not definite")
 
 
 def one_over_trace_of_inverse(rows: list[list[fmpq]]) -> fmpq:
     """1 / tr(A^-1) of a positive definite matrix; 0 of zeros, which say nothing."""
-    if not any(map(any, rows)):
+    if not is_nonzero(rows):
         return fmpq(0)
-    if first_bad_pivot(rows) is not None:
-        raise StepFailedError("the weights: a block of an information matrix is not definite")
+    check_weights(rows)
     inverse = fmpq_mat(rows).inv()
-    return 1 / sum((inverse[k, k] for k in range(len(rows))), fmpq(0))
+    diagonal_entries = (inverse[k, k] for k in range(len(rows)))
+    return 1 / sum(diagonal_entries, fmpq(0))
 
 
 def information_cost(edge: Edge, X_i: arb_mat, X_j: arb_mat) -> tuple[arb, arb_mat, Tangent | None]:
     """Share of an edge in chi2, W, and the tangent of what W leaves of it, if anything."""
     d = edge.tag.d
     R = edge.R
-    I_tt = edge.block(range(d), range(d))
+    translation = range(d)
+    I_tt = edge.block(translation, translation)
     tau = translation_weight(edge.triangle, d, edge.tag.is_point)
-    rest = fmpq_mat(less_tau(I_tt.tolist(), tau, d))
-    P_i = part(X_i, range(1, d + 1), range(d))  # R_i^T
-    moved = part(X_j, range(1), range(d)) - part(X_i, range(1), range(d))
-    r = P_i * moved.transpose() - edge.t
-    D = R * arb_mat(rest) * R.transpose()
+    I_tt_less_tau = fmpq_mat(less_tau(I_tt.tolist(), tau, d))
+    # Translations: the residual r and I_tt - tau I, both in the frame of pose i.
+    r = translation_residual(edge, X_i, X_j)
+    D = R * arb_mat(I_tt_less_tau) * R.transpose()
+    Dr = D * r
     share = inner(r, R * arb_mat(I_tt) * R.transpose() * r)
     if edge.tag.is_point:
-        return share, diagonal([tau]), Tangent((D * r).transpose(), inner(r, D * r))
+        tangent = Tangent(Dr.transpose(), inner(r, Dr))
+        return share, diagonal([tau]), tangent
+    # Rotations: s = a sin theta and H = (1 - cos theta) a a^T of E.
     axes = range(d, edge.tag.side)
-    I_tr = edge.block(range(d), axes)
+    I_tr = edge.block(translation, axes)
     I_rr = edge.block(axes, axes)
     is_coupled = any(I_tr.entries())
-    K = I_tr.transpose() * rest.inv() * I_tr if is_coupled else 0 * I_rr
-    W = blocks_on_diagonal(diagonal([tau]), rotation_weight(arb_mat(I_rr - K), d))
+    K = 0 * I_rr
+    if is_coupled:
+        K = I_tr.transpose() * I_tt_less_tau.inv() * I_tr
+    V = rotation_weight(arb_mat(I_rr - K), d)
+    W = blocks_on_diagonal(diagonal([tau]), V)
     turn = R if d == 3 else identity(1)  # of axes of rotations
-    E = P_i * part(X_j, range(1, d + 1), range(d)).transpose() * R.transpose()
+    E = rotation_residual(R, X_i, X_j)
     s = axis_times_sine(E)
     H = axis_times_versine(E)
     B = R * arb_mat(I_tr) * turn.transpose()
-    share += 2 * inner(r, B * s) + 2 * inner(H, turn * arb_mat(I_rr) * turn.transpose())
-    if not (is_coupled or any(rest.entries())):
+    turned_I_rr = turn * arb_mat(I_rr) * turn.transpose()
+    share += 2 * inner(r, B * s) + 2 * inner(H, turned_I_rr)
+    if not (is_coupled or any(I_tt_less_tau.entries())):
         return share, W, None
-    K_i = turn * arb_mat(K) * turn.transpose()
-    y_r = D * r + B * s
-    y_s = B.transpose() * r + K_i * s
-    N = K_i * H
-    of_E = (skew(y_s) + versine_adjoint(N + N.transpose(), d)) * arb(0.5)
-    C = above(y_r.transpose(), (of_E * R).transpose())
-    return share, W, Tangent(C, inner(r, y_r) + inner(s, y_s) + inner(H, N))
+    # The tangent of u^T J u + tr(H K H): half its gradients in r, s and H are y_r, y_s and
+    # (N + N^T) / 2.
+    turned_K = turn * arb_mat(K) * turn.transpose()
+    y_r = Dr + B * s
+    y_s = B.transpose() * r + turned_K * s
+    N = turned_K * H
+    # From E to the rotation rows of Z = rho R_i, in which E - I is linear: E - I = (R Z_R)^T.
+    gradient_in_E = skew(y_s) + versine_adjoint(N + N.transpose(), d)
+    half_gradient_in_E = gradient_in_E * arb(0.5)
+    C = above(y_r.transpose(), (half_gradient_in_E * R).transpose())
+    value = inner(r, y_r) + inner(s, y_s) + inner(H, N)
+    return share, W, Tangent(C, value)
+
+
+def translation_residual(edge: Edge, X_i: arb_mat, X_j: arb_mat) -> arb_mat:
+    """Residual R_i^T (t_j - t_i) - t_ij, (d, 1)."""
+    d = edge.tag.d
+    R_i_transposed = part(X_i, range(1, d + 1), range(d))
+    difference = part(X_j, range(1), range(d)) - part(X_i, range(1), range(d))
+    return R_i_transposed * difference.transpose() - edge.t
+
+
+def rotation_residual(R_ij: arb_mat, X_i: arb_mat, X_j: arb_mat) -> arb_mat:
+    """Residual R_i^T R_j R_ij^T, (d, d), the identity where the edge fits."""
+    d = R_ij.nrows()
+    R_i_transposed = part(X_i, range(1, d + 1), range(d))
+    R_j_transposed = part(X_j, range(1, d + 1), range(d))
+    return R_i_transposed * R_j_transposed.transpose() * R_ij.transpose()
 
 
 @lru_cache(maxsize=KEPT)
@@ -192,20 +253,23 @@ def translation_weight(triangle: tuple[fmpq, ...], d: int, is_point: bool) -> fm
     is a small share of the smallest eigenvalue of I_tt, and V a little indefinite, of which the
     proof asks nothing. An indefinite I, whose chi2 can be negative, is refused.
     """
-    rows = symmetric(triangle, d if is_point else 3 * d - 3)
+    rows = symmetric(triangle, information_side(d, is_point))
     I_tt = [row[:d] for row in rows[:d]]
+    I_tr = [row[d:] for row in rows[:d]]
     I_rr = [row[d:] for row in rows[d:]]
-    is_coupled = any(map(any, (row[d:] for row in rows[:d])))
-    for block in [I_tt, I_rr]:
-        if any(map(any, block)) and first_bad_pivot(block) is not None:
-            raise StepFailedError("the weights: a block of an information matrix is not definite")
+    check_weights(I_tt)
+    check_weights(I_rr)
     if not is_semidefinite(rows):
         raise StepFailedError("the weights: an information matrix is indefinite")
-    if not is_coupled and not any(map(any, less_tau(I_tt, I_tt[0][0], d))):
-        return I_tt[0][0]
-    tau = definite_tau(rows, d, COUPLED_SHARE) if is_coupled else definite_tau(I_tt, d, BELOW)
-    if tau is None and is_coupled:
-        tau = definite_tau(I_tt, d, SINGULAR_SHARE)
+    tau: fmpq | None
+    if is_nonzero(I_tr):
+        tau = definite_tau(rows, d, COUPLED_SHARE)
+        if tau is None:
+            tau = definite_tau(I_tt, d, SINGULAR_SHARE)
+    else:
+        first_entry = I_tt[0][0]
+        is_isotropic = not is_nonzero(less_tau(I_tt, first_entry, d))
+        tau = first_entry if is_isotropic else definite_tau(I_tt, d, BELOW)
     if tau is None:
         raise StepFailedError("the weights: an information matrix is all but singular")
     return tau
@@ -222,18 +286,25 @@ def definite_tau(rows: list[list[fmpq]], d: int, share: float) -> fmpq | None:
     high = min(doubles[a][a] for a in range(d))
     while high - low > RESOLUTION * high:
         middle = 0.5 * (low + high)
-        if first_bad_pivot(less_tau(doubles, middle, d)) is None:
+        guess = less_tau(doubles, middle, d)
+        if first_bad_pivot(guess) is None:
             low = middle
         else:
             high = middle
-    tau = fmpq(*(share * low).as_integer_ratio())
-    is_shown = tau > 0 and first_bad_pivot(less_tau(rows, tau, d)) is None
-    return tau if is_shown else None
+    numerator, denominator = (share * low).as_integer_ratio()
+    tau = fmpq(numerator, denominator)
+    if not tau > 0:
+        return None
+    is_definite = first_bad_pivot(less_tau(rows, tau, d)) is None
+    return tau if is_definite else None
 
 
 def less_tau(rows: list[list[Number]], tau: Number, d: int) -> list[list[Number]]:
     """A matrix less tau on the first d places of its diagonal."""
-    return [[x - tau if a == b < d else x for b, x in enumerate(row)] for a, row in enumerate(rows)]
+    smaller = [list(row) for row in rows]
+    for a in range(d):
+        smaller[a][a] -= tau
+    return smaller
 
 
 def inner(A: arb_mat, B: arb_mat) -> arb:
@@ -244,19 +315,23 @@ def inner(A: arb_mat, B: arb_mat) -> arb:
 def rotation_weight(I_rr: arb_mat, d: int) -> arb_mat:
     """V with tr(V (2 I - E - E^T)) = 2 (1 - cos theta) a^T I_rr a."""
     half_trace = I_rr.trace() / 2
-    return identity(2) * half_trace if d == 2 else identity(3) * half_trace - I_rr
+    if d == 2:
+        return identity(2) * half_trace
+    return identity(3) * half_trace - I_rr
 
 
 def axis_times_sine(E: arb_mat) -> arb_mat:
     """Return a sin theta of a rotation E by theta about a."""
     planes = [(1, 0)] if E.nrows() == 2 else [(2, 1), (0, 2), (1, 0)]
-    return arb_mat([[(E[a, b] - E[b, a]) / 2] for a, b in planes])
+    entries = [(E[a, b] - E[b, a]) / 2 for a, b in planes]
+    return arb_mat([[entry] for entry in entries])
 
 
 def skew(w: arb_mat) -> arb_mat:
     """Return the matrix with <skew(w), E> = 2 <w, axis_times_sine(E)>."""
     if w.nrows() == 1:
-        return arb_mat([[0, -w[0, 0]], [w[0, 0], 0]])
+        angle = w[0, 0]
+        return arb_mat([[0, -angle], [angle, 0]])
     x, y, z = w.entries()
     return arb_mat([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
@@ -267,10 +342,13 @@ def axis_times_versine(E: arb_mat) -> arb_mat:
     half_trace = D.trace() / 2
     if E.nrows() == 2:
         return arb_mat([[-half_trace]])
-    return (D + D.transpose()) * arb(0.5) - identity(3) * half_trace
+    symmetric_part = (D + D.transpose()) * arb(0.5)
+    return symmetric_part - identity(3) * half_trace
 
 
 def versine_adjoint(N: arb_mat, d: int) -> arb_mat:
     """Return the matrix with <versine_adjoint(N), E - I> = <N, axis_times_versine(E)>, N = N^T."""
     half_trace = N.trace() / 2
-    return -half_trace * identity(2) if d == 2 else N - identity(3) * half_trace
+    if d == 2:
+        return -half_trace * identity(2)
+    return N - identity(3) * half_trace

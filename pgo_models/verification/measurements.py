@@ -108,7 +108,8 @@ class Edge:
     def block(self, rows: range, columns: range) -> fmpq_mat:
         """Some rows and columns of the information matrix, translation first."""
         information = symmetric(self.triangle, self.tag.side)
-        return fmpq_mat([[information[a][b] for b in columns] for a in rows])
+        entries = [[information[a][b] for b in columns] for a in rows]
+        return fmpq_mat(entries)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +131,14 @@ def read_graph(path: Path, skip_unknown: bool) -> Graph:
     edges: list[Edge] = []
     landmarks: set[int] = set()
     offset_line = 0  # of a sensor that is not at its pose
-    for number, line in enumerate(read_text(path).split("\n"), 1):
+    lines = read_text(path).split("\n")
+    for number, line in enumerate(lines, 1):
         tag, *words = line.split() or ["#"]
         if tag in TAGS:
-            edges.append(read_edge(path, number, TAGS[tag], words))
-            if TAGS[tag].to_landmark:
-                landmarks.add(edges[-1].j)
+            edge = read_edge(path, number, TAGS[tag], words)
+            edges.append(edge)
+            if edge.tag.to_landmark:
+                landmarks.add(edge.j)
         elif tag in LANDMARK_TAGS:
             landmarks.add(read_id(path, number, words[0] if words else ""))
         elif tag == "PARAMS_SE3OFFSET":
@@ -186,7 +189,8 @@ def check_edge(path: Path, graph: Graph, edge: Edge) -> None:
 
 def read_edge(path: Path, line: int, tag: Tag, words: list[str]) -> Edge:
     """Edge of the words behind its tag."""
-    num_words = tag.num_ids + tag.num_measured + tag.side * (tag.side + 1) // 2
+    size_of_triangle = tag.side * (tag.side + 1) // 2
+    num_words = tag.num_ids + tag.num_measured + size_of_triangle
     if tag.has_offset and len(words) == num_words + 1:
         words = words[: tag.num_ids] + words[tag.num_ids + 1 :]
     if len(words) != num_words:
@@ -201,13 +205,16 @@ def read_edge(path: Path, line: int, tag: Tag, words: list[str]) -> Edge:
         raise FileFormatError(path, line, problem)
     if tag.is_toro and tag.d == 2:
         triangle = [triangle[place] for place in TORO_TRIANGLE]
-    i, j = ids if tag.num_ids == 2 else (WORLD, ids[0])
+    if tag.num_ids == 1:
+        ids = [WORLD, *ids]
+    i, j = ids
     return Edge(line, tag, i, j, tuple(measured), tuple(triangle))
 
 
 def read_id(path: Path, line: int, word: str) -> int:
     """Id of a pose, an integer of 64 bits."""
-    if not re.fullmatch(r"[+-]?[0-9]{1,19}", word) or abs(int(word)) >= WORLD:
+    is_integer = re.fullmatch(r"[+-]?[0-9]{1,19}", word) is not None
+    if not is_integer or abs(int(word)) >= WORLD:
         problem = f"id {word[:40]!r} is no integer of 64 bits; number the poses"
         raise FileFormatError(path, line, problem)
     return int(word)
@@ -222,7 +229,9 @@ def exact_number(path: Path, line: int, word: str) -> fmpq:
     sign, whole, fraction, exponent = parts.groups(default="0")
     digits = int(f"{sign}{whole}{fraction}")
     power = int(exponent) - len(fraction)
-    return fmpq(digits * 10**power) if power >= 0 else fmpq(digits, 10**-power)
+    if power >= 0:
+        return fmpq(digits * 10**power)
+    return fmpq(digits, 10**-power)
 
 
 def read_text(path: Path) -> str:

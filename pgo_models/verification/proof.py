@@ -19,6 +19,16 @@ WAY_OUT = "give a file of pgo solve --proof, as it was written"
 
 
 @dataclass(frozen=True, eq=False)
+class HandednessTerm:
+    """A term that the proof takes off the cost: v^T P v of the poses i and j, with T."""
+
+    i: int
+    j: int
+    T: list[list[float]]
+    P: list[float]  # upper triangle, row by row
+
+
+@dataclass(frozen=True, eq=False)
 class Proof:
     """What a proof file says; all numbers are doubles, exactly."""
 
@@ -32,6 +42,7 @@ class Proof:
     R: dict[int, list[list[float]]]  # not of landmarks
     # Upper triangles, row by row. Where there are none, those of a stationary point are taken.
     Lambda: dict[int, list[float]]
+    terms: list[HandednessTerm]
 
 
 def read_proof(path: Path, d: int) -> Proof:
@@ -50,25 +61,44 @@ def read_proof(path: Path, d: int) -> Proof:
     R: dict[int, list[list[float]]] = {}
     Lambda: dict[int, list[float]] = {}
     poses = entry(path, record, "poses")
-    for pose in poses if isinstance(poses, list) else [poses]:
+    if not isinstance(poses, list):
+        poses = [poses]
+    size_of_triangle = d * (d + 1) // 2
+    for pose in poses:
         name = name_of(path, entry(path, pose, "id"))
         t[name] = numbers(path, entry(path, pose, "t"), f"t of pose {name}", d)
         if "R" in pose:
             R[name] = numbers(path, pose["R"], f"R of pose {name}", d, d)
         if "Lambda" in pose:
-            size = d * (d + 1) // 2
-            Lambda[name] = numbers(path, pose["Lambda"], f"Lambda of pose {name}", size)
+            Lambda[name] = numbers(path, pose["Lambda"], f"Lambda of pose {name}", size_of_triangle)
     return Proof(
         cost=cost,
-        objective=numbers(path, entry(path, record, "objective"), "objective"),
-        lower_bound=numbers(path, entry(path, record, "lower_bound"), "lower_bound"),
-        rounding_level=numbers(path, entry(path, record, "rounding_level"), "rounding_level"),
+        objective=number_entry(path, record, "objective"),
+        lower_bound=number_entry(path, record, "lower_bound"),
+        rounding_level=number_entry(path, record, "rounding_level"),
         eta=read_shift(path, entry(path, record, "eta")),
         ground=name_of(path, entry(path, record, "ground")),
         t=t,
         R=R,
         Lambda=Lambda,
+        terms=read_terms(path, record, d),
     )
+
+
+def read_terms(path: Path, record: dict[str, Any], d: int) -> list[HandednessTerm]:
+    """The handedness terms of a proof, none where it has no such entry; they exist in 3D alone."""
+    rows = record.get("handedness", [])
+    if not isinstance(rows, list) or (rows and d != 3):
+        raise FileFormatError(path, None, f"handedness is no list of terms in 3D; {WAY_OUT}")
+    return [
+        HandednessTerm(
+            i=name_of(path, entry(path, row, "i")),
+            j=name_of(path, entry(path, row, "j")),
+            T=numbers(path, entry(path, row, "T"), "T of a handedness term", 3, 3),
+            P=numbers(path, entry(path, row, "P"), "P of a handedness term", 6),
+        )
+        for row in rows
+    ]
 
 
 def entry(path: Path, record: object, name: str) -> Any:  # noqa: ANN401 - of JSON
@@ -78,6 +108,12 @@ def entry(path: Path, record: object, name: str) -> Any:  # noqa: ANN401 - of JS
     return record[name]
 
 
+def number_entry(path: Path, record: object, name: str) -> float:
+    """Finite number in an entry of a JSON object."""
+    number: float = numbers(path, entry(path, record, name), name)
+    return number
+
+
 def numbers(path: Path, value: Any, what: str, *shape: int) -> Any:  # noqa: ANN401 - of JSON
     """A finite number, or as many of them in lists as a shape says."""
     if shape and isinstance(value, list) and len(value) == shape[0]:
@@ -85,7 +121,10 @@ def numbers(path: Path, value: Any, what: str, *shape: int) -> Any:  # noqa: ANN
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not shape and is_number and abs(value) <= sys.float_info.max:
         return float(value)
-    expected = f"{' x '.join(map(str, shape))} finite numbers" if shape else "a finite number"
+    expected = "a finite number"
+    if shape:
+        sizes = " x ".join(map(str, shape))
+        expected = f"{sizes} finite numbers"
     raise FileFormatError(path, None, f"{what}: {value!s:.40} is not {expected}; {WAY_OUT}")
 
 

@@ -1,41 +1,73 @@
 """Verify the proof of a lower bound without trusting whoever wrote it, in ball arithmetic.
 
 **The problem** is the one that the decimal numbers of a g2o file state. Pose i has the rows
-X_i = (t_i^T; R_i^T), and a landmark the row t_i^T alone. The cost, F or the file's chi2, is at
-least a quadratic form everywhere, and equal to it at the poses X' of the proof (`costs`):
+X_i = (t_i^T; R_i^T), R_i a rotation, and a landmark the row t_i^T alone; X stacks them all. The
+cost is F, a weighted sum of squared residuals with two weights for an edge, or chi2 with the
+information matrices of the file (`pgo_models.verification.costs` has both formulas). Neither
+changes if all poses and landmarks are moved together.
 
-    cost(X) >= tr(X^T M X) + constant   for all poses X.
+X' are the poses and landmarks of the proof, all moved together so that one pose r is at (0, I).
+With a symmetric matrix M and a constant that depend on the cost and, for chi2, on X',
+
+    cost(X) >= tr(X^T M X) + constant   for all poses X,
+
+and both sides are equal at X = X'. F is itself such a quadratic form, equal everywhere; chi2 is
+not, and its quadratic form is a tangent at X' that is nowhere above it. A common shift of all t_i
+does not change the right side.
 
 **The theorem.** Let Lambda_i be any symmetric matrices, and eta >= 0. As R_i^T R_i = I, the right
 side is
 
     q(X) = tr(X^T S X) + tr(Lambda) + constant,   S = M - blockdiag(0, Lambda_i).
 
-Move all poses of X' together, which changes nothing, so that pose r is at (0, I). Let G = S X',
-and let S_r and G_r be S and G without the rows of pose r. If H = S_r + eta blockdiag(0, I) is
-positive definite, then for all poses X
+Let G = S X'. An index r on S, G and Z means that pose r is left out: S_r is S without the rows and
+columns of pose r, and G_r is G without its rows. If H = S_r + eta blockdiag(0, I) is positive
+definite, then for all poses X
 
-    cost(X) >= q(X') - tr(G_r^T H^-1 G_r) - 8 eta (number of rotations - 1).
+    (A)   cost(X) >= q(X') - tr(G_r^T H^-1 G_r) - 8 eta (number of rotations - 1).
 
-Proof. Shift X, which changes nothing, so that t_r = 0. Let Q be R_r^T of X, and Z = X - X' Q, whose
-rows of pose r are zero. Then q(X) = q(X') + 2 tr((G Q)^T Z) + tr(Z^T S Z), and the last term is
-tr(Z_r^T H Z_r) - eta sum ||R_i^T - X'_i Q||^2. Two rotations are at most sqrt(8) apart. Completing
-the square, the rest is at least q(X') - tr(G_r^T H^-1 G_r).
+Proof. Shift X so that its pose r is at the origin, which does not change q(X). Let the rotation Q
+be the transpose of its R there; then X and X' Q have the same rows of pose r, so that Z = X - X' Q
+is zero there. As Q Q^T = I, q(X' Q) = q(X'), and
+
+    q(X) = q(X') + 2 tr((G_r Q)^T Z_r) + tr(Z_r^T S_r Z_r)
+         = q(X') + 2 tr((G_r Q)^T Z_r) + tr(Z_r^T H Z_r) - eta sum_i ||R_i^T - P_i Q||_F^2,
+
+where P_i is the rotation block of X'_i, and the sum is over all rotations but that of pose r. Two
+rotations are at most sqrt(8) apart, so that the sum is at most 8 (number of rotations - 1). The
+terms before it complete the square
+
+    tr((Z_r + H^-1 G_r Q)^T H (Z_r + H^-1 G_r Q)) - tr((G_r Q)^T H^-1 G_r Q),
+
+whose first term is not negative; the second is tr(G_r^T H^-1 G_r), as Q cancels in the trace.
 
 With Lambda_i - eta I in place of Lambda_i, S becomes S + eta blockdiag(0, I), and G becomes G' =
-G + eta blockdiag(0, I) X', while q(X') stays. So the same H proves, without a shift, that
+G + eta blockdiag(0, I) X', while q(X') stays, for the P_i are rotations. The matrix without pose r
+is H again, and (A) with zero in place of eta is
 
-    cost(X) >= q(X') - tr(G'_r^T H^-1 G'_r).
+    (B)   cost(X) >= q(X') - tr(G'_r^T H^-1 G'_r).
 
-The larger of the two is taken. The second is at least tr(Lambda) + constant - eta n d where all of
-S + eta blockdiag(0, I) is positive semidefinite (Rosen et al. 2019, theorem 7).
+The larger of the two is taken. (For comparison with the literature alone: where all of
+S + eta blockdiag(0, I) is positive semidefinite, (B) is at least tr(Lambda) + constant - eta n d
+with n rotations, the bound of Rosen et al. 2019, theorem 7.)
+
+**Handedness terms.** In three dimensions a proof may take terms off q that are never negative on
+rotations, so that the smaller form bounds the cost as well. For poses i and j, a rotation T and a
+positive semidefinite P, let rho = R_j^T - T^T R_i^T and W = (tr(P) / 2 I - P) / 4. Where the
+rotation E = T^T R_i^T R_j has the unit quaternion (w, v), Rodrigues' formula gives
+tr(rho^T W rho) = tr(W (2 I - E - E^T)) = v^T P v >= 0. A reflection is no such E: that is what
+these terms know, and S does not.
 
 **The arithmetic.** Numbers of the file are rational numbers. What is computed from them is a ball:
-a number with a bound on its error, by Arb through python-flint. If a ball is above zero, so is the
-number in it. The square is completed pose by pose (`eliminate`), which is a block LDL^T: H is
-positive definite if and only if all pivots are. Nothing in a proof is believed: other poses or
-multipliers give another bound, which holds as well. No other room of this project is imported, and
-there is no linear algebra in doubles.
+a number with a bound on its error, by Arb through python-flint. A comparison of balls is True only
+if it holds for all numbers in them; where they overlap, a <= b and a > b are both False. So what is
+to be shown is written as `if not a <= b: fail`, which also fails where nothing is decided. The
+square is completed pose by pose (`eliminate`), which is a block LDL^T: H is positive definite if
+and only if all pivots are. Doubles serve to guess a weight, which is then checked exactly
+(`pgo_models.verification.costs.definite_tau`), and for nothing else.
+
+Nothing in a proof is believed: other poses or multipliers give another bound, which holds as well.
+Nothing outside `pgo_models.verification` is imported but `pgo_models.errors`.
 """
 
 from dataclasses import dataclass
@@ -54,18 +86,24 @@ from pgo_models.verification.balls import (
     ctx,
     exact_parts,
     first_bad_pivot,
+    fmpq,
     identity,
+    is_semidefinite,
     part,
     symmetric,
 )
 from pgo_models.verification.costs import QuadraticForm, StepFailedError, UndecidedError, add_edge
 from pgo_models.verification.measurements import WORLD, Graph, read_graph
-from pgo_models.verification.proof import COSTS, Proof, read_proof
+from pgo_models.verification.proof import COSTS, HandednessTerm, Proof, read_proof
 
 PRECISIONS = (128, 512, 2048)  # bits; the next where a ball is too wide to tell its sign
-CLAIM_SLACK = 1e-9  # of the cost: what the solver claims is for its doubles, not for the file
+# Relative tolerance between what a proof claims and what is verified. The solver computed its
+# claims for doubles, and here they are compared with figures for the decimal numbers of the file.
+# The cost below which the solver could tell nothing from zero, the `rounding_level` of the proof,
+# is added to the tolerance. The bound itself uses neither.
+CLAIM_SLACK = 1e-9
 FARTHEST = 8  # the largest squared Frobenius norm of the difference of two rotations
-NO_ROTATION = 1e-6  # entries that far from those of the rotation beside them are a mistake
+NO_ROTATION = 1e-6  # entries that far from those of the rotation made of them are a mistake
 DIGITS = 20
 
 
@@ -82,7 +120,8 @@ class Verification:
     objective : arb, optional
         The cost of the poses. Its upper end is an upper bound on the least cost.
     bound : arb, optional
-        The lower end of this ball is a lower bound on the cost of all poses.
+        The lower end of this ball is a lower bound on the cost of all poses. It is exactly zero
+        where only the trivial bound is proven, as of a proof without eta.
     gap : arb, optional
         (objective - bound) / objective.
     failure : str
@@ -98,8 +137,10 @@ class Verification:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the balls by their mantissas and exponents, which python-flint does not do."""
-        balls = [exact_parts(ball) for ball in (self.objective, self.bound, self.gap)]
-        return _unpickled, (self.graph, self.cost, *balls, self.failure)
+        objective = exact_parts(self.objective)
+        bound = exact_parts(self.bound)
+        gap = exact_parts(self.gap)
+        return _unpickled, (self.graph, self.cost, objective, bound, gap, self.failure)
 
     @property
     def is_verified(self) -> bool:
@@ -117,7 +158,8 @@ class Verification:
         if self.failure:
             return f"FAILED at {self.failure}"
         if self.bound == 0:
-            return f"VERIFIED: {self.cost_name} is a sum of squares; no better bound is proven"
+            trivial = f"VERIFIED, but only the trivial bound: {self.cost_name} is a sum of squares"
+            return f"{trivial}; no better bound is proven"
         return f"VERIFIED: no poses have {self.cost_name} below this lower bound"
 
     def facts(self) -> list[tuple[str, str]]:
@@ -128,13 +170,16 @@ class Verification:
         list of (str, str)
             Pairs of a label and a text.
         """
-        balls = [(self.cost_name, self.objective), ("lower bound", self.bound), ("gap", self.gap)]
-        return [
+        facts = [
             ("graph", self.graph),
             ("cost", f"{COSTS[self.cost]}; numbers as the file has them, in decimals"),
-            *((label, ball.str(DIGITS)) for label, ball in balls if ball is not None),
-            ("verdict", self.verdict),
         ]
+        balls = [(self.cost_name, self.objective), ("lower bound", self.bound), ("gap", self.gap)]
+        for label, ball in balls:
+            if ball is not None:
+                facts.append((label, ball.str(DIGITS)))
+        facts.append(("verdict", self.verdict))
+        return facts
 
     def as_json(self) -> dict[str, object]:
         """Return what `pgo verify --json` prints.
@@ -144,17 +189,23 @@ class Verification:
         dict
             Balls are texts.
         """
-        balls = {"objective": self.objective, "lower_bound": self.bound, "gap": self.gap}
         return {
             "graph": self.graph,
             "cost": self.cost,
-            **{name: None if ball is None else ball.str(DIGITS) for name, ball in balls.items()},
+            "objective": _text(self.objective),
+            "lower_bound": _text(self.bound),
+            "gap": _text(self.gap),
             "verified": self.is_verified,
             "failure": self.failure,
         }
 
     def __str__(self) -> str:
         return "\n".join(f"{label:<12} {text}" for label, text in self.facts())
+
+
+def _text(ball: arb | None) -> str | None:
+    """A ball as it is printed; None of none."""
+    return None if ball is None else ball.str(DIGITS)
 
 
 def _unpickled(
@@ -240,7 +291,9 @@ def prove(graph: Graph, proof: Proof, name: str) -> Verification:
             objective += add_edge(form, edge, proof.cost, X)
         except StepFailedError as failed:
             raise StepFailedError(f"{failed} (line {edge.line})") from failed
-    bound = arb(0)  # the cost is a sum of squares, with weights that are not negative
+    # The cost is a sum of squares, with weights that are not negative. A proof without eta claims
+    # nothing beyond that.
+    bound = arb(0)
     if proof.eta is not None:
         bound = lower_bound(graph, proof, form, X, objective).max(bound)
     gap = (objective - bound) / objective if objective > 0 else None
@@ -255,55 +308,114 @@ def lower_bound(
     X: dict[int, arb_mat],
     objective: arb,
 ) -> arb:
-    """The larger bound of the theorem."""
+    """The larger bound of the theorem; `form` is used up.
+
+    The form comes as tr(X^T M X) + constant. Its matrix is changed in place, to S and then to
+    S + eta blockdiag(0, I), which without pose r is H.
+    """
+    d = graph.d
     rotations = [node for node in X if node not in graph.landmarks]
     eta = arb(proof.eta)
-    # without Lambda so far
-    S = form.S
-    G = form.product(X)
-    for pose in rotations:
-        Lambda = blocks_on_diagonal(arb_mat(1, 1), multipliers(proof, pose, G[pose], X[pose]))
-        S[pose][pose] -= Lambda
-        G[pose] -= Lambda * X[pose]
-        form.constant += Lambda.trace()
-    value = form.constant + sum((X[node].transpose() * G[node]).trace() for node in X)
-    if not value.overlaps(objective):
-        both = f"{value.str(DIGITS)} and {objective.str(DIGITS)}"
+    G = subtract_multipliers(proof, form, X, rotations)
+    value_at_X = form.constant + sum((X[node].transpose() * G[node]).trace() for node in X)
+    # This comparison finds no fault with a proof, whatever is in it.
+    if not value_at_X.overlaps(objective):
+        both = f"{value_at_X.str(DIGITS)} and {objective.str(DIGITS)}"
         raise StepFailedError(f"the cost: q(X') is not cost(X'), {both}: a defect of pgo verify")
-    shift = blocks_on_diagonal(arb_mat(1, 1), identity(graph.d) * eta)
-    G = {node: beside(block, block) for node, block in G.items()}  # G and G'
+    value_at_X -= subtract_terms(proof, form, G, X)
+    # Right-hand sides G and G' side by side, so that one elimination serves both bounds.
+    right_sides = {node: beside(block, block) for node, block in G.items()}
+    eta_block = blocks_on_diagonal(arb_mat(1, 1), identity(d) * eta)
     for pose in rotations:
-        S[pose][pose] += shift
-        G[pose] += beside(arb_mat(graph.d + 1, graph.d), shift * X[pose])
-    del G[proof.ground]
-    lost = eliminate(without_pose(S, proof.ground), G)
-    first = range(graph.d)
-    second = range(graph.d, 2 * graph.d)
-    shifted = value - part(lost, first, first).trace() - FARTHEST * eta * (len(rotations) - 1)
-    return shifted.max(value - part(lost, second, second).trace())
+        form.S[pose][pose] += eta_block
+        right_sides[pose] += beside(arb_mat(d + 1, d), eta_block * X[pose])
+    del right_sides[proof.ground]
+    H = without_pose(form.S, proof.ground)
+    products = eliminate(H, right_sides)
+    columns_of_G = range(d)
+    columns_of_shifted_G = range(d, 2 * d)
+    loss_to_G = part(products, columns_of_G, columns_of_G).trace()
+    loss_to_shifted_G = part(products, columns_of_shifted_G, columns_of_shifted_G).trace()
+    bound_A = value_at_X - loss_to_G - FARTHEST * eta * (len(rotations) - 1)
+    bound_B = value_at_X - loss_to_shifted_G
+    return bound_A.max(bound_B)
+
+
+def subtract_multipliers(
+    proof: Proof, form: QuadraticForm, X: dict[int, arb_mat], rotations: list[int]
+) -> dict[int, arb_mat]:
+    """G = S X', once M and the constant of the form are changed to S and constant + tr(Lambda)."""
+    products = form.product(X)
+    for pose in rotations:
+        Lambda_i = multipliers(proof, pose, products[pose], X[pose])
+        block = blocks_on_diagonal(arb_mat(1, 1), Lambda_i)
+        form.S[pose][pose] -= block
+        form.constant += block.trace()
+        products[pose] -= block * X[pose]
+    return products
+
+
+def subtract_terms(
+    proof: Proof, form: QuadraticForm, G: dict[int, arb_mat], X: dict[int, arb_mat]
+) -> arb:
+    """Take the handedness terms off S and G = S X', and return what they are at X', about zero."""
+    terms_at_X = arb(0)
+    zero = arb_mat(1, 1)  # translations have no part in them
+    for term in proof.terms:
+        if not {term.i, term.j} <= proof.R.keys() or term.i == term.j:
+            raise StepFailedError("the handedness terms: one is not of two poses with rotations")
+        T = exact_rotation(term.T, f"T of {pose_name(term.i)} and {pose_name(term.j)}")
+        W = blocks_on_diagonal(zero, weight_of_term(term))
+        begin = blocks_on_diagonal(zero, T.transpose())
+        rho = blocks_on_diagonal(zero, identity(3)) * X[term.j] - begin * X[term.i]
+        form.add(term.i, term.i, -(begin.transpose() * W * begin))
+        form.add(term.i, term.j, begin.transpose() * W)
+        form.add(term.j, term.j, -W)
+        G[term.i] += begin.transpose() * W * rho
+        G[term.j] -= W * rho
+        terms_at_X += (rho.transpose() * W * rho).trace()
+    return terms_at_X
+
+
+def weight_of_term(term: HandednessTerm) -> arb_mat:
+    """(tr(P) / 2 I - P) / 4, once P is shown to be positive semidefinite, exactly."""
+    triangle = [fmpq(*number.as_integer_ratio()) for number in term.P]
+    if not is_semidefinite(symmetric(triangle, 3)):
+        raise StepFailedError(
+            f"the handedness terms: P of {pose_name(term.i)} and {pose_name(term.j)} "
+            "is not positive semidefinite"
+        )
+    P = arb_mat(symmetric([arb(number) for number in term.P], 3))
+    return (identity(3) * (P.trace() / 2) - P) * arb(0.25)
 
 
 def multipliers(proof: Proof, pose: int, product: arb_mat, X_i: arb_mat) -> arb_mat:
     """Lambda_i of the proof, or else that of a stationary point: sym((M X')_i R_i)."""
     d = X_i.ncols()
     if pose in proof.Lambda:
-        return arb_mat(symmetric([arb(number) for number in proof.Lambda[pose]], d))
-    rows = range(1, d + 1), range(d)
-    found = part(product, *rows) * part(X_i, *rows).transpose()
-    return (found + found.transpose()) * arb(0.5)
+        triangle = [arb(number) for number in proof.Lambda[pose]]
+        return arb_mat(symmetric(triangle, d))
+    rotation_rows = range(1, d + 1)
+    product_block = part(product, rotation_rows, range(d))
+    R_i = part(X_i, rotation_rows, range(d)).transpose()
+    block = product_block * R_i
+    return (block + block.transpose()) * arb(0.5)
 
 
 def grounded_poses(graph: Graph, proof: Proof) -> dict[int, arb_mat]:
     """X', the rows of every pose and landmark, moved so that pose r is at (0, I)."""
     check_names(graph, proof)
     r = proof.ground
-    R = {pose: exact_rotation(rows, pose) for pose, rows in proof.R.items()}
+    t_r = proof.t[r]
+    R = {pose: exact_rotation(rows, f"R of {pose_name(pose)}") for pose, rows in proof.R.items()}
     X = {}
     for node, t in proof.t.items():
-        shift = [arb(a) - arb(b) for a, b in zip(t, proof.t[r], strict=True)]
-        X[node] = arb_mat([shift]) * R[r]
+        difference = [arb(a) - arb(b) for a, b in zip(t, t_r, strict=True)]
+        translation = arb_mat([difference]) * R[r]
+        X[node] = translation
         if node in R:
-            X[node] = above(X[node], R[node].transpose() * R[r])
+            rotation = R[node].transpose() * R[r]
+            X[node] = above(translation, rotation)
     X[r] = above(arb_mat(1, graph.d), identity(graph.d))
     return X
 
@@ -319,84 +431,126 @@ def check_names(graph: Graph, proof: Proof) -> None:
         raise StepFailedError(f"the poses: {pose_name(proof.ground)}, to be grounded, is none")
 
 
-def exact_rotation(rows: list[list[float]], pose: int) -> arb_mat:
-    """Ball of the rotation that Gram-Schmidt makes of doubles, which are one but for rounding."""
+def exact_rotation(rows: list[list[float]], name: str) -> arb_mat:
+    """Ball of a rotation close to a matrix of doubles; an error where the two differ by more.
+
+    Gram-Schmidt makes it of the first d - 1 columns; the last one follows from them, with
+    determinant 1.
+    """
     d = len(rows)
-    columns = [arb_mat([[arb(row[k])] for row in rows]) for k in range(d)]
-    first = normalized(columns[0])
+    given = arb_mat([[arb(entry) for entry in row] for row in rows])
+    first = normalized(part(given, range(d), range(1)))
     if d == 2:
         cosine, sine = first.entries()
-        found = arb_mat([[cosine, -sine], [sine, cosine]])
+        rotation = arb_mat([[cosine, -sine], [sine, cosine]])
     else:
-        second = normalized(columns[1] - first * (first.transpose() * columns[1]))
-        (a, b, c), (x, y, z) = first.entries(), second.entries()
-        third = [b * z - c * y, c * x - a * z, a * y - b * x]
-        found = arb_mat([[a, b, c], [x, y, z], third]).transpose()
-    given = arb_mat([[arb(entry) for entry in row] for row in rows])
-    if not all(abs(entry) < NO_ROTATION for entry in (found - given).entries()):
-        raise StepFailedError(f"the poses: R of {pose_name(pose)} is no rotation")
-    return found
+        second_column = part(given, range(d), range(1, 2))
+        along_first = first * (first.transpose() * second_column)
+        second = normalized(second_column - along_first)
+        a, b, c = first.entries()
+        x, y, z = second.entries()
+        cross_product = [b * z - c * y, c * x - a * z, a * y - b * x]
+        rotation = arb_mat([[a, b, c], [x, y, z], cross_product]).transpose()
+    differences = (rotation - given).entries()
+    # Not `any(.. >= NO_ROTATION)`, which is False of balls that are too wide.
+    if not all(abs(entry) < NO_ROTATION for entry in differences):
+        raise StepFailedError(f"the poses: {name} is no rotation")
+    return rotation
 
 
 def normalized(column: arb_mat) -> arb_mat:
     """A vector over its length."""
-    return column / (column.transpose() * column)[0, 0].sqrt()
+    squared_length = (column.transpose() * column)[0, 0]
+    return column / squared_length.sqrt()
 
 
 def without_pose(S: dict[int, dict[int, arb_mat]], r: int) -> dict[int, dict[int, arb_mat]]:
     """S without the rows and columns of pose r."""
-    return {i: {j: block for j, block in row.items() if j != r} for i, row in S.items() if i != r}
+    others = {}
+    for i, row in S.items():
+        if i != r:
+            others[i] = {j: block for j, block in row.items() if j != r}
+    return others
 
 
 def eliminate(H: dict[int, dict[int, arb_mat]], G: dict[int, arb_mat]) -> arb_mat:
     """G^T H^-1 G, once H is shown to be positive definite; both are used up.
 
-    Minus its trace is the least value of tr(Z^T H Z) + 2 tr(G^T Z). Terms with Z_k of a pose are
+    Minus its trace is the minimum of tr(Z^T H Z) + 2 tr(G^T Z), which is taken over the rows Z_k of
+    one pose at a time. The terms with Z_k are
 
-        tr(Z_k^T P Z_k) + 2 tr(Z_k^T V),   P = H_kk,   V = G_k + sum_i H_ki Z_i,
+        tr(Z_k^T P Z_k) + 2 tr(Z_k^T V),   P = H_kk,   V = G_k + sum_{i != k} H_ki Z_i.
 
-    whose least value is -tr(V^T P^-1 V). So -tr(G_k^T P^-1 G_k) beside the same form is left, with
+    If the pivot P is positive definite, their minimum over Z_k, at Z_k = -P^-1 V, is -tr(V^T P^-1
+    V). Multiplied out, that is the constant -tr(G_k^T P^-1 G_k), and terms in the other Z_i, which
+    change their form to
 
         H_ij <- H_ij - H_ik P^-1 H_kj,   G_i <- G_i - H_ik P^-1 G_k.
 
-    Next is a pose with the fewest neighbours left, so that few blocks become non-zero; of several
-    one that the fewest eliminations led to, one upon the other, as each makes balls wider.
+    If P is not positive definite, H is not.
+
+    The next pose is one with the fewest neighbours left, so that few blocks become non-zero. Ties
+    go to the smallest depth: the depth of a pose is the length of the longest chain of earlier
+    eliminations that its pivot depends on. Every link of such a chain makes the balls wider.
     """
     columns = next(iter(G.values())).ncols()
-    found = arb_mat(columns, columns)
+    total = arb_mat(columns, columns)
     depth = dict.fromkeys(H, 0)
     waiting = [(len(row), 0, k) for k, row in H.items()]
     heapify(waiting)
     while waiting:
-        count, level, k = heappop(waiting)
-        if k not in H or (count, level) != (len(H[k]), depth[k]):
-            continue  # its neighbours have changed: it waits elsewhere, too
+        num_blocks, depth_of_k, k = heappop(waiting)
+        # An entry is out of date if its pose was eliminated, or is in the heap again with other
+        # neighbours or another depth.
+        if k not in H or num_blocks != len(H[k]) or depth_of_k != depth[k]:
+            continue
         neighbours = H.pop(k)
+        G_k = G.pop(k)
         pivot = neighbours.pop(k)
-        check_definite(pivot, k)
-        try:
-            inverse = pivot.inv()
-            G_k = G.pop(k)
-        except ZeroDivisionError:
-            problem = f"the elimination: a pivot of {pose_name(k)} is not known well enough"
-            raise UndecidedError(problem) from None
-        found += G_k.transpose() * inverse * G_k
-        done: list[tuple[int, arb_mat]] = []
-        for i, H_ki in neighbours.items():
-            row = H[i]
-            del row[k]
-            done.append((i, H_ki))
-            share = H_ki.transpose() * inverse
-            G[i] -= share * G_k
-            for j, H_kj in done:
-                update = share * H_kj
-                row[j] = row[j] - update if j in row else -update
-                if j != i:
-                    H[j][i] = row[j].transpose()
+        inverse = inverse_of_definite(pivot, k)
+        total += G_k.transpose() * inverse * G_k
+        eliminate_pose(H, G, k, neighbours, inverse, G_k)
         for i in neighbours:
-            depth[i] = max(depth[i], depth[k] + 1)
+            depth[i] = max(depth[i], depth_of_k + 1)
             heappush(waiting, (len(H[i]), depth[i], i))
-    return found
+    return total
+
+
+def eliminate_pose(
+    H: dict[int, dict[int, arb_mat]],
+    G: dict[int, arb_mat],
+    k: int,
+    neighbours: dict[int, arb_mat],
+    inverse: arb_mat,
+    G_k: arb_mat,
+) -> None:
+    """Update H_ij and G_i for the elimination of pose k, given the blocks H_ki of its neighbours.
+
+    H stores H_ij and H_ji. Each pair is computed once, when the later of the two neighbours is
+    visited; the other block is its transpose.
+    """
+    visited: list[tuple[int, arb_mat]] = []
+    for i, H_ki in neighbours.items():
+        row = H[i]
+        del row[k]
+        visited.append((i, H_ki))
+        share = H_ki.transpose() * inverse
+        G[i] -= share * G_k
+        for j, H_kj in visited:
+            update = share * H_kj
+            row[j] = row[j] - update if j in row else -update
+            if j != i:
+                H[j][i] = row[j].transpose()
+
+
+def inverse_of_definite(pivot: arb_mat, pose: int) -> arb_mat:
+    """Inverse of a pivot, once it is shown to be positive definite."""
+    check_definite(pivot, pose)
+    try:
+        return pivot.inv()
+    except ZeroDivisionError:
+        problem = f"the elimination: a pivot of {pose_name(pose)} is not known well enough"
+        raise UndecidedError(problem) from None
 
 
 def check_definite(pivot: arb_mat, pose: int) -> None:
@@ -405,6 +559,7 @@ def check_definite(pivot: arb_mat, pose: int) -> None:
     if bad is None:
         return
     value = f"a pivot of {pose_name(pose)} is {arb(bad).str(5)}"
+    # A ball that contains zero is not <= 0: nothing is decided of it.
     if bad <= 0:
         raise StepFailedError(f"the elimination: H is not positive definite, {value}")
     raise UndecidedError(f"the elimination: H is not known to be positive definite, {value}")
@@ -418,8 +573,11 @@ def pose_name(pose: int) -> str:
 def broken_claim(proof: Proof, objective: arb, bound: arb) -> str:
     """What the proof claims and does not prove, or nothing."""
     slack = CLAIM_SLACK * arb(proof.objective) + proof.rounding_level
-    if not abs(objective - proof.objective) <= slack:
+    difference = abs(objective - proof.objective)
+    least_bound = proof.lower_bound - slack
+    # `not a <= b`, here and below, for a claim that is not decided counts as broken.
+    if not difference <= slack:
         return f"the claims: the cost of the poses is not {proof.objective!r}"
-    if not bound >= proof.lower_bound - slack:
+    if not bound >= least_bound:
         return f"the claims: what is proven is less than {proof.lower_bound!r}"
     return ""

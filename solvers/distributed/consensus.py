@@ -68,7 +68,7 @@ class RobotsOfDriver:
         """Give driver and robots omega, and the best translations for it: two rounds."""
         requests = [None] * self.num_robots
         answers = self.driver.network.ask(finish_copies, requests, Count.PIGGYBACKED)
-        R = np.empty_like(self.driver.at.R)
+        R = np.empty_like(self.driver.current.R)
         for answer in answers:
             R[answer.in_cover] = answer.R
         # The copies of robots that do not wait differ, so that all robots take those of the owners.

@@ -1,17 +1,44 @@
 """The driver of the substructured coupling: it solves for the separators, never for interior poses.
 
-The driver holds the poses G of a vertex cover of the edges between robots. Every robot eliminates
-its interior poses and sends what remains of its cost on the cover (a Schur complement and a reduced
-right-hand side); the driver sums up, solves for the cover, and sends the solution back. No message
-of an iteration contains an interior pose, or a measurement between two poses of the same robot.
-Outside the iterations interior poses pass through the driver's process in three places: a start
-that is handed out; snapshots, which it keeps without reading them where robots can be lost (Ray) or
-a checkpoint is written, and whose bytes the ledger counts apart; and the result that is collected.
+Terms:
 
-One gather of the robots' reduced right-hand sides, one solve and one scatter are a round. A solve
-of M x = b, a step (a) of SOC, a Newton direction, and the best translations of given rotations take
-one round each, a proof of the certificate two. Where robots hold fronts of the separator tree,
-gather and scatter go along the tree, level by level (`Ledger.bytes_by_level`).
+- cover: a set of poses with an end of every edge between two robots (a vertex cover), or a single
+  pose where there is no such edge. Its g poses are the separators, which the driver holds.
+- boundary of a robot: the poses of the cover that its edges join; its other poses are its interior.
+  Every edge belongs to one robot.
+- interface: the linear system on the cover, the sum of what all robots leave of their systems when
+  they eliminate their interiors (Schur complements and reduced right-hand sides).
+- fronts: the dense matrices in which the interface is factored, along a tree of groups of robots
+  (the separator tree, `solvers.distributed.multifrontal`). The driver holds the front of all robots
+  and, unless there are many large ones, the others, too.
+
+The robots eliminate their interiors, the driver sums, solves on the cover, and sends every robot
+the solution on its boundary. No message of an iteration contains an interior pose, or a measurement
+between two poses of the same robot. Outside the iterations interior poses pass through the driver's
+process in three places:
+
+- a start that is handed out;
+- snapshots, where robots can be lost (Ray) or a checkpoint is written; the driver keeps them
+  without reading them, and the ledger counts their bytes apart;
+- the result that is collected.
+
+Every `ask` scatters a request and gathers the answers. Its `Count` says what the ledger counts:
+
+- ROUND: the bytes both ways, and a round. Robots wait for what the driver has computed from their
+  earlier answers. One gather, one solve and one scatter are a round.
+- PIGGYBACKED: the bytes, and no round of its own: the message is part of the next round. The gather
+  with which a computation begins is one, and so is an order without numbers.
+- ALL_REDUCE: the bytes, and an all-reduce instead of a round.
+- OFF: nothing.
+
+A solve of M x = b, a step (a) of SOC, a Newton direction, and the best translations of given
+rotations take one round each, a proof of the certificate two. Where robots hold fronts, gather and
+scatter go along the tree, level by level (`Ledger.bytes_by_level`).
+
+The cost of poses is F = tr(X^T M X). X, ((d + 1) n, d), stacks the rows t_i^T of all n poses, then
+the d rows of every R_i^T; M, of side (d + 1) n, sums up the edges. M X is half the gradient of F.
+Rows on the cover have the same layout, with g in place of n. For chi2, which is not quadratic, M is
+that of the quadratic cost that touches it at the current poses.
 """
 
 import math
@@ -61,11 +88,11 @@ InteriorOrder = Callable[[Interior, Q], tuple[Interior, A]]
 
 @dataclass(frozen=True, eq=False)
 class CoverPoses:
-    """What the driver knows of the g poses of the cover."""
+    """What the driver knows of the g poses of the cover, and the cost of all poses."""
 
     R: Array  # (g, r, d): r is d, or the rank on the staircase
     t: Array  # (g, r)
-    force: Array  # ((d+1) g, r): rows of M X there
+    force: Array  # ((d+1) g, r): rows of M X on the cover
     objective: float = math.nan  # F of all poses
     # F if every residual were as large as rounding can make it.
     rounding_level: float = 0.0
@@ -82,8 +109,8 @@ class CoverPoses:
 class DriverState:
     """State of a driver between two steps: its attributes, and the ledger of its network."""
 
-    at: CoverPoses
-    kept: CoverPoses
+    current: CoverPoses
+    saved: CoverPoses
     block: RecursionBlock | None
     ledger: Ledger
     is_final: bool = False
@@ -94,22 +121,25 @@ class Driver:
 
     Attributes
     ----------
-    at, kept : CoverPoses
-        Current poses of the cover, and saved ones.
+    current, saved : CoverPoses
+        Current poses of the cover, and those of `save_poses`.
     cover : ndarray of int, (g,)
-        Numbers of these poses in the whole graph; the first is pose 0 if it is in the cover.
+        Numbers of the poses of the cover in the whole graph; the first is pose 0 if it is in the
+        cover.
     diagonal : ndarray, ((d + 1) g,)
         Diagonal of M on the cover.
     block : RecursionBlock, optional
-        Rotations of the cover in the recursion of SOC.
-    right : list of RightHandSide
-        Right-hand sides of the robots for the next step (a).
+        Rows of the recursion of SOC that belong to the rotations of the cover.
+    right_hand_sides : list of RightHandSide
+        Reduced right-hand sides of the robots for the next step (a).
     is_final : bool
-        Whether the current cost is the one that is solved, not the one that SOC minimizes.
-    grounded : int
-        Pose of the cover that is left out when a bound is proved.
-    robots : ndarray of int
-        Robots that count an edge.
+        Which of two costs is the current one, where a graph has two: the cost that is asked for
+        (`Part.final`; chi2, or one that is not convex), or the convex quadratic cost near it that
+        SOC minimizes instead (`PGOProblem.convex_part`). False where there is one cost.
+    grounded_position : int
+        Position in `cover` of the pose that is fixed when a bound is proved.
+    robots_with_edges : ndarray of int
+        Numbers of the robots to which at least one edge belongs. Only they have an interior.
     network : CountedPool
         All robots, and the ledger.
     """
@@ -118,41 +148,44 @@ class Driver:
         self,
         summaries: Sequence[RobotSummary],
         num_poses: int,
-        start: Callable[[], WorkerPool | CountedPool],
+        open_pool: Callable[[], WorkerPool | CountedPool],
         memory: float = DEFAULT_MEMORY,
-        grounded: int = 0,
+        grounded_position: int = 0,
     ) -> None:
-        """Start the robots, unless `start` returns a pool whose robots are at work already.
+        """Start the robots, unless `open_pool` returns a pool whose robots are at work already.
 
-        Orders about interiors go to the robots that count an edge. If `memory` is 0 the driver
-        stands for the network alone: it exchanges messages between robots, and sums. Raises a
-        SettingError if the separators would take more than `memory` bytes.
+        `memory` is the largest number of bytes that the interface may take; a SettingError if it
+        would take more. The value 0 selects a run without a driver (`leaderless`): no interface is
+        built or solved, and this object only carries the messages of the robots and adds up.
         """
         self.num_poses = num_poses
         self.d = summaries[0].d
-        self.grounded = grounded
+        self.grounded_position = grounded_position
         self.memory = memory
         self._read_cover(summaries)
         g = len(self.cover)
         R = np.broadcast_to(np.eye(self.d), (g, self.d, self.d)).copy()
-        self.at = CoverPoses(R, np.zeros((g, self.d)), np.zeros(((self.d + 1) * g, self.d)))
-        self.kept = self.at
+        self.current = CoverPoses(R, np.zeros((g, self.d)), np.zeros(((self.d + 1) * g, self.d)))
+        self.saved = self.current
         self.block: RecursionBlock | None = None
-        self.right: list[RightHandSide] = []
+        self.right_hand_sides: list[RightHandSide] = []
         self.is_final = False
         # Factor of the matrix of the translations on the cover, once it is needed.
         self._laplacian: Interface | None = None
 
+        # Boundaries of the robots with edges: `touched` is None where no edge belongs to a robot,
+        # and empty where none of its edges has an end in the cover.
         touched = tuple(robot.touched for robot in summaries if robot.touched is not None)
-        fronts = FrontOwners(touched if memory else (), g)
-        self._any_widths = Interface(g, (), touched, fronts)
+        has_interface = memory != 0
+        fronts = FrontOwners(touched if has_interface else (), g)
+        self._any_widths = Interface(g, (), touched, fronts)  # `interface` sets the widths
         self._interfaces: dict[Widths, Interface] = {}
-        if memory:
+        if has_interface:
             self.interface(*self.tangent).check_memory(memory)
-        pool = start()
+        pool = open_pool()
         self.network = pool if isinstance(pool, CountedPool) else CountedPool(pool, len(summaries))
         try:
-            fronts.hand_out(self.network, self.robots)
+            fronts.hand_out(self.network, self.robots_with_edges)
             self.describe(Count.OFF)
         except BaseException:  # also Ctrl-C: no robot stays behind
             self.network.workers.close()
@@ -165,17 +198,20 @@ class Driver:
         self.cover: IntArray = np.zeros(len(np.unique(positions)), dtype=np.int64)
         self.cover[positions] = numbers
         self._held_cover = [robot.in_cover for robot in summaries]
-        # Robots that count an edge, and the poses that these edges join.
-        counting = [robot for robot in summaries if robot.touched is not None]
-        self.robots = np.array([robot.robot for robot in counting])
-        self._parts = [robot.part for robot in counting]
+        # Robots with edges, and the poses that these edges join.
+        with_edges = [robot for robot in summaries if robot.touched is not None]
+        self.robots_with_edges = np.array([robot.robot for robot in with_edges])
+        self._parts = [robot.part for robot in with_edges]
         self._has_two_costs = any(robot.has_two_costs for robot in summaries)
         # Whether the process of the driver has the graph, too.
         self.has_whole = all(robot.part is not None for robot in summaries)
 
     def ask(self, order: InteriorOrder[Q, A], request: Q, count: Count = Count.ROUND) -> list[A]:
-        """Answers of all interiors to an order, with the same request for each."""
-        return self.ask_each(order, [request] * len(self.robots), count)
+        """Give all interiors an order with the same request; return their answers.
+
+        The module docstring says what `count` counts.
+        """
+        return self.ask_each(order, [request] * len(self.robots_with_edges), count)
 
     def ask_each(
         self,
@@ -184,50 +220,55 @@ class Driver:
         count: Count = Count.ROUND,
         is_along: bool = False,
     ) -> list[A]:
-        """Answers of all interiors to an order, each with its request.
+        """Give every interior an order with its own request; return their answers.
 
-        Requests with `is_along` are parts of a solution, which go along the separator tree if there
-        is one.
+        Requests and answers are in the order of `robots_with_edges`. Requests with `is_along` are
+        parts of a solution, which go along the separator tree where robots hold fronts.
         """
         request_of: list[Q | None] = [None] * self.network.ledger.num_robots
-        for robot, request in zip(self.robots.tolist(), requests, strict=True):
+        for robot, request in zip(self.robots_with_edges.tolist(), requests, strict=True):
             request_of[robot] = request
         order_of_agent = partial(order_interior, order)
-        answers = self.network.ask(order_of_agent, request_of, count, self.robots, is_along)
-        return [cast(A, answers[robot]) for robot in self.robots.tolist()]
+        answers = self.network.ask(
+            order_of_agent, request_of, count, self.robots_with_edges, is_along
+        )
+        return [cast(A, answers[robot]) for robot in self.robots_with_edges.tolist()]
 
-    def _gather_diagonal(self, parts: Sequence[Array]) -> Array:
+    def gather_diagonal(self, parts: Sequence[Array]) -> Array:
         """Diagonal of M on the cover, ((d + 1) g,), of the robots' parts."""
         columns = [part[:, None] for part in parts]
         return self.interface(1, self.d).gather(columns)[:, 0]
 
     def describe(self, count: Count) -> None:
         """Ask for the diagonal of M at the current poses."""
-        self.diagonal = self._gather_diagonal(self.ask(Interior.describe, None, count))
+        self.diagonal = self.gather_diagonal(self.ask(Interior.describe, None, count))
 
     def choose_cost(self, final: bool) -> None:
-        """Choose the cost that is solved (`final`), or the one that SOC minimizes.
+        """Make one of two costs the current one, see `is_final`.
 
-        Where the two are the same nothing happens.
+        Where there is one cost nothing happens.
         """
         if self._has_two_costs and final != self.is_final:
             self.is_final = final
             answers = self.ask(Interior.choose_cost, final, Count.PIGGYBACKED)
-            self.at = self.with_sums(self.at, answers)
+            self.current = self.with_cost(self.current, answers)
 
     def reweigh(self, order: Reweigh) -> None:
         """Weigh the robots' edges by their residuals at the current poses."""
         answers = self.ask(reweigh, order)
         self._laplacian = None  # its matrix has the weights of before
-        self.diagonal = self._gather_diagonal([answer.diagonal for answer in answers])
-        self.at = self.with_sums(self.at, [answer.at for answer in answers])
+        self.diagonal = self.gather_diagonal([answer.diagonal for answer in answers])
+        self.current = self.with_cost(self.current, [answer.at for answer in answers])
 
     def close(self) -> None:
         """Close the pool."""
         self.network.workers.close()
 
     def interface(self, *widths: int) -> Interface:
-        """Interface of unknowns whose fields have these numbers of columns for every pose."""
+        """Interface of unknowns with so many numbers per pose in every field.
+
+        (1, d) is the layout of X: one row of translations and d of rotations for every pose.
+        """
         if widths not in self._interfaces:
             self._interfaces[widths] = replace(self._any_widths, widths=widths)
         return self._interfaces[widths]
@@ -235,15 +276,15 @@ class Driver:
     @property
     def tangent(self) -> tuple[int, int]:
         """Widths of the tangent space at the current poses."""
-        return tangent_widths(self.at.R)
+        return tangent_widths(self.current.R)
 
     def fits(self, rank: int) -> bool:
-        """Whether the interface of poses of a rank is within the memory allowed."""
+        """Whether the interface of poses of this rank takes no more than `memory`."""
         widths = tangent_widths(np.zeros((0, rank, self.d)))
         return self.interface(*widths).num_bytes <= self.memory
 
     def measured(self, measurement: Measurement) -> Measurement:
-        """Figures of an iterate, with rounds, bytes and all-reduces so far."""
+        """Measurement of an iterate, with the rounds, bytes and all-reduces so far."""
         ledger = self.network.ledger
         return replace(
             measurement,
@@ -252,7 +293,7 @@ class Driver:
             all_reduces=ledger.all_reduces,
         )
 
-    # Columns of the driver's unknowns.
+    # Positions of the driver's unknowns.
 
     @property
     def rotation_rows(self) -> IntArray:
@@ -266,16 +307,25 @@ class Driver:
         diagonal = self.diagonal[self.rotation_rows].reshape(-1, self.d)
         return np.asarray(diagonal.mean(axis=1))
 
-    def ground(self, *widths: int) -> IntArray:
-        """Columns of pose 0, (1, sum(widths)), or (0, sum(widths)) if it is not in the cover."""
+    def columns_of_pose_0(self, *widths: int) -> IntArray:
+        """Columns of pose 0 in an interface, (1, sum(widths)).
+
+        (0, sum(widths)) if it is not in the cover.
+        """
         pose_0 = np.flatnonzero(self.cover[:1] == 0)
         if len(pose_0) == 0:
             return np.zeros((0, sum(widths)), dtype=int)
         return columns_of(pose_0, len(self.cover), widths)[None]
 
-    def grounded_translation(self) -> list[tuple[IntArray, Array]]:
-        """Block that doubles the (t_0, t_0) entry of M, if pose 0 is in the cover."""
-        column = self.ground(1)
+    def grounding_block(self) -> list[tuple[IntArray, Array]]:
+        """Block that doubles the (t_0, t_0) entry of M, if pose 0 is in the cover.
+
+        A shift of all translations costs nothing, so that the matrix of the translations is
+        singular. The larger entry makes it positive definite. The right-hand sides of all
+        translations sum to zero, so that the solution has t_0 = 0 and solves the system without the
+        block, too. If pose 0 is not in the cover, the robot whose interior it is in does the same.
+        """
+        column = self.columns_of_pose_0(1)
         if column.size == 0:
             return []
         return [(column, self.diagonal[column][:, :, None])]
@@ -285,7 +335,7 @@ class Driver:
     @property
     def state(self) -> DriverState:
         """State of the driver for `resume`, without factors, which are computed again."""
-        return DriverState(self.at, self.kept, self.block, self.network.ledger, self.is_final)
+        return DriverState(self.current, self.saved, self.block, self.network.ledger, self.is_final)
 
     def snapshots(self) -> list[Snapshot]:
         """State of every robot for `resume`, interior poses too; its bytes are counted apart."""
@@ -294,92 +344,107 @@ class Driver:
     def resume(self, state: DriverState, snapshots: Sequence[Snapshot]) -> None:
         """Continue from a state, and robots from their snapshots.
 
-        The robots send the matrix of the translations again.
+        The robots send again what they sent of the matrix of the translations.
         """
         self.network.ask(restore, snapshots, Count.OFF)
-        self.at = state.at
-        self.kept = state.kept
+        self.current = state.current
+        self.saved = state.saved
         self.block = state.block
         self.network.ledger = state.ledger
         self.is_final = state.is_final
         answers = self.ask(Interior.eliminated_translations, None, Count.PIGGYBACKED)
         matrices = [answer.schur for answer in answers if answer.schur is not None]
+        # Robots that had not sent their part yet have none. Without all parts the matrix is
+        # factored when it is needed (`best_translations`).
         if matrices and len(matrices) == len(answers):
             self._factorize_laplacian(matrices)
 
     # Poses.
 
-    def start(self) -> None:
-        """Go to the chordal relaxation of the rotations, with the best translations: two rounds."""
+    def go_to_chordal_start(self) -> None:
+        """Go to the chordal relaxation of the rotations, with the best translations: two rounds.
+
+        The first round gathers the systems of the relaxation and scatters its solution; the second
+        gathers those of the translations and scatters the best ones.
+        """
         answers = self.ask(Interior.chordal, None, Count.PIGGYBACKED)
         factor = self.interface(self.d).factorize([answer.schur for answer in answers])
         Y, parts, _ = factor.solve([answer.right.b for answer in answers])
-        self.at = replace(self.at, R=project_to_rotations(unstack_transposes(Y)))
+        self.current = replace(self.current, R=project_to_rotations(unstack_transposes(Y)))
         self.set_translations(self.ask_each(Interior.project, parts, is_along=True))
 
     def set_poses(self, poses: Poses) -> None:
-        """Take all poses as they are, with F and the forces; the next round counts their gather.
+        """Take all poses as they are, with F and M X on the cover, gathered with the next round.
 
         Raises a GraphError if their number or dimension differs from the graph's.
         """
         self.hand_out(poses)
-        self.at = self.with_sums(self.at, self.ask(Interior.evaluate, None, Count.PIGGYBACKED))
+        self.current = self.with_cost(
+            self.current, self.ask(Interior.evaluate, None, Count.PIGGYBACKED)
+        )
 
     def hand_out(self, poses: Poses) -> None:
-        """Give all poses to driver and robots as they are, without evaluating F.
+        """Give all poses to driver and robots as they are, without evaluating F: off the ledger.
 
         Raises a GraphError if their number or dimension differs from the graph's.
         """
         if (poses.num_poses, poses.d) != (self.num_poses, self.d):
             expected = f"{self.num_poses} poses in {self.d}D"
             raise GraphError(f"{poses} for {expected}; give one pose for every pose of the graph")
-        self.at = replace(self.at, R=poses.R[self.cover], t=poses.t[self.cover])
+        self.current = replace(self.current, R=poses.R[self.cover], t=poses.t[self.cover])
         poses_of_parts = [poses[part] for part in self._parts if part is not None]
         self.ask_each(Interior.set_poses, poses_of_parts, Count.OFF)
 
     def poses_of_cover(self) -> list[Poses]:
         """Poses of the cover for every robot that holds some of them."""
-        return [poses_from(self.at.R[held], self.at.t[held]) for held in self._held_cover]
+        return [poses_from(self.current.R[held], self.current.t[held]) for held in self._held_cover]
 
     def save_poses(self) -> None:
         """Save the current poses, here and on the robots."""
-        self.kept = self.at
+        self.saved = self.current
         self.ask(Interior.save_poses, None, Count.PIGGYBACKED)
 
     def restore_poses(self) -> None:
         """Return to the saved poses, here and on the robots."""
-        self.at = self.kept
+        self.current = self.saved
         self.ask(Interior.restore_poses, None, Count.PIGGYBACKED)
 
     def accept(self, trial: CoverPoses) -> None:
-        """Go to the trial, here and on all robots, even if Ctrl-C arrives meanwhile."""
+        """Go to the trial, here and on all robots, even if Ctrl-C arrives meanwhile.
+
+        Then all robots are asked again, as some may not have been. A robot that accepts its trial
+        twice is at the trial, as after once.
+        """
         try:
             self.ask(Interior.accept, None, Count.PIGGYBACKED)
         except KeyboardInterrupt:
             self.ask(Interior.accept, None, Count.OFF)
-            self.at = trial
+            self.current = trial
             raise
-        self.at = trial
+        self.current = trial
 
     def adopt(self, R: Array) -> None:
-        """Take rotations of the cover, (g, d, d), and best translations for them: two rounds."""
-        self.at = replace(self.at, R=R)
+        """Take rotations of the cover, (g, d, d), and best translations for them: two rounds.
+
+        The first round scatters the rotations; `set_translations` is the second.
+        """
+        self.current = replace(self.current, R=R)
         parts = self.scattered_rotations(stack_transposes(R))
         self.set_translations(self.ask_each(Interior.adopt, parts))
 
     def set_translations(self, answers: Sequence[ReducedTranslations]) -> None:
         """Go to the best translations for the current rotations: one round.
 
-        `answers` are the robots' reduced right-hand sides.
+        `answers` are the robots' reduced right-hand sides, which were gathered by the ask before.
         """
         t, parts = self.best_translations(answers)
         costs = self.ask_each(Interior.set_translations, parts, is_along=True)
-        self.at = self.with_sums(replace(self.at, t=t), costs)
+        self.current = self.with_cost(replace(self.current, t=t), costs)
 
     def best_translations(
         self, answers: Sequence[ReducedTranslations]
     ) -> tuple[Array, list[Array]]:
-        """Best translations of the cover, (g, d), and the rows of them that every robot needs."""
+        """Best translations of the cover, (g, d), and those on the boundary of every robot."""
         if self._laplacian is None:
             # Robots send a matrix once. If an answer has none, the factorisation of the matrices
             # that were sent has failed, and they are needed again.
@@ -394,10 +459,10 @@ class Driver:
 
     def _factorize_laplacian(self, matrices: Sequence[Array]) -> None:
         """Factor the matrix of the translations on the cover, of the robots' Schur complements."""
-        self._laplacian = self.interface(1).factorize(matrices, self.grounded_translation())
+        self._laplacian = self.interface(1).factorize(matrices, self.grounding_block())
 
-    def with_sums(self, poses: CoverPoses, answers: Sequence[CostParts]) -> CoverPoses:
-        """Poses of the cover with F, its rounding level, and the rows of M X there."""
+    def with_cost(self, poses: CoverPoses, answers: Sequence[CostParts]) -> CoverPoses:
+        """Poses with F, its rounding level and M X on the cover, summed over the robots' parts."""
         return replace(
             poses,
             force=self.interface(1, self.d).gather([answer.force for answer in answers]),
@@ -406,7 +471,7 @@ class Driver:
         )
 
     def scattered_rotations(self, z: Array) -> list[Array]:
-        """Rows of rotations on the cover, (d g, d), as every robot needs them."""
+        """Rows of rotations on the cover, (d g, d), cut into those on every robot's boundary."""
         no_translations = np.zeros((len(self.cover), self.d))
         parts = self.interface(1, self.d).scatter(np.concatenate([no_translations, z]))
         # Of h poses a part has h rows of translations, then d h rows of rotations.
@@ -416,13 +481,13 @@ class Driver:
 def collect(driver: Driver) -> tuple[Poses, Array]:
     """All poses and multipliers, for the result; off the ledger."""
     n = driver.num_poses
-    _, r, d = driver.at.R.shape
+    _, r, d = driver.current.R.shape
     R = np.empty((n, r, d))
     t = np.empty((n, r))
     Lambda = np.empty((n, d, d))
-    R[driver.cover] = driver.at.R
-    t[driver.cover] = driver.at.t
-    Lambda[driver.cover] = driver.at.multipliers
+    R[driver.cover] = driver.current.R
+    t[driver.cover] = driver.current.t
+    Lambda[driver.cover] = driver.current.multipliers
     for own in driver.ask(Interior.result, None, Count.OFF):
         R[own.poses] = own.R
         t[own.poses] = own.t

@@ -6,19 +6,20 @@ right-hand sides, rows of S X on the separators with their errors, and a few sum
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from pgo_models.certificates import lower_bound as central
 from pgo_models.certificates.definiteness import (
-    FIRST_SHIFT,
-    LEAST_SHIFT,
-    MARGIN,
+    FIRST_MARGIN,
+    LEAST_MARGIN,
+    ROUNDING_MULTIPLE,
     SHRINK,
     is_in_range,
 )
+from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.lower_bound import LowerBound
 from pgo_models.certificates.rounding_errors import evaluate_multipliers
 from pgo_models.errors import NotPositiveDefiniteError
@@ -29,7 +30,13 @@ from pgo_models.problem.matrices import columns_of
 from solvers.distributed.driver import Driver
 from solvers.distributed.interface import Interface
 from solvers.distributed.robots.proof import ProofSums
-from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
+from solvers.distributed.robots.proof_orders import (
+    describe_with_terms,
+    fits_part,
+    move_proof,
+    prove_interior,
+    report_terms,
+)
 from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep
 from solvers.network.counted_pool import Count
 
@@ -51,24 +58,28 @@ def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
     It is grounded without eta where that goes through, else the better form with the smallest eta
     found.
     """
-    is_near_zero = driver.at.objective <= driver.at.rounding_level
+    is_near_zero = driver.current.objective <= driver.current.rounding_level
     if is_near_zero and all(driver.ask(fits_part, None, Count.ROUND)):
         return central.NO_BOUND  # the poses are exact
     if driver.is_final:
         driver.describe(Count.PIGGYBACKED)
-        if not (driver.diagonal > 0.0).all():
-            return central.NO_BOUND
-    grounded = prove_grounded(driver, 0.0)
+    has_scale = bool((driver.diagonal > 0.0).all())
+    grounded = prove_grounded(driver, 0.0) if has_scale else None
     if grounded is not None and grounded.value > 0.0:
         return grounded
+    handed = _bound_with_terms(driver) if driver.d == 3 else None
+    if handed is not None:
+        return handed
+    if not has_scale:
+        return central.NO_BOUND
     count = driver.num_poses * driver.d
-    smallest = central.smallest_shift(gap, driver.at.objective, count)
+    smallest = central.smallest_shift(gap, driver.current.objective, count)
     # At stationary poses tr(Lambda) is F; it only says where the search ends.
     return central.search_forms(
         partial(prove_with_eta, driver),
         partial(prove_grounded, driver),
         smallest,
-        driver.at.objective,
+        driver.current.objective,
         count,
     )
 
@@ -78,23 +89,57 @@ def prove_with_eta(driver: Driver, eta: float) -> LowerBound | None:
 
     None unless S + eta blockdiag(0, I) without a translation is positive definite.
     """
-    proof = eliminate_S(driver, driver.ground(1).ravel(), eta, central.UNGROUNDED_SHIFT)
+    proof = eliminate_S(driver, driver.columns_of_pose_0(1).ravel(), eta, central.UNGROUNDED_MARGIN)
     if proof is None:
         return None
     return central.bound_with_eta(proof.traces, eta, driver.num_poses * driver.d)
 
 
-def prove_grounded(driver: Driver, eta: float) -> LowerBound | None:
-    """Bound F grounded at the driver's pose; None unless S_r + eta blockdiag(0, I) is definite."""
+def _bound_with_terms(driver: Driver) -> LowerBound | None:
+    """Bound grounded at a pose, of the cost less every robot's handedness terms, without eta.
+
+    The diagonal that rounding is measured by is that of M less the terms while this lasts.
+    """
+    described = driver.ask(describe_with_terms, None, Count.PIGGYBACKED)
+    if not any(answer.num_pairs for answer in described):
+        return None
+    diagonal = driver.diagonal
+    driver.diagonal = driver.gather_diagonal([answer.diagonal for answer in described])
+    handed = None
+    if (driver.diagonal > 0.0).all():
+        handed = prove_grounded(driver, 0.0, with_terms=True)
+    driver.diagonal = diagonal
+    if handed is None or not handed.value > 0.0:
+        return None
+    return replace(handed, terms=_collect_terms(driver))
+
+
+def _collect_terms(driver: Driver) -> HandednessTerms:
+    """All robots' handedness terms, for the result; off the ledger."""
+    reported = driver.ask(report_terms, None, Count.OFF)
+    terms = [of_robot for of_robot in reported if of_robot is not None]
+    return HandednessTerms(
+        np.concatenate([of_robot.i for of_robot in terms]),
+        np.concatenate([of_robot.j for of_robot in terms]),
+        np.concatenate([of_robot.T for of_robot in terms]),
+        np.concatenate([of_robot.P for of_robot in terms]),
+    )
+
+
+def prove_grounded(driver: Driver, eta: float, with_terms: bool = False) -> LowerBound | None:
+    """Bound F grounded at the driver's pose; None unless S_r + eta blockdiag(0, I) is definite.
+
+    With terms, S is that of the cost less the handedness terms of every robot's edges.
+    """
     g = len(driver.cover)
-    fixed = columns_of(np.array([driver.grounded]), g, (1, driver.d))
+    fixed = columns_of(np.array([driver.grounded_position]), g, (1, driver.d))
     X = _grounded_point(driver, fixed)
     proof = None
-    share = FIRST_SHIFT
+    share = FIRST_MARGIN
     while proof is None:
-        if share < LEAST_SHIFT:
+        if share < LEAST_MARGIN:
             return None
-        proof = eliminate_S(driver, fixed, eta, share, X)
+        proof = eliminate_S(driver, fixed, eta, share, X, with_terms)
         share *= SHRINK
     free = np.ones(len(X), dtype=bool)
     free[fixed] = False
@@ -109,10 +154,10 @@ def prove_grounded(driver: Driver, eta: float) -> LowerBound | None:
 def _grounded_point(driver: Driver, fixed: IntArray) -> Array:
     """Rows of X on the cover, ((d+1) g, d), with the grounded pose at (0, I) exactly."""
     d = driver.d
-    R = driver.at.R[driver.grounded]
-    t = driver.at.t[driver.grounded]
-    translations = (driver.at.t - t) @ R
-    rotations = stack_transposes(R.T @ driver.at.R)
+    R = driver.current.R[driver.grounded_position]
+    t = driver.current.t[driver.grounded_position]
+    translations = (driver.current.t - t) @ R
+    rotations = stack_transposes(R.T @ driver.current.R)
     X = np.concatenate([translations, rotations])
     X[fixed] = np.concatenate([np.zeros((1, d)), np.eye(d)])
     return X
@@ -198,7 +243,12 @@ def _sum_up(
 
 
 def eliminate_S(
-    driver: Driver, fixed: IntArray, eta: float, share: float, X: Array | None = None
+    driver: Driver,
+    fixed: IntArray,
+    eta: float,
+    share: float,
+    X: Array | None = None,
+    with_terms: bool = False,
 ) -> InterfaceProof | None:
     """Eliminate S + eta blockdiag(0, I) less a share of its diagonal, once.
 
@@ -208,7 +258,7 @@ def eliminate_S(
     g = len(driver.cover)
     d = driver.d
     space = driver.interface(1, d)
-    Lambda = driver.at.multipliers
+    Lambda = driver.current.multipliers
     added = eta * np.eye(d) - Lambda
     columns = driver.rotation_rows.reshape(g, d)
     diagonal = driver.diagonal.copy()
@@ -217,7 +267,7 @@ def eliminate_S(
         return None
     is_fixed = np.zeros(len(diagonal), dtype=bool)
     is_fixed[fixed] = True
-    orders = _proof_orders(driver, eta, share, is_fixed, diagonal, X)
+    orders = _proof_orders(driver, eta, share, is_fixed, diagonal, X, with_terms)
     answers = driver.ask_each(prove_interior, orders)
     contributions = [answer.schur for answer in answers if answer.schur is not None]
     sizes = [answer.sizes for answer in answers if answer.sizes is not None]
@@ -225,7 +275,7 @@ def eliminate_S(
         return None
     added[is_fixed[columns].any(axis=1)] = 0.0
     lost = space.rounding(sizes, [(columns, added)], diagonal) + 8.0 * UNIT_ROUNDOFF * diagonal
-    shift = np.maximum(share * diagonal, MARGIN * lost)
+    shift = np.maximum(share * diagonal, ROUNDING_MULTIPLE * lost)
     shifted = np.where(is_fixed, diagonal, -shift)
     own = [(columns, added), (np.arange(len(diagonal))[:, None], shifted[:, None, None])]
     try:
@@ -243,13 +293,14 @@ def _proof_orders(
     is_fixed: BoolArray,
     diagonal: Array,
     X: Array | None,
+    with_terms: bool,
 ) -> list[ProofOrder]:
     """Orders to the robots, each with what it holds of the rows of the cover."""
     space = driver.interface(1, driver.d)
     fixed_rows = space.scatter(is_fixed.astype(float))
     diagonals = space.scatter(diagonal)
-    points: Sequence[Array | None] = [None] * len(driver.robots)
+    points: Sequence[Array | None] = [None] * len(driver.robots_with_edges)
     if X is not None:
         points = space.scatter(X)
     rows = zip(fixed_rows, diagonals, points, strict=True)
-    return [ProofOrder(eta, share, *of_robot) for of_robot in rows]
+    return [ProofOrder(eta, share, *of_robot, with_terms) for of_robot in rows]

@@ -141,8 +141,8 @@ class EliminatedAlgebra:
         return moved.R, moved.t
 
     def _trial(self, R: Array, t: Array, answers: Sequence[TrialEvaluation]) -> CoverTrial:
-        at = CoverPoses(R, t, self.driver.at.force)
-        at = self.driver.with_sums(at, [answer.at for answer in answers])
+        at = CoverPoses(R, t, self.driver.current.force)
+        at = self.driver.with_cost(at, [answer.at for answer in answers])
         return CoverTrial(at, [answer.gradient for answer in answers])
 
 
@@ -169,7 +169,7 @@ class SubstructuredNewton:
         """State 0, at the poses that driver and robots hold."""
         if start is not None:
             return start
-        return SubstructuredNewtonState(k=0, objective=driver.at.objective)
+        return SubstructuredNewtonState(k=0, objective=driver.current.objective)
 
     def step(self, driver: Driver, state: SubstructuredNewtonState) -> SubstructuredNewtonState:
         """One factorisation and the moves it serves, two rounds each."""
@@ -177,13 +177,13 @@ class SubstructuredNewton:
         shift = None
         if self.is_shifted:
             num_rows = driver.num_poses * driver.d
-            shift = first_shift(state.eta, driver.at.objective, num_rows)
+            shift = first_shift(state.eta, driver.current.objective, num_rows)
         rules = StepRules(tolerance, self.newton.second_order, shift)
         result = newton_step(EliminatedAlgebra(driver), rules)
         eta = result.model.order.eta
         return SubstructuredNewtonState(
             k=state.k + 1,
-            objective=driver.at.objective,
+            objective=driver.current.objective,
             decrement=result.decrement,
             moved=result.moved,
             is_at_rounding=result.is_at_rounding,
@@ -216,7 +216,7 @@ def model_at(driver: Driver, order: ModelOrder) -> Model | None:
         factor = interface.factorize([answer.schur for answer in reduced], own)
     except NotPositiveDefiniteError:
         return None
-    return _solved(order, factor, driver.at, [answer.right for answer in reduced])
+    return _solved(order, factor, driver.current, [answer.right for answer in reduced])
 
 
 def _own(
@@ -224,18 +224,18 @@ def _own(
 ) -> list[tuple[IntArray, Array]]:
     """What the driver adds: the multipliers of the cover, the ground, the damping."""
     g = len(driver.cover)
-    at = LiftedPoses(driver.at.R, driver.at.t)
+    at = LiftedPoses(driver.current.R, driver.current.t)
     interface = driver.interface(*driver.tangent)
     layout = at.layout
     own: list[tuple[IntArray, Array]] = []
     diagonal = interface.gather([answer.diagonal[:, None] for answer in reduced])[:, 0]
     columns = layout.rotations(np.arange(g))
     if order.second_order:
-        curvature = -at.curvature(driver.at.multipliers - order.eta * np.eye(driver.d))
+        curvature = -at.curvature(driver.current.multipliers - order.eta * np.eye(driver.d))
         own.append((columns, curvature))
         diagonal[columns] += np.einsum("naa->na", curvature)
     extra = np.zeros_like(diagonal)
-    zero = driver.ground(*driver.tangent)
+    zero = driver.columns_of_pose_0(*driver.tangent)
     extra[zero] = abs(diagonal[zero])
     extra += order.damping * (diagonal + extra)
     own.append((np.arange(interface.side)[:, None], extra[:, None, None]))

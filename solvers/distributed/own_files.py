@@ -24,7 +24,7 @@ from pgo_models.certificates.rounding_errors import ObjectiveRounding, objective
 from pgo_models.errors import FileFormatError, GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
-from pgo_models.graphs.g2o import join_edges, make_folder, write_g2o
+from pgo_models.graphs.g2o import edge_rows_to_keep, make_folder, write_g2o
 from pgo_models.graphs.g2o_parser import G2OLines, information_of, poses_of, read_lines
 from pgo_models.graphs.pose_graph import (
     WORLD_ID,
@@ -211,7 +211,7 @@ def join_neighbours(agent: FileAgent, received: Mapping[int, Edges]) -> Border:
 def _joined_edges(edges_of: Mapping[int, Edges]) -> Edges:
     """Edges of several files as one, in which an edge of several files counts once."""
     files = [edges for _, edges in sorted(edges_of.items())]
-    kept_of_files = join_edges([(file.ids, file.rows) for file in files])
+    kept_of_files = edge_rows_to_keep([(file.ids, file.rows) for file in files])
     parts = [file.some(kept) for file, kept in zip(files, kept_of_files, strict=True)]
     return Edges.joined(parts)
 

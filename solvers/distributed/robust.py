@@ -122,7 +122,7 @@ class SharedGNC:
         return next_state(self.gnc, state)
 
     def measure(self, driver: Driver, state: SharedGNCState) -> Measurement:
-        """The robust cost, the share of undecided edges, and the decrement."""
+        """The robust cost, the share of undecided edges, and the relative decrease."""
         return driver.measured(measurement_of(state))
 
     def converged(self, state: SharedGNCState, measurement: Measurement) -> Status | None:

@@ -113,7 +113,7 @@ class StartByRobots:
         poses = self.find() if self.find is not None else None
         began = time.perf_counter()
         if poses is None:
-            driver.start()
+            driver.go_to_chordal_start()
         else:
             driver.set_poses(poses)
         objective = _final_objective(driver)
@@ -149,7 +149,7 @@ class SOCByRobots:
         if not journal.goes_on_with():
             driver.save_poses()
         finished = self._finished()
-        if not driver.at.objective <= driver.kept.objective:
+        if not driver.current.objective <= driver.saved.objective:
             driver.restore_poses()
         objective = _final_objective(driver)
         seconds = time.perf_counter() - began
@@ -215,7 +215,7 @@ class NewtonByRobots:
                 "Newton",
                 finished.status,
                 finished.iterations,
-                driver.at.objective,
+                driver.current.objective,
                 finished.seconds,
                 finished.history,
                 self.newton,
@@ -299,7 +299,7 @@ class ClimbByRobots:
                 "Staircase",
                 climb.status,
                 climb.iterations,
-                driver.at.objective,
+                driver.current.objective,
                 climb.seconds,
                 climb.history,
                 self.staircase,
@@ -344,4 +344,4 @@ class ConsensusAlone:
 def _final_objective(driver: Driver) -> float:
     """The cost that is solved, at the current poses; the driver stays with that cost."""
     driver.choose_cost(final=True)
-    return driver.at.objective
+    return driver.current.objective

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from pgo_models.certificates.definiteness import smallest_eta
-from pgo_models.certificates.lower_bound import UNGROUNDED_SHIFT, LowerBound, smallest_shift
+from pgo_models.certificates.lower_bound import UNGROUNDED_MARGIN, LowerBound, smallest_shift
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations
 from pgo_models.relaxations.low_rank import append_dimension, gram_matrix, poses_from
@@ -78,7 +78,7 @@ class SubstructuredStaircase:
         self, driver: Driver, state: SubstructuredStaircaseState
     ) -> SubstructuredStaircaseState:
         """One step of Newton; at a stationary point the bound and, if that is loose, the climb."""
-        rank = driver.at.R.shape[1]
+        rank = driver.current.R.shape[1]
         figures = state.newton
         is_low = rank < driver.d + _LOW
         is_saddle = is_low and not figures.is_convex and figures.decrement <= _AT_SADDLE
@@ -120,7 +120,7 @@ def round_lifted(driver: Driver) -> None:
     Their translations are the best ones. The factor is turned over if most of the cover reflect.
     """
     d = driver.d
-    R = driver.at.R
+    R = driver.current.R
     if R.shape[1] == d:
         return
     gram = sum(driver.ask(climbing.gram, None), gram_matrix(R))
@@ -130,7 +130,7 @@ def round_lifted(driver: Driver) -> None:
     if np.median(orientations) <= 0.0:
         V[:, 0] *= -1.0
     rounded = project_to_rotations(V.T @ R)
-    driver.at = replace(driver.at, R=rounded, t=driver.at.t @ V)
+    driver.current = replace(driver.current, R=rounded, t=driver.current.t @ V)
     driver.set_translations(driver.ask(climbing.round_to, V))
 
 
@@ -155,12 +155,12 @@ class EliminatedClimb:
     @property
     def objective(self) -> float:
         """F at the poses."""
-        return self.driver.at.objective
+        return self.driver.current.objective
 
     @property
     def rounding_level(self) -> float:
         """F where every residual is as large as rounding can make it."""
-        return self.driver.at.rounding_level
+        return self.driver.current.rounding_level
 
     @property
     def num_rows(self) -> int:
@@ -170,7 +170,7 @@ class EliminatedClimb:
     @property
     def has_room(self) -> bool:
         """Whether the interface of the next rank fits into the driver's memory."""
-        rank = self.driver.at.R.shape[1]
+        rank = self.driver.current.R.shape[1]
         return self.driver.fits(rank + 1)
 
     def prove(self, gap: float) -> LowerBound | None:
@@ -191,11 +191,13 @@ class EliminatedClimb:
         driver = self.driver
         x, moves, length = _direction(driver, proven.eta)
         values = driver.ask_each(climbing.climb, moves, is_along=True)
-        own = climbing.pulled(driver.at.multipliers, x[len(driver.cover) :])
+        own = climbing.pulled(driver.current.multipliers, x[len(driver.cover) :])
         value = math.fsum([*values, -own])
-        flat = append_dimension(poses_from(driver.at.R, driver.at.t))
-        force = np.concatenate([driver.at.force, np.zeros((len(driver.at.force), 1))], axis=1)
-        driver.at = replace(driver.at, R=flat.R, t=flat.t, force=force)
+        flat = append_dimension(poses_from(driver.current.R, driver.current.t))
+        force = np.concatenate(
+            [driver.current.force, np.zeros((len(driver.current.force), 1))], axis=1
+        )
+        driver.current = replace(driver.current, R=flat.R, t=flat.t, force=force)
         w, v = flat.upwards(x[:, 0])
         return CoverDirection(value, length, proven.eta, flat, w, v)
 
@@ -204,7 +206,7 @@ class EliminatedClimb:
         driver = self.driver
         answers = driver.ask(climbing.try_climb, length)
         moved = direction.flat.moved_along(length * direction.w, length * direction.v)
-        trial = driver.with_sums(replace(driver.at, R=moved.R, t=moved.t), answers)
+        trial = driver.with_cost(replace(driver.current, R=moved.R, t=moved.t), answers)
         return trial.objective, trial
 
     def accept(self, trial: CoverPoses) -> None:
@@ -220,7 +222,7 @@ def _direction(driver: Driver, eta: float) -> tuple[Array, list[Move], float]:
     eta that hardly makes Q - Lambda + eta I definite: the eigenvalue of its inverse is far above
     all others. The translations are the best ones.
     """
-    proof = eliminate_S(driver, driver.ground(1).ravel(), eta, UNGROUNDED_SHIFT)
+    proof = eliminate_S(driver, driver.columns_of_pose_0(1).ravel(), eta, UNGROUNDED_MARGIN)
     assert proof is not None  # it has just been proven
     g = len(driver.cover)
     d = driver.d

@@ -69,7 +69,7 @@ class SubstructuredSOC:
         orders = [Agree(agreement, z) for z in driver.scattered_rotations(block.z)]
         answers = driver.ask_each(Interior.agree, orders, Count.ALL_REDUCE)
         driver.block = block
-        driver.right = [answer.right for answer in answers]
+        driver.right_hand_sides = [answer.right for answer in answers]
         squares = own_squares + np.sum([answer.sums for answer in answers], axis=0)
         objective = math.fsum(answer.measured for answer in answers)
         return replace(state.after(merit, squares, state.size, anderson), objective=objective)
@@ -94,8 +94,8 @@ class SubstructuredSOC:
     def finish(self, driver: Driver) -> None:
         """Give driver and robots omega, and the best translations for it: two rounds."""
         z = _block(driver).z
-        driver.right = []
-        driver.at = replace(driver.at, R=unstack_transposes(z))
+        driver.right_hand_sides = []
+        driver.current = replace(driver.current, R=unstack_transposes(z))
         driver.set_translations(driver.ask_each(Interior.finish, driver.scattered_rotations(z)))
 
     def _penalized(self, driver: Driver, is_stationary: bool) -> SubstructuredState:
@@ -107,14 +107,14 @@ class SubstructuredSOC:
         step = None
         if not driver.has_whole and driver.num_poses >= ENOUGH_NORMS:
             step = driver.num_poses // ENOUGH_NORMS
-        Lambda = driver.at.multipliers
+        Lambda = driver.current.multipliers
         answers = [*driver.ask(Interior.multiplier_norms, step, Count.PIGGYBACKED)]
         answers.append(subsampled(Norms(multiplier_norms(Lambda), driver.scale), step))
         norms = np.concatenate([answer.norms for answer in answers])
         scales = np.concatenate([answer.scale for answer in answers])
         order = self.soc.penalty_order(norms / scales, is_stationary)
         ratio = order.rho(norms, scales) / scales
-        block = order.block(driver.at.R, Lambda, driver.diagonal[driver.rotation_rows])
+        block = order.block(driver.current.R, Lambda, driver.diagonal[driver.rotation_rows])
         _take(driver, block, driver.ask(Interior.penalize, order))
         # ||omega||_rho^2 = d sum_i rho_i, of which the sampled poses are a fraction 1 / step.
         squared_size = driver.d * (step or 1) * float(ratio @ scales)
@@ -159,7 +159,7 @@ def _solve_a(driver: Driver) -> tuple[RecursionBlock, Array]:
     interface = driver.interface(1, driver.d)
     b = np.zeros((interface.side, driver.d))
     b[rows] = (0.5 * block.penalty)[:, None] * block.shift
-    x, parts, _ = interface.solve([right.b for right in driver.right], b)
+    x, parts, _ = interface.solve([right.b for right in driver.right_hand_sides], b)
     block, own_sums = block.after_solve(x[rows])
     sums_of_robots = driver.ask_each(Interior.solve, parts, is_along=True)
     return block, own_sums + np.sum(sums_of_robots, axis=0)
@@ -173,8 +173,8 @@ def _take(driver: Driver, block: RecursionBlock, reduced: Sequence[Reduced]) -> 
     """
     rows = driver.rotation_rows[:, None]
     half_penalty = (0.5 * block.penalty)[:, None, None]
-    own = [(rows, half_penalty), *driver.grounded_translation()]
+    own = [(rows, half_penalty), *driver.grounding_block()]
     matrices = [answer.schur for answer in reduced]
     driver.interface(1, driver.d).factorize(matrices, own)
     driver.block = block
-    driver.right = [answer.right for answer in reduced]
+    driver.right_hand_sides = [answer.right for answer in reduced]

@@ -4,14 +4,26 @@ Following Yang, Antonante, Tzoumas & Carlone (IEEE RA-L 2020),
 
     minimise   sum over known inliers of r_e^2 + sum over the others of c_e^2 loss(r_e^2 / c_e^2)
 
-with r_e^2 the share of edge e in the cost and c_e^2 its quantile (`pgo_models.problem.thresholds`)
-times a scale. A surrogate of the loss with a control mu is convex in the residual at one end of the
-schedule and the loss at the other. Each step minimises it in the weights, which have a closed form
-(equations 12 and 14), and lowers it in the poses by one or a few Newton steps.
+with r_e^2 the cost of edge e at the current poses, and c_e^2 its threshold: a quantile of the cost
+of a correct edge, by chi^2 (`pgo_models.problem.thresholds`), times a scale. Surrogates of the loss
+with a control mu lead from a nearly convex cost to the robust one:
 
-Information matrices may claim far too little or too much precision: in parking-garage right edges
-cost 1e-5 of their thresholds. Once all edges are decided, the thresholds are scaled by the median
-of the edges kept, and the schedule starts once more.
+- truncated least squares: mu grows, from near 0 to infinity (here 1000), where the surrogate is the
+  loss;
+- Geman-McClure: mu falls, from a large value to 1, where the surrogate is the loss.
+
+By Black-Rangarajan duality a surrogate is a minimum over weights,
+
+    surrogate(r^2) = min over w in [0, 1] of  w r^2 + penalty(w)
+
+so that both sets of unknowns can be minimised in turn. For given poses the best weight is the
+derivative of the surrogate with respect to r^2, in closed form (equations 12 and 14). For given
+weights the poses are those of a weighted least-squares problem, whose cost one or a few Newton
+steps lower.
+
+Information matrices may claim far too little or too much precision: in the data set parking-garage
+correct edges cost 1e-5 of their thresholds. Once all edges are decided, the thresholds are scaled
+by the median ratio r_e^2 / c_e^2 of the edges kept, and the schedule starts once more.
 
 The algorithm is `next_state`. It is written against `ReweightedEdges`: who holds the edges
 evaluates their residuals and minimises with weights. `solvers.robust.weighted_edges` does that in
@@ -40,15 +52,16 @@ from solvers.robust.weighted_edges import RatioSums, WeightedEdges, first_poses,
 LAST_STEPS = 10
 # Most steps with weights of 0 and 1, in which the set of edges kept may alternate without end.
 _MOST_HARD_STEPS = 10
-# Relative decrement at which the poses follow the weights well enough.
+# Relative decrease of the weighted cost below which the poses follow the weights well enough.
 _NEARLY_STATIONARY = 1e-2
 # Scale of the thresholds: 2.5 times the quantile 0.99 is the quantile 1 - 1e-6, about.
 _LARGEST_SCALE = 2.5
 _LEAST_SCALE = 1e-12
-# Control after the thresholds are scaled, at most (its inverse, at least, for Geman-McClure): from
-# there edges beyond their thresholds can return.
+# Bound on the control at which the schedule starts again after the thresholds were scaled: mu is at
+# most this for truncated least squares, and at least its inverse for Geman-McClure. Edges of up to
+# about 100 times their thresholds then have weight again, and can return.
 _RESTARTED_CONTROL = 0.01
-# How often the thresholds are scaled at most, and factors on them that count as no change.
+# How often the thresholds are scaled at most. Factors on them in this range count as no change.
 _MOST_RESCALINGS = 4
 _NO_CHANGE = (0.5, 1.5)
 
@@ -58,34 +71,37 @@ class GNC(ValueEquality):
     """Settings of graduated non-convexity; an iteration is one set of weights.
 
     `primal_residual` of its history is the share of undecided edges, `dual_residual` the relative
-    decrement of the weighted cost.
+    decrease of the last weighted cost: by its Newton steps, and still to come by its quadratic
+    model.
 
     Parameters
     ----------
     loss : RobustLoss
         What a large residual costs.
     quantile : float
-        Probability with which a right edge costs no more than c_e^2 if its information matrix is
-        right, in (0, 1).
+        Probability with which a correct edge costs no more than its threshold c_e^2 if its
+        information matrix is right, in (0, 1).
     spread : float, optional
-        Factor on the thresholds that the median of the edges kept suggests, to which thresholds are
-        scaled, at most to 2.5; None leaves them as they are.
+        Whether and how the thresholds are scaled after a schedule has ended. They become `spread`
+        times those at which the edges kept would have the median ratio r_e^2 / c_e^2 of chi^2, but
+        at most 2.5 times the quantile. None leaves them as they are.
     scale : float
-        Factor on the first thresholds. A small one takes only the edges that agree best, before the
+        Factor on the first thresholds. A small one keeps only the edges that agree best, before the
         thresholds are scaled.
     known : BoolArray, (m,), optional
-        Edges that are right, whose weight stays 1. Unless given, odometry (poses of a robot whose
-        ids are neighbours) and priors.
+        Known inliers, whose weight stays 1. Unless given, odometry (edges between consecutive poses
+        of a robot) and priors.
     growth : float
-        Factor on the control mu from step to step, above 1.
+        Factor, above 1, by which the control mu is multiplied in every step (truncated least
+        squares), or divided (Geman-McClure).
     inner_steps : int
-        Newton steps for one set of weights, at most.
+        Maximal number of Newton steps for one set of weights.
     consistent : bool
         Whether `solve` first rejects the loop closures that `pairwise_consistent` leaves out.
     tolerance : float
-        Largest relative decrement of the last weighted cost.
+        Largest relative decrease of the last weighted cost at which a run has converged.
     max_iterations : int
-        Sets of weights, at most.
+        Maximal number of iterations, which is that of sets of weights.
 
     References
     ----------
@@ -94,16 +110,16 @@ class GNC(ValueEquality):
 
     Examples
     --------
-    A grid with one more loop closure, which is wrong, between its first and its last pose:
+    A grid with one more loop closure, an outlier, between its first and its last pose:
 
     >>> import solvers
     >>> from pgo_models import grid_world, Poses
-    >>> right = grid_world(1, 60, np.random.default_rng(0), d=2)
+    >>> correct = grid_world(1, 60, np.random.default_rng(0), d=2)
     >>> identity = Poses(np.eye(2)[None], np.zeros((1, 2)))
     >>> ends = np.array([0]), np.array([59])
-    >>> graph = right.with_edges(*ends, identity, right.kappa[-1:], right.tau[-1:])
+    >>> graph = correct.with_edges(*ends, identity, correct.kappa[-1:], correct.tau[-1:])
     >>> solution = solvers.solve(graph, robust=GNC())
-    >>> np.flatnonzero(solution.robust.rejected).tolist() == [right.num_edges]
+    >>> np.flatnonzero(solution.robust.rejected).tolist() == [correct.num_edges]
     True
     """
 
@@ -138,7 +154,7 @@ class GNC(ValueEquality):
         return next_state(self, state)
 
     def measure(self, problem: PGOProblem, state: GNCState) -> Measurement:
-        """The robust cost, the share of undecided edges, and the decrement."""
+        """The robust cost, the share of undecided edges, and the relative decrease."""
         return measurement_of(state)
 
     def poses(self, problem: PGOProblem, state: GNCState) -> Poses:
@@ -159,7 +175,7 @@ class GNC(ValueEquality):
         return state.poses
 
     def converged(self, state: GNCState, measurement: Measurement) -> Status | None:
-        """CONVERGED once all edges are decided, thresholds settled, and the decrement is small."""
+        """CONVERGED once edges are decided, thresholds settled, and the decrease is small."""
         return ending(self, state.schedule)
 
 
@@ -172,20 +188,23 @@ class GNCSchedule:
     # factor on the thresholds, and how often it may still change
     scale: float
     rescalings_left: int
-    # share of the edges, without the known ones, that the surrogate counts neither in full nor as
-    # wrong
+    # Share of undecided edges, without the known inliers. For truncated least squares these are the
+    # edges with a weight between 0 and 1. For Geman-McClure it is 1 as long as mu is above 1, and 0
+    # at mu = 1.
     undecided: float = 1.0
-    # what the last weighted cost has lost and could still lose, relative
-    decrement: float = math.inf
+    # Relative decrease of the last weighted cost: what its Newton steps have achieved, and what its
+    # quadratic model still promises.
+    decrease: float = math.inf
     # whether the poses have moved in the last step
     moved: bool = True
-    # steps since the weights are 0 and 1
+    # Steps in which the weights were 0 and 1, in a row up to now. Only truncated least squares has
+    # them: at its largest control.
     hard_steps: int = 0
 
     @property
-    def is_decided(self) -> bool:
-        """Whether all edges are decided, and the poses follow the weights."""
-        return self.undecided == 0.0 and follows_weights(self.decrement, self.moved)
+    def has_ended(self) -> bool:
+        """Whether all edges are decided, and the poses follow the weights or no longer move."""
+        return self.undecided == 0.0 and follows_weights(self.decrease, self.moved)
 
 
 class NewtonProgress(Protocol):
@@ -213,7 +232,7 @@ class ReweightedEdges(Protocol):
 
     @property
     def least_weight(self) -> float:
-        """Weight up to which an edge does not count."""
+        """Weight up to which an edge is left out of the weighted cost, or nearly so."""
 
     @property
     def newton(self) -> NewtonProgress:
@@ -223,10 +242,13 @@ class ReweightedEdges(Protocol):
         """Sums over the edges at the poses, with thresholds times `scale`."""
 
     def median_ratio(self, scale: float, num_kept: float) -> float:
-        """Median of r_e^2 / c_e^2 within 1, of `num_kept` edges that are not known inliers."""
+        """Median of the ratios r_e^2 / c_e^2 that are at most 1, without known inliers.
+
+        There are `num_kept` of them.
+        """
 
     def reweighted(self, loss: RobustLoss, mu: float, scale: float) -> Self:
-        """Edges with the weights that belong to their residuals."""
+        """Edges with the weights that belong to their residuals, by equation 12 or 14."""
 
     def newton_step(self) -> Self:
         """Edges after a Newton step on the weighted cost."""
@@ -281,13 +303,14 @@ S = TypeVar("S", bound=ScheduleState[Any])
 def next_state(settings: GNC, state: S) -> S:
     """One iteration: a set of weights, and Newton steps with it.
 
-    1. Once all edges are decided, scale the thresholds and start the schedule again.
-    2. Set each weight to the slope of the surrogate at the edge's residual.
-    3. Lower the weighted cost until the poses follow the weights.
+    1. If a schedule has ended, scale the thresholds and start the schedule again.
+    2. Set each weight to the derivative of the surrogate with respect to the edge's r^2.
+    3. Lower the weighted cost by Newton steps, `inner_steps` at most, until the poses follow the
+       weights.
     4. Move the control towards the robust loss.
     """
     schedule = state.schedule
-    if schedule.rescalings_left and schedule.is_decided:
+    if schedule.rescalings_left and schedule.has_ended:
         schedule = rescaled_schedule(settings, state)
     loss = settings.loss
     mu = schedule.mu
@@ -299,22 +322,28 @@ def next_state(settings: GNC, state: S) -> S:
         if follows_weights(edges.newton.decrement, edges.newton.moved):
             break
     sums = edges.sums(loss, mu, scale)
-    following = replace(
+    achieved = relative_decrease(weighted.newton, edges.newton)
+    updated = replace(
         advanced(settings, schedule),
         undecided=sums.undecided / max(1.0, sums.count),
-        decrement=edges.newton.decrement + relative_loss(weighted.newton, edges.newton),
+        decrease=edges.newton.decrement + achieved,
         moved=edges.newton.moved,
     )
-    return replace(state, k=state.k + 1, schedule=following, sums=sums, edges=edges)
+    return replace(state, k=state.k + 1, schedule=updated, sums=sums, edges=edges)
 
 
 def first_schedule(settings: GNC, edges: ReweightedEdges) -> tuple[GNCSchedule, RatioSums]:
     """Schedule of state 0, and the sums over its edges.
 
-    The surrogate of the largest residual is convex; where no edge would count with it, the control
-    is such that the smallest one does.
+    Its control is `first_control` of the largest ratio r_e^2 / c_e^2. If that is so small that even
+    the best-fitting edge would hardly count, the control of truncated least squares is raised until
+    this edge has `least_weight`, about.
     """
-    sums = edges.sums(settings.loss, 1.0, settings.scale)
+    # The control only decides which edges are undecided, a sum that is not used here.
+    sums = edges.sums(settings.loss, mu=1.0, scale=settings.scale)
+    # For small mu the weight of equation 14 is sqrt(mu (mu + 1) / ratio) - mu, or sqrt(mu / ratio)
+    # to first order, which is `least_weight` at mu = least_weight^2 ratio. The ratio is capped at 1
+    # because an edge beyond its threshold need not count; without any edge it is infinite.
     least_control = edges.least_weight**2 * min(1.0, sums.least)
     mu = first_control(settings.loss, sums.largest, least_control)
     num_rescalings = 0 if settings.spread is None else _MOST_RESCALINGS
@@ -322,7 +351,13 @@ def first_schedule(settings: GNC, edges: ReweightedEdges) -> tuple[GNCSchedule, 
 
 
 def first_control(loss: RobustLoss, largest_ratio: float, least_control: float) -> float:
-    """Control with which the surrogate is convex up to the largest ratio (remark 5)."""
+    """First control of a schedule (Yang et al. 2020, remark 5): no edge is rejected yet.
+
+    For truncated least squares mu = 1 / (2 largest_ratio - 1), at most 1 and at least
+    `least_control`: all ratios up to twice the largest one have a positive weight, unless
+    `least_control` is above the first value. For Geman-McClure mu = 2 largest_ratio, at least 1:
+    all weights are at least 4/9.
+    """
     if loss is RobustLoss.TRUNCATED:
         return max(1.0 / max(2.0 * largest_ratio - 1.0, 1.0), least_control)
     return max(2.0 * largest_ratio, 1.0)
@@ -339,11 +374,14 @@ def advanced(settings: GNC, schedule: GNCSchedule) -> GNCSchedule:
 
 
 def rescaled_schedule(settings: GNC, state: ScheduleState[E]) -> GNCSchedule:
-    """The schedule with thresholds scaled by the median of the edges kept, and its first control.
+    """What follows a schedule that has ended: another one with scaled thresholds, or none.
 
-    The thresholds become `spread` times those with which the median ratio of the edges kept would
-    be that of chi^2. Where they hardly change they are settled, and where no edge is kept; the
-    first time they hardly change the schedule is run once more with the thresholds as they are.
+    The thresholds become `spread` times those at which the median ratio of the edges kept would be
+    that of chi^2, up to a scale of 2.5, and the schedule starts again. The thresholds are settled,
+    and the schedule goes on as it is, if there is no `spread`, if no edge is kept, or if the
+    thresholds would hardly change (or their scale fall below 1e-12). But if this last case occurs
+    the first time that thresholds are to be scaled, the schedule starts again once, with the
+    thresholds as they are, and they are settled then. They are scaled four times at most.
     """
     schedule = state.schedule
     sums = state.sums
@@ -356,7 +394,8 @@ def rescaled_schedule(settings: GNC, state: ScheduleState[E]) -> GNCSchedule:
     rescalings_left = schedule.rescalings_left - 1
     hardly_changes = _NO_CHANGE[0] < factor < _NO_CHANGE[1]
     if hardly_changes or factor * schedule.scale < _LEAST_SCALE:
-        if schedule.rescalings_left < _MOST_RESCALINGS:
+        is_first_time = schedule.rescalings_left == _MOST_RESCALINGS
+        if not is_first_time:
             return settled
         factor = 1.0
         rescalings_left = 0
@@ -375,34 +414,41 @@ def rescaled_schedule(settings: GNC, state: ScheduleState[E]) -> GNCSchedule:
 
 
 def expected_median_ratio(d: int, quantile: float) -> float:
-    """Median of chi^2 over its quantile, with as many degrees of freedom as an edge has."""
+    """Median of chi^2 over its quantile, with the degrees of freedom of a relative pose."""
     dof = d + tangent_dimension(d)
     median, threshold = scipy.special.chdtri(dof, [0.5, 1.0 - quantile])
     return float(median / threshold)
 
 
-def follows_weights(decrement: float, moved: bool) -> bool:
-    """Whether the poses follow the weights well enough, or cannot follow them."""
-    return decrement <= _NEARLY_STATIONARY or not moved
+def follows_weights(decrease: float, moved: bool) -> bool:
+    """Whether the weighted cost is nearly stationary, or its Newton steps move the poses no more.
+
+    `decrease` is a relative decrease of that cost.
+    """
+    return decrease <= _NEARLY_STATIONARY or not moved
 
 
-def relative_loss(before: NewtonProgress, after: NewtonProgress) -> float:
-    """How much lower the weighted cost is after the steps, relative."""
+def relative_decrease(before: NewtonProgress, after: NewtonProgress) -> float:
+    """Decrease of the weighted cost by Newton steps, relative to the cost after them."""
     if not after.objective:
         return 0.0
     return before.objective / after.objective - 1.0
 
 
 def measurement_of(state: ScheduleState[E]) -> Measurement:
-    """The robust cost, the share of undecided edges, and the decrement."""
-    return Measurement(state.objective, state.schedule.undecided, state.schedule.decrement)
+    """The robust cost, the share of undecided edges, and the relative decrease."""
+    return Measurement(state.objective, state.schedule.undecided, state.schedule.decrease)
 
 
 def ending(settings: GNC, schedule: GNCSchedule) -> Status | None:
-    """How the run ends at this position of the schedule, if it does."""
+    """How the run ends at this position of the schedule, if it does.
+
+    Weights of 0 and 1 may alternate without end: after ten steps with them the run has stalled.
+    Geman-McClure has none; it goes on until the decrease is small or the poses no longer move.
+    """
     if schedule.rescalings_left or schedule.undecided > 0.0:
         return None
-    if schedule.decrement <= settings.tolerance:
+    if schedule.decrease <= settings.tolerance:
         return Status.CONVERGED
     may_go_on = schedule.moved and schedule.hard_steps < _MOST_HARD_STEPS
     return None if may_go_on else Status.STALLED

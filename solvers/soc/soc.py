@@ -1,19 +1,22 @@
 """SOC, splitting of orthogonality constraints: the paper's Algorithm 1 (`algo1: SOC`).
 
-Every rotation R_i has a copy omega_i that carries the constraint, and a scaled multiplier B_i. One
-iteration is
+Every rotation R_i is split in two: a d x d matrix x_i that enters the cost and need not be a
+rotation, and a rotation omega_i, with the constraint x_i = omega_i and its scaled multiplier B_i.
+One iteration is
 
-    (a) R-step      x     = argmin_R min_t  f(R, t) + 1/2 sum_i rho_i ||R_i - omega_i + B_i||_F^2
+    (a) R-step      x     = argmin_x min_t  F(x, t) + 1/2 sum_i rho_i ||x_i - omega_i + B_i||_F^2
     (b) projection  omega = the rotations nearest to x + B
     (c) Bregman     B     = B + x - omega
 
-f is the cost F. Step (a) is a convex quadratic program over all translations t_i and all d x d
-matrices R_i, which need not be rotations; step (b) is an SVD for every pose. `Joint.step` is one
-iteration. What wraps it has files of its own:
+F is the cost of rotations and translations, here evaluated at matrices x. Step (a) is a convex
+quadratic program over all matrices x_i and all translations t_i; step (b) is an SVD for every pose.
+`Joint.step` is one iteration. The parts around it have files of their own:
 
-- `anderson`: the acceleration, which moves x on before the projection;
+- `anderson`: over-relaxation and acceleration, which replace x by `x_ahead` in (b) and (c);
 - `penalty`: the rules that choose the penalties rho;
 - `safeguard`: when rho changes during a run, and when the recursion returns to its best iterate.
+
+The norm in which the recursion measures is ||v||_rho = sqrt(sum_i rho_i ||v_i||_F^2).
 
 The coupling CONSENSUS, in which robots hold copies of their neighbours' poses, is `consensus`.
 
@@ -43,19 +46,20 @@ from solvers.soc.settings import SOCSettings
 
 @dataclass(frozen=True, eq=False)
 class SOCState(Steps):
-    """Iterate k of JOINT: x, omega, B and rho of Algorithm 1, and what wraps them.
+    """Iterate k of JOINT: x, omega, B and rho of Algorithm 1, acceleration and safeguard.
 
     The fields of `Steps` (k, residuals, merits) come on top of these.
 
     Parameters
     ----------
     x : (n, d, d) array
-        Solution R of step (a), which is not orthogonal.
+        Solution of step (a): matrices that need not be orthogonal. At k = 0 the rotations of the
+        start.
     omega : (n, d, d) array
-        The rotations nearest to x + B, with x as the acceleration has moved it on and the B before
-        this step; at k = 0 those of the start.
+        The rotations nearest to x_ahead + B: x_ahead is x after over-relaxation and acceleration, B
+        is that of iterate k - 1. At k = 0 the rotations of the start.
     B : (n, d, d) array
-        Scaled multiplier of R = omega (Bregman variable); rho B is the unscaled one.
+        Scaled multiplier of x = omega (Bregman variable); rho B is the unscaled one.
     rho : (n,) array
         Penalty of every pose.
     r_step : JointStep
@@ -63,7 +67,8 @@ class SOCState(Steps):
     memory : AndersonShare
         Earlier steps, for the acceleration.
     best : (n, d, d) array or None
-        The omega + B with the smallest merit, to which the safeguard returns.
+        The omega + B with the smallest merit, to which the safeguard returns; None before the first
+        step.
     """
 
     x: Array
@@ -84,78 +89,104 @@ class Joint:
     def init(self, problem: PGOProblem, start: Poses) -> SOCState:
         """State 0: omega = the rotations of `start`, B = 0."""
         problem.stacked(start)  # raises unless the poses fit
-        return self._state_at(problem, start, is_stationary=False)
+        return self._state_at(problem, start, treat_as_stationary=False)
 
     def step(self, problem: PGOProblem, state: SOCState) -> SOCState:
-        """One iteration of Algorithm 1; `x_ahead` is x unless accelerated or over-relaxed."""
+        """One iteration of Algorithm 1.
+
+        `x_ahead` is x after over-relaxation and acceleration; it is x itself without them.
+        """
         state = self._with_due_penalty(problem, state)
         x = state.r_step.solve(state.omega - state.B)  # (a) R-step
-        x_ahead, following = self._accelerated(state, x)
+        x_ahead, updated = self._accelerated(state, x)
         if not np.isfinite(x_ahead).all():
             return replace(state.broken(), x=x)
         omega = project_to_rotations(x_ahead + state.B)  # (b) projection
         B = state.B + x_ahead - omega  # (c) Bregman update
-        return self._with_residuals(state, replace(following, x=x, omega=omega, B=B))
+        return self._with_residuals(state, replace(updated, x=x, omega=omega, B=B))
 
     def measure(self, problem: PGOProblem, state: SOCState) -> Measurement:
         """F at omega with the best translations for it, and the residuals."""
         if math.isnan(state.primal_residual):
             return Measurement(np.nan, np.nan, np.nan)
-        R = state.omega
-        X = np.concatenate([problem.recover_translations(R), stack_transposes(R)])
+        t = problem.recover_translations(state.omega)
+        X = np.concatenate([t, stack_transposes(state.omega)])
         return state.measurement(problem.objective_stacked(X))
 
     def poses(self, problem: PGOProblem, state: SOCState) -> Poses:
         """Omega with the best translations for it."""
         return problem.with_best_translations(state.omega)
 
-    # What wraps the step.
+    # Acceleration, residuals and penalties.
 
     def _accelerated(self, state: SOCState, x: Array) -> tuple[Array, SOCState]:
-        """Return x moved on, and the state with what the acceleration remembers of this step.
+        """Return `x_ahead`, and the state with the updated memory of the acceleration.
 
-        The recursion is a fixed-point iteration in s = omega + B: a plain step takes s to x + B, an
-        over-relaxed or accelerated step to a combination of this and earlier steps. The merit of a
-        step is the rho-norm of the over-relaxed change of s, alpha ||x - omega||_rho, with the
-        omega before the step. The safeguard compares merits.
+        The recursion is a fixed-point iteration in s = omega + B. Its map, with over-relaxation, is
+
+            s -> s + alpha (x - omega)
+
+        where omega and B are those before the step, and x solves (a) for them; alpha = 1 gives
+        x + B, the argument of the plain projection. Anderson acceleration combines the images of
+        this and earlier steps; `x_ahead` is the result less B. The merit of a step is the length of
+        the residual of the map, ||alpha (x - omega)||_rho. The safeguard compares merits.
         """
         s = state.omega + state.B
-        step = over_relax(x, state.omega, self.soc.alpha) - state.omega
-        residual = np.sqrt(state.rho)[:, None, None] * step
+        change = over_relax(x, state.omega, self.soc.alpha) - state.omega
+        # With the factor sqrt(rho) plain inner products of residuals are those of the rho-norm.
+        weighted_residual = np.sqrt(state.rho)[:, None, None] * change
         accelerated = extrapolate(
-            self.soc.acceleration, state.memory, state.sums, residual, s + step
+            self.soc.acceleration, state.memory, state.sums, weighted_residual, s + change
         )
-        following = replace(
+        updated = replace(
             state,
             sums=accelerated.sums,
             memory=accelerated.share,
             best=s if state.is_best(accelerated.merit) else state.best,
             merits=(*state.merits, accelerated.merit),
         )
-        return accelerated.image - state.B, following
+        return accelerated.image - state.B, updated
 
     def _with_residuals(self, before: SOCState, state: SOCState) -> SOCState:
-        """Count the step, with residuals relative to ||omega||_rho = sqrt(d sum_i rho_i)."""
+        """Count the step, and set its residuals, relative to ||omega||_rho = sqrt(d sum_i rho_i).
+
+        Before the division their squares are
+
+            primal  ||x - omega||_rho^2
+            dual    ||c (omega - omega_before)||_rho^2 + ||(c - 1) (x - omega)||_rho^2
+
+        with c = max(1, rho_i / diagonal of M) for every row of R_i^T, which is `r_step.stiffness`.
+        A penalty far above M makes short steps everywhere, not only near a minimum; the factor c
+        keeps the dual residual from being small there.
+        """
         rho = state.rho[:, None, None]
         squares = squared_residuals(state.x, state.omega, before.omega, rho, state.r_step.stiffness)
         size = math.sqrt(state.omega.shape[1] * float(state.rho.sum()))
         return state.with_residuals(squares, size)
 
-    def _state_at(self, problem: PGOProblem, poses: Poses, is_stationary: bool) -> SOCState:
-        """State 0 at poses, with B = 0, or with the B of a stationary point (`stationary_B`)."""
+    def _state_at(self, problem: PGOProblem, poses: Poses, treat_as_stationary: bool) -> SOCState:
+        """First state of a recursion at poses: of the run (k = 0), or after a refresh.
+
+        B is 0, or, if the poses are treated as stationary, the multiplier that belongs to a
+        stationary point (`stationary_B`). The penalties rho are the same in both cases.
+        """
         Lambda = multipliers(problem, poses)
         norms = multiplier_norms(Lambda)
-        scale = rotation_scale(problem)
-        rho = self.soc.penalty_order(norms / scale, is_stationary).rho(norms, scale)
-        B = stationary_B(poses.R, Lambda, rho) if is_stationary else np.zeros_like(poses.R)
+        scale = rotation_scale(problem)  # m_i: mean diagonal of M over the rows of R_i^T
+        order = self.soc.penalty_order(norms / scale, treat_as_stationary)
+        rho = order.rho(norms, scale)
+        B = stationary_B(poses.R, Lambda, rho) if treat_as_stationary else np.zeros_like(poses.R)
         r_step = prepare_joint(problem, rho, self.soc.r_step)
         return SOCState(x=poses.R, omega=poses.R, B=B, rho=rho, r_step=r_step)
 
     def _with_due_penalty(self, problem: PGOProblem, state: SOCState) -> SOCState:
         """State with the penalty that the rule or the safeguard asks for; usually unchanged.
 
-        RAISE goes back to the best iterate with a larger rho. REFRESH chooses rho and B anew from
-        the multipliers at omega. RESCALE multiplies rho by a factor; it counts as a refresh.
+        RAISE, from the safeguard, returns to the best iterate and multiplies rho by the factor. It
+        follows at least two steps, the first of which has set `best`. REFRESH and RESCALE come from
+        the rule of the penalty, whose changes `refreshes` counts: REFRESH chooses rho and B anew
+        from the multipliers at omega, RESCALE multiplies rho by the factor. RECHECK concerns the
+        translation penalty, which JOINT does not have.
         """
         due, factor = next_penalty(self.soc.penalty, state.rho / rotation_scale(problem), state)
         if due is Due.RAISE and state.best is not None:
@@ -164,13 +195,18 @@ class Joint:
             return replace(self._rescaled(problem, at_best, factor), raises=state.raises + 1)
         if due is Due.REFRESH:
             poses = problem.with_best_translations(state.omega)
-            return self._state_at(problem, poses, is_stationary=True).in_place_of(state)
+            return self._state_at(problem, poses, treat_as_stationary=True).in_place_of(state)
         if due is Due.RESCALE:
             return replace(self._rescaled(problem, state, factor), refreshes=state.refreshes + 1)
         return state
 
     def _rescaled(self, problem: PGOProblem, state: SOCState, factor: float) -> SOCState:
-        """State with factor * rho and the same rho B; its acceleration starts anew."""
+        """State with factor * rho and the same rho B; its acceleration starts anew.
+
+        The list of merits is emptied, because merits of different rho cannot be compared. `best`
+        still belongs to the old rho; the next step is the best one of an empty list, and replaces
+        it.
+        """
         rho = factor * state.rho
         return replace(
             state,
@@ -190,15 +226,18 @@ class SOC(SOCSettings):
     Parameters
     ----------
     coupling : Coupling or None
-        Who solves step (a). Unless given, JOINT without `robots` and CONSENSUS with them.
-        SUBSTRUCTURED has the iterates of JOINT: this class runs it as JOINT, and
-        `solve(.., robots=..)` runs it on robots.
+        Who solves step (a). JOINT: one quadratic program over all poses. CONSENSUS: every robot
+        solves a program over its own poses and copies of its neighbours', and the copies are made
+        to agree by the recursion. SUBSTRUCTURED: the program of JOINT, solved by robots that
+        eliminate their own poses and a driver that solves for the rest. Unless given, JOINT without
+        `robots` and CONSENSUS with them. SUBSTRUCTURED has the iterates of JOINT: this class runs
+        it as JOINT, and `solve(.., robots=..)` runs it on robots.
     robots : Partition or None
         Which robot owns which poses.
     penalty : MultiplierPenalty, FixedPenalty or BalancedPenalty
         Rule of the ADMM penalty rho.
     alpha : float in (0, 2)
-        Over-relaxation; 1 is none.
+        Over-relaxation: alpha x + (1 - alpha) omega takes the place of x in (b) and (c). 1 is none.
     acceleration : Anderson or None
         Settings of the acceleration; None is the plain recursion.
     r_step : RStep or CustomRStep
@@ -209,19 +248,23 @@ class SOC(SOCSettings):
         recursion.
     translation_penalty : float or None
         Of CONSENSUS alone: penalty of the translations of separators, the poses that several robots
-        hold, as a multiple of their diagonal in M. Unless given, 0.6 times the stiffness of the
-        separators, the inverse of their mean compliance (`solvers.soc.separator_stiffness`). It
-        is lowered when the penalties are chosen anew, if the translations have moved far compared
-        with the change of their multipliers.
+        hold, as a multiple of their diagonal in M, the matrix of the cost F = tr(X^T M X). The
+        default is 0.6 times the stiffness of the separators, the median over the robots. A robot's
+        stiffness is the inverse of its mean compliance: of how far a separator moves under a unit
+        force on its translation, in the scale of that diagonal, while rho holds the rotations and
+        common shifts are left out (`solvers.soc.separator_stiffness`). A penalty that is given
+        stays. The default is lowered when the penalties are chosen anew, if since they were last
+        chosen the multipliers of these translations have changed little compared with the penalty
+        times the distance that the translations have moved.
     separator_penalty : float or None
-        Of CONSENSUS alone: the least penalty of separator rotations under a MultiplierPenalty,
-        times their mean diagonal in M. On graphs with little noise the multipliers alone would hold
-        the copies too loosely together. Unless given, 0.7 times the square root of the translation
-        penalty, at most 0.3.
+        Of CONSENSUS alone: lower bound, under a MultiplierPenalty, on the penalty rho_i of every
+        separator's rotation, as a multiple of m_i, the mean diagonal of M over the rows of R_i^T.
+        On graphs with little noise the multipliers alone would hold the copies too loosely
+        together. The default is 0.7 times the square root of the translation penalty, at most 0.3.
     tolerance : float
-        On the primal and on the dual residual, both relative.
+        Largest primal and dual residual, both relative, of a run that has converged.
     max_iterations : int
-        Iterations at most.
+        Maximal number of iterations.
 
     Raises
     ------
@@ -230,12 +273,12 @@ class SOC(SOCSettings):
 
     Notes
     -----
-    CONVERGED means, for JOINT and SUBSTRUCTURED, that R agrees with omega and that omega has
+    CONVERGED means, for JOINT and SUBSTRUCTURED, that x agrees with omega and that omega has
     stopped moving, each within the tolerance in the norm of rho; F and the poses are those of omega
-    with the best translations for it. For CONSENSUS it means that R agrees with omega, and that the
+    with the best translations for it. For CONSENSUS it means that x agrees with omega, and that the
     relative gradient of F over rotations and translations (`pgo_models.problem.stationarity`) is
-    within the tolerance at the poses that the robots hold; F and the poses are those. Neither says
-    how far F is above an optimum, nor that the optimum is a global one.
+    within the tolerance at the poses that the robots hold; F and the poses are those. Convergence
+    does not bound the distance of F from a minimum, and the minimum need not be the global one.
 
     Examples
     --------
@@ -254,9 +297,11 @@ class SOC(SOCSettings):
     """
 
     def init(self, problem: PGOProblem, start: Poses | None) -> Any:  # noqa: ANN401
-        """State 0: R = omega = `start`, the chordal relaxation unless given, and B = 0.
+        """State 0: x = omega = `start`, the chordal relaxation unless given, and B = 0.
 
-        With many robots and a MultiplierPenalty B starts at its value at a stationary point.
+        In CONSENSUS with several robots B is not zero: it balances the different forces of the
+        robots on the copies of a pose, and with a MultiplierPenalty its mean over the copies is
+        that of a stationary point (`ConsensusRobot.start`).
         """
         problem.check_quadratic("SOC", convex=True)
         return self._recursion.init(problem, start if start is not None else chordal_start(problem))

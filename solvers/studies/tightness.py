@@ -1,6 +1,7 @@
 """Noise at which the semidefinite relaxation is no longer tight, on the paper's circle and grid.
 
-The rotation noise is swept from small to large.
+The rotation noise is swept from small to large. Graphs on which the relaxation is not tight are
+solved again with handedness terms, which tell rotations from reflections.
 """
 
 import enum
@@ -13,6 +14,7 @@ from pgo_models.figures import rounded_up
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NETWORK_KAPPA, NETWORK_TAU, NoiseModel, circle, grid, observe
+from solvers.pipeline import Pipeline
 from solvers.studies.benchmark_runs import solve_whole
 
 
@@ -34,35 +36,47 @@ class NoiseSweep:
     rotation_std : ndarray, (levels,)
         Standard deviation of the rotation noise, radians.
     certified : ndarray of bool, (levels, graphs)
-        Whether `solvers.solve` certified its solution. If it did, the relaxation is tight; if not,
-        the relaxation is not tight or the solution not optimal.
+        Whether `solvers.solve` without handedness terms certified its solution. If it did, the
+        relaxation is tight; if not, the relaxation is not tight or the solution not optimal.
     gap : ndarray, (levels, graphs)
-        Certified gap of the solution; that of the relaxation is at most as large.
+        Gap of that solution; that of the relaxation is at most as large.
+    certified_with_terms : ndarray of bool, (levels, graphs)
+        Whether `solvers.solve` certified its solution, with handedness terms where it needs them.
     """
 
     scene: SweptScene
     rotation_std: Array
     certified: BoolArray
     gap: Array
+    certified_with_terms: BoolArray
 
     @property
     def fraction(self) -> Array:
-        """Fraction of certified graphs at every level, (levels,)."""
+        """Fraction of graphs that the relaxation certifies at every level, (levels,)."""
         return np.asarray(self.certified.mean(axis=1))
 
     @property
+    def fraction_with_terms(self) -> Array:
+        """Fraction of graphs that are certified with terms at every level, (levels,)."""
+        return np.asarray(self.certified_with_terms.mean(axis=1))
+
+    @property
     def last_tight(self) -> float:
-        """Largest noise, radians, up to which every graph was certified; nan if there is none."""
+        """Largest noise, radians, up to which the relaxation certified every graph, or nan."""
         is_tight = np.logical_and.accumulate(self.certified.all(axis=1))
         if not is_tight.any():
             return float("nan")
         return float(self.rotation_std[is_tight][-1])
 
     def __str__(self) -> str:
-        rows = [f"{'degrees':>8} {'certified':>10} {'worst gap':>10}"]
-        for std, fraction, gaps in zip(self.rotation_std, self.fraction, self.gap, strict=True):
+        rows = [f"{'degrees':>8} {'certified':>10} {'worst gap':>10} {'with terms':>11}"]
+        levels = zip(
+            self.rotation_std, self.fraction, self.gap, self.fraction_with_terms, strict=True
+        )
+        for std, fraction, gaps, with_terms in levels:
             worst = rounded_up(gaps.max(), 2)
-            rows.append(f"{np.rad2deg(std):>8.1f} {fraction:>10.0%} {worst:>10}")
+            degrees = np.rad2deg(std)
+            rows.append(f"{degrees:>8.1f} {fraction:>10.0%} {worst:>10} {with_terms:>11.0%}")
         return "\n".join(rows)
 
 
@@ -118,10 +132,16 @@ def noise_sweep(
     if graphs < 1:
         raise SettingError(f"graphs must be at least 1, got {graphs}")
     certified = np.zeros((len(levels), graphs), dtype=bool)
+    certified_with_terms = np.zeros_like(certified)
     gap = np.zeros((len(levels), graphs))
+    relaxation_alone = Pipeline(handedness=None)
     for level, std in enumerate(levels):
         for number in range(graphs):
-            solution = solve_whole(noisy_scene(scene, float(std), rng))
+            graph = noisy_scene(scene, float(std), rng)
+            solution = solve_whole(graph, relaxation_alone)
             certified[level, number] = solution.is_certified
             gap[level, number] = solution.certificate.proven_gap
-    return NoiseSweep(scene, levels, certified, gap)
+            if not solution.is_certified:
+                solution = solve_whole(graph)
+            certified_with_terms[level, number] = solution.is_certified
+    return NoiseSweep(scene, levels, certified, gap, certified_with_terms)

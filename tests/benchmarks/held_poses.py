@@ -30,7 +30,7 @@ def rounds_held(name: str, num_robots: int, costs: Sequence[float]) -> dict[str,
     problem = pgo.PGOProblem(pgo.load(name))
     robots = pgo.partition(problem.graph, num_robots, pgo.PartitionMethod.METIS)
     driver = open_driver(problem, robots, InProcess())
-    driver.start()
+    driver.go_to_chordal_start()
     start = driver.network.ledger.rounds
     first: dict[float, int] = {}
 

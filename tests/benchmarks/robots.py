@@ -111,7 +111,7 @@ def faults_job(name: str, fault: str) -> dict[str, object]:
     problem = pgo.PGOProblem(graph)
     shared = pgo.partition(graph, 5, METIS)
     driver = open_driver(problem, shared, InProcess())
-    driver.start()
+    driver.go_to_chordal_start()
     soc = solvers.SOC(robots=shared, tolerance=1e-12, max_iterations=MAX_ROUNDS)
     gaps = []
 

@@ -97,17 +97,17 @@ def test_slack_and_solve_may_be_asked_for_in_either_order(backend: CholeskyBacke
 @pytest.mark.parametrize(
     ("of_entries", "of_factor"), [(0.3, 0.1), (0.1, 0.3), (0.6, 0.0), (0.0, 0.6), (1.5, 1.5)]
 )
-def test_slack_is_the_shift_less_both_errors_or_none(
+def test_slack_is_the_margin_less_both_errors_or_none(
     of_entries: float, of_factor: float, is_known: bool
 ) -> None:
     problem = PGOProblem(varied_graph(0, 5, 3))
-    shift = np.full(problem.side, 1e-9)
+    margin = np.full(problem.side, 1e-9)
     diagonal = np.linspace(1.0, 2.0, problem.side)
-    entries = of_entries * shift
-    error = of_factor * shift
+    entries = of_entries * margin
+    error = of_factor * margin
     factor = FactorOfKnownError(np.full(problem.side, math.nan) if is_known else error)
     proof = DefiniteProof(
-        problem.M, factor, diagonal, shift, entries, False, error if is_known else None
+        problem.M, factor, diagonal, margin, entries, False, error if is_known else None
     )
     slack = proof.slack()
     if of_entries + of_factor > 0.5:
@@ -115,7 +115,7 @@ def test_slack_is_the_shift_less_both_errors_or_none(
     else:
         assert slack is not None
         assert (slack > 0.0).all()
-        assert (slack <= (shift - entries - error) * diagonal).all()
+        assert (slack <= (margin - entries - error) * diagonal).all()
 
 
 @given(seed=SEEDS, d=DIMENSIONS)
@@ -152,7 +152,7 @@ def test_a_proof_counts_the_rounding_of_the_entries(seed: int, d: int) -> None:
     _, diagonal = shifted_certificate(problem, Lambda, np.zeros(problem.side))
     entries = matrix_errors(problem, diagonal)
     assert (entries > 0.0).all()
-    assert (slack <= (proof.shift - entries) * proof.diagonal).all()
+    assert (slack <= (proof.margin - entries) * proof.diagonal).all()
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -237,7 +237,7 @@ def test_a_driver_counts_the_rounding_of_the_separators_entries(
     with closing(driver_at(problem, contiguous(problem.graph, 3), optimum(problem))) as driver:
         no_rounding = np.zeros(4 * len(driver.cover))
         monkeypatch.setattr(distributed_bound.Interface, "rounding", lambda *_: no_rounding)
-        fixed = driver.ground(1).ravel()
+        fixed = driver.columns_of_pose_0(1).ravel()
         proof = distributed_bound.eliminate_S(driver, fixed, 1.0, 0.0)
         assert proof is not None
         # With nothing else to subtract, the shift is a multiple of these eight roundings, and slack

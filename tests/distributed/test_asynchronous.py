@@ -169,7 +169,7 @@ def test_a_run_does_not_end_on_old_rows(fault: str) -> None:
         assert outcome.iterations > SILENT_FROM + SILENT_ROUNDS
     RobotsOfDriver(driver).finish()
     best = problem.objective(polish(problem, chordal_start(problem)))
-    assert driver.at.objective - best <= 100 * tolerance**2 * max(1.0, best)
+    assert driver.current.objective - best <= 100 * tolerance**2 * max(1.0, best)
     last = outcome.history.records[-1].measurement
     assert max(last.primal_residual, last.dual_residual) <= tolerance
 

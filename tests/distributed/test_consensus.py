@@ -101,7 +101,9 @@ def check_end(problem: PGOProblem, last: ConsensusIterate, driver: Driver) -> No
     size = 1 + np.abs(expected.t).max()
     np.testing.assert_allclose(poses.R, expected.R, rtol=0, atol=SAME)
     np.testing.assert_allclose(poses.t - poses.t[0], expected.t, rtol=0, atol=SAME * size)
-    assert driver.at.objective == pytest.approx(problem.objective(expected), rel=1e-6, abs=1e-9)
+    assert driver.current.objective == pytest.approx(
+        problem.objective(expected), rel=1e-6, abs=1e-9
+    )
 
 
 @settings(max_examples=examples(25))
@@ -246,7 +248,7 @@ def test_a_state_that_is_not_finite_is_said_to_be_and_leaves_the_last_one_behind
     problem = varied_problem(0, 12, 3)
     engine = Recording()
     driver = driver_at(problem, metis(problem.graph, 2), None, engine)
-    start = driver.at.objective
+    start = driver.current.objective
     for acceleration in (Anderson(), Anderson(per_robot=True), None):
         method = ConsensusSOC(SOC(acceleration=acceleration))
         state = method.init(driver, None)
@@ -259,7 +261,7 @@ def test_a_state_that_is_not_finite_is_said_to_be_and_leaves_the_last_one_behind
         ).all()
         assert method.converged(broken, measurement) is None
         RobotsOfDriver(driver).finish()
-        assert driver.at.objective == pytest.approx(start, rel=1e-9)
+        assert driver.current.objective == pytest.approx(start, rel=1e-9)
 
 
 # solve(.., robots=..)

@@ -69,7 +69,7 @@ def check(problem: PGOProblem, parts: Partition, start: Poses, newton: Newton, s
             break
         assert other.moved == one.polish.moved
     poses, _ = collect(driver)
-    assert driver.at.objective == pytest.approx(problem.objective(poses), rel=1e-10, abs=1e-20)
+    assert driver.current.objective == pytest.approx(problem.objective(poses), rel=1e-10, abs=1e-20)
 
 
 @settings(max_examples=examples(30))
@@ -119,7 +119,7 @@ def test_as_many_steps_to_the_same_optimum(d: int) -> None:
     assert central.status is Status.CONVERGED
     assert states[-1].decrement <= STATIONARY_DECREMENT
     assert len(states) - 1 == central.iterations
-    assert driver.at.objective == pytest.approx(central.objective, rel=1e-13)
+    assert driver.current.objective == pytest.approx(central.objective, rel=1e-13)
 
 
 @settings(max_examples=examples(30))
@@ -224,7 +224,7 @@ def test_damping_grows_until_the_matrix_is_positive_definite(
         return model_at(driver, order) if order.damping >= 1e-3 else None
 
     monkeypatch.setattr("solvers.distributed.newton.model_at", spoiled)
-    before = driver.at.objective
+    before = driver.current.objective
     state = next(islice(iterate(SubstructuredNewton(), driver), 1, None))
     assert [second_order for second_order, _ in tried] == [True] + [False] * (len(tried) - 1)
     dampings = [damping for _, damping in tried[1:]]
@@ -232,7 +232,7 @@ def test_damping_grows_until_the_matrix_is_positive_definite(
         dampings, [0.0, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3], rtol=1e-12, atol=0
     )
     assert state.moved
-    assert driver.at.objective < before
+    assert driver.current.objective < before
 
 
 def test_a_shift_grows_until_the_matrix_is_positive_definite(
@@ -241,7 +241,7 @@ def test_a_shift_grows_until_the_matrix_is_positive_definite(
     # As if every factorisation failed with a shift below a thousand times the first one.
     problem = varied_problem(0, 12, 3)
     driver = driver_at(problem, metis(problem.graph, 2), near(problem, 0, 0.2))
-    first = 1e-3 * driver.at.objective / (driver.num_poses * driver.d)
+    first = 1e-3 * driver.current.objective / (driver.num_poses * driver.d)
     tried: list[float] = []
 
     def spoiled(driver: Driver, order: ModelOrder) -> object:

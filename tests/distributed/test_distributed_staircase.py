@@ -52,11 +52,11 @@ def test_it_solves_the_relaxation_as_one_place_does(
     assert found.status is Status.CONVERGED
     # Where no noise is, F is zero: both are near it, above the level of rounding or below.
     value = central.state.point.value
-    rounding = 10.0 * (central.state.rounding_level + driver.at.rounding_level)
-    assert driver.at.objective == pytest.approx(value, rel=1e-7, abs=rounding)
+    rounding = 10.0 * (central.state.rounding_level + driver.current.rounding_level)
+    assert driver.current.objective == pytest.approx(value, rel=1e-7, abs=rounding)
     lifted, Lambda = collect(driver)
     assert problem.objective(lifted) == pytest.approx(
-        driver.at.objective, rel=1e-9, abs=driver.at.rounding_level
+        driver.current.objective, rel=1e-9, abs=driver.current.rounding_level
     )
     dual = found.state.bound
     if dual is not None and dual.lower_bound > 0.0:
@@ -68,10 +68,10 @@ def test_it_solves_the_relaxation_as_one_place_does(
     round_lifted(driver)
     poses, _ = collect(driver)
     assert poses.R.shape == (n, d, d)
-    assert driver.at.objective == pytest.approx(
-        problem.objective(poses), rel=1e-9, abs=driver.at.rounding_level
+    assert driver.current.objective == pytest.approx(
+        problem.objective(poses), rel=1e-9, abs=driver.current.rounding_level
     )
-    assert driver.at.objective >= value * (1 - 1e-9) - rounding
+    assert driver.current.objective >= value * (1 - 1e-9) - rounding
 
 
 @pytest.mark.parametrize("partitioner", [contiguous, metis, singletons])
@@ -104,13 +104,13 @@ def test_a_climb_goes_on_from_a_snapshot() -> None:
     method = SubstructuredStaircase()
     first, second = (driver_at(problem, contiguous, 3, wound) for _ in range(2))
     state = method.init(first, None)
-    while first.at.R.shape[1] == problem.d:
+    while first.current.R.shape[1] == problem.d:
         state = method.step(first, state)
     second.resume(first.state, first.snapshots())
     for driver in (first, second):
         other = method.step(driver, state)
         assert np.isfinite(other.newton.objective)
-    np.testing.assert_array_equal(first.at.R, second.at.R)
+    np.testing.assert_array_equal(first.current.R, second.current.R)
     np.testing.assert_array_equal(collect(first)[0].t, collect(second)[0].t)
 
 
@@ -124,4 +124,4 @@ def test_a_rank_that_the_drivers_memory_does_not_hold_is_not_climbed_to() -> Non
     assert not driver.fits(4)
     found = run(SubstructuredStaircase(), driver)
     assert found.status is Status.STALLED
-    assert driver.at.R.shape[1] == 3
+    assert driver.current.R.shape[1] == 3

@@ -63,7 +63,7 @@ def check_start(problem: PGOProblem, parts: Partition) -> None:
     np.testing.assert_allclose(
         Lambda, multipliers(problem, poses), rtol=0, atol=1e-12 * scale * size
     )
-    assert driver.at.objective == pytest.approx(
+    assert driver.current.objective == pytest.approx(
         problem.objective(poses), rel=1e-12, abs=1e-24 * scale
     )
     assert driver.network.ledger.rounds == 2
@@ -92,10 +92,10 @@ def test_the_translations_are_asked_for_again_when_their_first_factorisation_fai
     with monkeypatch.context() as patch:
         patch.setattr(Interface, "factorize", failing)
         with pytest.raises(NotPositiveDefiniteError, match="once"):
-            driver.adopt(driver.at.R)
-    driver.adopt(driver.at.R)
+            driver.adopt(driver.current.R)
+    driver.adopt(driver.current.R)
     expected = problem.objective(problem.with_best_translations(start.R))
-    assert driver.at.objective == pytest.approx(expected, rel=1e-9)
+    assert driver.current.objective == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)
@@ -112,14 +112,14 @@ def test_poses_from_elsewhere_are_taken_as_they_are(
     given_poses = random_poses(n, d, seed)
     other = random_poses(n, d, seed + 1)
     driver = driver_at(problem, partitioner(problem.graph, seed), given_poses)
-    assert driver.at.objective == pytest.approx(problem.objective(given_poses), rel=1e-12)
+    assert driver.current.objective == pytest.approx(problem.objective(given_poses), rel=1e-12)
     driver.save_poses()
     driver.set_poses(other)
     driver.restore_poses()
     poses, Lambda = collect(driver)
     np.testing.assert_array_equal(poses.R, given_poses.R)
     np.testing.assert_array_equal(poses.t, given_poses.t)
-    assert driver.at.objective == pytest.approx(problem.objective(given_poses), rel=1e-12)
+    assert driver.current.objective == pytest.approx(problem.objective(given_poses), rel=1e-12)
     scale = float(problem.M.diagonal().max())
     np.testing.assert_allclose(Lambda, multipliers(problem, poses), rtol=0, atol=1e-11 * scale)
     assert driver.network.ledger.rounds == 0

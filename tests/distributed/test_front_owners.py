@@ -144,7 +144,7 @@ def test_every_front_but_the_root_has_a_robot_of_its_group(shared: None) -> None
         fronts = driver.interface(1).fronts
         below: list[set[int]] = []
         for number, front in enumerate(fronts.tree):
-            group = {int(driver.robots[robot]) for robot in front.robots}
+            group = {int(driver.robots_with_edges[robot]) for robot in front.robots}
             below.append(group.union(*(below[child] for child in front.children)))
             is_root = number == len(fronts.tree) - 1
             assert fronts.owner[number] in ({DRIVER} if is_root else below[number])

@@ -318,7 +318,7 @@ def test_the_staircase_climbs_from_the_best(
         driver = stage.job.driver
         began.extend(
             [
-                driver.at.objective,
+                driver.current.objective,
                 math.fsum(part.objective for part in driver.ask(Interior.evaluate, None)),
             ]
         )
@@ -332,7 +332,7 @@ def test_the_staircase_climbs_from_the_best(
         refined = newton(stage, answer)
         driver = stage.job.driver
         if len(began) == 0 and tolerances[-1] < WARM_START.tolerance:  # of the second try
-            driver.adopt(np.broadcast_to(project_to_rotations(away), driver.at.R.shape))
+            driver.adopt(np.broadcast_to(project_to_rotations(away), driver.current.R.shape))
         return refined
 
     monkeypatch.setattr(ClimbByRobots, "run", noted)

@@ -94,7 +94,7 @@ def test_sums_and_costs_are_those_of_the_whole_graph(wrong, loss: RobustLoss) ->
         mu = state.schedule.mu
         driver.reweigh(Reweigh(loss is RobustLoss.TRUNCATED, mu, 1.0, 1e-9))
         weights = np.where(known, 1.0, np.maximum(loss.weights(ratio, mu), 1e-13))
-        assert driver.at.objective == pytest.approx(
+        assert driver.current.objective == pytest.approx(
             float(weights @ problem.edge_costs(poses)), rel=1e-9
         )
 

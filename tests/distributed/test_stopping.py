@@ -55,7 +55,7 @@ def in_one_place(problem: PGOProblem, soc: SOC) -> Ended:
 def with_driver(problem: PGOProblem, soc: SOC) -> Ended:
     assert soc.robots is not None
     driver = open_driver(problem, soc.robots, InProcess())
-    driver.start()
+    driver.go_to_chordal_start()
     outcome = run(ConsensusSOC(soc), driver)
     return Ended(outcome.status, collect_copies(driver), outcome.history.records[-1].measurement)
 
@@ -203,7 +203,7 @@ def test_robots_that_do_not_wait_confirm_it_by_a_round_that_arrives_in_full() ->
     soc = SOC(robots=parts, tolerance=1e-4)
     engine = Recording()
     driver = open_driver(problem, parts, engine)
-    driver.start()
+    driver.go_to_chordal_start()
     rounds: list[int] = []
 
     def count(state: AsynchronousState, record: Record) -> None:
@@ -221,7 +221,7 @@ def test_a_confirmation_that_fails_goes_on(monkeypatch: pytest.MonkeyPatch) -> N
     problem = varied_problem(3, 20, 3)
     parts = metis(problem.graph, 4)
     driver = open_driver(problem, parts, InProcess())
-    driver.start()
+    driver.go_to_chordal_start()
     answered: list[float] = []
     honest = ConsensusRobot.stationarity_beside
 

@@ -82,7 +82,9 @@ def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> tuple[
     size = 1 + np.abs(expected.t).max()
     np.testing.assert_allclose(poses.R, expected.R, rtol=0, atol=1e-7)
     np.testing.assert_allclose(poses.t - poses.t[0], expected.t, rtol=0, atol=1e-7 * size)
-    assert driver.at.objective == pytest.approx(problem.objective(expected), rel=1e-6, abs=1e-9)
+    assert driver.current.objective == pytest.approx(
+        problem.objective(expected), rel=1e-6, abs=1e-9
+    )
     return central[-1].refreshes, central[-1].raises
 
 
@@ -162,7 +164,7 @@ def test_a_long_accelerated_run_ends_where_joint_ends(d: int) -> None:
 def test_a_state_that_is_not_finite_is_said_to_be_and_leaves_the_last_one_behind() -> None:
     problem = varied_problem(0, 12, 3)
     driver = driver_at(problem, metis(problem.graph, 2), None)
-    start = driver.at.objective
+    start = driver.current.objective
     method = SubstructuredSOC()
     state = method.init(driver, None)
     assert driver.block is not None
@@ -175,4 +177,4 @@ def test_a_state_that_is_not_finite_is_said_to_be_and_leaves_the_last_one_behind
     ).all()
     assert method.converged(broken, measurement) is None
     method.finish(driver)
-    assert driver.at.objective == pytest.approx(start, rel=1e-12)
+    assert driver.current.objective == pytest.approx(start, rel=1e-12)

@@ -82,10 +82,23 @@ def test_the_spectrum_is_drawn_by_sign_and_with_the_proofs_eta():
 def test_the_spectrum_is_drawn_with_the_shift_of_a_loose_relaxation():
     pytest.importorskip("matplotlib")
     graph = pgo.random_geometric(6, np.random.default_rng(3), noise=NoiseModel(0.5, 1.5))
-    certificate = solvers.solve(graph).certificate  # where the staircase solved the relaxation
+    problem = pgo.PGOProblem(graph)
+    # where the staircase solved the relaxation
+    certificate = solvers.solve(problem, solvers.Pipeline(handedness=None)).certificate
     assert certificate.eta > 0
-    (axes,) = plot_spectrum(pgo.PGOProblem(graph), certificate, 9).axes
+    (axes,) = plot_spectrum(problem, certificate, 9).axes
     assert f"{certificate.eta:.1e}" in axes.get_legend_handles_labels()[1][2]
+
+
+def test_the_spectrum_of_a_proof_with_terms_is_that_of_the_matrix_less_them():
+    pytest.importorskip("matplotlib")
+    graph = pgo.random_geometric(6, np.random.default_rng(3), noise=NoiseModel(0.5, 1.5))
+    problem = pgo.PGOProblem(graph)
+    certificate = solvers.solve(problem).certificate
+    assert certificate.bound.terms is not None
+    (axes,) = plot_spectrum(problem, certificate, 9).axes
+    (_, negative) = (line.get_xdata() for line in axes.lines)
+    assert (negative <= 3).all()  # rounding of the three zeros of a common turn
 
 
 def test_the_sparsity_counts_entries():

@@ -6,7 +6,16 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from budget import examples
-from graphs import DIMENSIONS, LOUD_NOISE, OPTIMUM, SEEDS, exact_graph, random_poses, varied_problem
+from graphs import (
+    DIMENSIONS,
+    LOUD_NOISE,
+    OPTIMUM,
+    SEEDS,
+    exact_graph,
+    random_poses,
+    restarts,
+    varied_problem,
+)
 from hypothesis import given, settings, strategies as st
 
 from pgo_models.certificates.certificate import Verdict, relative_gap
@@ -33,14 +42,6 @@ from solvers.studies.tightness import SweptScene, noisy_scene
 FORMS = st.sampled_from(list(RelaxationForm))
 NOT_TIGHT_DEGREES = 70.0
 NOT_TIGHT_SEED = 0
-
-
-def restarts(problem: PGOProblem, count: int, seed: int) -> float:
-    """Lowest F that polishing from random rotations finds."""
-    starts = (random_poses(problem.num_poses, problem.d, seed + k) for k in range(count))
-    return min(
-        problem.objective(polish(problem, problem.with_best_translations(s.R))) for s in starts
-    )
 
 
 @settings(max_examples=examples(9))
@@ -209,7 +210,8 @@ def test_the_reason_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
 def test_what_is_beyond_reach_is_refused_with_an_estimate() -> None:
     problem = PGOProblem(sphere(np.random.default_rng(0)))
     with pytest.raises(
-        SettingError, match=r"needs about [\d.]+ GB, above the limit of 4 GB .* use solvers.certify\("
+        SettingError,
+        match=r"needs about [\d.]+ GB, above the limit of 4 GB .* use solvers.certify\(",
     ) as caught:
         solve_relaxation(problem, RelaxationForm.PRIMAL, "CLARABEL")
     assert "PRIMAL and CLARABEL as asked for" in str(caught.value)

@@ -169,14 +169,14 @@ def test_known_inliers_of_another_size_are_refused():
 
 def test_a_run_ends_where_weights_of_0_and_1_do_not_settle():
     gnc = solvers.GNC()
-    schedule = GNCSchedule(500.0, 1.0, 0, undecided=0.0, decrement=1e-3)  # above the tolerance
+    schedule = GNCSchedule(500.0, 1.0, 0, undecided=0.0, decrease=1e-3)  # above the tolerance
     endings = []
     for _ in range(13):
         schedule = advanced(gnc, schedule)
         endings.append(ending(gnc, schedule))
     # One step with a softer control, ten with the hardest.
     assert endings == [None] * 10 + [Status.STALLED] * 3
-    within_tolerance = replace(advanced(gnc, schedule), decrement=1e-7)
+    within_tolerance = replace(advanced(gnc, schedule), decrease=1e-7)
     assert ending(gnc, within_tolerance) is Status.CONVERGED
     softer = advanced(gnc, replace(schedule, mu=1.0))
     assert softer.hard_steps == 0

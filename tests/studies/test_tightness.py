@@ -18,7 +18,10 @@ def test_little_noise_is_certified_and_much_is_not(scene: SweptScene) -> None:
     assert sweep.last_tight == QUIET
     assert (sweep.gap[0] <= 1e-6).all()
     assert (sweep.gap[1] > 1e-6).all()
-    assert str(sweep).splitlines()[1].split() == ["10.0", "100%", rounded_up(sweep.gap[0].max(), 2)]
+    worst = rounded_up(sweep.gap[0].max(), 2)
+    assert str(sweep).splitlines()[1].split() == ["10.0", "100%", worst, "100%"]
+    assert (sweep.certified_with_terms >= sweep.certified).all()
+    assert sweep.fraction_with_terms[1] == (1.0 if scene is SweptScene.CIRCLE else 0.0)
 
 
 def test_the_same_seed_gives_the_same_sweep() -> None:
@@ -39,9 +42,8 @@ def test_the_scene_keeps_all_but_the_rotation_noise() -> None:
 
 
 def test_nothing_certified_has_no_last_level() -> None:
-    sweep = NoiseSweep(
-        SweptScene.GRID, np.array([1.0, 2.0]), np.array([[False], [True]]), np.ones((2, 1))
-    )
+    certified = np.array([[False], [True]])
+    sweep = NoiseSweep(SweptScene.GRID, np.array([1.0, 2.0]), certified, np.ones((2, 1)), certified)
     assert np.isnan(sweep.last_tight)
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +27,7 @@ from proofs import PLANE, SPACE, assert_verified, edited, proof_of, written
 import solvers
 from pgo_models.certificates.certificate import BoundSource, certify_at
 from pgo_models.certificates.proof_file import save_proof
+from pgo_models.geometry.rotations import random_rotations
 from pgo_models.graphs.datasets import load, locate
 from pgo_models.graphs.g2o import read_g2o, write_g2o
 from pgo_models.graphs.residuals import chi2
@@ -33,6 +36,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.verification.verify import verify_proof
 from solvers.riemannian.certify import certify
+from solvers.studies.tightness import SweptScene, noisy_scene
 
 WEIGHTINGS = st.sampled_from(Weighting)
 BOTH = list(Weighting)
@@ -109,9 +113,7 @@ def test_a_bound_from_poses_that_are_no_optimum_is_a_bound(
 
 @pytest.mark.parametrize("seed", range(3))
 def test_shifted_and_ungrounded_bounds_are_verified(seed: int, tmp_path: Path) -> None:
-    from solvers.studies.tightness import SweptScene, noisy_scene
-
-    graph = noisy_scene(SweptScene.GRID, np.deg2rad(60), np.random.default_rng(seed))
+    graph = noisy_scene(SweptScene.GRID, np.deg2rad(80), np.random.default_rng(seed))
     path = written(tmp_path, graph)
     certificate, proof = proof_of(path)
     assert certificate.eta > 0
@@ -335,3 +337,69 @@ def test_semidefinite_matrices_are_verified_whole_and_indefinite_ones_refused(
     assert 10.72 < float(found.bound) < 10.735
     path.write_text(SEMIDEFINITE.replace("100 0 100 100", "100 0 101 100"))
     assert "an information matrix is indefinite" in verify_proof(path, proof).failure
+
+
+def handed_proof(tmp_path: Path) -> tuple[Path, Path, solvers.Solution]:
+    """File, proof and solution of a graph that handedness terms certify."""
+    rng = np.random.default_rng(1)
+    path = written(tmp_path, noisy_scene(SweptScene.CIRCLE, np.deg2rad(70.0), rng))
+    problem = PGOProblem(read_g2o(path))
+    solution = solvers.solve(problem)
+    proof = tmp_path / "handed.json"
+    save_proof(problem, solution.certificate, proof)
+    return path, proof, solution
+
+
+def test_handedness_terms_are_verified_and_nothing_less(tmp_path: Path) -> None:
+    path, proof, solution = handed_proof(tmp_path)
+    assert solution.certificate.bound.terms is not None
+    found = verify_proof(path, proof)
+    assert_verified(found, solution.certificate)
+    record = json.loads(proof.read_text())
+    assert len(record["handedness"]) == solution.certificate.bound.terms.num_pairs
+
+    def fails(change: Callable[[list[dict[str, Any]]], object], words: str) -> None:
+        changed = json.loads(proof.read_text())
+        change(changed["handedness"])
+        bad = tmp_path / "bad.json"
+        bad.write_text(json.dumps(changed))
+        found = verify_proof(path, bad)
+        assert not found.is_verified
+        assert words in found.failure
+
+    fails(lambda terms: terms.clear(), "the elimination")
+    fails(lambda terms: terms[0].update(P=[-1.0, 0.0, 0.0, 1.0, 0.0, 1.0]), "not positive semid")
+    fails(lambda terms: terms[0].update(P=[1.0, 1.01, 0.0, 1.0, 0.0, 1.0]), "not positive semid")
+    fails(lambda terms: terms[0].update(T=np.diag([1.0, 1.0, -1.0]).tolist()), "is no rotation")
+    fails(lambda terms: terms[0].update(j=terms[0]["i"]), "two poses")
+    fails(lambda terms: terms[0].update(j=10**9), "two poses")
+
+
+@given(seed=SEEDS, size=st.sampled_from([1e-3, 1.0, 1e3]))
+@settings(max_examples=examples(8))
+def test_no_false_bound_comes_of_made_up_handedness_terms(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, size: float
+) -> None:
+    """Any rotations T and any P >= 0 give a true bound, or none."""
+    rng = np.random.default_rng(seed)
+    path = written(tmp_path_factory.mktemp("made_up"), varied_graph(seed, 5, 3, LOUD_NOISE))
+    problem = PGOProblem(read_g2o(path))
+    poses = solvers.solve(problem).poses
+    proof = path.with_suffix(".json")
+    save_proof(problem, certify_at(problem, poses), proof)
+    record = json.loads(proof.read_text())
+    roots = rng.standard_normal((problem.graph.num_edges, 3, 3))
+    matrices = size * roots @ np.swapaxes(roots, 1, 2) + 1e-6 * np.eye(3)
+    turns = random_rotations(problem.graph.num_edges, 3, rng)
+    record["handedness"] = [
+        {
+            "i": int(problem.graph.pose_ids[i]),
+            "j": int(problem.graph.pose_ids[j]),
+            "T": T.tolist(),
+            "P": P[np.triu_indices(3)].tolist(),
+        }
+        for i, j, T, P in zip(problem.graph.i, problem.graph.j, turns, matrices, strict=True)
+    ]
+    proof.write_text(json.dumps(record))
+    found = verify_proof(path, proof)
+    assert found.bound is None or found.bound <= best_known(problem, seed) * (1.0 + 1e-12)

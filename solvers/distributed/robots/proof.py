@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.certificates.definiteness import MARGIN, is_in_range, shifted_certificate
+from pgo_models.certificates.definiteness import ROUNDING_MULTIPLE, is_in_range, shifted_certificate
+from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.lower_bound import quadratic_loss, squared_distances
 from pgo_models.certificates.rounding_errors import (
     evaluate_certificate,
@@ -58,6 +59,7 @@ class RobotProof:
     slack: Array  # (i,): S_r is at least so much in the rows of the interior
     interior: IntArray  # (i,): those rows
     fixed: Array  # ((d+1) g,): 1 for rows on the boundary that are left out
+    terms: HandednessTerms | None = None  # what is taken off the cost of the robot's edges
 
     def moved(self, step: Array) -> RobotProof:
         """Return the same at X - step."""
@@ -67,14 +69,21 @@ class RobotProof:
         return replace(self, X=X, low=self.low - step[:p])
 
     def evaluated(self, problem: PGOProblem, boundary: IntArray) -> tuple[ProofSums, Array]:
-        """Evaluate the parts of the bound at X, and S X."""
+        """Evaluate the parts of the bound at X, and S X.
+
+        What rounding can make of handedness terms is added to the error of the value.
+        """
+        lost = 0.0
+        if self.terms is not None:
+            problem = self.terms.taken_off(problem)
+            lost = self.terms.loss()
         at_X = evaluate_certificate(problem, self.Lambda, self.X, self.low)
         G = at_X.product[self.interior]
         error = at_X.product_error[self.interior]
         rotations = self.interior[self.interior >= len(self.low)]
         sums = ProofSums(
             value=at_X.value,
-            value_error=at_X.value_error,
+            value_error=at_X.value_error + OUTWARD * lost,
             left=quadratic_loss(G, 0.0, self.slack),
             quadratic=quadratic_loss(G, error, self.slack),
             squared_distances=squared_distances(self.X[rotations], self.start[rotations]),
@@ -85,7 +94,14 @@ class RobotProof:
 
 
 def begin_proof(
-    part: Part, poses: Poses, Lambda: Array, slack: Array, cut: Cut, point: Array, fixed: Array
+    part: Part,
+    poses: Poses,
+    Lambda: Array,
+    slack: Array,
+    cut: Cut,
+    point: Array,
+    fixed: Array,
+    terms: HandednessTerms | None = None,
 ) -> RobotProof:
     """Begin a proof at poses, in the frame in which the driver gives the rows of X on the boundary.
 
@@ -108,6 +124,7 @@ def begin_proof(
         slack=slack,
         interior=cut.interior,
         fixed=fixed,
+        terms=terms,
     )
 
 
@@ -147,7 +164,7 @@ def verify_interior(
     positions = problem.diagonal_positions[inside]
     error = entries + _expected_error(cut)
     for _ in range(_ATTEMPTS):
-        shift = np.maximum(share, MARGIN * error)
+        shift = np.maximum(share, ROUNDING_MULTIPLE * error)
         data[positions] = S.data[positions] - shift * diagonal[inside]
         matrix = problem.with_pattern_of_M(data.copy())
         try:

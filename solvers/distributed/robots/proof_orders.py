@@ -5,18 +5,22 @@ from dataclasses import replace
 
 import numpy as np
 
+from pgo_models.certificates.handedness import HandednessTerms, closed_form_terms
 from pgo_models.certificates.rounding_errors import fits_to_rounding
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.robots.elimination import row_sums, unpacked
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.proof import begin_proof, verify_interior
-from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep
+from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep, TermsAnswer
 
 
 def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofAnswer]:
     """Eliminate S for a proof, and at a point begin one (`solvers.distributed.robots.proof`)."""
     problem = robot.tangent_problem
+    terms = handedness_terms(robot) if order.with_terms else None
+    if terms is not None:
+        problem = terms.taken_off(problem)
     factors = robot.factors
     Lambda = robot.multipliers()
     Lambda[robot.part.boundary] = 0.0  # those are the driver's
@@ -37,10 +41,45 @@ def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofA
     if order.point is None:
         return following, ProofAnswer(elimination.schur, sizes, trace, None)
     proof = begin_proof(
-        robot.part, robot.state.poses, Lambda, slack, elimination.cut, order.point, order.fixed
+        robot.part,
+        robot.state.poses,
+        Lambda,
+        slack,
+        elimination.cut,
+        order.point,
+        order.fixed,
+        terms,
     )
     following, step = _evaluated(following.with_changes(proof=proof))
     return following, ProofAnswer(elimination.schur, sizes, trace, step)
+
+
+def handedness_terms(robot: Interior) -> HandednessTerms | None:
+    """Return the terms of the robot's edges in closed form, None where no edge needs one."""
+    if robot.problem.d == 2:
+        return None
+    return closed_form_terms(robot.tangent_problem, robot.state.poses)
+
+
+def describe_with_terms(robot: Interior, _: None) -> tuple[Interior, TermsAnswer]:
+    """Count the handedness terms of the robot's edges; the diagonal of M less them."""
+    terms = handedness_terms(robot)
+    problem = robot.tangent_problem
+    num_pairs = 0
+    if terms is not None:
+        problem = terms.taken_off(problem)
+        num_pairs = terms.num_pairs
+    diagonal = problem.M.data[problem.diagonal_positions]
+    return robot, TermsAnswer(num_pairs, diagonal[robot.boundary_rows])
+
+
+def report_terms(robot: Interior, _: None) -> tuple[Interior, HandednessTerms | None]:
+    """Return the handedness terms of the robot's edges, with the numbers of the whole graph."""
+    terms = handedness_terms(robot)
+    if terms is None:
+        return robot, None
+    numbers = robot.part.poses
+    return robot, replace(terms, i=numbers[terms.i], j=numbers[terms.j])
 
 
 def fits_part(robot: Interior, _: None) -> tuple[Interior, bool]:

@@ -128,6 +128,15 @@ class ProofOrder:
     fixed: Array  # ((d+1) g,): 1 for rows on the boundary that are left out
     diagonal: Array  # ((d+1) g,): of S there, summed over robots, or more
     point: Array | None  # ((d+1) g, d): X there, where a proof begins
+    with_terms: bool = False  # whether S is that of the cost less handedness terms
+
+
+@dataclass(frozen=True, eq=False)
+class TermsAnswer:
+    """Handedness terms of a robot's edges, before a proof with them."""
+
+    num_pairs: int
+    diagonal: Array  # ((d+1) g,): of M less the terms, on the boundary
 
 
 @dataclass(frozen=True, eq=False)

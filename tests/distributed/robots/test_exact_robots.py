@@ -120,9 +120,9 @@ def test_what_a_driver_says_to_be_definite_is(
     poses = polish(problem, chordal_start(problem))
     with closing(driver_at(problem, cut(problem.graph, seed), poses)) as driver:
         g = len(driver.cover)
-        r = driver.grounded
+        r = driver.grounded_position
         fixed = columns_of(np.array([r]), g, (1, d))
-        X = Poses(driver.at.R, driver.at.t).stacked()
+        X = Poses(driver.current.R, driver.current.t).stacked()
         proof = distributed_bound.eliminate_S(driver, fixed, 0.0, 1e-9, X)
         _, Lambda = collect(driver)
         rows = columns_of(driver.cover, n, (1, d))
@@ -172,8 +172,8 @@ def test_every_term_of_the_errors_of_a_driver_s_sums_is_there() -> None:
         d = driver.d
         rng = np.random.default_rng(0)
         space = driver.interface(1, d)
-        X = Poses(driver.at.R, driver.at.t).stacked()
-        Lambda = driver.at.multipliers
+        X = Poses(driver.current.R, driver.current.t).stacked()
+        Lambda = driver.current.multipliers
         slack = rng.uniform(1.0, 2.0, len(X))
         blocks = evaluate_multipliers(Lambda, X[g:].reshape(g, d, d))
         own = np.zeros_like(X)
@@ -207,11 +207,11 @@ def test_every_term_of_the_errors_of_a_driver_s_elimination_is_there(
     problem = PGOProblem(varied_graph(3, 16, 3))
     poses = polish(problem, chordal_start(problem))
     with closing(driver_at(problem, contiguous(problem.graph, 3), poses)) as driver:
-        Lambda = driver.at.multipliers
+        Lambda = driver.current.multipliers
         monkeypatch.setattr(
             Interface, "rounding", lambda self, sizes, own, diagonal: 0.0 * diagonal
         )
-        fixed = driver.ground(1).ravel()
+        fixed = driver.columns_of_pose_0(1).ravel()
         found = distributed_bound.eliminate_S(driver, fixed, 1.0, 1e-13, None)
         assert found is not None
         diagonal = driver.diagonal.copy()

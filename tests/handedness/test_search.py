@@ -1,0 +1,211 @@
+"""The search for handedness terms: its derivatives, its two spectra, and what it proves."""
+
+from itertools import islice
+
+import numpy as np
+import pytest
+from budget import examples
+from graphs import LOUD_NOISE, SEEDS, restarts, varied_graph
+from hypothesis import given, settings, strategies as st
+
+import solvers
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.graphs.scenes import victoria_park
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.handedness import certificate_spectrum
+from solvers.handedness.ascent import HandednessAscent, nearest_semidefinite
+from solvers.handedness.barrier import BASIS, HandednessBarrier, _newton_step
+from solvers.handedness.certificate_spectrum import HandedMatrix
+from solvers.handedness.search import HandednessSearch, pairs_with_edges
+from solvers.loop import RunMonitor, iterate, run
+from solvers.pipeline import Pipeline, solve
+from solvers.result import Status
+from solvers.riemannian.polish import polish
+from solvers.studies.tightness import SweptScene, noisy_scene
+
+SIZES = st.integers(3, 8)
+
+
+def matrix_of(problem: PGOProblem) -> HandedMatrix:
+    poses = problem.at_best_translations(polish(problem, chordal_start(problem)))
+    i, j = pairs_with_edges(problem.graph)
+    return HandedMatrix(problem, multipliers(problem, poses), poses, i, j)
+
+
+def noisy_matrix(seed: int, n: int) -> HandedMatrix:
+    return matrix_of(PGOProblem(varied_graph(seed, n, 3, LOUD_NOISE)))
+
+
+def random_P(matrix: HandedMatrix, seed: int) -> np.ndarray:
+    roots = np.random.default_rng(seed).standard_normal((len(matrix.i), 3, 3))
+    return roots @ np.swapaxes(roots, 1, 2)
+
+
+@given(seed=SEEDS, n=SIZES)
+def test_the_dense_matrix_is_the_schur_complement_of_the_sparse_one(seed: int, n: int) -> None:
+    matrix = noisy_matrix(seed, n)
+    P = random_P(matrix, seed)
+    S = matrix.sparse(P, 0.0).toarray()
+    translations = matrix.free
+    rotations = (n + 3 * matrix.free[:, None] + np.arange(3)).ravel()
+    coupling = S[np.ix_(translations, rotations)]
+    inner = S[np.ix_(translations, translations)]
+    schur = S[np.ix_(rotations, rotations)] - coupling.T @ np.linalg.solve(inner, coupling)
+    dense = matrix.dense(P)
+    np.testing.assert_allclose(dense, schur, rtol=0, atol=1e-7 * np.abs(dense).max())
+
+
+@settings(max_examples=examples(10))
+@given(seed=SEEDS)
+def test_both_spectra_agree(seed: int) -> None:
+    matrix = noisy_matrix(seed, 12)
+    P = random_P(matrix, seed)
+    dense = matrix.spectrum(P, 4, -1.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(certificate_spectrum, "MOST_DENSE", 0)
+        sparse = matrix.spectrum(P, 4, -1.0)
+    scale = np.abs(matrix.dense(P)).max()
+    np.testing.assert_allclose(sparse.values, dense.values, rtol=0, atol=1e-3 * scale)
+
+
+@settings(max_examples=examples(15))
+@given(seed=SEEDS, n=SIZES)
+def test_the_smallest_eigenvalue_rises_to_first_order_along_the_derivative(
+    seed: int, n: int
+) -> None:
+    matrix = noisy_matrix(seed, n)
+    ascent = HandednessAscent(num_eigenvalues=1)
+    state = ascent.init(matrix, random_P(matrix, seed))
+    D = state.spectrum.moves[:, :, 0]
+    outer = D[:, :, None] * D[:, None, :]
+    squares = np.sum(D * D, axis=1)[:, None, None]
+    derivative = 0.25 * (outer - 0.5 * squares * np.eye(3))
+    step = 1e-6
+    ahead = matrix.spectrum(state.P + step * derivative, 2, 0.0).values
+    change = (ahead[0] - state.smallest) / step
+    expected = float(np.sum(derivative**2))
+    gap = ahead[1] - ahead[0]
+    slack = step * expected * 1e3 / max(gap, 1e-12) + 1e-5 * expected + 1e-6
+    assert abs(change - expected) <= slack * max(1.0, expected)
+
+
+@settings(max_examples=examples(10))
+@given(seed=SEEDS, n=st.integers(3, 5))
+def test_a_newton_step_of_the_barrier_is_that_of_its_differences(seed: int, n: int) -> None:
+    matrix = noisy_matrix(seed, n)
+    state = HandednessBarrier().init(matrix, None)
+
+    def barrier(x: np.ndarray) -> float:
+        P = state.P + np.einsum("eq,qab->eab", x[:-1].reshape(-1, 6), BASIS)
+        t = state.t + x[-1]
+        slack = matrix.dense(P) - t * np.eye(3 * len(matrix.free))
+        return -t / state.mu - np.linalg.slogdet(slack)[1] - np.linalg.slogdet(P)[1].sum()
+
+    P_step, t_step, decrement = _newton_step(matrix, state)
+    direction = np.append(np.einsum("eab,qab->eq", P_step, BASIS).ravel(), t_step)
+    h = 1e-4
+    slope = (barrier(h * direction) - barrier(-h * direction)) / (2.0 * h)
+    assert slope == pytest.approx(-decrement, rel=1e-3, abs=1e-6)
+    curvature = (
+        barrier(h * direction) + barrier(-h * direction) - 2.0 * barrier(0 * direction)
+    ) / h**2
+    assert curvature == pytest.approx(decrement, rel=2e-2, abs=1e-3)
+
+
+def test_states_are_left_alone() -> None:
+    matrix = noisy_matrix(0, 6)
+    for method in (HandednessAscent(), HandednessBarrier()):
+        states = list(islice(iterate(method, matrix), 4))
+        kept = [state.P.copy() for state in states]
+        method.step(matrix, states[0])
+        for state, P in zip(states, kept, strict=True):
+            np.testing.assert_array_equal(state.P, P)
+        assert [state.k for state in states] == [0, 1, 2, 3]
+
+
+def test_matrices_stay_semidefinite() -> None:
+    matrix = noisy_matrix(1, 6)
+    for state in islice(iterate(HandednessAscent(), matrix), 8):
+        values = np.linalg.eigvalsh(state.P)
+        assert (values >= -1e-12 * max(1.0, np.abs(values).max())).all()
+    A = np.random.default_rng(0).standard_normal((20, 3, 3))
+    A = A + np.swapaxes(A, 1, 2)
+    assert (np.linalg.eigvalsh(nearest_semidefinite(A)) >= -1e-12).all()
+
+
+# Rotation noise, seed, and whether the relaxation is tight, of graphs that terms prove.
+LOOSE = [
+    (SweptScene.CIRCLE, 60, 0),
+    (SweptScene.CIRCLE, 70, 1),
+    (SweptScene.CIRCLE, 80, 2),
+    (SweptScene.GRID, 50, 1),
+    (SweptScene.GRID, 60, 3),
+]
+
+
+def noisy(scene: SweptScene, degrees: float, seed: int) -> PGOProblem:
+    return PGOProblem(noisy_scene(scene, np.deg2rad(degrees), np.random.default_rng(seed)))
+
+
+@pytest.mark.parametrize(("scene", "degrees", "seed"), LOOSE)
+def test_graphs_that_the_relaxation_leaves_open_are_certified(
+    scene: SweptScene, degrees: float, seed: int
+) -> None:
+    problem = noisy(scene, degrees, seed)
+    without = solve(problem, Pipeline(handedness=None))
+    assert not without.is_certified
+    solution = solve(problem)
+    assert solution.is_certified
+    assert solution.certificate.gap <= 1e-9
+    assert solution.certificate.bound.terms is not None
+    assert solution.status is Status.CONVERGED
+    assert solution.stages[-1].name.startswith("Handedness")
+    assert solution.stages[-1].status is Status.CONVERGED
+    assert solution.lower_bound <= restarts(problem, 40, seed) * (1.0 + 1e-12)
+    assert without.lower_bound <= solution.objective
+
+
+def test_the_interior_point_finds_what_the_ascent_does_not() -> None:
+    problem = noisy(SweptScene.GRID, 60, 1)
+    search = HandednessSearch(barrier=None)
+    ascent_alone = solve(problem, Pipeline(handedness=search))
+    assert not ascent_alone.is_certified
+    assert solve(problem).is_certified
+
+
+def test_where_no_terms_suffice_the_answer_is_as_without_them() -> None:
+    problem = noisy(SweptScene.GRID, 80, 0)
+    without = solve(problem, Pipeline(handedness=None))
+    solution = solve(problem)
+    assert not solution.is_certified
+    assert solution.lower_bound >= without.lower_bound
+    assert solution.status is without.status
+    assert [stage.name for stage in solution.stages[-2:]] == [
+        "HandednessAscent",
+        "HandednessBarrier",
+    ]
+    assert solution.stages[-1].status is Status.STALLED
+
+
+def test_the_search_respects_the_time_limit() -> None:
+    matrix = noisy_matrix(0, 8)
+    outcome = run(HandednessAscent(max_iterations=10**6), matrix, time_limit=1e-9)
+    assert outcome.status in (Status.TIME_LIMIT, Status.CONVERGED)
+    problem = noisy(SweptScene.GRID, 80, 0)
+    poses = solve(problem, Pipeline(handedness=None)).poses
+    monitor = RunMonitor(time_limit=1e-9)
+    _, stages = HandednessSearch().run(problem, poses, monitor)
+    assert [stage.status for stage in stages] == [Status.TIME_LIMIT]
+
+
+def test_landmarks_have_no_pairs() -> None:
+    graph = victoria_park(np.random.default_rng(0))
+    i, j = pairs_with_edges(graph)
+    assert not np.isin(graph.landmarks, np.concatenate([i, j])).any()
+
+
+def test_in_the_plane_nothing_is_sought() -> None:
+    graph = varied_graph(3, 6, 2, LOUD_NOISE)
+    solution = solvers.solve(graph)
+    assert not any("Handedness" in stage.name for stage in solution.stages)
