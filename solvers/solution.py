@@ -1,9 +1,12 @@
 """Solution: poses, cost, certificate and what each stage did; it prints and saves itself."""
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict
 from pgo_models.certificates.dual_variables import multipliers
@@ -16,7 +19,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import check_g2o_folder, write_g2o, write_g2o_folder
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import extreme_weight, indefinite_edges
+from pgo_models.graphs.precisions import extreme_weight, indefinite_edges, proper_information
 from pgo_models.graphs.residuals import chi2
 from pgo_models.graphs.trajectories import write_kitti, write_tum
 from pgo_models.html_tables import facts_table, rows_table
@@ -513,9 +516,10 @@ def certificate_json(certificate: Certificate) -> dict[str, object]:
 def note_of(problem: PGOProblem, certificate: Certificate, lacks: str = "") -> str:
     """Note of a solution: coupling that chi2 leaves out, and what the certificate lacks.
 
-    The latter is `lacks`, or unless given what `note_of_weights` says.
+    The latter is `lacks`, or unless given what `note_of_weights` and `note_of_tangent` say.
     """
-    notes = (note_of_coupling(problem), lacks or note_of_weights(problem.graph, certificate))
+    found = note_of_weights(problem.graph, certificate) or note_of_tangent(problem, certificate)
+    notes = (note_of_coupling(problem), lacks or found)
     return "; ".join(note for note in notes if note)
 
 
@@ -531,6 +535,29 @@ def note_of_weights(graph: PoseGraph, certificate: Certificate) -> str:
     if spread * UNIT_ROUNDOFF <= certificate.wanted_gap:
         return ""
     return f"{text}, too far from others for a proof; correct it, or solve graph.unit_weights()"
+
+
+def note_of_tangent(problem: PGOProblem, certificate: Certificate) -> str:
+    """Sentence on translations whose information the bound on chi2 cannot keep, or "".
+
+    That is so where the bound is one of smaller information matrices: the tangent keeps of every
+    I_tt its smallest eigenvalue, and the largest of them is beyond what could be proven.
+    """
+    if certificate.is_certified or certificate.bound.cap == math.inf:
+        return ""
+    d = problem.d
+    information = proper_information(problem.graph)[:, :d, :d]
+    values = np.linalg.eigvalsh(information)
+    is_known = values[:, 0] > 0.0
+    condition = values[is_known, -1] / values[is_known, 0]
+    num_beyond = int((condition > certificate.bound.cap).sum())
+    if num_beyond == 0:
+        return ""
+    return (
+        f"chi2 is open because of its translations: the information of {num_beyond} edges has a "
+        f"condition of up to {condition.max():.2g}, and the bound could keep "
+        f"{certificate.bound.cap:.2g}; F has no such loss"
+    )
 
 
 def note_of_coupling(problem: PGOProblem) -> str:

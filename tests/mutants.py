@@ -224,6 +224,49 @@ MUTANTS = (
         "errors = UNIT_ROUNDOFF * np.abs(rho)",
         ("tests/certificates/test_rounding_errors.py", "tests/certificates/test_error_formulas.py"),
     ),
+    # Handedness terms.
+    Mutant(
+        "handedness: what rounding makes of T and P is not subtracted",
+        "pgo_models/certificates/handedness.py",
+        "return OUTWARD * float(np.sum(of_T + of_P))",
+        "return 0.0",
+        ("tests/certificates/test_handedness.py",),
+    ),
+    Mutant(
+        "handedness: a P with an eigenvalue below zero counts as semidefinite",
+        "pgo_models/certificates/handedness.py",
+        "of_P = np.maximum(0.0, -least)",
+        "of_P = 0.0 * least",
+        ("tests/certificates/test_handedness.py",),
+    ),
+    Mutant(
+        "handedness: half of the trace is the whole",
+        "pgo_models/certificates/handedness.py",
+        'half_trace = 0.5 * np.einsum("kaa->k", P)',
+        'half_trace = np.einsum("kaa->k", P)',
+        ("tests/certificates/test_handedness.py",),
+    ),
+    Mutant(
+        "handedness: the loss is not taken off the bound",
+        "pgo_models/certificates/lower_bound.py",
+        "value = math.nextafter(found.value - lost, -math.inf)",
+        "value = found.value",
+        ("tests/certificates/test_handedness.py",),
+    ),
+    Mutant(
+        "handedness by robots: the loss is not in the error of the value",
+        "solvers/distributed/robots/proof.py",
+        "value_error=at_X.value_error + OUTWARD * lost",
+        "value_error=at_X.value_error",
+        ("tests/certificates/test_handedness.py",),
+    ),
+    Mutant(
+        "handedness: the verifier takes any P",
+        "pgo_models/verification/verify.py",
+        "if not is_semidefinite(symmetric(triangle, 3)):",
+        "if False:",
+        ("tests/verification/test_verify.py",),
+    ),
     # Elsewhere.
     Mutant(
         "multipliers of sets other than X^T X = I have the wrong sign",

@@ -25,8 +25,7 @@ POSITIVE = 1e-9  # of the mean diagonal of M: an eigenvalue above that is no rou
 _AIM = 0.05  # of the best eigenvalue so far: how far beyond zero a step aims,
 _LEAST_AIM = 0.02  # and of the first one at least
 _SOFTNESS = 0.1  # temperature of the soft minimum, as a share of the smallest eigenvalue
-_PATIENCE = 25  # steps in which the best eigenvalue has to rise by _PROGRESS of itself
-_PROGRESS = 0.02
+_WINDOW = 10  # last steps, whose rise tells whether those that are left can reach zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,14 +99,18 @@ class HandednessAscent:
         return measured(matrix, state.smallest, state.scale)
 
     def converged(self, state: AscentState, measurement: Measurement) -> Status | None:
-        """CONVERGED with a positive eigenvalue, STALLED where it has stopped rising."""
+        """CONVERGED with a positive eigenvalue, STALLED where it rises too slowly to become one.
+
+        Steps gain less and less, so that the rise of the last ones, times those that are left, is
+        more than there is to come.
+        """
         if state.smallest > POSITIVE * state.scale:
             return Status.CONVERGED
-        if len(state.best) <= _PATIENCE:
+        if len(state.best) <= _WINDOW:
             return None
-        before = state.best[-1 - _PATIENCE]
-        has_risen = state.best[-1] - before > _PROGRESS * abs(before)
-        return None if has_risen else Status.STALLED
+        rise = (state.best[-1] - state.best[-1 - _WINDOW]) / _WINDOW
+        steps_left = self.max_iterations - state.k
+        return None if state.best[-1] + steps_left * rise > 0.0 else Status.STALLED
 
     def _count(self, matrix: HandedMatrix) -> int:
         return min(self.num_eigenvalues, 3 * len(matrix.free) - 1)

@@ -81,6 +81,40 @@ def test_no_term_is_below_zero_on_rotations_by_more_than_is_subtracted(
     assert terms.loss() <= 1e-12 * np.linalg.norm(terms.P, axis=(1, 2)).sum()
 
 
+@given(seed=SEEDS, n=SIZES, scale=SCALES)
+def test_what_a_negative_P_can_cost_is_subtracted(seed: int, n: int, scale: float) -> None:
+    graph = varied_graph(seed, n, 3)
+    terms = random_terms(graph, random_poses(n, 3, seed), seed, scale)
+    negative = replace(terms, P=terms.P - 2.0 * scale * np.eye(3))
+    R = nearest_rotations(random_poses(n, 3, seed + 1).R)
+    least = total(np.minimum(exact_terms(negative, R), MP.mpf(0)))
+    assert least >= -exact(negative.loss())
+    assert negative.loss() > 0.1 * scale
+
+
+def test_the_loss_is_taken_off_the_bound() -> None:
+    problem = PGOProblem(varied_graph(1, 8, 3))
+    poses = polish(problem, chordal_start(problem))
+    Lambda = multipliers(problem, poses)
+    F = problem.objective(poses)
+    terms = random_terms(problem.graph, poses, 0, 1e-3)
+    rough = replace(terms, T=terms.T + 1e-7)
+    assert rough.loss() > 1e-12 * F
+    found = best_bound_with_terms(problem, Lambda, poses, 1e-6, F, rough)
+    less = best_bound(rough.taken_off(problem), Lambda, poses, 1e-6, F)
+    assert 0.0 < found.value <= less.value - rough.loss()
+    assert found.rounding == less.rounding + rough.loss()
+
+
+def test_robots_take_the_loss_off_their_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(HandednessTerms, "loss", lambda terms: 0.125)
+    problem = PGOProblem(ring_with_stiff_axes(0), weighting=Weighting.INFORMATION)
+    pipeline = solvers.Pipeline(second_try=False, staircase=None)
+    shared = solvers.solve(problem, pipeline, robots=3)
+    assert shared.certificate.bound.terms is not None
+    assert shared.lower_bound <= shared.objective - 0.125
+
+
 @given(seed=SEEDS, n=SIZES, coupled=st.booleans())
 def test_value_and_gradient_at_the_poses_stay(seed: int, n: int, coupled: bool) -> None:
     graph = informed(seed, n, 3, coupled)
