@@ -420,6 +420,19 @@ best_descent = min(loose_problem.objective(poses) for poses in descents)
 print(f"best of 40 descents {best_descent:.6f}, proven minimum {closed.lower_bound:.6f}")
 
 # %% [markdown]
+# The same constraint can be given to the relaxation itself: for a rotation $E$ with the unit
+# quaternion $q$ the matrix $4 q q^\top$ is linear in $E$, and $Z_{ij}$ is a mixture of rotations if and
+# only if this $4 \times 4$ matrix of $Z_{ij}$ is positive semidefinite. Here are both relaxations.
+
+# %%
+with_hulls = pgo.solve_relaxation(loose_problem, pgo.RelaxationForm.HULL_DUAL)
+for name, relaxation in (("without hulls", loose_relaxed), ("with hulls", with_hulls)):
+    print(
+        f"{name:13} value {relaxation.value:.4f}, rank of Z {relaxation.rank.rank}, "
+        f"Z rounded {relaxation.objective:.4f}, {relaxation.verdict.name}"
+    )
+
+# %% [markdown]
 # The answer was optimal all along. The relaxation's value is 0.2 % below it, because it admits blocks
 # $Z_{ij}$ that are no mixture of rotations. The terms are the multipliers of what excludes them: that
 # $Z_{ij}$ is in the convex hull of $\mathrm{SO}(3)$ (Saunderson, Parrilo, Willsky 2015). Olsson,
@@ -495,6 +508,8 @@ assert not loose.is_certified
 assert closed.is_certified
 assert closed.lower_bound <= best_descent * (1 + 1e-12)
 assert loose.lower_bound < closed.lower_bound
+assert with_hulls.verdict is pgo.Verdict.CERTIFIED
+assert with_hulls.rank.rank == 3
 assert all(abs(difference) < 1e-8 * objective for objective, difference, _ in rows.values())
 assert rows["8 poses, optimum"][2] > -1e-6
 assert rows["ring, optimum"][2] > -1e-6

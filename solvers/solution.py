@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict
+from pgo_models.certificates.certificate import Certificate, Verdict
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.proof_file import save_proof
 from pgo_models.errors import SettingError
@@ -361,7 +361,7 @@ class Solution:
         certificate = self.certificate
         size = f"{len(graph.bodies)} poses, {graph.num_edges} edges{graph.extras}, {graph.d}D"
         bound = certificate.bound_text
-        if certificate.source is BoundSource.RELAXATION:
+        if certificate.source.is_of_relaxation:
             bound += "   (the semidefinite relaxation's)"
         facts = [
             ("graph", f"{graph.name}: {size}"),

@@ -28,7 +28,7 @@ from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
-from solvers.handedness.search import HandednessSearch
+from solvers.handedness.search import HandednessSearch, stage_of_relaxation
 from solvers.loop import RunMonitor
 from solvers.result import OUT_OF_TIME, History, Record, Run, Stage, Status
 from solvers.riemannian.certify import with_shrunk_information
@@ -379,7 +379,11 @@ class ImproveBound:
 
 @dataclass(frozen=True, eq=False)
 class SeekHandednessTerms:
-    """Handedness terms at the best poses, where the certificate can still improve in space."""
+    """Handedness terms at the best poses, where the certificate can still improve in space.
+
+    Where no terms suffice there, small graphs get the bound of the relaxation with hulls of
+    rotations, and terms are sought again at its poses if these cost less.
+    """
 
     job: Job
     search: HandednessSearch
@@ -390,24 +394,50 @@ class SeekHandednessTerms:
         return "handedness terms"
 
     def run(self, answer: Answer) -> Answer:
-        """Return the same poses, with the better bound."""
+        """Return the answer with the better poses and the better bound."""
+        job = self.job
+        if job.problem.d == 2 or not self._is_open(answer):
+            return answer
+        try:
+            answer = self._with_terms(answer)
+            if not self._is_open(answer):
+                return answer
+            relaxed = self._with_hulls(answer)
+            if relaxed.poses is not answer.poses and self._is_open(relaxed):
+                return self._with_terms(relaxed)
+            return relaxed
+        except KeyboardInterrupt:
+            objective = job.problem.objective(answer.current_poses)
+            job.stages.append(Stage.interruption(objective))
+        except NotPositiveDefiniteError:
+            pass  # the bound stays as it is
+        return answer
+
+    def _is_open(self, answer: Answer) -> bool:
+        """Whether the certificate can improve, and there is time for it."""
+        return answer.current_certificate.can_improve and not self.job.is_out_of_time
+
+    def _with_terms(self, answer: Answer) -> Answer:
+        """The same poses, with the better bound."""
         job = self.job
         problem = job.problem
-        certificate = answer.current_certificate
-        if problem.d == 2 or job.is_out_of_time or not certificate.can_improve:
-            return answer
         poses = problem.at_best_translations(answer.current_poses)
-        try:
-            terms, stages = self.search.run(problem, poses, job.monitor)
-        except KeyboardInterrupt:
-            objective = problem.objective(answer.current_poses)
-            job.stages.append(Stage.interruption(objective))
-            return answer
-        except NotPositiveDefiniteError:
-            return answer
+        terms, stages = self.search.run(problem, poses, job.monitor)
         job.stages.extend(stages)
-        judged = judge(problem, answer.current_poses, certificate)
+        judged = judge(problem, answer.current_poses, answer.current_certificate)
         return replace(answer, certificate=with_terms(problem, judged, terms, poses))
+
+    def _with_hulls(self, answer: Answer) -> Answer:
+        """The better poses and the better bound of the answer and the relaxation with hulls."""
+        job = self.job
+        problem = job.problem
+        relaxed = self.search.relax(problem, job.gap, job.monitor)
+        if relaxed is None:
+            return answer
+        poses = polish(problem, relaxed.poses)
+        job.stages.append(stage_of_relaxation(relaxed, problem.objective(poses)))
+        other = judge(problem, poses, relaxed.certificate)
+        return job.better(answer, replace(other, poses=poses, poses_objective=other.objective))
 
 
 def finer(soc: AnySOC) -> AnySOC:

@@ -25,9 +25,13 @@ def written(folder: Path, graph: PoseGraph) -> Path:
     return path
 
 
-def proof_of(path: Path, weighting: Weighting = Weighting.ISOTROPIC) -> tuple[Certificate, Path]:
+def proof_of(
+    path: Path,
+    weighting: Weighting = Weighting.ISOTROPIC,
+    pipeline: solvers.Pipeline | None = None,
+) -> tuple[Certificate, Path]:
     """Solve a file; the certificate, and its proof beside it."""
-    solution = solvers.solve(PGOProblem(read_g2o(path), weighting=weighting))
+    solution = solvers.solve(PGOProblem(read_g2o(path), weighting=weighting), pipeline)
     proof = path.with_suffix(".json")
     solution.save_proof(proof)
     return solution.certificate, proof

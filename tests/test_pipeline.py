@@ -115,8 +115,8 @@ def test_where_the_relaxation_is_not_tight_its_bound_is_reported(seed):
     problem = pgo.PGOProblem(
         noisy_scene(SweptScene.GRID, np.deg2rad(90.0), np.random.default_rng(seed))
     )
-    without = solvers.solve(problem, solvers.Pipeline(staircase=None))
-    solution = solvers.solve(problem)
+    without = solvers.solve(problem, solvers.Pipeline(staircase=None, handedness=None))
+    solution = solvers.solve(problem, solvers.Pipeline(handedness=None))
     assert solution.certificate.source is BoundSource.RELAXATION
     assert solution.certificate.verdict is Verdict.NOT_CERTIFIED
     assert solution.objective <= without.objective

@@ -59,10 +59,19 @@ class BoundSource(enum.Enum):
         "where the staircase solved the semidefinite relaxation, "
         "whose optimum is below F if it is not tight"
     )
+    HULLS = (
+        "where the semidefinite relaxation with hulls of rotations was solved, "
+        "whose optimum is below F if it is not tight"
+    )
     SOFTENED = (
         "where smaller information matrices, whose cost is below chi2 at all poses, "
         "have their minimum"
     )
+
+    @property
+    def is_of_relaxation(self) -> bool:
+        """Whether the multipliers are those of a semidefinite relaxation as solved."""
+        return self in (BoundSource.RELAXATION, BoundSource.HULLS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,12 +368,14 @@ def certify_with(
     source: BoundSource,
     bound: LowerBound | None = None,
     ground: Poses | None = None,
+    terms: HandednessTerms | None = None,
 ) -> Certificate:
     """Certificate of poses with multipliers from anywhere: the proof asks nothing of them.
 
     Unless a bound is given that was proved with these multipliers already, it is found here,
     grounded at one of the poses `ground`: the given ones with their best translations, unless
-    given. A SettingError when gap is not positive and finite, or Lambda has the wrong shape.
+    given. Handedness terms, if any, are taken off the cost. A SettingError when gap is not positive
+    and finite, or Lambda has the wrong shape.
     """
     if not 0 < gap < math.inf:
         raise SettingError(f"gap is {gap}; give a positive relative gap, as 1e-6")
@@ -373,9 +384,12 @@ def certify_with(
     if bound is None:
         ground = ground if ground is not None else problem.at_best_translations(poses)
         tangent = problem.tangent_at(ground)
-        bound = (
-            NO_BOUND if rounding.is_exact else best_bound(tangent, Lambda, ground, gap, objective)
-        )
+        if rounding.is_exact:
+            bound = NO_BOUND
+        elif terms is None:
+            bound = best_bound(tangent, Lambda, ground, gap, objective)
+        else:
+            bound = best_bound_with_terms(tangent, Lambda, ground, gap, objective, terms)
     weighting = (
         problem.weighting if isinstance(problem.weighting, Weighting) else Weighting.ISOTROPIC
     )

@@ -30,7 +30,7 @@ import numpy as np
 from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, orthogonality_error, project_to_rotations
-from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, gamma
 from pgo_models.problem.problem import PGOProblem
 
@@ -50,7 +50,7 @@ class HandednessTerms(ReadOnly):
     i, j : (k,) array of int
         The poses of every pair.
     T : (k, 3, 3) array
-        Rotations, to rounding: R_i^T R_j where the bound is found.
+        Rotations, to rounding: R_i^T R_j where the bound is found, or any others.
     P : (k, 3, 3) array
         Positive semidefinite matrices, to rounding.
     """
@@ -62,7 +62,13 @@ class HandednessTerms(ReadOnly):
 
     @classmethod
     def at(cls, poses: Poses, i: IntArray, j: IntArray, P: Array) -> "HandednessTerms":
-        """Terms that are zero at poses, of the pairs whose P, (k, 3, 3), is not negligible.
+        """Terms that are zero at poses, of the pairs whose P, (k, 3, 3), is not negligible."""
+        T = np.swapaxes(poses.R[i], 1, 2) @ poses.R[j]
+        return cls.with_rotations(i, j, T, P)
+
+    @classmethod
+    def with_rotations(cls, i: IntArray, j: IntArray, T: Array, P: Array) -> "HandednessTerms":
+        """Terms of the pairs whose P, (k, 3, 3), is not negligible, with T, (k, 3, 3), projected.
 
         P is made symmetric, its negative eigenvalues are raised to zero, and `MARGIN` is added.
         """
@@ -73,10 +79,7 @@ class HandednessTerms(ReadOnly):
         axes = axes[chosen]
         raised = (axes * values[:, None, :]) @ np.swapaxes(axes, 1, 2)
         symmetric = 0.5 * (raised + np.swapaxes(raised, 1, 2))
-        i = i[chosen]
-        j = j[chosen]
-        T = project_to_rotations(np.swapaxes(poses.R[i], 1, 2) @ poses.R[j])
-        return cls(i, j, T, symmetric)
+        return cls(i[chosen], j[chosen], project_to_rotations(T[chosen]), symmetric)
 
     @property
     def num_pairs(self) -> int:
@@ -114,6 +117,17 @@ def weights_of(P: Array) -> Array:
     """W = (tr(P) / 2 I - P) / 4 of matrices P, (k, 3, 3)."""
     half_trace = 0.5 * np.einsum("kaa->k", P)
     return np.asarray(0.25 * (half_trace[:, None, None] * np.eye(3) - P))
+
+
+def distinct_pairs(graph: PoseGraph) -> IntArray:
+    """Pairs of poses with rotations that share an edge, (k, 2), in the order of their first edge.
+
+    The pose that the first edge begins at comes first.
+    """
+    turns = ~np.isin(graph.j, graph.landmarks)
+    ends = np.stack([graph.i[turns], graph.j[turns]], axis=1)
+    _, first = np.unique(np.sort(ends, axis=1), axis=0, return_index=True)
+    return np.asarray(ends[first])
 
 
 def closed_form_terms(problem: PGOProblem, poses: Poses) -> HandednessTerms | None:

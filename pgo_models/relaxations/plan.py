@@ -37,6 +37,13 @@ class RelaxationForm(enum.Enum):
     PRIMAL = "min tr(Q Z), Z_ii = I, Z PSD: one dense cone, translations marginalised out"
     DUAL = "max tr(Lambda), M - blockdiag(0, Lambda) PSD: one sparse linear matrix inequality"
     CLIQUES = "one small cone for every clique of a chordal extension"
+    HULL = "PRIMAL, and Z_ij in the convex hull of SO(3) at every edge"
+    HULL_DUAL = "DUAL, with a multiplier of the convex hull of SO(3) at every edge"
+
+    @property
+    def has_hull(self) -> bool:
+        """Whether blocks are mixtures of rotations: a tighter relaxation, in space."""
+        return self in (RelaxationForm.HULL, RelaxationForm.HULL_DUAL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +72,8 @@ def plan_relaxation(
     """Choose form and solver, unless they are given.
 
     They are the cliques with Clarabel where the cliques are small, and else the dense primal with
-    SCS. Nothing larger than the clique tree is formed. A SettingError when `memory_limit`, in
-    bytes, is exceeded or not positive.
+    SCS; the hull of rotations is posed only where it is asked for. Nothing larger than the clique
+    tree is formed. A SettingError when `memory_limit`, in bytes, is exceeded or not positive.
     """
     if not memory_limit > 0:
         raise SettingError(f"memory_limit is {memory_limit}; give positive bytes")
@@ -131,7 +138,7 @@ def _size_text(problem: PGOProblem, tree: CliqueTree) -> str:
 
 def _sides(problem: PGOProblem, tree: CliqueTree, form: RelaxationForm) -> Array:
     """Sides of all cones."""
-    if form is RelaxationForm.PRIMAL:
+    if form in (RelaxationForm.PRIMAL, RelaxationForm.HULL):
         return np.array([float(problem.d * problem.num_poses)])
     if form is RelaxationForm.CLIQUES:
         return np.asarray(clique_side(1, problem.d) + (problem.d + 1.0) * (tree.sizes - 1))
@@ -155,9 +162,9 @@ def _memory(
     if not solver.is_first_order:
         cones += _CLARABEL_BYTES * np.sum(triangles**2)
     dense_side = 0
-    if form is RelaxationForm.PRIMAL:
+    if form in (RelaxationForm.PRIMAL, RelaxationForm.HULL):
         dense_side = problem.d * problem.num_poses
-    elif form is RelaxationForm.DUAL:
+    elif form in (RelaxationForm.DUAL, RelaxationForm.HULL_DUAL):
         dense_side = problem.side  # cvxpy vectorises the inequality as a whole
     return float(cones + _DENSE_BYTES * dense_side**2)
 

@@ -26,11 +26,18 @@ from pgo_models.relaxations.primal_dual import (
     dual_relaxation,
     primal_relaxation,
 )
+from pgo_models.relaxations.rotation_hull import (
+    DualHullRelaxation,
+    PrimalHullRelaxation,
+    dual_hull_relaxation,
+    primal_hull_relaxation,
+)
 from pgo_models.relaxations.rounding import RankReport
 
 DEFAULT_RELAXATION_GAP = 1e-5
 TOLERANCE = 1e-10
 
+# The relaxations with hulls are subclasses of the first two.
 Relaxation = PrimalRelaxation | DualRelaxation | CliqueRelaxation
 
 
@@ -189,8 +196,20 @@ def solve_relaxation(
     relaxation = _posed(problem, plan)
     status = _solve(relaxation.model, plan.solver, time_limit, verbose)
     poses, rank = relaxation.rounded()
+    terms = None
+    source = BoundSource.RELAXATION
+    if isinstance(relaxation, PrimalHullRelaxation | DualHullRelaxation):
+        terms = relaxation.terms()
+        source = BoundSource.HULLS
     certificate = certify_with(
-        problem, poses, relaxation.Lambda(), gap, math.nan, BoundSource.RELAXATION, ground=poses
+        problem,
+        poses,
+        relaxation.Lambda(),
+        gap,
+        math.nan,
+        source,
+        ground=poses,
+        terms=terms,
     )
     value = float(relaxation.model.value) * relaxation.scale
     iterations = relaxation.model.solver_stats.num_iters or 0
@@ -208,6 +227,10 @@ def _posed(problem: PGOProblem, plan: RelaxationPlan) -> Relaxation:
         return clique_relaxation(problem, tree=plan.tree)
     if plan.form is RelaxationForm.PRIMAL:
         return primal_relaxation(problem)
+    if plan.form is RelaxationForm.HULL:
+        return primal_hull_relaxation(problem)
+    if plan.form is RelaxationForm.HULL_DUAL:
+        return dual_hull_relaxation(problem)
     return dual_relaxation(problem)
 
 

@@ -1,19 +1,23 @@
 """The search for handedness terms at given poses: the ascent, and the interior point after it."""
 
-from dataclasses import dataclass, field
+from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.handedness import HandednessTerms
+from pgo_models.certificates.handedness import HandednessTerms, distinct_pairs
+from pgo_models.errors import check_settings
 from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.problem import PGOProblem
 from solvers.handedness.ascent import AscentState, HandednessAscent
 from solvers.handedness.barrier import BarrierState, HandednessBarrier, is_small_enough
 from solvers.handedness.certificate_spectrum import HandedMatrix
 from solvers.loop import RunMonitor
-from solvers.result import OUT_OF_TIME, Outcome, Stage
+from solvers.result import OUT_OF_TIME, History, Outcome, Stage, Status
+
+if TYPE_CHECKING:
+    from pgo_models.relaxations.solve_sdp import RelaxationSolution
 
 
 @dataclass(frozen=True)
@@ -27,10 +31,23 @@ class HandednessSearch:
     barrier : HandednessBarrier or None
         What is tried next, where the ascent did not find terms and the graph is small: it finds
         them if there are any on pairs of poses that share an edge. None leaves it out.
+    most_hull_pairs : int
+        Pairs up to which the relaxation with the convex hull of rotations is solved, by cvxpy and
+        Clarabel, where no terms at the poses suffice. It gives the best bound that multipliers and
+        terms have, and poses that the staircase may miss. 0 leaves it out.
+
+    Raises
+    ------
+    SettingError
+        If `most_hull_pairs` is negative.
     """
 
     ascent: HandednessAscent = field(default_factory=HandednessAscent)
     barrier: HandednessBarrier | None = field(default_factory=HandednessBarrier)
+    most_hull_pairs: int = 150
+
+    def __post_init__(self) -> None:
+        check_settings(self, not_negative=["most_hull_pairs"])
 
     def run(
         self, problem: PGOProblem, poses: Poses, monitor: RunMonitor
@@ -39,7 +56,7 @@ class HandednessSearch:
 
         The poses have their best translations; of chi2 the terms are for the tangent there.
         """
-        i, j = pairs_with_edges(problem.graph)
+        i, j = distinct_pairs(problem.graph).T
         tangent = problem.tangent_at(poses)
         matrix = HandedMatrix(tangent, multipliers(problem, poses), poses, i, j)
         ascent = monitor.run(self.ascent, matrix)
@@ -53,13 +70,34 @@ class HandednessSearch:
             best = max(best, barrier.state, key=lambda state: state.smallest)
         return HandednessTerms.at(poses, i, j, best.P), stages
 
+    def relax(
+        self, problem: PGOProblem, gap: float, monitor: RunMonitor
+    ) -> RelaxationSolution | None:
+        """Return the solution of the relaxation with hulls, None of graphs that are too large."""
+        num_pairs = len(distinct_pairs(problem.graph))
+        if not problem.is_quadratic or num_pairs > self.most_hull_pairs:
+            return None
+        # cvxpy is slow to import
+        from pgo_models.relaxations.plan import RelaxationForm
+        from pgo_models.relaxations.solve_sdp import solve_relaxation
 
-def pairs_with_edges(graph: PoseGraph) -> tuple[IntArray, IntArray]:
-    """Pairs of poses that share an edge and have rotations, each once, as their first edge runs."""
-    turns = ~np.isin(graph.j, graph.landmarks)
-    ends = np.stack([graph.i[turns], graph.j[turns]], axis=1)
-    _, first = np.unique(np.sort(ends, axis=1), axis=0, return_index=True)
-    return ends[first, 0], ends[first, 1]
+        form = RelaxationForm.HULL_DUAL
+        return solve_relaxation(problem, form, gap=gap, time_limit=monitor.left)
+
+
+def stage_of_relaxation(solution: RelaxationSolution, objective: float) -> Stage:
+    """Stage of a relaxation with hulls, and the cost of the poses that follow from it."""
+    is_solved = solution.status.name == "OPTIMAL"
+    status = Status.CONVERGED if is_solved else Status.STALLED
+    return Stage(
+        "hulls of rotations",
+        status,
+        solution.iterations,
+        objective,
+        solution.seconds,
+        History(),
+        finds_poses=False,
+    )
 
 
 def _stage_of(outcome: Outcome[AscentState] | Outcome[BarrierState]) -> Stage:

@@ -8,7 +8,7 @@ import shlex
 from decimal import Decimal
 from typing import Protocol
 
-from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict
+from pgo_models.certificates.certificate import Certificate, Verdict
 from pgo_models.figures import in_percent, rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -146,7 +146,7 @@ def _conclusion(certificate: Certificate) -> str:
         return _OPTIMAL
     if certificate.gap <= _NEARLY_CLOSED:
         return _NEARLY_OPTIMAL
-    if certificate.source is BoundSource.RELAXATION:
+    if certificate.source.is_of_relaxation:
         return _NOT_TIGHT
     return _UNDECIDED
 
@@ -268,7 +268,7 @@ def _advice_if_not_certified(
         suggestions.append(Advice(text, f"{solve} --start file"))
     text = "Go straight from the chordal start to Newton."
     suggestions.append(Advice(text, f"{solve} --method newton"))
-    if certificate.source is BoundSource.RELAXATION:
+    if certificate.source.is_of_relaxation:
         wanted = "more of them, less noisy ones, or without those that are wrong"
         text = f"Better poses may not exist; then only better measurements close the gap: {wanted}."
         suggestions.append(Advice(text, f"{solve} --robust gnc"))

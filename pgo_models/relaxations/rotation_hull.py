@@ -1,0 +1,215 @@
+"""The relaxation with the convex hull of SO(3) at every edge, as cvxpy models: primal and dual.
+
+    primal   min tr(Q Z)                  Z_ii = I, Z PSD, A(Z_ij) PSD at every edge (i, j)
+    dual     max sum tr Lambda_i - sum tr Pi_e     Pi_e PSD,
+             M - blockdiag(0, Lambda) - sum_e N(Pi_e) PSD
+
+For a rotation E with the unit quaternion q, A(E) = 4 q q^T, which is linear in E: the matrices E
+with A(E) PSD are the mixtures of rotations (Saunderson, Parrilo & Willsky 2015). N(Pi) is the
+symmetric matrix with tr(X^T N X) = <Pi, A(R_i^T R_j)> - tr(Pi). The relaxation without A admits
+mirror images of rotations, too. For rotation averaging with anisotropic costs the same hull is
+added by Olsson, Lochman, Malmport & Zach (2025).
+
+A multiplier Pi that is zero on some unit quaternion, as it is where A(Z_ij) is not zero, is a
+handedness term: q^T Pi q = v^T P v / 4 with v the vector part of the quaternion of T^T E, where T
+is the rotation of that quaternion (`pgo_models.certificates.handedness`).
+"""
+
+from dataclasses import dataclass
+
+import cvxpy as cp
+import numpy as np
+from scipy.sparse import csc_array
+
+from pgo_models.certificates.handedness import HandednessTerms, distinct_pairs
+from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.relaxations.primal_dual import (
+    DualRelaxation,
+    PrimalRelaxation,
+    dual_relaxation,
+    primal_relaxation,
+)
+
+
+def _quaternion_products() -> Array:
+    """The matrices C_ab, (3, 3, 4, 4), with A(E) = I + sum_ab E_ab C_ab, q = (w, x, y, z)."""
+    C = np.zeros((3, 3, 4, 4))
+    signs = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    for k in range(4):
+        for a in range(3):
+            C[a, a, k, k] = signs[k, a]
+    for a in range(3):
+        b = (a + 1) % 3
+        c = (a + 2) % 3
+        # 4 w x_a = E_cb - E_bc, and 4 x_b x_c = E_bc + E_cb
+        for row, column in ((0, a + 1), (a + 1, 0)):
+            C[c, b, row, column] = 1.0
+            C[b, c, row, column] = -1.0
+        for row, column in ((b + 1, c + 1), (c + 1, b + 1)):
+            C[b, c, row, column] = 1.0
+            C[c, b, row, column] = 1.0
+    return C
+
+
+PRODUCTS = _quaternion_products()
+
+
+def hull_matrices(E: Array) -> Array:
+    """A(E), (k, 4, 4), of matrices E, (k, 3, 3): 4 q q^T for rotations, PSD for their mixtures."""
+    return np.asarray(np.eye(4) + np.einsum("kab,abcd->kcd", E, PRODUCTS))
+
+
+@dataclass(frozen=True, eq=False)
+class PrimalHullRelaxation(PrimalRelaxation):
+    """The primal with a hull constraint at every edge.
+
+    Parameters
+    ----------
+    edges : (k, 2) array of int
+        The poses of every constrained pair.
+    hull : tuple of constraints
+        A(Z_ij) is PSD; the dual value of each is Pi_e / scale.
+    """
+
+    edges: IntArray
+    hull: tuple[cp.Constraint, ...]
+
+    def Lambda(self) -> Array:
+        """Multipliers, (n, d, d), of the cost less the terms, as solved."""
+        return _less_diagonal_blocks(super().Lambda(), self.terms())
+
+    def terms(self) -> HandednessTerms:
+        """The handedness terms of the multipliers Pi, as solved."""
+        dual_values = np.stack([constraint.dual_value for constraint in self.hull])
+        return terms_of(self.edges, self.scale * dual_values)
+
+
+@dataclass(frozen=True, eq=False)
+class DualHullRelaxation(DualRelaxation):
+    """The dual with a multiplier Pi for every edge.
+
+    Parameters
+    ----------
+    edges : (k, 2) array of int
+        The poses of every pair with a multiplier.
+    multipliers : list of (4, 4) cp.Variable
+        Pi_e / scale.
+    """
+
+    edges: IntArray
+    multipliers: list[cp.Variable]
+
+    def Lambda(self) -> Array:
+        """Multipliers, (n, d, d), of the cost less the terms, as solved."""
+        return _less_diagonal_blocks(super().Lambda(), self.terms())
+
+    def terms(self) -> HandednessTerms:
+        """The handedness terms of the multipliers Pi, as solved."""
+        values = np.stack([variable.value for variable in self.multipliers])
+        return terms_of(self.edges, self.scale * values)
+
+
+def primal_hull_relaxation(problem: PGOProblem) -> PrimalHullRelaxation:
+    """Pose the primal; a SettingError in the plane, or where Q would be too large."""
+    plain = primal_relaxation(problem)
+    edges = edges_of(problem)
+    linear_map = PRODUCTS.reshape(9, 16).T
+    hull = []
+    for i, j in edges.tolist():
+        block = plain.Z[3 * i : 3 * i + 3, 3 * j : 3 * j + 3]
+        products = linear_map @ cp.reshape(block, (9,), order="C")
+        matrix = cp.reshape(products, (4, 4), order="C") + np.eye(4)
+        hull.append(matrix >> 0)
+    model = cp.Problem(plain.model.objective, [*plain.orthogonality, *hull])
+    return PrimalHullRelaxation(
+        problem, model, plain.Z, plain.orthogonality, plain.scale, edges, tuple(hull)
+    )
+
+
+def dual_hull_relaxation(problem: PGOProblem) -> DualHullRelaxation:
+    """Pose the dual as one sparse linear matrix inequality, beside a small cone for every edge."""
+    plain = dual_relaxation(problem)
+    edges = edges_of(problem)
+    multipliers = [cp.Variable((4, 4), name=f"Pi_{e}", PSD=True) for e in range(len(edges))]
+    stacked = cp.hstack([cp.reshape(Pi, (16,), order="C") for Pi in multipliers])
+    side = plain.certificate.args[0].shape[0]
+    coupling = cp.reshape(_coupling_blocks(edges, side) @ stacked, (side, side), order="F")
+    certificate = (plain.certificate.args[0] - coupling) >> 0
+    trace = sum(cp.trace(Pi) for Pi in multipliers)
+    model = cp.Problem(cp.Maximize(plain.model.objective.args[0] - trace), [certificate])
+    return DualHullRelaxation(
+        problem, model, plain.upper, certificate, plain.scale, edges, multipliers
+    )
+
+
+def edges_of(problem: PGOProblem) -> IntArray:
+    """Pairs of poses that share an edge, (k, 2), each once; a SettingError in the plane."""
+    if problem.d == 2:
+        raise SettingError(
+            "the hull of rotations adds nothing in the plane; take another RelaxationForm"
+        )
+    return distinct_pairs(problem.graph)
+
+
+def terms_of(edges: IntArray, Pi: Array) -> HandednessTerms:
+    """Handedness terms that are zero on the softest quaternion of every Pi, (k, 4, 4).
+
+    With tau the eigenvector of the smallest eigenvalue of Pi, T is its rotation and P = 4 L Pi L^T,
+    where L q is the vector part of conj(tau) q.
+    """
+    symmetric = 0.5 * (Pi + np.swapaxes(Pi, 1, 2))
+    _, vectors = np.linalg.eigh(symmetric)
+    w, x, y, z = vectors[:, :, 0].T
+    L = np.stack(
+        [
+            np.stack([-x, w, z, -y], axis=1),
+            np.stack([-y, -z, w, x], axis=1),
+            np.stack([-z, y, -x, w], axis=1),
+        ],
+        axis=1,
+    )
+    P = 4.0 * L @ symmetric @ np.swapaxes(L, 1, 2)
+    return HandednessTerms.with_rotations(edges[:, 0], edges[:, 1], _rotations(w, x, y, z), P)
+
+
+def _less_diagonal_blocks(Lambda: Array, terms: HandednessTerms) -> Array:
+    """Lambda, (n, 3, 3), less what a term has on the diagonal of B^T W B: T W T^T and W.
+
+    N(Pi) has nothing there, and a constant in its place.
+    """
+    reduced = Lambda.copy()
+    turned = terms.T @ terms.W @ np.swapaxes(terms.T, 1, 2)
+    np.subtract.at(reduced, terms.i, turned)
+    np.subtract.at(reduced, terms.j, terms.W)
+    return reduced
+
+
+def _rotations(w: Array, x: Array, y: Array, z: Array) -> Array:
+    """Rotations of unit quaternions, (k, 3, 3)."""
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def _coupling_blocks(edges: IntArray, side: int) -> csc_array:
+    """The matrix that takes all Pi, (16 k,), to sum_e N(Pi_e), its columns stacked.
+
+    The block (i, j) of N is half of sum_ab <Pi, C_ab> e_a e_b^T, and (j, i) its transpose; the
+    rotations of pose i have the rows n - 1 + 3 i of a matrix without the row of t_0.
+    """
+    num_translations = (side - 3) // 4
+    a, b, c, d = np.nonzero(PRODUCTS)
+    values = 0.5 * PRODUCTS[a, b, c, d]
+    row = num_translations + 3 * edges[:, :1] + a
+    column = num_translations + 3 * edges[:, 1:] + b
+    entry = 16 * np.arange(len(edges))[:, None] + 4 * c + d
+    weights = np.broadcast_to(values, entry.shape).ravel()
+    places = np.concatenate([(row + side * column).ravel(), (column + side * row).ravel()])
+    entries = np.tile(entry.ravel(), 2)
+    return csc_array((np.tile(weights, 2), (places, entries)), shape=(side * side, 16 * len(edges)))

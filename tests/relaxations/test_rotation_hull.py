@@ -1,0 +1,137 @@
+"""The relaxation with the convex hull of SO(3) at every edge, and the terms of its multipliers."""
+
+import json
+from pathlib import Path
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from budget import examples
+from graphs import SEEDS, restarts, varied_problem
+from hypothesis import given, settings, strategies as st
+
+import solvers
+from pgo_models.certificates.certificate import Verdict
+from pgo_models.certificates.proof_file import save_proof
+from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import random_rotations
+from pgo_models.graphs.g2o import read_g2o, write_g2o
+from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.relaxations.plan import RelaxationForm
+from pgo_models.relaxations.rotation_hull import (
+    dual_hull_relaxation,
+    hull_matrices,
+    primal_hull_relaxation,
+    terms_of,
+)
+from pgo_models.relaxations.solve_sdp import solve_relaxation
+from pgo_models.verification.verify import verify_proof
+from solvers.studies.tightness import SweptScene, noisy_scene
+
+HULLS = [RelaxationForm.HULL, RelaxationForm.HULL_DUAL]
+BURNING = NoiseModel(0.5, 1.5)
+
+
+@given(SEEDS)
+def test_the_matrix_of_a_rotation_is_its_quaternions_product(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    R = random_rotations(4, 3, rng)
+    A = hull_matrices(R)
+    values, vectors = np.linalg.eigh(A)
+    np.testing.assert_allclose(values, [[0.0, 0.0, 0.0, 4.0]] * 4, rtol=0, atol=1e-12)
+    w, x, y, z = vectors[:, :, 3].T
+    np.testing.assert_allclose(4 * w * w, 1 + np.einsum("kaa->k", R), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(4 * w * z, R[:, 1, 0] - R[:, 0, 1], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(4 * x * y, R[:, 1, 0] + R[:, 0, 1], rtol=0, atol=1e-12)
+    mirrored = R * np.array([1.0, 1.0, -1.0])
+    assert (np.linalg.eigvalsh(hull_matrices(mirrored))[:, 0] < -1.0).all()
+    mixtures = np.einsum("sk,kab->sab", rng.dirichlet(np.ones(4), 5), R)
+    assert (np.linalg.eigvalsh(hull_matrices(mixtures))[:, 0] >= -1e-12).all()
+
+
+@given(SEEDS)
+def test_terms_are_the_multipliers_where_these_vanish(seed: int) -> None:
+    """<Pi, A(E)> = v^T P v for a Pi that is zero on one quaternion."""
+    rng = np.random.default_rng(seed)
+    roots = rng.standard_normal((1, 4, 3))
+    Pi = roots @ np.swapaxes(roots, 1, 2)  # of rank 3
+    terms = terms_of(np.array([[0, 1]]), Pi)
+    E = random_rotations(20, 3, rng)
+    expected = np.einsum("cd,kcd->k", Pi[0], hull_matrices(E))
+    turned = terms.T[0].T @ E
+    found = np.einsum("ab,kab->k", terms.W[0], 2 * np.eye(3) - turned - np.swapaxes(turned, 1, 2))
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6 * np.abs(Pi).max())
+
+
+@settings(max_examples=examples(8))
+@given(seed=SEEDS, n=st.integers(2, 7))
+def test_primal_and_dual_agree_and_are_between_the_plain_relaxation_and_F(
+    seed: int, n: int
+) -> None:
+    problem = varied_problem(seed, n, 3, BURNING)
+    F = solvers.solve(problem).objective
+    plain = solve_relaxation(problem, RelaxationForm.DUAL, "CLARABEL")
+    solutions = [solve_relaxation(problem, form) for form in HULLS]
+    allowed = 1e-5 * max(1.0, F)
+    assert solutions[0].value == pytest.approx(solutions[1].value, abs=allowed)
+    for solution in solutions:
+        assert plain.value <= solution.value + allowed
+        assert solution.value <= F + allowed
+        assert solution.lower_bound <= F
+        assert solution.lower_bound >= solution.value - 10.0 * allowed - 1e-3 * F
+
+
+def test_both_models_as_posed_have_one_value() -> None:
+    problem = varied_problem(3, 5, 3, BURNING)
+    primal = primal_hull_relaxation(problem)
+    primal.model.solve(solver=cp.CLARABEL, max_threads=1)
+    dual = dual_hull_relaxation(problem)
+    dual.model.solve(solver=cp.CLARABEL, max_threads=1)
+    assert dual.model.value * dual.scale == pytest.approx(
+        primal.model.value * primal.scale, rel=1e-4
+    )
+
+
+def test_a_graph_that_the_plain_relaxation_leaves_open_is_tight_with_hulls(tmp_path: Path) -> None:
+    graph = noisy_scene(SweptScene.GRID, np.deg2rad(60), np.random.default_rng(3))
+    path = tmp_path / "graph.g2o"
+    write_g2o(graph, path)
+    problem = PGOProblem(read_g2o(path))
+    plain = solve_relaxation(problem)
+    assert plain.verdict is Verdict.NOT_CERTIFIED
+    hulls = solve_relaxation(problem, RelaxationForm.HULL_DUAL)
+    assert hulls.verdict is Verdict.CERTIFIED
+    assert hulls.rank.rank == 3
+    assert hulls.objective <= solvers.solve(problem).objective * (1 + 1e-7)
+    assert plain.lower_bound < hulls.lower_bound <= restarts(problem, 20, 0) * (1 + 1e-12)
+    proof = tmp_path / "proof.json"
+    save_proof(problem, hulls.certificate, proof)
+    assert verify_proof(path, proof).is_verified
+    assert (
+        len(json.loads(proof.read_text())["handedness"]) == hulls.certificate.bound.terms.num_pairs
+    )
+
+
+def test_where_no_terms_suffice_solve_has_the_bound_of_the_hulls(tmp_path: Path) -> None:
+    graph = noisy_scene(SweptScene.GRID, np.deg2rad(70), np.random.default_rng(4))
+    path = tmp_path / "graph.g2o"
+    write_g2o(graph, path)
+    problem = PGOProblem(read_g2o(path))
+    without = solvers.solve(problem, solvers.Pipeline(handedness=None))
+    solution = solvers.solve(problem)
+    assert not solution.is_certified
+    assert solution.certificate.gap < without.certificate.gap / 3.0
+    assert solution.stages[-1].name == "hulls of rotations"
+    assert solution.status is without.status
+    assert solution.lower_bound <= restarts(problem, 20, 0)
+    assert "hulls of rotations" in solution.certificate.source.value
+    proof = tmp_path / "proof.json"
+    save_proof(problem, solution.certificate, proof)
+    assert verify_proof(path, proof).is_verified
+
+
+@pytest.mark.parametrize("form", HULLS)
+def test_in_the_plane_hulls_are_refused(form: RelaxationForm) -> None:
+    with pytest.raises(SettingError, match="adds nothing in the plane"):
+        solve_relaxation(varied_problem(0, 4, 2), form)
