@@ -62,15 +62,16 @@ class Term:
 
 @dataclass(frozen=True, eq=False)
 class OrthogonalPoint:
-    """Where SOC starts or ends.
+    """Point at which the iteration of SOC starts or ends.
 
     Parameters
     ----------
     copies : tuple of arrays
         For every term, a point of its set.
     normals : tuple of arrays
-        For every term, rho B: the multiplier, as a vector normal to the set at the copy. At a
-        stationary point minus their sum over the terms of a variable is a subgradient of J.
+        For every term, the multiplier N = rho B, where B is the scaled multiplier of X = copy. At a
+        stationary point N is normal to the set at the copy, and -(sum of N over the terms of a
+        variable) is a subgradient of J.
     """
 
     copies: tuple[Array, ...]
@@ -391,7 +392,8 @@ class OrthogonalProblem(HoldsModel):
         problem = cp.Problem(objective, self.problem.constraints)
         if not problem.is_dcp(dpp=True):
             raise SettingError(
-                "a Parameter of the problem is not used by the rules of DPP; see cvxpy's manual"
+                "the problem uses a Parameter in a way that breaks the rules of disciplined "
+                "parametrized programming (DPP); see cvxpy's manual"
             )
         return SplitProblem(problem, self.variables, self.others, self.terms, root, shifts, solver)
 
@@ -442,7 +444,8 @@ class KKTResiduals:
     feasibility : float
         Norm of the violation of all constraints, and of the agreement of a variable's copies.
     stationarity : float
-        rho ||X - Z||_F, see `kkt_residuals`.
+        Norm over all variables of m rho (X - Z), m the number of terms of the variable, see
+        `kkt_residuals`.
     gradient_norm : float
         Norm of the subgradient of J that the multipliers balance: the scale of `stationarity`.
     multipliers : tuple of arrays
@@ -467,9 +470,10 @@ def kkt_residuals(
     rho should be of the order of the curvature of J. The normals N of the point, projected once
     more onto the normal spaces, are its multipliers: for X^T X = I they are -X Lambda. X is
     stationary if and only if -sum N is a subgradient of J at X, and that holds if and only if X is
-    Z = argmin J + sum rho/2 ||Z - (X - N / rho)||^2. In general -sum N + rho (X - Z) is a
-    subgradient at Z (times the number of terms of the variable), so rho ||X - Z|| is what
-    stationarity lacks.
+    Z = argmin J + sum rho/2 ||Z - (X - N / rho)||^2. J stands for J minimised over y and the
+    convex constraints. In general -sum N + sum rho (X - Z) is a subgradient of it at Z, both sums
+    over the terms of a variable, so that the norm of the second measures how far X is from
+    stationary. Copies of X that disagree count one by one.
     """
     normals = []
     V = []
@@ -478,13 +482,10 @@ def kkt_residuals(
         normals.append(normal)
         V.append(copy - normal / rho)
     Z, others = problem.split(solver).solve(V, rho)
-    values = problem.values(point.copies)
-    gaps = []
-    for position, X in enumerate(values):
-        num_terms = len(problem.terms_of(position))
-        difference = X - Z[position]
-        gaps.append(num_terms * rho * difference)
-    gradients = [np.zeros(X.shape) for X in values]
+    gaps = [np.zeros(minimiser.shape) for minimiser in Z]
+    for term, copy in zip(problem.terms, point.copies, strict=True):
+        gaps[term.variable] += rho * (copy - Z[term.variable])
+    gradients = [np.zeros(minimiser.shape) for minimiser in Z]
     multipliers = []
     for term, copy, normal in zip(problem.terms, point.copies, normals, strict=True):
         gradients[term.variable] -= normal
@@ -518,8 +519,8 @@ def _minimised(problem: cp.Problem) -> cp.Expression:
     if maximises and not expression.is_concave():
         raise SettingError(
             f"the problem maximises {expression}, which is {expression.curvature.lower()}; "
-            "only a concave function can be: on X^T X = I the constant c ||X||_F^2 may be "
-            "subtracted to get one"
+            "only a concave function can be maximised: where X^T X = I, ||X||_F^2 is constant, and "
+            "c ||X||_F^2 may be subtracted to get one"
         )
     J = -expression if maximises else expression
     convex_solver.check_convex(J, "the objective")

@@ -3,7 +3,7 @@
 import enum
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cvxpy as cp
 
@@ -193,7 +193,32 @@ def solve_relaxation(
     plan = plan_relaxation(problem, form, solver, memory_limit)
     if verbose:
         print(plan)
-    relaxation = _posed(problem, plan)
+    solution = _solve_posed(problem, plan, None, gap, time_limit, verbose)
+    if plan.form is RelaxationForm.CLIQUES and not solution.certificate.is_certified:
+        # Cliques lose digits where their centre is far from the optimum: once more around the poses
+        # that were found, in the time that is left.
+        seconds_left = time_limit - (time.perf_counter() - began)
+        if seconds_left > 0:
+            centre = solution.poses
+            again = _solve_posed(problem, plan, centre, gap, seconds_left, verbose)
+            solution = max(solution, again, key=lambda found: found.lower_bound)
+    solution = replace(solution, seconds=time.perf_counter() - began)
+    if verbose:
+        print(solution)
+    return solution
+
+
+def _solve_posed(
+    problem: PGOProblem,
+    plan: RelaxationPlan,
+    centre: Poses | None,
+    gap: float,
+    time_limit: float,
+    verbose: bool,
+) -> RelaxationSolution:
+    """Pose the relaxation, that over cliques around a centre, solve it, round it and prove it."""
+    began = time.perf_counter()
+    relaxation = _posed(problem, plan, centre)
     status = _solve(relaxation.model, plan.solver, time_limit, verbose)
     poses, rank = relaxation.rounded()
     terms = None
@@ -212,19 +237,16 @@ def solve_relaxation(
         terms=terms,
     )
     value = float(relaxation.model.value) * relaxation.scale
-    iterations = relaxation.model.solver_stats.num_iters or 0
+    iterations = int(relaxation.model.solver_stats.num_iters or 0)
     seconds = time.perf_counter() - began
-    solution = RelaxationSolution(
-        relaxation, plan, status, value, certificate, rank, int(iterations), seconds
+    return RelaxationSolution(
+        relaxation, plan, status, value, certificate, rank, iterations, seconds
     )
-    if verbose:
-        print(solution)
-    return solution
 
 
-def _posed(problem: PGOProblem, plan: RelaxationPlan) -> Relaxation:
+def _posed(problem: PGOProblem, plan: RelaxationPlan, centre: Poses | None) -> Relaxation:
     if plan.form is RelaxationForm.CLIQUES:
-        return clique_relaxation(problem, tree=plan.tree)
+        return clique_relaxation(problem, centre, plan.tree)
     if plan.form is RelaxationForm.PRIMAL:
         return primal_relaxation(problem)
     if plan.form is RelaxationForm.HULL:

@@ -9,13 +9,13 @@ import numpy as np
 from pgo_models.errors import SettingError
 from pgo_models.graphs.pose_graph import IntArray
 
-DRIVER = -1  # stands for the driver among the numbers of senders and receivers
+DRIVER = -1  # the driver's number as a sender or receiver; robots are 0, 1, ..
 BYTES_PER_NUMBER = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Traffic:
-    """Messages of one exchange; the same object may be counted many times.
+    """Messages of one exchange; pass the same object each time the exchange is repeated.
 
     Parameters
     ----------
@@ -26,7 +26,9 @@ class Traffic:
     num_bytes : IntArray, (q,)
         Payload of every message, eight bytes a number.
     level : int
-        Level in a tree of robots, 1 at its leaves; 0 between driver and robots, or neighbours.
+        Level of the separator tree whose messages these are, in either direction: 1 between its
+        leaves and their parents, and so on towards the root. 0 for messages outside of the tree,
+        between the driver and robots or between neighbouring robots.
     """
 
     sender: IntArray
@@ -45,11 +47,14 @@ class Traffic:
 
 @dataclass(frozen=True, eq=False)
 class Ledger:
-    """Account of a distributed run; `Solution.ledger` has that of a solve by robots.
+    """Communication of a distributed run; a solve by robots returns it as `Solution.ledger`.
 
-    A round is one exchange that robots wait for: between neighbours, or to the driver and back,
-    level by level where there is a tree of robots. An all-reduce, after which all robots know the
-    sum of a few numbers, is counted apart.
+    A round is one exchange that robots wait for: between neighbouring robots, or from the robots to
+    the driver, the process that coordinates them, and back. The way through a separator tree, level
+    by level, is one round. An all-reduce, after which every robot knows the sum of a few numbers,
+    is counted in `all_reduces`, not in `rounds`. Where the driver does the summing, its messages
+    are in `counted` like any others; elsewhere no single messages are known, and only their payload
+    is added to `all_reduce_bytes`.
 
     Parameters
     ----------
@@ -60,13 +65,14 @@ class Ledger:
     all_reduces : int
         Number of all-reduces.
     all_reduce_bytes : int
-        Payload in bytes of the all-reduces whose messages are not in `counted`, up and down for
-        every robot.
+        Payload in bytes of the all-reduces that have no messages in `counted`: what every robot
+        sends, and the sums that it receives.
     counted : tuple of (Traffic, int)
         Exchanges, and how often each took place.
     snapshot_bytes : int
-        Bytes of the snapshots for recovery and checkpoints, which robots give the process of the
-        driver. They are no messages of a method, and are in none of the other figures.
+        Bytes of the snapshots for recovery and checkpoints, which robots send to the driver's
+        process. They are not part of an algorithm's communication, and are in none of the other
+        figures.
 
     Examples
     --------
@@ -96,11 +102,7 @@ class Ledger:
         Ledger
             The ledger with the round and its messages.
         """
-        # Keys are objects: another object with equal content is counted on its own.
-        counted = dict(self.counted)
-        for traffic in exchanged:
-            counted[traffic] = counted.get(traffic, 0) + 1
-        return replace(self, rounds=self.rounds + 1, counted=tuple(counted.items()))
+        return replace(self._with_messages(*exchanged), rounds=self.rounds + 1)
 
     def after_exchange(self, traffic: Traffic, is_round: bool) -> Ledger:
         """Return the ledger after an exchange.
@@ -110,15 +112,24 @@ class Ledger:
         traffic : Traffic
             Messages of the exchange.
         is_round : bool
-            Whether robots wait for it. Otherwise it is part of the next round, or of an all-reduce.
+            Whether it counts as a round of its own. Otherwise only its messages are recorded: the
+            round or all-reduce that it belongs to is counted by another call.
 
         Returns
         -------
         Ledger
             The ledger with the messages, and with the round if it is one.
         """
-        after = self.after_round(traffic)
-        return after if is_round else replace(after, rounds=self.rounds)
+        return self.after_round(traffic) if is_round else self._with_messages(traffic)
+
+    def _with_messages(self, *exchanged: Traffic) -> Ledger:
+        """The ledger with the messages of exchanges."""
+        # Traffic is hashed by identity: equal but distinct objects get entries of their own, which
+        # leaves all totals as they are.
+        counted = dict(self.counted)
+        for traffic in exchanged:
+            counted[traffic] = counted.get(traffic, 0) + 1
+        return replace(self, counted=tuple(counted.items()))
 
     def after_all_reduce(self, count: int) -> Ledger:
         """Return the ledger after one more all-reduce.
@@ -182,21 +193,21 @@ class Ledger:
 
     @property
     def messages(self) -> int:
-        """Number of messages in all.
+        """Number of messages in `counted`.
 
-        Messages by which a driver sums are among them; of other all-reduces `all_reduce_bytes` has
-        the bytes.
+        Messages of all-reduces that the driver carries out are among them. Other all-reduces add
+        none; their payload is in `all_reduce_bytes`.
         """
         return sum(times * len(traffic.sender) for traffic, times in self.counted)
 
     @property
     def num_bytes(self) -> int:
-        """Payload of all messages in bytes."""
+        """Payload of the messages in `counted`, in bytes."""
         return int(self.bytes_by_level.sum())
 
     @property
     def bytes_by_level(self) -> IntArray:
-        """Bytes on every level of a tree of robots, (levels + 1,); entry 0 is outside the tree."""
+        """Bytes on every level of the separator tree, (levels + 1,); entry 0 is outside of it."""
         level = [traffic.level for traffic, _ in self.counted]
         payload = [times * int(traffic.num_bytes.sum()) for traffic, times in self.counted]
         return np.bincount(level, weights=payload, minlength=1).astype(np.int64)

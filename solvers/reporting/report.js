@@ -27,8 +27,7 @@ function draw() {
   }
 }
 
-// The page is painted before the library, most of the file, is parsed.
-requestAnimationFrame(() => setTimeout(() => {
+function parseLibrary() {
   performance.mark("library");
   const library = document.createElement("script");
   library.textContent = content("library");
@@ -36,7 +35,13 @@ requestAnimationFrame(() => setTimeout(() => {
   [figures, settings] = ["figures", "settings"].map(id => JSON.parse(content(id)));
   draw();
   for (const query of [dark, narrow]) query.addEventListener("change", draw);
-}));
+}
+
+// The page is painted before the library, most of the file, is parsed.
+requestAnimationFrame(() => {
+  performance.mark("frame");
+  setTimeout(parseLibrary);
+});
 
 for (const table of document.querySelectorAll("table.sortable")) {
   const heads = [...table.tHead.rows[0].cells];
