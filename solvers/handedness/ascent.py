@@ -63,7 +63,7 @@ class HandednessAscent:
         If the steps are negative, or there are no eigenvalues.
     """
 
-    max_iterations: int = 150
+    max_iterations: int = 100
     num_eigenvalues: int = 8
 
     def __post_init__(self) -> None:

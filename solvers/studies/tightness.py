@@ -14,6 +14,7 @@ from pgo_models.figures import rounded_up
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NETWORK_KAPPA, NETWORK_TAU, NoiseModel, circle, grid, observe
+from solvers.handedness.search import HandednessSearch
 from solvers.pipeline import Pipeline
 from solvers.studies.benchmark_runs import solve_whole
 
@@ -41,7 +42,8 @@ class NoiseSweep:
     gap : ndarray, (levels, graphs)
         Gap of that solution; that of the relaxation is at most as large.
     certified_with_terms : ndarray of bool, (levels, graphs)
-        Whether `solvers.solve` certified its solution, with handedness terms where it needs them.
+        Whether `solvers.solve` certified its solution, with handedness terms at its poses where it
+        needs them.
     """
 
     scene: SweptScene
@@ -135,6 +137,7 @@ def noise_sweep(
     certified_with_terms = np.zeros_like(certified)
     gap = np.zeros((len(levels), graphs))
     relaxation_alone = Pipeline(handedness=None)
+    terms_at_the_poses = Pipeline(handedness=HandednessSearch(most_hull_pairs=0))
     for level, std in enumerate(levels):
         for number in range(graphs):
             graph = noisy_scene(scene, float(std), rng)
@@ -142,6 +145,6 @@ def noise_sweep(
             certified[level, number] = solution.is_certified
             gap[level, number] = solution.certificate.proven_gap
             if not solution.is_certified:
-                solution = solve_whole(graph)
+                solution = solve_whole(graph, terms_at_the_poses)
             certified_with_terms[level, number] = solution.is_certified
     return NoiseSweep(scene, levels, certified, gap, certified_with_terms)
