@@ -115,7 +115,10 @@ def _no_text(path: Path, num_lines: int, bytes_before: bytes) -> FileFormatError
 
 def _count_lines(data: bytes) -> int:
     """How many lines end in the data: with LF, CR or both."""
-    return data.count(b"\n") + data.count(b"\r") - data.count(b"\r\n")
+    num_lines = data.count(b"\n")
+    if b"\r" in data:  # to look for both in a row takes ten times as long
+        num_lines += data.count(b"\r") - data.count(b"\r\n")
+    return num_lines
 
 
 def check_length(path: Path | str, line: int, text: str) -> None:
