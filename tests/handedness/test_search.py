@@ -149,6 +149,7 @@ def noisy(scene: SweptScene, degrees: float, seed: int) -> PGOProblem:
     return PGOProblem(noisy_scene(scene, np.deg2rad(degrees), np.random.default_rng(seed)))
 
 
+@pytest.mark.slow  # solves from end to end
 @pytest.mark.parametrize(("scene", "degrees", "seed"), LOOSE)
 def test_graphs_that_the_relaxation_leaves_open_are_certified(
     scene: SweptScene, degrees: float, seed: int
@@ -167,6 +168,7 @@ def test_graphs_that_the_relaxation_leaves_open_are_certified(
     assert without.lower_bound <= solution.objective
 
 
+@pytest.mark.slow  # solves from end to end
 def test_the_interior_point_finds_what_the_ascent_does_not() -> None:
     problem = noisy(SweptScene.GRID, 60, 1)
     search = HandednessSearch(barrier=None, most_hull_pairs=0)
@@ -175,6 +177,7 @@ def test_the_interior_point_finds_what_the_ascent_does_not() -> None:
     assert solve(problem).is_certified
 
 
+@pytest.mark.slow  # solves from end to end
 def test_where_no_terms_suffice_the_answer_is_as_without_them() -> None:
     problem = noisy(SweptScene.GRID, 80, 0)
     without = solve(problem, Pipeline(handedness=None))

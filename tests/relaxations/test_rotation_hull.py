@@ -93,6 +93,7 @@ def test_both_models_as_posed_have_one_value() -> None:
     )
 
 
+@pytest.mark.slow  # solves from end to end
 def test_a_graph_that_the_plain_relaxation_leaves_open_is_tight_with_hulls(tmp_path: Path) -> None:
     graph = noisy_scene(SweptScene.GRID, np.deg2rad(60), np.random.default_rng(3))
     path = tmp_path / "graph.g2o"
@@ -113,6 +114,7 @@ def test_a_graph_that_the_plain_relaxation_leaves_open_is_tight_with_hulls(tmp_p
     )
 
 
+@pytest.mark.slow  # solves from end to end
 def test_where_no_terms_suffice_solve_has_the_bound_of_the_hulls(tmp_path: Path) -> None:
     graph = noisy_scene(SweptScene.GRID, np.deg2rad(70), np.random.default_rng(4))
     path = tmp_path / "graph.g2o"
