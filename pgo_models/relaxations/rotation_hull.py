@@ -23,7 +23,7 @@ from scipy.sparse import csc_array
 
 from pgo_models.certificates.handedness import HandednessTerms, distinct_pairs
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.rotations import Array, rotations_from_quaternions
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.primal_dual import (
@@ -172,7 +172,8 @@ def terms_of(edges: IntArray, Pi: Array) -> HandednessTerms:
         axis=1,
     )
     P = 4.0 * L @ symmetric @ np.swapaxes(L, 1, 2)
-    return HandednessTerms.with_rotations(edges[:, 0], edges[:, 1], _rotations(w, x, y, z), P)
+    T = rotations_from_quaternions(np.stack([x, y, z, w], axis=1))
+    return HandednessTerms.with_rotations(edges[:, 0], edges[:, 1], T, P)
 
 
 def _less_diagonal_blocks(Lambda: Array, terms: HandednessTerms) -> Array:
@@ -185,16 +186,6 @@ def _less_diagonal_blocks(Lambda: Array, terms: HandednessTerms) -> Array:
     np.subtract.at(reduced, terms.i, turned)
     np.subtract.at(reduced, terms.j, terms.W)
     return reduced
-
-
-def _rotations(w: Array, x: Array, y: Array, z: Array) -> Array:
-    """Rotations of unit quaternions, (k, 3, 3)."""
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
 
 
 def _coupling_blocks(edges: IntArray, side: int) -> csc_array:
