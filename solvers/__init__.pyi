@@ -17,7 +17,7 @@ from solvers.distributed.checkpoint import Checkpoint as Checkpoint
 from solvers.folder_solve import FolderSolution as FolderSolution, solve_folder as solve_folder
 from solvers.growing import extend as extend
 from solvers.handedness.ascent import HandednessAscent as HandednessAscent
-from solvers.handedness.barrier import HandednessBarrier as HandednessBarrier
+from solvers.handedness.hull_lagrangian import HullLagrangian as HullLagrangian
 from solvers.handedness.search import HandednessSearch as HandednessSearch
 from solvers.loop import Method as Method, Solver as Solver, iterate as iterate, run as run
 from solvers.network.engine import (
@@ -135,7 +135,7 @@ __all__ += [
     "reproduce_tables",
 ]
 # Types in the signatures of the names above.
-__all__ += ["HandednessAscent", "HandednessBarrier"]
+__all__ += ["HandednessAscent", "HullLagrangian"]
 __all__ += ["EdgeFit", "Outcome", "Rejection", "Support"]
 __all__ += ["CustomRStep", "RSubproblem", "RotationStep"]
 __all__ += ["OrthogonalSolution", "Sweep"]

@@ -26,11 +26,14 @@ from pgo_models.certificates.certificate import (
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
-from solvers.handedness.search import HandednessSearch, stage_of_relaxation
+from pgo_models.relaxations.rounding import round_factor
+from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
+from solvers.handedness.search import HandednessSearch, stage_of_search
 from solvers.loop import RunMonitor
-from solvers.result import OUT_OF_TIME, History, Record, Run, Stage, Status
+from solvers.result import OUT_OF_TIME, History, Outcome, Record, Run, Stage, Status
 from solvers.riemannian.certify import with_shrunk_information
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.polish import polish
@@ -39,6 +42,8 @@ from solvers.soc.paper import PaperSOC
 from solvers.soc.soc import SOC
 
 SECOND_TRY_TOLERANCE = 1e-6
+HULL_PASSES = 3
+CLOSER = 0.1  # factor on the tolerance of the next pass
 AnySOC = TypeVar("AnySOC", bound=SOC | PaperSOC)
 
 
@@ -379,10 +384,11 @@ class ImproveBound:
 
 @dataclass(frozen=True, eq=False)
 class SeekHandednessTerms:
-    """Handedness terms at the best poses, where the certificate can still improve in space.
+    """Handedness terms, where the certificate can still improve in space.
 
-    Where no terms suffice there, small graphs get the bound of the relaxation with hulls of
-    rotations, and terms are sought again at its poses if these cost less.
+    The first are sought at the best poses. Where these do not suffice, the relaxation with hulls of
+    rotations gives a better bound, and maybe better poses. It is solved in passes, each closer to
+    poses than the one before, and after each its multipliers are terms to begin with at the poses.
     """
 
     job: Job
@@ -400,12 +406,9 @@ class SeekHandednessTerms:
             return answer
         try:
             answer = self._with_terms(answer)
-            if not self._is_open(answer):
-                return answer
-            relaxed = self._with_hulls(answer)
-            if relaxed.poses is not answer.poses and self._is_open(relaxed):
-                return self._with_terms(relaxed)
-            return relaxed
+            relaxation = self.search.relaxation(job.problem, job.gap)
+            if relaxation is not None:
+                answer = self._with_hulls(answer, relaxation)
         except KeyboardInterrupt:
             objective = job.problem.objective(answer.current_poses)
             job.stages.append(Stage.interruption(objective))
@@ -417,27 +420,59 @@ class SeekHandednessTerms:
         """Whether the certificate can improve, and there is time for it."""
         return answer.current_certificate.can_improve and not self.job.is_out_of_time
 
-    def _with_terms(self, answer: Answer) -> Answer:
-        """The same poses, with the better bound."""
+    def _with_terms(self, answer: Answer, Pi: Array | None = None) -> Answer:
+        """The same poses, with the better bound, by terms that vanish there.
+
+        The ascent begins with those of the multipliers Pi, (pairs, 4, 4), or with none.
+        """
         job = self.job
         problem = job.problem
         poses = problem.at_best_translations(answer.current_poses)
-        terms, stages = self.search.run(problem, poses, job.monitor)
-        job.stages.extend(stages)
+        terms, stage = self.search.run(problem, poses, job.monitor, Pi)
+        job.stages.append(stage)
         judged = judge(problem, answer.current_poses, answer.current_certificate)
         return replace(answer, certificate=with_terms(problem, judged, terms, poses))
 
-    def _with_hulls(self, answer: Answer) -> Answer:
+    def _with_hulls(self, answer: Answer, relaxation: HullLagrangian) -> Answer:
         """The better poses and the better bound of the answer and the relaxation with hulls."""
         job = self.job
+        start: Poses | HullState = answer.current_poses
+        for _ in range(HULL_PASSES):
+            if not self._is_open(answer):
+                break
+            finished: Outcome[HullState] = job.monitor.run(relaxation, job.problem, start)
+            job.stages.append(stage_of_search(finished))
+            state = finished.state
+            known = answer
+            answer = self._better(answer, state)
+            is_close = state.closeness <= relaxation.tolerance
+            has_moved = answer.poses is not known.poses
+            if not (is_close or has_moved) or not self._is_open(answer):
+                break
+            answer = self._with_terms(answer, state.Pi)
+            if not is_close:
+                break
+            start = state
+            relaxation = replace(relaxation, tolerance=CLOSER * relaxation.tolerance)
+        return answer
+
+    def _better(self, answer: Answer, state: HullState) -> Answer:
+        """The better poses and the better bound of an answer and a state of the relaxation."""
+        job = self.job
         problem = job.problem
-        relaxed = self.search.relax(problem, job.gap, job.monitor)
-        if relaxed is None:
+        poses = polish(problem, round_factor(problem, state.point.Y)[0])
+        if state.bound is None:
             return answer
-        poses = polish(problem, relaxed.poses)
-        job.stages.append(stage_of_relaxation(relaxed, problem.objective(poses)))
-        other = judge(problem, poses, relaxed.certificate)
-        return job.better(answer, replace(other, poses=poses, poses_objective=other.objective))
+        relaxed = certify_with(
+            problem,
+            poses,
+            state.bound.Lambda,
+            job.gap,
+            math.nan,
+            BoundSource.HULLS,
+            state.bound.bound,
+        )
+        return job.better(answer, relaxed)
 
 
 def finer(soc: AnySOC) -> AnySOC:
