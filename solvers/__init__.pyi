@@ -45,6 +45,7 @@ from solvers.result import (
 from solvers.riemannian.certify import certify as certify
 from solvers.riemannian.newton import Newton as Newton, gauss_newton as gauss_newton
 from solvers.riemannian.polish import polish as polish
+from solvers.riemannian.prefixes import GrowingStart as GrowingStart
 from solvers.riemannian.staircase import Staircase as Staircase
 from solvers.robust.consistency import PCM as PCM, pairwise_consistent as pairwise_consistent
 from solvers.robust.gnc import GNC as GNC
@@ -121,7 +122,7 @@ __all__ += [
 ]
 __all__ += ["SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "PaperStop", "RStep"]
 __all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty"]
-__all__ += ["HandednessSearch", "Newton", "Staircase", "gauss_newton", "polish"]
+__all__ += ["GrowingStart", "HandednessSearch", "Newton", "Staircase", "gauss_newton", "polish"]
 __all__ += ["GNC", "IRLS", "PCM", "RobustLoss", "pairwise_consistent"]
 __all__ += ["GaussSeidel", "LevenbergMarquardt"]
 __all__ += ["Checkpoint", "Faults", "InProcess", "Ledger", "RayEngine"]

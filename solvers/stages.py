@@ -37,6 +37,7 @@ from solvers.result import OUT_OF_TIME, History, Outcome, Record, Run, Stage, St
 from solvers.riemannian.certify import with_shrunk_information
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.polish import polish
+from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import DualBound, Staircase, StaircaseState
 from solvers.soc.paper import PaperSOC
 from solvers.soc.soc import SOC
@@ -44,6 +45,8 @@ from solvers.soc.soc import SOC
 SECOND_TRY_TOLERANCE = 1e-6
 HULL_PASSES = 3
 CLOSER = 0.1  # factor on the tolerance of the next pass
+GROWING_START = "growing start"
+BROKEN_OFF = (*OUT_OF_TIME, Status.STOPPED)
 AnySOC = TypeVar("AnySOC", bound=SOC | PaperSOC)
 
 
@@ -120,6 +123,21 @@ class Job:
     def is_out_of_time(self) -> bool:
         """Whether the last stage was interrupted or reached the time limit."""
         return self.stages[-1].status in OUT_OF_TIME
+
+    @property
+    def may_try_again(self) -> bool:
+        """Whether the first attempt ended well, and nothing has been broken off since.
+
+        How an attempt from a growing start ends says nothing of the first one.
+        """
+        last = self.stages[-1].status
+        if last.is_success or last in BROKEN_OFF:
+            return last.is_success
+        names = [stage.name for stage in self.stages]
+        if GROWING_START not in names:
+            return False
+        end_of_first = self.stages[names.index(GROWING_START) - 1]
+        return end_of_first.status.is_success
 
     def better(self, answer: Answer, other: Certificate) -> Answer:
         """The cheaper poses and the better bound of an answer and another certificate."""
@@ -281,6 +299,85 @@ class RunStaircase:
 
 
 @dataclass(frozen=True, eq=False)
+class GrowPrefixes:
+    """Start: poses that prefixes of the graph lead to."""
+
+    job: Job
+    growing: GrowingStart
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return GROWING_START
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the poses of the last prefix, whatever the answer so far is."""
+        job = self.job
+        finished = job.monitor.run(self.growing, job.problem)
+        job.stages.append(replace(Stage.of(finished), name=self.name))
+        return Answer(finished.poses)
+
+
+@dataclass(frozen=True, eq=False)
+class GrowingAttempt:
+    """Another attempt, from a start that grows, where the gap of the first is wider than asked for.
+
+    On graphs with landmarks the first attempt takes few steps of Newton's method, as it mostly
+    fails where these are not enough. `newton` takes them to the end where this attempt does not
+    give the gap either, so that no answer is worse for it.
+    """
+
+    job: Job
+    growing: GrowingStart
+    newton: Newton
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return "growing attempt"
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the better poses and the better bound of both attempts."""
+        job = self.job
+        was_cut_short = self._was_cut_short
+        grown = self._grown(answer, was_cut_short)
+        is_over = grown is not None and (grown.is_certified or job.is_out_of_time)
+        if was_cut_short and not is_over:
+            answer = run_stages([RunNewton(job, self.newton), FindCertificate(job)], answer)
+        return answer if grown is None else job.better(answer, grown)
+
+    @property
+    def _was_cut_short(self) -> bool:
+        """Whether Newton's method of the first attempt may take more steps than it was given."""
+        last = self.job.stages[-1]
+        may_take_more = last.iterations < self.newton.max_iterations
+        return last.status is Status.MAX_ITERATIONS and may_take_more
+
+    def _grown(self, answer: Answer, was_cut_short: bool) -> Certificate | None:
+        """Certificate of the attempt; None where there is no need or no way to make one.
+
+        There is no way where odometry does not join the poses, where the first attempt was broken
+        off, and where a matrix has no Cholesky factor.
+        """
+        job = self.job
+        may_go_on = was_cut_short or job.stages[-1].status.is_success
+        if not (answer.current_certificate.can_improve and may_go_on):
+            return None
+        if not self.growing.has_prefixes(job.problem.graph):
+            return None
+        planned: list[PlannedStage] = [
+            GrowPrefixes(job, self.growing),
+            RunNewton(job, self.newton),
+            FindCertificate(job),
+        ]
+        try:
+            return run_stages(planned, Answer()).certificate
+        except NotPositiveDefiniteError:
+            job.stages.append(Stage.without_factor(job.problem.objective(answer.current_poses)))
+            return None
+
+
+@dataclass(frozen=True, eq=False)
 class SecondAttempt:
     """Another attempt, where the gap of the first is wider than asked for.
 
@@ -303,8 +400,7 @@ class SecondAttempt:
         An attempt that ends for want of a Cholesky factor leaves the answer as it is.
         """
         job = self.job
-        has_ended_well = job.stages[-1].status.is_success
-        if not (answer.current_certificate.can_improve and has_ended_well):
+        if not (answer.current_certificate.can_improve and job.may_try_again):
             return answer
         try:
             other = run_stages(self._planned(), Answer())
