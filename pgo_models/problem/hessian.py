@@ -64,6 +64,19 @@ class TangentLayout:
         return rotation_columns(pose, size_of_v, self.turns)
 
 
+def unknowns_of(problem: PGOProblem, hessian: csc_array) -> tuple[csc_array, TangentLayout]:
+    """The Hessian in the unknowns of the problem, and their layout.
+
+    In a problem of rotations alone the rows of translations, which are padding, are left out.
+    """
+    layout = TangentLayout(problem.num_poses, problem.d)
+    if problem.has_translations:
+        return hessian, layout
+    size_of_v = problem.num_poses * problem.d
+    of_rotations = hessian[size_of_v:, size_of_v:].tocsc()
+    return of_rotations, TangentLayout(problem.num_poses, 0, layout.turns)
+
+
 def tangent_order(problem: PGOProblem) -> IntArray:
     """Order of elimination of the Hessian's rows."""
     p = tangent_dimension(problem.d)
