@@ -122,14 +122,20 @@ def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) 
     v_j = layout.translations(j)
     w_i = layout.rotations(i)
     w_j = layout.rotations(j)
-    blocks = [
+    blocks = (
+        []
+        if not weights.has_translations
+        else [
+            (*block_entries(v, w), -coupling_vw_sums),
+            (*block_entries(w, v), -np.swapaxes(coupling_vw_sums, 1, 2)),
+            (*block_entries(v_j, w_i), coupling_vw),
+            (*block_entries(w_i, v_j), np.swapaxes(coupling_vw, 1, 2)),
+        ]
+    )
+    blocks += [
         (v, v, tau_sums),
         (v_i, v_j, -tau),
         (v_j, v_i, -tau),
-        (*block_entries(v, w), -coupling_vw_sums),
-        (*block_entries(w, v), -np.swapaxes(coupling_vw_sums, 1, 2)),
-        (*block_entries(v_j, w_i), coupling_vw),
-        (*block_entries(w_i, v_j), np.swapaxes(coupling_vw, 1, 2)),
         (*block_entries(w_i, w_j), coupling_ww),
         (*block_entries(w_j, w_i), np.swapaxes(coupling_ww, 1, 2)),
         (*block_entries(w, w), diagonal_ww),
