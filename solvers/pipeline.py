@@ -200,9 +200,10 @@ def solve(
     8. where that is not tight, in space, handedness terms: what tells rotations from reflections.
 
     In one place, SOC with its default settings is left out where Newton alone is faster: in the
-    plane, where the start is averaged; on small graphs; and for chi2 that is not quadratic and
-    convex, where SOC would run on its `convex_part`. For such a chi2 the second attempt starts at
-    the optimum of F, and smaller information matrices take the place of the staircase.
+    plane, where the start is averaged; on small graphs; for rotations alone; and for chi2 that is
+    not quadratic and convex, where SOC would run on its `convex_part`. For such a chi2 the second
+    attempt starts at the optimum of F, and smaller information matrices take the place of the
+    staircase.
 
     Parameters
     ----------
@@ -594,7 +595,7 @@ def _choose_start(
 ) -> tuple[str, Callable[[], Poses]]:
     """Name of a start, and the function that finds its poses."""
     if start is not None:
-        return "given start", lambda: start
+        return "given start", lambda: problem.seen_poses(start)
     if isinstance(soc, PaperSOC):
         return "spanning tree", partial(spanning_tree_start, problem.convex_part.graph)
     name = "averaged start" if is_averaged else "chordal start"
@@ -635,7 +636,7 @@ def _plan_attempt_by_robots(
     problem = job.problem
     planned: list[PlannedStage] = []
     if start is not None:
-        planned.append(StartByRobots(shared, "given start", lambda: start))
+        planned.append(StartByRobots(shared, "given start", lambda: problem.seen_poses(start)))
     elif problem.graph.is_world_loose:
         # The rotation of the world depends on positions alone.
         find = partial(chordal_start, problem.convex_part)
@@ -683,7 +684,9 @@ def _solution(
 ) -> Solution:
     """Solution with the answer in the frame that was asked for."""
     problem = request.problem
-    poses, frame, held = choose_gauge(answer.current_poses, problem.graph, request.anchor)
+    current = problem.seen_poses(answer.current_poses)
+    poses, frame, held = choose_gauge(current, problem.graph, request.anchor)
+    poses = problem.seen_poses(poses)  # a frame has an origin, too
     # A frame far away rounds the poses: the certificate is of those that are returned.
     certificate = judge(problem, poses, answer.current_certificate)
     missing = "" if request.pipeline.has_driver else NO_CERTIFICATE

@@ -26,12 +26,12 @@ from pgo_models.html_tables import facts_table, rows_table
 from pgo_models.plots.graph_plots import compare_poses
 from pgo_models.plots.style import check_installed, is_picture, save_figure
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF
-from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
+from pgo_models.problem.hessian import riemannian_hessian, unknowns_of
 from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
-from pgo_models.problem.weighting import Weighting
+from pgo_models.problem.weighting import Weighting, name_of_cost
 from solvers.network.ledger import Ledger
 from solvers.reporting.result_table import finite_or_none
 from solvers.reporting.versions import installed_versions
@@ -59,7 +59,8 @@ class Solution:
     poses : Poses
         The answer, in the frame that `frame` says: F leaves it open.
     objective : float
-        Cost of the poses: F, or chi2 with `Weighting.INFORMATION`.
+        Cost of the poses: F, chi2 with `Weighting.INFORMATION`, or the rotation part of F with
+        `Weighting.ROTATIONS`. In a problem of rotations alone the poses have zero translations.
     certificate : Certificate
         Lower bound on the global optimum, gap and verdict.
     status : Status
@@ -160,8 +161,9 @@ class Solution:
     def marginals(self, *poses: int, anchor: int | None = None) -> Array:
         """Return the joint covariance of some poses, or of every pose on its own.
 
-        These are blocks of (Hess F / 2)^-1 relative to an anchor. `Marginals`, which answers many
-        such questions with one factorisation, has units, axes and errors.
+        These are blocks of (Hess F / 2)^-1 relative to an anchor; in a problem of rotations alone
+        they are of the rotations. `Marginals`, which answers many such questions with one
+        factorisation, has units, axes and errors.
 
         Parameters
         ----------
@@ -173,12 +175,13 @@ class Solution:
         Returns
         -------
         Array
-            Shape (k p, k p) for k poses, or (n, p, p) for every pose, with p = d(d+1)/2.
+            Shape (k p, k p) for k poses, or (n, p, p) for every pose, with p = d(d+1)/2, and
+            p = d(d-1)/2 for rotations.
         """
         hessian = riemannian_hessian(
             self.problem, self.poses, multipliers(self.problem, self.poses)
         )
-        layout = TangentLayout(self.problem.num_poses, self.problem.d)
+        hessian, layout = unknowns_of(self.problem, hessian)
         anchor = self.anchor if anchor is None else anchor
         marginals = Marginals(hessian, layout, anchor, self.problem.backend)
         return marginals.joint(*poses) if poses else marginals.diagonal
@@ -200,7 +203,7 @@ class Solution:
         SettingError
             For another suffix.
         PGOError
-            When the file cannot be written.
+            When the file cannot be written, or is a picture of rotations alone.
 
         Examples
         --------
@@ -277,7 +280,13 @@ class Solution:
         -------
         Figure
             Two pictures side by side.
+
+        Raises
+        ------
+        SettingError
+            In a problem of rotations alone, which have no positions.
         """
+        self.problem.check_positions("a picture")
         graph = self.problem.graph
         if self.robots is not None:
             graph = graph.with_robots(self.robots.robot)
@@ -300,10 +309,14 @@ class Solution:
         Returns
         -------
         dict
-            Numbers, texts and lists alone, as `json.dumps` takes them.
+            Numbers, texts and lists alone, as `json.dumps` takes them. Of rotations alone there are
+            no translations.
         """
         graph = self.problem.graph
         named = graph.in_files
+        translations = {}
+        if self.problem.has_translations:
+            translations["t"] = self.poses.t[named].tolist()
         return {
             "graph": {
                 "name": graph.name,
@@ -325,7 +338,7 @@ class Solution:
             "versions": installed_versions(self.problem.backend),
             "ids": graph.pose_ids[named].tolist(),
             "R": self.poses.R[named].tolist(),
-            "t": self.poses.t[named].tolist(),
+            **translations,
         }
 
     def __repr__(self) -> str:
@@ -365,6 +378,7 @@ class Solution:
             bound += "   (the semidefinite relaxation's)"
         facts = [
             ("graph", f"{graph.name}: {size}"),
+            *facts_of_unknowns(self.problem),
             ("status", f"{self.status.name}: {self.status.value}"),
             (certificate.cost, certificate.cost_text),
             ("lower bound", bound),
@@ -384,7 +398,7 @@ class Solution:
     def _verdict_text(self) -> str:
         if self.robust is not None:
             return self.robust.headline
-        return f"{self.verdict.name}: {self.verdict.value}"
+        return self.certificate.verdict_text
 
     def _network_facts(self) -> Facts:
         """What is printed of robots and of what they sent."""
@@ -427,19 +441,22 @@ def both_costs(problem: PGOProblem, poses: Poses) -> dict[str, float | str | Non
     """What `.json` files hold of the costs of poses: F, chi2 (chordal), which of them is the cost.
 
     chi2 is None without a file's matrices, or where these are indefinite; `edges_without_coupling`
-    counts those whose coupling blocks it leaves out, and `note` says so if it is the cost.
+    counts those whose coupling blocks it leaves out, and `note` says so if it is the cost. Both are
+    None of rotations alone in a graph with translations, which would be part of them.
     """
     graph = problem.graph
     weighting = problem.weighting
     isotropic = problem
     if weighting is not Weighting.ISOTROPIC:
         isotropic = PGOProblem(graph, problem.backend)
+    is_complete = problem.has_translations == graph.has_translations
     has_chi2 = graph.information is not None and not indefinite_edges(graph).any()
     num_uncoupled = 0 if graph.uncoupled is None else int(graph.uncoupled.sum())
     return {
+        "unknowns": "poses" if problem.has_translations else "rotations",
         "weighting": weighting.name if isinstance(weighting, Weighting) else "GIVEN",
-        "F": isotropic.objective(poses),
-        "chi2": chi2(graph, poses) if has_chi2 else None,
+        "F": isotropic.objective(poses) if is_complete else None,
+        "chi2": chi2(graph, poses) if is_complete and has_chi2 else None,
         "edges_without_coupling": num_uncoupled,
         "note": note_of_coupling(problem),
     }
@@ -448,20 +465,32 @@ def both_costs(problem: PGOProblem, poses: Poses) -> dict[str, float | str | Non
 def other_cost(problem: PGOProblem, poses: Poses) -> Facts:
     """What a summary says of the cost that is not bounded, where it is another."""
     costs = both_costs(problem, poses)
-    bounded = "F"
-    name = "chi2"
+    other = costs["chi2"]
+    other_weighting = Weighting.INFORMATION
     weights = "the file's information matrices"
     if costs["edges_without_coupling"]:
         weights += f", without the coupling blocks of {costs['edges_without_coupling']} edges"
     if costs["weighting"] == "INFORMATION":
-        bounded = "chi2"
-        name = "F"
-        weights = "two precisions an edge"
-    other = costs[name]
+        other = costs["F"]
+        other_weighting = Weighting.ISOTROPIC
+        num_precisions = "two precisions" if problem.has_translations else "one precision"
+        weights = f"{num_precisions} an edge"
     objective = problem.objective(poses)
     if not isinstance(other, float) or abs(other - objective) <= _SAME_COST * objective:
         return []
+    name = name_of_cost(other_weighting, problem.has_translations)
+    bounded = problem.cost_name
     return [(name, f"{rounded_up(other)} with {weights}; the bound is on {bounded} alone")]
+
+
+def facts_of_unknowns(problem: PGOProblem) -> Facts:
+    """What a summary says where the unknowns are rotations alone, and why they are."""
+    if problem.has_translations:
+        return []
+    why = "no edge measures a translation"
+    if problem.graph.has_translations:
+        why = "measured translations are left out"
+    return [("unknowns", f"rotations alone: {why}; poses are given with zero translations")]
 
 
 def check_format(path: Path) -> None:

@@ -15,6 +15,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, observe, random_geometric
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
 
 EPS = float(np.finfo(float).eps)
@@ -27,6 +28,10 @@ REFERENCE = json.loads((Path(__file__).parent.parent / "data" / "reference.json"
 OPTIMUM: dict[str, float] = {
     k: v for k, v in REFERENCE["certified_optimum"].items() if k != "source"
 }
+
+
+# Costs that translations have a part in, for graphs with landmarks or priors of positions.
+COSTS_OF_POSES = (Weighting.ISOTROPIC, Weighting.INFORMATION)
 
 
 def optimum_tolerance(name: str) -> float:

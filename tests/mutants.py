@@ -44,6 +44,28 @@ BOUNDS = (
     "tests/certificates/test_prove_bound.py",
 )
 MUTANTS = (
+    # Rotations alone.
+    Mutant(
+        "rotations alone: translations of given poses cost something",
+        "pgo_models/problem/rotation_averaging.py",
+        "if not poses.t.any():",
+        "if poses.t.any():",
+        ("tests/problem/test_rotation_averaging.py",),
+    ),
+    Mutant(
+        "rotations alone: the padding is in the proof",
+        "pgo_models/certificates/lower_bound.py",
+        "rows = np.union1d(np.arange(n), rows)",
+        "rows = np.union1d(rows, rows)",
+        ("tests/problem/test_rotation_averaging.py",),
+    ),
+    Mutant(
+        "verify: the translation weights of F are left in its rotation part",
+        "pgo_models/verification/costs.py",
+        "        tau = fmpq(0)\n    kappas",
+        "        tau = tau * 1\n    kappas",
+        ("tests/verification/test_verify.py",),
+    ),
     # The lower bound, central and by robots.
     Mutant(
         "robots: the rounding of the separators' own entries is not counted",

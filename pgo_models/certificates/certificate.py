@@ -32,7 +32,7 @@ from pgo_models.graphs.residuals import check_poses
 from pgo_models.html_tables import facts_table
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
-from pgo_models.problem.weighting import Weighting
+from pgo_models.problem.weighting import Weighting, name_of_cost
 
 DEFAULT_GAP = 1e-6
 
@@ -114,6 +114,8 @@ class Certificate(ReadOnly):
     objective_error : float
         Bound on the distance of the objective from the exact cost of the poses (of the rotations
         nearest to theirs); nan where none is known.
+    has_translations : bool
+        Whether this is said of poses; otherwise of rotations alone.
     """
 
     objective: float
@@ -129,6 +131,7 @@ class Certificate(ReadOnly):
     verdict: Verdict
     weighting: Weighting = Weighting.ISOTROPIC
     objective_error: float = math.nan
+    has_translations: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "Lambda", real_array(self.Lambda, "Lambda", SettingError))
@@ -249,7 +252,7 @@ class Certificate(ReadOnly):
             (self.cost, f"{self.cost_text}{stationary}"),
             ("lower bound", f"{self.bound_text}   ({self.proof}; {self.source.value})"),
             ("gap", f"{self.gap_text}   (asked for: {self.wanted_gap:.3g})"),
-            ("verdict", f"{self.verdict.name}: {self.verdict.value}"),
+            ("verdict", self.verdict_text),
         ]
         if self.source is not BoundSource.GIVEN:
             facts.insert(1, (f"best known {self.cost}", rounded_up(self.poses_objective)))
@@ -258,7 +261,13 @@ class Certificate(ReadOnly):
     @property
     def cost(self) -> str:
         """Name of the cost, as it is printed."""
-        return "chi2" if self.weighting is Weighting.INFORMATION else "F"
+        return name_of_cost(self.weighting, self.has_translations)
+
+    @property
+    def verdict_text(self) -> str:
+        """The verdict as it is printed, which says where it is of rotations alone."""
+        subject = "" if self.has_translations else "rotations "
+        return f"{self.verdict.name}: {subject}{self.verdict.value}"
 
     @property
     def proof(self) -> str:
@@ -396,7 +405,15 @@ def certify_with(
     # the gap comes with the verdict
     figures = objective, bound, math.nan, rounding.level, stationarity
     unjudged = Certificate(
-        *figures, source, poses, objective, Lambda, gap, Verdict.TRIVIAL, weighting
+        *figures,
+        source,
+        poses,
+        objective,
+        Lambda,
+        gap,
+        Verdict.TRIVIAL,
+        weighting,
+        has_translations=problem.has_translations,
     )
     return judge_cost(problem, unjudged, objective, rounding)
 

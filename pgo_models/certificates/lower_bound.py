@@ -48,6 +48,12 @@ nothing of poses: if S + eta blockdiag(0, I) is positive definite without the ro
 translation, F >= tr(Lambda) + constant - eta n d (Rosen et al. 2019, theorem 7; Carlone et al.
 2015).
 
+**Rotations alone.** A problem without translations (`PGOProblem.has_translations`) is bounded in
+the same way. Its X has zeros in the rows t_i^T, X' as well, and M = blockdiag(M_tt, L), where M_tt
+is padding. So Z vanishes in these rows, too, and they are left out as the rows of pose r are: S_r
+is what is left of L - Lambda. In the form with eta alone they are left out in place of one
+translation.
+
 The word shift is for eta alone. The share of the diagonal that a proof of definiteness subtracts to
 make up for rounding is its margin (`pgo_models.certificates.definiteness`).
 """
@@ -326,7 +332,7 @@ def squared_distances(moved: Array, rotations: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Ground:
-    """X' at which a proof begins, with pose r at (0, I) exactly, and the rows of that pose."""
+    """X' at which a proof begins, with pose r at (0, I) exactly, and the rows that are left out."""
 
     X: Array
     rows: IntArray
@@ -338,10 +344,12 @@ def _grounded_at(problem: PGOProblem, poses: Poses) -> _Ground:
     d = problem.d
     r = middle_pose(problem.graph)
     X = problem.stacked(poses)
-    X[:n] -= poses.t[r]
+    X[:n] -= X[r]
     X = X @ poses.R[r]
     rows = pose_rows(r, n, d)
     X[rows] = np.concatenate([np.zeros((1, d)), np.eye(d)])
+    if not problem.has_translations:
+        rows = np.union1d(np.arange(n), rows)
     return _Ground(X, rows)
 
 
@@ -367,7 +375,7 @@ def _prove(
 
 def _prove_with_eta(problem: PGOProblem, Lambda: Array, eta: float) -> LowerBound | None:
     """Form with eta alone, the first translation left out; None where definiteness is not shown."""
-    fixed = np.zeros(1, dtype=np.int64)
+    fixed = np.arange(1 if problem.has_translations else problem.num_poses)
     proof = prove_definite(problem, Lambda, eta, fixed, UNGROUNDED_MARGIN)
     if proof is not None and proof.slack() is None:
         # The margin was too small for the rounding of the factorisation, which nobody knew yet. It

@@ -25,8 +25,9 @@ def save_proof(problem: PGOProblem, certificate: Certificate, path: Path | str) 
     """Write what proves the bound of a certificate, as JSON; `verify_proof` checks it.
 
     All digits are written of poses, multipliers Lambda and the shift eta, and what they claim: the
-    cost of the poses, and the lower bound. Of a tangent of chi2 the multipliers are left out: they
-    depend on how it was chosen, and the verifier has its own.
+    cost of the poses, and the lower bound. Of rotations alone no translations are written. Of a
+    tangent of chi2 the multipliers are left out: they depend on how it was chosen, and the verifier
+    has its own.
 
     Parameters
     ----------
@@ -77,7 +78,9 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
     upper_triangle = np.triu_indices(d)
     rows: list[dict[str, object]] = []
     for pose in range(graph.num_poses):
-        row: dict[str, object] = {"id": _name(graph, pose), "t": poses.t[pose].tolist()}
+        row: dict[str, object] = {"id": _name(graph, pose)}
+        if problem.weighting is not Weighting.ROTATIONS:
+            row["t"] = poses.t[pose].tolist()
         if pose not in graph.landmarks:
             row["R"] = poses.R[pose].tolist()
             if problem.is_quadratic:
@@ -155,18 +158,20 @@ def _cost_name(problem: PGOProblem) -> str:
     if problem.weighting is Weighting.INFORMATION and graph.information is not None:
         return "chi2"
     turns = ~np.isin(graph.j, graph.landmarks)  # of a landmark no rotation is measured
-    if problem.weighting is Weighting.ISOTROPIC:
+    if isinstance(problem.weighting, Weighting):
+        of_rotations = problem.weighting is Weighting.ROTATIONS
         kappa = graph.kappa[turns]
-        tau = graph.tau
+        tau = np.zeros_like(graph.tau) if of_rotations else graph.tau
         has_unit_kappa = np.isin(kappa, (0.0, 1.0)).all()
         has_unit_tau = np.isin(tau, (0.0, 1.0)).all()
         if has_unit_kappa and has_unit_tau:
-            return "unit"
+            return "unit rotations" if of_rotations else "unit"
+        name = "rotations" if of_rotations else "F"
         if graph.information is None:
-            return "F"
+            return name
         kappa_of_file, tau_of_file = edge_precisions(graph.information)
         has_kappa_of_file = np.allclose(kappa, kappa_of_file[turns])
-        if has_kappa_of_file and np.allclose(tau, tau_of_file):
-            return "F"
+        if has_kappa_of_file and (of_rotations or np.allclose(tau, tau_of_file)):
+            return name
     way_out = "write the graph with write_g2o, and solve that file"
     raise SettingError(f"no proof to write: no g2o file has the weights of the problem; {way_out}")

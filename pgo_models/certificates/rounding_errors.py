@@ -242,6 +242,7 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     Whether the poses are exact is not asked of the level, a sum, but of every edge:
     `fits_to_rounding`.
     """
+    poses = problem.seen_poses(poses)
     graph = problem.graph
     d = problem.d
     m = problem.graph.num_edges
@@ -271,7 +272,7 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
 
 def rounding_level(problem: PGOProblem, poses: Poses) -> float:
     """Level of `objective_rounding`."""
-    e_t, e_R = _last_bits(problem, poses)
+    e_t, e_R = _last_bits(problem, problem.seen_poses(poses))
     return problem.weights.bound_of_norms(e_t, e_R)
 
 
@@ -312,6 +313,7 @@ def fits_to_rounding(problem: PGOProblem, poses: Poses) -> bool:
     bool
         False says nothing of how good the poses are.
     """
+    poses = problem.seen_poses(poses)
     return _is_exact(problem, poses, rounding_level(problem, poses))
 
 

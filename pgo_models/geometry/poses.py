@@ -336,6 +336,43 @@ def absolute_trajectory_error(estimate: Poses, truth: Poses) -> float:
     return float(np.sqrt(np.mean(squared_distance)))
 
 
+def absolute_rotation_error(estimate: Poses, truth: Poses) -> float:
+    """Compute the root mean square of the angles between R_i and R_i', after alignment.
+
+    The estimate is turned by the R that minimises sum_i ||R R_i - R_i'||^2; positions do not count.
+
+    Parameters
+    ----------
+    estimate : Poses
+        Poses to judge.
+    truth : Poses
+        True poses, with the rotations R_i'.
+
+    Returns
+    -------
+    float
+        Error, radians.
+
+    Raises
+    ------
+    GraphError
+        When the number of poses or the dimension differs.
+
+    Examples
+    --------
+    >>> truth = Poses.identity(3, 2)
+    >>> turned = truth.moved(np.array([[0.0, -1.0], [1.0, 0.0]]), np.zeros(2))
+    >>> absolute_rotation_error(turned, truth)
+    0.0
+    """
+    _check_same_size(estimate, truth)
+    correlation = np.einsum("nab,ncb->ac", truth.R, estimate.R)
+    turn = project_to_rotations(correlation[None])[0]
+    R_error = np.swapaxes(truth.R, 1, 2) @ (turn @ estimate.R)
+    squared_angle = np.sum(log_map(R_error) ** 2, axis=1)
+    return float(np.sqrt(np.mean(squared_angle)))
+
+
 def relative_pose_error(estimate: Poses, truth: Poses, step: int = 1) -> tuple[float, float]:
     """Compute the RPE over all pairs (i, i + step), without alignment.
 

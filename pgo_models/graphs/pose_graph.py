@@ -275,6 +275,9 @@ class PoseGraph(ReadOnly):
         list of (str, str)
             A label and a text for every row of the table that a notebook or `pgo info` shows.
         """
+        tau = "no edge measures a translation"
+        if self.has_translations:
+            tau = f"{self.tau.min():.4g} to {self.tau.max():.4g} per m^2"
         return [
             ("graph", f"{self.name}, {self.d}D"),
             ("poses", str(len(self.bodies))),
@@ -282,7 +285,7 @@ class PoseGraph(ReadOnly):
             ("robots", str(self.num_robots)),
             ("components", str(len(self.components()))),
             ("kappa", f"{self.kappa.min():.4g} to {self.kappa.max():.4g} per rad^2"),
-            ("tau", f"{self.tau.min():.4g} to {self.tau.max():.4g} per m^2"),
+            ("tau", tau),
             ("estimate", "with the graph" if self.initial is not None else "none"),
             ("truth", "with the graph" if self.truth is not None else "none"),
         ]
@@ -557,8 +560,15 @@ class PoseGraph(ReadOnly):
         """Whether every pose can be reached from every other along edges."""
         return len(self.components()) == 1
 
+    @property
+    def has_translations(self) -> bool:
+        """Whether any edge measures a translation; without one only rotations can be estimated."""
+        return bool(self.tau.any())
+
     def check_connected(self) -> None:
         """Check that the measurements determine all poses up to one gauge.
+
+        Where no edge measures a translation, the rotations alone are what they determine.
 
         Raises
         ------
@@ -567,6 +577,40 @@ class PoseGraph(ReadOnly):
             positive precision ties the positions or rotations of some poses to those of the
             others; or when priors of positions do not fix the rotation of the world.
         """
+        if not self.has_translations:
+            self.check_rotations_connected()
+            return
+        self._check_one_component()
+        self._check_tied("tau", "position")
+        self._check_tied("kappa", "rotation")
+        if self.is_world_loose:
+            self._check_priors_fix_world()
+
+    def check_rotations_connected(self) -> None:
+        """Check that the measured rotations determine those of all poses up to one gauge.
+
+        Raises
+        ------
+        GraphError
+            When the graph has landmarks, which have no rotation, or several components; or when no
+            edge with a positive kappa ties the rotations of some poses, or of the world, to the
+            others.
+        """
+        if len(self.landmarks):
+            raise GraphError(
+                f"{self.name} has {len(self.landmarks)} landmarks, which have no rotation; "
+                "leave them out (PoseGraph.subgraph with its bodies), or solve for poses"
+            )
+        self._check_one_component()
+        if self.is_world_loose:
+            raise GraphError(
+                "priors of positions alone say nothing of rotations; leave them out "
+                "(PoseGraph.without_edges), or solve for poses"
+            )
+        self._check_tied("kappa", "rotation")
+
+    def _check_one_component(self) -> None:
+        """Raise a GraphError that names the components where there are several."""
         parts = self.components()
         if len(parts) > 1:
             named = parts[:_NAMED_COMPONENTS]
@@ -579,10 +623,6 @@ class PoseGraph(ReadOnly):
                 f"(sizes {sizes}{rest}; with poses {firsts}{rest}); add edges between them, "
                 "or solve each on its own (PoseGraph.components, PoseGraph.subgraph)"
             )
-        self._check_tied("tau", "position")
-        self._check_tied("kappa", "rotation")
-        if self.is_world_loose:
-            self._check_priors_fix_world()
 
     def _check_tied(self, precision: str, quantity: str) -> None:
         """Raise a GraphError unless edges whose `precision` is positive connect all poses."""

@@ -113,9 +113,18 @@ class EdgeCost:
         """The arrays that determine the cost, for a fingerprint."""
         return [self.W(d), self.tau]
 
+    @property
+    def has_translations(self) -> bool:
+        """Whether translations are among the unknowns; else the cost is one of rotations alone."""
+        return True
+
     def seen_offsets(self, t_ij: Array) -> Array:
         """The vectors, (m, d), that take the place of t_ij in rho_t: here t_ij itself."""
         return t_ij
+
+    def seen_poses(self, poses: Poses) -> Poses:
+        """The poses that the cost is evaluated at: here the given ones."""
+        return poses
 
     # Convexity.
 

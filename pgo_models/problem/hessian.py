@@ -64,6 +64,19 @@ class TangentLayout:
         return rotation_columns(pose, size_of_v, self.turns)
 
 
+def unknowns_of(problem: PGOProblem, hessian: csc_array) -> tuple[csc_array, TangentLayout]:
+    """The Hessian in the unknowns of the problem, and their layout.
+
+    In a problem of rotations alone the rows of translations, which are padding, are left out.
+    """
+    layout = TangentLayout(problem.num_poses, problem.d)
+    if problem.has_translations:
+        return hessian, layout
+    size_of_v = problem.num_poses * problem.d
+    of_rotations = hessian[size_of_v:, size_of_v:].tocsc()
+    return of_rotations, TangentLayout(problem.num_poses, 0, layout.turns)
+
+
 def tangent_order(problem: PGOProblem) -> IntArray:
     """Order of elimination of the Hessian's rows."""
     p = tangent_dimension(problem.d)
@@ -109,14 +122,20 @@ def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) 
     v_j = layout.translations(j)
     w_i = layout.rotations(i)
     w_j = layout.rotations(j)
-    blocks = [
+    blocks = (
+        []
+        if not weights.has_translations
+        else [
+            (*block_entries(v, w), -coupling_vw_sums),
+            (*block_entries(w, v), -np.swapaxes(coupling_vw_sums, 1, 2)),
+            (*block_entries(v_j, w_i), coupling_vw),
+            (*block_entries(w_i, v_j), np.swapaxes(coupling_vw, 1, 2)),
+        ]
+    )
+    blocks += [
         (v, v, tau_sums),
         (v_i, v_j, -tau),
         (v_j, v_i, -tau),
-        (*block_entries(v, w), -coupling_vw_sums),
-        (*block_entries(w, v), -np.swapaxes(coupling_vw_sums, 1, 2)),
-        (*block_entries(v_j, w_i), coupling_vw),
-        (*block_entries(w_i, v_j), np.swapaxes(coupling_vw, 1, 2)),
         (*block_entries(w_i, w_j), coupling_ww),
         (*block_entries(w_j, w_i), np.swapaxes(coupling_ww, 1, 2)),
         (*block_entries(w, w), diagonal_ww),

@@ -25,14 +25,18 @@ from pgo_models.problem.hessian import TangentLayout
 from pgo_models.problem.matrices import block_entries, entry_positions
 from pgo_models.problem.selected_inversion import selected_inverse
 
+# Names of the p numbers of a move, by p.
+_NAMES_OF_POSES = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "rx", "ry", "rz")}
+_NAMES_OF_ROTATIONS = {1: ("theta",), 3: ("rx", "ry", "rz")}
+
 
 @dataclass(frozen=True, eq=False)
 class Marginals(ReadOnly):
     """Covariances of moves t_i + v_i, R_i Exp(hat(w_i)) of the poses.
 
     The p = 3 or 6 numbers (v_i, w_i) of a pose are in metres and radians: v is in the world frame,
-    w in the frame of the pose. GTSAM and g2o use R_i^T v_i in place of v_i, and Pose3 of GTSAM has
-    it after w.
+    w in the frame of the pose. Of rotations alone there are the p = 1 or 3 numbers w_i. GTSAM and
+    g2o use R_i^T v_i in place of v_i, and Pose3 of GTSAM has it after w.
 
     Parameters
     ----------
@@ -144,13 +148,15 @@ class Marginals(ReadOnly):
                 raise SettingError(f"there is no pose {pose}; give one of 0 to {last}")
 
 
-def write_covariances(covariances: Array, ids: IntArray, path: Path | str) -> None:
+def write_covariances(
+    covariances: Array, ids: IntArray, path: Path | str, has_translations: bool = True
+) -> None:
     """Write blocks (n, p, p) as CSV: the id and the upper triangle by rows, units in the heading.
 
-    Errors: `replace_when_done`.
+    They are of poses, or without translations of rotations alone. Errors: `replace_when_done`.
     """
-    is_planar = covariances.shape[1] == 3
-    names = ("x", "y", "theta") if is_planar else ("x", "y", "z", "rx", "ry", "rz")
+    kind = _NAMES_OF_POSES if has_translations else _NAMES_OF_ROTATIONS
+    names = kind[covariances.shape[1]]
     units = ["m" if name in "xyz" else "rad" for name in names]
     rows, columns = np.triu_indices(len(names))
     heading = ["id"]

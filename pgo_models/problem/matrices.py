@@ -78,7 +78,8 @@ def joint_matrix(graph: PoseGraph, weights: EdgeCost | None = None) -> csc_array
         R_j:  kappa I
 
     for W = kappa I; see `EdgeCost.matrix_blocks`. Diagonal d x d blocks are stored in full:
-    multipliers are subtracted in place.
+    multipliers are subtracted in place. Of rotations alone the entries between t and R, all zero,
+    are not stored.
     """
     n = graph.num_poses
     d = graph.d
@@ -99,14 +100,20 @@ def joint_matrix(graph: PoseGraph, weights: EdgeCost | None = None) -> csc_array
     block_j = rotation_columns(j, n, d)
     repeated_poses = np.repeat(poses[:, None], d, axis=1)
     repeated_j = np.repeat(j[:, None], d, axis=1)
-    blocks = [
+    blocks = (
+        []
+        if not weights.has_translations
+        else [
+            (repeated_poses, block, coupling_sums),
+            (block, repeated_poses, coupling_sums),
+            (repeated_j, block_i, -coupling_t),
+            (block_i, repeated_j, -coupling_t),
+        ]
+    )
+    blocks += [
         (poses, poses, tau_sums),
         (i, j, -tau),
         (j, i, -tau),
-        (repeated_poses, block, coupling_sums),
-        (block, repeated_poses, coupling_sums),
-        (repeated_j, block_i, -coupling_t),
-        (block_i, repeated_j, -coupling_t),
         (*block_entries(block, block), diagonal_sums),
         (*block_entries(block_i, block_j), -coupling_R),
         (*block_entries(block_j, block_i), -np.swapaxes(coupling_R, 1, 2)),

@@ -27,7 +27,13 @@ from pgo_models.problem.cholesky import (
 from pgo_models.problem.edge_cost import EdgeCost
 from pgo_models.problem.incidence import Incidence
 from pgo_models.problem.ordering import most_counts, pose_order, row_order
-from pgo_models.problem.weighting import Weighting, convex_cost, information_cost
+from pgo_models.problem.rotation_averaging import RotationAveraging
+from pgo_models.problem.weighting import (
+    Weighting,
+    convex_cost,
+    information_cost,
+    name_of_cost,
+)
 
 MOST_REFINEMENTS = 60  # of translations: each but the last halves F at least
 
@@ -44,6 +50,10 @@ class PGOProblem(ReadOnly):
     nothing couples them with rotations; else M is the quadratic part, and `tangent_at` gives
     quadratic problems that touch chi2 from below (`problem.excess`).
 
+    With `Weighting.ROTATIONS`, and where no edge measures a translation, the unknowns are the
+    rotations alone (`has_translations`): translations of poses are ignored, and those of solutions
+    are zero.
+
     Parameters
     ----------
     graph : PoseGraph
@@ -52,12 +62,12 @@ class PGOProblem(ReadOnly):
     backend : CholeskyBackend, optional
         The sparse Cholesky to use; `default_backend()` unless given.
     weighting : Weighting or EdgeCost
-        F, chi2, or a cost of the edges.
+        F, chi2, the rotation part of F, or a cost of the edges.
 
     Raises
     ------
     GraphError
-        When the graph is not connected.
+        When the graph is not connected, or of rotations alone not by measured rotations.
     SettingError
         When the backend or the weighting is none.
 
@@ -84,10 +94,17 @@ class PGOProblem(ReadOnly):
             raise SettingError(
                 f"backend is {self.backend!r}; give one of {', '.join(map(str, CholeskyBackend))}"
             )
-        self.graph.check_connected()
+        if self.weighting is Weighting.ROTATIONS:
+            self.graph.check_rotations_connected()
+        else:
+            self.graph.check_connected()
+        if self.weighting is Weighting.ISOTROPIC and not self.graph.has_translations:
+            object.__setattr__(self, "weighting", Weighting.ROTATIONS)
 
     def __repr__(self) -> str:
         cost = ", chi2" if self.weighting is Weighting.INFORMATION else ""
+        if not self.has_translations:
+            cost += ", rotations alone"
         size = f"d={self.d}, poses={self.num_poses}, edges={self.graph.num_edges}"
         return f"PGOProblem({self.graph.name!r}, {size}{cost})"
 
@@ -113,11 +130,23 @@ class PGOProblem(ReadOnly):
             return self.weighting
         if self.weighting is Weighting.ISOTROPIC:
             return matrices.isotropic_weights(self.graph)
+        if self.weighting is Weighting.ROTATIONS:
+            return RotationAveraging.of(self.graph)
         return information_cost(self.graph, self._information)
 
     @cached_property
     def _information(self) -> Array:
         return proper_information(self.graph)
+
+    @property
+    def has_translations(self) -> bool:
+        """Whether translations are among the unknowns; else these are the rotations alone."""
+        return self.weights.has_translations
+
+    @property
+    def cost_name(self) -> str:
+        """Name of the cost, as it is printed: F or chi2, of rotations alone F(R) or chi2(R)."""
+        return name_of_cost(self.weighting, self.has_translations)
 
     @property
     def is_quadratic(self) -> bool:
@@ -154,6 +183,25 @@ class PGOProblem(ReadOnly):
             raise SettingError(
                 f"{method} needs a cost that is {kind}, as F is, and chi2 here is not; "
                 "use convex_part"
+            )
+
+    def check_positions(self, purpose: str) -> None:
+        """Raise an error where something needs positions, and rotations alone are the unknowns.
+
+        Parameters
+        ----------
+        purpose : str
+            What needs them, for the message.
+
+        Raises
+        ------
+        SettingError
+            When the problem is one of rotations alone.
+        """
+        if not self.has_translations:
+            raise SettingError(
+                f"{purpose} needs positions, and the unknowns are rotations alone; "
+                "leave it out, and write .g2o, .tum or .json"
             )
 
     def tangent_at(self, poses: Poses) -> "PGOProblem":
@@ -585,6 +633,21 @@ class PGOProblem(ReadOnly):
                 break
         return poses
 
+    def seen_poses(self, poses: Poses) -> Poses:
+        """Return the poses that the cost is evaluated at.
+
+        Parameters
+        ----------
+        poses : Poses
+            One pose for every pose of the graph.
+
+        Returns
+        -------
+        Poses
+            The given ones; in a problem of rotations alone with zeros for translations.
+        """
+        return self.weights.seen_poses(poses)
+
     def stacked(self, poses: Poses) -> Array:
         """Return X of poses: the rows t_i, then the rows of every R_i^T.
 
@@ -604,7 +667,7 @@ class PGOProblem(ReadOnly):
             When they are no poses, or their number or dimension is not the graph's.
         """
         self._check_poses(poses)
-        return poses.stacked()
+        return self.seen_poses(poses).stacked()
 
     def _check_poses(self, poses: Poses) -> None:
         if not isinstance(poses, Poses):

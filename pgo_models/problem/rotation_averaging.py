@@ -2,43 +2,48 @@
 
 It is the rotation part tr(Y^T L Y) of F (the paper's equation `min overall` without translations;
 Rosen et al. 2019, section 4; Dellaert et al. 2020, *Shonan Rotation Averaging*).
+
+X and M keep the layout that they have for poses, so that every method for F applies. X has zeros
+for the translations, whatever poses are given, and M is blockdiag(M_tt, L). The rows of M_tt are
+padding. They hold the Laplacian of sum_e tau ||t_j - t_i||^2 with a tau > 0 for every kappa > 0,
+which is zero at t = 0, where the gradient in t is zero, too: no method moves a translation. What is
+proved is about L: proofs leave out the rows of translations.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.edge_cost import EdgeCost
-from pgo_models.problem.rotation_weights import ScaledIdentities
+from pgo_models.problem.edge_problem import EdgeProblem
+from pgo_models.problem.rotation_weights import RotationWeights, ScaledIdentities
 
 
 @dataclass(frozen=True, eq=False)
 class RotationAveraging(EdgeCost):
-    """Cost kappa ||R_j - R_i R_ij||_F^2 + tau ||t_j - t_i||^2 of every edge.
+    """Cost tr(W rho_R rho_R^T) of every edge, of rotations alone; kappa ||rho_R||_F^2 as in F.
 
-    Measured translations are ignored. For any rotations the second term is zero at its minimum,
-    where all translations are equal. So minima and lower bounds over poses are those over rotations
-    alone. All methods for F apply: M is block diagonal, with a positive semidefinite Laplacian for
-    the translations and L for the rotations.
+    Measured translations, and those of poses, are ignored.
 
     Parameters
     ----------
     tau : (m,) array
-        Positive weights of ||t_j - t_i||^2; the minimum does not depend on them.
+        Weights of the padding (see above). Costs, minima and bounds do not depend on them.
     rotation : RotationWeights
-        Weights kappa I of the rotation residuals.
+        Weights W of the rotation residuals.
 
     Examples
     --------
     >>> from pgo_models.graphs.scenes import circle
     >>> from pgo_models.problem.problem import PGOProblem
+    >>> from pgo_models.problem.weighting import Weighting
     >>> graph = circle(np.random.default_rng(0))
-    >>> problem = PGOProblem(graph, weighting=RotationAveraging.of(graph))
-    >>> truth = graph.truth.with_translations(np.zeros((25, 3)))
-    >>> Y = truth.stacked()[25:]
-    >>> bool(np.isclose(problem.objective(truth), np.sum(Y * (problem.L @ Y))))
+    >>> problem = PGOProblem(graph, weighting=Weighting.ROTATIONS)
+    >>> Y = graph.truth.stacked()[25:]
+    >>> bool(np.isclose(problem.objective(graph.truth), np.sum(Y * (problem.L @ Y))))
     True
     """
 
@@ -54,11 +59,45 @@ class RotationAveraging(EdgeCost):
         Returns
         -------
         RotationAveraging
-            Its cost, to be given to a `PGOProblem` as its weighting.
+            Its cost, that of `Weighting.ROTATIONS`.
         """
-        rotation = ScaledIdentities(graph.kappa)
-        return cls(graph.tau, rotation)
+        return cls.with_weights(ScaledIdentities(graph.kappa))
+
+    @classmethod
+    def with_weights(cls, rotation: RotationWeights) -> "RotationAveraging":
+        """Rotation averaging with weights W; tau is the size of W, so that M is well scaled.
+
+        Parameters
+        ----------
+        rotation : RotationWeights
+            Weights of the rotation residuals.
+
+        Returns
+        -------
+        RotationAveraging
+            The cost.
+        """
+        return cls(rotation.norm_bound, rotation)
+
+    @property
+    def has_translations(self) -> bool:
+        """False: translations are no unknowns."""
+        return False
 
     def seen_offsets(self, t_ij: Array) -> Array:
-        """Zeros, (m, d): every edge asks for t_j = t_i."""
+        """Zeros, (m, d): the padding asks for t_j = t_i."""
         return np.zeros_like(t_ij)
+
+    def seen_poses(self, poses: Poses) -> Poses:
+        """The poses with zeros for translations; those that have them already as they are."""
+        if not poses.t.any():
+            return poses
+        return poses.with_translations(np.zeros_like(poses.t))
+
+    def best_translations(self, problem: EdgeProblem, poses: Poses) -> Poses:
+        """The poses with zeros for translations."""
+        return self.seen_poses(poses)
+
+    def is_seen(self) -> tuple[BoolArray, BoolArray]:
+        """That the cost depends on no rho_t, and on which rho_R; (m,) each."""
+        return np.zeros(len(self.tau), dtype=bool), self.rotation.is_used

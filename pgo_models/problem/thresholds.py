@@ -31,7 +31,7 @@ class EdgeResiduals:
     Parameters
     ----------
     translation : Array, (m,)
-        ||t_j - t_i - R_i t_ij||, metres.
+        ||t_j - t_i - R_i t_ij||, metres; zeros in a problem of rotations alone.
     rotation : Array, (m,)
         Angle of R_ij^T R_i^T R_j, radians.
     cost : Array, (m,)
@@ -113,14 +113,18 @@ def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResidua
     """
     graph = problem if isinstance(problem, PoseGraph) else problem.graph
     translation, rotation, cost = edge_errors(graph, poses)
+    has_translations = True
     if isinstance(problem, PGOProblem):
         cost = problem.edge_costs(poses)
+        has_translations = problem.has_translations
+    if not has_translations:
+        translation = np.zeros_like(translation)
     w = _chi2_weights(problem)
     scale = _median_ratio(cost, w)
     quantile = 1.0 - FALSE_ALARM / max(graph.num_edges, 1)
     allowed = scale * _quantiles(w, quantile)
     # All edges together: the sum is taken for a scaled chi^2 with the same mean and variance.
-    redundancy = _redundancy(graph, w)
+    redundancy = _redundancy(graph, w, has_translations)
     mean = redundancy * np.sum(w)
     half_variance = redundancy * np.sum(w**2)
     overall = 0.0
@@ -142,10 +146,10 @@ def _median_ratio(cost: Array, w: Array) -> float:
     return max(1.0, float(np.median(ratios)))
 
 
-def _redundancy(graph: PoseGraph, w: Array) -> float:
+def _redundancy(graph: PoseGraph, w: Array, has_translations: bool) -> float:
     """1 - u / r for u unknowns and measurements of rank r."""
-    d = graph.d
-    p = tangent_dimension(d)
+    d = graph.d if has_translations else 0
+    p = tangent_dimension(graph.d)
     num_points = len(graph.landmarks)
     num_other_poses = graph.num_poses - num_points
     # One pose is fixed.
@@ -241,7 +245,9 @@ def _chi2_weights(problem: PGOProblem | PoseGraph) -> Array:
     W = weights.W(d)
     trace = np.einsum("mkk->m", W)[:, None, None]
     V = trace if d == 2 else trace * np.eye(3) - W
-    of_translations = weights.tau[:, None, None] * np.swapaxes(root_t, 1, 2) @ root_t
+    is_seen_t, _ = weights.is_seen()
+    tau = np.where(is_seen_t, weights.tau, 0.0)
+    of_translations = tau[:, None, None] * np.swapaxes(root_t, 1, 2) @ root_t
     of_rotations = np.swapaxes(root_r, 1, 2) @ V @ root_r
     w = np.linalg.eigvalsh(of_translations + of_rotations)
     least = LEAST_SCALED * w[:, -1:]

@@ -1,4 +1,4 @@
-"""The costs of a graph's measurements: F, with two precisions an edge, or chi2.
+"""The costs of a graph's measurements: F, with two precisions an edge, or chi2; or rotations alone.
 
 **F**: tau ||rho_t||^2 + kappa ||rho_R||_F^2 (`pgo_models.problem.edge_cost`).
 
@@ -8,6 +8,9 @@ cos theta) a^T I_rr a = tr(W (2 I - E - E^T)) with W = tr(I_rr) / 2 I - I_rr in 
 above the sum of the others. The rest of the translation term, r^T (I_tt - tau I) r for a tau below
 the smallest eigenvalue of I_tt, is a convex function of Z, and so is the coupling of translations
 with rotations: see `pgo_models.problem.excess`.
+
+**Rotations alone**: the rotation part of F, or of chi2 where no edge measures a translation
+(`pgo_models.problem.rotation_averaging`).
 """
 
 import enum
@@ -28,6 +31,7 @@ from pgo_models.problem.edge_cost import EdgeCost
 from pgo_models.problem.excess import CoupledExcess, Excess
 from pgo_models.problem.floating_point import OUTWARD, gamma
 from pgo_models.problem.information_costs import ExcessCost
+from pgo_models.problem.rotation_averaging import RotationAveraging
 from pgo_models.problem.rotation_weights import (
     RotationWeights,
     RoundedIdentities,
@@ -49,10 +53,21 @@ _SINGULAR_SHARE = 2.0**-20
 
 
 class Weighting(enum.Enum):
-    """Which cost of the graph's measurements a problem is: `ISOTROPIC` is F, `INFORMATION` chi2."""
+    """Which cost of the graph's measurements a problem is.
+
+    `ISOTROPIC` is F, `INFORMATION` chi2, and `ROTATIONS` the rotation part of F, of rotations
+    alone: rotation averaging. Of a graph in which no edge measures a translation F is that, too.
+    """
 
     ISOTROPIC = "F: two precisions an edge, kappa and tau, as in the paper and SE-Sync"
     INFORMATION = "chi2: the information matrices of the file"
+    ROTATIONS = "F(R): the rotation part of F, with one precision an edge, kappa"
+
+
+def name_of_cost(weighting: Weighting | EdgeCost, has_translations: bool) -> str:
+    """Name of a cost as it is printed: F or chi2, of rotations alone F(R) or chi2(R)."""
+    name = "chi2" if weighting is Weighting.INFORMATION else "F"
+    return name if has_translations else f"{name}(R)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +142,7 @@ def information_cost(graph: PoseGraph, information: Array) -> EdgeCost:
     is_coupled = bool(blocks.is_coupled.any())
     if is_isotropic and not is_coupled:
         tau = blocks.I_tt[:, 0, 0].copy()
-        return EdgeCost(tau, _uncoupled_rotation_weights(blocks.I_rr))
+        return _quadratic_cost(tau, _uncoupled_rotation_weights(blocks.I_rr))
     _check_positions(graph, blocks)
     if is_coupled:
         return _coupled_cost(graph, information, blocks)
@@ -243,7 +258,14 @@ def convex_cost(information: Array, d: int) -> EdgeCost:
     """
     kappa_F, tau_F = edge_precisions(information)
     rotation = _uncoupled_rotation_weights(information[:, d:, d:])
-    return EdgeCost(tau_F, rotation.raised_to(_LEAST_CONVEX * kappa_F))
+    return _quadratic_cost(tau_F, rotation.raised_to(_LEAST_CONVEX * kappa_F))
+
+
+def _quadratic_cost(tau: Array, rotation: RotationWeights) -> EdgeCost:
+    """The quadratic cost with tau and W; of rotations alone where every tau is zero."""
+    if tau.any():
+        return EdgeCost(tau, rotation)
+    return RotationAveraging.with_weights(rotation)
 
 
 def _uncoupled_rotation_weights(I_rr: Array) -> RotationWeights:

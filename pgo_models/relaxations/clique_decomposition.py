@@ -230,7 +230,8 @@ class _Layout:
         lengths = [side * (side + 1) // 2 for side in sides]
         ends = np.cumsum(lengths).tolist()
         median_kappa = np.median(graph.kappa[graph.kappa > 0])
-        median_tau = np.median(graph.tau[graph.tau > 0])
+        tau = problem.weights.tau
+        median_tau = np.median(tau[tau > 0])
         return cls(
             problem,
             tree,
@@ -465,7 +466,8 @@ def _cost_of_edge(layout: _Layout, k: int, e: int, W_e: Array) -> Array:
     rotation = layout.reference_rotation(k, identity - E)
     rotation += P_j_deviation - P_i_deviation
     shift = (layout.centre.t[j] - layout.centre.t[i])[:, None]
-    step = (R_i @ graph.t_ij[e])[:, None]
+    offset = problem.weights.seen_offsets(graph.t_ij[e])
+    step = (R_i @ offset)[:, None]
     t_j_deviation = layout.translation_deviation(k, j)
     t_i_deviation = layout.translation_deviation(k, i)
     translation = layout.reference_rotation(k, shift - step)

@@ -121,11 +121,11 @@ class RelaxationSolution:
             f"relaxation   {self.plan}",
             f"status       {self.status.name}: {self.status.value}",
             f"effort       {self.iterations} iterations, {self.seconds:.3g} s",
-            f"F rounded    {certificate.cost_text}",
+            f"{f'{certificate.cost} rounded':<12} {certificate.cost_text}",
             f"lower bound  {certificate.bound_text}   (solver: {self.value:.10g}; eta = {eta})",
             f"gap          {certificate.gap_text}   (asked for: {certificate.wanted_gap:.3g})",
             f"rank         {self.rank}",
-            f"verdict      {self.verdict.name}: {self.verdict.value}",
+            f"verdict      {certificate.verdict_text}",
         ]
         return "\n".join(lines)
 

@@ -4,7 +4,8 @@ The rows of pose i are X_i = (t_i^T; R_i^T). An edge has the residual rho = X_j 
 T = (1, t_ij^T; 0, R_ij^T); that of a position is the first row alone.
 
 **F** is the sum of tr(rho^T W rho) with W = diag(tau, kappa I), tau = d / tr(I_tt^-1), and
-kappa = 3 / (2 tr(I_rr^-1)) in space, I_theta in the plane (SE-Sync).
+kappa = 3 / (2 tr(I_rr^-1)) in space, I_theta in the plane (SE-Sync). **F(R)**, of rotations alone,
+has tau = 0.
 
 **chi2.** In the frame of pose i let r = R_i^T (t_j - t_i) - t_ij, and let E = R_i^T R_j R_ij^T be a
 turn by theta about a. Both s = a sin theta and H = (1 - cos theta) a a^T are linear in E. With the
@@ -44,6 +45,7 @@ from pgo_models.verification.balls import (
     symmetric,
 )
 from pgo_models.verification.measurements import Edge
+from pgo_models.verification.proof import ROTATION_COSTS
 
 RESOLUTION = 2.0**-26  # of a bisection, relative
 BELOW = 1.0 - 2.0**-24  # of the largest tau: what is left of the matrix is well above rounding
@@ -129,9 +131,11 @@ def residual_matrices(edge: Edge, rows_j: int) -> tuple[arb_mat, arb_mat]:
 def isotropic_cost(edge: Edge, cost: str, rho: arb_mat) -> tuple[arb, arb_mat]:
     """Share of an edge in F, and W."""
     kappa, tau = precisions(edge.triangle, edge.tag.d, edge.tag.is_point)
-    if cost == "unit":
+    if cost in ("unit", "unit rotations"):
         kappa = fmpq(kappa != 0)
         tau = fmpq(tau != 0)
+    if cost in ROTATION_COSTS:
+        tau = fmpq(0)
     kappas = [kappa] * (rho.nrows() - 1)
     W = diagonal([tau, *kappas])
     share = (rho.transpose() * W * rho).trace()
@@ -151,6 +155,13 @@ def precisions(triangle: tuple[fmpq, ...], d: int, is_point: bool) -> tuple[fmpq
     if d == 3:
         kappa = fmpq(3, 2) * kappa
     return kappa, tau
+
+
+def measures_translation(edge: Edge) -> bool:
+    """Whether the block I_tt of an edge is not zero."""
+    d = edge.tag.d
+    rows = symmetric(edge.triangle, information_side(d, edge.tag.is_point))
+    return is_nonzero([row[:d] for row in rows[:d]])
 
 
 def information_side(d: int, is_point: bool) -> int:

@@ -14,7 +14,11 @@ COSTS = {
     "F": "F, two precisions an edge, as in SE-Sync",
     "unit": "F with kappa = tau = 1, as in the paper",
     "chi2": "chi2 of the information matrices",
+    "rotations": "F(R), the rotation part of F: of rotations alone",
+    "unit rotations": "F(R) with kappa = 1, as in the paper's first stage",
 }
+# Costs of rotations alone; a proof of them has no translations.
+ROTATION_COSTS = ("rotations", "unit rotations")
 WAY_OUT = "give a file of pgo solve --proof, as it was written"
 
 
@@ -66,7 +70,9 @@ def read_proof(path: Path, d: int) -> Proof:
     size_of_triangle = d * (d + 1) // 2
     for pose in poses:
         name = name_of(path, entry(path, pose, "id"))
-        t[name] = numbers(path, entry(path, pose, "t"), f"t of pose {name}", d)
+        t[name] = [0.0] * d
+        if cost not in ROTATION_COSTS:
+            t[name] = numbers(path, entry(path, pose, "t"), f"t of pose {name}", d)
         if "R" in pose:
             R[name] = numbers(path, pose["R"], f"R of pose {name}", d, d)
         if "Lambda" in pose:

@@ -51,6 +51,10 @@ The larger of the two is taken. (For comparison with the literature alone: where
 S + eta blockdiag(0, I) is positive semidefinite, (B) is at least tr(Lambda) + constant - eta n d
 with n rotations, the bound of Rosen et al. 2019, theorem 7.)
 
+**Rotations alone.** Where no edge has a weight for its translation, the cost and q depend on the
+rows R_i^T alone. Then the rows t_i^T are left out of S, G and Z as those of pose r are, and the
+proof is the same without the shift of X.
+
 **Handedness terms.** In three dimensions a proof may take terms off q that are never negative on
 rotations, so that the smaller form bounds the cost as well. For poses i and j, a rotation T and a
 positive semidefinite P, let rho = R_j^T - T^T R_i^T and W = (tr(P) / 2 I - P) / 4. Where the
@@ -92,9 +96,21 @@ from pgo_models.verification.balls import (
     part,
     symmetric,
 )
-from pgo_models.verification.costs import QuadraticForm, StepFailedError, UndecidedError, add_edge
+from pgo_models.verification.costs import (
+    QuadraticForm,
+    StepFailedError,
+    UndecidedError,
+    add_edge,
+    measures_translation,
+)
 from pgo_models.verification.measurements import WORLD, Graph, read_graph
-from pgo_models.verification.proof import COSTS, HandednessTerm, Proof, read_proof
+from pgo_models.verification.proof import (
+    COSTS,
+    ROTATION_COSTS,
+    HandednessTerm,
+    Proof,
+    read_proof,
+)
 
 PRECISIONS = (128, 512, 2048)  # bits; the next where a ball is too wide to tell its sign
 # Relative tolerance between what a proof claims and what is verified. The solver computed its
@@ -149,7 +165,9 @@ class Verification:
 
     @property
     def cost_name(self) -> str:
-        """F or chi2."""
+        """F or chi2, of rotations alone F(R)."""
+        if self.cost in ROTATION_COSTS:
+            return "F(R)"
         return "chi2" if self.cost == "chi2" else "F"
 
     @property
@@ -160,7 +178,8 @@ class Verification:
         if self.bound == 0:
             trivial = f"VERIFIED, but only the trivial bound: {self.cost_name} is a sum of squares"
             return f"{trivial}; no better bound is proven"
-        return f"VERIFIED: no poses have {self.cost_name} below this lower bound"
+        unknowns = "rotations" if self.cost in ROTATION_COSTS else "poses"
+        return f"VERIFIED: no {unknowns} have {self.cost_name} below this lower bound"
 
     def facts(self) -> list[tuple[str, str]]:
         """Return the facts as they are printed, balls to 20 digits.
@@ -331,6 +350,8 @@ def lower_bound(
         right_sides[pose] += beside(arb_mat(d + 1, d), eta_block * X[pose])
     del right_sides[proof.ground]
     H = without_pose(form.S, proof.ground)
+    if is_of_rotations(graph, proof):
+        H, right_sides = without_translations(H, right_sides)
     products = eliminate(H, right_sides)
     columns_of_G = range(d)
     columns_of_shifted_G = range(d, 2 * d)
@@ -425,6 +446,8 @@ def check_names(graph: Graph, proof: Proof) -> None:
     strangers = sorted(graph.nodes ^ proof.t.keys())
     if strangers:
         raise StepFailedError(f"the poses: {pose_name(strangers[0])} is not in both files")
+    if graph.landmarks and is_of_rotations(graph, proof):
+        raise StepFailedError("the poses: rotations alone are none of landmarks")
     if proof.R.keys() != graph.nodes - graph.landmarks:
         raise StepFailedError("the poses: a pose has no R, or a landmark has one")
     if proof.ground not in proof.R:
@@ -471,6 +494,27 @@ def without_pose(S: dict[int, dict[int, arb_mat]], r: int) -> dict[int, dict[int
         if i != r:
             others[i] = {j: block for j, block in row.items() if j != r}
     return others
+
+
+def is_of_rotations(graph: Graph, proof: Proof) -> bool:
+    """Whether the cost is one of rotations alone: no edge has a weight for its translation."""
+    if proof.cost in ROTATION_COSTS:
+        return True
+    return not any(measures_translation(edge) for edge in graph.edges)
+
+
+def without_translations(
+    H: dict[int, dict[int, arb_mat]], right_sides: dict[int, arb_mat]
+) -> tuple[dict[int, dict[int, arb_mat]], dict[int, arb_mat]]:
+    """H and right-hand sides in the rows of rotations; H has zeros in those of translations."""
+    some_block = next(iter(right_sides.values()))
+    rows = range(1, some_block.nrows())
+    columns = range(some_block.ncols())
+    H_of_rotations = {}
+    for i, row in H.items():
+        H_of_rotations[i] = {j: part(block, rows, rows) for j, block in row.items()}
+    of_rotations = {i: part(block, rows, columns) for i, block in right_sides.items()}
+    return H_of_rotations, of_rotations
 
 
 def eliminate(H: dict[int, dict[int, arb_mat]], G: dict[int, arb_mat]) -> arb_mat:

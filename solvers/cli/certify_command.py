@@ -20,6 +20,7 @@ from solvers.cli.options import (
     GraphArgument,
     InformationOption,
     ProofOption,
+    RotationsOption,
     SkipUnknownOption,
 )
 from solvers.cli.shell import (
@@ -33,7 +34,13 @@ from solvers.cli.shell import (
 from solvers.cli.study_commands import DropEdgeOption, UnitWeightsOption
 from solvers.reporting.versions import installed_versions
 from solvers.riemannian.certify import certify
-from solvers.solution import both_costs, certificate_json, other_cost, write_json
+from solvers.solution import (
+    both_costs,
+    certificate_json,
+    facts_of_unknowns,
+    other_cost,
+    write_json,
+)
 
 _INDENT = 13  # columns of the labels of a certificate
 
@@ -55,6 +62,7 @@ def certify_command(
     proof: ProofOption = None,
     gap: GapOption = DEFAULT_GAP,
     unit_weights: UnitWeightsOption = False,
+    rotations: RotationsOption = False,
     information: InformationOption = False,
     drop_coupling: DropCouplingOption = False,
     skip_unknown: SkipUnknownOption = False,
@@ -68,7 +76,9 @@ def certify_command(
     for path in (out, proof):
         if path is not None:
             check_writable(path)
-    source = GraphOptions(graph, unit_weights, information, drop_coupling, skip_unknown, drop_edge)
+    source = GraphOptions(
+        graph, unit_weights, information, drop_coupling, skip_unknown, drop_edge, rotations
+    )
     problem = source.problem(source.loaded())
     poses = estimated_poses(problem.graph, estimate)
     certificate = certify(problem, poses, gap)
@@ -103,6 +113,7 @@ def _text(problem: PGOProblem, poses: Poses, certificate: Certificate, note: str
     """The certificate as it is printed, with a note and with the cost that is not bounded."""
     rows = [("note", note)] if note else []
     rows += other_cost(problem, poses)
+    rows += facts_of_unknowns(problem)
     lines = [str(certificate)]
     lines += [f"{label:<12} {text}" for label, text in rows]
     return wrapped("\n".join(lines), _INDENT)

@@ -43,6 +43,7 @@ class GraphOptions:
     drop_coupling: bool = False
     skip_unknown: bool = False
     drop_edge: Dropped = None
+    rotations: bool = False
 
     def loaded(self) -> PoseGraph:
         """The graph, without the edges to leave out."""
@@ -55,6 +56,13 @@ class GraphOptions:
         blocks are to be left out and it is not asked for. A GraphError names the first indefinite
         matrix by `file:line`, unless the coupling blocks of such matrices are to be left out.
         """
+        if self.rotations:
+            if self.information:
+                raise SettingError(
+                    "--rotations has the rotation precisions of F, and --information asks for "
+                    "chi2; leave out one of the two"
+                )
+            return PGOProblem(loaded, weighting=Weighting.ROTATIONS)
         if self.drop_coupling and not self.information:
             raise SettingError(
                 "--drop-coupling is for the information matrices of chi2; add --information"
@@ -83,6 +91,7 @@ class GraphOptions:
         """The name of the graph with all these options, as one types them."""
         options = {
             "--unit-weights": self.unit_weights,
+            "--rotations": self.rotations,
             "--information": self.information,
             "--drop-coupling": self.drop_coupling,
             "--skip-unknown": self.skip_unknown,

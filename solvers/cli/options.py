@@ -111,6 +111,14 @@ SplitOption = Annotated[
         "contiguous."
     ),
 ]
+RotationsOption = Annotated[
+    bool,
+    typer.Option(
+        "--rotations",
+        help="Estimate and certify rotations alone (rotation averaging): the cost is the rotation "
+        "part of F. A file whose edges have only rotations needs no such option.",
+    ),
+]
 InformationOption = Annotated[
     bool,
     typer.Option(

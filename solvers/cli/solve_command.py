@@ -8,16 +8,19 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from pgo_models.certificates.certificate import DEFAULT_GAP
 from pgo_models.errors import SettingError
 from pgo_models.files import check_writable
-from pgo_models.geometry.poses import absolute_trajectory_error
+from pgo_models.geometry.poses import absolute_rotation_error, absolute_trajectory_error
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.plots.style import is_picture
 from pgo_models.problem.marginals import write_covariances
+from pgo_models.problem.problem import PGOProblem
 from solvers.cli import options as choices
 from solvers.cli.explanations import (
     edge_fit_of_solution,
@@ -38,6 +41,7 @@ from solvers.cli.options import (
     InformationOption,
     ProofOption,
     Robust,
+    RotationsOption,
     Runner,
     SkipUnknownOption,
     SplitOption,
@@ -144,6 +148,7 @@ def solve_command(
     ] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for the iterations.")] = math.inf,
     unit_weights: UnitWeightsOption = False,
+    rotations: RotationsOption = False,
     information: InformationOption = False,
     drop_coupling: DropCouplingOption = False,
     skip_unknown: SkipUnknownOption = False,
@@ -194,7 +199,9 @@ def solve_command(
 ) -> None:
     """Solve a pose graph: poses, their cost, a proven lower bound on the optimum, and the gap."""
     given = _given_options(locals())
-    source = GraphOptions(graph, unit_weights, information, drop_coupling, skip_unknown, drop_edge)
+    source = GraphOptions(
+        graph, unit_weights, information, drop_coupling, skip_unknown, drop_edge, rotations
+    )
     stages = StageOptions(method, start, r_step, gap, max_iterations, tolerance, time_limit, robust)
     network = RobotOptions(robots, split, engine, address, resume, driver_memory)
     display = Display(verbose, quiet, as_json)
@@ -206,6 +213,7 @@ def solve_command(
     with JobBar(1, None, f"reading {graph}"):
         loaded = with_times(source.loaded(), times)
     problem = source.problem(loaded)
+    outputs.check_drawable(problem)
     outputs.check_writable(problem.graph.num_robots)
     stages.check_robust()
     say_memory_of_solve(graph, problem.graph, network.is_given)
@@ -381,6 +389,12 @@ class Outputs:
         if self.covariances is not None and self.covariances.suffix.lower() != ".csv":
             raise SettingError(f"cannot write {self.covariances}: covariances are written as .csv")
 
+    def check_drawable(self, problem: PGOProblem) -> None:
+        """Raise an error for a picture or report of rotations alone."""
+        for path in (*self.out, self.report):
+            if path is not None and (path is self.report or is_picture(path)):
+                problem.check_positions(str(path))
+
     def check_writable(self, num_robots: int) -> None:
         """Raise an error for the first file or folder that cannot be written."""
         for path in self.out:
@@ -482,7 +496,8 @@ def _files_of_solution(
         ids = graph.pose_ids[named]
 
         def save_covariances(path: Path) -> None:
-            write_covariances(solution.marginals()[named], ids, path)
+            has_translations = solution.problem.has_translations
+            write_covariances(solution.marginals()[named], ids, path, has_translations)
 
         targets.append((outputs.covariances, save_covariances))
     return targets
@@ -494,7 +509,12 @@ def _text_with_error(solution: Solution) -> str:
     if graph.truth is None:
         return str(solution)
     bodies = graph.bodies
-    error = absolute_trajectory_error(solution.poses[bodies], graph.truth[bodies])
+    estimate = solution.poses[bodies]
+    truth = graph.truth[bodies]
+    if not solution.problem.has_translations:
+        error = np.rad2deg(absolute_rotation_error(estimate, truth))
+        return f"{solution}\n\nerror to the truth, of rotations: {error:.4g} degrees"
+    error = absolute_trajectory_error(estimate, truth)
     return f"{solution}\n\nerror to the truth (ATE): {error:.4g} m"
 
 

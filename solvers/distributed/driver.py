@@ -138,6 +138,8 @@ class Driver:
         SOC minimizes instead (`PGOProblem.convex_part`). False where there is one cost.
     grounded_position : int
         Position in `cover` of the pose that is fixed when a bound is proved.
+    has_translations : bool
+        Whether translations are among the unknowns (`PGOProblem.has_translations`).
     robots_with_edges : ndarray of int
         Numbers of the robots to which at least one edge belongs. Only they have an interior.
     network : CountedPool
@@ -203,6 +205,7 @@ class Driver:
         self.robots_with_edges = np.array([robot.robot for robot in with_edges])
         self._parts = [robot.part for robot in with_edges]
         self._has_two_costs = any(robot.has_two_costs for robot in summaries)
+        self.has_translations = all(robot.has_translations for robot in summaries)
         # Whether the process of the driver has the graph, too.
         self.has_whole = all(robot.part is not None for robot in summaries)
 
@@ -316,6 +319,18 @@ class Driver:
         if len(pose_0) == 0:
             return np.zeros((0, sum(widths)), dtype=int)
         return columns_of(pose_0, len(self.cover), widths)[None]
+
+    def rows_left_out(self, position: int | None) -> IntArray:
+        """Rows of X on the cover that a proof of a bound leaves out, ascending.
+
+        They are those of the pose at a position in the cover; without one the translation of pose
+        0, if it is in the cover. In a problem of rotations alone all translations are left out.
+        """
+        g = len(self.cover)
+        rows = self.columns_of_pose_0(1).ravel()
+        if position is not None:
+            rows = columns_of(np.array([position]), g, (1, self.d))
+        return rows if self.has_translations else np.union1d(np.arange(g), rows)
 
     def grounding_block(self) -> list[tuple[IntArray, Array]]:
         """Block that doubles the (t_0, t_0) entry of M, if pose 0 is in the cover.

@@ -89,7 +89,7 @@ def prove_with_eta(driver: Driver, eta: float) -> LowerBound | None:
 
     None unless S + eta blockdiag(0, I) without a translation is positive definite.
     """
-    proof = eliminate_S(driver, driver.columns_of_pose_0(1).ravel(), eta, central.UNGROUNDED_MARGIN)
+    proof = eliminate_S(driver, driver.rows_left_out(None), eta, central.UNGROUNDED_MARGIN)
     if proof is None:
         return None
     return central.bound_with_eta(proof.traces, eta, driver.num_poses * driver.d)
@@ -132,8 +132,8 @@ def prove_grounded(driver: Driver, eta: float, with_terms: bool = False) -> Lowe
     With terms, S is that of the cost less the handedness terms of every robot's edges.
     """
     g = len(driver.cover)
-    fixed = columns_of(np.array([driver.grounded_position]), g, (1, driver.d))
-    X = _grounded_point(driver, fixed)
+    fixed = driver.rows_left_out(driver.grounded_position)
+    X = _grounded_point(driver)
     proof = None
     share = FIRST_MARGIN
     while proof is None:
@@ -151,15 +151,18 @@ def prove_grounded(driver: Driver, eta: float, with_terms: bool = False) -> Lowe
     return central.grounded_bound(sums.value, sums.value_error, sums.quadratic, eta, distances)
 
 
-def _grounded_point(driver: Driver, fixed: IntArray) -> Array:
+def _grounded_point(driver: Driver) -> Array:
     """Rows of X on the cover, ((d+1) g, d), with the grounded pose at (0, I) exactly."""
     d = driver.d
+    grounded = columns_of(np.array([driver.grounded_position]), len(driver.cover), (1, d))
     R = driver.current.R[driver.grounded_position]
     t = driver.current.t[driver.grounded_position]
     translations = (driver.current.t - t) @ R
+    if not driver.has_translations:
+        translations = np.zeros_like(translations)
     rotations = stack_transposes(R.T @ driver.current.R)
     X = np.concatenate([translations, rotations])
-    X[fixed] = np.concatenate([np.zeros((1, d)), np.eye(d)])
+    X[grounded] = np.concatenate([np.zeros((1, d)), np.eye(d)])
     return X
 
 

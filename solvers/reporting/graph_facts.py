@@ -42,20 +42,21 @@ def describe_graph(graph: PoseGraph, indefinite: str = "") -> list[tuple[str, st
 def _cost_facts(graph: PoseGraph, has_chi2: bool) -> list[tuple[str, str]]:
     """Costs of the estimate and of the starts, or the memory that a solve takes if it is a lot."""
     problem = PGOProblem(graph)
+    name = problem.cost_name
     rows = []
     estimate = graph.initial
     if estimate is not None:
-        rows.append(("F, estimate", rounded_up(problem.objective(estimate), 8)))
+        rows.append((f"{name}, estimate", rounded_up(problem.objective(estimate), 8)))
         if has_chi2:
             for convention in Chi2Convention:
                 cost = rounded_up(chi2(graph, estimate, convention), 8)
                 rows.append((f"chi2, {convention.name.lower()}", cost))
-    rows.append(("F, tree", rounded_up(problem.objective(spanning_tree_start(graph)), 8)))
+    rows.append((f"{name}, tree", rounded_up(problem.objective(spanning_tree_start(graph)), 8)))
     note = memory_note(graph)
     if note:
         rows.append(("memory", note))
     else:
-        rows.append(("F, chordal", rounded_up(problem.objective(chordal_start(problem)), 8)))
+        rows.append((f"{name}, chordal", rounded_up(problem.objective(chordal_start(problem)), 8)))
     return rows
 
 

@@ -67,7 +67,7 @@ def write_report(
     Raises
     ------
     SettingError
-        If the name has another ending.
+        If the name has another ending, or the solution is of rotations alone.
     MissingExtraError
         If plotly or Jinja2 is not installed.
     FileFormatError
@@ -86,6 +86,7 @@ def write_report(
     """
     path = Path(path)
     check_report(path)
+    solution.problem.check_positions(str(path))
     text = report_page(solution, source=source, fit=fit)
     with replace_when_done(path) as temporary:
         # Names of poses and files may contain characters that are not UTF-8.

@@ -152,6 +152,7 @@ def gauss_newton(max_iterations: int = Newton.max_iterations) -> Newton:
 def needs_no_soc(problem: PGOProblem) -> bool:
     """Whether Newton alone is faster from the chordal start.
 
-    It is in the plane, where its matrix is no larger than SOC's, and on small graphs.
+    It is in the plane, where its matrix is no larger than SOC's, on small graphs, and for rotations
+    alone, whose chordal start is near their optimum.
     """
-    return problem.d == 2 or problem.num_poses <= SMALL
+    return problem.d == 2 or problem.num_poses <= SMALL or not problem.has_translations

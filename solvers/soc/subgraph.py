@@ -131,6 +131,7 @@ class Subgraph:
             in_cover=self.in_cover[shared],
             touched=touched if self.is_counted.any() else None,
             has_two_costs=self.final is not None,
+            has_translations=self.weights.has_translations,
             part=self.poses[poses_of_part],
         )
 
@@ -154,6 +155,8 @@ class RobotSummary:
         none.
     has_two_costs : bool
         Whether SOC is run on another cost than the one that is solved.
+    has_translations : bool
+        Whether translations are among the unknowns (`PGOProblem.has_translations`).
     part : (p,) array or None
         Numbers of all poses that these edges join; None where only the robot may know them.
     """
@@ -164,6 +167,7 @@ class RobotSummary:
     in_cover: IntArray
     touched: IntArray | None
     has_two_costs: bool
+    has_translations: bool
     part: IntArray | None
 
 

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from budget import examples
-from graphs import SEEDS, informed
+from graphs import COSTS_OF_POSES, SEEDS, informed
 from hypothesis import given, settings, strategies as st
 from scipy.optimize import minimize_scalar
 from wrong_edges import spoiled
@@ -107,7 +107,7 @@ def test_the_first_poses_follow_odometry():
     np.testing.assert_allclose(first.t, expected.t, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("weighting", pgo.Weighting)
+@pytest.mark.parametrize("weighting", COSTS_OF_POSES)
 @pytest.mark.parametrize("loss", [TLS, GM])
 @pytest.mark.parametrize("kind", ["random", "aliased"])
 @pytest.mark.parametrize("d", [2, 3])

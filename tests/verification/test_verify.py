@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import (
+    COSTS_OF_POSES,
     DIMENSIONS,
     LOUD_NOISE,
     SEEDS,
@@ -27,6 +28,7 @@ from proofs import PLANE, SPACE, assert_verified, edited, proof_of, written
 import solvers
 from pgo_models.certificates.certificate import BoundSource, certify_at
 from pgo_models.certificates.proof_file import save_proof
+from pgo_models.errors import FileFormatError
 from pgo_models.geometry.rotations import random_rotations
 from pgo_models.graphs.datasets import load, locate
 from pgo_models.graphs.g2o import read_g2o, write_g2o
@@ -134,7 +136,7 @@ def test_unit_weights_priors_and_landmarks_are_verified(tmp_path: Path) -> None:
     park = victoria_park(np.random.default_rng(0), num_poses=30)
     for graph in (gps, park):
         path = written(tmp_path, graph)
-        for weighting in Weighting:
+        for weighting in COSTS_OF_POSES:
             certificate, proof = proof_of(path, weighting)
             assert_verified(verify_proof(path, proof), certificate)
         problem = PGOProblem(read_g2o(path).unit_weights())
@@ -161,7 +163,8 @@ def test_unit_weights_priors_and_landmarks_are_verified(tmp_path: Path) -> None:
 def test_every_tag_of_the_plane(line: str, tmp_path: Path) -> None:
     path = tmp_path / "graph.g2o"
     path.write_text(f"{PLANE}{line}\n")
-    for weighting in Weighting:
+    has_rotations = "_XY" not in line and "XYZ" not in line
+    for weighting in Weighting if has_rotations else COSTS_OF_POSES:
         certificate, proof = proof_of(path, weighting)
         assert_verified(verify_proof(path, proof), certificate)
 
@@ -186,7 +189,8 @@ TRIANGLE = "10 1 0 1 0 0  20 0 0 1 0  30 0 0 2  40 1 0  50 0  60"
 def test_every_tag_of_space(line: str, tmp_path: Path) -> None:
     path = tmp_path / "graph.g2o"
     path.write_text(f"{SPACE}{line}\n")
-    for weighting in Weighting:
+    has_rotations = "_XY" not in line and "XYZ" not in line
+    for weighting in Weighting if has_rotations else COSTS_OF_POSES:
         certificate, proof = proof_of(path, weighting)
         assert_verified(verify_proof(path, proof), certificate)
 
@@ -223,7 +227,7 @@ def examined(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Path, Path,
 SIZES_OF_CHANGES = st.sampled_from([1e-12, 1e-7, 1e-4, 0.1, 1.0, -10.0, 1e6, 1e200])
 
 
-@given(st.data(), st.integers(0, 3), SIZES_OF_CHANGES)
+@given(st.data(), st.integers(0, 5), SIZES_OF_CHANGES)
 @settings(max_examples=examples(80))
 def test_a_proof_that_was_changed_proves_nothing_false(
     examined: list[tuple[Path, Path, float]], data: st.DataObject, case: int, change: float
@@ -262,7 +266,7 @@ def test_a_proof_that_was_changed_proves_nothing_false(
         assert found.failure.startswith("the poses")
 
 
-@given(st.data(), st.integers(0, 3))
+@given(st.data(), st.integers(0, 5))
 @settings(max_examples=examples(20))
 def test_a_measurement_that_was_changed_is_noticed(
     examined: list[tuple[Path, Path, float]], data: st.DataObject, case: int
@@ -272,12 +276,54 @@ def test_a_measurement_that_was_changed_is_noticed(
     edges = [k for k, line in enumerate(lines) if line.startswith("EDGE")]
     line = data.draw(st.sampled_from(edges))
     words = lines[line].split()
-    place = data.draw(st.integers(3, 4))  # x or y
+    of_rotations = json.loads(proof.read_text())["cost"] == "rotations"
+    is_turned = of_rotations and data.draw(st.booleans())
+    place = 5 if is_turned else data.draw(st.integers(3, 4))  # an angle or z, x or y
+    if is_turned and words[0] == "EDGE_SE3:QUAT":
+        place = 8  # of the quaternion
     words[place] = repr(float(words[place]) * (1 + 1e-4) + 1e-4)
     changed = path.with_name("changed.g2o")
     changed.write_text("\n".join([*lines[:line], " ".join(words), *lines[line + 1 :]]))
     found = verify_proof(changed, proof)
-    assert found.failure.startswith("the claims")
+    if of_rotations and not is_turned:
+        assert found.is_verified  # no translation has a part in it
+    else:
+        assert found.failure.startswith("the claims")
+
+
+def test_proofs_of_files_without_translations_are_verified(tmp_path: Path) -> None:
+    graph = varied_graph(0, 6, 3)
+    for weighting in Weighting:
+        path = written(tmp_path, graph.with_weights(graph.kappa, np.zeros(graph.num_edges)))
+        certificate, proof = proof_of(path, weighting)
+        found = verify_proof(path, proof)
+        assert_verified(found, certificate)
+        assert found.cost == ("chi2" if weighting is Weighting.INFORMATION else "rotations")
+    problem = PGOProblem(read_g2o(path).unit_weights())
+    save_proof(problem, solvers.solve(problem).certificate, proof)
+    found = verify_proof(path, proof)
+    assert found.cost == "unit rotations"
+    assert found.is_verified
+    assert found.cost_name == "F(R)"
+
+
+def test_a_proof_of_rotations_has_no_translations_and_one_of_poses_needs_them(
+    tmp_path: Path,
+) -> None:
+    path = written(tmp_path, varied_graph(0, 6, 3))
+    _, proof = proof_of(path, Weighting.ROTATIONS)
+    assert all("t" not in pose for pose in json.loads(proof.read_text())["poses"])
+    for cost in ("F", "unit", "chi2"):
+        with pytest.raises(FileFormatError, match="no entry 't'"):
+            verify_proof(path, edited(proof, cost=cost))
+
+
+def test_landmarks_have_no_part_in_a_proof_of_rotations(tmp_path: Path) -> None:
+    path = tmp_path / "graph.g2o"
+    path.write_text(f"{PLANE}EDGE_SE2_XY 0 7 3 4 10 1 20\nEDGE_SE2_XY 2 7 1 4 10 1 20\n")
+    _, proof = proof_of(path)
+    found = verify_proof(path, edited(proof, cost="rotations"))
+    assert found.failure == "the poses: rotations alone are none of landmarks"
 
 
 def test_the_proof_of_another_graph_fails(tmp_path: Path) -> None:

@@ -30,6 +30,8 @@ def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofA
     fixed = cut.boundary[order.fixed > 0]
     if order.point is None and factors.grounds:
         fixed = np.append(fixed, 0)
+    if not problem.has_translations:
+        fixed = np.union1d(np.arange(problem.num_poses), fixed)
     verified = verify_interior(problem, Lambda, order.eta, cut, fixed, order.share, factors.backend)
     if verified is None:
         return robot.with_changes(proof=None), ProofAnswer(None, None, trace, None)
