@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOError, printable
-from pgo_models.files import check_writable, replace_when_done
+from pgo_models.files import check_lines, check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, BoolArray, log_map, quaternions_from_rotations
-from pgo_models.graphs.g2o_parser import G2OLines, information_of, poses_of, read_lines
-from pgo_models.graphs.g2o_tags import TAGS, Tag
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.g2o_parser import G2OLines, read_lines
+from pgo_models.graphs.g2o_rows import information_of, numbers_of, poses_of
+from pgo_models.graphs.g2o_tags import G2O_TAGS, Tag
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph, isotropic_information
 from pgo_models.graphs.precisions import RotationWeight, edge_precisions
 
@@ -36,11 +37,28 @@ def read_g2o(
 ) -> PoseGraph:
     """Read a g2o file, or a folder with one g2o file for each robot.
 
-    The reader takes FIX lines, and the lines of poses, landmarks and priors that g2o, GTSAM and
-    TORO write. It numbers the poses by ascending id; the world pose of priors comes last. It
+    The reader takes FIX lines, and the lines of poses, landmarks and priors that g2o, GTSAM, TORO
+    and iSAM write. It numbers the poses by ascending id; the world pose of priors comes last. It
     normalises quaternions, and counts every copy of an edge that a file repeats. An edge may lead
     to a pose that has no VERTEX line. `PoseGraph.initial` is set if every pose has a VERTEX line,
     and is None otherwise.
+
+    Where the lines leave a choice, a `GraphWarning` says what was assumed:
+
+    - EDGE2, EDGE3 and LANDMARK2 have information matrices, although iSAM's files have square roots
+      of them. The matrices of EDGE2 are in TORO's order, unless all are positive definite in
+      iSAM's, and not in TORO's.
+    - EDGE3 without a matrix has the identity.
+    - ODOMETRY and LANDMARK have covariance matrices, as in GTSAM.
+    - BR, a point by bearing and range with their standard deviations, becomes a point with the
+      covariance to first order, an approximation.
+    - EQUIV, which names edges that TORO may contract, is skipped.
+    - An id of a pose that is a landmark's, too, names two things; a power of ten is added to the
+      ids of all landmarks.
+
+    A measurement by a sensor that PARAMS_SE2OFFSET or PARAMS_SE3OFFSET places beside its pose is
+    brought into the frame of the pose. This is exact for landmarks; of an edge or prior that ends
+    at such a sensor, the information is right to first order in the rotation error.
 
     The robot of a pose is found in one of three ways:
 
@@ -77,8 +95,8 @@ def read_g2o(
     Raises
     ------
     FileFormatError
-        With file:line, for a line that cannot be read or measures nothing, and for FIX of an
-        unknown pose. Also for a folder with a 2D file and a 3D file, and if there are no edges or
+        With file:line of the first 20 lines that cannot be read or measure nothing, and for FIX of
+        unknown poses. Also for a folder with a 2D file and a 3D file, and if there are no edges or
         no files.
 
     References
@@ -95,6 +113,7 @@ def read_g2o(
     files = [read_lines(file, skip_unknown) for file in g2o_files(path)]
     files = _files_of_robots(files)
     d = _common_dimension(files)
+    _check_ids_of_landmarks(files)
     edge_ids, rows = _joined_edges(files)
     if not len(rows):
         raise FileFormatError(
@@ -150,6 +169,17 @@ def _common_dimension(files: list[G2OLines]) -> int:
             )
             raise FileFormatError(file.path, None, problem)
     return first.d
+
+
+def _check_ids_of_landmarks(files: list[G2OLines]) -> None:
+    """Raise a FileFormatError where a file of several has poses and landmarks with the same ids."""
+    for file in files:
+        if len(files) > 1 and file.landmark_shift:
+            problem = (
+                "ids of poses are those of landmarks, too; in a folder of several files, "
+                "give the landmarks ids of their own"
+            )
+            raise FileFormatError(file.path, None, problem)
 
 
 def _distinct(ids: list[IntArray]) -> IntArray:
@@ -602,12 +632,11 @@ def _initial(ids: IntArray, robot: IntArray | None, files: list[G2OLines]) -> Po
 def _fixed(ids: IntArray, files: list[G2OLines]) -> IntArray:
     """Poses of the FIX lines, ascending; a FileFormatError for one that has no other line."""
     for file in files:
-        is_unknown = ~np.isin(file.fixed, ids)
-        if is_unknown.any():
-            first = int(np.argmax(is_unknown))
-            problem = f"FIX names pose {file.fixed[first]}, which has no other line; remove it"
-            line = int(file.fixed_lines[first])
-            raise FileFormatError(file.path, line, problem)
+        problems = []
+        for row in np.flatnonzero(~np.isin(file.fixed, ids)):
+            problem = f"FIX names pose {file.fixed[row]}, which has no other line; remove it"
+            problems.append((int(file.fixed_lines[row]), problem))
+        check_lines(file.path, problems)
     fixed_ids = np.concatenate([file.fixed for file in files])
     fixed_poses = np.searchsorted(ids, fixed_ids)
     return np.unique(fixed_poses)
@@ -648,8 +677,8 @@ def _write(
 def _written_tags(d: int, is_edge: bool) -> dict[str, Tag]:
     """Tags of the VERTEX or EDGE lines that are written in d dimensions."""
     written = {}
-    for tag, kind in TAGS.items():
-        if kind.d == d and kind.is_edge == is_edge and not kind.is_toro:
+    for tag, kind in G2O_TAGS.items():
+        if kind.d == d and kind.is_edge == is_edge:
             written[tag] = kind
     return written
 
@@ -699,7 +728,7 @@ def _edge_lines(graph: PoseGraph, edges: BoolArray) -> Iterator[str]:
         numbers = np.concatenate([measured, triangles], axis=1)
         # The line of a prior names the measured pose alone, which is the second end of the edge.
         ids = end_ids[chosen, -kind.num_ids :]
-        offset = "0 " if kind.has_offset else ""
+        offset = "0 " * kind.num_offsets
         yield from _lines(tag, ids, numbers, offset)
 
 
@@ -707,8 +736,7 @@ def _numbers(poses: Poses, kind: Tag) -> Array:
     """Numbers of poses, (n, ..), as they stand on lines of a kind."""
     if kind.is_point:
         return poses.t
-    rotations = log_map(poses.R) if poses.d == 2 else quaternions_from_rotations(poses.R)
-    return np.concatenate([poses.t, rotations], axis=1)
+    return numbers_of(poses.R, poses.t)
 
 
 def _lines(tag: str, ids: IntArray, numbers: Array, offset: str = "") -> Iterator[str]:
