@@ -125,11 +125,11 @@ def _count_lines(data: bytes) -> int:
     return num_lines
 
 
-def check_lines(path: Path | str, problems: Sequence[Problem]) -> None:
+def check_lines(path: Path | str, problems: Sequence[Problem], unit: str = "lines") -> None:
     """Raise a FileFormatError when there are problems in the lines of a file.
 
     It has `file:line: problem` for each of the first 20 wrong lines, and their number. Of several
-    problems of a line the first is named.
+    problems of a line the first is named. `unit` is what is counted in place of lines.
     """
     if not problems:
         return
@@ -141,9 +141,9 @@ def check_lines(path: Path | str, problems: Sequence[Problem]) -> None:
     place = printable(str(path))
     texts = [f"{place}:{line}: {problem_of_line[line]}" for line in named]
     if len(lines) > len(named):
-        texts.append(f"{len(lines)} lines are wrong; the first {len(named)} are named")
+        texts.append(f"{len(lines)} {unit} are wrong; the first {len(named)} are named")
     elif len(lines) > 1:
-        texts.append(f"{len(lines)} lines are wrong")
+        texts.append(f"{len(lines)} {unit} are wrong")
     texts[0] = problem_of_line[named[0]]  # FileFormatError names the place of the first
     raise FileFormatError(path, named[0], "\n".join(texts))
 

@@ -13,7 +13,8 @@ from pathlib import Path
 
 from pgo_models.errors import DatasetError, FileFormatError
 from pgo_models.files import replace_when_done
-from pgo_models.graphs.g2o import name_of, read_g2o
+from pgo_models.graphs.g2o import edge_places, name_of, read_g2o
+from pgo_models.graphs.jrl import SUFFIX, jrl_edge_places, read_jrl
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.graphs.trajectories import read_tum
@@ -81,7 +82,8 @@ def load(
     Parameters
     ----------
     name_or_path : str or Path
-        Name of a data set (`known_datasets`), a g2o file, or a folder with one for each robot.
+        Name of a data set (`known_datasets`), a g2o file, a folder with one for each robot, or a
+        file of a JSON robot log, whose name ends in .jrl (`read_jrl`).
     registry : Registry
         Public data sets; those of SE-Sync unless given.
     download : bool
@@ -114,7 +116,8 @@ def load(
     PoseGraph('sphere', d=3, poses=50, edges=544, robots=1)
     """
     path = locate(name_or_path, registry, download=download)
-    graph = read_g2o(path, weights, skip_unknown=skip_unknown)
+    read = read_jrl if path.suffix == SUFFIX else read_g2o
+    graph = read(path, weights, skip_unknown=skip_unknown)
     truth_path = path.absolute().parent / f"{name_of(path)}.truth.tum"
     if not os.path.isfile(truth_path):
         return graph
@@ -144,7 +147,8 @@ def locate(
             return path
     elif os.path.exists(path):
         return path
-    if isinstance(name_or_path, Path) or path.suffix == ".g2o" or name != path.name:
+    is_file_name = path.suffix in (".g2o", SUFFIX)
+    if isinstance(name_or_path, Path) or is_file_name or name != path.name:
         raise FileFormatError(
             path, None, "no such file or folder; check the path, or give a data set's name"
         )
@@ -154,6 +158,11 @@ def locate(
     if name not in registry.checksums:
         raise _unknown(name, registry)
     return _cached(name, registry, download)
+
+
+def places_of_edges(path: Path) -> list[str]:
+    """`file:line` of every edge of the graph in a file or folder; as `load` reads it."""
+    return jrl_edge_places(path) if path.suffix == SUFFIX else edge_places(path)
 
 
 def _in_folders(name: str) -> Path | None:

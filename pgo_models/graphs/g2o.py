@@ -22,6 +22,7 @@ from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph, isotropi
 from pgo_models.graphs.precisions import RotationWeight, edge_precisions
 
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
+_LETTER_CODES = [ord(letter) for letter in _LETTERS]
 MOST_SYMBOLS = len(_LETTERS)  # robots whose poses can be named by GTSAM symbols
 _ROWS_AT_A_TIME = 2**14  # rows of numbers that are turned into text at a time
 _LETTER_SHIFT = 56  # a GTSAM symbol is a letter in the top byte and an index below it
@@ -112,8 +113,22 @@ def read_g2o(
     path = Path(path)
     files = [read_lines(file, skip_unknown) for file in g2o_files(path)]
     files = _files_of_robots(files)
-    d = _common_dimension(files)
     _check_ids_of_landmarks(files)
+    return graph_of_files(path, files, weights)
+
+
+def graph_of_files(
+    path: Path,
+    files: list[G2OLines],
+    weights: RotationWeight,
+    letters: Sequence[int] = _LETTER_CODES,
+) -> PoseGraph:
+    """Graph of the lines of a file for each robot, or of one file.
+
+    `path` is that of all files together. `letters` are the codes of those letters in the top byte
+    of ids that name robots.
+    """
+    d = _common_dimension(files)
     edge_ids, rows = _joined_edges(files)
     if not len(rows):
         raise FileFormatError(
@@ -123,7 +138,7 @@ def read_g2o(
     ids = _distinct([edge_ids.ravel(), *ids_of_vertices])
     file_ids = ids[ids != WORLD_ID]  # the world pose, if there is one, has the largest id
     edges = np.searchsorted(ids, edge_ids)
-    robot = _robots(file_ids, files)
+    robot = _robots(file_ids, files, letters)
     initial = _initial(file_ids, robot, files)
     world = None
     if len(file_ids) < len(ids):
@@ -386,9 +401,8 @@ def pose_names(graph: PoseGraph) -> list[str]:
     names = [graph.pose_name(pose) for pose in range(graph.num_poses)]
     poses = graph.in_files.tolist()
     ids = {pose: int(names[pose]) for pose in poses}
-    letter_codes = {ord(letter) for letter in _LETTERS}
     codes = {symbol >> _LETTER_SHIFT for symbol in ids.values()}
-    if not codes <= letter_codes:
+    if not codes <= set(_LETTER_CODES):
         return names
     index_bits = (1 << _LETTER_SHIFT) - 1
     for pose, symbol in ids.items():
@@ -567,11 +581,12 @@ def edge_rows_to_keep(files: Sequence[tuple[IntArray, Array]]) -> list[IntArray 
     return kept
 
 
-def _robots(ids: IntArray, files: list[G2OLines]) -> IntArray | None:
+def _robots(
+    ids: IntArray, files: list[G2OLines], letters_of_robots: Sequence[int]
+) -> IntArray | None:
     """Robot of every pose by the cases (a) and (b) of `read_g2o`; None in case (c)."""
     letters = ids >> _LETTER_SHIFT
-    letter_codes = [ord(letter) for letter in _LETTERS]
-    if np.isin(letters, letter_codes).all():
+    if np.isin(letters, letters_of_robots).all():
         return _ranks(letters)
     if len(files) == 1:
         return None

@@ -58,12 +58,9 @@ class Tag:
         """How many numbers stand behind the ids."""
         if self.noise is Noise.DEVIATIONS:
             return 4
-        k = self.d if self.is_point else 3 * self.d - 3
-        has_quaternion = k == 6 and not self.is_toro
-        num_measured = 7 if has_quaternion else k
         has_triangle = self.is_edge and self.noise is not Noise.MISSING
-        num_in_triangle = k * (k + 1) // 2 if has_triangle else 0
-        return num_measured + num_in_triangle
+        num_in_triangle = self._side * (self._side + 1) // 2 if has_triangle else 0
+        return self._num_measured + num_in_triangle
 
     @property
     def is_position(self) -> bool:
@@ -103,8 +100,9 @@ class Tag:
 
     @property
     def _num_measured(self) -> int:
-        """How many numbers the measurement of a line without a quaternion has."""
-        return self._side
+        """How many numbers the measurement has."""
+        has_quaternion = self._side == 6 and not self.is_toro
+        return 7 if has_quaternion else self._side
 
     def _with_information(self, numbers: Array) -> Array:
         """Numbers with the triangle of an information matrix in place of another noise."""

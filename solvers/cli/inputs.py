@@ -12,8 +12,8 @@ import numpy as np
 from pgo_models.errors import FileFormatError, GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray
-from pgo_models.graphs.datasets import load, locate
-from pgo_models.graphs.g2o import edge_places, read_g2o_poses
+from pgo_models.graphs.datasets import load, locate, places_of_edges
+from pgo_models.graphs.g2o import read_g2o_poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import (
     indefinite_edges,
@@ -143,7 +143,7 @@ def kept_edges(graph: str, dropped: Dropped) -> tuple[BoolArray, list[str]]:
     if not (path.is_file() or path.is_dir()):
         raise SettingError(f"{graph} can be read only once; give it as a file to name its edges")
     with warnings.catch_warnings(action="ignore"):
-        places = edge_places(path)
+        places = places_of_edges(path)
     kept = np.ones(len(places), dtype=bool)
     for name in dropped or ():
         kept[_edge_named(name, graph, places)] = False
