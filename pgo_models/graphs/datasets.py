@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pgo_models.errors import DatasetError, FileFormatError
+from pgo_models.errors import DatasetError, FileFormatError, SettingError
 from pgo_models.files import replace_when_done
 from pgo_models.graphs.g2o import edge_places, name_of, read_g2o
 from pgo_models.graphs.jrl import SUFFIX, jrl_edge_places, read_jrl
@@ -71,6 +71,7 @@ def load(
     download: bool = True,
     weights: RotationWeight = RotationWeight.SE_SYNC,
     skip_unknown: bool = False,
+    square_roots: bool = False,
 ) -> PoseGraph:
     """Load a pose graph by the name of a data set, or from a file or folder.
 
@@ -92,6 +93,8 @@ def load(
         As for `read_g2o`.
     skip_unknown : bool
         As for `read_g2o`.
+    square_roots : bool
+        As for `read_g2o`; a JSON robot log has none.
 
     Returns
     -------
@@ -102,6 +105,8 @@ def load(
     ------
     DatasetError
         When the name is unknown, the download fails or is not wanted, or its checksum is wrong.
+    SettingError
+        When square roots are asked for of a JSON robot log, which has covariances.
     FileFormatError
         As for `read_g2o`; also when the truth has not one pose for each of the graph.
 
@@ -116,8 +121,12 @@ def load(
     PoseGraph('sphere', d=3, poses=50, edges=544, robots=1)
     """
     path = locate(name_or_path, registry, download=download)
-    read = read_jrl if path.suffix == SUFFIX else read_g2o
-    graph = read(path, weights, skip_unknown=skip_unknown)
+    if path.suffix != SUFFIX:
+        graph = read_g2o(path, weights, skip_unknown=skip_unknown, square_roots=square_roots)
+    elif square_roots:
+        raise SettingError(f"{path} has covariances, and no square roots; leave square_roots out")
+    else:
+        graph = read_jrl(path, weights, skip_unknown=skip_unknown)
     truth_path = path.absolute().parent / f"{name_of(path)}.truth.tum"
     if not os.path.isfile(truth_path):
         return graph

@@ -35,6 +35,7 @@ def read_g2o(
     weights: RotationWeight = RotationWeight.SE_SYNC,
     *,
     skip_unknown: bool = False,
+    square_roots: bool = False,
 ) -> PoseGraph:
     """Read a g2o file, or a folder with one g2o file for each robot.
 
@@ -47,8 +48,8 @@ def read_g2o(
     Where the lines leave a choice, a `GraphWarning` says what was assumed:
 
     - EDGE2, EDGE3 and LANDMARK2 have information matrices, although iSAM's files have square roots
-      of them. The matrices of EDGE2 are in TORO's order, unless all are positive definite in
-      iSAM's, and not in TORO's.
+      of them (`square_roots`). The matrices of EDGE2 are in TORO's order, unless all are positive
+      definite in iSAM's, and not in TORO's.
     - EDGE3 without a matrix has the identity.
     - ODOMETRY and LANDMARK have covariance matrices, as in GTSAM.
     - BR, a point by bearing and range with their standard deviations, becomes a point with the
@@ -87,6 +88,9 @@ def read_g2o(
         kappa = I_theta (SE_SYNC) or kappa = I_theta / 2 (GAUSSIAN). It has no effect on 3D edges.
     skip_unknown : bool
         Whether lines with other tags are skipped with a warning.
+    square_roots : bool
+        Whether matrices, of all tags, are upper triangular square roots U of the information U^T U,
+        by rows, as iSAM writes them.
 
     Returns
     -------
@@ -111,7 +115,7 @@ def read_g2o(
     PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
     """
     path = Path(path)
-    files = [read_lines(file, skip_unknown) for file in g2o_files(path)]
+    files = [read_lines(file, skip_unknown, square_roots) for file in g2o_files(path)]
     files = _files_of_robots(files)
     _check_ids_of_landmarks(files)
     return graph_of_files(path, files, weights)

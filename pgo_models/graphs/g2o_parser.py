@@ -39,6 +39,7 @@ from pgo_models.graphs.g2o_tags import (
     SINGULAR,
     TAGS,
     TAGS_IN_FILES,
+    Noise,
     Tag,
 )
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
@@ -46,9 +47,8 @@ from pgo_models.graphs.precisions import are_definite
 
 _NAMED_TAGS = 10  # unknown tags that a warning names
 _KNOWN_TAGS = ", ".join(TAGS_IN_FILES)
-_TAKEN_AS_INFORMATION = (
-    "matrices are taken as information; iSAM's own files have square roots of it"
-)
+_SQUARE_ROOTS = "iSAM's own files have square roots of information (pgo info --square-roots --out)"
+_TAKEN_AS_INFORMATION = f"matrices are taken as information; {_SQUARE_ROOTS}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +80,14 @@ class _Rows(NamedTuple):
     is_point: BoolArray  # (n,): whether the last id is that of a landmark
 
 
-def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
+def read_lines(
+    path: Path | str, skip_unknown: bool = False, square_roots: bool = False
+) -> G2OLines:
     """Read and check the lines of one g2o file.
 
     Blank lines, comments (#), EQUIV lines and PARAMS_ lines that nothing uses are skipped. With
-    `skip_unknown`, so are lines with unknown tags. A `GraphWarning` gives the number of each
+    `skip_unknown`, so are lines with unknown tags. With `square_roots`, all matrices are square
+    roots U of the information U^T U, by rows. A `GraphWarning` gives the number of each
     unknown tag, and another one says what was assumed where the tags leave a choice: see the page
     "My g2o file" of the guide.
 
@@ -106,7 +109,7 @@ def read_lines(path: Path | str, skip_unknown: bool = False) -> G2OLines:
     if skip_unknown and source.unknown:
         warnings.warn(_text_of_unknown(source), GraphWarning, stacklevel=2)
     d = _dimension(source)
-    assembly = _Assembly(source, d)
+    assembly = _Assembly(source, d, square_roots)
     file = assembly.lines()
     check_lines(path, [*source.problems, *problems_of(file)])
     if assembly.notes:
@@ -182,10 +185,11 @@ class _Assembly:
     `notes` says what was assumed where files differ.
     """
 
-    def __init__(self, source: Source, d: int) -> None:
+    def __init__(self, source: Source, d: int, square_roots: bool) -> None:
         self.notes: list[str] = []
         self._source = source
         self._d = d
+        self._square_roots = square_roots
 
     def lines(self) -> G2OLines:
         """What the file holds. Lines with problems are left out, and noted in the source."""
@@ -215,10 +219,14 @@ class _Assembly:
     def _settle_edge2(self) -> None:
         """Settle the order of the matrices on EDGE2 lines.
 
-        Where it is that of rows, they are lines of EDGE_SE2.
+        Where it is that of rows, they are lines of EDGE_SE2. Square roots are iSAM's, by rows.
         """
         parsed = self._source.parsed
         if not parsed["EDGE2"]:
+            return
+        if self._square_roots:
+            parsed["EDGE_SE2"] += parsed["EDGE2"]
+            parsed["EDGE2"] = []
             return
         order = order_of_edge2([part.numbers for part in parsed["EDGE2"]])
         if order is MatrixOrder.ROWS:
@@ -235,19 +243,10 @@ class _Assembly:
             )
 
     def _note_noise(self) -> None:
-        """Note what the numbers behind a measurement are taken for, where files differ."""
+        """Note what is taken for the noise of measurements, where files differ or have none."""
         parsed = self._source.parsed
-        covariances = [tag for tag in ("ODOMETRY", "LANDMARK") if parsed[tag]]
-        if covariances:
-            self.notes.append(
-                f"{' and '.join(covariances)} matrices are taken as covariances, as GTSAM does; "
-                "iSAM's own files have square roots of information"
-            )
-        if "LANDMARK2" in self._source.written_tags:
-            self.notes.append(f"LANDMARK2 {_TAKEN_AS_INFORMATION}")
-        # TORO, whose matrices are information, writes vertices; iSAM does not.
-        if parsed["EDGE3"] and not parsed["VERTEX3"]:
-            self.notes.append(f"EDGE3 {_TAKEN_AS_INFORMATION}")
+        if not self._square_roots:
+            self._note_matrices()
         num_short = sum(len(part.lines) for part in parsed[SHORT_TAGS["EDGE3"]])
         if num_short:
             self.notes.append(f"{num_short} EDGE3 lines have no matrix; the identity is taken")
@@ -261,6 +260,21 @@ class _Assembly:
                 f"{self._source.num_equivalences} EQUIV lines are skipped: they name edges that "
                 "TORO may contract, and measure nothing"
             )
+
+    def _note_matrices(self) -> None:
+        """Note what matrices are taken for, which iSAM's files have the square roots of."""
+        parsed = self._source.parsed
+        covariances = [tag for tag in ("ODOMETRY", "LANDMARK") if parsed[tag]]
+        if covariances:
+            self.notes.append(
+                f"{' and '.join(covariances)} matrices are taken as covariances, as GTSAM does; "
+                f"{_SQUARE_ROOTS}"
+            )
+        if "LANDMARK2" in self._source.written_tags:
+            self.notes.append(f"LANDMARK2 {_TAKEN_AS_INFORMATION}")
+        # TORO, whose matrices are information, writes vertices; iSAM does not.
+        if parsed["EDGE3"] and not parsed["VERTEX3"]:
+            self.notes.append(f"EDGE3 {_TAKEN_AS_INFORMATION}")
 
     def _joined(self, is_edge: bool) -> _Rows:
         """All VERTEX or all EDGE lines in the order of the file.
@@ -294,6 +308,8 @@ class _Assembly:
 
         Lines with a noise or an offset that is none are left out; their problems are noted.
         """
+        if self._square_roots and kind.has_matrix:
+            kind = replace(kind, noise=Noise.SQUARE_ROOT)
         is_wrong, problem = kind.problem(part.numbers)
         if is_wrong.any():
             part = self._without(part, is_wrong, problem)

@@ -31,6 +31,7 @@ class Noise(enum.Enum):
     INFORMATION = "upper triangle of the information matrix"
     COVARIANCE = "upper triangle of the covariance matrix, row by row"
     DEVIATIONS = "standard deviations of bearing and range"
+    SQUARE_ROOT = "upper triangular matrix U, row by row, with the information U^T U"
     MISSING = "nothing; the identity is taken for the information matrix"
 
 
@@ -61,6 +62,11 @@ class Tag:
         has_triangle = self.is_edge and self.noise is not Noise.MISSING
         num_in_triangle = self._side * (self._side + 1) // 2 if has_triangle else 0
         return self._num_measured + num_in_triangle
+
+    @property
+    def has_matrix(self) -> bool:
+        """Whether a line has the triangle of a matrix."""
+        return self.is_edge and self.noise in (Noise.INFORMATION, Noise.COVARIANCE)
 
     @property
     def is_position(self) -> bool:
@@ -111,7 +117,10 @@ class Tag:
         if self.noise is Noise.DEVIATIONS:
             return _cartesian(numbers)
         measured = numbers[:, : self._num_measured]
-        if self.noise is Noise.MISSING:
+        if self.noise is Noise.SQUARE_ROOT:
+            U = np.triu(numbers[:, self._num_measured + triangle_places(self._side)])
+            information = U.mT @ U
+        elif self.noise is Noise.MISSING:
             information = np.tile(np.eye(self._side), (len(numbers), 1, 1))
         else:
             covariances = numbers[:, self._num_measured + triangle_places(self._side)]

@@ -116,17 +116,22 @@ def check_outputs_differ(outputs: Mapping[str, Path | list[Path] | None]) -> Non
 
 
 def load_graph(
-    graph: str, unit_weights: bool, skip_unknown: bool = False, dropped: Dropped = None
+    graph: str,
+    unit_weights: bool,
+    skip_unknown: bool = False,
+    dropped: Dropped = None,
+    square_roots: bool = False,
 ) -> PoseGraph:
     """Graph of a file, folder or data set, without the edges to leave out.
 
-    Its weights are its own, or with `unit_weights` those of the paper.
+    Its weights are its own, or with `unit_weights` those of the paper. With `square_roots`, its
+    file has square roots of information matrices.
     """
     # Both need memory, which the graph might leave none of.
     take_buffers()
     if default_backend() is CholeskyBackend.CHOLMOD:
         import_cvxopt()
-    loaded = load(graph, skip_unknown=skip_unknown)
+    loaded = load(graph, skip_unknown=skip_unknown, square_roots=square_roots)
     if dropped:
         kept, _ = kept_edges(graph, dropped)
         loaded = loaded.without_edges(~kept)

@@ -430,3 +430,39 @@ def test_all_wrong_lines_are_named_in_one_run(
         assert named[num_wrong:] == [f"{num_wrong} lines are wrong"]
     else:
         assert named[20:] == [f"{num_wrong} lines are wrong; the first 20 are named"]
+
+
+@given(seed=SEEDS, d=DIMENSIONS)
+def test_square_roots_are_those_of_the_information(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, d: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    folder = tmp_path_factory.mktemp("roots")
+    k = 3 * d - 3
+    of_pose = definite(rng, 2, k)
+    of_point = definite(rng, 2, d)
+    root_of_pose = np.linalg.cholesky(of_pose, upper=True)
+    root_of_point = np.linalg.cholesky(of_point, upper=True)
+    poses = random_poses(2, d, seed)
+    numbers = numbers_of(poses.R, poses.t)
+    edge = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}[d]
+    sight = {2: "EDGE_SE2_XY", 3: "EDGE_SE3_TRACKXYZ"}[d]
+    information = []
+    roots = []
+    for e in range(2):
+        start = f"{edge} {e} {e + 1} {words(numbers[e])}"
+        information.append(f"{start} {triangle(of_pose[e])}")
+        roots.append(f"{start} {triangle(root_of_pose[e])}")
+        start = f"{sight} {e} 9 {words(poses.t[e])}"
+        information.append(f"{start} {triangle(of_point[e])}")
+        roots.append(f"{start} {triangle(root_of_point[e])}")
+    expected = read(folder, information)
+    path = folder / "roots.g2o"
+    isam = {"EDGE_SE2 ": "EDGE2 ", "EDGE_SE2_XY": "LANDMARK"}
+    spellings = [roots]
+    if d == 2:
+        for tag, name in isam.items():
+            spellings.append([line.replace(tag, name) for line in roots])
+    for lines in spellings:
+        path.write_text("\n".join(lines))
+        assert_same_edges(read_g2o(path, square_roots=True), expected, rtol=1e-9)
