@@ -21,10 +21,11 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem, as_problem
+from pgo_models.problem.weighting import Weighting
 from solvers.distributed.checkpoint import Checkpoint, Journal, run_fingerprint
 from solvers.distributed.chosen_robots import robots_of_solve
 from solvers.distributed.driver import DEFAULT_MEMORY, collect
-from solvers.distributed.leaderless import NO_CERTIFICATE
+from solvers.distributed.leaderless import note_without_driver
 from solvers.distributed.robust import SharedEstimate, estimate_by_robots
 from solvers.distributed.stages import (
     CertifyByRobots,
@@ -164,6 +165,16 @@ class Pipeline:
         return self.driver_memory > 0
 
     @property
+    def default_weighting(self) -> Weighting:
+        """Which cost of a graph is minimised unless another is given: its own, where it can be.
+
+        Robots without a driver run SOC alone, and an ExtendedSOC adds terms to F.
+        """
+        return (
+            Weighting.OWN if self.has_driver and not self.has_added_terms else Weighting.ISOTROPIC
+        )
+
+    @property
     def has_added_terms(self) -> bool:
         """Whether the first stage is an ExtendedSOC, which adds terms and constraints to F."""
         return getattr(self.soc, "changer", None) is not None
@@ -208,7 +219,8 @@ def solve(
     Parameters
     ----------
     problem : PGOProblem or PoseGraph
-        What to solve. The cost of a PoseGraph is F, with two precisions an edge.
+        What to solve. The cost of a PoseGraph is its own: chi2 of its information matrices, or F
+        where it has none. Robots without a driver and an ExtendedSOC minimise F.
     pipeline : Pipeline, optional
         Settings of the stages; `Pipeline()` unless given.
     start : Poses, optional
@@ -295,9 +307,12 @@ def solve(
     >>> shared.ledger.num_robots, shared.ledger.num_bytes > 0
     (3, True)
     """
+    pipeline = Pipeline() if pipeline is None else pipeline
+    if isinstance(problem, PoseGraph) and isinstance(pipeline, Pipeline):
+        problem = PGOProblem(problem, weighting=pipeline.default_weighting)
     request = _Request(
         problem=as_problem(problem),
-        pipeline=Pipeline() if pipeline is None else pipeline,
+        pipeline=pipeline,
         start=start,
         robust=robust,
         robots=robots,
@@ -689,7 +704,7 @@ def _solution(
     poses = problem.seen_poses(poses)  # a frame has an origin, too
     # A frame far away rounds the poses: the certificate is of those that are returned.
     certificate = judge(problem, poses, answer.current_certificate)
-    missing = "" if request.pipeline.has_driver else NO_CERTIFICATE
+    missing = "" if request.pipeline.has_driver else note_without_driver(problem)
     return Solution(
         problem=problem,
         poses=poses,

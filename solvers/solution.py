@@ -448,7 +448,7 @@ def both_costs(problem: PGOProblem, poses: Poses) -> dict[str, float | str | Non
     weighting = problem.weighting
     isotropic = problem
     if weighting is not Weighting.ISOTROPIC:
-        isotropic = PGOProblem(graph, problem.backend)
+        isotropic = PGOProblem(graph, problem.backend, Weighting.ISOTROPIC)
     is_complete = problem.has_translations == graph.has_translations
     has_chi2 = graph.information is not None and not indefinite_edges(graph).any()
     num_uncoupled = 0 if graph.uncoupled is None else int(graph.uncoupled.sum())

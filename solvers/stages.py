@@ -29,6 +29,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from pgo_models.relaxations.rounding import round_factor
 from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
 from solvers.handedness.search import HandednessSearch, stage_of_search
@@ -416,7 +417,7 @@ class SecondAttempt:
         if problem.is_quadratic:
             soc = self.soc if self.soc is not None else SOC()
             return self.plan(finer(soc), None)
-        isotropic = PGOProblem(problem.graph, problem.backend)
+        isotropic = PGOProblem(problem.graph, problem.backend, Weighting.ISOTROPIC)
         return self.plan(None, polish(isotropic, chordal_start(isotropic)))
 
 

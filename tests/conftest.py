@@ -14,6 +14,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.g2o import read_g2o
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.cli import app as cli
 from solvers.riemannian.polish import polish
 
@@ -68,8 +69,12 @@ def benchmark_data() -> Path:
 
 @pytest.fixture(scope="session")
 def benchmark_problem(benchmark_data: Path) -> Callable[[str], PGOProblem]:
-    """Problem of a public benchmark graph, read once."""
-    return cache(lambda name: PGOProblem(read_g2o(benchmark_data / f"{name}.g2o")))
+    """Problem of F of a public benchmark graph, read once."""
+    return cache(
+        lambda name: PGOProblem(
+            read_g2o(benchmark_data / f"{name}.g2o"), weighting=Weighting.ISOTROPIC
+        )
+    )
 
 
 @pytest.fixture(scope="session")

@@ -70,7 +70,7 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
     cost = _cost_name(problem)
     if certificate.source is BoundSource.SOFTENED:
         what = "the bound is that of smaller information matrices, not the file's"
-        way_out = "leave out --proof, or --information to prove F"
+        way_out = "leave out --proof, or add --cost isotropic to prove F"
         raise SettingError(f"no proof to write: {what}; {way_out}")
     poses = _poses_of_bound(problem, certificate)
     transposed = np.swapaxes(certificate.Lambda, 1, 2)

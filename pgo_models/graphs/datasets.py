@@ -156,8 +156,10 @@ def locate(
             return path
     elif os.path.exists(path):
         return path
-    is_file_name = path.suffix in (".g2o", SUFFIX)
-    if isinstance(name_or_path, Path) or is_file_name or name != path.name:
+    if name == path.name and path.suffix == ".g2o" and path.stem in known_datasets(registry):
+        name = path.stem  # the file that a data set is kept in
+    is_file_name = name.endswith((".g2o", SUFFIX))
+    if isinstance(name_or_path, Path) or is_file_name or name != Path(name).name:
         raise FileFormatError(
             path, None, "no such file or folder; check the path, or give a data set's name"
         )

@@ -33,6 +33,7 @@ from pgo_models.problem.weighting import (
     convex_cost,
     information_cost,
     name_of_cost,
+    own_weighting,
 )
 
 MOST_REFINEMENTS = 60  # of translations: each but the last halves F at least
@@ -45,14 +46,10 @@ class PGOProblem(ReadOnly):
     F(R, t) = sum_e kappa ||R_j - R_i R_ij||_F^2 + tau ||t_j - t_i - R_i t_ij||^2. With X, (N, d), N
     = (d+1) n, the rows t_i and then the rows of every R_i^T, F = tr(X^T M X).
 
-    With `Weighting.INFORMATION` the cost is chi2 of the graph's information matrices. It is
-    quadratic in X, too, where all matrices of translations are multiples of the identity and
-    nothing couples them with rotations; else M is the quadratic part, and `tangent_at` gives
-    quadratic problems that touch chi2 from below (`problem.excess`).
-
-    With `Weighting.ROTATIONS`, and where no edge measures a translation, the unknowns are the
-    rotations alone (`has_translations`): translations of poses are ignored, and those of solutions
-    are zero.
+    The cost of a graph with information matrices is their chi2, unless `Weighting.ISOTROPIC` asks
+    for F. chi2 is quadratic in X, too, where all matrices of translations are multiples of the
+    identity and nothing couples them with rotations; else M is the quadratic part, and `tangent_at`
+    gives quadratic problems that touch chi2 from below (`problem.excess`).
 
     Parameters
     ----------
@@ -62,7 +59,8 @@ class PGOProblem(ReadOnly):
     backend : CholeskyBackend, optional
         The sparse Cholesky to use; `default_backend()` unless given.
     weighting : Weighting or EdgeCost
-        F, chi2, the rotation part of F, or a cost of the edges.
+        F, chi2, the rotation part of F, or a cost of the edges; unless given the graph's own: chi2
+        if it has information matrices, else F (`Weighting.OWN`).
 
     Raises
     ------
@@ -83,7 +81,7 @@ class PGOProblem(ReadOnly):
 
     graph: PoseGraph
     backend: CholeskyBackend | None = None
-    weighting: Weighting | EdgeCost = Weighting.ISOTROPIC
+    weighting: Weighting | EdgeCost = Weighting.OWN
 
     def __post_init__(self) -> None:
         if not isinstance(self.weighting, Weighting | EdgeCost):
@@ -94,6 +92,8 @@ class PGOProblem(ReadOnly):
             raise SettingError(
                 f"backend is {self.backend!r}; give one of {', '.join(map(str, CholeskyBackend))}"
             )
+        if self.weighting is Weighting.OWN:
+            object.__setattr__(self, "weighting", own_weighting(self.graph))
         if self.weighting is Weighting.ROTATIONS:
             self.graph.check_rotations_connected()
         else:

@@ -14,17 +14,20 @@ with rotations: see `pgo_models.problem.excess`.
 """
 
 import enum
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.errors import GraphError
+from pgo_models.errors import GraphError, GraphWarning
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import (
     LEAST_SCALED,
     are_definite,
     edge_precisions,
+    indefinite_edges,
+    text_of_indefinite,
     uncoupled_share,
 )
 from pgo_models.problem.edge_cost import EdgeCost
@@ -57,11 +60,45 @@ class Weighting(enum.Enum):
 
     `ISOTROPIC` is F, `INFORMATION` chi2, and `ROTATIONS` the rotation part of F, of rotations
     alone: rotation averaging. Of a graph in which no edge measures a translation F is that, too.
+    `OWN` stands for the one of them that `own_weighting` says.
     """
 
+    OWN = "the graph's own cost: chi2 if it has information matrices, else F"
     ISOTROPIC = "F: two precisions an edge, kappa and tau, as in the paper and SE-Sync"
     INFORMATION = "chi2: the information matrices of the file"
     ROTATIONS = "F(R): the rotation part of F, with one precision an edge, kappa"
+
+
+def own_weighting(graph: PoseGraph) -> Weighting:
+    """Which cost is the graph's own: chi2 of its information matrices, or F where it has none.
+
+    Where F is chi2, in space with matrices that are multiples of the identity, it is F. Where chi2
+    can be negative, because matrices are indefinite (`indefinite_edges`), it is F as well, with a
+    GraphWarning.
+    """
+    if graph.information is None or _is_isotropic(graph.information, graph.d):
+        return Weighting.ISOTROPIC
+    is_indefinite = indefinite_edges(graph)
+    if not is_indefinite.any():
+        return Weighting.INFORMATION
+    problem = text_of_indefinite(graph, is_indefinite)
+    message = (
+        f"{graph.name}: {problem}, so that chi2 can be negative; the cost is F, with two "
+        "precisions an edge (pgo solve --drop-coupling: chi2 without their coupling blocks)"
+    )
+    warnings.warn(message, GraphWarning, stacklevel=4)
+    return Weighting.ISOTROPIC
+
+
+def _is_isotropic(information: Array, d: int) -> bool:
+    """Whether chi2 is F: in space, with blocks that are multiples of the identity.
+
+    In the plane F counts the rotation term of chi2 twice, as SE-Sync does.
+    """
+    if d == 2:
+        return False
+    scales = np.repeat(information[:, [0, 3], [0, 3]], 3, axis=1)
+    return bool((information == scales[:, :, None] * np.eye(6)).all())
 
 
 def name_of_cost(weighting: Weighting | EdgeCost, has_translations: bool) -> str:

@@ -15,6 +15,7 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.cli.explanations import edge_fit, explained_by_its_graph, show_advice, warn_of_weights
 from solvers.cli.inputs import GraphOptions, estimated_poses, graph_in_commands
 from solvers.cli.options import (
+    CostOption,
     DropCouplingOption,
     GapOption,
     GraphArgument,
@@ -61,6 +62,7 @@ def certify_command(
     ] = None,
     proof: ProofOption = None,
     gap: GapOption = DEFAULT_GAP,
+    cost: CostOption = None,
     unit_weights: UnitWeightsOption = False,
     rotations: RotationsOption = False,
     information: InformationOption = False,
@@ -77,7 +79,14 @@ def certify_command(
         if path is not None:
             check_writable(path)
     source = GraphOptions(
-        graph, unit_weights, information, drop_coupling, skip_unknown, drop_edge, rotations
+        graph,
+        cost,
+        unit_weights,
+        information,
+        drop_coupling,
+        skip_unknown,
+        drop_edge,
+        rotations,
     )
     problem = source.problem(source.loaded())
     poses = estimated_poses(problem.graph, estimate)

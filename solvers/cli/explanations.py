@@ -157,5 +157,5 @@ def place_of_weight(graph: str, dropped: Dropped = None) -> str:
     ranges = (
         f"weights from {weights.min():.3g} to {weights.max():.3g} and lengths up to {length:.3g} m"
     )
-    way_out = "correct the information matrix, or use --unit-weights"
+    way_out = "correct the information matrix, or use --cost unit"
     return f"{places[edge]}: {problem}; {ranges} are too far apart for doubles; {way_out}"

@@ -26,6 +26,7 @@ from pgo_models.problem.cholmod import import_cvxopt
 from pgo_models.problem.kernels import take_buffers
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from solvers.cli.options import Cost
 
 Dropped = list[str] | None  # edges to leave out, by LINE or FILE:LINE
 
@@ -38,6 +39,7 @@ class GraphOptions:
     """
 
     graph: str
+    cost: Cost | None = None
     unit_weights: bool = False
     information: bool = False
     drop_coupling: bool = False
@@ -45,36 +47,54 @@ class GraphOptions:
     drop_edge: Dropped = None
     rotations: bool = False
 
+    def __post_init__(self) -> None:
+        asked = self._asked
+        if len(set(asked.values())) > 1:
+            first, second = list(asked)[:2]
+            raise SettingError(f"{first} and {second} ask for different costs; leave out one")
+
+    @property
+    def _asked(self) -> dict[str, str]:
+        """The cost that every option asks for."""
+        asked = {
+            "--rotations": "rotations" if self.rotations else "",
+            "--cost": self.cost.value if self.cost is not None else "",
+            "--information": Cost.CHI2.value if self.information else "",
+            "--unit-weights": Cost.UNIT.value if self.unit_weights else "",
+            "--drop-coupling": Cost.CHI2.value if self.drop_coupling else "",
+        }
+        return {option: cost for option, cost in asked.items() if cost}
+
+    @property
+    def chosen_cost(self) -> Cost | None:
+        """The cost that was asked for; None for the graph's own."""
+        if self.rotations:
+            return None
+        return next((Cost(cost) for cost in self._asked.values()), None)
+
     def loaded(self) -> PoseGraph:
         """The graph, without the edges to leave out."""
-        return load_graph(self.graph, self.unit_weights, self.skip_unknown, self.drop_edge)
+        has_unit_weights = self.chosen_cost is Cost.UNIT
+        return load_graph(self.graph, has_unit_weights, self.skip_unknown, self.drop_edge)
 
     def problem(self, loaded: PoseGraph) -> PGOProblem:
-        """Problem of the loaded graph, with the cost that was asked for.
+        """Problem of the loaded graph, with the cost that was asked for, or its own.
 
-        A SettingError where there are no information matrices for chi2, or where its coupling
-        blocks are to be left out and it is not asked for. A GraphError names the first indefinite
-        matrix by `file:line`, unless the coupling blocks of such matrices are to be left out.
+        A SettingError where chi2 is asked for and there are no information matrices. A GraphError
+        names the first indefinite matrix by `file:line`, unless the coupling blocks of such
+        matrices are to be left out.
         """
         if self.rotations:
-            if self.information:
-                raise SettingError(
-                    "--rotations has the rotation precisions of F, and --information asks for "
-                    "chi2; leave out one of the two"
-                )
             return PGOProblem(loaded, weighting=Weighting.ROTATIONS)
-        if self.drop_coupling and not self.information:
-            raise SettingError(
-                "--drop-coupling is for the information matrices of chi2; add --information"
-            )
-        if not self.information:
+        cost = self.chosen_cost
+        if cost is None:
             return PGOProblem(loaded)
-        if self.unit_weights or loaded.information is None:
-            why = f"{loaded.name} has none"
-            if self.unit_weights:
-                why = "--unit-weights takes them away"
+        if cost is not Cost.CHI2:
+            return PGOProblem(loaded, weighting=Weighting.ISOTROPIC)
+        if loaded.information is None:
+            (option,) = list(self._asked)[:1]
             raise SettingError(
-                f"--information asks for information matrices, and {why}; leave it out"
+                f"{option} is for information matrices, and {loaded.name} has none; leave it out"
             )
         if self.drop_coupling:
             loaded = without_indefinite_coupling(loaded)
@@ -82,7 +102,7 @@ class GraphOptions:
             raise GraphError(
                 f"{indefinite}, so that chi2 can be negative: correct them, "
                 "add --drop-coupling to go without their coupling blocks, "
-                "or leave out --information"
+                "or take --cost isotropic"
             )
         return PGOProblem(loaded, weighting=Weighting.INFORMATION)
 
@@ -90,19 +110,21 @@ class GraphOptions:
     def in_commands(self) -> str:
         """The name of the graph with all these options, as one types them."""
         options = {
-            "--unit-weights": self.unit_weights,
             "--rotations": self.rotations,
-            "--information": self.information,
             "--drop-coupling": self.drop_coupling,
             "--skip-unknown": self.skip_unknown,
         }
+        cost = self.chosen_cost
+        if cost in (Cost.ISOTROPIC, Cost.UNIT):
+            options[f"--cost {cost.value}"] = True
         return graph_in_commands(self.graph, options, self.drop_edge)
 
 
 def graph_in_commands(graph: str, options: Mapping[str, bool], dropped: Dropped) -> str:
     """The name of a graph in commands to type, with the options that change the problem."""
     words = [graph]
-    words += [name for name, is_given in options.items() if is_given]
+    for name, is_given in options.items():
+        words += name.split() if is_given else []
     for edge in dropped or ():
         words += ["--drop-edge", edge]
     return shlex.join(words)

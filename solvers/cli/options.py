@@ -92,6 +92,14 @@ ROBUST: dict[Robust, GNC | PCM] = {
 _PAPER_SCENES = {Scene.CIRCLE: circle, Scene.GRID: grid, Scene.SPHERE: sphere}
 
 
+class Cost(enum.Enum):
+    """The cost that a command minimises or judges by."""
+
+    CHI2 = "chi2"
+    ISOTROPIC = "isotropic"
+    UNIT = "unit"
+
+
 def _finite_gap(gap: float) -> float:
     if not 0 < gap < math.inf:
         raise typer.BadParameter(f"{gap} is no positive, finite number; 1e-6 is usual")
@@ -119,18 +127,22 @@ RotationsOption = Annotated[
         "part of F. A file whose edges have only rotations needs no such option.",
     ),
 ]
-InformationOption = Annotated[
-    bool,
+CostOption = Annotated[
+    Cost | None,
     typer.Option(
-        "--information", help="The cost is chi2 of the file's information matrices, not F."
+        help="chi2: of the file's information matrices, the default where it has them; isotropic: "
+        "F, two precisions an edge, as in SE-Sync; unit: F with the weights of the paper."
     ),
+]
+InformationOption = Annotated[
+    bool, typer.Option("--information", help="The same as --cost chi2.", hidden=True)
 ]
 DropCouplingOption = Annotated[
     bool,
     typer.Option(
         "--drop-coupling",
-        help="With --information: leave out coupling blocks that make matrices indefinite, "
-        "and say of how many edges; else such a file is an error.",
+        help="Solve for chi2 without the coupling blocks that make matrices indefinite, and say of "
+        "how many edges; without this option the cost of such a file is F.",
     ),
 ]
 SkipUnknownOption = Annotated[

@@ -3,7 +3,7 @@
 import math
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Annotated
@@ -34,6 +34,8 @@ from solvers.cli.explanations import (
 from solvers.cli.inputs import GraphOptions, check_outputs_differ, pose_named, with_times
 from solvers.cli.options import (
     BackEndName,
+    Cost,
+    CostOption,
     DropCouplingOption,
     FirstStage,
     GapOption,
@@ -147,6 +149,7 @@ def solve_command(
         float | None, typer.Option(help="Residual at which Newton takes over from SOC.")
     ] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for the iterations.")] = math.inf,
+    cost: CostOption = None,
     unit_weights: UnitWeightsOption = False,
     rotations: RotationsOption = False,
     information: InformationOption = False,
@@ -200,7 +203,14 @@ def solve_command(
     """Solve a pose graph: poses, their cost, a proven lower bound on the optimum, and the gap."""
     given = _given_options(locals())
     source = GraphOptions(
-        graph, unit_weights, information, drop_coupling, skip_unknown, drop_edge, rotations
+        graph,
+        cost,
+        unit_weights,
+        information,
+        drop_coupling,
+        skip_unknown,
+        drop_edge,
+        rotations,
     )
     stages = StageOptions(method, start, r_step, gap, max_iterations, tolerance, time_limit, robust)
     network = RobotOptions(robots, split, engine, address, resume, driver_memory)
@@ -212,6 +222,8 @@ def solve_command(
     outputs.check_pages()
     with JobBar(1, None, f"reading {graph}"):
         loaded = with_times(source.loaded(), times)
+    if network.has_no_driver and source.chosen_cost is None:
+        source = replace(source, cost=Cost.ISOTROPIC)
     problem = source.problem(loaded)
     outputs.check_drawable(problem)
     outputs.check_writable(problem.graph.num_robots)
@@ -306,6 +318,11 @@ class RobotOptions:
         """Whether one of the options was given that need robots of an engine."""
         options = (self.engine, self.address, self.resume, self.driver_memory)
         return any(option is not None for option in options)
+
+    @property
+    def has_no_driver(self) -> bool:
+        """Whether robots do without a driver."""
+        return self.driver_memory == 0
 
     def reads_own_files(self, graph: str) -> bool:
         """Whether the robots are on a Ray cluster, and each is to read its own file of a folder."""

@@ -10,7 +10,6 @@ import typer
 
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.files import check_writable
-from pgo_models.problem.problem import PGOProblem
 from solvers.cli.explanations import explained_by_its_graph
 from solvers.cli.inputs import check_outputs_differ, load_graph
 from solvers.cli.shell import BROKEN_OFF, JsonOption, QuietOption, save_then_show, wrapped
@@ -32,7 +31,8 @@ DownloadOption = Annotated[
 UnitWeightsOption = Annotated[
     bool,
     typer.Option(
-        "--unit-weights", help="Set kappa = tau = 1, the weights of the paper's equation."
+        "--unit-weights",
+        help="The cost is F with kappa = tau = 1, the weights of the paper's equation.",
     ),
 ]
 DropEdgeOption = Annotated[
@@ -127,7 +127,10 @@ def compare_command(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run several methods on a graph and hold them against each other and a proven bound."""
+    """Run several methods on a graph and hold them against each other and a proven bound.
+
+    The cost is F, with two precisions an edge, which all of these methods minimise.
+    """
     check_outputs_differ({"--out": out, "--plot": plot})
     _check(out, check_table_format)
     _check(plot, check_plot_format)
@@ -135,8 +138,8 @@ def compare_command(
         _chosen(BenchmarkMethod, methods, "method"),
         BenchmarkSettings(robots, time_limit=time_limit),
     )
-    problem = PGOProblem(load_graph(graph, unit_weights, dropped=drop_edge))
-    comparison = compare_methods(problem, settings, progress=False if quiet else None)
+    loaded = load_graph(graph, unit_weights, dropped=drop_edge)
+    comparison = compare_methods(loaded, settings, progress=False if quiet else None)
     table = comparison.table()
     tables = [(path, table.save) for path in out or []]
     plots = [(path, comparison.save_plot) for path in plot or []]

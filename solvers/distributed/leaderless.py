@@ -51,6 +51,13 @@ NO_CERTIFICATE = (
 )
 
 
+def note_without_driver(problem: PGOProblem) -> str:
+    """What a solution of robots without a driver lacks, and why its cost is F."""
+    if problem.graph.information is None:
+        return NO_CERTIFICATE
+    return f"{NO_CERTIFICATE}; the cost is F, as SOC alone needs one that is convex and quadratic"
+
+
 def attempt_leaderless(
     driver: Driver,
     problem: PGOProblem,

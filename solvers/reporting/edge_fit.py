@@ -94,14 +94,14 @@ class EdgeFit:
             text = (
                 f"There is no chi2 beside F: {self.no_chi2}. Solve without their coupling blocks."
             )
-            return [Advice(text, f"{solve} --information --drop-coupling")]
+            return [Advice(text, f"{_for_own_cost(solve)} --drop-coupling")]
         if self.lowered is None:
             return []
         cost_here = _total_cost(self.residuals)
         lower_cost = _total_cost(self.lowered)
         costs = f"is {cost_here} at these poses; its minimum is at most {lower_cost}"
         text = f"chi2, the file's own cost, {costs}. Solve for it."
-        return [Advice(text, f"{solve} --information")]
+        return [Advice(text, _for_own_cost(solve))]
 
     def advice_on_edges(self, solve: str) -> list[Advice]:
         """Return the advice to look for wrong measurements, if the edges cost too much.
@@ -121,7 +121,7 @@ class EdgeFit:
             return []
         text = fit_sentence(residuals, self.cost)
         if self.lowered is not None:
-            solve = f"{solve} --information"
+            solve = _for_own_cost(solve)
             text = f"With less chi2, too, the edges do not fit: {text[0].lower()}{text[1:]}"
         text = f"{text} Look for wrong loop closures, which need not be the worst edges."
         suggestions = [Advice(text, f"{solve} --robust gnc")]
@@ -190,6 +190,11 @@ def judge_edges(problem: PGOProblem, poses: Poses) -> EdgeFit:
     if abs(chi2 - own.cost.sum()) <= _SAME_COST * chi2:
         return EdgeFit("F", own)
     return EdgeFit("chi2", edge_residuals(whole, poses), _lowered(whole, poses, chi2))
+
+
+def _for_own_cost(solve: str) -> str:
+    """The command that solves a graph for its own cost, chi2, instead of F."""
+    return solve.replace(" --cost isotropic", "")
 
 
 def fit_sentence(residuals: EdgeResiduals, cost: str) -> str:

@@ -8,6 +8,7 @@ from pgo_models.graphs.precisions import condition, indefinite_edges, text_of_in
 from pgo_models.graphs.residuals import Chi2Convention, chi2
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.reporting.versions import installed_versions
 
 _WORTH_MENTIONING = 5e8  # bytes of memory
@@ -41,7 +42,7 @@ def describe_graph(graph: PoseGraph, indefinite: str = "") -> list[tuple[str, st
 
 def _cost_facts(graph: PoseGraph, has_chi2: bool) -> list[tuple[str, str]]:
     """Costs of the estimate and of the starts, or the memory that a solve takes if it is a lot."""
-    problem = PGOProblem(graph)
+    problem = PGOProblem(graph, weighting=Weighting.ISOTROPIC)
     name = problem.cost_name
     rows = []
     estimate = graph.initial

@@ -193,8 +193,8 @@ def _name_in_commands(graph: PoseGraph, certificate: Certificate) -> str:
     """Name of a known data set or of a g2o file, with the option for its cost."""
     file = graph.name if graph.name in known_datasets() else f"{graph.name}.g2o"
     name = shlex.quote(file)
-    if certificate.weighting is Weighting.INFORMATION:
-        name += " --information"
+    if certificate.weighting is Weighting.ISOTROPIC and graph.information is not None:
+        name += " --cost isotropic"
     return name
 
 

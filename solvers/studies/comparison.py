@@ -17,6 +17,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.plots.interactive_plots import save_page
 from pgo_models.plots.style import check_installed, is_picture, save_figure
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.progress_bars import JobBar
 from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
 from solvers.reporting.convergence_plots import Curve
@@ -196,7 +197,8 @@ def compare_methods(
     (True, 1)
     """
     settings = settings if settings is not None else ComparisonSettings()
-    problem = PGOProblem(problem) if isinstance(problem, PoseGraph) else problem
+    if isinstance(problem, PoseGraph):
+        problem = PGOProblem(problem, weighting=Weighting.ISOTROPIC)
     solution = solve_whole(problem)
     trials: list[BenchmarkRun] = []
     reasons: list[tuple[BenchmarkMethod, str]] = []

@@ -21,6 +21,7 @@ from pgo_models.plots.graph_plots import plot_panels
 from pgo_models.plots.interactive_plots import explore_graph, save_page
 from pgo_models.plots.style import column_figure, plotly, save_figure
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.progress_bars import JobBar
 from solvers.reporting.convergence_plots import explore_convergence, plot_convergence
 from solvers.reporting.result_table import gap_percent
@@ -207,7 +208,7 @@ def _run(row: PublishedRow, download: bool) -> PaperRun | str:
     """Run of the paper's method on a graph, or the reason why it is left out."""
     try:
         graph = graph_of_row(row, 0, download)
-        problem = PGOProblem(graph)
+        problem = PGOProblem(graph, weighting=Weighting.ISOTROPIC)
         bound = solve_whole(problem).lower_bound
         start = graph.initial if row.name in SCENES else None
         settings = BenchmarkSettings(max_rounds=row.soc.iterations)

@@ -16,6 +16,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.published_results import PublishedFigures, PublishedRow, published_rows
 from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.progress_bars import JobBar
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
 from solvers.studies.benchmark_runs import FAILURES, reason_of, run_benchmark, solve_whole
@@ -287,7 +288,7 @@ class _RowResults:
         except FAILURES as error:
             self._fail(reason_of(error), bar)
             return
-        problem = PGOProblem(graph)
+        problem = PGOProblem(graph, weighting=Weighting.ISOTROPIC)
         name = f"{self.row.name} {seed} {graph_fingerprint(graph)}"
         entry = _kept_or_computed(kept, f"{name} optimum", partial(_optimum, problem))
         if isinstance(entry, str):

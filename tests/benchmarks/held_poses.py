@@ -27,7 +27,7 @@ def rounds_held(name: str, num_robots: int, costs: Sequence[float]) -> dict[str,
     of the start, of setting up the penalties and of taking them anew. Returned are the rounds up to
     each cost, None where it was not reached, and of the start alone.
     """
-    problem = pgo.PGOProblem(pgo.load(name))
+    problem = pgo.PGOProblem(pgo.load(name), weighting=pgo.Weighting.ISOTROPIC)
     robots = pgo.partition(problem.graph, num_robots, pgo.PartitionMethod.METIS)
     driver = open_driver(problem, robots, InProcess())
     driver.go_to_chordal_start()

@@ -60,7 +60,7 @@ def row(
     moved = []
     gaps = []
     for graph, bound in zip(graphs, bounds, strict=True):
-        problem = pgo.PGOProblem(graph)
+        problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.ISOTROPIC)
         states: list[PaperState] = []
         result = solvers.run(
             method, problem, graph.initial, callback=lambda state, _, to=states: to.append(state)

@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,7 @@ CONTIGUOUS = pgo.PartitionMethod.CONTIGUOUS
 
 def substructured_job(name: str, robots: str, method: str) -> dict[str, object]:
     """Whole solve by driver and robots."""
-    graph = pgo.load(name)
+    graph = replace(pgo.load(name), information=None)  # the cost is F
     shared = pgo.partition(graph, int(robots), pgo.PartitionMethod[method])
     solution = solvers.solve(graph, robots=shared)
     assert solution.ledger is not None
@@ -82,7 +83,7 @@ def substructured_job(name: str, robots: str, method: str) -> dict[str, object]:
 
 def consensus_job(name: str, robots: str, method: str) -> dict[str, object]:
     """Rounds of CONSENSUS from the chordal start to three relative gaps; default settings."""
-    problem = pgo.PGOProblem(pgo.load(name))
+    problem = pgo.PGOProblem(pgo.load(name), weighting=pgo.Weighting.ISOTROPIC)
     shared = pgo.partition(problem.graph, int(robots), pgo.PartitionMethod[method])
     done = to_gap(
         problem,
@@ -107,8 +108,8 @@ def faults_job(name: str, fault: str) -> dict[str, object]:
     """Rounds of the asynchronous CONSENSUS, 5 robots, METIS partition, to 1e-6; the whole graph
     measures omega.
     """
-    graph = pgo.load(name)
-    problem = pgo.PGOProblem(graph)
+    graph = replace(pgo.load(name), information=None)  # the cost is F
+    problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.ISOTROPIC)
     shared = pgo.partition(graph, 5, METIS)
     driver = open_driver(problem, shared, InProcess())
     driver.go_to_chordal_start()
@@ -134,7 +135,7 @@ def ray_job(name: str, robots: str, coupling: str) -> dict[str, object]:
     """Iterations of SOC, no tolerance, in this process and in two actors that are kept: least of
     five solves each.
     """
-    graph = pgo.load(name)
+    graph = replace(pgo.load(name), information=None)  # the cost is F
     shared = pgo.partition(graph, int(robots), METIS)
     soc = solvers.SOC(
         robots=shared, coupling=solvers.Coupling[coupling], tolerance=1e-14, max_iterations=40
@@ -179,7 +180,7 @@ def world_job() -> dict[str, object]:
             ["generate", "grid-world", "--robots", "100", "--poses", "500", "--out", str(world)]
         )
         began = time.perf_counter()
-        graph = pgo.load(str(world))
+        graph = replace(pgo.load(str(world)), information=None)  # the cost is F
         solution = solvers.solve(graph, robots=pgo.partition(graph, 100, METIS))
         seconds = time.perf_counter() - began
     assert solution.ledger is not None
@@ -234,7 +235,7 @@ def driver_job(robots: str, poses: str) -> dict[str, object]:
         world = Path(folder) / "world.g2o"
         shape = ["--robots", robots, "--poses", poses, "-d", "2"]
         run_cli(["generate", "grid-world", *shape, "--out", str(world)])
-        graph = pgo.load(str(world))
+        graph = replace(pgo.load(str(world)), information=None)  # the cost is F
     shared = pgo.partition(graph, int(robots), METIS)
     timed = TimedRobots()
     began = time.process_time()

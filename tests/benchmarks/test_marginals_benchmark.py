@@ -17,6 +17,7 @@ from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
 
 MOST_FACTORISATIONS = 3.0
@@ -30,7 +31,7 @@ def seconds(call: Callable[[], object]) -> float:
 
 @pytest.mark.parametrize("name", ["city10000", "manhattan", "sphere2500", "torus3D", "cubicle"])
 def test_all_marginals(benchmark: BenchmarkFixture, benchmark_data, name: str) -> None:
-    problem = PGOProblem(read_g2o(benchmark_data / f"{name}.g2o"))
+    problem = PGOProblem(read_g2o(benchmark_data / f"{name}.g2o"), weighting=Weighting.ISOTROPIC)
     poses = polish(problem, chordal_start(problem))
     hessian = riemannian_hessian(problem, poses, multipliers(problem, poses))
     layout = TangentLayout(problem.num_poses, problem.d)

@@ -10,6 +10,7 @@ from pgo_models.convex.graph_subproblem import graph_qp
 from pgo_models.graphs.g2o import read_g2o
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.soc.penalty import MultiplierPenalty
 from solvers.soc.r_step import RStep, RSubproblem, prepare
 
@@ -18,7 +19,7 @@ LIMITS = {"tinyGrid3D": 3e-3, "smallGrid3D": 15e-3}  # seconds
 
 @pytest.mark.parametrize("name", list(LIMITS))
 def test_solving_again(benchmark: BenchmarkFixture, benchmark_data, name: str) -> None:
-    problem = PGOProblem(read_g2o(benchmark_data / f"{name}.g2o"))
+    problem = PGOProblem(read_g2o(benchmark_data / f"{name}.g2o"), weighting=Weighting.ISOTROPIC)
     n = problem.num_poses
     start = chordal_start(problem)
     rho = MultiplierPenalty().initial(problem, start)

@@ -19,27 +19,32 @@ def path(request):
     return Path(folder) / f"{request.param}.g2o"
 
 
+def problem_of(path):
+    """F of a file."""
+    return pgo.PGOProblem(pgo.read_g2o(path), weighting=pgo.Weighting.ISOTROPIC)
+
+
 def test_read(benchmark, path):
     benchmark.pedantic(pgo.read_g2o, args=(path,), rounds=5, warmup_rounds=1)
 
 
 def test_file_to_certificate(benchmark, path):
     solution = benchmark.pedantic(
-        lambda: solvers.solve(pgo.read_g2o(path)), rounds=5, warmup_rounds=1
+        lambda: solvers.solve(problem_of(path)), rounds=5, warmup_rounds=1
     )
     benchmark.extra_info["gap"] = solution.gap
     assert solution.is_certified
 
 
 def test_soc_iteration(benchmark, path):
-    problem = pgo.PGOProblem(pgo.read_g2o(path))
+    problem = problem_of(path)
     soc = solvers.SOC()
     state = soc.init(problem, None)
     benchmark.pedantic(soc.step, args=(problem, state), rounds=20, warmup_rounds=2)
 
 
 def test_certificate(benchmark, path):
-    problem = pgo.PGOProblem(pgo.read_g2o(path))
+    problem = problem_of(path)
     poses = solvers.solve(problem).certificate.poses
     Lambda = pgo.multipliers(problem, poses)
     benchmark.pedantic(pgo.prove_bound, args=(problem, Lambda, 1.0), rounds=5, warmup_rounds=1)

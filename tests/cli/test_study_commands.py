@@ -100,7 +100,7 @@ def test_compare_prints_a_table_and_draws(pgo_command, tmp_path):
 
 def test_compare_with_unit_weights_is_of_another_cost(pgo_command):
     _, out, _ = pgo_command("compare", "grid", "--methods", "newton", "--unit-weights")
-    weighted = pgo.PGOProblem(pgo.load("grid").unit_weights())
+    weighted = pgo.PGOProblem(pgo.load("grid").unit_weights(), weighting=pgo.Weighting.ISOTROPIC)
     best = weighted.objective(solvers.polish(weighted, pgo.chordal_start(weighted)))
     assert f"best F {best:.6g}"[:12] in out
 

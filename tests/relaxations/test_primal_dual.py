@@ -26,6 +26,7 @@ from pgo_models.errors import SettingError
 from pgo_models.graphs.g2o import read_g2o
 from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from pgo_models.relaxations.clique_decomposition import clique_relaxation
 from pgo_models.relaxations.plan import RelaxationForm, plan_relaxation
 from pgo_models.relaxations.rounding import rank_report, round_gram
@@ -251,12 +252,17 @@ def test_the_scenes_are_certified(scene) -> None:
 
 
 def test_tinyGrid3D_has_its_published_optimum(benchmark_data) -> None:
-    solution = certified(PGOProblem(read_g2o(benchmark_data / "tinyGrid3D.g2o")))
+    solution = certified(
+        PGOProblem(read_g2o(benchmark_data / "tinyGrid3D.g2o"), weighting=Weighting.ISOTROPIC)
+    )
     assert solution.value == pytest.approx(OPTIMUM["tinyGrid3D"], rel=1e-6)
 
 
 def test_a_long_trajectory_with_few_loops(benchmark_data) -> None:
-    problem = PGOProblem(read_g2o(benchmark_data / "kitti_00.g2o").subgraph(np.arange(2300, 3450)))
+    problem = PGOProblem(
+        read_g2o(benchmark_data / "kitti_00.g2o").subgraph(np.arange(2300, 3450)),
+        weighting=Weighting.ISOTROPIC,
+    )
     solution = certified(problem)
     assert problem.graph.num_edges - problem.num_poses >= 20  # loops
     assert solution.plan.form is RelaxationForm.CLIQUES

@@ -18,6 +18,7 @@ from pgo_models.geometry.rotations import random_rotations
 from pgo_models.graphs.g2o import read_g2o, write_g2o
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from pgo_models.relaxations.hull_models import dual_hull_relaxation, primal_hull_relaxation
 from pgo_models.relaxations.plan import RelaxationForm
 from pgo_models.relaxations.rotation_hull import hull_matrices, terms_of
@@ -94,7 +95,7 @@ def test_a_graph_that_the_plain_relaxation_leaves_open_is_tight_with_hulls(tmp_p
     graph = noisy_scene(SweptScene.GRID, np.deg2rad(60), np.random.default_rng(3))
     path = tmp_path / "graph.g2o"
     write_g2o(graph, path)
-    problem = PGOProblem(read_g2o(path))
+    problem = PGOProblem(read_g2o(path), weighting=Weighting.ISOTROPIC)
     plain = solve_relaxation(problem)
     assert plain.verdict is Verdict.NOT_CERTIFIED
     hulls = solve_relaxation(problem, RelaxationForm.HULL_DUAL)
@@ -115,7 +116,7 @@ def test_where_no_terms_suffice_solve_has_the_bound_of_the_hulls(tmp_path: Path)
     graph = noisy_scene(SweptScene.GRID, np.deg2rad(70), np.random.default_rng(4))
     path = tmp_path / "graph.g2o"
     write_g2o(graph, path)
-    problem = PGOProblem(read_g2o(path))
+    problem = PGOProblem(read_g2o(path), weighting=Weighting.ISOTROPIC)
     without = solvers.solve(problem, solvers.Pipeline(handedness=None))
     solution = solvers.solve(problem)
     assert not solution.is_certified

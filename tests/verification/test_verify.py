@@ -101,7 +101,7 @@ def test_a_bound_from_poses_that_are_no_optimum_is_a_bound(
     tmp_path_factory: pytest.TempPathFactory, seed: int, d: int, size: float
 ) -> None:
     path = written(tmp_path_factory.mktemp("proof"), varied_graph(seed, 6, d, LOUD_NOISE))
-    problem = PGOProblem(read_g2o(path))
+    problem = PGOProblem(read_g2o(path), weighting=Weighting.ISOTROPIC)
     rng = np.random.default_rng(seed)
     start = solvers.solve(problem).poses
     turned = replace(start, t=start.t + size * rng.standard_normal(start.t.shape))
@@ -120,7 +120,7 @@ def test_shifted_and_ungrounded_bounds_are_verified(seed: int, tmp_path: Path) -
     certificate, proof = proof_of(path, pipeline=solvers.Pipeline(handedness=None))
     assert certificate.eta > 0
     assert_verified(verify_proof(path, proof), certificate)
-    problem = PGOProblem(read_g2o(path))
+    problem = PGOProblem(read_g2o(path), weighting=Weighting.ISOTROPIC)
     kinds = {certificate.bound.is_grounded}
     for poses in (certificate.poses, graph.truth):
         other = certify_at(problem, poses)
@@ -139,7 +139,7 @@ def test_unit_weights_priors_and_landmarks_are_verified(tmp_path: Path) -> None:
         for weighting in COSTS_OF_POSES:
             certificate, proof = proof_of(path, weighting)
             assert_verified(verify_proof(path, proof), certificate)
-        problem = PGOProblem(read_g2o(path).unit_weights())
+        problem = PGOProblem(read_g2o(path).unit_weights(), weighting=Weighting.ISOTROPIC)
         certificate = solvers.solve(problem).certificate
         save_proof(problem, certificate, proof)
         found = verify_proof(path, proof)
@@ -303,7 +303,7 @@ def test_proofs_of_files_without_translations_are_verified(tmp_path: Path) -> No
         found = verify_proof(path, proof)
         assert_verified(found, certificate)
         assert found.cost == ("chi2" if weighting is Weighting.INFORMATION else "rotations")
-    problem = PGOProblem(read_g2o(path).unit_weights())
+    problem = PGOProblem(read_g2o(path).unit_weights(), weighting=Weighting.ISOTROPIC)
     save_proof(problem, solvers.solve(problem).certificate, proof)
     found = verify_proof(path, proof)
     assert found.cost == "unit rotations"
@@ -393,7 +393,7 @@ def handed_proof(tmp_path: Path) -> tuple[Path, Path, solvers.Solution]:
     """File, proof and solution of a graph that handedness terms certify."""
     rng = np.random.default_rng(1)
     path = written(tmp_path, noisy_scene(SweptScene.CIRCLE, np.deg2rad(70.0), rng))
-    problem = PGOProblem(read_g2o(path))
+    problem = PGOProblem(read_g2o(path), weighting=Weighting.ISOTROPIC)
     solution = solvers.solve(problem)
     proof = tmp_path / "handed.json"
     save_proof(problem, solution.certificate, proof)
@@ -433,7 +433,7 @@ def test_no_false_bound_comes_of_made_up_handedness_terms(
     """Any rotations T and any P >= 0 give a true bound, or none."""
     rng = np.random.default_rng(seed)
     path = written(tmp_path_factory.mktemp("made_up"), varied_graph(seed, 5, 3, LOUD_NOISE))
-    problem = PGOProblem(read_g2o(path))
+    problem = PGOProblem(read_g2o(path), weighting=Weighting.ISOTROPIC)
     poses = solvers.solve(problem).poses
     proof = path.with_suffix(".json")
     save_proof(problem, certify_at(problem, poses), proof)
