@@ -398,8 +398,8 @@ figure.tight_layout()
 
 # %% [markdown]
 # Which $P_e$ make $S_r$ positive definite? The smallest eigenvalue is a concave function of all
-# $P_e$. `solve` ascends it, and on small graphs solves the semidefinite program
-# $\max t : S_r(P) \succeq t I, P_e \succeq 0$ by its barrier.
+# $P_e$. `solve` ascends it, and where that does not suffice takes $P_e$ from the multipliers of a
+# tighter relaxation, which is described below.
 
 # %%
 closed = solvers.solve(loose_problem)
@@ -436,9 +436,11 @@ for name, relaxation in (("without hulls", loose_relaxed), ("with hulls", with_h
 # The answer was optimal all along. The relaxation's value is 0.2 % below it, because it admits blocks
 # $Z_{ij}$ that are no mixture of rotations. The terms are the multipliers of what excludes them: that
 # $Z_{ij}$ is in the convex hull of $\mathrm{SO}(3)$ (Saunderson, Parrilo, Willsky 2015). Olsson,
-# Lochman, Malmport and Zach (2025) add that hull to the semidefinite program of rotation averaging. Where no $P_e$ on the edges suffices,
-# as on most graphs of the grid at 70 degrees, the gap stays open. In the plane there is nothing to
-# gain: the hull of $\mathrm{SO}(2)$ is a disc, which the mirror images of rotations fill, too.
+# Lochman, Malmport and Zach (2025) add that hull to the semidefinite program of rotation averaging.
+# `solve` needs no model of cvxpy for it: an augmented Lagrangian on a low-rank factor of $Z$
+# (`HullLagrangian`) takes graphs of a thousand poses. Where no $P_e$ on the edges suffices, as on
+# most graphs of the grid at 70 degrees, the gap stays open. In the plane there is nothing to gain:
+# the hull of $\mathrm{SO}(2)$ is a disc, which the mirror images of rotations fill, too.
 
 # %% [markdown]
 # ## Exercises

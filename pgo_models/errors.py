@@ -60,6 +60,7 @@ class FileFormatError(PGOError):
         super().__init__(f"{place}: {problem}")
         self.path = Path(path)
         self.line = line
+        self.problem = problem
         self._given = (path, line, problem)
 
     def __reduce__(self) -> "tuple[type[FileFormatError], tuple[Path | str, int | None, str]]":

@@ -12,16 +12,20 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from pgo_models.errors import FileFormatError, PGOError
+from pgo_models.errors import FileFormatError, PGOError, printable
 
 LARGEST = 1e100  # beyond it squares and determinants would overflow; no measured number is near
 FARTHEST = 1e15  # metres: beyond it neighbouring doubles are more than 0.1 m apart
 LONGEST = 10_000  # characters of a line of numbers; an edge in space with all its digits has 750
 LONGEST_OF_ALL = 2**16  # bytes of any line, comments included
+_NAMED_LINES = 20  # wrong lines of a file that an error names
 _ZERO_QUATERNION = 1e-9  # a norm below this gives no direction: files hold about six digits
 _BLOCK = 2**24  # bytes of a file that are split into lines at a time
 _SHOWN = 40  # characters of a wrong word that a message shows
 _LF, _CR = b"\n\r"
+
+Problem = tuple[int, str]  # a line of a file, from 1, and what is wrong with it
+Lines = Sequence[int] | NDArray[np.integer[Any]]
 
 
 def read_text(path: Path | str) -> str:
@@ -121,6 +125,29 @@ def _count_lines(data: bytes) -> int:
     return num_lines
 
 
+def check_lines(path: Path | str, problems: Sequence[Problem], unit: str = "lines") -> None:
+    """Raise a FileFormatError when there are problems in the lines of a file.
+
+    It has `file:line: problem` for each of the first 20 wrong lines, and their number. Of several
+    problems of a line the first is named. `unit` is what is counted in place of lines.
+    """
+    if not problems:
+        return
+    problem_of_line: dict[int, str] = {}
+    for line, problem in problems:
+        problem_of_line.setdefault(line, problem)
+    lines = sorted(problem_of_line)
+    named = lines[:_NAMED_LINES]
+    place = printable(str(path))
+    texts = [f"{place}:{line}: {problem_of_line[line]}" for line in named]
+    if len(lines) > len(named):
+        texts.append(f"{len(lines)} {unit} are wrong; the first {len(named)} are named")
+    elif len(lines) > 1:
+        texts.append(f"{len(lines)} {unit} are wrong")
+    texts[0] = problem_of_line[named[0]]  # FileFormatError names the place of the first
+    raise FileFormatError(path, named[0], "\n".join(texts))
+
+
 def check_length(path: Path | str, line: int, text: str) -> None:
     """Raise a FileFormatError when a line of numbers is longer than `LONGEST`.
 
@@ -133,30 +160,27 @@ def check_length(path: Path | str, line: int, text: str) -> None:
         raise FileFormatError(path, line, problem)
 
 
-def check_metres(
-    path: Path | str, lines: Sequence[int] | NDArray[np.integer[Any]], t: NDArray[np.float64]
-) -> None:
-    """Raise a FileFormatError when a position or translation, (n, d), is beyond `FARTHEST`.
+def far_lines(lines: Lines, t: NDArray[np.float64]) -> list[Problem]:
+    """Problems of positions or translations, (n, d), that are beyond `FARTHEST`.
 
     Row k of t stands on line `lines[k]`.
     """
-    farthest = np.abs(t).max(axis=1, initial=0.0)
-    if (farthest > FARTHEST).any():
+    distance = np.abs(t).max(axis=1, initial=0.0)
+    problems = []
+    for row in np.flatnonzero(distance > FARTHEST).tolist():
         problem = (
-            f"{farthest.max():.3g} m is beyond {FARTHEST:g} m, "
+            f"{distance[row]:.3g} m is beyond {FARTHEST:g} m, "
             "where doubles tell no metres apart; correct the line"
         )
-        raise FileFormatError(path, int(lines[int(np.argmax(farthest))]), problem)
+        problems.append((int(lines[row]), problem))
+    return problems
 
 
-def check_quaternions(
-    path: Path | str, lines: Sequence[int] | NDArray[np.integer[Any]], q: NDArray[np.float64]
-) -> None:
-    """Raise a FileFormatError when a quaternion, (n, 4), of these lines is zero."""
+def zero_quaternion_lines(lines: Lines, q: NDArray[np.float64]) -> list[Problem]:
+    """Problems of quaternions, (n, 4), that are zero; row k of q stands on line `lines[k]`."""
     is_zero = np.linalg.norm(q, axis=1) < _ZERO_QUATERNION
-    if is_zero.any():
-        problem = "zero quaternion; it is no rotation: 0 0 0 1 is the unrotated one"
-        raise FileFormatError(path, int(lines[int(np.argmax(is_zero))]), problem)
+    problem = "zero quaternion; it is no rotation: 0 0 0 1 is the unrotated one"
+    return [(int(lines[row]), problem) for row in np.flatnonzero(is_zero).tolist()]
 
 
 def finite_number(path: Path | str, line: int, word: str) -> float:
@@ -181,8 +205,8 @@ def finite_number(path: Path | str, line: int, word: str) -> float:
 def read_table(path: Path | str, columns: int) -> tuple[NDArray[np.float64], list[int]]:
     """Numbers (n, columns) of a text file with one row a line, and the line of every row, from 1.
 
-    Blank lines and comments (#) are skipped. A FileFormatError with file:line, when a line has too
-    few or too many numbers or is not all numbers; also when there is no row.
+    Blank lines and comments (#) are skipped. A FileFormatError names the lines that have too few or
+    too many numbers or are not all numbers; also when there is no row.
     """
     lines = read_text(path).removesuffix("\n").split("\n")
     table = _sound_table(lines, columns)
@@ -190,17 +214,23 @@ def read_table(path: Path | str, columns: int) -> tuple[NDArray[np.float64], lis
         return table, list(range(1, len(lines) + 1))
     rows = []
     row_lines = []
+    problems: list[Problem] = []
     for number, line in enumerate(lines, 1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        check_length(path, number, line)
-        rows.append([finite_number(path, number, word) for word in words])
+        try:
+            check_length(path, number, line)
+            row = [finite_number(path, number, word) for word in words]
+        except FileFormatError as error:
+            problems.append((number, error.problem))
+            continue
+        if len(row) != columns:
+            problem = f"{len(row)} numbers where {columns} belong; complete or remove it"
+            problems.append((number, problem))
+        rows.append(row)
         row_lines.append(number)
-        if len(words) != columns:
-            raise FileFormatError(
-                path, number, f"{len(words)} numbers where {columns} belong; complete or remove it"
-            )
+    check_lines(path, problems)
     if not rows:
         raise FileFormatError(path, None, f"no rows; give lines of {columns} numbers")
     return np.array(rows), row_lines

@@ -17,7 +17,7 @@ from solvers.distributed.checkpoint import Checkpoint as Checkpoint
 from solvers.folder_solve import FolderSolution as FolderSolution, solve_folder as solve_folder
 from solvers.growing import extend as extend
 from solvers.handedness.ascent import HandednessAscent as HandednessAscent
-from solvers.handedness.barrier import HandednessBarrier as HandednessBarrier
+from solvers.handedness.hull_lagrangian import HullLagrangian as HullLagrangian
 from solvers.handedness.search import HandednessSearch as HandednessSearch
 from solvers.loop import Method as Method, Solver as Solver, iterate as iterate, run as run
 from solvers.network.engine import (
@@ -45,6 +45,7 @@ from solvers.result import (
 from solvers.riemannian.certify import certify as certify
 from solvers.riemannian.newton import Newton as Newton, gauss_newton as gauss_newton
 from solvers.riemannian.polish import polish as polish
+from solvers.riemannian.prefixes import GrowingStart as GrowingStart
 from solvers.riemannian.staircase import Staircase as Staircase
 from solvers.robust.consistency import PCM as PCM, pairwise_consistent as pairwise_consistent
 from solvers.robust.gnc import GNC as GNC
@@ -121,7 +122,7 @@ __all__ += [
 ]
 __all__ += ["SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "PaperStop", "RStep"]
 __all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty"]
-__all__ += ["HandednessSearch", "Newton", "Staircase", "gauss_newton", "polish"]
+__all__ += ["GrowingStart", "HandednessSearch", "Newton", "Staircase", "gauss_newton", "polish"]
 __all__ += ["GNC", "IRLS", "PCM", "RobustLoss", "pairwise_consistent"]
 __all__ += ["GaussSeidel", "LevenbergMarquardt"]
 __all__ += ["Checkpoint", "Faults", "InProcess", "Ledger", "RayEngine"]
@@ -135,7 +136,7 @@ __all__ += [
     "reproduce_tables",
 ]
 # Types in the signatures of the names above.
-__all__ += ["HandednessAscent", "HandednessBarrier"]
+__all__ += ["HandednessAscent", "HullLagrangian"]
 __all__ += ["EdgeFit", "Outcome", "Rejection", "Support"]
 __all__ += ["CustomRStep", "RSubproblem", "RotationStep"]
 __all__ += ["OrthogonalSolution", "Sweep"]

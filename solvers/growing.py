@@ -68,7 +68,9 @@ def extend(solution: Solution, graph: PoseGraph, pipeline: Pipeline | None = Non
         return solve(problem, pipeline, start)
     tolerance = max(pipeline.newton.tolerance, _SHARE * pipeline.gap)
     newton = replace(pipeline.newton, tolerance=tolerance)
-    newton_alone = replace(pipeline, soc=None, newton=newton, second_try=False, staircase=None)
+    newton_alone = replace(
+        pipeline, soc=None, newton=newton, growing=None, second_try=False, staircase=None
+    )
     update = solve(problem, newton_alone, start)
     if update.status in OUT_OF_TIME or not update.certificate.can_improve:
         return update

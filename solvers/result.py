@@ -20,6 +20,7 @@ class Status(enum.Enum):
     MAX_ITERATIONS = "iteration limit reached; raise max_iterations or loosen the tolerance"
     TIME_LIMIT = "time limit reached; raise it or loosen the tolerance"
     STALLED = "no further decrease is possible in double precision"
+    NO_PROGRESS = "the residuals have stopped falling; start from other poses, or take Newton"
     STOPPED = "stopped by the callback"
     INTERRUPTED = "interrupted; the best iterate so far is returned"
     START_KEPT = (

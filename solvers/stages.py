@@ -26,19 +26,27 @@ from pgo_models.certificates.certificate import (
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
-from solvers.handedness.search import HandednessSearch, stage_of_relaxation
+from pgo_models.relaxations.rounding import round_factor
+from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
+from solvers.handedness.search import HandednessSearch, stage_of_search
 from solvers.loop import RunMonitor
-from solvers.result import OUT_OF_TIME, History, Record, Run, Stage, Status
+from solvers.result import OUT_OF_TIME, History, Outcome, Record, Run, Stage, Status
 from solvers.riemannian.certify import with_shrunk_information
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.polish import polish
+from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import DualBound, Staircase, StaircaseState
 from solvers.soc.paper import PaperSOC
 from solvers.soc.soc import SOC
 
 SECOND_TRY_TOLERANCE = 1e-6
+HULL_PASSES = 3
+CLOSER = 0.1  # factor on the tolerance of the next pass
+GROWING_START = "growing start"
+BROKEN_OFF = (*OUT_OF_TIME, Status.STOPPED)
 AnySOC = TypeVar("AnySOC", bound=SOC | PaperSOC)
 
 
@@ -115,6 +123,21 @@ class Job:
     def is_out_of_time(self) -> bool:
         """Whether the last stage was interrupted or reached the time limit."""
         return self.stages[-1].status in OUT_OF_TIME
+
+    @property
+    def may_try_again(self) -> bool:
+        """Whether the first attempt ended well, and nothing has been broken off since.
+
+        How an attempt from a growing start ends says nothing of the first one.
+        """
+        last = self.stages[-1].status
+        if last.is_success or last in BROKEN_OFF:
+            return last.is_success
+        names = [stage.name for stage in self.stages]
+        if GROWING_START not in names:
+            return False
+        end_of_first = self.stages[names.index(GROWING_START) - 1]
+        return end_of_first.status.is_success
 
     def better(self, answer: Answer, other: Certificate) -> Answer:
         """The cheaper poses and the better bound of an answer and another certificate."""
@@ -276,6 +299,85 @@ class RunStaircase:
 
 
 @dataclass(frozen=True, eq=False)
+class GrowPrefixes:
+    """Start: poses that prefixes of the graph lead to."""
+
+    job: Job
+    growing: GrowingStart
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return GROWING_START
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the poses of the last prefix, whatever the answer so far is."""
+        job = self.job
+        finished = job.monitor.run(self.growing, job.problem)
+        job.stages.append(replace(Stage.of(finished), name=self.name))
+        return Answer(finished.poses)
+
+
+@dataclass(frozen=True, eq=False)
+class GrowingAttempt:
+    """Another attempt, from a start that grows, where the gap of the first is wider than asked for.
+
+    On graphs with landmarks the first attempt takes few steps of Newton's method, as it mostly
+    fails where these are not enough. `newton` takes them to the end where this attempt does not
+    give the gap either, so that no answer is worse for it.
+    """
+
+    job: Job
+    growing: GrowingStart
+    newton: Newton
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return "growing attempt"
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the better poses and the better bound of both attempts."""
+        job = self.job
+        was_cut_short = self._was_cut_short
+        grown = self._grown(answer, was_cut_short)
+        is_over = grown is not None and (grown.is_certified or job.is_out_of_time)
+        if was_cut_short and not is_over:
+            answer = run_stages([RunNewton(job, self.newton), FindCertificate(job)], answer)
+        return answer if grown is None else job.better(answer, grown)
+
+    @property
+    def _was_cut_short(self) -> bool:
+        """Whether Newton's method of the first attempt may take more steps than it was given."""
+        last = self.job.stages[-1]
+        may_take_more = last.iterations < self.newton.max_iterations
+        return last.status is Status.MAX_ITERATIONS and may_take_more
+
+    def _grown(self, answer: Answer, was_cut_short: bool) -> Certificate | None:
+        """Certificate of the attempt; None where there is no need or no way to make one.
+
+        There is no way where odometry does not join the poses, where the first attempt was broken
+        off, and where a matrix has no Cholesky factor.
+        """
+        job = self.job
+        may_go_on = was_cut_short or job.stages[-1].status.is_success
+        if not (answer.current_certificate.can_improve and may_go_on):
+            return None
+        if not self.growing.has_prefixes(job.problem.graph):
+            return None
+        planned: list[PlannedStage] = [
+            GrowPrefixes(job, self.growing),
+            RunNewton(job, self.newton),
+            FindCertificate(job),
+        ]
+        try:
+            return run_stages(planned, Answer()).certificate
+        except NotPositiveDefiniteError:
+            job.stages.append(Stage.without_factor(job.problem.objective(answer.current_poses)))
+            return None
+
+
+@dataclass(frozen=True, eq=False)
 class SecondAttempt:
     """Another attempt, where the gap of the first is wider than asked for.
 
@@ -298,8 +400,7 @@ class SecondAttempt:
         An attempt that ends for want of a Cholesky factor leaves the answer as it is.
         """
         job = self.job
-        has_ended_well = job.stages[-1].status.is_success
-        if not (answer.current_certificate.can_improve and has_ended_well):
+        if not (answer.current_certificate.can_improve and job.may_try_again):
             return answer
         try:
             other = run_stages(self._planned(), Answer())
@@ -379,10 +480,11 @@ class ImproveBound:
 
 @dataclass(frozen=True, eq=False)
 class SeekHandednessTerms:
-    """Handedness terms at the best poses, where the certificate can still improve in space.
+    """Handedness terms, where the certificate can still improve in space.
 
-    Where no terms suffice there, small graphs get the bound of the relaxation with hulls of
-    rotations, and terms are sought again at its poses if these cost less.
+    The first are sought at the best poses. Where these do not suffice, the relaxation with hulls of
+    rotations gives a better bound, and maybe better poses. It is solved in passes, each closer to
+    poses than the one before, and after each its multipliers are terms to begin with at the poses.
     """
 
     job: Job
@@ -400,12 +502,9 @@ class SeekHandednessTerms:
             return answer
         try:
             answer = self._with_terms(answer)
-            if not self._is_open(answer):
-                return answer
-            relaxed = self._with_hulls(answer)
-            if relaxed.poses is not answer.poses and self._is_open(relaxed):
-                return self._with_terms(relaxed)
-            return relaxed
+            relaxation = self.search.relaxation(job.problem, job.gap)
+            if relaxation is not None:
+                answer = self._with_hulls(answer, relaxation)
         except KeyboardInterrupt:
             objective = job.problem.objective(answer.current_poses)
             job.stages.append(Stage.interruption(objective))
@@ -417,27 +516,59 @@ class SeekHandednessTerms:
         """Whether the certificate can improve, and there is time for it."""
         return answer.current_certificate.can_improve and not self.job.is_out_of_time
 
-    def _with_terms(self, answer: Answer) -> Answer:
-        """The same poses, with the better bound."""
+    def _with_terms(self, answer: Answer, Pi: Array | None = None) -> Answer:
+        """The same poses, with the better bound, by terms that vanish there.
+
+        The ascent begins with those of the multipliers Pi, (pairs, 4, 4), or with none.
+        """
         job = self.job
         problem = job.problem
         poses = problem.at_best_translations(answer.current_poses)
-        terms, stages = self.search.run(problem, poses, job.monitor)
-        job.stages.extend(stages)
+        terms, stage = self.search.run(problem, poses, job.monitor, Pi)
+        job.stages.append(stage)
         judged = judge(problem, answer.current_poses, answer.current_certificate)
         return replace(answer, certificate=with_terms(problem, judged, terms, poses))
 
-    def _with_hulls(self, answer: Answer) -> Answer:
+    def _with_hulls(self, answer: Answer, relaxation: HullLagrangian) -> Answer:
         """The better poses and the better bound of the answer and the relaxation with hulls."""
         job = self.job
+        start: Poses | HullState = answer.current_poses
+        for _ in range(HULL_PASSES):
+            if not self._is_open(answer):
+                break
+            finished: Outcome[HullState] = job.monitor.run(relaxation, job.problem, start)
+            job.stages.append(stage_of_search(finished))
+            state = finished.state
+            known = answer
+            answer = self._better(answer, state)
+            is_close = state.closeness <= relaxation.tolerance
+            has_moved = answer.poses is not known.poses
+            if not (is_close or has_moved) or not self._is_open(answer):
+                break
+            answer = self._with_terms(answer, state.Pi)
+            if not is_close:
+                break
+            start = state
+            relaxation = replace(relaxation, tolerance=CLOSER * relaxation.tolerance)
+        return answer
+
+    def _better(self, answer: Answer, state: HullState) -> Answer:
+        """The better poses and the better bound of an answer and a state of the relaxation."""
+        job = self.job
         problem = job.problem
-        relaxed = self.search.relax(problem, job.gap, job.monitor)
-        if relaxed is None:
+        poses = polish(problem, round_factor(problem, state.point.Y)[0])
+        if state.bound is None:
             return answer
-        poses = polish(problem, relaxed.poses)
-        job.stages.append(stage_of_relaxation(relaxed, problem.objective(poses)))
-        other = judge(problem, poses, relaxed.certificate)
-        return job.better(answer, replace(other, poses=poses, poses_objective=other.objective))
+        relaxed = certify_with(
+            problem,
+            poses,
+            state.bound.Lambda,
+            job.gap,
+            math.nan,
+            BoundSource.HULLS,
+            state.bound.bound,
+        )
+        return job.better(answer, relaxed)
 
 
 def finer(soc: AnySOC) -> AnySOC:

@@ -127,3 +127,19 @@ def test_a_link_to_nothing_makes_its_file_and_a_circle_of_links_is_refused(tmp_p
     assert (tmp_path / "a").read_text() == "1"
     with pytest.raises(PGOError, match=r"cannot write .*circle: "):
         write_one(tmp_path / "circle")
+
+
+def test_all_wrong_rows_of_a_table_are_named(tmp_path: Path) -> None:
+    rows = ["1 2"] * 30
+    rows[3] = "1"
+    rows[4] = "1 two"
+    rows[29] = "1 2 3"
+    (tmp_path / "a").write_text("\n".join(rows))
+    with pytest.raises(FileFormatError) as caught:
+        read_table(tmp_path / "a", 2)
+    place = tmp_path / "a"
+    first, second, third, last = str(caught.value).split("\n")
+    assert first.startswith(f"{place}:4: 1 numbers where 2 belong")
+    assert second.startswith(f"{place}:5: 'two' is no number")
+    assert third.startswith(f"{place}:30: 3 numbers where 2 belong")
+    assert last == "3 lines are wrong"

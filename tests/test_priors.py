@@ -253,7 +253,7 @@ def test_files_hold_neither_the_world_nor_trajectories_of_landmarks(tmp_path, ca
         graph.with_position_prior(np.arange(0, 30, 5), graph.truth.t[:30:5], 9.0), truth=None
     )
     write_g2o(graph, tmp_path / "gps.g2o")
-    (tmp_path / "gps.g2o").write_text((tmp_path / "gps.g2o").read_text() + "BR 1 2\n")
+    (tmp_path / "gps.g2o").write_text((tmp_path / "gps.g2o").read_text() + "SIGHT 1 2\n")
     outs = [tmp_path / f"out.{suffix}" for suffix in ("g2o", "tum", "kitti", "json", "png")]
     options = [word for out in outs for word in ("-o", out)]
     options += ["--report", tmp_path / "report.html", "--covariances", tmp_path / "out.csv"]
@@ -265,7 +265,7 @@ def test_files_hold_neither_the_world_nor_trajectories_of_landmarks(tmp_path, ca
         assert run("solve", tmp_path / "gps.g2o", "--skip-unknown", *options) == 0
     text, said = capsys.readouterr()
     assert said.startswith("pgo: warning: ")
-    assert "skipped: 1 of BR" in said
+    assert "skipped: 1 of SIGHT" in said
     assert "priors=6" in text
     assert "CERTIFIED" in text
     assert [len(out.read_text().splitlines()) for out in outs[1:3]] == [30, 30]

@@ -241,7 +241,7 @@ def best_bound(
 def best_bound_with_terms(
     problem: PGOProblem,
     Lambda: Array,
-    poses: Poses,
+    poses: Poses | None,
     gap: float,
     objective: float,
     terms: HandednessTerms,

@@ -11,9 +11,10 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pgo_models.errors import DatasetError, FileFormatError
+from pgo_models.errors import DatasetError, FileFormatError, SettingError
 from pgo_models.files import replace_when_done
-from pgo_models.graphs.g2o import name_of, read_g2o
+from pgo_models.graphs.g2o import edge_places, name_of, read_g2o
+from pgo_models.graphs.jrl import SUFFIX, jrl_edge_places, read_jrl
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.graphs.trajectories import read_tum
@@ -70,6 +71,7 @@ def load(
     download: bool = True,
     weights: RotationWeight = RotationWeight.SE_SYNC,
     skip_unknown: bool = False,
+    square_roots: bool = False,
 ) -> PoseGraph:
     """Load a pose graph by the name of a data set, or from a file or folder.
 
@@ -81,7 +83,8 @@ def load(
     Parameters
     ----------
     name_or_path : str or Path
-        Name of a data set (`known_datasets`), a g2o file, or a folder with one for each robot.
+        Name of a data set (`known_datasets`), a g2o file, a folder with one for each robot, or a
+        file of a JSON robot log, whose name ends in .jrl (`read_jrl`).
     registry : Registry
         Public data sets; those of SE-Sync unless given.
     download : bool
@@ -90,6 +93,8 @@ def load(
         As for `read_g2o`.
     skip_unknown : bool
         As for `read_g2o`.
+    square_roots : bool
+        As for `read_g2o`; a JSON robot log has none.
 
     Returns
     -------
@@ -100,6 +105,8 @@ def load(
     ------
     DatasetError
         When the name is unknown, the download fails or is not wanted, or its checksum is wrong.
+    SettingError
+        When square roots are asked for of a JSON robot log, which has covariances.
     FileFormatError
         As for `read_g2o`; also when the truth has not one pose for each of the graph.
 
@@ -114,7 +121,12 @@ def load(
     PoseGraph('sphere', d=3, poses=50, edges=544, robots=1)
     """
     path = locate(name_or_path, registry, download=download)
-    graph = read_g2o(path, weights, skip_unknown=skip_unknown)
+    if path.suffix != SUFFIX:
+        graph = read_g2o(path, weights, skip_unknown=skip_unknown, square_roots=square_roots)
+    elif square_roots:
+        raise SettingError(f"{path} has covariances, and no square roots; leave square_roots out")
+    else:
+        graph = read_jrl(path, weights, skip_unknown=skip_unknown)
     truth_path = path.absolute().parent / f"{name_of(path)}.truth.tum"
     if not os.path.isfile(truth_path):
         return graph
@@ -144,7 +156,8 @@ def locate(
             return path
     elif os.path.exists(path):
         return path
-    if isinstance(name_or_path, Path) or path.suffix == ".g2o" or name != path.name:
+    is_file_name = path.suffix in (".g2o", SUFFIX)
+    if isinstance(name_or_path, Path) or is_file_name or name != path.name:
         raise FileFormatError(
             path, None, "no such file or folder; check the path, or give a data set's name"
         )
@@ -154,6 +167,11 @@ def locate(
     if name not in registry.checksums:
         raise _unknown(name, registry)
     return _cached(name, registry, download)
+
+
+def places_of_edges(path: Path) -> list[str]:
+    """`file:line` of every edge of the graph in a file or folder; as `load` reads it."""
+    return jrl_edge_places(path) if path.suffix == SUFFIX else edge_places(path)
 
 
 def _in_folders(name: str) -> Path | None:

@@ -12,15 +12,17 @@ from pathlib import Path
 import numpy as np
 
 from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOError, printable
-from pgo_models.files import check_writable, replace_when_done
+from pgo_models.files import check_lines, check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, BoolArray, log_map, quaternions_from_rotations
-from pgo_models.graphs.g2o_parser import G2OLines, information_of, poses_of, read_lines
-from pgo_models.graphs.g2o_tags import TAGS, Tag
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.g2o_parser import G2OLines, read_lines
+from pgo_models.graphs.g2o_rows import information_of, numbers_of, poses_of
+from pgo_models.graphs.g2o_tags import G2O_TAGS, Tag
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph, isotropic_information
 from pgo_models.graphs.precisions import RotationWeight, edge_precisions
 
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
+_LETTER_CODES = [ord(letter) for letter in _LETTERS]
 MOST_SYMBOLS = len(_LETTERS)  # robots whose poses can be named by GTSAM symbols
 _ROWS_AT_A_TIME = 2**14  # rows of numbers that are turned into text at a time
 _LETTER_SHIFT = 56  # a GTSAM symbol is a letter in the top byte and an index below it
@@ -33,14 +35,32 @@ def read_g2o(
     weights: RotationWeight = RotationWeight.SE_SYNC,
     *,
     skip_unknown: bool = False,
+    square_roots: bool = False,
 ) -> PoseGraph:
     """Read a g2o file, or a folder with one g2o file for each robot.
 
-    The reader takes FIX lines, and the lines of poses, landmarks and priors that g2o, GTSAM and
-    TORO write. It numbers the poses by ascending id; the world pose of priors comes last. It
+    The reader takes FIX lines, and the lines of poses, landmarks and priors that g2o, GTSAM, TORO
+    and iSAM write. It numbers the poses by ascending id; the world pose of priors comes last. It
     normalises quaternions, and counts every copy of an edge that a file repeats. An edge may lead
     to a pose that has no VERTEX line. `PoseGraph.initial` is set if every pose has a VERTEX line,
     and is None otherwise.
+
+    Where the lines leave a choice, a `GraphWarning` says what was assumed:
+
+    - EDGE2, EDGE3 and LANDMARK2 have information matrices, although iSAM's files have square roots
+      of them (`square_roots`). The matrices of EDGE2 are in TORO's order, unless all are positive
+      definite in iSAM's, and not in TORO's.
+    - EDGE3 without a matrix has the identity.
+    - ODOMETRY and LANDMARK have covariance matrices, as in GTSAM.
+    - BR, a point by bearing and range with their standard deviations, becomes a point with the
+      covariance to first order, an approximation.
+    - EQUIV, which names edges that TORO may contract, is skipped.
+    - An id of a pose that is a landmark's, too, names two things; a power of ten is added to the
+      ids of all landmarks.
+
+    A measurement by a sensor that PARAMS_SE2OFFSET or PARAMS_SE3OFFSET places beside its pose is
+    brought into the frame of the pose. This is exact for landmarks; of an edge or prior that ends
+    at such a sensor, the information is right to first order in the rotation error.
 
     The robot of a pose is found in one of three ways:
 
@@ -68,6 +88,9 @@ def read_g2o(
         kappa = I_theta (SE_SYNC) or kappa = I_theta / 2 (GAUSSIAN). It has no effect on 3D edges.
     skip_unknown : bool
         Whether lines with other tags are skipped with a warning.
+    square_roots : bool
+        Whether matrices, of all tags, are upper triangular square roots U of the information U^T U,
+        by rows, as iSAM writes them.
 
     Returns
     -------
@@ -77,8 +100,8 @@ def read_g2o(
     Raises
     ------
     FileFormatError
-        With file:line, for a line that cannot be read or measures nothing, and for FIX of an
-        unknown pose. Also for a folder with a 2D file and a 3D file, and if there are no edges or
+        With file:line of the first 20 lines that cannot be read or measure nothing, and for FIX of
+        unknown poses. Also for a folder with a 2D file and a 3D file, and if there are no edges or
         no files.
 
     References
@@ -92,8 +115,23 @@ def read_g2o(
     PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
     """
     path = Path(path)
-    files = [read_lines(file, skip_unknown) for file in g2o_files(path)]
+    files = [read_lines(file, skip_unknown, square_roots) for file in g2o_files(path)]
     files = _files_of_robots(files)
+    _check_ids_of_landmarks(files)
+    return graph_of_files(path, files, weights)
+
+
+def graph_of_files(
+    path: Path,
+    files: list[G2OLines],
+    weights: RotationWeight,
+    letters: Sequence[int] = _LETTER_CODES,
+) -> PoseGraph:
+    """Graph of the lines of a file for each robot, or of one file.
+
+    `path` is that of all files together. `letters` are the codes of those letters in the top byte
+    of ids that name robots.
+    """
     d = _common_dimension(files)
     edge_ids, rows = _joined_edges(files)
     if not len(rows):
@@ -104,7 +142,7 @@ def read_g2o(
     ids = _distinct([edge_ids.ravel(), *ids_of_vertices])
     file_ids = ids[ids != WORLD_ID]  # the world pose, if there is one, has the largest id
     edges = np.searchsorted(ids, edge_ids)
-    robot = _robots(file_ids, files)
+    robot = _robots(file_ids, files, letters)
     initial = _initial(file_ids, robot, files)
     world = None
     if len(file_ids) < len(ids):
@@ -150,6 +188,17 @@ def _common_dimension(files: list[G2OLines]) -> int:
             )
             raise FileFormatError(file.path, None, problem)
     return first.d
+
+
+def _check_ids_of_landmarks(files: list[G2OLines]) -> None:
+    """Raise a FileFormatError where a file of several has poses and landmarks with the same ids."""
+    for file in files:
+        if len(files) > 1 and file.landmark_shift:
+            problem = (
+                "ids of poses are those of landmarks, too; in a folder of several files, "
+                "give the landmarks ids of their own"
+            )
+            raise FileFormatError(file.path, None, problem)
 
 
 def _distinct(ids: list[IntArray]) -> IntArray:
@@ -356,9 +405,8 @@ def pose_names(graph: PoseGraph) -> list[str]:
     names = [graph.pose_name(pose) for pose in range(graph.num_poses)]
     poses = graph.in_files.tolist()
     ids = {pose: int(names[pose]) for pose in poses}
-    letter_codes = {ord(letter) for letter in _LETTERS}
     codes = {symbol >> _LETTER_SHIFT for symbol in ids.values()}
-    if not codes <= letter_codes:
+    if not codes <= set(_LETTER_CODES):
         return names
     index_bits = (1 << _LETTER_SHIFT) - 1
     for pose, symbol in ids.items():
@@ -537,11 +585,12 @@ def edge_rows_to_keep(files: Sequence[tuple[IntArray, Array]]) -> list[IntArray 
     return kept
 
 
-def _robots(ids: IntArray, files: list[G2OLines]) -> IntArray | None:
+def _robots(
+    ids: IntArray, files: list[G2OLines], letters_of_robots: Sequence[int]
+) -> IntArray | None:
     """Robot of every pose by the cases (a) and (b) of `read_g2o`; None in case (c)."""
     letters = ids >> _LETTER_SHIFT
-    letter_codes = [ord(letter) for letter in _LETTERS]
-    if np.isin(letters, letter_codes).all():
+    if np.isin(letters, letters_of_robots).all():
         return _ranks(letters)
     if len(files) == 1:
         return None
@@ -602,12 +651,11 @@ def _initial(ids: IntArray, robot: IntArray | None, files: list[G2OLines]) -> Po
 def _fixed(ids: IntArray, files: list[G2OLines]) -> IntArray:
     """Poses of the FIX lines, ascending; a FileFormatError for one that has no other line."""
     for file in files:
-        is_unknown = ~np.isin(file.fixed, ids)
-        if is_unknown.any():
-            first = int(np.argmax(is_unknown))
-            problem = f"FIX names pose {file.fixed[first]}, which has no other line; remove it"
-            line = int(file.fixed_lines[first])
-            raise FileFormatError(file.path, line, problem)
+        problems = []
+        for row in np.flatnonzero(~np.isin(file.fixed, ids)):
+            problem = f"FIX names pose {file.fixed[row]}, which has no other line; remove it"
+            problems.append((int(file.fixed_lines[row]), problem))
+        check_lines(file.path, problems)
     fixed_ids = np.concatenate([file.fixed for file in files])
     fixed_poses = np.searchsorted(ids, fixed_ids)
     return np.unique(fixed_poses)
@@ -648,8 +696,8 @@ def _write(
 def _written_tags(d: int, is_edge: bool) -> dict[str, Tag]:
     """Tags of the VERTEX or EDGE lines that are written in d dimensions."""
     written = {}
-    for tag, kind in TAGS.items():
-        if kind.d == d and kind.is_edge == is_edge and not kind.is_toro:
+    for tag, kind in G2O_TAGS.items():
+        if kind.d == d and kind.is_edge == is_edge:
             written[tag] = kind
     return written
 
@@ -699,7 +747,7 @@ def _edge_lines(graph: PoseGraph, edges: BoolArray) -> Iterator[str]:
         numbers = np.concatenate([measured, triangles], axis=1)
         # The line of a prior names the measured pose alone, which is the second end of the edge.
         ids = end_ids[chosen, -kind.num_ids :]
-        offset = "0 " if kind.has_offset else ""
+        offset = "0 " * kind.num_offsets
         yield from _lines(tag, ids, numbers, offset)
 
 
@@ -707,8 +755,7 @@ def _numbers(poses: Poses, kind: Tag) -> Array:
     """Numbers of poses, (n, ..), as they stand on lines of a kind."""
     if kind.is_point:
         return poses.t
-    rotations = log_map(poses.R) if poses.d == 2 else quaternions_from_rotations(poses.R)
-    return np.concatenate([poses.t, rotations], axis=1)
+    return numbers_of(poses.R, poses.t)
 
 
 def _lines(tag: str, ids: IntArray, numbers: Array, offset: str = "") -> Iterator[str]:

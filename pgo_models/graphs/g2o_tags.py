@@ -1,4 +1,4 @@
-"""The tags of g2o files, as g2o, GTSAM and TORO write them, and what stands on their lines.
+"""The tags of g2o files, as g2o, GTSAM, TORO and iSAM write them, and what stands on their lines.
 
 Numbers are brought into the order of EDGE_SE2 and EDGE_SE3:QUAT.
 
@@ -6,26 +6,43 @@ Sources: `types_slam2d.cpp`, `types_slam3d.cpp` and every `read` and `computeErr
 (Kuemmerle et al. 2011). Errors are of (measurement)^-1 x, so that the information of a prior is in
 the frame that was measured, that of a position in the frame of the world, and that of a landmark in
 the frame of the pose. TORO's page (Grisetti et al. 2007), except that its code and GTSAM take the
-first vertex of an edge for the one that observes.
+first vertex of an edge for the one that observes. `load2D` of GTSAM, for ODOMETRY, LANDMARK and BR.
 """
 
+import enum
 from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.geometry.rotations import Array, exp_map, quaternions_from_rotations
+from pgo_models.files import LARGEST
+from pgo_models.geometry.arrays import triangle_places
+from pgo_models.geometry.rotations import Array, BoolArray, exp_map, quaternions_from_rotations
+from pgo_models.graphs.precisions import are_definite
 
 # Places of the numbers of an EDGE2 line of TORO: x y theta, then the triangle as ff fs ss rr fr sr.
 _TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
+# An eigenvalue below this, of a matrix with ones on its diagonal, is rounding.
+SINGULAR = 1e-15
+
+
+class Noise(enum.Enum):
+    """How an EDGE line says how precise it is."""
+
+    INFORMATION = "upper triangle of the information matrix"
+    COVARIANCE = "upper triangle of the covariance matrix, row by row"
+    DEVIATIONS = "standard deviations of bearing and range"
+    SQUARE_ROOT = "upper triangular matrix U, row by row, with the information U^T U"
+    MISSING = "nothing; the identity is taken for the information matrix"
 
 
 @dataclass(frozen=True)
 class Tag:
-    """What stands on a line behind its tag: ids, a measurement and, on EDGE lines, a triangle.
+    """What stands on a line behind its tag: ids, a measurement and, on EDGE lines, its noise.
 
-    The triangle is the upper one of an information matrix, row by row. A point has d numbers, and
-    its matrix is d x d. An id of a PARAMS_SE3OFFSET line may stand between ids and numbers. Poses
-    of TORO in space have roll, pitch and yaw in place of a quaternion.
+    The noise is the upper triangle of an information matrix, row by row, unless `noise` says
+    otherwise. A point has d numbers, or bearing and range with DEVIATIONS, and its matrix is d x d.
+    The ids of PARAMS_SE2OFFSET or PARAMS_SE3OFFSET lines, `num_offsets` of them, may stand between
+    ids and numbers. Poses of TORO in space have roll, pitch and yaw in place of a quaternion.
     """
 
     d: int
@@ -33,20 +50,45 @@ class Tag:
     is_edge: bool = True
     is_point: bool = False
     to_landmark: bool = False
-    has_offset: bool = False
+    num_offsets: int = 0
     is_toro: bool = False
+    noise: Noise = Noise.INFORMATION
 
     @property
     def num_numbers(self) -> int:
         """How many numbers stand behind the ids."""
-        k = self.d if self.is_point else 3 * self.d - 3
-        has_quaternion = k == 6 and not self.is_toro
-        num_measured = 7 if has_quaternion else k
-        num_in_triangle = k * (k + 1) // 2 if self.is_edge else 0
-        return num_measured + num_in_triangle
+        if self.noise is Noise.DEVIATIONS:
+            return 4
+        has_triangle = self.is_edge and self.noise is not Noise.MISSING
+        num_in_triangle = self._side * (self._side + 1) // 2 if has_triangle else 0
+        return self._num_measured + num_in_triangle
+
+    @property
+    def has_matrix(self) -> bool:
+        """Whether a line has the triangle of a matrix."""
+        return self.is_edge and self.noise in (Noise.INFORMATION, Noise.COVARIANCE)
+
+    @property
+    def is_position(self) -> bool:
+        """Whether a line measures a position in the frame of the world."""
+        return self.is_point and self.num_ids == 1
+
+    def problem(self, numbers: Array) -> tuple[BoolArray, str]:
+        """Return which lines, (n, num_numbers), have a noise that is none, (n,), and why."""
+        if self.noise is Noise.DEVIATIONS:
+            is_wrong = np.asarray((numbers[:, 1:] <= 0.0).any(axis=1))
+            problem = "range and standard deviations are not all positive; correct or remove it"
+            return is_wrong, problem
+        if self.noise is Noise.COVARIANCE:
+            covariances = numbers[:, self._num_measured + triangle_places(self._side)]
+            is_covariance = are_definite(covariances, SINGULAR)
+            problem = "the covariance matrix is not positive definite; correct or remove it"
+            return ~is_covariance, problem
+        return np.zeros(len(numbers), dtype=bool), ""
 
     def rows(self, numbers: Array) -> Array:
         """Numbers of lines, (n, num_numbers), as rows of `G2OLines`."""
+        numbers = self._with_information(numbers)
         if self.is_point:
             return self._rows_of_points(numbers)
         if not self.is_toro:
@@ -56,6 +98,35 @@ class Tag:
         if self.is_edge:
             return numbers[:, _TORO]
         return numbers
+
+    @property
+    def _side(self) -> int:
+        """Rows of the information matrix."""
+        return self.d if self.is_point else 3 * self.d - 3
+
+    @property
+    def _num_measured(self) -> int:
+        """How many numbers the measurement has."""
+        has_quaternion = self._side == 6 and not self.is_toro
+        return 7 if has_quaternion else self._side
+
+    def _with_information(self, numbers: Array) -> Array:
+        """Numbers with the triangle of an information matrix in place of another noise."""
+        if self.noise is Noise.INFORMATION:
+            return numbers
+        if self.noise is Noise.DEVIATIONS:
+            return _cartesian(numbers)
+        measured = numbers[:, : self._num_measured]
+        if self.noise is Noise.SQUARE_ROOT:
+            U = np.triu(numbers[:, self._num_measured + triangle_places(self._side)])
+            information = U.mT @ U
+        elif self.noise is Noise.MISSING:
+            information = np.tile(np.eye(self._side), (len(numbers), 1, 1))
+        else:
+            covariances = numbers[:, self._num_measured + triangle_places(self._side)]
+            information = np.asarray(np.linalg.inv(covariances), dtype=float)
+        triangles = information[:, *np.triu_indices(self._side)]
+        return np.concatenate([measured, triangles], axis=1)
 
     def _rows_of_points(self, numbers: Array) -> Array:
         """Points as poses that are not turned, with no information on their rotation."""
@@ -88,7 +159,27 @@ def _with_quaternions(numbers: Array) -> Array:
     return np.concatenate([translations, quaternions, triangles], axis=1)
 
 
-TAGS = {
+def _cartesian(numbers: Array) -> Array:
+    """Points (x, y) and the triangles of their information, (n, 5), of points in polar coordinates.
+
+    A row has bearing, range and their standard deviations. To first order the error of the point is
+    that of the range along the line of sight, and range times that of the bearing across it. The
+    information is therefore R(bearing) diag(1 / std_range^2, 1 / (range std_bearing)^2)
+    R(bearing)^T, in the axes of the pose. This is an approximation: the exact density is bent.
+    """
+    bearing, distance, bearing_std, range_std = numbers.T
+    to_pose = exp_map(bearing[:, None])
+    points = distance[:, None] * to_pose[:, :, 0]
+    deviations = np.stack([range_std, distance * bearing_std], axis=1)
+    with np.errstate(over="ignore", divide="ignore"):
+        precisions = np.minimum(deviations**-2.0, LARGEST)
+    information = (to_pose * precisions[:, None, :]) @ to_pose.mT
+    triangle = information[:, *np.triu_indices(2)]
+    return np.concatenate([points, triangle], axis=1)
+
+
+# Tags that are read and written. EDGE_SE3_XYZ_PRIOR is a position of the pose itself.
+G2O_TAGS = {
     "VERTEX_SE2": Tag(2, 1, is_edge=False),
     "VERTEX_SE3:QUAT": Tag(3, 1, is_edge=False),
     "EDGE_SE2": Tag(2, 2),
@@ -96,16 +187,42 @@ TAGS = {
     "VERTEX_XY": Tag(2, 1, is_edge=False, is_point=True, to_landmark=True),
     "VERTEX_TRACKXYZ": Tag(3, 1, is_edge=False, is_point=True, to_landmark=True),
     "EDGE_SE2_XY": Tag(2, 2, is_point=True, to_landmark=True),
-    "EDGE_SE3_TRACKXYZ": Tag(3, 2, is_point=True, to_landmark=True, has_offset=True),
+    "EDGE_SE3_TRACKXYZ": Tag(3, 2, is_point=True, to_landmark=True, num_offsets=1),
     "EDGE_PRIOR_SE2": Tag(2, 1),
-    "EDGE_SE3_PRIOR": Tag(3, 1, has_offset=True),
+    "EDGE_SE3_PRIOR": Tag(3, 1, num_offsets=1),
     "EDGE_PRIOR_SE2_XY": Tag(2, 1, is_point=True),
-    "EDGE_SE3_XYZ_PRIOR": Tag(3, 1, is_point=True, has_offset=True),
+    "EDGE_SE3_XYZ_PRIOR": Tag(3, 1, is_point=True, num_offsets=1),
     "EDGE_PRIOR_XY": Tag(2, 1, is_point=True, to_landmark=True),
     "EDGE_POINTXYZ_PRIOR": Tag(3, 1, is_point=True, to_landmark=True),
+}
+# Tags that are only read.
+OTHER_TAGS = {
+    "EDGE_SE2_OFFSET": Tag(2, 2, num_offsets=2),
+    "EDGE_SE3_OFFSET": Tag(3, 2, num_offsets=2),
+    "EDGE_SE2_POINTXY_OFFSET": Tag(2, 2, is_point=True, to_landmark=True, num_offsets=1),
     "VERTEX2": Tag(2, 1, is_edge=False, is_toro=True),
     "VERTEX3": Tag(3, 1, is_edge=False, is_toro=True),
     "EDGE2": Tag(2, 2, is_toro=True),
     "EDGE3": Tag(3, 2, is_toro=True),
+    "ODOMETRY": Tag(2, 2, noise=Noise.COVARIANCE),
+    "LANDMARK": Tag(2, 2, is_point=True, to_landmark=True, noise=Noise.COVARIANCE),
+    "BR": Tag(2, 2, is_point=True, to_landmark=True, noise=Noise.DEVIATIONS),
 }
-ALIASES = {"EDGE_SE2_PRIOR": "EDGE_PRIOR_SE2", "EDGE_PRIOR_SE3": "EDGE_SE3_PRIOR"}
+# What a line of the tag is when it ends behind the measurement. The blanks keep these names apart
+# from all tags in files.
+SHORT_TAGS = {"EDGE3": "EDGE3 without a matrix"}
+TAGS = {
+    **G2O_TAGS,
+    **OTHER_TAGS,
+    SHORT_TAGS["EDGE3"]: Tag(3, 2, is_toro=True, noise=Noise.MISSING),
+}
+ALIASES = {
+    "EDGE_SE2_PRIOR": "EDGE_PRIOR_SE2",
+    "EDGE_PRIOR_SE3": "EDGE_SE3_PRIOR",
+    "LANDMARK2": "EDGE_SE2_XY",
+}
+TAGS_IN_FILES = (*G2O_TAGS, *OTHER_TAGS, *ALIASES, "FIX", "EQUIV")
+# Tags of the poses of sensors in the frames of their poses.
+OFFSET_TAGS = {2: "PARAMS_SE2OFFSET", 3: "PARAMS_SE3OFFSET"}
+# Tags of measurements that are neither poses nor points relative to a pose.
+REFUSED_TAGS = {"EDGE_RANGE": "a range without a bearing, which no edge of a pose graph has"}

@@ -10,11 +10,12 @@ import numpy as np
 
 from pgo_models.errors import FileFormatError, GraphError
 from pgo_models.files import (
-    check_metres,
-    check_quaternions,
+    check_lines,
+    far_lines,
     read_table,
     read_text,
     replace_when_done,
+    zero_quaternion_lines,
 )
 from pgo_models.geometry import rotations
 from pgo_models.geometry.poses import Poses
@@ -104,7 +105,7 @@ def read_tum(path: Path | str, d: int = 3) -> Poses:
     rows, lines = read_table(path, 8)
     t = rows[:, 1:4]
     quaternions = rows[:, 4:]
-    check_quaternions(path, lines, quaternions)
+    check_lines(path, zero_quaternion_lines(lines, quaternions))
     R = rotations.rotations_from_quaternions(quaternions)
     return _in_dimension(R, t, d, path, lines)
 
@@ -209,7 +210,7 @@ def _lifted(poses: Poses) -> tuple[Array, Array]:
 
 def _in_dimension(R: Array, t: Array, d: int, path: Path | str, lines: Sequence[int]) -> Poses:
     """Poses in d dimensions of those that a file has in space; every pose is one of `lines`."""
-    check_metres(path, lines, t)
+    check_lines(path, far_lines(lines, t))
     if d == 3:
         return Poses(R, t)
     height = np.abs(t[:, 2])

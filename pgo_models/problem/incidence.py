@@ -21,12 +21,17 @@ class Incidence:
     @classmethod
     def of(cls, graph: PoseGraph) -> "Incidence":
         """Incidence of a graph."""
-        m = graph.num_edges
-        shape = (graph.num_poses, m)
+        return cls.of_pairs(graph.num_poses, graph.i, graph.j)
+
+    @classmethod
+    def of_pairs(cls, num_poses: int, i: IntArray, j: IntArray) -> "Incidence":
+        """Incidence of pairs of poses, each taken for an edge from i to j."""
+        m = len(i)
+        shape = (num_poses, m)
         column_starts = np.arange(m + 1)
-        begins = csc_array((np.ones(m), graph.i, column_starts), shape=shape)
-        ends = csc_array((np.ones(m), graph.j, column_starts), shape=shape)
-        return cls(begins, ends, graph.i, graph.j)
+        begins = csc_array((np.ones(m), i, column_starts), shape=shape)
+        ends = csc_array((np.ones(m), j, column_starts), shape=shape)
+        return cls(begins, ends, i, j)
 
     def at_beginning(self, blocks: Array) -> Array:
         """Sums of blocks (m, a, b) over the edges that begin at a pose, (n a, b)."""

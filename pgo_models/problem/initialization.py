@@ -66,7 +66,7 @@ def odometry_start(graph: PoseGraph) -> Poses:
     order = np.arange(n)
     parent = np.arange(-1, n - 1)
     is_forward = np.ones(n - 1, dtype=bool)
-    return _compose(graph, order, parent, edge, is_forward)
+    return compose_along_tree(graph, order, parent, edge, is_forward)
 
 
 def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
@@ -105,8 +105,8 @@ def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
         raise SettingError("root is the world, of which positions alone are known; give a pose")
     order, parent, edge = spanning_tree(graph, root)
     is_forward = graph.j[edge] == order[1:]
-    poses = _compose(graph, order, parent, edge, is_forward)
-    return _with_world_fitted(graph, poses)
+    poses = compose_along_tree(graph, order, parent, edge, is_forward)
+    return with_world_fitted(graph, poses)
 
 
 def spanning_tree(graph: PoseGraph, root: int) -> tuple[IntArray, IntArray, IntArray]:
@@ -194,7 +194,7 @@ def _start_with_loose_world(problem: PGOProblem, world: int, averaged: bool) -> 
     inner_start = chordal_start(inner_problem, averaged)
     R = np.insert(inner_start.R, world, np.eye(problem.d), axis=0)
     t = np.insert(inner_start.t, world, 0.0, axis=0)
-    fitted = _with_world_fitted(graph, Poses(R, t))
+    fitted = with_world_fitted(graph, Poses(R, t))
     return problem.with_best_translations(fitted.R)
 
 
@@ -247,7 +247,7 @@ def relaxed_rotations(problem: PGOProblem, held: int | None) -> tuple[csc_array,
     return problem.with_pattern_of_M(data), b
 
 
-def _with_world_fitted(graph: PoseGraph, poses: Poses) -> Poses:
+def with_world_fitted(graph: PoseGraph, poses: Poses) -> Poses:
     """Poses with a loose world pose w at the minimum of sum_e ||t_j - t_w - R_w t_wj||^2."""
     if graph.world is None or not graph.is_world_loose:
         return poses
@@ -262,7 +262,7 @@ def _with_world_fitted(graph: PoseGraph, poses: Poses) -> Poses:
     return Poses(R, t)
 
 
-def _compose(
+def compose_along_tree(
     graph: PoseGraph, order: IntArray, parent: IntArray, edge: IntArray, forward: BoolArray
 ) -> Poses:
     """Poses of a tree: edge[k-1] joins order[k] with its parent and ends at it if forward[k-1].

@@ -1,37 +1,31 @@
-"""The relaxation with the convex hull of SO(3) at every edge, as cvxpy models: primal and dual.
-
-    primal   min tr(Q Z)                  Z_ii = I, Z PSD, A(Z_ij) PSD at every edge (i, j)
-    dual     max sum tr Lambda_i - sum tr Pi_e     Pi_e PSD,
-             M - blockdiag(0, Lambda) - sum_e N(Pi_e) PSD
+"""The convex hull of SO(3): its linear matrix inequality, and what its multipliers prove.
 
 For a rotation E with the unit quaternion q, A(E) = 4 q q^T, which is linear in E: the matrices E
-with A(E) PSD are the mixtures of rotations (Saunderson, Parrilo & Willsky 2015). N(Pi) is the
-symmetric matrix with tr(X^T N X) = <Pi, A(R_i^T R_j)> - tr(Pi). The relaxation without A admits
-mirror images of rotations, too. For rotation averaging with anisotropic costs the same hull is
-added by Olsson, Lochman, Malmport & Zach (2025).
+with A(E) PSD are the mixtures of rotations (Saunderson, Parrilo & Willsky 2015). A relaxation that
+asks A(Z_ij) PSD of Z_ij = R_i^T R_j at every pair (i, j) of poses that share an edge has a
+multiplier Pi >= 0, (4, 4), of every pair. With N(Pi) the symmetric matrix that has
+
+    tr(X^T N(Pi) X) = <Pi, A(R_i^T R_j)> - tr(Pi),
+
+the matrix M - blockdiag(0, Lambda) - sum_e N(Pi_e) PSD proves that no poses cost less than
+sum_i tr(Lambda_i) - sum_e tr(Pi_e).
 
 A multiplier Pi that is zero on some unit quaternion, as it is where A(Z_ij) is not zero, is a
 handedness term: q^T Pi q = v^T P v / 4 with v the vector part of the quaternion of T^T E, where T
 is the rotation of that quaternion (`pgo_models.certificates.handedness`).
 """
 
-from dataclasses import dataclass
-
-import cvxpy as cp
 import numpy as np
-from scipy.sparse import csc_array
 
 from pgo_models.certificates.handedness import HandednessTerms, distinct_pairs
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import Array, rotations_from_quaternions
+from pgo_models.geometry.rotations import (
+    Array,
+    quaternions_from_rotations,
+    rotations_from_quaternions,
+)
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.relaxations.primal_dual import (
-    DualRelaxation,
-    PrimalRelaxation,
-    dual_relaxation,
-    primal_relaxation,
-)
 
 
 def _quaternion_products() -> Array:
@@ -59,90 +53,17 @@ PRODUCTS = _quaternion_products()
 
 def hull_matrices(E: Array) -> Array:
     """A(E), (k, 4, 4), of matrices E, (k, 3, 3): 4 q q^T for rotations, PSD for their mixtures."""
-    return np.asarray(np.eye(4) + np.einsum("kab,abcd->kcd", E, PRODUCTS))
+    return np.asarray(np.eye(4) + hull_changes(E))
 
 
-@dataclass(frozen=True, eq=False)
-class PrimalHullRelaxation(PrimalRelaxation):
-    """The primal with a hull constraint at every edge.
-
-    Parameters
-    ----------
-    edges : (k, 2) array of int
-        The poses of every constrained pair.
-    hull : tuple of constraints
-        A(Z_ij) is PSD; the dual value of each is Pi_e / scale.
-    """
-
-    edges: IntArray
-    hull: tuple[cp.Constraint, ...]
-
-    def Lambda(self) -> Array:
-        """Multipliers, (n, d, d), of the cost less the terms, as solved."""
-        return _less_diagonal_blocks(super().Lambda(), self.terms())
-
-    def terms(self) -> HandednessTerms:
-        """The handedness terms of the multipliers Pi, as solved."""
-        dual_values = np.stack([constraint.dual_value for constraint in self.hull])
-        return terms_of(self.edges, self.scale * dual_values)
+def hull_changes(E: Array) -> Array:
+    """A(E) - I, (k, 4, 4), the linear part of A, of matrices E, (k, 3, 3)."""
+    return np.asarray((E.reshape(-1, 9) @ PRODUCTS.reshape(9, 16)).reshape(-1, 4, 4))
 
 
-@dataclass(frozen=True, eq=False)
-class DualHullRelaxation(DualRelaxation):
-    """The dual with a multiplier Pi for every edge.
-
-    Parameters
-    ----------
-    edges : (k, 2) array of int
-        The poses of every pair with a multiplier.
-    multipliers : list of (4, 4) cp.Variable
-        Pi_e / scale.
-    """
-
-    edges: IntArray
-    multipliers: list[cp.Variable]
-
-    def Lambda(self) -> Array:
-        """Multipliers, (n, d, d), of the cost less the terms, as solved."""
-        return _less_diagonal_blocks(super().Lambda(), self.terms())
-
-    def terms(self) -> HandednessTerms:
-        """The handedness terms of the multipliers Pi, as solved."""
-        values = np.stack([variable.value for variable in self.multipliers])
-        return terms_of(self.edges, self.scale * values)
-
-
-def primal_hull_relaxation(problem: PGOProblem) -> PrimalHullRelaxation:
-    """Pose the primal; a SettingError in the plane, or where Q would be too large."""
-    plain = primal_relaxation(problem)
-    edges = edges_of(problem)
-    linear_map = PRODUCTS.reshape(9, 16).T
-    hull = []
-    for i, j in edges.tolist():
-        block = plain.Z[3 * i : 3 * i + 3, 3 * j : 3 * j + 3]
-        products = linear_map @ cp.reshape(block, (9,), order="C")
-        matrix = cp.reshape(products, (4, 4), order="C") + np.eye(4)
-        hull.append(matrix >> 0)
-    model = cp.Problem(plain.model.objective, [*plain.orthogonality, *hull])
-    return PrimalHullRelaxation(
-        problem, model, plain.Z, plain.orthogonality, plain.scale, edges, tuple(hull)
-    )
-
-
-def dual_hull_relaxation(problem: PGOProblem) -> DualHullRelaxation:
-    """Pose the dual as one sparse linear matrix inequality, beside a small cone for every edge."""
-    plain = dual_relaxation(problem)
-    edges = edges_of(problem)
-    multipliers = [cp.Variable((4, 4), name=f"Pi_{e}", PSD=True) for e in range(len(edges))]
-    stacked = cp.hstack([cp.reshape(Pi, (16,), order="C") for Pi in multipliers])
-    side = plain.certificate.args[0].shape[0]
-    coupling = cp.reshape(_coupling_blocks(edges, side) @ stacked, (side, side), order="F")
-    certificate = (plain.certificate.args[0] - coupling) >> 0
-    trace = sum(cp.trace(Pi) for Pi in multipliers)
-    model = cp.Problem(cp.Maximize(plain.model.objective.args[0] - trace), [certificate])
-    return DualHullRelaxation(
-        problem, model, plain.upper, certificate, plain.scale, edges, multipliers
-    )
+def hull_gradients(Pi: Array) -> Array:
+    """Matrices C(Pi), (k, 3, 3), with <Pi, A(E)> = tr(Pi) + <C(Pi), E>, of Pi, (k, 4, 4)."""
+    return np.asarray((Pi.reshape(-1, 16) @ PRODUCTS.reshape(9, 16).T).reshape(-1, 3, 3))
 
 
 def edges_of(problem: PGOProblem) -> IntArray:
@@ -157,12 +78,33 @@ def edges_of(problem: PGOProblem) -> IntArray:
 def terms_of(edges: IntArray, Pi: Array) -> HandednessTerms:
     """Handedness terms that are zero on the softest quaternion of every Pi, (k, 4, 4).
 
-    With tau the eigenvector of the smallest eigenvalue of Pi, T is its rotation and P = 4 L Pi L^T,
-    where L q is the vector part of conj(tau) q.
+    That is the eigenvector of its smallest eigenvalue, and T is its rotation.
     """
     symmetric = 0.5 * (Pi + np.swapaxes(Pi, 1, 2))
     _, vectors = np.linalg.eigh(symmetric)
     w, x, y, z = vectors[:, :, 0].T
+    quaternions = np.stack([x, y, z, w], axis=1)
+    T = rotations_from_quaternions(quaternions)
+    P = _vector_form(symmetric, quaternions)
+    return HandednessTerms.with_rotations(edges[:, 0], edges[:, 1], T, P)
+
+
+def matrices_at(T: Array, Pi: Array) -> Array:
+    """The P, (k, 3, 3), that multipliers Pi, (k, 4, 4), have at rotations T, (k, 3, 3).
+
+    They are those of Pi as a form of quaternions, restricted to those orthogonal to that of T.
+    """
+    symmetric = 0.5 * (Pi + np.swapaxes(Pi, 1, 2))
+    return _vector_form(symmetric, quaternions_from_rotations(T))
+
+
+def _vector_form(Pi: Array, quaternions: Array) -> Array:
+    """P = 4 L Pi L^T, (k, 3, 3), where L q is the vector part of conj(tau) q.
+
+    The quaternions tau, (k, 4), are ordered (x, y, z, w), as those of
+    `rotations_from_quaternions`.
+    """
+    x, y, z, w = quaternions.T
     L = np.stack(
         [
             np.stack([-x, w, z, -y], axis=1),
@@ -171,12 +113,10 @@ def terms_of(edges: IntArray, Pi: Array) -> HandednessTerms:
         ],
         axis=1,
     )
-    P = 4.0 * L @ symmetric @ np.swapaxes(L, 1, 2)
-    T = rotations_from_quaternions(np.stack([x, y, z, w], axis=1))
-    return HandednessTerms.with_rotations(edges[:, 0], edges[:, 1], T, P)
+    return np.asarray(4.0 * L @ Pi @ np.swapaxes(L, 1, 2))
 
 
-def _less_diagonal_blocks(Lambda: Array, terms: HandednessTerms) -> Array:
+def less_diagonal_blocks(Lambda: Array, terms: HandednessTerms) -> Array:
     """Lambda, (n, 3, 3), less what a term has on the diagonal of B^T W B: T W T^T and W.
 
     N(Pi) has nothing there, and a constant in its place.
@@ -186,21 +126,3 @@ def _less_diagonal_blocks(Lambda: Array, terms: HandednessTerms) -> Array:
     np.subtract.at(reduced, terms.i, turned)
     np.subtract.at(reduced, terms.j, terms.W)
     return reduced
-
-
-def _coupling_blocks(edges: IntArray, side: int) -> csc_array:
-    """The matrix that takes all Pi, (16 k,), to sum_e N(Pi_e), its columns stacked.
-
-    The block (i, j) of N is half of sum_ab <Pi, C_ab> e_a e_b^T, and (j, i) its transpose; the
-    rotations of pose i have the rows n - 1 + 3 i of a matrix without the row of t_0.
-    """
-    num_translations = (side - 3) // 4
-    a, b, c, d = np.nonzero(PRODUCTS)
-    values = 0.5 * PRODUCTS[a, b, c, d]
-    row = num_translations + 3 * edges[:, :1] + a
-    column = num_translations + 3 * edges[:, 1:] + b
-    entry = 16 * np.arange(len(edges))[:, None] + 4 * c + d
-    weights = np.broadcast_to(values, entry.shape).ravel()
-    places = np.concatenate([(row + side * column).ravel(), (column + side * row).ravel()])
-    entries = np.tile(entry.ravel(), 2)
-    return csc_array((np.tile(weights, 2), (places, entries)), shape=(side * side, 16 * len(edges)))

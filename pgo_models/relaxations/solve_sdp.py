@@ -14,6 +14,12 @@ from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.clique_decomposition import CliqueRelaxation, clique_relaxation
+from pgo_models.relaxations.hull_models import (
+    DualHullRelaxation,
+    PrimalHullRelaxation,
+    dual_hull_relaxation,
+    primal_hull_relaxation,
+)
 from pgo_models.relaxations.plan import (
     DEFAULT_MEMORY_LIMIT,
     RelaxationForm,
@@ -25,12 +31,6 @@ from pgo_models.relaxations.primal_dual import (
     PrimalRelaxation,
     dual_relaxation,
     primal_relaxation,
-)
-from pgo_models.relaxations.rotation_hull import (
-    DualHullRelaxation,
-    PrimalHullRelaxation,
-    dual_hull_relaxation,
-    primal_hull_relaxation,
 )
 from pgo_models.relaxations.rounding import RankReport
 

@@ -6,7 +6,7 @@ landmark in the pose's.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pgo_models.errors import FileFormatError
@@ -56,6 +56,7 @@ TAGS = {
     "EDGE_SE2": Tag(2),
     "EDGE_SE3:QUAT": Tag(3),
     "EDGE_SE2_XY": Tag(2, is_point=True, to_landmark=True),
+    "LANDMARK2": Tag(2, is_point=True, to_landmark=True),
     "EDGE_SE3_TRACKXYZ": Tag(3, is_point=True, to_landmark=True, has_offset=True),
     "EDGE_PRIOR_SE2": Tag(2, num_ids=1),
     "EDGE_SE2_PRIOR": Tag(2, num_ids=1),
@@ -70,9 +71,10 @@ TAGS = {
 }
 LANDMARK_TAGS = ("VERTEX_XY", "VERTEX_TRACKXYZ")
 # They are no part of the cost.
-IGNORED_TAGS = ("VERTEX_SE2", "VERTEX_SE3:QUAT", "VERTEX2", "VERTEX3", "FIX")
+IGNORED_TAGS = ("VERTEX_SE2", "VERTEX_SE3:QUAT", "VERTEX2", "VERTEX3", "FIX", "EQUIV")
 # Places of xx xy xr yy yr rr in TORO's order of the plane, xx xy yy rr xr yr.
 TORO_TRIANGLE = (0, 1, 4, 2, 5, 3)
+WRITTEN_FILE = "verify the proof of the file that pgo solve --out one.g2o writes"
 WORLD = 2**63  # the pose that priors are measured from; ids have 64 bits, with a sign
 NUMBER = re.compile(r"([+-]?)(\d*)\.?(\d*)(?:[eE]([+-]?\d{1,3}))?", re.ASCII)
 LONGEST_WORD = 1000
@@ -149,10 +151,36 @@ def read_graph(path: Path, skip_unknown: bool) -> Graph:
     if not edges:
         raise FileFormatError(path, None, "no measurement in it; give the file that was solved")
     check_offset(path, edges, offset_line)
+    edges = in_order_of_isam(edges)
     graph = Graph(edges[0].tag.d, edges, landmarks)
     for edge in edges:
         check_edge(path, graph, edge)
     return graph
+
+
+def in_order_of_isam(edges: list[Edge]) -> list[Edge]:
+    """Edges with the matrices of EDGE2 lines by rows, as iSAM writes them, if that is their order.
+
+    It is where all of them are positive definite by rows, and some are not in TORO's order.
+    """
+    by_rows = {}
+    for place, edge in enumerate(edges):
+        if edge.tag.is_toro and edge.tag.d == 2:
+            triangle = [fmpq(0)] * len(TORO_TRIANGLE)
+            for entry, place_on_line in zip(edge.triangle, TORO_TRIANGLE, strict=True):
+                triangle[place_on_line] = entry
+            by_rows[place] = replace(edge, triangle=tuple(triangle))
+    if all(is_definite(edges[place]) for place in by_rows):
+        return edges
+    if not all(map(is_definite, by_rows.values())):
+        return edges
+    return [by_rows.get(place, edge) for place, edge in enumerate(edges)]
+
+
+def is_definite(edge: Edge) -> bool:
+    """Whether the information matrix is positive definite: its leading minors are positive."""
+    sizes = range(1, edge.tag.side + 1)
+    return all(edge.block(range(size), range(size)).det() > 0 for size in sizes)
 
 
 def check_ignored_tag(path: Path, line: int, tag: str) -> None:
@@ -160,7 +188,7 @@ def check_ignored_tag(path: Path, line: int, tag: str) -> None:
     if tag in IGNORED_TAGS or tag.startswith(("#", "PARAMS_")):
         return
     known = ", ".join([*TAGS, *LANDMARK_TAGS, *IGNORED_TAGS])
-    problem = f"unknown tag {tag[:40]!r}; known are {known}; or use --skip-unknown"
+    problem = f"unknown tag {tag[:40]!r}; known are {known}; use --skip-unknown, or {WRITTEN_FILE}"
     raise FileFormatError(path, line, problem)
 
 
@@ -170,7 +198,7 @@ def check_offset(path: Path, edges: list[Edge], offset_line: int) -> None:
     `offset_line` is the line that says so of a sensor, 0 where there is none.
     """
     if offset_line and any(edge.tag.has_offset for edge in edges):
-        problem = "a sensor that is not at its pose; give measurements in the frame of the pose"
+        problem = f"a sensor that is not at its pose; {WRITTEN_FILE}"
         raise FileFormatError(path, offset_line, problem)
 
 
@@ -182,7 +210,7 @@ def check_edge(path: Path, graph: Graph, edge: Edge) -> None:
     elif edge.i == edge.j:
         problem = "an edge from a pose to itself; remove it"
     elif edge.i in graph.landmarks or (edge.j in graph.landmarks and not edge.tag.is_point):
-        problem = "an edge that takes a landmark for a pose; renumber one of them"
+        problem = f"an edge that takes a landmark for a pose; {WRITTEN_FILE}"
     if problem:
         raise FileFormatError(path, edge.line, problem)
 

@@ -1,11 +1,17 @@
 """`pgo info`: what a pose graph is made of, or what the installation has."""
 
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pgo_models.errors import SettingError
+from pgo_models.files import check_writable
 from pgo_models.graphs.datasets import known_datasets
+from pgo_models.graphs.g2o import write_g2o
+from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.separators import report_partition
 from solvers.cli.explanations import explained_by_its_graph
 from solvers.cli.inputs import indefinite_matrices, load_graph
@@ -30,30 +36,58 @@ def info_command(
     ] = None,
     split: SplitOption = None,
     skip_unknown: SkipUnknownOption = False,
+    square_roots: Annotated[
+        bool,
+        typer.Option(
+            "--square-roots",
+            help="The matrices of a g2o file are square roots of information, as iSAM writes them.",
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Write the graph as .g2o, with the tags and information matrices of g2o, whatever "
+            "it was read from.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show what a pose graph is made of, or what this installation has."""
+    targets: list[tuple[Path, Callable[[Path], object]]] = []
     if graph is None:
-        facts, record = _describe_installation(robots, split)
+        if robots is not None or split is not None or out is not None:
+            raise SettingError("--robots, --split and --out are about a graph; give one")
+        facts, record = _describe_installation()
     else:
-        facts, record = _describe_graph(graph, robots, split, skip_unknown)
+        if out is not None:
+            _check_out(out)
+        loaded = load_graph(graph, False, skip_unknown, square_roots=square_roots)
+        facts, record = _describe_graph(graph, loaded, robots, split)
+        if out is not None:
+            targets = [(out, partial(write_g2o, loaded))]
     text = wrapped("\n".join(f"{label:<15} {text}" for label, text in facts), _INDENT)
-    save_then_show([], lambda: typer.echo(text), (lambda: record) if as_json else None)
+    save_then_show(targets, lambda: typer.echo(text), (lambda: record) if as_json else None)
 
 
-def _describe_installation(robots: int | None, split: Split | None) -> Described:
+def _check_out(out: Path) -> None:
+    """Raise a PGOError when no graph can be written there."""
+    if out.suffix.lower() != ".g2o":
+        raise SettingError(f"cannot write {out}: a graph is written as .g2o; give such a name")
+    check_writable(out)
+
+
+def _describe_installation() -> Described:
     """Versions and data sets, as facts and as a record for JSON."""
-    if robots is not None or split is not None:
-        raise SettingError("--robots and --split describe a graph; give one")
     facts = [*installation(), ("data sets", ", ".join(known_datasets()))]
     return facts, dict(facts)
 
 
 def _describe_graph(
-    graph: str, robots: int | None, split: Split | None, skip_unknown: bool
+    graph: str, loaded: PoseGraph, robots: int | None, split: Split | None
 ) -> Described:
     """Facts of a graph, and of a partition if one is asked for, with a record for JSON."""
-    loaded = load_graph(graph, False, skip_unknown)
     facts = describe_graph(loaded, indefinite_matrices(loaded, graph))
     record = figures_of_facts(facts)
     if robots is not None or split is not None:

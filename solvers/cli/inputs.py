@@ -12,8 +12,8 @@ import numpy as np
 from pgo_models.errors import FileFormatError, GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray
-from pgo_models.graphs.datasets import load, locate
-from pgo_models.graphs.g2o import edge_places, read_g2o_poses
+from pgo_models.graphs.datasets import load, locate, places_of_edges
+from pgo_models.graphs.g2o import read_g2o_poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import (
     indefinite_edges,
@@ -125,17 +125,22 @@ def check_outputs_differ(outputs: Mapping[str, Path | list[Path] | None]) -> Non
 
 
 def load_graph(
-    graph: str, unit_weights: bool, skip_unknown: bool = False, dropped: Dropped = None
+    graph: str,
+    unit_weights: bool,
+    skip_unknown: bool = False,
+    dropped: Dropped = None,
+    square_roots: bool = False,
 ) -> PoseGraph:
     """Graph of a file, folder or data set, without the edges to leave out.
 
-    Its weights are its own, or with `unit_weights` those of the paper.
+    Its weights are its own, or with `unit_weights` those of the paper. With `square_roots`, its
+    file has square roots of information matrices.
     """
     # Both need memory, which the graph might leave none of.
     take_buffers()
     if default_backend() is CholeskyBackend.CHOLMOD:
         import_cvxopt()
-    loaded = load(graph, skip_unknown=skip_unknown)
+    loaded = load(graph, skip_unknown=skip_unknown, square_roots=square_roots)
     if dropped:
         kept, _ = kept_edges(graph, dropped)
         loaded = loaded.without_edges(~kept)
@@ -152,7 +157,7 @@ def kept_edges(graph: str, dropped: Dropped) -> tuple[BoolArray, list[str]]:
     if not (path.is_file() or path.is_dir()):
         raise SettingError(f"{graph} can be read only once; give it as a file to name its edges")
     with warnings.catch_warnings(action="ignore"):
-        places = edge_places(path)
+        places = places_of_edges(path)
     kept = np.ones(len(places), dtype=bool)
     for name in dropped or ():
         kept[_edge_named(name, graph, places)] = False

@@ -44,7 +44,7 @@ _SAME_SIGNAL = 0.5
 # Characters of an error message. A longer word is shortened to its two ends.
 _LONGEST_WORD = 300
 _END_OF_WORD = 60
-_LONGEST_MESSAGE = 2000
+_LONGEST_MESSAGE = 6000
 QuietOption = Annotated[
     bool, typer.Option("--quiet", "-q", help="Print errors and warnings alone.")
 ]

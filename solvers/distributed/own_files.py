@@ -25,7 +25,8 @@ from pgo_models.errors import FileFormatError, GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.g2o import edge_rows_to_keep, make_folder, write_g2o
-from pgo_models.graphs.g2o_parser import G2OLines, information_of, poses_of, read_lines
+from pgo_models.graphs.g2o_parser import G2OLines, read_lines
+from pgo_models.graphs.g2o_rows import information_of, poses_of
 from pgo_models.graphs.pose_graph import (
     WORLD_ID,
     IntArray,

@@ -85,11 +85,11 @@ class SubstructuredSOC:
         return driver.measured(state.measurement(objective))
 
     def converged(self, state: SubstructuredState, measurement: Measurement) -> Status | None:
-        """CONVERGED when R agrees with omega and omega has stopped moving.
+        """CONVERGED when R agrees with omega and omega has stopped moving, or as `stall_of` says.
 
         Both hold within the tolerance in the norm of rho.
         """
-        return self.soc.converged(state, measurement)
+        return self.soc.converged(state, measurement) or self.soc.stall_of(state)
 
     def finish(self, driver: Driver) -> None:
         """Give driver and robots omega, and the best translations for it: two rounds."""

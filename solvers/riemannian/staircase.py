@@ -7,7 +7,6 @@ eigenvalue at a stationary point, its eigenvector in one more column of Y leads 
 
 import math
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -36,19 +35,10 @@ from solvers.riemannian.climb import (
     turning_length,
 )
 from solvers.riemannian.newton_step import ROUNDING, scaled_decrement
-from solvers.riemannian.truncated_cg import TruncatedStep, truncated_conjugate_gradients
+from solvers.riemannian.trust_region import Precision, first_radius, trust_region_step
 
 # of the mean diagonal entry of M over the rotations: makes Q, which is singular, definite
 _SHIFT = 1e-6
-_FIRST_RADIUS = 100.0  # times the preconditioned gradient, which soft directions outgrow
-# ratios of actual to promised decrease
-_ACCEPTED = 0.1
-_POOR = 0.25
-_GOOD = 0.75
-_SHRINK = 0.25
-_GROW = 2.0
-# norm of a block of the step, which saturates at about 1: beyond, the model says nothing
-_LONGEST = 10.0
 _FORCING = 0.1
 _FLOOR = 0.01  # of the tolerance: conjugate gradients go no deeper
 
@@ -177,43 +167,34 @@ class Staircase:
         return staircase_status(state.is_solved, state.stalled)
 
     def _descend(self, problem: PGOProblem, state: StaircaseState) -> StaircaseState:
-        """One iteration of the trust region (Absil, Mahony & Sepulchre, algorithm 10)."""
+        """One iteration of the trust region."""
         point = state.point
-        scale = max(state.point.value, state.rounding_level)
-        trial = truncated_conjugate_gradients(
-            point.gradient,
-            partial(hessian_product, problem, point),
-            partial(_precondition, problem, state.preconditioner, point.Y),
-            state.radius,
-            min(_FORCING, math.sqrt(state.decrement)),
-            4.0 * scale * _FLOOR * self.tolerance,
-            self.max_inner_iterations,
+        scale = max(point.value, state.rounding_level)
+        precision = Precision(
+            forcing=min(_FORCING, math.sqrt(state.decrement)),
+            floor=4.0 * scale * _FLOOR * self.tolerance,
+            rounding=ROUNDING * scale + state.rounding_level,
+            max_iterations=self.max_inner_iterations,
         )
-        spent = state.inner_iterations + trial.iterations
-        longest = float(np.linalg.norm(trial.step, axis=(1, 2)).max())
-        rejected = replace(state, k=state.k + 1, inner_iterations=spent)
-        if not longest <= _LONGEST:
-            radius = _SHRINK * state.radius
-            if np.isfinite(longest):
-                radius = trial.length / longest
-            return replace(rejected, radius=radius)
-        candidate = lifted_point(problem, retract(point.Y, trial.step))
-        # Near the end both decreases are below rounding, and their ratio is made to tend to one
-        # (Conn et al., 17.4.2).
-        rounding = ROUNDING * scale + state.rounding_level
-        ratio = (point.value - candidate.value + rounding) / (trial.decrease + rounding)
-        radius = _next_radius(state.radius, ratio, trial, longest)
-        is_below_rounding = trial.decrease <= rounding
-        if not ratio > _ACCEPTED:
+        function = _LiftedCost(problem, state.preconditioner)
+        step = trust_region_step(function, point, state.radius, precision)
+        spent = state.inner_iterations + step.iterations
+        if step.point is None:
             # Below rounding there is nothing to gain that double precision can see.
-            return replace(rejected, radius=radius, is_stationary=is_below_rounding)
+            return replace(
+                state,
+                k=state.k + 1,
+                radius=step.radius,
+                inner_iterations=spent,
+                is_stationary=step.is_below_rounding,
+            )
         arrived = self._arrive(
-            problem, state.k + 1, candidate, state.preconditioner, state.rounding_level
+            problem, state.k + 1, step.point, state.preconditioner, state.rounding_level
         )
-        is_stuck = is_below_rounding and arrived.decrement > 0.5 * state.decrement
+        is_stuck = step.is_below_rounding and arrived.decrement > 0.5 * state.decrement
         return replace(
             arrived,
-            radius=radius,
+            radius=step.radius,
             inner_iterations=spent,
             bound=state.bound,
             is_stationary=is_stuck or arrived.is_stationary,
@@ -249,38 +230,45 @@ class Staircase:
         level: float,
     ) -> StaircaseState:
         """State at a point, with the first radius of a rank."""
-        preconditioned = _precondition(problem, preconditioner, point.Y, point.gradient)
+        preconditioned = precondition(problem, preconditioner, point.Y, point.gradient)
         squared = inner(point.gradient, preconditioned)
         # An F below its rounding level is zero, whatever the gradient of its rounding is relative
         # to it.
         decrement = 0.0
         if point.value > level:
             decrement = scaled_decrement(0.5 * squared, point.value, level)
-        radius = _FIRST_RADIUS * math.sqrt(max(squared, 0.0))
         return StaircaseState(
             k=k,
             point=point,
             preconditioner=preconditioner,
             decrement=decrement,
-            radius=radius,
+            radius=first_radius(squared),
             rounding_level=level,
             is_stationary=decrement <= self.tolerance,
         )
 
 
-def _next_radius(radius: float, ratio: float, trial: TruncatedStep, longest: float) -> float:
-    """Radius of the trust region after a step, from the ratio of actual to promised decrease.
+@dataclass(frozen=True, eq=False)
+class _LiftedCost:
+    """f(Y), as a function for the trust region."""
 
-    `longest` is the norm of the step's longest block.
-    """
-    if not ratio >= _POOR:
-        return min(_SHRINK, 1.0 / max(1.0, longest)) * trial.length
-    if ratio > _GOOD and trial.is_at_boundary:
-        return _GROW * radius
-    return radius
+    problem: PGOProblem
+    preconditioner: CholeskyFactor
+
+    def evaluate(self, Y: Array) -> LiftedPoint:
+        """Return the point Y with value and gradient."""
+        return lifted_point(self.problem, Y)
+
+    def hessian_product(self, point: LiftedPoint, V: Array) -> Array:
+        """Apply the Riemannian Hessian at a point to a tangent."""
+        return hessian_product(self.problem, point, V)
+
+    def precondition(self, point: LiftedPoint, V: Array) -> Array:
+        """Apply the preconditioner to a tangent."""
+        return precondition(self.problem, self.preconditioner, point.Y, V)
 
 
-def _precondition(problem: PGOProblem, factor: CholeskyFactor, Y: Array, V: Array) -> Array:
+def precondition(problem: PGOProblem, factor: CholeskyFactor, Y: Array, V: Array) -> Array:
     """Apply P (Q + eps I)^-1 to V tangent at Y, with P the projection to the tangent space.
 
     After a climb it is with S for Q.
@@ -339,10 +327,7 @@ class CentralClimb:
     def direction(self, proven: LowerBound, smallest: float) -> EscapeDirection:
         """Return the direction of the smallest eigenvalue, by Lanczos."""
         point = self.point
-        curvature = negative_curvature(self.problem, point.Lambda, smallest, self.rng)
-        column = append_rank(np.zeros_like(point.Y), curvature.v)
-        length = turning_length(curvature.v)
-        return EscapeDirection(curvature.value, length, column, curvature.factor)
+        return escape_direction(self.problem, point.Lambda, point.Y, smallest, self.rng)
 
     def evaluate(self, direction: EscapeDirection, length: float) -> tuple[float, LiftedPoint]:
         """Return f after a move along the direction, and the point there."""
@@ -352,3 +337,13 @@ class CentralClimb:
 
     def accept(self, trial: LiftedPoint) -> None:
         """Do nothing: the caller has the point."""
+
+
+def escape_direction(
+    problem: PGOProblem, Lambda: Array, Y: Array, smallest: float, rng: np.random.Generator
+) -> EscapeDirection:
+    """Direction of the smallest eigenvalue of Q - blockdiag(Lambda), which is below -`smallest`."""
+    curvature = negative_curvature(problem, Lambda, smallest, rng)
+    column = append_rank(np.zeros_like(Y), curvature.v)
+    length = turning_length(curvature.v)
+    return EscapeDirection(curvature.value, length, column, curvature.factor)

@@ -26,6 +26,11 @@ _PATIENCE = 20
 # ... unless the median of rho_i / m_i is at least this. 4 ||Lambda_i|| is enough of a penalty, and
 # at an optimum that can be certified ||Lambda_i|| is about m_i at most.
 _SAFE_RATIO = 4.0
+# The run has stalled when so many iterations have not brought the larger residual down to this
+# share of the smallest one before. Of runs on graphs whose chordal start is near the optimum, the
+# slowest (parking-garage) takes 20 iterations for that.
+_STALL_ITERATIONS = 100
+_STALL_RATIO = 0.9
 
 
 class Due(enum.Enum):
@@ -62,6 +67,14 @@ class Steps:
     # How often the rule of the penalty changed rho, and how often the safeguard raised it.
     refreshes: int = 0
     raises: int = 0
+    # The smallest of the larger residuals, as of the last iterate that lowered it by enough.
+    least_residual: float = np.inf
+    last_progress: int = 0
+
+    @property
+    def makes_no_progress(self) -> bool:
+        """Whether the residuals have not fallen for long."""
+        return self.k - self.last_progress >= _STALL_ITERATIONS
 
     def is_best(self, merit: float) -> bool:
         """Whether no merit has been smaller since rho last changed."""
@@ -74,7 +87,11 @@ class Steps:
     def with_residuals(self, squares: Array, size: float) -> Self:
         """The next iterate, with these squared residuals, (2,), and ||omega||_rho."""
         primal, dual = (np.sqrt(squares) / size).tolist()
-        return replace(self, k=self.k + 1, primal_residual=primal, dual_residual=dual)
+        following = replace(self, k=self.k + 1, primal_residual=primal, dual_residual=dual)
+        residual = max(primal, dual)
+        if not residual <= _STALL_RATIO * self.least_residual:
+            return following
+        return replace(following, least_residual=residual, last_progress=following.k)
 
     def broken(self) -> Self:
         """State after a step that is not finite."""
@@ -82,7 +99,14 @@ class Steps:
 
     def in_place_of(self, before: Self) -> Self:
         """Return this new start as the successor of `before`, with penalties chosen anew."""
-        return replace(self, k=before.k, refreshes=before.refreshes + 1, raises=before.raises)
+        return replace(
+            self,
+            k=before.k,
+            refreshes=before.refreshes + 1,
+            raises=before.raises,
+            least_residual=before.least_residual,
+            last_progress=before.last_progress,
+        )
 
     def measurement(self, objective: float) -> Measurement:
         """F and the residuals."""

@@ -16,6 +16,7 @@ from solvers.soc.anderson import Anderson
 from solvers.soc.penalty import BoydPenalty, MultiplierPenalty, PenaltyOrder, PenaltyRule
 from solvers.soc.r_step import BackEnd, RStep
 from solvers.soc.recursion_block import StepSettings
+from solvers.soc.safeguard import Steps
 
 # The default `separator_penalty`: this times the square root of the translation penalty, but no
 # more than the maximum.
@@ -82,6 +83,15 @@ class SOCSettings:
         """CONVERGED when both residuals are within tolerance."""
         worst = max(measurement.primal_residual, measurement.dual_residual)
         return Status.CONVERGED if worst <= self.tolerance else None
+
+    def stall_of(self, steps: Steps) -> Status | None:
+        """NO_PROGRESS where the residuals have not fallen for long, under a MultiplierPenalty.
+
+        Another penalty may be far too small. The safeguard then doubles it many times, with
+        iterations without progress between.
+        """
+        has_stalled = isinstance(self.penalty, MultiplierPenalty) and steps.makes_no_progress
+        return Status.NO_PROGRESS if has_stalled else None
 
     # What the recursions are given.
 

@@ -35,7 +35,7 @@ from pgo_models.geometry.rotations import Array, project_to_rotations, stack_tra
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
-from solvers.result import Measurement
+from solvers.result import Measurement, Status
 from solvers.soc.anderson import AndersonShare, AndersonSums, extrapolate, over_relax
 from solvers.soc.consensus import LocalConsensus
 from solvers.soc.r_step import JointStep, prepare_joint
@@ -279,6 +279,8 @@ class SOC(SOCSettings):
     relative gradient of F over rotations and translations (`pgo_models.problem.stationarity`) is
     within the tolerance at the poses that the robots hold; F and the poses are those. Convergence
     does not bound the distance of F from a minimum, and the minimum need not be the global one.
+    JOINT and SUBSTRUCTURED with a MultiplierPenalty end with NO_PROGRESS where 100 iterations have
+    not brought the larger residual down by a tenth.
 
     Examples
     --------
@@ -335,6 +337,13 @@ class SOC(SOCSettings):
         """
         poses: Poses = self._recursion.poses(problem, state)
         return poses
+
+    def converged(self, state: object, measurement: Measurement) -> Status | None:
+        """CONVERGED when both residuals are within tolerance; NO_PROGRESS of JOINT alone."""
+        status = super().converged(state, measurement)
+        if status is None and isinstance(state, SOCState):
+            return self.stall_of(state)
+        return status
 
     @property
     def _recursion(self) -> Any:  # noqa: ANN401 - each has a state of its own

@@ -11,10 +11,10 @@ import numpy as np
 
 from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
-from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, BoolArray, random_rotations
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NETWORK_KAPPA, NETWORK_TAU, NoiseModel, circle, grid, observe
-from solvers.handedness.search import HandednessSearch
 from solvers.pipeline import Pipeline
 from solvers.studies.benchmark_runs import solve_whole
 
@@ -95,6 +95,24 @@ def noisy_scene(scene: SweptScene, rotation_std: float, rng: np.random.Generator
     )
 
 
+def noisy_lattice(side: int, rotation_std: float, rng: np.random.Generator) -> PoseGraph:
+    """side^3 poses at a distance of 1 m with an edge between neighbours, and rotation noise.
+
+    Truth rotations are uniform on SO(3), the rotation noise is in radians, that of translations
+    0.1 m. The weights are kappa = 10 and tau = 100 on every edge.
+    """
+    n = side**3
+    index = np.arange(n).reshape(side, side, side)
+    position = np.stack(np.unravel_index(np.arange(n), index.shape), axis=1).astype(float)
+    truth = Poses(random_rotations(n, 3, rng), position)
+    first = [np.take(index, range(side - 1), axis=axis).ravel() for axis in range(3)]
+    second = [np.take(index, range(1, side), axis=axis).ravel() for axis in range(3)]
+    noise = NoiseModel(translation_std=0.1, rotation_std=rotation_std)
+    i = np.concatenate(first)
+    j = np.concatenate(second)
+    return observe("lattice", truth, i, j, noise, 10.0, 100.0, rng)
+
+
 def noise_sweep(
     scene: SweptScene, rotation_std: Array, graphs: int, rng: np.random.Generator
 ) -> NoiseSweep:
@@ -137,7 +155,6 @@ def noise_sweep(
     certified_with_terms = np.zeros_like(certified)
     gap = np.zeros((len(levels), graphs))
     relaxation_alone = Pipeline(handedness=None)
-    terms_at_the_poses = Pipeline(handedness=HandednessSearch(most_hull_pairs=0))
     for level, std in enumerate(levels):
         for number in range(graphs):
             graph = noisy_scene(scene, float(std), rng)
@@ -145,6 +162,6 @@ def noise_sweep(
             certified[level, number] = solution.is_certified
             gap[level, number] = solution.certificate.proven_gap
             if not solution.is_certified:
-                solution = solve_whole(graph, terms_at_the_poses)
+                solution = solve_whole(graph)
             certified_with_terms[level, number] = solution.is_certified
     return NoiseSweep(scene, levels, certified, gap, certified_with_terms)

@@ -1,8 +1,9 @@
 """What handedness terms prove, and the relaxation with hulls of rotations beside the plain one.
 
-    python tests/benchmarks/handedness.py            # both tables
+    python tests/benchmarks/handedness.py            # all tables
     python tests/benchmarks/handedness.py chi2       # chi2 of noisy spheres with stiff axes
     python tests/benchmarks/handedness.py hulls      # relaxations of the paper's scenes
+    python tests/benchmarks/handedness.py lattices   # lattices that are too large for their models
 
 CPU seconds are of one thread.
 """
@@ -28,12 +29,13 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map
 from pgo_models.graphs.precisions import edge_precisions
 from solvers.riemannian.shrunk_bound import bound_by_shrinking
-from solvers.studies.tightness import SweptScene, noisy_scene
+from solvers.studies.tightness import SweptScene, noisy_lattice, noisy_scene
 
 T = TypeVar("T")
 SHARE_STIFF = 0.05  # of the edges
 STIFFNESS = 5.0  # how many times better a stiff edge knows its first axis
 SPHERES = [(10, 20, 12.0), (44, 50, 8.0), (44, 50, 12.0)]  # rings, poses a ring, degrees of noise
+LATTICES = [(6, 30, 0), (6, 40, 0), (6, 40, 1), (6, 50, 0), (10, 30, 0), (10, 40, 0)]
 LOOSE = [
     (SweptScene.GRID, 60, 3),
     (SweptScene.GRID, 60, 0),
@@ -121,8 +123,24 @@ def print_hulls() -> None:
             )
 
 
+def print_lattices() -> None:
+    """A row a lattice: the gap without and with handedness terms, and CPU seconds of both."""
+    print("| poses / edges | degrees | seed | gap, relaxation | CPU s | gap, with terms | CPU s |")
+    print("|---|---|---|---|---|---|---|")
+    for side, degrees, seed in LATTICES:
+        graph = noisy_lattice(side, np.deg2rad(degrees), np.random.default_rng(seed))
+        without, seconds = timed(partial(solvers.solve, graph, solvers.Pipeline(handedness=None)))
+        solution, more_seconds = timed(partial(solvers.solve, graph))
+        print(
+            f"| {graph.num_poses} / {graph.num_edges} | {degrees} | {seed} "
+            f"| {without.certificate.proven_gap:.1e} | {seconds:.1f} "
+            f"| {solution.certificate.proven_gap:.1e} | {more_seconds:.1f} |",
+            flush=True,
+        )
+
+
 if __name__ == "__main__":
-    tables = {"chi2": print_chi2, "hulls": print_hulls}
+    tables = {"chi2": print_chi2, "hulls": print_hulls, "lattices": print_lattices}
     for name in sys.argv[1:] or tables:
         tables[name]()
         print()

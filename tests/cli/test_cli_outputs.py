@@ -147,3 +147,38 @@ def test_the_worst_edge_is_named_with_the_option_that_leaves_it_out(
     assert "loop closures" not in pgo_command("solve", path, "--drop-edge", f"grid.g2o:{line}")[1]
     robust = pgo_command("solve", path, "--robust", "gnc", "--drop-edge", line)[1]
     assert "rejected" not in robust or f":{line}" not in robust
+
+
+@pytest.mark.filterwarnings("always::pgo_models.errors.GraphWarning")
+def test_info_writes_another_dialect_as_g2o(pgo_command, tmp_path):
+    path = tmp_path / "park.txt"
+    path.write_text("ODOMETRY 0 1 1 0 0.5 10 0 0 10 0 5\nLANDMARK 0 1 2 3 2 0 2\n")
+    information = tmp_path / "covariances.g2o"
+    code, out, err = pgo_command("info", path, "--out", information)
+    assert code == 0
+    assert f"written: {information}" in out
+    assert "taken as covariances" in err
+    assert "10 is added to the ids of landmarks" in err
+    roots = tmp_path / "roots.g2o"
+    code, _, err = pgo_command("info", path, "--square-roots", "--out", roots, "--json")
+    assert code == 0
+    assert "covariances" not in err
+    written = [pgo.read_g2o(out) for out in (information, roots)]
+    for graph, tau in zip(written, (0.1, 100.0), strict=True):
+        np.testing.assert_array_equal(graph.pose_ids, [0, 1, 11])
+        np.testing.assert_allclose(graph.tau[0], tau, rtol=1e-12, atol=0)
+    code, _, err = pgo_command("info", path, "--out", tmp_path / "x.json")
+    assert (code, "a graph is written as .g2o" in err) == (1, True)
+    code, _, err = pgo_command("info", "--out", roots)
+    assert (code, "--out are about a graph" in err) == (1, True)
+
+
+def test_all_wrong_lines_of_a_file_are_printed(pgo_command, tmp_path):
+    path = tmp_path / "bad.g2o"
+    path.write_text("EDGE_SE2 0 1 x 0 0 4 0 0 4 0 9\n" * 25)
+    code, out, err = pgo_command("solve", path)
+    lines = err.splitlines()
+    assert (code, out) == (1, "")
+    assert lines[0].startswith(f"pgo: {path}:1: 'x' is no number")
+    assert [line.split(": ")[0] for line in lines[1:20]] == [f"{path}:{k}" for k in range(2, 21)]
+    assert lines[20:] == ["25 lines are wrong; the first 20 are named"]

@@ -205,10 +205,6 @@ SEEN = "EDGE_SE2_XY 0 7 1 2 1 0 1"
         ),
         ([ODOMETRY_2D, "EDGE_PRIOR_SE2 0 1 2 0 0 0 0 0 0 0"], ":2", ["zero", "remove it"]),
         ([ODOMETRY_2D, "EDGE_SE2_XY 0 x 1 2 1 0 1"], ":2", ["id 'x'"]),
-        ([ODOMETRY_2D, SEEN, "EDGE_SE2 7 1 1 0 0 4 0 0 4 0 9"], ":3", ["landmark", "renumber"]),
-        ([ODOMETRY_2D, SEEN, "EDGE_SE2 1 7 1 0 0 4 0 0 4 0 9"], ":3", ["landmark", "renumber"]),
-        ([ODOMETRY_2D, SEEN, "VERTEX_SE2 7 1 0 0"], ":3", ["landmark", "renumber"]),
-        ([ODOMETRY_2D, SEEN, "EDGE_PRIOR_SE2_XY 7 1 0 1 0 1"], ":3", ["landmark", "renumber"]),
         ([ODOMETRY_3D, "EDGE_SE3_PRIOR 0 0 1 2 3"], ":2", ["1 id and 28 numbers", "cut off"]),
         ([ODOMETRY_3D, f"EDGE_SE3_PRIOR 0 1 2 3 0 0 0 0 {TRIANGLE_3D}"], ":2", ["zero quaternion"]),
         ([ODOMETRY_3D, SEEN], ":2", ["2D and 3D"]),
@@ -217,15 +213,51 @@ SEEN = "EDGE_SE2_XY 0 7 1 2 1 0 1"
             [
                 "PARAMS_SE3OFFSET 3 0 0 0.5 0 0 0 1",
                 ODOMETRY_3D,
-                "EDGE_SE3_TRACKXYZ 0 9 3 1 2 3 1 0 0 1 0 1",
+                "EDGE_SE3_XYZ_PRIOR 0 3 1 2 3 1 0 0 1 0 1",
             ],
-            ":1",
-            ["sensor", "frame of the pose"],
+            ":3",
+            ["sensor", "give the position of the pose"],
         ),
         (
-            ["BR 1 2", ODOMETRY_2D],
+            [ODOMETRY_3D, "EDGE_SE3_TRACKXYZ 0 9 3 1 2 3 1 0 0 1 0 1"],
+            ":2",
+            ["no PARAMS_SE3OFFSET line has the id 3", "add it"],
+        ),
+        (
+            ["PARAMS_SE3OFFSET 3 0 0 0.5 0 0 0", "EDGE_SE3_TRACKXYZ 0 9 3 1 2 3 1 0 0 1 0 1"],
             ":1",
-            ["unknown tag 'BR'", "EDGE_SE3_TRACKXYZ", "--skip-unknown"],
+            ["PARAMS_SE3OFFSET needs 1 id and 7 numbers, found 6"],
+        ),
+        (
+            ["PARAMS_SE3OFFSET 3 0 0 x 0 0 0 1", "EDGE_SE3_TRACKXYZ 0 9 3 1 2 3 1 0 0 1 0 1"],
+            ":1",
+            ["'x' is no number"],
+        ),
+        (
+            [
+                "PARAMS_SE3OFFSET 3 0 0 1 0 0 0 1",
+                "PARAMS_SE3OFFSET 3 0 0 2 0 0 0 1",
+                "EDGE_SE3_TRACKXYZ 0 9 3 1 2 3 1 0 0 1 0 1",
+            ],
+            ":2",
+            ["a second PARAMS_SE3OFFSET line", "line 1", "remove one"],
+        ),
+        (
+            ["EDGE_BEARING_SE2_XY 1 2", ODOMETRY_2D],
+            ":1",
+            ["unknown tag 'EDGE_BEARING_SE2_XY'", "EDGE_SE3_TRACKXYZ", "--skip-unknown"],
+        ),
+        ([ODOMETRY_2D, "BR 0 7 0.5 0 0.1 0.1"], ":2", ["not all positive", "correct or remove"]),
+        ([ODOMETRY_2D, "BR 0 7 0.5 2 0.1 -0.1"], ":2", ["not all positive"]),
+        (
+            [ODOMETRY_2D, "ODOMETRY 1 2 1 0 0 1 2 0 1 0 1"],
+            ":2",
+            ["covariance matrix is not positive definite"],
+        ),
+        (
+            [ODOMETRY_2D, "EDGE_RANGE 0 7 3.5 0.1"],
+            ":2",
+            ["EDGE_RANGE measures a range without a bearing", "--skip-unknown"],
         ),
     ],
 )
@@ -242,12 +274,14 @@ def test_an_offset_that_nobody_uses_is_skipped(tmp_path: Path) -> None:
 
 
 def test_unknown_tags_are_skipped_when_asked_for_and_named_once(tmp_path: Path) -> None:
-    lines = [ODOMETRY_2D, "BR 1 2 3", "EQUIV 0 1", "BR 4 5 6"]
+    lines = [ODOMETRY_2D, "SIGHT 1 2 3", "EDGE_RANGE 0 1", "SIGHT 4 5 6"]
     for reading in (read, lambda folder, *_, **options: load(folder / "graph.g2o", **options)):
         with pytest.warns(GraphWarning) as said:
             assert reading(tmp_path, *lines, skip_unknown=True).num_edges == 1
         (message,) = (str(one.message) for one in said)
-        assert message.endswith("skipped: 2 of BR (first: line 2), 1 of EQUIV (first: line 3)")
+        assert message.endswith(
+            "skipped: 2 of SIGHT (first: line 2), 1 of EDGE_RANGE (first: line 3)"
+        )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         read(tmp_path, ODOMETRY_2D, skip_unknown=True)

@@ -14,16 +14,17 @@ from pgo_models.certificates.handedness import distinct_pairs
 from pgo_models.graphs.scenes import victoria_park
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.relaxations.plan import RelaxationForm
+from pgo_models.relaxations.solve_sdp import solve_relaxation
 from solvers.handedness import certificate_spectrum
 from solvers.handedness.ascent import HandednessAscent, nearest_semidefinite
-from solvers.handedness.barrier import BASIS, HandednessBarrier, _newton_step
 from solvers.handedness.certificate_spectrum import HandedMatrix
 from solvers.handedness.search import HandednessSearch
 from solvers.loop import RunMonitor, iterate, run
 from solvers.pipeline import Pipeline, solve
 from solvers.result import Status
 from solvers.riemannian.polish import polish
-from solvers.studies.tightness import SweptScene, noisy_scene
+from solvers.studies.tightness import SweptScene, noisy_lattice, noisy_scene
 
 SIZES = st.integers(3, 8)
 
@@ -91,38 +92,15 @@ def test_the_smallest_eigenvalue_rises_to_first_order_along_the_derivative(
     assert abs(change - expected) <= slack * max(1.0, expected)
 
 
-@settings(max_examples=examples(10))
-@given(seed=SEEDS, n=st.integers(3, 5))
-def test_a_newton_step_of_the_barrier_is_that_of_its_differences(seed: int, n: int) -> None:
-    matrix = noisy_matrix(seed, n)
-    state = HandednessBarrier().init(matrix, None)
-
-    def barrier(x: np.ndarray) -> float:
-        P = state.P + np.einsum("eq,qab->eab", x[:-1].reshape(-1, 6), BASIS)
-        t = state.t + x[-1]
-        slack = matrix.dense(P) - t * np.eye(3 * len(matrix.free))
-        return -t / state.mu - np.linalg.slogdet(slack)[1] - np.linalg.slogdet(P)[1].sum()
-
-    P_step, t_step, decrement = _newton_step(matrix, state)
-    direction = np.append(np.einsum("eab,qab->eq", P_step, BASIS).ravel(), t_step)
-    h = 1e-4
-    slope = (barrier(h * direction) - barrier(-h * direction)) / (2.0 * h)
-    assert slope == pytest.approx(-decrement, rel=1e-3, abs=1e-6)
-    curvature = (
-        barrier(h * direction) + barrier(-h * direction) - 2.0 * barrier(0 * direction)
-    ) / h**2
-    assert curvature == pytest.approx(decrement, rel=2e-2, abs=1e-3)
-
-
 def test_states_are_left_alone() -> None:
     matrix = noisy_matrix(0, 6)
-    for method in (HandednessAscent(), HandednessBarrier()):
-        states = list(islice(iterate(method, matrix), 4))
-        kept = [state.P.copy() for state in states]
-        method.step(matrix, states[0])
-        for state, P in zip(states, kept, strict=True):
-            np.testing.assert_array_equal(state.P, P)
-        assert [state.k for state in states] == [0, 1, 2, 3]
+    method = HandednessAscent()
+    states = list(islice(iterate(method, matrix), 4))
+    kept = [state.P.copy() for state in states]
+    method.step(matrix, states[0])
+    for state, P in zip(states, kept, strict=True):
+        np.testing.assert_array_equal(state.P, P)
+    assert [state.k for state in states] == [0, 1, 2, 3]
 
 
 def test_matrices_stay_semidefinite() -> None:
@@ -169,27 +147,37 @@ def test_graphs_that_the_relaxation_leaves_open_are_certified(
 
 
 @pytest.mark.slow  # solves from end to end
-def test_the_interior_point_finds_what_the_ascent_does_not() -> None:
+def test_the_relaxation_with_hulls_finds_what_the_ascent_does_not() -> None:
     problem = noisy(SweptScene.GRID, 60, 1)
-    search = HandednessSearch(barrier=None, most_hull_pairs=0)
-    ascent_alone = solve(problem, Pipeline(handedness=search))
+    ascent_alone = solve(problem, Pipeline(handedness=HandednessSearch(hulls=None)))
     assert not ascent_alone.is_certified
-    assert solve(problem).is_certified
+    solution = solve(problem)
+    assert solution.is_certified
+    assert [stage.name for stage in solution.stages[-2:]] == ["HullLagrangian", "HandednessAscent"]
 
 
 @pytest.mark.slow  # solves from end to end
-def test_where_no_terms_suffice_the_answer_is_as_without_them() -> None:
+def test_where_no_terms_suffice_the_bound_is_that_of_the_relaxation_with_hulls() -> None:
     problem = noisy(SweptScene.GRID, 80, 0)
     without = solve(problem, Pipeline(handedness=None))
-    solution = solve(problem, Pipeline(handedness=HandednessSearch(most_hull_pairs=0)))
+    solution = solve(problem)
     assert not solution.is_certified
-    assert solution.lower_bound >= without.lower_bound
+    assert solution.objective <= without.objective
     assert solution.status is without.status
-    assert [stage.name for stage in solution.stages[-2:]] == [
-        "HandednessAscent",
-        "HandednessBarrier",
-    ]
     assert solution.stages[-1].status is Status.STALLED
+    relaxed = solve_relaxation(problem, RelaxationForm.HULL_DUAL)
+    allowed = 2e-3 * relaxed.value
+    assert without.lower_bound < solution.lower_bound <= relaxed.value + 1e-6 * relaxed.value
+    assert solution.lower_bound == pytest.approx(relaxed.value, abs=allowed)
+
+
+@pytest.mark.slow  # solves from end to end
+def test_a_lattice_that_is_too_large_for_a_model_of_cvxpy_is_certified() -> None:
+    graph = noisy_lattice(5, np.deg2rad(36), np.random.default_rng(0))
+    without = solve(graph, Pipeline(handedness=None))
+    assert without.certificate.gap > 1e-3
+    solution = solve(graph)
+    assert solution.certificate.gap <= 1e-9
 
 
 def test_the_search_respects_the_time_limit() -> None:
@@ -199,8 +187,8 @@ def test_the_search_respects_the_time_limit() -> None:
     problem = noisy(SweptScene.GRID, 80, 0)
     poses = solve(problem, Pipeline(handedness=None)).poses
     monitor = RunMonitor(time_limit=1e-9)
-    _, stages = HandednessSearch().run(problem, poses, monitor)
-    assert [stage.status for stage in stages] == [Status.TIME_LIMIT]
+    _, stage = HandednessSearch().run(problem, poses, monitor)
+    assert stage.status is Status.TIME_LIMIT
 
 
 def test_landmarks_have_no_pairs() -> None:

@@ -18,13 +18,9 @@ from pgo_models.geometry.rotations import random_rotations
 from pgo_models.graphs.g2o import read_g2o, write_g2o
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.relaxations.hull_models import dual_hull_relaxation, primal_hull_relaxation
 from pgo_models.relaxations.plan import RelaxationForm
-from pgo_models.relaxations.rotation_hull import (
-    dual_hull_relaxation,
-    hull_matrices,
-    primal_hull_relaxation,
-    terms_of,
-)
+from pgo_models.relaxations.rotation_hull import hull_matrices, terms_of
 from pgo_models.relaxations.solve_sdp import solve_relaxation
 from pgo_models.verification.verify import verify_proof
 from solvers.studies.tightness import SweptScene, noisy_scene
@@ -124,7 +120,7 @@ def test_where_no_terms_suffice_solve_has_the_bound_of_the_hulls(tmp_path: Path)
     solution = solvers.solve(problem)
     assert not solution.is_certified
     assert solution.certificate.gap < without.certificate.gap / 3.0
-    assert solution.stages[-1].name == "hulls of rotations"
+    assert solution.stages[-1].name == "HullLagrangian"
     assert solution.status is without.status
     assert solution.lower_bound <= restarts(problem, 20, 0)
     assert "hulls of rotations" in solution.certificate.source.value

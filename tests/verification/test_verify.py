@@ -157,9 +157,12 @@ def test_unit_weights_priors_and_landmarks_are_verified(tmp_path: Path) -> None:
         "VERTEX_XY 7 0 0\nEDGE_SE2_XY 0 7 3 4 10 1 20\nEDGE_PRIOR_XY 7 3.1 4 10 1 20\n"
         "EDGE_PRIOR_SE2 0 0.1 0 0 10 1 2 20 3 30",
         "EDGE2 2 0 -2 0.5 0.25 10 1 20 30 2 3",
+        "EDGE2 2 0 -2 0.5 0.25 10 1 2 20 3 30\nEDGE2 2 0 -2 0.5 0.25 10 0 0 20 0 30",
+        "LANDMARK2 0 7 3 4 10 1 20\nLANDMARK2 2 7 1 4 10 1 20\nEQUIV 0 1",
         "FIX 0\nVERTEX_SE2 0 0 0 0\nPARAMS_X 1\n# a comment",
     ],
 )
+@pytest.mark.filterwarnings("ignore::pgo_models.errors.GraphWarning")
 def test_every_tag_of_the_plane(line: str, tmp_path: Path) -> None:
     path = tmp_path / "graph.g2o"
     path.write_text(f"{PLANE}{line}\n")
@@ -186,6 +189,7 @@ TRIANGLE = "10 1 0 1 0 0  20 0 0 1 0  30 0 0 2  40 1 0  50 0  60"
         f"EDGE3 2 0 -2 0.5 0.25 0.3 0.2 0.1 {TRIANGLE}",
     ],
 )
+@pytest.mark.filterwarnings("ignore::pgo_models.errors.GraphWarning")
 def test_every_tag_of_space(line: str, tmp_path: Path) -> None:
     path = tmp_path / "graph.g2o"
     path.write_text(f"{SPACE}{line}\n")

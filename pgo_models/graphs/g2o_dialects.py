@@ -1,0 +1,127 @@
+"""What g2o files leave open line by line: decided, or put into common axes, with all lines in view.
+
+The order of the matrix on EDGE2 lines, sensors that are not at their poses, and ids that stand for
+a pose and a landmark.
+"""
+
+import enum
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from pgo_models.geometry.arrays import triangle_places
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.g2o_rows import information_of, numbers_of, poses_of
+from pgo_models.graphs.g2o_tags import SINGULAR, TAGS, Tag
+from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
+from pgo_models.graphs.precisions import are_definite
+
+# In place of the id of an offset, on lines that name none: the sensor is at its pose.
+NO_OFFSET = -(2**63)
+
+
+class MatrixOrder(enum.Enum):
+    """Order of the matrix on EDGE2 lines."""
+
+    TORO = "ff fs ss rr fr sr"
+    ROWS = "xx xy xt yy yt tt, as iSAM writes them"
+    EITHER = "all matrices are positive definite in both orders"
+
+
+def order_of_edge2(lines: Sequence[Array]) -> MatrixOrder:
+    """Order in which all matrices of EDGE2 lines, arrays (n, 9), are positive definite.
+
+    TORO's page defines this tag, so that TORO is returned, too, where neither order fits.
+    """
+    numbers = np.concatenate(lines)
+    is_toro = _all_are_definite(TAGS["EDGE2"].rows(numbers))
+    is_by_rows = _all_are_definite(TAGS["EDGE_SE2"].rows(numbers))
+    if is_toro and is_by_rows:
+        return MatrixOrder.EITHER
+    return MatrixOrder.ROWS if is_by_rows else MatrixOrder.TORO
+
+
+def _all_are_definite(rows: Array) -> bool:
+    """Whether the whole matrices on EDGE rows in the plane, (n, 9), are positive definite."""
+    matrices = rows[:, 3 + triangle_places(3)]
+    diagonals = np.einsum("mkk->mk", matrices)
+    return bool((diagonals > 0.0).all()) and bool(are_definite(matrices, SINGULAR).all())
+
+
+def in_frames_of_poses(kind: Tag, rows: Array, offsets: Sequence[Poses]) -> Array:
+    """EDGE rows, measured by sensors that are not at their poses, in the frames of the poses.
+
+    With the poses O of the sensors in the frames of x_i and x_j, and one of them the identity where
+    a tag has one offset, the measurement is Z of (x_i O_i)^-1 x_j O_j (`computeError` of g2o's
+    edges with offsets), so that x_i^-1 x_j is O_i Z O_j^-1. A point z is O_i z.
+
+    The information of a point is turned with it. That of a pose becomes A^T I A, where A takes an
+    error of x_i^-1 x_j to that of Z: e = O_j^-1 e' O_j. For a sensor beside its pose x_j this A is
+    of first order in the rotation error; otherwise it is exact.
+    """
+    d = kind.d
+    Z = Poses(*poses_of(d, rows))
+    information = information_of(d, rows)
+    identity = Poses.identity(len(rows), d)
+    if kind.is_point:
+        (first,) = offsets
+        points = first.t + np.einsum("nab,nb->na", first.R, Z.t)
+        measured = Poses(identity.R, points)
+        A = np.zeros_like(information)
+        A[:, :d, :d] = first.R.mT
+    else:
+        first, second = offsets if kind.num_offsets == 2 else (identity, offsets[0])
+        R = first.R @ Z.R @ second.R.mT
+        t = first.t + np.einsum("nab,nb->na", first.R, Z.t) - np.einsum("nab,nb->na", R, second.t)
+        measured = Poses(R, t)
+        A = _adjoint_of_inverse(second)
+    information = A.mT @ information @ A
+    triangle = np.triu_indices(information.shape[1])
+    return np.concatenate([numbers_of(measured.R, measured.t), information[:, *triangle]], axis=1)
+
+
+def _adjoint_of_inverse(poses: Poses) -> Array:
+    """Matrices, (n, k, k), that take small errors (t, w) of E to those of O^-1 E O.
+
+    They are [[R^T, -R^T [t]x], [0, R^T]] in space, and in the plane the same with w along z.
+    """
+    R_T = poses.R.mT
+    n, d = poses.t.shape
+    if d == 2:
+        turned = np.stack([-poses.t[:, 1], poses.t[:, 0]], axis=1)  # -[t]x w for w = 1 along z
+        A = np.zeros((n, 3, 3))
+        A[:, :2, :2] = R_T
+        A[:, :2, 2] = np.einsum("nab,nb->na", R_T, turned)
+        A[:, 2, 2] = 1.0
+        return A
+    x, y, z = poses.t.T
+    zero = np.zeros(n)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(n, 3, 3)
+    A = np.zeros((n, 6, 6))
+    A[:, :3, :3] = R_T
+    A[:, :3, 3:] = -R_T @ cross
+    A[:, 3:, 3:] = R_T
+    return A
+
+
+def landmark_shift(poses: IntArray, landmarks: IntArray) -> int:
+    """Return what is added to the ids of landmarks, so that none is that of a pose.
+
+    It is the least power of ten that puts them above all poses: landmark 7 becomes 1007. 0 where
+    ids of 64 bits have no room for that.
+    """
+    largest_pose = int(poses.max())
+    lowest_landmark = int(landmarks.min())
+    shift = 10
+    while shift + min(lowest_landmark, 0) <= largest_pose:
+        shift *= 10
+    has_room = int(landmarks.max()) + shift < WORLD_ID
+    return shift if has_room else 0
+
+
+def offsets_named(ids: IntArray, d: int, offset_of: Mapping[int, Array]) -> Poses:
+    """Poses of sensors, one for each of the ids, (n,), of offsets; numbers are rows of vertices."""
+    identity = numbers_of(np.eye(d)[None], np.zeros((1, d)))[0]
+    rows = [offset_of.get(offset_id, identity) for offset_id in ids.tolist()]
+    return Poses(*poses_of(d, np.array(rows)))

@@ -1,0 +1,39 @@
+"""Rows of the numbers on VERTEX and EDGE lines of g2o: poses and information matrices of them."""
+
+import numpy as np
+
+from pgo_models.geometry.arrays import triangle_places
+from pgo_models.geometry.rotations import (
+    Array,
+    exp_map,
+    log_map,
+    quaternions_from_rotations,
+    rotations_from_quaternions,
+)
+
+
+def poses_of(d: int, numbers: Array) -> tuple[Array, Array]:
+    """Rotations (n, d, d) and translations (n, d) of rows of `G2OLines`.
+
+    The rows open with x y theta, or x y z qx qy qz qw.
+    """
+    t = numbers[:, :d].copy()
+    if d == 2:
+        angles = numbers[:, 2:3]
+        return exp_map(angles), t
+    quaternions = numbers[:, 3:7]
+    return rotations_from_quaternions(quaternions), t
+
+
+def information_of(d: int, edges: Array) -> Array:
+    """Information matrices (m, k, k) of EDGE rows, k = 3 in the plane and 6 in space."""
+    k = 3 if d == 2 else 6
+    num_measured = 3 if d == 2 else 7
+    columns = num_measured + triangle_places(k)
+    return np.asarray(edges[:, columns])
+
+
+def numbers_of(R: Array, t: Array) -> Array:
+    """Rows x y theta, or x y z qx qy qz qw, of rotations and translations: `poses_of` backwards."""
+    rotations = log_map(R) if t.shape[1] == 2 else quaternions_from_rotations(R)
+    return np.concatenate([t, rotations], axis=1)
