@@ -563,7 +563,7 @@ def note_of_weights(graph: PoseGraph, certificate: Certificate) -> str:
     """
     if certificate.verdict is not Verdict.TRIVIAL:
         return ""
-    spread, _, text = extreme_weight(graph)
+    spread, _, text = extreme_weight(graph, certificate.has_translations)
     if spread * UNIT_ROUNDOFF <= certificate.wanted_gap:
         return ""
     return f"{text}, too far from others for a proof; correct it, or solve graph.unit_weights()"
