@@ -254,6 +254,16 @@ def test_every_method_ends_at_the_proven_minimum(
     np.testing.assert_array_equal(problem.seen_poses(finished.poses).t, 0.0)
 
 
+@settings(max_examples=examples(30))
+@given(seed=SEEDS, n=st.integers(4, 9), d=DIMENSIONS, robots=st.integers(2, 4))
+def test_no_bound_of_robots_is_above_the_exact_cost(seed: int, n: int, d: int, robots: int) -> None:
+    graph = varied_graph(seed, n, d, LOUD_NOISE)
+    problem = averaging(graph)
+    shared = solved(problem, robots)
+    for poses in (shared.poses, solved(problem).poses, random_poses(n, d, seed)):
+        assert shared.lower_bound <= exact_rotation_cost(graph, poses)
+
+
 @settings(max_examples=examples(20))
 @given(seed=SEEDS, n=st.integers(6, 14), d=DIMENSIONS, robots=st.integers(2, 4))
 def test_robots_find_and_prove_the_same(seed: int, n: int, d: int, robots: int) -> None:
