@@ -378,7 +378,7 @@ class Solution:
             bound += "   (the semidefinite relaxation's)"
         facts = [
             ("graph", f"{graph.name}: {size}"),
-            *facts_of_unknowns(self.problem),
+            *facts_of_unknowns(self.problem, of_poses="zero"),
             ("status", f"{self.status.name}: {self.status.value}"),
             (certificate.cost, certificate.cost_text),
             ("lower bound", bound),
@@ -483,14 +483,17 @@ def other_cost(problem: PGOProblem, poses: Poses) -> Facts:
     return [(name, f"{rounded_up(other)} with {weights}; the bound is on {bounded} alone")]
 
 
-def facts_of_unknowns(problem: PGOProblem) -> Facts:
-    """What a summary says where the unknowns are rotations alone, and why they are."""
+def facts_of_unknowns(problem: PGOProblem, of_poses: str) -> Facts:
+    """What a summary says where the unknowns are rotations alone, and why they are.
+
+    `of_poses` says what becomes of the translations of the poses.
+    """
     if problem.has_translations:
         return []
     why = "no edge measures a translation"
     if problem.graph.has_translations:
         why = "measured translations are left out"
-    return [("unknowns", f"rotations alone: {why}; poses are given with zero translations")]
+    return [("unknowns", f"rotations alone: {why}, and those of the poses are {of_poses}")]
 
 
 def check_format(path: Path) -> None:
@@ -560,7 +563,7 @@ def note_of_weights(graph: PoseGraph, certificate: Certificate) -> str:
     """
     if certificate.verdict is not Verdict.TRIVIAL:
         return ""
-    spread, _, text = extreme_weight(graph)
+    spread, _, text = extreme_weight(graph, certificate.has_translations)
     if spread * UNIT_ROUNDOFF <= certificate.wanted_gap:
         return ""
     return f"{text}, too far from others for a proof; correct it, or solve graph.unit_weights()"

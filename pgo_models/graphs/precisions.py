@@ -263,15 +263,17 @@ def _trace_of_inverse(A: Array) -> Array:
     return trace
 
 
-def extreme_weight(graph: PoseGraph) -> tuple[float, int, str]:
+def extreme_weight(graph: PoseGraph, has_translations: bool = True) -> tuple[float, int, str]:
     """Largest ratio of two weights of a connected graph, the edge to blame, and a sentence on it.
+
+    Where rotations alone are the unknowns, tau is no weight.
 
     Rounding beside the heaviest edge hides the lighter edges that alone hold a part of the graph.
     The lightest such edge is the lightest one of a maximum spanning tree. Of the heaviest and this
     edge, the one farther from the median is to blame.
     """
     extremes = []
-    for kind in ("kappa", "tau"):
+    for kind in ("kappa", "tau") if has_translations else ("kappa",):
         weight = getattr(graph, kind)
         # Only where all edges have this weight: some graphs measure positions alone, or rotations.
         if (weight > 0).all():

@@ -84,6 +84,10 @@ class RotationAveraging(EdgeCost):
         """False: translations are no unknowns."""
         return False
 
+    def arrays(self, d: int) -> list[Array]:
+        """W alone: the padding determines nothing."""
+        return [self.W(d)]
+
     def seen_offsets(self, t_ij: Array) -> Array:
         """Zeros, (m, d): the padding asks for t_j = t_i."""
         return np.zeros_like(t_ij)

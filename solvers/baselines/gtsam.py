@@ -133,6 +133,8 @@ def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noq
     gtsam = extra_module("gtsam", "peers")
     graph = problem.graph
     d = problem.d
+    if not problem.has_translations:
+        raise SettingError("GTSAM is compared for poses, and the unknowns are rotations; solve()")
     if not ((graph.kappa > 0) & (graph.tau > 0)).all():
         raise SettingError(
             f"{graph.name} has edges without a rotation or position, "

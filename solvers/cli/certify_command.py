@@ -122,7 +122,7 @@ def _text(problem: PGOProblem, poses: Poses, certificate: Certificate, note: str
     """The certificate as it is printed, with a note and with the cost that is not bounded."""
     rows = [("note", note)] if note else []
     rows += other_cost(problem, poses)
-    rows += facts_of_unknowns(problem)
+    rows += facts_of_unknowns(problem, of_poses="ignored")
     lines = [str(certificate)]
     lines += [f"{label:<12} {text}" for label, text in rows]
     return wrapped("\n".join(lines), _INDENT)

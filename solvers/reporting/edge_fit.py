@@ -42,7 +42,7 @@ class EdgeFit:
     Parameters
     ----------
     cost : str
-        "F" or "chi2".
+        "F" or "chi2", of rotations alone "F(R)" or "chi2(R)".
     residuals : EdgeResiduals
         Residuals at the poses.
     lowered : EdgeResiduals, optional
@@ -180,8 +180,7 @@ def judge_edges(problem: PGOProblem, poses: Poses) -> EdgeFit:
     """
     own = edge_residuals(problem, poses)
     if problem.weighting is not Weighting.ISOTROPIC or problem.graph.information is None:
-        cost = "chi2" if problem.weighting is Weighting.INFORMATION else "F"
-        return EdgeFit(cost, own)
+        return EdgeFit(problem.cost_name, own)
     is_indefinite = indefinite_edges(problem.graph)
     if is_indefinite.any():
         return EdgeFit("F", own, no_chi2=text_of_indefinite(problem.graph, is_indefinite))

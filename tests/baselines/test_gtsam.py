@@ -101,6 +101,13 @@ def test_with_little_noise_it_reaches_our_optimum(d: int, method: GtsamMethod) -
 
 
 @needs_gtsam
+def test_rotations_alone_are_refused() -> None:
+    problem = PGOProblem(varied_problem(4, 12, 3).graph, weighting=Weighting.ROTATIONS)
+    with pytest.raises(SettingError, match="the unknowns are rotations"):
+        run_gtsam(problem)
+
+
+@needs_gtsam
 def test_a_given_start_is_state_zero_and_is_left_alone() -> None:
     for d in (2, 3):
         problem = varied_problem(4, 12, d)
