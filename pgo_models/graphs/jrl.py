@@ -17,7 +17,7 @@ from pgo_models.errors import FileFormatError, GraphWarning, printable
 from pgo_models.files import LARGEST, Problem, check_lines, far_lines, zero_quaternion_lines
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import edge_rows_to_keep, graph_of_files
-from pgo_models.graphs.g2o_parser import G2OLines, problems_of
+from pgo_models.graphs.g2o_parser import G2OLines, far_information, problems_of
 from pgo_models.graphs.g2o_tags import Noise, Tag
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
@@ -261,9 +261,13 @@ def _file(
         of_kind = np.array(of_type.places, dtype=np.int64)
         problems += [(place, problem) for place in of_kind[is_wrong].tolist()]
         ids_of_kind = np.array(of_type.ids, dtype=np.int64).reshape(-1, 2)[~is_wrong]
-        rows.append(kind.rows(numbers[~is_wrong]))
-        ids.append(ids_of_kind)
-        places.append(of_kind[~is_wrong])
+        rows_of_kind = kind.rows(numbers[~is_wrong])
+        is_right = (np.abs(rows_of_kind) <= LARGEST).all(axis=1)
+        places_of_kind = of_kind[~is_wrong]
+        problems += far_information(places_of_kind[~is_right])
+        rows.append(rows_of_kind[is_right])
+        ids.append(ids_of_kind[is_right])
+        places.append(places_of_kind[is_right])
         if kind.to_landmark:
             landmarks.append(ids_of_kind[:, 1])
     edge_lines = np.concatenate(places)

@@ -234,6 +234,13 @@ def measurement(log: dict[str, Any], robot: str, entry: int) -> dict[str, Any]:
             ["covariance matrix is not positive definite"],
         ),
         (
+            lambda log: measurement(log, "b", 0).update(
+                covariance=(1e-200 * np.eye(6)).ravel().tolist()
+            ),
+            ":4",
+            ["information beyond 1e+100"],
+        ),
+        (
             lambda log: measurement(log, "b", 0).update(covariance=list(range(36))),
             ":4",
             ["covariance is not symmetric"],
