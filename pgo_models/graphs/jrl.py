@@ -166,7 +166,12 @@ def _logs(path: Path, log: Mapping[str, Any]) -> Iterator[tuple[str, Sequence[An
             problem = f"measurements of robot {printable(robot)} are no list of objects"
             raise FileFormatError(path, None, f"{problem}; give one object for each time")
         for entry in entries:
-            measurements += entry.get("measurements", [])
+            at_one_time = entry.get("measurements", [])
+            if not isinstance(at_one_time, list):
+                shown = printable(f"{at_one_time!r:.{_SHOWN}}")
+                problem = f"measurements of robot {printable(robot)} at one time are {shown}"
+                raise FileFormatError(path, None, f"{problem}, and no list; correct or remove it")
+            measurements += at_one_time
         yield robot, measurements
 
 
@@ -256,6 +261,8 @@ def _file(
     landmarks = [np.zeros(0, dtype=np.int64)]
     for of_type in by_type.values():
         kind = of_type.kind
+        if kind.d != d:  # none of its measurements could be read
+            continue
         numbers = np.array(of_type.numbers).reshape(-1, kind.num_numbers)
         is_wrong, problem = kind.problem(numbers)
         of_kind = np.array(of_type.places, dtype=np.int64)
