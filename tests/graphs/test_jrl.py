@@ -13,7 +13,7 @@ from graphs import DIMENSIONS, SEEDS, assert_says, informed
 from hypothesis import given, strategies as st
 
 import pgo_models as pgo
-from pgo_models.errors import FileFormatError, GraphWarning
+from pgo_models.errors import FileFormatError, GraphWarning, SettingError
 from pgo_models.geometry.rotations import log_map, quaternions_from_rotations
 from pgo_models.graphs.datasets import places_of_edges
 from pgo_models.graphs.g2o import read_g2o, symbol_ids, write_g2o
@@ -318,6 +318,11 @@ def test_files_that_are_no_logs_are_refused(tmp_path: Path, data: bytes, words: 
         read_jrl(tmp_path / "missing.jrl")
     with pytest.raises(FileFormatError, match="no such file"):
         pgo.load("missing.jrl")
+
+
+def test_square_roots_are_refused_of_a_log_which_has_covariances(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="has covariances, and no square roots; leave"):
+        pgo.load(write(tmp_path, LOG), square_roots=True)
 
 
 def test_2d_and_3d_measurements_do_not_go_together(tmp_path: Path) -> None:
