@@ -310,10 +310,10 @@ class _Assembly:
         """
         if self._square_roots and kind.has_matrix:
             kind = replace(kind, noise=Noise.SQUARE_ROOT)
-        is_wrong, problem = kind.problem(part.numbers)
-        if is_wrong.any():
-            part = self._without(part, is_wrong, problem)
+        part = self._without(part, *kind.problem(part.numbers))
         numbers = kind.rows(part.numbers)
+        if kind.noise is not Noise.INFORMATION or kind.num_offsets:
+            part, numbers = self._without_wrong_rows(part, numbers)
         if kind.num_offsets:
             numbers = self._in_frames_of_poses(kind, part, numbers)
         ids = part.ids[:, : kind.num_ids]
@@ -324,9 +324,24 @@ class _Assembly:
 
     def _without(self, part: ParsedLines, is_wrong: BoolArray, problem: str) -> ParsedLines:
         """Note the problem of wrong lines, (n,), and return the others."""
+        if not is_wrong.any():
+            return part
         self._note_problem(part.lines[is_wrong], problem)
         is_right = ~is_wrong
         return ParsedLines(part.lines[is_right], part.ids[is_right], part.numbers[is_right])
+
+    def _without_wrong_rows(self, part: ParsedLines, numbers: Array) -> tuple[ParsedLines, Array]:
+        """Note the problems of rows that cannot be brought into other axes; return the others."""
+        is_beyond = (np.abs(numbers) > LARGEST).any(axis=1)
+        problems = far_information(np.flatnonzero(is_beyond))
+        if self._d == 3:
+            problems += zero_quaternion_lines(np.arange(len(numbers)), numbers[:, 3:7])
+        is_right = np.ones(len(numbers), dtype=bool)
+        for row, problem in problems:
+            is_right[row] = False
+            self._source.problems.append((int(part.lines[row]), problem))
+        rest = ParsedLines(part.lines[is_right], part.ids[is_right], part.numbers[is_right])
+        return rest, numbers[is_right]
 
     def _note_problem(self, lines: IntArray, problem: str) -> None:
         self._source.problems += [(line, problem) for line in lines.tolist()]
@@ -420,7 +435,7 @@ class _Assembly:
             problem = f"id {both[0]} is that of a pose and of a landmark; renumber one of them"
             raise FileFormatError(self._source.path, None, problem)
         self.notes.append(
-            f"{len(both)} ids are those of a pose and of a landmark, which are kept apart: "
+            f"poses and landmarks have ids in common ({len(both)}), and are kept apart: "
             f"{shift} is added to the ids of landmarks"
         )
         is_fixed_landmark = np.isin(file.fixed, landmarks) & ~np.isin(file.fixed, poses)
@@ -433,6 +448,12 @@ class _Assembly:
             landmarks=landmarks + shift,
             landmark_shift=shift,
         )
+
+
+def far_information(lines: IntArray) -> list[Problem]:
+    """Problems of lines with information that is too large, because a covariance is too small."""
+    problem = f"information beyond {LARGEST:g}; correct the line"
+    return [(line, problem) for line in lines.tolist()]
 
 
 def problems_of(file: G2OLines) -> list[Problem]:

@@ -7,6 +7,8 @@ Sources: `types_slam2d.cpp`, `types_slam3d.cpp` and every `read` and `computeErr
 the frame that was measured, that of a position in the frame of the world, and that of a landmark in
 the frame of the pose. TORO's page (Grisetti et al. 2007), except that its code and GTSAM take the
 first vertex of an edge for the one that observes. `load2D` of GTSAM, for ODOMETRY, LANDMARK and BR.
+`Loader.cpp` of iSAM (Kaess et al. 2012), whose matrices are upper triangular square roots U of the
+information U^T U, by rows, and which takes the identity where EDGE3 has none.
 """
 
 import enum

@@ -17,7 +17,7 @@ from pgo_models.errors import FileFormatError, GraphWarning, printable
 from pgo_models.files import LARGEST, Problem, check_lines, far_lines, zero_quaternion_lines
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import edge_rows_to_keep, graph_of_files
-from pgo_models.graphs.g2o_parser import G2OLines, problems_of
+from pgo_models.graphs.g2o_parser import G2OLines, far_information, problems_of
 from pgo_models.graphs.g2o_tags import Noise, Tag
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
@@ -166,7 +166,12 @@ def _logs(path: Path, log: Mapping[str, Any]) -> Iterator[tuple[str, Sequence[An
             problem = f"measurements of robot {printable(robot)} are no list of objects"
             raise FileFormatError(path, None, f"{problem}; give one object for each time")
         for entry in entries:
-            measurements += entry.get("measurements", [])
+            at_one_time = entry.get("measurements", [])
+            if not isinstance(at_one_time, list):
+                shown = printable(f"{at_one_time!r:.{_SHOWN}}")
+                problem = f"measurements of robot {printable(robot)} at one time are {shown}"
+                raise FileFormatError(path, None, f"{problem}, and no list; correct or remove it")
+            measurements += at_one_time
         yield robot, measurements
 
 
@@ -256,14 +261,20 @@ def _file(
     landmarks = [np.zeros(0, dtype=np.int64)]
     for of_type in by_type.values():
         kind = of_type.kind
+        if kind.d != d:  # none of its measurements could be read
+            continue
         numbers = np.array(of_type.numbers).reshape(-1, kind.num_numbers)
         is_wrong, problem = kind.problem(numbers)
         of_kind = np.array(of_type.places, dtype=np.int64)
         problems += [(place, problem) for place in of_kind[is_wrong].tolist()]
         ids_of_kind = np.array(of_type.ids, dtype=np.int64).reshape(-1, 2)[~is_wrong]
-        rows.append(kind.rows(numbers[~is_wrong]))
-        ids.append(ids_of_kind)
-        places.append(of_kind[~is_wrong])
+        rows_of_kind = kind.rows(numbers[~is_wrong])
+        is_right = (np.abs(rows_of_kind) <= LARGEST).all(axis=1)
+        places_of_kind = of_kind[~is_wrong]
+        problems += far_information(places_of_kind[~is_right])
+        rows.append(rows_of_kind[is_right])
+        ids.append(ids_of_kind[is_right])
+        places.append(places_of_kind[is_right])
         if kind.to_landmark:
             landmarks.append(ids_of_kind[:, 1])
     edge_lines = np.concatenate(places)

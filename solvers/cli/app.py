@@ -50,6 +50,6 @@ app.command("figures")(figures_command)
 def main(arguments: list[str] | None = None) -> None:
     """Run `pgo` and leave with its exit code.
 
-    Every error and warning of ours is one line on stderr.
+    Every error and warning of ours is one line on stderr, or one for each wrong line of a file.
     """
     raise SystemExit(run_command(app, sys.argv[1:] if arguments is None else arguments))

@@ -44,7 +44,7 @@ _SAME_SIGNAL = 0.5
 # Characters of an error message. A longer word is shortened to its two ends.
 _LONGEST_WORD = 300
 _END_OF_WORD = 60
-_LONGEST_MESSAGE = 6000
+_LONGEST_LINE = 2000
 QuietOption = Annotated[
     bool, typer.Option("--quiet", "-q", help="Print errors and warnings alone.")
 ]
@@ -74,7 +74,8 @@ class _BrokenOffError(PGOError):
 def run_command(app: typer.Typer, arguments: list[str]) -> int:
     """Run a command, and return its exit code.
 
-    An error is printed on stderr as one line, and so is a warning.
+    An error is printed on stderr as one line, or a line for each wrong line of a file; a warning
+    is one line.
     """
     warnings.showwarning = _show_warning
     interruption = Interruption()
@@ -114,13 +115,16 @@ def _is_output_lost(out: "Outlet", interruption: "Interruption") -> bool:
 def shown(message: str) -> str:
     """An error or a warning as a terminal shows it.
 
-    Control characters are made visible, and long words and long messages are shortened.
+    Control characters are made visible, and long words and long lines are shortened.
     """
-    text = "\n".join(map(printable, message.split("\n")))
-    text = re.sub(rf"\S{{{_LONGEST_WORD},}}", _ends_of_word, text)
-    if len(text) <= _LONGEST_MESSAGE:
+    return "\n".join(map(_shown_line, message.split("\n")))
+
+
+def _shown_line(line: str) -> str:
+    text = re.sub(rf"\S{{{_LONGEST_WORD},}}", _ends_of_word, printable(line))
+    if len(text) <= _LONGEST_LINE:
         return text
-    return f"{text[:_LONGEST_MESSAGE]} .."
+    return f"{text[:_LONGEST_LINE]} .."
 
 
 def _ends_of_word(match: re.Match[str]) -> str:

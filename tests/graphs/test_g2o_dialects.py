@@ -184,7 +184,7 @@ def test_tags_keep_poses_and_landmarks_of_one_id_apart(folder: Path) -> None:
         "EDGE_PRIOR_SE2 7 1 0 0 1 0 0 1 0 1",
         "FIX 8 0",
     ]
-    graph = read_with_notes(folder, lines, "1 ids are those of a pose and of a landmark", "10 is")
+    graph = read_with_notes(folder, lines, "ids in common (1)", "10 is")
     np.testing.assert_array_equal(graph.pose_ids[graph.in_files], [0, 7, 17, 18])
     np.testing.assert_array_equal(graph.initial.t[:4], [[0, 0], [1, 0], [3, 4], [5, 6]])
     np.testing.assert_array_equal(graph.j, [1, 2, 3, 2, 1])
@@ -466,3 +466,51 @@ def test_square_roots_are_those_of_the_information(
     for lines in spellings:
         path.write_text("\n".join(lines))
         assert_same_edges(read_g2o(path, square_roots=True), expected, rtol=1e-9)
+
+
+PLANE = [
+    "PARAMS_SE2OFFSET 1 0.1 0.2 0.3",
+    "EDGE2 0 1 1 0 0.5 4 0 4 9 0 0",
+    "ODOMETRY 1 2 1 0 0.5 4 0 0 4 0 9",
+    "EDGE_SE2_OFFSET 2 3 1 1 1 0 0.5 4 0 0 4 0 9",
+    "LANDMARK 0 1 3 4 2 0 2",
+    "LANDMARK2 1 1 2 3 2 0 2",
+    "BR 2 2 0.5 4 0.1 0.2",
+    "EDGE_SE2_POINTXY_OFFSET 3 2 1 0.5 4 3 0 3",
+    "EQUIV 0 1",
+]
+SPACE = [
+    "PARAMS_SE3OFFSET 1 0.1 0.2 0.3 0 0 0.6 0.8",
+    "EDGE3 0 1 1 0 0 0.1 0.2 0.3",
+    f"EDGE3 1 2 1 0 0 0.1 0.2 0.3 {triangle(np.eye(6))}",
+    f"EDGE_SE3_OFFSET 2 3 1 1 1 0 0 0 0 0 1 {triangle(np.eye(6))}",
+    f"EDGE_SE3_PRIOR 2 1 1 0 0 0 0 0 1 {triangle(np.eye(6))}",
+    "EDGE_SE3_TRACKXYZ 0 1 1 1 2 3 1 0 0 1 0 1",
+    "EDGE_SE3_TRACKXYZ 1 1 1 2 3 1 0 0 1 0 1",
+]
+NOISE = st.sampled_from(
+    ["", "0", "-1", "1e99", "1e-99", "5e-324", "-3", "x", "nan", "9" * 18, "\n", "1 2", "#", "1.5"]
+)
+
+
+@pytest.mark.filterwarnings("ignore::pgo_models.errors.GraphWarning")
+@given(lines=st.sampled_from([PLANE, SPACE]), noise=NOISE, roots=st.booleans(), data=st.data())
+def test_damaged_lines_are_read_or_refused_with_their_place(
+    tmp_path_factory: pytest.TempPathFactory,
+    lines: list[str],
+    noise: str,
+    roots: bool,
+    data: st.DataObject,
+) -> None:
+    path = tmp_path_factory.mktemp("damaged") / "graph.g2o"
+    parts = " \n ".join(lines).split(" ")
+    parts[data.draw(st.integers(0, len(parts) - 1))] = noise
+    path.write_text(" ".join(parts))
+    problem = str(path)
+    try:
+        graph = read_g2o(path, square_roots=roots)
+        for values in (graph.kappa, graph.tau, graph.information):
+            assert np.isfinite(values).all()
+    except FileFormatError as error:
+        problem = str(error)
+    assert problem.startswith(str(path))

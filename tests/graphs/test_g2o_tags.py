@@ -255,6 +255,12 @@ SEEN = "EDGE_SE2_XY 0 7 1 2 1 0 1"
             ["covariance matrix is not positive definite"],
         ),
         (
+            [ODOMETRY_2D, "ODOMETRY 1 2 1 0 0 1e-200 0 0 1 0 1"],
+            ":2",
+            ["information beyond 1e+100"],
+        ),
+        ([ODOMETRY_2D, "BR 0 7 0.5 2 1e-99 1e-99"], ":2", ["information beyond 1e+100"]),
+        (
             [ODOMETRY_2D, "EDGE_RANGE 0 7 3.5 0.1"],
             ":2",
             ["EDGE_RANGE measures a range without a bearing", "--skip-unknown"],

@@ -13,7 +13,7 @@ from graphs import DIMENSIONS, SEEDS, assert_says, informed
 from hypothesis import given, strategies as st
 
 import pgo_models as pgo
-from pgo_models.errors import FileFormatError, GraphWarning
+from pgo_models.errors import FileFormatError, GraphWarning, SettingError
 from pgo_models.geometry.rotations import log_map, quaternions_from_rotations
 from pgo_models.graphs.datasets import places_of_edges
 from pgo_models.graphs.g2o import read_g2o, symbol_ids, write_g2o
@@ -234,6 +234,13 @@ def measurement(log: dict[str, Any], robot: str, entry: int) -> dict[str, Any]:
             ["covariance matrix is not positive definite"],
         ),
         (
+            lambda log: measurement(log, "b", 0).update(
+                covariance=(1e-200 * np.eye(6)).ravel().tolist()
+            ),
+            ":4",
+            ["information beyond 1e+100"],
+        ),
+        (
             lambda log: measurement(log, "b", 0).update(covariance=list(range(36))),
             ":4",
             ["covariance is not symmetric"],
@@ -313,6 +320,11 @@ def test_files_that_are_no_logs_are_refused(tmp_path: Path, data: bytes, words: 
         pgo.load("missing.jrl")
 
 
+def test_square_roots_are_refused_of_a_log_which_has_covariances(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="has covariances, and no square roots; leave"):
+        pgo.load(write(tmp_path, LOG), square_roots=True)
+
+
 def test_2d_and_3d_measurements_do_not_go_together(tmp_path: Path) -> None:
     log = copy.deepcopy(LOG)
     measurement(log, "b", 0).update(
@@ -322,3 +334,41 @@ def test_2d_and_3d_measurements_do_not_go_together(tmp_path: Path) -> None:
     )
     with pytest.raises(FileFormatError, match=r":4: 2D and 3D in one file \(measurement 1 is"):
         read_jrl(write(tmp_path, log))
+
+
+def places_in(part: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Keys and indices that lead to every part of a log."""
+    keys: list[Any] = []
+    if isinstance(part, dict):
+        keys = list(part)
+    elif isinstance(part, list):
+        keys = list(range(len(part)))
+    places = [(*place, key) for key in keys]
+    for key in keys:
+        places += places_in(part[key], (*place, key))
+    return places
+
+
+NUMBERS = st.sampled_from([0, -1, 1e99, 5e-324, 2**63 - 1, 2**64, 10**400, float("nan"), A0, B0])
+TYPES = st.sampled_from(["x", "Pose2", "BearingRangeFactor2D", "BetweenFactorPose2", "Point3"])
+WRONG_PARTS = NUMBERS | TYPES | st.sampled_from([None, True, [], {}, [1], [[]], {"theta": 1}])
+
+
+@pytest.mark.filterwarnings("ignore::pgo_models.errors.GraphWarning")
+@given(place=st.sampled_from(places_in(LOG)), wrong=WRONG_PARTS, skip_unknown=st.booleans())
+def test_a_damaged_log_is_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, place: tuple[Any, ...], wrong: Any, skip_unknown: bool
+) -> None:
+    log = copy.deepcopy(LOG)
+    part: Any = log
+    *path_to_part, last = place
+    for key in path_to_part:
+        part = part[key]
+    part[last] = wrong
+    path = write(tmp_path_factory.mktemp("jrl"), log)
+    problem = str(path)
+    try:
+        read_jrl(path, skip_unknown=skip_unknown)
+    except FileFormatError as error:
+        problem = str(error)
+    assert problem.startswith(str(path))
