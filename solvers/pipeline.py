@@ -244,8 +244,8 @@ def solve(
         given, the first of `graph.fixed`; without one the poses are aligned with the estimate, or
         pose 0 is at the identity. An anchor cannot be combined with priors.
     callback : callable, optional
-        Called with every state and its `Record`. A true answer ends the stage: SOC, Newton or the
-        staircase. The certificate is found all the same.
+        Called with every state and its `Record`. A true answer ends the stage: SOC, Newton, the
+        growing start or the staircase. The certificate is found all the same.
     time_limit : float, optional
         Seconds of the iterative stages together; unlimited unless given.
     verbose : bool, optional

@@ -188,6 +188,7 @@ SETTINGS = (
 SETTINGS += (
     "Newton",
     "Staircase",
+    "GrowingStart",
     "HandednessAscent",
     "HandednessSearch",
     "HullLagrangian",

@@ -157,6 +157,25 @@ def test_victoria_park_is_certified(robots):
     )
 
 
+@pytest.mark.parametrize("coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS])
+@pytest.mark.parametrize("d", [2, 3])
+def test_robots_share_landmarks_and_gps(d, coupling):
+    """The world pose and the landmarks are poses that several robots hold."""
+    rng = np.random.default_rng(d)
+    graph = with_gps(varied_graph(7, 12, d), 4)
+    for _ in range(2):
+        seen_from = np.array([0, 5, 6, 11])
+        graph = graph.with_landmark(seen_from, rng.standard_normal((4, d)), 2.0)
+    robots = pgo.partition(graph, 3)
+    soc = solvers.SOC(robots=robots, coupling=coupling, tolerance=1e-3, max_iterations=1000)
+    solution = solvers.solve(graph, solvers.Pipeline(soc=soc), robots=robots)
+    best = solvers.solve(graph)
+    assert best.is_certified
+    assert solution.is_certified
+    assert solution.frame == "that of the priors"
+    np.testing.assert_allclose(solution.objective, best.objective, rtol=1e-9, atol=0)
+
+
 def test_a_landmark_seen_once_moves_nothing_and_is_named():
     graph = replace(varied_graph(1, 10, 3), ids=np.arange(50, 60))
     more = graph.with_landmark(np.array([4]), np.ones((1, 3)), 3.0)

@@ -31,6 +31,7 @@ from solvers.distributed.checkpoint import Checkpoint
 from solvers.loop import Solver, iterate, run
 from solvers.result import Record, Status
 from solvers.riemannian.newton import Newton, gauss_newton
+from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import Staircase
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC, GNCState
@@ -73,6 +74,7 @@ SOLVERS: dict[str, Make] = {
     "gauss_newton": lambda problem, **changes: dataclasses.replace(gauss_newton(), **changes),
     "levenberg_marquardt": lambda problem, **changes: LevenbergMarquardt(**changes),
     "staircase": lambda problem, **changes: Staircase(**changes),
+    "growing_start": lambda problem, **changes: GrowingStart(first_size=2, growth=0.1, **changes),
     "gnc": lambda problem, **changes: GNC(spread=None, **changes),
     "gnc_geman_mcclure": lambda problem, **changes: GNC(
         RobustLoss.GEMAN_MCCLURE, spread=None, **changes

@@ -226,9 +226,7 @@ def _advice_on_status(status: Status, solve: str) -> Advice:
             "The run ended at its iteration limit: give it more.", f"{solve} --max-iterations 2000"
         )
     if status is Status.NO_PROGRESS:
-        return Advice(
-            "The residuals of SOC have stopped falling: leave it out.", f"{solve} --method newton"
-        )
+        return Advice("The run of SOC makes no progress: leave it out.", f"{solve} --method newton")
     if status is Status.NOT_FINITE:
         return Advice("The first stage overflowed: leave it out.", f"{solve} --method newton")
     if status is Status.NOT_FACTORED:

@@ -367,10 +367,11 @@ def test_it_never_diverges(
     robots = robots_of(problem, seed, method)
     for soc in (SOC(), SOC(alpha=1.6), SOC(robots=robots), SOC(penalty=BalancedPenalty())):
         result = run(replace(soc, max_iterations=200), problem, start)
-        assert result.status in (Status.CONVERGED, Status.MAX_ITERATIONS)
+        unfinished = (Status.MAX_ITERATIONS, Status.NO_PROGRESS)
+        assert result.status is Status.CONVERGED or result.status in unfinished
         assert np.isfinite(result.history.objective).all()
         assert np.isfinite(result.history.primal_residual[1:]).all()
-        if result.status is Status.MAX_ITERATIONS:
+        if result.status in unfinished:
             best = result.history.objective.min()
             assert best <= at_start * (1 + 1e-12)
             # robots sum it up in another order

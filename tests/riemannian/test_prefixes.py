@@ -1,0 +1,257 @@
+"""The start that grows: its order of the poses, its prefixes, and where it leads."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from budget import examples
+from graphs import DIMENSIONS, SEEDS, varied_graph
+from hypothesis import given, settings, strategies as st
+
+import solvers
+from pgo_models.certificates.certificate import Verdict
+from pgo_models.errors import GraphError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.g2o import read_g2o
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import NoiseModel, victoria_park
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
+from solvers.loop import iterate
+from solvers.result import Status
+from solvers.riemannian.prefixes import EntryTree, GrowingStart, _prefix_problem, entry_tree
+
+FIRST_ALONE = solvers.Pipeline(growing=None, second_try=False, staircase=None)
+GROWING = solvers.Pipeline(second_try=False, staircase=None)
+
+
+def trees(
+    seed: int, num_poses: int = 200, rotation_std: float = 0.15, reach: float = 3.0
+) -> PoseGraph:
+    """Few trees seen from a drive whose odometry soon loses its heading."""
+    rng = np.random.default_rng(seed)
+    noise = NoiseModel(translation_std=0.05, rotation_std=rotation_std)
+    return victoria_park(rng, num_poses=num_poses, noise=noise, reach=reach)
+
+
+def with_points_and_priors(seed: int, n: int, d: int, has_world: bool) -> PoseGraph:
+    """A graph with two landmarks, the first seen by late poses first, and perhaps priors."""
+    rng = np.random.default_rng(seed)
+    graph = varied_graph(seed, n, d)
+    for _ in range(2):
+        seen_from = rng.permutation(n)[:3]
+        graph = graph.with_landmark(seen_from, rng.standard_normal((3, d)), 5.0)
+    if has_world:
+        measured = np.sort(rng.permutation(n)[:2])
+        graph = graph.with_prior(measured, graph_poses(graph, rng)[measured], 2.0, 3.0)
+    return graph
+
+
+def graph_poses(graph: PoseGraph, rng: np.random.Generator) -> Poses:
+    """Random positions, and rotations of I."""
+    return Poses.of_points(rng.standard_normal((graph.num_poses, graph.d)))
+
+
+def tree_of(graph: PoseGraph) -> EntryTree:
+    tree = entry_tree(graph)
+    assert tree is not None
+    return tree
+
+
+@settings(max_examples=examples(30))
+@given(seed=SEEDS, n=st.integers(4, 15), d=DIMENSIONS, has_world=st.booleans())
+def test_every_prefix_is_connected_and_its_cost_is_that_of_its_edges(
+    seed: int, n: int, d: int, has_world: bool
+) -> None:
+    graph = with_points_and_priors(seed, n, d, has_world)
+    problem = PGOProblem(graph)
+    tree = tree_of(graph)
+    poses = tree.poses
+    costs = problem.edge_costs(poses)
+    for size in range(2, n + 1):
+        members = tree.members(size)
+        prefix = _prefix_problem(problem, members)  # raises unless it is connected
+        bodies = np.isin(members, graph.bodies).sum()
+        inside = np.isin(graph.i, members) & np.isin(graph.j, members)
+        assert bodies == size
+        np.testing.assert_allclose(
+            prefix.objective(poses[members]), costs[inside].sum(), rtol=1e-9, atol=1e-9
+        )
+    assert len(tree.members(n)) == graph.num_poses
+
+
+@settings(max_examples=examples(30))
+@given(seed=SEEDS, n=st.integers(4, 15), d=DIMENSIONS, has_world=st.booleans())
+def test_what_is_solved_stays_and_the_rest_follows_by_its_entry_edges(
+    seed: int, n: int, d: int, has_world: bool
+) -> None:
+    graph = with_points_and_priors(seed, n, d, has_world)
+    rng = np.random.default_rng(seed)
+    tree = tree_of(graph)
+    members = tree.members(int(rng.integers(1, n + 1)))
+    moved = tree.poses[members].moved_along(
+        rng.standard_normal((len(members), 1 if d == 2 else 3)),
+        rng.standard_normal((len(members), d)),
+    )
+    poses = tree.continued(members, moved)
+    np.testing.assert_array_equal(poses.t[members], moved.t)
+    np.testing.assert_array_equal(poses.R[members], moved.R)
+    new = np.setdiff1d(np.arange(graph.num_poses), members)
+    parent = tree.parent[new]
+    assert (tree.rank[parent] <= tree.rank[new]).all()
+    relative = relative_translations(poses, parent, new)
+    expected = relative_translations(tree.poses, parent, new)
+    np.testing.assert_allclose(relative, expected, rtol=0, atol=1e-9)
+
+
+def relative_translations(poses: Poses, i: Array, j: Array) -> Array:
+    return np.einsum("nba,nb->na", poses.R[i], poses.t[j] - poses.t[i])
+
+
+@settings(max_examples=examples(10))
+@given(seed=SEEDS, d=DIMENSIONS)
+def test_without_noise_every_state_is_exact(seed: int, d: int) -> None:
+    graph = without_noise(varied_graph(seed, 20, d))
+    problem = PGOProblem(graph)
+    scale = float((graph.kappa.sum() + graph.tau.sum()) * (1 + np.abs(graph.truth.t).max() ** 2))
+    states = iterate(GrowingStart(first_size=3), problem)
+    for _ in range(5):
+        assert problem.objective(next(states).poses) <= 1e-20 * scale
+
+
+def without_noise(graph: PoseGraph) -> PoseGraph:
+    truth = graph.truth
+    assert truth is not None
+    R_i = truth.R[graph.i]
+    R_ij = np.swapaxes(R_i, 1, 2) @ truth.R[graph.j]
+    return replace(graph, R_ij=R_ij, t_ij=relative_translations(truth, graph.i, graph.j))
+
+
+def test_a_landmark_enters_with_the_pose_that_saw_it_first() -> None:
+    graph = trees(0)
+    tree = tree_of(graph)
+    sights = graph.first_sights
+    np.testing.assert_array_equal(tree.rank[graph.j[sights]], graph.i[sights])
+    assert np.isin(graph.landmarks, tree.members(60)).sum() < len(graph.landmarks)
+
+
+@pytest.mark.parametrize("weighting", [Weighting.ISOTROPIC, Weighting.INFORMATION])
+@pytest.mark.parametrize(
+    "park", [(3, 200, 0.12, 3.0), (2, 400, 0.1, 3.0), (2, 400, 0.1, 5.0), (2, 400, 0.12, 5.0)]
+)
+def test_it_reaches_the_certified_optimum_where_a_batch_start_does_not(
+    park: tuple[int, int, float, float], weighting: Weighting
+) -> None:
+    problem = PGOProblem(trees(*park), weighting=weighting)
+    batch = solvers.solve(problem, FIRST_ALONE)
+    grown = solvers.solve(problem, GROWING)
+    assert not batch.is_certified
+    assert grown.certificate.verdict is Verdict.CERTIFIED
+    assert grown.objective < 0.9 * batch.objective
+    assert batch.lower_bound <= grown.objective
+    names = [stage.name for stage in grown.stages]
+    assert names == ["averaged start", "Newton", "growing start", "Newton"]
+    assert len(grown.stages[2].history) == grown.stages[2].iterations + 1
+
+
+def test_prefixes_that_miss_their_minimum_are_dropped() -> None:
+    """New poses come in ever smaller numbers then, and all poses are solved at last."""
+    problem = PGOProblem(trees(0))
+    course = []
+    run = solvers.run(
+        GrowingStart(growth=2.0),
+        problem,
+        callback=lambda state, record: course.append((state.num_solved, state.size)),
+    )
+    solved = [num_solved for num_solved, _ in course]
+    assert run.status is Status.CONVERGED
+    assert solved == sorted(solved)
+    assert solved[-1] == 200
+    assert len(set(solved)) < len(solved)  # a state that solved nothing
+
+
+def test_where_odometry_does_not_join_the_poses_it_is_left_out() -> None:
+    graph = trees(0)
+    without = graph.without_edges((graph.i == 99) & (graph.j == 100))
+    turned = Poses(np.eye(2)[None], np.zeros((1, 2)))
+    without = without.with_edges(np.array([99]), np.array([101]), turned, 1.0, 1.0)
+    assert not GrowingStart().has_prefixes(without)
+    with pytest.raises(GraphError, match="odometry does not join the poses"):
+        solvers.run(GrowingStart(), without)
+    solution = solvers.solve(without, GROWING)
+    assert "growing start" not in [stage.name for stage in solution.stages]
+
+
+def test_a_certified_answer_ends_the_solve_before_it() -> None:
+    graph = victoria_park(np.random.default_rng(0))
+    names = [stage.name for stage in solvers.solve(graph).stages]
+    assert names == ["averaged start", "Newton"]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_answer_is_worse_for_it(seed: int) -> None:
+    """Where no attempt is certified, Newton of the first one is taken to its end all the same."""
+    graph = trees(seed)
+    rng = np.random.default_rng(seed)
+    wrong = rng.integers(0, 200, (40, 2))
+    far = np.abs(wrong[:, 0] - wrong[:, 1]) > 20
+    i, j = wrong[far].T
+    measured = Poses.of_points(rng.standard_normal((len(i), 2)))
+    problem = PGOProblem(graph.with_edges(i, j, measured, 100.0, 100.0))
+    batch = solvers.solve(problem, FIRST_ALONE)
+    grown = solvers.solve(problem, GROWING)
+    assert grown.objective <= batch.objective * (1 + 1e-12)
+    cheapest = min(stage.objective for stage in grown.stages)
+    assert grown.objective <= cheapest * (1 + 1e-9)
+    assert grown.lower_bound >= batch.lower_bound * (1 - 1e-12)
+
+
+def test_few_steps_of_the_user_are_not_exceeded() -> None:
+    problem = PGOProblem(trees(0))
+    pipeline = replace(GROWING, newton=solvers.Newton(max_iterations=3))
+    solution = solvers.solve(problem, pipeline)
+    assert [stage.iterations for stage in solution.stages if stage.name == "Newton"] == [3]
+    assert solution.status is Status.MAX_ITERATIONS
+
+
+def test_the_time_limit_ends_it() -> None:
+    solution = solvers.solve(PGOProblem(trees(0)), time_limit=1e-9)
+    assert solution.status is Status.TIME_LIMIT
+    assert "growing start" not in [stage.name for stage in solution.stages]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings(
+    "ignore:.*landmarks seen once", "ignore:.*LANDMARK2 matrices", "ignore:.*landmarks are"
+)
+@pytest.mark.parametrize(
+    ("weighting", "optimum"),
+    [(Weighting.ISOTROPIC, 466.0304924), (Weighting.INFORMATION, 389.7265658)],
+)
+def test_the_public_graph_of_victoria_park_is_certified(
+    weighting: Weighting, optimum: float, benchmark_data: Path
+) -> None:
+    """From a batch start F ends at 20787 and chi2 at 8590."""
+    graph = read_g2o(benchmark_data / "victoriaPark.g2o")
+    solution = solvers.solve(PGOProblem(graph, weighting=weighting))
+    assert solution.certificate.verdict is Verdict.CERTIFIED
+    assert solution.objective == pytest.approx(optimum, rel=1e-9)
+    assert 0 <= solution.certificate.proven_gap < 1e-11
+    assert [stage.name for stage in solution.stages][2:] == ["growing start", "Newton"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_soc_ends_where_its_residuals_stop_falling(seed: int) -> None:
+    """Of these graphs the chordal start is far from the optimum."""
+    rng = np.random.default_rng(seed)
+    noise = NoiseModel(translation_std=0.05, rotation_std=0.3)
+    graph = victoria_park(rng, num_poses=600, noise=noise, reach=3.0)
+    run = solvers.run(solvers.SOC(tolerance=1e-6), graph)
+    residual = np.maximum(run.history.primal_residual, run.history.dual_residual)
+    assert run.status is Status.NO_PROGRESS
+    assert not run.status.is_success
+    assert run.iterations < 500
+    assert residual[-100:].min() > 0.9 * residual[1:-100].min()
