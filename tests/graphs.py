@@ -30,6 +30,8 @@ OPTIMUM: dict[str, float] = {
 }
 
 
+# All costs: `Weighting.OWN` stands for one of them.
+COSTS = (Weighting.ISOTROPIC, Weighting.INFORMATION, Weighting.ROTATIONS)
 # Costs that translations have a part in, for graphs with landmarks or priors of positions.
 COSTS_OF_POSES = (Weighting.ISOTROPIC, Weighting.INFORMATION)
 

@@ -22,7 +22,8 @@ from solvers.studies.tightness import SweptScene, noisy_scene
 def test_every_benchmark_file_is_solved_to_the_published_optimum_and_certified(
     name, benchmark_data
 ):
-    solution = solvers.solve(pgo.read_g2o(benchmark_data / f"{name}.g2o"))
+    graph = pgo.read_g2o(benchmark_data / f"{name}.g2o")
+    solution = solvers.solve(pgo.PGOProblem(graph, weighting=pgo.Weighting.ISOTROPIC))
     assert solution.status is solvers.Status.CONVERGED
     assert solution.certificate.verdict is Verdict.CERTIFIED
     assert 0 <= solution.gap <= 1e-10

@@ -14,12 +14,11 @@ with rotations: see `pgo_models.problem.excess`.
 """
 
 import enum
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.errors import GraphError, GraphWarning
+from pgo_models.errors import GraphError
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import (
@@ -27,7 +26,6 @@ from pgo_models.graphs.precisions import (
     are_definite,
     edge_precisions,
     indefinite_edges,
-    text_of_indefinite,
     uncoupled_share,
 )
 from pgo_models.problem.edge_cost import EdgeCost
@@ -73,21 +71,14 @@ def own_weighting(graph: PoseGraph) -> Weighting:
     """Which cost is the graph's own: chi2 of its information matrices, or F where it has none.
 
     Where F is chi2, in space with matrices that are multiples of the identity, it is F. Where chi2
-    can be negative, because matrices are indefinite (`indefinite_edges`), it is F as well, with a
-    GraphWarning.
+    can be negative, because matrices are indefinite (`indefinite_edges`), it is F as well, and what
+    `pgo solve` prints says so.
     """
     if graph.information is None or _is_isotropic(graph.information, graph.d):
         return Weighting.ISOTROPIC
-    is_indefinite = indefinite_edges(graph)
-    if not is_indefinite.any():
-        return Weighting.INFORMATION
-    problem = text_of_indefinite(graph, is_indefinite)
-    message = (
-        f"{graph.name}: {problem}, so that chi2 can be negative; the cost is F, with two "
-        "precisions an edge (pgo solve --drop-coupling: chi2 without their coupling blocks)"
-    )
-    warnings.warn(message, GraphWarning, stacklevel=4)
-    return Weighting.ISOTROPIC
+    if indefinite_edges(graph).any():
+        return Weighting.ISOTROPIC
+    return Weighting.INFORMATION
 
 
 def _is_isotropic(information: Array, d: int) -> bool:

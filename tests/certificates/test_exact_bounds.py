@@ -32,6 +32,7 @@ from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.certify import certify
 from solvers.riemannian.polish import polish
 
@@ -63,7 +64,8 @@ def raw_bound(problem: PGOProblem, poses: Poses) -> LowerBound:
 def solved(
     graph: PoseGraph, backend: CholeskyBackend | None = None, robots: int | None = None
 ) -> solvers.Solution:
-    return solvers.solve(PGOProblem(graph, backend), robots=robots, progress=False)
+    problem = PGOProblem(graph, backend, Weighting.ISOTROPIC)
+    return solvers.solve(problem, robots=robots, progress=False)
 
 
 def check(

@@ -1,4 +1,4 @@
-"""`--information`: the file's own cost on the command line, and the hint that names it."""
+"""`--cost`: the file's own cost on the command line, which is the default, and the others."""
 
 from __future__ import annotations
 
@@ -33,14 +33,12 @@ def test_both_costs_are_in_the_file_and_the_hint_is_a_line(
     pgo_command: Call, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "500")  # for commands with long paths on one line
-    code, out, err = pgo_command("solve", file, "--out", tmp_path / "F.json")
+    code, out, err = pgo_command("solve", file, "--cost", "isotropic", "--out", tmp_path / "F.json")
     assert (code, err) == (0, "")
     F = json.loads((tmp_path / "F.json").read_text())
     assert F["weighting"] == "ISOTROPIC"
     assert F["objective"] == F["F"]
-    code, out_chi2, err = pgo_command(
-        "solve", file, "--information", "--out", tmp_path / "chi2.json"
-    )
+    code, out_chi2, err = pgo_command("solve", file, "--out", tmp_path / "chi2.json")
     assert (code, err) == (0, "")
     chi2 = json.loads((tmp_path / "chi2.json").read_text())
     assert chi2["weighting"] == "INFORMATION"
@@ -51,7 +49,7 @@ def test_both_costs_are_in_the_file_and_the_hint_is_a_line(
     hint = " ".join(out.split()).rpartition("the file's own cost")[2].partition(" written: ")[0]
     below = float(hint.split("at most ")[1].split()[0])
     assert below >= 0.999 * chi2["chi2"]
-    assert hint.endswith(f"Solve for it. pgo solve {file} --information")
+    assert hint.endswith(f"Solve for it. pgo solve {file}")
     assert "the file's own cost" not in out_chi2
     assert any(line.startswith("chi2 ") for line in out_chi2.splitlines())
     assert "with two precisions an edge; the bound is on chi2 alone" in " ".join(out_chi2.split())
@@ -75,9 +73,10 @@ def test_anyones_poses_are_judged_by_chi2(pgo_command: Call, file: Path, tmp_pat
 def test_information_that_is_not_there_is_asked_for_in_vain(pgo_command: Call, file: Path) -> None:
     code, _, err = pgo_command("solve", "circle", "--information")
     assert (code, err) == (0, "")
-    code, _, err = pgo_command("solve", file, "--information", "--unit-weights")
-    assert (code, err.count("\n")) == (1, 1)
-    assert "--unit-weights takes them away; leave it out" in err
+    for options in (["--information", "--unit-weights"], ["--cost", "unit", "--drop-coupling"]):
+        code, _, err = pgo_command("solve", file, *options)
+        assert (code, err.count("\n")) == (1, 1)
+        assert "ask for different costs; leave out one" in err
 
 
 def test_the_advice_of_a_report_is_about_the_same_cost(
@@ -87,7 +86,7 @@ def test_the_advice_of_a_report_is_about_the_same_cost(
     code, _, err = pgo_command("solve", file, "--information", "--report", tmp_path / "r.html")
     assert (code, err) == (0, "")
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
-    assert f"pgo certify {file} --information --estimate solved.g2o" in page
+    assert f"pgo certify {file} --estimate solved.g2o" in page
 
 
 def test_robots_do_it_too(pgo_command: Call, file: Path) -> None:
@@ -122,8 +121,9 @@ def test_indefinite_matrices_are_refused_with_their_line(
             " edge 4" in err
         )
         assert "--drop-coupling" in err
-    code, _, err = pgo_command("solve", indefinite, "--drop-coupling")
-    assert (code, "add --information" in err) == (1, True)
+    code, out, err = pgo_command("solve", indefinite, "--drop-coupling")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[2].startswith("chi2 ")
 
 
 def test_coupling_that_is_left_out_is_said_wherever_chi2_is(

@@ -154,7 +154,7 @@ def test_every_method_ends_at_the_same_cost(pgo_command: Call, method: str) -> N
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        (["--information"], "--rotations has the rotation precisions of F"),
+        (["--information"], "--rotations and --information ask for different costs"),
         (["--report", "report.html"], "report.html needs positions"),
         (["--out", "picture.svg"], "picture.svg needs positions"),
     ],

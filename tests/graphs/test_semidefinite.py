@@ -100,7 +100,10 @@ def test_indefinite_matrices_are_refused_by_name_and_count_and_f_stays_as_it_is(
         with pytest.raises(GraphError, match=refused):
             ask()
     of_F = solvers.solve(bad, progress=False)
-    expected = solvers.solve(graph, progress=False)
+    expected = solvers.solve(
+        pgo.PGOProblem(graph, weighting=pgo.Weighting.ISOTROPIC), progress=False
+    )
+    assert of_F.problem.weighting is pgo.Weighting.ISOTROPIC
     assert (of_F.objective, of_F.lower_bound) == (expected.objective, expected.lower_bound)
     record = of_F.as_json()
     assert (record["chi2"], record["edges_without_coupling"]) == (None, 0)
@@ -130,7 +133,7 @@ def test_coupling_that_is_left_out_is_remembered_and_said() -> None:
     assert solution.note.startswith(said)
     assert said in str(solution)
     assert solution.as_json()["edges_without_coupling"] == 2
-    of_F = solvers.solve(changed, progress=False)
+    of_F = solvers.solve(pgo.PGOProblem(changed, weighting=pgo.Weighting.ISOTROPIC), progress=False)
     assert "left out" not in of_F.note
     assert "without the coupling blocks of 2 edges" in str(of_F)
 

@@ -374,7 +374,7 @@ def test_a_file_whose_edges_have_only_rotations(d: int, tmp_path: Path) -> None:
     read = read_g2o(path)
     assert not read.has_translations
     central = solved(averaging(graph))
-    solution = solved(read)
+    solution = solved(PGOProblem(read, weighting=Weighting.ISOTROPIC))
     assert solution.objective == pytest.approx(central.objective, rel=1e-9)
     assert "no edge measures a translation" in str(solution)
     assert "CERTIFIED: rotations globally optimal" in str(solution)

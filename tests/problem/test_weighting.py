@@ -154,7 +154,7 @@ def test_matrices_beyond_double_precision_are_refused_by_name() -> None:
 
 
 def test_a_weighting_is_asked_for() -> None:
-    with pytest.raises(SettingError, match=r"give one of Weighting\.ISOTROPIC"):
+    with pytest.raises(SettingError, match=r"give one of Weighting\.OWN, Weighting\.ISOTROPIC"):
         PGOProblem(varied_graph(0, 3, 2), weighting="information")  # type: ignore[arg-type]
 
 

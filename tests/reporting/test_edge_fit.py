@@ -57,8 +57,8 @@ def test_the_least_F_is_judged_by_chi2_and_advised_to_minimise_it(seed: int, d: 
     assert not fit.suspected.is_doubtful
     minimum = solvers.solve(pgo.PGOProblem(graph, weighting=Weighting.INFORMATION))
     assert minimum.lower_bound <= fit.lowered.cost.sum() < fit.residuals.cost.sum()
-    (advice,) = fit.advice("pgo solve strained.g2o", is_robust=False)
-    assert advice.command == "pgo solve strained.g2o --information"
+    (advice,) = fit.advice("pgo solve strained.g2o --cost isotropic", is_robust=False)
+    assert advice.command == "pgo solve strained.g2o"
     assert f"{fit.residuals.overall:.3g} times what is expected" in advice.text
     # At the minimum itself there is nothing left to advise.
     assert (
@@ -72,14 +72,10 @@ def test_the_least_F_is_judged_by_chi2_and_advised_to_minimise_it(seed: int, d: 
 def test_edges_that_fit_no_better_in_chi2_are_suspected(seed: int, d: int) -> None:
     fit = solved_fit(with_wrong_closure(strained(seed, d)))
     assert fit.lowered is not None
-    commands = [advice.command for advice in fit.advice("pgo solve g.g2o", is_robust=False)]
-    assert commands == [
-        "pgo solve g.g2o --information",
-        "pgo solve g.g2o --information --robust gnc",
-    ]
-    assert [advice.command for advice in fit.advice("pgo solve g.g2o", is_robust=True)] == commands[
-        :1
-    ]
+    solve = "pgo solve g.g2o --cost isotropic"
+    commands = [advice.command for advice in fit.advice(solve, is_robust=False)]
+    assert commands == ["pgo solve g.g2o", "pgo solve g.g2o --robust gnc"]
+    assert [advice.command for advice in fit.advice(solve, is_robust=True)] == commands[:1]
 
 
 @pytest.mark.parametrize("name", ["sphere", "circle", "grid", "robots"])
@@ -109,7 +105,8 @@ def test_page_and_command_give_the_same_advice(
         graph = with_wrong_closure(graph)
     path = tmp_path / "strained.g2o"
     pgo.write_g2o(graph, path)
-    _, out, err = pgo_command("solve", path, "--report", tmp_path / "out.html")
+    options = ("--cost", "isotropic")
+    _, out, err = pgo_command("solve", path, *options, "--report", tmp_path / "out.html")
     assert err == ""
     fit = solved_fit(pgo.read_g2o(path))
     text = (tmp_path / "out.html").read_text(encoding="utf-8")
@@ -117,7 +114,7 @@ def test_page_and_command_give_the_same_advice(
     assert f"{fit.residuals.cost.sum():.10g}" in page.text
     assert fit.sentence() in page.text
     assert "Counted in chi2" in page.text
-    advice = fit.advice(f"pgo solve {path}", is_robust=False)
+    advice = fit.advice(f"pgo solve {path} --cost isotropic", is_robust=False)
     assert len(advice) == 1 + is_wrong
     printed = " ".join(out.split())
     commands = re.findall("<code>(.*?)</code>", own_part(text))
@@ -133,9 +130,11 @@ def test_page_and_command_give_the_same_advice(
 
 def test_the_page_of_MIT_says_that_its_edges_do_not_fit(benchmark_data: Path) -> None:
     pytest.importorskip("plotly")
-    page = Page(report_page(solvers.solve(pgo.read_g2o(benchmark_data / "MIT.g2o"))))
+    graph = pgo.read_g2o(benchmark_data / "MIT.g2o")
+    solution = solvers.solve(pgo.PGOProblem(graph, weighting=Weighting.ISOTROPIC))
+    page = Page(report_page(solution))
     assert "4 edges cost more than errors as their information matrices say" in page.text
     assert "chi2 is 39.7 times what is expected" in page.text
     assert "its minimum is at most 41.17" in page.text
-    assert "pgo solve MIT --information" in page.text
+    assert "pgo solve MIT" in page.text
     assert "No edge costs more" not in page.text

@@ -199,7 +199,7 @@ def test_the_command_line_writes_one_whose_commands_can_be_typed(unit_weights, t
         "<code>(.*?)</code>", own_part((tmp_path / "out.html").read_text(encoding="utf-8"))
     )
     assert commands[0].split()[:3] == ["pgo", "solve", "grid"]
-    assert all(("--unit-weights" in command) == unit_weights for command in commands)
+    assert all(("--cost unit" in command) == unit_weights for command in commands)
 
 
 def cases(solution, uncertain):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import (
+    COSTS,
     COSTS_OF_POSES,
     DIMENSIONS,
     LOUD_NOISE,
@@ -40,8 +41,8 @@ from pgo_models.verification.verify import verify_proof
 from solvers.riemannian.certify import certify
 from solvers.studies.tightness import SweptScene, noisy_scene
 
-WEIGHTINGS = st.sampled_from(Weighting)
-BOTH = list(Weighting)
+WEIGHTINGS = st.sampled_from(COSTS)
+BOTH = list(COSTS)
 
 
 @pytest.mark.parametrize("weighting", BOTH)
@@ -167,7 +168,7 @@ def test_every_tag_of_the_plane(line: str, tmp_path: Path) -> None:
     path = tmp_path / "graph.g2o"
     path.write_text(f"{PLANE}{line}\n")
     has_rotations = "_XY" not in line and "LANDMARK" not in line
-    for weighting in Weighting if has_rotations else COSTS_OF_POSES:
+    for weighting in COSTS if has_rotations else COSTS_OF_POSES:
         certificate, proof = proof_of(path, weighting)
         assert_verified(verify_proof(path, proof), certificate)
 
@@ -194,7 +195,7 @@ def test_every_tag_of_space(line: str, tmp_path: Path) -> None:
     path = tmp_path / "graph.g2o"
     path.write_text(f"{SPACE}{line}\n")
     has_rotations = not any(word in line for word in ("_XY", "XYZ", "LANDMARK"))
-    for weighting in Weighting if has_rotations else COSTS_OF_POSES:
+    for weighting in COSTS if has_rotations else COSTS_OF_POSES:
         certificate, proof = proof_of(path, weighting)
         assert_verified(verify_proof(path, proof), certificate)
 
@@ -219,7 +220,7 @@ def examined(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Path, Path,
     """Files, their proofs, and their least cost, from above."""
     found = []
     for seed, d in ((0, 2), (1, 3)):
-        for weighting in Weighting:
+        for weighting in COSTS:
             folder = tmp_path_factory.mktemp("proof")
             path = written(folder, informed(seed, 5, d, coupled=True, spread=0.3))
             certificate, proof = proof_of(path, weighting)
@@ -297,7 +298,7 @@ def test_a_measurement_that_was_changed_is_noticed(
 
 def test_proofs_of_files_without_translations_are_verified(tmp_path: Path) -> None:
     graph = varied_graph(0, 6, 3)
-    for weighting in Weighting:
+    for weighting in COSTS:
         path = written(tmp_path, graph.with_weights(graph.kappa, np.zeros(graph.num_edges)))
         certificate, proof = proof_of(path, weighting)
         found = verify_proof(path, proof)
