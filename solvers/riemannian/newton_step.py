@@ -230,13 +230,18 @@ def first_shift(last_shift: float, objective: float, num_rows: int) -> float:
 
 
 def backtrack(algebra: NewtonAlgebra[M, T], model: M) -> T | None:
-    """Return the first of the moves -y, -y/2, .. that lowers F enough, y = H^-1 g, or None."""
+    """Return the first of the moves -y, -y/2, .. that lowers F enough, y = H^-1 g, or None.
+
+    Moves whose decrease would be below the rounding of F are not tried, but for the full one.
+    """
     length = 1.0
     for _ in range(HALVINGS):
         trial = algebra.evaluate(model, length)
         if is_low_enough(model, trial.objective, length):
             return trial
         length *= 0.5
+        if length * model.square <= ROUNDING * model.objective:
+            break
     return None
 
 
