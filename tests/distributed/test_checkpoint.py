@@ -387,11 +387,11 @@ solvers.solve(graph, settings, robots=robots, checkpoint=checkpoint, callback=wa
 
 
 def long_run():
-    """Graph, settings and robots of a run with 250 iterations of SOC."""
+    """Graph, settings and robots of a run with 150 iterations of SOC."""
     graph = pgo.load("circle")
     robots = chosen_partition(graph, 3, None)
     settings = chosen_pipeline(
-        FirstStage.SUBSTRUCTURED, robots, BackEndName.FACTORIZED, 1e-6, 250, 1e-300
+        FirstStage.SUBSTRUCTURED, robots, BackEndName.FACTORIZED, 1e-6, 150, 1e-300
     )
     return graph, settings, robots
 
@@ -433,6 +433,6 @@ def test_a_killed_process_goes_on_where_it_was(tmp_path):
     np.testing.assert_allclose(found.objective, expected.objective, rtol=1e-8, atol=0)
     assert found.is_certified
     soc = next(stage for stage in found.stages if stage.name == "SOC")
-    assert soc.iterations == 250
+    assert soc.iterations == 150
     assert 50 <= seen[0] <= 61  # the first state after the resume is not the start
     assert len(seen) < len(soc.history)

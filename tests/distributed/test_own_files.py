@@ -57,7 +57,8 @@ def tower(num_robots: int, poses_each: int) -> PoseGraph:
 
 def check_same(solution: FolderSolution, graph: PoseGraph, out: Path) -> None:
     """Objective and bound of the central solve, and files with poses that have this objective."""
-    central = solvers.solve(graph, robots=pgo.partition(graph, graph.num_robots))
+    problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.ISOTROPIC)
+    central = solvers.solve(problem, robots=pgo.partition(graph, graph.num_robots))
     certificate = solution.certificate
     assert solution.status.is_success
     assert certificate.verdict is central.certificate.verdict
@@ -69,9 +70,9 @@ def check_same(solution: FolderSolution, graph: PoseGraph, out: Path) -> None:
     assert (written.num_poses, written.num_edges) == (graph.num_poses, graph.num_edges)
     np.testing.assert_array_equal(written.robots, graph.robots)
     assert written.initial is not None
-    assert pgo.PGOProblem(written).objective(written.initial) == pytest.approx(
-        certificate.objective, rel=1e-9, abs=level
-    )
+    assert pgo.PGOProblem(written, weighting=pgo.Weighting.ISOTROPIC).objective(
+        written.initial
+    ) == pytest.approx(certificate.objective, rel=1e-9, abs=level)
 
 
 @settings(max_examples=12, deadline=None)
@@ -111,7 +112,7 @@ def test_what_is_certified_is_what_is_written_however_far_its_frame(
     certificate = solve_folder(tmp_path / "in", out=tmp_path / "out").certificate
     written = read_g2o(tmp_path / "out")
     assert written.initial is not None
-    F = pgo.PGOProblem(written).objective(written.initial)
+    F = pgo.PGOProblem(written, weighting=pgo.Weighting.ISOTROPIC).objective(written.initial)
     level = certificate.rounding_level
     assert certificate.objective == pytest.approx(F, rel=1e-9, abs=level)
     assert certificate.gap == pytest.approx((F - certificate.lower_bound) / F, rel=1e-6, abs=1e-9)
@@ -273,16 +274,17 @@ def test_the_staircase_is_run_by_the_robots(d: int, tmp_path: Path) -> None:
     graph = graph.with_robots(pgo.partition(graph, 4).robot)
     write_g2o_folder(graph, tmp_path / "in")
     solution = solve_folder(tmp_path / "in", out=tmp_path / "out")
-    central = solvers.solve(graph, robots=pgo.partition(graph, 4))
+    problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.ISOTROPIC)
+    central = solvers.solve(problem, robots=pgo.partition(graph, 4))
     assert [stage.name for stage in solution.stages] == [stage.name for stage in central.stages]
     assert "Staircase" in [stage.name for stage in solution.stages]
     assert solution.certificate.source is central.certificate.source is BoundSource.RELAXATION
     assert solution.certificate.lower_bound == pytest.approx(central.lower_bound, rel=1e-6)
     written = read_g2o(tmp_path / "out")
     assert written.initial is not None
-    assert pgo.PGOProblem(written).objective(written.initial) == pytest.approx(
-        solution.certificate.objective, rel=1e-9
-    )
+    assert pgo.PGOProblem(written, weighting=pgo.Weighting.ISOTROPIC).objective(
+        written.initial
+    ) == pytest.approx(solution.certificate.objective, rel=1e-9)
     unfinished = solvers.Pipeline(
         soc=None, newton=solvers.Newton(max_iterations=0), second_try=False, staircase=None
     )
@@ -362,9 +364,9 @@ def test_ctrl_c_between_the_loops_keeps_what_was_found(
     assert solution.status is Status.INTERRUPTED
     written = read_g2o(tmp_path / "out")
     assert written.initial is not None
-    assert pgo.PGOProblem(written).objective(written.initial) == pytest.approx(
-        solution.certificate.objective, rel=1e-9
-    )
+    assert pgo.PGOProblem(written, weighting=pgo.Weighting.ISOTROPIC).objective(
+        written.initial
+    ) == pytest.approx(solution.certificate.objective, rel=1e-9)
 
 
 def test_a_second_try_keeps_the_better(monkeypatch: pytest.MonkeyPatch) -> None:
