@@ -115,6 +115,7 @@ class FolderSolution:
             ("frame", self.frame),
             ("seconds", f"{self.seconds:.3g}"),
             ("robots", robots),
+            ("cost", "F: robots that read their own files do not minimise chi2"),
             *self.ledger.facts(),
         ]
         return "\n".join(f"{label:<12} {text}" for label, text in facts if text)
