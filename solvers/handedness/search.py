@@ -29,7 +29,7 @@ class HandednessSearch:
         the best bound that multipliers and terms have, poses that the staircase may miss, and terms
         that the ascent begins with once more. None leaves it out.
     most_hull_poses : int
-        Poses up to which the relaxation is solved; it takes about 20 CPU seconds of 1,000 poses.
+        Poses up to which the relaxation is solved; it takes about 55 CPU seconds of 1,000 poses.
 
     Raises
     ------
