@@ -68,9 +68,10 @@ def extend(solution: Solution, graph: PoseGraph, pipeline: Pipeline | None = Non
         return solve(problem, pipeline, start)
     tolerance = max(pipeline.newton.tolerance, _SHARE * pipeline.gap)
     newton = replace(pipeline.newton, tolerance=tolerance)
-    newton_alone = replace(
-        pipeline, soc=None, newton=newton, growing=None, second_try=False, staircase=None
-    )
+    # Terms are sought at the poses alone: the whole solve has the relaxation with hulls.
+    search = pipeline.handedness
+    terms = None if search is None else replace(search, hulls=None)
+    newton_alone = replace(pipeline.with_newton_alone(newton), handedness=terms)
     update = solve(problem, newton_alone, start)
     if update.status in OUT_OF_TIME or not update.certificate.can_improve:
         return update

@@ -164,6 +164,29 @@ class Pipeline:
         """Whether a solve by robots has a driver."""
         return self.driver_memory > 0
 
+    def with_newton_alone(self, newton: Newton) -> Pipeline:
+        """The pipeline without all stages but a start, Newton and its certificate.
+
+        Parameters
+        ----------
+        newton : Newton
+            Settings of Newton.
+
+        Returns
+        -------
+        Pipeline
+            Gap, faults and memory of the driver are those of this one.
+        """
+        return replace(
+            self,
+            soc=None,
+            newton=newton,
+            growing=None,
+            second_try=False,
+            staircase=None,
+            handedness=None,
+        )
+
     @property
     def default_weighting(self) -> Weighting:
         """Which cost of a graph is minimised unless another is given: its own, where it can be.
@@ -465,16 +488,7 @@ def _solve_without_wrong_edges(request: _Request, robust: GNC | PCM) -> Solution
     newton = pipeline.newton
     if isinstance(robust, GNC):
         newton = replace(newton, max_iterations=LAST_STEPS)
-    newton_alone = replace(
-        pipeline,
-        soc=None,
-        newton=newton,
-        growing=None,
-        second_try=False,
-        staircase=None,
-        handedness=None,
-    )
-    solve_once = partial(request.solve_once(), pipeline=newton_alone)
+    solve_once = partial(request.solve_once(), pipeline=pipeline.with_newton_alone(newton))
     estimate: Callable[..., SharedEstimate] | None = None
     if request.robots is not None:
         robots = robots_of_solve(pipeline.soc, request.robots, request.problem.graph)

@@ -284,8 +284,9 @@ class HullLagrangian:
         function = AugmentedLagrangian.of(problem, state.Pi, state.rho, state.preconditioner)
         # (a)
         level = state.rounding_level
+        start = self._without_negligible_columns(state.point.Y)
         enough = min(max(_ENOUGH * state.closeness, _FINEST), _COARSEST)
-        point = _minimised(function, function.evaluate(state.point.Y), level, enough)
+        point = _minimised(function, function.evaluate(start), level, enough)
         bound = state.bound
         for _ in range(_MOST_CLIMBS):
             rng = np.random.default_rng(state.k)
@@ -304,7 +305,7 @@ class HullLagrangian:
         return replace(
             state,
             k=state.k + 1,
-            point=replace(point, Y=self._without_negligible_columns(point.Y)),
+            point=point,
             Pi=Pi,
             rho=rho,
             objective=problem.objective(round_factor(problem, point.Y)[0]),

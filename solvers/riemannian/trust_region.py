@@ -11,7 +11,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.geometry.stiefel import retract
 from solvers.riemannian.truncated_cg import TruncatedStep, truncated_conjugate_gradients
 
-FIRST_RADIUS = 100.0  # times the preconditioned gradient, which soft directions outgrow
+_FIRST_RADIUS = 100.0  # times the preconditioned gradient, which soft directions outgrow
 # ratios of actual to promised decrease
 _ACCEPTED = 0.1
 _POOR = 0.25
@@ -113,7 +113,7 @@ def trust_region_step(
 
 def first_radius(squared: float) -> float:
     """Radius of the first step, from <g, P g> of the gradient g and the preconditioner P."""
-    return FIRST_RADIUS * math.sqrt(max(squared, 0.0))
+    return _FIRST_RADIUS * math.sqrt(max(squared, 0.0))
 
 
 def _next_radius(radius: float, ratio: float, trial: TruncatedStep, longest: float) -> float:
