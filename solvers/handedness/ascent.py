@@ -8,17 +8,19 @@ derivative for P_e is
 
 A step goes along it as far as the smallest eigenvalue would need to become positive if it were
 linear (Polyak 1969), and back to P >= 0.
+
+How far a step goes, and when to stop, is decided here; where the P and the eigenvectors are is
+`AscentPoint`. There are two: `solvers.handedness.certificate_spectrum` in one place, and
+`solvers.distributed.handedness` by a driver and its robots, each of which has the P of its edges.
 """
 
 from dataclasses import dataclass, replace
+from typing import Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
 from pgo_models.errors import check_settings
 from pgo_models.geometry.rotations import Array
-from pgo_models.problem.matrices import inner
-from pgo_models.problem.stationarity import rotation_scale
-from solvers.handedness.certificate_spectrum import HandedMatrix, Spectrum
 from solvers.result import Measurement, Status
 
 POSITIVE = 1e-9  # of the mean diagonal of M: an eigenvalue above that is no rounding
@@ -28,20 +30,44 @@ _SOFTNESS = 0.1  # temperature of the soft minimum, as a share of the smallest e
 _WINDOW = 10  # last steps, whose rise tells whether those that are left can reach zero
 
 
+class AscentPoint(Protocol):
+    """Matrices P of pairs of poses, with the lowest eigenvalues of what they leave."""
+
+    @property
+    def values(self) -> Array:
+        """The lowest eigenvalues of S_r less the terms, ascending, (q,)."""
+
+    @property
+    def objective(self) -> float:
+        """The cost of the poses."""
+
+    @property
+    def scale(self) -> float:
+        """Mean diagonal of M over the rotations."""
+
+    def ascended(self, weights: Array, rise: float) -> Self:
+        """Return the point after a step along the derivative, (q,) weights of the eigenvectors.
+
+        It is so long that the weighted mean of the eigenvalues, if it were linear, would gain
+        `rise`, and leads back to P >= 0.
+        """
+
+
+T = TypeVar("T", bound=AscentPoint)
+
+
 @dataclass(frozen=True, eq=False)
-class AscentState:
-    """State k: the matrices, the lowest eigenvalues with them, and the best one of each step."""
+class AscentState(Generic[T]):
+    """State k: the matrices with the lowest eigenvalues, and the best one of each step so far."""
 
     k: int
-    P: Array  # (pairs, 3, 3)
-    spectrum: Spectrum
-    scale: float  # mean diagonal of M over the rotations
+    point: T
     best: tuple[float, ...]  # best smallest eigenvalue up to every step so far
 
     @property
     def smallest(self) -> float:
         """The smallest eigenvalue."""
-        return float(self.spectrum.values[0])
+        return float(self.point.values[0])
 
 
 @dataclass(frozen=True)
@@ -69,42 +95,36 @@ class HandednessAscent:
     def __post_init__(self) -> None:
         check_settings(self, not_negative=["max_iterations"], at_least_one=["num_eigenvalues"])
 
-    def init(self, matrix: HandedMatrix, start: Array | None) -> AscentState:
-        """State 0: the P of all pairs in `start`, (pairs, 3, 3), or zero."""
-        P = np.zeros((len(matrix.i), 3, 3)) if start is None else start
-        scale = float(rotation_scale(matrix.problem).mean())
-        spectrum = matrix.spectrum(P, self._count(matrix), -scale)
-        return AscentState(0, P, spectrum, scale, (float(spectrum.values[0]),))
+    def init(self, first: T, start: None) -> AscentState[T]:
+        """State 0, at the first point."""
+        return AscentState(0, first, (float(first.values[0]),))
 
-    def step(self, matrix: HandedMatrix, state: AscentState) -> AscentState:
+    def step(self, first: T, state: AscentState[T]) -> AscentState[T]:
         """One step along the derivative of the soft minimum."""
         best = state.best[-1]
-        first = abs(state.best[0])
+        least = _LEAST_AIM * abs(state.best[0])
+        values = state.point.values
         smallest = state.smallest
-        aim = max(_AIM * abs(best), _LEAST_AIM * first)
-        temperature = _SOFTNESS * max(abs(smallest), _LEAST_AIM * first)
-        weights = np.exp(-(state.spectrum.values - smallest) / temperature)
+        aim = max(_AIM * abs(best), least)
+        temperature = max(_SOFTNESS * abs(smallest), _SOFTNESS * least)
+        weights = np.exp(-(values - smallest) / temperature)
         weights /= weights.sum()
-        D = state.spectrum.moves * np.sqrt(weights)
-        squares = np.sum(D * D, axis=(1, 2))
-        derivative = 0.25 * (D @ np.swapaxes(D, 1, 2) - 0.5 * squares[:, None, None] * np.eye(3))
-        length = (aim - smallest) / inner(derivative, derivative)
-        P = nearest_semidefinite(state.P + length * derivative)
-        spectrum = matrix.spectrum(P, self._count(matrix), smallest)
-        now = max(best, float(spectrum.values[0]))
-        return replace(state, k=state.k + 1, P=P, spectrum=spectrum, best=(*state.best, now))
+        point = state.point.ascended(weights, aim - smallest)
+        now = max(best, float(point.values[0]))
+        return replace(state, k=state.k + 1, point=point, best=(*state.best, now))
 
-    def measure(self, matrix: HandedMatrix, state: AscentState) -> Measurement:
-        """The cost of the poses, and what the smallest eigenvalue lacks."""
-        return measured(matrix, state.smallest, state.scale)
+    def measure(self, first: T, state: AscentState[T]) -> Measurement:
+        """The cost of the poses, and what the smallest eigenvalue lacks to be positive."""
+        lacking = max(0.0, POSITIVE - state.smallest / first.scale)
+        return Measurement(first.objective, 0.0, lacking, infeasibility=lacking)
 
-    def converged(self, state: AscentState, measurement: Measurement) -> Status | None:
+    def converged(self, state: AscentState[T], measurement: Measurement) -> Status | None:
         """CONVERGED with a positive eigenvalue, STALLED where it rises too slowly to become one.
 
         Steps gain less and less, so that the rise of the last ones, times those that are left, is
         more than there is to come.
         """
-        if state.smallest > POSITIVE * state.scale:
+        if state.smallest > POSITIVE * state.point.scale:
             return Status.CONVERGED
         if len(state.best) <= _WINDOW:
             return None
@@ -112,15 +132,15 @@ class HandednessAscent:
         steps_left = self.max_iterations - state.k
         return None if state.best[-1] + steps_left * rise > 0.0 else Status.STALLED
 
-    def _count(self, matrix: HandedMatrix) -> int:
-        return min(self.num_eigenvalues, 3 * len(matrix.free) - 1)
 
+def derivative_of_minimum(moves: Array, weights: Array) -> Array:
+    """Derivative for the P of every pair, (k, 3, 3), of eigenvalues with weights, (q,).
 
-def measured(matrix: HandedMatrix, smallest: float, scale: float) -> Measurement:
-    """The cost of the poses, and what a smallest eigenvalue lacks to be positive."""
-    lacking = max(0.0, POSITIVE - smallest / scale)
-    objective = matrix.problem.objective(matrix.poses)
-    return Measurement(objective, 0.0, lacking, infeasibility=lacking)
+    Their eigenvectors do `moves` to the pairs, (k, 3, q).
+    """
+    D = moves * np.sqrt(weights)
+    squares = np.sum(D * D, axis=(1, 2))
+    return np.asarray(0.25 * (D @ np.swapaxes(D, 1, 2) - 0.5 * squares[:, None, None] * np.eye(3)))
 
 
 def nearest_semidefinite(P: Array) -> Array:

@@ -6,7 +6,7 @@ the matrices P of pairs take sum_e B_e^T W_e B_e off it. Small graphs have it as
 large ones the lowest eigenvalues come from sparse factorisations, by inverse Lanczos.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,6 +24,8 @@ from pgo_models.graphs.pose_graph import IntArray, middle_pose
 from pgo_models.problem import matrices
 from pgo_models.problem.cholesky import CholeskyFactor
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.stationarity import rotation_scale
+from solvers.handedness.ascent import derivative_of_minimum, nearest_semidefinite
 
 MOST_DENSE = 130  # poses up to which dense eigenvalues are faster
 _ACCURACY = 1e-3  # of sparse eigenvalues, relative to their distance from the shift
@@ -77,6 +79,16 @@ class HandedMatrix:
     def free(self) -> IntArray:
         """The poses but r, (n - 1,)."""
         return np.delete(np.arange(self.problem.num_poses), self.ground)
+
+    @cached_property
+    def scale(self) -> float:
+        """Mean diagonal of M over the rotations."""
+        return float(rotation_scale(self.problem).mean())
+
+    @cached_property
+    def objective(self) -> float:
+        """The cost of the poses."""
+        return self.problem.objective(self.poses)
 
     @property
     def is_dense(self) -> bool:
@@ -202,3 +214,51 @@ class HandedMatrix:
         order = np.argsort(-inverted)
         z[self.free] = vectors[:, order].reshape(-1, 3, count)
         return Spectrum(shift + 1.0 / inverted[order], self.differences(z))
+
+
+@dataclass(frozen=True, eq=False)
+class HandedPoint:
+    """`ascent.AscentPoint` in one place: the P of all pairs, (k, 3, 3), and the spectrum there.
+
+    `count` lowest eigenvalues count, if there are so many; the smallest is about `expected`.
+    """
+
+    matrix: HandedMatrix
+    P: Array
+    count: int
+    expected: float
+
+    @classmethod
+    def first(cls, matrix: HandedMatrix, P: Array | None, num_eigenvalues: int) -> "HandedPoint":
+        """The point that an ascent begins at, with the P of all pairs, or zero."""
+        if P is None:
+            P = np.zeros((len(matrix.i), 3, 3))
+        count = min(num_eigenvalues, 3 * len(matrix.free) - 1)
+        return cls(matrix, P, count, -matrix.scale)
+
+    @cached_property
+    def spectrum(self) -> Spectrum:
+        """The lowest eigenvalues, and what their eigenvectors do to the pairs."""
+        return self.matrix.spectrum(self.P, self.count, self.expected)
+
+    @property
+    def values(self) -> Array:
+        """The lowest eigenvalues, ascending, (q,)."""
+        return self.spectrum.values
+
+    @property
+    def objective(self) -> float:
+        """The cost of the poses."""
+        return self.matrix.objective
+
+    @property
+    def scale(self) -> float:
+        """Mean diagonal of M over the rotations."""
+        return self.matrix.scale
+
+    def ascended(self, weights: Array, rise: float) -> "HandedPoint":
+        """Return the point after a step along the derivative, as long as `rise` asks for."""
+        derivative = derivative_of_minimum(self.spectrum.moves, weights)
+        length = rise / matrices.inner(derivative, derivative)
+        P = nearest_semidefinite(self.P + length * derivative)
+        return replace(self, P=P, expected=float(self.values[0]))

@@ -1,6 +1,7 @@
 """The search for handedness terms: an ascent at given poses, and the relaxation with hulls."""
 
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import HandednessTerms, distinct_pairs
@@ -10,10 +11,12 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.rotation_hull import matrices_at
 from solvers.handedness.ascent import AscentState, HandednessAscent
-from solvers.handedness.certificate_spectrum import HandedMatrix
-from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
+from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint
+from solvers.handedness.hull_lagrangian import HullLagrangian
 from solvers.loop import RunMonitor
 from solvers.result import Outcome, Stage
+
+S = TypeVar("S")
 
 
 @dataclass(frozen=True)
@@ -55,9 +58,10 @@ class HandednessSearch:
         i, j = distinct_pairs(problem.graph).T
         tangent = problem.tangent_at(poses)
         matrix = HandedMatrix(tangent, multipliers(problem, poses), poses, i, j)
-        start = None if Pi is None else matrices_at(matrix.T, Pi)
-        ascent: Outcome[AscentState] = monitor.run(self.ascent, matrix, start)
-        return HandednessTerms.at(poses, i, j, ascent.state.P), stage_of_search(ascent)
+        P = None if Pi is None else matrices_at(matrix.T, Pi)
+        first = HandedPoint.first(matrix, P, self.ascent.num_eigenvalues)
+        ascent: Outcome[AscentState[HandedPoint]] = monitor.run(self.ascent, first)
+        return HandednessTerms.at(poses, i, j, ascent.state.point.P), stage_of_search(ascent)
 
     def relaxation(self, problem: PGOProblem, gap: float) -> HullLagrangian | None:
         """The method for the relaxation with hulls; None where it does not suit the problem.
@@ -70,7 +74,7 @@ class HandednessSearch:
         return replace(self.hulls, gap=gap)
 
 
-def stage_of_search(outcome: Outcome[AscentState] | Outcome[HullState]) -> Stage:
+def stage_of_search(outcome: Outcome[S]) -> Stage:
     """Stage of a search for a bound, which a time limit or Ctrl-C may end, but no failure."""
     return Stage(
         outcome.name,

@@ -18,7 +18,7 @@ from pgo_models.relaxations.plan import RelaxationForm
 from pgo_models.relaxations.solve_sdp import solve_relaxation
 from solvers.handedness import certificate_spectrum
 from solvers.handedness.ascent import HandednessAscent, nearest_semidefinite
-from solvers.handedness.certificate_spectrum import HandedMatrix
+from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint
 from solvers.handedness.search import HandednessSearch
 from solvers.loop import RunMonitor, iterate, run
 from solvers.pipeline import Pipeline, solve
@@ -37,6 +37,10 @@ def matrix_of(problem: PGOProblem) -> HandedMatrix:
 
 def noisy_matrix(seed: int, n: int) -> HandedMatrix:
     return matrix_of(PGOProblem(varied_graph(seed, n, 3, LOUD_NOISE)))
+
+
+def first_point(matrix: HandedMatrix, P: np.ndarray | None = None, count: int = 8) -> HandedPoint:
+    return HandedPoint.first(matrix, P, count)
 
 
 def random_P(matrix: HandedMatrix, seed: int) -> np.ndarray:
@@ -78,13 +82,13 @@ def test_the_smallest_eigenvalue_rises_to_first_order_along_the_derivative(
 ) -> None:
     matrix = noisy_matrix(seed, n)
     ascent = HandednessAscent(num_eigenvalues=1)
-    state = ascent.init(matrix, random_P(matrix, seed))
-    D = state.spectrum.moves[:, :, 0]
+    state = ascent.init(first_point(matrix, random_P(matrix, seed), 1), None)
+    D = state.point.spectrum.moves[:, :, 0]
     outer = D[:, :, None] * D[:, None, :]
     squares = np.sum(D * D, axis=1)[:, None, None]
     derivative = 0.25 * (outer - 0.5 * squares * np.eye(3))
     step = 1e-6
-    ahead = matrix.spectrum(state.P + step * derivative, 2, 0.0).values
+    ahead = matrix.spectrum(state.point.P + step * derivative, 2, 0.0).values
     change = (ahead[0] - state.smallest) / step
     expected = float(np.sum(derivative**2))
     gap = ahead[1] - ahead[0]
@@ -93,20 +97,20 @@ def test_the_smallest_eigenvalue_rises_to_first_order_along_the_derivative(
 
 
 def test_states_are_left_alone() -> None:
-    matrix = noisy_matrix(0, 6)
+    first = first_point(noisy_matrix(0, 6))
     method = HandednessAscent()
-    states = list(islice(iterate(method, matrix), 4))
-    kept = [state.P.copy() for state in states]
-    method.step(matrix, states[0])
+    states = list(islice(iterate(method, first), 4))
+    kept = [state.point.P.copy() for state in states]
+    method.step(first, states[0])
     for state, P in zip(states, kept, strict=True):
-        np.testing.assert_array_equal(state.P, P)
+        np.testing.assert_array_equal(state.point.P, P)
     assert [state.k for state in states] == [0, 1, 2, 3]
 
 
 def test_matrices_stay_semidefinite() -> None:
-    matrix = noisy_matrix(1, 6)
-    for state in islice(iterate(HandednessAscent(), matrix), 8):
-        values = np.linalg.eigvalsh(state.P)
+    first = first_point(noisy_matrix(1, 6))
+    for state in islice(iterate(HandednessAscent(), first), 8):
+        values = np.linalg.eigvalsh(state.point.P)
         assert (values >= -1e-12 * max(1.0, np.abs(values).max())).all()
     A = np.random.default_rng(0).standard_normal((20, 3, 3))
     A = A + np.swapaxes(A, 1, 2)
@@ -181,8 +185,8 @@ def test_a_lattice_that_is_too_large_for_a_model_of_cvxpy_is_certified() -> None
 
 
 def test_the_search_respects_the_time_limit() -> None:
-    matrix = noisy_matrix(0, 8)
-    outcome = run(HandednessAscent(max_iterations=10**6), matrix, time_limit=1e-9)
+    first = first_point(noisy_matrix(0, 8))
+    outcome = run(HandednessAscent(max_iterations=10**6), first, time_limit=1e-9)
     assert outcome.status in (Status.TIME_LIMIT, Status.CONVERGED)
     problem = noisy(SweptScene.GRID, 80, 0)
     poses = solve(problem, Pipeline(handedness=None)).poses
